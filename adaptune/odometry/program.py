@@ -128,17 +128,17 @@ def _about(folder: Path) -> Any:
 # Notice poses that belong to another frame than the LiDAR's, and references that do.
 
 
-_FEWEST, _SHORTEST = 10, 5.0
+_MIN_FRAMES, _MIN_LENGTH = 10, 5.0
 """Frames, and metres, below which nothing is said of a reference."""
-_MOVED = 0.2
+_MIN_MOTION = 0.2
 """Metres that an odometry moves while the reference moves one."""
-_APART, _EXPLAINED = 20.0, 0.3
+_MIN_DEGREES, _MAX_LEFT = 20.0, 0.3
 """Degrees between an odometry's motions and the reference's, and the share that may be left."""
-_SWAPPED = 45.0
+_MIN_SWAPPED_DEGREES = 45.0
 """Degrees between them that no rotation explains."""
-_TURNED, _OTHERS = np.radians(3.0), 0.1
+_MIN_TURN, _MAX_OTHER_TURNS = np.radians(3.0), 0.1
 """Radians of a turn, and the share of turns that may be otherwise than the others."""
-_BACKWARDS = 120.0
+_MIN_REVERSED_DEGREES = 120.0
 """Degrees from which a reference may be reversed in time."""
 
 
@@ -150,25 +150,28 @@ def check_frame(T_own_sensor: Poses, T_ref_sensor: Poses | None) -> None:
     """
     if T_ref_sensor is None:
         return
-    ends = window_ends(T_ref_sensor, 1.0)
-    starts = np.flatnonzero((ends >= 0) & np.isfinite(T_own_sensor[:, 0, 0]))
-    starts = starts[np.isfinite(T_own_sensor[ends[starts], 0, 0])]
-    if len(starts) < 10:
+    T_own, T_true = _motions(T_own_sensor, T_ref_sensor, 1.0)
+    known = np.isfinite(T_own).all(axis=(1, 2))
+    own, true = T_own[known, :3, 3], T_true[known, :3, 3]
+    if len(own) < _MIN_FRAMES:
         return
-    own, truth = (
-        (invert(T[starts]) @ T[ends[starts]])[:, :3, 3] for T in (T_own_sensor, T_ref_sensor)
-    )
-    U, _, Vt = np.linalg.svd(truth.T @ own)
-    T_truth_own = np.eye(4)
-    T_truth_own[:3, :3] = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
-    before = np.linalg.norm(own - truth, axis=1).mean()
-    after = np.linalg.norm(own @ T_truth_own[:3, :3].T - truth, axis=1).mean()
+    T_true_own = np.eye(4)
+    T_true_own[:3, :3] = R_true_own = _aligning(own, true)
+    before = np.linalg.norm(own - true, axis=1).mean()
+    after = np.linalg.norm(own @ R_true_own.T - true, axis=1).mean()
     if before > 0.3 and after < 0.2 * before:
-        angle = np.degrees(rotation_angle(T_truth_own))
+        angle = np.degrees(rotation_angle(T_true_own))
         raise OdometryError(
             f"the program's poses are those of another frame: turned by {angle:.0f} degrees, they "
             f"are the reference's; give the LiDAR's pose in it (odometry.settings.extrinsic)"
         )
+
+
+def _aligning(own: Poses, true: Poses) -> Poses:
+    """The rotation that takes directions of shape (n, 3) nearest to others, of shape (3, 3)."""
+    U, _, Vt = np.linalg.svd(true.T @ own)
+    R_true_own: Poses = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    return R_true_own
 
 
 def contradiction(T_odom_sensor: Poses, T_ref_sensor: Poses) -> str | None:
@@ -192,16 +195,19 @@ def contradiction(T_odom_sensor: Poses, T_ref_sensor: Poses) -> str | None:
     """
     T_own, T_true = _motions(T_odom_sensor, T_ref_sensor, 1.0)
     # An odometry that stands still says nothing.
-    moved = np.linalg.norm(T_own[:, :3, 3], axis=1) > _MOVED
-    if moved.sum() < max(_FEWEST, 0.5 * len(moved)) or travelled(T_ref_sensor)[-1] < _SHORTEST:
+    moved = np.linalg.norm(T_own[:, :3, 3], axis=1) > _MIN_MOTION
+    if (
+        moved.sum() < max(_MIN_FRAMES, 0.5 * len(moved))
+        or travelled(T_ref_sensor)[-1] < _MIN_LENGTH
+    ):
         return None
     apart, left = _apart(T_own[moved, :3, 3], T_true[moved, :3, 3])
-    if apart > _APART and left < _EXPLAINED * apart:
+    if apart > _MIN_DEGREES and left < _MAX_LEFT * apart:
         return _turned(apart, T_odom_sensor, T_ref_sensor)
-    same = _same_turns(*_motions(T_odom_sensor, T_ref_sensor, _SHORTEST))
-    if same > 1.0 - _OTHERS and apart > _SWAPPED:
+    same = _same_turns(*_motions(T_odom_sensor, T_ref_sensor, _MIN_LENGTH))
+    if same > 1.0 - _MAX_OTHER_TURNS and apart > _MIN_SWAPPED_DEGREES:
         return "its orientations fit, but its positions do not: it looks as if axes were swapped"
-    if same < _OTHERS and apart < _APART:
+    if same < _MAX_OTHER_TURNS and apart < _MIN_DEGREES:
         return "its turns go the other way: it looks mirrored, or its z axis points down"
     return None
 
@@ -218,19 +224,18 @@ def _same_turns(T_own: Poses, T_true: Poses) -> float:
     """Share of the turns that go the same way; NaN if there are few."""
     from scipy.spatial.transform import Rotation
 
-    if len(T_own) < _FEWEST:
+    if len(T_own) < _MIN_FRAMES:
         return np.nan
     own, true = (Rotation.from_matrix(T[:, :3, :3]).as_rotvec() for T in (T_own, T_true))
-    turning = np.minimum(np.linalg.norm(own, axis=1), np.linalg.norm(true, axis=1)) > _TURNED
+    turning = np.minimum(np.linalg.norm(own, axis=1), np.linalg.norm(true, axis=1)) > _MIN_TURN
     same = (own * true).sum(axis=1)[turning] > 0.0
-    return float(same.mean()) if len(same) >= _FEWEST else np.nan
+    return float(same.mean()) if len(same) >= _MIN_FRAMES else np.nan
 
 
 def _apart(own: Poses, true: Poses) -> tuple[float, float]:
     """Median angle between displacements in degrees, and what a rotation leaves of it."""
     own, true = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (own, true))
-    U, _, Vt = np.linalg.svd(true.T @ own)
-    R_true_own = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    R_true_own = _aligning(own, true)
     both = ((v * true).sum(axis=1).clip(-1.0, 1.0) for v in (own, own @ R_true_own.T))
     before, after = (float(np.degrees(np.median(np.arccos(cosine)))) for cosine in both)
     return before, after
@@ -239,7 +244,7 @@ def _apart(own: Poses, true: Poses) -> tuple[float, float]:
 def _turned(degrees: float, T_odom_sensor: Poses, T_ref_sensor: Poses) -> str:
     """Tell a turned reference from one that runs backwards, by speeds and turn rates."""
     turned = f"it looks turned by about {5 * round(degrees / 5)} degrees"
-    if degrees < _BACKWARDS:
+    if degrees < _MIN_REVERSED_DEGREES:
         return turned
     own, true = (
         np.nan_to_num([np.linalg.norm(T[:, :3, 3], axis=1), rotation_angle(T)])
@@ -314,6 +319,11 @@ class WholeRun(OdometryInstance):
         self._T_odom_own = np.eye(4)
         self._usage = Usage(0.0, None)
         self._last_motion = LastMotion()
+
+    @staticmethod
+    def describe(settings: Any) -> Description:  # noqa: ARG004
+        """The study defines the parameters, and nothing can change on the way."""
+        return Description(space=None, live=False, whole=True)
 
     @classmethod
     def instance(cls, *given: Any) -> Self:
@@ -500,11 +510,6 @@ class Command(WholeRun):
     settings_type = CommandSettings
 
     @staticmethod
-    def describe(settings: CommandSettings) -> Description:  # noqa: ARG004
-        """The study defines the parameters, and nothing can change on the way."""
-        return Description(space=None, live=False, whole=True)
-
-    @staticmethod
     def check(settings: CommandSettings, parameters: ParameterSet) -> None:
         """Raise an `OdometryError` if there is no such program, or no way for a parameter to it."""
         program = settings.command[0]
@@ -529,12 +534,11 @@ class Command(WholeRun):
 
     def _command(self, given: ProgramInput, output: Path, folder: Path) -> list[str]:
         values: dict[str, Any] = {"input": given.path.resolve(), "output": output}
-        values |= {"points": given.points, "imu": given.imu}
+        values |= {"points": given.points, "imu": given.imu, **self.parameters}
         if self.settings.template is not None:
             template = Template(Path(self.settings.template))
             values["parameters"] = folder / template.path.name
             values["parameters"].write_text(template.fill(self.parameters), encoding="utf-8")
-        values |= self.parameters
         return [replace(argument, values) for argument in self.settings.command]
 
     def _execute(self, command: list[str], folder: Path, log: Path, n: int) -> str | None:

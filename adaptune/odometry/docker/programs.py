@@ -66,11 +66,6 @@ class DockerCommand(WholeRun):
     settings_type = DockerCommandSettings
 
     @staticmethod
-    def describe(settings: DockerCommandSettings) -> Description:  # noqa: ARG004
-        """The study defines the parameters, and nothing can change on the way."""
-        return Description(space=None, live=False, whole=True)
-
-    @staticmethod
     def check(settings: DockerCommandSettings, parameters: ParameterSet) -> None:
         """Raise an `OdometryError` if the image is not here, or a parameter has no way to it."""
         image_digest(settings.image)
@@ -90,11 +85,10 @@ class DockerCommand(WholeRun):
         inside = "/data" if source.is_dir() else f"/data/{source.name}"
         mounts = [Mount(source, inside), Mount(output, _OUTPUT, writable=True)]
         values: dict[str, Any] = {"input": inside, "output": f"{_OUTPUT}/{self.settings.output}"}
-        values |= {"points": given.points, "imu": given.imu}
+        values |= {"points": given.points, "imu": given.imu, **self.parameters}
         if self.settings.template is not None:
             mounts.append(self._fill(folder))
             values["parameters"] = mounts[-1].target
-        values |= self.parameters
         container = Container(
             self.settings,
             self._limits.memory,
