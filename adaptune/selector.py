@@ -22,9 +22,9 @@ from adaptune.model.descriptor import (
     lowest_elevation,
     speed_and_turn_rate,
 )
-from adaptune.model.rules import NOVEL, PairedExpectedRatio
+from adaptune.model.rules import NOVEL_FAMILIARITY, PairedExpectedRatio
 from adaptune.model.weights import (
-    SMOOTHING,
+    SMOOTHED_SELECTIONS,
     measured_weights,
     renormalised,
     smooth_weights,
@@ -152,7 +152,7 @@ class Selector:
         """Forget all scans and selections, as before a new recording."""
         self._scan: Scan | None = None
         self._descriptors: deque[NDArray[np.float32]] = deque(maxlen=self._model.window)
-        self._found: deque[Selection] = deque(maxlen=SMOOTHING)
+        self._found: deque[Selection] = deque(maxlen=SMOOTHED_SELECTIONS)
         self._current: int | None = None
         self._stamp = self._switched = 0
         self._recent: deque[tuple[int, Poses]] = deque()  # registered scans
@@ -267,7 +267,7 @@ class Selector:
         self._familiar.append(familiarity)
         error = self._live.own_error()
         is_worse = error is not None and error.low > WORSE * predicted
-        is_new = float(np.median(self._familiar)) < NOVEL
+        is_new = float(np.median(self._familiar)) < NOVEL_FAMILIARITY
         if is_new or is_worse or self._failed or self._live.lost:
             self._at_work = seconds + REMEMBERED
         # Somebody has to go on.

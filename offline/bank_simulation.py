@@ -18,9 +18,9 @@ from adaptune.metrics import cap, sub_trajectory_rte, sub_trajectory_vectors, tr
 from adaptune.model.weights import MemberWeights
 from adaptune.study.study import PER_STRETCH
 
-NOTICED = 1.0
+SECONDS_UNTIL_NOTICED = 1.0
 """Seconds until a bank notices that a member has lost track."""
-FELT = 0.25
+MISFIT_PER_METRE = 0.25
 """By how much farther a scan is from the one before, about, in a metre by which it is misplaced."""
 
 
@@ -123,7 +123,7 @@ class BankSimulation:
         T_ref = np.array([invert(self.T_ref_sensor[frame - n]) @ T_ref_now for n in ago])
         T = invert(T_ref)[:, None] @ T_then_now
         apart = np.linalg.norm(T[..., :3, 3], axis=-1) + LEVER * rotation_angle(T)
-        found = np.minimum(1.0, FELT * apart).mean(axis=0)
+        found = np.minimum(1.0, MISFIT_PER_METRE * apart).mean(axis=0)
         return np.asarray(np.where(np.isnan(found), np.inf, found))
 
     def errors(
@@ -154,8 +154,8 @@ def recorded_motions(frames: Frames, trials: Sequence[Trial]) -> Poses:
     """Motions over every scan but the first, as the trials recorded them.
 
     Where a trial lost track, its motion was not recorded, and it started again at the reference. In
-    a bank nobody knows at once: here it stands still for `NOTICED` seconds, as all others do that
-    lose track there, and then goes on.
+    a bank nobody knows at once: here it stands still for `SECONDS_UNTIL_NOTICED`, as all others do
+    that lose track there, and then goes on.
 
     Returns shape (n_frames - 1, n_trials, 4, 4).
     """
@@ -168,10 +168,10 @@ def recorded_motions(frames: Frames, trials: Sequence[Trial]) -> Poses:
 
 
 def _for_a_while(lost: NDArray[np.bool_], stamps: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Steps that begin less than `NOTICED` seconds after the begin of one that is lost."""
+    """Steps that begin less than `SECONDS_UNTIL_NOTICED` after the begin of one that is lost."""
     begins = stamps[:-1]
     last = np.maximum.accumulate(np.where(lost, begins, np.iinfo(np.int64).min // 2))
-    return np.asarray(begins - last < NOTICED * 1e9)
+    return np.asarray(begins - last < SECONDS_UNTIL_NOTICED * 1e9)
 
 
 def motions_from_archive(
@@ -194,7 +194,7 @@ def motions_from_archive(
 # Stretches: recordings are cut into them, and one after the other is left out.
 
 
-MARGIN = 2
+MARGIN_FRAMES = 2
 """Frames that a part of a simulation is longer than its stretch: a distance that is summed from
 another frame may differ in its last bits, and a sub-trajectory then ends one frame later."""
 
@@ -274,7 +274,7 @@ def stretches_of_view(
 def part_of(simulation: BankSimulation, extent: Extent) -> tuple[BankSimulation, Extent]:
     """The part of a simulation that a stretch takes, and the stretch's extent in it."""
     first = int(extent.frames.min())
-    stop = min(int(extent.ends.max()) + 1 + MARGIN, len(simulation.stamps))
+    stop = min(int(extent.ends.max()) + 1 + MARGIN_FRAMES, len(simulation.stamps))
     frames = slice(first, stop)
 
     def motions(members: tuple[int, ...]) -> Poses:

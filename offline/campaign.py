@@ -360,7 +360,7 @@ def baseline_warning(
 # Run the baselines before anything else: a setup in which one fails is stopped at once.
 
 
-MOST_WITHOUT_POSE = 0.1
+MAX_SHARE_WITHOUT_POSE = 0.1
 """Share of the scans from which an odometry that gives no pose for them has failed."""
 
 
@@ -435,9 +435,9 @@ def check_baseline(odometry: str, sequence: str, run: Trial) -> None:
     BaselineError
     """
     n, missing = len(run.errors), run.unhealthy.get("no_pose", 0)
-    if not run.faults and missing < MOST_WITHOUT_POSE * n:
+    if not run.faults and missing < MAX_SHARE_WITHOUT_POSE * n:
         return
-    failed = missing >= MOST_WITHOUT_POSE * n
+    failed = missing >= MAX_SHARE_WITHOUT_POSE * n
     gave_up = len(run.faults) >= MOST_FAULTS * max(1, len(run.repeats))
     last = run.faults[-1] if run.faults else "it gave no pose, and no reason"
     if failed or gave_up:

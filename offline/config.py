@@ -13,10 +13,10 @@ from adaptune.strict import Mistake, StrictModel, validated
 from adaptune.study.config import StudyConfig
 from adaptune.study.study import Study
 from offline.sampler_settings import (
-    FORGETFUL,
     NAMES,
     SETTINGS,
-    SINGLE,
+    SINGLE_OBJECTIVE,
+    STATELESS,
     SamplerError,
     check_class,
     check_sampler,
@@ -121,8 +121,8 @@ class OfflineConfig(StrictModel):
         """Find mistakes in the sampler and its settings."""
         yield from self._search_mistakes(space)
         key = ("sampler_settings",)
-        if len(self.objective) > 1 and self.sampler in SINGLE:
-            others = ", ".join(sorted(set(NAMES) - set(SINGLE)))
+        if len(self.objective) > 1 and self.sampler in SINGLE_OBJECTIVE:
+            others = ", ".join(sorted(set(NAMES) - set(SINGLE_OBJECTIVE)))
             message = f"{self.sampler} minimises one objective only; choose one of {others}"
             yield Mistake(("sampler",), message)
         if self.sampler in SETTINGS:
@@ -144,7 +144,7 @@ class OfflineConfig(StrictModel):
         """Find samplers that cannot search among several odometries."""
         n = 1 if space is None else len(space.baselines)
         grid = "grid" in self.sampler_settings
-        if n > 1 and (self.sampler not in (*FORGETFUL, "random") or grid):
+        if n > 1 and (self.sampler not in (*STATELESS, "random") or grid):
             message = "with several odometries, choose tpe, gp or random, without a grid"
             yield Mistake(("sampler",), message)
         if self.trials is not None and self.trials < n:

@@ -13,7 +13,7 @@ from adaptune.metrics import cap, span
 from adaptune.model import ModelError, TrainingData
 from adaptune.model.descriptor import averaged
 from adaptune.model.rules import BASELINE, Costs, SetCost, Spending, mean_errors
-from adaptune.model.weights import POOL
+from adaptune.model.weights import MEMBER_POOL_SIZE
 from adaptune.odometry.factory import Factory
 from adaptune.recording.scan import origin, places, stretch_numbers
 from adaptune.space import ParameterSets
@@ -381,7 +381,7 @@ def labelled_data(
     means = mean_errors(np.concatenate([s.errors for s, _, _ in read]), number)
     # With a sequence left out, others than now may be among the best. To read the poses of
     # thousands of trials would take long.
-    order = np.argsort(means, kind="stable")[: 2 * POOL]
+    order = np.argsort(means, kind="stable")[: 2 * MEMBER_POOL_SIZE]
     best = [sets.trials[c] for c in order]
     eligible = {t for t in (BASELINE, *best) if t in sets and np.isfinite(means[sets.column(t)])}
     named = (n if isinstance(n, int) else sets.find(n) for n in config.online.switching.sets or ())

@@ -31,9 +31,9 @@ OPTUNA = {
 }
 """Optuna's samplers; their settings are the keywords of the class."""
 NAMES = ("annealing", "grid", "random", *OPTUNA)
-SINGLE = ("annealing", "cmaes")
+SINGLE_OBJECTIVE = ("annealing", "cmaes")
 """Samplers that minimise one objective only."""
-FORGETFUL = ("tpe", "gp")
+STATELESS = ("tpe", "gp")
 """Samplers that keep no notes: they continue from any list of trials."""
 NEEDS = {"cmaes": "cmaes", "gp": "torch"}
 """Packages that a sampler needs; adaptune's extra has the sampler's name."""
@@ -176,7 +176,7 @@ SETTINGS: dict[str, type[BaseModel]] = {
 # Grids of parameter sets, whose points are made when they are asked for.
 
 
-LARGEST = 10_000
+MAX_UNBUDGETED_POINTS = 10_000
 """Points of the largest grid that a search without a budget may try."""
 
 
@@ -321,11 +321,11 @@ def check_grid(
     if len(made) < len(space):
         return
     grid = Grid(made)
-    if not bounded and grid.size > LARGEST:
+    if not bounded and grid.size > MAX_UNBUDGETED_POINTS:
         yield Mistake(
             ("grid",),
             f"has {grid.size:,} points, and the study sets no budget; give offline.trials, hours "
-            f"or stagnation, or a coarser grid (up to {LARGEST:,} points)",
+            f"or stagnation, or a coarser grid (up to {MAX_UNBUDGETED_POINTS:,} points)",
         )
     elif grid.size >= 2**62:
         yield Mistake(("grid",), "has more points than can be numbered; give a coarser grid")
@@ -334,10 +334,10 @@ def check_grid(
 # Mistakes in a sampler's settings that only the sampler and the parameters show.
 
 
-_ELSEWHERE = {"seed": "seed", "n_startup_trials": "initial", "constraints_func": "limits"}
+_SET_BY_KEY = {"seed": "seed", "n_startup_trials": "initial", "constraints_func": "limits"}
 """Settings of Optuna's samplers that adaptune sets, and from which key."""
 _BOX = ("low", "high")
-_MOST = 100_000
+_MAX_SETTING = 100_000
 """Candidates, or members of a population: more of them take hours, or all memory."""
 
 
@@ -388,12 +388,12 @@ def check_sampler(
 def _check_optuna(
     name: str, settings: Mapping[str, Any], space: ParameterSpace | None
 ) -> Iterable[Mistake]:
-    if taken := next((key for key in _ELSEWHERE if key in settings), None):
-        yield Mistake((taken,), f"is set by offline.{_ELSEWHERE[taken]}")
+    if taken := next((key for key in _SET_BY_KEY if key in settings), None):
+        yield Mistake((taken,), f"is set by offline.{_SET_BY_KEY[taken]}")
         return
     for key, value in settings.items():
-        if isinstance(value, int) and abs(value) > _MOST:
-            yield Mistake((key,), f"give a number of at most {_MOST:,}, not {value}")
+        if isinstance(value, int) and abs(value) > _MAX_SETTING:
+            yield Mistake((key,), f"give a number of at most {_MAX_SETTING:,}, not {value}")
             return
     try:
         make = _make_elsewhere if is_user_sampler(name) else optuna_sampler

@@ -27,8 +27,8 @@ from offline.annealing import AnnealingSampler
 from offline.config import OfflineConfig
 from offline.objective import SamplerResult, exceeded, penalised
 from offline.sampler_settings import (
-    FORGETFUL,
     SERVICE,
+    STATELESS,
     AnnealingSettings,
     Grid,
     GridSettings,
@@ -239,7 +239,7 @@ class AskedSampler(Sampler):
     def __init__(self, space: ParameterSpace, config: OfflineConfig):
         super().__init__(space, config)
         self._distributions = {name: _distribution(p) for name, p in space.parameters.items()}
-        self._forgetful = config.sampler in FORGETFUL
+        self._forgetful = config.sampler in STATELESS
         self._begin(0, ())
         self.constrained = isinstance(self._study.sampler, CONSTRAINED)
 

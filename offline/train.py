@@ -61,7 +61,7 @@ from offline.trial import TrialSettings, TrialSetup
 from offline.tuning import DO_NOT_ADAPT, NO_BANK, choose, driven_cost, reserve, rivals
 from offline.workers import Workers
 
-COARSE = 0.6
+COARSE_REFERENCE = 0.6
 """A reference whose error is more than this share of the best set's hardly tells sets apart."""
 
 COST = "cost [ms]"
@@ -117,7 +117,7 @@ def doubts(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     coarse = [
         f"{row['sequence']} ({row['_reference_error']:.2g} against {row['own best']:.2g} %)"
         for row in rows
-        if (row["_reference_error"] or 0.0) > COARSE * row["own best"]
+        if (row["_reference_error"] or 0.0) > COARSE_REFERENCE * row["own best"]
     ]
     if not coarse:
         return []

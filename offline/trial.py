@@ -307,7 +307,7 @@ Advance = Callable[[int, int], None]
 
 MIN_POINTS = 20
 """No odometry can use a scan with fewer points."""
-_AROUND = 1.0
+_CLOCK_TOLERANCE = 1.0
 """Seconds by which a reference's clock may differ from the scans' while its length is looked at."""
 
 
@@ -463,7 +463,9 @@ def _during(scans: recording.Recording, reference: Trajectory) -> NDArray[np.boo
         return np.ones(len(reference.stamps), bool)
     seconds, section = (reference.stamps - span[0]) * 1e-9, scans.section
     stop = np.inf if section.stop is None else section.stop
-    return np.asarray((seconds > section.start - _AROUND) & (seconds < stop + _AROUND))
+    return np.asarray(
+        (seconds > section.start - _CLOCK_TOLERANCE) & (seconds < stop + _CLOCK_TOLERANCE)
+    )
 
 
 def _too_short(key: str, T: Poses, settings: TrialSettings) -> AdaptuneError:

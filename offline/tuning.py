@@ -15,7 +15,7 @@ from adaptune.metrics import cap, worst_tenth
 from adaptune.model import BankRule, BankSettings, PairedExpectedRatio, PairedSettings, TrainingData
 from adaptune.model.rules import BASELINE, ERROR_FLOOR, Spending, complementary, mean_errors
 from adaptune.model.weights import (
-    POOL,
+    MEMBER_POOL_SIZE,
     MemberWeights,
     NearProducts,
     bank_weights,
@@ -40,9 +40,9 @@ if TYPE_CHECKING:
 # Expected loss: one number by which all ways to adapt are compared with the fixed set.
 
 
-RISK = 0.5
+WORST_TENTH_WEIGHT = 0.5
 """Weight of the worst tenth."""
-BLOCK = 2
+BLOCK_STRETCHES = 2
 """Consecutive stretches that a bootstrap draws together."""
 RESAMPLES = 500
 """Of a bootstrap."""
@@ -87,7 +87,7 @@ def expected_loss(logs: Logs, recordings: Sequence[str]) -> float:
     """
     if not logs.any():
         return 0.0
-    risk = RISK * max(0.0, worst_tenth(logs))
+    risk = WORST_TENTH_WEIGHT * max(0.0, worst_tenth(logs))
     return float(logs.mean() + risk + standard_error(logs, recordings))
 
 
@@ -113,9 +113,9 @@ def _resampled_means(logs: Logs, number: NDArray[np.intp], seed: int = 0) -> NDA
     for recording in np.unique(number):
         of = np.flatnonzero(number == recording)
         following[of] = np.roll(of, -1)
-    n_blocks = -(-len(logs) // BLOCK)
+    n_blocks = -(-len(logs) // BLOCK_STRETCHES)
     drawn = np.random.default_rng(seed).integers(0, len(logs), (RESAMPLES, n_blocks))
-    return np.asarray((logs[drawn] + logs[following[drawn]]).mean(axis=1) / BLOCK)
+    return np.asarray((logs[drawn] + logs[following[drawn]]).mean(axis=1) / BLOCK_STRETCHES)
 
 
 def interval_of(logs: Logs, recordings: Sequence[str]) -> tuple[float, float]:
@@ -165,7 +165,7 @@ BANK_SETTINGS = [
 """A bank is driven with one of these; of equally good ones the first."""
 MOST_FOLDS = 12
 """So many folds at most compare ways to adapt where evidence is left out already."""
-ELSEWHERE, AS_MANY = float(np.log(0.8)), 2
+LOSS_ELSEWHERE, STRETCHES_ELSEWHERE = float(np.log(0.8)), 2
 """The loss of banks elsewhere, and as how many stretches it counts: few stretches show little."""
 ROUNDING = 1e-6
 """A smaller loss, or gain, is one of rounding."""
@@ -273,7 +273,9 @@ def least_loss(
 
 def _with_elsewhere(losses: NDArray[np.float64], n_stretches: int) -> NDArray[np.float64]:
     """Expected losses of banks, drawn to what they are elsewhere; one that never adapts has 0."""
-    drawn = (n_stretches * losses + AS_MANY * ELSEWHERE) / (n_stretches + AS_MANY)
+    drawn = (n_stretches * losses + STRETCHES_ELSEWHERE * LOSS_ELSEWHERE) / (
+        n_stretches + STRETCHES_ELSEWHERE
+    )
     return np.where(losses == 0.0, 0.0, drawn)
 
 
@@ -403,7 +405,9 @@ def complementary_members(
     errors, number = np.concatenate([s.errors for s in data.sequences]), data.stretches()
     means = mean_errors(errors, number)
     best = [
-        data.sets.trials[c] for c in np.argsort(means, kind="stable")[:POOL] if means[c] < np.inf
+        data.sets.trials[c]
+        for c in np.argsort(means, kind="stable")[:MEMBER_POOL_SIZE]
+        if means[c] < np.inf
     ]
     pool = [t for t in best if t != fixed and all(t in s.vectors for s in data.sequences)]
     few = data.sets.subset([fixed, *pool])

@@ -16,7 +16,7 @@ from adaptune.space import ParameterSets
 # The evidence about a scene: the training frames that look like it.
 
 
-NOVEL = 0.1
+NOVEL_FAMILIARITY = 0.1
 """Familiarity below which evidence counts less and less."""
 _QUANTILES = 10
 """Of the distances of each training sequence's frames from the other sequences."""
@@ -68,7 +68,7 @@ class Evidence(NamedTuple):
 
 def trust_in(familiarity: NDArray[np.float64]) -> NDArray[np.float64]:
     """How far evidence counts, from 0 to 1: fully where familiarity is unknown."""
-    return np.asarray(np.fmin(1.0, familiarity / NOVEL))
+    return np.asarray(np.fmin(1.0, familiarity / NOVEL_FAMILIARITY))
 
 
 class NearestFrames:

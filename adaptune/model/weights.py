@@ -30,13 +30,13 @@ from adaptune.model.rules import (
 from adaptune.selection import Selection
 from adaptune.space import ParameterSets
 
-UNFAMILIAR = 0.2
+UNFAMILIAR_PRIOR_SHARE = 0.2
 """Share of the prior's windows that remain where a scan is unlike all training."""
-DOUBT = 4.0
+UNTRIED_MEAN_SQUARE = 4.0
 """Mean square of a member that nobody has tried, in that of the first one."""
-SMOOTHING = 5
+SMOOTHED_SELECTIONS = 5
 """Selections whose weights are averaged: errors cancel each other while weights stay the same."""
-POOL = 64
+MEMBER_POOL_SIZE = 64
 """A bank's members are searched for among this many of the best sets."""
 
 
@@ -200,7 +200,9 @@ def bank_weights(
     trust = near.evidence.trust[:, None, None]
     learned = np.einsum("qs,qsjk->qjk", of_sequences, relative)
     learned = trust * learned + (1.0 - trust) * _untried(len(near.members))
-    windows = settings.prior_windows * (UNFAMILIAR + (1.0 - UNFAMILIAR) * near.evidence.trust)
+    windows = settings.prior_windows * (
+        UNFAMILIAR_PRIOR_SHARE + (1.0 - UNFAMILIAR_PRIOR_SHARE) * near.evidence.trust
+    )
     squares = np.array([blend(*of_scan) for of_scan in zip(learned, windows, live, strict=True)])
     weights = np.array([minimum_variance_weights(of_scan, settings.even) for of_scan in squares])
     measured = np.array([0.0 if one is None else one.windows for one in live])
@@ -231,7 +233,7 @@ def measured_weights(n_members: int, live: LiveSquares | None) -> NDArray[np.flo
 
 def _untried(n_members: int) -> NDArray[np.float64]:
     """Mean products of the errors of members of which the training says nothing."""
-    return np.diag([1.0, *[DOUBT] * (n_members - 1)])
+    return np.diag([1.0, *[UNTRIED_MEAN_SQUARE] * (n_members - 1)])
 
 
 def renormalised(weights: NDArray[np.float64], present: NDArray[np.bool_]) -> NDArray[np.float64]:
@@ -246,16 +248,18 @@ def renormalised(weights: NDArray[np.float64], present: NDArray[np.bool_]) -> ND
 
 
 def smooth_weights(weights: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Mean of the weights at each selection and at those before it, `SMOOTHING` at most.
+    """Mean of the weights at each selection and at those before it, `SMOOTHED_SELECTIONS` at most.
 
     They are of shape (n_selections, n_members).
 
     Returns shape (n_selections, n_members).
     """
     total = weights.copy()
-    for k in range(1, SMOOTHING):
+    for k in range(1, SMOOTHED_SELECTIONS):
         total[k:] += weights[:-k]
-    return np.asarray(total / np.minimum(np.arange(1, len(weights) + 1), SMOOTHING)[:, None])
+    return np.asarray(
+        total / np.minimum(np.arange(1, len(weights) + 1), SMOOTHED_SELECTIONS)[:, None]
+    )
 
 
 def clip_errors(
@@ -330,7 +334,11 @@ def choose_members(
     """
     number = np.repeat(np.arange(len(errors)), [len(e) for e in errors])
     means = mean_errors(np.concatenate(errors), number)
-    best = [sets.trials[c] for c in np.argsort(means, kind="stable")[:POOL] if means[c] < np.inf]
+    best = [
+        sets.trials[c]
+        for c in np.argsort(means, kind="stable")[:MEMBER_POOL_SIZE]
+        if means[c] < np.inf
+    ]
     pool = [fixed, *(t for t in best if t != fixed and all(t in known for known in vectors))]
     squares = []
     for known in vectors:

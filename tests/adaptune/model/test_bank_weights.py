@@ -11,8 +11,8 @@ from adaptune.live.hops import LiveSquares
 from adaptune.metrics import FAILURE
 from adaptune.model import BankRule, BankSettings, TrainingData
 from adaptune.model.weights import (
-    SMOOTHING,
-    UNFAMILIAR,
+    SMOOTHED_SELECTIONS,
+    UNFAMILIAR_PRIOR_SHARE,
     bank_weights,
     choose_members,
     clip_errors,
@@ -106,7 +106,7 @@ def test_in_a_place_unlike_all_others_what_is_measured_counts_for_more():
     assert rule.select(known).weights[0] < 0.1
     assert max(rule.select(new).weights.items(), key=lambda item: item[1])[0] == 0
     # As many windows as the prior has there: half and half.
-    few = live._replace(windows=UNFAMILIAR * rule.settings.prior_windows)
+    few = live._replace(windows=UNFAMILIAR_PRIOR_SHARE * rule.settings.prior_windows)
     (found,), _ = bank_weights(rule.near(new[None]), rule.settings, [few])
     assert found[0] == pytest.approx(rule.weigh(rule.near(new[None]), few).weights[0])
 
@@ -201,7 +201,7 @@ def test_smoothed_weights_are_means_of_the_last(n, seed):
     found = smooth_weights(weights)
     for i in range(n):
         np.testing.assert_allclose(
-            found[i], weights[max(0, i + 1 - SMOOTHING) : i + 1].mean(axis=0)
+            found[i], weights[max(0, i + 1 - SMOOTHED_SELECTIONS) : i + 1].mean(axis=0)
         )
     assert (smooth_weights(np.eye(2)[[0] * n]) == [1.0, 0.0]).all()
 
