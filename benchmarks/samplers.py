@@ -247,7 +247,7 @@ def thesis(folder: Path, png: Path, names: list[str]) -> None:
             drawn.append(Line(n, np.median(errors, axis=0), sampler))
         panels.append(Panel(x, y, tuple(drawn), name))
     title = f"Median and range over {len(THESIS_SEEDS)} seeds"
-    draw_chart(png, Chart("samplers", title, tuple(panels), columns=2))
+    draw_chart(Chart("samplers", title, tuple(panels), columns=2), png, png.with_suffix(".svg"))
 
 
 if __name__ == "__main__":

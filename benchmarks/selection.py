@@ -221,7 +221,8 @@ def draw_growth(path: Path, n_sets: int = 64, n_sequences: int = 16) -> None:
     x = Axis(f"training frames [-], {n_sequences} sequences, {n_sets} sets", log=True)
     y = Axis("CPU time of a selection [ms]", log=True)
     lines = tuple(Line(sizes, of_rule, name) for name, of_rule in medians.items())
-    draw_chart(path, Chart("selection", "Cost of a selection", (Panel(x, y, lines),)))
+    chart = Chart("selection", "Cost of a selection", (Panel(x, y, lines),))
+    draw_chart(chart, path, path.with_suffix(".svg"))
 
 
 def main(png: Path | None) -> None:

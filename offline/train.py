@@ -431,7 +431,7 @@ def _write_pareto(
         np.array([verdicts[n].values for n in front]),
         {name: verdicts[n].values for name, n in (("baseline", 0), ("fixed", fixed))},
     )
-    draw_chart(folder / "pareto.png", chart)
+    draw_chart(chart, folder / "pareto.png", folder / "pareto.svg")
 
 
 # Fit the error model to the labelled data set.

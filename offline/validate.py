@@ -429,7 +429,7 @@ def validate(
     stretches = _stretch_rows(validation)
     tables.write_rows(study.folder, "stretches", stretches)
     if (chart := stretch_chart(stretches)) is not None:
-        draw_chart(study.folder / "validation.png", chart)
+        draw_chart(chart, *(study.folder / f"validation.{kind}" for kind in ("png", "svg")))
     summaries = {mode: validation.summary(mode) for mode in validation.modes}
     replace(model, validation=summaries).save(study.model_path)
     bounds = data.bounds()

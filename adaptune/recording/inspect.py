@@ -24,7 +24,7 @@ from adaptune.recording.recording import RecordedSequence
 from adaptune.recording.scan import TIME_FIELDS
 from adaptune.recording.survey import Fault, Parts, Reading, Survey, n_valid, survey
 from adaptune.report.charts import Axis, Chart, Cloud, Panel, Points
-from adaptune.report.drawing import write_pictures
+from adaptune.report.drawing import draw_chart
 from adaptune.trajectory import Trajectory, is_kitti, read_kitti, read_trajectory
 
 Layout = tuple[tuple[str, str, int], ...]
@@ -488,7 +488,7 @@ def draw_inspection(inspection: Inspection, path: Path) -> None:
     )
     text = f"{_scan_text(inspection.scan)}; drawn within {reach:.0f} m"
     title = f"{inspection.path.name}, first scan: {text}"
-    write_pictures(Chart("scan", title, panels), path)
+    draw_chart(Chart("scan", title, panels), path)
 
 
 def render_cache() -> RenderableType:

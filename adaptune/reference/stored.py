@@ -14,7 +14,7 @@ from adaptune.files import write_text
 from adaptune.geometry import Poses
 from adaptune.metrics import sub_trajectory_rte, travelled
 from adaptune.report.charts import Axis, Chart, Drawn, Line, Panel, Points, Spans
-from adaptune.report.drawing import write_pictures
+from adaptune.report.drawing import draw_chart
 from adaptune.trajectory import Trajectory, write_tum
 
 # An estimated reference: poses, where they can be trusted, and how accurate they are.
@@ -267,7 +267,7 @@ def write_estimate(
     # What is known of an estimate before is not of these poses.
     path.with_suffix(".json").unlink(missing_ok=True)
     chart = estimate_chart(path.stem, found, stored, length)
-    write_pictures(chart, path.with_suffix(".png"))
+    draw_chart(chart, path.with_suffix(".png"))
     write_tum(path, found.trajectory())
     known = stored._asdict() | {"error_percent": stored.errors}
     known["unknown_seconds"] = [

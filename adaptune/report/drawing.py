@@ -254,20 +254,7 @@ def spec(chart: Chart, titled: bool = True) -> Spec:
     return made
 
 
-def draw_chart(path: Path, chart: Chart) -> None:
-    """Draw a chart as PNG, and as SVG beside it.
-
-    Parameters
-    ----------
-    path
-        Of the PNG.
-    chart
-        What to draw.
-    """
-    write_pictures(chart, path, path.with_suffix(".svg"))
-
-
-def write_pictures(chart: Chart, *files: Path) -> None:
+def draw_chart(chart: Chart, *files: Path) -> None:
     """Draw a chart into files; one whose name ends in ``.svg`` is an SVG, others are PNGs."""
     import vl_convert
 
@@ -394,8 +381,7 @@ class _Drawing:
         if _is_empty(panel):
             self._x["axis"] |= {"values": []}
             self._y["axis"] |= {"values": []}
-            empty = {"data": _table(x=[np.nan], y=[np.nan]), "mark": "point"}
-            empty["encoding"] = {"x": self._x, "y": self._y}
+            empty = self._drawn({"type": "point"}, {"x": [np.nan], "y": [np.nan]})
             middle = {"x": 0.5 * self._width, "y": 0.5 * self._height}
             text = {"type": "text", "text": NO_DATA, "color": "#666666", **middle}
             said = {"data": _table(i=[0]), "mark": text, "encoding": {}}
@@ -422,24 +408,32 @@ class _Drawing:
             names = [wrapped(name, room) for name in axis.names]
             turned = which == "x" and max(len(part) for name in names for part in name) > room
             names = [[name] for name in axis.names] if turned else names
-            texts = "[" + ",".join(f"[{','.join(map(_literal, name))}]" for name in names) + "]"
-            drawn = {"values": list(range(len(names))), "labelExpr": f"{texts}[datum.value]"}
+            drawn = {"values": list(range(len(names)))}
+            drawn["labelExpr"] = f"{json.dumps(names)}[datum.value]"
             drawn |= {"grid": False} | ({"labelAngle": -35} if turned else {})
         elif axis.log:
             drawn = {"values": ticks(low, high), "format": "~r"}
         title: Any = wrapped(axis.label, size / _LETTER) if axis.label else None
         if hidden:
             title, drawn = None, drawn | {"labels": False, "ticks": False}
-        scale = {"type": "log" if axis.log else "linear", "domain": [low, high], "nice": False}
         if which == "y":
             drawn |= {"minExtent": 44}
+        scale: Spec = {"type": "log"} if axis.log else {"type": "linear", "zero": False}
+        scale |= {"domain": [low, high], "nice": False}
         made: Spec = {"field": which, "type": "quantitative", "title": title}
-        if not axis.log:
-            scale["zero"] = False
         return made | {"scale": scale, "axis": drawn}
 
+    def _drawn(self, mark: Spec, data: dict[str, Any], **encoding: Any) -> Spec:
+        """A mark at x and y, and up to x2 and y2 where the data have them."""
+        ends = {name: {"field": name} for name in ("x2", "y2") if name in data}
+        every = {"x": self._x, "y": self._y} | ends | encoding
+        return {"data": _table(**data), "mark": {"clip": True} | mark, "encoding": every}
+
+    def _look(self, name: str) -> Look:
+        return self._looks.get(name, Look("#666666"))
+
     def _line(self, line: Line) -> Iterator[Spec]:
-        look = self._looks.get(line.name, Look("#666666"))
+        look = self._look(line.name)
         x, y = numbers(line.x, self._panel.x), numbers(line.y, self._panel.y)
         kept = thinned(x, y, most=_MOST_FAINT if line.faint else _MOST)
         mark: Spec = {
@@ -451,27 +445,19 @@ class _Drawing:
             "interpolate": "step-after" if line.steps else "linear",
             "strokeJoin": "round",
             "tooltip": line.name,
-            "clip": True,
         }
         # Drawn in the order of the points, and not from left to right.
-        encoding = {"x": self._x, "y": self._y, "order": {"value": None}}
-        yield {"data": _table(x=x[kept], y=y[kept]), "mark": mark, "encoding": encoding}
+        yield self._drawn(mark, {"x": x[kept], "y": y[kept]}, order={"value": None})
 
     def _points(self, points: Points) -> Iterator[Spec]:
-        look = self._looks.get(points.name, Look("#666666"))
+        look = self._look(points.name)
         panel, many = self._panel, len(points.x) > _MANY
         x, y = numbers(points.x, panel.x), numbers(points.y, panel.y)
-        shape = points.shape or look.shape
-        scaled = shape.startswith("M")
-        mark: Spec = {
-            "type": "point",
-            "shape": shape,
-            "size": 12 if many else 60 if scaled else 45,
-            "opacity": 0.35 if points.faint else 0.7 if many else 1.0,
-            "filled": True,
-            "color": look.colour,
-            "clip": True,
-        }
+        mark = _marker(points, look)
+        if many:
+            mark |= {"size": 12, "opacity": 0.7}
+        if points.faint:
+            mark |= {"opacity": 0.35}
         if not many and not points.faint:
             mark |= _OUTLINE
         columns: dict[str, Any] = {"x": x, "y": y}
@@ -482,31 +468,24 @@ class _Drawing:
         if points.texts is not None:
             columns["text"] = points.texts
             tips.insert(0, {"field": "text", "title": points.name or "point"})
-        encoding = {"x": self._x, "y": self._y, "tooltip": tips}
         if points.colour is None:
-            yield {"data": _table(**columns), "mark": mark, "encoding": encoding}
+            yield self._drawn(mark, columns, tooltip=tips)
             return
         colour = numbers(points.colour, Axis("", log=points.log_colour))
         known = np.isfinite(colour)
         unknown = {name: np.array(column)[~known] for name, column in columns.items()}
         if len(unknown["x"]):
-            grey = mark | {"color": _UNKNOWN}
-            yield {"data": _table(**unknown), "mark": grey, "encoding": encoding}
+            yield self._drawn(mark | {"color": _UNKNOWN}, unknown, tooltip=tips)
         if known.any():
             columns = {name: np.array(of)[known] for name, of in columns.items()}
+            columns["c"] = colour[known]
             limits = float(colour[known].min()), float(colour[known].max())
             bar = self._colour_bar(points.colour_label, limits, points.log_colour)
-            del mark["color"]
-            data = _table(**columns, c=colour[known])
-            yield {"data": data, "mark": mark, "encoding": encoding | {"color": bar}}
+            yield self._drawn(mark, columns, tooltip=tips, color=bar)
 
     def _colour_bar(self, words: str, limits: tuple[float, float], log: bool) -> Spec:
-        length = min(self._height - 40, 220)
-        legend: Spec = {
-            "title": wrapped(words, 12),
-            "gradientLength": length,
-            "gradientOpacity": 1.0,
-        }
+        legend: Spec = {"title": wrapped(words, 12), "gradientOpacity": 1.0}
+        legend["gradientLength"] = min(self._height - 40, 220)
         legend |= {"values": ticks(*limits), "format": "~r"} if log else {"tickCount": 5}
         scale = {"type": "log" if log else "linear", "domain": limits, "range": _MAP}
         return {"field": "c", "type": "quantitative", "scale": scale, "legend": legend}
@@ -534,31 +513,29 @@ class _Drawing:
                 there = (x + right >= 0) & (x + right < wide) & (y + up >= 0) & (y + up < high)
                 opaque = np.column_stack([colours[there], np.full(there.sum(), 255.0)])
                 pixels[high - 1 - y[there] - up, x[there] + right] = opaque
-        url = "data:image/png;base64," + base64.b64encode(png(pixels)).decode()
+        url = "data:image/png;base64," + base64.b64encode(_png(pixels)).decode()
         size: Spec = {"width": self._width, "height": self._height, "aspect": False}
         image: Spec = {"type": "image", "url": url, "x": 0, "y": 0, "align": "left"}
         yield {"data": _table(i=[0]), "mark": image | size | {"baseline": "top"}, "encoding": {}}
         bar = self._colour_bar(cloud.colour_label, cloud.colour_limits, cloud.log_colour)
         # Points without a size, for the axes and the colour bar.
-        encoding = {"x": self._x, "y": self._y, "color": bar}
-        data = _table(x=self._extent["x"], y=self._extent["y"], c=cloud.colour_limits)
-        yield {"data": data, "mark": {"type": "point", "size": 0}, "encoding": encoding}
+        yield self._drawn(
+            {"type": "point", "size": 0}, self._extent | {"c": cloud.colour_limits}, color=bar
+        )
 
     def _band(self, band: Band) -> Iterator[Spec]:
-        look, panel = self._looks.get(band.name, Look("#666666")), self._panel
+        look, panel = self._look(band.name), self._panel
         x, high = numbers(band.x, panel.x), numbers(band.high, panel.y)
         low = numbers(band.low, panel.y)
         if panel.y.log:
             low = np.where(np.isfinite(high) & np.isnan(low), self._extent["y"][0], low)
         kept = thinned(x, low, high)
-        data = _table(x=x[kept], y=low[kept], y2=high[kept])
-        mark: Spec = {"type": "area", "color": look.colour, "fillOpacity": 0.25, "clip": True}
+        mark: Spec = {"type": "area", "color": look.colour, "fillOpacity": 0.25}
         mark |= {"stroke": look.colour, "strokeOpacity": 0.6, "tooltip": band.name}
-        encoding = {"x": self._x, "y": self._y, "y2": {"field": "y2"}}
-        yield {"data": data, "mark": mark, "encoding": encoding}
+        yield self._drawn(mark, {"x": x[kept], "y": low[kept], "y2": high[kept]})
 
     def _bars(self, bars: Bars) -> Iterator[Spec]:
-        look, panel = self._looks.get(bars.name, Look("#666666")), self._panel
+        look, panel = self._look(bars.name), self._panel
         along, across = (panel.y, panel.x) if bars.flat else (panel.x, panel.y)
         a, b = ("y", "x") if bars.flat else ("x", "y")
         place, ends = numbers(bars.x, along), numbers(bars.heights, across)
@@ -566,31 +543,26 @@ class _Drawing:
         half = 0.5 * bars.width
         columns = {a: place - half, f"{a}2": place + half, b: base, f"{b}2": ends}
         there = np.isfinite(ends)
-        encoding = {"x": self._x, "y": self._y, "x2": {"field": "x2"}, "y2": {"field": "y2"}}
         tip = {"field": f"{b}2", "type": "quantitative", "title": bars.name, "format": ".4~g"}
-        data = _table(**{name: column[there] for name, column in columns.items()})
-        mark = {"type": "rect", "color": look.colour, "clip": True} | _OUTLINE
-        yield {"data": data, "mark": mark, "encoding": encoding | {"tooltip": [tip]}}
+        mark = {"type": "rect", "color": look.colour} | _OUTLINE
+        columns = {name: column[there] for name, column in columns.items()}
+        yield self._drawn(mark, columns, tooltip=[tip])
         if bars.low is not None and bars.high is not None:
             low, high = numbers(bars.low, across), numbers(bars.high, across)
-            data = _table(**{a: place, b: low, f"{b}2": high})
-            encoding = {"x": self._x, "y": self._y, f"{b}2": {"field": f"{b}2"}}
-            yield {"data": data, "mark": {"type": "rule", "clip": True}, "encoding": encoding}
+            yield self._drawn({"type": "rule"}, {a: place, b: low, f"{b}2": high})
 
     def _shares(self, shares: Shares) -> Iterator[Spec]:
         x = numbers(shares.x, self._panel.x)
         made = np.nan_to_num(np.array(shares.shares, np.float64).reshape(len(shares.names), -1))
         ends = np.vstack([np.zeros(len(x)), np.cumsum(made, axis=0)])
-        encoding = {"x": self._x, "y": self._y, "y2": {"field": "y2"}}
         for name, low, high in zip(shares.names, ends[:-1], ends[1:], strict=True):
-            mark: Spec = {"type": "area", "color": self._looks[name].colour, "clip": True}
+            mark: Spec = {"type": "area", "color": self._looks[name].colour, "tooltip": name}
             mark |= {"interpolate": "step-after", "stroke": "white", "strokeWidth": 0.5}
-            data = _table(x=x, y=low, y2=high)
-            yield {"data": data, "mark": mark | {"tooltip": name}, "encoding": encoding}
+            yield self._drawn(mark, {"x": x, "y": low, "y2": high})
 
     def _spans(self, spans: Spans, named: bool) -> Iterator[Spec]:
         """Shade stretches, and write their names above them, or turned where they are short."""
-        tinted = span_tints(spans)
+        tinted = _span_tints(spans)
         if not tinted:
             return
         begins, ends, _, tints = zip(*tinted, strict=True)
@@ -632,11 +604,6 @@ class _Drawing:
             yield {"data": data, "mark": text, "encoding": encoding}
 
 
-def _literal(words: str) -> str:
-    """Words as a string of Vega's expressions."""
-    return json.dumps(words)
-
-
 def ticks(low: float, high: float) -> list[float]:
     """Values to name on a logarithmic axis between two numbers above zero."""
     decades = np.log10(high) - np.log10(low)  # the ratio may be too large for a number
@@ -652,7 +619,7 @@ def ticks(low: float, high: float) -> list[float]:
     return [value for value in values if low <= value <= high]
 
 
-def span_tints(spans: Spans) -> list[tuple[float, float, str, str]]:
+def _span_tints(spans: Spans) -> list[tuple[float, float, str, str]]:
     """Begin, end, name and colour of each span that is shaded."""
     edges = np.asarray(spans.edges, float).tolist()
     different = list(dict.fromkeys(name for name in spans.names if name))
@@ -663,7 +630,7 @@ def span_tints(spans: Spans) -> list[tuple[float, float, str, str]]:
     ]
 
 
-def png(pixels: NDArray[np.uint8]) -> bytes:
+def _png(pixels: NDArray[np.uint8]) -> bytes:
     """Pixels of shape (height, width, 4), red, green, blue and alpha, as a PNG file."""
     height, width, _ = pixels.shape
 
@@ -713,12 +680,16 @@ def _glyphs(kinds: dict[type, Drawn], look: Look, x: float, y: float) -> Iterato
     if isinstance(line := kinds.get(Line), Line):
         ends = {"x": {"value": x}, "x2": {"value": x + 32.0}, "y": {"value": y}}
         dash = (5, 3) if line.dashed else look.dash
-        mark: Spec = {"type": "rule", "color": look.colour, "strokeWidth": look.width}
-        mark |= {"strokeDash": dash, "opacity": 0.4 if line.faint else 1.0}
+        width, opacity = (min(look.width, 1.2), 0.4) if line.faint else (look.width, 1.0)
+        mark: Spec = {"type": "rule", "color": look.colour, "strokeWidth": width}
+        mark |= {"strokeDash": dash, "opacity": opacity}
         yield {"mark": mark, "encoding": ends}
     if isinstance(points := kinds.get(Points), Points):
-        shape = points.shape or look.shape
-        point: Spec = {"type": "point", "x": x + 16.0, "y": y, "filled": True, "shape": shape}
-        colour = _MAP[3] if points.colour is not None else look.colour
-        size = {"size": 60 if shape.startswith("M") else 45, "opacity": 1.0}
-        yield {"mark": point | size | {"color": colour, **_OUTLINE}}
+        colour = {"color": _MAP[3]} if points.colour is not None else {}
+        yield {"mark": _marker(points, look) | {"x": x + 16.0, "y": y} | colour | _OUTLINE}
+
+
+def _marker(points: Points, look: Look) -> Spec:
+    shape = points.shape or look.shape
+    mark: Spec = {"type": "point", "filled": True, "shape": shape, "color": look.colour}
+    return mark | {"size": 60 if shape.startswith("M") else 45, "opacity": 1.0}

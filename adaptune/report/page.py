@@ -57,8 +57,9 @@ def write_page(path: Path, page: Page) -> None:
     charts = [chart for section in page.sections for chart in section.charts]
     names = file_names([chart.key for chart in charts])
     with processes(len(charts), [__name__]) as pool:
-        pictures = [path.parent / FIGURES / f"{names[chart.key]}.png" for chart in charts]
-        drawn = pool.map(draw_chart, pictures, charts)
+        figures = [path.parent / FIGURES / names[chart.key] for chart in charts]
+        files = ([f"{figure}.{kind}" for figure in figures] for kind in ("png", "svg"))
+        drawn = pool.map(draw_chart, charts, *(map(Path, of_kind) for of_kind in files))
         text = page_text(page)
         list(drawn)  # raises what went wrong
     write_text(path, text)

@@ -24,7 +24,7 @@ from adaptune.recording.export import (
 )
 from adaptune.recording.scan import Scan
 from adaptune.report.charts import Axis, Chart, Cloud, Line, Panel
-from adaptune.report.drawing import write_pictures
+from adaptune.report.drawing import draw_chart
 from adaptune.simulation import kernels
 from adaptune.simulation.course import (
     IMU,
@@ -294,7 +294,7 @@ def record(
             _write_bag(drive, scans, new, 1 if layout == "ros1" else 2)
         stamps = drive.stamps()
         write_tum(temporary_truth, Trajectory(stamps, drive.ride.poses(drive.seconds(stamps))))
-        write_pictures(picture.chart(), *previews)
+        draw_chart(picture.chart(), *previews)
 
 
 def _layout(path: Path) -> Layout:

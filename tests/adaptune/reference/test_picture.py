@@ -9,7 +9,7 @@ from pictures import texts
 
 from adaptune.reference.stored import Registrations, StoredEstimate, estimate_chart
 from adaptune.report.charts import Line, Points, Spans
-from adaptune.report.drawing import write_pictures
+from adaptune.report.drawing import draw_chart
 
 NAN = float("nan")
 
@@ -72,5 +72,5 @@ def test_the_title_says_how_accurate_it_is_and_what_is_unknown():
 
 def test_a_picture_is_drawn(tmp_path):
     found = reference(accepted=[1, 0], residual=[0.01, NAN], lost=[3])
-    write_pictures(chart_of(found), tmp_path / "a.svg")
+    draw_chart(chart_of(found), tmp_path / "a.svg")
     assert {"path", "1 agree", "1 failed", "unknown", "start"} <= set(texts(tmp_path / "a.png"))

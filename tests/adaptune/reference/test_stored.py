@@ -67,7 +67,7 @@ def test_what_is_known_is_written_last(tmp_path, monkeypatch):
     def fails(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("adaptune.reference.stored.write_pictures", fails)
+    monkeypatch.setattr("adaptune.reference.stored.draw_chart", fails)
     with pytest.raises(KeyboardInterrupt):
         write_estimate(tmp_path / "drive.tum", reference(), ABOUT)
     assert StoredEstimate.read(tmp_path / "drive.tum") is None
@@ -138,7 +138,7 @@ def test_a_sound_file_is_read(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "at", ["adaptune.reference.stored.write_pictures", "adaptune.reference.stored.write_text"]
+    "at", ["adaptune.reference.stored.draw_chart", "adaptune.reference.stored.write_text"]
 )
 def test_what_was_known_before_is_not_of_new_poses(tmp_path, monkeypatch, at):
     path = tmp_path / "one.tum"

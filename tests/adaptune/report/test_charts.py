@@ -29,7 +29,7 @@ KERNEL = Categorical(choices=("none", 1, True), baseline=1)
 
 def drawn(chart, folder):
     """The texts of a chart's SVG, and all of it."""
-    draw_chart(folder / "chart.png", chart)
+    draw_chart(chart, folder / "chart.png", folder / "chart.svg")
     assert (folder / "chart.png").read_bytes().startswith(b"\x89PNG")
     text = (folder / "chart.svg").read_text("utf-8")
     root = ElementTree.fromstring(text)
