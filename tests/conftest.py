@@ -2,91 +2,26 @@
 
 import fcntl
 import os
+import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import drives
+import fake_odometry
 import pytest
+from in_process import InProcess
 from needs import lacking
 
+from adaptune.odometry.registry import ODOMETRIES
+from offline import train as training
 from offline.config import load_study
 from offline.train import train
+from offline.workers import Workers
+from online.compare import compare
+from online.run import run_replays
 
 Factory = pytest.TempPathFactory
-
-SLOW = [
-    "offline/test_kill.py",
-    "offline/test_left_out.py",
-    "adaptune/odometry/test_conformance.py",
-    "offline/test_cluster.py",
-    "online/test_comparison.py",
-    "online/test_compared_modes.py",
-    "adaptune/commands/test_cli.py",
-    "offline/test_campaign.py",
-    "adaptune/odometry/test_conformance_isolated.py",
-    "adaptune/odometry/test_gicp.py",
-    "offline/test_full.py",
-    "adaptune/odometry/docker/test_played_bag.py",
-    "adaptune/odometry/docker/test_lockstep.py",
-    "adaptune/odometry/docker/test_docker_command.py",
-    "adaptune/odometry/docker/test_docker_process.py",
-    "adaptune/odometry/docker/test_engine.py",
-    "adaptune/odometry/test_protocol.py",
-    "adaptune/recording/test_survey.py",
-    "adaptune/recording/test_inspect.py",
-    "offline/test_resume.py",
-    "adaptune/odometry/test_command.py",
-    "offline/test_objective.py",
-    "test_reference_image.py",
-    "adaptune/simulation/test_recording.py",
-    "offline/test_search.py",
-    "online/test_stale_replays.py",
-    "adaptune/test_inputs.py",
-    "offline/test_baseline.py",
-    "adaptune/odometry/test_frame_check.py",
-    "offline/test_samplers.py",
-    "test_readme.py",
-    "test_benchmarks.py",
-    "offline/test_budget.py",
-    "offline/test_oracle.py",
-    "adaptune/simulation/test_scenes.py",
-    "offline/test_pruning.py",
-    "adaptune/simulation/test_simulate.py",
-    "offline/test_trial.py",
-    "adaptune/test_selector.py",
-    "adaptune/model/test_knn.py",
-    "online/test_untrained.py",
-    "offline/test_estimated_training.py",
-    "online/test_estimated_replays.py",
-    "offline/test_storage.py",
-    "adaptune/reference/test_estimate.py",
-    "adaptune/test_hosting.py",
-    "offline/test_hosted_sampler.py",
-    "adaptune/odometry/test_isolation.py",
-    "adaptune/odometry/test_process.py",
-    "adaptune/reference/test_registering.py",
-    "adaptune/reference/test_consensus.py",
-    "offline/test_progress.py",
-    "online/test_recordings.py",
-    "adaptune/test_interrupt.py",
-    "adaptune/report/test_page.py",
-    "adaptune/reference/test_picture.py",
-    "adaptune/test_mistakes.py",
-    "offline/test_tuning.py",
-]
-"""Files that take more than a few seconds, the longest first; `make quick` leaves them out."""
-
-
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Run the longest files first, so that all processes end at about the same time."""
-    tests = Path(__file__).parent
-    place = {tests / name: i for i, name in enumerate(SLOW)}
-    if missing := [str(path) for path in place if not path.exists()]:
-        raise pytest.UsageError(f"{__file__}: SLOW lists {', '.join(missing)}")
-    items.sort(key=lambda item: place.get(item.path, len(place)))
-    for item in items:
-        if item.path in place:
-            item.add_marker("slow")
+SUPPORT = Path(__file__).parent / "support"
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -120,10 +55,47 @@ def shared(factory: Factory, name: str, make: Callable[[Path], object]) -> Path:
     return folder
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _fake() -> Iterator[None]:
+    """Let the fake odometry run in this process, as if it were adaptune's own."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(ODOMETRIES, fake_odometry.NAME, fake_odometry.NAME)
+        # Commands in processes of their own find it, too.
+        support = [str(SUPPORT), os.environ.get("PYTHONPATH", "")]
+        patch.setenv("PYTHONPATH", os.pathsep.join(filter(None, support)))
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _in_process() -> Iterator[None]:
+    """Run trials in this process, which takes no time to start; see `processes`."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(training, "Workers", InProcess)
+        yield
+
+
+@pytest.fixture
+def processes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Run trials in processes of their own, as adaptune does."""
+    monkeypatch.setattr(training, "Workers", Workers)
+
+
 @pytest.fixture(scope="session")
 def study_file(tmp_path_factory: Factory) -> Path:
-    """A study of three short drives, with its bags; not to be changed."""
+    """A study of three short drives with the fake odometry, and its bags; not to be changed."""
     return shared(tmp_path_factory, "study", drives.write_study) / drives.STUDY_FILE
+
+
+@pytest.fixture(scope="session")
+def gicp_study_file(study_file: Path, tmp_path_factory: Factory) -> Path:
+    """The same with keyframe GICP."""
+
+    def make(folder: Path) -> None:
+        shutil.copytree(study_file.parent, folder)
+        text = study_file.read_text()
+        (folder / drives.STUDY_FILE).write_text(text.replace(f'"{fake_odometry.NAME}"', "gicp"))
+
+    return shared(tmp_path_factory, "gicp", make) / drives.STUDY_FILE
 
 
 @pytest.fixture(scope="session")
@@ -134,3 +106,16 @@ def trained_folder(study_file: Path, tmp_path_factory: Factory) -> Path:
         train(load_study(study_file, [], folder))
 
     return shared(tmp_path_factory, "trained", make)
+
+
+@pytest.fixture(scope="session")
+def replayed_folder(study_file: Path, trained_folder: Path, tmp_path_factory: Factory) -> Path:
+    """The same with the replays of all modes, and their comparison; not to be changed."""
+
+    def make(folder: Path) -> None:
+        shutil.copytree(trained_folder, folder)
+        study = load_study(study_file, [], folder)
+        run_replays(study, study.model_path)
+        compare(study)
+
+    return shared(tmp_path_factory, "replayed", make)

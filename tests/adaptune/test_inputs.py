@@ -180,7 +180,7 @@ def test_another_version_of_a_package(load, monkeypatch):
     study = load()
     note(study)
     monkeypatch.setattr("importlib.metadata.version", lambda _: "99.0")
-    refused(study, "the version of small_gicp is 99.0, and was ")
+    refused(study, "the version of fake_odometry is 99.0, and was ")
 
 
 def test_a_sequence_that_is_not_trained_on_may_change(load, tmp_path):

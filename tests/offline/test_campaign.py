@@ -118,6 +118,7 @@ def test_finished_work_is_not_repeated(trained, monkeypatch):
     assert train(study).means == training.means
 
 
+@pytest.mark.usefixtures("processes")
 def test_a_killed_worker_is_replaced(trained, study_file, tmp_path, monkeypatch):
     study, _ = trained
     again = load_study(study_file, [], tmp_path / "study")
@@ -141,6 +142,7 @@ def test_a_killed_worker_is_replaced(trained, study_file, tmp_path, monkeypatch)
     assert contents(again.folder) == contents(study.folder)
 
 
+@pytest.mark.usefixtures("processes")
 def test_a_task_that_kills_every_worker_is_told(study_file, tmp_path, monkeypatch):
     study = load_study(study_file, ["offline.workers=1"], tmp_path / "study")
     spawn = Workers._spawn
@@ -165,13 +167,13 @@ def test_what_a_worker_finds_wrong_reaches_the_user(study_file, tmp_path):
         train(study)
 
 
-def test_views_are_trained_on_beside_their_origin(study_file, tmp_path):
+def test_views_are_trained_on_beside_their_origin(gicp_study_file, tmp_path):
     overrides = [
         "offline.augment=[{noise: {sigma: 0.02}}, {reverse: true}, {noise: {sigma: 0.1}}]",
         "offline.trials=2",
         "training=[one]",
     ]
-    study = load_study(study_file, overrides, tmp_path / "study")
+    study = load_study(gicp_study_file, overrides, tmp_path / "study")
     names = ["one", "one+noise", "one+reverse", "one+noise2"]
     training = train(study)
     assert training.model.sequences == names
@@ -183,7 +185,7 @@ def test_views_are_trained_on_beside_their_origin(study_file, tmp_path):
     errors = [training.means[name][0] for name in names]
     assert len(set(errors)) == 4
     with pytest.raises(ConfigurationError, match=r"other values of offline\.augment"):
-        load_study(study_file, overrides[1:], study.folder).check()
+        load_study(gicp_study_file, overrides[1:], study.folder).check()
 
 
 def test_a_view_that_cannot_be_is_told(study_file, tmp_path):

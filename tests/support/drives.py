@@ -12,7 +12,7 @@ FIRST_STAMP = 1_700_000_000_123_456_789
 STUDY_FILE = "small.yaml"
 STUDY = """\
 odometry:
-  name: gicp
+  name: "fake_odometry:Fake"
   settings: {downsampling: 0.5, min_range: 0.5}
   parameters:
     max_correspondence_distance: {low: 0.1, high: 5.0, baseline: 2.0, log: true}

@@ -247,8 +247,8 @@ def test_help_and_version(adaptune):
     assert adaptune("--version").stdout.startswith("adaptune 0.")
 
 
-def test_ctrl_c_leaves_a_study_that_resumes(adaptune, study_file, tmp_path):
-    command = [sys.executable, "-m", "adaptune.commands.cli", "offline", str(study_file)]
+def test_ctrl_c_leaves_a_study_that_resumes(adaptune, gicp_study_file, tmp_path):
+    command = [sys.executable, "-m", "adaptune.commands.cli", "offline", str(gicp_study_file)]
     many = ["-o", "offline.trials=400", "-o", "offline.batch=4"]
     campaign = subprocess.Popen(
         command + many,
@@ -269,7 +269,7 @@ def test_ctrl_c_leaves_a_study_that_resumes(adaptune, study_file, tmp_path):
     assert "run the same command again" in said
     assert "Traceback" not in said
     finished = {p: p.stat().st_mtime_ns for p in archive.folder.glob("*/0000[0-3].npz")}
-    assert adaptune("offline", study_file).exit_code == 0
+    assert adaptune("offline", gicp_study_file).exit_code == 0
     assert {p: p.stat().st_mtime_ns for p in finished} == finished
 
 
