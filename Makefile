@@ -6,12 +6,12 @@ BIN := $(VENV)/bin
 STUDY := configs/demo.yaml
 SUDO := $(if $(filter 0,$(shell id -u)),,sudo)
 
-.PHONY: help demo test quick lint types pytest services reference-image format clean
+.PHONY: help demo test test-services lint types pytest services reference-image format clean
 
 help:
 	@echo "make demo    simulate, train, replay and compare, in a few minutes"
-	@echo "make test    run linters, type checker, import contract and all tests"
-	@echo "make quick   run linters and the fast tests, in about a minute"
+	@echo "make test    run linters, type checker, import contract and all tests that need no service"
+	@echo "make test-services  test with Docker, ROS, a browser, a cluster, kills and benchmarks"
 	@echo "make services  install what pip cannot bring: ROS 1, Docker, Chromium (Debian 12)"
 	@echo "make reference-image  build the image of a ROS 1 odometry that tests run"
 	@echo "make format  format the code"
@@ -23,10 +23,11 @@ demo: $(VENV)/.installed
 	$(BIN)/adaptune online $(STUDY)
 	$(BIN)/adaptune compare $(STUDY)
 
+test: PYTEST_OPTIONS = -m "not services"
 test: lint types pytest
 
-quick: PYTEST_OPTIONS = -m "not slow"
-quick: lint pytest
+test-services: PYTEST_OPTIONS = -m services
+test-services: pytest
 
 lint: $(VENV)/.installed
 	$(BIN)/ruff check .
@@ -37,7 +38,7 @@ types: $(VENV)/.installed
 	$(BIN)/mypy
 
 pytest: $(VENV)/.installed
-	$(BIN)/pytest -n auto --dist loadfile --no-loadscope-reorder $(PYTEST_OPTIONS)
+	$(BIN)/pytest -n auto --dist worksteal $(PYTEST_OPTIONS)
 
 services:
 	$(SUDO) apt-get update

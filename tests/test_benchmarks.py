@@ -23,6 +23,8 @@ from adaptune.study.references import to_estimate
 from offline.config import OfflineStudy, load_study
 from online.statistics import ComparisonRow
 
+pytestmark = pytest.mark.services
+
 
 def benchmark(name):
     """A benchmark's module."""

@@ -15,6 +15,8 @@ from adaptune.odometry.remote import Limits, Process, ProcessSettings
 from adaptune.recording.scan import Scan
 from adaptune.trajectory import read_tum
 
+pytestmark = pytest.mark.services
+
 USER = "1234:1234"
 PARAMETERS = {"max_correspondence_distance": 2.0, "keyframe_interval": 1.5}
 FILE = """\

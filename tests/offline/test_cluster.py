@@ -15,6 +15,8 @@ from offline.cluster import Cluster, ClusterError
 from offline.config import load_study
 from offline.train import train
 
+pytestmark = pytest.mark.services
+
 distributed = pytest.importorskip("distributed")
 
 

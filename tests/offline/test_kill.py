@@ -2,12 +2,19 @@
 
 import kills
 import numpy as np
+import pytest
+
+from offline.config import load_study
+from offline.train import train
+
+pytestmark = pytest.mark.services
 
 
-def test_killed_campaigns_end_as_undisturbed_ones(study_file, trained_folder, tmp_path):
+def test_killed_campaigns_end_as_undisturbed_ones(gicp_study_file, tmp_path):
+    train(load_study(gicp_study_file, [], tmp_path / "undisturbed"))
     rng = np.random.default_rng(1)
-    n_files = len(kills.files(trained_folder))
-    killed = kills.disturb(study_file, tmp_path / "study", 4, n_files, rng)
+    n_files = len(kills.files(tmp_path / "undisturbed"))
+    killed = kills.disturb(gicp_study_file, tmp_path / "study", 4, n_files, rng)
     assert sum(killed) >= 2
-    assert kills.contents(tmp_path / "study") == kills.contents(trained_folder)
+    assert kills.contents(tmp_path / "study") == kills.contents(tmp_path / "undisturbed")
     kills.check_once(tmp_path / "study", 10, ["one", "two"])

@@ -15,7 +15,6 @@ def finished(study_file, trained_folder, tmp_path_factory):
     return folder
 
 
-@pytest.mark.slow
 def test_a_finished_study_has_a_page_of_everything(finished):
     ended = call("compare", finished)
     assert ended.exit_code == 0
@@ -31,7 +30,6 @@ def test_a_finished_study_has_a_page_of_everything(finished):
         assert f">{mode}</td>" in page
 
 
-@pytest.mark.slow
 def test_a_study_that_is_not_finished_has_one_too_that_says_what_is_missing(finished, tmp_path):
     folder = shutil.copytree(finished, tmp_path / "half")
     shutil.rmtree(folder / "replays/three/fixed")
@@ -48,7 +46,6 @@ def test_a_study_that_has_not_begun_has_nothing_to_compare(study_file, tmp_path)
     assert not (tmp_path / "none").exists()
 
 
-@pytest.mark.slow
 def test_studies_are_compared_side_by_side_by_their_folders(finished, tmp_path):
     other = shutil.copytree(finished, tmp_path / "other")
     ended = call("compare", finished, other, "--to", tmp_path / "both")

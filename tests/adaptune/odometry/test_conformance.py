@@ -32,7 +32,7 @@ from adaptune import processes
 from adaptune.geometry import invert
 from adaptune.odometry import OdometryError
 from adaptune.odometry.base import prepared_bytes
-from adaptune.odometry.registry import ODOMETRIES, PROGRAMS, odometry_class
+from adaptune.odometry.registry import CONTAINERS, ODOMETRIES, PROGRAMS, odometry_class
 from adaptune.recording import Scan
 from adaptune.selection import Selection
 
@@ -40,10 +40,15 @@ CLEAN = [name for name in ODOMETRIES if odometry_class(name).clean]
 """Those that live in this process; test_conformance_isolated.py holds what the others must do."""
 
 # Programs are reached in many ways, but what they do is theirs.
-every_odometry = pytest.mark.parametrize("name", [*CLEAN, *PROGRAMS, LOCKSTEP])
+programs = [
+    pytest.param(name, marks=pytest.mark.services) if name in CONTAINERS else name
+    for name in PROGRAMS
+]
+in_lockstep = pytest.param(LOCKSTEP, marks=pytest.mark.services)
+every_odometry = pytest.mark.parametrize("name", [*CLEAN, *programs, in_lockstep])
 
 # A node's clock does not go back; test_lockstep.py holds more of it.
-but_lockstep = pytest.mark.parametrize("name", [*CLEAN, *PROGRAMS])
+but_lockstep = pytest.mark.parametrize("name", [*CLEAN, *programs])
 
 in_python = pytest.mark.parametrize("name", CLEAN)
 

@@ -22,6 +22,8 @@ from adaptune.ros.link import LinkError
 from adaptune.ros.ros1 import local_ros1, ros_python
 from adaptune.trajectory import read_tum
 
+pytestmark = pytest.mark.services
+
 ROBOT = Path(drives.__file__).with_name("ros1_robot.py")
 """Only the Python of ROS can import it."""
 

@@ -21,6 +21,8 @@ from adaptune.trajectory import read_tum
 from offline.config import load_study
 from online.robot import RobotDrive
 
+pytestmark = pytest.mark.services
+
 STORE = message_types()
 HASHES = {  # as ROS 2 Jazzy has them
     "SetParameters": "RIHS01_56eed9a67e169f9cb6c1f987bc88f868c14a8fc9f743a263bc734c154015d7e0",

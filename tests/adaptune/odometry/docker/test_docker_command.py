@@ -25,6 +25,8 @@ from adaptune.odometry.template import Template
 from adaptune.strict import ConfigurationError
 from offline.config import load_study
 
+pytestmark = pytest.mark.services
+
 PLAIN = ("odometry-plain", "{points}")
 
 

@@ -14,6 +14,8 @@ from adaptune.odometry.keyframe import KeyframeGicp
 from adaptune.odometry.remote import Limits
 from adaptune.selection import Selection
 
+pytestmark = pytest.mark.services
+
 SERVE = ("odometry-serve", "{socket}")
 
 

@@ -23,6 +23,8 @@ from adaptune.odometry.docker.engine import (
     image_digest,
 )
 
+pytestmark = pytest.mark.services
+
 NOBODY = "65534:65534"
 LOOK = """
 import json, os, resource, socket

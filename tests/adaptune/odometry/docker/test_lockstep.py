@@ -28,7 +28,10 @@ from adaptune.odometry.docker.rustle import Rustle
 from adaptune.odometry.keyframe import KeyframeGicp
 from adaptune.selection import Selection
 
-pytestmark = pytest.mark.filterwarnings("error::pytest.PytestUnhandledThreadExceptionWarning")
+pytestmark = [
+    pytest.mark.services,
+    pytest.mark.filterwarnings("error::pytest.PytestUnhandledThreadExceptionWarning"),
+]
 
 OTHER = {"max_correspondence_distance": 3.0}
 SET = """

@@ -32,7 +32,10 @@ from adaptune.odometry.docker.engine import image_digest
 from adaptune.odometry.docker.rustle import PlayedBag, Rustle
 from adaptune.odometry.remote import Limits
 
-pytestmark = pytest.mark.filterwarnings("error::pytest.PytestUnhandledThreadExceptionWarning")
+pytestmark = [
+    pytest.mark.services,
+    pytest.mark.filterwarnings("error::pytest.PytestUnhandledThreadExceptionWarning"),
+]
 
 SIDE_BY_SIDE = 3
 
