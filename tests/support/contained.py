@@ -23,7 +23,7 @@ from adaptune.recording import Scan
 
 LABEL = "adaptune.owner"
 N_SCANS = 40
-LIMITS = Limits(seconds=10.0, memory=2.0)
+LIMITS = Limits(seconds=60.0, memory=2.0)
 VALUES = {"max_correspondence_distance": 2.0, "keyframe_interval": 1.5}
 """Of the parameters in the template that are tuned here."""
 FIXED = {"downsampling": 0.7, "iterations": 20}
@@ -66,7 +66,7 @@ def template(path, sim="true", points="/points", **imitate):
 
 def rustle(file, **settings):
     """Settings of the reference image's system, with a parameter file."""
-    given = {"image": reference_image(), "odometry": "/Odometry", "rate": 4.0, "drain": 1.0}
+    given = {"image": reference_image(), "odometry": "/Odometry", "rate": 4.0, "drain": 60.0}
     return RustleSettings(template=str(file), **(given | settings))
 
 

@@ -76,7 +76,7 @@ def _contained(name, parameters):
         "docker_command": {"command": ("odometry-plain", "{points}"), "template": str(file)},
         "docker_process": {"command": ("odometry-serve", "{socket}")},
         "rustle": {"template": str(file), "odometry": "/Odometry", "rate": 4.0},
-        LOCKSTEP: {"play": "lockstep", "node": "/gicp", "patience": 5.0},
+        LOCKSTEP: {"play": "lockstep", "node": "/gicp", "patience": 60.0},
     }
     given[LOCKSTEP] |= {"template": str(file), "odometry": "/Odometry"}
     settings = kind.settings_type(image=image, **given[name])

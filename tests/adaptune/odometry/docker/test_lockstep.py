@@ -65,7 +65,7 @@ def make(tmp_path):
 
     def begin(parameters=VALUES, imitate=None, points="/points", settings=()):
         file = template(tmp_path / "params.yaml", points=points, **(imitate or {}))
-        given = rustle(file, **({"play": "lockstep", "patience": 5.0} | dict(settings)))
+        given = rustle(file, **({"play": "lockstep", "patience": 60.0} | dict(settings)))
         odometries.append(Rustle.instance(parameters, given, LIMITS, None))
         return odometries[-1]
 
@@ -169,7 +169,7 @@ def test_a_command_sets_parameters(make, systems):
 
 
 def test_one_that_dies_is_a_fault_with_its_last_lines(make):
-    odometry = make(imitate={"die_at": 4}, settings={"patience": 2.0})
+    odometry = make(imitate={"die_at": 4}, settings={"patience": 10.0})
     poses = drive(odometry)
     np.testing.assert_allclose(poses[:4], host_poses()[:4], atol=1e-6)
     assert np.isnan(poses[-1]).all()

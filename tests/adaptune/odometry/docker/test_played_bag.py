@@ -1,7 +1,6 @@
 """Trials of the reference image on a short bag; those that need no other run side by side."""
 
 import re
-import time
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
@@ -42,42 +41,19 @@ SIDE_BY_SIDE = 3
 TRIALS = {
     "plain": {"parameters": VALUES | {"other.voxel": 2}},
     "late": {
-        "imitate": {"ready_delay": 3.0},
+        "imitate": {"ready_delay": 3.0, "rate": 5000},
         "points": "/velodyne",
         "settings": {"points": "/velodyne"},
     },
-    "rate": {"imitate": {"rate": 5000}},
-    "by the clock": {"imitate": {"stamp_now": True, "seconds_per_scan": 0.03}},
-    "present time": {
-        "imitate": {"stamp_now": True},
-        "sim": "false",
-        "settings": {"use_sim_time": False},
-    },
-    "lag": {"imitate": {"seconds_per_scan": 0.1}, "settings": {"drain": 2.0}},
-    "no time": {"imitate": {"seconds_per_scan": 3.0}, "settings": {"rate": 20.0, "drain": 0.0}},
-    "too slow": {
-        "imitate": {"seconds_per_scan": 60.0},
-        "limits": Limits(seconds=6.0 / N_SCANS),
-        "settings": {"drain": 60.0},
-    },
+    "lag": {"imitate": {"seconds_per_scan": 0.1}},
+    "too slow": {"imitate": {"seconds_per_scan": 60.0}, "limits": Limits(seconds=6.0 / N_SCANS)},
     "drops": {"imitate": {"seconds_per_scan": 0.1, "queue_size": 1}, "settings": {"rate": 2.0}},
-    "loses nearly all": {
-        "imitate": {"seconds_per_scan": 3.0, "queue_size": 1},
-        "settings": {"drain": 6.0},
-    },
-    "dies": {"imitate": {"die_at": 3}, "settings": {"rate": 0.1}},
     "node dies": {
         "imitate": {"die_at": 3},
         "settings": {"rate": 0.1, "arguments": ("required:=false",)},
     },
-    "quits": {"imitate": {"quit_launch": True}},
-    "silent": {"imitate": {"silent": True}},
-    "another topic": {"settings": {"odometry": "/odom"}},
-    "no poses": {"settings": {"odometry": "/points"}},
+    "silent": {"imitate": {"silent": True}, "settings": {"drain": 1.0}},
     "camera": {"imitate": {"frame": "camera"}},
-    "jump": {"imitate": {"jump": 20}},
-    "another package": {"settings": {"package": "other"}},
-    "hears nothing": {"points": "/velodyne"},
 }
 """What is imitated and set in each trial."""
 
@@ -87,7 +63,6 @@ class Ran(NamedTuple):
     odometry: PlayedBag
     error: str
     said: str
-    seconds: float
 
 
 def run(
@@ -95,7 +70,6 @@ def run(
     imitate=None,
     parameters=VALUES,
     limits=LIMITS,
-    sim="true",
     points="/points",
     settings=(),
 ):
@@ -103,15 +77,15 @@ def run(
     folder.mkdir(parents=True)
     given = recording(folder, folder / "logs")
     given.logs.mkdir()
-    file = template(folder / "template.yaml", sim, points, **(imitate or {}))
+    file = template(folder / "template.yaml", points=points, **(imitate or {}))
     odometry = Rustle.instance(parameters, rustle(file, **dict(settings)), limits, lambda: given)
-    poses, error, begin = None, "", time.monotonic()
+    poses, error = None, ""
     with Said() as said:
         try:
             poses = drive(odometry)
         except OdometryError as caught:
             error = str(caught)
-    return Ran(poses, odometry, error, str(said), time.monotonic() - begin)
+    return Ran(poses, odometry, error, str(said))
 
 
 @pytest.fixture(scope="module")
@@ -180,38 +154,16 @@ def test_what_is_kept_of_a_trial(ran, folder):
     assert note["parameters"] == VALUES | {"other.voxel": 2}
     assert note["rate"] == 4.0
     assert note["seconds"].keys() == {"container", "ready", "bag", "drained", "removed"}
-    assert note["seconds"]["bag"] > 0.9
     assert note["input"].endswith("/plain/drive.bag")
 
 
-def test_it_waits_for_one_that_is_late_and_renames_topics(ran):
+def test_it_waits_for_one_that_is_late_and_sleeps_by_the_clock(ran):
+    """And it renames topics."""
     assert_good(ran("late"))
 
 
-def test_one_that_sleeps_by_the_clock_finishes_when_the_bag_has_ended(ran):
-    assert_good(ran("rate"))
-
-
-def test_stamps_by_the_clock_are_refused(ran):
-    (fault,) = ran("by the clock").odometry.faults
-    assert re.search(
-        r"^(its stamps are|its poses are of) .*: the system stamps poses by its own clock", fault
-    )
-
-
-def test_stamps_of_the_present_time_are_refused(ran):
-    (fault,) = ran("present time").odometry.faults
-    assert re.search(
-        r"its poses are of \d+\.\d{3} s to .*, the scans of 1700000000\.123 s to 1700000004.*: the "
-        r"system stamps poses by its own clock",
-        fault,
-    )
-
-
-def test_it_waits_for_one_that_lags_behind(ran, folder):
+def test_it_waits_for_one_that_lags_behind(ran):
     assert_good(ran("lag"))
-    seconds = yaml.safe_load((kept(folder, "lag") / "trial.yaml").read_text())["seconds"]
-    assert seconds["drained"] > 1.0
 
 
 def test_one_that_is_far_too_slow_is_ended(ran):
@@ -228,55 +180,22 @@ def test_scans_that_are_dropped_are_counted(ran):
     )
 
 
-def test_one_that_drops_nearly_all_scans_has_a_fault(ran):
-    (fault,) = ran("loses nearly all").odometry.faults
-    assert re.match(r"it gave poses for \d+ of 40 scans, the last at|its poses are of", fault)
-
-
-@pytest.mark.parametrize(
-    ("name", "words"),
-    [
-        ("dies", r"(roslaunch ended with code \d+|node /gicp died): "),
-        ("node dies", r"node /gicp died: "),
-    ],
-)
-def test_one_that_dies_is_a_fault_at_once(ran, name, words):
-    trial = ran(name)
+def test_one_that_dies_is_a_fault_at_once(ran):
+    trial = ran("node dies")
     (fault,) = trial.odometry.faults
-    assert re.match(words, fault), fault
+    # The bag goes on for forty seconds, and the fault is not that it ended.
+    assert re.match(r"node /gicp died: ", fault), fault
     assert "terminating after 3 scans: the map is corrupt" in fault
-    # The bag alone takes forty.
-    assert trial.seconds < 35.0
     assert np.isnan(trial.poses[-1]).all()
 
 
-@pytest.mark.parametrize(
-    ("name", "words"),
-    [
-        ("quits", r"roslaunch ended with code 0: .*gicp-1.*"),
-        (
-            "silent",
-            r"nothing was published on /Odometry until 1 s after the bag, though a node announces "
-            r"it \(others publish .*/gicp/parameter_.*\); .*longer odometry\.settings\.drain",
-        ),
-        ("no time", r"nothing was published on /Odometry until 0 s after the bag, .*drain"),
-        ("another topic", r"nothing was published on /odom, but on /Odometry, .*set.*odometry"),
-        ("no poses", r"/points is sensor_msgs/msg/PointCloud2; odometry\.settings\.odometry must"),
-        ("jump", r"1 of 40 poses are no poses \(NaN, or no rotation\)"),
-        ("another package", r"roslaunch ended with code 1: there is no package other"),
-        (
-            "hears nothing",
-            r"no node subscribed to the clouds' topic /points in \d+ s \(topics with subscribers: "
-            r".*/velodyne.*\); name the topic",
-        ),
-    ],
-)
-def test_what_went_wrong_is_told(ran, name, words):
-    trial = ran(name)
-    assert not trial.error
-    (fault,) = trial.odometry.faults
-    assert re.match(words, fault), fault
-    assert np.isnan(trial.poses[-1]).all()
+def test_one_that_publishes_nothing_is_told(ran):
+    (fault,) = ran("silent").odometry.faults
+    assert re.match(
+        r"nothing was published on /Odometry until 1 s after the bag, though a node announces it "
+        r"\(others publish .*/gicp/parameter_.*\); .*longer odometry\.settings\.drain",
+        fault,
+    )
 
 
 def test_poses_of_another_frame_are_refused(ran):

@@ -1,5 +1,9 @@
 """Stamps and poses that a system publishes, without a container."""
 
+from pathlib import Path
+from types import SimpleNamespace
+
+import contained
 import local_link
 import numpy as np
 import pytest
@@ -8,7 +12,15 @@ from hypothesis import strategies as st
 from rosbags.highlevel import AnyReader
 
 from adaptune.odometry import OdometryError
-from adaptune.odometry.docker.rustle import PoseRecorder, check_stamps, drained, write_poses
+from adaptune.odometry.docker.rustle import (
+    PlayedBag,
+    PoseRecorder,
+    RustleSettings,
+    check_stamps,
+    drained,
+    write_poses,
+)
+from adaptune.odometry.program import ProgramInput
 from adaptune.recording.clouds import POSES, usable
 
 PERIOD = 10**8
@@ -147,6 +159,51 @@ def test_messages_that_hold_no_poses_are_refused(link):
     link.publish(local_link.imu(0))
     with pytest.raises(OdometryError, match=r"/found is sensor_msgs/msg/Imu; odometry\.settings"):
         recorder.poses()
+
+
+@pytest.fixture
+def played(tmp_path):
+    """A system that hears a bag of the scans, as it is before a trial."""
+    file = contained.template(tmp_path / "template.yaml")
+    settings = RustleSettings(
+        image="an image", template=str(file), odometry="/Odometry", rate=4.0, drain=2.0
+    )
+    return PlayedBag(contained.VALUES, settings, contained.LIMITS, None)
+
+
+GIVEN = ProgramInput(Path("drive.bag"), "/points", "", SCANS, None)
+
+
+@pytest.mark.parametrize(
+    ("topics", "words"),
+    [
+        (
+            ["/odom", "/clock"],
+            "nothing was published on /Odometry, but on /odom; name its topic as",
+        ),
+        (["/Odometry"], r"nothing was published on /Odometry until 2 s after the bag, though a"),
+    ],
+)
+def test_a_topic_without_poses_is_told_with_the_others(link, played, topics, words):
+    system = SimpleNamespace(link=SimpleNamespace(topics=lambda: dict.fromkeys(topics)))
+    with pytest.raises(OdometryError, match=words):
+        played._check_published(system, PoseRecorder(link, "/Odometry"))
+
+
+def test_poses_that_are_none_are_refused(link, played):
+    recorder = PoseRecorder(link, "/Odometry")
+    for i in range(40):
+        link.publish(odometry(i, np.nan if i == 20 else 0.3 * i))
+    with pytest.raises(OdometryError, match=r"1 of 40 poses are no poses \(NaN, or no rotation\)"):
+        played._checked(recorder, GIVEN)
+
+
+def test_scans_without_a_pose_are_counted(link, played, caplog):
+    recorder = PoseRecorder(link, "/Odometry")
+    for i in range(0, 40, 2):
+        link.publish(odometry(i, 0.3 * i))
+    assert len(played._checked(recorder, GIVEN)) == 20
+    assert "an image: 20 of 40 scans have no pose at rate 4: it drops scans" in caplog.text
 
 
 def test_of_paths_the_last_holds_all(link, tmp_path):
