@@ -47,8 +47,8 @@ class Chain:
         self.params: dict[str, Any] | None = None  # it steps from; None before its first trial
         self.energy = self.best = math.inf  # error of that set, and the least error so far
         self.temperature = settings.initial_temperature
-        # Steps since the last acceptance, and since the best trial; how often it was heated.
-        self.unaccepted = self.no_best = self.reanneals = 0
+        # Steps since the last acceptance, and since the best trial.
+        self.unaccepted = self.no_best = 0
         # Steps since the chain was last heated, for each of the three triggers.
         self._fixed = self._unaccepted = self._no_best = 0
 
@@ -83,7 +83,6 @@ class Chain:
             or _reached(self._no_best, s.reanneal_best)
         ):
             self.temperature = s.initial_temperature
-            self.reanneals += 1
             self._fixed = self._unaccepted = self._no_best = 0
         else:
             self.temperature *= s.alpha
@@ -211,16 +210,6 @@ class AnnealingSampler(BaseSampler):
     def chains(self, study: Study) -> list[Chain]:
         """The chains after the study's finished trials."""
         return self._walk(study, self._finished(study))
-
-    def reannealed(self, study: Study) -> list[int]:
-        """Numbers of the finished trials after which a chain was heated again."""
-        trials = sorted(self._finished(study), key=lambda trial: trial[0])
-        found, before = [], 0
-        for i, (number, *_) in enumerate(trials):
-            count = sum(chain.reanneals for chain in self._walk(study, trials[: i + 1]))
-            found += [number] if count > before else []
-            before = count
-        return found
 
     def stalled(self, study: Study) -> bool:
         """Whether all chains have stalled."""

@@ -21,7 +21,6 @@ from adaptune.report.charts import (
     Charts,
     Drawn,
     Line,
-    Mark,
     Panel,
     Points,
     charts_of,
@@ -31,8 +30,7 @@ from adaptune.report.charts import (
 from adaptune.space import ODOMETRY, ParameterSet, ParameterSpace
 from adaptune.study.study import Study
 from offline.config import OfflineConfig, OfflineStudy
-from offline.objective import judge, label, pareto_front, sampler_results, weighted
-from offline.search import Search, assess, make_searches
+from offline.objective import judge, label, pareto_front, weighted
 from offline.storage import distribution
 from offline.tuning import figures
 
@@ -210,17 +208,8 @@ def _marked(table: TrialTable, x: NDArray[Any], y: NDArray[Any]) -> list[Drawn]:
     return [Points(x[at], y[at], mode) for mode, at in places.items() if len(at)]
 
 
-def iteration_chart(table: TrialTable, reannealed: Mapping[int, Sequence[int]]) -> Chart | None:
-    """Error of each trial, and the least so far, over the trial's number: one panel a search.
-
-    Parameters
-    ----------
-    table
-        The trials.
-    reannealed
-        By the number of a search, 0 for that over all sequences, the numbers in it of the trials
-        after which annealing was heated again.
-    """
+def iteration_chart(table: TrialTable) -> Chart | None:
+    """Error of each trial, and the least so far, over the trial's number: one panel a search."""
     panels = []
     slots = table.numbers // OF_SLOT
     for slot in np.unique(slots).tolist()[:MOST_PANELS]:
@@ -241,19 +230,16 @@ def iteration_chart(table: TrialTable, reannealed: Mapping[int, Sequence[int]]) 
         ]
         first = number == 0
         drawn += [Points(number[first], errors[first], "baseline")] if first.any() else []
-        marks = [int(i) for i in reannealed.get(slot, ())]
-        drawn += [Mark(i, "" if k else "reannealing", "x") for k, i in enumerate(marks)]
         log = bool((errors > 0.0).all())
         panels.append(Panel(Axis("trial [-]"), Axis(table.objective, log), tuple(drawn), title))
     if not panels:
         return None
-    marked = " Dashed: where annealing was heated again." if any(reannealed.values()) else ""
     return Chart(
         "iterations",
         "The search for parameters",
         tuple(panels),
         "Error of each trial in the order of the search, and the least so far of those within the "
-        f"limits. A flat end means that more trials promise little.{marked}",
+        "limits. A flat end means that more trials promise little.",
         columns=min(2, len(panels)),
     )
 
@@ -502,7 +488,7 @@ def _of_trials(study: OfflineStudy, table: TrialTable) -> Iterator[Chart | str |
     if (n := len(table.space.parameters)) > MOST_PANELS:
         yield f"Of {n} parameters, the charts show the first {MOST_PANELS}."
     found = {name: importances(of) for name, of in table.shared().odometries().items()}
-    yield iteration_chart(table, reannealings(study))
+    yield iteration_chart(table)
     yield importance_chart(found) or (
         f"No importance of parameters: it takes {FEW} finished trials and two parameters."
     )
@@ -524,40 +510,6 @@ def most_important(table: TrialTable, shares: Mapping[str, float]) -> list[str]:
     """Names of two parameters: those that matter most, or the first that all sets have."""
     every = [n for n in table.space.parameters if all(v is not None for v in table.column(n))]
     return [*shares, *(name for name in every if name not in shares)][:2]
-
-
-def reannealings(study: OfflineStudy) -> dict[int, list[int]]:
-    """By the slot of a search, the numbers in it of the trials after which it was heated again.
-
-    There are none where the sampler does not anneal.
-    """
-    if study.config.offline.sampler != "annealing":
-        return {}
-    archive = Archive(study.folder / "trials")
-    config, space = study.config.offline, study.odometry.space
-    finished = {name: archive.finished(name) for name in study.training}
-    found = {}
-    for search in make_searches(config, space, study.training, archive):
-        slot = search.number(1) // OF_SLOT
-        found[slot] = _reannealed(search, study, finished)
-    return found
-
-
-def _reannealed(search: Search, study: OfflineStudy, finished: Mapping[str, Any]) -> list[int]:
-    from offline.samplers import AskedSampler
-
-    config, batch = study.config.offline, study.config.offline.batch
-    of_search = {n for name in search.sequences for n in finished[name]}
-    numbers: list[int] = []
-    while (number := search.number(len(numbers))) in of_search:
-        numbers.append(number)
-    numbers = numbers[: len(numbers) // batch * batch]
-    sampler = search.make_sampler()
-    if not numbers or not isinstance(sampler, AskedSampler):
-        return []
-    runs = {name: finished[name] for name in search.sequences}
-    verdicts = [assess(n, search.sequences, config, search.sequences, runs) for n in numbers]
-    return sampler.reannealed(sampler_results(verdicts))
 
 
 def charts_of_validation(study: Study) -> Charts:

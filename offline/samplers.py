@@ -311,21 +311,6 @@ class AskedSampler(Sampler):
             return True
         return False
 
-    def reannealed(self, history: Sequence[tuple[Any, ...]]) -> list[int]:
-        """Which results of a history were followed by reannealing, see `propose`; by their index.
-
-        There are none where the sampler does not anneal.
-        """
-        self.propose(history)
-        sampler, found = self._study.sampler, []
-        heated = sampler.reannealed(self._study) if isinstance(sampler, AnnealingSampler) else []
-        # Sets that were proposed twice have several trials here.
-        seen: set[str] = set()
-        for trial in self._study.get_trials(deepcopy=False):
-            seen.add(key(self._decode(trial.params)))
-            found += [len(seen) - 1] if trial.number in heated else []
-        return found
-
     def _n_initial(self, numbers: range) -> int:
         n = 1 if self.config.sampler == "qmc" else self.config.initial
         return max(numbers.start, min(numbers.stop, n))

@@ -1,14 +1,11 @@
 import json
 
-import drawn
 import numpy as np
 import pytest
 from made_trials import write_trials
 
-from adaptune.archive import Archive
 from adaptune.errors import AdaptuneError
-from offline.campaign import run_batches
-from offline.charts import charts_of_trials, charts_of_validation, reannealings
+from offline.charts import charts_of_trials, charts_of_validation
 from offline.config import load_study
 
 BOTH = """\
@@ -60,31 +57,6 @@ def test_each_of_several_odometries_has_a_scatter(tmp_path):
     assert len(set(keys)) == len(keys)
     importance = charts[keys.index("importance")]
     assert {panel.title for panel in importance.panels} <= {"gicp", "ndt"}
-
-
-def annealing(study_file, folder, **given):
-    settings = {"reanneal_fixed": 6, "chains": 1}
-    overrides = [f"offline.sampler_settings={json.dumps(settings)}", "offline.sampler=annealing"]
-    given = {"trials": 28, "initial": 1, "batch": 4} | given
-    overrides += [f"offline.{key}={value}" for key, value in given.items()]
-    study = load_study(study_file, overrides, folder)
-    folder.mkdir()
-    run_batches(study, Archive(folder / "trials"), drawn.Drawn(error))
-    return study
-
-
-def test_reannealing_is_marked_at_the_trials_after_which_it_happened(study_file, tmp_path):
-    # The baseline begins the chain; every sixth step heats it.
-    assert reannealings(annealing(study_file, tmp_path / "shared")) == {0: [6, 12, 18, 24]}
-    own = annealing(study_file, tmp_path / "own", sets="own", trials=16)
-    assert reannealings(own) == {1: [6, 12], 2: [6, 12]}
-    marks = [d for d in charts_of_trials(own).charts[0].panels[0].drawn if hasattr(d, "at")]
-    assert [mark.at for mark in marks] == [6, 12]
-
-
-def test_other_samplers_have_no_reannealing(study):
-    write_trials(study, error, 4)
-    assert reannealings(study) == {}
 
 
 def test_validation_is_read_or_missed(study):

@@ -2,7 +2,7 @@ import numpy as np
 from made_trials import SPACE, made_table
 
 from adaptune.archive import OF_SLOT, Summary
-from adaptune.report.charts import Axis, Line, Mark, Points
+from adaptune.report.charts import Axis, Line, Points
 from offline.charts import (
     cost_chart,
     iteration_chart,
@@ -41,15 +41,11 @@ def test_a_scatter_has_a_panel_for_each_sequence_and_the_mean():
     assert scatter_chart(table, ["distance"], ["one"]) is None
 
 
-def test_iterations_show_the_best_so_far_and_reannealing():
+def test_iterations_show_the_best_so_far():
     table = made_table(error, fixed=3)
-    (panel,) = iteration_chart(table, {0: [7, 20]}).panels
+    (panel,) = iteration_chart(table).panels
     (line,) = of_kind(panel, Line)
     np.testing.assert_array_equal(line.y, np.minimum.accumulate(table.values))
-    assert [(mark.at, mark.words, mark.axis) for mark in of_kind(panel, Mark)] == [
-        (7, "reannealing", "x"),
-        (20, "", "x"),
-    ]
 
 
 def test_a_trial_beyond_a_limit_is_no_best():
@@ -58,7 +54,7 @@ def test_a_trial_beyond_a_limit_is_no_best():
         i: Summary(SPACE.baseline | {"points": i + 1}, 1.0 - 0.1 * i, 0, 0, 9.0 if i == 2 else 1.0)
         for i in range(4)
     }
-    (panel,) = iteration_chart(trial_table(config, SPACE, {"one": runs}), {}).panels
+    (panel,) = iteration_chart(trial_table(config, SPACE, {"one": runs})).panels
     np.testing.assert_allclose(of_kind(panel, Line)[0].y, [1.0, 0.9, 0.9, 0.7])
 
 
@@ -73,10 +69,9 @@ def test_each_search_of_its_own_has_a_panel():
         for slot, name in ((1, "one"), (2, "two"))
     }
     own = trial_table(OfflineConfig(), SPACE, runs)
-    one, two = iteration_chart(own, {2: [4]}).panels
+    one, two = iteration_chart(own).panels
     assert (one.title, two.title) == ("one alone", "two alone")
     assert list(of_kind(one, Line)[0].x) == list(range(1, 10))
-    assert [mark.at for mark in of_kind(two, Mark)] == [4]
     # They were not run on all sequences.
     assert cost_chart(own) is None
 
