@@ -1,6 +1,7 @@
 """Trials on disk: parameters, poses, and the error at every frame."""
 
 import json
+import logging
 import operator
 import os
 import re
@@ -12,16 +13,20 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune import files
+from adaptune import files, manifest
 from adaptune.errors import AdaptuneError, nearest
 from adaptune.files import DAMAGED_NPZ, needing_room, replacing, write_text
 from adaptune.geometry import Poses
 from adaptune.live.hops import Hops
 from adaptune.metrics import cap
+from adaptune.recording.cache import status_key
 from adaptune.space import ODOMETRY, ParameterSet, in_words
+from adaptune.strict import ConfigurationError
 from adaptune.trajectory import Trajectory, write_tum
 
 REGISTER_MS, PREPARE_MS = "register_ms", "prepare_ms"  # in `Trial.usage`
+
+_log = logging.getLogger(__name__)
 
 
 class ArchiveError(AdaptuneError):
@@ -174,6 +179,24 @@ class _Entry(NamedTuple):
             return None
 
 
+class Sources(NamedTuple):
+    """What the trials of a study depend on."""
+
+    shared: manifest.Inputs  # on every sequence
+    of_sequence: Callable[[str], manifest.Inputs]
+    # The files that digests in these are of, see `manifest.changes`.
+    files: Callable[[str], Mapping[str, Sequence[Path]]]
+
+    def inputs(self, sequence: str) -> dict[str, Any]:
+        """All that trials on a sequence depend on."""
+        inputs: dict[str, Any] = manifest.plain({**self.shared, **self.of_sequence(sequence)})
+        return inputs
+
+    def statuses(self, sequence: str) -> dict[Path, str]:
+        """By file of a sequence, what shows that it is the same as before."""
+        return {file: status_key(file) for of in self.files(sequence).values() for file in of}
+
+
 INDEX = "index.jsonl"
 SLOTS = "slots.json"
 """Of each sequence that is searched for sets of its own, the hundred thousand of its trials."""
@@ -196,14 +219,112 @@ class Archive:
     ----------
     folder
         Need not exist.
-    note
-        Called with a sequence's name before anything is written about it.
+    sources
+        What trials depend on; recorded beside the first of a sequence that is written.
     """
 
-    def __init__(self, folder: Path, note: Callable[[str], None] = lambda _: None):
+    def __init__(self, folder: Path, sources: Sources | None = None):
         self.folder = folder
-        self._note = note
+        self._sources = sources
+        self._statuses: dict[str, dict[Path, str]] = {}
         self._finished: dict[str, dict[int, Summary]] | None = None
+
+    def _note(self, sequence: str) -> None:
+        """Record what the trials on a sequence depend on, before the first of them is written."""
+        path = self.folder / sequence / manifest.FILE
+        if self._sources is None or path.exists():
+            return
+        now = self._sources.statuses(sequence)
+        if changed := dict(now.items() ^ self._statuses.get(sequence, now).items()):
+            raise ConfigurationError(
+                f"{next(iter(changed))}: has changed while {sequence} was read, and nothing on "
+                f"{sequence} is stored; run the same command again"
+            )
+        manifest.record(path, self._sources.inputs(sequence))
+
+    def inputs(self, sequence: str) -> dict[str, Any]:
+        """All that trials on a sequence depend on now."""
+        assert self._sources is not None
+        return self._sources.inputs(sequence)
+
+    def changes(self, sequence: str) -> list[str]:
+        """In what this differs from what the stored trials depend on, in words."""
+        assert self._sources is not None
+        before = manifest.recorded(self.folder / sequence / manifest.FILE)
+        return manifest.changes(before, self.inputs(sequence), self._sources.files(sequence))
+
+    def renew(self, sequences: Sequence[str]) -> bool:
+        """Set aside what was computed from other inputs than there are now, and say why.
+
+        Earlier results of these inputs count again. Of trials on other sequences than these, only
+        what all share is compared.
+
+        Returns
+        -------
+        bool
+            Whether trials were moved.
+        """
+        assert self._sources is not None
+        self._statuses = {name: self._sources.statuses(name) for name in sequences}
+        moved: list[Path] = []
+        why: dict[str, None] = {}
+        for folder in sorted(self.folder.glob("*/")):
+            name = folder.name
+            files: Mapping[str, Sequence[Path]] = {}
+            before = manifest.recorded(folder / manifest.FILE)
+            now = {**(before or {}), **self._sources.shared}
+            if name in sequences:
+                now, files = self._sources.inputs(name), self._sources.files(name)
+            if outdated := self._outdated(name, before, now):
+                why |= dict.fromkeys(manifest.changes(before, now, files))
+                moved += outdated
+        if moved:
+            n = sum(_TRIAL.fullmatch(file.name) is not None for file in moved)
+            what = f"{n} trials are run" if n else f"{len(moved)} sequences are described"
+            _log.warning("%s again: %s", what, "; ".join(why))
+        self._finished = None
+        back = [file for name in sequences for file in self._bring_back(name)]
+        return any(_TRIAL.fullmatch(file.name) for file in [*moved, *back])
+
+    def _outdated(
+        self, name: str, before: manifest.Inputs | None, now: manifest.Inputs
+    ) -> list[Path]:
+        """Set aside the files of a sequence that depend on what has changed."""
+        folder, study = self.folder / name, self.folder.parent
+        differing = {key.partition(".")[0] for key, *_ in manifest.differences(before or {}, now)}
+        if not differing:
+            return []
+        partly = before is not None and differing <= {"descriptors", "limits"}
+        files = [] if partly else sorted(folder.glob("*.npz"))
+        if partly and "descriptors" in differing:
+            files += folder.glob("frames.npz")
+        if partly and "limits" in differing:
+            faulty = [n for n, run in self.finished(name).items() if run.faults]
+            files += (file for n in faulty for file in folder.glob(f"{n:05d}*.npz"))
+        manifest.set_aside(study, folder, before, files)
+        # The record changes last: until then, it is known what these depend on.
+        if partly:
+            manifest.record(folder / manifest.FILE, now)
+        else:
+            (folder / manifest.FILE).unlink(missing_ok=True)
+        return [folder / file.name for file in files]
+
+    def _bring_back(self, name: str) -> list[Path]:
+        """Let earlier results of the same inputs count again, unless numbers now mean others."""
+        assert self._sources is not None
+        study, folder = self.folder.parent, self.folder / name
+        if not (study / manifest.EARLIER).exists():
+            return []
+        now = self._sources.inputs(name)
+        sets = Archive(manifest.earlier(study, folder, now).parent).finished(name)
+        own = self.sets()
+        if any(own.get(number, run.parameters) != run.parameters for number, run in sets.items()):
+            return []
+        files = manifest.bring_back(study, folder, now)
+        if files:
+            _log.info("%s: %d earlier results count again", name, len(files))
+        self._finished = None
+        return files
 
     def trial_path(self, sequence: str, number: int, whole: bool = False) -> Path:
         """File of a trial, or of its whole run, which is driven as a replay is."""

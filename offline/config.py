@@ -152,11 +152,11 @@ class OfflineConfig(StrictModel):
             yield Mistake(("trials",), message)
 
 
-_LASTING = (
+_SEARCH = (
     *("sampler", "sampler_settings", "sets", "initial", "batch", "seed"),
-    *("objective", "limits", "runs", "repeats", "baseline_runs", "augment", "pruning"),
+    *("objective", "limits", "runs", "repeats", "baseline_runs", "pruning"),
 )
-"""Settings that may not change when a study is resumed."""
+"""Settings by which a search differs from another."""
 
 
 class OfflineStudyConfig(StudyConfig):
@@ -186,12 +186,11 @@ class OfflineStudyConfig(StudyConfig):
             resolved["offline"]["sampler_settings"] = whole
         return resolved
 
-    @classmethod
-    def lasting(cls, resolved: Mapping[str, Any]) -> dict[str, Any]:
-        """See `StudyConfig.lasting`."""
-        offline = resolved.get("offline", {})
-        kept = {key: value for key in _LASTING if (value := offline.get(key))}
-        return super().lasting(resolved) | {"offline": kept}
+    @property
+    def search_inputs(self) -> dict[str, Any]:
+        """What makes the trials of a study those that they are: another search has others."""
+        offline = self.resolved()["offline"]
+        return {key: value for key in _SEARCH if (value := offline.get(key))}
 
 
 # A study with the settings of the offline stage.

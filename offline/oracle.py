@@ -5,21 +5,15 @@ from typing import Any
 
 import numpy as np
 
+from adaptune.archive import Archive
 from adaptune.errors import AdaptuneError
 from adaptune.metrics import cap
 from adaptune.model import ErrorModel
 from adaptune.model.rules import TrainingData, complementary, mean_errors
 from adaptune.progress import Progress, unseen
 from adaptune.recording.config import NO_REFERENCE
-from adaptune.study.inputs import (
-    FILE,
-    OracleErrors,
-    check_model,
-    oracle_archive,
-    oracle_changes,
-    read_oracle,
-)
 from adaptune.study.references import ensure_references
+from adaptune.study.study import OracleErrors, oracle_errors
 from offline.campaign import trial_tasks, watch_tasks
 from offline.config import OfflineStudy
 from offline.train import trial_workers
@@ -49,14 +43,14 @@ def run_oracle(
     AdaptuneError
         If there is no model, it was fitted to something else, or no test sequence has a reference.
     """
-    model = ErrorModel.load(study.model_path)
-    check_model(study, model.sequences, model.provenance)
+    model = study.model()
     study.open()
     names = _judged(study, progress)
     numbers = oracle_sets(model, n_sets)
+    archive = study.archive("oracle")
+    archive.renew(names)
     for name in names:
-        _remove_stale(study, name, model)
-    archive = oracle_archive(study)
+        _remove_other_sets(archive, name, model)
     archive.tidy()
     due = {name: [n for n in numbers if n not in archive.finished(name)] for name in names}
     described = study.config.descriptor
@@ -67,7 +61,7 @@ def run_oracle(
             at_once, one_by_one = len(workers.workers()), study.odometry.one_by_one
             tasks = trial_tasks(missing, without_frames, at_once, one_by_one)
             watch_tasks(archive, workers, tasks, "runs on test sequences", progress)
-    found = {name: read_oracle(study, name, model) for name in names}
+    found = {name: oracle_errors(archive, name, model) for name in names}
     return [_row(name, errors) for name, errors in found.items() if errors is not None]
 
 
@@ -111,17 +105,11 @@ def _judged(study: OfflineStudy, progress: Progress) -> list[str]:
     return names
 
 
-def _remove_stale(study: OfflineStudy, name: str, model: ErrorModel) -> None:
-    """Remove the trials on a sequence that depend on something that has changed."""
-    archive = oracle_archive(study)
-    if changes := oracle_changes(study, name):
-        _log.info("%s: run again, with another %s", name, ", ".join(changes))
-        # The note goes last: until then, the trials are known to be stale.
-        for path in (*(archive.folder / name).glob("*.npz"), archive.folder / name / FILE):
-            path.unlink(missing_ok=True)
-        return
+def _remove_other_sets(archive: Archive, name: str, model: ErrorModel) -> None:
+    """Remove trials whose numbers are those of other sets in the model."""
     for number, summary in archive.finished(name).items():
         if number in model.sets and summary.parameters != model.sets[number]:
+            _log.info("%s: trial %d is run again: it is another set now", name, number)
             archive.trial_path(name, number).unlink()
 
 

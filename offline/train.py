@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from adaptune import files
+from adaptune import files, manifest
 from adaptune.archive import Archive, Summary
 from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
@@ -24,7 +24,6 @@ from adaptune.report import tables
 from adaptune.report.drawing import draw_chart
 from adaptune.space import ParameterSets, ParameterSpace, in_words
 from adaptune.study.config import SwitchingConfig
-from adaptune.study.inputs import InputNotes, digest, resume
 from adaptune.study.references import (
     ensure_references,
     estimates_as_data,
@@ -132,28 +131,30 @@ def train(
     study: OfflineStudy,
     progress: Progress = unseen,
     cluster: str | None = None,
-    again: bool = False,
 ) -> Training:
     """Estimate the references that are lacking, run the trials that are, and fit the model.
 
     The study's folder receives the archive, the error model, the fixed set (``fixed.yaml``),
     tables of the trials (``trials``) and of the training sequences (``training``), and with
     several objectives their Pareto front (``pareto``). `cluster` is the address of a Dask
-    scheduler whose workers run the trials. `again` removes trials that depend on something that
-    has changed.
+    scheduler whose workers run the trials. Trials of other inputs than now are run again.
 
     Raises
     ------
     AdaptuneError
-        If a sequence, its reference or the odometry cannot be used, no set keeps the limits, or
-        stored trials depend on something that has changed.
+        If a sequence, its reference or the odometry cannot be used, or no set keeps the limits.
     """
     _ensure_references(study, progress)
-    resume(study, again)
+    study.open()
     config = study.config.offline
     if timed := " and ".join(sorted(config.metrics & set(TIMED))):
         _log.warning("%s differ from run to run: another run will not find the same sets", timed)
-    archive = Archive(study.folder / "trials", InputNotes(study))
+    archive = study.archive(more={"offline": study.config.search_inputs})
+    if archive.renew(study.training):
+        # The search is told again what has been run; where nothing has, its time begins anew.
+        elapsed = () if archive.sets() else study.folder.glob("elapsed*.json")
+        for path in (*study.folder.glob("optuna.log*"), *elapsed):
+            path.unlink()
     archive.tidy()
     names, space = study.training, study.odometry.space
     with trial_workers(study, names, cluster) as workers:
@@ -280,16 +281,19 @@ def _fitted(
     """The study's error model: the one before, if that was fitted to just this, or fitted now."""
     settings = study.config.offline.model_dump(mode="json", exclude={*BUDGETS, "workers"})
     provenance = {"versions": study.odometry.versions} | settings
-    provenance |= {"inputs": digest(study)}
+    inputs = study.model_inputs
+    provenance |= {"inputs": manifest.digest(inputs)}
     if judged := estimates_as_data(study, study.training):
         provenance |= {"estimated_references": judged}
     provenance |= {"evidence": _evidence(study, archive, verdicts, fixed, provenance)}
     if before is not None and before.provenance == provenance:
+        manifest.record(study.model_inputs_path, inputs)
         return before
     model = _fit(study, archive, verdicts, fixed, provenance)
     if before is not None and before.digest == model.digest:
         model = replace(model, validation=before.validation)
     model.save(study.model_path)
+    manifest.record(study.model_inputs_path, inputs)
     return model
 
 

@@ -24,7 +24,6 @@ from adaptune.model.rules import ERROR_FLOOR
 from adaptune.progress import Progress, unseen
 from adaptune.report import tables
 from adaptune.report.drawing import draw_chart
-from adaptune.study.inputs import check_model
 from adaptune.study.references import estimates_beside_intervals
 from adaptune.study.study import (
     MIN_RECORDINGS,
@@ -490,11 +489,7 @@ def _labelled(study: OfflineStudy, model: ErrorModel) -> LabelledData:
 
 
 def _checked_model(study: OfflineStudy) -> ErrorModel:
-    path = study.model_path
-    model = ErrorModel.load(path)
-    length = study.config.sub_trajectory
-    check_model(study, model.sequences, model.provenance)
-    model.check_study(study.odometry.identity, study.odometry.space, length, path)
+    path, model = study.model_path, study.model()
     if (study.training, study.window) != (model.sequences, model.window):
         raise ModelError(
             f"{path}: was fitted to other training sequences or descriptors than the study's; run "

@@ -288,7 +288,7 @@ def _whole(
     scans = {
         mode: len(replay.trajectory)
         for mode, replay in replays.items()
-        if replay.summary.about.real_time is None
+        if replay.summary.inputs["real_time"] is None
     }
     short = short_replays(scans)
     whole = {mode: replay for mode, replay in replays.items() if mode not in short}
@@ -345,7 +345,7 @@ def _read_mode(
 
 def _member(replay: StoredReplay, model: ErrorModel | None, number: int) -> str:
     """What a member of a bank is called. Those of a bank without a model are no trials."""
-    if replay.summary.about.mode == UNTRAINED:
+    if replay.summary.mode == UNTRAINED:
         return f"untrained set {number}" if number else "baseline's set"
     if model is None or number not in model.sets:
         return f"trial {number}"

@@ -8,12 +8,19 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from adaptune import manifest
 from adaptune.metrics import MIN_BLOCKS, RESAMPLES, resampled_means, worst_tenth
 from adaptune.model import ErrorModel
 from adaptune.report import tables as report
 from adaptune.study.config import ALSO
-from adaptune.study.inputs import check_model, read_oracle
-from adaptune.study.study import EQUAL_COST, MIN_RECORDINGS, PER_STRETCH, RIVALS, Study
+from adaptune.study.study import (
+    EQUAL_COST,
+    MIN_RECORDINGS,
+    PER_STRETCH,
+    RIVALS,
+    Study,
+    oracle_errors,
+)
 from online.modes import (
     BASELINE,
     MODES,
@@ -162,7 +169,7 @@ def _model(study: Study, name: str) -> ErrorModel | None:
     """The model of the replays of a sequence; None if its file is gone, or they need none."""
     there = (mode for mode in MODES if _is_there(study, name, mode))
     summaries = (ReplaySummary.read(_folder(study, name, mode)) for mode in there)
-    files = [s.model_file for s in summaries if s.model_file and s.about.model]
+    files = [s.model_file for s in summaries if s.model_file and s.inputs["model"]]
     path = Path(files[0]) if files else study.model_path
     return ErrorModel.load(path) if path.exists() else None
 
@@ -448,14 +455,15 @@ def _differing(
 ) -> list[str]:
     """In what a replay differs from one that would be made now, given what all modes share."""
     # What was made in real time may be compared without saying so.
-    now, about = {**shared, "real_time": None}, summary.about.model_dump() | {"real_time": None}
-    mode = summary.about.mode
+    now, about = {**shared, "real_time": None}, summary.inputs | {"real_time": None}
+    mode = summary.mode
     if model is not None or mode in WITHOUT_MODEL:
         whole = setup.identity(mode, model, "" if model is None else model.digest)
         now |= {key: whole[key] for key in ("model", "parameters")}
         if not _is_automatic(study, whole["switching"], about["switching"]):
             now["switching"] = whole["switching"]
-    return [key for key, value in now.items() if about[key] != value]
+    files = study.sequences.sources(next(iter(shared["recording"])))
+    return manifest.changes({key: about.get(key) for key in now}, now, files)
 
 
 def _command(study: Study, mode: str, path: Path) -> str:
@@ -472,11 +480,11 @@ def _refusal(
     """Why replays of a sequence are refused."""
     folder = study.folder / "replays" / name
     what = f"{folder / modes[0]}: was" if len(modes) == 1 else f"{folder}: {', '.join(modes)} were"
-    return f"{what} replayed with another {', '.join(differing)}; run {command} with this study"
+    return f"{what} made from other inputs: {'; '.join(differing)}; run {command} with this study"
 
 
 def _check_rates(study: Study, summaries: Collection[ReplaySummary]) -> None:
-    if len({str(summary.about.real_time) for summary in summaries}) > 1:
+    if len({str(summary.inputs["real_time"]) for summary in summaries}) > 1:
         raise StoredReplayError(
             f"{study.folder / 'replays'}: some were made in real time, and others not, or not so; "
             f"run `adaptune online` again, with --rate or without"
@@ -490,14 +498,15 @@ def _check_reference(study: Study, name: str, modes: Sequence[str]) -> None:
 
 def _files(summaries: Iterable[ReplaySummary]) -> dict[str, str]:
     """The files of the models of replays, by digest."""
-    return {s.about.model: s.model_file for s in summaries if s.about.model and s.model_file}
+    models = ((s.inputs["model"], s.model_file) for s in summaries)
+    return {digest: file for digest, file in models if digest and file}
 
 
 def _model_of(study: Study, summaries: Collection[ReplaySummary]) -> tuple[Path, ErrorModel | None]:
     """File of the model that all replays are of, and the model if the file is still there."""
     files = _files(summaries)
     if len(files) > 1:
-        commands = {replayed_by(study, s.about.mode) for s in summaries if s.about.model}
+        commands = {replayed_by(study, s.mode) for s in summaries if s.inputs["model"]}
         raise StoredReplayError(
             f"{study.folder / 'replays'}: holds replays with different models "
             f"({' and '.join(sorted(set(files.values())))}); run {max(commands, key=len)} again"
@@ -508,10 +517,8 @@ def _model_of(study: Study, summaries: Collection[ReplaySummary]) -> tuple[Path,
 
 def _load(study: Study, path: Path) -> ErrorModel:
     """A model; the study's own is still of its recordings."""
-    model = ErrorModel.load(path)
-    if path == study.model_path.resolve():
-        check_model(study, model.sequences, model.provenance)
-    return model
+    own = path == study.model_path.resolve()
+    return study.model(path) if own else ErrorModel.load(path)
 
 
 def _is_automatic(study: Study, now: Any, made: Any) -> bool:
@@ -561,7 +568,7 @@ def compare(study: Study) -> ComparedReplays:
         every = _with_fixed_rivals(replays, model)
         of_modes = compare_modes(name, every, reference)
         judged.append(of_modes._replace(recording=study.sequences.recorded_in(name)))
-        oracle = None if model is None else read_oracle(study, name, model)
+        oracle = None if model is None else oracle_errors(study.archive("oracle"), name, model)
         if oracle is not None and model is not None:
             period = study.config.online.period
             oracles += oracle_rows(judged[-1], oracle, model.fixed, period)

@@ -17,7 +17,6 @@ from adaptune.selection import Selection
 from adaptune.selector import AnySelector, Selector, UntrainedSelector, untrained_sets
 from adaptune.space import ParameterSet, ParameterSets
 from adaptune.study.config import RealTimeConfig, StudyConfig, SwitchingConfig
-from adaptune.study.inputs import check_model
 from adaptune.study.study import (
     RIVALS,
     Mechanism,
@@ -228,10 +227,7 @@ class ReplaySetup:
             If it is of another odometry, other parameters or other sub-trajectories, or what the
             study's own model was fitted to has changed.
         """
-        model = ErrorModel.load(path)
-        if path.resolve() == study.model_path.resolve():
-            check_model(study, model.sequences, model.provenance)
-        model.check_study(self.odometry.identity, self.odometry.space, self.sub_trajectory, path)
+        model = study.model(path)
         self.check(model, path)
         return model
 

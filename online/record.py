@@ -2,7 +2,6 @@
 
 import csv
 import itertools
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,13 +10,13 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, Field, ValidationError
 
+from adaptune import manifest
 from adaptune.errors import AdaptuneError
 from adaptune.files import replacing, write_text
 from adaptune.odometry.tracker import RegisteredScan
-from adaptune.strict import in_one_line
-from adaptune.study.study import differences
+from adaptune.strict import ConfigurationError, in_one_line
 from adaptune.trajectory import Trajectory, TrajectoryError, read_tum, write_tum
 from online.replay import Choice, ReplayRecord
 
@@ -29,25 +28,6 @@ _TIMES = ("prepare_ms", "register_ms")
 
 class StoredReplayError(AdaptuneError):
     """A replay that is missing or damaged."""
-
-
-class ReplayIdentity(BaseModel):
-    """All that a replay depends on."""
-
-    model_config = ConfigDict(frozen=True, ser_json_inf_nan="constants")
-
-    mode: str
-    parameters: dict[str, Any] | None  # of baseline and fixed, which keep them
-    model: str | None  # its digest, of an adaptive mode
-    switching: dict[str, Any] | None  # see `online.modes.ReplaySetup.identity`
-    period: float  # seconds
-    real_time: dict[str, Any] | None = None  # see `online.real_time.RealTime`
-    odometry: dict[str, Any]  # with its content, see `adaptune.study.inputs.odometry_inputs`
-    health: dict[str, Any]
-    sequence: dict[str, Any]
-    course: dict[str, Any] | None
-    recording: list[str]  # hashes of the recording's files
-    repeat: int = 1  # which of several replays of the same
 
 
 class ReplaySummary(BaseModel):
@@ -67,7 +47,12 @@ class ReplaySummary(BaseModel):
     memory_mb: float | None = None  # most megabytes of all processes
     real_time: dict[str, float] | None = None  # how it kept up, see `kept_up`
     model_file: str | None  # of the model that it was made with; None if it needed none
-    about: ReplayIdentity
+    inputs: dict[str, Any] = Field({}, exclude=True)  # see `adaptune.manifest`
+
+    @property
+    def mode(self) -> str:
+        """Which mode was replayed."""
+        return str(self.inputs["mode"])
 
     @classmethod
     def read(cls, folder: Path) -> Self:
@@ -83,8 +68,9 @@ class ReplaySummary(BaseModel):
                 f"{folder}: there is no replay; run `adaptune online` with this study first"
             )
         try:
-            return cls.model_validate_json(path.read_bytes())
-        except (OSError, ValidationError) as error:
+            inputs = manifest.recorded(folder / manifest.FILE)
+            return cls.model_validate_json(path.read_bytes()).model_copy(update={"inputs": inputs})
+        except (OSError, ValidationError, ConfigurationError) as error:
             raise damaged(path, error) from error
 
 
@@ -109,24 +95,23 @@ def read_repeats(folder: Path) -> list["StoredReplay"]:
         If the first one is missing, or one of them is damaged.
     """
     replays = [StoredReplay.read(folder)]
-    about = replays[0].summary.about
+    inputs = replays[0].summary.inputs
     while True:
         repeat = len(replays) + 1
-        of, identity = repeat_folder(folder, repeat), about.model_copy(update={"repeat": repeat})
-        if other_keys(of, identity) != []:
+        of = repeat_folder(folder, repeat)
+        if replay_changes(of, inputs | {"repeat": repeat}) != []:
             return replays
         replays.append(StoredReplay.read(of))
 
 
-def other_keys(folder: Path, about: ReplayIdentity) -> list[str] | None:
-    """In what a stored replay differs from another; None if there is none, or not all of it."""
+def replay_changes(folder: Path, inputs: manifest.Inputs) -> list[str] | None:
+    """In what a stored replay's inputs differ from others, in words; None if it is not complete."""
+    if not all((folder / name).exists() for name in ("replay.json", "trajectory.tum", *_TABLES)):
+        return None
     try:
-        made = ReplaySummary.read(folder).about.model_dump()
+        return manifest.changes(ReplaySummary.read(folder).inputs, inputs)
     except StoredReplayError:
         return None
-    if not all((folder / name).exists() for name in ("trajectory.tum", *_TABLES)):
-        return None
-    return sorted(differences(made, about.model_dump()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,7 +158,7 @@ class StoredReplay:
             raise damaged(folder / "frames.csv", error) from error
         chosen = _choices(folder / "selections.csv", summary.selections)
         if not len(chosen.stamps):
-            kept = summary.about.parameters or {}
+            kept = summary.inputs["parameters"] or {}
             chosen = chosen._replace(
                 stamps=trajectory.stamps[:1],
                 parameters={name: _numbers([str(value)]) for name, value in kept.items()},
@@ -184,7 +169,7 @@ class StoredReplay:
 
 
 def write_replay(
-    folder: Path, replay: ReplayRecord, about: ReplayIdentity, model_file: Path | None
+    folder: Path, replay: ReplayRecord, inputs: manifest.Inputs, model_file: Path | None
 ) -> None:
     """Write ``trajectory.tum``, ``selections.csv``, ``frames.csv`` and, last, ``replay.json``.
 
@@ -194,7 +179,7 @@ def write_replay(
         Where to.
     replay
         The replay.
-    about
+    inputs
         What it was made from.
     model_file
         The model that it was made with, if any.
@@ -222,8 +207,8 @@ def write_replay(
         memory_mb=round(replay.memory, 1),
         real_time=kept_up(replay),
         model_file=None if model_file is None else str(model_file.resolve()),
-        about=about,
     )
+    manifest.record(folder / manifest.FILE, inputs)
     write_text(folder / "replay.json", summary.model_dump_json(indent=2) + "\n")
 
 
@@ -413,21 +398,24 @@ def _made_again(folder: Path) -> str:
 # The reference beside the replays of a sequence, and what it was made from.
 
 
+_REFERENCE_INPUTS = f"reference.{manifest.FILE}"
+
+
 class StoredReferenceError(AdaptuneError):
     """A reference that does not go with a replay."""
 
 
-def is_reference_of(folder: Path, about: dict[str, Any]) -> bool:
+def is_reference_of(folder: Path, about: manifest.Inputs) -> bool:
     """Whether the reference in a folder was made from just this."""
+    known = (folder / "reference.tum").exists()
     try:
-        made: Any = json.loads((folder / "reference.json").read_text(encoding="utf-8"))
-        of, known = made["about"], made["known"]
-    except (OSError, ValueError, TypeError, KeyError):
+        made = manifest.recorded(folder / _REFERENCE_INPUTS)
+    except ConfigurationError:
         return False
-    return bool(of == about and known == (folder / "reference.tum").exists())
+    return made is not None and not manifest.changes(made, {**about, "known": known})
 
 
-def check_reference(folder: Path, about: dict[str, Any], option: str = "") -> None:
+def check_reference(folder: Path, about: manifest.Inputs, option: str = "") -> None:
     """Refuse a reference that was made from something else.
 
     Parameters
@@ -451,7 +439,7 @@ def check_reference(folder: Path, about: dict[str, Any], option: str = "") -> No
 
 
 def write_reference(
-    folder: Path, reference: Trajectory | None, odometry: Trajectory, about: dict[str, Any]
+    folder: Path, reference: Trajectory | None, odometry: Trajectory, about: manifest.Inputs
 ) -> None:
     """Write ``reference.tum``, at the scans' stamps; remove it if there is none.
 
@@ -464,7 +452,7 @@ def write_reference(
     odometry
         A replay, which has the stamps.
     about
-        What the reference is made from, noted in ``reference.json``.
+        What the reference is made from, see `adaptune.manifest`.
     """
     path = folder / "reference.tum"
     if reference is None:
@@ -478,5 +466,4 @@ def write_reference(
                 f"are of the same recording and clock"
             )
         write_tum(path, Trajectory(odometry.stamps[known], T[known]))
-    note = {"about": about, "known": reference is not None}
-    write_text(folder / "reference.json", json.dumps(note, indent=1) + "\n")
+    manifest.record(folder / _REFERENCE_INPUTS, {**about, "known": reference is not None})

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune import geometry
+from adaptune import geometry, manifest
 from adaptune.errors import nearest
 from adaptune.files import replacing_folder
 from adaptune.geometry import invert
@@ -115,11 +115,11 @@ def record_replays(study: Study, name: str, progress: Progress = unseen) -> Path
     replays = {mode: StoredReplay.read(folder / mode) for mode in modes}
     now = study.sequences.identity(name)
     for mode, replay in replays.items():
-        about = replay.summary.about.model_dump()
-        if differing := [key for key, value in now.items() if about[key] != value]:
+        before = {key: replay.summary.inputs.get(key) for key in now}
+        if said := manifest.changes(before, now, study.sequences.sources(name)):
             raise StoredReplayError(
-                f"{folder / mode}: was replayed with another {', '.join(differing)}; run "
-                f"`adaptune online` with this study"
+                f"{folder / mode}: is of other inputs: {'; '.join(said)}; run `adaptune online` "
+                f"with this study"
             )
     check_reference(folder, study.sequences.reference(name))
     reference = Reference.read(folder, study.config.sub_trajectory)

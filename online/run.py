@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from adaptune import manifest
 from adaptune.errors import AdaptuneError
 from adaptune.model import ErrorModel
 from adaptune.model.descriptor import DescriptorError
@@ -14,17 +15,15 @@ from adaptune.processes import release_memory
 from adaptune.recording.scan import Recording
 from adaptune.selection import Selection
 from adaptune.study.config import StudyConfig
-from adaptune.study.inputs import odometry_inputs
 from adaptune.study.references import ensure_references
 from adaptune.study.study import Study
 from online.modes import UNTRAINED, WITHOUT_MODEL, ReplaySetup, sequences_without_model
 from online.real_time import SelectorProcess, replay_in_real_time
 from online.record import (
-    ReplayIdentity,
     StoredReplay,
     is_reference_of,
-    other_keys,
     repeat_folder,
+    replay_changes,
     write_reference,
     write_replay,
 )
@@ -46,7 +45,6 @@ class ReplayError(AdaptuneError):
 def run_replays(
     study: Study,
     model_path: Path,
-    again: bool = False,
     progress: Progress = lambda *_: None,
     look: Look | None = None,
 ) -> int:
@@ -59,8 +57,6 @@ def run_replays(
         ``repeat_2`` in it, and so on, those of repeats.
     model_path
         The error model.
-    again
-        Replay even what was done before.
     progress
         Called about every scan.
     look
@@ -87,12 +83,11 @@ def run_replays(
         names = " and ".join(name for name in asked if obstacles[name] == why)
         _log.warning("not replayed: %s, because %s", names, why)
     modes = _Modes(setup, setup.modes(model), look, model, model_path)
-    return _replay_all(study, study.config.test, modes, again, progress)
+    return _replay_all(study, study.config.test, modes, progress)
 
 
 def run_untrained(
     study: Study,
-    again: bool = False,
     progress: Progress = lambda *_: None,
     look: Look | None = None,
 ) -> int:
@@ -109,7 +104,7 @@ def run_untrained(
     setup = ReplaySetup.of(study)
     setup.mode(UNTRAINED)  # or an error
     modes = _Modes(setup, WITHOUT_MODEL, look)
-    return _replay_all(study, sequences_without_model(study.config), modes, again, progress)
+    return _replay_all(study, sequences_without_model(study.config), modes, progress)
 
 
 class _Run(NamedTuple):
@@ -134,9 +129,7 @@ class _Modes(NamedTuple):
     model_path: Path | None = None
 
 
-def _replay_all(
-    study: Study, sequences: Sequence[str], modes: _Modes, again: bool, progress: Progress
-) -> int:
+def _replay_all(study: Study, sequences: Sequence[str], modes: _Modes, progress: Progress) -> int:
     """Replay what was not replayed before; the number of replays that were made.
 
     Sequences without a reference get an estimated one before, where that is possible.
@@ -147,13 +140,10 @@ def _replay_all(
         _log.warning("%s; it is replayed without a reference, and not judged", said)
     made = 0
     for name in sequences:
-        folder, due = study.folder / "replays" / name, dict[_Run, ReplayIdentity]()
-        for run, about in _identities(study, name, modes).items():
-            keys = other_keys(repeat_folder(folder / run.mode, run.repeat), about)
-            if keys:
-                _log.info("%s: replayed again, with another %s", run, ", ".join(keys))
-            if again or keys != []:
-                due[run] = about
+        folder, due = study.folder / "replays" / name, dict[_Run, dict[str, Any]]()
+        for run, inputs in _inputs(study, name, modes).items():
+            if _is_due(study.folder, run, inputs):
+                due[run] = inputs
         if due:
             _replay_due(study, name, due, modes, progress)
         else:
@@ -162,16 +152,27 @@ def _replay_all(
     return made
 
 
-def _identities(study: Study, name: str, modes: _Modes) -> dict[_Run, ReplayIdentity]:
-    """All replays of a sequence; each mode has its first one before any has its second."""
+def _is_due(study: Path, run: _Run, inputs: manifest.Inputs) -> bool:
+    """Whether a replay is to be made; one of other inputs is set aside, an earlier one kept."""
+    folder = repeat_folder(study / "replays" / run.sequence / run.mode, run.repeat)
+    changes = replay_changes(folder, inputs)
+    if changes:
+        _log.info("%s: replayed again: %s", run, "; ".join(changes))
+        before, files = manifest.recorded(folder / manifest.FILE), folder.iterdir()
+        manifest.set_aside(study, folder, before, [file for file in files if file.is_file()])
+    if changes != [] and manifest.bring_back(study, folder, inputs):
+        _log.info("%s: the earlier replay of these inputs counts again", run)
+        changes = replay_changes(folder, inputs)
+    return changes != []
+
+
+def _inputs(study: Study, name: str, modes: _Modes) -> dict[_Run, dict[str, Any]]:
+    """What all replays of a sequence are made from; each mode has its first before any second."""
     shared = shared_identity(study, name)
     digest = "" if modes.model is None else modes.model.digest
-    about = {
-        mode: ReplayIdentity(**modes.setup.identity(mode, modes.model, digest), **shared)
-        for mode in modes.names
-    }
+    about = {mode: modes.setup.identity(mode, modes.model, digest) | shared for mode in modes.names}
     return {
-        _Run(name, mode, repeat): of.model_copy(update={"repeat": repeat})
+        _Run(name, mode, repeat): manifest.plain(of | {"repeat": repeat})
         for repeat in range(1, study.config.online.repeats + 1)
         for mode, of in about.items()
     }
@@ -180,7 +181,7 @@ def _identities(study: Study, name: str, modes: _Modes) -> dict[_Run, ReplayIden
 def _replay_due(
     study: Study,
     name: str,
-    due: Mapping[_Run, ReplayIdentity],
+    due: Mapping[_Run, dict[str, Any]],
     modes: _Modes,
     progress: Progress,
 ) -> None:
@@ -283,6 +284,7 @@ def shared_identity(study: Study, name: str) -> dict[str, Any]:
     return {
         "period": study.config.online.period,
         "real_time": in_real_time and in_real_time.model_dump(mode="json"),
-        "odometry": odometry_inputs(study),
         "health": study.config.health.model_dump(mode="json"),
-    } | study.sequences.identity(name)
+        **study.odometry_inputs,
+        **study.sequences.identity(name),
+    }

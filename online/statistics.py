@@ -25,8 +25,7 @@ from adaptune.metrics import (
     window_ends,
 )
 from adaptune.reference.stored import StoredEstimate
-from adaptune.study.inputs import OracleErrors
-from adaptune.study.study import Study
+from adaptune.study.study import OracleErrors, Study
 from adaptune.trajectory import Trajectory, read_tum
 from online.record import ReplaySummary, StoredReplay
 

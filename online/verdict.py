@@ -313,7 +313,7 @@ def of_lengths(name: str, scans: Mapping[str, int], short: Sequence[str]) -> str
     listed = ", ".join(f"{mode} {scans[mode]}" for mode in short)
     return (
         f"On {name} the replays have different lengths ({listed} of {max(scans.values())} scans); "
-        f"errors are compared where all have scans. Run `adaptune online --again`."
+        f"errors are compared where all have scans. Remove them and run `adaptune online`."
     )
 
 

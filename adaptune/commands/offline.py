@@ -57,7 +57,6 @@ def offline(
     override: Override = [],  # noqa: B006
     folder: Folder = None,
     cluster: Cluster = None,
-    again: Annotated[bool, typer.Option("--again", help="Renew what has changed.")] = False,
 ) -> None:
     """Run trials on the training sequences, and fit the error model.
 
@@ -72,7 +71,7 @@ def offline(
     from offline.train import train
 
     with progress() as show:
-        training = train(loaded, show, cluster, again)
+        training = train(loaded, show, cluster)
     model = training.model
     console.print(
         tables.table(
@@ -123,11 +122,9 @@ def trials(
     from adaptune import archive as table
     from adaptune.archive import Archive
     from adaptune.report import tables
-    from adaptune.study.inputs import warn_of_stale
     from adaptune.study.references import estimates_in_words
     from offline.search import has_ended
 
-    warn_of_stale(loaded)
     names, archive = loaded.training, Archive(loaded.folder / "trials")
     finished = table.rows(archive, names)
     if not finished:

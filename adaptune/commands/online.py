@@ -77,7 +77,6 @@ def online(
     override: Override = [],  # noqa: B006
     folder: Folder = None,
     model: Model = None,
-    again: Annotated[bool, typer.Option(help="Repeat finished replays.")] = False,
     rate: Rate = None,
     untrained: Untrained = False,
     thorough: Thorough = False,
@@ -127,7 +126,7 @@ def online(
         return
     if mode is not None:
         raise AdaptuneError(f"--mode {mode} is for a robot (--ros, --ros2); all modes are replayed")
-    made, n = _replay(loaded, model, again, untrained)
+    made, n = _replay(loaded, model, untrained)
     there = f"{made} of {n} replays made" if made else f"All {n} replays were there already"
     say(f"{there}: {loaded.folder / 'replays'}/")
     say_next_of_study("table and pictures of the modes", "compare", study, override, folder)
@@ -178,9 +177,7 @@ def _on_one_core(study: "OfflineStudy") -> Iterator[None]:
         unbind()
 
 
-def _replay(
-    loaded: "OfflineStudy", model: Path | None, again: bool, untrained: bool
-) -> tuple[int, int]:
+def _replay(loaded: "OfflineStudy", model: Path | None, untrained: bool) -> tuple[int, int]:
     """Make the replays that are missing; how many were made, and how many there are."""
     from adaptune.commands.dashboard import Dashboard
     from adaptune.model import ErrorModel
@@ -190,9 +187,9 @@ def _replay(
     dashboard, path = Dashboard(), model or loaded.model_path
     with _on_one_core(loaded), progress(dashboard) as show:
         if untrained:
-            made = run_untrained(loaded, again, show, dashboard.look)
+            made = run_untrained(loaded, show, dashboard.look)
         else:
-            made = run_replays(loaded, path, again, show, dashboard.look)
+            made = run_replays(loaded, path, show, dashboard.look)
     repeats = loaded.config.online.repeats
     if untrained:
         return made, len(sequences_without_model(loaded.config)) * len(WITHOUT_MODEL) * repeats
@@ -281,7 +278,6 @@ def _compared(loaded: "OfflineStudy") -> "ComparedReplays":
     from online.compare import compare as compare_replays
     from online.tables import tables
 
-    loaded.check()
     begin_work()
     try:
         found = compare_replays(loaded)
@@ -463,7 +459,6 @@ def record(
     loaded = load(study, override, folder)
     from online.recordings import record_replays, replayed_sequences
 
-    loaded.check()
     with progress() as show:
         names = replayed_sequences(loaded, sequences or ())
         written = [record_replays(loaded, name, show) for name in names]

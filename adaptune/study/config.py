@@ -293,15 +293,6 @@ class StudyConfig(StrictModel):
         """The configuration as plain data, with nothing left to defaults."""
         return self.model_dump(mode="json")
 
-    @classmethod
-    def lasting(cls, resolved: Mapping[str, Any]) -> dict[str, Any]:
-        """The part of a resolved configuration that may not change when a study is resumed.
-
-        Trials depend on it. What is compared elsewhere, see `adaptune.study.inputs`, and the test
-        sequences may change.
-        """
-        return {key: resolved[key] for key in ("sub_trajectory", "lost_track")}
-
 
 # The keys of a study's YAML, for the completion of `-o`.
 

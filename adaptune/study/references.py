@@ -1,14 +1,14 @@
 """Estimate the references of a study's sequences that have none."""
 
-import json
 import logging
 import math
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+from adaptune import manifest
 from adaptune.processes import pin
 from adaptune.recording.cache import fingerprints
 from adaptune.recording.opening import (
@@ -30,12 +30,8 @@ from adaptune.reference.stored import (
 )
 from adaptune.study.study import Study
 
-_CHANGES = {
-    "estimator": "adaptune estimates it in another way",
-    "scans": "its scans are others",
-    "prior": "its position prior is another",
-}
-"""What a reference depends on, and what is said when that has changed."""
+_OF_VIEWS = ("views", "compensate", "imu")
+"""Keys of a sequence on which its scans as they were recorded do not depend."""
 
 _log = logging.getLogger(__name__)
 
@@ -124,7 +120,8 @@ def estimated_at(
     """
     about, stored, refusal = _about(study, name), StoredEstimate.read(path), Refusal.read(path)
     before = stored or refusal
-    changes = [] if before is None else _changes(before.about, about)
+    files = study.sequences.sources(name)
+    changes = [] if before is None else manifest.changes(before.about, about, files)
     if changes:
         _log.info("%s: its reference is estimated again: %s", name, "; ".join(changes))
     elif stored is not None and path.exists():
@@ -138,25 +135,21 @@ def estimated_at(
     raise EstimateError(f"{study.sequences.key(name)}: {refusal.refused}")
 
 
-def _changes(before: Mapping[str, Any], about: Mapping[str, Any]) -> list[str]:
-    return [said for key, said in _CHANGES.items() if before.get(key) != about[key]]
-
-
 def _about(study: Study, name: str) -> dict[str, Any]:
     """Everything that an estimated reference depends on, as plain data."""
     given = study.sequences.unseen(name)
     scans = study.sequences.identity(name)
-    # Scans as they were recorded depend on none of these.
-    seen = {"views", "compensate", "imu"}
-    scans["sequence"] = {key: v for key, v in scans["sequence"].items() if key not in seen}
+    for kind in ("sequences", "courses"):
+        for of in scans.get(kind, {}).values():
+            of.update(dict.fromkeys(_OF_VIEWS))
     prior = None
     if given.position_prior is not None:
         files = prior_files(given)
         keys = {"child_frame", "extrinsic", "clock_offset", "max_gap"}
         prior = of_prior(given).model_dump(mode="json", include=keys)
         prior["poses"] = fingerprints(files) if files else given.position_prior
-    about = {"estimator": estimate.VERSION, "scans": scans, "prior": prior}
-    plain: dict[str, Any] = json.loads(json.dumps(about))
+    about = {"estimator": estimate.VERSION, "position_prior": prior} | scans
+    plain: dict[str, Any] = manifest.plain(about)
     return plain
 
 

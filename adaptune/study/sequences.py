@@ -1,11 +1,12 @@
 """The sequences of a study by name: recordings, simulated courses, and views of them."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from adaptune.manifest import merged
 from adaptune.odometry.program import ProgramInput, program_input
 from adaptune.recording.cache import fingerprints
 from adaptune.recording.config import REFERENCE_FILES, SequenceConfig, ViewConfig
@@ -83,10 +84,6 @@ class StudySequences:
         there = given is not None and path.exists() and path.with_suffix(".json").exists()
         return there and wants_estimate(self.recordings[origin(name)])
 
-    def is_estimated(self, name: str) -> bool:
-        """Whether the reference of a sequence, or a view, is one that was estimated."""
-        return self.estimate(name) is not None
-
     def estimate(self, name: str) -> StoredEstimate | None:
         """What is known about an estimated reference, also a file's; None if it is not one."""
         if self._is_made(name):
@@ -148,6 +145,10 @@ class StudySequences:
         self._check_recorded(name)
         return sequence_files(self.config(name))
 
+    def inputs(self, name: str) -> dict[str, Any]:
+        """Everything that the scans and the reference of a sequence depend on."""
+        return merged([self.identity(name), self.reference(name)])
+
     def identity(self, name: str) -> dict[str, Any]:
         """Everything that the scans of a sequence depend on, as plain data.
 
@@ -156,11 +157,9 @@ class StudySequences:
         course = self.courses.get(origin(name))
         others = {*_PATHS, *_AS_ESTIMATED, "cache"}
         config = self.config(name).model_dump(mode="json", exclude=others)
-        return {
-            "sequence": config,
-            "course": None if course is None else course.model_dump(mode="json"),
-            "recording": fingerprints(self.files(name).recording),
-        }
+        own = {} if course is None else course.model_dump(mode="json")
+        recording = fingerprints(self.files(name).recording)
+        return {self._kind(name): {name: config | own}, "recording": {name: recording}}
 
     def reference(self, name: str) -> dict[str, Any]:
         """Everything that the reference of a sequence depends on besides its scans."""
@@ -168,13 +167,21 @@ class StudySequences:
         files = self.files(name).reference
         if files and config["reference"] is not None:
             config["reference"] = "a file"
-        return {"poses": config, "reference": fingerprints(files)}
+        return {self._kind(name): {name: config}, "reference": {name: fingerprints(files)}}
+
+    def _kind(self, name: str) -> str:
+        return "courses" if origin(name) in self.courses else "sequences"
+
+    def sources(self, name: str) -> dict[str, Sequence[Path]]:
+        """The files of a sequence, by the keys of their digests in `inputs`."""
+        files = self.files(name)
+        return {f"recording.{name}": files.recording, f"reference.{name}": files.reference}
 
     def program_input(self, name: str) -> ProgramInput:
         """A sequence as a program reads it."""
         folder = self.folder / "inputs" / name
-        # 3: with the recording's content.
-        about = {"version": 3, "input": self.layout} | self.identity(name)
+        # 4: with the inputs by name.
+        about = {"version": 4, "input": self.layout} | self.identity(name)
         key = str(folder), json.dumps(about)
         if key not in _inputs:
             config = self.config(name)

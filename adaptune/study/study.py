@@ -1,22 +1,31 @@
 """A study: a checked configuration, and what is made of it."""
 
 import fcntl
+import logging
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import IO, Any, Generic, Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from typing_extensions import TypeVar
 
-from adaptune import files
+from adaptune import files, manifest
+from adaptune.archive import Archive, Sources
 from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
 from adaptune.model import ErrorModel
+from adaptune.model.descriptor import descriptor_content
 from adaptune.odometry.base import Description
-from adaptune.odometry.factory import Factory, OdometryFactory, OdometryPool, declare
+from adaptune.odometry.factory import (
+    Factory,
+    OdometryFactory,
+    OdometryPool,
+    declare,
+)
 from adaptune.processes import available
 from adaptune.recording.scan import OF_VIEW
 from adaptune.space import ODOMETRY, ParameterSet, ParameterSpace
@@ -37,38 +46,6 @@ WINDOW = 3.0
 
 _locks: dict[str, IO[str]] = {}
 """Open files whose locks last as long as the process."""
-
-
-def check_folder(
-    folder: Path,
-    resolved: Mapping[str, Any],
-    lasting: Callable[[Mapping[str, Any]], dict[str, Any]],
-) -> None:
-    """Refuse a folder that was begun with another study.
-
-    Raises
-    ------
-    ConfigurationError
-        It names the keys that differ.
-    """
-    path = folder / CONFIGURATION
-    if not path.exists():
-        return
-    try:
-        data: Any = files.Document(path.read_text(encoding="utf-8")).data
-        before = lasting(data)
-    except (files.YamlError, UnicodeDecodeError, AttributeError, KeyError, TypeError) as error:
-        raise ConfigurationError(
-            f"{path}: is damaged ({error}); give this study another folder (--folder), or remove "
-            f"that one"
-        ) from error
-    differing = sorted(differences(before, lasting(resolved)))
-    # Without trials, nothing binds the folder to a configuration.
-    if differing and any(folder.glob("trials/*/*.npz")):
-        raise ConfigurationError(
-            f"{folder} was begun with other values of {', '.join(differing)}; give this study "
-            f"another folder (--folder), or remove that one"
-        )
 
 
 def open_folder(folder: Path, resolved: Mapping[str, Any]) -> None:
@@ -100,16 +77,9 @@ def open_folder(folder: Path, resolved: Mapping[str, Any]) -> None:
     write_text(folder / CONFIGURATION, files.dump(resolved))
 
 
-def differences(a: Any, b: Any, path: str = "") -> Iterable[str]:
-    """Paths of the values in which nested mappings differ."""
-    if isinstance(a, dict) and isinstance(b, dict):
-        for key in a.keys() | b.keys():
-            yield from differences(a.get(key), b.get(key), f"{path}.{key}" if path else str(key))
-    elif a != b:
-        yield path
-
-
 C_co = TypeVar("C_co", bound=StudyConfig, covariant=True, default=StudyConfig)
+
+_log = logging.getLogger(__name__)
 
 Mechanism = Literal["live", "bank"]
 
@@ -200,18 +170,76 @@ class Study(Generic[C_co]):
         own = self.config.online.switching.warm_up
         return self.odometry.description.warm_up if own is None else own
 
-    def check(self) -> None:
-        """Refuse a folder that was begun with other settings of the offline stage.
+    @property
+    def odometry_inputs(self) -> dict[str, Any]:
+        """Everything about the odometry that trials and replays depend on, as plain data."""
+        odometry = self.odometry
+        parameters = {"parameters": odometry.space.dump()}
+        about = {"odometry": odometry.identity | parameters, "content": odometry.content}
+        limits = {"limits": self.config.isolation.model_dump()} if odometry.apart else {}
+        inputs: dict[str, Any] = manifest.plain(about | limits)
+        return inputs
 
-        The budget, the number of workers, the sequences and the replays may change. What results
-        depend on is compared by `adaptune.study.inputs`.
+    def archive(self, kind: str = "trials", more: Mapping[str, Any] | None = None) -> Archive:
+        """The archive of the trials, or of other ones, which records what they depend on.
+
+        Parameters
+        ----------
+        kind
+            Name of its folder.
+        more
+            What they depend on besides odometry, sequences and descriptors.
+        """
+        config = self.config
+        shared = self.odometry_inputs | {
+            "sub_trajectory": config.sub_trajectory,
+            "lost_track": config.lost_track,
+            "descriptors": descriptor_content(config.descriptor),
+            **(more or {}),
+        }
+        sources = Sources(shared, self.sequences.inputs, self.sequences.sources)
+        return Archive(self.folder / kind, sources)
+
+    @property
+    def model_inputs(self) -> dict[str, Any]:
+        """Everything that the study's trials, and so its error model, depend on."""
+        archive = self.archive()
+        inputs = manifest.merged(archive.inputs(name) for name in self.training)
+        return {key: value for key, value in inputs.items() if key != "limits"}
+
+    @property
+    def model_inputs_path(self) -> Path:
+        """File of what the error model was fitted to."""
+        return self.model_path.with_suffix(f".{manifest.FILE}")
+
+    def model(self, path: Path | None = None) -> ErrorModel:
+        """Load an error model, by default the study's own.
 
         Raises
         ------
-        ConfigurationError
-            It names the keys that differ.
+        AdaptuneError
+            If there is none, it is of another odometry, other parameters or other sub-trajectories,
+            or what the study's own was fitted to has changed.
         """
-        check_folder(self.folder, self._resolved(), self.config.lasting)
+        path = path or self.model_path
+        model = ErrorModel.load(path)
+        files: dict[str, Any] = {}
+        if path.resolve() == self.model_path.resolve():
+            before, now = manifest.recorded(self.model_inputs_path), self.model_inputs
+            if before is not None and model.provenance.get("inputs") != manifest.digest(before):
+                before = None
+            files = manifest.merged(map(self.sequences.sources, self.training))
+        else:
+            parameters = {"parameters": self.odometry.space.definition()}
+            now = {"odometry": self.odometry.identity | parameters}
+            now |= {"sub_trajectory": self.config.sub_trajectory}
+            before = {"odometry": model.odometry | {"parameters": model.sets.space.definition()}}
+            before = manifest.plain(before | {"sub_trajectory": model.length})
+        if said := manifest.changes(before, now, files):
+            raise ConfigurationError(
+                f"{path}: is not of this study: {'; '.join(said)}; run `adaptune offline` with it"
+            )
+        return model
 
     def open(self) -> None:
         """Make and lock the folder, and write the resolved configuration to it.
@@ -219,10 +247,8 @@ class Study(Generic[C_co]):
         Raises
         ------
         ConfigurationError
-            If the folder cannot be made, another process works in it, or it was begun with another
-            study.
+            If the folder cannot be made, or another process works in it.
         """
-        self.check()
         open_folder(self.folder, self._resolved())
 
     def _resolved(self) -> dict[str, Any]:
@@ -500,3 +526,54 @@ def _another_bank(key: str) -> ModeError:
         f"online.switching.{key}: the model was fitted for another bank; run `adaptune offline` "
         f"again, which fits it to the finished trials"
     )
+
+
+# What trials on the test sequences found, for the best choice in hindsight. Nothing learns from it.
+
+
+class OracleErrors(NamedTuple):
+    """Errors of several sets on a test sequence, as trials measure them.
+
+    A trial restarts at the reference after a lost track. A replay does not.
+    """
+
+    stamps: NDArray[np.int64]  # (n_frames,): nanoseconds
+    trials: tuple[int, ...]  # numbers of the sets, the fixed one's first if it is among them
+    # (n_frames, n_sets): sub-trajectory RTE in percent, NaN without a sub-trajectory, infinite
+    # where the track was lost.
+    errors: NDArray[np.float32]
+
+
+def oracle_errors(archive: Archive, name: str, model: ErrorModel) -> OracleErrors | None:
+    """The errors of a model's sets on a test sequence; None where no trials were run.
+
+    Trials that were run with something else than there is now are left out, with a warning.
+
+    Parameters
+    ----------
+    archive
+        The study's trials on the test sequences.
+    name
+        Of the sequence.
+    model
+        The sets are those of the model that were run.
+
+    Raises
+    ------
+    ArchiveError
+        If a file is damaged.
+    """
+    finished = archive.finished(name)
+    known = [t for t in model.sets if t in finished and finished[t].parameters == model.sets[t]]
+    if known and (changes := archive.changes(name)):
+        what = "; ".join(changes)
+        _log.warning(
+            "%s: the oracle's trials are of other inputs: %s; run `adaptune online --oracle`",
+            name,
+            what,
+        )
+    if not known or changes:
+        return None
+    trials = tuple(sorted(known, key=lambda trial: (trial != model.fixed, trial)))
+    stamps = archive.read_frames(name).stamps
+    return OracleErrors(stamps, trials, archive.read_errors(name, trials))

@@ -9,7 +9,7 @@ from adaptune.commands.cli import app
 from adaptune.errors import AdaptuneError
 from adaptune.metrics import cap
 from adaptune.model import ErrorModel
-from adaptune.study.inputs import oracle_archive, read_oracle
+from adaptune.study.study import oracle_errors
 from offline.config import load_study
 from offline.oracle import oracle_sets, run_oracle
 from offline.train import train
@@ -47,7 +47,8 @@ def test_errors_on_test_sequences_are_read(oracle):
     study, done = oracle
     assert done.exit_code == 0, done.output
     model = ErrorModel.load(study.model_path)
-    found = read_oracle(study, "three", model)
+    archive = study.archive("oracle")
+    found = oracle_errors(archive, "three", model)
     assert set(found.trials) == set(oracle_sets(model, N))
     assert found.trials[0] == model.fixed
     assert found.errors.shape == (len(found.stamps), N) == (40, N)
@@ -56,7 +57,7 @@ def test_errors_on_test_sequences_are_read(oracle):
     assert np.isnan(found.errors[31:]).all()
     least = np.nanmean(cap(found.errors), axis=0).min()
     assert f"{least:.3f}" in done.stdout
-    assert read_oracle(study, "one", model) is None
+    assert oracle_errors(archive, "one", model) is None
 
 
 def test_nothing_learns_from_it(oracle, study_file, trained_folder):
@@ -72,7 +73,7 @@ def test_nothing_learns_from_it(oracle, study_file, trained_folder):
 
 def test_it_resumes_and_renews_what_has_changed(load, caplog):
     study = load()
-    archive, model = oracle_archive(study), ErrorModel.load(study.model_path)
+    archive, model = study.archive("oracle"), ErrorModel.load(study.model_path)
     run_oracle(study, 3)
     files = {n: archive.trial_path("three", n) for n in oracle_sets(model, 4)}
     made = {n: path.stat().st_mtime_ns for n, path in files.items() if path.exists()}
@@ -84,11 +85,11 @@ def test_it_resumes_and_renews_what_has_changed(load, caplog):
     assert [now[n] == made.get(n) for n in files] == [n in made and n != removed for n in files]
     # The same recording seen in another way.
     other = load("sequences.three.stop=3")
-    assert read_oracle(other, "three", model) is None
-    assert "run with another sequence.stop; run `adaptune online --oracle` again" in caplog.text
+    assert oracle_errors(other.archive("oracle"), "three", model) is None
+    assert "of other inputs: sequences.three.stop is new; run `adaptune online" in caplog.text
     (row,) = run_oracle(other, 2)
     assert row["sets"] == 2
-    assert len(read_oracle(other, "three", model).stamps) < 40
+    assert len(oracle_errors(other.archive("oracle"), "three", model).stamps) < 40
     assert not files[oracle_sets(model, 4)[3]].exists()
 
 

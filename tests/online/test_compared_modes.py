@@ -55,8 +55,8 @@ def selections(study, mode, sequence="three"):
 
 
 def about(study, mode, sequence="three"):
-    path = study.folder / "replays" / sequence / mode / "replay.json"
-    return json.loads(path.read_text())["about"]
+    path = study.folder / "replays" / sequence / mode / "inputs.json"
+    return json.loads(path.read_text())["inputs"]
 
 
 def test_all_are_compared_in_the_order_of_their_lines(replayed):
@@ -151,7 +151,7 @@ def test_every_mode_is_repeated(own):
     assert run_replays(study, study.model_path) == 8
     assert run_replays(study, study.model_path) == 0
     adaptive = read_repeats(kept / "adaptive")
-    assert [replay.summary.about.repeat for replay in adaptive] == [1, 2, 3]
+    assert [replay.summary.inputs["repeat"] for replay in adaptive] == [1, 2, 3]
     for replay in adaptive[1:]:
         np.testing.assert_array_equal(
             replay.trajectory.T_world_sensor, adaptive[0].trajectory.T_world_sensor

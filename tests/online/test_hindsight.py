@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from adaptune.study.inputs import OracleErrors
+from adaptune.study.study import OracleErrors
 from online.statistics import ORACLES, ComparisonRow, JudgedModes, oracle_rows
 
 

@@ -15,7 +15,7 @@ from adaptune.odometry.tracker import RegisteredScan
 from adaptune.selection import Selection
 from adaptune.trajectory import Trajectory
 from offline.config import load_study
-from online.record import ReplayIdentity, StoredReplayError, write_reference, write_replay
+from online.record import StoredReplayError, write_reference, write_replay
 from online.recordings import record_replays, topic
 from online.replay import Choice, ReplayRecord
 from online.run import shared_identity
@@ -73,7 +73,7 @@ def study(study_file, tmp_path):
         ("fixed", replay_of(along_x(0.01)), FIXED),
         ("adaptive", replay_of(along_x(0.005), list(selections()), **in_time), None),
     ):
-        about = ReplayIdentity(mode=mode, parameters=kept, model=None, switching=None, **shared)
+        about = {"mode": mode, "parameters": kept, "model": None, "switching": None} | shared
         write_replay(folder / mode, made, about, None)
     elsewhere = np.eye(4)
     elsewhere[:2, :2] = [[0.0, -1.0], [1.0, 0.0]]
@@ -243,7 +243,7 @@ def test_sequences_that_were_not_replayed_are_refused(study, study_file, tmp_pat
 
 def test_replays_of_something_else_are_refused(study, study_file):
     other = load_study(study_file, ["sequences.three.stop=2"], study.folder)
-    with pytest.raises(StoredReplayError, match="was replayed with another sequence; run"):
+    with pytest.raises(StoredReplayError, match=r"is of other inputs: sequences\.three.*; run"):
         record_replays(other, "three")
     other = load_study(study_file, ["sequences.three.reference=none"], study.folder)
     with pytest.raises(StoredReplayError, match="was judged by another reference; run"):

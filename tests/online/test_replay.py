@@ -17,7 +17,7 @@ from adaptune.selection import Selection
 from adaptune.selector import UntrainedSelector, untrained_sets
 from adaptune.space import Float, ParameterSpace
 from adaptune.trajectory import read_tum
-from online.record import ReplayIdentity, StoredReplay, write_replay
+from online.record import StoredReplay, write_replay
 from online.replay import replay
 
 
@@ -62,18 +62,7 @@ class Cautious(HealthCheck):
 
 HEALTH = Cautious(max_speed=5.0)
 MODEL = Path("model.safetensors")
-ABOUT = ReplayIdentity(
-    mode="x",
-    parameters=None,
-    model=None,
-    switching=None,
-    period=1.0,
-    odometry={},
-    health={},
-    sequence={},
-    course=None,
-    recording=[],
-)
+ABOUT = {"mode": "x", "parameters": None, "model": None, "real_time": None}
 
 
 class Chooser:
