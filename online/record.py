@@ -104,12 +104,14 @@ def read_repeats(folder: Path) -> list["StoredReplay"]:
         replays.append(StoredReplay.read(of))
 
 
-def replay_changes(folder: Path, inputs: manifest.Inputs) -> list[str] | None:
+def replay_changes(
+    folder: Path, inputs: manifest.Inputs, files: Mapping[str, Sequence[Path]] | None = None
+) -> list[str] | None:
     """In what a stored replay's inputs differ from others, in words; None if it is not complete."""
     if not all((folder / name).exists() for name in ("replay.json", "trajectory.tum", *_TABLES)):
         return None
     try:
-        return manifest.changes(ReplaySummary.read(folder).inputs, inputs)
+        return manifest.changes(ReplaySummary.read(folder).inputs, inputs, files)
     except StoredReplayError:
         return None
 

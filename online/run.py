@@ -142,7 +142,7 @@ def _replay_all(study: Study, sequences: Sequence[str], modes: _Modes, progress:
     for name in sequences:
         folder, due = study.folder / "replays" / name, dict[_Run, dict[str, Any]]()
         for run, inputs in _inputs(study, name, modes).items():
-            if _is_due(study.folder, run, inputs):
+            if _is_due(study, run, inputs):
                 due[run] = inputs
         if due:
             _replay_due(study, name, due, modes, progress)
@@ -152,15 +152,16 @@ def _replay_all(study: Study, sequences: Sequence[str], modes: _Modes, progress:
     return made
 
 
-def _is_due(study: Path, run: _Run, inputs: manifest.Inputs) -> bool:
+def _is_due(study: Study, run: _Run, inputs: manifest.Inputs) -> bool:
     """Whether a replay is to be made; one of other inputs is set aside, an earlier one kept."""
-    folder = repeat_folder(study / "replays" / run.sequence / run.mode, run.repeat)
-    changes = replay_changes(folder, inputs)
+    folder = repeat_folder(study.folder / "replays" / run.sequence / run.mode, run.repeat)
+    files_of = study.sequences.sources(run.sequence)
+    changes = replay_changes(folder, inputs, files_of)
     if changes:
         _log.info("%s: replayed again: %s", run, "; ".join(changes))
         before, files = manifest.recorded(folder / manifest.FILE), folder.iterdir()
-        manifest.set_aside(study, folder, before, [file for file in files if file.is_file()])
-    if changes != [] and manifest.bring_back(study, folder, inputs):
+        manifest.set_aside(study.folder, folder, before, [file for file in files if file.is_file()])
+    if changes != [] and manifest.bring_back(study.folder, folder, inputs):
         _log.info("%s: the earlier replay of these inputs counts again", run)
         changes = replay_changes(folder, inputs)
     return changes != []

@@ -155,7 +155,7 @@ def test_a_recording_of_empty_clouds_is_refused(tmp_path):
 def test_two_cannot_work_in_one_folder(study):
     study.open()
     other = (
-        "from pathlib import Path; from offline.offline_study import load_study;"
+        "from pathlib import Path; from offline.config import load_study;"
         f"load_study(Path({str(study.folder.parent / 'small.yaml')!r}), [],"
         f" Path({str(study.folder)!r})).open()"
     )
