@@ -3,7 +3,7 @@
 import json
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from itertools import islice
 from operator import itemgetter
 from typing import Any
@@ -86,30 +86,20 @@ class Sampler(ABC):
     def _propose(self, numbers: range, history: Sequence[SamplerResult]) -> list[ParameterSet]: ...
 
 
-class Tried:
-    """Parameter sets that were proposed before."""
-
-    def __init__(self, sets: Iterable[ParameterSet] = ()):
-        self._keys = set(map(key, sets))
-
-    def add(self, parameters: ParameterSet) -> None:
-        """Add a set."""
-        self._keys.add(key(parameters))
-
-    def __contains__(self, parameters: ParameterSet) -> bool:
-        return key(parameters) in self._keys
-
-    def another(self, space: ParameterSpace, rng: np.random.Generator) -> ParameterSet | None:
-        """Draw a set that was not proposed before; None if none is left."""
-        everything = Grid.of(space)
-        if everything is not None and everything.size <= _ENUMERABLE:
-            left = [s for s in map(everything.__getitem__, range(everything.size)) if s not in self]
-            return left[rng.integers(len(left))] if left else None
-        for _ in range(_DRAWS):
-            (drawn,) = space.from_unit(rng.random((1, len(space))))
-            if drawn not in self:
-                return drawn
-        return None
+def untried(
+    space: ParameterSpace, tried: Collection[str], rng: np.random.Generator
+) -> ParameterSet | None:
+    """Draw a set whose `key` is not among those that were tried; None if none is left."""
+    everything = Grid.of(space)
+    if everything is not None and everything.size <= _ENUMERABLE:
+        sets = map(everything.__getitem__, range(everything.size))
+        left = [parameters for parameters in sets if key(parameters) not in tried]
+        return left[rng.integers(len(left))] if left else None
+    for _ in range(_DRAWS):
+        (drawn,) = space.from_unit(rng.random((1, len(space))))
+        if key(drawn) not in tried:
+            return drawn
+    return None
 
 
 def key(parameters: ParameterSet) -> str:
@@ -139,19 +129,18 @@ class RandomSampler(Sampler):
         if self._grid is not None:
             order = _shuffled(self._grid.size, self.config.seed, numbers.stop)
             return _walk(self._grid, order, self.space.baseline, numbers)
-        tried = Tried(result.parameters for result in history)
+        tried = {key(result.parameters) for result in history}
         sets: list[ParameterSet] = []
         for number in numbers:
-            drawn = self._point(number)
-            point = drawn if drawn not in tried else tried.another(self.space, self._rng(number))
+            point: ParameterSet | None = self._point(number)
+            if point is not None and key(point) in tried:
+                rng = np.random.default_rng((self.config.seed, number, 1))
+                point = untried(self.space, tried, rng)
             if point is None:
                 break
-            tried.add(point)
+            tried.add(key(point))
             sets.append(point)
         return sets
-
-    def _rng(self, number: int) -> np.random.Generator:
-        return np.random.default_rng((self.config.seed, number, 1))
 
     def _point(self, number: int) -> ParameterSet:
         if number == 0:
@@ -292,7 +281,7 @@ class AskedSampler(Sampler):
     def _ask(self, numbers: range) -> list[ParameterSet]:
         """Sets of the next batch; the same sets until they are answered."""
         if not self._waiting and not self._stalled():
-            tried = Tried(result.parameters for result in self._history)
+            tried = {key(result.parameters) for result in self._history}
             n_initial = self._n_initial(numbers)
             given = [self.space.baseline] if numbers.start == 0 else []
             given += sobol_points(
@@ -315,11 +304,11 @@ class AskedSampler(Sampler):
         n = 1 if self.config.sampler == "qmc" else self.config.initial
         return max(numbers.start, min(numbers.stop, n))
 
-    def _ask_once(self, number: int, given: ParameterSet | None, tried: Tried) -> bool:
+    def _ask_once(self, number: int, given: ParameterSet | None, tried: set[str]) -> bool:
         for attempt in range(_ATTEMPTS):
             if attempt == _ATTEMPTS - 1:
                 rng = np.random.default_rng((self.config.seed, number, 1))
-                given = tried.another(self.space, rng)
+                given = untried(self.space, tried, rng)
                 if given is None:
                     return False
             if given is not None:
@@ -333,7 +322,7 @@ class AskedSampler(Sampler):
                 self._waiting[name][1].append(trial)
             else:
                 self._waiting[name] = (parameters, [trial])
-                tried.add(parameters)
+                tried.add(name)
                 return True
         raise AssertionError
 
