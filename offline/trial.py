@@ -25,7 +25,7 @@ from adaptune.model.descriptor import (
     lowest_elevation,
     speed_and_turn_rate,
 )
-from adaptune.odometry.base import OdometryInstance, Usage, prepared_bytes
+from adaptune.odometry.base import MIN_POINTS, OdometryInstance, Usage, prepared_bytes
 from adaptune.odometry.factory import Factory
 from adaptune.odometry.tracker import HealthCheck, Tracker, unhealthy
 from adaptune.processes import apart
@@ -305,8 +305,6 @@ def with_measured_hops(
 Advance = Callable[[int, int], None]
 """Called with how many scans of a sequence are done, and how many there are."""
 
-MIN_POINTS = 20
-"""No odometry can use a scan with fewer points."""
 _CLOCK_TOLERANCE = 1.0
 """Seconds by which a reference's clock may differ from the scans' while its length is looked at."""
 

@@ -21,8 +21,7 @@ from adaptune.strict import ConfigurationError
 from adaptune.study.config import SwitchingConfig
 from adaptune.study.study import driven
 from offline import tuning
-from offline import validate as leave_one_out_module
-from offline import validate as validation_of_study
+from offline import validate as validation
 from offline.config import load_study
 from offline.labelled import LabelledSequence
 from offline.train import fit, tuned
@@ -34,7 +33,7 @@ from offline.validate import LeftOut, ValidationError, leave_one_out, validate
 def _few_settings(monkeypatch):
     """Try few settings of a bank, on few folds: the tests are about what is left out."""
     monkeypatch.setattr(tuning, "BANK_SETTINGS", tuning.BANK_SETTINGS[::6])
-    monkeypatch.setattr(leave_one_out_module, "MOST_FOLDS", 3)
+    monkeypatch.setattr(validation, "MOST_FOLDS", 3)
 
 
 def test_rules_gain_where_places_tell_the_sets_apart():
@@ -205,8 +204,8 @@ def judged(data, study, monkeypatch, given=()):
     model = fit(data, data.fixed(), {}, 10.0, 1, {})
     model = tuned(replace(model, blocks={"ndt": 90}), data, switching)
     model = replace(model, **dict(given))
-    monkeypatch.setattr(validation_of_study, "_checked_model", lambda _: model)
-    monkeypatch.setattr(validation_of_study, "_labelled", lambda *_: data)
+    monkeypatch.setattr(validation, "_checked_model", lambda _: model)
+    monkeypatch.setattr(validation, "_labelled", lambda *_: data)
     return model, validate(study)
 
 
