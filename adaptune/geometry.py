@@ -163,3 +163,39 @@ def interpolate(
         translations = T_world_sensor[:, :3, 3]
         T[between, :3, 3] = (1.0 - share) * translations[left] + share * translations[left + 1]
     return T
+
+
+_FARTHEST = 1e6
+"""Metres between two frames of one platform."""
+
+
+def to_pose(given: Any) -> Poses:
+    """Pose of shape (4, 4) from ``x y z qx qy qz qw`` or a matrix's rows; else a ValueError."""
+    what = "give numbers: x y z qx qy qz qw, or the four rows of a 4x4 matrix"
+    rows = given if isinstance(given, list | tuple) else ()
+    nested = any(isinstance(row, list | tuple) for row in rows)
+    for row in rows if nested else (rows,):
+        for number in row if isinstance(row, list | tuple) else (row,):
+            real = isinstance(number, int | float) and not isinstance(number, bool)
+            if not (real and abs(number) <= _FARTHEST):
+                raise ValueError(f"holds {number!r:.20}; {what}")
+    values = np.array(rows, np.float64) if len({np.shape(row) for row in rows}) == 1 else None
+    if values is not None and values.shape == (7,):
+        if not 0.99 < np.linalg.norm(values[3:]) < 1.01:
+            raise ValueError("its quaternion (qx qy qz qw, the last four) has not length 1")
+        pose: Poses = from_quaternions(values[None, :3], values[None, 3:])[0]
+        return pose
+    if values is None or values.shape not in ((4, 4), (3, 4)):
+        raise ValueError(what)
+    R = values[:3, :3]
+    if np.abs(R @ R.T - np.eye(3)).max() > 1e-2 or np.linalg.det(R) < 0:
+        raise ValueError("its first three columns and rows are not a rotation")
+    if values.shape == (4, 4) and np.abs(values[3] - (0, 0, 0, 1)).max() > 1e-6:
+        raise ValueError("its last row is not 0 0 0 1; is it transposed?")
+    from scipy.spatial.transform import Rotation
+
+    T = np.eye(4)
+    # Written with a few digits, it is a rotation only nearly.
+    T[:3, :3] = Rotation.from_matrix(R).as_matrix()
+    T[:3, 3] = values[:3, 3]
+    return T

@@ -21,7 +21,7 @@ from adaptune.odometry.base import InProcess
 from adaptune.odometry.keyframe import KeyframeGicp
 from adaptune.odometry.tracker import HealthCheck, Tracker
 from adaptune.recording.config import SequenceConfig
-from adaptune.recording.opening import open_sequence
+from adaptune.recording.recording import open_sequence
 from adaptune.recording.scan import Scan
 from adaptune.simulation import Course
 from adaptune.simulation.record import simulate

@@ -28,7 +28,7 @@ from adaptune.odometry import InProcess, OdometryInstance
 from adaptune.odometry.registry import ODOMETRIES, odometry_class
 from adaptune.odometry.remote import Isolated, Limits
 from adaptune.recording import Scan, SequenceError
-from adaptune.recording.opening import open_sequence
+from adaptune.recording.recording import open_sequence
 from adaptune.recording.views import WithImu
 from adaptune.simulation import Course
 from adaptune.simulation.course import as_sequence

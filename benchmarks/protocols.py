@@ -27,11 +27,11 @@ from types import MappingProxyType
 import numpy as np
 
 from adaptune.geometry import Poses, invert
+from adaptune.recording.compensation import compensate
 from adaptune.recording.config import SequenceConfig
 from adaptune.recording.export import T_CAMERA_LIDAR, write_kitti_poses, write_kitti_sequence
 from adaptune.recording.folder import ELEVATION, turn_up
-from adaptune.recording.opening import open_sequence
-from adaptune.recording.recording import compensate
+from adaptune.recording.recording import open_sequence
 from adaptune.recording.scan import Scan, read_part
 from adaptune.simulation import Course
 from adaptune.simulation.record import Drive, record, standing

@@ -23,7 +23,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from adaptune.recording import SequenceConfig
 from adaptune.recording.clouds import decode_cloud
-from adaptune.recording.opening import open_sequence
+from adaptune.recording.recording import open_sequence
 
 POINTS = 29_000
 STEP = 22
@@ -156,7 +156,7 @@ def streaming(path: Path, gigabytes: float) -> None:
     write(path, round(gigabytes * 1e9 / (POINTS * STEP)))
     code = (
         "import resource, sys; from adaptune.recording import SequenceConfig\n"
-        "from adaptune.recording.opening import open_sequence\n"
+        "from adaptune.recording.recording import open_sequence\n"
         "n = sum(1 for _ in open_sequence(SequenceConfig(bag=sys.argv[1], cache=False)))\n"
         "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)"
     )

@@ -36,7 +36,7 @@ from adaptune.odometry.keyframe import KeyframeGicp
 from adaptune.odometry.remote import Limits
 from adaptune.odometry.tracker import HealthCheck
 from adaptune.recording.config import SequenceConfig
-from adaptune.recording.opening import open_sequence
+from adaptune.recording.recording import open_sequence
 from adaptune.recording.scan import Scan
 from adaptune.selector import Selector, untrained_sets
 from adaptune.simulation import Course

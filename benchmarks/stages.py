@@ -26,7 +26,7 @@ from adaptune.model.ndt import ndt_histogram
 from adaptune.odometry.keyframe import crop
 from adaptune.odometry.tracker import HealthCheck
 from adaptune.recording import SequenceConfig
-from adaptune.recording.opening import open_sequence
+from adaptune.recording.recording import open_sequence
 from adaptune.selection import Selection
 from adaptune.selector import Selector
 from adaptune.space import ParameterSet

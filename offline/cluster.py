@@ -25,7 +25,7 @@ from adaptune.geometry import Poses
 from adaptune.processes import pin
 from adaptune.recording import Scan, SequenceConfig, cache
 from adaptune.recording.cache import fingerprints
-from adaptune.recording.opening import sequence_files
+from adaptune.recording.recording import sequence_files
 from adaptune.recording.scan import Imu, ImuNoise
 from adaptune.recording.views import WithImu
 from adaptune.study.sequences import StudySequences

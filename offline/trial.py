@@ -459,11 +459,10 @@ def _during(scans: recording.Recording, reference: Trajectory) -> NDArray[np.boo
     span = scans.source.span() if isinstance(scans, RecordedSequence) else None
     if span is None or not isinstance(scans, RecordedSequence):
         return np.ones(len(reference.stamps), bool)
-    seconds, section = (reference.stamps - span[0]) * 1e-9, scans.section
-    stop = np.inf if section.stop is None else section.stop
-    return np.asarray(
-        (seconds > section.start - _CLOCK_TOLERANCE) & (seconds < stop + _CLOCK_TOLERANCE)
-    )
+    seconds = (reference.stamps - span[0]) * 1e-9
+    stop = np.inf if scans.stop is None else scans.stop
+    inside = (seconds > scans.start - _CLOCK_TOLERANCE) & (seconds < stop + _CLOCK_TOLERANCE)
+    return np.asarray(inside)
 
 
 def _too_short(key: str, T: Poses, settings: TrialSettings) -> AdaptuneError:

@@ -16,7 +16,7 @@ from rosbags.typesys.store import Typestore
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses, to_quaternions
 from adaptune.recording.clouds import PointCloud2, from_fields, message_stamp, read_points
-from adaptune.recording.recording import ImuSettings
+from adaptune.recording.config import ImuConfig
 from adaptune.recording.scan import Imu, Scan, Timing
 from adaptune.ros.link import LinkError, RosLink
 from adaptune.selection import Selection
@@ -70,7 +70,7 @@ class LiveScans:
         points: str,
         timing: Timing,
         queue: int = 1,
-        imu: ImuSettings | None = None,
+        imu: ImuConfig | None = None,
     ):
         self.ignored = self.damaged = 0
         self.frame = "sensor"
@@ -194,9 +194,7 @@ class LiveScans:
             taken = [one for one in taken if one[0] > scan.stamp] or taken[-1:]
         stamps = np.array([stamp for stamp, _ in taken], np.int64)
         values = np.array([values for _, values in taken], np.float64).reshape(-1, 6)
-        T = np.eye(4) if self._settings.T_sensor_imu is None else self._settings.T_sensor_imu
-        acceleration = values[:, 3:] * self._settings.scale
-        imu = Imu(stamps, values[:, :3], acceleration, T, self._settings.noise)
+        imu = self._settings.in_si(Imu(stamps, values[:, :3], values[:, 3:]))
         return replace(scan, imu=imu)
 
 

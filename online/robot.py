@@ -19,12 +19,11 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 
 from adaptune.errors import AdaptuneError, OdometryError, nearest
-from adaptune.geometry import Poses, invert
+from adaptune.geometry import Poses, invert, to_pose
 from adaptune.odometry.base import LastMotion, Motions, OdometryInstance, Registration, Usage
 from adaptune.odometry.tracker import RegisteredScan
 from adaptune.recording.clouds import POSES
-from adaptune.recording.config import ImuConfig, SequenceConfig, to_pose
-from adaptune.recording.opening import imu_settings
+from adaptune.recording.config import ImuConfig, SequenceConfig
 from adaptune.recording.scan import Scan, Timing
 from adaptune.ros.link import RosLink, Steering
 from adaptune.selection import Selection
@@ -389,9 +388,8 @@ class RobotDrive:
         timing = Timing(like.stamp, like.time_unit, like.period)
         needs = self._study.odometry.description.needs_imu and not self._steers
         if needs:
-            settings = imu_settings(like.imu) or imu_settings(ImuConfig())
-            assert settings is not None
-            imu = replace(settings, topic=_topic(link, settings.topic, IMU, "imu.topic"))
+            imu = like.imu or ImuConfig()
+            imu = imu.model_copy(update={"topic": _topic(link, imu.topic, IMU, "imu.topic")})
         points = _topic(link, self._ros.points or like.points, CLOUD, "online.ros.points")
         return LiveScans(link, points, timing, self._settings.queue, imu)
 

@@ -16,7 +16,7 @@ from adaptune.geometry import invert
 from adaptune.odometry.docker import rustle
 from adaptune.recording import SequenceError
 from adaptune.recording.config import SequenceConfig
-from adaptune.recording.opening import open_sequence
+from adaptune.recording.recording import open_sequence
 from adaptune.simulation.record import Drive
 from adaptune.strict import ConfigurationError
 from adaptune.study.references import to_estimate

@@ -138,7 +138,7 @@ def _of_recording(
 ) -> None:
     """Estimate the reference of a recording, write it, and say what it is worth."""
     from adaptune.recording.inspect import inspect
-    from adaptune.recording.opening import open_sequence
+    from adaptune.recording.recording import open_sequence
     from adaptune.reference import check as of_recording
     from adaptune.reference import estimate
     from adaptune.reference.check import proposed_sub_trajectory

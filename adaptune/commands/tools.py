@@ -86,7 +86,7 @@ def _measured(found: "Inspection", show: Progress) -> "tuple[MeasuredReference |
     """
     if found.reference is None or not found.name or found.missing.get("offline"):
         return None, ""
-    from adaptune.recording.opening import open_sequence
+    from adaptune.recording.recording import open_sequence
     from adaptune.reference.check import (
         accuracy_words,
         advice,

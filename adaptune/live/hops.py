@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptune.geometry import Poses, rectify, squared_ranges
-from adaptune.recording.recording import compensate
+from adaptune.recording.compensation import compensate
 from adaptune.recording.scan import Scan
 
 LENGTHS = (10.0, 5.0)

@@ -20,7 +20,7 @@ from pydantic import AfterValidator
 from adaptune import processes
 from adaptune.errors import OdometryError, UnavailableError, nearest
 from adaptune.files import replacing_folder, temporary_folder
-from adaptune.geometry import Poses, invert, rotation_angle, steps
+from adaptune.geometry import Poses, invert, rotation_angle, steps, to_pose
 from adaptune.metrics import travelled, window_ends
 from adaptune.odometry.base import (
     BaseSettings,
@@ -34,7 +34,7 @@ from adaptune.odometry.base import (
 )
 from adaptune.odometry.remote import Arguments, Limits
 from adaptune.odometry.template import Template, check_names, placeholders, replace
-from adaptune.recording.config import SequenceConfig, Transform, resolve, to_pose
+from adaptune.recording.config import SequenceConfig, Transform, resolve
 from adaptune.recording.export import IMU, POINTS, Layout, export
 from adaptune.recording.scan import Recording, Scan
 from adaptune.ros.link import LinkError

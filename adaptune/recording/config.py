@@ -3,10 +3,10 @@
 import os
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-import numpy as np
 from pydantic import (
     AfterValidator,
     BeforeValidator,
@@ -18,8 +18,7 @@ from pydantic import (
 from adaptune import geometry
 from adaptune.errors import AdaptuneError
 from adaptune.files import expand_user
-from adaptune.geometry import Poses
-from adaptune.recording.scan import USUAL, Part, SequenceError, Unit
+from adaptune.recording.scan import USUAL, Imu, ImuNoise, Part, SequenceError, Unit
 from adaptune.strict import StrictModel
 
 MOST_VIEWS = 16
@@ -28,11 +27,7 @@ REFERENCE_FILES = (".tum", ".txt", ".csv")
 ESTIMATED, NO_REFERENCE = "estimated", "none"
 """In place of a `reference`: it is estimated from the scans, or there is none."""
 _SOURCES = ("bag", "kitti", "folder", "evalio")
-
-
-_POSE = "give numbers: x y z qx qy qz qw, or the four rows of a 4x4 matrix"
-_FARTHEST = 1e6
-"""Metres between two frames of one platform."""
+_STANDARD_GRAVITY = 9.80665
 
 
 def expand(text: str) -> str:
@@ -116,46 +111,13 @@ def _in_folder(folder: Path) -> list[Path]:
     raise SequenceError(f"{folder}: neither a ROS 2 bag nor a folder with bags")
 
 
-_Numbers = tuple[float, ...]
-
-
-def _check_transform(given: Any) -> Any:
-    rows: Any = given if isinstance(given, list | tuple) else ()
-    nested = any(isinstance(row, list | tuple) for row in rows)
-    for row in rows if nested else (rows,):
-        for number in row if isinstance(row, list | tuple) else (row,):
-            real = isinstance(number, int | float) and not isinstance(number, bool)
-            if not (real and abs(number) <= _FARTHEST):
-                raise ValueError(f"holds {number!r:.20}; {_POSE}")
-    to_pose(rows)
+def _pose(given: Any) -> Any:
+    geometry.to_pose(given)
     return given
 
 
-def to_pose(given: _Numbers | tuple[_Numbers, ...]) -> Poses:
-    """Pose of shape (4, 4) from ``x y z qx qy qz qw`` or a matrix's rows; else a ValueError."""
-    values = np.array(given, np.float64) if len({np.shape(row) for row in given}) == 1 else None
-    if values is not None and values.shape == (7,):
-        if not 0.99 < np.linalg.norm(values[3:]) < 1.01:
-            raise ValueError("its quaternion (qx qy qz qw, the last four) has not length 1")
-        pose: Poses = geometry.from_quaternions(values[None, :3], values[None, 3:])[0]
-        return pose
-    if values is None or values.shape not in ((4, 4), (3, 4)):
-        raise ValueError(_POSE)
-    R = values[:3, :3]
-    if np.abs(R @ R.T - np.eye(3)).max() > 1e-2 or np.linalg.det(R) < 0:
-        raise ValueError("its first three columns and rows are not a rotation")
-    if values.shape == (4, 4) and np.abs(values[3] - (0, 0, 0, 1)).max() > 1e-6:
-        raise ValueError("its last row is not 0 0 0 1; is it transposed?")
-    from scipy.spatial.transform import Rotation
-
-    T = np.eye(4)
-    # Written with a few digits, it is a rotation only nearly.
-    T[:3, :3] = Rotation.from_matrix(R).as_matrix()
-    T[:3, 3] = values[:3, 3]
-    return T
-
-
-Transform = Annotated[_Numbers | tuple[_Numbers, ...], BeforeValidator(_check_transform)]
+_Numbers = tuple[float, ...]
+Transform = Annotated[_Numbers | tuple[_Numbers, ...], BeforeValidator(_pose)]
 """A pose as seven numbers, or as the rows of a matrix."""
 
 
@@ -203,7 +165,6 @@ class ViewConfig(StrictModel):
     drop: DropConfig | None = None
     speed: SpeedConfig | None = None
     reverse: Literal[True] | None = None
-    rings: int | None = Field(None, ge=2, le=256)  # keep one ring in so many
     noise: NoiseConfig | None = None
     transform: Transform | None = None  # pose of the LiDAR in the frame from which to see it
 
@@ -244,6 +205,14 @@ class ImuConfig(StrictModel):
     extrinsic: Transform | None = None  # its pose in the LiDAR's frame
     unit: Literal["m/s2", "g"] = "m/s2"  # of its accelerometer
     noise: NoiseDensities = NoiseDensities()  # for odometries that weigh it against the LiDAR
+
+    def in_si(self, imu: Imu) -> Imu:
+        """Measurements in SI units, of an IMU in this place and with this noise."""
+        # Livox IMUs measure acceleration in multiples of gravity.
+        acceleration = imu.acceleration * (_STANDARD_GRAVITY if self.unit == "g" else 1.0)
+        T = imu.T_sensor_imu if self.extrinsic is None else geometry.to_pose(self.extrinsic)
+        noise = ImuNoise(**self.noise.model_dump())
+        return replace(imu, acceleration=acceleration, T_sensor_imu=T, noise=noise)
 
 
 class SequenceConfig(_Part):
@@ -304,6 +273,18 @@ class SequenceConfig(_Part):
                 f"or leave `position_prior` out"
             )
         return self
+
+    @property
+    def poses_file(self) -> Path | None:
+        """The file of its reference poses, if it names one."""
+        named = self.reference or ""
+        return Path(named) if named.endswith(REFERENCE_FILES) else None
+
+    @property
+    def poses_topic(self) -> str | None:
+        """The topic of its reference poses, if it names one."""
+        is_topic = self.poses_file is None and self.reference not in (ESTIMATED, NO_REFERENCE)
+        return self.reference if is_topic else None
 
     def paths(self) -> list[Path]:
         """Files and folders that it is read from; a SequenceError if there is no such bag."""

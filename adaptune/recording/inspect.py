@@ -19,8 +19,7 @@ from adaptune.recording import Scan, SequenceConfig, SequenceError, cache
 from adaptune.recording import survey as faults
 from adaptune.recording.clouds import DATATYPES, RING_FIELDS
 from adaptune.recording.config import BAG_SUFFIXES, REFERENCE_FILES
-from adaptune.recording.opening import open_sequence
-from adaptune.recording.recording import RecordedSequence
+from adaptune.recording.recording import RecordedSequence, open_sequence
 from adaptune.recording.scan import TIME_FIELDS
 from adaptune.recording.survey import Fault, Parts, Reading, Survey, n_valid, survey
 from adaptune.report.charts import Axis, Chart, Cloud, Panel, Points

@@ -1,8 +1,9 @@
-"""A part of a recording, with its reference and its IMU."""
+"""Recordings: what every format offers, and the part of one that a study uses."""
 
 import logging
+import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, Protocol
@@ -12,18 +13,17 @@ from numpy.typing import NDArray
 
 from adaptune import geometry
 from adaptune.errors import AdaptuneError
-from adaptune.geometry import Poses
-from adaptune.recording import cache
+from adaptune.geometry import to_pose
+from adaptune.recording import cache, compensation, views
 from adaptune.recording.cache import alongside
-from adaptune.recording.scan import (
-    USUAL,
-    Fractions,
-    Imu,
-    ImuNoise,
-    Scan,
-    SequenceError,
-    clock_offset,
+from adaptune.recording.config import (
+    ESTIMATED,
+    NO_REFERENCE,
+    SequenceConfig,
+    bag_paths,
+    files_of,
 )
+from adaptune.recording.scan import Imu, Recording, Scan, SequenceError, Timing
 from adaptune.trajectory import Trajectory, TrajectoryError, is_kitti, read_kitti, read_trajectory
 
 # What every format of recordings offers, and which of its scans are used.
@@ -148,186 +148,149 @@ def _leap(last: Frame | None, frame: Frame) -> int:
     return abs(frame.stamp - frame.recorded - usual)
 
 
-@dataclass(frozen=True)
-class Section:
-    """A part of a sequence."""
-
-    # Seconds since the first scan; those in [start, stop) belong to it.
-    start: float = 0.0
-    stop: float | None = None
-    stride: int = 1  # use every stride-th scan
-
-    def of(self, frames: Iterable[Frame]) -> Iterator[Frame]:
-        """The frames in it; their stamps strictly increase."""
-        first, number = None, 0
-        for frame in frames:
-            first = frame.stamp if first is None else first
-            seconds = (frame.stamp - first) * 1e-9
-            if self.stop is not None and seconds >= self.stop:
-                return
-            if seconds >= self.start:
-                if number % self.stride == 0:
-                    yield frame
-                number += 1
-
-    def part(self, part: Fractions, seconds: float) -> "Section":
-        """A part of it in a recording of so many seconds; the last part has the last scan."""
-        begin, end = part
-        whole = (seconds if self.stop is None else min(self.stop, seconds)) - self.start
-        stop = self.stop if end == 1.0 else self.start + end * whole
-        return replace(self, start=self.start + begin * whole, stop=stop)
-
-    def count(self, n: int, seconds: float) -> int:
-        """About how many of `n` scans are in it, in a recording of so many seconds."""
-        stop = seconds if self.stop is None else min(self.stop, seconds)
-        share = max(stop - self.start, 0.0) / seconds if seconds > 0.0 else 1.0
-        return -(-round(n * share) // self.stride)
-
-    def __str__(self) -> str:
-        stop = "the end" if self.stop is None else f"{self.stop:g} s"
-        return f"between start = {self.start:g} s and stop = {stop}"
+# Opening recordings, and what they are read from, without reading their scans.
 
 
-# Motion compensation: all points of a scan as seen from the sensor's pose at its start.
+PRIOR_GAP = 3.0
+"""Seconds. The default of `max_gap` for a prior: a GPS may give a position a second, and miss
+one."""
 
 
-# Rotation changes slowly: between these many moments of a scan it is taken as constant.
-_MOMENTS = 64
-# Metres: cells and search radius for the registration of a scan with its neighbour.
-_CELL, _REACH = 0.5, 2.0
-# small_gicp crashes on an empty target.
-_FEWEST = 20
-# Seconds; the mean velocity between scans further apart is not that of either.
-_FAR = 1.0
+def open_sequence(config: SequenceConfig) -> Recording:
+    """Open what a study describes; scans are not read before they are asked for.
 
-
-def compensate(scan: Scan, T_start_end: Poses, duration: float) -> Scan:
-    """Undo a motion of constant velocity: the points as seen from the sensor at the scan's stamp.
-
-    `T_start_end` is the sensor's pose `duration` seconds after the stamp, seen from where it was at
-    the stamp. Afterwards all points have the time 0. A scan whose points have no times is returned
-    as it is.
+    A SequenceError says why it cannot be opened as described.
     """
-    if scan.times is None or not len(scan):
-        return scan
-    from scipy.spatial.transform import Rotation
-
-    twist = Rotation.from_matrix(T_start_end[:3, :3]).as_rotvec() / duration
-    velocity = T_start_end[:3, 3] / duration
-    moments = np.linspace(0.0, max(float(scan.times.max()), 1e-9), _MOMENTS)
-    points = _rotate(scan, moments, Rotation.from_rotvec(moments[:, None] * twist))
-    points += scan.times[:, None] * velocity.astype(np.float32)
-    return replace(scan, points=points, times=np.zeros_like(scan.times))
+    sequence: views.Reversible = RecordedSequence(config)
+    if config.compensate == "constant_velocity":
+        sequence = views.WithoutMotion(sequence)
+    elif config.compensate == "gyro":
+        sequence = views.without_rotation(sequence)
+    for view in config.views:
+        sequence = views.VIEWS[view.name](sequence, getattr(view, view.name))
+    return sequence
 
 
-def neighbour_motions(scans: Iterable[Scan]) -> Iterator[tuple[Scan, Poses | None, float]]:
-    """Register each scan with the one read before it (GICP).
+def check_sequence(config: SequenceConfig) -> None:
+    """Find what would fail while it is read, without reading its scans.
 
-    Both were measured in the same motion, so that its distortion hardly matters.
+    A SequenceError says that it cannot be opened as described, ends before its `start`, or that its
+    reference is of another time.
+    """
+    RecordedSequence(config).check()
+    if config.position_prior is None:
+        return
+    if not wants_estimate(config):
+        raise SequenceError(
+            f"position_prior: joins an estimated reference, and the recording has poses of its "
+            f"own; write `reference: {ESTIMATED}`, or leave `position_prior` out"
+        )
+    RecordedSequence(of_prior(config)).check()
 
-    Yields
+
+def wants_estimate(config: SequenceConfig) -> bool:
+    """Whether the reference of a sequence is to be estimated; a SequenceError if it cannot tell."""
+    if config.reference is not None or config.bag is not None:
+        return config.reference in (None, ESTIMATED)
+    source, _ = _source(config)
+    if config.evalio is not None:
+        return source.poses(None, None) is None
+    return not source.pose_files
+
+
+def position_prior(config: SequenceConfig) -> Trajectory | None:
+    """Poses of the LiDAR that are right over long distances only, if the sequence names any."""
+    return None if config.position_prior is None else RecordedSequence(of_prior(config)).reference()
+
+
+def prior_files(config: SequenceConfig) -> Sequence[Path]:
+    """The files of these poses, where they are not in the recording."""
+    return () if config.position_prior is None else sequence_files(of_prior(config)).reference
+
+
+def of_prior(config: SequenceConfig) -> SequenceConfig:
+    """The sequence with the poses of its prior as its reference."""
+    gap = config.max_gap if "max_gap" in config.model_fields_set else PRIOR_GAP
+    of = {"reference": config.position_prior, "position_prior": None, "max_gap": gap}
+    return config.model_copy(update=of)
+
+
+class SequenceFiles(NamedTuple):
+    """The files that a sequence is read from."""
+
+    recording: Sequence[Path]
+    reference: Sequence[Path]  # those of the poses, where they are not in the recording
+
+
+def sequence_files(config: SequenceConfig) -> SequenceFiles:
+    """The files that a sequence is read from; a SequenceError if it cannot be opened."""
+    own = None if config.poses_file is None else [config.poses_file]
+    if config.reference in (ESTIMATED, NO_REFERENCE):
+        own = []
+    if config.bag is not None:
+        bags = bag_paths((config.bag,) if isinstance(config.bag, str) else config.bag)
+        return SequenceFiles(files_of(bags), own or ())
+    source, _ = _source(config)
+    return SequenceFiles(source.files, source.pose_files if own is None else own)
+
+
+def interval_of(config: SequenceConfig) -> tuple[float, float]:
+    """From which stamp to before which one a sequence uses its recording, in nanoseconds.
+
+    Raises
     ------
-    scan : Scan
-    T_before_scan : ndarray of shape (4, 4), or None where it is not known
-    seconds : float
-        Between their stamps; negative where scans are read backwards.
+    SequenceError
+        If it cannot be opened.
     """
-    import small_gicp
-
-    before: Any = None
-    last, guess = 0, np.eye(4)
-    for scan in scans:
-        now = None
-        if len(scan) >= _FEWEST:
-            points = scan.points.astype(np.float64)
-            now = small_gicp.preprocess_points(points, downsampling_resolution=_CELL, num_threads=1)
-            now = now if now[0].size() >= _FEWEST else None
-        seconds = (scan.stamp - last) * 1e-9
-        T_before_scan = None
-        if before is not None and now is not None and 0 < abs(seconds) <= _FAR:
-            options = {"max_correspondence_distance": _REACH, "num_threads": 1}
-            result = small_gicp.align(
-                before[0], now[0], before[1], init_T_target_source=guess, **options
-            )
-            if result.converged and result.num_inliers > now[0].size() / 2:
-                T_before_scan = geometry.rectify(result.T_target_source)
-        yield scan, T_before_scan, seconds
-        guess = np.eye(4) if T_before_scan is None else T_before_scan
-        before, last = now, scan.stamp
+    recorded = RecordedSequence(config)
+    first, _ = recorded.source.span() or (0, 0)
+    stop = math.inf if recorded.stop is None else first + 1e9 * recorded.stop
+    return first + 1e9 * recorded.start, stop
 
 
-def compensate_neighbours(scans: Iterable[Scan]) -> Iterator[Scan]:
-    """Undo the motion within each scan, as fast as it was since the one read before.
+def _source(config: SequenceConfig) -> tuple[Source, str | None]:
+    """What reads the recording, and under which key its decoded scans are kept."""
+    # Formats import this module, and rosbags takes long to import.
+    from adaptune.recording.bag import BagSource
+    from adaptune.recording.folder import kitti, scan_folder
 
-    Where that is not known, the motion known last still holds for a second. Other scans, such as
-    the first, pass as they are.
-    """
-    known: tuple[Poses, float, int] | None = None
-    for scan, T_before_scan, seconds in neighbour_motions(scans):
-        if T_before_scan is not None:
-            known = T_before_scan, seconds, scan.stamp
-        if known is None or abs(scan.stamp - known[2]) > _FAR * 1e9:
-            yield scan
-        elif known[1] > 0:
-            yield compensate(scan, known[0], known[1])
-        else:
-            yield compensate(scan, geometry.invert(known[0]), -known[1])
+    timing = Timing(config.stamp, config.time_unit, config.period)
+    if config.kitti is not None:
+        return kitti(Path(config.kitti), config.elevation), None
+    if config.folder is not None:
+        return scan_folder(Path(config.folder), timing), None
+    if config.evalio is not None:
+        # evalio is an optional package.
+        from adaptune.recording.evalio import evalio_source
 
-
-def turning_of(scans: Iterable[Scan]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """How fast the sensor turned: stamps between scans and radians per second, of shape (n,)."""
-    stamps, rates = [], []
-    for scan, T_before_scan, seconds in neighbour_motions(scans):
-        if T_before_scan is not None:
-            stamps.append(scan.stamp - round(seconds * 0.5e9))
-            rates.append(float(geometry.rotation_angle(T_before_scan)) / seconds)
-    return np.array(stamps, np.int64), np.array(rates, np.float64)
-
-
-def compensate_rotation(scan: Scan, imu: Imu) -> Scan:
-    """Undo the rotation that a gyroscope measured during the scan.
-
-    Translation stays. A scan without times, or without measurements around it, is returned as it
-    is. Both are on the same clock.
-    """
-    if scan.times is None or not len(scan):
-        return scan
-    span = float(scan.times.max())
-    first, last = np.searchsorted(imu.stamps, [scan.stamp, scan.stamp + round(span * 1e9)])
-    # One measurement before the scan and one after it.
-    if first == 0 or last >= len(imu):
-        return scan
-    part = slice(first - 1, last + 1)
-    seconds = (imu.stamps[part] - scan.stamp) * 1e-9
-    rates = imu.angular_velocity[part] @ imu.T_sensor_imu[:3, :3].T
-    from scipy.spatial.transform import Rotation
-
-    moments = np.linspace(0.0, max(span, 1e-9), _MOMENTS)
-    at = np.stack([np.interp(moments, seconds, rates[:, i]) for i in range(3)], axis=1)
-    steps = Rotation.from_rotvec((at[1:] + at[:-1]) * 0.5 * np.diff(moments)[:, None])
-    rotations = [Rotation.identity()]
-    for step in steps:
-        rotations.append(rotations[-1] * step)
-    return replace(scan, points=_rotate(scan, moments, Rotation.concatenate(rotations)))
+        return evalio_source(config.evalio), None
+    bags = (config.bag,) if isinstance(config.bag, str) else config.bag or ()
+    paths = bag_paths(bags)
+    if not config.cache or not cache.cap():
+        return BagSource(paths, config.points, timing), None
+    try:
+        part = (config.start, config.stop, config.stride, config.part)
+        key = cache.key(paths, (config.points, timing, *part))
+    except OSError as error:
+        raise SequenceError(f"{paths[0]}: cannot be read ({error})") from error
+    entry = cache.find(key)
+    about = None if entry is None else entry.about
+    return BagSource(paths, config.points, timing, about), key
 
 
-def _rotate(scan: Scan, moments: NDArray[np.float64], rotations: Any) -> NDArray[np.float32]:
-    """Rotate each point by the rotation at its time.
+def _check_topics(source: Source, config: SequenceConfig) -> None:
+    """Find topics that are named and not there."""
+    from adaptune.recording.bag import IMU_TYPES, BagSource
 
-    The rotation of a point is looked up on a grid fine enough that the step between neighbours,
-    a 64th of the scan's rotation, is met by interpolating the rotated points linearly.
-    """
-    assert scan.times is not None
-    matrices = rotations.as_matrix().astype(np.float32)
-    place = np.clip(scan.times / np.float32(moments[1]), 0, _MOMENTS - 1)
-    low = np.minimum(place.astype(np.intp), _MOMENTS - 2)
-    share = (place - low)[:, None]
-    before = np.einsum("nij,nj->ni", matrices[low], scan.points)
-    after = np.einsum("nij,nj->ni", matrices[low + 1], scan.points)
-    return np.asarray(before + share * (after - before))
+    if isinstance(source, BagSource):
+        topic = None if config.imu is None else config.imu.topic
+        source.check(config.poses_topic, topic)
+        if config.imu is not None and config.bag is not None:
+            source.topic(topic, IMU_TYPES, "an IMU's measurements")
 
 
-_log = logging.getLogger(__name__)
+# Which part of a recording is used, and its reference and IMU.
+
 
 # At most so many scans are registered to find a clock offset.
 _MOST_SCANS = 600
@@ -336,60 +299,34 @@ _MOST_SCANS = 600
 _FASTEST = 100.0
 
 
-@dataclass(frozen=True, eq=False)
-class ReferenceSettings:
-    """Where reference poses come from and how they become those of the LiDAR."""
-
-    source: str | Path | None = None  # a topic or a file; the recording's own poses if left out
-    child_frame: str | None = None  # on a topic of transforms, the frame whose poses to take
-    # The LiDAR's pose in the frame that the poses are of, of shape (4, 4).
-    T_reference_sensor: Poses | None = None
-    clock_offset: float = 0.0  # seconds to add to the poses' stamps
-    max_gap: float = 1.0  # seconds. Between poses further apart the reference is unknown.
-    given: bool = True  # whether there is one; if not, not even the recording's own poses count
-
-
-@dataclass(frozen=True, eq=False)
-class ImuSettings:
-    """Which IMU, and how its measurements become SI units."""
-
-    topic: str | None = None  # the only one when left out
-    T_sensor_imu: Poses | None = None  # the IMU's pose in the LiDAR's frame, of shape (4, 4)
-    scale: float = 1.0  # metres per second squared in a unit of its accelerometer
-    noise: ImuNoise = USUAL
-
-
-_WHOLE = Section()
-_OWN = ReferenceSettings()
-
-
 class RecordedSequence:
-    """A part of a recording, with its reference.
+    """The scans of a recording as they were recorded, without views and without compensation.
 
     Its methods raise a SequenceError where the recording cannot be read as described.
 
-    Parameters
+    Attributes
     ----------
-    source
-        The recording.
-    section
-        The part to read.
-    reference, imu
-        Where its motion comes from; no IMU if left out.
-    key
-        Key of the decoded scans in the cache; not cached if left out.
+    source : Source
+        The whole recording.
+    start, stop, stride : float, float or None, int
+        The scans to use: those in [start, stop) seconds since the first one, every stride-th.
+    key : str or None
+        Of the decoded scans in the cache; None if they are not kept.
     """
 
-    def __init__(
-        self,
-        source: Source,
-        section: Section = _WHOLE,
-        reference: ReferenceSettings = _OWN,
-        imu: ImuSettings | None = None,
-        key: str | None = None,
-    ):
-        self.source, self.section, self.key = source, section, key
-        self._reference, self._imu = reference, imu
+    def __init__(self, config: SequenceConfig):
+        if (file := config.poses_file) is not None and not file.is_file():
+            raise SequenceError(f"{file}: there is no such file")
+        self.source, self.key = _source(config)
+        self.start, self.stop, self.stride = config.start, config.stop, config.stride
+        self._config = config
+        _check_topics(self.source, config)
+        if config.part is not None and (span := self.source.span()) is not None:
+            begin, end = config.part
+            seconds = (span[1] - span[0]) * 1e-9
+            whole = (seconds if self.stop is None else min(self.stop, seconds)) - self.start
+            self.stop = self.stop if end == 1.0 else self.start + end * whole
+            self.start += begin * whole
 
     @property
     def name(self) -> str:
@@ -400,7 +337,10 @@ class RecordedSequence:
     def n_messages(self) -> int:
         """About how many scans of the recording it uses."""
         begin, end = self.source.span() or (0, 0)
-        return self.section.count(self.source.n_messages, (end - begin) * 1e-9)
+        seconds = (end - begin) * 1e-9
+        stop = seconds if self.stop is None else min(self.stop, seconds)
+        share = max(stop - self.start, 0.0) / seconds if seconds > 0.0 else 1.0
+        return -(-round(self.source.n_messages * share) // self.stride)
 
     def __iter__(self) -> Iterator[Scan]:
         """Read the scans one after the other.
@@ -422,7 +362,7 @@ class RecordedSequence:
 
     def _decode(self, repairs: Repairs) -> Iterator[Scan]:
         last = None
-        for frame in self.section.of(in_order(self.source.frames(), repairs)):
+        for frame in self._frames(repairs):
             scan = frame.load()
             if last is not None and scan.stamp <= last:
                 repairs.add(BACKWARD)
@@ -430,14 +370,29 @@ class RecordedSequence:
             last = scan.stamp
             yield scan
         if last is None:
+            stop = "the end" if self.stop is None else f"{self.stop:g} s"
             raise SequenceError(
-                f"{self.name}: no scan {self.section}; change start, stop or stride"
+                f"{self.name}: no scan between start = {self.start:g} s and stop = {stop}; change "
+                f"start, stop or stride"
             )
+
+    def _frames(self, repairs: Repairs) -> Iterator[Frame]:
+        """The frames of the part that is used; their stamps strictly increase."""
+        first, number = None, 0
+        for frame in in_order(self.source.frames(), repairs):
+            first = frame.stamp if first is None else first
+            seconds = (frame.stamp - first) * 1e-9
+            if self.stop is not None and seconds >= self.stop:
+                return
+            if seconds >= self.start:
+                if number % self.stride == 0:
+                    yield frame
+                number += 1
 
     def backward(self) -> Iterator[Scan]:
         """Read the scans, the last one first. A bag is decoded to the cache before."""
         if self.source.random_access:
-            frames = list(self.section.of(in_order(self.source.frames(), Repairs())))
+            frames = list(self._frames(Repairs()))
             yield from (frame.load() for frame in reversed(frames))
             return
         if self.key is not None and cache.find(self.key) is None:
@@ -457,30 +412,26 @@ class RecordedSequence:
 
     def imu(self) -> Imu | None:
         """Measurements of the IMU in SI units, if one is set."""
-        settings = self._imu
+        settings = self._config.imu
         imu = None if settings is None else self.source.imu(settings.topic)
-        if settings is None or imu is None:
-            return None
-        T = imu.T_sensor_imu if settings.T_sensor_imu is None else settings.T_sensor_imu
-        acceleration = imu.acceleration * settings.scale
-        return replace(imu, acceleration=acceleration, T_sensor_imu=T, noise=settings.noise)
+        return imu if settings is None or imu is None else settings.in_si(imu)
 
     def reference(self) -> Trajectory | None:
         """Poses of the LiDAR, if they are known."""
-        settings = self._reference
-        if not settings.given:
+        config = self._config
+        if config.reference in (ESTIMATED, NO_REFERENCE):
             return None
-        if isinstance(settings.source, Path):
-            trajectory: Trajectory | None = self._from_file(settings.source)
+        if config.poses_file is not None:
+            trajectory: Trajectory | None = self._from_file(config.poses_file)
         else:
-            trajectory = self.source.poses(settings.source, settings.child_frame)
+            trajectory = self.source.poses(config.poses_topic, config.child_frame)
         if trajectory is None:
             return None
         T = trajectory.T_world_sensor
-        if settings.T_reference_sensor is not None:
-            T = T @ settings.T_reference_sensor
-        stamps = trajectory.stamps + round(settings.clock_offset * 1e9)
-        trajectory = Trajectory(stamps, T, settings.max_gap)
+        if config.extrinsic is not None:
+            T = T @ to_pose(config.extrinsic)
+        stamps = trajectory.stamps + round(config.clock_offset * 1e9)
+        trajectory = Trajectory(stamps, T, config.max_gap)
         self._check(trajectory)
         return trajectory
 
@@ -493,18 +444,18 @@ class RecordedSequence:
         span = self.source.span()
         if span is None:
             return
-        seconds, start = (span[1] - span[0]) * 1e-9, self.section.start
-        if start > seconds:
-            what = f"start = {start:g} s is beyond its end, it lasts {seconds:.1f} s"
+        seconds = (span[1] - span[0]) * 1e-9
+        if self.start > seconds:
+            what = f"start = {self.start:g} s is beyond its end, it lasts {seconds:.1f} s"
             raise SequenceError(f"{self.name}: {what}")
-        settings = self._reference
-        if isinstance(settings.source, str):
-            first = self.source.first_pose(settings.source)
-            offset = round(settings.clock_offset * 1e9)
+        topic, file = self._config.poses_topic, self._config.poses_file
+        if topic is not None:
+            first = self.source.first_pose(topic)
+            offset = round(self._config.clock_offset * 1e9)
             if first is None or abs(first + offset - span[0]) <= span[1] - span[0]:
                 return
-        if isinstance(settings.source, Path) and is_kitti(settings.source):
-            self._check_count(settings.source, len(read_kitti(settings.source)))
+        if file is not None and is_kitti(file):
+            self._check_count(file, len(read_kitti(file)))
         else:
             self.reference()
 
@@ -545,7 +496,7 @@ class RecordedSequence:
     def _proposal(self, trajectory: Trajectory) -> str:
         """The offset found from the gyroscope, or from the scans if there is none."""
         try:
-            imu = self.source.imu(None if self._imu is None else self._imu.topic)
+            imu = self.source.imu(self._config.imu.topic if self._config.imu else None)
         except AdaptuneError:
             imu = None
         if imu is not None:
@@ -554,15 +505,17 @@ class RecordedSequence:
         else:
             _log.info("%s: comparing how its scans turn with the reference", self.name)
             try:
-                stamps, turning = turning_of(islice(self._decode(Repairs()), _MOST_SCANS))
+                stamps, turning = compensation.turning_of(
+                    islice(self._decode(Repairs()), _MOST_SCANS)
+                )
             except AdaptuneError:
                 return ""
             what = "scans show"
-        found = clock_offset(trajectory, stamps, turning)
+        found = compensation.clock_offset(trajectory, stamps, turning)
         if found is None:
             return ""
         # The stamps already include the offset that is set.
-        offset = self._reference.clock_offset + found
+        offset = self._config.clock_offset + found
         return f" (the {what} the same motion with clock_offset: {offset:.3f})"
 
 
@@ -574,3 +527,6 @@ def _warn_of_jumps(name: str, trajectory: Trajectory) -> None:
         first = trajectory.stamps[jumps[0] + 1] * 1e-9
         message = "%s: the reference jumps %d times, first at %.3f s, faster than %g m/s"
         _log.warning(message, name, len(jumps), first, _FASTEST)
+
+
+_log = logging.getLogger(__name__)

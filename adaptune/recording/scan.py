@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BeforeValidator
 
-from adaptune import geometry
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses
 from adaptune.trajectory import Trajectory
@@ -17,7 +16,6 @@ from adaptune.trajectory import Trajectory
 # Measurements of an IMU.
 
 
-_CORRELATION = 0.8
 _MEASURED = ("stamps", "angular_velocity", "acceleration")
 
 
@@ -74,80 +72,6 @@ def joined(parts: Sequence[Imu]) -> Imu:
     whole: dict[str, Any]
     whole = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _MEASURED}
     return replace(parts[0], **whole)
-
-
-def clock_offset(
-    trajectory: Trajectory,
-    stamps: NDArray[np.int64],
-    turning: NDArray[np.float64],
-    rate: float = 50.0,
-) -> float | None:
-    """Seconds to add to a trajectory's stamps so that it turns when a gyroscope or a LiDAR does.
-
-    The rates of turning, which no choice of frames changes, are correlated at every offset at
-    which the shorter recording lies at least half inside the other.
-
-    Parameters
-    ----------
-    trajectory
-        On its own clock.
-    stamps, turning
-        Nanoseconds on the other clock and radians per second, of shape (n,).
-    rate
-        Samples per second to compare.
-
-    Returns
-    -------
-    float or None
-        None if the two do not show the same motion.
-    """
-    if len(trajectory) < 3 or len(stamps) < 3:
-        return None
-    turned = geometry.rotation_angle(geometry.steps(trajectory.T_world_sensor))
-    seconds = np.diff(trajectory.stamps) * 1e-9
-    middles = (trajectory.stamps[:-1] - trajectory.stamps[0]) * 1e-9 + seconds / 2
-    other = (stamps - stamps[0]) * 1e-9
-    # Each is a mean over the time between its samples: it is averaged over the other's too.
-    a = _sampled(middles, turned / seconds, rate, float(np.median(np.diff(other))))
-    b = _sampled(other, turning, rate, float(np.median(seconds)))
-    if min(len(a), len(b)) < 2 * rate:
-        return None
-    coefficients, lags = _correlation(a, b)
-    best = int(np.argmax(coefficients))
-    if coefficients[best] < _CORRELATION:
-        return None
-    start = (stamps[0] - trajectory.stamps[0]) * 1e-9 - middles[0]
-    return float(start + lags[best] / rate)
-
-
-def _sampled(
-    seconds: NDArray[np.float64], values: NDArray[np.float64], rate: float, over: float
-) -> NDArray[np.float64]:
-    # Ten hours at 50 Hz; anything longer is a stamp gone wrong.
-    grid = np.arange(seconds[0], min(seconds[-1], seconds[0] + 36000.0), 1.0 / rate)
-    window = min(max(round(over * rate), 1), max(len(grid), 1))
-    return np.convolve(np.interp(grid, seconds, values), np.ones(window) / window, mode="same")
-
-
-def _correlation(
-    a: NDArray[np.float64], b: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Pearson's coefficient of the overlap of `a`, moved to start at each sample of `b`."""
-    from scipy.signal import correlate
-
-    def slide(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.asarray(correlate(y, x, mode="full", method="fft"))
-
-    lags = np.arange(-(len(a) - 1), len(b))
-    ones_a, ones_b = np.ones_like(a), np.ones_like(b)
-    n = np.maximum(slide(ones_a, ones_b).round(), 1.0)
-    mean_a, mean_b = slide(a, ones_b) / n, slide(ones_a, b) / n
-    covariance = slide(a, b) / n - mean_a * mean_b
-    variance_a = slide(a**2, ones_b) / n - mean_a**2
-    variance_b = slide(ones_a, b**2) / n - mean_b**2
-    scale = np.sqrt(np.maximum(variance_a * variance_b, 1e-18))
-    enough = n >= min(len(a), len(b)) / 2
-    return np.where(enough, covariance / scale, -1.0), lags
 
 
 @dataclass(frozen=True, eq=False)

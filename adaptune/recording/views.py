@@ -9,14 +9,14 @@ from collections.abc import Sequence as Items
 from dataclasses import dataclass, replace
 from functools import cache as once
 from functools import cached_property
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from adaptune import geometry
-from adaptune.geometry import Poses
-from adaptune.recording.recording import compensate_neighbours, compensate_rotation
+from adaptune.recording.compensation import compensate_neighbours, compensate_rotation
+from adaptune.recording.config import DropConfig, NoiseConfig, SpeedConfig
 from adaptune.recording.scan import Imu, Recording, Scan, SequenceError
 from adaptune.trajectory import Trajectory
 
@@ -133,7 +133,7 @@ class _First:
         return seconds >= start and (stop is None or seconds < stop)
 
 
-def cut(sequence: Reversible, parts: Items[Part]) -> View:
+def _cut(sequence: Reversible, parts: Items[Part]) -> View:
     """Only these parts of it; stamps stay as they are."""
     first = _First(sequence)
     return View(
@@ -142,19 +142,19 @@ def cut(sequence: Reversible, parts: Items[Part]) -> View:
     )
 
 
-def drop(sequence: Reversible, share: float, part: Part, seed: int) -> View:
+def _drop(sequence: Reversible, given: DropConfig) -> View:
     """Lose a share of the scans of a part, each at random by itself."""
-    first = _First(sequence)
+    first, part = _First(sequence), (given.start, given.stop)
 
     def lose(scan: Scan) -> Scan | None:
-        lost = first.within(scan.stamp, part) and _rng(seed, scan).random() < share
+        lost = first.within(scan.stamp, part) and _rng(given.seed, scan).random() < given.share
         return None if lost else scan
 
     return View(sequence, lose)
 
 
-def speed(sequence: Reversible, factor: float, part: Part) -> View:
-    """A part of it arrives `factor` times faster.
+def _speed(sequence: Reversible, given: SpeedConfig) -> View:
+    """A part of it arrives `given.factor` times faster.
 
     Scans, stamps and poses stay the same. Only `played_at` changes, for odometries that run
     against the clock.
@@ -162,35 +162,22 @@ def speed(sequence: Reversible, factor: float, part: Part) -> View:
     first = _First(sequence)
 
     def arrival(stamps: NDArray[np.int64]) -> NDArray[np.int64]:
-        start = first.stamp + round(part[0] * 1e9)
+        start = first.stamp + round(given.start * 1e9)
         # Later than any stamp, and small enough to subtract from.
-        stop = 2**62 if part[1] is None else first.stamp + round(part[1] * 1e9)
+        stop = 2**62 if given.stop is None else first.stamp + round(given.stop * 1e9)
         inside = np.clip(stamps, start, stop) - start
-        saved: NDArray[np.int64] = np.rint(inside * (1.0 - 1.0 / factor)).astype(np.int64)
+        saved: NDArray[np.int64] = np.rint(inside * (1.0 - 1.0 / given.factor)).astype(np.int64)
         return stamps - saved
 
     return View(sequence, of_clock=arrival)
 
 
-def thin_rings(sequence: Reversible, every: int) -> View:
-    """Keep one ring in `every`, as a LiDAR with fewer lasers sees; points must have rings."""
-
-    def thin(scan: Scan) -> Scan:
-        if scan.rings is not None:
-            return scan.select(scan.rings % every == 0)
-        if len(scan):
-            raise SequenceError(f"{sequence.name}: its points have no ring; leave `rings` out")
-        return scan
-
-    return View(sequence, thin)
-
-
-def add_noise(sequence: Reversible, sigma: float, seed: int) -> View:
-    """Move every point along its ray by a normal error of `sigma` metres."""
+def _noise(sequence: Reversible, given: NoiseConfig) -> View:
+    """Move every point along its ray by a normal error."""
 
     def disturb(scan: Scan) -> Scan:
         ranges = np.linalg.norm(scan.points, axis=1)
-        error = _rng(seed, scan).normal(0.0, sigma, len(scan)).astype(np.float32)
+        error = _rng(given.seed, scan).normal(0.0, given.sigma, len(scan)).astype(np.float32)
         # A point does not come out behind the sensor.
         scale = np.maximum(1.0 + error / ranges, 1e-3)
         return replace(scan, points=scan.points * scale[:, None])
@@ -198,8 +185,9 @@ def add_noise(sequence: Reversible, sigma: float, seed: int) -> View:
     return View(sequence, disturb)
 
 
-def transform(sequence: Reversible, T_seen_sensor: Poses) -> View:
+def _transform(sequence: Reversible, given: Any) -> View:
     """See it from another frame, as if the LiDAR were mounted differently."""
+    T_seen_sensor = geometry.to_pose(given)
     R = T_seen_sensor[:3, :3].astype(np.float32)
     t = T_seen_sensor[:3, 3].astype(np.float32)
     T_sensor_seen = geometry.invert(T_seen_sensor)
@@ -259,6 +247,17 @@ class Reversed(View):
         """When measurements of `stamps` arrive."""
         mirrored: NDArray[np.int64] = self._sum - self.inner.played_at(self._sum - stamps)
         return mirrored
+
+
+VIEWS: dict[str, Callable[[Reversible, Any], Reversible]] = {
+    "cut": _cut,
+    "drop": _drop,
+    "speed": _speed,
+    "reverse": lambda sequence, _: Reversed(sequence),
+    "noise": _noise,
+    "transform": _transform,
+}
+"""By the names of a study's views, each with its settings."""
 
 
 class WithImu:

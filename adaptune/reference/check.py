@@ -16,7 +16,7 @@ from adaptune.live.hops import Hops
 from adaptune.metrics import cap, sub_trajectory_rte, travelled
 from adaptune.recording.config import ESTIMATED, SequenceConfig
 from adaptune.recording.inspect import Inspection
-from adaptune.recording.opening import position_prior
+from adaptune.recording.recording import position_prior
 from adaptune.recording.scan import Recording, Scan
 from adaptune.reference.stored import EstimatedReference, EstimateError, StoredEstimate
 from adaptune.trajectory import Trajectory

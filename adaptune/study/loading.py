@@ -13,7 +13,7 @@ from adaptune.odometry.registry import PROGRAMS, is_user_class, odometry_class, 
 from adaptune.recording import cache
 from adaptune.recording.cache import MANY, fingerprint
 from adaptune.recording.config import SequenceConfig
-from adaptune.recording.opening import check_sequence, interval_of, sequence_files
+from adaptune.recording.recording import check_sequence, interval_of, sequence_files
 from adaptune.space import (
     ODOMETRY,
     Categorical,

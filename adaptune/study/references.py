@@ -11,9 +11,9 @@ from typing import Any
 from adaptune import manifest
 from adaptune.processes import pin
 from adaptune.recording.cache import fingerprints
-from adaptune.recording.opening import (
+from adaptune.recording.recording import (
+    RecordedSequence,
     of_prior,
-    open_unseen,
     position_prior,
     prior_files,
     wants_estimate,
@@ -159,7 +159,7 @@ def _estimate(
     """The reference of a sequence, or why it cannot be estimated."""
     study.open()
     given = study.sequences.unseen(name)
-    scans, prior = open_unseen(given), position_prior(given)
+    scans, prior = RecordedSequence(given), position_prior(given)
     # GTSAM's sums may depend on its threads: only on one core do results repeat bit by bit.
     unpin = pin(os.getpid())
     try:

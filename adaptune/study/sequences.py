@@ -11,7 +11,12 @@ from adaptune.odometry.program import ProgramInput, program_input
 from adaptune.recording.cache import fingerprints
 from adaptune.recording.config import REFERENCE_FILES, SequenceConfig, ViewConfig
 from adaptune.recording.export import Layout
-from adaptune.recording.opening import SequenceFiles, open_sequence, sequence_files, wants_estimate
+from adaptune.recording.recording import (
+    SequenceFiles,
+    open_sequence,
+    sequence_files,
+    wants_estimate,
+)
 from adaptune.recording.scan import OF_VIEW, Recording, origin, part_name
 from adaptune.recording.views import WithImu
 from adaptune.reference.stored import BREAK, EstimateError, StoredEstimate

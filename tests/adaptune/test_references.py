@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from adaptune.recording.config import ImuConfig, SequenceConfig
-from adaptune.recording.opening import open_sequence, wants_estimate
+from adaptune.recording.recording import open_sequence, wants_estimate
 from adaptune.reference.stored import EstimateError
 from adaptune.strict import ConfigurationError
 from adaptune.study.references import ensure_references, estimates_as_data, estimates_in_words

@@ -186,6 +186,6 @@ def test_views_are_trained_on_beside_their_origin(gicp_study_file, tmp_path):
 
 
 def test_a_view_that_cannot_be_is_told(study_file, tmp_path):
-    study = load_study(study_file, ["offline.augment=[{rings: 2}]"], tmp_path / "study")
-    with pytest.raises(AdaptuneError, match=r"its points have no ring"):
+    study = load_study(study_file, ["offline.augment=[{cut: [[100, 200]]}]"], tmp_path / "study")
+    with pytest.raises(AdaptuneError, match=r"its views leave no scan"):
         train(study)

@@ -5,8 +5,8 @@ import local_link
 import numpy as np
 import pytest
 
-from adaptune.recording.recording import ImuSettings
-from adaptune.recording.scan import USUAL, Timing
+from adaptune.recording.config import ImuConfig
+from adaptune.recording.scan import Timing
 from online import live
 from online.live import LiveScans
 
@@ -113,7 +113,7 @@ def test_a_topic_that_falls_silent_and_comes_back(link, caplog, monkeypatch):
 
 def test_scans_bring_along_what_the_imu_measured(link, monkeypatch):
     monkeypatch.setattr(live, "IMU_WAIT", 0.01)
-    settings = ImuSettings("/imu", None, 2.0, USUAL)
+    settings = ImuConfig(topic="/imu", unit="g")
     scans = topic(link, imu=settings)
     for i in range(-50, 250):
         link.play("/imu", local_link.imu(START + i * 10**6, rate=float(i)))
@@ -128,12 +128,12 @@ def test_scans_bring_along_what_the_imu_measured(link, monkeypatch):
     assert rates[0][-1] == 0.0
     assert rates[1] == list(range(1, 101))
     assert rates[2] == list(range(101, 201))
-    assert found[1].acceleration[0, 2] == pytest.approx(2.0 * 9.81)
+    assert found[1].acceleration[0, 2] == pytest.approx(9.80665 * 9.81)
 
 
 def test_an_imu_that_is_silent_does_not_hold_up_the_scans(link, monkeypatch):
     monkeypatch.setattr(live, "IMU_WAIT", 0.01)
-    scans = topic(link, imu=ImuSettings("/imu", None, 1.0, USUAL))
+    scans = topic(link, imu=ImuConfig(topic="/imu"))
     play(link, range(2))
     for i, arrival in enumerate(scans.arrivals()):
         assert len(arrival.scan.imu) == 0

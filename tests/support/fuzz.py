@@ -30,7 +30,7 @@ from adaptune.recording import Scan, SequenceConfig, clouds
 from adaptune.recording.clouds import PointCloudError
 from adaptune.recording.export import Messages
 from adaptune.recording.inspect import inspect, render_inspection
-from adaptune.recording.opening import open_sequence
+from adaptune.recording.recording import open_sequence
 from adaptune.recording.scan import AUTO
 from offline.config import load_study
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from adaptune.recording.config import SequenceConfig
-from adaptune.recording.opening import open_sequence
+from adaptune.recording.recording import open_sequence
 from adaptune.reference.stored import EstimatedReference, Registrations
 
 

@@ -26,7 +26,7 @@ from rosbags.typesys.store import Typestore
 
 from adaptune.errors import AdaptuneError, OdometryError, UnavailableError
 from adaptune.files import temporary_prefix
-from adaptune.geometry import Poses, invert, rectify
+from adaptune.geometry import Poses, invert, rectify, to_pose
 from adaptune.odometry.base import (
     Description,
     Faulting,
@@ -47,7 +47,7 @@ from adaptune.odometry.program import ProgramInput, WholeRun, WholeSettings
 from adaptune.odometry.remote import Limits
 from adaptune.odometry.template import Template, check_names
 from adaptune.recording.clouds import PATH, POSES, Pose, usable
-from adaptune.recording.config import resolve, to_pose
+from adaptune.recording.config import resolve
 from adaptune.recording.export import IMU, POINTS, Messages, structured
 from adaptune.recording.scan import Scan
 from adaptune.ros.link import LinkError, Steering

@@ -9,8 +9,7 @@ import pytest
 
 from adaptune.commands import terminal
 from adaptune.recording.config import SequenceConfig
-from adaptune.recording.opening import open_sequence
-from adaptune.recording.recording import RecordedSequence
+from adaptune.recording.recording import RecordedSequence, open_sequence
 from adaptune.recording.scan import SequenceError
 from adaptune.reference import estimate
 from adaptune.reference.stored import EstimateError, StoredEstimate, write_estimate

@@ -11,7 +11,7 @@ from adaptune.odometry.keyframe import KeyframeGicp
 from adaptune.odometry.program import contradiction
 from adaptune.odometry.tracker import HealthCheck, Tracker
 from adaptune.recording.config import SequenceConfig
-from adaptune.recording.opening import open_sequence
+from adaptune.recording.recording import open_sequence
 
 N = 400
 

@@ -8,7 +8,7 @@ import pytest
 from adaptune.errors import AdaptuneError
 from adaptune.recording import SequenceConfig, SequenceError
 from adaptune.recording.clouds import LIVOX_TYPES
-from adaptune.recording.opening import open_sequence
+from adaptune.recording.recording import open_sequence
 
 
 def opened(path: Path | list[Path], **options: Any) -> Any:

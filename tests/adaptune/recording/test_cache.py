@@ -11,7 +11,7 @@ import pytest
 
 from adaptune.recording import SequenceConfig, cache
 from adaptune.recording.bag import BagSource
-from adaptune.recording.opening import open_sequence
+from adaptune.recording.recording import open_sequence
 from adaptune.recording.scan import Scan
 
 

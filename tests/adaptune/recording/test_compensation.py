@@ -7,9 +7,13 @@ from scipy.spatial.transform import Rotation
 
 from adaptune import geometry
 from adaptune.recording import Imu, Scan, SequenceConfig, SequenceError
-from adaptune.recording.opening import open_sequence
-from adaptune.recording.recording import compensate, compensate_neighbours, compensate_rotation
-from adaptune.recording.scan import clock_offset
+from adaptune.recording.compensation import (
+    clock_offset,
+    compensate,
+    compensate_neighbours,
+    compensate_rotation,
+)
+from adaptune.recording.recording import open_sequence
 from adaptune.trajectory import Trajectory
 
 RATE = np.array([0.3, -0.2, 1.5])

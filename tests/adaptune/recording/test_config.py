@@ -7,9 +7,9 @@ import pytest
 from pydantic import ValidationError
 
 from adaptune import files
+from adaptune.geometry import to_pose
 from adaptune.recording import SequenceConfig, SequenceError
-from adaptune.recording.config import to_pose
-from adaptune.recording.opening import check_sequence, open_sequence
+from adaptune.recording.recording import check_sequence, open_sequence
 from adaptune.strict import ConfigurationError
 from adaptune.trajectory import Trajectory, write_kitti, write_tum
 from offline.config import load_study

@@ -7,7 +7,7 @@ import pytest
 
 from adaptune.recording import SequenceConfig, SequenceError
 from adaptune.recording.evalio import EvalioFiles
-from adaptune.recording.opening import open_sequence
+from adaptune.recording.recording import open_sequence
 
 
 def test_without_evalio_the_error_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,7 +4,7 @@ import turns
 
 from adaptune.recording import Imu, Scan, SequenceConfig
 from adaptune.recording.export import export
-from adaptune.recording.opening import open_sequence
+from adaptune.recording.recording import open_sequence
 
 FIRST = 1_700_000_000_123_456_000
 

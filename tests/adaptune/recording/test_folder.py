@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from adaptune import files, geometry
 from adaptune.recording import SequenceConfig, SequenceError
 from adaptune.recording.folder import turn_up
-from adaptune.recording.opening import open_sequence
+from adaptune.recording.recording import open_sequence
 from adaptune.trajectory import write_kitti
 
 

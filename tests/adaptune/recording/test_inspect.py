@@ -12,7 +12,7 @@ from adaptune import files
 from adaptune.commands.cli import app
 from adaptune.recording import SequenceConfig, SequenceError
 from adaptune.recording.inspect import draw_inspection, inspect
-from adaptune.recording.opening import open_sequence
+from adaptune.recording.recording import open_sequence
 from offline.config import load_study
 
 

@@ -7,7 +7,7 @@ from pydantic import ValidationError
 
 from adaptune.odometry.program import program_input
 from adaptune.recording import SequenceConfig
-from adaptune.recording.opening import check_sequence, open_sequence
+from adaptune.recording.recording import check_sequence, open_sequence
 from adaptune.recording.scan import part_name, read_part
 
 

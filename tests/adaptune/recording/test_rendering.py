@@ -7,7 +7,7 @@ from small_bag import START, cloud, drive, write
 
 from adaptune.recording import SequenceConfig
 from adaptune.recording.inspect import draw_inspection, inspect, render_cache
-from adaptune.recording.opening import open_sequence
+from adaptune.recording.recording import open_sequence
 
 
 @pytest.fixture(autouse=True)

@@ -14,7 +14,7 @@ from small_bag import START, bad_cloud, cloud, pose, write
 
 from adaptune.recording import survey
 from adaptune.recording.inspect import inspect
-from adaptune.recording.opening import open_sequence
+from adaptune.recording.recording import open_sequence
 
 
 @pytest.fixture

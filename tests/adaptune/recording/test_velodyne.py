@@ -6,7 +6,7 @@ import pytest
 from rosbags.typesys import get_types_from_msg
 
 from adaptune.recording import SequenceConfig, SequenceError, bag, clouds
-from adaptune.recording.opening import open_sequence
+from adaptune.recording.recording import open_sequence
 
 DEFINITIONS = {
     "velodyne_msgs/msg/VelodynePacket": "time stamp\nuint8[1206] data\n",

@@ -7,7 +7,7 @@ from rosbags.highlevel import AnyReader
 
 from adaptune.geometry import invert, rotation_angle, steps
 from adaptune.recording.config import SequenceConfig
-from adaptune.recording.opening import open_sequence
+from adaptune.recording.recording import open_sequence
 from adaptune.simulation import Course, SimulationError
 from adaptune.simulation.record import Drive, record, simulate, undistort
 from adaptune.trajectory import read_kitti, read_tum
