@@ -4,8 +4,9 @@ import shutil
 import numpy as np
 import pytest
 
-from adaptune.recording import SequenceConfig, cache, recording
+from adaptune.recording import SequenceConfig, cache
 from adaptune.recording.cache import FingerprintError, alongside, fingerprints
+from adaptune.recording.recording import open_sequence, sequence_files
 
 
 @pytest.fixture(autouse=True)
@@ -98,7 +99,7 @@ def test_what_cannot_be_read_is_named(tmp_path):
 
 def test_a_bag_is_hashed_while_it_is_decoded(rec, tmp_path, hashed, monkeypatch):
     config = SequenceConfig(bag=str(rec.drive(tmp_path / "a.bag")))
-    for _ in recording.open_sequence(config):
+    for _ in open_sequence(config):
         pass
     assert hashed == ["a.bag"]
     forget(monkeypatch)
@@ -117,10 +118,10 @@ def test_a_pass_that_ends_early_leaves_no_thread(tmp_path, hashed):
 @pytest.mark.parametrize("small", [1, 1 << 24])
 def test_a_decoded_bag_is_that_of_its_content(rec, tmp_path, monkeypatch, small):
     """Also if another one of the same size and time takes its place."""
-    monkeypatch.setattr(recording.cache, "SMALL", small)
+    monkeypatch.setattr(cache, "SMALL", small)
     path = rec.drive(tmp_path / "a.bag", n=300)
     config = SequenceConfig(bag=str(path))
-    before = [scan.points for scan in recording.open_sequence(config)]
+    before = [scan.points for scan in open_sequence(config)]
     data, times = bytearray(path.read_bytes()), (path.stat().st_atime_ns, path.stat().st_mtime_ns)
     at = data.find(before[150][50].tobytes())
     data[at : at + 12] = np.float32([1, 2, 3]).tobytes()
@@ -130,7 +131,7 @@ def test_a_decoded_bag_is_that_of_its_content(rec, tmp_path, monkeypatch, small)
     copy.write_bytes(data)
     shutil.copyfile(copy, path)
     os.utime(path, ns=times)
-    after = [scan.points for scan in recording.open_sequence(config)]
+    after = [scan.points for scan in open_sequence(config)]
     assert (before[150] != after[150]).any()
 
 
@@ -154,6 +155,6 @@ def test_a_source_names_its_files(rec, tmp_path, kind):
             write(tmp_path / name, b"0\n")
         config = SequenceConfig(kitti=str(tmp_path))
         recording, reference = ["000000.bin", "times.txt"], ["poses.txt", "calib.txt"]
-    files = recording.sequence_files(config)
+    files = sequence_files(config)
     assert [file.name for file in files.recording] == recording
     assert [file.name for file in files.reference] == reference
