@@ -197,7 +197,7 @@ def scatter_chart(
         f"Each point is a trial; its colour is its error, and each panel has colours of its own; "
         f"they end at {_COLOURED:g} times the least error there. "
         "Where the good region lies elsewhere from panel to panel, adapting can gain." + more,
-        columns=min(3, len(panels)),
+        columns=2 if len(panels) in (2, 4) else min(3, len(panels)),
     )
 
 

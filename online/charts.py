@@ -387,7 +387,7 @@ def familiarity_chart(replayed: ReplayedSequence) -> Chart | None:
             if np.isfinite(of).any()
         )
         if points:
-            x = Axis("familiarity [-]", limits=(0.0, 1.02))
+            x = Axis("familiarity [-]", limits=(-0.02, 1.02))
             panels.append(Panel(x, Axis(_RATIO, log=True), (*points, Mark(1.0))))
     return Chart(
         f"{replayed.name}-familiarity",
@@ -624,7 +624,7 @@ def _estimates(mode: str, track: ModeReplay, replayed: ReplayedSequence) -> Pane
         Band(seconds, low, high, "95 % interval"),
         Line(seconds, estimated, "measured while driving"),
     ]
-    y = Axis(f"RTE over {replayed.length:g} m, last 30 s [%]", log=True)
+    y = Axis(f"RTE over {replayed.length:g} m,\nlast 30 s [%]", log=True)
     return Panel(TIME, y, tuple(drawn), f"{mode}: its error as measured while driving")
 
 

@@ -74,8 +74,8 @@ _UNKNOWN = "#bbbbbb"
 """Colour of points without a number where colours say numbers."""
 _MOST, _MOST_FAINT = 1500, 500
 """Most points of a line that are drawn."""
-_MANY = 1000
-"""Points from which on they are small."""
+_MANY, _OUTLINED = 1000, 150
+"""Points from which on they are small, and up to which they have outlines."""
 
 
 def looks(chart: Chart) -> dict[str, Look]:
@@ -283,7 +283,7 @@ def _beside(panel: Panel) -> float:
         isinstance(item, Cloud) or (isinstance(item, Points) and item.colour is not None)
         for item in panel.drawn
     )
-    return 44.0 + max(22.0, _LETTER * max(map(len, names), default=0)) + 90.0 * bar
+    return 44.0 + max(22.0, _LETTER * max(map(len, names), default=0)) + 110.0 * bar
 
 
 def _coordinates(panel: Panel) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64]]]:
@@ -329,12 +329,15 @@ def _extent(panel: Panel, which: Literal["x", "y"]) -> tuple[float, float]:
     if not len(values):
         return 1.0, 10.0
     low, high = float(values.min()), float(values.max())
-    share = 0.01 if which == "x" else 0.06
+    # A line may begin at the edge; points are not cut.
+    marked = any(isinstance(item, Points) and not item.faint for item in panel.drawn)
+    share = 0.06 if which == "y" else 0.03 if marked else 0.01
     if axis.log:
         beyond = max((high / low) ** share, 1.0 + share)
         return low / beyond, high * beyond
     beyond = share * (high - low) or 0.1 * abs(high) or 1.0
-    return (low if low == 0.0 < high else low - beyond), high + beyond
+    begins = low == 0.0 < high and not (which == "x" and marked)
+    return (low if begins else low - beyond), high + beyond
 
 
 def _equal(extent: _Extent, width: int, most: float) -> tuple[_Extent, int]:
@@ -458,7 +461,7 @@ class _Drawing:
             mark |= {"size": 12, "opacity": 0.7}
         if points.faint:
             mark |= {"opacity": 0.35}
-        if not many and not points.faint:
+        if len(x) <= _OUTLINED and not points.faint:
             mark |= _OUTLINE
         columns: dict[str, Any] = {"x": x, "y": y}
         tips: list[Spec] = [
@@ -484,7 +487,7 @@ class _Drawing:
             yield self._drawn(mark, columns, tooltip=tips, color=bar)
 
     def _colour_bar(self, words: str, limits: tuple[float, float], log: bool) -> Spec:
-        legend: Spec = {"title": wrapped(words, 12), "gradientOpacity": 1.0}
+        legend: Spec = {"title": wrapped(words, 16), "gradientOpacity": 1.0}
         legend["gradientLength"] = min(self._height - 40, 220)
         legend |= {"values": ticks(*limits), "format": "~r"} if log else {"tickCount": 5}
         scale = {"type": "log" if log else "linear", "domain": limits, "range": _MAP}

@@ -143,23 +143,19 @@ def latex(listing: Listing, label: str) -> str:
     for row in cells:
         texts = [rf"\textbf{{{_escaped(text)}}}" if bold else _escaped(text) for text, bold in row]
         lines.append(" & ".join(texts) + r" \\")
-    return "\n".join(
-        [
-            r"\begin{table}",
-            r"\centering",
-            rf"\caption{{{_escaped(listing.title)}. {_escaped(listing.caption)}}}".replace(
-                ". }", "}"
-            ),
-            rf"\label{{tab:{label}}}",
-            rf"\begin{{tabular}}{{l{'r' * (len(keys) - 1)}}}",
-            r"\toprule",
-            *lines,
-            r"\bottomrule",
-            r"\end{tabular}",
-            r"\end{table}",
-            "",
-        ]
-    )
+    caption = _escaped(f"{listing.title}. {listing.caption}").removesuffix(". ")
+    rows = "\n".join(lines)
+    return rf"""\begin{{table}}
+\centering
+\caption{{{caption}}}
+\label{{tab:{label}}}
+\begin{{tabular}}{{l{"r" * (len(keys) - 1)}}}
+\toprule
+{rows}
+\bottomrule
+\end{{tabular}}
+\end{{table}}
+"""
 
 
 def _printed(listing: Listing) -> tuple[list[str], list[list[tuple[str, bool]]]]:
