@@ -233,7 +233,7 @@ class ReplayRecord:
         self._n += 1
         self.steps.append(step)
 
-    def finish(self, usage: Usage, elsewhere: float = 0.0) -> Self:
+    def finish(self, usage: Usage, other_cpu: float = 0.0) -> Self:
         """Sum up, with what the odometry used, and what else took CPU seconds.
 
         Raises
@@ -244,7 +244,7 @@ class ReplayRecord:
         if not self._n:
             raise AdaptuneError("there is no scan to replay; check start, stop and views")
         self.seconds = time.perf_counter() - self._started
-        self.cpu_ms = 1e3 * (self._cpu + usage.elsewhere + elsewhere) / self._n
+        self.cpu_ms = 1e3 * (self._cpu + usage.other_cpu + other_cpu) / self._n
         self.memory += usage.memory or 0.0
         return self
 

@@ -55,7 +55,7 @@ class Usage(NamedTuple):
     cpu: float  # seconds of CPU time
     memory: float | None  # peak megabytes of its own processes; None if it shares this process
     seconds: float | None = None  # a scan, if it runs apart from its calls; None if within them
-    elsewhere: float = 0.0  # of `cpu`, seconds in other processes
+    other_cpu: float = 0.0  # of `cpu`, seconds in other processes
 
     @classmethod
     def total(cls, usages: Iterable["Usage"], memory: Callable[[list[float]], float]) -> "Usage":
@@ -63,8 +63,8 @@ class Usage(NamedTuple):
         every = list(usages)
         known = [usage.memory for usage in every if usage.memory is not None]
         peak = memory(known) if known else None
-        cpu, elsewhere = sum(one.cpu for one in every), sum(one.elsewhere for one in every)
-        return cls(cpu, peak, elsewhere=elsewhere)
+        cpu, other = sum(one.cpu for one in every), sum(one.other_cpu for one in every)
+        return cls(cpu, peak, other_cpu=other)
 
 
 class Motions(NamedTuple):

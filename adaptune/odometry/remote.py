@@ -122,7 +122,7 @@ class Isolated(Faulting):
 
     @property
     def usage(self) -> Usage:
-        return Usage(self._cpu, self._memory, elsewhere=self._cpu)
+        return Usage(self._cpu, self._memory, other_cpu=self._cpu)
 
     @property
     def busy(self) -> bool:

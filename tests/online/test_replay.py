@@ -282,7 +282,7 @@ def test_what_a_replay_costs_is_measured_without_reading(tmp_path):
             return super().register(prepared)
 
     class Elsewhere(InProcess):
-        usage = Usage(cpu=1.0, memory=1000.0, elsewhere=0.5)
+        usage = Usage(cpu=1.0, memory=1000.0, other_cpu=0.5)
 
     def reading(of):
         for scan in of:

@@ -188,7 +188,7 @@ class Lockstep(Faulting):
             self._look(self._system)
         cpu = self._used_before.cpu + self._used.cpu
         memory = max(self._used_before.memory or 0.0, self._used.memory or 0.0)
-        return Usage(cpu, memory, elsewhere=cpu)
+        return Usage(cpu, memory, other_cpu=cpu)
 
     def prepare(self, scan: Scan) -> Scan:
         return scan  # the system prepares

@@ -135,7 +135,7 @@ def test_usage_counts_the_process_once(scans):
     odometry = bank(2)
     run(odometry, scans[:10])
     used = odometry.usage
-    assert 0.0 < used.elsewhere < used.cpu
+    assert 0.0 < used.other_cpu < used.cpu
     assert 20.0 < used.memory < 5_000.0
 
 
