@@ -49,22 +49,19 @@ class Limit(StrictModel):
     max: float = Field(gt=0, le=1e9)
 
 
-def _rule(pruning: Any) -> Any:
-    if pruning in ("halving", "hyperband"):
-        raise ValueError(f"{pruning} is gone, for it never saved more than wilcoxon; give that")
-    return pruning
+_GONE = {
+    "halving": "wilcoxon, which saved more",
+    "hyperband": "wilcoxon, which saved more",
+    "both": "shared, or own",
+    "episodes": "restart, or whole",
+}
+"""Values of earlier versions, and what to give instead."""
 
 
-def _sets(sets: Any) -> Any:
-    if sets == "both":
-        raise ValueError("both is gone; give shared, or own")
-    return sets
-
-
-def _runs(runs: Any) -> Any:
-    if runs == "episodes":
-        raise ValueError("episodes is gone; give restart, or whole")
-    return runs
+def _present(value: Any) -> Any:
+    if isinstance(value, str) and value in _GONE:
+        raise ValueError(f"{value} is gone; give {_GONE[value]}")
+    return value
 
 
 class OfflineConfig(StrictModel):
@@ -72,7 +69,7 @@ class OfflineConfig(StrictModel):
 
     sampler: str = "tpe"
     sampler_settings: dict[str, Any] = Field(default_factory=dict)
-    sets: Annotated[Literal["shared", "own"], BeforeValidator(_sets)] = "shared"
+    sets: Annotated[Literal["shared", "own"], BeforeValidator(_present)] = "shared"
     trials: int | None = Field(None, ge=1, le=10**6)
     hours: float | None = Field(None, gt=0, le=1e5)
     stagnation: int | None = Field(None, ge=1, le=10**6)
@@ -84,11 +81,11 @@ class OfflineConfig(StrictModel):
         {"rte": 1.0},
     )
     limits: dict[Metric, Limit] = Field(default_factory=dict)
-    runs: Annotated[Literal["restart", "whole"], BeforeValidator(_runs)] = "restart"
+    runs: Annotated[Literal["restart", "whole"], BeforeValidator(_present)] = "restart"
     repeats: int = Field(1, ge=1, le=100)
     baseline_runs: int | None = Field(None, ge=1, le=1000)
     augment: Annotated[tuple[ViewConfig, ...], Field(max_length=MOST_VIEWS)] = ()
-    pruning: Annotated[Literal["none", "wilcoxon"], BeforeValidator(_rule)] = "none"
+    pruning: Annotated[Literal["none", "wilcoxon"], BeforeValidator(_present)] = "none"
 
     @model_validator(mode="after")
     def _check_pruning(self) -> Self:
