@@ -7,7 +7,6 @@ from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from adaptune.archive import Archive, Frames, Trial
 from adaptune.bank.agreement import LEVER, Agreement, share
@@ -237,6 +236,8 @@ class Extent(NamedTuple):
 
         A view counts frames in another way, and may be played backwards.
         """
+        from scipy.spatial import cKDTree  # slow to import
+
         path = cKDTree(left_out.positions)
         near = path.query(self.positions)[0] <= self.length
         if is_view:
@@ -268,6 +269,8 @@ def stretches_of_view(
 
     It is that of the recording's nearest frame: a view shares the recording's reference.
     """
+    from scipy.spatial import cKDTree
+
     return np.asarray(numbers[cKDTree(recording.positions).query(view.positions)[1]])
 
 
