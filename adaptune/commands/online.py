@@ -344,15 +344,16 @@ def _called(make: "Callable[[], PageSection]") -> "PageSection":
 
 def _comparison(study: "OfflineStudy", found: "ComparedReplays | str") -> "PageSection":
     from adaptune.report.page import PageSection
-    from online.charts import charts_of_comparison
+    from online.charts import comparison_chart
     from online.tables import modes_in_words, tables
 
     title = "What adapting gained"
     if isinstance(found, str):
         return PageSection(title, missing=(found,))
-    charts, notes = charts_of_comparison(found.rows)
+    chart = comparison_chart(found.rows)
+    missing = () if chart else ("No ratios of errors: no sequence has a reference.",)
     made = [*tables(found.rows, study.config.sub_trajectory), modes_in_words(found.rows)]
-    return PageSection(title, (), tuple(notes), tuple(charts), tuple(made))
+    return PageSection(title, (), missing, (chart,) if chart else (), tuple(made))
 
 
 def _along(study: "OfflineStudy", sequence: str) -> "PageSection":

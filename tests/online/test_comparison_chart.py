@@ -3,11 +3,12 @@ import pytest
 
 from adaptune.report.charts import Line, Points
 from online.charts import comparison_chart
+from online.statistics import ComparisonRow
 
 
 def row(sequence, mode, ratio, low=None, high=None, other="fixed"):
-    ends = {"ratio_low": low, "ratio_high": high}
-    return {"sequence": sequence, "mode": mode, f"vs {other}": ratio} | ends
+    ends = None if low is None else (low, high)
+    return ComparisonRow(sequence, mode, 1.0, ratio, 0, 0, 0, ratio_interval=ends, yardstick=other)
 
 
 ROWS = [
