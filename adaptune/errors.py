@@ -69,6 +69,7 @@ DELETED = {
     "online.switching.full_rate": _NO_HAND_OVER,
     "online.switching.stride": _NO_HAND_OVER,
     "health.max_acceleration": "is gone: 30 m/s^2 is the bound; leave it out",
+    "health.max_turn_rate": "is gone: 360 degrees a second are the bound; leave it out",
     "health.max_unregistered": "is gone: 10 scans in a row are the bound; leave it out",
     "offline.memory": "is gone: workers keep scans in a quarter of the machine's memory",
     "offline.preset": "is gone; for the paper's, give trials: 256, sets: own, runs: whole",

@@ -32,9 +32,6 @@ def inspect(
             show_default=False,
         ),
     ],
-    png: Annotated[
-        Path | None, typer.Option(help="Draw the first scan to this PNG or SVG.", dir_okay=False)
-    ] = None,
     deep: Annotated[bool, typer.Option("--deep", help="Read all messages, not a sample.")] = False,
 ) -> None:
     """Show what is in a recording, what each stage lacks, and how to name it in a study.
@@ -44,8 +41,8 @@ def inspect(
     if file.suffix == MODEL_SUFFIX or (file / f"model{MODEL_SUFFIX}").exists():
         _show_model(file)
         return
-    from adaptune.recording.inspect import draw_inspection, render_inspection
     from adaptune.recording.inspect import inspect as inspect_file
+    from adaptune.recording.inspect import render_inspection
 
     begin_work()
     measured, accuracy = None, "`--deep` also measures how wrong it is"
@@ -57,9 +54,6 @@ def inspect(
         found = inspect_file(file)
     console.print(render_inspection(found, accuracy), crop=False)
     _begin_study(found, measured)
-    if png is not None:  # last: the lines of the study are to be copied in one piece
-        draw_inspection(found, png)
-        say(f"First scan: {png}")
 
 
 def _show_model(file: Path) -> None:

@@ -47,8 +47,6 @@ class HealthCheck(StrictModel):
     ----------
     max_speed : float
         Metres a second.
-    max_turn_rate : float
-        Degrees a second.
     max_freeze : float
         Seconds for which the pose may stay where it is to the micrometre, after a step faster than
         half a metre a second. A robot slows down before it stops, and the noise of its scans moves
@@ -56,7 +54,6 @@ class HealthCheck(StrictModel):
     """
 
     max_speed: float = Field(40.0, gt=0, le=1e9)
-    max_turn_rate: float = Field(360.0, gt=0, le=1e9)
     max_freeze: float = Field(1.0, gt=0, le=1e9)
 
     # Metres a second squared, of the step's mean velocity against the last healthy one's; generous
@@ -64,6 +61,8 @@ class HealthCheck(StrictModel):
     # mean velocity over up to a second: what is taken back within it does not. In the first second
     # of a recording it does not count.
     max_acceleration: ClassVar[float] = 30.0
+    # Degrees a second.
+    max_turn_rate: ClassVar[float] = 360.0
     # Scans in a row that the odometry reports as not registered.
     max_unregistered: ClassVar[int] = 10
 

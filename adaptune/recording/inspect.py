@@ -22,8 +22,6 @@ from adaptune.recording.config import BAG_SUFFIXES, REFERENCE_FILES
 from adaptune.recording.recording import RecordedSequence, open_sequence
 from adaptune.recording.scan import TIME_FIELDS
 from adaptune.recording.survey import Fault, Parts, Reading, Survey, n_valid, survey
-from adaptune.report.charts import Axis, Chart, Cloud, Panel, Points
-from adaptune.report.drawing import draw_chart
 from adaptune.trajectory import Trajectory, is_kitti, read_kitti, read_trajectory
 
 Layout = tuple[tuple[str, str, int], ...]
@@ -357,7 +355,7 @@ def _entry(path: Path, given: dict[str, Any], found: Survey | None = None) -> st
     return text
 
 
-# Show an inspected recording, and the cache, on a terminal; draw a recording's first scan.
+# Show an inspected recording, and the cache, on a terminal.
 
 
 def render_inspection(inspection: Inspection, accuracy: str = "") -> RenderableType:
@@ -461,33 +459,6 @@ def _reference_text(reference: Trajectory, complete: bool) -> str:
     # Poses without stamps are numbered by nanoseconds.
     lasted = f" in {seconds:.1f} s" if seconds > 1e-3 else ""
     return f"{len(reference):,} {words}{length:.1f} m{lasted}"
-
-
-def draw_inspection(inspection: Inspection, path: Path) -> None:
-    """Draw the first scan from above and from the side, as SVG if the path says so, else as PNG.
-
-    A SequenceError says that there is none.
-    """
-    if inspection.scan is None:
-        raise SequenceError(f"{inspection.path}: no scan can be drawn, none could be read")
-    points = inspection.scan.scan.points
-    # Few far points would shrink all others to a dot.
-    reach = float(np.percentile(np.abs(points[:, :2]), 98)) if len(points) else 1.0
-    low, high = np.percentile(points[:, 2], (1, 99)).tolist() if len(points) else (0.0, 1.0)
-    margin = 0.1 * (high - low) + 0.5
-    x, y, z = points[np.argsort(points[:, 2])].T
-    look: Any = {"colour_label": "height z [m]", "colour_limits": (low, max(high, low + 0.1))}
-    lidar = Points([0.0], [0.0], "LiDAR", shape="cross")
-    x_axis, y_axis = (Axis(f"{name} [m]", limits=(-reach, reach)) for name in "xy")
-    z_axis = Axis("z [m]", limits=(low - margin, high + margin))
-    above, side = Cloud(x, y, z, **look), Cloud(x, z, z, **look)
-    panels = (
-        Panel(x_axis, y_axis, (above, lidar), "from above", equal=True, height=2.0),
-        Panel(x_axis, z_axis, (side, lidar), "from the side, z not to scale"),
-    )
-    text = f"{_scan_text(inspection.scan)}; drawn within {reach:.0f} m"
-    title = f"{inspection.path.name}, first scan: {text}"
-    draw_chart(Chart("scan", title, panels), path)
 
 
 def render_cache() -> RenderableType:

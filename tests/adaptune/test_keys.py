@@ -41,6 +41,16 @@ def complaints(key):
     return " ".join(mistake.message for mistake in mistakes)
 
 
+MOST_KEYS = 50
+"""Outside of odometries, sequences and courses."""
+
+
+def test_there_are_no_more_keys_than_a_reader_can_take_in():
+    names = [key.rstrip("=") for key in complete(OfflineStudyConfig, "")]
+    shared = [n for n in names if n.split(".")[0] not in ("odometry", "sequences", "courses")]
+    assert len(shared) <= MOST_KEYS, shared
+
+
 def test_all_keys_are_keys_of_a_study():
     names = [key.rstrip("=") for key in complete(OfflineStudyConfig, "")]
     assert {"sub_trajectory", "health.max_speed", "descriptor"} <= set(names)

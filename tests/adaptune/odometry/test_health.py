@@ -45,9 +45,9 @@ def test_healthy(velocity, last, elapsed, healthy):
 @pytest.mark.parametrize(
     ("degrees", "healthy"), [(0, True), (89, True), (91, False), (np.nan, False)]
 )
-def test_turning(degrees, healthy):
-    check = HealthCheck(max_turn_rate=90.0)
-    said = check.exceeded(np.zeros(3), np.zeros(3), 0.1, np.radians(degrees))
+def test_turning(degrees, healthy, monkeypatch):
+    monkeypatch.setattr(HealthCheck, "max_turn_rate", 90.0)
+    said = HealthCheck().exceeded(np.zeros(3), np.zeros(3), 0.1, np.radians(degrees))
     assert said == (None if healthy else "max_turn_rate")
 
 
@@ -87,7 +87,7 @@ def test_a_vehicle_in_a_town_is_healthy():
     "bounds",
     [
         {"max_speed": 0},
-        {"max_turn_rate": -1},
+        {"max_freeze": -1},
         {"max_jerk": 1},
         {"max_speed": "fast"},
     ],
