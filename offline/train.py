@@ -149,13 +149,7 @@ def train(
     config = study.config.offline
     if timed := " and ".join(sorted(config.metrics & set(TIMED))):
         _log.warning("%s differ from run to run: another run will not find the same sets", timed)
-    archive = study.archive(more={"offline": study.config.search_inputs})
-    if archive.renew(study.training):
-        # The search is told again what has been run; where nothing has, its time begins anew.
-        elapsed = () if archive.sets() else study.folder.glob("elapsed*.json")
-        for path in (*study.folder.glob("optuna.log*"), *elapsed):
-            path.unlink()
-    archive.tidy()
+    archive = _renewed_archive(study)
     names, space = study.training, study.odometry.space
     with trial_workers(study, names, cluster) as workers:
         run_baseline(study, archive, workers, progress)
@@ -189,6 +183,18 @@ def train(
     said += baseline_words(config, [trials[0] for trials in finished.values()])
     means = {name: _means(trials, verdicts) for name, trials in finished.items()}
     return Training(model, means, fixed, rows, remark, said)
+
+
+def _renewed_archive(study: OfflineStudy) -> Archive:
+    """The archive, without trials of other inputs than now."""
+    archive = study.archive(more={"offline": study.config.search_inputs})
+    if archive.renew(study.training):
+        # The search is told again what has been run; where nothing has, its time begins anew.
+        elapsed = () if archive.sets() else study.folder.glob("elapsed*.json")
+        for path in (*study.folder.glob("optuna.log*"), *elapsed):
+            path.unlink()
+    archive.tidy()
+    return archive
 
 
 def _means(trials: Mapping[int, Summary], numbers: Iterable[int]) -> list[float]:
