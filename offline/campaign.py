@@ -14,7 +14,7 @@ from adaptune.odometry.base import MOST_FAULTS
 from adaptune.odometry.program import contradiction
 from adaptune.odometry.tracker import HealthCheck
 from adaptune.progress import Progress, unseen
-from adaptune.space import ParameterSet, ParameterSpace, PooledSpace
+from adaptune.space import ParameterSet, PooledSpace
 from offline.config import OfflineConfig, OfflineStudy
 from offline.objective import Verdict, best_by_trials, judge, label, mean_value, weighted
 from offline.search import Clock, Finished, Search, assess, make_searches, rungs
@@ -382,10 +382,18 @@ def run_baseline(
     BaselineError
         If one fails on one of them.
     """
-    baselines = _by_label(study.odometry.name, study.odometry.space)
-    labels = list(baselines)
+    space, health = study.odometry.space, study.config.health
+    # What the study calls its odometries, in the order of their baselines' trials.
+    labels = list(space.spaces) if isinstance(space, PooledSpace) else [study.odometry.name]
+    tasks: list[Task] = []
+    for name in study.training:
+        # The first task of a sequence returns its frames, if they are lacking.
+        frames = not archive.has_frames(name, study.config.descriptor)
+        for number, parameters in enumerate(space.baselines):
+            if whole_run(archive, name, number, health) is None:
+                tasks.append(Task(name, (number,), (parameters,), True, frames))
+                frames = False
     done = []
-    tasks = _baseline_tasks(study, archive, baselines)
     for task, result, _ in watched(workers, tasks, "baseline", progress):
         check_baseline(labels[task.numbers[0]], task.sequence, result.trials[0])
         done.append((task, result))
@@ -404,27 +412,6 @@ def run_baseline(
                 task.sequence,
                 what,
             )
-
-
-def _by_label(name: str, space: ParameterSpace) -> dict[str, ParameterSet]:
-    """The baselines by what the study calls their odometries, in the order of their trials."""
-    if isinstance(space, PooledSpace):
-        return dict(zip(space.spaces, space.baselines, strict=True))
-    return {name: space.baseline}
-
-
-def _baseline_tasks(
-    study: OfflineStudy, archive: Archive, baselines: Mapping[str, ParameterSet]
-) -> list[Task]:
-    """The whole runs that are lacking; the first of a sequence returns its frames, if they are."""
-    tasks: list[Task] = []
-    for name in study.training:
-        frames = not archive.has_frames(name, study.config.descriptor)
-        for number, parameters in enumerate(baselines.values()):
-            if whole_run(archive, name, number, study.config.health) is None:
-                tasks.append(Task(name, (number,), (parameters,), True, frames))
-                frames = False
-    return tasks
 
 
 def check_baseline(odometry: str, sequence: str, run: Trial) -> None:
