@@ -629,10 +629,6 @@ class _Timed:
         return data
 
 
-if __name__ == "__main__":
-    main(socket.socket(fileno=int(sys.argv[1])), float(sys.argv[2]), sys.argv[3], sys.argv[4])
-
-
 # Which cores a process may use.
 
 
@@ -795,3 +791,7 @@ def processes(most: int, preload: Sequence[str] = ()) -> Iterator[Executor]:
 def _ignore_interrupts() -> None:
     # Ctrl-C reaches all processes; the first of them decides what happens.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+if __name__ == "__main__":
+    main(socket.socket(fileno=int(sys.argv[1])), float(sys.argv[2]), sys.argv[3], sys.argv[4])

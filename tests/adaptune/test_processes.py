@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from wicked import IMPORTS, gone
 
-from adaptune import processes as hosting
-from adaptune.commands.tools import show
+from adaptune import processes
+from adaptune.commands.tools import inspect
+from adaptune.errors import AdaptuneError
 from adaptune.model import ModelError
 from adaptune.model.error_model import ErrorModel
 from adaptune.odometry.factory import OdometryFactory
@@ -32,7 +33,7 @@ NAMED = {
 def mine(tmp_path, monkeypatch):
     """Write modules that a study can name."""
     monkeypatch.syspath_prepend(str(tmp_path))
-    hosting.server.cache_clear()
+    processes.server.cache_clear()
 
     def write(name, text):
         (tmp_path / f"{name}.py").write_text(text)
@@ -48,7 +49,7 @@ def test_an_import_that_goes_wrong_is_one_error(mine, monkeypatch, study_file, f
     text, words = IMPORTS[fault]
     mine("wicked_one", text)
     if fault == "sleep":
-        monkeypatch.setattr(hosting, "IMPORT_SECONDS", 1.0)
+        monkeypatch.setattr(processes, "IMPORT_SECONDS", 1.0)
     with pytest.raises(ConfigurationError, match=f"wicked_one:It: .*{words}"):
         load_study(study_file, NAMED[kind])
     assert "wicked_one" not in sys.modules
@@ -120,7 +121,7 @@ def test_the_driver_imports_no_code_of_the_user_s(mine, study_file, tmp_path, ca
 
     # Another study does not name the descriptor: nothing of it is used.
     (tmp_path / "imported").unlink()
-    hosting.server.cache_clear()
+    processes.server.cache_clear()
     with pytest.raises(ModelError, match="the model: uses the descriptor 'users_own:described'"):
         Selector(model)
     assert Selector(model, descriptors=["users_own:described"]).fixed == model.fixed
@@ -128,7 +129,7 @@ def test_the_driver_imports_no_code_of_the_user_s(mine, study_file, tmp_path, ca
     (tmp_path / "imported").unlink()
     with pytest.raises(ModelError, match=r"model\.safetensors: uses the descriptor 'users_own:des"):
         run_replays(other, study.model_path)
-    show(study.model_path)
+    inspect(study.model_path)
     assert "users_own:described" in capsys.readouterr().out
     ErrorModel.load(study.model_path)
     assert not (tmp_path / "imported").exists()
@@ -146,11 +147,11 @@ def test_mistakes_in_the_settings_of_a_user_s_class(mine, study_file):
             load_study(study_file, [*base, given])
 
 
-def wait_until_gone(processes, seconds=10.0):
+def wait_until_gone(pids, seconds=10.0):
     end = time.monotonic() + seconds
-    while not all(map(gone, processes)) and time.monotonic() < end:
+    while not all(map(gone, pids)) and time.monotonic() < end:
         time.sleep(0.02)
-    assert [process for process in processes if not gone(process)] == []
+    assert [process for process in pids if not gone(process)] == []
 
 
 # A child in the program's own session, and one that leaves it.
@@ -160,37 +161,37 @@ LEAVES = "sleep 1000 & echo $!; setsid sleep 1000 & echo $!; echo $$; "
 def begin(tmp_path, then):
     """A program that leaves children, and the processes that it has started."""
     with (tmp_path / "output").open("wb+") as output:
-        program = hosting.Program(["sh", "-c", LEAVES + then], 4.0, stdout=output)
-        while len(processes := (tmp_path / "output").read_text().split()) < 3:
+        program = processes.Program(["sh", "-c", LEAVES + then], 4.0, stdout=output)
+        while len(pids := (tmp_path / "output").read_text().split()) < 3:
             time.sleep(0.01)
-    return program, processes
+    return program, pids
 
 
 def test_what_a_program_has_started_ends_with_it(tmp_path):
-    program, processes = begin(tmp_path, "sleep 0.2; exit 7")
+    program, pids = begin(tmp_path, "sleep 0.2; exit 7")
     assert program.wait(10.0).code == 7
-    wait_until_gone(processes)
+    wait_until_gone(pids)
     program.close()
-    of_its_group = hosting.Program(["sh", "-c", "kill -9 0"], 4.0)
+    of_its_group = processes.Program(["sh", "-c", "kill -9 0"], 4.0)
     assert of_its_group.wait(10.0).code == -signal.SIGKILL
     of_its_group.close()
-    for end in (hosting.Program.close, hosting.Program.end):
-        program, processes = begin(tmp_path, "wait")
+    for end in (processes.Program.close, processes.Program.end):
+        program, pids = begin(tmp_path, "wait")
         assert program.wait(0.05) is None
-        assert not any(map(gone, processes))
+        assert not any(map(gone, pids))
         end(program)
-        wait_until_gone(processes)
+        wait_until_gone(pids)
         program.close()
 
 
 DRIVER = """
 import sys, time
 import numpy as np
-from adaptune import processes as hosting
+from adaptune import processes
 from adaptune.odometry.base import BaseSettings
 from adaptune.odometry.remote import Isolated, Limits
 from adaptune.recording import Scan
-program = hosting.Program(["sh", "-c", {leaves!r} + "wait"], 4.0)
+program = processes.Program(["sh", "-c", {leaves!r} + "wait"], 4.0)
 odometry = Isolated("with_children:Mine", {{}}, BaseSettings(), Limits())
 odometry.start(Scan(0, np.zeros((5, 3), np.float32)), np.eye(4))
 time.sleep(60)
@@ -218,16 +219,16 @@ def test_what_a_driver_has_started_ends_when_it_is_killed(mine, tmp_path):
         text=True,
         env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
     )
-    processes = [driver.stdout.readline().strip() for _ in range(3)]
+    pids = [driver.stdout.readline().strip() for _ in range(3)]
     path = tmp_path / "children"
     end = time.monotonic() + 30.0
     while not (path.exists() and path.read_text().endswith("\n")) and time.monotonic() < end:
         time.sleep(0.02)
-    processes += path.read_text().split()
-    assert not any(map(gone, processes))
+    pids += path.read_text().split()
+    assert not any(map(gone, pids))
     driver.send_signal(signal.SIGKILL)
     driver.wait()
-    wait_until_gone(processes)
+    wait_until_gone(pids)
 
 
 def test_an_odometry_that_kills_its_group_costs_one_fault(mine, tmp_path):
@@ -268,9 +269,117 @@ os.read(running, 1)  # until both have ended; it takes no notice of how
 
 
 def test_a_program_is_measured_with_all_that_it_starts():
-    program = hosting.Program([sys.executable, "-c", BUSY], 4.0)
+    program = processes.Program([sys.executable, "-c", BUSY], 4.0)
     code, cpu, memory = program.wait(30.0)
     program.close()
     assert code == 0
     assert 0.6 <= cpu < 3.0
     assert 200.0 <= memory < 400.0
+
+
+# Which cores a process may use, and its memory.
+
+
+@pytest.fixture
+def allowed(monkeypatch):
+    """Cores of this process, of which a test may have as many as it likes."""
+    now = {2, 3, 5, 7}
+
+    def keep(_, some):
+        now.clear()
+        now.update(some)
+
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(now), raising=False)
+    monkeypatch.setattr(os, "sched_setaffinity", keep, raising=False)
+    return now
+
+
+def test_a_process_is_kept_on_one_core_until_that_is_undone(allowed):
+    unpin = processes.pin(6)
+    assert allowed == {5}
+    assert processes.available() == 1
+    unpin()
+    assert allowed == {2, 3, 5, 7}
+
+
+def test_others_get_one_core_after_the_other(allowed):
+    some = [processes.next_core() for _ in range(8)]
+    assert some[:4] == some[4:]
+    assert set(some) == allowed
+
+
+def test_others_get_the_rest_only_where_this_process_is_alone(allowed):
+    unpin = processes.pin(1, alone=True)
+    assert {processes.next_core() for _ in range(4)} == {2, 3, 5, 7}
+    unpin()
+    unpin = processes.pin(1)
+    assert {processes.next_core() for _ in range(4)} == allowed == {3}
+    unpin()
+
+
+def test_those_that_work_for_this_process_get_other_cores(allowed):
+    assert [processes.other_core(i) for i in range(4)] == [3, 5, 7, 3]
+    unpin = processes.pin(1, alone=True)
+    assert processes.together() == 4
+    assert [processes.other_core(i) for i in range(4)] == [2, 5, 7, 2]
+    unpin()
+    allowed.clear()
+    allowed.add(7)
+    assert [processes.other_core(i) for i in range(2)] == [7, 7]
+    assert processes.together() == 1
+
+
+def test_mapped_files_are_no_memory_of_the_process(tmp_path):
+    path = tmp_path / "mapped"
+    np.zeros(50_000_000, np.uint8).tofile(path)
+    mapped = np.memmap(path, np.uint8, "r")
+    before = processes.resident_megabytes()
+    assert mapped.sum() == 0  # now all of it is there
+    assert processes.resident_megabytes() < before + 20.0
+    held = np.ones(50_000_000, np.uint8)
+    assert processes.resident_megabytes() > before + 40.0
+    del held
+    processes.release_memory()
+    assert processes.resident_megabytes() < before + 20.0
+
+
+def test_processes_compute_and_say_what_went_wrong():
+    with processes.processes(2) as pool:
+        assert list(pool.map(divmod, (7, 9), (2, 4))) == [(3, 1), (2, 1)]
+        with pytest.raises(ZeroDivisionError):
+            list(pool.map(divmod, (7, 9), (0, 4)))
+
+
+def test_a_process_that_is_killed_is_told():
+    with pytest.raises(AdaptuneError, match="was the memory full"), processes.processes(1) as pool:
+        pool.submit(os._exit, 1).result()
+
+
+HOLES = """
+import contextlib, sys
+import numpy as np
+from adaptune import processes as cores
+before = cores.resident_megabytes()
+np.ones(2**21)  # once it is free, the C library keeps arrays of this size
+large, small = [], []
+with cores.apart() if sys.argv[1] == "apart" else contextlib.nullcontext():
+    if sys.argv[1] == "apart":
+        with cores.apart():
+            pass  # the outer block goes on
+    for _ in range(50):
+        large.append(np.ones(2**18))
+        small.append(np.ones(2**10))
+large.clear()
+print(cores.resident_megabytes() - before)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="no glibc")
+def test_large_arrays_among_small_ones_leave_no_holes():
+    def kept(what):
+        """Megabytes that a process keeps of 105 that are free."""
+        command = [sys.executable, "-c", HOLES, what]
+        return float(subprocess.run(command, capture_output=True, check=True, text=True).stdout)
+
+    assert kept("as ever") > 50.0
+    assert kept("apart") < 10.0
