@@ -13,6 +13,7 @@ from adaptune.metrics import MIN_BLOCKS, RESAMPLES, resampled_means, worst_tenth
 from adaptune.model import ErrorModel
 from adaptune.report import tables as report
 from adaptune.study.config import ALSO
+from adaptune.study.sequences import StudySequences
 from adaptune.study.study import (
     EQUAL_COST,
     MIN_RECORDINGS,
@@ -70,14 +71,14 @@ class ComparedModes(NamedTuple):
 
     def words(self, study: Study) -> list[str]:
         """Sentences about what is not shown because it is missing."""
-        said = []
+        said, replays, asked = [], study.folder / "replays", study.config.online.also
         if self.unfinished:
             there = [m for m in self.modes if m not in ALSO or self.modes == WITHOUT_MODEL]
             lacking = (
-                f"{name} ({', '.join(f'`{m}`' for m in there if not _is_there(study, name, m))})"
+                f"{name} ({', '.join(f'`{m}`' for m in there if not _is_there(replays, name, m))})"
                 for name in self.unfinished
             )
-            command = replayed_by(study, UNTRAINED if self.modes == WITHOUT_MODEL else "fixed")
+            command = replayed_by(asked, UNTRAINED if self.modes == WITHOUT_MODEL else "fixed")
             said.append(
                 f"Not compared, because replays are missing: {', '.join(lacking)}; "
                 f"{command} makes them."
@@ -89,7 +90,7 @@ class ComparedModes(NamedTuple):
             are = "are" if len(modes) > 1 else "is"
             each = " and ".join(f"`{mode}`" for mode in modes)
             on = "any sequence" if names == self.sequences else " and ".join(names)
-            command = " or ".join(dict.fromkeys(replayed_by(study, mode) for mode in modes))
+            command = " or ".join(dict.fromkeys(replayed_by(asked, mode) for mode in modes))
             said.append(
                 f"{each} {are} not compared: there is no replay on {on}; {command} makes what "
                 f"is missing."
@@ -97,9 +98,9 @@ class ComparedModes(NamedTuple):
         return said
 
 
-def replayed_by(study: Study, mode: str) -> str:
-    """The command that replays a mode, as `adaptune online --thorough`."""
-    on_demand = mode in ALSO and mode not in study.config.online.also
+def replayed_by(asked: Sequence[str], mode: str) -> str:
+    """The command that replays a mode, given those on demand that the study asks for."""
+    on_demand = mode in ALSO and mode not in asked
     option = "--untrained" if mode == UNTRAINED else "--thorough"
     return f"`adaptune online{f' {option}' if on_demand else ''}`"
 
@@ -112,25 +113,26 @@ def compared_modes(study: Study) -> ComparedModes:
     StoredReplayError
         If the fixed set was replayed on none of them, and baseline and untrained bank not on all.
     """
-    setup = ReplaySetup.of(study)
+    setup, replays = ReplaySetup.of(study), study.folder / "replays"
     names, without_model = study.config.test, sequences_without_model(study.config)
     of_model = [mode for mode in MODES if mode not in WITHOUT_MODEL]
-    if not _any(study, names, of_model) and _any(study, without_model, [UNTRAINED]):
-        made, unfinished = _finished(study, without_model, WITHOUT_MODEL)
+    if not _any(replays, names, of_model) and _any(replays, without_model, [UNTRAINED]):
+        made, unfinished = _finished(replays, without_model, WITHOUT_MODEL)
         if made:
             return ComparedModes(made, WITHOUT_MODEL, {}, unfinished)
     if not names:
         raise StoredReplayError("test: name at least one sequence to compare on")
-    unfixed = [name for name in names if not _is_there(study, name, "fixed")]
+    unfixed = [name for name in names if not _is_there(replays, name, "fixed")]
     if len(unfixed) == len(names):
-        if all(_is_there(study, name, m) for name in names for m in WITHOUT_MODEL):
+        if all(_is_there(replays, name, m) for name in names for m in WITHOUT_MODEL):
             return ComparedModes(names, WITHOUT_MODEL, {"fixed": unfixed})
-        ReplaySummary.read(_folder(study, names[0], "fixed"))
-    names, unfinished = _finished(study, names, ("fixed", BASELINE, *setup.rules))
-    model = _model(study, names[0])
-    also = _on_demand(study, setup, model)
+        ReplaySummary.read(replays / names[0] / "fixed")
+    names, unfinished = _finished(replays, names, ("fixed", BASELINE, *setup.rules))
+    model = _model(replays, names[0], study.model_path)
+    asked = [m for m in ALSO if m in setup.also or _any(replays, study.config.test, [m])]
+    also = [mode for mode in asked if not setup.obstacle(mode, model)]
     there = {
-        mode: [name for name in names if _is_there(study, name, mode)]
+        mode: [name for name in names if _is_there(replays, name, mode)]
         for mode in MODES
         if mode in (BASELINE, *RIVALS, "fixed", *setup.rules, *also)
     }
@@ -148,42 +150,31 @@ def compared_modes(study: Study) -> ComparedModes:
 
 
 def _finished(
-    study: Study, names: Sequence[str], modes: Sequence[str]
+    replays: Path, names: Sequence[str], modes: Sequence[str]
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Sequences that were replayed in all modes that any was, and those that were not yet."""
-    made = [mode for mode in modes if _any(study, names, [mode])]
-    finished = tuple(n for n in names if all(_is_there(study, n, mode) for mode in made))
+    made = [mode for mode in modes if _any(replays, names, [mode])]
+    finished = tuple(n for n in names if all(_is_there(replays, n, mode) for mode in made))
     if not finished:  # no mode is everywhere: those with the fixed set are compared
-        finished = tuple(n for n in names if _is_there(study, n, "fixed"))
+        finished = tuple(n for n in names if _is_there(replays, n, "fixed"))
     return finished, tuple(name for name in names if name not in finished)
 
 
-def _on_demand(study: Study, setup: ReplaySetup, model: ErrorModel | None) -> list[str]:
-    """The modes on demand that were asked for or replayed."""
-    names, asked = study.config.test, study.config.online.also
-    found: list[str] = [mode for mode in ALSO if mode in asked or _any(study, names, [mode])]
-    return [mode for mode in found if not setup.obstacle(mode, model)]
-
-
-def _model(study: Study, name: str) -> ErrorModel | None:
+def _model(replays: Path, name: str, own: Path) -> ErrorModel | None:
     """The model of the replays of a sequence; None if its file is gone, or they need none."""
-    there = (mode for mode in MODES if _is_there(study, name, mode))
-    summaries = (ReplaySummary.read(_folder(study, name, mode)) for mode in there)
+    there = (mode for mode in MODES if _is_there(replays, name, mode))
+    summaries = (ReplaySummary.read(replays / name / mode) for mode in there)
     files = [s.model_file for s in summaries if s.model_file and s.inputs["model"]]
-    path = Path(files[0]) if files else study.model_path
+    path = Path(files[0]) if files else own
     return ErrorModel.load(path) if path.exists() else None
 
 
-def _any(study: Study, names: Iterable[str], modes: Sequence[str]) -> bool:
-    return any(_is_there(study, name, mode) for name in names for mode in modes)
+def _any(replays: Path, names: Iterable[str], modes: Sequence[str]) -> bool:
+    return any(_is_there(replays, name, mode) for name in names for mode in modes)
 
 
-def _is_there(study: Study, name: str, mode: str) -> bool:
-    return (_folder(study, name, mode) / "replay.json").exists()
-
-
-def _folder(study: Study, name: str, mode: str) -> Path:
-    return study.folder / "replays" / name / mode
+def _is_there(replays: Path, name: str, mode: str) -> bool:
+    return (replays / name / mode / "replay.json").exists()
 
 
 # The comparison over all sequences.
@@ -387,11 +378,10 @@ def check_replays(
     path, model = _model_of(study, made.values())
     # Both read what they are about.
     shared = {name: shared_identity(study, name) for name in names}
-    _check_rates(study, made.values())
+    _check_rates(study.folder / "replays", made.values())
     for (name, mode), summary in made.items():
-        if differing := _differing(study, setup, summary, model, shared[name]):
-            command = _command(study, mode, path)
-            raise StoredReplayError(_refusal(study, name, [mode], differing, command))
+        if differing := _differing(study.sequences, setup, summary, model, shared[name]):
+            raise StoredReplayError(_refusal(study, name, [mode], differing, path))
     for name in names:
         _check_reference(study, name, modes)
     return model
@@ -420,18 +410,19 @@ def current_modes(study: Study, name: str) -> CurrentModes:
     path, model = of
     considered = _considered(setup, model)
     made = {mode: summary for mode, summary in made.items() if mode in considered}
-    _check_rates(study, made.values())
+    _check_rates(study.folder / "replays", made.values())
     _check_reference(study, name, list(made))
     shared = shared_identity(study, name)
-    current, refused = [], dict[tuple[str, ...], list[str]]()
+    current, refused = [], dict[tuple[Any, ...], list[str]]()
     for mode, summary in made.items():
-        if differing := _differing(study, setup, summary, model, shared):
-            refused.setdefault((_command(study, mode, path), *differing), []).append(mode)
+        if differing := _differing(study.sequences, setup, summary, model, shared):
+            on_demand = replayed_by(setup.also, mode), mode == UNTRAINED
+            refused.setdefault((*on_demand, *differing), []).append(mode)
         else:
             current.append(mode)
     said = (
-        f"{_refusal(study, name, modes, differing, command)}."
-        for (command, *differing), modes in refused.items()
+        f"{_refusal(study, name, modes, differing, path)}."
+        for (_, _, *differing), modes in refused.items()
     )
     return CurrentModes(tuple(current), tuple(said))
 
@@ -447,7 +438,7 @@ def _considered(setup: ReplaySetup, model: ErrorModel | None) -> set[str]:
 
 
 def _differing(
-    study: Study,
+    sequences: StudySequences,
     setup: ReplaySetup,
     summary: ReplaySummary,
     model: ErrorModel | None,
@@ -460,33 +451,33 @@ def _differing(
     if model is not None or mode in WITHOUT_MODEL:
         whole = setup.identity(mode, model, "" if model is None else model.digest)
         now |= {key: whole[key] for key in ("model", "parameters")}
-        if not _is_automatic(study, whole["switching"], about["switching"]):
+        both = whole["switching"], about["switching"]
+        automatic = setup.switching.mechanism == "auto" and None not in both
+        # Another machine would choose another mechanism.
+        if not automatic or both[0]["mechanism"] == both[1]["mechanism"]:
             now["switching"] = whole["switching"]
-    files = study.sequences.sources(next(iter(shared["recording"])))
+    files = sequences.sources(next(iter(shared["recording"])))
     return manifest.changes({key: about.get(key) for key in now}, now, files)
 
 
-def _command(study: Study, mode: str, path: Path) -> str:
-    """The command that makes a replay again, with the model of a file."""
-    command = replayed_by(study, mode)
-    if mode == UNTRAINED or path == study.model_path.resolve():
-        return command
-    return f"{command[:-1]} --model {path}`"
-
-
 def _refusal(
-    study: Study, name: str, modes: Sequence[str], differing: Sequence[str], command: str
+    study: Study, name: str, modes: Sequence[str], differing: Sequence[str], path: Path
 ) -> str:
-    """Why replays of a sequence are refused."""
-    folder = study.folder / "replays" / name
+    """Why replays of a sequence are refused, and the command that makes them with a model."""
+    folder, command = (
+        study.folder / "replays" / name,
+        replayed_by(study.config.online.also, modes[0]),
+    )
+    if modes[0] != UNTRAINED and path != study.model_path.resolve():
+        command = f"{command[:-1]} --model {path}`"
     what = f"{folder / modes[0]}: was" if len(modes) == 1 else f"{folder}: {', '.join(modes)} were"
     return f"{what} made from other inputs: {'; '.join(differing)}; run {command} with this study"
 
 
-def _check_rates(study: Study, summaries: Collection[ReplaySummary]) -> None:
+def _check_rates(replays: Path, summaries: Collection[ReplaySummary]) -> None:
     if len({str(summary.inputs["real_time"]) for summary in summaries}) > 1:
         raise StoredReplayError(
-            f"{study.folder / 'replays'}: some were made in real time, and others not, or not so; "
+            f"{replays}: some were made in real time, and others not, or not so; "
             f"run `adaptune online` again, with --rate or without"
         )
 
@@ -506,7 +497,9 @@ def _model_of(study: Study, summaries: Collection[ReplaySummary]) -> tuple[Path,
     """File of the model that all replays are of, and the model if the file is still there."""
     files = _files(summaries)
     if len(files) > 1:
-        commands = {replayed_by(study, s.mode) for s in summaries if s.inputs["model"]}
+        commands = {
+            replayed_by(study.config.online.also, s.mode) for s in summaries if s.inputs["model"]
+        }
         raise StoredReplayError(
             f"{study.folder / 'replays'}: holds replays with different models "
             f"({' and '.join(sorted(set(files.values())))}); run {max(commands, key=len)} again"
@@ -519,13 +512,6 @@ def _load(study: Study, path: Path) -> ErrorModel:
     """A model; the study's own is still of its recordings."""
     own = path == study.model_path.resolve()
     return study.model(path) if own else ErrorModel.load(path)
-
-
-def _is_automatic(study: Study, now: Any, made: Any) -> bool:
-    """Whether a replay differs only in the mechanism that this machine would choose."""
-    if study.config.online.switching.mechanism != "auto" or None in (now, made):
-        return False
-    return bool(now["mechanism"] != made["mechanism"])
 
 
 class ComparedReplays(NamedTuple):
@@ -541,7 +527,7 @@ def compare(study: Study) -> ComparedReplays:
     """Compare the replays that were made, and write tables.
 
     A mode is compared if it was replayed on all sequences that are compared, see
-    `online.compared_modes.compared_modes`. The untrained bank is compared with the baseline alone
+    `compared_modes`. The untrained bank is compared with the baseline alone
     if only these two were replayed.
 
     Parameters

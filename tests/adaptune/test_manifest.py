@@ -234,7 +234,7 @@ def test_another_version_of_a_package(load, monkeypatch, caplog):
     run(load())
     monkeypatch.setattr("importlib.metadata.version", lambda _: "99.0")
     said, _ = renewed(load(), caplog)
-    assert re.search(r"the version of fake_odometry changed from [\d.]+ to 99\.0", said)
+    assert re.search(r"the version of fake_odometry changed from .* to 99\.0", said)
 
 
 def test_of_sequences_that_are_not_trained_on_only_the_odometry_counts(load, tmp_path, caplog):
