@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -513,34 +512,19 @@ def most_important(table: TrialTable, shares: Mapping[str, float]) -> list[str]:
 
 
 def charts_of_validation(study: Study) -> Charts:
-    """Charts of what `adaptune validate` found, and what is missing."""
-    return charts_of(_of_validation(study))
+    """The chart of what `adaptune validate` found, or what is missing.
 
-
-def _of_validation(study: Study) -> Iterator[Chart | str | None]:
-    stretches = _rows(study, "stretches")
-    if not stretches:
-        yield "No validation: run `adaptune validate`."
-        return
-    with _damage_told(study, "stretches"):
-        yield stretch_chart(stretches)
-
-
-def _rows(study: Study, name: str) -> list[dict[str, Any]]:
-    """Rows that `adaptune.report.write_rows` wrote, with NaN where numbers are missing."""
-    path = study.folder / f"{name}.json"
+    Raises
+    ------
+    AdaptuneError
+        If its file is not as `adaptune validate` wrote it.
+    """
+    path = study.folder / "stretches.json"
     if not path.exists():
-        return []
-    with _damage_told(study, name):
-        rows = json.loads(path.read_text("utf-8"))
-        return [{k: np.nan if v is None else v for k, v in row.items()} for row in rows]
-
-
-@contextmanager
-def _damage_told(study: Study, name: str) -> Iterator[None]:
-    """Name the file whose rows are not as `adaptune validate` wrote them."""
+        return Charts([], ["No validation: run `adaptune validate`."])
     try:
-        yield
+        rows = json.loads(path.read_text("utf-8"))
+        known = [{k: np.nan if v is None else v for k, v in row.items()} for row in rows]
+        return charts_of([stretch_chart(known)])
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        path = study.folder / f"{name}.json"
         raise AdaptuneError(f"{path}: is damaged ({error!r}); run `adaptune validate`") from error
