@@ -23,10 +23,9 @@ from adaptune.report.charts import (
     Panel,
     Points,
     charts_of,
-    on_axis,
-    parameter_axis,
 )
-from adaptune.space import ODOMETRY, ParameterSet, ParameterSpace
+from adaptune.space import ODOMETRY, Categorical, Float, Integer, ParameterSet, ParameterSpace
+from adaptune.space import label as parameter_label
 from adaptune.study.study import Study
 from offline.config import OfflineConfig, OfflineStudy
 from offline.objective import judge, label, pareto_front, weighted
@@ -57,10 +56,6 @@ class TrialTable:
     def column(self, name: str) -> list[Any]:
         """Values of one of `space.parameters`; None where a set has none."""
         return [self.space.flat(of_set).get(name) for of_set in self.sets]
-
-    def on(self, sequence: str) -> NDArray[np.float64]:
-        """First objective on a sequence, of shape (n,)."""
-        return self.by_sequence[sequence]
 
     def some(self, kept: NDArray[np.bool_]) -> "TrialTable":
         """The same of some of the trials."""
@@ -167,7 +162,7 @@ def scatter_chart(
     x_axis, y_axis = (parameter_axis(name, table.space.parameters[name]) for name in parameters)
     xy = [on_axis(table.column(name), table.space.parameters[name]) for name in parameters]
     shown = list(sequences)[: MOST_PANELS - 1]
-    values = {name: table.on(name) for name in shown}
+    values = {name: table.by_sequence[name] for name in shown}
     if len(sequences) > 1:
         values["mean over all sequences"] = table.values
     panels = []
@@ -215,8 +210,8 @@ def iteration_chart(table: TrialTable) -> Chart | None:
         values, title = table.values, ""
         if slot:
             # A search of its own is on one sequence.
-            of = max(table.by_sequence, key=lambda n: _n_known(table.on(n)[slots == slot]))
-            values, title = table.on(of), f"{of} alone"
+            of = max(table.by_sequence, key=lambda n: _n_known(table.by_sequence[n][slots == slot]))
+            values, title = table.by_sequence[of], f"{of} alone"
         kept = (slots == slot) & np.isfinite(values)
         number, errors = table.numbers[kept] - OF_SLOT * slot, values[kept]
         if len(number) < 2:
@@ -331,6 +326,33 @@ def pareto_chart(
     return Chart("pareto", title, tuple(panels), columns=2)
 
 
+# Axes of parameters: their unit, their scale, and their categories.
+
+
+Parameter = Float | Integer | Categorical
+
+
+def parameter_axis(name: str, parameter: Parameter) -> Axis:
+    """The axis of a parameter: logarithmic as its range is, or with the names of its choices."""
+    if isinstance(parameter, Categorical):
+        return Axis(parameter_label(name, parameter), names=tuple(map(str, parameter.choices)))
+    return Axis(parameter_label(name, parameter), log=parameter.log)
+
+
+def on_axis(values: Sequence[Any], parameter: Parameter) -> NDArray[np.float64]:
+    """Where values are on this axis, of shape (n,); NaN for None.
+
+    Parameters
+    ----------
+    values
+        Values of the parameter; None where a set has none.
+    parameter
+        The parameter.
+    """
+    at = parameter.index if isinstance(parameter, Categorical) else float
+    return np.array([np.nan if value is None else at(value) for value in values], np.float64)
+
+
 # Which parameters matter: importances by Optuna, and what is drawn of them.
 
 
@@ -397,7 +419,7 @@ def importance_chart(by_odometry: Mapping[str, Mapping[str, float]]) -> Chart | 
             continue
         names = tuple(reversed(list(shares)))
         percent = [100.0 * shares[name] for name in names]
-        bars = Bars(np.arange(len(names)), percent, "", flat=True)
+        bars = Bars(percent, "")
         x = Axis("share of the error's variance [%]", limits=(0.0, 100.0))
         panels.append(Panel(x, Axis("", names=names), (bars,), odometry))
     if not panels:

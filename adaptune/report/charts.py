@@ -7,8 +7,6 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune.space import Categorical, Float, Integer, label
-
 Values = NDArray[Any] | Sequence[Any]
 """Numbers, or names where an axis has names."""
 
@@ -75,16 +73,10 @@ class Band:
 
 @dataclass(frozen=True)
 class Bars:
-    """Bars from zero, or from `base`; on a logarithmic axis zero is the axis's low end."""
+    """Bars from zero along x, one for each name of the y axis."""
 
-    x: Values
-    heights: Values  # the values that they reach
+    values: Values
     name: str
-    low: Values | None = None  # ends of an interval of each
-    high: Values | None = None
-    width: float = 0.8  # in units of x
-    base: float = 0.0
-    flat: bool = False  # along x, with `x` on the y axis
 
 
 @dataclass(frozen=True)
@@ -153,30 +145,3 @@ def charts_of(found: Iterable[Chart | str | None]) -> Charts:
     every = list(found)
     charts = [one for one in every if isinstance(one, Chart)]
     return Charts(charts, [one for one in every if isinstance(one, str)])
-
-
-# Axes of parameters: their unit, their scale, and their categories.
-
-
-Parameter = Float | Integer | Categorical
-
-
-def parameter_axis(name: str, parameter: Parameter) -> Axis:
-    """The axis of a parameter: logarithmic as its range is, or with the names of its choices."""
-    if isinstance(parameter, Categorical):
-        return Axis(label(name, parameter), names=tuple(map(str, parameter.choices)))
-    return Axis(label(name, parameter), log=parameter.log)
-
-
-def on_axis(values: Sequence[Any], parameter: Parameter) -> NDArray[np.float64]:
-    """Where values are on this axis, of shape (n,); NaN for None.
-
-    Parameters
-    ----------
-    values
-        Values of the parameter; None where a set has none.
-    parameter
-        The parameter.
-    """
-    at = parameter.index if isinstance(parameter, Categorical) else float
-    return np.array([np.nan if value is None else at(value) for value in values], np.float64)

@@ -296,12 +296,8 @@ def _coordinates(panel: Panel) -> Iterator[tuple[NDArray[np.float64], NDArray[np
                 x = numbers(item.x, panel.x)
                 yield np.tile(x, 2), np.r_[numbers(item.low, panel.y), numbers(item.high, panel.y)]
             case Bars():
-                along, across = (panel.y, panel.x) if item.flat else (panel.x, panel.y)
-                places = numbers(item.x, along)
-                places = np.r_[places - 0.5 * item.width, places + 0.5 * item.width]
-                others = (each for each in (item.low, item.high) if each is not None)
-                ends = numbers(np.r_[item.base, item.heights, *others], across)
-                yield (ends, places) if item.flat else (places, ends)
+                values = numbers(item.values, panel.x)
+                yield np.r_[0.0 * values, values], np.tile(np.arange(len(values)), 2)
             case Shares():
                 x = numbers(item.x, panel.x)
                 yield np.tile(x, 2), np.r_[0.0 * x, np.sum(item.shares, axis=0)]
@@ -538,21 +534,13 @@ class _Drawing:
         yield self._drawn(mark, {"x": x[kept], "y": low[kept], "y2": high[kept]})
 
     def _bars(self, bars: Bars) -> Iterator[Spec]:
-        look, panel = self._look(bars.name), self._panel
-        along, across = (panel.y, panel.x) if bars.flat else (panel.x, panel.y)
-        a, b = ("y", "x") if bars.flat else ("x", "y")
-        place, ends = numbers(bars.x, along), numbers(bars.heights, across)
-        base = np.full(len(place), max(bars.base, self._extent[b][0]) if across.log else bars.base)
-        half = 0.5 * bars.width
-        columns = {a: place - half, f"{a}2": place + half, b: base, f"{b}2": ends}
-        there = np.isfinite(ends)
-        tip = {"field": f"{b}2", "type": "quantitative", "title": bars.name, "format": ".4~g"}
-        mark = {"type": "rect", "color": look.colour} | _OUTLINE
-        columns = {name: column[there] for name, column in columns.items()}
-        yield self._drawn(mark, columns, tooltip=[tip])
-        if bars.low is not None and bars.high is not None:
-            low, high = numbers(bars.low, across), numbers(bars.high, across)
-            yield self._drawn({"type": "rule"}, {a: place, b: low, f"{b}2": high})
+        ends = numbers(bars.values, self._panel.x)
+        place, there = np.arange(len(ends)), np.isfinite(ends)
+        columns = {"x": 0.0 * ends, "x2": ends, "y": place - 0.4, "y2": place + 0.4}
+        tip = {"field": "x2", "title": self._panel.x.label, "format": ".4~g"}
+        mark = {"type": "rect", "color": self._look(bars.name).colour} | _OUTLINE
+        data = {name: column[there] for name, column in columns.items()}
+        yield self._drawn(mark, data, tooltip=[tip])
 
     def _shares(self, shares: Shares) -> Iterator[Spec]:
         x = numbers(shares.x, self._panel.x)
@@ -652,7 +640,7 @@ def _legend(chart: Chart, every: dict[str, Look]) -> list[Spec]:
     kinds: dict[str, dict[type, Drawn]] = {}
     for item in (item for panel in chart.panels for item in panel.drawn):
         for name in item.names if isinstance(item, Shares) else [getattr(item, "name", "")]:
-            if name and not (isinstance(item, Line | Points | Bars) and not len(item.x)):
+            if name and not (isinstance(item, Line | Points) and not len(item.x)):
                 kinds.setdefault(name, {}).setdefault(type(item), item)
     layers: list[Spec] = []
     x, y = 0.0, 0.5 * _LINE

@@ -27,5 +27,5 @@ def test_the_most_important_is_at_the_top():
     (panel,) = importance_chart({"": {"a": 0.7, "b": 0.3}}).panels
     assert panel.y.names == ("b", "a")
     (bars,) = panel.drawn
-    np.testing.assert_allclose(bars.heights, [30.0, 70.0])
+    np.testing.assert_allclose(bars.values, [30.0, 70.0])
     assert importance_chart({"gicp": {}}) is None

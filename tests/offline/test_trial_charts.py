@@ -3,9 +3,12 @@ from made_trials import SPACE, made_table
 
 from adaptune.archive import OF_SLOT, Summary
 from adaptune.report.charts import Axis, Line, Points
+from adaptune.space import Categorical, Float, Integer
 from offline.charts import (
     cost_chart,
     iteration_chart,
+    on_axis,
+    parameter_axis,
     pareto_chart,
     scatter_chart,
     sensitivity_chart,
@@ -97,3 +100,12 @@ def test_a_front_is_a_line_of_two_objectives_and_none_of_three():
     first, second = pareto_chart(names, values, values[:3], marked).panels
     assert (first.x.label, first.y.label, second.y.label) == tuple(names)
     assert not any(isinstance(d, Line) for panel in (first, second) for d in panel.drawn)
+
+
+def test_parameters_have_the_scale_of_their_range_or_names():
+    kernel = Categorical(choices=("none", 1, True), baseline=1)
+    distance = Float(low=1.0, high=10.0, baseline=4.0, log=True)
+    assert parameter_axis("distance", distance) == Axis("distance", log=True)
+    assert parameter_axis("points", Integer(low=1, high=9, baseline=4)) == Axis("points")
+    assert parameter_axis("kernel", kernel).names == ("none", "1", "True")
+    np.testing.assert_array_equal(on_axis([True, None, "none"], kernel), [2.0, np.nan, 0.0])

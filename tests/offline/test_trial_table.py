@@ -16,7 +16,7 @@ def test_the_mean_is_over_all_sequences_or_unknown():
     }
     table = trial_table(OfflineConfig(), SPACE, runs, sets[1])
     np.testing.assert_array_equal(table.values, [2.0, 2.5, np.nan])
-    np.testing.assert_array_equal(table.on("two"), [3.0, 3.0, np.nan])
+    np.testing.assert_array_equal(table.by_sequence["two"], [3.0, 3.0, np.nan])
     assert (table.fixed, table.objective, len(table)) == (1, "RTE [%]", 3)
     assert np.isnan(table.costs).all()
 

@@ -81,25 +81,18 @@ def trials(n: int = 2000) -> Chart:
 
 
 def comparison() -> Chart:
-    """Bars, upright and flat, with intervals."""
+    """Bars and points at names."""
     names = ("campus, morning", "campus, evening", "tunnel <b>north</b>", "forest_$x_1$")
-    x, values = np.arange(4.0), np.array([1.0, 2.0, 0.7, np.nan])
-    pairs = (
-        Bars(x - 0.2, values, "fixed", values - 0.2, values + 0.3, 0.4),
-        Bars(x + 0.2, [0.8, 1.1, 0.9, 0.4], "kiss & tell", width=0.4),
-    )
-    flat = Bars(
-        ["voxel_size", "max_range", "iterations"], [1.4, 0.8, 1.05], "ratio", base=1.0, flat=True
-    )
+    points = Points(np.arange(4.0), [1.0, 2.0, 0.7, np.nan], "kiss & tell")
     return Chart(
         "comparison",
         "Errors by sequence",
         (
-            Panel(Axis("sequence", names=names), Axis("mean RTE [%]"), pairs),
+            Panel(Axis("sequence", names=names), Axis("mean RTE [%]"), (points,)),
             Panel(
                 Axis("error over the fixed set's [-]"),
                 Axis("parameter", names=("voxel_size", "max_range", "iterations")),
-                (flat, Mark(1.0, "as good", "x")),
+                (Bars([1.4, 0.8, 1.05], "fixed"), Mark(1.0, "as good", "x")),
             ),
         ),
         columns=2,
@@ -127,7 +120,7 @@ def empty() -> Chart:
     drawn = (
         Line([], [], "fixed"),
         Points([1.0], [np.nan], "trials", [np.nan], "size [m]", log_colour=True),
-        Bars([], [], "bars"),
+        Bars([], "bars"),
         Band([], [], [], "band"),
         Shares([], np.zeros((2, 0)), ("a", "b")),
         Mark(1.0, "goal"),

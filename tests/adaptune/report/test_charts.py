@@ -18,13 +18,8 @@ from adaptune.report.charts import (
     Points,
     Shares,
     Spans,
-    on_axis,
-    parameter_axis,
 )
 from adaptune.report.drawing import MODES, draw_chart, looks, spec, thinned, ticks, wrapped
-from adaptune.space import Categorical, Float, Integer
-
-KERNEL = Categorical(choices=("none", 1, True), baseline=1)
 
 
 def drawn(chart, folder):
@@ -48,8 +43,7 @@ def chart_of(*items, **panel):
         Line([0, 1], [1, 2], "fixed", steps=True, dashed=True),
         Points([0, 1], [1, 2], "fixed", texts=["a", "b"]),
         Band([0, 1], [1, 2], [2, 3], "fixed"),
-        Bars([0, 1], [1, 2], "fixed", [0.5, 1], [1.5, 3]),
-        Bars([0, 1], [1, 2], "fixed", flat=True),
+        Bars([1, 2], "fixed"),
         Shares([0, 1, 2], np.full((2, 3), 50.0), ("fixed", "b")),
     ],
     ids=lambda item: type(item).__name__,
@@ -89,17 +83,15 @@ def test_spans_are_named_above_and_marks_carry_their_words(tmp_path):
 
 def test_names_stand_along_an_axis_also_long_ones(tmp_path):
     names = tuple(f"a_long_name_of_a_drive_{i}" for i in range(12))
-    bars = Bars(np.arange(12.0), np.arange(1.0, 13.0), "")
-    texts, _ = drawn(chart_of(bars, x=Axis("", names=names)), tmp_path)
+    points = Points(np.arange(12.0), np.arange(1.0, 13.0), "")
+    texts, _ = drawn(chart_of(points, x=Axis("", names=names)), tmp_path)
     assert set(names) <= {text.replace(" ", "") for text in texts}
     narrow = tuple(f"sequence{i:02d}" for i in range(20))
-    bars = Bars(np.arange(20.0), np.arange(1.0, 21.0), "")
-    texts, svg = drawn(chart_of(bars, x=Axis("", names=narrow)), tmp_path)
+    points = Points(np.arange(20.0), np.arange(1.0, 21.0), "")
+    texts, svg = drawn(chart_of(points, x=Axis("", names=narrow)), tmp_path)
     assert set(narrow) <= set(texts)
     assert svg.count("rotate(325") >= 20
-    texts, _ = drawn(
-        chart_of(Bars(names, np.ones(12), "", flat=True), y=Axis("", names=names)), tmp_path
-    )
+    texts, _ = drawn(chart_of(Bars(np.ones(12), ""), y=Axis("", names=names)), tmp_path)
     assert set(names) <= {text.replace(" ", "") for text in texts}
 
 
@@ -176,11 +168,3 @@ def test_logarithmic_axes_name_round_numbers(ends, named):
 def test_long_names_are_broken_after_underscores():
     assert wrapped("max_correspondence_distance [m]", 20) == ["max_correspondence_", "distance [m]"]
     assert wrapped("", 20) == [""]
-
-
-def test_parameters_have_the_scale_of_their_range_or_names():
-    distance = Float(low=1.0, high=10.0, baseline=4.0, log=True)
-    assert parameter_axis("distance", distance) == Axis("distance", log=True)
-    assert parameter_axis("points", Integer(low=1, high=9, baseline=4)) == Axis("points")
-    assert parameter_axis("kernel", KERNEL).names == ("none", "1", "True")
-    np.testing.assert_array_equal(on_axis([True, None, "none"], KERNEL), [2.0, np.nan, 0.0])

@@ -135,7 +135,7 @@ def test_charts_are_drawn_and_say_what_a_point_is(opened):
     opened.locator("#comparison .mark-rect path").first.hover()
     tip = opened.locator("#vg-tooltip-element.visible")
     tip.wait_for()
-    assert re.search(r"fixed:?\s*1", tip.inner_text())
+    assert re.search(r"error over the fixed set's \[-\]\s*1.4", tip.inner_text())
 
 
 def column(page, i):
