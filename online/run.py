@@ -1,9 +1,8 @@
 """The online stage: replay the test sequences in every mode."""
 
 import logging
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import ExitStack, closing
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,6 +11,7 @@ from adaptune.errors import AdaptuneError
 from adaptune.model import ErrorModel
 from adaptune.model.descriptor import DescriptorError
 from adaptune.processes import release_memory
+from adaptune.progress import Progress, unseen
 from adaptune.recording.scan import Recording
 from adaptune.selection import Selection
 from adaptune.study.config import StudyConfig
@@ -29,11 +29,8 @@ from online.record import (
 )
 from online.replay import Look, ReplayRecord, Watch, replay
 
-Progress = Callable[[str, int, int], None]
-"""Called with what is being done, how much of it is done, and how much there is."""
-
-SCANT = 1.5
-"""Training sequences below which a selection rests on hardly more than one."""
+MIN_SEQUENCES = 1.5
+"""Effective training stretches below which a selection rests on hardly more than one."""
 
 _log = logging.getLogger(__name__)
 
@@ -45,8 +42,8 @@ class ReplayError(AdaptuneError):
 def run_replays(
     study: Study,
     model_path: Path,
-    progress: Progress = lambda *_: None,
-    look: Look | None = None,
+    progress: Progress = unseen,
+    look: Look = lambda *_: None,
 ) -> int:
     """Replay every test sequence in every mode, as often as asked, unless that was done before.
 
@@ -82,14 +79,14 @@ def run_replays(
     for why in dict.fromkeys(filter(None, obstacles.values())):
         names = " and ".join(name for name in asked if obstacles[name] == why)
         _log.warning("not replayed: %s, because %s", names, why)
-    modes = _Modes(setup, setup.modes(model), look, model, model_path)
-    return _replay_all(study, study.config.test, modes, progress)
+    modes = _Modes(setup, setup.modes(model), progress, look, model, model_path)
+    return _replay_all(study, study.config.test, modes)
 
 
 def run_untrained(
     study: Study,
-    progress: Progress = lambda *_: None,
-    look: Look | None = None,
+    progress: Progress = unseen,
+    look: Look = lambda *_: None,
 ) -> int:
     """Replay sequences with the baseline, and with a bank that needs no model.
 
@@ -103,8 +100,8 @@ def run_untrained(
     """
     setup = ReplaySetup.of(study)
     setup.mode(UNTRAINED)  # or an error
-    modes = _Modes(setup, WITHOUT_MODEL, look)
-    return _replay_all(study, sequences_without_model(study.config), modes, progress)
+    modes = _Modes(setup, WITHOUT_MODEL, progress, look)
+    return _replay_all(study, sequences_without_model(study.config), modes)
 
 
 class _Run(NamedTuple):
@@ -124,30 +121,39 @@ class _Modes(NamedTuple):
 
     setup: ReplaySetup
     names: tuple[str, ...]
-    look: Look | None = None
+    progress: Progress
+    look: Look
     model: ErrorModel | None = None
     model_path: Path | None = None
 
 
-def _replay_all(study: Study, sequences: Sequence[str], modes: _Modes, progress: Progress) -> int:
+def _replay_all(study: Study, sequences: Sequence[str], modes: _Modes) -> int:
     """Replay what was not replayed before; the number of replays that were made.
 
     Sequences without a reference get an estimated one before, where that is possible.
     """
     study.open()
-    refused = ensure_references(study, sequences, progress, required=False)
-    for said in refused.values():
-        _log.warning("%s; it is replayed without a reference, and not judged", said)
+    refused = ensure_references(study, sequences, modes.progress, required=False)
+    for why in refused.values():
+        _log.warning("%s; it is replayed without a reference, and not judged", why)
     made = 0
     for name in sequences:
-        folder, due = study.folder / "replays" / name, dict[_Run, dict[str, Any]]()
-        for run, inputs in _inputs(study, name, modes).items():
-            if _is_due(study, run, inputs):
-                due[run] = inputs
-        if due:
-            _replay_due(study, name, due, modes, progress)
-        else:
-            _renew_reference(study, name, folder / modes.names[0])
+        folder, every = study.folder / "replays" / name, _inputs(study, name, modes)
+        due = {run: inputs for run, inputs in every.items() if _is_due(study, run, inputs)}
+        poses = study.sequences.reference(name)
+        if not due and is_reference_of(folder, poses):
+            continue
+        recording = study.sequences.open(name)
+        for i, (run, inputs) in enumerate(due.items()):
+            record = _replayed(study.config, recording, run, modes)
+            if i == 0:
+                write_reference(folder, recording.reference(), record.trajectory, poses)
+            of_run = repeat_folder(folder / run.mode, run.repeat)
+            write_replay(of_run, record, inputs, modes.model_path)
+        if not due:
+            trajectory = StoredReplay.read(folder / modes.names[0]).trajectory
+            write_reference(folder, recording.reference(), trajectory, poses)
+            _log.info("%s: the reference has changed; no replay depends on it", name)
         made += len(due)
     return made
 
@@ -179,59 +185,35 @@ def _inputs(study: Study, name: str, modes: _Modes) -> dict[_Run, dict[str, Any]
     }
 
 
-def _replay_due(
-    study: Study,
-    name: str,
-    due: Mapping[_Run, dict[str, Any]],
-    modes: _Modes,
-    progress: Progress,
-) -> None:
-    """Make some replays of a sequence."""
-    folder = study.folder / "replays" / name
-    poses, sequence = study.sequences.reference(name), study.sequences.open(name)
-    for i, (run, about) in enumerate(due.items()):
-        what = str(run)
-        release_memory()
-        drive = _in_lockstep if study.config.online.real_time is None else _in_real_time
-        try:
-            watch = partial(_watch, progress, modes.look, what, sequence.n_messages)
-            result = drive(study.config, sequence, run, modes, watch)
-        except DescriptorError as error:
-            raise ReplayError(f"sequences.{name}: {error}") from error
-        progress(what, sequence.n_messages, sequence.n_messages)
-        if i == 0:
-            write_reference(folder, sequence.reference(), result.trajectory, poses)
-        write_replay(repeat_folder(folder / run.mode, run.repeat), result, about, modes.model_path)
-        if modes.model is not None and result.choices:
-            selections = [choice.selection for choice in result.choices]
-            fixed = modes.setup.mode(run.mode, modes.model).fixed
-            warn_of_scant_evidence(what, selections, fixed)
+def _replayed(config: StudyConfig, recording: Recording, run: _Run, modes: _Modes) -> ReplayRecord:
+    """Make a replay."""
+    what, n = str(run), recording.n_messages
+    release_memory()
 
+    def watch(record: ReplayRecord) -> None:
+        modes.progress(what, record.done, n)
+        modes.look(what, n, record)
 
-def _watch(progress: Progress, look: Look | None, what: str, n: int, record: ReplayRecord) -> None:
-    """Pass on how far a replay is."""
-    progress(what, record.done, n)
-    if look is not None:
-        look(what, n, record)
-
-
-def _renew_reference(study: Study, name: str, replayed: Path) -> None:
-    """Write the reference beside the replays again, if it has changed."""
-    poses = study.sequences.reference(name)
-    if not is_reference_of(replayed.parent, poses):
-        trajectory = StoredReplay.read(replayed).trajectory
-        reference = study.sequences.open(name).reference()
-        write_reference(replayed.parent, reference, trajectory, poses)
-        _log.info("%s: the reference has changed; no replay depends on it", name)
+    try:
+        drive = _in_lockstep if config.online.real_time is None else _in_real_time
+        record = drive(config, recording, run, modes, watch)
+    except DescriptorError as error:
+        raise ReplayError(f"sequences.{run.sequence}: {error}") from error
+    modes.progress(what, n, n)
+    if modes.model is not None and record.choices:
+        selections = [choice.selection for choice in record.choices]
+        fixed = modes.setup.mode(run.mode, modes.model).fixed
+        warn_of_scant_evidence(what, selections, fixed)
+    return record
 
 
 def _in_lockstep(
-    config: StudyConfig, sequence: Recording, run: _Run, modes: _Modes, watch: Watch
+    config: StudyConfig, recording: Recording, run: _Run, modes: _Modes, watch: Watch
 ) -> ReplayRecord:
     odometry, selector = modes.setup.start(run.mode, modes.model, run.sequence)
     with closing(odometry):
         return replay(
-            sequence,
+            recording,
             odometry,
             config.health,
             selector,
@@ -243,7 +225,7 @@ def _in_lockstep(
 
 
 def _in_real_time(
-    config: StudyConfig, sequence: Recording, run: _Run, modes: _Modes, watch: Watch
+    config: StudyConfig, recording: Recording, run: _Run, modes: _Modes, watch: Watch
 ) -> ReplayRecord:
     assert config.online.real_time is not None
     mode = modes.setup.mode(run.mode, modes.model)
@@ -254,7 +236,7 @@ def _in_real_time(
             selector = SelectorProcess(mode.selector, config.online.period)
             stack.enter_context(closing(selector))
         return replay_in_real_time(
-            sequence,
+            recording,
             odometry,
             config.health,
             config.online.real_time,
@@ -266,16 +248,16 @@ def _in_real_time(
 
 def warn_of_scant_evidence(what: str, selections: Iterable[Selection], fixed: int) -> None:
     """Warn of selections that rest on hardly more than one training stretch."""
-    left = [s for s in selections if s.trial != fixed]
-    few = sum(s.n_sequences < SCANT for s in left)
-    if few:
+    others = [s for s in selections if s.trial != fixed]
+    scant = sum(s.n_sequences < MIN_SEQUENCES for s in others)
+    if scant:
         _log.warning(
             "%s: %d of %d selections of another set than the fixed one rest on hardly more than "
             "one stretch of the training (see selections.csv); more recordings would show whether "
             "they hold",
             what,
-            few,
-            len(left),
+            scant,
+            len(others),
         )
 
 
