@@ -422,7 +422,7 @@ def validate(
     try:
         validation = leave_one_out(data, None, progress, bank)
     except ValidationError as error:
-        raise ValidationError(f"{error}. {online.words}") from error
+        raise ValidationError(f"{error}. {online}") from error
     rows = _rows(validation, _rate(data))
     tables.write_rows(study.folder, "validation", rows)
     stretches = _stretch_rows(validation)
@@ -434,7 +434,7 @@ def validate(
     bounds = data.bounds()
     best = min(bounds, key=lambda n: bounds[n])
     warning = baseline_warning(study.config.offline, data.whole(), best, data.fixed())
-    said = [online.words, *_verdicts(study.rules, study.mechanism == "bank", validation)]
+    said = [online, *_verdicts(study.rules, study.mechanism == "bank", validation)]
     said += [warning] if warning else []
     said += estimates_beside_intervals(study, study.training)
     return Validated(validation, rows, said)

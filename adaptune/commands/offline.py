@@ -88,7 +88,7 @@ def offline(
     if len(loaded.config.offline.objective) > 1:
         front = loaded.folder / "pareto"
         say(f"The sets that no other set beats in every objective: {front}.*")
-    say(driven(loaded, model).words)
+    say(driven(loaded, model))
     say(f"Error model: {loaded.model_path}")
     say_next_of_trained(bool(model.expected), loaded.config.test, study, override, folder)
 

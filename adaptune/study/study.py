@@ -317,51 +317,49 @@ class ModeError(AdaptuneError):
     """A mode that the model does not allow."""
 
 
-class Driven(NamedTuple):
-    """What is driven, and by what."""
-
-    mechanism: Mechanism | None  # of `adaptive`; None if the fixed set is its plan
-    words: str  # a sentence
-
-
-def driven(study: Study, model: ErrorModel) -> Driven:
-    """What `adaptune online` will drive with the study's model.
+def driven(study: Study, model: ErrorModel) -> str:
+    """What `adaptune online` will drive with the study's model, in a sentence or two.
 
     Raises
     ------
     ModeError
         If the model does not go with the study's bank.
     """
-    number = f"trial {named(model, model.fixed)}" + ("" if model.fixed else ", the baseline")
-    fixed = f"`online` will drive the fixed set ({number})"
+    fixed = f"`online` will drive the fixed set (trial {named(model, model.fixed)}"
+    fixed += ")" if model.fixed else ", the baseline)"
+    switching, live = study.config.online.switching, study.odometry.description.live
+    if study.mechanism is None:
+        return f"{fixed} only, because {cannot_adapt(study.odometry, None)}."
     if not study.rules:
-        why = "no rule is named (online.rules)"
-        if study.mechanism is None:
-            why = cannot_adapt(study.odometry, None)
-        return Driven(None, f"{fixed} only, because {why}.")
+        return f"{fixed} only, because no rule is named (online.rules)."
     if "adaptive" not in study.rules:
-        return Driven(None, "`online` will drive `paper`, and not `adaptive` (online.rules).")
-    live = study.odometry.description.live
+        return "`online` will drive `paper`, and not `adaptive` (online.rules)."
     mechanism = mechanism_of("adaptive", model, study.mechanism, live)
+    joining = _who_joins_in(switching, model) if mechanism == "bank" else ""
     if mechanism == "bank" and model.bank_adapts:
-        trials = always_at_work(study.config.online.switching, model)
+        trials = always_at_work(switching, model)
         members = ", ".join(named(model, trial) for trial in trials)
         words = f"`online` will drive the bank of trials {members} as `adaptive`"
         if model.costs is not None and math.isfinite(cost := model.costs.adaptive(trials)):
             words += f", at {cost:.1f} ms of CPU time a scan"
         if BANK in model.expected:
-            words += f", because it has the least expected loss: {_expected(model, BANK)}."
+            why = f", because it has the least expected loss: {_expected(model, BANK)}."
         else:
-            words += f". It relies on what it measures while it drives, for {_too_little(model)}."
-        words += _who_joins_in(study, model)
-        return Driven("bank", words)
+            why = f". It relies on what it measures while it drives, for {_too_little(model)}."
+        return words + why + joining
     if mechanism == "live" and model.paired.adapt:
         words = "`online` will drive one set at a time as `adaptive`, changed live"
         if ONE_SET in model.expected:
             words += f", because it has the least expected loss: {_expected(model, ONE_SET)}"
-        return Driven(mechanism, f"{words}.")
-    why = _why_fixed(study, model, mechanism)
-    return Driven(None, f"{fixed} as `adaptive`, because {why}")
+        return f"{words}."
+    ways = [BANK, ONE_SET] if study.mechanism == "bank" else [ONE_SET]
+    compared = [way for way in ways if way in model.expected]
+    why = _too_little(model)
+    if compared:
+        way = min(compared, key=lambda way: model.expected[way]["loss"])
+        best = f"{'a bank' if way == BANK else 'one set at a time'}: {_expected(model, way)}"
+        why = f"it has the least expected loss; the best alternative is {best}"
+    return f"{fixed} as `adaptive`, because {why}.{joining}"
 
 
 def cannot_adapt(odometry: Factory, mechanism: Mechanism | None) -> str:
@@ -376,25 +374,8 @@ def cannot_adapt(odometry: Factory, mechanism: Mechanism | None) -> str:
     )
 
 
-def _why_fixed(study: Study, model: ErrorModel, mechanism: Mechanism | None) -> str:
-    """Why the fixed set is driven, and where it is left."""
-    ways = [BANK, ONE_SET] if study.mechanism == "bank" else [ONE_SET]
-    known = [way for way in ways if way in model.expected]
-    if known:
-        way = min(known, key=lambda way: model.expected[way]["loss"])
-        best = "a bank" if way == BANK else "one set at a time"
-        why = (
-            f"it has the least expected loss; the best alternative is {best}: "
-            f"{_expected(model, way)}"
-        )
-    else:
-        why = _too_little(model)
-    return f"{why}.{_who_joins_in(study, model) if mechanism == 'bank' else ''}"
-
-
-def _who_joins_in(study: Study, model: ErrorModel) -> str:
+def _who_joins_in(switching: SwitchingConfig, model: ErrorModel) -> str:
     """Which members of a bank rest, and when they do not; empty if none rests."""
-    switching = study.config.online.switching
     always = always_at_work(switching, model)
     others = [named(model, t) for t in bank_members(switching, model) if t not in always]
     if not others:

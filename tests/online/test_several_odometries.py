@@ -76,7 +76,7 @@ def test_the_model_knows_what_its_sets_cost(trained):
         == len(set(downsampling))
         == len({*zip(numbers, downsampling, strict=True)})
     )
-    assert f"({model.sets[model.fixed][ODOMETRY]})" in driven(study, model).words
+    assert f"({model.sets[model.fixed][ODOMETRY]})" in driven(study, model)
 
 
 def test_it_is_validated_against_its_rivals(trained):
