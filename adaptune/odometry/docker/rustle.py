@@ -210,8 +210,6 @@ class Lockstep(Faulting):
             self._begin(prepared)
             self._show(prepared)
             self._correct()
-        except UnavailableError:
-            raise
         except (OdometryError, LinkError) as error:
             told = self._told(error)
             # One that has run can be gone for good.
@@ -225,27 +223,26 @@ class Lockstep(Faulting):
         if self._system is not None:
             try:
                 self._show(prepared)
-            except UnavailableError:
-                raise
             except (OdometryError, LinkError) as error:
                 self.note_fault(self._told(error))
 
     def collect(self) -> Registration:
         self._waiting = False
-        lost = Registration(np.full((4, 4), np.nan), registered=False)
-        if self._system is None:
-            return lost
+        registration = Registration(np.full((4, 4), np.nan), registered=False)
+        if self._system is not None:
+            try:
+                registration = self._registration()
+            except (OdometryError, LinkError) as error:
+                registration = self.note_fault(self._told(error))
+        self._last_motion.move(registration.T_odom_sensor)
+        return registration
+
+    def _registration(self) -> Registration:
         T_before = self._T_odom_sensor
         self._T_odom_sensor = T_before @ self._T_step
-        try:
-            registered = self._correct()
-        except UnavailableError:
-            raise
-        except (OdometryError, LinkError) as error:
-            return self.note_fault(self._told(error))
+        registered = self._correct()
         if registered:
             self._T_step = rectify(invert(T_before) @ self._T_odom_sensor)
-        self._last_motion.move(self._T_odom_sensor)
         return Registration(self._T_odom_sensor.copy(), registered)
 
     def ready(self, seconds: float) -> bool:
@@ -403,7 +400,9 @@ class Lockstep(Faulting):
                 self._news.notify_all()
 
     def _told(self, error: Exception) -> str:
-        """An error, and the last lines that the system wrote."""
+        """An error, and the last lines that the system wrote; no engine is no fault of a trial."""
+        if isinstance(error, UnavailableError):
+            raise error
         words = "" if self._system is None else self._system.words()
         return f"{error}: {words}" if words else str(error)
 

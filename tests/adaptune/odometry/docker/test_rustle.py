@@ -1,5 +1,6 @@
 """What needs no container."""
 
+import numpy as np
 import pytest
 from contained import template
 from pydantic import ValidationError
@@ -7,6 +8,8 @@ from pydantic import ValidationError
 from adaptune.odometry import OdometryError
 from adaptune.odometry.docker.engine import EngineError
 from adaptune.odometry.docker.rustle import Rustle, RustleSettings
+from adaptune.odometry.remote import Limits
+from adaptune.recording import Scan
 
 
 def settings(**given):
@@ -56,6 +59,14 @@ def test_what_it_says_of_itself():
         assert (described.live, described.needs_imu, described.whole) == (live, needs_imu, whole)
     assert settings().packages == ("rustle-ros", "rustle")
     assert settings(package="own").packages == ("own",)
+
+
+def test_a_system_that_has_ended_has_no_motion():
+    odometry = Rustle.instance({}, settings(play="lockstep"), Limits(), None)
+    assert odometry.ended
+    odometry.submit(Scan(0, np.zeros((0, 3), np.float32)))
+    assert np.isnan(odometry.collect().T_odom_sensor).all()
+    assert np.isnan(odometry.motions.T_previous_current).all()
 
 
 def test_what_is_checked_before_a_campaign(tmp_path, monkeypatch):
