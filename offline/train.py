@@ -27,7 +27,7 @@ from adaptune.study.config import SwitchingConfig
 from adaptune.study.references import (
     ensure_references,
     estimates_as_data,
-    estimates_beside_intervals,
+    estimates_in_words,
     estimates_of,
 )
 from adaptune.study.study import BANK, ONE_SET, expected_in_words
@@ -175,11 +175,13 @@ def train(
     tables.write_rows(study.folder, "trials", list(table.values()))
     if len(config.objective) > 1:
         _write_pareto(study.folder, config.objective, verdicts, fixed, table)
-    errors = {n: of.error(model.length) for n, of in estimates_of(study, finished).items()}
+    estimates = estimates_of(study.sequences, names)
+    errors = {name: stored.error(model.length) for name, stored in estimates.items()}
     rows = _training_rows(config, verdicts, finished, fixed, whole, errors, space)
     tables.write_rows(study.folder, "training", rows)
     said = [] if before is None else changes(before, model)
-    said += [*estimates_beside_intervals(study, names), *doubts(rows)]
+    said += [*estimates_in_words(estimates, model.length, intervals=True)]
+    said += doubts(rows)
     said += baseline_words(config, [trials[0] for trials in finished.values()])
     means = {name: _means(trials, verdicts) for name, trials in finished.items()}
     return Training(model, means, fixed, rows, remark, said)
@@ -289,7 +291,8 @@ def _fitted(
     provenance = {"versions": study.odometry.versions} | settings
     inputs = study.model_inputs
     provenance |= {"inputs": manifest.digest(inputs)}
-    if judged := estimates_as_data(study, study.training):
+    estimates = estimates_of(study.sequences, study.training)
+    if judged := estimates_as_data(estimates, study.config.sub_trajectory):
         provenance |= {"estimated_references": judged}
     provenance |= {"evidence": _evidence(study, archive, verdicts, fixed, provenance)}
     if before is not None and before.provenance == provenance:

@@ -24,7 +24,7 @@ from adaptune.model.rules import ERROR_FLOOR
 from adaptune.progress import Progress, unseen
 from adaptune.report import tables
 from adaptune.report.drawing import draw_chart
-from adaptune.study.references import estimates_beside_intervals
+from adaptune.study.references import estimates_in_words, estimates_of
 from adaptune.study.study import (
     MIN_RECORDINGS,
     ONE_SET,
@@ -436,7 +436,8 @@ def validate(
     warning = baseline_warning(study.config.offline, data.whole(), best, data.fixed())
     said = [online, *_verdicts(study.rules, study.mechanism == "bank", validation)]
     said += [warning] if warning else []
-    said += estimates_beside_intervals(study, study.training)
+    estimates = estimates_of(study.sequences, study.training)
+    said += estimates_in_words(estimates, model.length, intervals=True)
     return Validated(validation, rows, said)
 
 

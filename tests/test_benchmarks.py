@@ -81,8 +81,8 @@ def test_without_reference_only_the_test_knows_poses(recorded, tmp_path, monkeyp
         given = module.definition(module.DIRECTIONS[name], "ndt", 3, 0, no_reference=True)
         path.write_text(files.dump(given))
         study = load_study(path, folder=tmp_path / name)
-        assert to_estimate(study, study.config.training) == list(study.config.training)
-        assert to_estimate(study, study.config.test) == ["street"] * (name == "cars")
+        assert to_estimate(study.sequences, study.config.training) == list(study.config.training)
+        assert to_estimate(study.sequences, study.config.test) == ["street"] * (name == "cars")
 
 
 def test_rows_of_all_studies_are_collected(tmp_path):

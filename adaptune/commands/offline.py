@@ -122,7 +122,7 @@ def trials(
     from adaptune import archive as table
     from adaptune.archive import Archive
     from adaptune.report import tables
-    from adaptune.study.references import estimates_in_words
+    from adaptune.study.references import estimates_in_words, estimates_of
     from offline.search import has_ended
 
     names, archive = loaded.training, Archive(loaded.folder / "trials")
@@ -139,7 +139,8 @@ def trials(
         if judged := [row for row in finished if row["mean"] is not None]:
             best = min(judged, key=lambda row: row["mean"])
             say(f"Best mean: {best['mean']:.3f} %, of trial {best['trial']}.")
-        for sentence in estimates_in_words(loaded, names):
+        estimates = estimates_of(loaded.sequences, names)
+        for sentence in estimates_in_words(estimates, loaded.config.sub_trajectory):
             say(sentence)
         if has_ended(loaded.folder):
             say_next_of_trained(len(names) > 1, loaded.config.test, study, override, folder)

@@ -216,7 +216,7 @@ def _of_study(study: "OfflineStudy") -> None:
     from adaptune.report import tables
     from adaptune.study.references import ensure_references, estimates_of, to_estimate
 
-    names = to_estimate(study, (*study.config.training, *study.config.test))
+    names = to_estimate(study.sequences, (*study.config.training, *study.config.test))
     if not names:
         raise AdaptuneError(
             f"{study.name}: every sequence has a reference; write `reference: estimated` where it "
@@ -234,7 +234,7 @@ def _of_study(study: "OfflineStudy") -> None:
             "its error [%]": stored.error(length),
             "unknown [% of the scans]": 100.0 * stored.unknown_share,
         }
-        for name, stored in estimates_of(study, names).items()
+        for name, stored in estimates_of(study.sequences, names).items()
     ]
     if rows:
         caption = f"Errors are estimates over {length:g} m. A picture of each shows where it fails."

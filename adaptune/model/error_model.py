@@ -30,7 +30,6 @@ from adaptune.report import tables
 from adaptune.space import (
     ParameterSet,
     ParameterSets,
-    ParameterSpace,
     SpaceError,
     in_words,
     load_space,
@@ -283,31 +282,6 @@ class ErrorModel:
         if isinstance(named, int):
             return named if named in self.sets else None
         return self.sets.find(named)
-
-    def check_study(
-        self, odometry: dict[str, Any], space: ParameterSpace, length: float, path: Path
-    ) -> None:
-        """Refuse a model of another odometry, of other parameters, or of other sub-trajectories.
-
-        Raises
-        ------
-        ModelError
-        """
-        if self.odometry != odometry:
-            raise ModelError(
-                f"{path}: is a model of {json.dumps(self.odometry)}, the study's odometry is "
-                f"{json.dumps(odometry)}; run `adaptune offline` for this study"
-            )
-        if self.sets.space != space:
-            raise ModelError(
-                f"{path}: is a model of other parameters or ranges than the study's; run `adaptune "
-                f"offline` for this study"
-            )
-        if self.length != length:
-            raise ModelError(
-                f"{path}: is a model of errors over {self.length:g} m, the study's sub_trajectory "
-                f"is {length:g} m; run `adaptune offline` for this study"
-            )
 
     def check_descriptors(
         self, descriptors: Collection[str], where: Path | str = "the model"

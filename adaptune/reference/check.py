@@ -146,17 +146,11 @@ def mean_difference(T_one: Poses, T_other: Poses, length: float) -> float:
     float
         NaN where both together hold no sub-trajectory.
     """
-    T_one, T_other = common_poses(T_one, T_other)
+    known = np.isfinite(T_one + T_other).all(axis=(1, 2), keepdims=True)
+    T_one, T_other = (np.where(known, T, np.nan) for T in (T_one, T_other))
     errors = sub_trajectory_rte(T_one, T_other, length)
     errors = cap(errors[~np.isnan(errors)])
     return float(errors.mean()) if len(errors) else float("nan")
-
-
-def common_poses(T_one: Poses, T_other: Poses) -> tuple[Poses, Poses]:
-    """Two references, unknown wherever one of them is."""
-    known = np.isfinite(T_one + T_other).all(axis=(1, 2), keepdims=True)
-    one, other = (np.where(known, T, np.nan) for T in (T_one, T_other))
-    return one, other
 
 
 # Which length of sub-trajectories to propose for a study, given how accurate its reference is.

@@ -3,7 +3,7 @@
 import logging
 import math
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -28,6 +28,7 @@ from adaptune.reference.stored import (
     StoredEstimate,
     write_estimate,
 )
+from adaptune.study.sequences import StudySequences
 from adaptune.study.study import Study
 
 _OF_VIEWS = ("views", "compensate", "imu")
@@ -36,12 +37,12 @@ _OF_VIEWS = ("views", "compensate", "imu")
 _log = logging.getLogger(__name__)
 
 
-def to_estimate(study: Study, names: Iterable[str]) -> list[str]:
+def to_estimate(sequences: StudySequences, names: Iterable[str]) -> list[str]:
     """Those of the sequences whose reference is to be estimated: none is given, or it is asked for.
 
     Views count as the sequence that they are of. A course has a reference of its own.
     """
-    recordings = study.sequences.recordings
+    recordings = sequences.recordings
     each = dict.fromkeys(map(origin, names))
     return [name for name in each if name in recordings and wants_estimate(recordings[name])]
 
@@ -80,7 +81,7 @@ def ensure_references(
         If the reference of a sequence cannot be estimated, and is required.
     """
     refused = {}
-    for name in to_estimate(study, names):
+    for name in to_estimate(study.sequences, names):
         path, before = study.sequences.estimate_path(name), study.sequences.estimate(name)
         try:
             shown = partial(progress, f"{name}, estimating its reference")
@@ -118,8 +119,8 @@ def estimated_at(
     EstimateError
         If it cannot be estimated, now or when it was tried with the same scans.
     """
-    about, stored, refusal = _about(study, name), StoredEstimate.read(path), Refusal.read(path)
-    before = stored or refusal
+    stored, refusal = StoredEstimate.read(path), Refusal.read(path)
+    about, before = _about(study.sequences, name), stored or refusal
     files = study.sequences.sources(name)
     changes = [] if before is None else manifest.changes(before.about, about, files)
     if changes:
@@ -127,7 +128,8 @@ def estimated_at(
     elif stored is not None and path.exists():
         return stored
     if refusal is None or changes:
-        found = _estimate(study, name, advance)
+        study.open()
+        found = _estimate(study.sequences, name, advance)
         if isinstance(found, EstimatedReference):
             return write_estimate(path, found, about, study.config.sub_trajectory)
         refusal = Refusal(about, found)
@@ -135,10 +137,10 @@ def estimated_at(
     raise EstimateError(f"{study.sequences.key(name)}: {refusal.refused}")
 
 
-def _about(study: Study, name: str) -> dict[str, Any]:
+def _about(sequences: StudySequences, name: str) -> dict[str, Any]:
     """Everything that an estimated reference depends on, as plain data."""
-    given = study.sequences.unseen(name)
-    scans = study.sequences.identity(name)
+    given = sequences.unseen(name)
+    scans = sequences.identity(name)
     for kind in ("sequences", "courses"):
         for of in scans.get(kind, {}).values():
             of.update(dict.fromkeys(_OF_VIEWS))
@@ -154,11 +156,10 @@ def _about(study: Study, name: str) -> dict[str, Any]:
 
 
 def _estimate(
-    study: Study, name: str, advance: Callable[[int, int], None]
+    sequences: StudySequences, name: str, advance: Callable[[int, int], None]
 ) -> EstimatedReference | str:
     """The reference of a sequence, or why it cannot be estimated."""
-    study.open()
-    given = study.sequences.unseen(name)
+    given = sequences.unseen(name)
     scans, prior = RecordedSequence(given), position_prior(given)
     # GTSAM's sums may depend on its threads: only on one core do results repeat bit by bit.
     unpin = pin(os.getpid())
@@ -180,38 +181,31 @@ def accuracy_in_words(stored: StoredEstimate, length: float) -> str:
     return f"{own} over {length:g} m, unknown for {share:.0f} % of the scans"
 
 
-def estimates_of(study: Study, names: Iterable[str]) -> dict[str, StoredEstimate]:
+def estimates_of(sequences: StudySequences, names: Iterable[str]) -> dict[str, StoredEstimate]:
     """The estimated references of those of the sequences that have one, by their names."""
-    found = {name: study.sequences.estimate(name) for name in dict.fromkeys(map(origin, names))}
+    found = {name: sequences.estimate(name) for name in dict.fromkeys(map(origin, names))}
     return {name: stored for name, stored in found.items() if stored is not None}
 
 
-def estimates_in_words(study: Study, names: Iterable[str]) -> list[str]:
-    """A sentence that says which sequences are judged by an estimated reference, if any."""
-    length = study.config.sub_trajectory
-    each = [
-        f"{name} ({accuracy_in_words(stored, length)})"
-        for name, stored in estimates_of(study, names).items()
-    ]
-    if not each:
-        return []
-    return [f"Judged by an estimated reference: {'; '.join(each)}."]
+def estimates_in_words(
+    estimates: Mapping[str, StoredEstimate], length: float, intervals: bool = False
+) -> list[str]:
+    """A sentence about the sequences that an estimated reference judges, if there are any.
+
+    With `intervals`, it stands beside some that do not include the error of a reference.
+    """
+    each = [f"{name} ({accuracy_in_words(of, length)})" for name, of in estimates.items()]
+    excluded = " Intervals do not include its error." if intervals else ""
+    return [f"Judged by an estimated reference: {'; '.join(each)}.{excluded}"] if each else []
 
 
-def estimates_beside_intervals(study: Study, names: Iterable[str]) -> list[str]:
-    """The same beside intervals that do not include the error of a reference."""
-    said = estimates_in_words(study, names)
-    return [f"{sentence} Intervals do not include its error." for sentence in said]
-
-
-def estimates_as_data(study: Study, names: Iterable[str]) -> dict[str, Any]:
-    """The same as plain data, by the names of the sequences; empty if there is none."""
-    length = study.config.sub_trajectory
-    found = {}
-    for name, stored in estimates_of(study, names).items():
-        error = stored.error(length)
-        found[name] = {
+def estimates_as_data(estimates: Mapping[str, StoredEstimate], length: float) -> dict[str, Any]:
+    """The same as plain data, by the names of the sequences."""
+    errors = {name: stored.error(length) for name, stored in estimates.items()}
+    return {
+        name: {
             "error_percent": None if math.isnan(error) else round(error, 4),
-            "unknown_share": stored.unknown_share,
+            "unknown_share": estimates[name].unknown_share,
         }
-    return found
+        for name, error in errors.items()
+    }

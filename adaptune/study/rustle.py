@@ -6,6 +6,7 @@ and tells of them.
 
 import math
 import re
+import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, TypeVar
@@ -483,12 +484,15 @@ class ImportedStudy(NamedTuple):
 
 
 def _wrapped(begin: str, text: str) -> list[str]:
-    lines = [begin]
-    for word in text.split():
-        if len(lines[-1]) + len(word) >= _WIDTH and lines[-1].strip(" #-"):
-            lines.append("# ".ljust(len(begin)))
-        lines[-1] += f"{word} "
-    return [line.rstrip() for line in lines]
+    after = "# ".ljust(len(begin))
+    return textwrap.wrap(
+        text,
+        _WIDTH - 1,
+        initial_indent=begin,
+        subsequent_indent=after,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
 
 
 def import_rustle(

@@ -11,12 +11,21 @@ from adaptune.recording.config import ImuConfig, SequenceConfig
 from adaptune.recording.recording import open_sequence, wants_estimate
 from adaptune.reference.stored import EstimateError
 from adaptune.strict import ConfigurationError
-from adaptune.study.references import ensure_references, estimates_as_data, estimates_in_words
+from adaptune.study.references import (
+    ensure_references,
+    estimates_as_data,
+    estimates_in_words,
+    estimates_of,
+)
 from adaptune.trajectory import Trajectory, write_tum
 from offline.config import load_study
 
 LEFT_OUT = "sequences.one.reference="
 EXTRINSIC = "sequences.one.extrinsic=[0, 2, 0, 0, 0, 0, 1]"
+
+
+def data(study, names):
+    return estimates_as_data(estimates_of(study.sequences, names), study.config.sub_trajectory)
 
 
 @pytest.fixture
@@ -97,17 +106,18 @@ def test_where_it_is_not_trusted_there_is_a_gap(estimator, load, caplog):
     at = reference.at(np.array([drives.FIRST_STAMP + 25 * 10**8]))
     assert np.isnan(at).all()
     assert "unknown for 25 % of the scans" in caplog.text
-    assert estimates_as_data(study, ["one", "two"]) == {
+    assert data(study, ["one", "two"]) == {
         "one": {"error_percent": 0.3116, "unknown_share": pytest.approx(0.25, abs=0.01)}
     }
 
 
 def test_what_judged_is_said(estimator, load):
     study = load(LEFT_OUT, "sequences.two.reference=")
-    assert estimates_in_words(study, study.training) == []
+    assert estimates_in_words({}, 3.0) == []
     estimator.halves = (1.0, 1.004)
     ensure_references(study, study.training)
-    (said,) = estimates_in_words(study, [*study.training, "three"])
+    estimates = estimates_of(study.sequences, [*study.training, "three"])
+    (said,) = estimates_in_words(estimates, study.config.sub_trajectory)
     assert said == (
         "Judged by an estimated reference: one (its own error is 0.31 % over 3 m, unknown for 0 % "
         "of the scans); two (its own error is 0.31 % over 3 m, unknown for 0 % of the scans)."
@@ -118,13 +128,13 @@ def test_what_judged_is_said(estimator, load):
 def test_a_file_that_was_estimated_is_called_so(load, tmp_path):
     study = load(LEFT_OUT)
     ensure_references(study, ["one"])
-    known, file = estimates_as_data(study, ["one"]), tmp_path / "my_reference.tum"
+    known, file = data(study, ["one"]), tmp_path / "my_reference.tum"
     for suffix in (".tum", ".json"):
         made = study.folder / f"references/one{suffix}"
         made.rename(file.with_suffix(suffix))
     named = load(f"sequences.one.reference={file}")
     assert named.sequences.estimate("one+back")
-    assert estimates_as_data(named, ["one", "two"]) == known
+    assert data(named, ["one", "two"]) == known
     assert named.sequences.config("one").reference == str(file)
     # Other files beside it say nothing.
     for text in ("[1, 2]", "{}", "no JSON"):
