@@ -41,7 +41,7 @@ def test_stages_needs_its_argument_only(recorded, monkeypatch):
     measured: list[OfflineStudy] = []
     monkeypatch.setenv("ADAPTUNE_TEST_DATA", "to be restored")
     os.environ.pop("ADAPTUNE_TEST_DATA")
-    monkeypatch.setattr(stages.cores, "pin", lambda _: None)
+    monkeypatch.setattr(stages.processes, "pin", lambda _: None)
     monkeypatch.setattr(stages, "trial", measured.append)
     monkeypatch.setattr(stages, "train", lambda _: SimpleNamespace(model=None))
     monkeypatch.setattr(stages, "adaptive_replay", lambda study, _: measured.append(study))
@@ -110,7 +110,7 @@ def test_recorded_prints_every_mode_and_resumes(
     given = {**files.Document(text).data, "online": online}
     monkeypatch.setattr(module, "DIRECTIONS", {"small": None, "other": None})
     monkeypatch.setattr(module, "definition", lambda *_, **__: given)
-    monkeypatch.setattr(module.cores, "pin", lambda _: None)
+    monkeypatch.setattr(module.processes, "pin", lambda _: None)
     monkeypatch.setenv("ADAPTUNE_TEST_DATA", str(tmp_path))
     words = ["--odometries", "gicp", "--directions", "small", "--sets", "10", "--seed", "3"]
     monkeypatch.setattr(sys, "argv", ["recorded.py", str(tmp_path), *words])
@@ -135,7 +135,7 @@ def test_recorded_goes_on_after_a_study_that_is_not_possible(tmp_path, monkeypat
 
     monkeypatch.setattr(module, "load_study", lambda path, **_: path.stem)
     monkeypatch.setattr(module, "run", run)
-    monkeypatch.setattr(module.cores, "pin", lambda _: None)
+    monkeypatch.setattr(module.processes, "pin", lambda _: None)
     monkeypatch.setenv("ADAPTUNE_TEST_DATA", str(tmp_path))
     monkeypatch.setattr(sys, "argv", ["recorded.py", str(tmp_path), "--odometries", "ndt"])
     module.main()

@@ -11,7 +11,7 @@ ROOT = Path(__file__).parents[1]
 PACKAGES = ("adaptune", "offline", "online")
 SOURCES = (*PACKAGES, "benchmarks", "docker")
 MAX_FILE_LINES, MAX_FUNCTION_LINES, MAX_PARAMETERS, MAX_NESTING = 800, 60, 8, 4
-MAX_OPTIONS = 13
+MAX_OPTIONS = 12
 
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
