@@ -15,7 +15,7 @@ from offline.labelled import labelled_data
 def test_motions_are_read_of_the_best_sets_and_of_the_baseline(
     study_file, trained_folder, monkeypatch, pool
 ):
-    monkeypatch.setattr(offline.labelled, "POOL", pool)
+    monkeypatch.setattr(offline.labelled, "MEMBER_POOL_SIZE", pool)
     study = load_study(study_file, [], trained_folder)
     model = ErrorModel.load(study.model_path)
     data = labelled_data(

@@ -118,7 +118,6 @@ def test_inspect_says_what_to_do_where_the_reference_does_not_serve(tmp_path):
     ("command", "following"),
     [
         (["trials"], "validate"),
-        (["trials", "-o", "offline.trials=12"], "offline"),
         (["validate"], "online"),
         (["inspect", "MODEL"], "online"),
         (["cache"], "cache"),
