@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from adaptune import manifest
 from adaptune.commands.cli import app
 from adaptune.model import BankSettings, ErrorModel, PairedSettings
 from adaptune.selector import UntrainedSelector, untrained_sets
@@ -67,7 +68,7 @@ def test_nothing_but_a_recording_is_needed(load, caplog):
     assert not study.model_path.exists()
     folder = study.folder / "replays/three"
     assert not (folder / "reference.tum").exists()
-    about = json.loads((folder / "untrained/replay.json").read_text())["about"]
+    about = manifest.recorded(folder / "untrained" / manifest.FILE)
     sets = untrained_sets(study.odometry.space)
     assert about["switching"]["members"] == list(sets.parameters)
     assert about["model"] is None
@@ -153,7 +154,7 @@ def test_it_is_compared_with_the_trained_modes_too(load, trained_folder):
     assert [row.mode for row in rows] == ["baseline", "fixed", "adaptive", "untrained", "paper"]
     assert {row.yardstick for row in rows} == {"fixed"}
     other = load("online.switching.size=3")
-    with pytest.raises(StoredReplayError, match=r"another switching; run `adaptune online --untr"):
+    with pytest.raises(StoredReplayError, match=r"switching\.members changed .* --untrained"):
         compare(other)
     assert run_untrained(other) == 1
     # Only what is there for all sequences is compared.
