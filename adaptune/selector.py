@@ -38,14 +38,14 @@ from adaptune.space import ODOMETRY, ParameterSets, ParameterSpace, PooledSpace
 SCANS_TO_KNOW = 10
 """The sensor is recognised by the median over this many scans that selections are made from."""
 
-WORSE = 2.0
+MAX_TIMES_PREDICTED = 2.0
 """A single odometry leaves a set whose error is surely more than so many times the predicted."""
 REMEMBERED = 60.0
-"""Seconds for which what was measured of that set counts, and not what is predicted; and for which
-members of a bank keep working that would otherwise rest."""
-NEW = 2 * 10**9
+"""Seconds for which a failure, or what was measured of that set, counts, and not what is predicted;
+and for which members of a bank keep working that would otherwise rest."""
+SETTLING = 2 * 10**9
 """Nanoseconds after a selection for which a failure says nothing of the set."""
-FEW = 5
+SELECTIONS_TO_JUDGE_PLACE = 5
 """A place is new by the median of so many selections: a single one may look odd."""
 
 _log = logging.getLogger(__name__)
@@ -162,7 +162,7 @@ class Selector:
         self._worse: dict[int, _Worse] = {}  # by trial
         self._at_work = -np.inf  # until when a bank may not rest, in seconds
         self._resting: frozenset[int] = frozenset()
-        self._familiar: deque[float] = deque(maxlen=FEW)
+        self._familiar: deque[float] = deque(maxlen=SELECTIONS_TO_JUDGE_PLACE)
         self._starts: int | None = None
         self._failed = False
         self._predicted = np.nan
@@ -266,7 +266,7 @@ class Selector:
         seconds = self._stamp * 1e-9
         self._familiar.append(familiarity)
         error = self._live.own_error()
-        is_worse = error is not None and error.low > WORSE * predicted
+        is_worse = error is not None and error.low > MAX_TIMES_PREDICTED * predicted
         is_new = float(np.median(self._familiar)) < NOVEL_FAMILIARITY
         if is_new or is_worse or self._failed or self._live.lost:
             self._at_work = seconds + REMEMBERED
@@ -282,9 +282,9 @@ class Selector:
         current = self._current
         if current is not None:
             # One that has just been selected may have begun with an odometry that was lost.
-            if self._failed and self._stamp - self._switched > NEW:
+            if self._failed and self._stamp - self._switched > SETTLING:
                 self._worse[current] = _Worse(FAILURE, seconds + REMEMBERED)
-            elif error is not None and error.low > WORSE * self._predicted:
+            elif error is not None and error.low > MAX_TIMES_PREDICTED * self._predicted:
                 self._worse[current] = _Worse(error.mean, seconds + REMEMBERED)
         return {trial: worse.error for trial, worse in self._worse.items()}
 

@@ -28,7 +28,7 @@ SILENCE = 2.0
 """Seconds without a scan after which the log says so."""
 IMU_WAIT = 0.1
 """Seconds that a scan waits for the IMU's measurements up to its end."""
-_MOST_IMU = 20_000
+_MAX_IMU = 20_000
 """Measurements that are kept."""
 CLOUD, IMU = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/Imu"
 
@@ -79,7 +79,7 @@ class LiveScans:
         _warm_up(timing)
         self._news = threading.Condition()
         self._waiting: deque[tuple[Scan, float]] = deque()
-        self._measured: deque[tuple[int, tuple[float, ...]]] = deque(maxlen=_MOST_IMU)
+        self._measured: deque[tuple[int, tuple[float, ...]]] = deque(maxlen=_MAX_IMU)
         self._dropped = 0
         self._stopped = False
         if imu is not None and imu.topic is not None:
@@ -229,7 +229,7 @@ def to_scan(message: Any, timing: Timing) -> Scan:
 # What adaptune publishes while a robot drives.
 
 
-UNKNOWN = 5.0
+UNKNOWN_ERROR = 5.0
 """Percent of the way that an odometry is believed to err by before anything is known of it."""
 _OK, _WARN, _ERROR = 0, 1, 2
 
@@ -249,7 +249,7 @@ class Uncertainty:
 
     def __init__(self, length: float):
         self._length = length
-        self._share = 1e-2 * UNKNOWN
+        self._share = 1e-2 * UNKNOWN_ERROR
         self.position = self.rotation = 0.0  # variances: square metres, square radians
 
     def learn(self, selection: Selection) -> None:

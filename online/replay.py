@@ -18,7 +18,7 @@ from adaptune.odometry.tracker import HealthCheck, RegisteredScan, Tracker
 from adaptune.processes import resident_megabytes
 from adaptune.recording.scan import Scan
 from adaptune.selection import Selection
-from adaptune.selector import NEW, REMEMBERED, Schedule, Selects
+from adaptune.selector import REMEMBERED, SETTLING, Schedule, Selects
 from adaptune.trajectory import Trajectory
 
 # Applies what is selected, and returns to the fixed set where that or the odometry goes wrong.
@@ -112,7 +112,7 @@ class Driver:
         if applied[:3] == fixed[:3] and not applied.resting:
             return False
         is_baseline = applied.weights is None and applied.trial == BASELINE
-        if is_baseline and stamp - self._since <= NEW:
+        if is_baseline and stamp - self._since <= SETTLING:
             return False
         return self._fall_back(stamp, applied, f"the health check found {what}")
 

@@ -141,7 +141,8 @@ SILENT = 10
 """Scans in a row without a pose after which the log says so."""
 _COMMAND = 5.0
 """Seconds for a command that sets a parameter."""
-"""Poses that are kept."""
+_KEPT = 1000
+"""Poses of a node, and scans of a drive, that are kept."""
 _GAP = 1.0
 """Seconds between poses over which a pose is interpolated."""
 
@@ -271,8 +272,6 @@ def _run(command: list[str]) -> tuple[int, str]:
 
 
 SELECTION_TOPIC, DIAGNOSTICS_TOPIC = "adaptune/selection", "/diagnostics"
-_KEPT = 1000
-"""Scans whose times are kept."""
 _EVERY = 10**9
 """Nanoseconds from one message of diagnostics to the next."""
 

@@ -18,7 +18,7 @@ SHARE = 0.08
 """Share of the way by which they may always differ and agree."""
 SPREAD = 6.0
 """They may also differ by this many times what agreeing members usually differ by."""
-MOST = 2.0
+MAX_TIMES_LEAST = 2.0
 """But not by more than this many times what they may always differ by: a departure that was not
 noticed must not become usual."""
 FAR = 2.0
@@ -55,7 +55,7 @@ class Agreement:
     more than ::
 
         least = max(FLOOR, SHARE * way)
-        min(max(least, SPREAD * usual difference), MOST * least, lost_track)
+        min(max(least, SPREAD * usual difference), MAX_TIMES_LEAST * least, lost_track)
 
     and, over the newest scan alone, by no more than `lost_track` metres a second. Before the first
     half second, the newest scan alone counts. The heaviest group of members that are all near each
@@ -193,7 +193,7 @@ class Agreement:
         least = max(FLOOR * scale, SHARE * (ways[len(ways) // 2] if ways else 0.0))
         # As long as nothing is usual, they may differ by the most.
         usual = SPREAD * self._usual.value * scale if self._usual else np.inf
-        bound = min(max(least, usual), MOST * least)
+        bound = min(max(least, usual), MAX_TIMES_LEAST * least)
         most = self._lost_track * span
         far = ~near | (apart > min(FAR * bound, most))
         return near & (apart <= min(bound, most)), far, apart / scale

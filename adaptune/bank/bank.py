@@ -211,7 +211,7 @@ class Clock(NamedTuple):
 CLOCK = Clock(time.perf_counter, time.sleep)
 """The machine's."""
 
-ALWAYS = 5.0
+MAX_LATE_SECONDS = 5.0
 """A member that is late at every scan for so many seconds is removed."""
 _INTERVALS = 11
 """Newest intervals between scans whose median says when the next scan is due."""
@@ -338,10 +338,10 @@ class Lateness:
         # Another member of its process may be at work.
         self._behind[i] += interval if self._owing[i] else 0.0
         # Somebody has to go on.
-        if self._behind[i] >= ALWAYS and self.removed.sum() < len(self._members) - 1:
+        if self._behind[i] >= MAX_LATE_SECONDS and self.removed.sum() < len(self._members) - 1:
             self.removed[i] = True
             what = "%s was late for %g s; the bank goes on without it"
-            _log.warning(what, self._names[i], ALWAYS)
+            _log.warning(what, self._names[i], MAX_LATE_SECONDS)
 
     def motion(self, i: int, T_odom_previous: Poses) -> Poses:
         """A member's motion over the newest scan, of shape (4, 4); NaN if it is absent or late.

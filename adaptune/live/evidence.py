@@ -35,13 +35,13 @@ from adaptune.selection import Selection
 # several times the chain's.
 
 
-COVERED = 0.5
+MIN_COVERED = 0.5
 """Least share of a chain that its hops cover; in between, the odometry's own motion is taken."""
-NEARLY = 0.8
+MIN_REACH = 0.8
 """A chain that reaches over this share of the length is long enough."""
 GROWTH = -0.15
 """The error over some metres, as a share of them, grows with this power of the metres."""
-UNSURE = 0.3
+LOG_DEVIATION = 0.3
 """Standard deviation of the logarithm of an estimate that rests on one chain; and of one that is
 scaled to e times the metres of its chains."""
 HOP_ERROR = 0.05
@@ -96,7 +96,7 @@ class OwnErrors:
     def add(self, link: Link) -> None:
         """Add the newest hop."""
         self._links.append(link)
-        while link.end - self._links[0].end > self._length + LENGTHS[0] / COVERED:
+        while link.end - self._links[0].end > self._length + LENGTHS[0] / MIN_COVERED:
             self._links.popleft()
         self._chains.append(_chain(self._links, self._length))
         if self._whole:
@@ -127,11 +127,11 @@ class OwnErrors:
         reach = end - start
         # Of a whole recording, the last chain may be a short one.
         usual = float(reach.max() if self._whole else reach[-1])
-        long = reach >= NEARLY * min(self._length, usual)
+        long = reach >= MIN_REACH * min(self._length, usual)
         start, end, reach, error, hops = (of[long] for of in (start, end, reach, error, hops))
         times = max(1.0, self._length / float(reach.mean()))
         mean = times**GROWTH * float((100.0 * error / reach).mean())
-        deviation = UNSURE * np.sqrt(1.0 / windows(start, end) + np.log(times) ** 2)
+        deviation = LOG_DEVIATION * np.sqrt(1.0 / windows(start, end) + np.log(times) ** 2)
         factor = float(np.exp(1.96 * deviation))
         # Some of it, or all, may be what the hops are wrong by.
         of_hops = times**GROWTH * float((100.0 * HOP_ERROR * np.sqrt(hops) / reach).mean())
@@ -145,12 +145,12 @@ def _chain(links: deque[Link], length: float) -> _Chain:
     covered, n = newest.end - newest.start, 1
     T = _completed(newest)
     for link in reversed(links):
-        if newest.end - first.start >= NEARLY * length:
+        if newest.end - first.start >= MIN_REACH * length:
             break
         if link.end > first.start:
             continue
         metres = covered + link.end - link.start
-        if metres < COVERED * (newest.end - link.start):
+        if metres < MIN_COVERED * (newest.end - link.start):
             break
         T = _completed(link) @ (invert(link.T_odom_end) @ first.T_odom_start) @ T
         first, covered, n = link, metres, n + 1
@@ -176,14 +176,14 @@ LOST = 10.0
 """Percent of a hop. An odometry that is more wrong has lost track."""
 DOUBTFUL = 5.0
 """Percent of a hop. One that differs so much from the odometry must be confirmed by another."""
-TWICE = 2
+HOPS_TO_BE_LOST = 2
 """Hops in a row that must be rejected, or disagree, before an odometry counts as lost."""
 _APART = 0.3
 """Metres between guesses that are worth a registration each."""
 _GUESSES = 3
 _TRY_AGAIN = 5
 """After so many shorter hops, a long one is tried again."""
-_FEWEST_DIRECTIONS = 1.5
+_MIN_DIRECTIONS = 1.5
 """A hop must tell the motion in two directions at least."""
 _FULL_TURN = 10.0
 """Metres at which a difference in rotation counts as one in translation, in radians."""
@@ -331,7 +331,7 @@ class LiveEvidence:
         self._measured = end.metres
         found = self._register(starts, end)
         # On an open plain only height can be told; that is no loss of track.
-        if found is not None and np.trace(found.hop.projection) < _FEWEST_DIRECTIONS:
+        if found is not None and np.trace(found.hop.projection) < _MIN_DIRECTIONS:
             return None
         if found is None or not self._is_confirmed(found):
             self._rejected += 1
@@ -416,14 +416,14 @@ class LiveEvidence:
         self._update_lost()
 
     def _update_lost(self) -> None:
-        self.lost = max(self._rejected, self._disagreeing) >= TWICE
+        self.lost = max(self._rejected, self._disagreeing) >= HOPS_TO_BE_LOST
 
     def _told_to_restart(self) -> frozenset[int]:
         """Trial numbers of the members that two hops in a row have shown to be lost.
 
         Each is told once. Then only hops that begin after that count against it.
         """
-        told = self._wrong >= TWICE
+        told = self._wrong >= HOPS_TO_BE_LOST
         told[0] = False
         self._wrong = np.where(told, 0, self._wrong)
         self._no_pose = self._no_pose + told

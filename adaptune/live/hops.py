@@ -23,7 +23,7 @@ MIN_INLIERS = 0.35
 DEGENERATE = 0.002
 """A direction is unknown if its information is less than this share of the best direction's."""
 _CELL, _NEIGHBOURS, _MIN_RANGE = 0.25, 20, 1.0
-_FEWEST = 100
+_MIN_POINTS = 100
 """Points; small_gicp crashes on an empty target, and three points always converge."""
 _REACHES = (2.0, 0.5)
 """Metres of the greatest distance of correspondences, one registration after the other."""
@@ -110,12 +110,12 @@ def _prepare(scan: Scan, T_previous_current: Poses, seconds: float) -> Any:
     if seconds > 0.0:
         scan = compensate(scan, T_previous_current, seconds)
     points = scan.points[squared_ranges(scan.points) >= _MIN_RANGE**2].astype(np.float64)
-    if len(points) < _FEWEST:
+    if len(points) < _MIN_POINTS:
         return None
     cloud, tree = small_gicp.preprocess_points(
         points, downsampling_resolution=_CELL, num_neighbors=_NEIGHBOURS, num_threads=1
     )
-    return (cloud, tree) if cloud.size() >= _FEWEST else None
+    return (cloud, tree) if cloud.size() >= _MIN_POINTS else None
 
 
 def register(

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptune.geometry import Poses
-from adaptune.live.evidence import NEARLY, Link, OwnError, OwnErrors, hops_along
+from adaptune.live.evidence import MIN_REACH, Link, OwnError, OwnErrors, hops_along
 from adaptune.live.hops import LENGTHS as HOPS
 from adaptune.live.hops import Hops
 from adaptune.metrics import cap, sub_trajectory_rte, travelled
@@ -79,7 +79,7 @@ class MeasuredReference:
                     self.hops.hop(i),
                 )
             )
-        found = errors.estimate() if reach >= NEARLY * longer else None
+        found = errors.estimate() if reach >= MIN_REACH * longer else None
         scale = longer / length
         return None if found is None else OwnError(*(scale * value for value in found))
 

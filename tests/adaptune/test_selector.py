@@ -16,7 +16,7 @@ from adaptune.model.weights import measured_weights
 from adaptune.odometry.base import Motions
 from adaptune.recording.scan import Scan
 from adaptune.selection import Selection
-from adaptune.selector import REMEMBERED, WORSE, Selector
+from adaptune.selector import MAX_TIMES_PREDICTED, REMEMBERED, Selector
 from adaptune.simulation import Course
 from adaptune.simulation.record import simulate
 from adaptune.space import Float, ParameterSets, ParameterSpace
@@ -243,7 +243,7 @@ def test_a_single_odometry_leaves_a_set_that_does_worse_than_predicted(monkeypat
 
     first = select(0.0)
     assert first.trial == 5
-    limit, forgotten = WORSE * first.predicted_error, told.forgotten
+    limit, forgotten = MAX_TIMES_PREDICTED * first.predicted_error, told.forgotten
     told.error = OwnError(9.0, 0.99 * limit, 20.0)  # not surely worse
     assert select(1.0).trial == 5
     assert told.forgotten == forgotten

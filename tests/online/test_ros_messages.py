@@ -7,7 +7,7 @@ import pytest
 from rosbags.typesys import Stores, get_typestore
 
 from adaptune.selection import Selection
-from online.live import UNKNOWN, RosMessages, Status, Uncertainty
+from online.live import UNKNOWN_ERROR, RosMessages, Status, Uncertainty
 from online.replay import ReplayRecord
 
 MESSAGES = RosMessages(local_link.STORE, "odom")
@@ -22,8 +22,8 @@ def ahead(metres):
 @pytest.mark.parametrize(
     ("selection", "percent"),
     [
-        (None, UNKNOWN),
-        (Selection(1, {}), UNKNOWN),
+        (None, UNKNOWN_ERROR),
+        (Selection(1, {}), UNKNOWN_ERROR),
         (Selection(1, {}, predicted_error=2.0), 2.0),
         (Selection(1, {}, predicted_error=2.0, estimated_error=3.0), 3.0),
     ],

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from clocks import SteppedClock
 
-from adaptune.bank.bank import ALWAYS, Bank, Lateness
+from adaptune.bank.bank import MAX_LATE_SECONDS, Bank, Lateness
 from adaptune.bank.members import SERVICE
 from adaptune.odometry.base import LastMotion, OdometryInstance, Registration
 from adaptune.odometry.factory import OdometryFactory, OdometryPool
@@ -132,7 +132,7 @@ def test_a_member_that_is_always_late_is_removed(clock, caplog):
     def before(i):
         members[5].seconds = 0.0 if i < 5 else 1e6
 
-    n = 8 + round(ALWAYS / 0.1)
+    n = 8 + round(MAX_LATE_SECONDS / 0.1)
     with caplog.at_level(logging.WARNING, "adaptune.bank.bank"):
         x, _ = run(bank, clock, n, before)
     assert list(bank.late.removed) == [False, True]

@@ -5,7 +5,7 @@ import pytest
 from rooms import moved, scan_at, street
 
 from adaptune.live import evidence
-from adaptune.live.evidence import LOST, TWICE, LiveEvidence
+from adaptune.live.evidence import HOPS_TO_BE_LOST, LOST, LiveEvidence
 from adaptune.live.hops import LENGTHS, Hop
 from adaptune.model.weights import measured_weights
 from adaptune.odometry.base import Motions
@@ -197,7 +197,7 @@ def test_a_member_without_poses_counts_as_lost_for_weights(exactly):  # noqa: AR
         return Motions(moved(STEP), {5: moved(STEP), 7: nan})
 
     live = LiveEvidence((5, 7))
-    drive(live, 10 * (TWICE + 2), motions)
+    drive(live, 10 * (HOPS_TO_BE_LOST + 2), motions)
     assert live.estimated(Selection(5, {})).restart == frozenset()  # the bank does that
     squares = live.squares()
     assert np.isfinite(squares.products).all()

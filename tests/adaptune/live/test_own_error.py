@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from rooms import moved
 
-from adaptune.live.evidence import COVERED, GROWTH, HOP_ERROR, UNSURE, Link, OwnErrors
+from adaptune.live.evidence import GROWTH, HOP_ERROR, LOG_DEVIATION, MIN_COVERED, Link, OwnErrors
 from adaptune.live.hops import SECONDS, Hop
 
 KNOWN = np.eye(3)
@@ -68,7 +68,7 @@ def test_hops_with_short_gaps_are_chained_and_with_long_ones_not():
     def believed(metres):
         return moved(1.02 * metres)
 
-    apart = 1.0 / COVERED
+    apart = 1.0 / MIN_COVERED
     for share in (0.9, 1.1):
         own, start = OwnErrors(40.0), 10.0 * (2.0 * share * apart - 1.0)
         reach = start + 10.0 if share < 1.0 else 10.0
@@ -92,7 +92,7 @@ def test_a_length_that_no_chain_reaches_is_scaled_and_less_sure():
     own.add(link(0.0, 10.0, lambda metres: moved(1.02 * metres)))
     one = own.estimate()
     assert one.mean == pytest.approx(2.0 * 10.0**GROWTH)
-    deviation = UNSURE * np.sqrt(1.0 + np.log(10.0) ** 2)
+    deviation = LOG_DEVIATION * np.sqrt(1.0 + np.log(10.0) ** 2)
     assert one.high / one.mean == pytest.approx(np.exp(1.96 * deviation))
     of_hops = 10.0**GROWTH * 100.0 * HOP_ERROR / 10.0
     without = np.sqrt(one.mean**2 - of_hops**2)
@@ -122,7 +122,7 @@ def test_what_is_long_ago_is_forgotten():
     assert found[80].mean == pytest.approx(5.0, rel=0.05)
     assert found[100 + 25 + int(SECONDS) + 1].mean == pytest.approx(0.0, abs=1e-9)
     assert len(own._chains) < 2 * SECONDS
-    assert len(own._links) < 25 + 10 / COVERED + 5
+    assert len(own._links) < 25 + 10 / MIN_COVERED + 5
 
 
 def test_path_that_no_hop_covers_does_not_make_it_surer():
@@ -134,7 +134,9 @@ def test_path_that_no_hop_covers_does_not_make_it_surer():
         own.add(link(0.0, 10.0, wrong)._replace(seconds=0.0))
         own.add(link(second, second + 10.0, wrong)._replace(seconds=27.0))
         found = own.estimate()
-        assert np.log(found.high / found.mean) == pytest.approx(1.96 * UNSURE / np.sqrt(windows))
+        assert np.log(found.high / found.mean) == pytest.approx(
+            1.96 * LOG_DEVIATION / np.sqrt(windows)
+        )
 
 
 def test_after_a_gap_the_newest_hop_counts():
