@@ -299,8 +299,6 @@ def _compared(loaded: "OfflineStudy") -> "ComparedReplays":
 
 _BEST = 50
 """Trials of the page's table: the best ones."""
-_NEEDED = ("adaptune.report.page", "offline.charts", "online.charts")
-"""What the processes that make the sections import."""
 
 
 def _write_page(study: "OfflineStudy", found: "ComparedReplays | str") -> None:
@@ -313,7 +311,6 @@ def _write_page(study: "OfflineStudy", found: "ComparedReplays | str") -> None:
     found
         The comparison, or why there is none.
     """
-    from adaptune.processes import processes
     from adaptune.report.page import Page, write_page
     from online.modes import sequences_without_model
 
@@ -321,13 +318,9 @@ def _write_page(study: "OfflineStudy", found: "ComparedReplays | str") -> None:
     # Without a test, some may have been replayed without a model.
     others = sequences_without_model(config)
     replayed = [name for name in others if (study.folder / "replays" / name).exists()]
-    makers = [partial(_along, study, name) for name in config.test or replayed]
-    makers += [partial(make, study) for make in (_search, _validation, _settings)]
-    with progress() as show, processes(len(makers), _NEEDED) as pool:
-        sections = [_comparison(study, found)]
-        for section in pool.map(_called, makers):
-            sections.append(section)
-            show("page", len(sections) - 1, len(makers))
+    sections = [_comparison(study, found)]
+    sections += [_along(study, name) for name in config.test or replayed]
+    sections += [_search(study), _validation(study), _settings(study)]
     subtitle = (
         f"{', '.join(config.odometries)}: trained on {len(config.training)} sequences, tested on "
         f"{len(config.test)}, errors over {config.sub_trajectory:g} m, seed {config.offline.seed}"
@@ -336,10 +329,6 @@ def _write_page(study: "OfflineStudy", found: "ComparedReplays | str") -> None:
     path = study.folder / "report" / "report.html"
     write_page(path, Page(study.name, subtitle, words, tuple(sections)))
     say(f"Page: {path}; its charts as PNG and SVG: {path.parent}/figures/")
-
-
-def _called(make: "Callable[[], PageSection]") -> "PageSection":
-    return make()
 
 
 def _comparison(study: "OfflineStudy", found: "ComparedReplays | str") -> "PageSection":
