@@ -346,14 +346,13 @@ def _in_words(stored: StoredEstimate, length: float) -> str:
 def _path_panel(found: EstimatedReference) -> Panel:
     x, y = found.T_world_sensor[:, :2, 3].T
     known = found.known
-    drawn: list[Drawn] = []
+    drawn: list[Drawn] = [Line(np.where(known, x, np.nan), np.where(known, y, np.nan), "path")]
     if known.any() and not known.all():
         # Beyond a gap, the unknown path may lead anywhere.
         inside = [(a > a[known].min() - _MARGIN) & (a < a[known].max() + _MARGIN) for a in (x, y)]
         shown = inside[0] & inside[1]
         unknown = np.where(shown, x, np.nan), np.where(shown, y, np.nan)
-        drawn.append(Line(*unknown, "unknown path", dashed=True))
-    drawn.append(Line(np.where(known, x, np.nan), np.where(known, y, np.nan), "path"))
+        drawn.append(Line(*unknown, "unknown path", dashed=True, faint=True))
     drawn.append(Points(x[:1], y[:1], "start", shape="cross"))
     return Panel(Axis("x [m]"), Axis("y [m]"), tuple(drawn), "path", equal=True)
 

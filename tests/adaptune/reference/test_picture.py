@@ -38,7 +38,7 @@ def test_registrations_are_counted_by_what_became_of_them():
     named = [points.name for points in drawn(found, Points)]
     assert named == ["start", "2 differ", "3 agree", "1 failed"]
     assert len(drawn(found, Spans)) == 2
-    assert [line.name for line in drawn(found, Line)] == ["unknown path", "path"]
+    assert [line.name for line in drawn(found, Line)] == ["path", "unknown path"]
 
 
 @pytest.mark.parametrize(
