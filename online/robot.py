@@ -29,7 +29,8 @@ from adaptune.ros.link import RosLink, Steering
 from adaptune.selection import Selection
 from adaptune.selector import BACK, Selector
 from adaptune.strict import in_one_line
-from adaptune.study.config import RealTimeConfig, SteerConfig
+from adaptune.study.config import RealTimeConfig, RosConfig, SteerConfig, StudyConfig
+from adaptune.study.sequences import StudySequences
 from adaptune.study.study import ModeError, Study
 from adaptune.trajectory import Trajectory, tum_lines
 from online.live import CLOUD, IMU, LiveScans, RosMessages, Status, Uncertainty
@@ -316,7 +317,7 @@ class RobotDrive:
         self._study, self._setup, self._settings = study, setup, real_time
         self._ros = config.online.ros
         self._model = None if model_path is None else setup.model(study, model_path)
-        self._like = _like(study)
+        self._like = _like(config, study.sequences)
         self._scans: LiveScans | None = None
         self._stopped = False
         modes: tuple[str, ...] = WITHOUT_MODEL
@@ -362,7 +363,7 @@ class RobotDrive:
                 selector = SelectorProcess(self._mode.selector, period)
                 stack.enter_context(closing(selector))
             self._scans = scans = self._topics(link)
-            publisher = _Publisher(link, self._study, scans)
+            publisher = _Publisher(link, self._ros, self._study.config.sub_trajectory, scans)
             driven = None
             while driven is None or not (scans.stopped or self._stopped):
                 odometry = steered or self._setup.instance(self._mode)
@@ -437,10 +438,10 @@ class RobotDrive:
 class _Publisher:
     """Publishes and records what a drive finds."""
 
-    def __init__(self, link: RosLink, study: Study, scans: LiveScans):
-        ros, self._scans = study.config.online.ros, scans
+    def __init__(self, link: RosLink, ros: RosConfig, length: float, scans: LiveScans):
+        self._scans = scans
         self._messages = RosMessages(link.store, ros.frame)
-        self._length = study.config.sub_trajectory
+        self._length = length
         self._selection = link.advertise(SELECTION_TOPIC, "std_msgs/msg/String")
         diagnostics = "diagnostic_msgs/msg/DiagnosticArray"
         self._diagnostics = link.advertise(DIAGNOSTICS_TOPIC, diagnostics)
@@ -485,13 +486,12 @@ class _Publisher:
             self._diagnostics(message)
 
 
-def _like(study: Study) -> SequenceConfig:
-    """The sequence of the study that was recorded with the robot's sensor."""
-    name = study.config.online.ros.like or study.config.training[0]
-    known = (*study.config.sequences, *study.config.courses)
-    if name not in known:
-        raise AdaptuneError(f"online.ros.like: no sequence {name!r}; {nearest(name, known)}")
-    return study.sequences.config(name)
+def _like(config: StudyConfig, sequences: StudySequences) -> SequenceConfig:
+    """The sequence of a study that was recorded with the robot's sensor."""
+    name, names = config.online.ros.like or config.training[0], [*config.sequences, *config.courses]
+    if name not in names:
+        raise AdaptuneError(f"online.ros.like: no sequence {name!r}; {nearest(name, names)}")
+    return sequences.config(name)
 
 
 def _topic(link: RosLink, name: str | None, kind: str, key: str) -> str:

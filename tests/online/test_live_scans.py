@@ -54,7 +54,7 @@ def test_scans_come_as_they_are(link):
     for i, (scan, due, dropped) in enumerate(arrivals):
         np.testing.assert_array_equal(scan.points, points(i))
         assert scan.stamp == START + i * TENTH
-        assert 0.0 <= time.perf_counter() - due < 5.0
+        assert due <= time.perf_counter()
         assert dropped == 0
     assert scans.frame == "lidar"
 

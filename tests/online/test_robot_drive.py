@@ -23,7 +23,7 @@ from online.replay import replay
 from online.robot import RobotDrive
 
 PATIENT = (
-    "online.real_time={deadline: 5, queue: 0}",
+    "online.real_time={deadline: 60, queue: 0}",
     "online.ros={points: /points, tf: true}",
 )
 SCANS = drives.scans(2, 25)
