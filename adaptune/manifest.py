@@ -119,7 +119,9 @@ def _words(key: str, was: Any, now: Any, files: Mapping[str, Sequence[Path]]) ->
         yield f"{rest or key if kind in _CONTENTS else key} is {'new' if was is None else 'gone'}"
     elif kind not in _CONTENTS or rest.startswith("version of "):
         what = f"the {rest}" if kind in _CONTENTS else key
-        yield f"{what} changed from {_short(was)} to {_short(now)}"
+        texts = [v if isinstance(v, str) else json.dumps(v) for v in (was, now)]
+        short = max(map(len, texts)) <= _MAX_VALUE
+        yield f"{what} changed from {' to '.join(texts)}" if short else f"{what} has another value"
     else:
         named = _changed_files(was, now, files[key]) if key in files else [rest or key]
         for each in named:
@@ -132,11 +134,6 @@ def _changed_files(was: Sequence[str], now: Sequence[str], files: Sequence[Path]
     if 0 < len(files) < MAX_NAMED_FILES:
         return list(files)
     return [files[0].parent if files else "the reference"]
-
-
-def _short(value: Any) -> str:
-    text = value if isinstance(value, str) else json.dumps(value)
-    return text if len(text) <= _MAX_VALUE else f"{text[: _MAX_VALUE - 3]}..."
 
 
 def earlier(folder: Path, result: Path, inputs: Inputs) -> Path:

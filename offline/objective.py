@@ -250,7 +250,7 @@ def affordable(costs: Costs, trials: Sequence[int], budget: float) -> list[int]:
     if all(np.isnan(costs.alone(n)) for n in trials):
         raise AdaptuneError(
             "online.budget: the trials are of an older adaptune, which did not measure what they "
-            "cost; run `adaptune offline --again`"
+            "cost; remove the folder of trials and run `adaptune offline`"
         )
     few = [n for n in trials if costs.alone(n) <= budget + ROUNDING]
     if not few:

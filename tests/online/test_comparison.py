@@ -8,6 +8,7 @@ import drives
 import numpy as np
 import pytest
 
+from adaptune import manifest
 from adaptune.errors import AdaptuneError
 from adaptune.model import BankSettings, ErrorModel, PairedSettings
 from adaptune.selection import Selection
@@ -68,7 +69,7 @@ def test_rows_and_files(replayed):
 def test_baseline_and_fixed_keep_their_parameters_and_adaptive_has_its_own(replayed):
     model = ErrorModel.load(replayed.folder / "model.safetensors")
     folder = replayed.folder / "replays/three"
-    about = {m: json.loads((folder / m / "replay.json").read_text())["about"] for m in MODES}
+    about = {m: json.loads((folder / m / "inputs.json").read_text())["inputs"] for m in MODES}
     assert about["baseline"]["parameters"] == replayed.odometry.space.baseline
     assert about["fixed"]["parameters"] == model.sets[model.fixed]
     for mode in ("adaptive", "paper"):
@@ -81,10 +82,9 @@ def test_baseline_and_fixed_keep_their_parameters_and_adaptive_has_its_own(repla
 
 
 def test_values_that_stay_read_as_those_that_change(own):
-    path = own.folder / "replays/three/fixed/replay.json"
-    about = json.loads(path.read_text())
-    about["about"]["parameters"] = {"mode": True, "size": 3, "kernel": "none"}
-    path.write_text(json.dumps(about))
+    path = own.folder / "replays/three/fixed" / manifest.FILE
+    parameters = {"mode": True, "size": 3, "kernel": "none"}
+    manifest.record(path, manifest.recorded(path) | {"parameters": parameters})
     choices = StoredReplay.read(path.parent).choices
     assert choices == {"mode": ["True"], "size": [3.0], "kernel": ["none"]}
 
@@ -102,7 +102,9 @@ def test_one_set_at_a_time_is_driven_where_a_bank_does_not_pay(own, study_file, 
     assert row.rte < 3.0
     folder = study.folder / "replays/three/adaptive"
     about = {
-        mode: json.loads((folder.with_name(mode) / "replay.json").read_text())["about"]["switching"]
+        mode: json.loads((folder.with_name(mode) / "inputs.json").read_text())["inputs"][
+            "switching"
+        ]
         for mode in ("adaptive", "paper")
     }
     assert about["paper"]["mechanism"] == mechanism
@@ -224,10 +226,10 @@ def test_rows_over_several_sequences(replayed, study_file, tmp_path):
 @pytest.mark.parametrize(
     ("override", "words"),
     [
-        ("odometry.settings.downsampling=0.4", "is a model of .*0.5.*0.4"),
-        ("odometry.parameters.keyframe_interval.high=20", "other parameters or ranges"),
+        ("odometry.settings.downsampling=0.4", "downsampling changed from 0.5 to 0.4"),
+        ("odometry.parameters.keyframe_interval.high=20", "high changed from 15.0 to 20.0"),
         ("test=[]", "name at least one sequence"),
-        ("sub_trajectory=2", "is a model of errors over 3 m, the study's sub_trajectory is 2 m"),
+        ("sub_trajectory=2", "sub_trajectory changed from 3.0 to 2.0"),
     ],
 )
 def test_refuses_a_model_of_something_else(trained, study_file, tmp_path, override, words):
@@ -342,7 +344,7 @@ def test_what_was_possible_in_hindsight_is_not_known_without_the_oracle(replayed
     (said,) = (said for said in compare(replayed).words if "`adaptune online --oracle`" in said)
     assert said.startswith("What the best set would have gained is not known")
     best = ComparisonRow("three", "oracle, sequence", 0.5, 0.9, 0, 0, 0)
-    monkeypatch.setattr("online.compare.read_oracle", lambda *_: "its trials")
+    monkeypatch.setattr("online.compare.oracle_errors", lambda *_: "its trials")
     monkeypatch.setattr("online.compare.oracle_rows", lambda *_: [best])
     assert not any("`adaptune online --oracle`" in said for said in compare(replayed).words)
 

@@ -44,7 +44,8 @@ def test_it_is_recorded_how_a_replay_kept_up(study):
     for mode in ("baseline", "fixed", "adaptive"):
         found = summary(study, mode)
         kept = found["real_time"]
-        assert found["about"]["real_time"] == {"rate": 5.0, "deadline": 5.0, "queue": 0}
+        inputs = json.loads((study.folder / f"replays/three/{mode}/inputs.json").read_text())
+        assert inputs["inputs"]["real_time"] == {"rate": 5.0, "deadline": 5.0, "queue": 0}
         assert (kept["rate"], kept["dropped_scans"], kept["missed_selections"]) == (5.0, 0, 0)
         assert 0.0 < kept["pose_ms_p50"] <= kept["pose_ms_p99"]
         assert (kept["selection_ms_p50"] > 0.0) == (mode == "adaptive")
