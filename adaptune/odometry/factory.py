@@ -354,7 +354,7 @@ class OdometryFactory:
         if isolated or not self._clean or (is_user_class(self.name) and not self.user_code):
             return Isolated(self.name, given, self.settings, self.limits)
         if is_user_class(self.name):
-            return Guarded(self.name, given, self.settings, self.limits.seconds)
+            return Guarded(self.name, odometry_class, given, self.settings, self.limits.seconds)
         cls: Any = odometry_class(self.name)
         return InProcess(cls(given, self.settings))
 

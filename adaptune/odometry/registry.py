@@ -3,7 +3,7 @@
 from contextlib import suppress
 from functools import cache
 from importlib import metadata
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pydantic import ValidationError
 
@@ -13,11 +13,6 @@ from adaptune.odometry.base import Description, Odometry
 from adaptune.odometry.wire import Served
 from adaptune.space import ParameterSet
 from adaptune.strict import in_one_line
-
-if TYPE_CHECKING:
-    from adaptune.odometry.docker.rustle import Rustle
-    from adaptune.odometry.program import WholeRun
-    from adaptune.odometry.remote import Isolated
 
 ENTRY_POINTS = "adaptune.odometries"
 """Group in which other packages announce their odometries, each by its name."""
@@ -53,8 +48,6 @@ CONTAINERS = ("docker_command", "docker_process", "rustle")
 PACKAGES = {"gicp": "small_gicp", "kiss_icp": "kiss-icp", "ndt": "open3d", "vgicp": "small_gicp"}
 """Packages that our odometries run on, where they are not named as the adapter's module is."""
 
-AnyOdometry = type[Odometry] | type["Isolated"] | type["WholeRun"] | type["Rustle"]
-
 
 def is_user_class(name: str) -> bool:
     """Whether an odometry is a class that is not adaptune's: another package's, or the user's."""
@@ -75,7 +68,7 @@ def where(name: str) -> str:
         raise OdometryError(str(error)) from error
 
 
-def odometry_class(name: str) -> "AnyOdometry":
+def odometry_class(name: str) -> type[Any]:
     """Class of an odometry; see `adaptune.odometry.factory` for a user's.
 
     Parameters

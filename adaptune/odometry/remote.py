@@ -31,7 +31,6 @@ from adaptune.odometry.base import (
     Usage,
     pose_fault,
 )
-from adaptune.odometry.registry import odometry_class
 from adaptune.processes import available, next_core
 from adaptune.recording.scan import Scan
 from adaptune.selection import Selection
@@ -412,15 +411,24 @@ class Guarded(Faulting):
     ----------
     name, parameters
         The odometry.
+    find
+        Imports the class of a name.
     settings
         Its checked settings.
     seconds
         Time for one scan. It holds for Python code in the main thread; other code is trusted.
     """
 
-    def __init__(self, name: str, parameters: ParameterSet, settings: BaseModel, seconds: float):
+    def __init__(
+        self,
+        name: str,
+        find: Callable[[str], type[Any]],
+        parameters: ParameterSet,
+        settings: BaseModel,
+        seconds: float,
+    ):
         super().__init__(name, parameters)
-        self._seconds = seconds
+        self._find, self._seconds = find, seconds
         self._settings = settings.model_dump(mode="json")
         self._odometry: Odometry | None = None
         self._cpu = 0.0
@@ -502,7 +510,7 @@ class Guarded(Faulting):
         try:
             with _limited(self._seconds):
                 if self._odometry is None:
-                    cls: Any = odometry_class(self.name)
+                    cls = self._find(self.name)
                     settings = cls.settings_type.model_validate(self._settings)
                     self._odometry = cls(self.parameters, settings)
                 return call(self._odometry)

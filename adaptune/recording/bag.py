@@ -30,8 +30,7 @@ from adaptune.recording.clouds import (
     usable,
 )
 from adaptune.recording.config import files_of
-from adaptune.recording.recording import Frame, Repairs
-from adaptune.recording.scan import AUTO, Imu, Scan, SequenceError, Timing
+from adaptune.recording.scan import AUTO, Frame, Imu, Repairs, Scan, SequenceError, Timing
 from adaptune.trajectory import Trajectory
 
 # ROS 1 bags that are opened by the index at their end alone.

@@ -14,8 +14,7 @@ from adaptune import geometry
 from adaptune.geometry import Poses
 from adaptune.recording.bag import BagSource
 from adaptune.recording.config import bag_paths
-from adaptune.recording.recording import Frame, Source
-from adaptune.recording.scan import Imu, Scan, SequenceError, Timing
+from adaptune.recording.scan import Frame, Imu, Scan, SequenceError, Source, Timing
 from adaptune.trajectory import Trajectory
 
 

@@ -18,8 +18,7 @@ from adaptune import files as open3d
 from adaptune import geometry
 from adaptune.geometry import Poses
 from adaptune.recording.clouds import PointCloudError, from_fields
-from adaptune.recording.recording import Frame
-from adaptune.recording.scan import AUTO, Imu, Scan, SequenceError, Timing
+from adaptune.recording.scan import AUTO, Frame, Imu, Scan, SequenceError, Timing
 from adaptune.trajectory import Trajectory, TrajectoryError, read_kitti, read_oxts
 
 SUFFIXES = (".bin", ".npy", ".pcd", ".ply")

@@ -2,11 +2,10 @@
 
 import logging
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import islice
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,82 +22,19 @@ from adaptune.recording.config import (
     bag_paths,
     files_of,
 )
-from adaptune.recording.scan import Imu, Recording, Scan, SequenceError, Timing
+from adaptune.recording.scan import (
+    Frame,
+    Imu,
+    Recording,
+    Repairs,
+    Scan,
+    SequenceError,
+    Source,
+    Timing,
+)
 from adaptune.trajectory import Trajectory, TrajectoryError, is_kitti, read_kitti, read_trajectory
 
 # What every format of recordings offers, and which of its scans are used.
-
-
-class Frame(NamedTuple):
-    """A scan before it is decoded."""
-
-    stamp: int  # nanoseconds, as recorded
-    recorded: int  # nanoseconds on the clock of the recorder; the stamp where there is none
-    load: Callable[[], Scan]  # decodes the scan
-
-
-class Source(Protocol):
-    """One format of recordings.
-
-    Attributes
-    ----------
-    random_access : bool
-        Whether frames hold nothing in memory before they are loaded.
-    """
-
-    random_access: ClassVar[bool]
-
-    @property
-    def name(self) -> str:
-        """Its file, for messages."""
-
-    @property
-    def n_messages(self) -> int:
-        """At least as many as there are scans."""
-
-    @property
-    def files(self) -> Sequence[Path]:
-        """All files that its scans and its IMU are read from."""
-
-    @property
-    def pose_files(self) -> Sequence[Path]:
-        """All other files that its own poses are read from."""
-
-    def frames(self) -> Iterator[Frame]:
-        """All scans in the order of their recording."""
-
-    def about(self) -> dict[str, Any]:
-        """Plain data to store with its decoded scans."""
-
-    def span(self) -> tuple[int, int] | None:
-        """First stamp, and about the last one; none where there is no scan."""
-
-    def poses(self, name: str | None, child_frame: str | None) -> Trajectory | None:
-        """Reference poses of the recording itself, or those of one topic."""
-
-    def first_pose(self, name: str) -> int | None:
-        """Stamp of the first pose on a topic."""
-
-    def imu(self, name: str | None) -> Imu | None:
-        """Measurements of its IMU, in the IMU's own units."""
-
-
-@dataclass
-class Repairs:
-    """Counts of what was left out of a recording, by reason."""
-
-    counts: dict[str, int] = field(default_factory=dict)
-
-    def add(self, reason: str, n: int = 1) -> None:
-        """Count what was left out."""
-        if n:
-            self.counts[reason] = self.counts.get(reason, 0) + n
-
-    def report(self, name: str) -> None:
-        """Log the counts, if there are any."""
-        if self.counts:
-            what = ", ".join(f"{n} {reason}" for reason, n in self.counts.items())
-            _log.warning("%s: left out %s", name, what)
 
 
 BACKWARD = "scans whose stamps do not come after the one before"

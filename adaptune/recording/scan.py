@@ -1,9 +1,11 @@
-"""One turn of a LiDAR."""
+"""What recordings consist of: scans, measurements of an IMU, and the formats that give them."""
 
+import logging
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Any, Literal, NamedTuple, Protocol
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +14,8 @@ from pydantic import BeforeValidator
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses
 from adaptune.trajectory import Trajectory
+
+_log = logging.getLogger(__name__)
 
 # Measurements of an IMU.
 
@@ -336,3 +340,75 @@ def part_name(name: str, part: Fractions) -> str:
 
 
 Part = Annotated[Fractions, BeforeValidator(read_part)]
+
+
+class Frame(NamedTuple):
+    """A scan before it is decoded."""
+
+    stamp: int  # nanoseconds, as recorded
+    recorded: int  # nanoseconds on the clock of the recorder; the stamp where there is none
+    load: Callable[[], Scan]  # decodes the scan
+
+
+class Source(Protocol):
+    """One format of recordings.
+
+    Attributes
+    ----------
+    random_access : bool
+        Whether frames hold nothing in memory before they are loaded.
+    """
+
+    random_access: ClassVar[bool]
+
+    @property
+    def name(self) -> str:
+        """Its file, for messages."""
+
+    @property
+    def n_messages(self) -> int:
+        """At least as many as there are scans."""
+
+    @property
+    def files(self) -> Sequence[Path]:
+        """All files that its scans and its IMU are read from."""
+
+    @property
+    def pose_files(self) -> Sequence[Path]:
+        """All other files that its own poses are read from."""
+
+    def frames(self) -> Iterator[Frame]:
+        """All scans in the order of their recording."""
+
+    def about(self) -> dict[str, Any]:
+        """Plain data to store with its decoded scans."""
+
+    def span(self) -> tuple[int, int] | None:
+        """First stamp, and about the last one; none where there is no scan."""
+
+    def poses(self, name: str | None, child_frame: str | None) -> Trajectory | None:
+        """Reference poses of the recording itself, or those of one topic."""
+
+    def first_pose(self, name: str) -> int | None:
+        """Stamp of the first pose on a topic."""
+
+    def imu(self, name: str | None) -> Imu | None:
+        """Measurements of its IMU, in the IMU's own units."""
+
+
+@dataclass
+class Repairs:
+    """Counts of what was left out of a recording, by reason."""
+
+    counts: dict[str, int] = field(default_factory=dict)
+
+    def add(self, reason: str, n: int = 1) -> None:
+        """Count what was left out."""
+        if n:
+            self.counts[reason] = self.counts.get(reason, 0) + n
+
+    def report(self, name: str) -> None:
+        """Log the counts, if there are any."""
+        if self.counts:
+            what = ", ".join(f"{n} {reason}" for reason, n in self.counts.items())
+            _log.warning("%s: left out %s", name, what)
