@@ -4,15 +4,17 @@ import pytest
 from commands import call
 
 from offline.config import load_study
+from offline.train import train
 from online.run import run_replays
 
 
 @pytest.fixture(scope="module")
-def finished(study_file, trained_folder, tmp_path_factory):
+def finished(gicp_study_file, tmp_path_factory):
     """The folder of a study that was trained and replayed."""
-    folder = shutil.copytree(trained_folder, tmp_path_factory.mktemp("run") / "study")
-    run_replays(load_study(study_file, [], folder), folder / "model.safetensors")
-    return folder
+    study = load_study(gicp_study_file, [], tmp_path_factory.mktemp("run") / "study")
+    train(study)
+    run_replays(study, study.model_path)
+    return study.folder
 
 
 def test_a_finished_study_has_a_page_of_everything(finished):
