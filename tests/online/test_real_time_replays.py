@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from commands import call
 
+from adaptune import manifest
 from adaptune.model import BankSettings, ErrorModel
 from offline.config import load_study
 from online.compare import compare
@@ -17,7 +18,7 @@ from online.run import run_replays
 from online.verdict import remarks
 
 RATE = "online.real_time.rate=5"
-WAITS = "online.real_time.deadline=5"
+WAITS = "online.real_time.deadline=60"
 TWO_CORES = "online.switching.cores=2"
 
 
@@ -44,13 +45,13 @@ def test_it_is_recorded_how_a_replay_kept_up(study):
     for mode in ("baseline", "fixed", "adaptive"):
         found = summary(study, mode)
         kept = found["real_time"]
-        inputs = json.loads((study.folder / f"replays/three/{mode}/inputs.json").read_text())
-        assert inputs["inputs"]["real_time"] == {"rate": 5.0, "deadline": 5.0, "queue": 0}
+        inputs = manifest.recorded(study.folder / f"replays/three/{mode}" / manifest.FILE)
+        assert inputs["real_time"] == {"rate": 5.0, "deadline": 60.0, "queue": 0}
         assert (kept["rate"], kept["dropped_scans"], kept["missed_selections"]) == (5.0, 0, 0)
         assert 0.0 < kept["pose_ms_p50"] <= kept["pose_ms_p99"]
         assert (kept["selection_ms_p50"] > 0.0) == (mode == "adaptive")
-        # Forty scans in 0.8 s.
-        assert 0.7 < found["replay_s"] < 60.0
+        # Forty scans in 0.8 s at least.
+        assert found["replay_s"] > 0.7
         with (study.folder / f"replays/three/{mode}/frames.csv").open() as file:
             late = [float(row["late_ms"]) for row in csv.DictReader(file)]
         assert np.percentile(late, 50) == pytest.approx(kept["pose_ms_p50"], abs=0.01)

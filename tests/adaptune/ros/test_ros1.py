@@ -163,7 +163,7 @@ def test_the_command_drives_until_ctrl_c(link, robot, study_file, trained_folder
     folder = shutil.copytree(trained_folder, tmp_path / "run")
     extra = ["-o", "online.ros.points=/velodyne", "-o", "online.ros.odometry=/found"]
     # Nothing is too late, also where the tests share a core.
-    extra += ["-o", "online.real_time={deadline: 5, queue: 0}"]
+    extra += ["-o", "online.real_time={deadline: 60, queue: 0}"]
     if steers:
         extra += ["-o", f"online.ros.steer={{node: {robot}, odometry: /truth}}"]
     poses = taken(link, "/found", "nav_msgs/msg/Odometry")

@@ -291,7 +291,7 @@ def test_without_the_extra_it_says_what_to_install(monkeypatch):
 def test_it_drives_over_zenoh(link, robot, study_file, trained_folder, tmp_path):
     """Scans come from another session, and poses go to it."""
     folder = shutil.copytree(trained_folder, tmp_path / "run")
-    patient = ["online.real_time={deadline: 5, queue: 0}", "online.ros.points=/velodyne"]
+    patient = ["online.real_time={deadline: 60, queue: 0}", "online.ros.points=/velodyne"]
     study = load_study(study_file, patient, folder)
     drive = RobotDrive(study, "fixed", study.model_path)
     scans, poses = drives.scans(2, 15), []
