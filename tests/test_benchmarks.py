@@ -14,26 +14,30 @@ import pytest
 from adaptune import files
 from adaptune.geometry import invert
 from adaptune.odometry.docker import rustle
-from adaptune.recording import SequenceError
 from adaptune.recording.config import SequenceConfig
 from adaptune.recording.recording import open_sequence
 from adaptune.simulation.record import Drive
 from adaptune.strict import ConfigurationError
-from adaptune.study.references import to_estimate
 from offline.config import OfflineStudy, load_study
-from online.statistics import ComparisonRow
 
 pytestmark = pytest.mark.services
+
+FOLDER = Path(__file__).parents[1] / "benchmarks"
 
 
 def benchmark(name):
     """A benchmark's module."""
-    path = Path(__file__).parents[1] / f"benchmarks/{name}.py"
-    spec = importlib.util.spec_from_file_location(name, path)
+    spec = importlib.util.spec_from_file_location(name, FOLDER / f"{name}.py")
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
     spec.loader.exec_module(module)
     return module
+
+
+@pytest.mark.parametrize("name", sorted(path.stem for path in FOLDER.glob("*.py")))
+def test_each_can_be_imported(name, monkeypatch):
+    monkeypatch.syspath_prepend(str(FOLDER))
+    benchmark(name)
 
 
 def test_stages_needs_its_argument_only(recorded, monkeypatch):
@@ -73,33 +77,6 @@ def test_directions_of_recorded_data_are_studies(recorded, tmp_path, monkeypatch
     assert "compensate" not in module.sequence("town", "kiss_icp")[1]
 
 
-def test_without_reference_only_the_test_knows_poses(recorded, tmp_path, monkeypatch):
-    module = benchmark("recorded")
-    monkeypatch.setenv("ADAPTUNE_TEST_DATA", str(recorded))
-    for name in ("hall_1", "cars", "campus"):
-        path = tmp_path / f"{name}.yaml"
-        given = module.definition(module.DIRECTIONS[name], "ndt", 3, 0, no_reference=True)
-        path.write_text(files.dump(given))
-        study = load_study(path, folder=tmp_path / name)
-        assert to_estimate(study.sequences, study.config.training) == list(study.config.training)
-        assert to_estimate(study.sequences, study.config.test) == ["street"] * (name == "cars")
-
-
-def test_rows_of_all_studies_are_collected(tmp_path):
-    module = benchmark("recorded")
-    for name, extra in (("a", {}), ("b", {"real_time": {"rate": 2.0}})):
-        row = ComparisonRow("town", "fixed", float("nan"), 1.0, 0, 0, 0, **extra)
-        module.keep(tmp_path / name, {"odometry": name}, [row])
-    module.collect(tmp_path)
-    rows = json.loads((tmp_path / "recorded.json").read_text())
-    assert [(row["odometry"], row["mode"], row["rate"]) for row in rows] == [
-        ("a", "fixed", None),
-        ("b", "fixed", 2.0),
-    ]
-    assert rows[0]["RTE [%]"] is None
-    assert len((tmp_path / "recorded.csv").read_text().splitlines()) == 3
-
-
 def test_recorded_prints_every_mode_and_resumes(
     study_file, trained_folder, tmp_path, monkeypatch, capsys
 ):
@@ -125,22 +102,6 @@ def test_recorded_prints_every_mode_and_resumes(
     module.main()
     assert row in capsys.readouterr().out
     assert {path: path.stat().st_mtime_ns for path in made} == made
-
-
-def test_recorded_goes_on_after_a_study_that_is_not_possible(tmp_path, monkeypatch, capsys):
-    module = benchmark("recorded")
-
-    def run(study, _):
-        raise SequenceError(f"{study}: too short")
-
-    monkeypatch.setattr(module, "load_study", lambda path, **_: path.stem)
-    monkeypatch.setattr(module, "run", run)
-    monkeypatch.setattr(module.processes, "pin", lambda _: None)
-    monkeypatch.setenv("ADAPTUNE_TEST_DATA", str(tmp_path))
-    monkeypatch.setattr(sys, "argv", ["recorded.py", str(tmp_path), "--odometries", "ndt"])
-    module.main()
-    said = capsys.readouterr().out
-    assert said.count("not possible: ndt-") == len(module.DIRECTIONS)
 
 
 def test_simulated_kitti_is_read_as_it_was_driven(tmp_path, monkeypatch):
@@ -181,17 +142,6 @@ def test_recorded_drives_are_undistorted_by_their_poses(recorded):
         assert np.abs(scan.points[late] - before.points[late]).max() > 0.5
 
 
-def test_gardens_have_what_the_study_names(tmp_path, monkeypatch):
-    module = benchmark("protocols")
-    monkeypatch.setattr(module, "GARDENS", ("1005_00",))
-    module.simulate_gardens(tmp_path, metres=10.0)
-    entry = files.Document.of_file(module.CONFIGS / "botanic_garden_gicp.yaml").data["sequences"]
-    monkeypatch.setenv("BOTANIC_GARDEN", str(tmp_path))
-    sequence = open_sequence(SequenceConfig.model_validate(entry["1005_00"]))
-    assert sequence.reference() is not None
-    assert len(next(iter(sequence))) > 5000
-
-
 @pytest.mark.parametrize("name", ["kitti", "drives", "garden", "docker"])
 def test_commands_of_a_protocol_lack_nothing_but_their_data(name, tmp_path, monkeypatch):
     module = benchmark("protocols")
@@ -218,10 +168,3 @@ def mistakes_of(path, overrides, folder):
     except ConfigurationError as error:
         return str(error).splitlines()
     return []
-
-
-def test_grids_fill_the_searches_that_they_are_compared_with():
-    module = benchmark("protocols")
-    for grid, points in ((module.GICP_GRID, 30), (module.DOCKER_GRID, 18)):
-        counts = [axis["count"] for axis in files.scalar(grid).values()]
-        assert np.prod(counts) == points
