@@ -32,8 +32,7 @@ from adaptune.model.weights import (
 )
 from adaptune.odometry.base import Motions
 from adaptune.recording.scan import Scan
-from adaptune.selection import Selection
-from adaptune.space import ODOMETRY, ParameterSets, ParameterSpace, PooledSpace
+from adaptune.space import ODOMETRY, ParameterSets, ParameterSpace, PooledSpace, Selection
 
 SCANS_TO_KNOW = 10
 """The sensor is recognised by the median over this many scans that selections are made from."""

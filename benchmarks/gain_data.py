@@ -12,20 +12,21 @@ from numpy.typing import NDArray
 from adaptune.archive import Frames
 from adaptune.files import replacing
 from adaptune.live.hops import Hops
-from adaptune.model.descriptor import (
-    averaged,
-    lowest_elevation,
-)
+from adaptune.model.descriptor import averaged, lowest_elevation
 from adaptune.model.ndt import N_FEATURES, ndt_histogram
-from adaptune.odometry.factory import OdometryFactory
-from adaptune.odometry.registry import odometry_class
+from adaptune.odometry.registry import OdometryFactory, odometry_class
 from adaptune.odometry.remote import Limits
 from adaptune.simulation import Course
 from adaptune.simulation.record import simulate
 from adaptune.space import ParameterSets, ParameterSpace
-from offline.bank_simulation import BankSimulation, error_vectors, recorded_motions
 from offline.config import OfflineConfig
-from offline.labelled import LabelledData, LabelledSequence
+from offline.labelled import (
+    BankSimulation,
+    LabelledData,
+    LabelledSequence,
+    error_vectors,
+    recorded_motions,
+)
 from offline.samplers import make_sampler
 from offline.trial import SharedScan, SharedScans, TrialSettings, run_trials, with_measured_hops
 

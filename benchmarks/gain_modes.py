@@ -10,8 +10,7 @@ from adaptune.live.evidence import Link, OwnErrors
 from adaptune.live.hops import Hop
 from adaptune.metrics import sub_trajectory_rte, travelled, window_ends
 from adaptune.model.weights import MemberWeights, clip_errors, minimum_variance_weights
-from offline.bank_simulation import chained
-from offline.labelled import LabelledData, LabelledSequence, periods
+from offline.labelled import LabelledData, LabelledSequence, chained, periods
 from offline.tuning import bank_errors, cancelling_members
 from offline.validate import Validation, leave_one_out, leave_out
 

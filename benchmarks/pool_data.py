@@ -16,13 +16,17 @@ from adaptune.live.hops import Hops
 from adaptune.model.descriptor import averaged, lowest_elevation
 from adaptune.model.ndt import N_FEATURES, ndt_histogram
 from adaptune.model.rules import Costs, SetCost
-from adaptune.odometry.factory import OdometryFactory, OdometryPool
-from adaptune.odometry.registry import odometry_class
+from adaptune.odometry.registry import OdometryFactory, OdometryPool, odometry_class
 from adaptune.odometry.remote import Limits
 from adaptune.simulation.record import simulate
 from adaptune.space import ODOMETRY, ParameterSet, ParameterSets, ParameterSpace
-from offline.bank_simulation import BankSimulation, error_vectors, recorded_motions
-from offline.labelled import LabelledData, LabelledSequence
+from offline.labelled import (
+    BankSimulation,
+    LabelledData,
+    LabelledSequence,
+    error_vectors,
+    recorded_motions,
+)
 from offline.samplers import sobol_points
 from offline.trial import TrialSettings, run_trials, with_measured_hops
 

@@ -31,8 +31,8 @@ from adaptune.bank.bank import Bank
 from adaptune.model import ErrorModel
 from adaptune.model.descriptor import lowest_elevation
 from adaptune.model.ndt import N_FEATURES, ndt_histogram
-from adaptune.odometry.factory import OdometryFactory
 from adaptune.odometry.keyframe import KeyframeGicp
+from adaptune.odometry.registry import OdometryFactory
 from adaptune.odometry.remote import Limits
 from adaptune.odometry.tracker import HealthCheck
 from adaptune.recording.config import SequenceConfig

@@ -42,8 +42,8 @@ from adaptune.report import tables
 from adaptune.study.config import ALSO
 from offline.config import OfflineStudy, load_study
 from offline.train import train
+from online.modes import run_replays, run_untrained
 from online.record import StoredReplay
-from online.run import run_replays, run_untrained
 from online.statistics import ComparisonRow, Reference, compare_modes
 
 ODOMETRIES = ("gicp", "ndt", "kiss_icp")

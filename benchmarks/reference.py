@@ -27,13 +27,12 @@ from adaptune.files import replacing
 from adaptune.metrics import cap, sub_trajectory_rte, sub_trajectory_vectors
 from adaptune.model import PairedExpectedRatio
 from adaptune.reference.estimate import VERSION, estimated
-from adaptune.reference.registering import pass_over
+from adaptune.reference.graph import pass_over
 from adaptune.reference.stored import EstimateError
 from adaptune.simulation import Course
 from adaptune.simulation.record import simulate
 from offline import validate as validation
-from offline.bank_simulation import chained
-from offline.labelled import LabelledData
+from offline.labelled import LabelledData, chained
 from offline.tuning import choose
 from offline.validate import PAIRED, LeftOut, Validation
 

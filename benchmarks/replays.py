@@ -27,13 +27,13 @@ from adaptune.model.ndt import N_FEATURES
 from adaptune.model.rules import ERROR_FLOOR
 from adaptune.model.weights import weighted_selection
 from adaptune.odometry.base import Motions, OdometryInstance
-from adaptune.odometry.factory import OdometryFactory
+from adaptune.odometry.registry import OdometryFactory
 from adaptune.odometry.tracker import HealthCheck
 from adaptune.recording.scan import Scan
-from adaptune.selection import Selection
 from adaptune.selector import Selector, Selects, UntrainedSelector, untrained_sets
 from adaptune.simulation import Course
 from adaptune.simulation.record import SimulatedScan, simulate
+from adaptune.space import Selection
 from offline.labelled import LabelledData
 from offline.train import fit
 from offline.tuning import Policy, choose

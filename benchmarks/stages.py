@@ -27,9 +27,8 @@ from adaptune.odometry.keyframe import crop
 from adaptune.odometry.tracker import HealthCheck
 from adaptune.recording import SequenceConfig
 from adaptune.recording.recording import open_sequence
-from adaptune.selection import Selection
 from adaptune.selector import Selector
-from adaptune.space import ParameterSet
+from adaptune.space import ParameterSet, Selection
 from adaptune.trajectory import read_kitti
 from offline.config import OfflineStudy, load_study
 from offline.train import train

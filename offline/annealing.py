@@ -25,7 +25,7 @@ from optuna.study import Study, StudyDirection
 from optuna.trial import FrozenTrial, TrialState
 
 from adaptune.errors import nearest
-from offline.sampler_settings import AnnealingSettings, Step
+from offline.config import AnnealingSettings, Step
 
 SIGMA = 0.05
 """Standard deviation of a step, as a share of the range."""

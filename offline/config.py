@@ -1,26 +1,491 @@
 """The configuration of a study with the settings of the offline stage."""
 
+import inspect
+import math
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, get_args
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import BaseModel, BeforeValidator, Field, model_validator
 
-from adaptune.errors import nearest
+from adaptune import processes, strict
+from adaptune.errors import AdaptuneError, nearest
 from adaptune.recording.config import MOST_VIEWS, ViewConfig
-from adaptune.space import ParameterSpace
+from adaptune.space import (
+    Categorical,
+    Float,
+    Integer,
+    ParameterSet,
+    ParameterSpace,
+    Value,
+    describe,
+)
 from adaptune.strict import Mistake, StrictModel, validated
 from adaptune.study.config import StudyConfig
 from adaptune.study.study import Study
-from offline.sampler_settings import (
-    NAMES,
-    SETTINGS,
-    SINGLE_OBJECTIVE,
-    STATELESS,
-    SamplerError,
-    check_class,
-    check_sampler,
-)
+
+# The samplers by name, and the settings of each.
+
+
+OPTUNA = {
+    "cmaes": "optuna.samplers:CmaEsSampler",
+    "gp": "optuna.samplers:GPSampler",
+    "nsga2": "optuna.samplers:NSGAIISampler",
+    "qmc": "optuna.samplers:QMCSampler",
+    "tpe": "optuna.samplers:TPESampler",
+}
+"""Optuna's samplers; their settings are the keywords of the class."""
+NAMES = ("annealing", "grid", "random", *OPTUNA)
+SINGLE_OBJECTIVE = ("annealing", "cmaes")
+"""Samplers that minimise one objective only."""
+STATELESS = ("tpe", "gp")
+"""Samplers that keep no notes: they continue from any list of trials."""
+NEEDS = {"cmaes": "cmaes", "gp": "torch"}
+"""Packages that a sampler needs; adaptune's extra has the sampler's name."""
+SERVICE = processes.Service("offline.samplers")
+"""What a server does with a sampler of the user."""
+
+
+def is_user_sampler(name: str) -> bool:
+    """Whether a sampler is a class that is neither adaptune's nor Optuna's."""
+    return ":" in name and name.partition(":")[0].partition(".")[0] != "optuna"
+
+
+class SamplerError(AdaptuneError):
+    """A sampler that cannot be used."""
+
+
+class Step(StrictModel):
+    """How far a step of annealing moves a parameter.
+
+    ``docs/reference-study.md`` describes the settings and their defaults.
+    """
+
+    mu: float | None = None
+    sigma: float | None = Field(None, ge=0)
+    delta_max: int | None = Field(None, ge=0, le=2**53)
+    change: float | None = Field(None, ge=0, le=1)
+    # Bounds of the walk, within the parameter's range.
+    low: int | float | None = None
+    high: int | float | None = None
+
+
+class AnnealingSettings(StrictModel):
+    """Settings of simulated annealing, with the names they have in RUSTLE.
+
+    ``docs/reference-study.md`` describes them.
+    """
+
+    initial_temperature: float = Field(0.1, gt=0)
+    alpha: float = Field(0.9, gt=0, le=1)
+    energy_scale: float | None = Field(None, gt=0)
+    reanneal_fixed: int | None = Field(None, ge=1, le=10**9)
+    reanneal_accepted: int | None = Field(None, ge=1, le=10**9)
+    reanneal_best: int | None = Field(None, ge=1, le=10**9)
+    stall_accepted: int | None = Field(None, ge=1, le=10**9)
+    stall_best: int | None = Field(None, ge=1, le=10**9)
+    chains: int = Field(2, ge=1, le=1000)
+    # Where the chains begin, instead of at the best of the initial points.
+    start: dict[str, int | float] | None = None
+    steps: dict[str, Step] = Field(default_factory=dict)
+
+
+MOST_VALUES = 100_000
+"""Of one parameter in a grid."""
+
+
+class Span(StrictModel):
+    """`count` values from `low` to `high`, evenly in ratio where the parameter's scale is log."""
+
+    low: float
+    high: float
+    count: int = Field(ge=1, le=MOST_VALUES)
+
+
+class GridSettings(StrictModel):
+    """Settings of `grid`."""
+
+    # For every number ``[first, step, count]`` or a `Span`; for categories the choices to try, by
+    # default all.
+    grid: dict[str, Span | tuple[Value, ...]]
+
+
+class RandomSettings(StrictModel):
+    """Settings of `random`: with a grid, it draws the grid's points without repetition."""
+
+    grid: dict[str, Span | tuple[Value, ...]] | None = None
+
+
+def optuna_class(name: str) -> type[Any]:
+    """Class of an Optuna sampler.
+
+    Raises
+    ------
+    SamplerError
+        It names the nearest sampler, or what to install.
+    """
+    if name in NEEDS and find_spec(NEEDS[name]) is None:
+        raise SamplerError(
+            f"{name} needs the package {NEEDS[name]}: pip install 'adaptune[{name}]'"
+        )
+    if name == "sobol":
+        raise SamplerError("sobol is gone; choose qmc, Optuna's, or tpe, which begins with points")
+    if name not in OPTUNA and ":" not in name:
+        raise SamplerError(
+            f"there is no sampler {name!r}: {nearest(name, NAMES)} (another Optuna sampler is "
+            f"package.module:Class)"
+        )
+    from optuna.samplers import BaseSampler
+
+    try:
+        path = strict.path_of(name, "sampler", OPTUNA, "", "Class")
+        found = strict.load(name, path, "class")
+    except strict.PluginError as error:
+        raise SamplerError(str(error)) from error
+    if not (isinstance(found, type) and issubclass(found, BaseSampler)):
+        raise SamplerError(f"{name}: is not a class derived from optuna.samplers.BaseSampler")
+    return found
+
+
+def optuna_sampler(name: str, settings: Mapping[str, Any], seed: int) -> Any:
+    """Make an Optuna sampler.
+
+    Raises
+    ------
+    SamplerError
+        If it does not take these settings.
+    """
+    cls = optuna_class(name)
+    keywords = inspect.signature(cls).parameters
+    if not any(k.kind is inspect.Parameter.VAR_KEYWORD for k in keywords.values()):
+        for key in settings:
+            if key not in keywords:
+                raise SamplerError(f"{key}: {name} has no such setting; {nearest(key, keywords)}")
+    seeded = {"seed": seed} if "seed" in keywords else {}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # about what is experimental, or deprecated
+        try:
+            return cls(**seeded, **settings)
+        except Exception as error:
+            raise SamplerError(f"{name} does not take its settings: {error}") from error
+
+
+SETTINGS: dict[str, type[BaseModel]] = {
+    "annealing": AnnealingSettings,
+    "grid": GridSettings,
+    "random": RandomSettings,
+}
+"""Settings of adaptune's own samplers."""
+
+
+# Grids of parameter sets, whose points are made when they are asked for.
+
+
+MAX_UNBUDGETED_POINTS = 10_000
+"""Points of the largest grid that a search without a budget may try."""
+
+
+class Grid:
+    """All combinations of the axes' values, in row-major order: the last axis changes fastest.
+
+    Attributes
+    ----------
+    size : int
+        Number of points.
+    """
+
+    def __init__(self, axes: Mapping[str, Sequence[Value]]):
+        self.axes = dict(axes)
+        self.size = math.prod(map(len, self.axes.values()))
+
+    def __getitem__(self, index: int) -> ParameterSet:
+        values: ParameterSet = {}
+        for name, axis in reversed(self.axes.items()):
+            index, i = divmod(index, len(axis))
+            values[name] = axis[i]
+        return {name: values[name] for name in self.axes}
+
+    def index(self, parameters: ParameterSet) -> int | None:
+        """Index of a point, up to rounding; None if it is not on the grid."""
+        index = 0
+        for name, axis in self.axes.items():
+            i = next((i for i, v in enumerate(axis) if _alike(v, parameters[name])), None)
+            if i is None:
+                return None
+            index = index * len(axis) + i
+        return index
+
+    @classmethod
+    def of(cls, space: ParameterSpace) -> "Grid | None":
+        """All sets of a space; None if there are infinitely many."""
+        axes: dict[str, Sequence[Value]] = {}
+        for name, p in space.parameters.items():
+            if isinstance(p, Float):
+                return None
+            if isinstance(p, Categorical):
+                axes[name] = p.choices
+            else:
+                axes[name] = range(int(p.low), int(p.high) + 1)
+        return cls(axes)
+
+
+def _alike(one: Value, other: Value) -> bool:
+    if isinstance(one, float) and isinstance(other, float):
+        return math.isclose(one, other, rel_tol=1e-9, abs_tol=1e-12)
+    return type(one) is type(other) and one == other
+
+
+def make_grid(space: ParameterSpace, grid: Mapping[str, Span | Sequence[Value]]) -> Grid:
+    """Make a grid from its settings, which have no mistakes."""
+    return Grid({name: _axis(p, grid.get(name)) for name, p in space.parameters.items()})
+
+
+def _axis(
+    parameter: Float | Integer | Categorical, given: Span | Sequence[Value] | None
+) -> Sequence[Value]:
+    """The values of a parameter; a ValueError says what is wrong with them."""
+    if isinstance(parameter, Categorical):
+        return _choices(parameter, parameter.choices if given is None else given)
+    if given is None:
+        raise ValueError("is missing; give [first, step, count] or {low, high, count}")
+    numbers = _span(parameter, given) if isinstance(given, Span) else _steps(parameter, given)
+    whole = isinstance(parameter, Integer)
+    values: list[Value] = [round(x) if whole else _within(parameter, x) for x in numbers]
+    for end in (values[0], values[-1]):
+        if not parameter.contains(end):
+            raise ValueError(f"{end:g} is outside {describe(parameter)}")
+    return values
+
+
+def _within(parameter: Float | Integer, x: float) -> float:
+    """The bound of a range where rounding has missed it, or the number itself."""
+    bounds = (parameter.low, parameter.high)
+    return next((b for b in bounds if math.isclose(x, b, abs_tol=1e-12)), x)
+
+
+def _choices(parameter: Categorical, given: Span | Sequence[Value]) -> Sequence[Value]:
+    if isinstance(given, Span) or not given:
+        raise ValueError("give a list of its choices")
+    for choice in given:
+        if not parameter.contains(choice):
+            raise ValueError(f"{choice!r} is not one of {describe(parameter)}")
+    if len(set(map(repr, given))) < len(given):
+        raise ValueError("choices repeat themselves")
+    return given
+
+
+def _span(parameter: Float | Integer, given: Span) -> list[float]:
+    low, high, count = given.low, given.high, given.count
+    if low > high or (count > 1 and low == high):
+        raise ValueError(f"low ({low:g}) must be less than high ({high:g})")
+    if isinstance(parameter, Integer) and count > high - low + 1:
+        raise ValueError(f"there are no {count} whole numbers from {low:g} to {high:g}")
+    if parameter.log and low <= 0:
+        raise ValueError(f"a log scale needs low ({low:g}) above 0")
+    if parameter.log:
+        low, high = math.log(low), math.log(high)
+    step = (high - low) / max(count - 1, 1)
+    numbers = [low + i * step for i in range(count)]
+    return [math.exp(x) for x in numbers] if parameter.log else numbers
+
+
+def _steps(parameter: Float | Integer, given: Sequence[Value]) -> list[float]:
+    if len(given) != 3 or any(isinstance(v, bool | str) for v in given):
+        raise ValueError("give [first, step, count], three numbers, or {low, high, count}")
+    first, step, count = map(float, given)
+    if not (1 <= count <= MOST_VALUES and count.is_integer()):
+        raise ValueError(f"count, the last number, must be a whole one from 1 to {MOST_VALUES:,}")
+    if step == 0 and count > 1:
+        raise ValueError("a step of 0 gives the same value again and again")
+    if isinstance(parameter, Integer) and not (first.is_integer() and step.is_integer()):
+        raise ValueError("first and step must be whole numbers, as the parameter is")
+    return [first + i * step for i in range(int(count))]
+
+
+def check_grid(
+    axes: Mapping[str, Span | Sequence[Value]], space: ParameterSpace, bounded: bool
+) -> Iterable[Mistake]:
+    """Find mistakes in a grid.
+
+    Yields
+    ------
+    Mistake
+        Its key begins below the sampler's settings.
+    """
+    for name in axes:
+        if name not in space.names:
+            help_ = nearest(name, space.names)
+            yield Mistake(("grid", name), f"no parameter {name!r} is tuned: {help_}")
+            return
+    made = {}
+    for name, parameter in space.parameters.items():
+        try:
+            made[name] = _axis(parameter, axes.get(name))
+        except ValueError as error:
+            yield Mistake(("grid", name), str(error))
+    if len(made) < len(space):
+        return
+    grid = Grid(made)
+    if not bounded and grid.size > MAX_UNBUDGETED_POINTS:
+        yield Mistake(
+            ("grid",),
+            f"has {grid.size:,} points, and the study sets no budget; give offline.trials, hours "
+            f"or stagnation, or a coarser grid (up to {MAX_UNBUDGETED_POINTS:,} points)",
+        )
+    elif grid.size >= 2**62:
+        yield Mistake(("grid",), "has more points than can be numbered; give a coarser grid")
+
+
+# Mistakes in a sampler's settings that only the sampler and the parameters show.
+
+
+_SET_BY_KEY = {"seed": "seed", "n_startup_trials": "initial", "constraints_func": "limits"}
+"""Settings of Optuna's samplers that adaptune sets, and from which key."""
+_BOX = ("low", "high")
+_MAX_SETTING = 100_000
+"""Candidates, or members of a population: more of them take hours, or all memory."""
+
+
+def check_class(name: str) -> None:
+    """Refuse a name that leads to no Optuna sampler; the user's are imported elsewhere.
+
+    Raises
+    ------
+    SamplerError
+    """
+    if not is_user_sampler(name):
+        optuna_class(name)
+        return
+    try:
+        processes.server(SERVICE, name)
+    except processes.HostError as error:
+        raise SamplerError(str(error)) from error
+
+
+def check_sampler(
+    name: str, settings: Mapping[str, Any], space: ParameterSpace | None, budgeted: bool
+) -> Iterable[Mistake]:
+    """Find mistakes in a sampler's settings, where `space` is None without the parameters.
+
+    Yields
+    ------
+    Mistake
+        Its key begins below the settings.
+    """
+    if name == "tpe" and not settings:
+        return  # a look at Optuna would take long
+    if name not in SETTINGS:
+        yield from _check_optuna(name, settings, space)
+    elif space is None:
+        return
+    elif name == "annealing":
+        given = AnnealingSettings.model_validate(settings)
+        for parameter, value in (given.start or {}).items():
+            yield from _check_start(parameter, value, given.steps.get(parameter, Step()), space)
+        for parameter, step in given.steps.items():
+            yield from _check_step(parameter, step, space)
+    elif name in ("grid", "random"):
+        axes = RandomSettings.model_validate(settings).grid
+        if axes is not None:
+            yield from check_grid(axes, space, bounded=budgeted or name == "random")
+
+
+def _check_optuna(
+    name: str, settings: Mapping[str, Any], space: ParameterSpace | None
+) -> Iterable[Mistake]:
+    if taken := next((key for key in _SET_BY_KEY if key in settings), None):
+        yield Mistake((taken,), f"is set by offline.{_SET_BY_KEY[taken]}")
+        return
+    for key, value in settings.items():
+        if isinstance(value, int) and abs(value) > _MAX_SETTING:
+            yield Mistake((key,), f"give a number of at most {_MAX_SETTING:,}, not {value}")
+            return
+    try:
+        make = _make_elsewhere if is_user_sampler(name) else optuna_sampler
+        make(name, settings, 0)
+    except SamplerError as error:
+        key, _, rest = str(error).partition(": ")
+        yield Mistake((key,), rest) if key in settings else Mistake((), str(error))
+    parameters = () if space is None else space.parameters.values()
+    if name == "cmaes" and parameters and all(isinstance(p, Categorical) for p in parameters):
+        yield Mistake((), "cmaes searches among numbers, and all parameters are categories")
+
+
+def _check_step(name: str, step: Step, space: ParameterSpace) -> Iterable[Mistake]:
+    key = ("steps", name)
+    parameter = space.parameters.get(name)
+    if parameter is None:
+        yield Mistake(key, f"no parameter {name!r} is tuned: {nearest(name, space.names)}")
+        return
+    allowed = _allowed(parameter)
+    given = step.model_dump(exclude_none=True)
+    for setting in given:
+        if setting not in allowed:
+            kind = "log " * getattr(parameter, "log", False) + parameter.type
+            message = f"steps of a {kind} are set by {_listed(allowed)}"
+            yield Mistake((*key, setting), message)
+    if not isinstance(parameter, Categorical):
+        low, high = box = _box(parameter, step)
+        if not (low < high and all(map(parameter.contains, box))):
+            message = f"the walk's low and high must lie in {describe(parameter)}, low below high"
+            yield Mistake(key, message)
+    still = {k: v for k, v in given.items() if k in allowed and k not in _BOX}
+    if still and not any(still.values()) and (allowed[0] != "mu" or "sigma" in still):
+        named = " and ".join(f"{k} {v:g}" for k, v in still.items())
+        yield Mistake(key, f"never moves with {named}")
+
+
+def _check_start(name: str, value: float, step: Step, space: ParameterSpace) -> Iterable[Mistake]:
+    key = ("start", name)
+    parameter = space.parameters.get(name)
+    if parameter is None:
+        yield Mistake(key, f"no parameter {name!r} is tuned: {nearest(name, space.names)}")
+    elif isinstance(parameter, Categorical):
+        yield Mistake(key, "is a category, which starts at the baseline; leave it out")
+    else:
+        low, high = _box(parameter, step)
+        if not (parameter.contains(value) and low <= value <= high):
+            what = "a whole number" if isinstance(parameter, Integer) else "a number"
+            yield Mistake(key, f"give {what} from {low:g} to {high:g}, not {value!r}")
+
+
+def _box(parameter: Float | Integer, step: Step) -> tuple[float, float]:
+    """Bounds of the walk."""
+    low, high = step.low, step.high
+    return parameter.low if low is None else low, parameter.high if high is None else high
+
+
+def _allowed(parameter: Float | Integer | Categorical) -> tuple[str, ...]:
+    if isinstance(parameter, Categorical):
+        return ("change",)
+    linear = isinstance(parameter, Integer) and not parameter.log
+    return (*(("delta_max",) if linear else ("mu", "sigma")), *_BOX)
+
+
+def _make_elsewhere(name: str, settings: Mapping[str, Any], seed: int) -> None:
+    """Try whether a sampler of the user takes its settings.
+
+    Raises
+    ------
+    SamplerError
+    """
+    seconds = processes.IMPORT_SECONDS
+    bounds = processes.Bounds(seconds, late=f"it took longer than {seconds:g} s to begin")
+    process = processes.Conversation(processes.Forked(SERVICE, name, "make", bounds))
+    try:
+        process.ask({"settings": dict(settings), "seed": seed})
+    except processes.HostError as error:
+        raise SamplerError(str(error)) from error
+    finally:
+        process.close()
+
+
+def _listed(words: tuple[str, ...]) -> str:
+    *first, last = words
+    return f"{', '.join(first)} and {last}" if first else last
+
 
 Metric = Literal["rte", "kitti", "rpe", "ape", "ms_per_scan", "cpu", "memory"]
 """What a trial can be judged by; `offline.objective` explains each."""

@@ -24,14 +24,13 @@ from adaptune.space import (
     PooledSpace,
 )
 from offline.annealing import AnnealingSampler
-from offline.config import OfflineConfig
-from offline.objective import SamplerResult, exceeded, penalised
-from offline.sampler_settings import (
+from offline.config import (
     SERVICE,
     STATELESS,
     AnnealingSettings,
     Grid,
     GridSettings,
+    OfflineConfig,
     RandomSettings,
     SamplerError,
     is_user_sampler,
@@ -39,6 +38,7 @@ from offline.sampler_settings import (
     optuna_class,
     optuna_sampler,
 )
+from offline.objective import SamplerResult, exceeded, penalised
 from offline.storage import distribution
 
 _ENUMERABLE = 4096

@@ -26,13 +26,13 @@ from adaptune.model.descriptor import (
     speed_and_turn_rate,
 )
 from adaptune.odometry.base import MIN_POINTS, OdometryInstance, Usage, prepared_bytes
-from adaptune.odometry.factory import Factory
+from adaptune.odometry.registry import Factory
 from adaptune.odometry.tracker import HealthCheck, Tracker, unhealthy
 from adaptune.processes import apart
 from adaptune.recording.recording import RecordedSequence
 from adaptune.recording.scan import Scan
 from adaptune.space import ParameterSet
-from adaptune.study.sequences import StudySequences
+from adaptune.study.study import StudySequences
 from adaptune.trajectory import Trajectory
 from offline.config import OfflineStudyConfig
 from offline.objective import trajectory_metrics

@@ -33,7 +33,7 @@ from online.compare import current_modes
 from online.modes import UNTRAINED
 from online.record import StoredReplay, damaged, read_applied, read_columns
 from online.statistics import ALL, ComparisonRow, Reference, reference_of
-from online.verdict import of_lengths, short_replays
+from online.tables import of_lengths, short_replays
 
 # The chart of a comparison: the ratio of each mode's error, over all sequences and on each.
 

@@ -13,13 +13,13 @@ from adaptune.metrics import MIN_BLOCKS, RESAMPLES, resampled_means, worst_tenth
 from adaptune.model import ErrorModel
 from adaptune.report import tables as report
 from adaptune.study.config import ALSO
-from adaptune.study.sequences import StudySequences
 from adaptune.study.study import (
     EQUAL_COST,
     MIN_RECORDINGS,
     PER_STRETCH,
     RIVALS,
     Study,
+    StudySequences,
     oracle_errors,
 )
 from online.modes import (
@@ -29,6 +29,7 @@ from online.modes import (
     WITHOUT_MODEL,
     ReplaySetup,
     sequences_without_model,
+    shared_identity,
 )
 from online.record import (
     ReplaySummary,
@@ -37,7 +38,6 @@ from online.record import (
     check_reference,
     read_repeats,
 )
-from online.run import shared_identity
 from online.statistics import (
     ALL,
     ERROR_FACTOR,
@@ -54,8 +54,7 @@ from online.statistics import (
     oracle_rows,
     reference_of,
 )
-from online.tables import tables
-from online.verdict import CONTROLS, remarks
+from online.tables import CONTROLS, remarks, tables
 
 # Which replays are compared: the modes that were replayed on every sequence.
 

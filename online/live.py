@@ -19,8 +19,8 @@ from adaptune.recording.clouds import PointCloud2, from_fields, message_stamp, r
 from adaptune.recording.config import ImuConfig
 from adaptune.recording.scan import Imu, Scan, Timing
 from adaptune.ros.link import LinkError, RosLink
-from adaptune.selection import Selection
 from adaptune.selector import BACK
+from adaptune.space import Selection
 from online.real_time import Arrival
 from online.replay import ReplayRecord
 

@@ -23,8 +23,8 @@ from adaptune.odometry.base import Motions, OdometryInstance
 from adaptune.odometry.tracker import HealthCheck, RegisteredScan
 from adaptune.processes import shared_cores
 from adaptune.recording.scan import Imu, Scan, joined
-from adaptune.selection import Selection
 from adaptune.selector import AnySelector, Schedule, TimedSelector
+from adaptune.space import Selection
 from adaptune.study.config import RealTimeConfig
 from online.replay import Choice, Driver, ReplayRecord, Watch
 

@@ -17,8 +17,8 @@ from adaptune.odometry.base import OdometryInstance, Usage
 from adaptune.odometry.tracker import HealthCheck, RegisteredScan, Tracker
 from adaptune.processes import resident_megabytes
 from adaptune.recording.scan import Scan
-from adaptune.selection import Selection
 from adaptune.selector import REMEMBERED, SETTLING, Schedule, Selects
+from adaptune.space import Selection
 from adaptune.trajectory import Trajectory
 
 # Applies what is selected, and returns to the fixed set where that or the odometry goes wrong.

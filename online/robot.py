@@ -26,12 +26,11 @@ from adaptune.recording.clouds import POSES
 from adaptune.recording.config import ImuConfig, SequenceConfig
 from adaptune.recording.scan import Scan, Timing
 from adaptune.ros.link import RosLink, Steering
-from adaptune.selection import Selection
 from adaptune.selector import BACK, Selector
+from adaptune.space import Selection
 from adaptune.strict import in_one_line
 from adaptune.study.config import RealTimeConfig, RosConfig, SteerConfig, StudyConfig
-from adaptune.study.sequences import StudySequences
-from adaptune.study.study import ModeError, Study
+from adaptune.study.study import ModeError, Study, StudySequences
 from adaptune.trajectory import Trajectory, tum_lines
 from online.live import CLOUD, IMU, LiveScans, RosMessages, Status, Uncertainty
 from online.modes import UNTRAINED, WITHOUT_MODEL, Mode, ReplaySetup, needed

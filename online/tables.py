@@ -3,8 +3,19 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from adaptune.metrics import MIN_BLOCKS
 from adaptune.report.tables import Listing
-from online.statistics import ALL, ERROR_FACTOR, GAP, ORACLES, ComparisonRow, mean_of
+from adaptune.study.study import MIN_RECORDINGS, RIVAL_WORDS, RIVALS
+from online.statistics import (
+    ALL,
+    ERROR_FACTOR,
+    GAP,
+    NO_DIFFERENCE,
+    ORACLES,
+    ComparisonRow,
+    Ratio,
+    mean_of,
+)
 
 _COUNTS = ("restarts", "switches")
 _ERRORS = ("RTE [%]", "APE [m]", "RPE [m]", "height [%]", "KITTI [%]", "[deg/100 m]")
@@ -201,3 +212,427 @@ def _change(row: ComparisonRow, rows: Sequence[ComparisonRow]) -> dict[str, Any]
         cells[key], change = mine, f"{key[:3]} change [%]"
         cells[change] = f"{100 * (mine / others - 1):+.1f}" if mine and others else None
     return cells
+
+
+# The first sentences of a comparison: what was gained, how surely, at what cost, what to do.
+
+
+NEARLY = 0.05
+"""Where a whole interval lies within this share of 1, there is no difference."""
+CONTROLS = {
+    "even": "The study's bank with even weights",
+}
+"""Modes that choose nothing, in words."""
+ROUNDING = 1e-6
+"""A ratio that differs less from 1 is 1."""
+_SAME_COST = 0.2
+"""Costs that differ by a smaller share are not worth a sentence."""
+ENOUGH_STRETCHES = 20
+"""Fewer stretches say little about the worst tenth of others."""
+_UNSURE = "nothing can be said of how sure that is"
+_YARDSTICKS = {"fixed": "fixed set", "baseline": "baseline"}
+_NOT_ADAPTIVE = ("baseline", "fixed", *RIVALS, *ORACLES, *CONTROLS)
+
+
+def verdict(rows: Sequence[ComparisonRow]) -> list[str]:
+    """What the comparison says, in the order in which a user asks.
+
+    Parameters
+    ----------
+    rows
+        Of all sequences and modes, those over all sequences last.
+    """
+    last = {row.mode: row for row in rows if row.sequence == rows[-1].sequence}
+    if all(row.ratio is None for row in last.values()):
+        return ["No test sequence has a reference: nobody can say what was gained."]
+    adaptive = [row for mode, row in last.items() if mode not in _NOT_ADAPTIVE]
+    tuned = []
+    if {"fixed", "baseline"} <= last.keys():
+        tuned = [*_of_baseline(last["baseline"], rows), *_cost_of_tuning(last)]
+    if not adaptive:
+        return [*tuned, _advice(last)]
+    # `adaptive` comes first; without a model there is the untrained bank.
+    main = next((row for row in adaptive if row.mode == "adaptive"), adaptive[-1])
+    if _is_yardstick(main):
+        what = f"`{main.mode}` kept the {_YARDSTICKS[main.yardstick]} {_where(rows)}."
+        said = [f"Nothing was adapted, nothing gained: {what}"]
+    else:
+        said = [_gain(main, rows), *_how_surely(main, rows), *_cost(main, last[main.yardstick])]
+    said += [
+        _against(main, mode, main.against[mode], last.get(mode))
+        for mode in RIVALS
+        if mode in main.against
+    ]
+    said += _controls(main, last)
+    said += _nothing_to_choose(last)
+    said += [_other(row) for row in adaptive if row is not main and not _is_yardstick(row)]
+    return [*said, *tuned, _advice(last)]
+
+
+def _is_yardstick(row: ComparisonRow) -> bool:
+    """Whether a mode did what the yardstick did."""
+    # A bank whose other members rest moves as the fixed set does, but for rounding.
+    return row.ratio is not None and abs(row.ratio - 1.0) < ROUNDING and not row.switches
+
+
+def _judged(rows: Sequence[ComparisonRow]) -> list[str]:
+    return list(dict.fromkeys(r.sequence for r in rows if r.rte is not None and r.sequence != ALL))
+
+
+def _where(rows: Sequence[ComparisonRow]) -> str:
+    names = _judged(rows)
+    return f"on {len(names)} test sequences" if len(names) > 1 else f"on {names[0]}"
+
+
+def _interval(ratio: Ratio) -> str:
+    ends = ratio.interval
+    return "no interval" if ends is None else f"95 % interval {_end(ends[0])} to {_end(ends[1])}"
+
+
+def _end(ratio: float) -> str:
+    """An end of an interval; one that is near 1 has more digits, to show on which side it lies."""
+    text = f"{ratio:.2f}"
+    return f"{ratio:.3f}" if text == "1.00" and ratio != 1.0 else text
+
+
+def _ratio(row: ComparisonRow) -> Ratio:
+    assert row.ratio is not None
+    return Ratio(row.ratio, row.ratio_interval)
+
+
+def _times(row: ComparisonRow) -> str:
+    return (
+        f"{row.ratio:.2f} times the {_YARDSTICKS[row.yardstick]}'s error ({_interval(_ratio(row))})"
+    )
+
+
+def _surely(ratio: Ratio) -> str:
+    """Whether a ratio is surely `less`, `more`, or `equal`; `open` or `unknown` otherwise."""
+    if ratio.interval is None:
+        return "unknown"
+    low, high = ratio.interval
+    if (high < 1.0 or low > 1.0) and abs(ratio.value - 1.0) >= NO_DIFFERENCE:
+        return "less" if high < 1.0 else "more"
+    return "equal" if low > 1.0 - NEARLY and high < 1.0 + NEARLY else "open"
+
+
+def _gain(row: ComparisonRow, rows: Sequence[ComparisonRow]) -> str:
+    ratio = _ratio(row)
+    has, how = f"`{row.mode}` has {_times(row)}", _surely(ratio)
+    # The parts of one recording are one.
+    n = row.recordings or len(_judged(rows))
+    few = rows[-1].sequence != ALL or n < MIN_RECORDINGS
+    alone = " The interval speaks of these recordings alone." if few else ""
+    if how == "unknown":
+        return f"Whether adapting gains is not known, {_where(rows)}: {has}; {_UNSURE}."
+    if how == "open":
+        return f"Whether adapting gains is open, {_where(rows)}: {has}.{alone}"
+    if how == "equal":
+        return f"Adapting changed nothing that counts {_where(rows)}: {has}.{alone}"
+    what = "gained" if how == "less" else "lost"
+    percent = 100.0 * abs(ratio.value - 1.0)
+    return f"Adapting {what} {percent:.0f} % {_where(rows)}: {has}.{alone}"
+
+
+def _how_surely(row: ComparisonRow, rows: Sequence[ComparisonRow]) -> list[str]:
+    """On how many sequences it is better, on which it is worse, and the worst tenth."""
+    said = []
+    if row.better is not None:
+        of = [r for r in rows if r.mode == row.mode and r.ratio is not None and r.sequence != ALL]
+        worse = [r.sequence for r in of if r.ratio is not None and r.ratio > 1.0 + NO_DIFFERENCE]
+        on = f"on {row.worse} ({', '.join(worse)})" if worse else "on none"
+        surely = ""
+        if row.surely_better is not None:
+            known = sum(r.ratio_interval is not None for r in of)
+            which = "" if known == len(of) else f", of {known} long enough to tell"
+            surely = f"; surely better on {row.surely_better}, surely worse on {row.surely_worse}"
+            surely += which
+        less = f"By more than 1 %, it has less error on {row.better} of {len(of)} sequences"
+        said.append(f"{less}, and more {on}{surely}.")
+    if row.worst_tenth is not None:
+        said.append(
+            f"In the worst tenth of {row.stretches} stretches it has {row.worst_tenth:.2f} times "
+            f"the {_YARDSTICKS[row.yardstick]}'s error."
+        )
+    if row.gap_closed is not None and row.gap_closed > 0.0:
+        share = f"It gains {100 * row.gap_closed:.0f} %"
+        said.append(f"{share} of what the best set of each sequence would gain in hindsight.")
+    return said
+
+
+def _cost(row: ComparisonRow, yardstick: ComparisonRow) -> list[str]:
+    if row.cpu_ms is None or not yardstick.cpu_ms:
+        return []
+    cores = "" if row.cores is None else f", {row.cores:.2f} cores at the sensor's rate"
+    return [
+        f"It takes {row.cpu_ms:.1f} ms of CPU time a scan{cores}: "
+        f"{row.cpu_ms / yardstick.cpu_ms:.1f} times what the {_YARDSTICKS[row.yardstick]} takes."
+    ]
+
+
+def _cost_of_tuning(last: Mapping[str, ComparisonRow]) -> list[str]:
+    """What the fixed set costs, if that differs from the baseline."""
+    fixed, baseline = last["fixed"].cpu_ms, last["baseline"].cpu_ms
+    if not fixed or not baseline or abs(fixed / baseline - 1.0) < _SAME_COST:
+        return []
+    return [
+        f"The fixed set takes {fixed:.1f} ms of CPU time a scan, {fixed / baseline:.1f} times what "
+        f"the baseline takes."
+    ]
+
+
+def _against(
+    main: ComparisonRow, mode: str, ratio: Ratio, other: ComparisonRow | None = None
+) -> str:
+    """How the mode compares with another one, on the same frames, and in cost with a rival."""
+    what, cost = RIVAL_WORDS.get(mode, f"`{mode}`"), ""
+    if other is not None and other.cpu_ms is not None and main.cpu_ms is not None:
+        cost = f", at {main.cpu_ms:.1f} ms of CPU time a scan against {other.cpu_ms:.1f}"
+    has = f"`{main.mode}` has {ratio.value:.2f} times the error of {what}"
+    return f"{has} ({_interval(ratio)}){cost}."
+
+
+def _controls(main: ComparisonRow, last: Mapping[str, ComparisonRow]) -> list[str]:
+    """What the same sets give if nothing is chosen, and what choosing adds."""
+    added = {
+        "less": "Choosing added to that",
+        "more": "Choosing took from that",
+        "equal": "Choosing added nothing to that",
+        "open": "Whether choosing adds to that is open",
+        "unknown": "Whether choosing adds to that is not known",
+    }
+    said = []
+    for mode, what in CONTROLS.items():
+        row, ratio = last.get(mode), main.against.get(mode)
+        if row is not None and row.ratio is not None:
+            said.append(f"{what} has {_times(row)}.")
+            if ratio is not None and not _is_yardstick(main):
+                how = added[_surely(ratio)]
+                said.append(f"{how}: {_against(main, mode, ratio)}")
+    return said
+
+
+def _nothing_to_choose(last: Mapping[str, ComparisonRow]) -> list[str]:
+    """That no choice of one set could gain, if that is so."""
+    best = last.get(ORACLES[0])
+    if best is None or best.ratio is None or best.ratio <= 1.0 - NO_DIFFERENCE:
+        return []
+    return [
+        "In hindsight, the best set of each sequence would gain less than 1 %: one set for all is "
+        "as good as any choice of one set for each."
+    ]
+
+
+def _other(row: ComparisonRow) -> str:
+    how = {
+        "less": "is better",
+        "more": "is worse",
+        "equal": "changed nothing that counts",
+        "open": "does not surely differ",
+    }
+    if (sure := _surely(_ratio(row))) in how:
+        return f"`{row.mode}` {how[sure]}: {_times(row)}."
+    return f"`{row.mode}` has {_times(row)}; {_UNSURE}."
+
+
+def _of_baseline(row: ComparisonRow, rows: Sequence[ComparisonRow]) -> list[str]:
+    if row.ratio is None:
+        return []
+    has, how = f"the baseline has {_times(row)}", _surely(_ratio(row))
+    if how == "unknown":
+        return [f"Whether tuning gains is not known, {_where(rows)}: {has}."]
+    if how == "open":
+        return [f"Whether tuning gains is open, {_where(rows)}: {has}."]
+    if how == "equal":
+        return [f"No difference that counts between baseline and fixed set: {has}."]
+    if how == "less":
+        return [f"The baseline is better than the fixed set: {has}."]
+    gained = 100.0 * (1.0 - 1.0 / row.ratio)
+    return [f"Tuning alone gained {gained:.0f} % of the baseline's error: {has}."]
+
+
+def _preferred(row: ComparisonRow) -> float:
+    return _ratio(row).value * (1.0 - NEARLY * (row.mode == "adaptive"))
+
+
+def _advice(last: Mapping[str, ComparisonRow]) -> str:
+    """What to do: drive what is surely better than the yardstick, the best of it.
+
+    The best of several is so by chance, too: `adaptive` is kept if it is nearly as good.
+    """
+    drivable = {m: r for m, r in last.items() if m not in (*ORACLES, *CONTROLS) and r.ratio}
+    better = [row for row in drivable.values() if _surely(_ratio(row)) == "less"]
+    yardstick = _YARDSTICKS[next(iter(last.values())).yardstick]
+    if better:
+        best = min(better, key=_preferred)
+        called = RIVAL_WORDS.get(best.mode, f"`{best.mode}`")
+        look = ""
+        if best.worst_tenth is not None and (best.stretches or 0) >= ENOUGH_STRETCHES:
+            look = ", and look at where it is worse (pictures)" if best.worst_tenth > 1.1 else ""
+        return f"What to do: drive {called}{look}."
+    others = [r for r in drivable.values() if r.mode != r.yardstick and not _is_yardstick(r)]
+    if any(_surely(_ratio(row)) == "unknown" for row in others):
+        return (
+            f"What to do: replay {MIN_RECORDINGS} test recordings or more, or longer ones (at "
+            f"least {MIN_BLOCKS} sub-trajectories each); without, nothing can be said of how sure "
+            f"this is. Until then, drive the {yardstick}."
+        )
+    promising = [r for r in others if _ratio(r).value < 1.0 - NO_DIFFERENCE]
+    if any(_surely(_ratio(row)) == "open" for row in promising):
+        return f"What to do: replay more test sequences; until they decide, drive the {yardstick}."
+    return f"What to do: drive the {yardstick}; nothing is surely better."
+
+
+# A comparison in words.
+
+
+_WHOLE = 0.95
+"""Share of the longest replay's scans that a whole replay has at least."""
+
+
+def remarks(rows: Sequence[ComparisonRow]) -> list[str]:
+    """In words: what was gained, and what must be known to trust it."""
+    return (
+        verdict(rows)
+        + _lengths(rows)
+        + _judges(rows)
+        + _estimates(rows)
+        + _losses(rows)
+        + _kept_up(rows)
+        + _restarts(rows)
+    )
+
+
+def _lengths(rows: Sequence[ComparisonRow]) -> list[str]:
+    """A sentence about every sequence whose replays have different lengths."""
+    said = []
+    for name in dict.fromkeys(row.sequence for row in rows if row.sequence != ALL):
+        scans = {row.mode: row.scans for row in rows if row.sequence == name and row.scans}
+        if short := short_replays(scans):
+            said.append(of_lengths(name, scans, short))
+    return said
+
+
+def short_replays(scans: Mapping[str, int]) -> list[str]:
+    """The modes whose replays of a sequence are shorter than the longest, given their scans."""
+    # In real time, some scans are dropped.
+    return [mode for mode, n in scans.items() if n < _WHOLE * max(scans.values())]
+
+
+def of_lengths(name: str, scans: Mapping[str, int], short: Sequence[str]) -> str:
+    """A sentence about the replays of a sequence of which some are short, given their scans."""
+    listed = ", ".join(f"{mode} {scans[mode]}" for mode in short)
+    return (
+        f"On {name} the replays have different lengths ({listed} of {max(scans.values())} scans); "
+        f"errors are compared where all have scans. Remove them and run `adaptune online`."
+    )
+
+
+def _judges(rows: Sequence[ComparisonRow]) -> list[str]:
+    """A sentence about every sequence that an estimated reference judges."""
+    judged = {row.sequence: row for row in rows if row.sequence != ALL}
+    said = []
+    for name, row in judged.items():
+        if row.reference != "estimated":
+            continue
+        if row.reference_error is None:
+            own = "its own error is not known, and not in the intervals"
+        elif row.rte_interval is None:
+            own = f"its own error is about {row.reference_error:.2g} %"
+        else:
+            own = f"its own error, about {row.reference_error:.2g} %, is in the intervals"
+        said.append(f"On {name} an estimated reference judged: {own}.")
+    return said
+
+
+def _estimates(rows: Sequence[ComparisonRow]) -> list[str]:
+    """What is estimated where there is no reference, and where the reference contradicts it."""
+    said = []
+    contradicted: dict[str, list[str]] = {}
+    for row in rows:
+        if row.estimated is None or row.sequence == ALL:
+            continue
+        ends = row.estimated_interval
+        interval = "" if ends is None else f"95 % interval {ends[0]:.3f}-{ends[1]:.3f} %"
+        if row.rte is None:
+            said.append(
+                f"{row.sequence} has no reference. `{row.mode}` estimates its own mean RTE there: "
+                f"{row.estimated:.3f} %{interval and f' ({interval})'}."
+            )
+        elif ends is not None and not ends[0] <= row.rte <= ends[1]:
+            contradicted.setdefault(row.mode, []).append(
+                f"{row.estimated:.3f} % ({interval}) on {row.sequence}, where by the "
+                f"{_called(row)} it is {row.rte:.3f} %"
+            )
+    for mode, those in contradicted.items():
+        said.append(
+            f"`{mode}` estimates its own mean RTE at {'; '.join(those)}. "
+            f"Either the estimate or the reference is wrong there over this length."
+        )
+    return said
+
+
+def _called(row: ComparisonRow) -> str:
+    """What the reference of a row is called in a sentence."""
+    return "estimated reference" if row.reference == "estimated" else "reference"
+
+
+def _losses(rows: Sequence[ComparisonRow]) -> list[str]:
+    """A sentence about every mode that was lost for a while."""
+    said = []
+    for mode in dict.fromkeys(row.mode for row in rows):
+        lost = {
+            row.sequence: row.lost_seconds
+            for row in rows
+            if row.mode == mode and row.lost_seconds and row.sequence != ALL
+        }
+        if lost:
+            on = ", ".join(f"{name} ({seconds:.1f} s)" for name, seconds in lost.items())
+            said.append(f"`{mode}` was lost for {sum(lost.values()):.1f} s: on {on}.")
+    return said
+
+
+def _kept_up(rows: Sequence[ComparisonRow]) -> list[str]:
+    """Of replays in real time, a sentence about each that did not get all scans or selections."""
+    said, timed = [], [(row, row.real_time) for row in rows if row.real_time is not None]
+    for row, kept in timed:
+        found = [
+            f"{kept[key]:.0f} {what}{'' if kept[key] == 1 else 's'}"
+            for key, what in (("dropped_scans", "scan"), ("missed_selections", "selection"))
+            if kept[key]
+        ]
+        if found:
+            said.append(
+                f"On {row.sequence} `{row.mode}` was too late for {' and '.join(found)}, at "
+                f"{kept['rate']:g} times the recorded rate; 99 % of its poses came within "
+                f"{kept['pose_ms_p99']:.0f} ms of the scans."
+            )
+        if late := kept.get("late_members_scans"):
+            removed = f", and {n:.0f} removed" if (n := kept.get("removed_members")) else ""
+            said.append(
+                f"On {row.sequence} members of the bank of `{row.mode}` were late at {late:.0f} "
+                f"scans in all{removed}."
+            )
+    if timed and not said:
+        rate = timed[0][1]["rate"]
+        said.append(f"Replayed at {rate:g} times the recorded rate: nothing came too late.")
+    return said
+
+
+def _restarts(rows: Sequence[ComparisonRow]) -> list[str]:
+    """For each sequence a sentence about the modes that the health check restarted."""
+    said = []
+    for name in dict.fromkeys(row.sequence for row in rows if row.first_restart is not None):
+        mine = [row for row in rows if row.sequence == name]
+        modes: dict[str, list[str]] = {}
+        for row in mine:
+            if row.first_restart is not None:
+                at = f"at {row.first_restart:.1f} s"
+                when = at if row.restarts == 1 else f"{row.restarts} times, first {at}"
+                modes.setdefault(f"{when} ({', '.join(row.unhealthy)})", []).append(row.mode)
+        each = (
+            f"{'all modes' if len(those) == len(mine) else ', '.join(those)} {what}"
+            for what, those in modes.items()
+        )
+        said.append(f"On {name} the health check restarted {'; '.join(each)}.")
+    return said

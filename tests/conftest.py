@@ -18,7 +18,7 @@ from offline.config import load_study
 from offline.train import train
 from offline.workers import Workers
 from online.compare import compare
-from online.run import run_replays
+from online.modes import run_replays
 
 Factory = pytest.TempPathFactory
 SUPPORT = Path(__file__).parent / "support"

@@ -12,7 +12,7 @@ from adaptune.model import BankSettings, ErrorModel, PairedSettings
 from adaptune.trajectory import read_tum
 from offline.config import load_study
 from offline.train import train
-from online.run import run_replays
+from online.modes import run_replays
 
 README = Path(__file__).parent.parent / "README.md"
 (EXAMPLE,) = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)

@@ -12,8 +12,7 @@ import numpy as np
 import small_gicp
 from numpy.typing import NDArray
 
-from adaptune.bank.agreement import Agreement
-from adaptune.bank.members import spread
+from adaptune.bank.members import Agreement, spread
 from adaptune.errors import OdometryError
 from adaptune.geometry import Poses, invert, rectify, squared_ranges
 from adaptune.odometry.base import (
@@ -25,10 +24,9 @@ from adaptune.odometry.base import (
     Registration,
     Usage,
 )
-from adaptune.odometry.factory import Factory
+from adaptune.odometry.registry import Factory
 from adaptune.recording.scan import Scan
-from adaptune.selection import Selection
-from adaptune.space import ODOMETRY, ParameterSet
+from adaptune.space import ODOMETRY, ParameterSet, Selection
 
 # The scans of the last seconds, on which a new instance builds its map before it takes over.
 
@@ -145,7 +143,7 @@ class ShortRegistrations:
     """Mean distances of the newest scan from earlier ones, where motions place it.
 
     Scans are only kept. Work is done where somebody asks. Calling it gives what
-    `adaptune.bank.agreement.Alignment` describes.
+    `adaptune.bank.members.Alignment` describes.
     """
 
     def __init__(self) -> None:

@@ -7,19 +7,21 @@ its process, it ends the others there, too.
 
 import itertools
 import time
+from bisect import bisect_left, insort
 from collections import OrderedDict, defaultdict, deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from adaptune import processes
 from adaptune.errors import AdaptuneError
-from adaptune.geometry import Poses
+from adaptune.geometry import Poses, invert, mean_motion
 from adaptune.odometry import wire
 from adaptune.odometry.base import InProcess, OdometryInstance, Preparations, PreparedScan, Usage
-from adaptune.odometry.factory import Factory, OdometryFactory
-from adaptune.odometry.registry import make_here, odometry_class
+from adaptune.odometry.registry import Factory, OdometryFactory, make_here, odometry_class
 from adaptune.odometry.remote import Isolated
 from adaptune.processes import other_core
 from adaptune.recording.scan import Scan
@@ -312,3 +314,308 @@ def spread(make: Factory, sets: Sequence[ParameterSet], cores: int) -> list[Odom
             made[i] = Member(process, number, factory, own)
         process.open()
     return made
+
+
+# Which members of a bank agree, by how they moved over the last second.
+
+
+WINDOW = 1.0
+"""Seconds over which motions are compared. Jitter within them cancels, departure adds up."""
+FLOOR = 0.1
+"""Metres a second by which motions may always differ and agree."""
+SHARE = 0.08
+"""Share of the way by which they may always differ and agree."""
+SPREAD = 6.0
+"""They may also differ by this many times what agreeing members usually differ by."""
+MAX_TIMES_LEAST = 2.0
+"""But not by more than this many times what they may always differ by: a departure that was not
+noticed must not become usual."""
+FAR = 2.0
+"""Members restart where they differ from those that agree by this many times what they may."""
+LEVER = 5.0
+"""Metres. A turn that differs counts as much as the way that it makes at this distance."""
+RESTART = 1.0
+"""Seconds that pass between restarts of the same member."""
+MEMORY = 30.0
+"""Seconds in which members show by how much they usually differ."""
+MARGIN = 0.006
+"""Metres by which a scan that lies as well as the best may be farther from the scans before."""
+
+_ENDLESS = 1e6
+"""Metres that no motion has. What is not a number is not below them either."""
+_METRES = np.repeat([LEVER / np.sqrt(2.0), 1.0], [9, 3])
+"""What makes entries of a rotation and of a translation metres."""
+
+Alignment = Callable[[Poses, tuple[int, ...]], NDArray[np.float64]]
+"""Says how far the newest scan is from earlier ones, as the motions of members place it.
+
+Receives ``T_then_now`` of shape (n_scans, n_members, 4, 4), and how many scans ago each `then` was.
+Returns mean distances of shape (n_members,) in metres; infinite where there is nothing to compare.
+"""
+
+
+class Agreement:
+    """Tells which members of a bank agree, scan after scan.
+
+    Motions over the last second are compared, not motions over a scan. Each pose of a member in
+    this second is a vector: the way, and the turn as the way it makes at `LEVER` metres. A straight
+    line through these vectors says how far the member came; so a jump back and forth hardly counts,
+    and a slow departure does. Two members are near each other if they differ, in a second, by no
+    more than ::
+
+        least = max(FLOOR, SHARE * way)
+        min(max(least, SPREAD * usual difference), MAX_TIMES_LEAST * least, lost_track)
+
+    and, over the newest scan alone, by no more than `lost_track` metres a second. Before the first
+    half second, the newest scan alone counts. The heaviest group of members that are all near each
+    other agrees. Every member votes with its weight.
+
+    Parameters
+    ----------
+    n_members
+        Size of the bank.
+    lost_track
+        Metres a second by which motions may never differ and agree.
+
+    Attributes
+    ----------
+    T_previous_current : ndarray of shape (4, 4)
+        How the bank moved over the last scan: the weighted mean of the members that agree; NaN if
+        no member had a motion.
+    due : ndarray of shape (n_members,)
+        Which members should restart at the bank's pose: those that were left out at the last scan,
+        that differ by more than `FAR` times what they may, and that have not restarted in the last
+        second.
+    judged : bool
+        Whether the short registrations decided at the last scan.
+
+    Notes
+    -----
+    A simulation along recorded motions calls `judge` for every scan but the first, and moves by
+    `T_previous_current`. It restarts the members that are `due` as far as it can, says so by
+    `restarted`, and calls `start` where the bank itself begins anew.
+    """
+
+    def __init__(self, n_members: int, lost_track: float):
+        self._n_members, self._lost_track = n_members, lost_track
+        self._usual = RunningMedian(MEMORY)
+        self._times = deque([0.0])
+        self.start()
+
+    def start(self) -> None:
+        """Forget how the members and the bank have moved; what is usual stays."""
+        # Each track begins where it likes; the bank's is the last.
+        self._tracks = deque([np.tile(np.eye(4), (self._n_members + 1, 1, 1))])
+        self._times = deque([self._times[-1]])
+        self._restarted = np.full(self._n_members, -np.inf)
+        self.T_previous_current = np.eye(4)
+        self.judged = False
+        self.due = np.zeros(self._n_members, np.bool_)
+
+    def judge(
+        self,
+        T_previous_current: Poses,
+        seconds: float,
+        weights: NDArray[np.float64],
+        alignment: Alignment | None = None,
+        lost: bool = False,
+    ) -> NDArray[np.bool_]:
+        """Which members agree at the next scan.
+
+        Parameters
+        ----------
+        T_previous_current
+            Motions over the scan, of shape (n_members, 4, 4); NaN where there is none.
+        seconds
+            Since the scan before.
+        weights
+            Of shape (n_members,).
+        alignment
+            Short registrations. They are asked where the heaviest group does not hold more than
+            half of the votes and of the members; then only members within `MARGIN` of the best are
+            believed.
+        lost
+            Whether the bank is known to be lost: then they are asked wherever members disagree.
+
+        Returns
+        -------
+        ndarray of shape (n_members,)
+            All False if there is no motion at all.
+        """
+        known = np.asarray((np.abs(T_previous_current) < _ENDLESS).all(axis=(1, 2)))
+        moved = np.where(known[:, None, None], T_previous_current, np.eye(4))
+        self._advance(moved, seconds)
+        near, far, apart = self._near(known, moved, seconds)
+        agreeing = self._heaviest(near, weights, moved, alignment, lost)
+        self._move(T_previous_current, weights, agreeing)
+        self.due = np.zeros_like(agreeing)
+        if agreeing.any():
+            self._remember(apart, agreeing)
+        if agreeing.any() and not agreeing.all():
+            self._begin_anew(~known)
+            # A single member may be the only one that is not lost.
+            sure = agreeing.sum() > 1 or self.judged
+            # Stamps are not quite even.
+            long_ago = self._times[-1] - self._restarted > 0.95 * RESTART
+            self.due = far[:, agreeing].all(axis=1) & (sure | ~known) & long_ago
+        return agreeing
+
+    def restarted(self, members: NDArray[np.bool_]) -> None:
+        """Members, as a mask of shape (n_members,), begin anew: as the bank has moved so far."""
+        self._begin_anew(members)
+        self._restarted[members] = self._times[-1]
+
+    def _begin_anew(self, members: NDArray[np.bool_]) -> None:
+        if members.any():
+            for tracks in self._tracks:
+                tracks[:-1][members] = tracks[-1]
+
+    def _advance(self, moved: Poses, seconds: float) -> None:
+        tracks = self._tracks[-1].copy()
+        tracks[:-1] = tracks[:-1] @ moved
+        self._tracks.append(tracks)
+        self._times.append(self._times[-1] + seconds)
+        # Stamps are not quite even.
+        while len(self._times) > 2 and self._times[-1] - self._times[0] > 1.05 * WINDOW:
+            self._tracks.popleft()
+            self._times.popleft()
+
+    def _near(
+        self, known: NDArray[np.bool_], moved: Poses, seconds: float
+    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.float64]]:
+        """Which members are near each other, which are far, and by how many metres a second.
+
+        All of shape (n_members, n_members).
+        """
+        tracks = np.array(self._tracks)[:, :-1]
+        times = np.array(self._times)
+        times -= times.mean()
+        way = _vectors(invert(tracks[0]) @ tracks).reshape(len(times), -1)
+        span = times[-1] - times[0]
+        came = (times * (span / (times @ times)) @ way).reshape(-1, 12)
+        apart = _distances(came)
+        scale = max(span, WINDOW)
+        near = (_distances(_vectors(moved)) <= self._lost_track * seconds) & known & known[:, None]
+        if span < 0.5 * WINDOW:
+            return near, ~near, apart / scale
+        ways = sorted(np.linalg.norm(came[known, 9:], axis=1).tolist())
+        least = max(FLOOR * scale, SHARE * (ways[len(ways) // 2] if ways else 0.0))
+        # As long as nothing is usual, they may differ by the most.
+        usual = SPREAD * self._usual.value * scale if self._usual else np.inf
+        bound = min(max(least, usual), MAX_TIMES_LEAST * least)
+        most = self._lost_track * span
+        far = ~near | (apart > min(FAR * bound, most))
+        return near & (apart <= min(bound, most)), far, apart / scale
+
+    def _heaviest(
+        self,
+        near: NDArray[np.bool_],
+        weights: NDArray[np.float64],
+        moved: Poses,
+        alignment: Alignment | None,
+        lost: bool,
+    ) -> NDArray[np.bool_]:
+        """The heaviest group of members that are near each other, among those believed."""
+        self.judged = False
+        known = near.diagonal()
+        if near[known][:, known].all():
+            return known.copy()
+        # Among members without weight, two that agree outvote one.
+        votes = weights + 1e-9
+        group = self._group(near, votes, moved)
+        most = votes[group].sum() > 0.5 * votes.sum() and group.sum() > 0.5 * self._n_members
+        if alignment is None or (most and not lost):
+            return group
+        distances = np.where(known, alignment(*self._to_now()), np.inf)
+        self.judged = bool(np.isfinite(distances).any())
+        believed = distances <= distances[known].min() + MARGIN
+        return self._group(near & believed & believed[:, None], votes, moved)
+
+    def _group(
+        self, near: NDArray[np.bool_], votes: NDArray[np.float64], moved: Poses
+    ) -> NDArray[np.bool_]:
+        """The heaviest group; of those as heavy the one that goes on most like the bank before."""
+        inside = _groups(self._n_members)
+        # No two that are not near each other, and nobody who is not near itself.
+        possible = inside[~(inside @ ~near & inside).any(axis=1)]
+        heard = possible @ votes
+        best = possible[heard > heard.max() - 1e-12]
+        if len(best) == 1:
+            return np.asarray(best[0])
+        as_before = np.linalg.norm(moved[:, :3, 3] - self.T_previous_current[:3, 3], axis=1)
+        return np.asarray(best[((best @ as_before) / best.sum(axis=1)).argmin()])
+
+    def _to_now(self) -> tuple[Poses, tuple[int, ...]]:
+        """Motions since the scan before and since the oldest of the window; see `Alignment`."""
+        ago = (1, len(self._tracks) - 1)[: len(self._tracks) - 1]
+        now = self._tracks[-1][:-1]
+        return np.array([invert(self._tracks[-1 - n][:-1]) @ now for n in ago]), ago
+
+    def _move(
+        self, T_previous_current: Poses, weights: NDArray[np.float64], agreeing: NDArray[np.bool_]
+    ) -> None:
+        """Move the bank by the mean of the members that agree."""
+        if not agreeing.any():
+            self.T_previous_current = np.full((4, 4), np.nan)
+            return
+        shares = share(weights, agreeing)[agreeing]
+        self.T_previous_current = mean_motion(T_previous_current[agreeing], shares)
+        self._tracks[-1][-1] = self._tracks[-1][-1] @ self.T_previous_current
+
+    def _remember(self, apart: NDArray[np.float64], agreeing: NDArray[np.bool_]) -> None:
+        """Remember by how much agreeing members differ, once there is a second to tell it from."""
+        if agreeing.sum() > 1 and self._times[-1] - self._times[0] > 0.5 * WINDOW:
+            # Each pair twice, and each member from itself.
+            differences = sorted(apart[agreeing][:, agreeing].ravel().tolist())
+            n = int(agreeing.sum())
+            self._usual.add(self._times[-1], differences[(n * n + n) // 2 - 1])
+
+
+class RunningMedian:
+    """The median of the values of the last seconds; 0 if there are none."""
+
+    def __init__(self, seconds: float):
+        self._seconds = seconds
+        self._values: deque[tuple[float, float]] = deque()
+        self._sorted: list[float] = []
+
+    def add(self, time: float, value: float) -> None:
+        """Add a value, at a time in seconds that does not fall."""
+        self._values.append((time, value))
+        insort(self._sorted, value)
+        while time - self._values[0][0] > self._seconds:
+            del self._sorted[bisect_left(self._sorted, self._values.popleft()[1])]
+
+    def __bool__(self) -> bool:
+        return bool(self._values)
+
+    @property
+    def value(self) -> float:
+        """The median; of an even number of values the greater of the two in the middle."""
+        return self._sorted[len(self._sorted) // 2] if self._sorted else 0.0
+
+
+def share(weights: NDArray[np.float64], agreeing: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Weights of the members that agree; equal if they have none. Of shape (..., n_members)."""
+    shares = np.where(agreeing, weights, 0.0)
+    return np.where(shares.any(axis=-1, keepdims=True), shares, agreeing.astype(np.float64))
+
+
+@cache
+def _groups(n_members: int) -> NDArray[np.bool_]:
+    """All groups of members but the empty one, of shape (2 ** n_members - 1, n_members)."""
+    numbers = np.arange(1, 2**n_members)
+    return np.asarray(numbers[:, None] >> np.arange(n_members) & 1, np.bool_)
+
+
+def _vectors(T: Poses) -> NDArray[np.float64]:
+    """Motions of shape (..., 4, 4) as vectors of shape (..., 12) that differ by metres."""
+    vectors = T[..., :3, :].swapaxes(-1, -2).reshape(*T.shape[:-2], 12)
+    # The distance of rotation matrices is the square root of two times the chord of the turn.
+    return np.asarray(vectors * _METRES)
+
+
+def _distances(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Distances of shape (n, n) between vectors of shape (n, n_dimensions)."""
+    differences = vectors[:, None] - vectors
+    return np.asarray(np.sqrt(np.einsum("ijk,ijk->ij", differences, differences)))

@@ -5,7 +5,8 @@ from typing import Annotated, Any
 
 import typer
 
-from adaptune.commands import offline, online, reference, tools
+from adaptune.commands import offline, online, tools
+from adaptune.commands import offline as reference
 from adaptune.commands.terminal import Commands, errors, say
 
 # Every command imports what it needs, so that `adaptune --help` answers at once.

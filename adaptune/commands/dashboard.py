@@ -10,7 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from adaptune.report.drawing import plain
-from adaptune.selection import Selection
+from adaptune.space import Selection
 from online.replay import ReplayRecord
 
 NEWEST = 1000

@@ -1,8 +1,12 @@
 """Commands of the offline stage."""
 
+import math
+import os
 import sys
+from collections.abc import Callable
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -17,11 +21,23 @@ from adaptune.commands.terminal import (
     load,
     progress,
     say,
+    say_next,
     say_next_of_study,
     say_next_of_trained,
     say_next_online,
 )
 from adaptune.errors import AdaptuneError
+from adaptune.progress import Progress
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from adaptune.recording.config import SequenceConfig
+    from adaptune.recording.scan import Recording
+    from adaptune.reference.check import Comparison
+    from adaptune.reference.stored import Gap, StoredEstimate
+    from adaptune.trajectory import Trajectory
+    from offline.config import OfflineStudy
 
 
 def simulate(
@@ -185,3 +201,218 @@ def validate(
     names = ("validation", "stretches")
     say(f"Tables and picture: {', '.join(f'{loaded.folder / name}.*' for name in names)}")
     say_next_online(loaded.config.test, study, override, folder)
+
+
+# The command that estimates references.
+
+
+_STUDIES = (".yaml", ".yml")
+
+
+Target = Annotated[
+    Path,
+    typer.Argument(metavar="TARGET", help="A recording, or a study's YAML.", show_default=False),
+]
+Out = Annotated[
+    Path | None,
+    typer.Option(
+        "--folder",
+        "--out",
+        help="Where to write; of a study, its folder.",
+        show_default="here; of a study, the YAML's name, under runs/",
+        file_okay=False,
+    ),
+]
+Points = Annotated[
+    str | None,
+    typer.Option(metavar="TOPIC", help="Topic of the scans.", show_default="as `inspect` proposes"),
+]
+Given = Annotated[
+    str | None,
+    typer.Option(
+        "--reference",
+        metavar="TOPIC|FILE",
+        help="A given reference to compare with.",
+        show_default="as `inspect` proposes",
+    ),
+]
+Prior = Annotated[
+    str | None,
+    typer.Option(
+        "--position-prior",
+        metavar="TOPIC|FILE",
+        help="Positions to join that are right over long distances, as those of a GPS.",
+        show_default="none",
+    ),
+]
+Length = Annotated[
+    float | None,
+    typer.Option(
+        metavar="METRES",
+        help="Length of the sub-trajectories over which errors are told.",
+        min=0.01,
+        show_default="25, or what fits",
+    ),
+]
+
+
+def reference(
+    target: Target,
+    override: Override = [],  # noqa: B006
+    folder: Out = None,
+    points: Points = None,
+    given: Given = None,
+    prior: Prior = None,
+    length: Length = None,
+) -> None:
+    """Estimate the reference of a recording from its scans, without ground truth.
+
+    It writes the poses (TUM), what is known of their error (JSON), and a picture. Of a study, it
+    estimates the references of all sequences that have none, or `reference: estimated`.
+    """
+    if target.suffix not in _STUDIES:
+        if override:
+            raise AdaptuneError(f"{target}: -o is for studies; give a study's YAML")
+        with _on_one_core():
+            _of_recording(target, folder or Path(), (points, given, prior), length)
+        return
+    options: dict[str, str | float | None] = {"--points": points, "--reference": given}
+    options |= {"--position-prior": prior, "--length": length}
+    if wrong := [name for name, value in options.items() if value is not None]:
+        raise AdaptuneError(
+            f"{wrong[0]} is for a single recording; of a study, the YAML says it, see "
+            f"docs/reference-study.md"
+        )
+    loaded = load(target, override, folder)
+    _of_study(loaded)
+    say_next_of_study("run trials, fit the error model", "offline", target, override, folder)
+
+
+@contextmanager
+def _on_one_core() -> "Iterator[None]":
+    """So that results repeat bit by bit, see `pin`."""
+    from adaptune.processes import pin
+
+    unpin = pin(os.getpid())
+    try:
+        yield
+    finally:
+        unpin()
+
+
+def _advance(show: Progress, what: str) -> Callable[[int, int], None]:
+    return lambda done, total: show(what, done, total)
+
+
+def _of_recording(
+    target: Path,
+    out: Path,
+    topics: tuple[str | None, str | None, str | None],
+    length: float | None,
+) -> None:
+    """Estimate the reference of a recording, write it, and say what it is worth."""
+    from adaptune.recording.inspect import inspect
+    from adaptune.recording.recording import open_sequence
+    from adaptune.reference import check as of_recording
+    from adaptune.reference import estimate
+    from adaptune.reference.check import proposed_sub_trajectory
+    from adaptune.reference.graph import warn_of_unused
+    from adaptune.reference.stored import write_estimate
+
+    points, given, prior = topics
+    config = of_recording.recording_config(inspect(target), points, given)
+    scans = open_sequence(config)
+    joined = None if prior is None else of_recording.read_prior(config, prior)
+    path = out / f"{of_recording.estimated_name(target)}.tum"
+    # What can fail is found before the estimate, which takes minutes.
+    of_recording.check_writable(path)
+    there = _given_reference(scans, required=given is not None)
+    with progress() as show:
+        found = estimate.estimate_reference(scans, _advance(show, "estimating"), joined)
+        warn_of_unused(scans.name, joined, found)
+        about = {"recording": str(target.resolve()), "points": config.points}
+        about["position_prior"] = prior
+        metres = length or proposed_sub_trajectory(found.trajectory())
+        stored = write_estimate(path, found, about, metres)
+        if there is not None:
+            advance = _advance(show, "given reference")
+            comparison = of_recording.beside_given(scans, there, found, metres, advance)
+    _say_estimate(stored, found.gaps(), metres)
+    if there is not None:
+        _say_comparison(comparison, config, metres)
+    say(f"Files: {path}, {path.with_suffix('.json').name}, {path.with_suffix('.png').name}")
+    first = f"write `reference: {path}` under this sequence in a study; then "
+    why = "train with it, as with a given one"
+    say_next(why, "offline", "STUDY.yaml", first=first)
+
+
+def _given_reference(scans: "Recording", required: bool) -> "Trajectory | None":
+    """The reference to compare with; one that was not asked for may be of no use."""
+    try:
+        return scans.reference()
+    except AdaptuneError as error:
+        if required:
+            raise
+        say(f"The given reference is not compared with: {error}")
+        return None
+
+
+def _say_estimate(stored: "StoredEstimate", unknown: "list[Gap]", length: float) -> None:
+    """What the estimated reference is worth."""
+    say(f"Estimated reference: {stored.metres:.1f} m, {stored.scans:,} scans.")
+    error = stored.error(length)
+    if math.isnan(error):
+        say(f"Its error is not known: the path holds no {length:g} m without interruption.")
+    else:
+        say(f"It is wrong by about {error:.2g} % over {length:g} m, as its two halves tell.")
+    if not unknown:
+        say("It is known everywhere.")
+        return
+    where = ", ".join(f"{gap.begin:.1f}-{gap.end:.1f} s ({gap.reason})" for gap in unknown)
+    share = f"{100.0 * stored.unknown_share:.1f} % of the scans"
+    say(f"It is unknown for {share}, which have no pose: {where} after the first scan.")
+
+
+def _say_comparison(comparison: "Comparison", config: "SequenceConfig", length: float) -> None:
+    """What the given reference is worth, and how far the two differ."""
+    from adaptune.reference.check import accuracy_words
+
+    of = "" if config.reference is None else f" ({config.reference})"
+    say(f"Given reference{of}: {accuracy_words(comparison.measured, length)}.")
+    if math.isnan(comparison.difference):
+        say(f"The two share no stretch of {length:g} m.")
+    else:
+        say(f"The two differ by {comparison.difference:.2g} % over {length:g} m.")
+
+
+def _of_study(study: "OfflineStudy") -> None:
+    """Estimate the references that a study lacks, and say what each is worth."""
+    from adaptune.report import tables
+    from adaptune.study.references import ensure_references, estimates_of, to_estimate
+
+    names = to_estimate(study.sequences, (*study.config.training, *study.config.test))
+    if not names:
+        raise AdaptuneError(
+            f"{study.name}: every sequence has a reference; write `reference: estimated` where it "
+            f"is to be estimated"
+        )
+    study.open()
+    with progress() as show:
+        refused = ensure_references(study, names, show, required=False)
+    length = study.config.sub_trajectory
+    rows = [
+        {
+            "reference": name,
+            "scans": stored.scans,
+            "metres": stored.metres,
+            "its error [%]": stored.error(length),
+            "unknown [% of the scans]": 100.0 * stored.unknown_share,
+        }
+        for name, stored in estimates_of(study.sequences, names).items()
+    ]
+    if rows:
+        caption = f"Errors are estimates over {length:g} m. A picture of each shows where it fails."
+        console.print(tables.table("Estimated references", rows, caption))
+        say(f"Files: {study.folder / 'references'}/")
+    if refused:
+        raise AdaptuneError("\n".join(refused.values()))

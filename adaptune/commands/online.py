@@ -135,7 +135,7 @@ def online(
 def _oracle(loaded: "OfflineStudy", cluster: str | None) -> None:
     """Run sets of the model on the test sequences as trials."""
     from adaptune.report import tables
-    from offline.oracle import run_oracle
+    from offline.train import run_oracle
 
     with progress() as show:
         rows = run_oracle(loaded, ORACLE_SETS, show, cluster)
@@ -181,8 +181,13 @@ def _replay(loaded: "OfflineStudy", model: Path | None, untrained: bool) -> tupl
     """Make the replays that are missing; how many were made, and how many there are."""
     from adaptune.commands.dashboard import Dashboard
     from adaptune.model import ErrorModel
-    from online.modes import WITHOUT_MODEL, ReplaySetup, sequences_without_model
-    from online.run import run_replays, run_untrained
+    from online.modes import (
+        WITHOUT_MODEL,
+        ReplaySetup,
+        run_replays,
+        run_untrained,
+        sequences_without_model,
+    )
 
     dashboard, path = Dashboard(), model or loaded.model_path
     with _on_one_core(loaded), progress(dashboard) as show:

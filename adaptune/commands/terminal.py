@@ -241,8 +241,7 @@ StudyFile = Annotated[
 def _complete_override(incomplete: str) -> list[str]:
     """Keys and values for `-o`, when the shell asks."""
     from adaptune.study.config import complete
-    from offline.config import OfflineStudyConfig
-    from offline.sampler_settings import NAMES
+    from offline.config import NAMES, OfflineStudyConfig
 
     return complete(OfflineStudyConfig, incomplete, {"offline.sampler": NAMES})
 

@@ -24,7 +24,7 @@ from adaptune.live.hops import (
 )
 from adaptune.odometry.base import Motions
 from adaptune.recording.scan import Scan
-from adaptune.selection import Selection
+from adaptune.space import Selection
 
 # An odometry's own error, estimated without ground truth from chains of hops.
 #

@@ -6,11 +6,11 @@ from collections.abc import Callable, Iterable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune import plugins, processes
+from adaptune import processes, strict
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses, invert, rotation_angle
 from adaptune.odometry import wire
-from adaptune.odometry.factory import python_content
+from adaptune.odometry.registry import python_content
 from adaptune.recording.scan import Scan
 
 # The motion of the sensor, computed from the poses of the scans before.
@@ -92,16 +92,16 @@ def where(name: str) -> str:
     if name in GONE:
         raise DescriptorError(f"{name} is gone, for it did no better; choose ndt or motion")
     try:
-        return plugins.path_of(name, "descriptor", DESCRIPTORS, ENTRY_POINTS, "function")
-    except plugins.PluginError as error:
+        return strict.path_of(name, "descriptor", DESCRIPTORS, ENTRY_POINTS, "function")
+    except strict.PluginError as error:
         raise DescriptorError(str(error)) from error
 
 
 def descriptor(name: str) -> Descriptor:
     """Function of a descriptor, see `where`; a DescriptorError if there is none."""
     try:
-        found = plugins.load(name, where(name), "function")
-    except plugins.PluginError as error:
+        found = strict.load(name, where(name), "function")
+    except strict.PluginError as error:
         raise DescriptorError(str(error)) from error
     if not callable(found):
         raise DescriptorError(f"{name}: is not a function from a scan to an array")

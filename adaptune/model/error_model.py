@@ -27,18 +27,11 @@ from adaptune.model.rules import Costs, PairedSettings, Spending, TrainingData, 
 from adaptune.model.weights import BankSettings
 from adaptune.recording.scan import places, stretch_numbers
 from adaptune.report import tables
-from adaptune.space import (
-    ParameterSet,
-    ParameterSets,
-    SpaceError,
-    in_words,
-    load_space,
-)
+from adaptune.space import ParameterSet, ParameterSets, SpaceError, in_words, load_space
 from adaptune.strict import in_one_line
 
 if TYPE_CHECKING:
     from adaptune.model.pca import ScaledPCA
-
 
 # Files of error models: arrays and text in the safetensors format, which runs no code on load.
 
@@ -230,6 +223,8 @@ class ErrorModel:
 
     def pca(self) -> "ScaledPCA":
         """Principal components of the training frames' descriptors."""
+        # not needed to load a model
+
         from adaptune.model.pca import ScaledPCA  # not needed to load a model
 
         return ScaledPCA(blocks=tuple(self.blocks.values())).fit(self.descriptors)

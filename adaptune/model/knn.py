@@ -10,7 +10,7 @@ from sklearn.utils.validation import check_array, check_is_fitted, validate_data
 
 from adaptune.metrics import FAILURE
 from adaptune.model.rules import Rule, TrainingData
-from adaptune.selection import Selection
+from adaptune.space import Selection
 
 
 class ProductKNeighborsRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):  # type: ignore[misc]

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
 from adaptune.metrics import FAILURE, cap
-from adaptune.selection import Selection
-from adaptune.space import ParameterSets
+from adaptune.space import ParameterSets, Selection
 
 # The evidence about a scene: the training frames that look like it.
 

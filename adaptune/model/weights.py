@@ -15,7 +15,7 @@ from pydantic import (
     PositiveInt,
 )
 
-from adaptune.bank.agreement import share
+from adaptune.bank.members import share
 from adaptune.live.hops import LiveSquares, blend
 from adaptune.metrics import FAILURE
 from adaptune.model.rules import (
@@ -27,8 +27,7 @@ from adaptune.model.rules import (
     TrainingData,
     mean_errors,
 )
-from adaptune.selection import Selection
-from adaptune.space import ParameterSets
+from adaptune.space import ParameterSets, Selection
 
 UNFAMILIAR_PRIOR_SHARE = 0.2
 """Share of the prior's windows that remain where a scan is unlike all training."""

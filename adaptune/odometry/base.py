@@ -12,8 +12,7 @@ from pydantic import Field
 from adaptune.errors import AdaptuneError, OdometryError, nearest
 from adaptune.geometry import Poses, invert, rectify, scale
 from adaptune.recording.scan import Scan
-from adaptune.selection import Selection
-from adaptune.space import ParameterSet, ParameterSpace
+from adaptune.space import ParameterSet, ParameterSpace, Selection
 from adaptune.strict import StrictModel
 
 _log = logging.getLogger(__name__)

@@ -1,18 +1,30 @@
 """The odometries by name, imported when they are asked for."""
 
+import json
+import os
+import shutil
+import sys
+from collections.abc import Callable, Mapping
 from contextlib import suppress
-from functools import cache
+from dataclasses import dataclass, field, replace
+from functools import cache, cached_property, partial
 from importlib import metadata
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ConfigDict, RootModel, ValidationError
 
-from adaptune import plugins
+from adaptune import processes, strict
 from adaptune.errors import OdometryError
-from adaptune.odometry.base import Description, Odometry
+from adaptune.odometry.base import Description, InProcess, Odometry, OdometryInstance
+from adaptune.odometry.remote import SERVICE, Guarded, Isolated, Limits
 from adaptune.odometry.wire import Served
-from adaptune.space import ParameterSet
-from adaptune.strict import in_one_line
+from adaptune.space import ParameterSet, ParameterSpace, PooledSpace
+from adaptune.strict import Mistake, in_one_line, validated
+
+if TYPE_CHECKING:
+    from adaptune.odometry.program import ProgramInput
+
 
 ENTRY_POINTS = "adaptune.odometries"
 """Group in which other packages announce their odometries, each by its name."""
@@ -63,13 +75,13 @@ def where(name: str) -> str:
         If there is no such odometry, with the nearest name.
     """
     try:
-        return plugins.path_of(name, "odometry", ODOMETRIES | PROGRAMS, ENTRY_POINTS, "Class")
-    except plugins.PluginError as error:
+        return strict.path_of(name, "odometry", ODOMETRIES | PROGRAMS, ENTRY_POINTS, "Class")
+    except strict.PluginError as error:
         raise OdometryError(str(error)) from error
 
 
 def odometry_class(name: str) -> type[Any]:
-    """Class of an odometry; see `adaptune.odometry.factory` for a user's.
+    """Class of an odometry; see `adaptune.odometry.registry` for a user's.
 
     Parameters
     ----------
@@ -83,8 +95,8 @@ def odometry_class(name: str) -> type[Any]:
         If there is no such odometry, with the nearest name, or if the class cannot be used.
     """
     try:
-        found = plugins.load(name, where(name), "class")
-    except plugins.PluginError as error:
+        found = strict.load(name, where(name), "class")
+    except strict.PluginError as error:
         raise OdometryError(str(error)) from error
     if name in PROGRAMS:
         return found  # type: ignore[no-any-return]
@@ -135,3 +147,427 @@ def versions(name: str) -> dict[str, str]:
 
 _distributions = cache(metadata.packages_distributions)
 """The packages by the modules that they bring, which takes a third of a second to find."""
+
+
+# Make an odometry from its name, wherever it runs.
+
+
+# What an odometry says of itself. A class of the user is asked in a process of its own.
+
+
+class UserSettings(RootModel[dict[str, Any]]):
+    """Checked settings of a class of the user, with nothing left to defaults."""
+
+    model_config = ConfigDict(frozen=True)
+
+
+@dataclass(frozen=True)
+class Declaration:
+    """An odometry with given settings.
+
+    Attributes
+    ----------
+    settings : BaseModel or None
+        The checked settings; None if they have mistakes.
+    mistakes : list of Mistake
+        Mistakes in the settings.
+    description : Description or None
+        None if the odometry cannot be described without sound settings.
+    clean : bool
+        Whether instances in one process know nothing of each other, see `Odometry`.
+    module : str
+        Module in which its class is written.
+    """
+
+    settings: Any
+    mistakes: list[Mistake]
+    description: Description | None
+    clean: bool
+    module: str
+
+    def sound(self, name: str) -> tuple[Any, Description]:
+        """Settings and description.
+
+        Raises
+        ------
+        OdometryError
+            If the settings have mistakes.
+        """
+        if self.settings is None or self.description is None:
+            said = "; ".join(f"{'.'.join(map(str, m.key))}: {m.message}" for m in self.mistakes)
+            raise OdometryError(f"{name}: settings: {said}")
+        return self.settings, self.description
+
+
+def declare(name: str, settings: Any, folder: Path | None = None) -> Declaration:
+    """Let an odometry check its settings and describe itself.
+
+    Parameters
+    ----------
+    name
+        The odometry, see `adaptune.odometry.registry.odometry_class`.
+    settings
+        A mapping, or a model.
+    folder
+        Where relative paths in the settings begin.
+
+    Raises
+    ------
+    OdometryError
+        If there is no such odometry, or it does not answer.
+    """
+    if not is_user_class(name):
+        return declare_here(name, settings, folder)
+    given = settings.model_dump(mode="json") if isinstance(settings, BaseModel) else settings
+    answer = _ask(name, json.dumps(given, default=str), str(folder or ""))
+    space = ParameterSpace.load(answer["space"])
+    complete = answer["settings"]
+    return Declaration(
+        None if complete is None else UserSettings(complete),
+        [Mistake(tuple(key), message) for key, message in answer["mistakes"]],
+        Description(space, answer["live"], answer["needs_imu"], answer["warm_up"], answer["whole"]),
+        answer["clean"],
+        answer["module"],
+    )
+
+
+def declare_here(name: str, settings: Any, folder: Path | None = None) -> Declaration:
+    """Do `declare` in this process."""
+    cls: Any = odometry_class(name)
+    mistakes: list[Mistake] = []
+    context = None if folder is None else {"folder": folder}
+    found: Any = validated(cls.settings_type, settings, (), mistakes, context)
+    is_class = issubclass(cls, Odometry)
+    described = cls.describe(found) if is_class or found is not None else None
+    return Declaration(found, mistakes, described, is_class and cls.clean, cls.__module__)
+
+
+@cache
+def _ask(name: str, settings: str, folder: str) -> dict[str, Any]:
+    bounds = processes.Bounds(processes.IMPORT_SECONDS)
+    process = processes.Conversation(processes.Forked(SERVICE, name, "describe", bounds))
+    try:
+        message = {"type": "describe", "settings": json.loads(settings), "folder": folder}
+        return process.ask(message).header
+    except processes.HostError as error:
+        raise OdometryError(str(error)) from error
+    finally:
+        process.close()
+
+
+# What an odometry is, by its content: versions, sources, programs.
+#
+# Nothing of the user's is imported. What a class imports, shared libraries, and a program behind
+# an address are not part of it.
+
+
+Content = dict[str, str]
+"""By what it is of, in words, a version or the hash of a file."""
+
+
+def odometry_content(name: str, settings: Any, module: str = "") -> Content:
+    """What the poses of an odometry depend on besides its name, settings and parameters.
+
+    Parameters
+    ----------
+    name
+        See `adaptune.odometry.registry.odometry_class`.
+    settings
+        Its settings, which name the files of a program.
+    module
+        Module in which the class is written, if another one exports it.
+    """
+    if name in PROGRAMS:
+        return _program(settings)
+    if name in ODOMETRIES:
+        package = package_of(name)
+        return {f"version of {package}": _version(package)}
+    return python_content(name, ENTRY_POINTS, module)
+
+
+def python_content(name: str, group: str, written_in: str = "") -> Content:
+    """Source of a module, and version of the distribution that it is from.
+
+    Parameters
+    ----------
+    name
+        ``module:attribute``, or what a distribution calls it in an entry-point group.
+    group
+        The group.
+    written_in
+        Another module whose source counts.
+    """
+    from adaptune.recording.cache import fingerprint
+
+    versions: Content = {}
+    if ":" not in name:
+        for point in metadata.entry_points(group=group, name=name):
+            name = point.value
+            if point.dist is not None:
+                versions[f"version of {point.dist.name}"] = point.dist.version
+    module = name.partition(":")[0]
+    file = module_file(module)
+    if file is None:
+        return versions
+    if not versions and "site-packages" in file.parts:
+        # This takes half a second.
+        for package in metadata.packages_distributions().get(module.partition(".")[0], ()):
+            versions[f"version of {package}"] = _version(package)
+    files = {module: file} | {m: f for m in [written_in] if m and (f := module_file(m))}
+    return versions | {f"module {m}": fingerprint(f) for m, f in files.items()}
+
+
+def module_file(name: str) -> Path | None:
+    """File of a module, found without importing it or what it is in; None if there is none."""
+    where, origin, parts = None, None, name.split(".")
+    for i in range(len(parts)):
+        full = ".".join(parts[: i + 1])
+        specs = (finder.find_spec(full, where) for finder in sys.meta_path)
+        spec = next((spec for spec in specs if spec is not None), None)
+        if spec is None:
+            return None
+        where, origin = spec.submodule_search_locations, spec.origin
+    return Path(origin) if origin is not None and os.path.isfile(origin) else None  # noqa: PTH113
+
+
+def _program(settings: Any) -> Content:
+    from adaptune.recording.cache import fingerprint
+
+    if (image := getattr(settings, "image", None)) is not None:
+        from adaptune.odometry.docker.engine import image_digest
+
+        found = {f"image {image}": image_digest(image)}
+        files: tuple[str | None, ...] = ()
+    else:
+        program, *arguments = settings.command or ("",)
+        found, files = {}, (shutil.which(program), *arguments)
+    for name in (*files, getattr(settings, "template", None)):
+        # Arguments may be anything, also too long for a path.
+        for file in (name or "", *(name or "").split("=", 1)[1:]):
+            if os.path.isfile(file):  # noqa: PTH113
+                found[file] = fingerprint(Path(file))
+    return found
+
+
+def _version(package: str) -> str:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return "unknown"
+
+
+@dataclass(frozen=True)
+class OdometryFactory:
+    """Makes instances of one odometry, in any process: it pickles.
+
+    Attributes
+    ----------
+    name : str
+        The odometry, see `adaptune.odometry.registry.odometry_class`.
+    settings : BaseModel
+        Its settings; a mapping is validated.
+    space : ParameterSpace
+        The parameters that are tuned.
+    limits : Limits
+        Limits of odometries in processes of their own.
+    program_input : callable, optional
+        Gives the recording of a sequence, for programs that run whole recordings.
+    user_code : bool
+        Whether classes of the user may run in this process, if they are clean. Only processes that
+        the user can do without may allow it.
+    description : Description
+        What a study must know of the odometry.
+    module : str
+        Module in which its class is written.
+    """
+
+    name: str
+    settings: Any
+    space: ParameterSpace
+    limits: Limits
+    program_input: Callable[[str], "ProgramInput"] | None = None
+    user_code: bool = False
+    description: Description = field(init=False)
+    module: str = field(init=False)
+    _clean: bool = field(init=False)
+
+    def __post_init__(self) -> None:
+        declared = declare(self.name, self.settings)
+        settings, description = declared.sound(self.name)
+        for name, value in (
+            ("settings", settings),
+            ("description", description),
+            ("_clean", declared.clean),
+            ("module", declared.module),
+        ):
+            object.__setattr__(self, name, value)
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """Name and settings, by which a model knows the odometry that it was made for."""
+        return {"name": self.name, "settings": self.settings.model_dump(mode="json")}
+
+    @property
+    def content(self) -> Content:
+        """What the poses depend on besides name, settings and parameters."""
+        return odometry_content(self.name, self.settings, self.module)
+
+    def allowing(self, user_code: bool) -> "OdometryFactory":
+        """The same where classes of the user may, or may not, run in this process."""
+        return replace(self, user_code=user_code)
+
+    def reading(self, program_input: Callable[[str], "ProgramInput"]) -> "OdometryFactory":
+        """The same with another source of whole recordings, if it reads any."""
+        return self if self.program_input is None else replace(self, program_input=program_input)
+
+    @property
+    def apart(self) -> bool:
+        """Whether it runs in processes of their own, which have limits."""
+        return self.name in PROGRAMS or not self._clean or is_user_class(self.name)
+
+    @property
+    def one_by_one(self) -> bool:
+        """Whether trials gain nothing from sharing a pass: what runs them shares nothing."""
+        return self.description.whole or self.name in CONTAINERS
+
+    @property
+    def versions(self) -> dict[str, str]:
+        """Versions of the packages that the poses depend on."""
+        return versions(self.name)
+
+    def alone(self, parameters: ParameterSet) -> tuple["OdometryFactory", ParameterSet]:
+        """What makes the odometry that a set is for, and all parameters that it takes."""
+        return self, self.space.complete(parameters)
+
+    def __call__(
+        self,
+        parameters: ParameterSet | None = None,
+        sequence: str | None = None,
+        isolated: bool = False,
+    ) -> OdometryInstance:
+        """Make a new instance.
+
+        Parameters
+        ----------
+        parameters
+            Parameters not given keep their baseline.
+        sequence
+            Name of the sequence on which the instance will run; programs that run whole recordings
+            need it.
+        isolated
+            Run in a process of its own even if the odometry is clean, to measure its memory.
+        """
+        given = self.space.complete(parameters or {})
+        if self.name in PROGRAMS:
+            read = None
+            if sequence is not None and self.program_input is not None:
+                read = partial(self.program_input, sequence)
+            program: Any = odometry_class(self.name)
+            made: OdometryInstance = program.instance(given, self.settings, self.limits, read)
+            return made
+        if isolated or not self._clean or (is_user_class(self.name) and not self.user_code):
+            return Isolated(self.name, given, self.settings, self.limits)
+        if is_user_class(self.name):
+            return Guarded(self.name, odometry_class, given, self.settings, self.limits.seconds)
+        cls: Any = odometry_class(self.name)
+        return InProcess(cls(given, self.settings))
+
+
+# Several odometries in one study: a parameter set says which of them it is for.
+
+
+@dataclass(frozen=True)
+class OdometryPool:
+    """Makes instances of several odometries, in any process: it pickles.
+
+    It offers what `OdometryFactory` does. Parameter sets are those of a `PooledSpace`.
+
+    Attributes
+    ----------
+    factories : dict
+        By label, what makes each odometry.
+    """
+
+    factories: Mapping[str, OdometryFactory]
+    space: PooledSpace = field(init=False)
+
+    def __post_init__(self) -> None:
+        spaces = {label: factory.space for label, factory in self.factories.items()}
+        object.__setattr__(self, "space", PooledSpace(spaces))
+
+    @property
+    def name(self) -> str:
+        """All labels."""
+        return ", ".join(self.factories)
+
+    @cached_property
+    def description(self) -> Description:
+        """What a study must know of all together.
+
+        No instance changes from one odometry to another, so none is live. The longest warm-up is
+        long enough for all.
+        """
+        every = [factory.description for factory in self.factories.values()]
+        return Description(
+            self.space,
+            live=False,
+            needs_imu=any(one.needs_imu for one in every),
+            warm_up=max(one.warm_up for one in every),
+            whole=any(one.whole for one in every),
+        )
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """The labels, and by label name and settings, by which a model knows what it is of."""
+        settings = {label: factory.identity for label, factory in self.factories.items()}
+        return {"name": self.name, "settings": settings}
+
+    @property
+    def apart(self) -> bool:
+        """Whether any of them runs in processes of its own, which have limits."""
+        return any(factory.apart for factory in self.factories.values())
+
+    @property
+    def one_by_one(self) -> bool:
+        """See `OdometryFactory`."""
+        return any(factory.one_by_one for factory in self.factories.values())
+
+    @property
+    def versions(self) -> dict[str, str]:
+        """Versions of the packages that the poses depend on."""
+        every = (factory.versions for factory in self.factories.values())
+        return {package: version for one in every for package, version in sorted(one.items())}
+
+    @property
+    def content(self) -> Content:
+        """See `OdometryFactory`."""
+        return {k: v for factory in self.factories.values() for k, v in factory.content.items()}
+
+    def allowing(self, user_code: bool) -> "OdometryPool":
+        """The same where classes of the user may, or may not, run in this process."""
+        return OdometryPool({k: replace(f, user_code=user_code) for k, f in self.factories.items()})
+
+    def reading(self, program_input: Any) -> "OdometryPool":
+        """The same with another source of whole recordings."""
+        given = {k: f.reading(program_input) for k, f in self.factories.items()}
+        return OdometryPool(given)
+
+    def alone(self, parameters: ParameterSet) -> tuple[OdometryFactory, ParameterSet]:
+        """See `OdometryFactory.alone`."""
+        label, own = self.space.split(parameters)
+        return self.factories[label].alone(own)
+
+    def __call__(
+        self,
+        parameters: ParameterSet | None = None,
+        sequence: str | None = None,
+        isolated: bool = False,
+    ) -> OdometryInstance:
+        """Make a new instance of the odometry that the set names, see `OdometryFactory`."""
+        whole = self.space.baseline if parameters is None else parameters
+        label, own = self.space.split(whole)
+        return self.factories[label](own, sequence, isolated)
+
+
+Factory = OdometryFactory | OdometryPool
+"""What makes instances of one odometry, or of several."""

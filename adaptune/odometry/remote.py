@@ -33,8 +33,7 @@ from adaptune.odometry.base import (
 )
 from adaptune.processes import available, next_core
 from adaptune.recording.scan import Scan
-from adaptune.selection import Selection
-from adaptune.space import ParameterSet
+from adaptune.space import ParameterSet, Selection
 from adaptune.strict import StrictModel
 
 SERVICE = processes.Service("adaptune.odometry.serving", tuple(processes.ONE_THREAD.items()))

@@ -14,8 +14,14 @@ from adaptune import processes
 from adaptune.errors import OdometryError
 from adaptune.odometry import wire
 from adaptune.odometry.base import Description, FaultError, Registration
-from adaptune.odometry.factory import declare, declare_here
-from adaptune.odometry.registry import check_served, is_user_class, make_here, odometry_class
+from adaptune.odometry.registry import (
+    check_served,
+    declare,
+    declare_here,
+    is_user_class,
+    make_here,
+    odometry_class,
+)
 from adaptune.odometry.remote import Isolated, Limits, parse_address
 from adaptune.recording.scan import Scan
 from adaptune.space import ParameterSet
@@ -114,7 +120,7 @@ def converse(name: str) -> processes.Answer:
 
 
 def describe(name: str) -> processes.Answer:
-    """Answer what `adaptune.odometry.factory.declare` asks."""
+    """Answer what `adaptune.odometry.registry.declare` asks."""
     return partial(_declared, name)
 
 

@@ -15,13 +15,7 @@ from adaptune.errors import AdaptuneError
 from adaptune.geometry import to_pose
 from adaptune.recording import cache, compensation, views
 from adaptune.recording.cache import alongside
-from adaptune.recording.config import (
-    ESTIMATED,
-    NO_REFERENCE,
-    SequenceConfig,
-    bag_paths,
-    files_of,
-)
+from adaptune.recording.config import ESTIMATED, NO_REFERENCE, SequenceConfig, bag_paths, files_of
 from adaptune.recording.scan import (
     Frame,
     Imu,

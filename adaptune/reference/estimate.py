@@ -11,11 +11,23 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune.bank.agreement import LEVER
+from adaptune.bank.members import LEVER
 from adaptune.geometry import Poses, invert, mean_motion, rectify, rotation_angle, steps
 from adaptune.recording.scan import Recording, Scan
-from adaptune.reference.graph import Edge, Positions, closed, loops, optimised, positions
-from adaptune.reference.registering import HALVES, LENGTHS, SPACING, Guess, Pass, pass_over
+from adaptune.reference.graph import (
+    HALVES,
+    LENGTHS,
+    SPACING,
+    Edge,
+    Guess,
+    Pass,
+    Positions,
+    closed,
+    loops,
+    optimised,
+    pass_over,
+    positions,
+)
 from adaptune.reference.stored import EstimatedReference, EstimateError, Registrations
 from adaptune.trajectory import Trajectory
 

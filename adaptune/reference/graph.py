@@ -4,19 +4,297 @@ Solved by GTSAM (Dellaert and Kaess, *Factor Graphs for Robot Perception*, 2017)
 """
 
 import logging
-from collections.abc import Iterable, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from adaptune.bank.bank import Bank
 from adaptune.geometry import Poses, invert, rectify, rotation_angle, steps
 from adaptune.live.hops import Hop, HopCloud, register
 from adaptune.metrics import travelled
+from adaptune.odometry.base import InProcess, Odometry
+from adaptune.odometry.registry import odometry_class
+from adaptune.odometry.tracker import HealthCheck, Tracker
 from adaptune.recording.scan import Scan
-from adaptune.reference.registering import LENGTHS
 from adaptune.reference.stored import EstimatedReference
+from adaptune.space import ParameterSet, Selection
 from adaptune.trajectory import Trajectory
+
+# One pass over a recording: the consensus, and registrations of scans to scans before them.
+
+
+# The consensus: several odometries side by side, and the motion on which they agree.
+
+
+POOL: tuple[tuple[str, Mapping[str, float]], ...] = (
+    ("gicp", {"max_correspondence_distance": 2.2, "keyframe_interval": 1.3}),
+    ("gicp", {"max_correspondence_distance": 1.3, "keyframe_interval": 3.1}),
+    ("gicp", {"max_correspondence_distance": 4.5, "keyframe_interval": 5.3}),
+    ("vgicp", {"resolution": 0.9, "keyframe_interval": 1.7}),
+    ("vgicp", {"resolution": 1.8, "keyframe_interval": 3.7}),
+)
+"""Odometries and their parameters. No study's trials are among them: the reference that judges an
+odometry is not made with it."""
+_WARM_UP = 2.0
+"""Seconds. Odometries that register to a keyframe have no map to build."""
+HALVES = ((0, 1, 2), (3, 4))
+"""Members of either half, which have no algorithm in common."""
+_SETTINGS: Mapping[str, Mapping[str, float]] = {
+    "gicp": {"downsampling": 0.45},
+    "vgicp": {"downsampling": 0.45},
+}
+
+
+class Consensus:
+    """Runs the pool scan after scan.
+
+    A bank of even weights: members that agree move it by their mean, others are warmed up on the
+    last scans at its pose.
+
+    Attributes
+    ----------
+    n_members : int
+        Size of the pool.
+    """
+
+    n_members = len(POOL)
+
+    def __init__(self) -> None:
+        def adapter(kind: str, parameters: Mapping[str, float]) -> Odometry:
+            cls: Any = odometry_class(kind)
+            made: Odometry = cls(dict(parameters), cls.settings_type(**_SETTINGS[kind]))
+            return made
+
+        def make(parameters: Mapping[str, Any]) -> InProcess:
+            return InProcess(adapter(*POOL[int(parameters["number"])]))
+
+        sets: dict[int, ParameterSet] = {n: {"number": n} for n in range(len(POOL))}
+        self._bank = Bank(make, sets, _WARM_UP)
+        even = dict.fromkeys(sets, 1.0)
+        self._bank.apply(Selection(trial=0, parameters={}, weights=even))
+        self._tracker = Tracker(self._bank, HealthCheck())
+
+    def register(self, scan: Scan) -> tuple[Poses, Poses, bool]:
+        """Register the next scan.
+
+        Returns
+        -------
+        T_odom_sensor : ndarray of shape (4, 4)
+            Of the consensus.
+        T_previous_current : ndarray of shape (n_members, 4, 4)
+            Motions of the members; NaN where one has none.
+        registered : bool
+            False where no member could register the scan.
+        """
+        found = self._tracker.register(scan)
+        members = self._bank.motions.members
+        T_previous_current = np.array([members[i] for i in range(self.n_members)])
+        return found.T_odom_sensor, T_previous_current, found.registered
+
+
+LENGTHS = (2.0, 5.0, 10.0)
+"""Metres over which scans are registered directly. Over 25 m, too little overlaps in caves."""
+INTERVAL = 0.25
+"""Seconds from one scan that is registered to the next: three scans of a usual LiDAR."""
+SPACING = (0.2, 2.0)
+"""Metres from one to the next: at least, so that a robot that stands costs nothing; and the way
+after which it comes sooner."""
+DEPARTURE = (0.2, 0.08)
+"""A registration is rejected if it departs from the guess by more than so many metres, and by more
+than this share of the way."""
+MIN_INLIERS_OFFLINE = 0.3
+"""Least share of points near a point of the other scan. Many registrations check each other, so it
+may be lower than while driving."""
+_APART = 0.3
+"""Metres between guesses that are worth a registration each."""
+
+
+class Guess(NamedTuple):
+    """A registration of two scans that began at the motion of the consensus, or of a member.
+
+    Attributes
+    ----------
+    start, end : int
+        Numbers of the scans.
+    member : int
+        Whose motion it began at; -1 for the consensus.
+    hop : Hop or None
+        What was found; None if too few points lie on each other, or it departs too far.
+    """
+
+    start: int
+    end: int
+    member: int
+    hop: Hop | None
+
+
+@dataclass(frozen=True, eq=False)
+class Pass:
+    """What one pass over a recording finds.
+
+    Attributes
+    ----------
+    stamps : ndarray of shape (n,)
+        Of the scans, in nanoseconds.
+    T_odom_sensor : ndarray of shape (n, 4, 4)
+        Of the consensus.
+    T_previous_current : ndarray of shape (n, n_members, 4, 4)
+        Motions of the members; NaN where one has none.
+    registered : ndarray of shape (n,)
+        Whether any member could register the scan.
+    guesses : list of Guess
+        All registrations, by end, start, and member.
+    """
+
+    stamps: NDArray[np.int64]
+    T_odom_sensor: Poses
+    T_previous_current: Poses
+    registered: NDArray[np.bool_]
+    guesses: Sequence[Guess]
+
+
+class _Anchor(NamedTuple):
+    """A scan that is registered."""
+
+    number: int
+    stamp: int
+    metres: float  # driven until there
+    cloud: HopCloud
+    T_odom_sensor: Poses  # (1 + n_members, 4, 4): of the consensus, then of its members
+
+
+def pass_over(scans: Iterable[Scan], advance: Callable[[], None] = lambda: None) -> Pass:
+    """Run the consensus along a recording, and register scans directly to those before them.
+
+    Only the scans of the last metres and seconds are kept in memory.
+
+    Parameters
+    ----------
+    scans
+        The recording.
+    advance
+        Called after every scan.
+    """
+    consensus, registering = Consensus(), _Registering(Consensus.n_members)
+    stamps: list[int] = []
+    poses: list[Poses] = []
+    motions: list[Poses] = []
+    registered: list[bool] = []
+    for scan in scans:
+        T_odom_sensor, T_previous_current, sound = consensus.register(scan)
+        registering.add(scan, T_odom_sensor, T_previous_current)
+        stamps.append(scan.stamp)
+        poses.append(T_odom_sensor)
+        motions.append(T_previous_current)
+        registered.append(sound)
+        advance()
+    registering.end()
+    return Pass(
+        np.array(stamps, np.int64),
+        np.array(poses).reshape(-1, 4, 4),
+        np.array(motions).reshape(-1, Consensus.n_members, 4, 4),
+        np.array(registered, bool),
+        registering.guesses,
+    )
+
+
+class _Registering:
+    """Registers every few scans to those some metres before."""
+
+    def __init__(self, n_members: int):
+        self.guesses: list[Guess] = []
+        self._anchors: deque[_Anchor] = deque()
+        self._tracks = np.tile(np.eye(4), (1 + n_members, 1, 1))
+        self._newest: tuple[int, Scan] | None = None
+        self._T_last, self._seconds = np.eye(4), 0.0  # the last motion, and how long it took
+        self._n_to_first = 0  # registrations to the first scan
+
+    def add(self, scan: Scan, T_odom_sensor: Poses, T_previous_current: Poses) -> None:
+        """Take the next scan, with the pose of the consensus and the motions of its members."""
+        if self._newest is None:
+            self._tracks = np.tile(T_odom_sensor, (len(self._tracks), 1, 1))
+            self._newest = 0, scan
+            return
+        number, before = self._newest
+        T = invert(self._tracks[0]) @ T_odom_sensor
+        seconds = (scan.stamp - before.stamp) * 1e-9
+        # How the sensor moved during a scan is known once the next one is registered.
+        self._register(number, before, T, seconds)
+        known = np.asarray(np.isfinite(T_previous_current).all(axis=(1, 2)))
+        members = np.where(known[:, None, None], T_previous_current, T)
+        self._tracks[1:] = rectify(self._tracks[1:] @ members)
+        self._tracks[0] = T_odom_sensor
+        self._newest = number + 1, scan
+        self._T_last, self._seconds = T, seconds
+
+    def end(self) -> None:
+        """Register the last scan, however near it is to the last one that was registered."""
+        if self._newest is not None and self._newest[0]:
+            self._register(*self._newest, self._T_last, self._seconds, last=True)
+
+    def _register(
+        self, number: int, scan: Scan, T_current_next: Poses, seconds: float, last: bool = False
+    ) -> None:
+        """Register a scan if it is far enough from the one that was registered before, or last."""
+        metres = 0.0
+        if self._anchors:
+            before = self._anchors[-1]
+            # The straight way: a robot that stands does not drive by jitter.
+            way = float(np.linalg.norm((invert(before.T_odom_sensor[0]) @ self._tracks[0])[:3, 3]))
+            least, most = SPACING
+            elapsed = (scan.stamp - before.stamp) * 1e-9
+            soon = way < least or (elapsed < INTERVAL and way < most)
+            if soon and not last:
+                return
+            metres = before.metres + way
+        cloud = HopCloud(scan, T_current_next, seconds)
+        end = _Anchor(number, scan.stamp, metres, cloud, self._tracks.copy())
+        for start in self._starts(metres):
+            self.guesses += self._tries(start, end)
+        self._anchors.append(end)
+        while len(self._anchors) > 1 and metres - self._anchors[1].metres >= LENGTHS[-1]:
+            self._anchors.popleft()
+
+    def _starts(self, metres: float) -> Iterator[_Anchor]:
+        """The scans to which one is registered, each once."""
+        starts = []
+        for length in LENGTHS:
+            starts += [a for a in self._anchors if metres - a.metres >= length][-1:]
+            # The robot may stand at first: without these, nothing spans its first motions.
+            if self._n_to_first < len(LENGTHS) and metres >= LENGTHS[self._n_to_first]:
+                starts.append(self._anchors[0])
+                self._n_to_first += 1
+        yield from {start.number: start for start in starts}.values()
+
+    def _tries(self, start: _Anchor, end: _Anchor) -> Iterator[Guess]:
+        """Register two scans; where the consensus does not lead there, as its members moved."""
+        T_start_end = invert(start.T_odom_sensor) @ end.T_odom_sensor
+        hop = _registered(start, end, T_start_end[0])
+        yield Guess(start.number, end.number, -1, hop)
+        tried = [T_start_end[0]]
+        for member, T in enumerate(T_start_end[1:]):
+            if hop is None and all(_metres_apart(T, other) > _APART for other in tried):
+                tried.append(T)
+                yield Guess(start.number, end.number, member, _registered(start, end, T))
+
+
+def _registered(start: _Anchor, end: _Anchor, T_start_end: Poses) -> Hop | None:
+    """A registration that stays near its guess."""
+    hop = register(start.cloud, end.cloud, [T_start_end], MIN_INLIERS_OFFLINE)
+    if hop is None:
+        return None
+    metres, share = DEPARTURE
+    most = metres + share * (end.metres - start.metres)
+    return hop if _metres_apart(hop.T_start_end, T_start_end) <= most else None
+
+
+def _metres_apart(T: Poses, other: Poses) -> float:
+    return float(np.linalg.norm(T[:3, 3] - other[:3, 3]))
+
 
 _OF_A_STEP = (0.005, 0.002)
 """Metres and radians by which the motion from scan to scan is wrong, about, if it is small."""

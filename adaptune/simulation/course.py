@@ -1,10 +1,14 @@
 """Configuration of a simulated recording."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, model_validator
 
 from adaptune import geometry
@@ -13,8 +17,170 @@ from adaptune.geometry import Poses
 from adaptune.recording.config import SequenceConfig
 from adaptune.recording.scan import ImuNoise, Part
 from adaptune.simulation.scenes import SCENES
-from adaptune.simulation.sensors import MOTIONS, SENSORS, WEATHERS
 from adaptune.strict import StrictModel
+
+# LiDARs: their rays, rates and noise.
+
+
+@dataclass(frozen=True, eq=False)
+class Sensor:
+    """A LiDAR."""
+
+    # Radians above the sensor's horizon, by the ring number its driver gives: upwards on Velodynes,
+    # downwards on Ousters. On a Livox, the offset of each of its lines, of shape (n_rings,).
+    elevations: NDArray[np.float64]
+    columns: int  # firings in a turn; all rings fire at once
+    rate: float  # turns in a second
+    # Least and greatest range in metres. The greatest holds for a target that reflects a tenth of
+    # the light or more and is met squarely.
+    range: tuple[float, float]
+    noise: float  # standard deviation of a range in metres
+    dropout: float  # share of echoes lost for no reason
+    # Whether it turns about its vertical axis, or draws a rosette ahead which never repeats.
+    pattern: Literal["spin", "rosette"] = "spin"
+
+    @property
+    def rings(self) -> int:
+        """Lasers that fire at once."""
+        return len(self.elevations)
+
+
+def _sensor(
+    degrees: NDArray[np.floating], columns: int, reach: tuple[float, float], noise: float = 0.015
+) -> Sensor:
+    return Sensor(np.radians(degrees), columns, 10.0, reach, noise, 0.005)
+
+
+# Two blocks of 32 lasers: a third of a degree apart above, half a degree below.
+_HDL64E = np.concatenate([2.0 - np.arange(32) / 3.0, -8.83 - 0.5 * np.arange(32)])[::-1]
+
+SENSORS: Mapping[str, Sensor] = MappingProxyType(
+    {
+        "vlp16": _sensor(np.arange(-15.0, 16.0, 2.0), 1800, (0.5, 100.0)),
+        # 900 columns, half of what it can do, keep a scan at 28,800 rays.
+        "hdl32e": _sensor(10.67 - (4.0 / 3.0) * np.arange(31, -1, -1), 900, (1.0, 100.0)),
+        "hdl64e": _sensor(_HDL64E, 2083, (0.9, 120.0)),
+        "os0-64": _sensor(np.linspace(45.0, -45.0, 64), 1024, (0.3, 50.0)),
+        "os1-128": _sensor(np.linspace(22.5, -22.5, 128), 1024, (0.5, 120.0)),
+        "avia": replace(
+            _sensor((np.arange(6) - 2.5) * 0.6, 4000, (1.0, 190.0), 0.02), pattern="rosette"
+        ),
+    }
+)
+"""LiDARs by name."""
+
+_PRISMS = (7294.0 / 60.0, -4664.0 / 60.0)
+"""Turns in a second of the two prisms of a Livox. Their ratio closes no rosette within hours."""
+
+_FIELD = np.radians((70.4, 77.2)) / 2.0
+"""Half of the Avia's horizontal and vertical field of view."""
+
+
+@cache
+def _spin(name: str, columns: int) -> NDArray[np.float32]:
+    elevations = SENSORS[name].elevations
+    # A Velodyne turns clockwise seen from above. The seam lies behind, away from what is ahead.
+    azimuth = np.pi - 2.0 * np.pi * np.arange(columns) / columns
+    directions = _unit(azimuth, elevations)
+    directions.setflags(write=False)
+    return directions
+
+
+def _rosette(sensor: Sensor, times: NDArray[np.float64]) -> NDArray[np.float32]:
+    first, second = (2.0 * np.pi * f * times for f in _PRISMS)
+    lines = sensor.elevations - sensor.elevations.mean()
+    azimuth = _FIELD[0] * (np.cos(first) + np.cos(second)) / 2.0
+    elevation = (_FIELD[1] - lines.max()) * (np.sin(first) + np.sin(second)) / 2.0
+    return _unit(azimuth, elevation[:, None] + lines)
+
+
+def _unit(azimuth: NDArray[np.float64], elevation: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Unit vectors at the azimuths of columns and the elevations of rings."""
+    level = np.cos(elevation)
+    x, y = level * np.cos(azimuth)[:, None], level * np.sin(azimuth)[:, None]
+    z = np.broadcast_to(np.sin(elevation), x.shape)
+    return np.stack([x, y, z], axis=-1).astype(np.float32)
+
+
+def directions(name: str, columns: int, start: float, rate: float) -> NDArray[np.float32]:
+    """Where a sensor looks during one scan of some firings (`columns`).
+
+    The scan starts `start` seconds after the recording, which has `rate` scans a second. Unit
+    vectors of shape (columns, n_rings, 3) are in the sensor's frame: x ahead, y to the left, z up.
+    """
+    sensor = SENSORS[name]
+    if sensor.pattern == "spin":
+        return _spin(name, columns)
+    return _rosette(sensor, start + np.arange(columns) / (columns * rate))
+
+
+# Ways of carrying a sensor.
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A way of carrying a sensor."""
+
+    speed: float  # usual speed in m/s
+    acceleration: float  # greatest acceleration and braking in m/s^2
+    turning: float  # greatest lateral acceleration in m/s^2: it goes slower through bends
+    height: float  # metres of the sensor above the ground
+    base: tuple[float, float]  # length and width in metres over which the ground carries it
+    weave: float  # metres by which it strays from the road's middle, about
+    # Standard deviation along x, y and z of the mount's shake on a paved road, in metres.
+    shift: tuple[float, float, float]
+    turn: tuple[float, float, float]  # standard deviation about x, y and z of the same, in radians
+    band: tuple[float, float]  # least and greatest frequency of the shake in Hz
+
+    @property
+    def least_rate(self) -> float:
+        """Scans a second below which its shake is lost or scans lie two metres apart."""
+        return max(2.0 * self.band[1], self.speed / 2.0)
+
+
+MOTIONS: Mapping[str, Motion] = MappingProxyType(
+    {
+        # Speed, acceleration, turning, height, base and weave; shift, turn and band of the shake.
+        "robot": Motion(
+            *(3.0, 0.8, 1.0, 0.9, (0.8, 0.6), 0.15),
+            *((0.002, 0.003, 0.004), (0.0015, 0.0015, 0.001), (0.5, 3.5)),
+        ),
+        "car": Motion(
+            *(10.0, 2.0, 2.5, 1.75, (2.7, 1.6), 0.15),
+            *((0.003, 0.006, 0.010), (0.0015, 0.0020, 0.0007), (0.6, 2.5)),
+        ),
+        "handheld": Motion(
+            *(1.3, 0.6, 0.8, 1.5, (0.4, 0.4), 0.3),
+            *((0.012, 0.020, 0.022), (0.012, 0.012, 0.015), (0.4, 2.5)),
+        ),
+    }
+)
+"""Ways of carrying a sensor, by name."""
+
+
+# Effect of weather on a LiDAR.
+
+
+@dataclass(frozen=True)
+class Weather:
+    """Effect of the air on rays."""
+
+    extinction: float  # share of the light lost in a metre, each way (1/m)
+    # Chance in a metre that drops send back an echo before the target does (1/m).
+    backscatter: float
+    reach: float  # metres within which such an echo is strong enough to be seen
+
+
+WEATHERS: Mapping[str, Weather] = MappingProxyType(
+    {
+        "clear": Weather(0.0, 0.0, 0.0),
+        # 10 mm/h, and fog through which one sees some 150 m (3.9 / extinction).
+        "rain": Weather(0.003, 0.0015, 20.0),
+        "fog": Weather(0.026, 0.012, 12.0),
+    }
+)
+"""Weathers by name."""
+
 
 LONGEST = 20_000.0
 """Metres; a longer course is most likely a mistake."""

@@ -146,7 +146,7 @@ def receive(
     cast, sensor
         The rays with their hits, and the receiver.
     air
-        Extinction, backscatter and its reach: see `adaptune.simulation.sensors.Weather`.
+        Extinction, backscatter and its reach: see `adaptune.simulation.course.Weather`.
     chance, normal
         Uniform random numbers of shape (2, n), and normal ones of shape (n,).
 

@@ -28,16 +28,19 @@ from adaptune.report.drawing import draw_chart
 from adaptune.simulation import kernels
 from adaptune.simulation.course import (
     IMU,
+    MOTIONS,
     NOISE,
     POINTS,
     POSES,
+    SENSORS,
     T_IMU_LIDAR,
+    WEATHERS,
     Course,
     SimulationError,
+    directions,
 )
 from adaptune.simulation.mesh import REFLECTIVITY, Mesh
 from adaptune.simulation.scenes import SCENES, TILE
-from adaptune.simulation.sensors import MOTIONS, SENSORS, WEATHERS, directions
 from adaptune.simulation.world import RADIUS, Ride, Road, World, model, populate
 from adaptune.trajectory import Trajectory, write_tum
 

@@ -9,9 +9,9 @@ from scipy.interpolate import PchipInterpolator, make_interp_spline
 from scipy.ndimage import gaussian_filter1d
 
 from adaptune.geometry import Poses
+from adaptune.simulation.course import Motion
 from adaptune.simulation.mesh import Mesh, car, grid, merge, walker
 from adaptune.simulation.scenes import TILE, Scene, Spots, Tile
-from adaptune.simulation.sensors import Motion
 
 # The line that a course follows over the ground.
 

@@ -8,20 +8,12 @@ from typing import Any, TypeVar
 from adaptune import files
 from adaptune.errors import AdaptuneError, NotInstalledError, OdometryError, nearest
 from adaptune.odometry.base import Description
-from adaptune.odometry.factory import declare
-from adaptune.odometry.registry import PROGRAMS, is_user_class, odometry_class, where
+from adaptune.odometry.registry import PROGRAMS, declare, is_user_class, odometry_class, where
 from adaptune.recording import cache
 from adaptune.recording.cache import MANY, fingerprint
 from adaptune.recording.config import SequenceConfig
 from adaptune.recording.recording import check_sequence, interval_of, sequence_files
-from adaptune.space import (
-    ODOMETRY,
-    Categorical,
-    Float,
-    Integer,
-    ParameterSpace,
-    PooledSpace,
-)
+from adaptune.space import ODOMETRY, Categorical, Float, Integer, ParameterSpace, PooledSpace
 from adaptune.strict import ConfigurationError, Key, Mistake, validated, validated_rest
 from adaptune.study.config import OdometryConfig, StudyConfig, settle_roles
 from adaptune.study.study import Study, describe_odometry, tuned_space, whole_definition

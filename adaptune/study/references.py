@@ -28,8 +28,7 @@ from adaptune.reference.stored import (
     StoredEstimate,
     write_estimate,
 )
-from adaptune.study.sequences import StudySequences
-from adaptune.study.study import Study
+from adaptune.study.study import Study, StudySequences
 
 _OF_VIEWS = ("views", "compensate", "imu")
 """Keys of a sequence on which its scans as they were recorded do not depend."""

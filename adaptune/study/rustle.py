@@ -15,7 +15,7 @@ from pydantic import AliasChoices, BaseModel, ConfigDict, Field
 
 from adaptune import files
 from adaptune.errors import AdaptuneError, OdometryError, nearest
-from adaptune.odometry.template import Template
+from adaptune.odometry.program import Template
 from adaptune.strict import Key, Mistake, StrictModel, validated
 
 Number = int | float

@@ -6,8 +6,8 @@ import pytest
 from drives import STUDY
 from needs import needs_evalio
 
-from adaptune.odometry.factory import OdometryPool
 from adaptune.odometry.keyframe import KeyframeGicp, KeyframeVgicp
+from adaptune.odometry.registry import OdometryPool
 from adaptune.space import ODOMETRY
 from adaptune.strict import ConfigurationError
 from offline.config import load_study

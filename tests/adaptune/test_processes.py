@@ -13,14 +13,14 @@ from adaptune.commands.tools import inspect
 from adaptune.errors import AdaptuneError
 from adaptune.model import ModelError
 from adaptune.model.error_model import ErrorModel
-from adaptune.odometry.factory import OdometryFactory
+from adaptune.odometry.registry import OdometryFactory
 from adaptune.odometry.remote import Limits
 from adaptune.selector import Selector
 from adaptune.space import Float, ParameterSpace
 from adaptune.strict import ConfigurationError
 from offline.config import load_study
 from offline.train import train
-from online.run import run_replays
+from online.modes import run_replays
 
 NAMED = {
     "odometry": ["odometry.name=wicked_one:It", "odometry.parameters=", "odometry.settings="],

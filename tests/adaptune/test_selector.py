@@ -15,11 +15,10 @@ from adaptune.model.ndt import describe
 from adaptune.model.weights import measured_weights
 from adaptune.odometry.base import Motions
 from adaptune.recording.scan import Scan
-from adaptune.selection import Selection
 from adaptune.selector import MAX_TIMES_PREDICTED, REMEMBERED, Selector
 from adaptune.simulation import Course
 from adaptune.simulation.record import simulate
-from adaptune.space import Float, ParameterSets, ParameterSpace
+from adaptune.space import Float, ParameterSets, ParameterSpace, Selection
 
 SPACE = ParameterSpace({"speed": Float(low=0.0, high=9.0, baseline=1.0)})
 SETS = ParameterSets(SPACE, (3, 5), ({"speed": 1.0}, {"speed": 8.0}))

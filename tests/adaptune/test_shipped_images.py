@@ -7,7 +7,7 @@ import pytest
 
 from adaptune import files
 from adaptune.odometry.docker import rustle
-from adaptune.odometry.template import Template
+from adaptune.odometry.program import Template
 from adaptune.space import ParameterSpace
 from adaptune.strict import ConfigurationError
 from offline.config import OfflineConfig, load_study

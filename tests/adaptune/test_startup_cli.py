@@ -29,9 +29,7 @@ def test_help_imports_neither_numpy_nor_a_stage():
     assert not names & {"numpy", "pydantic", "offline", "online", *HEAVY}
 
 
-@pytest.mark.parametrize(
-    "module", ["adaptune.study.config", "offline.config", "offline.sampler_settings"]
-)
+@pytest.mark.parametrize("module", ["adaptune.study.config", "offline.config"])
 def test_configuration_models_import_nothing_heavy(module):
     names = imported(f"import {module}")
     assert not names & set(HEAVY)

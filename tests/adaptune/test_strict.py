@@ -8,8 +8,7 @@ from pydantic import Field, ValidationError
 from adaptune.odometry.registry import ODOMETRIES, PROGRAMS, odometry_class
 from adaptune.space import Value
 from adaptune.strict import StrictModel, plain_words
-from offline.config import OfflineStudyConfig
-from offline.sampler_settings import SETTINGS
+from offline.config import SETTINGS, OfflineStudyConfig
 
 
 class Inner(StrictModel):

@@ -257,7 +257,7 @@ def test_a_large_grid_may_be_walked_with_a_budget(study_file):
 
 
 def test_names_what_to_install(study_file, monkeypatch):
-    monkeypatch.setattr("offline.sampler_settings.find_spec", lambda _: None)
+    monkeypatch.setattr("offline.config.find_spec", lambda _: None)
     for name, package in (("gp", "torch"), ("cmaes", "cmaes")):
         text = failure(study_file, f"offline.sampler={name}")
         assert f"{name} needs the package {package}: pip install 'adaptune[{name}]'" in text

@@ -12,9 +12,8 @@ from random_models import random_model
 from adaptune.odometry.base import InProcess, Motions
 from adaptune.odometry.keyframe import KeyframeGicp
 from adaptune.recording.scan import Scan
-from adaptune.selection import Selection
 from adaptune.selector import Schedule, Selector, TimedSelector, UntrainedSelector
-from adaptune.space import ParameterSets
+from adaptune.space import ParameterSets, Selection
 
 SCAN = Scan(0, np.zeros((0, 3), np.float32))
 GUIDE = Path(__file__).parents[2] / "docs/adapting-live.md"

@@ -11,7 +11,7 @@ from optuna.testing import pytest_samplers
 from scipy import stats
 
 from offline.annealing import AnnealingSampler, Chain, reflected, step_from
-from offline.sampler_settings import AnnealingSettings, Step
+from offline.config import AnnealingSettings, Step
 
 SPACE = {
     "x": FloatDistribution(-5.0, 5.0),

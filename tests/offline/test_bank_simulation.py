@@ -12,9 +12,8 @@ from adaptune.model.weights import MemberWeights
 from adaptune.odometry import InProcess, Odometry
 from adaptune.odometry.base import Registration
 from adaptune.recording import Scan
-from adaptune.selection import Selection
-from adaptune.space import Float, ParameterSpace
-from offline.bank_simulation import BankSimulation, error_vectors, recorded_motions
+from adaptune.space import Float, ParameterSpace, Selection
+from offline.labelled import BankSimulation, error_vectors, recorded_motions
 
 N = 60
 LENGTH = 5.0

@@ -10,10 +10,10 @@ import kills
 import pytest
 from setups import setup_of
 
-from offline import cluster
-from offline.cluster import Cluster, ClusterError
+from offline import workers as cluster
 from offline.config import load_study
 from offline.train import train
+from offline.workers import Cluster, ClusterError
 
 pytestmark = pytest.mark.services
 

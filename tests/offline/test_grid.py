@@ -5,8 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from adaptune.space import Categorical, Float, Integer, ParameterSpace
-from offline.config import OfflineConfig
-from offline.sampler_settings import Grid, Span, make_grid
+from offline.config import Grid, OfflineConfig, Span, make_grid
 from offline.samplers import make_sampler
 
 SPACE = ParameterSpace(

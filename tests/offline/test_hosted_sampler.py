@@ -8,8 +8,7 @@ import pytest
 from adaptune import processes
 from adaptune.space import Categorical, Float, Integer, ParameterSpace
 from adaptune.strict import ConfigurationError
-from offline.config import OfflineConfig, load_study
-from offline.sampler_settings import SamplerError, check_class
+from offline.config import OfflineConfig, SamplerError, check_class, load_study
 from offline.samplers import AskedSampler, HostedSampler, make_sampler
 
 MINE = """

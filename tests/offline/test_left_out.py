@@ -16,7 +16,7 @@ from labelled_places import (
 from adaptune.errors import AdaptuneError
 from adaptune.model import ErrorModel, ModelError
 from adaptune.model.rules import Rule
-from adaptune.selection import Selection
+from adaptune.space import Selection
 from adaptune.strict import ConfigurationError
 from adaptune.study.config import SwitchingConfig
 from adaptune.study.study import driven

@@ -11,8 +11,7 @@ from adaptune.metrics import cap
 from adaptune.model import ErrorModel
 from adaptune.study.study import oracle_errors
 from offline.config import load_study
-from offline.oracle import oracle_sets, run_oracle
-from offline.train import train
+from offline.train import oracle_sets, run_oracle, train
 
 N = 5
 

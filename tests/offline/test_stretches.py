@@ -7,8 +7,7 @@ from hypothesis import strategies as st
 from labelled_places import in_stretches, labelled, with_motions
 
 from adaptune.metrics import travelled, window_ends
-from offline.bank_simulation import PER_STRETCH, Extent, cut, stretches_of_view
-from offline.labelled import LabelledSequence
+from offline.labelled import PER_STRETCH, Extent, LabelledSequence, cut, stretches_of_view
 
 LENGTH = 10.0
 

@@ -7,8 +7,7 @@ from labelled_places import TRIALS, in_stretches, labelled, sequence, two_kinds,
 from adaptune.model import BankSettings, PairedSettings
 from adaptune.model.rules import Costs, SetCost
 from offline import tuning
-from offline.bank_simulation import BankSimulation
-from offline.labelled import LabelledData
+from offline.labelled import BankSimulation, LabelledData
 from offline.tuning import (
     BANK_SETTINGS,
     DO_NOT_ADAPT,

@@ -15,8 +15,8 @@ from adaptune.model import BankSettings, ErrorModel, PairedSettings
 from adaptune.study.config import ALSO
 from offline.config import load_study
 from online.compare import compare, compared_modes
+from online.modes import run_replays, run_untrained
 from online.record import StoredReplayError, read_repeats, repeat_folder
-from online.run import run_replays, run_untrained
 
 EVERY = ["baseline", "fixed", "adaptive", "untrained", "even", "paper"]
 

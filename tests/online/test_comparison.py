@@ -11,16 +11,16 @@ import pytest
 from adaptune import manifest
 from adaptune.errors import AdaptuneError
 from adaptune.model import BankSettings, ErrorModel, PairedSettings
-from adaptune.selection import Selection
+from adaptune.space import Selection
 from adaptune.strict import ConfigurationError
 from adaptune.study.study import ModeError, bank_members
 from adaptune.trajectory import Trajectory, read_tum, write_tum
 from offline.config import load_study
 from online.compare import compare
+from online.modes import run_replays, warn_of_scant_evidence
 from online.record import StoredReplay, StoredReplayError
-from online.run import run_replays, warn_of_scant_evidence
 from online.statistics import ComparisonRow, Reference
-from online.verdict import remarks
+from online.tables import remarks
 
 MODES = ["baseline", "fixed", "adaptive", "paper"]
 

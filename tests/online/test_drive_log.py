@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from adaptune.odometry.tracker import RegisteredScan
-from adaptune.selection import Selection
+from adaptune.space import Selection
 from adaptune.trajectory import read_tum
 from online.replay import Choice
 from online.robot import DriveLog

@@ -8,10 +8,9 @@ import pytest
 from adaptune.reference.stored import EstimateError
 from offline.config import load_study
 from online.compare import compare
-from online.run import run_untrained
+from online.modes import run_untrained
 from online.statistics import allowing_for
-from online.tables import tables
-from online.verdict import remarks
+from online.tables import remarks, tables
 
 BOTH = ["baseline", "untrained"]
 

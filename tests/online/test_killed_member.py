@@ -11,8 +11,7 @@ import pytest
 from needs import needs_evalio
 
 from adaptune.bank.bank import Bank
-from adaptune.odometry.factory import OdometryFactory, OdometryPool
-from adaptune.odometry.registry import odometry_class
+from adaptune.odometry.registry import OdometryFactory, OdometryPool, odometry_class
 from adaptune.odometry.remote import SERVICE, Limits
 from adaptune.odometry.tracker import HealthCheck
 from adaptune.processes import server

@@ -7,8 +7,7 @@ import pytest
 from random_models import random_model
 
 from adaptune.model import BankSettings, PairedSettings
-from adaptune.odometry.factory import OdometryFactory, OdometryPool
-from adaptune.odometry.registry import odometry_class
+from adaptune.odometry.registry import OdometryFactory, OdometryPool, odometry_class
 from adaptune.odometry.remote import Limits
 from adaptune.space import ParameterSpace
 from adaptune.study.config import ALSO, SwitchingConfig

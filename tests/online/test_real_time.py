@@ -9,7 +9,7 @@ from adaptune.errors import AdaptuneError, OdometryError
 from adaptune.odometry.base import InProcess, Registration
 from adaptune.odometry.tracker import HealthCheck
 from adaptune.recording.scan import Imu, ImuNoise, Scan
-from adaptune.selection import Selection
+from adaptune.space import Selection
 from adaptune.study.config import RealTimeConfig
 from online.real_time import Answer, arrivals, replay_in_real_time
 

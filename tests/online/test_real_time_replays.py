@@ -13,9 +13,9 @@ from adaptune import manifest
 from adaptune.model import BankSettings, ErrorModel
 from offline.config import load_study
 from online.compare import compare
+from online.modes import run_replays
 from online.record import StoredReplay, StoredReplayError
-from online.run import run_replays
-from online.verdict import remarks
+from online.tables import remarks
 
 RATE = "online.real_time.rate=5"
 WAITS = "online.real_time.deadline=60"

@@ -12,13 +12,13 @@ from rosbags.highlevel import AnyReader
 
 from adaptune.geometry import invert
 from adaptune.odometry.tracker import RegisteredScan
-from adaptune.selection import Selection
+from adaptune.space import Selection
 from adaptune.trajectory import Trajectory
 from offline.config import load_study
+from online.modes import shared_identity
 from online.record import StoredReplayError, write_reference, write_replay
 from online.recordings import record_replays, topic
 from online.replay import Choice, ReplayRecord
-from online.run import shared_identity
 
 N = 40
 STAMPS = drives.FIRST_STAMP + np.arange(N) * 100_000_000

@@ -13,9 +13,8 @@ from adaptune.odometry.base import InProcess, Odometry, Registration, Usage
 from adaptune.odometry.keyframe import KeyframeGicp
 from adaptune.odometry.tracker import HealthCheck
 from adaptune.recording.scan import Scan
-from adaptune.selection import Selection
 from adaptune.selector import UntrainedSelector, untrained_sets
-from adaptune.space import Float, ParameterSpace
+from adaptune.space import Float, ParameterSpace, Selection
 from adaptune.trajectory import read_tum
 from online.record import StoredReplay, write_replay
 from online.replay import replay

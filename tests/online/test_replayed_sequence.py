@@ -7,8 +7,8 @@ import pytest
 from offline.config import load_study
 from online.charts import charts_of_replays, read_replays, scenes_along
 from online.compare import compare
+from online.modes import run_replays
 from online.record import StoredReplayError
-from online.run import run_replays
 
 COURSE = """\
 odometry: {name: gicp}

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
-from adaptune.selection import Selection
+from adaptune.space import Selection
 from online.live import UNKNOWN_ERROR, RosMessages, Status, Uncertainty
 from online.replay import ReplayRecord
 

@@ -11,8 +11,7 @@ from adaptune.errors import OdometryError
 from adaptune.odometry.base import InProcess, Odometry, Registration
 from adaptune.odometry.tracker import HealthCheck
 from adaptune.recording.scan import Scan
-from adaptune.selection import Selection
-from adaptune.space import Float, ParameterSpace
+from adaptune.space import Float, ParameterSpace, Selection
 from online.replay import replay
 
 TENTH = 10**8

@@ -15,9 +15,8 @@ from offline.config import load_study
 from offline.train import train
 from offline.validate import validate
 from online.compare import compare
-from online.run import run_replays
-from online.tables import tables
-from online.verdict import remarks
+from online.modes import run_replays
+from online.tables import remarks, tables
 
 ODOMETRIES = """\
 odometry:

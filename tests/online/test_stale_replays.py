@@ -16,8 +16,8 @@ from offline.train import train
 from offline.validate import validate
 from online.charts import charts_of_replays
 from online.compare import compare, current_modes
+from online.modes import run_replays
 from online.record import StoredReplayError, check_reference
-from online.run import run_replays
 
 
 @pytest.fixture(scope="module")

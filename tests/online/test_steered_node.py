@@ -7,7 +7,7 @@ import pytest
 from adaptune.errors import OdometryError
 from adaptune.recording.scan import Scan
 from adaptune.ros.link import LinkError
-from adaptune.selection import Selection
+from adaptune.space import Selection
 from adaptune.study.config import SteerConfig
 from online import robot
 from online.robot import SteeredNode

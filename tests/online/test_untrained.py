@@ -17,11 +17,9 @@ from adaptune.study.study import ModeError
 from offline.config import load_study
 from online.charts import read_replays
 from online.compare import compare
-from online.modes import ReplaySetup, sequences_without_model
+from online.modes import ReplaySetup, run_replays, run_untrained, sequences_without_model
 from online.record import StoredReplay, StoredReplayError
-from online.run import run_replays, run_untrained
-from online.tables import tables
-from online.verdict import remarks
+from online.tables import remarks, tables
 
 MODES = ["baseline", "untrained"]
 BLIND = "sequences.three.reference=none"

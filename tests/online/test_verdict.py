@@ -3,7 +3,7 @@ from dataclasses import replace
 import pytest
 
 from online.statistics import ALL, ORACLES, ComparisonRow, Ratio
-from online.verdict import remarks, verdict
+from online.tables import remarks, verdict
 
 
 def rows_of(sequence=ALL, **ratios):

@@ -8,8 +8,7 @@ from tables import table
 
 from adaptune.live.hops import Hops
 from adaptune.metrics import sub_trajectory_vectors
-from offline.bank_simulation import BankSimulation, Extent, cut
-from offline.labelled import LabelledData, LabelledSequence
+from offline.labelled import BankSimulation, Extent, LabelledData, LabelledSequence, cut
 
 TRIALS = (0, 3, 4, 7, 8)
 SETS = table(np.linspace(0.0, 1.0, 5)[:, None], TRIALS)

@@ -4,7 +4,7 @@ import time
 from pathlib import Path
 
 from adaptune.errors import AdaptuneError
-from adaptune.selection import Selection
+from adaptune.space import Selection
 
 
 class Noting:

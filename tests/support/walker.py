@@ -4,8 +4,7 @@ import numpy as np
 
 from adaptune.odometry import InProcess, Odometry, Registration
 from adaptune.recording import Scan
-from adaptune.selection import Selection
-from adaptune.space import Float, ParameterSpace
+from adaptune.space import Float, ParameterSpace, Selection
 
 
 class Walker(Odometry):

@@ -30,12 +30,13 @@ from adaptune.odometry.docker.engine import (
 from adaptune.odometry.program import (
     FileSettings,
     ProgramInput,
+    Template,
     WholeRun,
     check_arguments,
     read_output,
+    replace,
 )
 from adaptune.odometry.remote import FIRST_ANSWER, Limits, UserProgram, announced_by
-from adaptune.odometry.template import Template, replace
 from adaptune.space import ParameterSet
 from adaptune.trajectory import Trajectory
 

@@ -30,7 +30,7 @@ from adaptune.odometry.docker.engine import (
     regular_files,
     remove_shared,
 )
-from adaptune.odometry.template import Template
+from adaptune.odometry.program import Template
 from adaptune.ros.link import LinkError, equal_values
 from adaptune.ros.ros1 import Ros1
 from adaptune.space import ParameterSet

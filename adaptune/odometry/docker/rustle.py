@@ -43,17 +43,15 @@ from adaptune.odometry.docker.ros_container import (
     warn_of_unread,
     whole_name,
 )
-from adaptune.odometry.program import ProgramInput, WholeRun, WholeSettings
+from adaptune.odometry.program import ProgramInput, Template, WholeRun, WholeSettings, check_names
 from adaptune.odometry.remote import Limits
-from adaptune.odometry.template import Template, check_names
 from adaptune.recording.clouds import PATH, POSES, Pose, usable
 from adaptune.recording.config import resolve
 from adaptune.recording.export import IMU, POINTS, Messages, structured
 from adaptune.recording.scan import Scan
 from adaptune.ros.link import LinkError, Steering
 from adaptune.ros.ros1 import Ros1
-from adaptune.selection import Selection
-from adaptune.space import ParameterSet
+from adaptune.space import ParameterSet, Selection
 from adaptune.trajectory import Trajectory
 
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from adaptune.bank.agreement import Agreement, RunningMedian, share
+from adaptune.bank.members import Agreement, RunningMedian, share
 
 EVEN = np.full(4, 0.25)
 

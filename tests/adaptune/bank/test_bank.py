@@ -14,7 +14,7 @@ from adaptune.odometry.base import MOST_FAULTS, InProcess
 from adaptune.odometry.evalio import EvalioSettings
 from adaptune.odometry.keyframe import KeyframeGicp, KeyframeSettings
 from adaptune.odometry.remote import Isolated, Limits
-from adaptune.selection import Selection
+from adaptune.space import Selection
 
 NEAR = {"max_correspondence_distance": 2.0, "keyframe_interval": 1.0}
 FAR = {"max_correspondence_distance": 1.0, "keyframe_interval": 4.0}

@@ -14,13 +14,12 @@ from clocks import SteppedClock
 from adaptune.bank.bank import MAX_LATE_SECONDS, Bank, Lateness
 from adaptune.bank.members import SERVICE
 from adaptune.odometry.base import LastMotion, OdometryInstance, Registration
-from adaptune.odometry.factory import OdometryFactory, OdometryPool
-from adaptune.odometry.registry import odometry_class
+from adaptune.odometry.registry import OdometryFactory, OdometryPool, odometry_class
 from adaptune.odometry.remote import Limits
 from adaptune.odometry.tracker import HealthCheck, Tracker
 from adaptune.processes import server
 from adaptune.recording.scan import Scan
-from adaptune.selection import Selection
+from adaptune.space import Selection
 
 STEP, TENTH = 0.25, 10**8
 """Metres, and nanoseconds, between scans."""

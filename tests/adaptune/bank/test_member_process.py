@@ -9,13 +9,12 @@ import pytest
 from adaptune.bank.bank import Bank
 from adaptune.bank.members import KEPT, SERVICE, Member, spread
 from adaptune.odometry.base import InProcess
-from adaptune.odometry.factory import OdometryFactory, OdometryPool
 from adaptune.odometry.keyframe import KeyframeGicp, KeyframeVgicp
-from adaptune.odometry.registry import odometry_class
+from adaptune.odometry.registry import OdometryFactory, OdometryPool, odometry_class
 from adaptune.odometry.remote import Limits
 from adaptune.processes import server
 from adaptune.recording.scan import Scan
-from adaptune.selection import Selection
+from adaptune.space import Selection
 
 POOL = OdometryPool(
     {

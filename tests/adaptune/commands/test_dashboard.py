@@ -3,7 +3,7 @@ from rich.console import Console
 
 from adaptune.commands.dashboard import Dashboard
 from adaptune.odometry.tracker import RegisteredScan
-from adaptune.selection import Selection
+from adaptune.space import Selection
 from online.replay import Choice, ReplayRecord
 
 TENTH = 10**8

@@ -5,7 +5,7 @@ from commands import call
 
 from offline.config import load_study
 from offline.train import train
-from online.run import run_replays
+from online.modes import run_replays
 
 
 @pytest.fixture(scope="module")

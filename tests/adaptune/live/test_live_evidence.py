@@ -10,7 +10,7 @@ from adaptune.live.hops import LENGTHS, Hop
 from adaptune.model.weights import measured_weights
 from adaptune.odometry.base import Motions
 from adaptune.recording.scan import Scan
-from adaptune.selection import Selection
+from adaptune.space import Selection
 
 STEP = 1.0
 """Metres from scan to scan, ten a second."""

@@ -79,7 +79,7 @@ def test_several_descriptors_stand_one_after_the_other():
 
 def test_descriptors_of_other_packages(monkeypatch):
     point = metadata.EntryPoint("theirs", "my_descriptors:shape", "adaptune.descriptors")
-    monkeypatch.setattr("adaptune.plugins.entry_points", lambda group: [point] * bool(group))
+    monkeypatch.setattr("adaptune.strict.entry_points", lambda group: [point] * bool(group))
     assert Describer(["theirs"]).blocks == {"theirs": 2}
 
 

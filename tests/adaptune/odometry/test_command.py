@@ -14,14 +14,14 @@ from needs import lacking
 from setups import setup_of
 
 from adaptune.errors import AdaptuneError
-from adaptune.odometry.template import Template
+from adaptune.odometry.program import Template
 from adaptune.odometry.tracker import HealthCheck
 from adaptune.strict import ConfigurationError
 from offline.campaign import BaselineError
 from offline.config import load_study
 from offline.train import train
 from online.compare import compare
-from online.run import run_replays
+from online.modes import run_replays
 
 STUDY = """\
 odometry:

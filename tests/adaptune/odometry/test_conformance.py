@@ -34,7 +34,7 @@ from adaptune.odometry import OdometryError
 from adaptune.odometry.base import prepared_bytes
 from adaptune.odometry.registry import CONTAINERS, ODOMETRIES, PROGRAMS, odometry_class
 from adaptune.recording import Scan
-from adaptune.selection import Selection
+from adaptune.space import Selection
 
 CLEAN = [name for name in ODOMETRIES if odometry_class(name).clean]
 """Those that live in this process; test_conformance_isolated.py holds what the others must do."""

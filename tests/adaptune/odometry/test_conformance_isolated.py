@@ -12,7 +12,7 @@ from adaptune.odometry import OdometryError
 from adaptune.odometry.registry import ODOMETRIES, odometry_class
 from adaptune.odometry.remote import Isolated, Limits
 from adaptune.recording import Scan
-from adaptune.selection import Selection
+from adaptune.space import Selection
 
 NAMES = [name for name in ODOMETRIES if not odometry_class(name).clean]
 """test_conformance.py holds what the others must do."""

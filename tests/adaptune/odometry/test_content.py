@@ -4,8 +4,8 @@ from importlib import metadata
 import pytest
 
 from adaptune.model.descriptor import descriptor_content
-from adaptune.odometry.factory import module_file, odometry_content
 from adaptune.odometry.program import CommandSettings
+from adaptune.odometry.registry import module_file, odometry_content
 from adaptune.odometry.remote import ProcessSettings
 
 

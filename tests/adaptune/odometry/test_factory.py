@@ -7,9 +7,9 @@ from needs import needs_evalio
 
 from adaptune.odometry import OdometryError
 from adaptune.odometry.base import InProcess
-from adaptune.odometry.factory import OdometryFactory
 from adaptune.odometry.keyframe import KeyframeGicp, KeyframeSettings
 from adaptune.odometry.program import ProgramInput
+from adaptune.odometry.registry import OdometryFactory
 from adaptune.odometry.remote import Limits
 from adaptune.recording import Scan
 from adaptune.space import Float, ParameterSpace

@@ -4,7 +4,7 @@ from walker import Walker, at, x_on
 
 from adaptune.bank.bank import Bank
 from adaptune.odometry import InProcess, Motions, Odometry, OdometryError, Usage
-from adaptune.selection import Selection
+from adaptune.space import Selection
 
 
 class Mixed:

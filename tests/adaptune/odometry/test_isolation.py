@@ -16,15 +16,14 @@ from adaptune import processes
 from adaptune.archive import Archive
 from adaptune.odometry import OdometryError, wire
 from adaptune.odometry.base import MOST_FAULTS
-from adaptune.odometry.factory import OdometryFactory
 from adaptune.odometry.keyframe import KeyframeGicp, KeyframeSettings
-from adaptune.odometry.registry import make_here
+from adaptune.odometry.registry import OdometryFactory, make_here
 from adaptune.odometry.remote import SERVICE, Guarded, Isolated, Limits
 from adaptune.odometry.tracker import HealthCheck
 from adaptune.processes import server
 from adaptune.recording import Imu, Scan
 from adaptune.recording.scan import ImuNoise
-from adaptune.selection import Selection
+from adaptune.space import Selection
 from offline.config import load_study
 from offline.workers import Task, Workers, run
 from online.replay import replay

@@ -5,9 +5,8 @@ import pickle
 import pytest
 
 from adaptune.odometry import OdometryError
-from adaptune.odometry.factory import OdometryFactory, OdometryPool
 from adaptune.odometry.keyframe import KeyframeGicp, KeyframeNdt
-from adaptune.odometry.registry import odometry_class
+from adaptune.odometry.registry import OdometryFactory, OdometryPool, odometry_class
 from adaptune.odometry.remote import Limits
 from adaptune.space import ODOMETRY, SpaceError
 

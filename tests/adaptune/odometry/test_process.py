@@ -16,7 +16,7 @@ from adaptune.odometry.keyframe import KeyframeGicp
 from adaptune.odometry.remote import Limits, Process, ProcessSettings
 from adaptune.odometry.serving import listen
 from adaptune.recording import Scan
-from adaptune.selection import Selection
+from adaptune.space import Selection
 from adaptune.strict import ConfigurationError
 from offline.config import load_study
 

@@ -8,10 +8,10 @@ from adaptune.bank.bank import Bank
 from adaptune.geometry import invert
 from adaptune.odometry import OdometryError, OdometryInstance, Usage
 from adaptune.odometry.base import InProcess
-from adaptune.odometry.factory import OdometryFactory
 from adaptune.odometry.keyframe import KeyframeGicp, KeyframeSettings
+from adaptune.odometry.registry import OdometryFactory
 from adaptune.odometry.remote import Isolated, Limits
-from adaptune.selection import Selection
+from adaptune.space import Selection
 
 BASELINE = KeyframeGicp.space.baseline
 OTHER = {"max_correspondence_distance": 1.0, "keyframe_interval": 1.0}

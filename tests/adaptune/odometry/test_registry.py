@@ -68,7 +68,7 @@ def test_an_odometry_that_a_package_announces(monkeypatch):
     point = metadata.EntryPoint(
         "theirs", "adaptune.odometry.keyframe:KeyframeGicp", "adaptune.odometries"
     )
-    monkeypatch.setattr("adaptune.plugins.entry_points", lambda group: [point][: "odom" in group])
+    monkeypatch.setattr("adaptune.strict.entry_points", lambda group: [point][: "odom" in group])
     assert odometry_class("theirs") is KeyframeGicp
     with pytest.raises(OdometryError, match="did you mean 'theirs'"):
         odometry_class("thiers")

@@ -6,7 +6,7 @@ from adaptune.geometry import steps
 from adaptune.metrics import sub_trajectory_rte
 from adaptune.odometry.registry import odometry_class
 from adaptune.recording.scan import Scan
-from adaptune.reference.registering import HALVES, POOL, Consensus
+from adaptune.reference.graph import HALVES, POOL, Consensus
 
 
 def test_the_halves_are_the_pool_and_have_no_algorithm_in_common():

@@ -23,7 +23,7 @@ from adaptune.metrics import sub_trajectory_rte
 from adaptune.recording.scan import Scan
 from adaptune.reference import estimate
 from adaptune.reference.estimate import estimate_reference, estimated
-from adaptune.reference.registering import HALVES, Consensus, Guess, pass_over
+from adaptune.reference.graph import HALVES, Consensus, Guess, pass_over
 from adaptune.reference.stored import EstimateError
 from adaptune.simulation import Course
 from adaptune.simulation.record import simulate

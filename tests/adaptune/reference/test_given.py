@@ -5,11 +5,7 @@ from hypothesis import strategies as st
 from rooms import moved, scan_at, street
 
 from adaptune.live.hops import Hops
-from adaptune.reference.check import (
-    MeasuredReference,
-    mean_difference,
-    measure_reference,
-)
+from adaptune.reference.check import MeasuredReference, mean_difference, measure_reference
 from adaptune.trajectory import Trajectory
 
 WORLD = street()

@@ -11,14 +11,8 @@ from adaptune.geometry import invert, steps
 from adaptune.live.hops import Hop, HopCloud
 from adaptune.metrics import travelled
 from adaptune.recording.scan import Scan
-from adaptune.reference import registering
-from adaptune.reference.registering import (
-    DEPARTURE,
-    LENGTHS,
-    MIN_INLIERS_OFFLINE,
-    SPACING,
-    pass_over,
-)
+from adaptune.reference import graph
+from adaptune.reference.graph import DEPARTURE, LENGTHS, MIN_INLIERS_OFFLINE, SPACING, pass_over
 
 N_MEMBERS = 3
 
@@ -40,9 +34,9 @@ class Made:
             def register(self, _):
                 return *next(along), True
 
-        monkeypatch.setattr(registering, "Consensus", Along)
-        monkeypatch.setattr(registering, "HopCloud", self._cloud)
-        monkeypatch.setattr(registering, "register", self._register)
+        monkeypatch.setattr(graph, "Consensus", Along)
+        monkeypatch.setattr(graph, "HopCloud", self._cloud)
+        monkeypatch.setattr(graph, "register", self._register)
 
     def drive(self):
         points = np.zeros((0, 3), np.float32)

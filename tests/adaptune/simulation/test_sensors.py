@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from adaptune.simulation import SENSORS
-from adaptune.simulation.sensors import directions
+from adaptune.simulation.course import directions
 
 
 @pytest.mark.parametrize(

@@ -20,8 +20,8 @@ from setups import setup_of
 
 from adaptune.odometry.docker.engine import Container, EngineError
 from adaptune.odometry.docker.programs import DockerCommand, DockerCommandSettings
+from adaptune.odometry.program import Template
 from adaptune.odometry.remote import Limits
-from adaptune.odometry.template import Template
 from adaptune.strict import ConfigurationError
 from offline.config import load_study
 

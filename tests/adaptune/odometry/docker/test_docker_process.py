@@ -12,7 +12,7 @@ from adaptune.odometry.docker.engine import engine
 from adaptune.odometry.docker.programs import DockerProcess, DockerProcessSettings
 from adaptune.odometry.keyframe import KeyframeGicp
 from adaptune.odometry.remote import Limits
-from adaptune.selection import Selection
+from adaptune.space import Selection
 
 pytestmark = pytest.mark.services
 

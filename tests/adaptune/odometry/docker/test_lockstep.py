@@ -26,7 +26,7 @@ from adaptune.odometry.docker.engine import engine
 from adaptune.odometry.docker.ros_container import RosSystem
 from adaptune.odometry.docker.rustle import Rustle
 from adaptune.odometry.keyframe import KeyframeGicp
-from adaptune.selection import Selection
+from adaptune.space import Selection
 
 pytestmark = [
     pytest.mark.services,

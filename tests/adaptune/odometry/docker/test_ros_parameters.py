@@ -4,7 +4,7 @@ from contained import template
 
 from adaptune.odometry import OdometryError
 from adaptune.odometry.docker.ros_container import server_keys, warn_of_unread
-from adaptune.odometry.template import Template
+from adaptune.odometry.program import Template
 
 HELD = {
     "gicp": {"keyframe_interval": 1.5, "iterations": 20, "robust": True, "name": "x"},
