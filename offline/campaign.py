@@ -235,7 +235,7 @@ def watched(
     read: several workers may read the same sequence.
     """
     total, done = sum(len(task.numbers) for task in tasks), 0
-    read: dict[str, int] = {}  # scans, by what for
+    read: dict[str, float] = {}  # scans, by what for
     under_way: dict[tuple[str, tuple[int, ...]], float] = {}  # runs of unfinished tasks
 
     def report(task: Task, of_task: TaskProgress) -> None:

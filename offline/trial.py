@@ -29,6 +29,7 @@ from adaptune.odometry.base import MIN_POINTS, OdometryInstance, Usage, prepared
 from adaptune.odometry.registry import Factory
 from adaptune.odometry.tracker import HealthCheck, Tracker, unhealthy
 from adaptune.processes import apart
+from adaptune.progress import Progress, unseen
 from adaptune.recording.recording import RecordedSequence
 from adaptune.recording.scan import Scan
 from adaptune.space import ParameterSet
@@ -36,8 +37,6 @@ from adaptune.study.study import StudySequences
 from adaptune.trajectory import Trajectory
 from offline.config import OfflineStudyConfig
 from offline.objective import trajectory_metrics
-
-# Scans that are prepared once for all trials of a worker.
 
 
 @dataclass
@@ -139,9 +138,6 @@ class _Reader:
         return self._scan
 
 
-# Runs of an odometry on frames whose reference is known.
-
-
 class TrialRun:
     """A run of an odometry on a sequence, restarted at the reference where it loses track.
 
@@ -198,16 +194,12 @@ class TrialRun:
         if self._odometry is not None:
             self._odometry.close()
 
-    def _started(self) -> OdometryInstance:
-        self._odometry = self._make()
-        return self._odometry
-
     def _step(self, i: int, scan: SharedScan) -> None:
         if i == 0:
             T = self._T_ref_sensor[i]
             T = np.eye(4) if np.isnan(T[0, 0]) else T
-            odometry = self._started()
-            odometry.start(scan(odometry), T)
+            self._odometry = self._make()
+            self._odometry.start(scan(self._odometry), T)
             self.T_odom_sensor[i] = T
             return
         assert self._odometry is not None
@@ -239,14 +231,11 @@ class TrialRun:
             self.T_odom_sensor[i] = np.eye(4) if i == 0 else self.T_odom_sensor[i - 1]
 
     def _lost(self, i: int, T_step: Poses | None) -> bool:
-        if i == 0:
-            return False
-        T_ref_step = self._T_ref_steps[i - 1]
-        if np.isnan(T_ref_step[0, 0]) or np.isinf(self._bounds[i - 1]):
+        if i == 0 or np.isnan(self._T_ref_steps[i - 1, 0, 0]) or np.isinf(self._bounds[i - 1]):
             return False
         if T_step is None:
             return True
-        departure = T_step[:3, 3] - T_ref_step[:3, 3]
+        departure = T_step[:3, 3] - self._T_ref_steps[i - 1, :3, 3]
         return bool(np.linalg.norm(departure) > self._bounds[i - 1])
 
 
@@ -260,7 +249,8 @@ class DrivenRun(TrialRun):
 
     def _step(self, i: int, scan: SharedScan) -> None:
         if i == 0:
-            self._tracker = Tracker(self._started(), self._health)
+            self._odometry = self._make()
+            self._tracker = Tracker(self._odometry, self._health)
         prepared = scan(self._tracker.odometry)
         found = self._tracker.register_prepared(self._stamps[i], prepared)
         self.T_odom_sensor[i], self.registered[i] = found.T_odom_sensor, found.registered
@@ -272,19 +262,10 @@ class DrivenRun(TrialRun):
         self.unhealthy["no_pose"] += 1
 
 
-# Hops along a training sequence: what a bank will measure there while it drives.
-
-
 def with_measured_hops(
-    scans: Iterable[Scan], frames: Frames, advance: Callable[[int, int], None] = lambda *_: None
+    scans: Iterable[Scan], frames: Frames, progress: Progress = unseen
 ) -> Frames:
-    """Register scans directly to those some metres before, see `hops_along`.
-
-    Returns
-    -------
-    Frames
-        The same with the hops, and with the CPU time that they took.
-    """
+    """The frames with the hops along them, see `hops_along`, and with the CPU time they took."""
     n, reading = len(frames.stamps), 0.0
 
     def read() -> Iterator[Scan]:
@@ -297,13 +278,10 @@ def with_measured_hops(
 
     begin = time.process_time()
     with_poses = zip(read(), frames.T_ref_sensor, strict=True)
-    hops = hops_along(with_poses, lambda done: advance(done, n))
+    hops = hops_along(with_poses, lambda done: progress("registering hops of", done, n))
     seconds = time.process_time() - begin - reading
     return replace(frames, hops=hops, evidence_ms=1e3 * seconds / n)
 
-
-Advance = Callable[[int, int], None]
-"""Called with how many scans of a sequence are done, and how many there are."""
 
 _CLOCK_TOLERANCE = 1.0
 """Seconds by which a reference's clock may differ from the scans' while its length is looked at."""
@@ -342,6 +320,7 @@ class PreparedSequence:
     Attributes
     ----------
     name : str
+    scans : Recording
     frames : Frames
     shared : SharedScans
         The prepared scans, which take `memory` bytes at most.
@@ -361,12 +340,11 @@ class PreparedSequence:
         odometry: Factory,
         settings: TrialSettings,
         memory: float,
-        advance: Advance = lambda *_: None,
-        key: str | None = None,
+        progress: Progress,
+        key: str,
     ):
-        key = key or f"sequences.{name}"
         self.name = name
-        self._scans = scans
+        self.scans = scans
         self.shared = SharedScans(scans, memory)
         self._baseline = partial(odometry, isolated=settings.isolated)
         self._odometry: OdometryInstance | None = None
@@ -374,7 +352,7 @@ class PreparedSequence:
         with _of_sequence(name):
             describe = Describer(settings.descriptors)
         stamps, descriptors, elevations, full, enough = [], [], [], False, False
-        for scan in _watched(scans, scans.n_messages, advance):
+        for scan in _watched(scans, scans.n_messages, "reading", progress):
             enough = enough or len(scan) >= MIN_POINTS
             stamps.append(scan.stamp)
             with _of_sequence(name):
@@ -396,15 +374,6 @@ class PreparedSequence:
         elevation = np.array(elevations, np.float32)
         self.frames = Frames(at, T_ref_sensor, described, describe.blocks, elevation)
 
-    def measured_frames(self, advance: Advance = lambda *_: None) -> Frames:
-        """The frames with the hops between them, for which the scans are read again."""
-        return with_measured_hops(self._scans, self.frames, advance)
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes that the prepared scans take."""
-        return self.shared.nbytes
-
     def __iter__(self) -> Iterator[SharedScan]:
         yield from islice(self.shared, len(self.frames.stamps))
 
@@ -423,12 +392,12 @@ class PreparedSequence:
         return self.shared.n_kept(self._odometry) <= i
 
 
-def _watched(scans: Iterable[Any], n: int, advance: Advance) -> Iterator[Any]:
+def _watched(scans: Iterable[Any], n: int, what: str, progress: Progress) -> Iterator[Any]:
     done = 0
     for done, scan in enumerate(scans, start=1):
         yield scan
-        advance(min(done, n), n)
-    advance(done, done)
+        progress(what, min(done, n), n)
+    progress(what, done, done)
 
 
 @contextmanager
@@ -505,7 +474,7 @@ def run_trials(
     scans: PreparedSequence,
     sets: Sequence[ParameterSet],
     whole: bool = False,
-    advance: Advance = lambda *_: None,
+    progress: Progress = unseen,
 ) -> list[Trial]:
     """Run an odometry with several parameter sets on one pass over a sequence.
 
@@ -528,7 +497,7 @@ def run_trials(
     with ExitStack() as ended:
         for run in each:
             ended.callback(run.close)
-        for i, scan in enumerate(_watched(scans, len(frames.stamps), advance)):
+        for i, scan in enumerate(_watched(scans, len(frames.stamps), "running", progress)):
             for run in each:
                 run.step(i, scan)
     return [
@@ -611,20 +580,17 @@ class TrialSetup:
     odometry: Factory
     sequences: StudySequences
 
-    def prepare(
-        self, name: str, memory: float, advance: Advance = lambda *_: None
-    ) -> PreparedSequence:
+    def prepare(self, name: str, memory: float, progress: Progress = unseen) -> PreparedSequence:
         """Read and prepare a sequence, see `PreparedSequence`."""
-        scans = self.sequences.open(name)
-        key = self.sequences.key(name)
-        return PreparedSequence(name, scans, self.odometry, self.settings, memory, advance, key)
+        scans, key = self.sequences.open(name), self.sequences.key(name)
+        return PreparedSequence(name, scans, self.odometry, self.settings, memory, progress, key)
 
     def run(
         self,
         scans: PreparedSequence,
         sets: Sequence[ParameterSet],
         whole: bool = False,
-        advance: Advance = lambda *_: None,
+        progress: Progress = unseen,
     ) -> list[Trial]:
         """Run trials, see `run_trials`."""
-        return run_trials(self.settings, self.odometry, scans, sets, whole, advance)
+        return run_trials(self.settings, self.odometry, scans, sets, whole, progress)

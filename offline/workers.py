@@ -15,10 +15,9 @@ import traceback
 from collections import Counter
 from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerProcess
-from typing import Any, Generic, Literal, NamedTuple, Protocol, Self, TypeVar
+from typing import Any, Generic, NamedTuple, Protocol, Self, TypeVar
 from uuid import uuid4
 
 import numpy as np
@@ -29,6 +28,7 @@ from adaptune.archive import Frames, Trial
 from adaptune.errors import AdaptuneError, in_a_line
 from adaptune.geometry import Poses
 from adaptune.processes import apart, how_it_ended, pin
+from adaptune.progress import Progress, unseen
 from adaptune.recording import Scan, SequenceConfig, cache
 from adaptune.recording.cache import fingerprints
 from adaptune.recording.recording import sequence_files
@@ -36,7 +36,7 @@ from adaptune.recording.scan import Imu, ImuNoise
 from adaptune.recording.views import WithImu
 from adaptune.space import ParameterSet
 from adaptune.study.study import StudySequences
-from offline.trial import PreparedSequence, TrialSetup
+from offline.trial import PreparedSequence, TrialSetup, with_measured_hops
 
 MOST_DEATHS = 3
 """A task fails after so many workers have died at it."""
@@ -60,7 +60,7 @@ class Task(NamedTuple):
 
     @property
     def key(self) -> tuple[str, tuple[int, ...]]:
-        """What identifies it among the tasks of a run, also when it is run again."""
+        """Identifies it among the tasks of a run, also when it is run again."""
         return self.sequence, self.numbers
 
     def __str__(self) -> str:
@@ -82,21 +82,15 @@ class Death(NamedTuple):
     killed: bool = True  # from outside, as systems do where the memory is full
 
 
-Work = Literal["reading", "running", "registering hops of"]
-
-
 class TaskProgress(NamedTuple):
-    """How far a task is that goes on."""
+    """A call of a task's `Progress`, on its way from a worker."""
 
-    stage: Work
-    done: int  # scans
+    stage: str
+    done: float  # scans
     total: int
 
 
 Outcome = TaskResult | AdaptuneError | Death
-
-Report = Callable[[TaskProgress], None]
-"""Called now and then by a task."""
 
 W = TypeVar("W", bound=Hashable)
 """Identifies a worker of a pool."""
@@ -225,51 +219,42 @@ class Sequences:
         self._memory = memory
         self._ready: dict[tuple[str, bool], PreparedSequence] = {}
 
-    def run(self, task: Task, report: Report) -> TaskResult:
+    def run(self, task: Task, progress: Progress) -> TaskResult:
         """Do a task."""
         setup = self._apart if task.apart else self._setup
-        sequence = self._prepared(setup, task, report)
-        advance = partial(_report, report, "running")
-        trials = setup.run(sequence, task.sets, task.whole, advance)
+        sequence = self._prepared(setup, task, progress)
+        trials = setup.run(sequence, task.sets, task.whole, progress)
         frames = None
-        if task.frames:
-            frames = sequence.measured_frames(partial(_report, report, "registering hops of"))
+        if task.frames:  # which reads the scans again
+            frames = with_measured_hops(sequence.scans, sequence.frames, progress)
         return TaskResult(trials, frames)
 
-    def _prepared(self, setup: TrialSetup, task: Task, report: Report) -> PreparedSequence:
+    def _prepared(self, setup: TrialSetup, task: Task, progress: Progress) -> PreparedSequence:
         key = task.sequence, setup is self._setup
         sequence = self._ready.pop(key, None)
         if sequence is None:
             # Make room: drop the sequences that were not used for longest.
-            while self._ready and sum(s.nbytes for s in self._ready.values()) > self._memory / 2:
+            while self._ready and self._used() > self._memory / 2:
                 del self._ready[next(iter(self._ready))]
-            free = self._memory - sum(s.nbytes for s in self._ready.values())
-            advance = partial(_report, report, "reading")
             with apart():
-                sequence = setup.prepare(task.sequence, free, advance)
+                sequence = setup.prepare(task.sequence, self._memory - self._used(), progress)
         self._ready[key] = sequence
         return sequence
 
-
-def _report(report: Report, stage: Work, done: int, total: int) -> None:
-    report(TaskProgress(stage, done, total))
+    def _used(self) -> int:
+        return sum(sequence.shared.nbytes for sequence in self._ready.values())
 
 
 def attempt(
-    sequences: Sequences, task: Task, report: Report = lambda _: None
+    sequences: Sequences, task: Task, progress: Progress = unseen
 ) -> TaskResult | AdaptuneError:
     """Do a task; return an exception instead of raising it."""
     try:
-        return sequences.run(task, report)
+        return sequences.run(task, progress)
     except AdaptuneError as error:
         return error
     except Exception:
         return WorkerError(f"{task}:\n{traceback.format_exc()}")
-
-
-class _Worker(NamedTuple):
-    process: ForkServerProcess
-    connection: Connection
 
 
 class Workers:
@@ -286,18 +271,18 @@ class Workers:
         # what workers need forks them in milliseconds.
         self._context = mp.get_context("forkserver")
         self._context.set_forkserver_preload(["offline.trial", "adaptune.model.descriptor"])
-        self._workers: dict[int, _Worker] = {}
+        self._workers: dict[int, tuple[ForkServerProcess, Connection]] = {}
         self._busy: set[int] = set()
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        for worker in self._workers.values():
-            worker.process.terminate()
-            worker.connection.close()
-        for worker in self._workers.values():
-            worker.process.join()
+        for process, connection in self._workers.values():
+            process.terminate()
+            connection.close()
+        for process, _connection in self._workers.values():
+            process.join()
 
     def workers(self) -> Collection[int]:
         """See `Pool`."""
@@ -305,17 +290,17 @@ class Workers:
 
     def start(self, worker: int, task: Task) -> None:
         """See `Pool`."""
-        if worker not in self._workers or not self._workers[worker].process.is_alive():
+        if worker not in self._workers or not self._workers[worker][0].is_alive():
             self._workers[worker] = self._spawn(worker)
         self._busy.add(worker)
         with contextlib.suppress(BrokenPipeError):  # `wait` notices it
-            self._workers[worker].connection.send(task)
+            self._workers[worker][1].send(task)
 
     def wait(self) -> list[tuple[int, Outcome | TaskProgress]]:
         """See `Pool`."""
-        ready = wait([self._workers[w].connection for w in self._busy])
+        ready = wait([self._workers[w][1] for w in self._busy])
         outcomes: list[tuple[int, Outcome | TaskProgress]] = []
-        for w in [w for w in self._busy if self._workers[w].connection in ready]:
+        for w in [w for w in self._busy if self._workers[w][1] in ready]:
             process, connection = self._workers[w]
             try:
                 outcomes.append((w, connection.recv()))
@@ -328,7 +313,7 @@ class Workers:
                 self._busy.remove(w)
         return outcomes
 
-    def _spawn(self, w: int) -> _Worker:
+    def _spawn(self, w: int) -> tuple[ForkServerProcess, Connection]:
         here, there = self._context.Pipe()
         given = (there, os.getpid() + w, self.memory / self.n)
         process = self._context.Process(target=_serve, args=given, daemon=True)
@@ -336,7 +321,7 @@ class Workers:
         there.close()
         with contextlib.suppress(BrokenPipeError):  # `wait` notices it
             here.send(self.setup)
-        return _Worker(process, here)
+        return process, here
 
 
 def _serve(connection: Connection, core: int, memory: float) -> None:
@@ -349,33 +334,24 @@ def _serve(connection: Connection, core: int, memory: float) -> None:
     except Exception as error:
         connection.send(WorkerError(f"a worker cannot import what it needs: {in_a_line(error)}"))
         return
-    report = now_and_then(connection.send)
+    progress = now_and_then(connection.send)
     with contextlib.suppress(EOFError, BrokenPipeError):
         while True:
-            connection.send(attempt(sequences, connection.recv(), report))
+            connection.send(attempt(sequences, connection.recv(), progress))
 
 
-def now_and_then(report: Report) -> Report:
-    """Report once in `REPORT_EVERY` seconds, and when all scans are done."""
+def now_and_then(send: Callable[[TaskProgress], None]) -> Progress:
+    """Send progress once in `REPORT_EVERY` seconds, and when all scans are done."""
     last = time.monotonic()
 
-    def some(progress: TaskProgress) -> None:
+    def some(text: str, done: float, of: int, remark: str = "", /) -> None:  # noqa: ARG001
         nonlocal last
         now = time.monotonic()
-        if progress.done == progress.total or now - last > REPORT_EVERY:
+        if done == of or now - last > REPORT_EVERY:
             last = now
-            report(progress)
+            send(TaskProgress(text, done, of))
 
     return some
-
-
-# A Dask cluster whose workers run trials.
-#
-# A worker reads recordings that it has under the same path. Other recordings are decoded and sent
-# to
-# it once; it keeps them in its cache of decoded sequences under a digest of their contents.
-# Results
-# always return to the driver.
 
 
 CHUNK = 1 << 26
@@ -395,15 +371,11 @@ class LackingError(AdaptuneError):
     """A worker does not have the sequence."""
 
 
-class _Place(NamedTuple):
-    """The place of a worker: its host, and its number on that host."""
-
-    host: str
-    rank: int
-
-
 class Cluster:
     """The workers of a Dask cluster, as a `Pool`.
+
+    A worker reads recordings that it has under the same path. Others are decoded and sent to it
+    once; it keeps them in its cache of decoded sequences, under a digest of their contents.
 
     Its workers share `memory` bytes for prepared scans. Use it as a context: leaving it cancels the
     tasks that are not done.
@@ -427,7 +399,7 @@ class Cluster:
         self._away = _away(setup, self._digests)
         # Distinguishes this campaign from others on the same workers.
         self._token = uuid4().hex
-        self._places: dict[str, _Place] = {}
+        self._places: dict[str, tuple[str, int]] = {}  # of a worker its host, and its number there
         self._tasks: dict[str, Task] = {}
         self._futures: dict[str, Any] = {}
         self._done = threading.Event()
@@ -466,9 +438,9 @@ class Cluster:
         if new := [worker for worker in hosts if worker not in self._places]:
             self._check(new)
             for worker in new:
-                taken = {p.rank for p in self._places.values() if p.host == hosts[worker]}
+                taken = {rank for host, rank in self._places.values() if host == hosts[worker]}
                 rank = next(r for r in range(len(taken) + 1) if r not in taken)
-                self._places[worker] = _Place(hosts[worker], rank)
+                self._places[worker] = hosts[worker], rank
         if not hosts and not self._waits:
             _log.warning("%s: no worker is left; waiting for others", self._address)
         self._waits = not hosts
@@ -483,7 +455,7 @@ class Cluster:
             self._token,
             self._away,
             task,
-            self._places[worker].rank,
+            self._places[worker][1],
             memory,
             workers=[worker],
             allow_other_workers=False,

@@ -27,7 +27,7 @@ def scans(of):
 
 def test_hops_are_those_of_the_sensor():
     of, told = frames(42), []
-    measured = with_measured_hops(scans(of), of, lambda done, n: told.append((done, n)))
+    measured = with_measured_hops(scans(of), of, lambda _, *done: told.append(done))
     hops = measured.hops
     # Once a second, from the newest scan whose motion is known.
     assert hops.end.tolist() == [9, 19, 29, 39]

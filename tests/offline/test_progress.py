@@ -92,7 +92,7 @@ def test_workers_report_now_and_then_and_at_the_end(monkeypatch):
     told = []
     report = now_and_then(told.append)
     for i in range(1, 21):
-        report(TaskProgress("running", i, 20))
+        report("running", i, 20)
     assert [progress.done for progress in told] == [6, 12, 18, 20]
 
 

@@ -31,6 +31,8 @@ class InProcess:
         worker = next(iter(self._tasks))
         said: list[tuple[int, Any]] = []
         outcome = attempt(
-            self._sequences[worker], self._tasks.pop(worker), lambda now: said.append((worker, now))
+            self._sequences[worker],
+            self._tasks.pop(worker),
+            lambda *now: said.append((worker, TaskProgress(*now))),
         )
         return [*said, (worker, outcome)]
