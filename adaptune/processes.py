@@ -151,7 +151,6 @@ def _exactly(stream: Readable, size: int) -> bytes:
 # Python code is imported once, by a server that then forks a fresh process for each use of it.
 # Programs run under a keeper. Both end with this process, and so does all that they have started.
 
-
 IMPORT_SECONDS = 60.0
 """An import of user code may take so long."""
 
@@ -257,40 +256,21 @@ class Program:
 
 
 class Service(NamedTuple):
-    """What a server does with user code.
+    """What a server does with user code."""
 
-    Attributes
-    ----------
-    module : str
-        Its function ``load(name)`` imports the user code. Others make an `Answer` from the name.
-    environment : dict
-        Additional variables.
-    """
-
+    # Its function ``load(name)`` imports the user code. Others make an `Answer` from the name.
     module: str
-    environment: tuple[tuple[str, str], ...] = ()
+    environment: tuple[tuple[str, str], ...] = ()  # additional variables
 
 
 class Bounds(NamedTuple):
-    """Limits of a process that a server forks.
+    """Limits of a process that a server forks."""
 
-    Attributes
-    ----------
-    seconds : float
-        Time for each message; 0 for no limit.
-    memory : float
-        Gigabytes, in addition to what the process begins with; 0 for no limit.
-    late, full : str
-        What is said where one of them is exceeded.
-    core : int, optional
-        The only core that it may use.
-    """
-
-    seconds: float = 0.0
-    memory: float = 0.0
-    late: str = "it took too long"
+    seconds: float = 0.0  # time for each message; 0 for no limit
+    memory: float = 0.0  # gigabytes, in addition to what the process begins with; 0 for no limit
+    late: str = "it took too long"  # what is said where one of them is exceeded
     full: str = "out of memory"
-    core: int | None = None
+    core: int | None = None  # the only core that it may use
 
 
 UNBOUNDED = Bounds()
@@ -530,7 +510,6 @@ def answer_all(reader: Readable, writer: Writable, answer: Answer) -> None:
 # Run with the number of a socket, the time for the import, the module of a service and the name of
 # the user code. For every socket that it receives it forks a watcher, which forks the process and
 # reports how that ended.
-
 
 _LONGER = 5
 """Seconds by which the limit on the import is longer here: it is for servers left behind."""

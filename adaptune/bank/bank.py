@@ -30,7 +30,6 @@ from adaptune.space import ODOMETRY, ParameterSet, Selection
 
 # The scans of the last seconds, on which a new instance builds its map before it takes over.
 
-
 Make = Callable[[ParameterSet], OdometryInstance]
 """Makes a new instance with these parameters."""
 
@@ -124,7 +123,6 @@ def catch_up_together(successors: Sequence[Successor]) -> None:
 
 
 # How well motions place the newest scan on the scans before it: what tells a lost member.
-
 
 N_POINTS = 2000
 """About as many points of the newest scan are placed."""

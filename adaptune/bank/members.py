@@ -318,7 +318,6 @@ def spread(make: Factory, sets: Sequence[ParameterSet], cores: int) -> list[Odom
 
 # Which members of a bank agree, by how they moved over the last second.
 
-
 WINDOW = 1.0
 """Seconds over which motions are compared. Jitter within them cancels, departure adds up."""
 FLOOR = 0.1

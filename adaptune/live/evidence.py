@@ -34,7 +34,6 @@ from adaptune.space import Selection
 # reach over a sub-trajectory. There the odometry's errors, above all those of its rotation, are
 # several times the chain's.
 
-
 MIN_COVERED = 0.5
 """Least share of a chain that its hops cover; in between, the odometry's own motion is taken."""
 MIN_REACH = 0.8
@@ -495,7 +494,6 @@ def _apart(T: Poses, other: Poses) -> float:
 
 
 # Hops along a recording whose poses are known, at least in part.
-
 
 PERIOD = 1_000_000_000
 """Nanoseconds from one registration to the next."""

@@ -67,38 +67,25 @@ class Usage(NamedTuple):
 
 
 class Motions(NamedTuple):
-    """How the sensor moved over the last scan, before any health check.
+    """How the sensor moved over the last scan, before any health check."""
 
-    Attributes
-    ----------
-    T_previous_current : ndarray of shape (4, 4)
-        NaN if there was no pose. After a start, what `start` received, or the identity.
-    members : dict of ndarray
-        The same for each member of a bank, by trial number; empty for single odometries.
-    starts : int
-        How often it has begun anew so far: one more than before means that it failed.
-    """
-
+    # (4, 4); NaN if there was no pose. After a start, what `start` received, or the identity.
     T_previous_current: Poses
+    # the same for each member of a bank, by trial number; empty for single odometries
     members: Mapping[int, Poses]
+    # how often it has begun anew so far: one more than before means that it failed
     starts: int = 0
 
 
 class Description(NamedTuple):
-    """What a study must know of an odometry before it runs it; see also `Odometry`.
+    """What a study must know of an odometry before it runs it; see also `Odometry`."""
 
-    Attributes
-    ----------
-    space : ParameterSpace or None
-        The parameters that can be tuned; None if the study defines them.
-    whole : bool
-        Whether it runs whole recordings only, with one parameter set from end to end.
-    """
-
+    # the parameters that can be tuned; None if the study defines them
     space: ParameterSpace | None
     live: bool
     needs_imu: bool = False
     warm_up: float = 12.0  # seconds of scans that a member of a bank sees when it restarts
+    # whether it runs whole recordings only, with one parameter set from end to end
     whole: bool = False
 
 
@@ -461,7 +448,6 @@ class InProcess(OdometryInstance):
 
 # An odometry that may go wrong.
 
-
 MOST_FAULTS = 10
 """An instance with so many faults does not start again: the rest of its sequence is lost."""
 
@@ -602,7 +588,6 @@ class AtStamp:
 
 
 # Odometries that begin at rest in a frame of their own.
-
 
 NO_IMU = "{} needs an IMU, and the scans do not bring along what one measured"
 

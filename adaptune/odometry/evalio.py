@@ -31,7 +31,6 @@ from adaptune.space import Float, Integer, ParameterSet, ParameterSpace, Value
 # Points go over as raw bytes, not one Python object each. The conversion is evalio's own for
 # PointCloud2 messages, which is not documented: hence the pinned version.
 
-
 FIELDS = ("x", "y", "z", "t", "row")
 """A point as evalio reads it, four bytes each: float32 metres, uint32 nanoseconds since the scan's
 stamp, uint32 laser. The laser is left out where the pipeline does not ask for it."""
@@ -427,7 +426,6 @@ class Form(GridPipeline):
 
 
 # The pipelines of evalio that need a LiDAR and an IMU.
-
 
 _BEHIND = 2
 """Scans that LIO-SAM waits for before it registers one."""

@@ -46,7 +46,6 @@ from adaptune.trajectory import Trajectory, TrajectoryError, read_kitti, read_tu
 
 # Parameter files made from a template: YAML, JSON, TOML, and the layouts of ROS 1 and ROS 2.
 
-
 _YAML = (lambda text: files.Document(text).data, files.dump)
 _FORMATS: dict[str, tuple[Callable[[str], Any], Callable[[Any], str]]] = {
     ".yaml": _YAML,
@@ -443,7 +442,6 @@ def _alike(own: Sequence[NDArray[np.float64]], true: Sequence[NDArray[np.float64
 
 
 # Odometries that run once on a whole recording.
-
 
 _log = getLogger(__name__)
 

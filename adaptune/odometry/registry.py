@@ -163,27 +163,14 @@ class UserSettings(RootModel[dict[str, Any]]):
 
 @dataclass(frozen=True)
 class Declaration:
-    """An odometry with given settings.
+    """An odometry with given settings."""
 
-    Attributes
-    ----------
-    settings : BaseModel or None
-        The checked settings; None if they have mistakes.
-    mistakes : list of Mistake
-        Mistakes in the settings.
-    description : Description or None
-        None if the odometry cannot be described without sound settings.
-    clean : bool
-        Whether instances in one process know nothing of each other, see `Odometry`.
-    module : str
-        Module in which its class is written.
-    """
-
-    settings: Any
+    settings: Any  # the checked settings; None if they have mistakes
     mistakes: list[Mistake]
+    # None if the odometry cannot be described without sound settings
     description: Description | None
-    clean: bool
-    module: str
+    clean: bool  # whether instances in one process know nothing of each other, see `Odometry`
+    module: str  # module in which its class is written
 
     def sound(self, name: str) -> tuple[Any, Description]:
         """Settings and description.
@@ -259,7 +246,6 @@ def _ask(name: str, settings: str, folder: str) -> dict[str, Any]:
 #
 # Nothing of the user's is imported. What a class imports, shared libraries, and a program behind
 # an address are not part of it.
-
 
 Content = dict[str, str]
 """By what it is of, in words, a version or the hash of a file."""
@@ -358,37 +344,19 @@ def _version(package: str) -> str:
 
 @dataclass(frozen=True)
 class OdometryFactory:
-    """Makes instances of one odometry, in any process: it pickles.
+    """Makes instances of one odometry, in any process: it pickles."""
 
-    Attributes
-    ----------
-    name : str
-        The odometry, see `adaptune.odometry.registry.odometry_class`.
-    settings : BaseModel
-        Its settings; a mapping is validated.
-    space : ParameterSpace
-        The parameters that are tuned.
-    limits : Limits
-        Limits of odometries in processes of their own.
-    program_input : callable, optional
-        Gives the recording of a sequence, for programs that run whole recordings.
-    user_code : bool
-        Whether classes of the user may run in this process, if they are clean. Only processes that
-        the user can do without may allow it.
-    description : Description
-        What a study must know of the odometry.
-    module : str
-        Module in which its class is written.
-    """
-
-    name: str
-    settings: Any
-    space: ParameterSpace
-    limits: Limits
+    name: str  # the odometry, see `adaptune.odometry.registry.odometry_class`
+    settings: Any  # its settings; a mapping is validated
+    space: ParameterSpace  # the parameters that are tuned
+    limits: Limits  # of odometries in processes of their own
+    # gives the recording of a sequence, for programs that run whole recordings
     program_input: Callable[[str], "ProgramInput"] | None = None
+    # Whether classes of the user may run in this process, if they are clean. Only processes that
+    # the user can do without may allow it.
     user_code: bool = False
-    description: Description = field(init=False)
-    module: str = field(init=False)
+    description: Description = field(init=False)  # what a study must know of the odometry
+    module: str = field(init=False)  # module in which its class is written
     _clean: bool = field(init=False)
 
     def __post_init__(self) -> None:
@@ -481,14 +449,9 @@ class OdometryPool:
     """Makes instances of several odometries, in any process: it pickles.
 
     It offers what `OdometryFactory` does. Parameter sets are those of a `PooledSpace`.
-
-    Attributes
-    ----------
-    factories : dict
-        By label, what makes each odometry.
     """
 
-    factories: Mapping[str, OdometryFactory]
+    factories: Mapping[str, OdometryFactory]  # by label, what makes each odometry
     space: PooledSpace = field(init=False)
 
     def __post_init__(self) -> None:

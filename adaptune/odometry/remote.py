@@ -237,7 +237,6 @@ class Isolated(Faulting):
 
 # Odometries in programs of the user that receive scans and return poses, one after the other.
 
-
 FIRST_ANSWER = 60.0
 """Seconds that a program may need to begin."""
 

@@ -18,7 +18,6 @@ from adaptune.strict import StrictModel
 
 # A check of an odometry's poses that needs no reference.
 
-
 _STILL = 1e-6
 """Metres and radians by which a pose that stays where it is may move."""
 _WALK = 0.5
@@ -287,23 +286,14 @@ class _Seen(NamedTuple):
 
 @dataclass
 class Tracker:
-    """Registers scan after scan, and restarts the odometry where its motion is not healthy.
-
-    Attributes
-    ----------
-    odometry : OdometryInstance
-        A new instance.
-    health : HealthCheck
-        What motions are healthy.
-    fall_back : callable, optional
-        Called with the stamp of a scan and what is wrong, before the odometry restarts. It may
-        change the parameters; if it says that it did, the odometry sees the scans of the last
-        `WARM_UP` seconds again. If its motion is still not healthy then, it restarts without a
-        past.
-    """
+    """Registers scan after scan, and restarts the odometry where its motion is not healthy."""
 
     odometry: OdometryInstance
     health: HealthCheck
+    # Called with the stamp of a scan and what is wrong, before the odometry restarts. It may
+    # change the parameters; if it says that it did, the odometry sees the scans of the last
+    # `WARM_UP` seconds again. If its motion is still not healthy then, it restarts without a
+    # past.
     fall_back: Callable[[int, str], bool] | None = None
     _last: RegisteredScan | None = field(default=None, init=False)
 

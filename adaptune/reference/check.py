@@ -27,21 +27,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class MeasuredReference:
-    """A reference at the scans' stamps, and registrations of the scans.
+    """A reference at the scans' stamps, and registrations of the scans."""
 
-    Attributes
-    ----------
-    stamps : ndarray of shape (n,)
-        Of the scans, in nanoseconds.
-    T_ref_sensor : ndarray of shape (n, 4, 4)
-        Poses of the reference; NaN where there is none.
-    hops : Hops
-        Direct registrations of the same scans.
-    """
-
-    stamps: NDArray[np.int64]
-    T_ref_sensor: Poses
-    hops: Hops
+    stamps: NDArray[np.int64]  # (n,): of the scans, in nanoseconds
+    T_ref_sensor: Poses  # (n, 4, 4): poses of the reference; NaN where there is none
+    hops: Hops  # direct registrations of the same scans
 
     def error(self, length: float) -> OwnError | None:
         """Mean error of the reference, in percent of the sub-trajectories' length.
@@ -154,7 +144,6 @@ def mean_difference(T_one: Poses, T_other: Poses, length: float) -> float:
 
 
 # Which length of sub-trajectories to propose for a study, given how accurate its reference is.
-
 
 LENGTHS = {25.0: 8, 10.0: 8, 5.0: 1.4, 2.0: 2}
 """Metres of a sub-trajectory, and how many of them the path of the test must hold: over short ones,

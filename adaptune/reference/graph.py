@@ -29,7 +29,6 @@ from adaptune.trajectory import Trajectory
 
 # The consensus: several odometries side by side, and the motion on which they agree.
 
-
 POOL: tuple[tuple[str, Mapping[str, float]], ...] = (
     ("gicp", {"max_correspondence_distance": 2.2, "keyframe_interval": 1.3}),
     ("gicp", {"max_correspondence_distance": 1.3, "keyframe_interval": 3.1}),
@@ -114,47 +113,25 @@ _APART = 0.3
 
 
 class Guess(NamedTuple):
-    """A registration of two scans that began at the motion of the consensus, or of a member.
+    """A registration of two scans that began at the motion of the consensus, or of a member."""
 
-    Attributes
-    ----------
-    start, end : int
-        Numbers of the scans.
-    member : int
-        Whose motion it began at; -1 for the consensus.
-    hop : Hop or None
-        What was found; None if too few points lie on each other, or it departs too far.
-    """
-
-    start: int
+    start: int  # numbers of the scans
     end: int
-    member: int
+    member: int  # whose motion it began at; -1 for the consensus
+    # what was found; None if too few points lie on each other, or it departs too far
     hop: Hop | None
 
 
 @dataclass(frozen=True, eq=False)
 class Pass:
-    """What one pass over a recording finds.
+    """What one pass over a recording finds."""
 
-    Attributes
-    ----------
-    stamps : ndarray of shape (n,)
-        Of the scans, in nanoseconds.
-    T_odom_sensor : ndarray of shape (n, 4, 4)
-        Of the consensus.
-    T_previous_current : ndarray of shape (n, n_members, 4, 4)
-        Motions of the members; NaN where one has none.
-    registered : ndarray of shape (n,)
-        Whether any member could register the scan.
-    guesses : list of Guess
-        All registrations, by end, start, and member.
-    """
-
-    stamps: NDArray[np.int64]
-    T_odom_sensor: Poses
+    stamps: NDArray[np.int64]  # (n,): of the scans, in nanoseconds
+    T_odom_sensor: Poses  # (n, 4, 4): of the consensus
+    # (n, n_members, 4, 4): motions of the members; NaN where one has none
     T_previous_current: Poses
-    registered: NDArray[np.bool_]
-    guesses: Sequence[Guess]
+    registered: NDArray[np.bool_]  # (n,): whether any member could register the scan
+    guesses: Sequence[Guess]  # all registrations, by end, start, and member
 
 
 class _Anchor(NamedTuple):
@@ -474,7 +451,6 @@ def _robust(noise: Any, bounded: bool = True) -> Any:
 
 # Registrations where the path comes by again.
 
-
 LATER = 30.0
 """Metres driven until a place counts as one that the path comes by again."""
 NEAR = 3.0
@@ -558,7 +534,6 @@ def closed(scans: Iterable[Scan], wanted: Sequence[Loop], T_world_sensor: Poses)
 
 
 # Whether positions that are right over long distances were of use to an estimate.
-
 
 _log = logging.getLogger(__name__)
 

@@ -19,7 +19,6 @@ from adaptune.trajectory import Trajectory, write_tum
 
 # An estimated reference: poses, where they can be trusted, and how accurate they are.
 
-
 BREAK = 1.0
 """Seconds. Where the reference is not to be trusted, a longer gap without poses says so."""
 HALVES_TO_WHOLE = 0.75
@@ -43,46 +42,24 @@ class Gap(NamedTuple):
 
 
 class Registrations(NamedTuple):
-    """Direct registrations of scans to scans some metres before.
+    """Direct registrations of scans to scans some metres before."""
 
-    Attributes
-    ----------
-    start, end : ndarray of shape (m,)
-        Numbers of the scans.
-    accepted : ndarray of shape (m,)
-        Whether the pose graph agrees with it.
-    residual : ndarray of shape (m,)
-        Metres by which it differs from the pose graph; NaN if the registration failed.
-    """
-
-    start: NDArray[np.intp]
+    start: NDArray[np.intp]  # (m,): numbers of the scans
     end: NDArray[np.intp]
-    accepted: NDArray[np.bool_]
+    accepted: NDArray[np.bool_]  # (m,): whether the pose graph agrees with it
+    # (m,): metres by which it differs from the pose graph; NaN if the registration failed
     residual: NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class EstimatedReference:
-    """A reference that was computed from the recording.
+    """A reference that was computed from the recording."""
 
-    Attributes
-    ----------
-    stamps : ndarray of shape (n,)
-        Of all scans, in nanoseconds.
-    T_world_sensor : ndarray of shape (n, 4, 4)
-        The pose of every scan; the first is the identity.
-    trusted : ndarray of shape (n - 1,)
-        Whether the motion from each scan to the next can be trusted.
-    halves : ndarray of shape (2, n, 4, 4)
-        The poses from either half of the registrations alone.
-    registrations : Registrations
-        All registrations.
-    """
-
-    stamps: NDArray[np.int64]
-    T_world_sensor: Poses
+    stamps: NDArray[np.int64]  # (n,): of all scans, in nanoseconds
+    T_world_sensor: Poses  # (n, 4, 4): the pose of every scan; the first is the identity
+    # (n - 1,): whether the motion from each scan to the next can be trusted
     trusted: NDArray[np.bool_]
-    halves: Poses
+    halves: Poses  # (2, n, 4, 4): the poses from either half of the registrations alone
     registrations: Registrations
 
     @property
@@ -167,29 +144,14 @@ _BEYOND = 1.5
 
 
 class StoredEstimate(NamedTuple):
-    """What is known about an estimated reference in a file.
+    """What is known about an estimated reference in a file."""
 
-    Attributes
-    ----------
-    path : Path
-        Its TUM file.
-    about : dict
-        What it was estimated from, as plain data.
-    scans : int
-        Number of scans.
-    metres : float
-        Length of its path.
-    unknown_share : float
-        Share of the scans whose pose is unknown.
-    errors : dict
-        Its estimated mean RTE in percent, by the length of sub-trajectories in metres.
-    """
-
-    path: Path
-    about: dict[str, Any]
+    path: Path  # of its TUM file
+    about: dict[str, Any]  # what it was estimated from, as plain data
     scans: int
-    metres: float
-    unknown_share: float
+    metres: float  # length of its path
+    unknown_share: float  # share of the scans whose pose is unknown
+    # its estimated mean RTE in percent, by the length of sub-trajectories in metres
     errors: dict[float, float]
 
     @classmethod
@@ -279,17 +241,9 @@ def write_estimate(
 
 
 class Refusal(NamedTuple):
-    """Why no reference could be estimated.
+    """Why no reference could be estimated."""
 
-    Attributes
-    ----------
-    about : dict
-        What it was to be estimated from, as plain data.
-    refused : str
-        The reason.
-    """
-
-    about: dict[str, Any]
+    about: dict[str, Any]  # what it was to be estimated from, as plain data
     refused: str
 
     @classmethod
@@ -309,7 +263,6 @@ class Refusal(NamedTuple):
 
 
 # Picture of an estimated reference.
-
 
 _MARGIN = 20.0
 """Metres around the known path in which the unknown is drawn."""

@@ -59,7 +59,6 @@ class RosLink(Protocol):
 
 # Parameters of a node that somebody else wrote, set while it runs.
 
-
 Run = Callable[[list[str]], tuple[int, str]]
 """Runs a command; its exit code, and what it wrote."""
 

@@ -385,7 +385,6 @@ class Container:
 
 # Folders that containers write to. Nothing that is in them is trusted.
 
-
 _SECONDS = 20.0
 """Seconds that a container may take to remove what its user has written."""
 

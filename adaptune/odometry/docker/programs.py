@@ -138,7 +138,6 @@ class DockerCommand(WholeRun):
 
 # Programs in Docker images that receive scans and return poses, one after the other.
 
-
 _FOLDER = "/adaptune"
 _BETWEEN_SOCKET_LOOKS = 0.02
 """Seconds."""

@@ -407,7 +407,6 @@ class Lockstep(Faulting):
 
 # A ROS 1 system in a container, on a bag that is played.
 
-
 _BETWEEN_TOPIC_LOOKS = 0.1
 _BETWEEN_STATES = 1.0
 _LONGEST_PAUSE = 10.0
