@@ -16,7 +16,6 @@ EXPECTED = {
     ("n_stretches", "n_recordings", "reach"),
     [
         (24, 6, "in other recordings (24 stretches of 6 recordings)"),
-        (24, 5, "elsewhere along these recordings (24 stretches of 5 recordings)"),
         (7, 1, "elsewhere along this recording (7 stretches of one recording)"),
     ],
 )

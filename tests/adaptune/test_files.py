@@ -1,5 +1,3 @@
-"""Files that are there whole or not at all."""
-
 import os
 import stat
 
@@ -19,16 +17,6 @@ def test_a_file_appears_when_all_went_well(tmp_path):
     assert list(path.parent.iterdir()) == [path]
 
 
-def test_the_old_file_stays_until_the_end(tmp_path):
-    path = tmp_path / "a.npz"
-    path.write_text("old")
-    with replacing(path) as beside:
-        beside.write_text("new")
-        assert path.read_text() == "old"
-    assert path.read_text() == "new"
-    assert list(tmp_path.iterdir()) == [path]
-
-
 @pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt, SystemExit])
 def test_the_old_file_survives_a_failure(tmp_path, error):
     path = tmp_path / "a.txt"
@@ -43,17 +31,6 @@ def test_the_old_file_survives_a_failure(tmp_path, error):
         fail()
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
-
-
-def test_nothing_is_left_where_nothing_was(tmp_path):
-    def fail():
-        with replacing(tmp_path / "a.txt") as beside:
-            beside.write_text("half")
-            raise RuntimeError
-
-    with pytest.raises(RuntimeError):
-        fail()
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_two_writers_do_not_meet(tmp_path):
@@ -78,8 +55,3 @@ def test_a_file_is_as_readable_as_any_new_one(tmp_path, umask):
         os.umask(before)
     modes = {stat.S_IMODE(p.stat().st_mode) for p in tmp_path.iterdir()}
     assert modes == {0o666 & ~umask}
-
-
-def test_text_is_utf_8(tmp_path):
-    write_text(tmp_path / "a.txt", "Straße\n")
-    assert (tmp_path / "a.txt").read_bytes() == "Straße\n".encode()

@@ -21,7 +21,6 @@ def test_ctrl_c_while_importing_ends_without_a_traceback(study_file, tmp_path, m
         # What runs in a shell's background is told to ignore it.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # noqa: PLW1509
     )
-    assert process.stderr is not None
     assert any(line.rpartition("|")[2].strip() == module for line in process.stderr)
     os.kill(process.pid, signal.SIGINT)
     _, said = process.communicate(timeout=30)

@@ -1,8 +1,5 @@
 import numpy as np
-import pytest
 from tables import table
-
-from adaptune.space import ParameterSets
 
 
 def test_sets_are_known_by_their_trials():
@@ -25,10 +22,3 @@ def test_a_set_is_found_by_what_differs_from_the_baseline():
     assert sets.find({"p1": 0.2}) == 1
     assert sets.find({"p0": 0.3}) == 2
     assert sets.find({"p0": 0.4}) is None
-
-
-@pytest.mark.parametrize(("trials", "n"), [((0, 0), 2), ((0,), 2), ((0, 1), 1)])
-def test_each_set_has_a_number_of_its_own(trials, n):
-    of_two = table([[0.1], [0.2]])
-    with pytest.raises(ValueError, match="number of its own"):
-        ParameterSets(of_two.space, trials, of_two.parameters[:n])

@@ -1,5 +1,3 @@
-"""Whatever pydantic says is told in plain words; classes of the user may make it say anything."""
-
 import datetime
 import enum
 import re

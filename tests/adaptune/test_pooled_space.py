@@ -49,13 +49,6 @@ def test_a_set_returns_from_the_unit_cube(parameters):
     assert back == {k: pytest.approx(v) if k == "distance" else v for k, v in parameters.items()}
 
 
-@given(sets(), sets())
-def test_odometries_are_farther_apart_than_neighbouring_sets(one, other):
-    a, b = SPACE.to_unit([one, other])
-    if one[ODOMETRY] != other[ODOMETRY]:
-        assert np.linalg.norm(a - b) >= np.sqrt(2.0)
-
-
 def test_it_is_read_as_it_was_written():
     assert load_space(SPACE.dump()) == SPACE
     assert load_space(GICP.dump()) == GICP
@@ -63,18 +56,6 @@ def test_it_is_read_as_it_was_written():
     # A parameter may be called what a parameter has.
     odd = PooledSpace({"a": ParameterSpace.of(type=Float(low=0.0, high=1.0, baseline=0.5))})
     assert load_space(odd.dump()) == odd
-
-
-def test_names_and_columns():
-    assert SPACE.names == (ODOMETRY, "distance", "kernel", "passes")
-    assert list(SPACE.parameters) == [
-        *(ODOMETRY, "gicp.distance", "gicp.kernel"),
-        *("ndt.distance", "ndt.passes"),
-    ]
-    given_set = {ODOMETRY: "ndt", "distance": 3.0, "passes": 2}
-    assert SPACE.flat(given_set) == {ODOMETRY: "ndt", "ndt.distance": 3.0, "ndt.passes": 2}
-    row = {ODOMETRY: "ndt", "distance": 3.0, "kernel": None, "passes": 2}
-    assert SPACE.row(given_set) == row
 
 
 def test_baselines():
@@ -92,9 +73,7 @@ def test_baselines():
     [
         ({"distance": 1.0}, "names no odometry"),
         ({ODOMETRY: "ntd", "distance": 1.0}, "did you mean 'ndt'"),
-        ({ODOMETRY: "ndt", "distance": 1.0}, "no value for passes"),
         ({ODOMETRY: "ndt", "distance": 9.0, "passes": 1}, "is outside"),
-        ({ODOMETRY: "ndt", "kernel": "none"}, "unknown parameter 'kernel'"),
     ],
 )
 def test_sets_that_do_not_fit(wrong, message):

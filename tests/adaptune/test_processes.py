@@ -302,12 +302,6 @@ def test_a_process_is_kept_on_one_core_until_that_is_undone(allowed):
     assert allowed == {2, 3, 5, 7}
 
 
-def test_others_get_one_core_after_the_other(allowed):
-    some = [processes.next_core() for _ in range(8)]
-    assert some[:4] == some[4:]
-    assert set(some) == allowed
-
-
 def test_others_get_the_rest_only_where_this_process_is_alone(allowed):
     unpin = processes.pin(1, alone=True)
     assert {processes.next_core() for _ in range(4)} == {2, 3, 5, 7}
@@ -341,13 +335,6 @@ def test_mapped_files_are_no_memory_of_the_process(tmp_path):
     del held
     processes.release_memory()
     assert processes.resident_megabytes() < before + 20.0
-
-
-def test_processes_compute_and_say_what_went_wrong():
-    with processes.processes(2) as pool:
-        assert list(pool.map(divmod, (7, 9), (2, 4))) == [(3, 1), (2, 1)]
-        with pytest.raises(ZeroDivisionError):
-            list(pool.map(divmod, (7, 9), (0, 4)))
 
 
 def test_a_process_that_is_killed_is_told():

@@ -1,5 +1,3 @@
-"""Estimated references of the sequences of a study."""
-
 import os
 
 import drives
@@ -7,14 +5,13 @@ import estimates
 import numpy as np
 import pytest
 
-from adaptune.recording.config import ImuConfig, SequenceConfig
+from adaptune.recording.config import SequenceConfig
 from adaptune.recording.recording import open_sequence, wants_estimate
 from adaptune.reference.stored import EstimateError
 from adaptune.strict import ConfigurationError
 from adaptune.study.references import (
     ensure_references,
     estimates_as_data,
-    estimates_in_words,
     estimates_of,
 )
 from adaptune.trajectory import Trajectory, write_tum
@@ -64,25 +61,6 @@ def test_only_what_has_no_reference_is_estimated_and_once(estimator, load, caplo
     assert len(study.sequences.files("one").reference) == 1
 
 
-def test_a_view_shares_it(estimator, load):
-    study = load(LEFT_OUT, "offline.augment=[{reverse: true}]")
-    view = study.training[1]
-    ensure_references(study, study.training)
-    assert len(estimator.asked) == 1
-    backward = study.sequences.open(view).reference().T_world_sensor[:, 0, 3]
-    assert backward[0] - backward[-1] == pytest.approx(39 * 0.3003)
-    assert study.sequences.config(view).reference == study.sequences.config("one").reference
-
-
-def test_a_view_of_the_sequence_itself_is_left_out(estimator, load):
-    study = load(LEFT_OUT, "sequences.one.views=[{drop: {share: 0.5}}]")
-    ensure_references(study, ["one"])
-    known = len(study.sequences.open("one").reference())
-    assert known == 40
-    ensure_references(load(LEFT_OUT, "sequences.one.compensate=constant_velocity"), ["one"])
-    assert len(estimator.asked) == 1
-
-
 @pytest.mark.usefixtures("estimator")
 def test_it_is_asked_for_where_there_are_poses(load):
     # What is said of the recorded poses is not of the estimated ones.
@@ -109,19 +87,6 @@ def test_where_it_is_not_trusted_there_is_a_gap(estimator, load, caplog):
     assert data(study, ["one", "two"]) == {
         "one": {"error_percent": 0.3116, "unknown_share": pytest.approx(0.25, abs=0.01)}
     }
-
-
-def test_what_judged_is_said(estimator, load):
-    study = load(LEFT_OUT, "sequences.two.reference=")
-    assert estimates_in_words({}, 3.0) == []
-    estimator.halves = (1.0, 1.004)
-    ensure_references(study, study.training)
-    estimates = estimates_of(study.sequences, [*study.training, "three"])
-    (said,) = estimates_in_words(estimates, study.config.sub_trajectory)
-    assert said == (
-        "Judged by an estimated reference: one (its own error is 0.31 % over 3 m, unknown for 0 % "
-        "of the scans); two (its own error is 0.31 % over 3 m, unknown for 0 % of the scans)."
-    )
 
 
 @pytest.mark.usefixtures("estimator")
@@ -254,19 +219,6 @@ def test_a_recording_that_allows_none_is_named_and_not_tried_again(estimator, lo
     assert not ensure_references(study, ["one"], required=False)
     assert caplog.messages[0] == "one: its reference is estimated again: sequences.one.stop is gone"
     assert study.sequences.estimate("one") is not None
-
-
-def test_with_an_imu_it_is_the_same_estimate(estimator, load, monkeypatch):
-    study = load(LEFT_OUT)
-    ensure_references(study, ["one"])
-    with_imu = study.sequences.config("two").model_copy(update={"imu": ImuConfig(unit="g")})
-    config = with_imu.model_copy(
-        update={"bag": study.sequences.config("one").bag, "reference": None}
-    )
-    monkeypatch.setitem(study.sequences.recordings, "one", config)
-    assert study.sequences.identity("one")["sequences"]["one"]["imu"]["unit"] == "g"
-    ensure_references(study, ["one"])
-    assert len(estimator.asked) == 1
 
 
 def test_an_interruption_leaves_those_that_are_done(estimator, load, monkeypatch):

@@ -65,7 +65,6 @@ def selections(selector, scans, motions=STILL):
 
 
 def test_scans_of_another_sensor_get_the_fixed_set(caplog):
-    """A cave looks alike to many sensors; what lies lowest does not."""
     model = of_two_caves()
     for sensor, chosen in (("hdl32e", 5), ("vlp16", 3)):
         made = selections(Selector(model, members=()), drive_cave(sensor, 3))
@@ -97,17 +96,6 @@ def with_motion():
     )
 
 
-def test_places_differ_by_the_sensors_motion():
-    selector = Selector(with_motion(), "paper")
-    (scan, *_) = drive_cave("hdl32e", 3)
-    for speed, chosen in ((0.5, 3), (5.0, 5)):
-        selector.reset()
-        for i in range(30):
-            motions = STILL if i < 2 else moving(0.1 * speed)
-            selector.observe(i * 10**8, scan, motions)
-        assert selector.select().trial == chosen
-
-
 @pytest.fixture(scope="module")
 def by_motion():
     return Selector(with_motion(), "paper")
@@ -129,11 +117,6 @@ def test_its_motion_is_that_of_the_last_second_of_poses(by_motion, steps):
         np.testing.assert_allclose(fill_in.call_args.args[2], want, atol=1e-6)
 
 
-def test_a_scan_comes_before_a_selection():
-    with pytest.raises(ValueError, match="observe a scan"):
-        Selector(of_two_caves()).select()
-
-
 def test_after_a_reset_it_is_as_new():
     scans = drive_cave("hdl32e", 3)
     selector = Selector(replace(of_two_caves(), window=3))
@@ -141,16 +124,6 @@ def test_after_a_reset_it_is_as_new():
     assert repr(selections(selector, scans, IN_A_BANK)) != repr(first)
     selector.reset()
     assert repr(selections(selector, scans, IN_A_BANK)) == repr(first)
-
-
-def test_it_takes_the_bank_that_was_shown_to_pay():
-    model = of_two_caves()
-    assert Selector(model).members == (3, 5)
-    assert Selector(model, "paper").members == ()
-    assert Selector(model, members=()).members == ()
-    unpaid = replace(model, bank_settings=BankSettings(adapt=False))
-    assert Selector(unpaid).members == ()
-    assert Selector(model, "paper", [5, 3]).fixed == 5
 
 
 def test_a_banks_weights_change_slowly(monkeypatch):
@@ -385,15 +358,6 @@ def test_the_reserve_of_a_bank_joins_in_where_training_knows_nothing(monkeypatch
     # Their errors are as large, and independent.
     np.testing.assert_allclose(shares[9], [0.5, 0.5, 0.0], atol=0.01)
     np.testing.assert_allclose(shares[19], [1 / 3] * 3, atol=0.01)
-
-
-def test_a_selection_tells_what_was_measured(monkeypatch):
-    told, scans = Told(monkeypatch), drive_cave("hdl32e", 3)
-    selector = Selector(of_two_caves())
-    assert np.isnan(selections(selector, scans[:1], IN_A_BANK)[0].estimated_error)
-    told.error = OwnError(1.0, 0.5, 2.0)
-    (one,) = selections(selector, scans[1:2], IN_A_BANK)
-    assert (one.estimated_error, one.estimated_low, one.estimated_high) == (1.0, 0.5, 2.0)
 
 
 @pytest.mark.parametrize("settings", [BankSettings(), BankSettings(adapt=False)])

@@ -1,8 +1,4 @@
-import subprocess
-import sys
-
 import numpy as np
-import pytest
 
 from adaptune.live.evidence import LiveEvidence
 from adaptune.live.hops import LiveSquares
@@ -32,31 +28,6 @@ def test_the_baseline_is_the_first_and_the_others_are_around_it():
     assert max(values) > 0.4
 
 
-def test_the_others_are_far_from_each_other():
-    few, many = untrained_sets(SPACE, 4).unit, untrained_sets(SPACE, 8).unit
-    np.testing.assert_array_equal(few, many[:4])
-    # Of all candidates, the next one is the farthest from those before it.
-    every = untrained_sets(SPACE, CANDIDATES + 1).unit
-    for k in range(1, 4):
-        apart = np.linalg.norm(every[k:, None] - every[None, :k], axis=-1).min(axis=1)
-        assert apart.argmax() == 0
-        assert apart[0] > 0.2
-
-
-@pytest.mark.parametrize(
-    ("space", "n"),
-    [
-        (ParameterSpace({}), 1),
-        (ParameterSpace.of(on=Categorical(choices=(False, True), baseline=False)), 2),
-        (ParameterSpace.of(size=Integer(low=3, high=5, baseline=4)), 3),
-    ],
-)
-def test_no_set_is_in_the_bank_twice(space, n):
-    sets = untrained_sets(space)
-    assert len(sets) == n
-    assert len({str(one) for one in sets.parameters}) == n
-
-
 def test_the_baseline_has_all_the_weight_until_others_are_confirmed(monkeypatch):
     sets = untrained_sets(SPACE)
     selector = UntrainedSelector(sets, 25.0)
@@ -76,11 +47,6 @@ def test_the_baseline_has_all_the_weight_until_others_are_confirmed(monkeypatch)
     weights = selector.select().weights
     assert weights[0] > weights[1] > 0.3
     assert max(weights[2], weights[3]) < 0.1
-
-
-def test_it_is_imported_fast():
-    code = "import sys, adaptune.selector; sys.exit('scipy.stats' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 def test_of_several_odometries_all_baselines_are_in_the_bank():

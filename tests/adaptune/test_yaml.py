@@ -1,5 +1,3 @@
-"""YAML as people mean it."""
-
 import math
 
 import pytest
@@ -35,34 +33,17 @@ plain = st.recursive(
     ("text", "value"),
     [
         ("1e3", 1000.0),
-        ("1E-3", 0.001),
-        ("-2.5e+2", -250.0),
         (".5", 0.5),
-        ("1.", 1.0),
-        ("+3", 3),
         ("010", 10),
-        ("-08", -8),
         (".inf", math.inf),
-        ("-.INF", -math.inf),
         ("true", True),
-        ("FALSE", False),
         ("null", None),
-        ("~", None),
         ("", None),
         ("on", "on"),
-        ("off", "off"),
-        ("yes", "yes"),
-        ("No", "No"),
-        ("y", "y"),
         ("1:30", "1:30"),
         ("1_000", "1_000"),
-        ("2001-01-01", "2001-01-01"),
-        ("1e", "1e"),
-        ("e3", "e3"),
         (".", "."),
-        ("-", [None]),
         ("'1e3'", "1e3"),
-        ('"true"', "true"),
         ("/velodyne_points", "/velodyne_points"),
         ("[1, 2.0, a]", [1, 2.0, "a"]),
         ("{a: 1e-2, b: }", {"a": 0.01, "b": None}),
@@ -74,48 +55,25 @@ def test_scalars(text, value):
     assert type(got) is type(value)
 
 
-def test_not_a_number():
-    assert math.isnan(scalar(".nan"))
-
-
-def test_keys_are_read_as_values_are():
-    assert Document("on: 1\n010: 2\n1e3: 3\n").data == {"on": 1, 10: 2, 1000.0: 3}
-
-
 # Ten lines of aliases, which stand for ten to the tenth values.
 LAUGHS = "a0: &a0 [x]\n" + "".join(
     f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]\n" for i in range(1, 11)
 )
 
 
-def test_aliases_are_read():
-    assert Document("a: &a {b: [1, 2]}\nc: [*a, *a]\n").data["c"] == [{"b": [1, 2]}] * 2
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         ("a: 1\nb: 2\na: 3\n", "line 3: 'a' was given before, in line 1"),
-        ("a:\n  b: 1\n  c: 1\n  b: 2\n", "line 4: 'b' was given before, in line 2"),
         ("- {a: 1,\n   a: 2}\n", "line 2: 'a' was given before, in line 1"),
-        ("# a comment\n10: 1\n010: 2\n", "line 3: 10 was given before, in line 2"),
-        ('a: 1\n"a": 2\n', "line 2: 'a' was given before, in line 1"),
         ("a: 1\n? [b]\n: 2\n", "line 2: a key must be"),
-        ("a: [1, 2\n", "line 2: "),
         ("a: 1\n\tb: 2\n", "line 2: "),
-        ("a: 1\nb: c: d\n", "line 2: "),
         ("a: 1\nb: *there\n", "line 2: .*there"),
         ("a: !thing 1\n", "line 1: .*!thing"),
-        ("a: !!python/object/apply:os.getpid []\n", "line 1: "),
         ("a: 1\n---\nb: 1\n", "line 2: "),
         ("[" * 5000, "nested too deeply"),
         ("b: 1\na: " + "9" * 5000, "line 2: a number of 5,000 digits"),
-        ("a: !!int many", "a tag .* does not fit its value"),
-        ("a: !!binary aaaa\n", "line 1: .*binary"),
-        ("a: !!timestamp 2001-01-01\n", "line 1: .*timestamp"),
-        ("a: !!set {b}\n", "line 1: .*set"),
         ('b: 1\na: "\\0"\n', "line 2: a text holds a null character"),
-        ('a: "\\ud800"\n', "line 1: a text holds a null character or half of one"),
         ("a: &a [*a]\n", "an alias of itself"),
         ("a: &a {b: {c: *a}}\n", "an alias of itself"),
         (LAUGHS, "more than 100,000 values"),
@@ -125,10 +83,6 @@ def test_mistakes_are_told_with_their_line(text, message):
     with pytest.raises(YamlError, match=message):
         Document(text)
     assert issubclass(YamlError, AdaptuneError)
-
-
-def test_the_same_key_in_two_mappings_is_no_mistake():
-    assert Document("a: {x: 1}\nb: {x: 2}\n").data == {"a": {"x": 1}, "b": {"x": 2}}
 
 
 TEXT = """\
@@ -151,31 +105,16 @@ training:
     ("path", "line"),
     [
         ([], None),
-        (["odometry"], 2),
         (["odometry", "name"], 3),
-        (["odometry", "parameters"], 5),
         (["odometry", "parameters", "interval", "high"], 7),
-        (["odometry", "parameters", "interval", "log"], 6),
-        (["odometry", "nmae"], 2),
         (["odometry", "name", "deeper"], 3),
-        (["training"], 8),
         (["training", 0], 9),
         (["training", 1, "stop"], 11),
-        (["training", 7], 8),
-        (["training", "first"], 8),
         ([3], 12),
-        (["test"], None),
     ],
 )
 def test_line_of_a_path(path, line):
     assert Document(TEXT).line(path) == line
-
-
-def test_an_empty_document():
-    for text in ("", "\n", "# nothing\n"):
-        document = Document(text)
-        assert document.data is None
-        assert document.line(["a"]) is None
 
 
 @modest
@@ -188,20 +127,3 @@ def test_what_is_dumped_is_read_back(data):
     assert back == data
     # 1 == 1.0 == True, but they are not the same.
     assert repr(back) == repr(data)
-
-
-def test_dump_keeps_the_order_and_the_letters():
-    assert dump({"b": 1, "a": [0.5, "grün"]}) == "b: 1\na:\n- 0.5\n- grün\n"
-
-
-@pytest.mark.parametrize(
-    "text",
-    ["a: !!bool maybe", "a: !!float ''", "a: !!timestamp soon", "a: \x00", "a: '\ud800'"],
-)
-def test_mistakes_that_pyyaml_does_not_report_as_its_own(text):
-    with pytest.raises(YamlError):
-        Document(text)
-
-
-def test_signs_of_older_yaml_are_words():
-    assert Document("a: =\n").data == {"a": "="}

@@ -74,28 +74,6 @@ def test_a_loaded_study_goes_on_as_if_it_had_never_stopped():
     assert history(study) == history(once)
 
 
-def test_maximizes():
-    study = optuna.create_study(sampler=AnnealingSampler(seed=1), direction="maximize")
-    study.optimize(lambda t: -objective(t), n_trials=100)
-    assert study.best_value > -1.0
-
-
-def test_begins_at_an_enqueued_trial():
-    study = optuna.create_study(
-        sampler=AnnealingSampler(settings(steps={"x": {"sigma": 0.01}, "n": {"delta_max": 1}}))
-    )
-    study.enqueue_trial({"x": 4.0, "n": 20, "c": "blue"})
-    study.optimize(objective, n_trials=10)
-    assert all(abs(t.params["x"] - 4.0) < 0.5 for t in study.trials)
-
-
-def test_chains_begin_at_the_best_of_the_first_trials():
-    sampler = AnnealingSampler(settings(chains=2), n_startup_trials=10, seed=1)
-    study = optimize(10, sampler)
-    energies = sorted(t.value for t in study.trials)
-    assert [chain.energy for chain in sampler.chains(study)] == energies[:2]
-
-
 def test_stops_when_all_chains_have_stalled():
     sampler = AnnealingSampler(settings(chains=3, stall_best=5), seed=1)
     study = optuna.create_study(sampler=sampler)
@@ -103,11 +81,6 @@ def test_stops_when_all_chains_have_stalled():
     # Each of three chains needs five steps after the first trial, and they take turns.
     assert len(study.trials) == 1 + 3 * 5
     assert sampler.stalled(study)
-
-
-def test_a_step_of_an_unknown_parameter_is_an_error():
-    with pytest.raises(ValueError, match=r"steps of 'xx': there is no such parameter; did you"):
-        optimize(5, AnnealingSampler(settings(steps={"xx": {"sigma": 1.0}})))
 
 
 def test_failed_and_infinite_trials_do_no_harm():
@@ -136,10 +109,6 @@ def walk(energies, **given):
         chain.step({}, energy, 1.0, 0.999)
         temperatures.append(chain.temperature)
     return chain, temperatures
-
-
-def test_cools_with_every_step():
-    assert walk([0.5, 2.0, 0.1])[1] == [0.5, 0.25, 0.125]
 
 
 def test_is_heated_after_a_number_of_steps():
@@ -221,13 +190,6 @@ def test_categories_change_as_often_as_they_are_told():
     cs = steps_from("red", SPACE["c"], Step(change=0.4))
     share = {c: cs.count(c) / len(cs) for c in ("red", "green", "blue")}
     assert share == pytest.approx({"red": 0.6, "green": 0.2, "blue": 0.2}, abs=0.04)
-
-
-def test_whole_numbers_in_log_scale_always_move():
-    ms = steps_from(3, SPACE["m"], Step(sigma=0.001))
-    assert set(ms) == {2, 4}
-    assert set(steps_from(1, SPACE["m"], Step(sigma=0.001))) == {2}
-    assert set(steps_from(1000, SPACE["m"], Step(sigma=0.0001))) == {999}
 
 
 @given(

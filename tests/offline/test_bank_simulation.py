@@ -197,7 +197,6 @@ class Recorded(Odometry):
 
 
 def test_it_is_what_a_bank_does():
-    """Weights that change, members that disagree but are not lost."""
     rng = np.random.default_rng(0)
     trials = [trial(straight(0.3 + rng.normal(0.0, 0.005, N - 1))) for _ in range(3)]
     weights = rng.dirichlet(np.ones(3), 6)

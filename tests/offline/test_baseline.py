@@ -1,5 +1,3 @@
-"""A setup in which the baseline fails, and what the baseline says of a reference."""
-
 import logging
 from dataclasses import replace
 
@@ -59,7 +57,6 @@ def test_a_single_fault_is_told(caplog):
         ({}, None),
         ({"axis": 1}, "turned by about 90 degrees"),
         ({"step": -0.3}, "turned by about 180 degrees, or reversed in time"),
-        ({"step": 0.01}, None),
     ],
 )
 def test_a_reference_that_contradicts_the_motion_is_told(
@@ -122,11 +119,3 @@ def test_the_baseline_of_every_odometry_is_run_once(study_file, tmp_path, monkey
     archive.trial_path("two", 1, whole=True).unlink()
     run_baselines(study)
     assert ran == [("apart", "two")]
-
-
-def test_any_odometry_that_fails_stops_the_campaign(study_file, tmp_path):
-    second = "{name: 'stumbling:Apart', label: lame, settings: {fault: register}}"
-    study = study_of_two(study_file, tmp_path / "study", second)
-    with pytest.raises(BaselineError, match=r"sequences\.(one|two): lame fails .*no licence"):
-        train(study)
-    assert not list(study.folder.rglob("*.npz"))

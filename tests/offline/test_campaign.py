@@ -1,18 +1,13 @@
-import csv
-import itertools
 import os
 import shutil
 import signal
 import time
 
-import drives
 import numpy as np
 import pytest
 from kills import contents
 
-from adaptune import files
 from adaptune.archive import Archive
-from adaptune.errors import AdaptuneError
 from adaptune.model import ErrorModel
 from adaptune.model.descriptor import averaged
 from offline.config import load_study
@@ -25,27 +20,6 @@ def trained(study_file, trained_folder, tmp_path_factory):
     folder = shutil.copytree(trained_folder, tmp_path_factory.mktemp("run") / "study")
     study = load_study(study_file, [], folder)
     return study, train(study)
-
-
-def test_every_trial_is_in_the_archive(trained):
-    study, training = trained
-    archive = Archive(study.folder / "trials")
-    for name, number in itertools.product(("one", "two"), range(10)):
-        trial = archive.read(name, number)
-        assert trial.parameters == training.model.sets[number]
-        assert training.means[name][number] == pytest.approx(trial.mean_error, rel=1e-6)
-    assert training.model.sets[0] == study.odometry.space.baseline
-
-
-def test_the_table_of_trials(trained):
-    study, training = trained
-    with (study.folder / "trials.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    assert [int(row["trial"]) for row in rows] == list(range(10))
-    assert float(rows[7]["two"]) == pytest.approx(training.means["two"][7])
-    best = min(rows, key=lambda row: float(row["mean"]))
-    fixed = files.Document((study.folder / "fixed.yaml").read_text()).data
-    assert {name: float(best[name]) for name in fixed} == fixed
 
 
 def test_the_fixed_set_is_the_best_of_the_candidates_in_whole_runs(trained):
@@ -107,16 +81,6 @@ def test_more_trials_go_on_where_fewer_stopped(trained, study_file, tmp_path):
     assert {k: ours[k] for k in theirs} == theirs
 
 
-def test_finished_work_is_not_repeated(trained, monkeypatch):
-    study, training = trained
-
-    def spawn(*_):
-        raise AssertionError("a worker was started")
-
-    monkeypatch.setattr(Workers, "_spawn", spawn)
-    assert train(study).means == training.means
-
-
 @pytest.mark.usefixtures("processes")
 def test_a_killed_worker_is_replaced(trained, study_file, tmp_path, monkeypatch):
     study, _ = trained
@@ -157,15 +121,6 @@ def test_a_task_that_kills_every_worker_is_told(study_file, tmp_path, monkeypatc
         train(study)
 
 
-def test_what_a_worker_finds_wrong_reaches_the_user(study_file, tmp_path):
-    drives.write_bag(tmp_path / "short.bag", drives.scans(0, 9))
-    study = load_study(
-        study_file, [f"sequences.two.bag={tmp_path / 'short.bag'}"], tmp_path / "study"
-    )
-    with pytest.raises(AdaptuneError, match=r"two: its path of 2\.4 m holds no sub-trajectory"):
-        train(study)
-
-
 def test_views_are_trained_on_beside_their_origin(gicp_study_file, tmp_path):
     overrides = [
         "offline.augment=[{noise: {sigma: 0.02}}, {reverse: true}, {noise: {sigma: 0.1}}]",
@@ -183,9 +138,3 @@ def test_views_are_trained_on_beside_their_origin(gicp_study_file, tmp_path):
     np.testing.assert_allclose(frames[0], frames[2][::-1], atol=1e-9)
     errors = [training.means[name][0] for name in names]
     assert len(set(errors)) == 4
-
-
-def test_a_view_that_cannot_be_is_told(study_file, tmp_path):
-    study = load_study(study_file, ["offline.augment=[{cut: [[100, 200]]}]"], tmp_path / "study")
-    with pytest.raises(AdaptuneError, match=r"its views leave no scan"):
-        train(study)

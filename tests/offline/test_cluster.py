@@ -1,5 +1,3 @@
-"""Campaigns on a Dask cluster of real worker processes."""
-
 import os
 import signal
 import subprocess
@@ -97,7 +95,6 @@ def test_a_cluster_without_workers_is_told(study_file, tmp_path, scheduler, monk
 
 
 def test_the_cluster_gives_the_local_trials(study_file, tmp_path, scheduler, workers, local):
-    """On three worker processes."""
     assert len(workers) == 3
     study = load_study(study_file, [], tmp_path / "study")
     train(study, cluster=scheduler[0])

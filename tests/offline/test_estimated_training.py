@@ -1,17 +1,12 @@
-"""Training on sequences whose references are estimated."""
-
 import io
 
 import estimates
 import pytest
 from rich.console import Console
-from typer.testing import CliRunner
 
-from adaptune.commands.cli import app
 from adaptune.errors import AdaptuneError
 from adaptune.model import ErrorModel
 from adaptune.model.error_model import render
-from adaptune.reference.stored import EstimateError
 from offline.config import load_study
 from offline.train import train
 from offline.validate import validate
@@ -48,21 +43,6 @@ def test_trials_model_and_validation_say_what_judged(load, monkeypatch, caplog):
     train(load())
     assert len(estimator.asked) == 4
     assert "one.tum has other content" in caplog.text
-
-
-def test_a_training_sequence_without_is_an_error_before_the_first_trial(
-    study_file, tmp_path, monkeypatch
-):
-    estimator = estimates.install(monkeypatch)
-    estimator.refusal = EstimateError("the robot hardly moves")
-    words = [word for text in BLIND for word in ("-o", text)]
-    done = CliRunner().invoke(
-        app, ["offline", str(study_file), *words, "--folder", str(tmp_path / "run")]
-    )
-    assert done.exit_code == 2
-    assert "error: sequences.one: " in done.stderr
-    assert "one.bag: the robot hardly moves" in done.stderr
-    assert not (tmp_path / "run/trials").exists()
 
 
 def test_a_sequence_without_reference_is_refused_before_trials_are_removed(load, monkeypatch):

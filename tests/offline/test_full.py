@@ -1,8 +1,5 @@
-"""A campaign on a full disk."""
-
 import os
 import subprocess
-from pathlib import Path
 
 import kills
 import pytest
@@ -42,7 +39,7 @@ def small_disk(tmp_path):
     subprocess.run(["umount", "-l", str(disk)], check=True)
 
 
-def leave(disk: Path, free: int):
+def leave(disk, free):
     """Fill a disk but for so many bytes."""
     ballast = disk / "ballast"
     ballast.unlink(missing_ok=True)

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from adaptune.space import Categorical, Float, Integer, ParameterSpace
-from offline.config import Grid, OfflineConfig, Span, make_grid
+from offline.config import OfflineConfig, Span, make_grid
 from offline.samplers import make_sampler
 
 SPACE = ParameterSpace(
@@ -82,24 +82,3 @@ def test_index_is_the_inverse(n, m, first, step, log):
         space.check(grid[i])
         assert grid.index(grid[i]) == i
     assert grid.index({"a": 0.001, "b": 3, "c": 1}) is None
-
-
-def test_a_span_is_even_in_ratio_in_log_scale():
-    space = ParameterSpace({"a": Float(low=0.1, high=10.0, baseline=1.0, log=True)})
-    grid = make_grid(space, {"a": Span(low=0.1, high=10.0, count=3)})
-    assert [grid[i]["a"] for i in range(3)] == pytest.approx([0.1, 1.0, 10.0])
-    space.check(grid[2])
-
-
-def test_all_sets_of_a_space():
-    space = ParameterSpace(
-        {
-            "b": Integer(low=-1, high=1, baseline=0, log=False),
-            "c": Categorical(choices=("x", "y"), baseline="x"),
-        }
-    )
-    grid = Grid.of(space)
-    assert [tuple(grid[i].values()) for i in range(grid.size)] == list(
-        itertools.product((-1, 0, 1), "xy")
-    )
-    assert Grid.of(SPACE) is None

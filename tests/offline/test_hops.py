@@ -1,5 +1,4 @@
 import numpy as np
-import pytest
 from rooms import scan_at, street
 
 from adaptune.archive import Frames
@@ -47,11 +46,3 @@ def test_where_the_reference_is_unknown_nothing_is_measured():
     # None leads over it.
     assert hops.start[1] > 11
     np.testing.assert_allclose(hops.T_start_end[:, 0, 3], STEP * (hops.end - hops.start), atol=0.03)
-
-
-@pytest.mark.parametrize("n", [1, 4])
-def test_a_short_sequence_has_none(n):
-    of = frames(n)
-    hops = with_measured_hops(scans(of), of).hops
-    assert len(hops.end) == 0
-    assert hops.T_start_end.shape == (0, 4, 4)

@@ -1,8 +1,6 @@
 from dataclasses import replace
 
 import numpy as np
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from tables import table
 
 from adaptune.archive import Summary
@@ -74,7 +72,6 @@ def test_whole_runs_decide_where_there_are_some():
 
 
 def test_a_candidate_of_all_sequences_is_none_where_its_luck_is_left_out():
-    """The study's candidates were chosen on all sequences, and with luck on the one left out."""
     rng = np.random.default_rng(0)
     errors = rng.uniform(0.9, 1.1, (8, 256))  # all sets are equally good
     luckiest = int(errors.mean(axis=0).argmin())
@@ -95,40 +92,3 @@ def test_a_candidate_of_all_sequences_is_none_where_its_luck_is_left_out():
     lost[1, others.fixed()] = np.inf
     some = [replace(s, errors=lost if s.name == "s3" else s.errors) for s in others.sequences]
     assert others._replace(sequences=some).fixed() != others.fixed()
-
-
-values = st.lists(
-    st.lists(st.lists(st.floats(0.1, 9.0), min_size=3, max_size=3), min_size=3, max_size=3),
-    min_size=1,
-    max_size=4,
-)
-
-
-@settings(deadline=None)
-@given(values)
-def test_there_is_one_definition_of_fixed(runs):
-    config, found = verdicts(runs)
-    bounds = [verdict.values[0] + verdict.margin for verdict in found.values()]
-    if len(np.unique(np.round(bounds, 9))) == 3:
-        assert labelled(runs).fixed() == best_by_trials(config, found)
-
-
-def test_a_sequence_is_left_out_with_its_views():
-    of_one = labelled([[[1.0], [2.0], [3.0]]]).sequences[0]
-    names = ["a", "b", "a+noise", "c"]
-    data = LabelledData(
-        [LabelledSequence(n, *list(vars(of_one).values())[1:]) for n in names], SETS
-    )
-    left_out = {one.name: [s.name for s in others.sequences] for one, others in data.folds()}
-    assert left_out == {"a": ["b", "c"], "b": ["a", "a+noise", "c"], "c": ["a", "b", "a+noise"]}
-
-
-SETS = table(np.eye(3), (0, 2, 5))
-
-
-def test_a_set_that_misses_frames_is_not_complete():
-    data = labelled([[[1.0], [2.0], [3.0]]] * 2)
-    data.sequences[1].errors[0, 1] = np.nan
-    complete = data.complete()
-    assert complete.sets.trials == (0, 5)
-    assert complete.sequences[0].values.tolist() == [1.0, 3.0]

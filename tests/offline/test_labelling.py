@@ -1,5 +1,3 @@
-"""Reading the labelled data set of a study."""
-
 import numpy as np
 import pytest
 

@@ -1,5 +1,3 @@
-"""What trials are judged by."""
-
 import drives
 import numpy as np
 import pytest
@@ -15,8 +13,6 @@ from adaptune.odometry.keyframe import KeyframeGicp
 from adaptune.strict import ConfigurationError
 from offline.config import OfflineConfig, load_study
 from offline.objective import (
-    PENALTY,
-    SamplerResult,
     Verdict,
     baseline_words,
     best_by_trials,
@@ -24,10 +20,7 @@ from offline.objective import (
     choose_fixed,
     joined,
     judge,
-    label,
     pareto_front,
-    penalised,
-    sampler_results,
 )
 from offline.train import train
 
@@ -36,25 +29,11 @@ def config(**given):
     return OfflineConfig.model_validate(given)
 
 
-def test_every_way_to_write_an_objective():
-    assert config().objective == ({"rte": 1.0},)
-    assert config(objective="ape").objective == ({"ape": 1.0},)
-    assert config(objective={"rpe": 2.0, "ape": 0.5}).objective == ({"rpe": 2.0, "ape": 0.5},)
-    both = config(objective=["rte", {"ms_per_scan": 0.1}])
-    assert both.objective == ({"rte": 1.0}, {"ms_per_scan": 0.1})
-    assert both.metrics == {"rte", "ms_per_scan"}
-    assert config(limits={"cpu": {"max": 50}}).metrics == {"rte", "cpu"}
-    assert label({"rte": 1.0, "ms_per_scan": 0.1}) == "rte + 0.1 ms_per_scan"
-
-
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("offline.objective=rtee", "offline.objective"),
         ("offline.objective={rte: -1}", "offline.objective"),
         ("offline.objective=[]", "offline.objective"),
-        ("offline.objective={}", "offline.objective"),
-        ("offline.limits={rte: {min: 1}}", "offline.limits.rte.min: unknown key"),
         ("offline.limits={speed: {max: 1}}", "offline.limits.speed"),
     ],
 )
@@ -130,17 +109,6 @@ def test_runs_of_the_baseline_alone_give_it_no_margin_but_a_sentence():
         config(repeats=3, baseline_runs=2)
 
 
-def test_samplers_receive_limits():
-    history = sampler_results(
-        [Verdict({"a": 0}, (2.0,), (-0.3,)), Verdict({"a": 1}, (1.0,), (0.5,))]
-    )
-    assert history == [SamplerResult({"a": 0}, 2.0, (-0.3,)), SamplerResult({"a": 1}, 1.0, (0.5,))]
-    assert penalised(history) == [({"a": 0}, 2.0, ()), ({"a": 1}, 1.0 + PENALTY * 2.0 * 1.5, ())]
-    several = sampler_results([Verdict({}, (0.0, 4.0)), Verdict({}, (1.0, 1.0), (1.0, -2.0))])
-    assert [result.value for result in several] == [(0.0, 4.0), (1.0, 1.0)]
-    assert [result.value for result in penalised(several)] == [(0.0, 4.0), (21.0, 81.0)]
-
-
 @given(arrays(float, st.tuples(st.integers(1, 20), st.integers(1, 3)), elements=st.integers(0, 5)))
 def test_the_front_is_what_nothing_dominates(values):
     front = pareto_front(values)
@@ -190,21 +158,6 @@ def test_a_lost_track_is_in_the_metrics_of_the_trajectory(study_file, tmp_path):
     assert np.flatnonzero(trial.restarted).tolist() == [10]
     assert trial.metrics["rpe"] == pytest.approx(5.0 / np.sqrt(39), rel=0.02)
     assert trial.metrics["ape"] > 1.0
-
-
-def test_limits_that_no_set_keeps(study_file, tmp_path):
-    overrides = ["offline.limits={ms_per_scan: {max: 1e-6}}", "offline.trials=4"]
-    study = load_study(study_file, overrides, tmp_path / "study")
-    with pytest.raises(AdaptuneError, match="none of 4 parameter sets keeps ms_per_scan <= 1e-06"):
-        train(study)
-
-
-def test_kittis_error_needs_its_length(study_file, tmp_path):
-    study = load_study(study_file, ["offline.objective=kitti"], tmp_path / "study")
-    with pytest.raises(
-        AdaptuneError, match=r"(one|two): its path holds no sub-trajectory of 100 m"
-    ):
-        train(study)
 
 
 def test_memory_is_that_of_a_process_of_its_own(study_file, tmp_path):

@@ -6,7 +6,6 @@ from typer.testing import CliRunner
 
 from adaptune.archive import Archive
 from adaptune.commands.cli import app
-from adaptune.errors import AdaptuneError
 from adaptune.metrics import cap
 from adaptune.model import ErrorModel
 from adaptune.study.study import oracle_errors
@@ -30,16 +29,6 @@ def oracle(study_file, trained_folder, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("adaptune.commands.online.ORACLE_SETS", N)
         return load_study(study_file, [], folder), CliRunner().invoke(app, words)
-
-
-def test_the_sets_are_the_fixed_one_the_bank_and_others(oracle):
-    model = ErrorModel.load(oracle[0].model_path)
-    chosen = oracle_sets(model, len(model.sets))
-    assert chosen[: len(model.bank)] == model.bank
-    assert chosen[0] == model.fixed
-    complete = [t for t in model.sets if np.isfinite(model.errors[:, model.sets.column(t)]).any()]
-    assert sorted(chosen) == sorted(set(complete))
-    assert oracle_sets(model, 2) == chosen[:2]
 
 
 def test_errors_on_test_sequences_are_read(oracle):
@@ -90,10 +79,3 @@ def test_it_resumes_and_renews_what_has_changed(load, caplog):
     assert row["sets"] == 2
     assert len(oracle_errors(other.archive("oracle"), "three", model).stamps) < 40
     assert not files[oracle_sets(model, 4)[3]].exists()
-
-
-def test_a_test_sequence_without_reference_cannot_be_judged(load):
-    with pytest.raises(AdaptuneError, match="name at least one sequence with a reference"):
-        run_oracle(load("sequences.three.reference=none"))
-    with pytest.raises(AdaptuneError, match="name at least one sequence with a reference"):
-        run_oracle(load("test=[]"))

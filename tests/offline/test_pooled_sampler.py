@@ -1,5 +1,3 @@
-"""The samplers of several odometries, which must do what every sampler does."""
-
 import collections
 
 import pytest
@@ -45,14 +43,6 @@ def labels(history):
     return [s[ODOMETRY] for s, _ in history]
 
 
-def test_sets_are_of_the_space_and_differ(config):
-    history = run(config, 5)
-    assert len(history) == 40
-    for parameters, _ in history:
-        SPACE.check(parameters)
-    assert len({repr(sorted(s.items())) for s, _ in history}) == 40
-
-
 def test_the_first_trials_are_the_baselines_and_then_all_take_turns(config):
     history = run(config, 2)
     assert [s for s, _ in history[:3]] == SPACE.baselines
@@ -60,28 +50,10 @@ def test_the_first_trials_are_the_baselines_and_then_all_take_turns(config):
     assert min(collections.Counter(labels(history)).values()) >= 4
 
 
-def test_the_best_odometry_gets_the_largest_share(config):
-    counts = collections.Counter(labels(run(config, 6)[16:]))
-    assert counts["gicp"] > max(counts["ndt"], counts["kiss"]) > 0
-
-
 @pytest.mark.parametrize("known", [0, 1, 3])
 def test_resumes_exactly(config, known):
     history = run(config, 4)
     assert run(config, 4 - known, history[: 8 * known]) == history
-
-
-@pytest.mark.parametrize(
-    ("settings", "key"),
-    [
-        ({"sampler": "annealing"}, "sampler"),
-        ({"sampler": "random", "sampler_settings": {"grid": {}}}, "sampler"),
-        ({"trials": 2}, "trials"),
-    ],
-)
-def test_what_several_odometries_cannot_be_searched_with(settings, key):
-    found = list(OfflineConfig(**settings)._search_mistakes(SPACE))
-    assert [mistake.key for mistake in found] == [(key,)]
 
 
 @given(
@@ -117,16 +89,6 @@ def test_a_finite_pool_is_tried_to_its_end(config, batch):
     assert len(history) == len({repr(s) for s, _ in history}) == 23
 
 
-def test_of_several_objectives_the_first_splits_the_batches():
-    config = OfflineConfig(objective=["rte", "rpe"], batch=8, initial=8, seed=5)
-    sampler, history = make_sampler(SPACE, config), []
-    for _ in range(4):
-        history += [(s, (error(s), -error(s))) for s in sampler.propose(history)]
-    counts = collections.Counter(labels(history[8:]))
-    assert counts["gicp"] > max(counts["ndt"], counts["kiss"]) > 0
-    assert make_sampler(SPACE, config).propose(history[:16]) == [s for s, _ in history[16:24]]
-
-
 def late_sets(limit):
     """The last sets of two alike odometries; a smaller voxel is better."""
     space = PooledSpace(dict.fromkeys(("one", "other"), SPACE.spaces["kiss"]))
@@ -137,6 +99,5 @@ def late_sets(limit):
 
 
 def test_sets_that_break_limits_earn_no_share():
-    """What one of them does best, it may not do."""
     late = late_sets(lambda s: (1.0 if s[ODOMETRY] == "one" else -1.0,))
     assert collections.Counter(s[ODOMETRY] for s in late) == {"one": 9, "other": 18}

@@ -1,8 +1,6 @@
-from contextlib import contextmanager
 from itertools import islice
 
 import numpy as np
-import pytest
 
 from adaptune.odometry.base import OdometryInstance
 from adaptune.recording.scan import Scan
@@ -58,28 +56,6 @@ def test_each_scan_is_prepared_once_for_all_that_are_alike():
     assert shared.nbytes == 2 * N * SIZE
 
 
-def test_clouds_that_trials_prepare_are_kept_apart_too(monkeypatch):
-    inside = []
-
-    @contextmanager
-    def apart():
-        inside.append(True)
-        yield
-        inside.pop()
-
-    class Watched(Preparer):
-        def prepare(self, scan):
-            assert inside == [True]
-            return super().prepare(scan)
-
-    monkeypatch.setattr("offline.trial.apart", apart)
-    shared = SharedScans(Read(), 1e6)
-    one = Watched("a")
-    passes(shared, one)
-    passes(shared, one)
-    assert (one.count, inside) == (N, [])
-
-
 def test_what_memory_does_not_hold_is_read_again():
     read = Read()
     shared = SharedScans(read, 2.5 * SIZE)
@@ -100,12 +76,3 @@ def test_preparations_that_a_pass_does_not_use_make_room():
     # Of two that are used, none makes room for the other.
     passes(shared, one, other)
     assert (shared.n_kept(one), shared.n_kept(other)) == (1, N - 1)
-
-
-def test_it_knows_what_preparing_costs(monkeypatch):
-    clock = iter(np.arange(0.0, 1e3, 0.004))
-    monkeypatch.setattr("offline.trial.time.process_time", lambda: next(clock))
-    shared, one = SharedScans(Read(), 1e6), Preparer("a")
-    passes(shared, one)
-    assert shared.milliseconds(one) == pytest.approx(4.0)
-    assert shared.milliseconds(Preparer("b")) == 0.0

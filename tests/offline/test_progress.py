@@ -25,16 +25,6 @@ class TwoWords:
         return [(0, self.said.pop(0) if self.said else TaskResult([], None))]
 
 
-def test_tasks_tell_how_far_they_are():
-    task, told = Task("one", (0, 1), ({}, {})), []
-    finished = list(run(TwoWords(), [task], lambda *about: told.append(about)))
-    assert told == [
-        (task, TaskProgress("reading", 5, 10)),
-        (task, TaskProgress("running", 2, 10)),
-    ]
-    assert [done for done, *_ in finished] == [task]
-
-
 def test_what_a_dead_worker_had_done_does_not_count():
     pool, calls = TwoWords(), []
     half = TaskProgress("running", 8, 10)
@@ -63,27 +53,6 @@ def test_a_worker_that_cannot_import_tells_why():
     with Workers(Elsewhere(), 1, 1e9) as pool, pytest.raises(workers.WorkerError) as caught:
         list(run(pool, [Task("one", (0, 1), ({}, {}))]))
     assert "No module named 'no_module_of_the_worker_s'" in str(caught.value)
-
-
-def test_a_second_look_at_a_sequence_is_told_apart():
-    pool, calls = TwoWords(), []
-    pool.said = [TaskProgress(what, 9, 10) for what in ("reading", "registering hops of")]
-    list(watched(pool, [Task("one", (0,), ({},))], "runs", lambda *call: calls.append(call)))
-    told = [call[:3] for call in calls]
-    assert ("reading one", 9, 10) in told
-    assert ("registering hops of one", 9, 10) in told
-
-
-def test_the_remark_counts_workers_and_not_runs():
-    class TwoWorkers(TwoWords):
-        def workers(self):
-            return [0, 1]
-
-        def wait(self):
-            return [(0, TaskResult([], None))]
-
-    tasks = [Task("one", tuple(range(8)), ()), Task("one", tuple(range(8, 16)), ())]
-    assert next(run(TwoWorkers(), tasks))[2] == 1
 
 
 def test_workers_report_now_and_then_and_at_the_end(monkeypatch):

@@ -1,5 +1,3 @@
-"""Trials that are given up before they have seen all sequences."""
-
 import csv
 import dataclasses
 import math
@@ -7,22 +5,13 @@ import math
 import drives
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from adaptune.archive import Archive
 from adaptune.model import ErrorModel
-from adaptune.strict import ConfigurationError
 from offline.config import load_study
-from offline.search import estimate, rungs, survivors
+from offline.search import survivors
 from offline.train import train
 from offline.validate import validate
-
-
-def test_the_first_batch_runs_on_all_sequences():
-    assert rungs(True, 0, 5) == rungs(False, 1, 5) == [5]
-    assert rungs(True, 1, 5) == [2, 3, 4, 5]
-    assert rungs(True, 1, 2) == [2]
 
 
 def test_what_cannot_win_any_more_is_given_up():
@@ -39,14 +28,6 @@ def test_what_is_surely_worse_than_the_best_is_given_up():
     assert survivors(batch, before) == [4]
     # Two sequences cannot tell.
     assert survivors({5: (best[:2] + 1.0).tolist()}, before) == [5]
-
-
-@given(st.lists(st.floats(0.1, 30.0), min_size=2, max_size=9), st.floats(0.1, 5.0))
-def test_an_estimate_keeps_the_ratio_to_the_baseline(baseline, ratio):
-    for m in range(1, len(baseline) + 1):
-        values = [ratio * value for value in baseline[:m]]
-        assert estimate(values, baseline) == pytest.approx(ratio * np.mean(baseline))
-    assert estimate([2.0], [0.0, 1.0]) == 2.0
 
 
 @pytest.fixture(scope="module")
@@ -95,13 +76,3 @@ def test_what_a_pruned_trial_has_seen_feeds_the_model(study_file, tmp_path):
     assert (study.folder / "model.safetensors").read_bytes() == before
     again = Archive(study.folder / "trials")
     assert [[n in again.finished(name) for name in study.training] for n in range(9)] == seen
-
-
-def test_other_rules_are_gone(study_file):
-    with pytest.raises(ConfigurationError, match="halving is gone; give wilcoxon"):
-        load_study(study_file, ["offline.pruning=halving"])
-
-
-def test_pruning_goes_by_one_objective(study_file):
-    with pytest.raises(ConfigurationError, match="pruning goes by one objective"):
-        load_study(study_file, ["offline.objective=[rte, ape]"])

@@ -1,5 +1,3 @@
-"""What becomes of a study whose files were damaged, whose recordings changed, or that is in use."""
-
 import re
 import shutil
 import subprocess
@@ -99,7 +97,6 @@ def test_only_what_depends_on_another_recording_is_computed_again(trained, tmp_p
 
 
 def test_with_nothing_to_do_nothing_is_done(trained):
-    """And the validation stays."""
     validate(trained)
     before, time = trained.model_path.read_bytes(), trained.model_path.stat().st_mtime_ns
     first = train(trained)
@@ -114,25 +111,6 @@ def test_with_nothing_to_do_nothing_is_done(trained):
     more = load_study(trained.folder.parent / "small.yaml", ["offline.trials=5"], trained.folder)
     assert not train(more).model.validation
     assert len(first.means["one"]) == 4
-
-
-def test_with_nothing_to_do_nothing_heavy_is_imported(trained):
-    code = (
-        "import sys\n"
-        "from typer.testing import CliRunner\n"
-        "from adaptune.commands.cli import app\n"
-        "from adaptune.odometry.registry import ODOMETRIES\n"
-        "ODOMETRIES['fake_odometry:Fake'] = 'fake_odometry:Fake'\n"
-        f"given = ['offline', {str(trained.folder.parent / 'small.yaml')!r}, '--folder', "
-        f"{str(trained.folder)!r}, '-o', 'offline.trials=4']\n"
-        "done = CliRunner().invoke(app, given)\n"
-        "assert done.exit_code == 0, done.output\n"
-        "print(*sys.modules)"
-    )
-    command = [sys.executable, "-c", code]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    heavy = {"optuna", "sklearn", "scipy", "open3d", "numba", "vl_convert", "pandas", "sqlalchemy"}
-    assert not heavy.intersection(done.stdout.split())
 
 
 @pytest.mark.parametrize("place", [("two", 2), ("one", 3)])

@@ -91,13 +91,6 @@ def test_rivals_are_left_out_too(validation):
     assert "ms" in said[1]
 
 
-def test_without_costs_there_is_no_rival_of_equal_cost(validation):
-    known, _ = validation
-    found = leave_one_out(known._replace(costs=None), {}, bank=0)
-    assert EQUAL_COST not in found.ratios
-    assert np.isnan(found.cost("fixed"))
-
-
 def test_a_bank_stays_within_the_budget():
     rng = np.random.default_rng(7)
     rich = data([with_motions(f"s{i}", rng, 100) for i in range(4)])

@@ -1,5 +1,3 @@
-"""Sets that are searched for on one sequence alone, beside those that all share."""
-
 import itertools
 from functools import partial
 
@@ -9,13 +7,12 @@ import pytest
 
 from adaptune.archive import Archive, Summary
 from adaptune.space import Categorical, ParameterSets, ParameterSpace
-from adaptune.strict import ConfigurationError
 from offline.campaign import run_batches
 from offline.config import OfflineConfig, load_study
 from offline.labelled import labelled_data
 from offline.objective import best_by_trials
 from offline.samplers import make_sampler
-from offline.search import Search, make_searches, owner
+from offline.search import Search, owner
 from offline.validate import leave_one_out
 
 NAMES = ["one", "two", "three"]
@@ -58,11 +55,6 @@ def run(study):
     return verdicts, seen, archive
 
 
-def searches_of(study):
-    space, archive = study.odometry.space, Archive(study.folder / "trials")
-    return make_searches(study.config.offline, space, study.training, archive)
-
-
 def owner_of(archive, number):
     return owner(archive.slots(), number)
 
@@ -70,22 +62,6 @@ def owner_of(archive, number):
 def sets(archive):
     """All parameter sets in the archive, by sequence and number."""
     return {(name, n): s.parameters for name in NAMES for n, s in archive.finished(name).items()}
-
-
-@pytest.mark.parametrize("kind", ["shared", "own"])
-def test_every_number_is_of_one_search(study_of, kind):
-    study = study_of(sets=kind)
-    searches = searches_of(study)
-    assert len(searches) == {"shared": 1, "own": 3}[kind]
-    assert len({search.number(i) for search in searches for i in range(1, 20)}) == 19 * len(
-        searches
-    )
-    slots = Archive(study.folder / "trials").slots()
-    for search in searches:
-        assert search.number(0) == 0
-        alone = search.sequences[0] if len(search.sequences) == 1 else None
-        assert {owner(slots, search.number(i)) for i in range(1, 9)} == {alone}
-    assert owner(slots, 0) is None
 
 
 def test_each_sequence_searches_for_itself(study_of):
@@ -150,7 +126,6 @@ def test_stopped_and_resumed_it_is_the_same(study_of, sampler, kind):
 @pytest.mark.parametrize("sampler", SAMPLERS)
 @pytest.mark.parametrize("kind", ["shared", "own"])
 def test_sequences_are_added_and_removed(study_of, sampler, kind):
-    """Sets that have run are not proposed again, and numbers stay."""
     given = {"sets": kind, "sampler": sampler, "sampler_settings": SAMPLERS[sampler]}
 
     def run_on(names, trials, folder=None):
@@ -180,14 +155,6 @@ def test_sequences_are_added_and_removed(study_of, sampler, kind):
     of_search = [text for n, text in numbers.items() if n < 100_000]
     assert len(set(of_search)) == len(of_search)
     assert run_on(NAMES, 14, folder)[2] == set()
-
-
-def test_a_search_that_is_over_waits_for_the_others(study_of):
-    study = study_of(sets="own", stagnation=12, trials=60)
-    verdicts, seen, archive = run(study)
-    n = {name: sum(owner_of(archive, k) == name for k in seen) for name in NAMES}
-    assert len(set(n.values())) > 1
-    assert list(verdicts) == list(seen)
 
 
 def test_what_a_place_has_found_is_not_known_where_it_is_left_out(study_of):
@@ -225,15 +192,10 @@ def test_what_a_place_has_found_is_not_known_where_it_is_left_out(study_of):
         assert left_out.errors["oracle, sequence"].mean() == pytest.approx(min(known), rel=1e-5)
 
 
-def test_pruning_needs_sets_that_are_shared(study_file):
-    with pytest.raises(ConfigurationError, match="pruning spares trials further sequences"):
-        load_study(study_file, ["offline.sets=own", "offline.pruning=wilcoxon"])
-
-
 def test_verdicts_belong_to_their_trials_where_numbers_are_left_out():
     space = ParameterSpace({"k": Categorical(choices=("a", "b", "c"), baseline="a")})
     config = OfflineConfig(trials=8, initial=2, batch=2)
-    finished: dict[str, dict[int, Summary]] = {"one": {}}
+    finished = {"one": {}}
     # Trial 100003 is known from another sequence.
     known = {0: {"k": "a"}, 100003: {"k": "b"}}
     sampler = partial(make_sampler, space, config)

@@ -1,5 +1,3 @@
-"""Searches among several odometries."""
-
 import numpy as np
 import pytest
 from drawn import Drawn
@@ -62,15 +60,3 @@ def test_stopped_and_resumed_it_is_the_same(study_of, sampler):
         path.unlink()
     again, _ = run(study_of("stopped", sampler=sampler))
     assert again == expected
-
-
-def test_all_get_sets_in_every_batch(study_of):
-    study = study_of("several")
-    verdicts, sets = run(study)
-    assert [sets[0], sets[1]] == study.odometry.space.baselines
-    for parameters in sets.values():
-        study.odometry.space.check(parameters)
-    for first in (8, 16, 24):
-        batch = [sets[n][ODOMETRY] for n in range(first, first + 8)]
-        assert min(batch.count("gicp"), batch.count("vgicp")) >= 2
-    assert all(verdict.complete for verdict in verdicts.values())

@@ -1,5 +1,3 @@
-"""The mirror of a study's trials in Optuna's storages."""
-
 from pathlib import Path
 
 import numpy as np
@@ -62,7 +60,6 @@ def test_trials_are_told_once_and_in_order(folder):
 
 
 def test_numbers_may_come_in_any_order(folder):
-    """As where every sequence has a search of its own."""
     mirror_in(folder).report([0, 3, 1], row)
     mirror_in(folder).report([0, 3, 6, 1, 4], row)
     numbers = [trial.user_attrs["adaptune trial"] for trial in in_journal(folder).get_trials()]
@@ -108,7 +105,6 @@ def test_what_is_no_number_is_a_failed_trial(folder):
 
 
 def test_trials_of_several_odometries_have_their_own_parameters_alone(folder):
-    """In Optuna's words: parameters are conditional on the odometry."""
     distance = Float(low=0.1, high=10.0, baseline=1.0, log=True)
     space = PooledSpace(
         {

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from labelled_places import in_stretches, labelled, with_motions
 
 from adaptune.metrics import travelled, window_ends
-from offline.labelled import PER_STRETCH, Extent, LabelledSequence, cut, stretches_of_view
+from offline.labelled import PER_STRETCH, Extent, cut, stretches_of_view
 
 LENGTH = 10.0
 
@@ -79,19 +79,6 @@ def test_nothing_that_is_known_comes_near_to_what_is_left_out(T, which):
     apart = np.linalg.norm(dropped.positions[:, None] - left.positions[None], axis=-1).min(axis=1)
     overlaps = (dropped.frames <= last) & (dropped.ends >= first)
     assert (overlaps | (apart <= LENGTH)).all()
-
-
-def test_a_second_visit_is_not_known():
-    there = np.full(200, 0.5)
-    turns = np.zeros(400)
-    turns[200] = np.pi
-    T = poses(np.concatenate([there, there]), turns)  # 100 m there, and back
-    extent = extent_of(T)
-    numbers = cut(T, extent)
-    assert numbers.max() + 1 == 5
-    kept = extent.some(~extent.near(extent.some(numbers == 0), is_view=False))
-    assert kept.positions[:, 0].min() > 40.0 + LENGTH - 1.0
-    assert len(kept.frames)
 
 
 def test_a_view_that_is_played_backwards_is_cut_as_its_recording():
@@ -173,12 +160,3 @@ def test_a_stretch_takes_its_part_of_everything():
     assert one.frames(np.ones(n, bool)) is one
     cut_again = some.frames(np.arange(kept.sum()) < 5)
     np.testing.assert_array_equal(cut_again.extent.frames, np.flatnonzero(kept)[:5])
-
-
-def test_without_an_extent_a_sequence_is_one_stretch():
-    plain = LabelledSequence("a", np.zeros(4, int), np.zeros((4, 9)), np.ones((4, 5), np.float32))
-    assert plain.stretch.tolist() == [0] * 4
-    assert labelled([plain]).folds() == []
-    folds = labelled([plain, replace(plain, name="b"), replace(plain, name="a+noise")]).folds()
-    names = [[s.name for s in others.sequences] for _, others in folds]
-    assert names == [["b"], ["a", "a+noise"]]

@@ -1,6 +1,5 @@
 import json
 
-import numpy as np
 import pytest
 from made_trials import write_trials
 
@@ -13,10 +12,6 @@ odometry: [{name: gicp}, {name: ndt}]
 courses: {a: {scenes: [cave]}}
 training: [a]
 """
-
-
-def error(_, parameters):
-    return 0.1 + abs(np.log(parameters["keyframe_interval"] / 3.0))
 
 
 @pytest.fixture
@@ -37,13 +32,6 @@ def test_trials_have_their_charts(study):
     assert [note.split(":")[0] for note in notes] == ["No costs of trials"]
     # The most important one comes first.
     assert charts[-1].panels[0].x.label == "keyframe_interval [m]"
-
-
-def test_few_trials_say_what_is_missing(study):
-    write_trials(study, error, 3)
-    charts, notes = charts_of_trials(study)
-    assert {"iterations", "sensitivity", "parameter-scatter"} == {chart.key for chart in charts}
-    assert len(notes) == 2
 
 
 def test_each_of_several_odometries_has_a_scatter(tmp_path):
@@ -70,7 +58,13 @@ def test_validation_is_read_or_missed(study):
     assert notes == []
 
 
-@pytest.mark.parametrize("text", ["[{", "{}x", '{"a": 1}', '[{"a": 1}]', "[1]"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "[{",
+        '[{"a": 1}]',
+    ],
+)
 def test_a_damaged_validation_is_named(study, text):
     (study.folder).mkdir(exist_ok=True)
     (study.folder / "stretches.json").write_text(text, "utf-8")

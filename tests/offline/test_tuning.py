@@ -13,9 +13,7 @@ from offline.tuning import (
     DO_NOT_ADAPT,
     NO_BANK,
     PAIRED_SETTINGS,
-    cancelling_members,
     choose,
-    complementary_members,
     expected_loss,
     reserve,
 )
@@ -122,18 +120,6 @@ def test_the_least_loss_wins(monkeypatch):
     rng = np.random.default_rng(7)
     alone = labelled([with_motions("s", rng, 100)])
     assert choose(alone, 2).bank == BankSettings()
-
-
-def test_members_are_chosen_in_both_ways():
-    rng = np.random.default_rng(7)
-    data = labelled([in_stretches(with_motions(f"s{i}", rng, 500)) for i in range(2)])
-    assert set(cancelling_members(data, 0, 2)) == {0, 8}
-    found = complementary_members(data, 0, 4)
-    assert found[0] == 0
-    assert len(set(found)) == 4
-    # A set whose motions are unknown is no member.
-    few = [replace(s, vectors={t: s.vectors[t] for t in (0, 3)}) for s in data.sequences]
-    assert complementary_members(labelled(few), 0, 4) == [0, 3]
 
 
 def test_the_baseline_is_the_reserve_of_a_bank():

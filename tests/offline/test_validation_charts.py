@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from adaptune.report.charts import Band, Line, Points
-from offline.charts import MOST_NAMED, stretch_chart
+from offline.charts import stretch_chart
 from offline.tuning import figures
 
 
@@ -35,11 +35,3 @@ def test_stretches_are_sorted_and_have_the_interval_of_their_mean():
     mean = next(d for d in panel.drawn if isinstance(d, Line))
     assert mean.y[0] == pytest.approx(np.exp(np.log(ratios).mean()))
     assert panel.title == f"adaptive: {of.geometric:.2f} ({of.low:.2f}-{of.high:.2f})"
-
-
-def test_many_recordings_are_not_named():
-    (panel,) = stretch_chart(stretches(MOST_NAMED + 1, 2)).panels
-    (points,) = (d for d in panel.drawn if isinstance(d, Points))
-    assert len(points.x) == 2 * (MOST_NAMED + 1)
-    assert set(points.texts) == {f"drive_{r}" for r in range(MOST_NAMED + 1)}
-    assert stretch_chart([]) is None

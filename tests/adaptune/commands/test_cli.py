@@ -1,7 +1,6 @@
 import os
 import re
 import shlex
-import shutil
 import signal
 import subprocess
 import sys
@@ -72,14 +71,6 @@ def test_one_bag_is_enough_and_every_command_names_the_next(adaptune, study_file
     assert (tmp_path / "my study[v2]/report/figures/one_60-100-paths.png").exists()
 
 
-def test_what_inspect_prints_is_a_study(study_file, tmp_path):
-    done = CliRunner().invoke(app, ["inspect", str(study_file.parent / "one.bag")])
-    assert done.exit_code == 0, done.output
-    begin, end = (done.stdout.index(word) for word in ("sequences:", "Next:"))
-    (tmp_path / "one.yaml").write_text(done.stdout[begin:end])
-    assert load_study(tmp_path / "one.yaml", [], tmp_path / "run").training == ["one_0-60"]
-
-
 @pytest.mark.parametrize(
     ("tested", "length"),
     [(0.4, 1.0), (6.0, 2.0), (8.0, 5.0), (20.0, 5.0), (99.0, 10.0), (1e3, 25.0)],
@@ -104,68 +95,6 @@ def test_inspect_proposes_a_study_without_a_reference_too(tmp_path):
     study = load_study(tmp_path / "one.yaml", [], tmp_path / "run")
     assert study.training == ["scans_0-60"]
     assert study.config.sub_trajectory == 5.0
-
-
-def test_inspect_says_what_to_do_where_the_reference_does_not_serve(tmp_path):
-    still = [(stamp, points, np.eye(4)) for stamp, points, _ in drives.scans(n_scans=3)]
-    bag = drives.write_bag(tmp_path / "still.bag", still)
-    done = CliRunner().invoke(app, ["inspect", str(bag)])
-    assert done.exit_code == 0, done.output
-    assert "write `reference: estimated`" in done.stdout.splitlines()[-1]
-
-
-@pytest.mark.parametrize(
-    ("command", "following"),
-    [
-        (["trials"], "validate"),
-        (["validate"], "online"),
-        (["inspect", "MODEL"], "online"),
-        (["cache"], "cache"),
-    ],
-)
-def test_other_commands_name_the_next_too(
-    adaptune, study_file, trained_folder, tmp_path, command, following
-):
-    folder = tmp_path / "run"
-    shutil.copytree(trained_folder, folder)
-    if "MODEL" in command:
-        words = [*command[:-1], folder / "model.safetensors"]
-    elif command == ["cache"]:
-        words = command
-    else:
-        words = [*command, study_file, "--folder", folder]
-    done = adaptune(*words)
-    assert done.exit_code == 0, done.stderr
-    assert next_words(done)[0] == following
-    csv = adaptune("trials", study_file, "--folder", folder, "--csv")
-    assert "Next" not in csv.stdout
-
-
-def test_a_model_in_a_study_folder_names_a_command_that_works(adaptune, study_file, tmp_path):
-    folder = tmp_path / "my run"
-    roles = ("-o", "training=[one]", "-o", "test=[two]", "-o", "offline.trials=4")
-    assert adaptune("offline", study_file, *roles, "--folder", folder).exit_code == 0
-    done = adaptune("inspect", folder)
-    assert "Not validated yet: `adaptune validate` shows what adapting gains" in done.stdout
-    done = adaptune(*next_words(done))
-    assert done.exit_code == 0, done.stderr
-    assert "4 of 4 replays made" in done.stdout
-    done = adaptune("online", folder / "study.yaml", "--folder", folder)
-    assert "All 4 replays were there already" in done.stdout
-    shutil.copy(folder / "model.safetensors", tmp_path)
-    assert "Next:" not in adaptune("inspect", "model.safetensors").stdout
-
-
-def test_parts_of_a_course_are_recorded_once(adaptune, study_file, tmp_path):
-    course = "courses={cave: {scenes: [cave], length: 10, seed: 1, columns: 64}}"
-    roles = ["training=[cave: 0-50%]", "test=[cave: 50-100%]"]
-    overrides = [word for text in (course, *roles) for word in ("-o", text)]
-    words = ("simulate", study_file, "--folder", "run", *overrides)
-    done = adaptune(*words)
-    assert done.exit_code == 0, done.stderr
-    assert "Recorded 1 of 1 courses" in done.stdout
-    assert [path.name for path in (tmp_path / "run/recordings").glob("*.bag")] == ["cave.bag"]
-    assert "Recorded 0 of 1" in adaptune(*words).stdout
 
 
 def test_the_whole_way(study_file, tmp_path):
@@ -207,13 +136,6 @@ def test_mistakes_are_told_in_a_sentence(study_file, tmp_path, arguments, words,
     done = CliRunner().invoke(app, [str(study_file) if a == "STUDY" else a for a in arguments])
     assert done.exit_code == 2
     assert words in done.stderr
-    assert "Traceback" not in done.stderr
-
-
-def test_a_process_ends_with_a_sentence_too(tmp_path):
-    done = process("offline", "none.yaml", cwd=tmp_path)
-    assert done.returncode == 2
-    assert "none.yaml: there is no such file" in done.stderr
     assert "Traceback" not in done.stderr
 
 
@@ -286,13 +208,3 @@ def test_a_deep_inspection_measures_the_reference(adaptune, study_file, tmp_path
     begin, end = (done.stdout.index(word) for word in ("sequences:", "Next:"))
     (tmp_path / "wrong.yaml").write_text(done.stdout[begin:end])
     assert load_study(tmp_path / "wrong.yaml").training == ["wrong_0-60"]
-
-
-def test_a_study_of_one_trial_tells_how_much_the_baseline_varies(adaptune, study_file):
-    keys = ("offline.trials=1", "offline.baseline_runs=3", "offline.runs=whole")
-    options = [word for key in keys for word in ("-o", key)]
-    done = adaptune("offline", study_file, *options, "--folder", "once")
-    assert done.exit_code == 0, done.stderr
-    assert re.search(r"The baseline ran 3 times: rte \[%\] \d\.\d+ in the mean, ", done.stdout)
-    assert "standard deviation 0." in done.stdout  # GICP always does the same
-    assert "the fixed set is the baseline." in done.stdout

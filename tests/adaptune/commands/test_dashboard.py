@@ -29,10 +29,6 @@ def shown(dashboard):
     return dict(line.split(maxsplit=1) for line in lines if line)
 
 
-def test_it_is_empty_before_the_first_scan():
-    assert shown(Dashboard()) == {}
-
-
 def test_a_single_odometry_in_lockstep():
     dashboard, record = Dashboard(), ReplayRecord()
     record.note(Choice(0, SET, 0.005))
@@ -68,18 +64,3 @@ def test_a_bank_in_real_time_that_is_lost():
     assert found["lost"] == "do not rely on the pose"
     assert found["warning"] == "too late"
     assert "measured" not in found
-
-
-def test_another_replay_begins_anew():
-    dashboard = Dashboard()
-    for what, made in (("home", step(0, "max_speed")), ("away", step(50))):
-        record = ReplayRecord()
-        record.begin()
-        record.end(made)
-        if what == "home":
-            record.note(Choice(0, SET, 0.005))
-        dashboard.look(what, 9, record)
-    found = shown(dashboard)
-    assert found["away"].startswith("0.0 s driven")
-    assert found["scans"].startswith("1 of 9; ")
-    assert "selections" not in found

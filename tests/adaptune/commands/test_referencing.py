@@ -1,10 +1,8 @@
 import re
 
 import commands
-import drives
 import estimates
 import made_references
-import numpy as np
 import pytest
 
 from adaptune.commands import terminal
@@ -55,35 +53,6 @@ def test_where_it_is_lost_is_said(adaptune, bag, tmp_path, monkeypatch):
     assert (tmp_path / "refs/one_reference.json").exists()
 
 
-def test_a_recording_without_reference_is_not_compared(adaptune, tmp_path):
-    folder = tmp_path / "scans"
-    folder.mkdir()
-    for i, (_, points, _) in enumerate(drives.scans(0, 40)):
-        np.save(folder / f"{i:03d}.npy", points)
-
-    def made(scans, *_):
-        stamps = np.array([scan.stamp for scan in scans])
-        return made_references.made_of(stamps, np.array([T for *_, T in drives.scans(0, 40)]))
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(estimate, "estimate_reference", made)
-        done = adaptune(folder)
-    assert done.exit_code == 0, done.stderr
-    assert "Given reference" not in done.stdout
-    assert (tmp_path / "scans_reference.tum").exists()
-
-
-def test_a_prior_is_a_topic_or_a_file(adaptune, bag, tmp_path):
-    assert adaptune(bag).exit_code == 0
-    for prior in ("/truth", "one_reference.tum"):
-        done = adaptune(bag, "--position-prior", prior, "--out", "with")
-        assert done.exit_code == 0, done.stderr
-        assert (
-            StoredEstimate.read(tmp_path / "with/one_reference.tum").about["position_prior"]
-            == prior
-        )
-
-
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
@@ -112,8 +81,6 @@ def test_mistakes_are_told_in_a_sentence(adaptune, bag, study_file, tmp_path, wo
         (["--out", "a_file/refs"], "a_file/refs: cannot be written to"),
         (["--out", "mine"], "mine/one_reference.tum: is there, and is not of an estimate"),
         (["--reference", "early.tum"], "covers 1.000 s to 2.000 s"),
-        (["--reference", "bad.tum"], "bad.tum"),
-        (["--position-prior", "early.tum"], "covers 1.000 s to 2.000 s"),
         (["--position-prior", "bad.tum"], "bad.tum"),
     ],
 )
@@ -135,12 +102,6 @@ def test_what_is_wrong_is_told_before_the_estimate(adaptune, bag, tmp_path, word
     assert (tmp_path / "mine/one_reference.tum").read_text() == "mine"
 
 
-def test_an_estimate_is_made_again_over_itself(adaptune, bag):
-    for _ in range(2):
-        done = adaptune(bag, "--out", "refs")
-        assert done.exit_code == 0, done.stderr
-
-
 def test_a_reference_of_another_time_that_was_not_asked_for_hinders_nothing(
     adaptune, bag, monkeypatch
 ):
@@ -153,16 +114,6 @@ def test_a_reference_of_another_time_that_was_not_asked_for_hinders_nothing(
     assert done.exit_code == 0, done.stderr
     assert "is not compared with: the reference covers another time" in done.stdout
     assert "The two differ" not in done.stdout
-
-
-def test_a_recording_that_cannot_be_estimated_is_told(adaptune, bag, monkeypatch):
-    def refuse(*_):
-        raise EstimateError("one.bag: the robot moves 0.1 m only")
-
-    monkeypatch.setattr(estimate, "estimate_reference", refuse)
-    done = adaptune(bag)
-    assert done.exit_code == 2
-    assert "moves 0.1 m only" in done.stderr
 
 
 def test_of_a_study_those_that_it_lacks_are_estimated(

@@ -32,22 +32,6 @@ def test_a_finished_study_has_a_page_of_everything(finished):
         assert f">{mode}</td>" in page
 
 
-def test_a_study_that_is_not_finished_has_one_too_that_says_what_is_missing(finished, tmp_path):
-    folder = shutil.copytree(finished, tmp_path / "half")
-    shutil.rmtree(folder / "replays/three/fixed")
-    (folder / "model.safetensors").unlink()
-    assert call("compare", folder).exit_code == 2
-    page = (folder / "report/report.html").read_text()
-    assert "No comparison: " in page
-    assert "What was tried</h2>" in page
-
-
-def test_a_study_that_has_not_begun_has_nothing_to_compare(study_file, tmp_path):
-    ended = call("compare", study_file, "--folder", tmp_path / "none")
-    assert ended.exit_code == 2
-    assert not (tmp_path / "none").exists()
-
-
 def test_studies_are_compared_side_by_side_by_their_folders(finished, tmp_path):
     other = shutil.copytree(finished, tmp_path / "other")
     ended = call("compare", finished, other, "--to", tmp_path / "both")

@@ -1,4 +1,3 @@
-import dataclasses
 import io
 import logging
 import sys
@@ -6,12 +5,9 @@ import time
 
 import pytest
 from rich.console import Console
-from typer.testing import CliRunner
 
 from adaptune.commands import terminal
-from adaptune.commands.cli import app
 from adaptune.commands.terminal import say_next
-from adaptune.model import ErrorModel
 from adaptune.report import tables
 
 ODD = "my[v2] [/b] :x: [red]"
@@ -33,26 +29,6 @@ def test_bars_print_names_as_they_are(monkeypatch):
         show(ODD, 1, 2, f"remark {ODD}")
     text = screen.file.getvalue()
     assert text.count(ODD) >= 2
-
-
-def test_a_line_is_not_broken(capsys):
-    terminal.say("x" * 500)
-    assert "x" * 500 in capsys.readouterr().out
-
-
-def test_errors_print_names_as_they_are(study_file):
-    done = CliRunner().invoke(app, ["offline", str(study_file.with_name("my[v2] [b] :x:.yaml"))])
-    assert "my[v2] [b] :x:.yaml: there is no such file" in done.stderr
-
-
-def test_model_show_prints_what_a_file_says_as_it_is(trained_folder, tmp_path):
-    model = ErrorModel.load(trained_folder / "model.safetensors")
-    file = tmp_path / "my[v2].safetensors"
-    dataclasses.replace(model, provenance={"made by": ODD}).save(file)
-    (tmp_path / "study.yaml").touch()
-    done = CliRunner().invoke(app, ["inspect", str(file)])
-    assert ODD in " ".join(done.stdout.split())
-    assert f"--model '{file}'" in done.stdout
 
 
 def test_a_log_has_a_line_of_progress_now_and_then(caplog, monkeypatch):
@@ -98,19 +74,6 @@ def test_what_a_resumed_study_has_done_already_does_not_count(caplog, monkeypatc
             now += 1.0
             show("runs", i, 2000)
     assert caplog.messages[-1].startswith("runs: 1099 of 2000, about 15 min left")
-
-
-@pytest.mark.parametrize("is_terminal", [True, False])
-def test_what_a_second_worker_reads_is_not_shown_again(caplog, monkeypatch, is_terminal):
-    screen = Console(file=io.StringIO(), force_terminal=is_terminal, width=200)
-    monkeypatch.setattr(terminal, "errors", screen)
-    monkeypatch.setattr(terminal, "LOG_EVERY", -1.0)
-    with caplog.at_level(logging.INFO), terminal.progress() as show:
-        for done in (3, 8, 8, 3):
-            show("reading hall", done, 8)
-    said = caplog.text + screen.file.getvalue()
-    assert said.count("3 of 8") <= 1 if not is_terminal else "3/8" not in said
-    assert "8 of 8" in said or "8/8" in said
 
 
 @pytest.mark.parametrize(

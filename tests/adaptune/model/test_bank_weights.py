@@ -52,7 +52,6 @@ def test_errors_that_cancel_get_the_weight():
 
 
 def test_weights_are_of_the_places_that_are_near():
-    """In one kind of place set 1 is right, in the other set 2."""
     rng = np.random.default_rng(1)
     data = places(rng)
     kind = data.sequence % 2
@@ -133,13 +132,6 @@ def test_without_training_the_first_member_has_the_weight_until_others_are_confi
     assert alike[0] > alike[1] == pytest.approx(alike[2])
     many = measured_weights(3, LiveSquares(np.diag([100.0, 1.0, 1.0]), 0.0, 30.0))
     assert many[0] < 0.1
-
-
-def test_a_bank_needs_members():
-    data = places(np.random.default_rng(4))
-    for lacking in ({"candidates": None}, {"vectors": None}, {"candidates": (1, 0, 2, 3)}):
-        with pytest.raises(ValueError, match="needs members, the fixed set first"):
-            BankRule().fit(replace(data, **lacking))
 
 
 @settings(deadline=None)

@@ -30,11 +30,6 @@ def test_sequences_weigh_the_same_however_long():
     assert chosen(errors, [0] * 9 + [1], 2) == [0, 2]
 
 
-def test_a_failure_counts_as_much_as_everywhere():
-    errors = [[40.0, 31.0, 40.0], [5.0, 5.0, 4.5]]
-    assert chosen(errors, [0, 1], 2) == [0, 2]
-
-
 def test_a_set_that_was_not_run_everywhere_is_not_chosen():
     nan = np.nan
     errors = [[5.0, 1.0, 4.0, 0.5], [5.0, nan, 4.0, 0.6], [9.0, 1.0, 9.0, nan]]

@@ -1,5 +1,3 @@
-"""Costs, rivals, a budget and several odometries in the file of an error model."""
-
 import dataclasses
 import json
 

@@ -1,5 +1,3 @@
-"""The error model as a file."""
-
 import dataclasses
 import json
 import tracemalloc
@@ -55,17 +53,6 @@ def test_a_loaded_model_chooses_as_the_saved_one_did(tmp_path):
             assert repr(a.select(feature)) == repr(b.select(feature))
 
 
-def test_training_data_is_the_model_in_numbers():
-    model = random_model()
-    pca = model.pca()
-    data = model.training_data(pca)
-    np.testing.assert_array_equal(data.features, pca.transform(model.descriptors))
-    assert data.sets is model.sets
-    np.testing.assert_array_equal(data.errors, model.errors)
-    np.testing.assert_array_equal(data.sequence, model.sequence)
-    assert data.fixed == 4
-
-
 def test_missing_pairs_descriptors_that_are_no_counts_and_figures_survive(tmp_path):
     model = random_model()
     model.errors[model.sequence == 1, 3:] = np.nan
@@ -91,10 +78,6 @@ def test_the_digest_is_of_what_selections_depend_on(tmp_path):
         assert dataclasses.replace(model, **other).digest != model.digest
 
 
-def test_a_missing_model(tmp_path):
-    assert "there is no such model" in refused(tmp_path / "model.safetensors")
-
-
 @pytest.mark.parametrize("share", [0.0, 0.01, 0.3, 0.9, 0.99, 0.9999])
 def test_a_file_cut_short_is_refused(tmp_path, share):
     path = saved(tmp_path)
@@ -112,12 +95,6 @@ def test_other_files_are_refused(tmp_path, content):
     refused(path)
 
 
-def test_an_older_format_is_refused_by_name(tmp_path):
-    path = saved(tmp_path)
-    rewrite(path, text={"version": "0.0.1", "format": FORMAT - 1})
-    assert "older adaptune (0.0.1)" in refused(path)
-
-
 def test_a_newer_format_is_refused_by_name(tmp_path):
     path = saved(tmp_path)
     rewrite(path, text={"version": "7.8.9", "format": FORMAT + 1})
@@ -126,39 +103,19 @@ def test_a_newer_format_is_refused_by_name(tmp_path):
     assert "newer" in message
 
 
-def test_what_a_newer_file_adds_does_not_hurt_while_the_format_is_the_same(tmp_path):
-    path = saved(tmp_path)
-    rewrite(path, {"extra": np.arange(3)}, remark="hello")
-    assert_same(ErrorModel.load(path), random_model())
-
-
 @pytest.mark.parametrize(
     "header",
     [
         {"fixed": 1},
-        {"fixed": -1},
-        {"fixed": None},
-        {"trials": [0, 2, 4, 6, 8]},
         {"trials": [0, 2, 4, 6, 8, 8]},
         {"bank": [4, 5]},
-        {"bank": [4, 4]},
         {"sequences": ["cave"]},
         {"sets": [{"distance": 4.0, "points": 3, "kernel": "none"}] * 5},
-        {"sets": [{"distance": 4.0, "points": 3, "kernel": "none"}] * 5 + [{"distance": 4.0}]},
         {"sets": [{"distance": 99.0, "points": 3, "kernel": "none"}] * 6},
         {"space": {"distance": {"type": "float", "low": 3}}},
-        {"space": {}},
         {"length": 0.0},
-        {"length": "25"},
-        {"length": float("nan")},
         {"blocks": {"ndt": 80}},
-        {"blocks": {"ndt": 90, "more": 0}},
-        {"blocks": {"ndt": 90.0}},
         {"window": 0},
-        {"sequences": "ab"},
-        {"provenance": []},
-        {"sets": [[1]] * 6},
-        {"odometry": None},
     ],
 )
 def test_parts_that_do_not_go_together_are_refused(tmp_path, header):
@@ -171,32 +128,17 @@ def test_parts_that_do_not_go_together_are_refused(tmp_path, header):
     "arrays",
     [
         {"descriptors": np.zeros((49, 90), np.uint16)},
-        {"descriptors": np.zeros((50, 80), np.uint16)},
         {"sequence": np.zeros(49, np.uint32)},
-        {"stretch": np.zeros(49, np.uint32)},
         {"sequence": np.full(50, 2, np.uint32)},
-        {"errors": np.zeros((50, 5), np.float32)},
         {"errors": np.zeros(50, np.float32)},
         {"errors": np.full((50, 6), np.nan, np.float32)},
         {"errors": np.full((50, 6), -1.0, np.float32)},
-        {"errors": np.zeros((50, 6))},
         {"descriptors": np.full((50, 90), np.nan, np.float32)},
-        {"errors": np.zeros((50, 6), np.int32)},
     ],
 )
 def test_arrays_that_do_not_go_together_are_refused(tmp_path, arrays):
     path = saved(tmp_path)
     rewrite(path, arrays)
-    refused(path)
-
-
-def test_an_empty_model_is_refused(tmp_path):
-    path = saved(
-        tmp_path,
-        descriptors=np.zeros((0, 90), np.float32),
-        sequence=np.zeros(0, int),
-        errors=np.zeros((0, 6), np.float32),
-    )
     refused(path)
 
 
@@ -269,7 +211,6 @@ def test_whatever_happens_to_the_bytes_a_sentence_is_all_that_comes_of_it(tmp_pa
 )
 @given(st.data())
 def test_any_header_is_understood_or_refused(tmp_path, data):
-    """The checksum keeps damage away from the header; here somebody computes it again."""
     path = saved(tmp_path)
     json_values = st.recursive(
         st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),

@@ -1,5 +1,3 @@
-"""The published selection."""
-
 import dataclasses
 
 import numpy as np
@@ -81,26 +79,6 @@ def test_it_chooses_among_those_named_on_the_evidence_of_all():
     assert rule.select(np.zeros(4)).trial == min(named, key=lambda j: of_all[j])
 
 
-def test_a_lost_track_counts_as_30():
-    data = TrainingData(
-        np.zeros((2, 1)),
-        np.zeros(2, int),
-        np.array([[np.inf, 50.0], [1.0, 2.0]], np.float32),
-        table([[0.0], [1.0]]),
-        0,
-    )
-    # Two pairs of the set itself, at the same place.
-    np.testing.assert_allclose(
-        NearestNeighbours(2).fit(data).predict(np.zeros(1)), [15.5, 16.0], rtol=1e-6
-    )
-
-
-def test_fewer_pairs_than_neighbours():
-    data = random_data(2, 2, 2)
-    want = np.full(2, np.minimum(data.errors, 30.0).mean())
-    np.testing.assert_allclose(NearestNeighbours(5).fit(data).predict(np.zeros(4)), want, rtol=1e-6)
-
-
 @parametrize_with_checks([ProductKNeighborsRegressor()])
 def test_it_is_a_regressor_of_scikit_learn(estimator, check):
     check(estimator)
@@ -163,16 +141,6 @@ def test_ties_fall_to_the_nearer_frame_then_to_the_earlier_pair(shape, k):
             )
             want = np.mean([targets[i, m] for *_, i, m in known[:k]])
             assert of_query[j] == pytest.approx(want, rel=1e-12, abs=1e-12)
-
-
-def test_frames_and_sets_without_any_pair_change_nothing():
-    frames, sets, targets, queries = product(3, 12, 5, "pairs")
-    more = np.full((14, 6), np.nan)
-    more[:12, :5] = targets
-    regressor = ProductKNeighborsRegressor(np.vstack([sets, [[0.0, 0.0]]]), 4)
-    regressor.fit(np.vstack([frames, queries[:2]]), more)
-    want = ProductKNeighborsRegressor(sets, 4).fit(frames, targets).predict(queries)
-    np.testing.assert_array_equal(regressor.predict(queries)[:, :5], want)
 
 
 @pytest.mark.parametrize(

@@ -1,10 +1,8 @@
-"""Speed and turn rate before each scan."""
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from adaptune.geometry import invert
-from adaptune.model.descriptor import fill_in, speed_and_turn_rate
+from adaptune.model.descriptor import speed_and_turn_rate
 
 STAMPS = 10**18 + np.arange(40, dtype=np.int64) * 10**8
 
@@ -39,11 +37,3 @@ def test_where_no_pose_is_known_the_last_motion_stands():
     # Across the gap: over the eleven scans since the last one that is known.
     np.testing.assert_allclose(found[30, 1], 0.5, rtol=1e-6)
     assert not speed_and_turn_rate(STAMPS, np.full_like(T, np.nan)).any()
-
-
-def test_only_what_is_left_free_is_filled_in():
-    descriptors = np.ones((3, 6), np.float32)
-    fill_in(descriptors, {"ndt": 3, "motion": 2, "mine": 1}, np.array([[2.0, 3.0]] * 3))
-    np.testing.assert_array_equal(descriptors, [[1, 1, 1, 2, 3, 1]] * 3)
-    fill_in(descriptors, {"ndt": 6}, np.zeros((3, 2)))
-    np.testing.assert_array_equal(descriptors, [[1, 1, 1, 2, 3, 1]] * 3)

@@ -1,5 +1,3 @@
-"""The histogram of NDT cells, and its principal components."""
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -72,7 +70,6 @@ def test_histogram_follows_its_definition(seed):
 @modest
 @given(seeds, st.floats(0.01, 0.3), st.floats(0.01, 1.0), st.floats(0.01, 1.0))
 def test_any_shape_follows_its_definition(seed, size, second, third):
-    """Cells of every kind, through their covariance."""
     rng = np.random.default_rng(seed)
     rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0]
     points = []
@@ -91,14 +88,6 @@ def test_any_shape_follows_its_definition(seed, size, second, third):
 LINE, PLANE = (0.1, 0.02, 0.01), (0.1, 0.1, 0.01)
 
 
-def test_one_point_seen_many_times_has_no_shape():
-    assert ndt_histogram(np.full((50, 3), 0.3, np.float32)).sum() == 0
-
-
-def test_an_empty_cloud():
-    assert ndt_histogram(np.empty((0, 3), np.float32)).tolist() == [0.0] * 90
-
-
 @modest
 @given(seeds, st.sampled_from([1, 2, 3]))
 def test_quarter_turns_change_nothing(seed, quarters):
@@ -108,21 +97,6 @@ def test_quarter_turns_change_nothing(seed, quarters):
         x, y = -y, x
     turned = np.stack([x, y, z], axis=1)
     np.testing.assert_array_equal(ndt_histogram(turned), ndt_histogram(points))
-
-
-def l1_share(a, b):
-    return np.abs(a - b).sum() / (a.sum() + b.sum())
-
-
-@modest
-@given(seeds, st.floats(0.0, 2 * np.pi))
-def test_any_turn_changes_little(seed, angle):
-    """Cells are cut differently, but what the place looks like stays."""
-    points = street(seed, 20000)
-    still, turned = ndt_histogram(points), ndt_histogram(street(seed, 20000, angle))
-    bare = ndt_histogram(points[points[:, 2] < -1.5])
-    assert l1_share(still, turned) < 0.2
-    assert l1_share(still, turned) < 0.5 * l1_share(still, bare)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])

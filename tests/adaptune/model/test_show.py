@@ -105,17 +105,6 @@ def test_no_model_shows_raw_data(model, tmp_path, i):
         assert raw not in text, raw
 
 
-def test_nested_data_are_shown_in_words(model, tmp_path):
-    *_, augmented, configured, program, _ = kinds(model)
-    assert "versions.numpy 2 augment name noise, sigma 0.1; name cut" in shown(augmented, tmp_path)
-    text = shown(configured, tmp_path)
-    assert "objective rte 1, ape 0.5; memory 1" in text
-    assert "limits.rte.max 3" in text
-    text = shown(program, tmp_path)
-    assert "command slam, --fast" in text
-    assert "extrinsic.translation 0, 0.5, 1 gpu true" in text
-
-
 def test_text_of_a_file_is_shown_literally(model, tmp_path):
     strange = dataclasses.replace(
         model,
@@ -127,25 +116,6 @@ def test_text_of_a_file_is_shown_literally(model, tmp_path):
     for name in LITERAL:
         assert text.count(name) >= 2, name
     assert text.count("{kept}") == 4
-
-
-def test_what_validation_found_is_shown(model, tmp_path):
-    found = {"adaptive": {"geometric": 0.61, "verdict": "Adapt by `adaptive`."}}
-    assert "adaptive 0.610" in shown(dataclasses.replace(model, validation=found), tmp_path)
-
-
-def test_sets_that_a_sequence_lacks_are_shown(model, tmp_path):
-    model.errors[2:, 0] = np.nan
-    text = shown(model, tmp_path)
-    assert "street 2 2 - 5.000 1 -" in text
-    assert "0, fixed inf" in text
-
-
-def test_a_file_that_is_no_model_is_refused_in_a_sentence(tmp_path):
-    (tmp_path / "model.safetensors").write_bytes(b"no")
-    result = CliRunner().invoke(app, ["inspect", str(tmp_path / "model.safetensors")])
-    assert result.exit_code == 2
-    assert "Traceback" not in result.output
 
 
 def test_a_bank_its_costs_rivals_and_budget_are_shown(model, tmp_path):

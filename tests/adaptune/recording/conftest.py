@@ -1,8 +1,3 @@
-"""Recordings that the tests write for themselves."""
-
-import os
-from collections.abc import Callable, Iterable, Sequence
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -16,7 +11,7 @@ from adaptune.recording.clouds import DEFINITIONS
 DATATYPES = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
 ROS1, ROS2 = get_typestore(Stores.ROS1_NOETIC), get_typestore(Stores.ROS2_HUMBLE)
 for _store in (ROS1, ROS2):
-    _types: Any = {}
+    _types = {}
     for _name, _text in DEFINITIONS.items():
         _types.update(get_types_from_msg(_text, _name))
     _store.register(_types)
@@ -25,14 +20,14 @@ ROS1.register(get_types_from_msg(_tf, "tf2_msgs/msg/TFMessage"))
 START = 1_700_000_000_123_456_789
 
 
-def header(stamp: int, frame: str = "lidar", store: Any = ROS2) -> Any:
+def header(stamp, frame="lidar", store=ROS2):
     time = store.types["builtin_interfaces/msg/Time"](stamp // 10**9, stamp % 10**9)
     if store is ROS1:
         return store.types["std_msgs/msg/Header"](0, time, frame)
     return store.types["std_msgs/msg/Header"](time, frame)
 
 
-def velodyne(points: np.ndarray, span: float = 0.1) -> np.ndarray:
+def velodyne(points, span=0.1):
     """Points of shape (n, 3) with the fields of Velodyne's driver, its odd offsets included."""
     dtype = np.dtype(
         {
@@ -50,7 +45,7 @@ def velodyne(points: np.ndarray, span: float = 0.1) -> np.ndarray:
     return raw
 
 
-def cloud(raw: np.ndarray, stamp: int = START, store: Any = ROS2, **changes: Any) -> Any:
+def cloud(raw, stamp=START, store=ROS2, **changes):
     """A PointCloud2 of a structured array of shape (n,) or (height, width)."""
     fields = []
     big = False
@@ -76,14 +71,14 @@ def cloud(raw: np.ndarray, stamp: int = START, store: Any = ROS2, **changes: Any
     return store.types["sensor_msgs/msg/PointCloud2"](**(given | changes))
 
 
-def pose(stamp: int, position: Sequence[float], quaternion: Sequence[float], store: Any) -> Any:
+def pose(stamp, position, quaternion, store):
     types = store.types
     return types["geometry_msgs/msg/PoseStamped"](
         header(stamp, "map", store), bare_pose(position, quaternion, store)
     )
 
 
-def bare_pose(position: Sequence[float], quaternion: Sequence[float], store: Any) -> Any:
+def bare_pose(position, quaternion, store):
     types = store.types
     return types["geometry_msgs/msg/Pose"](
         types["geometry_msgs/msg/Point"](*position),
@@ -95,9 +90,7 @@ Message = tuple[str, int, Any]
 """Topic, time of recording, message."""
 
 
-def write_bag(
-    path: Path, messages: Iterable[Message], compression: str | None = None, topics: Any = ()
-) -> Path:
+def write_bag(path, messages, compression=None, topics=()):
     """Write a ROS 1 bag, or a ROS 2 one where the path says so: ``.sqlite3``, ``.mcap``.
 
     Messages are made by `store_of(path)`. `topics` are pairs of topic and type without messages.
@@ -125,20 +118,20 @@ def write_bag(
     return path
 
 
-def store_of(path: Path) -> Any:
+def store_of(path):
     return ROS1 if path.suffix == ".bag" else ROS2
 
 
-def scans(n: int = 5, points: int = 60, seed: int = 0) -> list[np.ndarray]:
+def scans(n=5, points=60, seed=0):
     """Clouds to record, of shape (points, 3)."""
     rng = np.random.default_rng(seed)
     return [rng.normal(0, 10, (points, 3)).astype(np.float32) for _ in range(n)]
 
 
-def drive(path: Path, n: int = 20, **options: Any) -> Path:
+def drive(path, n=20, **options):
     """Record `n` scans at 10 Hz on /points and poses at 20 Hz on /poses, moving along x."""
     store = store_of(path)
-    messages: list[Message] = []
+    messages = []
     for i, points in enumerate(scans(n)):
         stamp = START + i * 10**8
         messages.append(("/points", stamp + 10**7, cloud(velodyne(points), stamp, store)))
@@ -149,7 +142,7 @@ def drive(path: Path, n: int = 20, **options: Any) -> Path:
 
 
 @pytest.fixture(scope="session")
-def rec() -> SimpleNamespace:
+def rec():
     """The functions of this file."""
     return SimpleNamespace(
         ROS1=ROS1,
@@ -168,21 +161,8 @@ def rec() -> SimpleNamespace:
 
 
 @pytest.fixture(autouse=True)
-def cache_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def cache_folder(tmp_path, monkeypatch):
     """Keep decoded sequences out of the user's cache."""
     monkeypatch.setenv("ADAPTUNE_CACHE", str(tmp_path / "cache"))
     monkeypatch.delenv("ADAPTUNE_CACHE_GB", raising=False)
     return tmp_path / "cache"
-
-
-@pytest.fixture(scope="session")
-def recorded_data() -> Callable[[str], Path]:
-    """Path of a recording among the data that is not part of the project."""
-
-    def find(name: str) -> Path:
-        folder = os.environ.get("ADAPTUNE_TEST_DATA")
-        if not folder:
-            pytest.skip("ADAPTUNE_TEST_DATA is not set: no recorded data to read")
-        return Path(folder) / name
-
-    return find

@@ -1,6 +1,4 @@
 import shutil
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -11,12 +9,12 @@ from adaptune.recording.clouds import LIVOX_TYPES
 from adaptune.recording.recording import open_sequence
 
 
-def opened(path: Path | list[Path], **options: Any) -> Any:
+def opened(path, **options):
     bag = [str(p) for p in path] if isinstance(path, list) else str(path)
     return open_sequence(SequenceConfig(**({"bag": bag, "cache": False} | options)))
 
 
-def same(a: list[Any], b: list[Any], shift: int = 0) -> bool:
+def same(a, b, shift=0):
     return len(a) == len(b) and all(
         x.stamp == y.stamp + shift
         and np.array_equal(x.points, y.points)
@@ -40,9 +38,7 @@ def same(a: list[Any], b: list[Any], shift: int = 0) -> bool:
         ("a.mcap", "FILE"),
     ],
 )
-def test_every_container_and_compression_gives_the_same(
-    rec: Any, tmp_path: Path, name: str, compression: str | None
-) -> None:
+def test_every_container_and_compression_gives_the_same(rec, tmp_path, name, compression):
     sequence = opened(rec.drive(tmp_path / name, compression=compression), reference="/poses")
     scans = list(sequence)
     clouds = rec.scans(20)
@@ -57,7 +53,7 @@ def test_every_container_and_compression_gives_the_same(
     np.testing.assert_allclose(reference.T_world_sensor[:, 0, 3], 0.1 * np.arange(40))
 
 
-def test_bare_files_and_folders_without_metadata_are_read(rec: Any, tmp_path: Path) -> None:
+def test_bare_files_and_folders_without_metadata_are_read(rec, tmp_path):
     whole = list(opened(rec.drive(tmp_path / "a.mcap")))
     folder = rec.drive(tmp_path / "b.sqlite3")
     (folder / "metadata.yaml").unlink()
@@ -67,7 +63,7 @@ def test_bare_files_and_folders_without_metadata_are_read(rec: Any, tmp_path: Pa
 
 
 @pytest.mark.parametrize("suffix", [".bag", ".mcap"])
-def test_bags_that_follow_each_other_are_one(rec: Any, tmp_path: Path, suffix: str) -> None:
+def test_bags_that_follow_each_other_are_one(rec, tmp_path, suffix):
     clouds, parts = rec.scans(6), []
     for part in range(3):
         path = tmp_path / f"part_{part}{suffix}"
@@ -87,7 +83,7 @@ def test_bags_that_follow_each_other_are_one(rec: Any, tmp_path: Path, suffix: s
         assert same(list(opened(tmp_path)), scans)
 
 
-def test_a_section_counts_from_the_first_scan(rec: Any, tmp_path: Path) -> None:
+def test_a_section_counts_from_the_first_scan(rec, tmp_path):
     bag = rec.drive(tmp_path / "a.bag")
     stamps = [(s.stamp - rec.START) // 10**8 for s in opened(bag, start=0.45, stop=1.5, stride=3)]
     assert stamps == [5, 8, 11, 14]
@@ -95,7 +91,7 @@ def test_a_section_counts_from_the_first_scan(rec: Any, tmp_path: Path) -> None:
         list(opened(bag, start=7))
 
 
-def test_topics_are_found_or_asked_for(rec: Any, tmp_path: Path) -> None:
+def test_topics_are_found_or_asked_for(rec, tmp_path):
     bag = rec.drive(tmp_path / "a.bag")
     for options, message in [
         ({"points": "/pionts"}, r"no topic /pionts; did you mean '/points'\?"),
@@ -115,7 +111,7 @@ def test_topics_are_found_or_asked_for(rec: Any, tmp_path: Path) -> None:
     assert len(list(opened(two, points="/b"))) == 1
 
 
-def poses_of(rec: Any, store: Any) -> dict[str, list[Any]]:
+def poses_of(rec, store):
     """Two poses in a message of each type, at (0, 0, 0) and (1, 2, 3) turned half about z."""
     t = store.types
     q = (0.0, 0.0, 1.0, 0.0)
@@ -168,7 +164,7 @@ def poses_of(rec: Any, store: Any) -> dict[str, list[Any]]:
         "TFMessage",
     ],
 )
-def test_poses_come_in_many_types(rec: Any, tmp_path: Path, kind: str, suffix: str) -> None:
+def test_poses_come_in_many_types(rec, tmp_path, kind, suffix):
     path = tmp_path / f"a{suffix}"
     store = rec.store_of(path)
     messages = [("/points", rec.START, rec.cloud(rec.velodyne(rec.scans(1)[0]), rec.START, store))]
@@ -179,7 +175,7 @@ def test_poses_come_in_many_types(rec: Any, tmp_path: Path, kind: str, suffix: s
     np.testing.assert_allclose(np.diag(reference.T_world_sensor[1]), [-1, -1, 1, 1], atol=1e-12)
 
 
-def test_of_transforms_one_frame_is_taken(rec: Any, tmp_path: Path) -> None:
+def test_of_transforms_one_frame_is_taken(rec, tmp_path):
     transforms = [m.transforms[0] for m in poses_of(rec, rec.ROS1)["TFMessage"]]
     transforms[0].child_frame_id = "base"
     messages = [
@@ -194,7 +190,7 @@ def test_of_transforms_one_frame_is_taken(rec: Any, tmp_path: Path) -> None:
     assert len(opened(bag, reference="/tf", child_frame="base").reference()) == 1
 
 
-def livox(rec: Any, store: Any, kind: str, points: np.ndarray) -> Any:
+def livox(rec, store, kind, points):
     t = store.types
     each = [
         t[kind.replace("Msg", "Point")](i * 1000, *map(float, p), 10, 16, i % 6)
@@ -207,7 +203,7 @@ def livox(rec: Any, store: Any, kind: str, points: np.ndarray) -> Any:
 @pytest.mark.parametrize("suffix", [".bag", ".mcap", ".sqlite3"])
 @pytest.mark.parametrize("kind", LIVOX_TYPES)
 @pytest.mark.parametrize("n", [0, 1, 2, 50])
-def test_livox_messages_are_read(rec: Any, tmp_path: Path, kind: str, suffix: str, n: int) -> None:
+def test_livox_messages_are_read(rec, tmp_path, kind, suffix, n):
     path = tmp_path / f"a{suffix}"
     points = rec.scans(1, n)[0]
     message = livox(rec, rec.store_of(path), kind, points)
@@ -218,7 +214,7 @@ def test_livox_messages_are_read(rec: Any, tmp_path: Path, kind: str, suffix: st
     assert np.array_equal(scan.rings, np.arange(n) % 6)
 
 
-def test_a_livox_message_cut_short_is_an_error(rec: Any) -> None:
+def test_a_livox_message_cut_short_is_an_error(rec):
     from adaptune.recording import clouds as module
     from adaptune.recording.clouds import PointCloudError
     from adaptune.recording.scan import AUTO
@@ -235,7 +231,7 @@ def test_a_livox_message_cut_short_is_an_error(rec: Any) -> None:
                 module.decode_livox(data[:length], *args)
 
 
-def bag_of_stamps(rec: Any, path: Path, stamps: list[float], delay: float = 0.0) -> Path:
+def bag_of_stamps(rec, path, stamps, delay=0.0):
     """One scan each 0.1 s on the recorder's clock, stamped as said, in seconds."""
     clouds = rec.scans(len(stamps))
     messages = [
@@ -262,15 +258,8 @@ def bag_of_stamps(rec: Any, path: Path, stamps: list[float], delay: float = 0.0)
 )
 @pytest.mark.parametrize("cache", [False, True])
 def test_wrong_stamps_cost_the_fewest_scans_and_are_told(
-    rec: Any,
-    tmp_path: Path,
-    caplog: pytest.LogCaptureFixture,
-    *,
-    stamps: list[float],
-    kept: list[float],
-    told: str | None,
-    cache: bool,
-) -> None:
+    rec, tmp_path, caplog, *, stamps, kept, told, cache
+):
     bag = bag_of_stamps(rec, tmp_path / "a.bag", stamps, delay=0.02)
     for _ in range(2):
         caplog.clear()
@@ -279,9 +268,7 @@ def test_wrong_stamps_cost_the_fewest_scans_and_are_told(
         assert (told in caplog.text) if told else not caplog.records
 
 
-def test_unusable_poses_are_left_out_and_told(
-    rec: Any, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_unusable_poses_are_left_out_and_told(rec, tmp_path, caplog):
     nan = float("nan")
     given = [
         (0, (0, 0, 0), (0, 0, 0, 1)),
@@ -303,13 +290,13 @@ def test_unusable_poses_are_left_out_and_told(
     assert "jumps 1 times" in caplog.text
 
 
-def truncated(path: Path, share: float) -> Path:
+def truncated(path, share):
     data = path.read_bytes()
     path.write_bytes(data[: int(len(data) * share)])
     return path
 
 
-def without_index(path: Path) -> Path:
+def without_index(path):
     """As a ROS 1 recorder that was killed leaves a bag: index_pos is zero."""
     data = bytearray(path.read_bytes())
     at = data.index(b"index_pos=") + len(b"index_pos=")
@@ -318,61 +305,43 @@ def without_index(path: Path) -> Path:
     return path
 
 
-def scrambled(path: Path) -> Path:
+def scrambled(path):
     data = bytearray(path.read_bytes())
     data[len(data) // 3 : len(data) // 3 + 400] = b"\xa5" * 400
     path.write_bytes(data)
     return path
 
 
-def file_of(folder: Path) -> Path:
+def file_of(folder):
     return next(p for p in folder.iterdir() if p.suffix in (".db3", ".mcap"))
 
 
 BROKEN = {
     "no such file": lambda _, tmp: tmp / "none.bag",
     "a text": lambda _, tmp: _text(tmp / "a.bag"),
-    "a bag of another kind": lambda _, tmp: _text(tmp / "a.pcap"),
     "empty file": lambda _, tmp: _text(tmp / "a.bag", ""),
-    "empty folder": lambda _, tmp: _folder(tmp / "a"),
     "cut short": lambda rec, tmp: truncated(rec.drive(tmp / "a.bag"), 0.6),
     "cut short, LZ4": lambda rec, tmp: truncated(rec.drive(tmp / "a.bag", compression="LZ4"), 0.5),
     "mcap cut short": lambda rec, tmp: truncated(file_of(rec.drive(tmp / "a.mcap")), 0.6),
     "sqlite cut short": lambda rec, tmp: truncated(file_of(rec.drive(tmp / "a.sqlite3")), 0.5),
     "no index": lambda rec, tmp: without_index(rec.drive(tmp / "a.bag")),
     "scrambled": lambda rec, tmp: scrambled(rec.drive(tmp / "a.bag", compression="BZ2")),
-    "metadata damaged": lambda rec, tmp: _metadata(rec.drive(tmp / "a.mcap")),
     "no message": lambda rec, tmp: rec.write_bag(
         tmp / "a.bag", [], topics=[("/points", "sensor_msgs/msg/PointCloud2")]
     ),
     "no topic": lambda rec, tmp: rec.write_bag(tmp / "a.bag", []),
-    "wrong type": lambda rec, tmp: rec.write_bag(
-        tmp / "a.bag", [], topics=[("/points", "sensor_msgs/msg/Imu")]
-    ),
     "ROS 1 and 2": lambda rec, tmp: [rec.drive(tmp / "a.bag"), rec.drive(tmp / "a.mcap")],
 }
 
 
-def _text(path: Path, text: str = "not a bag at all\n") -> Path:
+def _text(path, text="not a bag at all\n"):
     path.write_text(text)
     return path
 
 
-def _folder(path: Path) -> Path:
-    path.mkdir()
-    return path
-
-
-def _metadata(folder: Path) -> Path:
-    (folder / "metadata.yaml").write_text("rosbag2_bagfile_information: [\n")
-    return folder
-
-
 @pytest.mark.parametrize("make", BROKEN.values(), ids=BROKEN)
 @pytest.mark.parametrize("cache", [False, True])
-def test_a_broken_bag_is_a_clear_error(
-    rec: Any, tmp_path: Path, make: Any, cache: bool, cache_folder: Path
-) -> None:
+def test_a_broken_bag_is_a_clear_error(rec, tmp_path, make, cache, cache_folder):
     path = make(rec, tmp_path)
     with pytest.raises(AdaptuneError) as caught:
         list(opened(path, cache=cache))
@@ -382,7 +351,7 @@ def test_a_broken_bag_is_a_clear_error(
     assert not list(cache_folder.glob("*")), "half a cache was left"
 
 
-def test_a_damaged_message_is_named(rec: Any, tmp_path: Path) -> None:
+def test_a_damaged_message_is_named(rec, tmp_path):
     good = rec.cloud(rec.velodyne(rec.scans(1)[0]), rec.START, rec.ROS1)
     bad = rec.cloud(
         rec.velodyne(rec.scans(1)[0]), rec.START + 10**8, rec.ROS1, data=np.empty(9, np.uint8)
@@ -392,7 +361,7 @@ def test_a_damaged_message_is_named(rec: Any, tmp_path: Path) -> None:
         list(opened(bag))
 
 
-def test_an_unknown_custom_type_beside_the_clouds_does_no_harm(rec: Any, tmp_path: Path) -> None:
+def test_an_unknown_custom_type_beside_the_clouds_does_no_harm(rec, tmp_path):
     from rosbags.typesys import get_types_from_msg
 
     rec.ROS1.register(get_types_from_msg("float32 a\nuint8[] b\n", "my_msgs/msg/Odd"))
@@ -404,28 +373,7 @@ def test_an_unknown_custom_type_beside_the_clouds_does_no_harm(rec: Any, tmp_pat
         opened(bag, points="/odd")
 
 
-def test_the_botanic_garden_scan(recorded_data: Any) -> None:
-    (scan,) = opened(recorded_data("botanic_garden_scan.bag"))
-    assert len(scan) == 24_859
-    assert np.ptp(scan.times) == pytest.approx(0.10, abs=0.005)
-    assert len(np.unique(scan.rings)) == 16
-
-
-def test_the_hilti_scan(recorded_data: Any) -> None:
-    (scan,) = opened(recorded_data("hilti_2022_scan.bag"))
-    assert len(np.unique(scan.rings)) == 32
-    assert scan.times.min() == 0
-    assert scan.times.max() == pytest.approx(0.1, abs=0.01)
-
-
-def test_the_hall(recorded_data: Any) -> None:
-    scans = list(opened(recorded_data("hall.bag"), stop=2.1))
-    assert len(scans) == 5
-    assert all(30_000 < len(scan) < 40_000 for scan in scans)
-    assert scans[0].times is None
-
-
-def test_the_folder_of_a_copied_bag_does_not_matter(rec: Any, tmp_path: Path) -> None:
+def test_the_folder_of_a_copied_bag_does_not_matter(rec, tmp_path):
     bag = rec.drive(tmp_path / "a.bag")
     (tmp_path / "elsewhere").mkdir()
     copy = shutil.copy2(bag, tmp_path / "elsewhere" / "b.bag")

@@ -1,5 +1,3 @@
-from pathlib import Path
-
 import pytest
 from rosbags.rosbag1 import Reader, ReaderError, Writer
 from small_bag import START, STORE, cloud, pose
@@ -7,7 +5,7 @@ from small_bag import START, STORE, cloud, pose
 from adaptune.recording.bag import IndexReader
 
 
-def many(path: Path, compression: str | None = None) -> Path:
+def many(path, compression=None):
     """Several chunks; poses in only some of them."""
     writer = Writer(path)
     if compression:
@@ -27,7 +25,7 @@ def many(path: Path, compression: str | None = None) -> Path:
 
 
 @pytest.mark.parametrize("compression", [None, "BZ2", "LZ4"])
-def test_a_bag_is_what_rosbags_reads(tmp_path: Path, compression: str | None) -> None:
+def test_a_bag_is_what_rosbags_reads(tmp_path, compression):
     path = many(tmp_path / "a.bag", compression)
     with Reader(path) as theirs, IndexReader(path) as ours:
         assert len(ours.chunk_infos) > 3
@@ -45,7 +43,7 @@ def test_a_bag_is_what_rosbags_reads(tmp_path: Path, compression: str | None) ->
             assert len(list(ours.messages(own))) == connection.msgcount
 
 
-def test_only_chunks_of_the_time_are_looked_up(tmp_path: Path) -> None:
+def test_only_chunks_of_the_time_are_looked_up(tmp_path):
     path = many(tmp_path / "a.bag")
     with IndexReader(path) as reader:
         first = reader.chunk_infos[0]

@@ -1,6 +1,5 @@
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -8,16 +7,14 @@ from pydantic import ValidationError
 
 from adaptune import files
 from adaptune.geometry import to_pose
-from adaptune.recording import SequenceConfig, SequenceError
+from adaptune.recording import SequenceConfig
 from adaptune.recording.recording import check_sequence, open_sequence
 from adaptune.strict import ConfigurationError
 from adaptune.trajectory import Trajectory, write_kitti, write_tum
 from offline.config import load_study
 
 
-def test_paths_are_of_the_studys_folder_and_know_variables(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_paths_are_of_the_studys_folder_and_know_variables(tmp_path, monkeypatch):
     monkeypatch.setenv("RECORDINGS", "/recordings")
     config = SequenceConfig.model_validate(
         {"bag": ["a.bag", "${RECORDINGS}/b.bag"], "reference": "truth/a.tum"},
@@ -29,7 +26,7 @@ def test_paths_are_of_the_studys_folder_and_know_variables(
         SequenceConfig(bag="${NOT_THERE}/a.bag")
 
 
-def test_a_configuration_survives_its_own_dump(tmp_path: Path) -> None:
+def test_a_configuration_survives_its_own_dump(tmp_path):
     config = SequenceConfig(
         bag=str(tmp_path / "a.bag"),
         reference="/poses",
@@ -45,42 +42,34 @@ def test_a_configuration_survives_its_own_dump(tmp_path: Path) -> None:
     ("given", "message"),
     [
         ({}, "give one of bag, kitti, folder, evalio, not none"),
-        ({"bag": "a.bag", "kitti": "b"}, "not bag and kitti"),
-        ({"bag": []}, "a list of paths"),
         ({"kitti": "b", "points": "/p"}, "`points` names a topic of a bag; kitti has none"),
         ({"bag": "a", "start": 3, "stop": 2}, r"start \(3\) must be less than stop \(2\)"),
-        ({"bag": "a", "stride": 0}, "greater than or equal to 1"),
-        ({"bag": "a", "stamp": "middle"}, "'auto', 'start' or 'end'"),
         ({"bag": "a", "compensate": "gyro"}, "needs `imu`"),
         ({"bag": "a", "extrinsic": [1, 2, 3, 0, 0, 0, 0]}, "has not length 1"),
-        ({"bag": "a", "extrinsic": [1, 2, 3]}, "x y z qx qy qz qw, or the four rows"),
-        ({"bag": "a", "extrinsic": [[1, 0, 0], [0, 1]]}, "x y z qx qy qz qw, or the four rows"),
-        ({"bag": "a", "extrinsic": (2 * np.eye(4)).tolist()}, "not a rotation"),
         ({"bag": "a", "extrinsic": np.diag([1, 1, -1, 1]).tolist()}, "not a rotation"),
-        ({"bag": "a", "clock_offset": float("nan")}, "finite"),
         ({"bag": "a", "topic": "/p"}, "Extra inputs"),
     ],
 )
-def test_mistakes_are_told(given: dict[str, Any], message: str) -> None:
+def test_mistakes_are_told(given, message):
     with pytest.raises(ValidationError, match=message):
         SequenceConfig(**given)
 
 
-def test_the_two_ways_to_write_a_pose_agree() -> None:
+def test_the_two_ways_to_write_a_pose_agree():
     T = to_pose((1.0, 2.0, 3.0, 0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)))
     np.testing.assert_allclose(to_pose(tuple(map(tuple, T.tolist()))), T, atol=1e-15)
     np.testing.assert_allclose(to_pose(tuple(map(tuple, T[:3].tolist()))), T, atol=1e-15)
     np.testing.assert_allclose(T[:3, :3] @ [1, 0, 0], [0, 1, 0], atol=1e-15)
 
 
-def tum(path: Path, seconds: list[float], start: int) -> str:
+def tum(path, seconds, start):
     T = np.tile(np.eye(4), (len(seconds), 1, 1))
     T[:, 0, 3] = seconds
     write_tum(path, Trajectory(start + np.rint(np.array(seconds) * 1e9).astype(np.int64), T))
     return str(path)
 
 
-def test_a_reference_is_moved_to_the_lidar_and_its_clock(rec: Any, tmp_path: Path) -> None:
+def test_a_reference_is_moved_to_the_lidar_and_its_clock(rec, tmp_path):
     bag = str(rec.drive(tmp_path / "a.bag"))
     reference = tum(tmp_path / "a.tum", [0, 1, 2], rec.START - 5 * 10**9)
     extrinsic = [0, 0, 2, 0, 0, 1, 0]  # 2 m above, looking back
@@ -88,52 +77,12 @@ def test_a_reference_is_moved_to_the_lidar_and_its_clock(rec: Any, tmp_path: Pat
         SequenceConfig(bag=bag, reference=reference, extrinsic=extrinsic, clock_offset=5)
     )
     trajectory = sequence.reference()
-    assert trajectory is not None
     T = trajectory.at(np.array([rec.START + 500_000_000]))[0]
     np.testing.assert_allclose(T[:3, 3], [0.5, 0, 2])
     np.testing.assert_allclose(T[:3, 0], [-1, 0, 0], atol=1e-12)
 
 
-def test_gaps_beyond_the_limit_are_unknown(rec: Any, tmp_path: Path) -> None:
-    bag = str(rec.drive(tmp_path / "a.bag"))
-    reference = tum(tmp_path / "a.tum", [0, 0.4, 2, 2.2], rec.START)
-    at = rec.START + np.array([2, 10, 21]) * 10**8
-    for max_gap, known in [(1.0, [True, False, True]), (2.0, [True] * 3), (0.1, [False] * 3)]:
-        config = SequenceConfig(bag=bag, reference=reference, max_gap=max_gap)
-        trajectory = open_sequence(config).reference()
-        assert trajectory is not None
-        assert np.isfinite(trajectory.at(at)[:, 0, 0]).tolist() == known
-
-
-def test_a_reference_of_another_time_is_refused(rec: Any, tmp_path: Path) -> None:
-    bag = str(rec.drive(tmp_path / "a.bag"))
-    for start in (-(10**12), 10**12):
-        reference = tum(tmp_path / "a.tum", [0, 1], rec.START + start)
-        with pytest.raises(SequenceError, match="set `clock_offset` to the seconds"):
-            open_sequence(SequenceConfig(bag=bag, reference=reference)).reference()
-
-
-def test_missing_files_are_found_at_once(rec: Any, tmp_path: Path) -> None:
-    bag = str(rec.drive(tmp_path / "a.bag"))
-    with pytest.raises(SequenceError, match=r"none\.tum: there is no such file"):
-        open_sequence(SequenceConfig(bag=bag, reference=str(tmp_path / "none.tum")))
-    with pytest.raises(SequenceError, match=r"none\.bag: there is no such bag"):
-        open_sequence(SequenceConfig(bag=str(tmp_path / "none.bag")))
-
-
-@pytest.mark.parametrize("name", ["botanic_garden_gicp", "kitti_gicp"])
-def test_shipped_studies_lack_nothing_but_their_data(
-    name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setenv("BOTANIC_GARDEN", str(tmp_path))
-    monkeypatch.setenv("KITTI", str(tmp_path))
-    configs = Path(__file__).parents[3] / "configs"
-    with pytest.raises(ConfigurationError) as caught:
-        load_study(configs / f"{name}.yaml")
-    assert all("there is no such" in line for line in str(caught.value).splitlines())
-
-
-def test_what_would_fail_later_is_found_at_once(rec: Any, tmp_path: Path) -> None:
+def test_what_would_fail_later_is_found_at_once(rec, tmp_path):
     bag = rec.drive(tmp_path / "a.bag")
     write_tum(tmp_path / "late.tum", at(rec.START + 10**12, 3))
     write_kitti(tmp_path / "short.txt", np.tile(np.eye(4), (3, 1, 1)))
@@ -157,5 +106,5 @@ def test_what_would_fail_later_is_found_at_once(rec: Any, tmp_path: Path) -> Non
     check_sequence(SequenceConfig(bag=str(bag), reference="/poses", start=1.5))
 
 
-def at(stamp: int, n: int) -> Trajectory:
+def at(stamp, n):
     return Trajectory(stamp + np.arange(n) * 10**8, np.tile(np.eye(4), (n, 1, 1)))

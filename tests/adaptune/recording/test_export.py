@@ -39,15 +39,6 @@ def test_bags_hold_all_that_scans_hold(tmp_path, layout):
     np.testing.assert_array_equal(found.acceleration, imu.acceleration)
 
 
-def test_what_scans_do_not_tell_is_not_made_up(tmp_path):
-    plain = [Scan(s.stamp, s.points) for s in scans()]
-    export(plain, None, tmp_path / "run.bag", "bag")
-    config = {"bag": str(tmp_path / "run.bag"), "cache": False}
-    for found in open_sequence(SequenceConfig.model_validate(config)):
-        assert found.times is None
-        assert found.rings is None
-
-
 def test_a_kitti_folder(tmp_path):
     export(scans(), None, tmp_path / "kitti", "kitti")
     folder = str(tmp_path / "kitti" / "sequences" / "00")

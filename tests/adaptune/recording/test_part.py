@@ -1,7 +1,3 @@
-from pathlib import Path
-from typing import Any
-
-import numpy as np
 import pytest
 from pydantic import ValidationError
 
@@ -20,26 +16,24 @@ from adaptune.recording.scan import part_name, read_part
         ([0.25, 0.5], (0.25, 0.5), "a_25-50"),
     ],
 )
-def test_parts_are_read_and_named(text: Any, part: tuple[float, float], name: str) -> None:
+def test_parts_are_read_and_named(text, part, name):
     assert read_part(text) == part
     assert part_name("a", part) == name
 
 
-@pytest.mark.parametrize(
-    "text", ["abc", "60-0%", "50-50%", "0-120%", "0-60", "-10-50%", "", 60, None, [0.5], [0, "a"]]
-)
-def test_what_is_no_part_is_refused_with_an_example(text: Any) -> None:
+@pytest.mark.parametrize("text", ["abc", "60-0%", "0-120%", "", 60, [0, "a"]])
+def test_what_is_no_part_is_refused_with_an_example(text):
     with pytest.raises(ValueError, match="as in 0-60%"):
         read_part(text)
     with pytest.raises(ValidationError, match="as in 0-60%"):
         SequenceConfig(bag="a.bag", part=text or "")
 
 
-def tenths(rec: Any, sequence: Any) -> list[int]:
+def tenths(rec, sequence):
     return [round((scan.stamp - rec.START) / 1e8) for scan in sequence]
 
 
-def test_the_parts_of_a_bag_are_the_bag(rec: Any, tmp_path: Path) -> None:
+def test_the_parts_of_a_bag_are_the_bag(rec, tmp_path):
     bag = str(rec.drive(tmp_path / "a.bag"))
     for _ in range(2):  # read, and from the cache
         first = open_sequence(SequenceConfig(bag=bag, part="0-60%"))
@@ -53,26 +47,7 @@ def test_the_parts_of_a_bag_are_the_bag(rec: Any, tmp_path: Path) -> None:
     assert tenths(rec, within) == list(range(10, 15))
 
 
-def test_views_are_of_the_part(rec: Any, tmp_path: Path) -> None:
-    config = SequenceConfig(
-        bag=str(rec.drive(tmp_path / "a.bag")), part="50-100%", views=[{"cut": [[0.0, 0.35]]}]
-    )
-    seen = tenths(rec, open_sequence(config))
-    assert seen == list(range(seen[0], seen[0] + 4))
-    assert seen[0] == pytest.approx(10, abs=1)
-
-
-def test_parts_of_a_folder(rec: Any, tmp_path: Path) -> None:
-    for i, points in enumerate(rec.scans(10)):
-        np.save(tmp_path / f"{i}.npy", points)
-    first, second = (
-        open_sequence(SequenceConfig(folder=str(tmp_path), part=part))
-        for part in ("0-60%", "60-100%")
-    )
-    assert (len(list(first)), len(list(second))) == (6, 4)
-
-
-def test_a_program_reads_the_part_alone(rec: Any, tmp_path: Path) -> None:
+def test_a_program_reads_the_part_alone(rec, tmp_path):
     bag = rec.drive(tmp_path / "a.bag")
     for part, own in ((None, True), ("0-60%", False)):
         config = SequenceConfig(bag=str(bag), reference="/poses", part=part)

@@ -1,6 +1,6 @@
 import numpy as np
 
-from adaptune.simulation.mesh import fractal, fractal_plane
+from adaptune.simulation.mesh import fractal
 
 RNG = np.random.default_rng(0)
 
@@ -19,8 +19,3 @@ def test_noise_depends_on_place_and_seed_alone():
     whole = fractal(points, 2.0, seed=1, octaves=3)
     np.testing.assert_array_equal(fractal(points[40:60], 2.0, seed=1, octaves=3), whole[40:60])
     assert np.abs(fractal(points, 2.0, seed=2, octaves=3) - whole).max() > 0.1
-
-
-def test_plane_keeps_the_shape():
-    x, y = np.meshgrid(np.arange(4.0), np.arange(3.0))
-    assert fractal_plane(x, y, 2.0, seed=0).shape == (3, 4)

@@ -17,13 +17,6 @@ def test_stations_and_coordinates_are_inverse(road):
     np.testing.assert_allclose(road.station(x), s, atol=1e-9)
 
 
-def test_line_is_as_long_as_it_says(road):
-    s = np.arange(0.0, road.length, 0.25)
-    x, y = road.plane(s, np.zeros_like(s))
-    np.testing.assert_allclose(np.hypot(np.diff(x), np.diff(y)), 0.25, rtol=1e-3)
-    assert road.length == 160.0
-
-
 def test_scenes_share_the_ground_without_a_step(road):
     s = np.linspace(-30.0, 190.0, 4401)
     np.testing.assert_allclose(sum(share for _, share in road.shares(s)), 1.0)
@@ -31,12 +24,3 @@ def test_scenes_share_the_ground_without_a_step(road):
         z = road.ground(*road.plane(s, np.full_like(s, d)))
         # A kerb and a river bank are steep; a step would be more.
         assert np.abs(np.diff(z)).max() < 0.2, d
-
-
-def test_neighbours_of_one_kind_are_one_leg():
-    cave, street = SCENES["cave"], SCENES["street"]
-    road = Road([(cave, 10.0), (cave, 15.0), (street, 10.0)], seed=0)
-    assert [(leg.scene, leg.start, leg.stop) for leg in road.legs] == [
-        (cave, -APRON, 25.0),
-        (street, 25.0, 35.0 + APRON),
-    ]

@@ -25,12 +25,6 @@ def test_elevations_are_those_of_the_data_sheet(name, rings, first, second, last
     np.testing.assert_allclose(elevations[[0, 1, -1]], [first, second, last], atol=0.01)
 
 
-def test_hdl64e_has_a_fine_and_a_coarse_block():
-    gaps = np.diff(np.degrees(SENSORS["hdl64e"].elevations))
-    np.testing.assert_allclose(gaps[:31], 0.5)
-    np.testing.assert_allclose(gaps[32:], 1.0 / 3.0)
-
-
 def test_spinning_sensors_turn_once_clockwise_from_behind():
     looks = directions("vlp16", 360, 0.0, 10.0).astype(float)
     azimuth = np.unwrap(np.arctan2(looks[:, 0, 1], looks[:, 0, 0]))

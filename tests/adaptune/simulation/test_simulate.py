@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from adaptune import files
-from adaptune.geometry import invert
 from adaptune.simulation import SCENES, SENSORS, Course, SceneLeg
 from adaptune.simulation.record import EPOCH, Drive, simulate
 from adaptune.simulation.world import World, populate
@@ -107,30 +106,6 @@ def test_weather_thins_the_far_and_fills_the_near():
     assert np.sum(away[1] > 20.0) < 0.5 * np.sum(away[0] > 20.0)
     up = [scan.points[:, 2] > 0.1 * a for scan, a in zip((clear, fog), away, strict=True)]
     assert up[1].sum() > up[0].sum() + 20
-
-
-def test_only_what_is_near_is_kept():
-    drive = Drive(course("open", length=400.0))
-    world = World(drive.road)
-    sizes = [len(world.around(s, 100.0).triangles) for s in (100.0, 200.0, 300.0)]
-    assert max(sizes) < 1.5 * min(sizes)
-    assert len(world.tiles) <= 11
-
-
-def test_a_tile_looks_the_same_whenever_it_is_built():
-    road = Drive(course("garden", "cave", length=40.0)).road
-    first, second = World(road), World(road)
-    first.around(0.0, 60.0)
-    np.testing.assert_array_equal(first.tile(2).vertices, second.tile(2).vertices)
-
-
-def test_truth_is_the_ride():
-    drive = Drive(course("cave"))
-    scan = next(drive.scans())
-    np.testing.assert_array_equal(scan.T_world_sensor, drive.ride.poses(np.zeros(1))[0])
-    np.testing.assert_allclose(
-        invert(scan.T_world_sensor) @ scan.T_world_sensor, np.eye(4), atol=1e-12
-    )
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
