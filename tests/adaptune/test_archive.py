@@ -61,12 +61,6 @@ def test_trials_survive(tmp_path):
     assert list(again.finished("cave")) == [12]
 
 
-def test_frames_survive(tmp_path):
-    frames = random_frames()
-    Archive(tmp_path).write_frames("street", frames)
-    assert_same(Archive(tmp_path).read_frames("street"), frames)
-
-
 def test_frames_count_with_their_descriptors_only(tmp_path):
     archive = Archive(tmp_path)
     shares = np.random.default_rng(0).random((N, 92), np.float32)

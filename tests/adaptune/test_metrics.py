@@ -137,17 +137,6 @@ def test_the_end_is_the_first_frame_beyond_the_length():
     np.testing.assert_array_equal(window_ends(T[:1], 1.0), [-1])
 
 
-def test_windows_with_a_new_start_are_failures():
-    T = line(*range(9))
-    restarted = np.zeros(9, bool)
-    restarted[4] = True
-    # A window that ends there holds the failed step, one that begins there does not.
-    errors = sub_trajectory_rte(T, T, 1.5, restarted)
-    np.testing.assert_array_equal(np.isinf(errors), [i in (2, 3) for i in range(9)])
-    np.testing.assert_allclose(errors[[0, 1, 4, 5, 6]], 0.0, atol=1e-12)
-    assert np.isnan(errors[7:]).all()
-
-
 def test_kitti_error_of_a_recorded_pair(recorded):
     folder = recorded / "kitti_00"
     T_ref = read_kitti(folder / "ground_truth_kitti.txt")

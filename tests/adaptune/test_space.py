@@ -14,7 +14,6 @@ from adaptune.space import (
     Float,
     Integer,
     ParameterSpace,
-    PooledSpace,
     SpaceError,
 )
 
@@ -39,27 +38,12 @@ def floats(draw):
     return Float(low=low, high=high, baseline=low, log=log)
 
 
-@st.composite
-def integers(draw):
-    log = draw(st.booleans())
-    low = draw(st.integers(1 if log else -50, 50))
-    high = low + draw(st.integers(1, 60))
-    return Integer(low=low, high=high, baseline=low, log=log)
-
-
 @modest
 @given(floats(), unit)
 def test_float_survives_the_unit_interval(parameter, u):
     value = parameter.from_unit(u)
     assert parameter.contains(value)
     assert parameter.to_unit(value) == pytest.approx(u, abs=1e-6)
-
-
-@modest
-@given(integers())
-def test_every_integer_survives_the_unit_interval(parameter):
-    for value in range(parameter.low, parameter.high + 1):
-        assert parameter.from_unit(parameter.to_unit(value)) == value
 
 
 @pytest.mark.parametrize(("low", "high"), [(0, 1), (2, 7), (-3, 3)])
@@ -194,16 +178,3 @@ def test_a_unit_is_for_pictures_only():
     assert space == plain
     assert space.dump() == plain.dump()
     assert ParameterSpace.load(space.definition()).labels == space.labels
-
-
-KERNEL = Categorical(choices=("none", "huber"), baseline="none")
-
-
-def test_odometries_of_a_pool_may_differ_in_units():
-    metres, centimetres = (
-        ParameterSpace.of(voxel=Float(low=1.0, high=2.0, baseline=1.0, unit=unit), kernel=KERNEL)
-        for unit in ("m", "cm")
-    )
-    labels = PooledSpace({"one": metres, "two": centimetres}).labels
-    assert labels == {"odometry": "odometry", "voxel": "voxel", "kernel": "kernel"}
-    assert PooledSpace({"one": metres, "two": metres}).labels["voxel"] == "voxel [m]"

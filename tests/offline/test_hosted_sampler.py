@@ -10,7 +10,7 @@ from offline.config import OfflineConfig, SamplerError, check_class, load_study
 from offline.samplers import AskedSampler, HostedSampler, make_sampler
 
 MINE = """
-import os, sys, time
+import os, time
 import optuna
 
 class Fine(optuna.samplers.RandomSampler):
@@ -38,10 +38,6 @@ class Raises(Wrong):
     def of(self, name):
         raise ValueError("no idea")
 
-class Exits(Wrong):
-    def of(self, name):
-        sys.exit("good bye")
-
 class Beyond(Wrong):
     def of(self, name):
         return 0 if name == 'kernel' else 1e9
@@ -49,10 +45,6 @@ class Beyond(Wrong):
 class Words(Wrong):
     def of(self, name):
         return "much"
-
-class NoNumber(Wrong):
-    def of(self, name):
-        return float("nan")
 """
 
 SPACE = ParameterSpace(

@@ -66,15 +66,6 @@ def timeless(frames):
         return {name: arrays[name].tobytes() for name in arrays if name != "evidence_ms"}
 
 
-def test_a_damaged_trial_is_named(trained):
-    trial = trained.folder / "trials/two/00002.npz"
-    trial.write_bytes(trial.read_bytes()[:1000])
-    with pytest.raises(AdaptuneError, match=r"00002\.npz: is damaged .* remove it"):
-        train(trained)
-    trial.unlink()
-    train(trained)
-
-
 def mtimes(folder):
     """When the files of trials were written, by sequence and number."""
     return {path.relative_to(folder): path.stat().st_mtime_ns for path in folder.rglob("*.npz")}

@@ -45,22 +45,6 @@ def test_a_log_has_a_line_of_progress_now_and_then(caplog, monkeypatch):
     ]
 
 
-@pytest.mark.parametrize("is_terminal", [True, False])
-def test_time_left_is_told_once_a_piece_is_done_and_no_sooner(caplog, monkeypatch, is_terminal):
-    screen = Console(file=io.StringIO(), force_terminal=is_terminal, width=200)
-    monkeypatch.setattr(terminal, "errors", screen)
-    clock = iter(range(0, 10000, 10))
-    monkeypatch.setattr(time, "monotonic", lambda: next(clock))
-    with caplog.at_level(logging.INFO), terminal.progress() as show:
-        for done in (0.0, 0.001, 0.9):
-            show("baseline", done, 1)
-        show("runs", 0, 4)
-        show("runs", 0.5, 4)
-        assert " left" not in caplog.text + screen.file.getvalue()
-        show("runs", 2, 4)
-    assert "left" in caplog.text + screen.file.getvalue()
-
-
 def test_what_a_resumed_study_has_done_already_does_not_count(caplog, monkeypatch):
     monkeypatch.setattr(terminal, "errors", Console(file=io.StringIO(), force_terminal=False))
     now = 0.0

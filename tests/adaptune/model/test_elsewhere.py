@@ -13,7 +13,7 @@ from offline.config import load_study
 from offline.workers import Task, Workers, run
 
 MINE = """
-import ctypes, os, sys, time
+import ctypes, sys, time
 import numpy as np
 
 def everything(scan):
@@ -44,12 +44,6 @@ def hangs(scan):
 def leaves(scan):
     sys.exit(0) if len(scan) else None
     return [0.0]
-
-def nothing(scan):
-    return None
-
-def process(scan):
-    return [os.getpid()]
 """
 
 SAID = {

@@ -9,9 +9,8 @@ from hypothesis import strategies as st
 from model_files import assert_same, refused, rewrite, saved
 from random_models import random_model
 
-from adaptune.model import ErrorModel, ModelError, PairedExpectedRatio
+from adaptune.model import ErrorModel, ModelError
 from adaptune.model.error_model import FORMAT
-from adaptune.model.knn import NearestNeighbours
 
 
 def test_knows_the_sensors_of_its_training():
@@ -41,16 +40,6 @@ def test_a_model_survives_bit_for_bit(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
     loaded.save(tmp_path / "again.safetensors")
     assert_same(ErrorModel.load(tmp_path / "again.safetensors"), model)
-
-
-def test_a_loaded_model_chooses_as_the_saved_one_did(tmp_path):
-    model, loaded = random_model(), ErrorModel.load(saved(tmp_path))
-    np.testing.assert_array_equal(loaded.pca().components_, model.pca().components_)
-    for make in (PairedExpectedRatio, NearestNeighbours):
-        a, b = (make().fit(m.training_data(m.pca())) for m in (model, loaded))
-        for feature in np.random.default_rng(1).normal(size=(5, 10)):
-            np.testing.assert_array_equal(a.predict(feature), b.predict(feature))
-            assert repr(a.select(feature)) == repr(b.select(feature))
 
 
 def test_missing_pairs_descriptors_that_are_no_counts_and_figures_survive(tmp_path):
@@ -83,15 +72,6 @@ def test_a_file_cut_short_is_refused(tmp_path, share):
     path = saved(tmp_path)
     data = path.read_bytes()
     path.write_bytes(data[: int(share * len(data))])
-    refused(path)
-
-
-@pytest.mark.parametrize(
-    "content", [b"", b"distance: 3\n", b"PK\x03\x04", bytes(1000), b"\xff" * 1000]
-)
-def test_other_files_are_refused(tmp_path, content):
-    path = tmp_path / "model.safetensors"
-    path.write_bytes(content)
     refused(path)
 
 

@@ -1,6 +1,3 @@
-import json
-from pathlib import Path
-
 import numpy as np
 import pytest
 from pydantic import ValidationError
@@ -24,18 +21,6 @@ def test_paths_are_of_the_studys_folder_and_know_variables(tmp_path, monkeypatch
     assert config.reference == str(tmp_path / "truth" / "a.tum")
     with pytest.raises(ValidationError, match="variable NOT_THERE is not set"):
         SequenceConfig(bag="${NOT_THERE}/a.bag")
-
-
-def test_a_configuration_survives_its_own_dump(tmp_path):
-    config = SequenceConfig(
-        bag=str(tmp_path / "a.bag"),
-        reference="/poses",
-        extrinsic=[[1, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]],
-        imu={"unit": "g"},
-        views=[{"cut": [[1, 2]]}, {"noise": {"sigma": 0.1}}, {"reverse": True}],
-    )
-    dumped = json.loads(json.dumps(config.model_dump(mode="json")))
-    assert SequenceConfig.model_validate(dumped, context={"folder": Path("/elsewhere")}) == config
 
 
 @pytest.mark.parametrize(

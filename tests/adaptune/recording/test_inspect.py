@@ -69,15 +69,6 @@ def test_faults_are_reported_with_what_to_do(tmp_path, stamps, poses, expected):
         assert "has all it needs" not in text
 
 
-def test_without_a_reference_nothing_is_missing(tmp_path):
-    inspection = inspect(drive(tmp_path / "a.bag", [0, 0.1], []))
-    assert not inspection.missing["offline"]
-    text = inspection_text(inspection, width=1000)
-    assert "reference: none; adaptune estimates one from the scans" in text
-    assert "offline: has all it needs" in text
-    assert "# reference: a topic, or a TUM, KITTI or EuRoC file; estimated if left out" in text
-
-
 @pytest.mark.parametrize("of", ["NaN", "zero", "far", "few"])
 def test_clouds_without_valid_points_are_reported(tmp_path, of):
     times = [START + i * 10**8 for i in range(5)]
