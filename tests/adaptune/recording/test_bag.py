@@ -2,6 +2,7 @@ import shutil
 
 import numpy as np
 import pytest
+import rec
 
 from adaptune.errors import AdaptuneError
 from adaptune.recording import SequenceConfig, SequenceError
@@ -38,7 +39,7 @@ def same(a, b, shift=0):
         ("a.mcap", "FILE"),
     ],
 )
-def test_every_container_and_compression_gives_the_same(rec, tmp_path, name, compression):
+def test_every_container_and_compression_gives_the_same(tmp_path, name, compression):
     sequence = opened(rec.drive(tmp_path / name, compression=compression), reference="/poses")
     scans = list(sequence)
     clouds = rec.scans(20)
@@ -53,7 +54,7 @@ def test_every_container_and_compression_gives_the_same(rec, tmp_path, name, com
     np.testing.assert_allclose(reference.T_world_sensor[:, 0, 3], 0.1 * np.arange(40))
 
 
-def test_bare_files_and_folders_without_metadata_are_read(rec, tmp_path):
+def test_bare_files_and_folders_without_metadata_are_read(tmp_path):
     whole = list(opened(rec.drive(tmp_path / "a.mcap")))
     folder = rec.drive(tmp_path / "b.sqlite3")
     (folder / "metadata.yaml").unlink()
@@ -63,7 +64,7 @@ def test_bare_files_and_folders_without_metadata_are_read(rec, tmp_path):
 
 
 @pytest.mark.parametrize("suffix", [".bag", ".mcap"])
-def test_bags_that_follow_each_other_are_one(rec, tmp_path, suffix):
+def test_bags_that_follow_each_other_are_one(tmp_path, suffix):
     clouds, parts = rec.scans(6), []
     for part in range(3):
         path = tmp_path / f"part_{part}{suffix}"
@@ -83,7 +84,7 @@ def test_bags_that_follow_each_other_are_one(rec, tmp_path, suffix):
         assert same(list(opened(tmp_path)), scans)
 
 
-def test_a_section_counts_from_the_first_scan(rec, tmp_path):
+def test_a_section_counts_from_the_first_scan(tmp_path):
     bag = rec.drive(tmp_path / "a.bag")
     stamps = [(s.stamp - rec.START) // 10**8 for s in opened(bag, start=0.45, stop=1.5, stride=3)]
     assert stamps == [5, 8, 11, 14]
@@ -91,7 +92,7 @@ def test_a_section_counts_from_the_first_scan(rec, tmp_path):
         list(opened(bag, start=7))
 
 
-def test_topics_are_found_or_asked_for(rec, tmp_path):
+def test_topics_are_found_or_asked_for(tmp_path):
     bag = rec.drive(tmp_path / "a.bag")
     for options, message in [
         ({"points": "/pionts"}, r"no topic /pionts; did you mean '/points'\?"),
@@ -111,7 +112,7 @@ def test_topics_are_found_or_asked_for(rec, tmp_path):
     assert len(list(opened(two, points="/b"))) == 1
 
 
-def poses_of(rec, store):
+def poses_of(store):
     """Two poses in a message of each type, at (0, 0, 0) and (1, 2, 3) turned half about z."""
     t = store.types
     q = (0.0, 0.0, 1.0, 0.0)
@@ -164,19 +165,19 @@ def poses_of(rec, store):
         "TFMessage",
     ],
 )
-def test_poses_come_in_many_types(rec, tmp_path, kind, suffix):
+def test_poses_come_in_many_types(tmp_path, kind, suffix):
     path = tmp_path / f"a{suffix}"
     store = rec.store_of(path)
     messages = [("/points", rec.START, rec.cloud(rec.velodyne(rec.scans(1)[0]), rec.START, store))]
-    messages += [("/truth", rec.START + i, m) for i, m in enumerate(poses_of(rec, store)[kind])]
+    messages += [("/truth", rec.START + i, m) for i, m in enumerate(poses_of(store)[kind])]
     reference = opened(rec.write_bag(path, messages), reference="/truth").reference()
     assert reference.stamps.tolist() == [rec.START, rec.START + 10**9]
     np.testing.assert_allclose(reference.T_world_sensor[1][:3, 3], [1, 2, 3])
     np.testing.assert_allclose(np.diag(reference.T_world_sensor[1]), [-1, -1, 1, 1], atol=1e-12)
 
 
-def test_of_transforms_one_frame_is_taken(rec, tmp_path):
-    transforms = [m.transforms[0] for m in poses_of(rec, rec.ROS1)["TFMessage"]]
+def test_of_transforms_one_frame_is_taken(tmp_path):
+    transforms = [m.transforms[0] for m in poses_of(rec.ROS1)["TFMessage"]]
     transforms[0].child_frame_id = "base"
     messages = [
         ("/points", rec.START, rec.cloud(rec.velodyne(rec.scans(1)[0]), rec.START, rec.ROS1)),
@@ -190,7 +191,7 @@ def test_of_transforms_one_frame_is_taken(rec, tmp_path):
     assert len(opened(bag, reference="/tf", child_frame="base").reference()) == 1
 
 
-def livox(rec, store, kind, points):
+def livox(store, kind, points):
     t = store.types
     each = [
         t[kind.replace("Msg", "Point")](i * 1000, *map(float, p), 10, 16, i % 6)
@@ -203,10 +204,10 @@ def livox(rec, store, kind, points):
 @pytest.mark.parametrize("suffix", [".bag", ".mcap", ".sqlite3"])
 @pytest.mark.parametrize("kind", LIVOX_TYPES)
 @pytest.mark.parametrize("n", [0, 1, 2, 50])
-def test_livox_messages_are_read(rec, tmp_path, kind, suffix, n):
+def test_livox_messages_are_read(tmp_path, kind, suffix, n):
     path = tmp_path / f"a{suffix}"
     points = rec.scans(1, n)[0]
-    message = livox(rec, rec.store_of(path), kind, points)
+    message = livox(rec.store_of(path), kind, points)
     (scan,) = opened(rec.write_bag(path, [("/livox/lidar", rec.START, message)]))
     assert scan.stamp == rec.START
     assert np.array_equal(scan.points, points)
@@ -214,7 +215,7 @@ def test_livox_messages_are_read(rec, tmp_path, kind, suffix, n):
     assert np.array_equal(scan.rings, np.arange(n) % 6)
 
 
-def test_a_livox_message_cut_short_is_an_error(rec):
+def test_a_livox_message_cut_short_is_an_error():
     from adaptune.recording import clouds as module
     from adaptune.recording.clouds import PointCloudError
     from adaptune.recording.scan import AUTO
@@ -222,7 +223,7 @@ def test_a_livox_message_cut_short_is_an_error(rec):
     kind = LIVOX_TYPES[0]
     fields = {cdr: store.fielddefs for cdr, store in ((False, rec.ROS1), (True, rec.ROS2))}
     for cdr, store in ((False, rec.ROS1), (True, rec.ROS2)):
-        message = livox(rec, store, kind, rec.scans(1, 5)[0])
+        message = livox(store, kind, rec.scans(1, 5)[0])
         data = bytes((store.serialize_cdr if cdr else store.serialize_ros1)(message, kind))
         args = (fields[cdr][kind][1], fields[cdr][kind.replace("Msg", "Point")][1], cdr, AUTO)
         assert len(module.decode_livox(data, *args)) == 5
@@ -231,7 +232,7 @@ def test_a_livox_message_cut_short_is_an_error(rec):
                 module.decode_livox(data[:length], *args)
 
 
-def bag_of_stamps(rec, path, stamps, delay=0.0):
+def bag_of_stamps(path, stamps, delay=0.0):
     """One scan each 0.1 s on the recorder's clock, stamped as said, in seconds."""
     clouds = rec.scans(len(stamps))
     messages = [
@@ -258,9 +259,9 @@ def bag_of_stamps(rec, path, stamps, delay=0.0):
 )
 @pytest.mark.parametrize("cache", [False, True])
 def test_wrong_stamps_cost_the_fewest_scans_and_are_told(
-    rec, tmp_path, caplog, *, stamps, kept, told, cache
+    tmp_path, caplog, *, stamps, kept, told, cache
 ):
-    bag = bag_of_stamps(rec, tmp_path / "a.bag", stamps, delay=0.02)
+    bag = bag_of_stamps(tmp_path / "a.bag", stamps, delay=0.02)
     for _ in range(2):
         caplog.clear()
         scans = list(opened(bag, cache=cache))
@@ -268,7 +269,7 @@ def test_wrong_stamps_cost_the_fewest_scans_and_are_told(
         assert (told in caplog.text) if told else not caplog.records
 
 
-def test_unusable_poses_are_left_out_and_told(rec, tmp_path, caplog):
+def test_unusable_poses_are_left_out_and_told(tmp_path, caplog):
     nan = float("nan")
     given = [
         (0, (0, 0, 0), (0, 0, 0, 1)),
@@ -317,20 +318,20 @@ def file_of(folder):
 
 
 BROKEN = {
-    "no such file": lambda _, tmp: tmp / "none.bag",
-    "a text": lambda _, tmp: _text(tmp / "a.bag"),
-    "empty file": lambda _, tmp: _text(tmp / "a.bag", ""),
-    "cut short": lambda rec, tmp: truncated(rec.drive(tmp / "a.bag"), 0.6),
-    "cut short, LZ4": lambda rec, tmp: truncated(rec.drive(tmp / "a.bag", compression="LZ4"), 0.5),
-    "mcap cut short": lambda rec, tmp: truncated(file_of(rec.drive(tmp / "a.mcap")), 0.6),
-    "sqlite cut short": lambda rec, tmp: truncated(file_of(rec.drive(tmp / "a.sqlite3")), 0.5),
-    "no index": lambda rec, tmp: without_index(rec.drive(tmp / "a.bag")),
-    "scrambled": lambda rec, tmp: scrambled(rec.drive(tmp / "a.bag", compression="BZ2")),
-    "no message": lambda rec, tmp: rec.write_bag(
+    "no such file": lambda tmp: tmp / "none.bag",
+    "a text": lambda tmp: _text(tmp / "a.bag"),
+    "empty file": lambda tmp: _text(tmp / "a.bag", ""),
+    "cut short": lambda tmp: truncated(rec.drive(tmp / "a.bag"), 0.6),
+    "cut short, LZ4": lambda tmp: truncated(rec.drive(tmp / "a.bag", compression="LZ4"), 0.5),
+    "mcap cut short": lambda tmp: truncated(file_of(rec.drive(tmp / "a.mcap")), 0.6),
+    "sqlite cut short": lambda tmp: truncated(file_of(rec.drive(tmp / "a.sqlite3")), 0.5),
+    "no index": lambda tmp: without_index(rec.drive(tmp / "a.bag")),
+    "scrambled": lambda tmp: scrambled(rec.drive(tmp / "a.bag", compression="BZ2")),
+    "no message": lambda tmp: rec.write_bag(
         tmp / "a.bag", [], topics=[("/points", "sensor_msgs/msg/PointCloud2")]
     ),
-    "no topic": lambda rec, tmp: rec.write_bag(tmp / "a.bag", []),
-    "ROS 1 and 2": lambda rec, tmp: [rec.drive(tmp / "a.bag"), rec.drive(tmp / "a.mcap")],
+    "no topic": lambda tmp: rec.write_bag(tmp / "a.bag", []),
+    "ROS 1 and 2": lambda tmp: [rec.drive(tmp / "a.bag"), rec.drive(tmp / "a.mcap")],
 }
 
 
@@ -341,8 +342,8 @@ def _text(path, text="not a bag at all\n"):
 
 @pytest.mark.parametrize("make", BROKEN.values(), ids=BROKEN)
 @pytest.mark.parametrize("cache", [False, True])
-def test_a_broken_bag_is_a_clear_error(rec, tmp_path, make, cache, cache_folder):
-    path = make(rec, tmp_path)
+def test_a_broken_bag_is_a_clear_error(tmp_path, make, cache, cache_folder):
+    path = make(tmp_path)
     with pytest.raises(AdaptuneError) as caught:
         list(opened(path, cache=cache))
     message = str(caught.value)
@@ -351,7 +352,7 @@ def test_a_broken_bag_is_a_clear_error(rec, tmp_path, make, cache, cache_folder)
     assert not list(cache_folder.glob("*")), "half a cache was left"
 
 
-def test_a_damaged_message_is_named(rec, tmp_path):
+def test_a_damaged_message_is_named(tmp_path):
     good = rec.cloud(rec.velodyne(rec.scans(1)[0]), rec.START, rec.ROS1)
     bad = rec.cloud(
         rec.velodyne(rec.scans(1)[0]), rec.START + 10**8, rec.ROS1, data=np.empty(9, np.uint8)
@@ -361,7 +362,7 @@ def test_a_damaged_message_is_named(rec, tmp_path):
         list(opened(bag))
 
 
-def test_an_unknown_custom_type_beside_the_clouds_does_no_harm(rec, tmp_path):
+def test_an_unknown_custom_type_beside_the_clouds_does_no_harm(tmp_path):
     from rosbags.typesys import get_types_from_msg
 
     rec.ROS1.register(get_types_from_msg("float32 a\nuint8[] b\n", "my_msgs/msg/Odd"))
@@ -373,7 +374,7 @@ def test_an_unknown_custom_type_beside_the_clouds_does_no_harm(rec, tmp_path):
         opened(bag, points="/odd")
 
 
-def test_the_folder_of_a_copied_bag_does_not_matter(rec, tmp_path):
+def test_the_folder_of_a_copied_bag_does_not_matter(tmp_path):
     bag = rec.drive(tmp_path / "a.bag")
     (tmp_path / "elsewhere").mkdir()
     copy = shutil.copy2(bag, tmp_path / "elsewhere" / "b.bag")

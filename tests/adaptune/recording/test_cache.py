@@ -6,6 +6,7 @@ import time
 
 import numpy as np
 import pytest
+import rec
 
 from adaptune.recording import SequenceConfig, cache
 from adaptune.recording.bag import BagSource
@@ -17,9 +18,7 @@ def entries(folder):
     return sorted(p.name for p in folder.iterdir()) if folder.exists() else []
 
 
-def test_the_second_opening_reads_no_bag_and_gives_the_same(
-    rec, tmp_path, cache_folder, monkeypatch
-):
+def test_the_second_opening_reads_no_bag_and_gives_the_same(tmp_path, cache_folder, monkeypatch):
     config = SequenceConfig(bag=str(rec.drive(tmp_path / "a.bag")), reference="/poses")
     first = list(open_sequence(config))
     assert len(entries(cache_folder)) == 1
@@ -40,7 +39,7 @@ def test_the_second_opening_reads_no_bag_and_gives_the_same(
         assert not b.points.flags.writeable
 
 
-def test_half_a_pass_keeps_nothing(rec, tmp_path, cache_folder):
+def test_half_a_pass_keeps_nothing(tmp_path, cache_folder):
     config = SequenceConfig(bag=str(rec.drive(tmp_path / "a.bag")))
     scans = iter(open_sequence(config))
     next(scans)
@@ -51,7 +50,7 @@ def test_half_a_pass_keeps_nothing(rec, tmp_path, cache_folder):
 @pytest.mark.parametrize(
     "change", [{"start": 0.5}, {"stride": 2}, {"stamp": "end"}, {"time_unit": "ms"}]
 )
-def test_other_settings_are_another_entry(rec, tmp_path, cache_folder, change):
+def test_other_settings_are_another_entry(tmp_path, cache_folder, change):
     bag = str(rec.drive(tmp_path / "a.bag"))
     plain = list(open_sequence(SequenceConfig(bag=bag)))
     changed = list(open_sequence(SequenceConfig(bag=bag, **change)))
@@ -118,7 +117,7 @@ def test_what_is_larger_than_the_cap_is_passed_on_and_not_kept(monkeypatch, capl
     assert "not kept" in caplog.text
 
 
-def test_listing_and_clearing(rec, tmp_path, cache_folder):
+def test_listing_and_clearing(tmp_path, cache_folder):
     assert cache.list_cache() == []
     assert cache.clear_cache() == 0
     bag = rec.drive(tmp_path / "a.bag")
@@ -131,7 +130,7 @@ def test_listing_and_clearing(rec, tmp_path, cache_folder):
     assert entries(cache_folder) == ["notes.txt"]
 
 
-def test_a_damaged_entry_is_made_anew(rec, tmp_path, cache_folder, caplog):
+def test_a_damaged_entry_is_made_anew(tmp_path, cache_folder, caplog):
     config = SequenceConfig(bag=str(rec.drive(tmp_path / "a.bag")), cache=True)
     whole = list(open_sequence(config))
     (entry,) = cache_folder.iterdir()

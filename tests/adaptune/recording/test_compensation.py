@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+import rec
 from scipy.spatial.transform import Rotation
 
 from adaptune import geometry
@@ -169,7 +170,7 @@ def test_no_offset_is_proposed_where_the_motions_differ():
     assert offset_of(Trajectory(trajectory.stamps[:2], trajectory.T_world_sensor[:2]), imu) is None
 
 
-def imu_bag(rec, path, offset):
+def imu_bag(path, offset):
     """Scans and an IMU on one clock, poses on another."""
     imu, trajectory = imu_and_trajectory(offset)
     types = rec.ROS1.types
@@ -197,8 +198,8 @@ def imu_bag(rec, path, offset):
 
 
 @pytest.mark.parametrize("wrong", [0.0, 5000.0])
-def test_clocks_that_do_not_meet_are_an_error_with_a_proposal(rec, tmp_path, wrong):
-    bag = str(imu_bag(rec, tmp_path / "a.bag", 1e6))
+def test_clocks_that_do_not_meet_are_an_error_with_a_proposal(tmp_path, wrong):
+    bag = str(imu_bag(tmp_path / "a.bag", 1e6))
     with pytest.raises(SequenceError, match=r"set `clock_offset`.*clock_offset: (\S+)\)") as caught:
         open_sequence(SequenceConfig(bag=bag, reference="/poses", clock_offset=wrong)).reference()
     proposed = float(str(caught.value).split("clock_offset: ")[-1].rstrip(")"))
@@ -207,7 +208,7 @@ def test_clocks_that_do_not_meet_are_an_error_with_a_proposal(rec, tmp_path, wro
     assert sequence.reference() is not None
 
 
-def test_scans_tell_the_offset_where_there_is_no_imu(rec, tmp_path):
+def test_scans_tell_the_offset_where_there_is_no_imu(tmp_path):
     rng = np.random.default_rng(0)
     seconds = np.arange(0, 12, 0.1)
     yaw = np.cumsum(turning(seconds)) * 0.1
@@ -227,10 +228,10 @@ def test_scans_tell_the_offset_where_there_is_no_imu(rec, tmp_path):
 
 
 @pytest.mark.parametrize("how", ["constant_velocity", "gyro"])
-def test_what_has_no_times_cannot_be_compensated(rec, tmp_path, how):
+def test_what_has_no_times_cannot_be_compensated(tmp_path, how):
     raw = np.zeros(30, [(a, "<f4") for a in "xyz"])
     raw["x"] = np.arange(1, 31)
-    bag = imu_bag(rec, tmp_path / "a.bag", 0.0)
+    bag = imu_bag(tmp_path / "a.bag", 0.0)
     plain = rec.write_bag(
         tmp_path / "b.bag", [("/flat", 10**18, rec.cloud(raw, 10**18 + 5 * 10**9, rec.ROS1))]
     )
@@ -241,8 +242,8 @@ def test_what_has_no_times_cannot_be_compensated(rec, tmp_path, how):
         list(sequence)
 
 
-def test_an_imu_comes_in_si_units_with_its_place(rec, tmp_path):
-    bag = str(imu_bag(rec, tmp_path / "a.bag", 0.0))
+def test_an_imu_comes_in_si_units_with_its_place(tmp_path):
+    bag = str(imu_bag(tmp_path / "a.bag", 0.0))
     assert open_sequence(SequenceConfig(bag=bag)).imu() is None
     extrinsic = [1, 2, 3, 0, 0, 0, 1]
     imu = open_sequence(SequenceConfig(bag=bag, imu={"unit": "g", "extrinsic": extrinsic})).imu()

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+import rec
 from pydantic import ValidationError
 
 from adaptune import files
@@ -54,7 +55,7 @@ def tum(path, seconds, start):
     return str(path)
 
 
-def test_a_reference_is_moved_to_the_lidar_and_its_clock(rec, tmp_path):
+def test_a_reference_is_moved_to_the_lidar_and_its_clock(tmp_path):
     bag = str(rec.drive(tmp_path / "a.bag"))
     reference = tum(tmp_path / "a.tum", [0, 1, 2], rec.START - 5 * 10**9)
     extrinsic = [0, 0, 2, 0, 0, 1, 0]  # 2 m above, looking back
@@ -67,7 +68,7 @@ def test_a_reference_is_moved_to_the_lidar_and_its_clock(rec, tmp_path):
     np.testing.assert_allclose(T[:3, 0], [-1, 0, 0], atol=1e-12)
 
 
-def test_what_would_fail_later_is_found_at_once(rec, tmp_path):
+def test_what_would_fail_later_is_found_at_once(tmp_path):
     bag = rec.drive(tmp_path / "a.bag")
     write_tum(tmp_path / "late.tum", at(rec.START + 10**12, 3))
     write_kitti(tmp_path / "short.txt", np.tile(np.eye(4), (3, 1, 1)))

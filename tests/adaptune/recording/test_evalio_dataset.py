@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+import rec
 
 from adaptune.recording import SequenceConfig, SequenceError
 from adaptune.recording.evalio import EvalioFiles
@@ -21,7 +22,7 @@ def test_names_that_evalio_does_not_know_or_have():
         open_sequence(SequenceConfig(evalio="botanic_garden/b1005_00"))
 
 
-def test_a_data_set_is_read_as_evalio_reads_it(rec, tmp_path, datasets):
+def test_a_data_set_is_read_as_evalio_reads_it(tmp_path, datasets):
     folder = tmp_path / "botanic_garden" / "b1005_00"
     folder.mkdir(parents=True)
     types = rec.ROS1.types

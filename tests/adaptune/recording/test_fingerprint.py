@@ -3,6 +3,7 @@ import shutil
 
 import numpy as np
 import pytest
+import rec
 
 from adaptune.recording import SequenceConfig, cache
 from adaptune.recording.cache import alongside, fingerprints
@@ -86,7 +87,7 @@ def test_many_files_have_one_hash(tmp_path):
     assert fingerprints(files) != [before]
 
 
-def test_a_bag_is_hashed_while_it_is_decoded(rec, tmp_path, hashed, monkeypatch):
+def test_a_bag_is_hashed_while_it_is_decoded(tmp_path, hashed, monkeypatch):
     config = SequenceConfig(bag=str(rec.drive(tmp_path / "a.bag")))
     for _ in open_sequence(config):
         pass
@@ -105,7 +106,7 @@ def test_a_pass_that_ends_early_leaves_no_thread(tmp_path, hashed):
 
 
 @pytest.mark.parametrize("small", [1, 1 << 24])
-def test_a_decoded_bag_is_that_of_its_content(rec, tmp_path, monkeypatch, small):
+def test_a_decoded_bag_is_that_of_its_content(tmp_path, monkeypatch, small):
     monkeypatch.setattr(cache, "SMALL", small)
     path = rec.drive(tmp_path / "a.bag", n=300)
     config = SequenceConfig(bag=str(path))

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+import rec
 from scipy.spatial.transform import Rotation
 
 from adaptune import files, geometry
@@ -14,7 +15,7 @@ def poses(n):
     return geometry.from_quaternions(rng.normal(0, 3, (n, 3)), rng.normal(0, 1, (n, 4)))
 
 
-def kitti_odometry(rec, folder, n=4):
+def kitti_odometry(folder, n=4):
     """Write a sequence, and tell where its LiDAR was as seen from its first camera's start."""
     (folder / "velodyne").mkdir(parents=True)
     for i, points in enumerate(rec.scans(n)):
@@ -30,8 +31,8 @@ def kitti_odometry(rec, folder, n=4):
     return geometry.invert(T_camera_sensor) @ T_world_camera @ T_camera_sensor
 
 
-def test_a_kitti_sequence_is_what_the_bags_are(rec, tmp_path):
-    expected = kitti_odometry(rec, tmp_path / "sequences" / "00")
+def test_a_kitti_sequence_is_what_the_bags_are(tmp_path):
+    expected = kitti_odometry(tmp_path / "sequences" / "00")
     sequence = open_sequence(SequenceConfig(kitti=str(tmp_path / "sequences" / "00"), elevation=0))
     bags = [
         list(open_sequence(SequenceConfig(bag=str(rec.drive(tmp_path / f"a{suffix}", n=4)))))
@@ -59,10 +60,10 @@ def test_rays_are_turned_up_in_their_own_planes():
     assert np.array_equal(turn_up(up, 2.0), up)
 
 
-def test_kittis_rays_are_corrected_unless_told_otherwise(rec, tmp_path):
-    kitti_odometry(rec, tmp_path / "sequences" / "00")
-    drive, _ = drive_360(rec, tmp_path)
-    write_drive(rec, tmp_path / "raw", "timestamps_start.txt")
+def test_kittis_rays_are_corrected_unless_told_otherwise(tmp_path):
+    kitti_odometry(tmp_path / "sequences" / "00")
+    drive, _ = drive_360(tmp_path)
+    write_drive(tmp_path / "raw", "timestamps_start.txt")
     points = rec.scans(1)[0]
     for folder, elevation, degrees in [
         (tmp_path / "sequences" / "00", None, 0.205),
@@ -75,10 +76,10 @@ def test_kittis_rays_are_corrected_unless_told_otherwise(rec, tmp_path):
         np.testing.assert_allclose(next(iter(sequence)).points, turn_up(points, degrees), atol=1e-6)
 
 
-def drive_360(rec, root):
+def drive_360(root):
     name = "2013_05_28_drive_0000_sync"
     drive = root / "data_3d_raw" / name
-    write_drive(rec, drive, "timestamps.txt")
+    write_drive(drive, "timestamps.txt")
     T_world_body, T_body_camera, T_sensor_camera = poses(3), poses(5)[3], poses(5)[4]
     (root / "calibration").mkdir()
 
@@ -94,7 +95,7 @@ def drive_360(rec, root):
     return drive, T_world_body @ T_body_camera @ geometry.invert(T_sensor_camera)
 
 
-def write_drive(rec, drive, stamps):
+def write_drive(drive, stamps):
     data = drive / "velodyne_points" / "data"
     data.mkdir(parents=True)
     for i, points in enumerate(rec.scans(4)):
@@ -104,8 +105,8 @@ def write_drive(rec, drive, stamps):
     (drive / "velodyne_points" / stamps).write_text("\n".join(lines) + "\n")
 
 
-def test_a_kitti_360_drive(rec, tmp_path):
-    drive, expected = drive_360(rec, tmp_path)
+def test_a_kitti_360_drive(tmp_path):
+    drive, expected = drive_360(tmp_path)
     sequence = open_sequence(SequenceConfig(kitti=str(drive)))
     stamps = [scan.stamp for scan in sequence]
     assert stamps == [1317386425_000000001 + i * 10**8 for i in (0, 1, 3)]
@@ -114,9 +115,9 @@ def test_a_kitti_360_drive(rec, tmp_path):
     np.testing.assert_allclose(reference.T_world_sensor, expected, atol=1e-12)
 
 
-def test_a_kitti_raw_drive(rec, tmp_path):
+def test_a_kitti_raw_drive(tmp_path):
     drive = tmp_path / "2011_09_30_drive_0027_sync"
-    write_drive(rec, drive, "timestamps_start.txt")
+    write_drive(drive, "timestamps_start.txt")
     (tmp_path / "calib_imu_to_velo.txt").write_text(
         "calib_time: 25-May-2012 16:47:16\nR: 1 0 0 0 1 0 0 0 1\nT: -0.8 0 0.5\n"
     )
@@ -139,7 +140,7 @@ def test_a_kitti_raw_drive(rec, tmp_path):
 
 
 @pytest.mark.parametrize("suffix", [".npy", ".pcd", ".ply", ".bin", "structured"])
-def test_folders_of_files(rec, tmp_path, suffix):
+def test_folders_of_files(tmp_path, suffix):
     for i, points in enumerate(rec.scans(11)):
         path = tmp_path / f"scan_{i}{suffix}"
         if suffix == ".npy":
@@ -170,7 +171,7 @@ def test_folders_of_files(rec, tmp_path, suffix):
         (["1", "2"], "5.000000001\n6\n", [5_000_000_001, 6 * 10**9]),
     ],
 )
-def test_stamps_of_files(rec, tmp_path, names, times, stamps):
+def test_stamps_of_files(tmp_path, names, times, stamps):
     for name, points in zip(names, rec.scans(2), strict=True):
         np.save(tmp_path / f"{name}.npy", points)
     if times:
@@ -179,7 +180,7 @@ def test_stamps_of_files(rec, tmp_path, names, times, stamps):
     assert found[: len(stamps)] == stamps
 
 
-def test_a_kitti_pose_file_goes_with_any_recording(rec, tmp_path):
+def test_a_kitti_pose_file_goes_with_any_recording(tmp_path):
     expected = poses(6)
     write_kitti(tmp_path / "gt.txt", expected)
     bag = str(rec.drive(tmp_path / "a.bag", n=6))
@@ -223,9 +224,9 @@ def test_broken_folders_are_clear_errors(tmp_path, key, make, message):
         ("velodyne/x.bin", "", "numbers do not go with"),
     ],
 )
-def test_broken_kitti_sequences_are_clear_errors(rec, tmp_path, file, content, message):
+def test_broken_kitti_sequences_are_clear_errors(tmp_path, file, content, message):
     folder = tmp_path / "sequences" / "00"
-    kitti_odometry(rec, folder)
+    kitti_odometry(folder)
     if content is None:
         (folder / file).unlink()
     else:

@@ -1,4 +1,5 @@
 import pytest
+import rec
 from pydantic import ValidationError
 
 from adaptune.odometry.program import program_input
@@ -29,25 +30,25 @@ def test_what_is_no_part_is_refused_with_an_example(text):
         SequenceConfig(bag="a.bag", part=text or "")
 
 
-def tenths(rec, sequence):
+def tenths(sequence):
     return [round((scan.stamp - rec.START) / 1e8) for scan in sequence]
 
 
-def test_the_parts_of_a_bag_are_the_bag(rec, tmp_path):
+def test_the_parts_of_a_bag_are_the_bag(tmp_path):
     bag = str(rec.drive(tmp_path / "a.bag"))
     for _ in range(2):  # read, and from the cache
         first = open_sequence(SequenceConfig(bag=bag, part="0-60%"))
         second = open_sequence(SequenceConfig(bag=bag, part="60-100%"))
-        begin, end = tenths(rec, first), tenths(rec, second)
+        begin, end = tenths(first), tenths(second)
         assert begin + end == list(range(20))
         assert len(begin) == pytest.approx(12, abs=1)
     assert first.n_messages == pytest.approx(12, abs=1)
     check_sequence(SequenceConfig(bag=bag, part="0-60%"))
     within = open_sequence(SequenceConfig(bag=bag, start=0.5, stop=1.5, part="50-100%"))
-    assert tenths(rec, within) == list(range(10, 15))
+    assert tenths(within) == list(range(10, 15))
 
 
-def test_a_program_reads_the_part_alone(rec, tmp_path):
+def test_a_program_reads_the_part_alone(tmp_path):
     bag = rec.drive(tmp_path / "a.bag")
     for part, own in ((None, True), ("0-60%", False)):
         config = SequenceConfig(bag=str(bag), reference="/poses", part=part)

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+import rec
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
@@ -62,7 +63,7 @@ def layouts(draw):
     padding=st.integers(0, 9),
     data=st.data(),
 )
-def test_any_layout_gives_the_points_written(rec, dtype, width, *, height, padding, data):
+def test_any_layout_gives_the_points_written(dtype, width, *, height, padding, data):
     rng = np.random.default_rng(data.draw(st.integers(0, 2**32)))
     raw = np.zeros((height, width), dtype)
     points = rng.uniform(1, 50, (height, width, 3)).astype(np.float32)
@@ -101,7 +102,7 @@ def test_any_layout_gives_the_points_written(rec, dtype, width, *, height, paddi
         elements=st.sampled_from([0.0, 1.0, -2.5, np.nan, np.inf, -np.inf]),
     )
 )
-def test_points_that_are_not_measurements_are_dropped_with_all_that_is_theirs(rec, points):
+def test_points_that_are_not_measurements_are_dropped_with_all_that_is_theirs(points):
     raw = rec.velodyne(points)
     raw["intensity"] = np.where(np.arange(len(points)) % 5, np.arange(len(points)), np.nan)
     keep = np.isfinite(points).all(axis=1) & (points != 0).any(axis=1)
@@ -119,7 +120,7 @@ def test_points_that_are_not_measurements_are_dropped_with_all_that_is_theirs(re
     ("field", "kind", "known"),
     [("intensity", "<u1", True), ("reflectivity", "<u2", True), ("intensity", "(3,)<f4", False)],
 )
-def test_intensities_of_any_kind(rec, field, kind, known):
+def test_intensities_of_any_kind(field, kind, known):
     values = np.ones((4, 3) if "(" in kind else 4)
     scan = decode(rec.cloud(raw_of(4, **{field: (kind, values)})))
     assert (scan.intensities is not None) == known
@@ -156,7 +157,7 @@ DIALECTS = {
     ("field", "kind", "values", "stamp", "times", "shift"), DIALECTS.values(), ids=DIALECTS
 )
 def test_times_count_from_the_start_of_the_scan_in_every_dialect(
-    rec, *, field, kind, values, stamp, times, shift
+    *, field, kind, values, stamp, times, shift
 ):
     scan = decode(rec.cloud(raw_of(len(values), **{field: (kind, values)}), stamp))
     expected = np.array(values) - values[0] if times is None else times
@@ -173,14 +174,14 @@ def test_times_count_from_the_start_of_the_scan_in_every_dialect(
         ("end", [S, S + 0.1], -0.1),
     ],
 )
-def test_what_the_stamp_marks_can_be_set(rec, mark, values, shift):
+def test_what_the_stamp_marks_can_be_set(mark, values, shift):
     raw = raw_of(2, timestamp=("<f8", values))
     scan = decode(rec.cloud(raw, NS), Timing(mark))
     assert abs(scan.stamp - (NS + shift * 1e9)) < 1000
     np.testing.assert_allclose(scan.times, [0, values[1] - values[0]], atol=1e-6)
 
 
-def test_a_scan_stamped_at_its_end_without_times_starts_a_period_before(rec):
+def test_a_scan_stamped_at_its_end_without_times_starts_a_period_before():
     assert decode(rec.cloud(raw_of(1), NS), Timing("end", period=0.2)).stamp == NS - 200_000_000
 
 
@@ -188,7 +189,7 @@ def test_a_scan_stamped_at_its_end_without_times_starts_a_period_before(rec):
     ("unit", "kind", "values"),
     [("us", "<u4", [0, 100_000]), ("ms", "<f4", [0, 100]), ("ns", "<f4", [0, 1e8])],
 )
-def test_a_unit_can_be_set(rec, unit, kind, values):
+def test_a_unit_can_be_set(unit, kind, values):
     raw = raw_of(2, time=(kind, values))
     scan = decode(rec.cloud(raw), Timing(unit=unit))
     np.testing.assert_allclose(scan.times, [0, 0.1], rtol=1e-6)
@@ -197,38 +198,38 @@ def test_a_unit_can_be_set(rec, unit, kind, values):
 @pytest.mark.parametrize(
     ("values", "kind"), [([0, 100.0], "<f4"), ([1e30, 2e30], "<f4"), ([500.0, 500.1], "<f4")]
 )
-def test_times_no_scan_takes_are_refused(rec, values, kind):
+def test_times_no_scan_takes_are_refused(values, kind):
     with pytest.raises(PointCloudError, match="time_unit"):
         decode(rec.cloud(raw_of(2, time=(kind, values))))
 
 
-def damaged(rec, **changes):
+def damaged(**changes):
     return rec.cloud(rec.velodyne(rec.scans(1)[0]), **changes)
 
 
-def field(rec, *given):
+def field(*given):
     return rec.ROS2.types["sensor_msgs/msg/PointField"](*given)
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        (lambda rec: {"fields": [field(rec, a, 0, 7, 1) for a in "xy"]}, "no field z; there is x"),
-        (lambda rec: {"fields": [field(rec, "x", 20, 7, 1)]}, "ends beyond"),
-        (lambda rec: {"fields": [field(rec, "x", 0, 99, 1)]}, "unknown datatype 99"),
-        (lambda rec: {"fields": [field(rec, "x", 0, 7, 1)] * 2}, "appears twice"),
-        (lambda rec: {"fields": [field(rec, a, 0, 7, 2) for a in "xyz"]}, "not one number"),
-        (lambda _: {"width": 2**32 - 1, "height": 2**32 - 1}, "need"),
-        (lambda _: {"data": np.empty(0, np.uint8)}, "there are 0"),
+        ({"fields": [field(a, 0, 7, 1) for a in "xy"]}, "no field z; there is x"),
+        ({"fields": [field("x", 20, 7, 1)]}, "ends beyond"),
+        ({"fields": [field("x", 0, 99, 1)]}, "unknown datatype 99"),
+        ({"fields": [field("x", 0, 7, 1)] * 2}, "appears twice"),
+        ({"fields": [field(a, 0, 7, 2) for a in "xyz"]}, "not one number"),
+        ({"width": 2**32 - 1, "height": 2**32 - 1}, "need"),
+        ({"data": np.empty(0, np.uint8)}, "there are 0"),
     ],
 )
-def test_a_message_that_is_no_cloud_is_refused(rec, changes, message):
+def test_a_message_that_is_no_cloud_is_refused(changes, message):
     with pytest.raises(PointCloudError, match=message):
-        decode(damaged(rec, **changes(rec)))
+        decode(damaged(**changes))
 
 
 @pytest.mark.parametrize("frame", ["", "a", "ab", "abc", "abcd"])
-def test_a_message_is_the_same_however_it_is_serialised(rec, frame):
+def test_a_message_is_the_same_however_it_is_serialised(frame):
     raw = rec.velodyne(rec.scans(1)[0])
     forms = []
     for store, serialise in (
@@ -246,7 +247,7 @@ def test_a_message_is_the_same_however_it_is_serialised(rec, frame):
 
 
 @pytest.mark.parametrize("cdr", [False, True])
-def test_a_message_cut_short_or_too_long_is_refused(rec, cdr):
+def test_a_message_cut_short_or_too_long_is_refused(cdr):
     store = rec.ROS2 if cdr else rec.ROS1
     message = rec.cloud(rec.velodyne(rec.scans(1, 3)[0]), store=store)
     serialise = store.serialize_cdr if cdr else store.serialize_ros1
@@ -259,7 +260,7 @@ def test_a_message_cut_short_or_too_long_is_refused(rec, cdr):
 
 @settings(max_examples=200, deadline=None)
 @given(st.data())
-def test_any_change_of_a_message_gives_a_scan_or_an_error(rec, data):
+def test_any_change_of_a_message_gives_a_scan_or_an_error(data):
     u32 = st.one_of(st.integers(0, 100), st.integers(0, 2**32 - 1))
     changes = data.draw(
         st.fixed_dictionaries(
@@ -273,7 +274,7 @@ def test_any_change_of_a_message_gives_a_scan_or_an_error(rec, data):
                 "data": st.binary(max_size=2000).map(lambda b: np.frombuffer(b, np.uint8)),
                 "fields": st.lists(
                     st.builds(
-                        lambda *given: field(rec, *given),
+                        field,
                         st.sampled_from(["x", "y", "z", "time", "t", "ring", "", "é"]),
                         u32,
                         st.integers(0, 255),
@@ -285,7 +286,7 @@ def test_any_change_of_a_message_gives_a_scan_or_an_error(rec, data):
         )
     )
     try:
-        scan = decode(damaged(rec, **changes))
+        scan = decode(damaged(**changes))
     except PointCloudError:
         return
     assert np.isfinite(scan.points).all()

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+import rec
 from rosbags.typesys import get_types_from_msg
 
 from adaptune.recording import SequenceConfig, SequenceError, bag, clouds
@@ -27,7 +28,7 @@ def packet(number, metres, model=VLP16):
     return np.frombuffer(raw, np.uint8)
 
 
-def scan(rec, store, packets):
+def scan(store, packets):
     types = store.types
     if KIND not in types:
         found = {}
@@ -44,11 +45,11 @@ def scan(rec, store, packets):
 
 
 @pytest.mark.parametrize("name", ["a.bag", "a.mcap"])
-def test_packets_are_decoded(rec, tmp_path, name):
+def test_packets_are_decoded(tmp_path, name):
     pytest.importorskip("velodyne_decoder")
     path = tmp_path / name
     store = rec.store_of(path)
-    message = scan(rec, store, [packet(k, 10.0) for k in range(75)])
+    message = scan(store, [packet(k, 10.0) for k in range(75)])
     bag_ = rec.write_bag(path, [("/packets", rec.START, message)])
     (first,) = open_sequence(SequenceConfig(bag=str(bag_)))
     assert len(first) == 75 * 12 * 32
@@ -68,25 +69,25 @@ def test_packets_are_decoded(rec, tmp_path, name):
         ([packet(0, 1.0, model=0x77)], "message 1 on /packets: .*model"),
     ],
 )
-def test_packets_that_tell_nothing_are_an_error(rec, tmp_path, packets, told):
+def test_packets_that_tell_nothing_are_an_error(tmp_path, packets, told):
     pytest.importorskip("velodyne_decoder")
     path = tmp_path / "a.bag"
-    rec.write_bag(path, [("/packets", rec.START, scan(rec, rec.ROS1, packets))])
+    rec.write_bag(path, [("/packets", rec.START, scan(rec.ROS1, packets))])
     with pytest.raises(SequenceError, match=told):
         list(open_sequence(SequenceConfig(bag=str(path))))
 
 
-def test_what_decodes_packets_is_named_where_it_is_missing(rec, tmp_path, monkeypatch):
+def test_what_decodes_packets_is_named_where_it_is_missing(tmp_path, monkeypatch):
     path = tmp_path / "a.bag"
-    rec.write_bag(path, [("/packets", rec.START, scan(rec, rec.ROS1, [packet(0, 1.0)]))])
+    rec.write_bag(path, [("/packets", rec.START, scan(rec.ROS1, [packet(0, 1.0)]))])
     monkeypatch.setattr(bag, "find_spec", lambda _: None)
     with pytest.raises(SequenceError, match=r"install adaptune\[velodyne\]"):
         open_sequence(SequenceConfig(bag=str(path)))
 
 
-def test_points_are_preferred_to_the_packets_they_were_made_of(rec, tmp_path):
+def test_points_are_preferred_to_the_packets_they_were_made_of(tmp_path):
     path = tmp_path / "a.bag"
     cloud = rec.cloud(rec.velodyne(rec.scans(1)[0]), rec.START, rec.ROS1)
-    both = [("/packets", 5, scan(rec, rec.ROS1, [])), ("/points", 6, cloud)]
+    both = [("/packets", 5, scan(rec.ROS1, [])), ("/points", 6, cloud)]
     (found,) = open_sequence(SequenceConfig(bag=str(rec.write_bag(path, both))))
     assert len(found) == 60

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+import rec
 from pydantic import ValidationError
 
 from adaptune.recording import Imu, Scan, SequenceConfig, SequenceError
@@ -8,7 +9,7 @@ from adaptune.recording.views import WithImu
 
 
 @pytest.fixture(scope="module")
-def bag(rec, tmp_path_factory):
+def bag(tmp_path_factory):
     return rec.drive(tmp_path_factory.mktemp("drive") / "a.bag")
 
 
@@ -16,26 +17,26 @@ def seen(bag, *views, **options):
     return open_sequence(SequenceConfig(bag=str(bag), reference="/poses", views=views, **options))
 
 
-def tenths(rec, sequence):
+def tenths(sequence):
     return [(scan.stamp - rec.START) // 10**8 for scan in sequence]
 
 
-def test_cut_keeps_parts(rec, bag):
-    assert tenths(rec, seen(bag, {"cut": [[0.2, 0.45], [1, 1.15]]})) == [2, 3, 4, 10, 11]
+def test_cut_keeps_parts(bag):
+    assert tenths(seen(bag, {"cut": [[0.2, 0.45], [1, 1.15]]})) == [2, 3, 4, 10, 11]
     with pytest.raises(SequenceError, match="its views leave no scan; cut or drop less"):
         list(seen(bag, {"cut": [[100, 200]]}))
 
 
-def test_drop_loses_its_share_by_its_seed_alone(rec, bag):
+def test_drop_loses_its_share_by_its_seed_alone(bag):
     lossy = {"drop": {"share": 0.5, "start": 0.5, "stop": 1.5, "seed": 3}}
-    kept = tenths(rec, seen(bag, lossy))
+    kept = tenths(seen(bag, lossy))
     assert set(range(5)) | set(range(15, 20)) <= set(kept)
     assert 10 < len(kept) < 20
-    assert tenths(rec, seen(bag, lossy)) == kept
+    assert tenths(seen(bag, lossy)) == kept
     other = {"drop": {"share": 0.5, "start": 0.5, "stop": 1.5, "seed": 4}}
-    assert tenths(rec, seen(bag, other)) != kept
+    assert tenths(seen(bag, other)) != kept
     cut = {"cut": [[0.7, 1.2]]}
-    assert tenths(rec, seen(bag, lossy, cut)) == [k for k in kept if 7 <= k < 12]
+    assert tenths(seen(bag, lossy, cut)) == [k for k in kept if 7 <= k < 12]
 
 
 def test_speed_changes_arrival_and_nothing_else(bag):
