@@ -82,10 +82,10 @@ def test_reads_a_study(gicp_study_file, tmp_path):
         ("offline.sampler=math:sin", ["offline.sampler", "not a class derived from optuna"]),
         ("offline.sampler=no.such:Best", ["cannot import no.such", "PYTHONPATH"]),
         (
-            "offline.config.gama=1",
+            "offline.sampler_settings.gama=1",
             ["gama: tpe has no such setting; did you mean 'gamma'"],
         ),
-        ("offline.config.seed=1", ["sampler_settings.seed", "offline.seed"]),
+        ("offline.sampler_settings.seed=1", ["sampler_settings.seed", "offline.seed"]),
         (
             "offline={sampler: grid, sampler_settings: {grid: "
             "{max_correspondence_distance: [1, 5, 0], keyframe_interval: [1, 0, 3]}}}",
@@ -157,7 +157,7 @@ def test_names_mistakes_in_sampler_settings_with_their_lines(study_file, offline
     lines = study_file.read_text().splitlines()
     file.write_text("\n".join([*lines[:-1], offline, ""]))
     message = failure(file)
-    assert f"line {line}: offline.config" in message
+    assert f"line {line}: offline.sampler_settings" in message
     assert words in message
     assert len(message.splitlines()) == 1
 

@@ -52,7 +52,7 @@ def trials(folder):
 
 
 GRID = (
-    "offline.config={grid: {max_correspondence_distance: [1.0, 2.0, 2],"
+    "offline.sampler_settings={grid: {max_correspondence_distance: [1.0, 2.0, 2],"
     " keyframe_interval: [1.0, 4.0, 3]}}"
 )
 

@@ -119,6 +119,6 @@ def test_settings_that_do_not_do(monkeypatch, study_file, settings, words):
     if settings == "{mode: 3}":
         check_class("users_samplers:Picky")  # which takes its time to import
         monkeypatch.setattr(processes, "IMPORT_SECONDS", 2.0)
-    given = ["offline.sampler=users_samplers:Picky", f"offline.config={settings}"]
+    given = ["offline.sampler=users_samplers:Picky", f"offline.sampler_settings={settings}"]
     with pytest.raises(ConfigurationError, match=re.escape(words)):
         load_study(study_file, given)
