@@ -93,7 +93,7 @@ def open_sequence(config: SequenceConfig) -> Recording:
     """
     sequence: views.Reversible = RecordedSequence(config)
     if config.compensate == "constant_velocity":
-        sequence = views.WithoutMotion(sequence)
+        sequence = views.without_motion(sequence)
     elif config.compensate == "gyro":
         sequence = views.without_rotation(sequence)
     for view in config.views:

@@ -4,11 +4,10 @@ A view changes a scan depending on the scan and the view's seed alone. The same 
 the same noise is added in every process, in either direction, whatever was cut before.
 """
 
-from collections.abc import Callable, Iterable, Iterator
-from collections.abc import Sequence as Items
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache as once
-from functools import cached_property
+from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
@@ -23,9 +22,6 @@ from adaptune.trajectory import Trajectory
 # Nanoseconds after the first scan at which an IMU that is on the same clock has begun.
 _LATE = 10 * 10**9
 
-Part = tuple[float, float | None]
-"""Seconds since the first scan: [start, stop), to the end where stop is None."""
-
 
 class Reversible(Recording, Protocol):
     """A sequence that can be read from its end."""
@@ -36,15 +32,15 @@ class Reversible(Recording, Protocol):
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A sequence of which every scan is changed or left out by itself."""
+    """A sequence whose scans are changed or left out, and read from its end if `reverse`."""
 
-    inner: Reversible  # what it is a view of
-    # Gives the scan as seen, or None to leave it out.
-    change: Callable[[Scan], Scan | None] = lambda scan: scan
-    # What the view does to poses, to measurements and to the time of arrival.
+    inner: Reversible
+    # What it does to the scans, to poses, to measurements and to the time of arrival.
+    of_scans: Callable[[Iterator[Scan]], Iterable[Scan]] = lambda scans: scans
     of_reference: Callable[[Trajectory], Trajectory] = lambda trajectory: trajectory
     of_imu: Callable[[Imu], Imu] = lambda imu: imu
-    of_clock: Callable[[NDArray[np.int64]], NDArray[np.int64]] = lambda stamps: stamps
+    clock: Callable[[NDArray[np.int64]], NDArray[np.int64]] | None = None  # None: as before
+    reverse: bool = False
 
     @property
     def name(self) -> str:
@@ -58,19 +54,17 @@ class View:
 
     def __iter__(self) -> Iterator[Scan]:
         """Read the scans; a SequenceError if the view leaves none."""
-        return self._changed(self.inner)
+        return self._seen(self.inner.backward() if self.reverse else iter(self.inner))
 
     def backward(self) -> Iterator[Scan]:
         """Read the scans, the last one first."""
-        return self._changed(self.inner.backward())
+        return self._seen(iter(self.inner) if self.reverse else self.inner.backward())
 
-    def _changed(self, scans: Iterable[Scan]) -> Iterator[Scan]:
-        seen = None
-        for scan in scans:
-            if (changed := self.change(scan)) is not None:
-                seen = changed
-                yield seen
-        if seen is None:
+    def _seen(self, scans: Iterator[Scan]) -> Iterator[Scan]:
+        scan = None
+        for scan in self.of_scans(scans):
+            yield scan
+        if scan is None:
             raise SequenceError(f"{self.name}: its views leave no scan; cut or drop less")
 
     def reference(self) -> Trajectory | None:
@@ -85,72 +79,66 @@ class View:
 
     def played_at(self, stamps: NDArray[np.int64]) -> NDArray[np.int64]:
         """When measurements of `stamps` arrive."""
-        return self.of_clock(self.inner.played_at(stamps))
+        return (self.clock or self.inner.played_at)(stamps)
 
 
-@dataclass(frozen=True, eq=False)
-class WithoutMotion(View):
-    """Points as if the sensor had stood still since the scan's start, its velocity being constant.
+def without_motion(sequence: Reversible) -> View:
+    """Points as if the sensor had kept its place since the scan's start, at constant velocity.
 
     The velocity is that since the scan read before, which is registered for it.
     """
-
-    def _changed(self, scans: Iterable[Scan]) -> Iterator[Scan]:
-        return compensate_neighbours(_timed(self.name, scan) for scan in scans)
+    return View(sequence, lambda scans: compensate_neighbours(_timed(sequence, scans)))
 
 
 def without_rotation(sequence: Reversible) -> View:
     """Points as if the sensor had not turned since the scan's start, by its gyroscope."""
     imu = once(sequence.imu)
 
-    def change(scan: Scan) -> Scan:
+    def compensated(scans: Iterator[Scan]) -> Iterable[Scan]:
         if (measured := imu()) is None:
-            return scan
-        return compensate_rotation(_timed(sequence.name, scan), measured)
+            return scans
+        return (compensate_rotation(scan, measured) for scan in _timed(sequence, scans))
 
-    return View(sequence, change)
-
-
-def _timed(name: str, scan: Scan) -> Scan:
-    if scan.times is None and len(scan):
-        raise SequenceError(f"{name}: its points have no times; leave `compensate` out")
-    return scan
+    return View(sequence, compensated)
 
 
-@dataclass(frozen=True, eq=False)
-class _First:
-    """Stamp of the first scan, read when it is wanted."""
+def _timed(sequence: Reversible, scans: Iterator[Scan]) -> Iterator[Scan]:
+    for scan in scans:
+        if scan.times is None and len(scan):
+            raise SequenceError(
+                f"{sequence.name}: its points have no times; leave `compensate` out"
+            )
+        yield scan
 
-    sequence: Recording
 
-    @cached_property
-    def stamp(self) -> int:
-        return next(iter(self.sequence)).stamp
+def _is_within(sequence: Reversible) -> Callable[[Scan, float, float | None], bool]:
+    """Whether a scan is in [start, stop) seconds since the first one, to the end if None."""
+    first = once(lambda: next(iter(sequence)).stamp)
 
-    def within(self, stamp: int, part: Part) -> bool:
-        seconds = (stamp - self.stamp) * 1e-9
-        start, stop = part
+    def within(scan: Scan, start: float, stop: float | None) -> bool:
+        seconds = (scan.stamp - first()) * 1e-9
         return seconds >= start and (stop is None or seconds < stop)
 
+    return within
 
-def _cut(sequence: Reversible, parts: Items[Part]) -> View:
+
+def _cut(sequence: Reversible, parts: Sequence[tuple[float, float]]) -> View:
     """Only these parts of it; stamps stay as they are."""
-    first = _First(sequence)
+    within = _is_within(sequence)
     return View(
-        sequence,
-        lambda scan: scan if any(first.within(scan.stamp, part) for part in parts) else None,
+        sequence, lambda scans: (s for s in scans if any(within(s, *part) for part in parts))
     )
 
 
 def _drop(sequence: Reversible, given: DropConfig) -> View:
     """Lose a share of the scans of a part, each at random by itself."""
-    first, part = _First(sequence), (given.start, given.stop)
+    within = _is_within(sequence)
 
-    def lose(scan: Scan) -> Scan | None:
-        lost = first.within(scan.stamp, part) and _rng(given.seed, scan).random() < given.share
-        return None if lost else scan
+    def lost(scan: Scan) -> bool:
+        chance = within(scan, given.start, given.stop)
+        return chance and _rng(given.seed, scan).random() < given.share
 
-    return View(sequence, lose)
+    return View(sequence, lambda scans: (scan for scan in scans if not lost(scan)))
 
 
 def _speed(sequence: Reversible, given: SpeedConfig) -> View:
@@ -159,17 +147,18 @@ def _speed(sequence: Reversible, given: SpeedConfig) -> View:
     Scans, stamps and poses stay the same. Only `played_at` changes, for odometries that run
     against the clock.
     """
-    first = _First(sequence)
+    first = once(lambda: next(iter(sequence)).stamp)
 
     def arrival(stamps: NDArray[np.int64]) -> NDArray[np.int64]:
-        start = first.stamp + round(given.start * 1e9)
+        start = first() + round(given.start * 1e9)
         # Later than any stamp, and small enough to subtract from.
-        stop = 2**62 if given.stop is None else first.stamp + round(given.stop * 1e9)
+        stop = 2**62 if given.stop is None else first() + round(given.stop * 1e9)
+        stamps = sequence.played_at(stamps)
         inside = np.clip(stamps, start, stop) - start
         saved: NDArray[np.int64] = np.rint(inside * (1.0 - 1.0 / given.factor)).astype(np.int64)
         return stamps - saved
 
-    return View(sequence, of_clock=arrival)
+    return View(sequence, clock=arrival)
 
 
 def _noise(sequence: Reversible, given: NoiseConfig) -> View:
@@ -182,7 +171,7 @@ def _noise(sequence: Reversible, given: NoiseConfig) -> View:
         scale = np.maximum(1.0 + error / ranges, 1e-3)
         return replace(scan, points=scan.points * scale[:, None])
 
-    return View(sequence, disturb)
+    return View(sequence, partial(map, disturb))
 
 
 def _transform(sequence: Reversible, given: Any) -> View:
@@ -193,67 +182,49 @@ def _transform(sequence: Reversible, given: Any) -> View:
     T_sensor_seen = geometry.invert(T_seen_sensor)
     return View(
         sequence,
-        lambda scan: replace(scan, points=scan.points @ R.T + t),
+        lambda scans: (replace(scan, points=scan.points @ R.T + t) for scan in scans),
         lambda poses: replace(poses, T_world_sensor=poses.T_world_sensor @ T_sensor_seen),
         lambda imu: replace(imu, T_sensor_imu=T_seen_sensor @ imu.T_sensor_imu),
     )
 
 
-@dataclass(frozen=True, eq=False)
-class Reversed(View):
-    """A sequence played backwards: the last scan comes first, and time still goes forward."""
+def _reverse(sequence: Reversible, _: Any) -> View:
+    """Played backwards: the last scan comes first, and time still goes forward."""
 
-    def __iter__(self) -> Iterator[Scan]:
-        """Read the scans."""
-        return map(self._mirror, self.inner.backward())
-
-    def backward(self) -> Iterator[Scan]:
-        """Read the scans, the last one first."""
-        return map(self._mirror, self.inner)
-
-    @cached_property
-    def _sum(self) -> int:
+    @once
+    def total() -> int:
         """Sum of a moment and its mirror image."""
-        first, last = next(iter(self.inner)), next(self.inner.backward())
+        first, last = next(iter(sequence)), next(sequence.backward())
         return first.stamp + last.stamp + last.span
 
-    def _mirror(self, scan: Scan) -> Scan:
+    def mirror(scan: Scan) -> Scan:
         times, span = scan.times, scan.span
         if times is not None:
             times = np.maximum(np.float32(span * 1e-9) - times, np.float32(0.0))
-        return replace(scan, stamp=self._sum - scan.stamp - span, times=times)
+        return replace(scan, stamp=total() - scan.stamp - span, times=times)
 
-    def reference(self) -> Trajectory | None:
-        """Poses of the LiDAR in mirrored time."""
-        trajectory = self.inner.reference()
-        if trajectory is None:
-            return None
-        stamps = (self._sum - trajectory.stamps)[::-1]
-        return replace(trajectory, stamps=stamps, T_world_sensor=trajectory.T_world_sensor[::-1])
+    def poses(given: Trajectory) -> Trajectory:
+        stamps = (total() - given.stamps)[::-1]
+        return replace(given, stamps=stamps, T_world_sensor=given.T_world_sensor[::-1])
 
-    def imu(self) -> Imu | None:
-        """Measurements in mirrored time: it turns the other way, and accelerates the same."""
-        imu = self.inner.imu()
-        if imu is None:
-            return None
+    def measured(imu: Imu) -> Imu:
+        """It turns the other way, and accelerates the same."""
+        stamps, turning = (total() - imu.stamps)[::-1], -imu.angular_velocity[::-1]
         return replace(
-            imu,
-            stamps=(self._sum - imu.stamps)[::-1],
-            angular_velocity=-imu.angular_velocity[::-1],
-            acceleration=imu.acceleration[::-1],
+            imu, stamps=stamps, angular_velocity=turning, acceleration=imu.acceleration[::-1]
         )
 
-    def played_at(self, stamps: NDArray[np.int64]) -> NDArray[np.int64]:
-        """When measurements of `stamps` arrive."""
-        mirrored: NDArray[np.int64] = self._sum - self.inner.played_at(self._sum - stamps)
-        return mirrored
+    def clock(stamps: NDArray[np.int64]) -> NDArray[np.int64]:
+        return total() - sequence.played_at(total() - stamps)
+
+    return View(sequence, partial(map, mirror), poses, measured, clock, reverse=True)
 
 
-VIEWS: dict[str, Callable[[Reversible, Any], Reversible]] = {
+VIEWS: dict[str, Callable[[Reversible, Any], View]] = {
     "cut": _cut,
     "drop": _drop,
     "speed": _speed,
-    "reverse": lambda sequence, _: Reversed(sequence),
+    "reverse": _reverse,
     "noise": _noise,
     "transform": _transform,
 }
