@@ -18,10 +18,10 @@ from adaptune.errors import AdaptuneError, OdometryError, nearest
 from adaptune.odometry.program import Template
 from adaptune.strict import Key, Mistake, StrictModel, validated
 
-Number = int | float
-Count = Annotated[int, Field(ge=0, le=10**9)]
-_Speed = Annotated[Number, Field(gt=0, le=1000)]
-Positive = Annotated[int, Field(ge=1, le=10**6)]
+_Number = int | float
+_Count = Annotated[int, Field(ge=0, le=10**9)]
+_Speed = Annotated[_Number, Field(gt=0, le=1000)]
+_Positive = Annotated[int, Field(ge=1, le=10**6)]
 
 
 class RustleError(AdaptuneError):
@@ -32,28 +32,22 @@ class _Loose(StrictModel):
     model_config = ConfigDict(extra="allow")
 
 
-class Algorithm(_Loose):
-    """A SLAM system in an image, its parameter file and the topics of its poses."""
-
+class _Algorithm(_Loose):
     name: str
     image_name: str
-    parameters: str
+    parameters: str  # a file
     odom_topics: Annotated[tuple[str, ...], Field(min_length=1)]
-    version: str | Number | None = None
+    version: str | _Number | None = None
     ros_version: str = "ROS_1"
 
 
-class Algorithms(_Loose):
-    """The file of the algorithms."""
-
-    algorithms: tuple[Algorithm, ...]
+class _Algorithms(_Loose):
+    algorithms: tuple[_Algorithm, ...]
 
 
-class Dataset(_Loose):
-    """A folder of bags, and the topic of its ground truth."""
-
+class _Dataset(_Loose):
     name: str
-    dataset_path: str
+    dataset_path: str  # a folder of bags
     ground_truth_topic: str | None = Field(
         None, validation_alias=AliasChoices("ground_truth_topic", "groundtruth_topic")
     )
@@ -61,123 +55,108 @@ class Dataset(_Loose):
     ros_version: str = "ROS_1"
 
 
-class Datasets(_Loose):
-    """The file of the data sets."""
-
-    datasets: tuple[Dataset, ...]
+class _Datasets(_Loose):
+    datasets: tuple[_Dataset, ...]
 
 
-class TypeOfTest(_Loose):
-    """What a test does to the recording."""
-
+class _TypeOfTest(_Loose):
     type: Literal["simple", "speed", "drop", "cut"]
     speed_factors: Annotated[tuple[_Speed, ...], Field(min_length=1, max_length=100)] | None = None
-    speed_range: Annotated[Number, Field(ge=1, le=100)] | None = None
-    speed_step: Annotated[Number, Field(ge=1e-2)] | None = None
+    speed_range: Annotated[_Number, Field(ge=1, le=100)] | None = None
+    speed_step: Annotated[_Number, Field(ge=1e-2)] | None = None
     drop_list: Any = None
     cut_list: Any = None
 
 
-class RustleTest(_Loose):
-    """A test: some algorithms on a data set, each run several times."""
-
+class _Test(_Loose):
     name: str
     dataset_name: str
     algo_list: Annotated[tuple[str, ...], Field(min_length=1)]
-    test_type: TypeOfTest
+    test_type: _TypeOfTest
     workers: Annotated[int, Field(ge=1, le=256)] = 1
     iterations: Annotated[int, Field(ge=1, le=1000)] = Field(
         1, validation_alias=AliasChoices("iterations", "num_iterations")
     )
 
 
-class RustleTests(_Loose):
-    """The file of the tests."""
-
-    test_definitions: Annotated[tuple[RustleTest, ...], Field(min_length=1)]
+class _Tests(_Loose):
+    test_definitions: Annotated[tuple[_Test, ...], Field(min_length=1)]
 
 
-class DatasetSettings(_Loose):
-    """The part of a data set that a tuning plays."""
-
+class _DatasetSettings(_Loose):
     name: str
-    start: Annotated[Number, Field(ge=0)] = 0.0
-    duration: Number | None = None  # seconds; all if it is not positive
+    start: Annotated[_Number, Field(ge=0)] = 0.0
+    duration: _Number | None = None  # seconds; all if it is not positive
 
 
-class EarlyStopping(_Loose):
-    """When a grid or a random search gives up."""
-
-    tolerance: Positive
-    delta: Number | None = None
+class _EarlyStopping(_Loose):
+    tolerance: _Positive
+    delta: _Number | None = None
 
 
-class MetricWeights(_Loose):
-    """What a tuning minimises."""
-
-    ape: Annotated[Number, Field(ge=0)] = 0.0
-    rpe: Annotated[Number, Field(ge=0)] = 0.0
+class _MetricWeights(_Loose):
+    ape: Annotated[_Number, Field(ge=0)] = 0.0
+    rpe: Annotated[_Number, Field(ge=0)] = 0.0
 
 
-class Temperature(_Loose):
-    """How annealing cools down."""
-
-    initial_value: Annotated[Number, Field(gt=0)]
+class _Temperature(_Loose):
+    initial_value: Annotated[_Number, Field(gt=0)]
     function: Literal["fast", "boltzman", "exponential"] | None = None
-    alpha: Annotated[Number, Field(gt=0, le=1)] | None = None
+    alpha: Annotated[_Number, Field(gt=0, le=1)] | None = None
 
 
-class Triggers(_Loose):
-    """Numbers of iterations."""
-
-    fixed: Count | None = None
-    accepted: Count | None = None
-    best: Count | None = None
-
-
-class Perturbation(_Loose):
-    """Steps of annealing for parameters that have none of their own."""
-
-    integer_delta_max: Count | None = None
-    float_mean: Number | None = None
-    float_std_dev: Annotated[Number, Field(ge=0)] | None = None
+class _Triggers(_Loose):
+    # _Numbers of iterations.
+    fixed: _Count | None = None
+    accepted: _Count | None = None
+    best: _Count | None = None
 
 
-class Annealing(_Loose):
-    """Settings of simulated annealing."""
+class _Perturbation(_Loose):
+    # For parameters that have no step of their own.
+    integer_delta_max: _Count | None = None
+    float_mean: _Number | None = None
+    float_std_dev: Annotated[_Number, Field(ge=0)] | None = None
 
-    temperature: Temperature
+
+class _Annealing(_Loose):
+    temperature: _Temperature
     # For each parameter its first value, its bounds, and perhaps its step: the longest one, or mean
     # and standard deviation.
-    parameter_bounds: dict[str, Annotated[tuple[Number, ...], Field(min_length=3, max_length=5)]]
-    reanneal: Triggers = Triggers()
-    halting_conditions: Triggers = Triggers()
-    perturbation_functions: Perturbation = Perturbation()
-    max_iterations: Positive | None = None
+    parameter_bounds: dict[str, Annotated[tuple[_Number, ...], Field(min_length=3, max_length=5)]]
+    reanneal: _Triggers = _Triggers()
+    halting_conditions: _Triggers = _Triggers()
+    perturbation_functions: _Perturbation = _Perturbation()
+    max_iterations: _Positive | None = None
 
 
-class Tuning(_Loose):
-    """A search for parameters."""
-
+class _Tuning(_Loose):
     name: str
     algo_name: str
-    dataset_settings: DatasetSettings
+    dataset_settings: _DatasetSettings
     tuning_algo: Literal["grid_search", "random_search", "simulated_annealing"]
-    metric_weights: MetricWeights = MetricWeights(rpe=1.0)
-    early_stopping: EarlyStopping | None = None
-    time_limit: Annotated[Number, Field(gt=0, le=1e5)] | None = None  # hours
+    metric_weights: _MetricWeights = _MetricWeights(rpe=1.0)
+    early_stopping: _EarlyStopping | None = None
+    time_limit: Annotated[_Number, Field(gt=0, le=1e5)] | None = None  # hours
     parameters: dict[str, Any] | None = None
-    tuning_settings: Annealing | None = None
+    tuning_settings: _Annealing | None = None
 
 
 M = TypeVar("M", bound=BaseModel)
 
 
-class RustleFile(NamedTuple):
-    """A file, its text, and where things stand in it."""
+class _File:
+    """A file, its content, and where things stand in it."""
 
-    path: Path
-    document: files.Document
+    def __init__(self, path: Path):
+        self.path = path
+        try:
+            self.document = files.Document.of_file(path)
+        except files.YamlError as error:
+            raise RustleError(str(error)) from error
+        self.data: Any = self.document.data
+        if not isinstance(self.data, dict):
+            raise RustleError(f"{path}: this is no file of RUSTLE, which has keys and values")
 
     def error(self, key: Key, message: str) -> RustleError:
         """An error about the value at a key."""
@@ -186,41 +165,18 @@ class RustleFile(NamedTuple):
         dotted = ".".join(map(str, key))
         return RustleError(f"{where}: {dotted + ': ' if dotted else ''}{message}")
 
-    def check(self, model: type[M]) -> M:
-        """The content, or an error that lists the mistakes in it."""
+    def check(self, model: type[M], notes: list[str]) -> M:
+        """The content, or an error that lists the mistakes in it; notes tell of unknown keys."""
         mistakes: list[Mistake] = []
-        found = validated(model, self.document.data, (), mistakes)
-        if found is None:
+        content = validated(model, self.data, (), mistakes)
+        if content is None:
             raise RustleError("\n".join(str(self.error(*mistake)) for mistake in mistakes))
-        return found
-
-    def find(self, key: str, names: list[str], name: str, asked: Key, by: "RustleFile") -> int:
-        """Place of the entry of a list with a name for which another file asks."""
-        if name not in names:
-            what = f"{self.path.name} has no {name!r} in {key}: {nearest(name, names)}"
-            raise by.error(asked, what)
-        return names.index(name)
+        ignored = "is not known here, and is ignored."
+        notes += [f"{self.path.name}: {key} {ignored}" for key in _unknown_keys(content)]
+        return content
 
 
-def read(path: Path) -> RustleFile:
-    """Read a file.
-
-    Raises
-    ------
-    RustleError
-        If it cannot be read, or is no YAML with keys.
-    """
-    try:
-        document = files.Document.of_file(path)
-    except files.YamlError as error:
-        raise RustleError(str(error)) from error
-    if not isinstance(document.data, dict):
-        raise RustleError(f"{path}: this is no file of RUSTLE, which has keys and values")
-    return RustleFile(path, document)
-
-
-def unknown_keys(model: BaseModel, key: Key = ()) -> Iterator[str]:
-    """Keys that RUSTLE does not have, as far as is known here."""
+def _unknown_keys(model: BaseModel, key: Key = ()) -> Iterator[str]:
     for name in model.model_extra or {}:
         yield ".".join(map(str, (*key, name)))
     for name in type(model).model_fields:
@@ -228,13 +184,13 @@ def unknown_keys(model: BaseModel, key: Key = ()) -> Iterator[str]:
         entries = enumerate(value) if isinstance(value, tuple) else [(None, value)]
         for i, entry in entries:
             if isinstance(entry, BaseModel):
-                yield from unknown_keys(entry, (*key, name) if i is None else (*key, name, i))
+                yield from _unknown_keys(entry, (*key, name) if i is None else (*key, name, i))
 
 
 # Searches for parameters in RUSTLE's tunings, as settings of the offline stage.
 
 
-MOST_POINTS = 10**6
+_MOST_POINTS = 10**6
 """Trials of a random search over a grid, and points on an axis."""
 _ALPHA = 0.95
 """What RUSTLE's exponential cooling multiplies the temperature by."""
@@ -243,29 +199,7 @@ Search = tuple[dict[str, Any], dict[str, Any]]
 """The parameters, and the settings of the search."""
 
 
-def search_of(file: RustleFile, tuning: Tuning, template: Template, notes: list[str]) -> Search:
-    """Make the parameters and the search of a tuning.
-
-    Parameters
-    ----------
-    file, tuning
-        The tuning, and the file that holds it.
-    template
-        The system's parameter file, which has the types and the defaults.
-    notes
-        Receives what has no counterpart.
-
-    Raises
-    ------
-    RustleError
-        It names the file, the line and the key.
-    """
-    if tuning.tuning_algo == "simulated_annealing":
-        return _annealing(file, tuning, template, notes)
-    return _grid(file, tuning, template, notes)
-
-
-def range_of(low: Number, high: Number, baseline: Number) -> dict[str, Any]:
+def _range(low: _Number, high: _Number, baseline: _Number) -> dict[str, Any]:
     """A parameter of a study; it is a whole number if all three are."""
     whole = all(isinstance(value, int) for value in (low, high, baseline))
     ends = {"low": low, "high": high, "baseline": baseline}
@@ -274,15 +208,22 @@ def range_of(low: Number, high: Number, baseline: Number) -> dict[str, Any]:
     return {"type": "float", **{key: float(value) for key, value in ends.items()}}
 
 
-def _default(file: RustleFile, key: Key, template: Template) -> Any:
-    """What a parameter is in the parameter file."""
+def _default(file: _File, key: Key, template: Template) -> Any:
+    """What a parameter is in the parameter file, which has its type."""
     try:
         return template.value(str(key[-1]))
     except OdometryError as error:
         raise file.error(key, str(error)) from error
 
 
-def _grid(file: RustleFile, tuning: Tuning, template: Template, notes: list[str]) -> Search:
+def _number_default(file: _File, key: Key, template: Template) -> _Number:
+    default: _Number = _default(file, key, template)
+    if not _is_number(default):
+        raise file.error(key, f"is {default!r} in the parameter file, which cannot be tuned")
+    return default
+
+
+def _grid(file: _File, tuning: _Tuning, template: Template, notes: list[str]) -> Search:
     if not tuning.parameters:
         raise file.error(("parameters",), "give the parameters, each [first, step, number]")
     parameters: dict[str, Any] = {}
@@ -298,7 +239,7 @@ def _grid(file: RustleFile, tuning: Tuning, template: Template, notes: list[str]
             parameters[name], axes[name] = _categories(file, key, given, default), given
             size *= len(given)
         else:
-            parameters[name] = _axis(file, key, given, default)
+            parameters[name] = _axis(file, key, given, _number_default(file, key, template))
             axes[name] = given
             size *= given[2]
     if not parameters:
@@ -307,7 +248,7 @@ def _grid(file: RustleFile, tuning: Tuning, template: Template, notes: list[str]
     if tuning.tuning_algo == "random_search":
         offline["sampler"] = "random"
         if tuning.time_limit is None:
-            offline["trials"] = min(size + 1, MOST_POINTS)
+            offline["trials"] = min(size + 1, _MOST_POINTS)
     stopping = tuning.early_stopping
     if stopping is not None and tuning.time_limit is None:
         offline["stagnation"] = stopping.tolerance
@@ -319,9 +260,7 @@ def _grid(file: RustleFile, tuning: Tuning, template: Template, notes: list[str]
     return parameters, offline
 
 
-def _categories(
-    file: RustleFile, key: Key, given: list[Any], default: str | bool
-) -> dict[str, Any]:
+def _categories(file: _File, key: Key, given: list[Any], default: str | bool) -> dict[str, Any]:
     if not given or any(type(value) is not type(default) for value in given):
         raise file.error(key, f"give a list of values like {default!r}")
     choices = given if default in given else [default, *given]
@@ -334,22 +273,20 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-def _axis(file: RustleFile, key: Key, given: list[Any], default: Any) -> dict[str, Any]:
+def _axis(file: _File, key: Key, given: list[Any], default: Any) -> dict[str, Any]:
     """A range that holds the grid's points and the default."""
-    if not _is_number(default):
-        raise file.error(key, f"is {default!r} in the parameter file, which cannot be tuned")
     form = "give [first, step, number]"
     if len(given) != 3 or not all(map(_is_number, given)) or not isinstance(given[2], int):
         raise file.error(key, f"{form}, not {given!r}")
     first, step, number = given
-    if not 1 <= number <= MOST_POINTS or (step == 0 and number > 1):
+    if not 1 <= number <= _MOST_POINTS or (step == 0 and number > 1):
         raise file.error(key, f"{form}, the number from 1 on and the step not 0")
     last = first + step * (number - 1)
     low, high = min(first, last, default), max(first, last, default)
-    return range_of(low, high if high > low else low + (abs(step) or 1), default)
+    return _range(low, high if high > low else low + (abs(step) or 1), default)
 
 
-def _annealing(file: RustleFile, tuning: Tuning, template: Template, notes: list[str]) -> Search:
+def _annealing(file: _File, tuning: _Tuning, template: Template, notes: list[str]) -> Search:
     given = tuning.tuning_settings
     if given is None:
         raise file.error(("tuning_settings",), "is missing")
@@ -377,7 +314,7 @@ def _annealing(file: RustleFile, tuning: Tuning, template: Template, notes: list
     return {name: walk.parameter for name, walk in walks.items()}, offline
 
 
-def _schedule(given: Annealing, notes: list[str]) -> dict[str, Any]:
+def _schedule(given: _Annealing, notes: list[str]) -> dict[str, Any]:
     """Temperatures and triggers."""
     settings: dict[str, Any] = {"chains": 1, "energy_scale": 1.0}
     settings["initial_temperature"] = float(given.temperature.initial_value)
@@ -398,21 +335,19 @@ def _schedule(given: Annealing, notes: list[str]) -> dict[str, Any]:
 
 class _Walk(NamedTuple):
     parameter: dict[str, Any]
-    start: Number
+    start: _Number
     step: dict[str, Any]
 
 
 def _walk(
-    file: RustleFile, key: Key, bounds: Sequence[Number], given: Annealing, template: Template
+    file: _File, key: Key, bounds: Sequence[_Number], given: _Annealing, template: Template
 ) -> _Walk:
-    default = _default(file, key, template)
-    if not _is_number(default):
-        raise file.error(key, f"is {default!r} in the parameter file, which cannot be tuned")
+    default = _number_default(file, key, template)
     first, low, high = bounds[:3]
     if not low <= first <= high or low == high:
         raise file.error(key, "give [first, low, high, ...], low below high and first in them")
     # A range must hold the default; the walk keeps RUSTLE's bounds.
-    parameter = range_of(min(low, default), max(high, default), default)
+    parameter = _range(min(low, default), max(high, default), default)
     step = _step(file, key, bounds, parameter["type"], given)
     step |= {"low": low} if default < low else {}
     step |= {"high": high} if default > high else {}
@@ -420,11 +355,11 @@ def _walk(
 
 
 def _step(
-    file: RustleFile,
+    file: _File,
     key: Key,
-    bounds: Sequence[Number],
+    bounds: Sequence[_Number],
     kind: str,
-    given: Annealing,
+    given: _Annealing,
 ) -> dict[str, Any]:
     """A step of its own, or the one of all parameters."""
     own, usual = bounds[3:], given.perturbation_functions
@@ -448,51 +383,31 @@ _TOPICS = {
     "imu": ("imu_topic", "imuTopic"),
 }
 """How parameter files call the topics that a system reads."""
-_WIDTH = 99
 
 
 class ImportedStudy(NamedTuple):
-    """A study made of RUSTLE's files.
+    """A study made of RUSTLE's files."""
 
-    Attributes
-    ----------
-    name : str
-        What distinguishes it from the other studies of the same file.
-    about : str
-        What it was made of.
-    data : dict
-        The study as plain data.
-    notes : list of str
-        What has no counterpart, and what is to be looked at.
-    """
-
-    name: str
-    about: str
+    name: str  # what distinguishes it from the other studies of the same file
+    about: str  # what it was made of
     data: dict[str, Any]
-    notes: list[str]
+    notes: list[str]  # what has no counterpart, and what is to be looked at
 
     @property
     def text(self) -> str:
         """The study's YAML, with comments."""
-        lines = [*_wrapped("# ", self.about), "# Not taken over, or to be looked at:"]
+        lines = _wrapped("# ", self.about)
+        if self.notes:
+            lines.append("# Not taken over, or to be looked at:")
         for note in self.notes:
             lines += _wrapped("# - ", note)
-        if not self.notes:
-            lines.pop()
         sections = [files.dump({key: value}) for key, value in self.data.items()]
         return "\n".join([*lines, "", "\n".join(sections)])
 
 
 def _wrapped(begin: str, text: str) -> list[str]:
-    after = "# ".ljust(len(begin))
-    return textwrap.wrap(
-        text,
-        _WIDTH - 1,
-        initial_indent=begin,
-        subsequent_indent=after,
-        break_long_words=False,
-        break_on_hyphens=False,
-    )
+    lines = textwrap.wrap(text, 98 - len(begin), break_long_words=False, break_on_hyphens=False)
+    return [f"{'# '.ljust(len(begin)) if i else begin}{line}" for i, line in enumerate(lines)]
 
 
 def import_rustle(
@@ -519,12 +434,11 @@ def import_rustle(
     RustleError
         It names the file, the line and the key.
     """
-    file = read(path)
-    library = _Library(file, read(algorithms), read(datasets))
-    keys: Mapping[str, Any] = file.document.data or {}
-    if "test_definitions" in keys:
+    file = _File(path)
+    library = _Library(file, algorithms, datasets)
+    if "test_definitions" in file.data:
         return _of_tests(file, library)
-    if "tuning_algo" in keys:
+    if "tuning_algo" in file.data:
         return [_of_tuning(file, library)], []
     raise file.error((), "has neither test_definitions, as tests, nor tuning_algo, as a tuning")
 
@@ -532,30 +446,31 @@ def import_rustle(
 class _Library:
     """The algorithms and the data sets, as sections of a study."""
 
-    def __init__(self, asking: RustleFile, algorithms: RustleFile, datasets: RustleFile):
-        self._asking, self._algorithms, self._datasets = asking, algorithms, datasets
-        self.algorithms = algorithms.check(Algorithms)
-        self.datasets = datasets.check(Datasets)
+    def __init__(self, asking: _File, algorithms: Path, datasets: Path):
+        self.notes: list[str] = []
+        self._asking = asking
+        self._algorithms, self._datasets = _File(algorithms), _File(datasets)
+        self.algorithms = self._algorithms.check(_Algorithms, self.notes).algorithms
+        self.datasets = self._datasets.check(_Datasets, self.notes).datasets
 
-    def unknown(self) -> Iterator[str]:
-        """Notes on keys that say nothing here."""
-        for file, model in (
-            (self._algorithms, self.algorithms),
-            (self._datasets, self.datasets),
-        ):
-            yield from _ignored(file, unknown_keys(model))
+    def _place(self, file: _File, key: str, names: list[str], name: str, asked: Key) -> int:
+        """Place of the entry for which the file of the studies asks."""
+        if name not in names:
+            what = f"{file.path.name} has no {name!r} in {key}: {nearest(name, names)}"
+            raise self._asking.error(asked, what)
+        return names.index(name)
 
     def system(self, name: str, asked: Key) -> "_System | None":
         """An algorithm; None if it is one for ROS 2."""
-        entries, file = self.algorithms.algorithms, self._algorithms
-        i = file.find("algorithms", [e.name for e in entries], name, asked, self._asking)
-        given, key = entries[i], ("algorithms", i)
-        if _is_ros2(given.ros_version):
+        file, names = self._algorithms, [each.name for each in self.algorithms]
+        i = self._place(file, "algorithms", names, name, asked)
+        given = self.algorithms[i]
+        if given.ros_version.lower().replace("_", "") == "ros2":
             return None
         try:
             template = Template((file.path.parent / given.parameters).resolve())
         except OdometryError as error:
-            raise file.error((*key, "parameters"), str(error)) from error
+            raise file.error(("algorithms", i, "parameters"), str(error)) from error
         settings = {"image": given.image_name, "template": str(template.path)}
         settings |= {"odometry": given.odom_topics[0]}
         settings |= {kind: topic for kind in _TOPICS if (topic := _topic(template, kind))}
@@ -569,11 +484,13 @@ class _Library:
         )
         return _System(name, settings, template, notes)
 
-    def sequence(self, name: str, asked: Key, system: "_System") -> "_Section":
-        """A data set as a sequence for a system."""
-        entries, file = self.datasets.datasets, self._datasets
-        i = file.find("datasets", [e.name for e in entries], name, asked, self._asking)
-        given, folder = entries[i], file.path.parent / entries[i].dataset_path
+    def sequence(
+        self, name: str, asked: Key, topics: Mapping[str, str]
+    ) -> tuple[dict[str, Any], list[str]]:
+        """A data set as a sequence, for a system that reads these topics, and notes on it."""
+        file, names = self._datasets, [each.name for each in self.datasets]
+        given = self.datasets[self._place(file, "datasets", names, name, asked)]
+        folder = file.path.parent / given.dataset_path
         bags, notes = sorted(folder.glob("*.bag")), []
         if not folder.exists():
             notes.append(f"There is no {folder} here: correct the path of the bag.")
@@ -583,14 +500,13 @@ class _Library:
             notes.append(f"The bags of {folder} are taken for one recording, as RUSTLE plays them.")
         bag = bags[0] if len(bags) == 1 else folder
         data: dict[str, Any] = {"bag": str(bag.resolve())}
-        topics = system.settings
         data |= {"points": topics["points"]} if "points" in topics else {}
         data |= {"imu": {"topic": topics["imu"]}} if "imu" in topics else {}
         if given.ground_truth_topic is not None:
             data["reference"] = given.ground_truth_topic
         else:
             notes.append(f"{name} has no ground truth: adaptune estimates a reference.")
-        return _Section(data, notes)
+        return data, notes
 
 
 class _System(NamedTuple):
@@ -598,15 +514,6 @@ class _System(NamedTuple):
     settings: dict[str, Any]
     template: Template
     notes: list[str]
-
-
-class _Section(NamedTuple):
-    data: dict[str, Any]
-    notes: list[str]
-
-
-def _is_ros2(version: str) -> bool:
-    return version.lower().replace("_", "") == "ros2"
 
 
 def _topic(template: Template, kind: str) -> str | None:
@@ -620,32 +527,25 @@ def _topic(template: Template, kind: str) -> str | None:
     return None
 
 
-def _ignored(file: RustleFile, keys: Iterator[str]) -> list[str]:
-    return [f"{file.path.name}: {key} is not known here, and is ignored." for key in keys]
-
-
 def _name(*parts: str) -> str:
     return "_".join(re.sub(r"[^\w.-]+", "_", part).strip("._-") or "unnamed" for part in parts)
 
 
 def _study(
-    system: _System, parameters: Mapping[str, Any], name: str, sequence: _Section, offline: Any
+    settings: dict[str, Any], parameters: Any, name: str, sequence: Any, offline: Any
 ) -> dict[str, Any]:
-    odometry = {"name": "rustle", "settings": system.settings, "parameters": dict(parameters)}
     return {
-        "odometry": odometry,
-        "sequences": {_name(name): sequence.data},
+        "odometry": {"name": "rustle", "settings": settings, "parameters": parameters},
+        "sequences": {_name(name): sequence},
         "training": [_name(name)],
         "offline": offline,
     }
 
 
-# Tests.
-
-
-def _of_tests(file: RustleFile, library: _Library) -> tuple[list[ImportedStudy], list[str]]:
-    tests = file.check(RustleTests)
-    studies, skipped = [], [*_ignored(file, unknown_keys(tests)), *library.unknown()]
+def _of_tests(file: _File, library: _Library) -> tuple[list[ImportedStudy], list[str]]:
+    studies, skipped = list[ImportedStudy](), list[str]()
+    tests = file.check(_Tests, skipped)
+    skipped += library.notes
     for i, test in enumerate(tests.test_definitions):
         kind, key = test.test_type.type, ("test_definitions", i)
         if kind in ("drop", "cut"):
@@ -659,15 +559,19 @@ def _of_tests(file: RustleFile, library: _Library) -> tuple[list[ImportedStudy],
             if system is None:
                 skipped.append(f"Test {test.name!r} is left out for {name}, an image of ROS 2.")
                 continue
-            sequence = library.sequence(test.dataset_name, (*key, "dataset_name"), system)
-            speeds = _speeds(file, key, test)
-            studies += [_of_test(file, test, system, sequence, speed) for speed in speeds]
+            sequence, notes = library.sequence(
+                test.dataset_name, (*key, "dataset_name"), system.settings
+            )
+            studies += [
+                _of_test(file, test, system._replace(notes=system.notes + notes), sequence, speed)
+                for speed in _speeds(file, key, test)
+            ]
     if not studies:
         raise RustleError("\n".join([f"{file.path}: no study can be made of it", *skipped]))
     return studies, skipped
 
 
-def _speeds(file: RustleFile, key: Key, test: RustleTest) -> list[float]:
+def _speeds(file: _File, key: Key, test: _Test) -> list[float]:
     """Speeds of the bag, as RUSTLE makes them."""
     given = test.test_type
     if given.type == "simple":
@@ -685,16 +589,15 @@ def _speeds(file: RustleFile, key: Key, test: RustleTest) -> list[float]:
 
 
 def _of_test(
-    file: RustleFile, test: RustleTest, system: _System, sequence: _Section, speed: float
+    file: _File, test: _Test, system: _System, sequence: Any, speed: float
 ) -> ImportedStudy:
     parameters = dict(_every_number(system.template))
     if not parameters:
         raise file.error((), f"{system.template.path} holds no number that could be tuned")
-    own = system._replace(settings=system.settings | {"rate": speed})
     offline = {"objective": "rpe", "runs": "whole", "trials": 1}
     offline |= {"baseline_runs": test.iterations, "workers": test.workers}
     notes = [
-        *(*system.notes, *sequence.notes),
+        *system.notes,
         "A test tunes nothing, so the study has one trial, the baseline, which runs "
         f"{test.iterations} times. To tune, keep the parameters that you want, give them ranges "
         "that make sense (those below are half and twice the value), and raise offline.trials.",
@@ -707,7 +610,8 @@ def _of_test(
         f"Made of the test {test.name!r} of {file.path.name}: {system.name} on "
         f"{test.dataset_name}, played {speed:g} times as fast as recorded."
     )
-    data = _study(own, parameters, test.dataset_name, sequence, offline)
+    settings = system.settings | {"rate": speed}
+    data = _study(settings, parameters, test.dataset_name, sequence, offline)
     return ImportedStudy(_name(*names), about, data, notes)
 
 
@@ -726,30 +630,28 @@ def _every_number(template: Template) -> Iterator[tuple[str, dict[str, Any]]]:
         ends = sorted((value / 2, 2 * value))
         if isinstance(value, int):
             ends = [math.ceil(ends[0]), math.floor(ends[1])]
-        yield "/".join(parts), range_of(ends[0], ends[1], value)
+        yield "/".join(parts), _range(ends[0], ends[1], value)
 
 
-# Tunings.
-
-
-def _of_tuning(file: RustleFile, library: _Library) -> ImportedStudy:
-    tuning = file.check(Tuning)
+def _of_tuning(file: _File, library: _Library) -> ImportedStudy:
+    notes: list[str] = []
+    tuning = file.check(_Tuning, notes)
     system = library.system(tuning.algo_name, ("algo_name",))
     if system is None:
         raise file.error(("algo_name",), f"{tuning.algo_name} is an image of ROS 2, not of ROS 1")
     of = tuning.dataset_settings
-    sequence = library.sequence(of.name, ("dataset_settings", "name"), system)
+    sequence, of_data = library.sequence(of.name, ("dataset_settings", "name"), system.settings)
     part = {"start": float(of.start)} if of.start else {}
     if of.duration is not None and of.duration > 0:
         part["stop"] = float(of.start + of.duration)
-    notes = [*_ignored(file, unknown_keys(tuning)), *library.unknown()]
-    notes += [*system.notes, *sequence.notes]
+    notes += [*library.notes, *system.notes, *of_data]
     if part and "points" not in system.settings:
         notes.append(
             "Only a part of the recording is played, from a bag that adaptune writes: "
             "give odometry.settings points, and imu, the topics that the system reads."
         )
-    parameters, offline = search_of(file, tuning, system.template, notes)
+    search = _annealing if tuning.tuning_algo == "simulated_annealing" else _grid
+    parameters, offline = search(file, tuning, system.template, notes)
     weights = {k: float(w) for k, w in tuning.metric_weights if w and k in ("ape", "rpe")}
     if not weights:
         raise file.error(("metric_weights",), "give ape or rpe a weight above 0")
@@ -758,8 +660,7 @@ def _of_tuning(file: RustleFile, library: _Library) -> ImportedStudy:
     offline = {"objective": objective, "runs": "whole", "workers": 1} | offline
     if tuning.time_limit is not None:
         offline["hours"] = float(tuning.time_limit)
-    section = _Section(sequence.data | part, [])
-    data = _study(system, parameters, of.name, section, offline)
+    data = _study(system.settings, parameters, of.name, sequence | part, offline)
     how = tuning.tuning_algo.replace("_", " ")
     what = f"Made of the tuning {tuning.name!r}, {file.path.name}"
     about = f"{what}: {how} for {system.name} on {of.name}."
