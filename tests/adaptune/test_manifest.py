@@ -131,25 +131,33 @@ def test_what_did_not_change_is_not_run_again(load, caplog):
     assert load("training=[two, one]").model_inputs == load().model_inputs
 
 
-def test_a_bag_of_the_same_size_and_time(load, tmp_path, caplog):
-    run(load())
-    replace_bag(tmp_path / "two.bag")
-    said, left = renewed(load(), caplog)
-    assert re.fullmatch(r"2 trials are run again: .*/two\.bag has other content", said)
-    assert left == ONE
-    assert [name for name in files(load(), "earlier") if "frames" not in name] == TWO
+@pytest.mark.parametrize(
+    ("edited", "study", "left"),
+    [
+        ("two.bag", "small", ONE),
+        ("one.tum", "small", TWO),
+        ("class", "small", []),
+        ("run.sh", "program", []),
+        ("set.yaml", "program", []),
+    ],
+)
+def test_what_was_edited_is_run_again(load, tmp_path, caplog, edited, study, left):
+    overrides, path = mine(tmp_path) if edited == "class" else ([], tmp_path / edited)
 
+    def again():
+        return load(*overrides, file=f"{study}.yaml")
 
-def test_a_reference_of_the_same_and_of_another_size(load, tmp_path, caplog):
-    path = tmp_path / "one.tum"
-    run(study := load())
-    text = path.read_text()
-    for other in (text.replace("1", "2", 1), text + text.splitlines()[-1].replace("17", "27", 1)):
-        path.write_text(other)
-        said, left = renewed(study, caplog)
-        assert "one.tum has other content" in said
-        assert left == TWO
-        run(study)
+    run(again())
+    if edited == "two.bag":
+        replace_bag(path)
+    else:
+        path.write_text(path.read_text() + "\n# other\n")
+    said, found = renewed(again(), caplog)
+    told = rf"{4 - len(left)} trials are run again: .*{path.stem}.* has other content"
+    assert re.fullmatch(told, said)
+    assert found == left
+    moved = [name for name in files(again(), "earlier") if "frames" not in name]
+    assert moved == [name for name in ONE + TWO if name not in left]
 
 
 def test_a_recording_may_move(load, tmp_path, caplog):
@@ -186,23 +194,6 @@ def test_earlier_trials_whose_numbers_mean_other_sets_stay_away(load, tmp_path, 
     load().archive().write("one", 0, trial({"a": "another"}))
     (tmp_path / "two.bag").write_bytes(bag)
     assert renewed(load(), caplog)[1] == ["one/00000"]
-
-
-def test_a_class_that_was_edited(load, tmp_path, caplog):
-    overrides, module = mine(tmp_path)
-    run(load(*overrides))
-    module.write_text(module.read_text() + "\n# other\n")
-    said, left = renewed(load(*overrides), caplog)
-    assert said == f"4 trials are run again: module {module.stem} has other content"
-    assert left == []
-
-
-@pytest.mark.parametrize("file", ["run.sh", "set.yaml"])
-def test_a_program_or_template_that_was_edited(load, tmp_path, file, caplog):
-    run(load(file="program.yaml"))
-    assert renewed(load(file="program.yaml"), caplog) == ("", ONE + TWO)
-    (tmp_path / file).write_text((tmp_path / file).read_text() + "# other\n")
-    assert f"{file} has other content" in renewed(load(file="program.yaml"), caplog)[0]
 
 
 @pytest.mark.parametrize(

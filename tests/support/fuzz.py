@@ -101,11 +101,7 @@ def samples() -> Iterator[tuple[bytes, Decode]]:
         for kind in (*LAYOUTS, LIVOX):
             typename = LIVOX if kind == LIVOX else CLOUD
             sound = message(made, kind, START, rng)
-            if kind == LIVOX:
-                fields = store.fielddefs
-                decode: Decode = _livox(fields, cdr)
-            else:
-                decode = _cloud(cdr)
+            decode = decoder(kind, cdr, store.fielddefs)
             if cdr:
                 yield bytes(store.serialize_cdr(sound, typename)), decode
                 yield bytes(store.serialize_cdr(sound, typename, little_endian=False)), decode
@@ -113,11 +109,9 @@ def samples() -> Iterator[tuple[bytes, Decode]]:
                 yield bytes(store.serialize_ros1(sound, typename)), decode
 
 
-def _cloud(cdr: bool) -> Decode:
-    return lambda data: clouds.decode_cloud(data, cdr)
-
-
-def _livox(fields: Any, cdr: bool) -> Decode:
+def decoder(kind: str, cdr: bool, fields: Any) -> Decode:
+    if kind != LIVOX:
+        return lambda data: clouds.decode_cloud(data, cdr)
     point = fields[LIVOX.replace("Msg", "Point")][1]
     return lambda data: clouds.decode_livox(data, fields[LIVOX][1], point, cdr, AUTO)
 
@@ -301,13 +295,7 @@ def fuzz_bags(number: int, seed: int, folder: Path) -> Counter[str]:
 
 @contextlib.contextmanager
 def case(what: str) -> Iterator[None]:
-    """Tell what was damaged where something else happens than should, and stop what does not end.
-
-    Raises
-    ------
-    AssertionError
-        Naming the case.
-    """
+    """Tell what was damaged where something else happens than should, and stop what does not end."""
 
     def late(*_: object) -> None:
         raise TimeoutError(f"took more than {SECONDS} s")

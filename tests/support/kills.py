@@ -39,17 +39,9 @@ def contents(folder: Path) -> dict[Path, object]:
 def begin(study_file: Path, folder: Path, *overrides: str) -> subprocess.Popen[str]:
     """Start a campaign in a process of its own."""
     given = [word for text in overrides for word in ("-o", text)]
-    command = [
-        "-m",
-        "adaptune.commands.cli",
-        "offline",
-        str(study_file),
-        "--folder",
-        str(folder),
-        *given,
-    ]
+    command = [sys.executable, "-m", "adaptune.commands.cli", "offline", str(study_file)]
     return subprocess.Popen(
-        [sys.executable, *command],
+        [*command, "--folder", str(folder), *given],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
         text=True,
@@ -89,26 +81,9 @@ def disturb(
     """Run a campaign to its end, killing its driver or one of its workers at random moments.
 
     Moments are counted in trials and not in seconds, so that as many kills land on a machine that
-    is busy: each comes up to `PAUSE` after up to a fifth of all trials were finished since the
-    last one, be it while the driver starts or while the model is fitted.
-
-    Parameters
-    ----------
-    study_file, folder
-        The study.
-    kills
-        The most to kill.
-    n_files
-        How many trials an undisturbed campaign writes, see `files`.
-    rng
-        Chooses moments, and whether a driver or a worker is killed, with equal chance.
-    overrides
-        Of the study's values.
-
-    Returns
-    -------
-    n_drivers, n_workers : int
-        How many were killed.
+    is busy: each comes up to `PAUSE` after up to a fifth of all trials (`n_files` in all) were
+    finished since the last one, be it while the driver starts or while the model is fitted.
+    Returns how many drivers and workers were killed.
     """
     killed = [0, 0]
     finished: dict[Path, tuple[int, int]] = {}

@@ -1,7 +1,5 @@
 """Recordings that tests write."""
 
-from typing import Any
-
 import numpy as np
 from rosbags import rosbag1, rosbag2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -65,7 +63,7 @@ def cloud(raw, stamp=START, store=ROS2, **changes):
         "is_bigendian": big,
         "point_step": step,
         "row_step": step * width,
-        "data": np.frombuffer(np.ascontiguousarray(raw).tobytes(), np.uint8),
+        "data": np.ascontiguousarray(raw).ravel().view(np.uint8).copy(),
         "is_dense": False,
     }
     return store.types["sensor_msgs/msg/PointCloud2"](**(given | changes))
@@ -84,8 +82,14 @@ def bare_pose(position, quaternion, store):
     )
 
 
-Message = tuple[str, int, Any]
-"""Topic, time of recording, message."""
+def imu(stamp, rate, force, store=ROS2):
+    """Measurements without orientation."""
+    types, unknown = store.types, np.zeros(9)
+    rate, force = (types["geometry_msgs/msg/Vector3"](*map(float, v)) for v in (rate, force))
+    orientation = types["geometry_msgs/msg/Quaternion"](0, 0, 0, 1)
+    return types["sensor_msgs/msg/Imu"](
+        header(stamp, "imu", store), orientation, unknown, rate, unknown, force, unknown
+    )
 
 
 def write_bag(path, messages, compression=None, topics=()):
@@ -94,7 +98,6 @@ def write_bag(path, messages, compression=None, topics=()):
     Messages are made by `store_of(path)`. `topics` are pairs of topic and type without messages.
     """
     store = store_of(path)
-    writer: Any
     if store is ROS1:
         writer = rosbag1.Writer(path)
         if compression:

@@ -173,24 +173,12 @@ def test_no_offset_is_proposed_where_the_motions_differ():
 def imu_bag(path, offset):
     """Scans and an IMU on one clock, poses on another."""
     imu, trajectory = imu_and_trajectory(offset)
-    types = rec.ROS1.types
-    vector = types["geometry_msgs/msg/Vector3"]
-    nothing = np.zeros(9)
     messages = [
         ("/points", s, rec.cloud(rec.velodyne(rec.scans(1)[0]), s, rec.ROS1))
         for s in range(10**18, 10**18 + 60 * 10**9, 10**10)
     ]
     for stamp, rate in zip(imu.stamps[::4].tolist(), imu.angular_velocity[::4], strict=True):
-        message = types["sensor_msgs/msg/Imu"](
-            rec.header(stamp, "imu", rec.ROS1),
-            types["geometry_msgs/msg/Quaternion"](0, 0, 0, 1),
-            nothing,
-            vector(*rate.tolist()),
-            nothing,
-            vector(0.0, 0.0, 1.0),
-            nothing,
-        )
-        messages.append(("/imu", stamp, message))
+        messages.append(("/imu", stamp, rec.imu(stamp, rate, (0, 0, 1), rec.ROS1)))
     q = geometry.to_quaternions(trajectory.T_world_sensor)
     for stamp, o in zip(trajectory.stamps.tolist(), q.tolist(), strict=True):
         messages.append(("/poses", 10**18, rec.pose(stamp, (0, 0, 0), o, rec.ROS1)))

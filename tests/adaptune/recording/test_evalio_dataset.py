@@ -25,8 +25,6 @@ def test_names_that_evalio_does_not_know_or_have():
 def test_a_data_set_is_read_as_evalio_reads_it(tmp_path, datasets):
     folder = tmp_path / "botanic_garden" / "b1005_00"
     folder.mkdir(parents=True)
-    types = rec.ROS1.types
-    zero = types["geometry_msgs/msg/Vector3"](0.0, 0.0, 1.0)
     messages = []
     for i, points in enumerate(rec.scans(3, 200)):
         raw = rec.velodyne(points)
@@ -34,16 +32,8 @@ def test_a_data_set_is_read_as_evalio_reads_it(tmp_path, datasets):
         raw["time"] = np.linspace(-0.1, 0, len(raw))
         stamp = rec.START + (i + 1) * 10**8
         messages.append(("/velodyne_points", stamp, rec.cloud(raw, stamp, rec.ROS1)))
-        imu = types["sensor_msgs/msg/Imu"](
-            rec.header(stamp, "imu", rec.ROS1),
-            types["geometry_msgs/msg/Quaternion"](0, 0, 0, 1),
-            np.zeros(9),
-            zero,
-            np.zeros(9),
-            zero,
-            np.zeros(9),
-        )
-        messages.append(("/imu/data", stamp, imu))
+        measured = rec.imu(stamp, (0, 0, 1), (0, 0, 1), rec.ROS1)
+        messages.append(("/imu/data", stamp, measured))
     rec.write_bag(folder / "1005_00.bag", messages)
     seconds = [
         f"{(rec.START + i * 10**8) // 10**9}.{(rec.START + i * 10**8) % 10**9:09d}" for i in (0, 3)

@@ -2,9 +2,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import rec
 from inspected import entry, inspection_text, texts
 from rosbags.highlevel import AnyReader
-from small_bag import START, STORE, bad_cloud, cloud, drive, header, write
+from small_bag import START, STORE, bad_cloud, cloud, drive, write
 
 from adaptune import files
 from adaptune.recording import SequenceConfig, SequenceError
@@ -111,13 +112,10 @@ def test_a_bag_that_is_damaged_in_the_middle_says_so(tmp_path):
 
 
 def test_an_imu_that_is_not_finite_is_reported(tmp_path):
-    types = STORE.types
-    q, none = types["geometry_msgs/msg/Quaternion"](0, 0, 0, 1), np.zeros(9)
     messages = [("/points", t, cloud(t)) for t in (START, START + 10**8)]
-    for z in (9.81, np.nan):
-        v = types["geometry_msgs/msg/Vector3"](0, 0, z)
-        imu = types["sensor_msgs/msg/Imu"](header(START), q, none, v, none, v, none)
-        messages.append(("/imu", START, imu))
+    messages += [
+        ("/imu", START, rec.imu(START, (0, 0, z), (0, 0, z), STORE)) for z in (9.81, np.nan)
+    ]
     inspection = inspect(write(tmp_path / "a.bag", messages))
     assert "/imu: 1 of 2 messages do not decode" in " ".join(texts(inspection))
     text = inspection_text(inspection, width=1000)
