@@ -295,7 +295,7 @@ def fuzz_bags(number: int, seed: int, folder: Path) -> Counter[str]:
 
 @contextlib.contextmanager
 def case(what: str) -> Iterator[None]:
-    """Tell what was damaged where something else happens than should, and stop what does not end."""
+    """Tell what was damaged where something goes wrong, and stop what does not end."""
 
     def late(*_: object) -> None:
         raise TimeoutError(f"took more than {SECONDS} s")
