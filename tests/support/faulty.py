@@ -10,18 +10,6 @@ import numpy as np
 from adaptune.odometry import BaseSettings, Odometry, Registration
 from adaptune.space import Float, ParameterSpace
 
-FAULTS = (
-    "abort",
-    "segmentation fault",
-    "exit",
-    "raise",
-    "hang",
-    "memory",
-    "NaN",
-    "not rigid",
-    "mirrored",
-    "shape",
-)
 ELSEWHERE = ("init", "prepare", "start", "nothing", "hangs in init")
 """Faults that do not happen at the scan, and a registration that returns nothing."""
 n_instances = 0

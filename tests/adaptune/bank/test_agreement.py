@@ -42,24 +42,17 @@ def test_jitter_is_no_departure():
     assert not judged(each)[5:, 3].any()
 
 
-@pytest.mark.parametrize("drift", [0.2, -0.2])
-def test_a_slow_departure_is_noticed_within_a_second(drift):
-    sound, drifting = motions(*[0.1] * 4), motions(0.1, 0.1, 0.1, 0.1 + 0.1 * drift)
-    agreeing = judged([sound] * 20 + [drifting] * 10)
+@pytest.mark.parametrize("speed", [0.5, 1.0, 10.0])
+@pytest.mark.parametrize("drift", [0.2, -0.2, -1.0])
+def test_a_departure_is_noticed_within_a_second(drift, speed):
+    step = 0.1 * speed
+    departing = motions(step, step, step, step * (1.0 + drift))
+    agreeing = judged([motions(*[step] * 4)] * 20 + [departing] * 10)
     assert agreeing[:20].all()
     assert agreeing[:, :3].all()
     assert not agreeing[-1, 3]
     # Seven hundredths of the way are not a departure.
-    assert judged([motions(0.1, 0.1, 0.1, 0.107)] * 40).all()
-
-
-@pytest.mark.parametrize("speed", [0.5, 1.0, 10.0])
-def test_a_member_that_stands_still_is_noticed_within_a_second(speed):
-    stands = [motions(*[0.1 * speed] * 3, 0.0)] * 10
-    agreeing = judged([motions(*[0.1 * speed] * 4)] * 20 + stands)
-    assert agreeing[:20].all()
-    assert agreeing[:, :3].all()
-    assert not agreeing[-1, 3]
+    assert judged([motions(step, step, step, 1.07 * step)] * 40).all()
 
 
 def test_a_member_that_turns_otherwise_is_noticed_within_a_second():
@@ -162,9 +155,7 @@ def test_they_are_asked_only_where_nobody_has_the_most_or_the_bank_is_lost():
     assert judged(of_five, weights=weights, alignment=asked)[-1].sum() == 3
     assert not asked.calls
     light = np.array([0.1, 0.1, 0.2, 0.3, 0.3])
-    assert judged(of_five, weights=light, alignment=asked)[-1].tolist() == [True, True] + 3 * [
-        False
-    ]
+    assert np.flatnonzero(judged(of_five, weights=light, alignment=asked)[-1]).tolist() == [0, 1]
     # Nobody is asked what all agree on.
     asked = Asked(0.1, 0.2, 0.3, 0.4)
     assert judged([motions(*[0.1] * 4)] * 3, alignment=asked, lost=True).all()
@@ -210,19 +201,6 @@ def test_who_slips_is_left_out_and_who_is_far_off_restarts_as_well(departs, due)
     assert any(asked for _, asked in found) == due
 
 
-def test_who_has_restarted_and_is_sound_agrees_at_once():
-    stands, sound = motions(0.1, 0.1, 0.1, 0.0), motions(*[0.1] * 4)
-    agrees = {}
-    for told in (False, True):
-        agreement = Agreement(4, 3.0)
-        for _ in range(12):
-            agreement.judge(stands, 0.1, EVEN)
-        if told:
-            agreement.restarted(np.array([False, False, False, True]))
-        agrees[told] = agreement.judge(sound, 0.1, EVEN)[3]
-    assert agrees == {False: False, True: True}
-
-
 def test_who_restarts_begins_where_the_bank_is_and_has_a_second():
     agreement = Agreement(4, 3.0)
     lost = motions(0.1, 0.1, 0.1, 0.0)
@@ -263,11 +241,3 @@ def test_equal_shares_where_those_that_agree_have_no_weight():
     agreeing = np.array([False, True, True])
     assert share(np.array([0.5, 0.3, 0.2]), agreeing).tolist() == [0.0, 0.3, 0.2]
     assert share(np.array([1.0, 0.0, 0.0]), agreeing).tolist() == [0.0, 1.0, 1.0]
-
-
-def test_a_lost_track_bounds_what_fast_members_may_differ_by():
-    usually = motions(1.0, 1.02, 0.98, 1.0)
-    each = [usually] * 12 + [motions(1.0, 1.02, 0.98, 1.6)] + [usually] * 5
-    # Over a second it departs by up to 0.9 m, of 10 m.
-    assert not judged(each, lost_track=0.7)[-1, 3]
-    assert judged(each, lost_track=1.4)[-1, 3]

@@ -4,14 +4,11 @@ import faulty
 import numpy as np
 import pytest
 import turns
-from needs import needs_evalio
 from walker import at, kept, makes, selected, x_of, x_on
 
 from adaptune.bank.bank import Bank
-from adaptune.geometry import invert
 from adaptune.odometry import OdometryError
 from adaptune.odometry.base import MOST_FAULTS, InProcess
-from adaptune.odometry.evalio import EvalioSettings
 from adaptune.odometry.keyframe import KeyframeGicp, KeyframeSettings
 from adaptune.odometry.remote import Isolated, Limits
 from adaptune.space import Selection
@@ -57,16 +54,6 @@ def test_a_lost_one_is_left_out_and_started_anew(lost):
     # Scans 3, 4 and 5 lie within two seconds.
     assert [second for second, _ in made[lost].starts] == [0, 3]
     assert made[lost].seen[-7:] == [5, 3, 4, 5, 6, 7, 8]
-
-
-def test_where_two_disagree_the_heavier_is_believed():
-    make, _ = makes()
-    odometry = Bank(make, {7: {"speed": 1.0}, 3: {"speed": 3.0}}, 2.0, 0.1)
-    assert x_of(odometry, range(5), {3: 3}) == [0, 1, 2, 5, 8]
-    for heavy, step, seconds in ((0.4, 1.0, range(5, 8)), (0.6, 3.0, range(8, 11))):
-        weigh(odometry, 1.0 - heavy, heavy)
-        np.testing.assert_allclose(np.diff(x_on(odometry, seconds)), step)
-    assert odometry.restarts == 0
 
 
 def test_a_member_restarts_once_a_second_at_most():
@@ -148,15 +135,6 @@ def test_members_that_rest_see_no_scans_until_they_are_woken():
     assert [one.starts[1:] for one in made[1:]] == [[(12, 0.0)], []]
 
 
-@pytest.mark.parametrize("chosen", [1.0, 3.0])
-def test_no_pose_is_worse_than_any(chosen):
-    make, _ = makes({1.0: {3: np.nan}})
-    odometry = Bank(make, {7: {"speed": 1.0}, 3: {"speed": 3.0}}, 2.0, 0.1)
-    x = x_of(odometry, range(6), {0: 7 if chosen == 1.0 else 3})
-    assert np.diff(x).tolist() == [chosen, chosen, 3.0, chosen, chosen]
-    assert odometry.restarts == 1
-
-
 def test_no_pose_at_all_is_told():
     make, _ = makes({s: {3: np.nan} for s in (1.0, 3.0)})
     odometry = Bank(make, {7: {"speed": 1.0}, 3: {"speed": 3.0}}, 2.0, 0.1)
@@ -216,26 +194,12 @@ def test_a_bank_of_equal_instances_is_the_single_run():
     np.testing.assert_allclose(switched, drive(gicp(NEAR), n=15), atol=1e-12)
 
 
-def test_a_bank_that_rests_is_the_single_run():
-    bank = Bank(gicp, {0: NEAR, 1: FAR}, warm_up=1.0)
-    bank.apply(Selection(0, {}, {0: 1.0}, resting=frozenset({1})))
-    np.testing.assert_allclose(drive(bank, n=15), drive(gicp(NEAR), n=15), atol=1e-12)
-
-
 def test_a_bank_in_other_processes_is_the_same():
     def elsewhere(parameters):
         return Isolated("gicp", parameters, KeyframeSettings(), Limits())
 
     a, b = (drive(Bank(make, {0: NEAR, 1: FAR}, 0.5), [0, 1], 15) for make in (gicp, elsewhere))
     np.testing.assert_array_equal(a, b)
-
-
-def test_real_odometries_go_straight_on():
-    sets = {0: NEAR, 1: FAR, 2: {**NEAR, "keyframe_interval": 2.0}}
-    poses = drive(Bank(gicp, sets, 0.5), [1, 0], n=15)
-    steps = invert(poses[:-1]) @ poses[1:]
-    np.testing.assert_allclose(steps[:, 0, 3], turns.STEP, atol=0.05)
-    np.testing.assert_allclose(steps[:, 1:3, 3], 0.0, atol=0.05)
 
 
 def with_faulty(fault):
@@ -308,30 +272,3 @@ def test_other_processes_work_while_members_of_this_one_do():
     x_of(bank, range(2))
     assert calls == [("submit", True), ("submit", False), ("collect", False), ("collect", True)]
     assert [T[0, 3] for T in bank.motions.members.values()] == [1.0, 1.02]
-
-
-def test_odometries_with_global_state_are_as_if_they_were_alone():
-    needs_evalio()
-    sets = {0: {"voxel_size": 0.4}, 1: {"voxel_size": 0.8}}
-
-    def genz(parameters):
-        return Isolated("genz_icp", parameters, EvalioSettings(), Limits())
-
-    bank, moved = Bank(genz, sets, 1.0), []
-    alone = {trial: genz(parameters) for trial, parameters in sets.items()}
-    for i in range(12):
-        if i == 0:
-            bank.start(bank.prepare(turns.turn(0)), np.eye(4))
-            for one in alone.values():
-                one.start(one.prepare(turns.turn(0)), np.eye(4))
-            continue
-        bank.register(bank.prepare(turns.turn(i)))
-        for one in alone.values():
-            one.register(one.prepare(turns.turn(i)))
-        for trial, one in alone.items():
-            np.testing.assert_array_equal(bank.motions.members[trial], one.motions[0])
-        moved.append([T[0, 3] for T in bank.motions.members.values()])
-    assert bank.restarts == 0
-    assert not np.array_equal(*np.transpose(moved))
-    for one in (bank, *alone.values()):
-        one.close()

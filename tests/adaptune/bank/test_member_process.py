@@ -9,7 +9,6 @@ import pytest
 from adaptune.bank.bank import Bank
 from adaptune.bank.members import KEPT, SERVICE, Member, spread
 from adaptune.odometry.base import InProcess
-from adaptune.odometry.keyframe import KeyframeGicp, KeyframeVgicp
 from adaptune.odometry.registry import OdometryFactory, OdometryPool, odometry_class
 from adaptune.odometry.remote import Limits
 from adaptune.processes import server
@@ -136,21 +135,3 @@ def test_usage_counts_the_process_once(scans):
     used = odometry.usage
     assert 0.0 < used.other_cpu < used.cpu
     assert 20.0 < used.memory < 5_000.0
-
-
-def test_parameters_change_in_the_process(scans):
-    for cls, name in ((KeyframeGicp, "gicp"), (KeyframeVgicp, "vgicp")):
-        factory = OdometryFactory(name, {}, cls.space, Limits())
-        other = {"keyframe_interval": 1.0}
-        found = []
-        for n_cores in (1, 2):
-            # The member of the other process, if there is one, is the last.
-            member = spread(factory, [cls.space.baseline] * 2, n_cores)[-1]
-            member.start(member.prepare(scans[0]), np.eye(4))
-            for i, scan in enumerate(scans[1:20]):
-                if i == 5:
-                    member.apply(Selection(0, other))
-                pose = member.register(member.prepare(scan)).T_odom_sensor
-            found.append(pose)
-            member.close()
-        np.testing.assert_array_equal(*found)

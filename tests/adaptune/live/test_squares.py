@@ -93,13 +93,6 @@ def test_windows_are_counted_by_the_path_that_they_cover(start, windows):
     assert live_squares(hops(np.ones((len(start), 2, 3)), start)).windows == pytest.approx(windows)
 
 
-def test_a_hop_within_another_adds_no_window():
-    inner = HopErrors(
-        np.ones((3, 1, 3)), np.array([0.0, 2.0, 10.0]), np.array([20.0, 7.0, 25.0]), np.zeros(3)
-    )
-    assert live_squares(inner).windows == pytest.approx(25.0 / (40.0 / 3.0))
-
-
 @pytest.mark.parametrize("length", [10.0, 5.0])
 def test_the_registrations_own_part_grows_with_shorter_hops(length):
     found = live_squares(hops(np.ones((3, 2, 3)), length=length))

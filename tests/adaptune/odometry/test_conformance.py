@@ -11,7 +11,6 @@ from functools import cache
 
 import numpy as np
 import pytest
-from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 from street import (
     LOCKSTEP,
@@ -121,6 +120,9 @@ def test_a_second_instance_is_fresh(name):
     first, second = make(name), make(name)
     drive(first, prepared[:8])
     np.testing.assert_allclose(drive(second, prepared), usual_drive(name), atol=1e-6)
+    # So is the first, when it starts again.
+    if name in CLEAN:
+        np.testing.assert_allclose(drive(first, prepared), usual_drive(name), atol=1e-6)
 
 
 @in_python
@@ -134,14 +136,6 @@ def test_two_instances_side_by_side_do_not_meet(name):
         T_back = back.register(prepared[-1 - i]).T_odom_sensor
     np.testing.assert_allclose(T_there, usual_drive(name)[-1], atol=1e-6)
     assert T_back[0, 3] == pytest.approx(-STEP * (N_SCANS - 1), abs=0.1)
-
-
-@in_python
-def test_start_forgets_all_before(name):
-    prepared = prepared_drive(name)
-    odometry = make(name)
-    drive(odometry, prepared[::-1])
-    np.testing.assert_allclose(drive(odometry, prepared), usual_drive(name), atol=1e-6)
 
 
 @every_odometry
@@ -228,16 +222,6 @@ def test_points_that_are_all_too_near_or_too_far_make_a_poor_scan(name, scale):
 
 
 @in_python
-@pytest.mark.parametrize("n", [26, 32, 36])
-def test_a_scan_that_stays_where_it_was_predicted_is_counted(name, n):
-    odometry = make(name)
-    T_before, T = drive(odometry, prepared_drive(name)[:6])[-2:]
-    T_next, registered = odometry.register(odometry.prepare(poor_scan(n, 6)))
-    if np.allclose(T_next, T @ invert(T_before) @ T, atol=1e-9):
-        assert not registered
-
-
-@in_python
 def test_prepared_scans_say_what_they_take(name):
     odometry, points = make(name), np.random.default_rng(0).uniform(-50, 50, (200_000, 3))
     times = np.linspace(0, 0.1, len(points), dtype=np.float32)
@@ -321,7 +305,6 @@ def test_preparing_leaves_the_scan_and_serves_all_instances(name):
     np.testing.assert_allclose(drive(make(name), prepared), first, atol=1e-6)
     np.testing.assert_array_equal(points, before[0])
     np.testing.assert_array_equal(times, before[1])
-    assert prepared_bytes(prepared[0]) > 0
 
 
 @every_odometry
@@ -335,20 +318,6 @@ def test_parameters_that_do_not_exist_are_refused(name):
         odometry.start(prepared_drive(name)[0], np.eye(4))
         with pytest.raises(OdometryError, match="has no parameter 'voxl'"):
             odometry.apply(Selection(0, {"voxl": 1.0}))
-
-
-@every_odometry
-def test_settings_that_do_not_exist_are_refused(name):
-    with pytest.raises(ValidationError, match="donwsampling"):
-        odometry_class(name.partition(",")[0]).settings_type(donwsampling=0.5)
-
-
-@pytest.mark.parametrize(
-    ("name", "help_"), [("gipc", "did you mean 'gicp'"), ("zzz", "'gicp', 'kiss_icp'.*'ndt'")]
-)
-def test_an_odometry_that_does_not_exist(name, help_):
-    with pytest.raises(OdometryError, match=help_):
-        odometry_class(name)
 
 
 if __name__ == "__main__":

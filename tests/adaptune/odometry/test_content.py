@@ -5,7 +5,7 @@ import pytest
 
 from adaptune.model.descriptor import descriptor_content
 from adaptune.odometry.program import CommandSettings
-from adaptune.odometry.registry import module_file, odometry_content
+from adaptune.odometry.registry import odometry_content
 from adaptune.odometry.remote import ProcessSettings
 
 
@@ -28,14 +28,6 @@ def test_a_class_is_its_module(package):
     assert not any(name.startswith("theirs") for name in sys.modules)
 
 
-def test_modules_are_found_without_importing_them(package):
-    assert module_file("theirs.odometry") == package / "odometry.py"
-    assert module_file("theirs") == package / "__init__.py"
-    assert module_file("theirs.nothing") is None
-    assert module_file("nothing.at.all") is None
-    assert odometry_content("nothing:Mine", None) == {}
-
-
 @pytest.mark.parametrize(
     ("name", "package"),
     [("gicp", "small_gicp"), ("vgicp", "small_gicp"), ("ndt", "open3d"), ("mad_icp", "evalio")],
@@ -43,11 +35,6 @@ def test_modules_are_found_without_importing_them(package):
 def test_a_built_in_one_is_the_version_of_its_package(name, package):
     version = metadata.version(package)
     assert odometry_content(name, None) == {f"version of {package}": version}
-
-
-def test_a_class_of_a_distribution_is_its_version_too():
-    found = odometry_content("kiss_icp.kiss_icp:KissICP", None)
-    assert found["version of kiss-icp"] == metadata.version("kiss-icp")
 
 
 def test_a_program_is_its_files(tmp_path):

@@ -23,7 +23,6 @@ CHECK = Cautious(max_speed=10.0)
         ((6, 6, 6), None, 0.1, False),
         # At once from rest to full speed: nothing is known of how fast it was.
         ((10, 0, 0), None, 0.001, True),
-        ((5, 0, 0), (5, 0, 0), 0.1, True),
         ((5.4, 0, 0), (5, 0, 0), 0.1, True),
         ((5.6, 0, 0), (5, 0, 0), 0.1, False),
         ((4.4, 0, 0), (5, 0, 0), 0.1, False),
@@ -34,7 +33,6 @@ CHECK = Cautious(max_speed=10.0)
         ((10.5, 0, 0), (9, 0, 0), 100.0, False),
         ((np.nan, 0, 0), None, 0.1, False),
         ((0, np.inf, 0), (0, 0, 0), 0.1, False),
-        ((0, 0, np.nan), (0, 0, 0), 0.1, False),
     ],
 )
 def test_healthy(velocity, last, elapsed, healthy):
@@ -60,14 +58,6 @@ def moved(x, degrees=0.0):
 
 
 @pytest.mark.parametrize(
-    ("T", "still"),
-    [(moved(0), True), (moved(5e-7), True), (moved(1e-4), False), (moved(0, 0.001), False)],
-)
-def test_standing_still_is_to_the_micrometre(T, still):
-    assert CHECK.still(T) is still
-
-
-@pytest.mark.parametrize(
     ("seconds", "speed", "frozen"),
     [(0.9, 5.0, False), (1.1, 5.0, True), (1.1, 0.4, False), (100.0, 0.0, False)],
 )
@@ -75,23 +65,7 @@ def test_who_stops_dead_has_frozen(seconds, speed, frozen):
     assert CHECK.frozen(seconds, speed) is frozen
 
 
-def test_a_vehicle_in_a_town_is_healthy():
-    check = HealthCheck()
-    fast = np.array([16.7, 0.0, 0.0])
-    assert check.exceeded(np.array([16.7, 0.2, 0.0]), np.array([16.2, 0.0, 0.1]), 0.1) is None
-    assert check.exceeded(np.array([16.7, 5.0, 0.0]), fast, 0.1) == "max_acceleration"
-    assert check.exceeded(np.array([60.0, 0.0, 0.0]), None, 0.1) == "max_speed"
-
-
-@pytest.mark.parametrize(
-    "bounds",
-    [
-        {"max_speed": 0},
-        {"max_freeze": -1},
-        {"max_jerk": 1},
-        {"max_speed": "fast"},
-    ],
-)
+@pytest.mark.parametrize("bounds", [{"max_speed": 0}, {"max_freeze": -1}, {"max_jerk": 1}])
 def test_bounds_that_make_no_sense(bounds):
     with pytest.raises(ValidationError):
         HealthCheck(**bounds)
@@ -204,14 +178,3 @@ def test_a_restart_takes_back_the_jump():
     assert guard.check(moved(1.0), 0.1) is None
     assert guard.check(np.full((4, 4), np.nan), 0.1) == "no_pose"
     np.testing.assert_allclose(guard.go_on(0.1)[0], np.eye(4))
-
-
-def test_regular_stamps_excuse_nothing():
-    """3 m/s within 0.1 s is the bound, before and after stamps that jitter."""
-    regular = [0.1] * 12
-    ten = [0.1] * 10
-    assert drive([*regular, *ten], [*[1.0] * 12, *[1.31] * 10])[-1] == "max_acceleration"
-    assert drive([*regular, *ten], [*[1.0] * 12, *[1.29] * 10])[-1] is None
-    jittered = [*regular, 0.13, 0.07, *regular]
-    said = drive([*jittered, *ten], [*[1.0] * 26, *[1.31] * 10])
-    assert said == [*[None] * 35, "max_acceleration"]

@@ -37,23 +37,6 @@ def test_it_makes_the_odometry_that_the_set_names():
         OdometryPool({"a": factory("gicp").__class__("gipc", {}, both.space, Limits())})
 
 
-def test_it_says_what_a_study_must_know():
-    both = pool()
-    assert both.name == "gicp, coarse"
-    every = [one.description for one in both.factories.values()]
-    assert all(one.live for one in every)
-    assert not both.description.live
-    assert not both.description.needs_imu
-    assert not both.description.whole
-    assert both.description.space is both.space
-    assert both.description.warm_up == max(one.warm_up for one in every)
-    settings = {label: one.identity for label, one in both.factories.items()}
-    assert both.identity == {"name": "gicp, coarse", "settings": settings}
-    assert {"small_gicp", "open3d"} <= set(both.versions)
-    assert not both.apart
-    assert all(one.user_code for one in both.allowing(user_code=True).factories.values())
-
-
 def test_it_pickles():
     both = pool()
     copy = pickle.loads(pickle.dumps(both))

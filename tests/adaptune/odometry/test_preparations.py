@@ -54,15 +54,6 @@ def test_a_scan_is_prepared_once_for_all_that_are_alike():
     assert shared.stamp == 3 * 10**8
 
 
-def test_the_first_one_prepares_for_all():
-    preparations, one, alike = Preparations(), cell(1.0), cell(1.0)
-    alike.odometry.prepare = None
-    for i in range(3):
-        shared = preparations.of(scan(i))
-        shared.by(one)
-        assert shared.by(alike)[0] == i * 10**8
-
-
 def test_gicp_and_vgicp_share_clouds_of_the_same_downsampling():
     fine = {"downsampling": 0.25}
     assert KeyframeGicp(fine).preparation == KeyframeVgicp(fine).preparation
@@ -72,10 +63,3 @@ def test_gicp_and_vgicp_share_clouds_of_the_same_downsampling():
     assert KeyframeGicp(fine).preparation != KeyframeGicp(fine, near).preparation
     # The number of iterations does not matter.
     assert KeyframeGicp({"iterations": 5}).preparation == KeyframeGicp().preparation
-
-
-def test_what_a_setting_fixes_is_not_tuned():
-    settings = KeyframeSettings(downsampling=0.3)
-    assert "downsampling" not in KeyframeGicp.describe(settings).space.names
-    assert "iterations" in KeyframeGicp.describe(settings).space.names
-    assert KeyframeGicp(settings=settings).parameters["downsampling"] == 0.3

@@ -44,13 +44,6 @@ def test_it_drives_and_changes_its_parameters():
     assert not odometry.faults
 
 
-def test_it_says_what_it_is():
-    described = Process.describe(program())
-    assert described.space.dump() == server.SPACE
-    assert described.live
-    assert not described.needs_imu
-
-
 FAULTS = {
     "exit": "its process ended with code 3: about to go wrong",
     "hang": r"a scan took longer than isolation\.seconds = 0\.5: about to go wrong",
@@ -102,7 +95,6 @@ def test_equal_faults_are_told_once(caplog):
             ProcessSettings(address="tcp://127.0.0.1:9"),
             r"nothing listens at tcp://127.0.0.1:9 \(Conn.*\): start the program there first",
         ),
-        (ProcessSettings(address="unix:/nowhere/there"), r"nothing listens at unix:/nowhere/there"),
         (ProcessSettings(address="127.0.0.1:9000"), "neither tcp://HOST:PORT nor unix:PATH"),
     ],
 )
@@ -172,7 +164,6 @@ def test_it_is_the_same_odometry_behind_the_command_line(monkeypatch):
     [
         (("command", "--listen", "tcp://127.0.0.1:0"), "command is a program of the user: serve"),
         (("process",), "process is a program of the user: serve"),
-        (("gipc",), "there is no odometry 'gipc': did you mean 'gicp'"),
         (("gipc", "--listen", "tcp://127.0.0.1:0"), "did you mean 'gicp'"),
     ],
 )
@@ -202,18 +193,6 @@ def test_a_fault_of_a_served_odometry_arrives(listening):
     odometry.register(scan(2))
     assert np.isnan(odometry.register(scan(3)).T_odom_sensor).all()
     assert odometry.faults == ["its process was ended by SIGABRT: about to go wrong"]
-
-
-def test_a_server_that_hangs_up():
-    with socket.create_server(("127.0.0.1", 0)) as quiet:
-        address = f"tcp://127.0.0.1:{quiet.getsockname()[1]}"
-
-        def hang_up():
-            quiet.accept()[0].close()
-
-        threading.Thread(target=hang_up, daemon=True).start()
-        with pytest.raises(OdometryError, match="it ended the conversation"):
-            Process.describe(ProcessSettings(address=address))
 
 
 def test_garbage_ends_its_own_conversation_only(listening):

@@ -128,8 +128,3 @@ def test_it_begins_again_after_it_was_closed(kind):
     # A hand-over has no parameters but those it has; its second start is like the first.
     np.testing.assert_allclose(drive(odometry, prepared_by(odometry)), expected, atol=1e-6)
     assert odometry.usage.cpu == used if kind == "command" else odometry.usage.cpu > used
-
-
-def test_weights_that_a_bank_does_not_hold():
-    with pytest.raises(OdometryError, match="the bank holds trials 4, 9, not 1"):
-        KINDS["bank"]().apply(Selection(1, OTHER))

@@ -25,13 +25,17 @@ from adaptune.reference import estimate
 from adaptune.reference.estimate import estimate_reference, estimated
 from adaptune.reference.graph import HALVES, Consensus, Guess, pass_over
 from adaptune.reference.stored import EstimateError
-from adaptune.simulation import Course
-from adaptune.simulation.record import simulate
 from adaptune.trajectory import Trajectory
 
 N = 121
 TRUTH = winding(N)
 SHORT, MIDDLE, LONG = REACHES
+
+
+def equal_members():
+    """Motions of members that all move as the truth."""
+    motions = np.concatenate([np.eye(4)[None], steps(TRUTH)])
+    return np.repeat(motions[:, None], Consensus.n_members, axis=1)
 
 
 class Recorded(list):
@@ -49,18 +53,6 @@ def later(scans, first, seconds):
     ]
 
 
-def watched(monkeypatch):
-    """Motions and registrations of the graphs that are solved."""
-    seen, optimised = [], estimate.optimised
-
-    def watch(T, edges, *given, **more):
-        seen.append((steps(T), edges))
-        return optimised(T, edges, *given, **more)
-
-    monkeypatch.setattr(estimate, "optimised", watch)
-    return seen
-
-
 class TestOfACourse:
     def test_it_is_right_and_knows_how_right(self):
         found, T = estimated("street", passed()), truth()
@@ -76,10 +68,8 @@ class TestOfACourse:
     def test_the_same_scans_give_the_same_bytes(self):
         scans = Recorded(course()[:38])
         first, second = estimate_reference(scans), estimated("a", pass_over(scans))
-        for name in ("stamps", "T_world_sensor", "trusted", "halves"):
+        for name in ("T_world_sensor", "trusted", "halves"):
             assert getattr(first, name).tobytes() == getattr(second, name).tobytes()
-        for one, other in zip(first.registrations, second.registrations, strict=True):
-            assert one.tobytes() == other.tobytes()
 
     def test_scans_that_stop_for_ten_seconds_of_driving_are_masked(self):
         scans = course()[:40] + later(course()[63:], 0, 10.0 - 2.4)
@@ -89,13 +79,6 @@ class TestOfACourse:
         seconds = (found.stamps - found.stamps[0]) * 1e-9
         assert gap[0] <= seconds[39] < seconds[40] < gap[1]
         assert found.unknown_share() < 0.3
-
-    def test_two_recordings_in_one_are_not_joined(self):
-        other = simulate(Course(scenes=("street",), length=12.0, seed=5, columns=160))
-        scans = course()[:40] + later(other, 0, 60.0)
-        found = estimate_reference(Recorded(scans))
-        assert not found.trusted[39]
-        assert found.trusted[:35].mean() > 0.9
 
 
 class TestRefusals:
@@ -125,10 +108,6 @@ class TestRefusals:
         with pytest.raises(EstimateError, match=r"% of its scans cannot be registered"):
             estimated("a", made_pass(straight(N), blind))
 
-    def test_no_scans(self):
-        with pytest.raises(EstimateError, match=r"comes 0\.0 m far"):
-            estimate_reference(Recorded())
-
     @pytest.mark.parametrize("found", [[], failed(guesses(TRUTH), lambda *_: True)])
     def test_nothing_can_be_registered(self, found):
         with pytest.raises(EstimateError, match=r"^a: 99 % of its scans cannot .* too bare"):
@@ -148,8 +127,8 @@ class TestMembers:
     lost = slice(50, 53)
 
     def members(self):
-        motions = np.concatenate([np.eye(4)[None], steps(TRUTH)])
-        found = np.repeat(motions[:, None], Consensus.n_members, axis=1)
+        found = equal_members()
+        motions = found[:, 0].copy()
         # The one that is right there is noisy elsewhere.
         found[:, 3, 1, 3] += 0.02 * np.sin(np.arange(N))
         found[51:54, 3] = motions[51:54]
@@ -171,12 +150,17 @@ class TestMembers:
         return made_pass(self.consensus(), right + guesses(TRUTH, spanning, member), self.members())
 
     def test_one_takes_over_where_registrations_confirm_it(self, monkeypatch):
-        seen = watched(monkeypatch)
+        begun, optimised = [], estimate.optimised
+        monkeypatch.setattr(
+            estimate,
+            "optimised",
+            lambda T, *of, **more: begun.append(T) or optimised(T, *of, **more),
+        )
         found = estimated("a", self.passed(3))
         off = np.linalg.norm((steps(found.T_world_sensor) - steps(TRUTH))[:, :3, 3], axis=1)
         assert off.max() < 0.02
         assert found.trusted.all()
-        np.testing.assert_allclose(seen[0][0][self.lost], steps(TRUTH)[self.lost], atol=1e-9)
+        np.testing.assert_allclose(steps(begun[0])[self.lost], steps(TRUTH)[self.lost], atol=1e-9)
         # Elsewhere the consensus stays, which is better there.
         assert off[:40].max() < 0.001
 
@@ -188,14 +172,6 @@ class TestMembers:
         assert np.isfinite(found.T_world_sensor).all()
         assert np.isfinite(found.halves).all()
 
-    def test_none_takes_over_without_registrations(self):
-        made = self.passed(3)
-        few = [g for g in made.guesses if g.member == -1 or g.start >= 51]
-        found = estimated("a", made_pass(made.T_odom_sensor, few, made.T_previous_current))
-        assert not found.trusted[50]
-        way = steps(found.T_world_sensor)[50, 0, 3]
-        assert way == pytest.approx(1.4, abs=0.05)
-
     def test_the_one_with_most_registrations_takes_over(self):
         made = self.passed(3)
         wrong = self.consensus()
@@ -203,18 +179,6 @@ class TestMembers:
         others = [Guess(*pair, 1, hop(wrong, *pair)) for pair in some]
         found = estimated("a", made_pass(wrong, [*made.guesses, *others], made.T_previous_current))
         assert np.linalg.norm(found.T_world_sensor[-1, :3, 3] - TRUTH[-1, :3, 3]) < 0.2
-
-    def test_a_registration_that_spans_two_such_stretches_counts_once(self, monkeypatch):
-        def weak(start, end):
-            return any(start < stop and end > first for first, stop in ((50, 53), (56, 59)))
-
-        seen = watched(monkeypatch)
-        between = guesses(TRUTH, [(53, 55), (53, 56), (54, 56)])
-        spanning = guesses(TRUTH, [pair for pair in pairs(N) if weak(*pair)], 3)
-        estimated("a", made_pass(TRUTH, [*failed(guesses(TRUTH), weak), *between, *spanning]))
-        counted = [edge[:2] for edge in seen[0][1]]
-        assert (48, 60) in counted
-        assert len(counted) == len(set(counted))
 
 
 class TestTrust:
@@ -227,13 +191,6 @@ class TestTrust:
     def estimated(self, found):
         return estimated("a", made_pass(TRUTH, found))
 
-    def test_all_is_trusted_where_all_agree(self):
-        found = self.estimated(guesses(TRUTH))
-        assert found.trusted.all()
-        assert found.registrations.accepted.all()
-        assert found.registrations.residual.max() < 1e-3
-        assert found.unknown_share() == 0.0
-
     def test_short_registrations_that_fail_are_evidence_against_a_motion(self):
         some = self.over(SHORT, MIDDLE)
         # All short ones, and of the long ones all but four.
@@ -243,10 +200,6 @@ class TestTrust:
         assert not found.trusted[60]
         assert found.trusted[:45].all()
         assert found.trusted[75:].all()
-
-    def test_as_long_as_they_are_more_than_those_that_confirm_it(self):
-        found = self.estimated(failed(guesses(TRUTH), self.over(SHORT, MIDDLE)))
-        assert found.trusted.all()
 
     def test_long_ones_that_fail_are_not(self):
         # Two short ones confirm it, and eight long ones fail.
@@ -300,7 +253,7 @@ class TestTrust:
 
 class TestHalves:
     def test_either_half_is_made_of_its_members_and_of_half_of_the_scans(self):
-        motions = np.repeat(np.concatenate([np.eye(4)[None], steps(TRUTH)])[:, None], 5, axis=1)
+        motions = equal_members()
         motions[1:, list(HALVES[0]), 0, 3] += 0.02
         made = made_pass(TRUTH, guesses(TRUTH), motions)
         found = estimated("a", made)
@@ -319,19 +272,11 @@ class TestHalves:
         assert 0.5 < reference.error(5.0) < 2.0
 
     def test_a_member_that_is_lost_does_not_count(self):
-        motions = np.repeat(np.concatenate([np.eye(4)[None], steps(TRUTH)])[:, None], 5, axis=1)
+        motions = equal_members()
         motions[1:, 1, 0, 3] += 0.5
         motions[1:, 4] = np.nan
         found = estimated("a", made_pass(TRUTH, guesses(TRUTH), motions))
         assert found.error(5.0) < 0.05
-
-    def test_where_no_member_is_near_the_reference_counts(self):
-        motions = np.repeat(np.concatenate([np.eye(4)[None], steps(TRUTH)])[:, None], 5, axis=1)
-        motions[30:33, ..., 0, 3] += 0.5
-        motions[40, :] = np.nan
-        found = estimated("a", made_pass(TRUTH, guesses(TRUTH), motions))
-        assert np.isfinite(found.halves).all()
-        assert found.error(5.0) < 1.0
 
 
 def test_positions_are_right_over_long_ways():
@@ -371,8 +316,3 @@ def test_where_the_path_comes_by_again_scans_are_registered(monkeypatch):
         back, was, true = (invert(P[start]) @ P[end] for P in (found.T_world_sensor, wrong, T))
         far = [np.linalg.norm((P - true)[:3, 3]) for P in (back, was)]
         assert far[0] < 0.3 * far[1]
-
-
-def test_a_pass_without_the_scans_asks_for_no_loops():
-    T = chained([moved(x=0.4, yaw=2 * np.pi / 150)] * 201)
-    assert estimated("a", made_pass(T, guesses(T))).trusted.all()

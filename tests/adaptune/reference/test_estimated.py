@@ -14,7 +14,6 @@ from adaptune.reference.stored import (
     EstimatedReference,
     Registrations,
 )
-from adaptune.trajectory import read_tum, write_tum
 
 NONE = np.zeros(0, np.intp)
 NO_REGISTRATIONS = Registrations(NONE, NONE, NONE.astype(bool), NONE.astype(float))
@@ -75,17 +74,6 @@ def test_no_sub_trajectory_crosses_a_motion_that_is_not_trusted(found, length):
         assert not ((untrusted >= start) & (untrusted < ends[start])).any()
 
 
-def test_nor_does_one_of_its_file(tmp_path):
-    found = reference(lost=[40])
-    write_tum(tmp_path / "a.tum", found.trajectory())
-    # Other scans of the same drive, as of a second LiDAR.
-    between = found.stamps + 33_000_000
-    ends = window_ends(read_tum(tmp_path / "a.tum").at(between), 3.0)
-    starts = np.flatnonzero(ends >= 0)
-    assert len(starts) > 50
-    assert not ((starts <= 40) & (ends[starts] > 40)).any()
-
-
 @given(references())
 @settings(max_examples=200, deadline=None)
 def test_gaps_are_where_poses_are_unknown(found):
@@ -107,19 +95,6 @@ def test_a_gap_lasts_from_the_last_known_pose_to_the_next():
     assert reference(lost=[0]).gaps()[0][:2] == pytest.approx((0.0, 1.1))
     assert reference().gaps() == []
     assert reference().unknown_share() == 0.0
-
-
-def test_a_pose_is_left_out_over_a_long_pause_too():
-    assert reference(10, 5.0, [3]).gaps()[0][:2] == pytest.approx((15.0, 25.0))
-
-
-def test_its_trajectory_holds_the_poses_that_are_known():
-    found = reference(lost=[20])
-    trajectory = found.trajectory()
-    kept = np.r_[0:21, 31:101]
-    np.testing.assert_array_equal(trajectory.stamps, found.stamps[kept])
-    np.testing.assert_array_equal(trajectory.T_world_sensor, found.T_world_sensor[kept])
-    assert np.isnan(trajectory.at(found.stamps[25:26])).all()
 
 
 def test_the_path_counts_as_far_as_it_is_known():

@@ -58,15 +58,6 @@ def test_noise_counts_less_over_a_longer_way():
     assert of.error(5.0).mean == pytest.approx(2.0 * errors[0])
 
 
-def test_the_whole_recording_counts_not_only_its_end():
-    T = straight(400)
-    T_ref = T.copy()
-    T_ref[:, 0, 3] *= np.where(np.arange(400) < 200, 1.04, 1.0)
-    T_ref[200:, 0, 3] += 200 * 0.04
-    found = measured(T_ref, T, range(390)).error(10.0)
-    assert found.mean == pytest.approx(2.0, rel=0.1)
-
-
 def test_no_chain_leads_over_poses_that_are_unknown():
     T = straight(60)
     T_ref = T.copy()
@@ -77,12 +68,6 @@ def test_no_chain_leads_over_poses_that_are_unknown():
     assert of.error(25.0).mean == pytest.approx(0.0, abs=1e-6)
     # Neither part is as long.
     assert of.error(50.0) is None
-
-
-@pytest.mark.parametrize("starts", [[], [0]])
-def test_with_few_registrations_nothing_is_known(starts):
-    T = straight(40)
-    assert measured(T, T, starts).error(25.0) is None
 
 
 def recording(n, every=10**8):

@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from made_passes import chained, drifting, hop, pairs, straight, winding
 from rooms import moved
 
-from adaptune.geometry import invert, steps
+from adaptune.geometry import steps
 from adaptune.metrics import sub_trajectory_rte
 from adaptune.reference.graph import Edge, optimised, positions
 from adaptune.trajectory import Trajectory
@@ -114,20 +114,3 @@ class TestPositions:
         places = positions(self.gps(0.0), self.stamps, self.T)
         np.testing.assert_array_equal(places.numbers, np.arange(0, 500, 5))
         np.testing.assert_allclose(places.metres, self.T[::5, :3, 3], atol=1e-6)
-
-    def test_are_left_out_where_there_are_none(self):
-        gps = self.gps(0.0)
-        half = Trajectory(gps.stamps[:200], gps.T_world_sensor[:200])
-        assert positions(half, self.stamps, self.T).numbers.max() < 200
-
-    @pytest.mark.parametrize(("n", "enough"), [(10, False), (11, True)])
-    def test_need_to_be_three(self, n, enough):
-        gps = self.gps(0.0)
-        few = Trajectory(gps.stamps[:n], gps.T_world_sensor[:n])
-        assert (positions(few, self.stamps, self.T) is not None) is enough
-
-
-def test_the_search_may_begin_elsewhere():
-    found = optimised(DRIFTING, edges(TRUTH), T_first_guess=moved(y=3.0) @ TRUTH)
-    np.testing.assert_allclose(found, optimised(DRIFTING, edges(TRUTH)), atol=1e-3)
-    assert np.isfinite(invert(found)).all()

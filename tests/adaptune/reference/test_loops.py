@@ -38,12 +38,6 @@ def test_a_loop_begins_at_the_nearest_place():
         assert end - start == 160
 
 
-def test_poses_are_chosen_from_those_that_are_offered():
-    found = found_in(circle(80.0, 2), 7)
-    assert found
-    assert all(number % 7 == 0 for loop in found for number in loop)
-
-
 def test_there_are_not_too_many():
     T = circle(400.0, 4)
     found = found_in(T)
@@ -55,11 +49,6 @@ def test_there_are_not_too_many():
 @pytest.mark.parametrize("T", [straight(400), circle(28.0, 1), np.tile(np.eye(4), (50, 1, 1))])
 def test_a_path_that_does_not_come_by_again_has_none(T):
     assert not found_in(T)
-
-
-def test_no_poses_have_none():
-    assert not loops(straight(9), np.array([], np.intp))
-    assert not loops(straight(9), np.unique([]))
 
 
 class TestClosed:
@@ -88,11 +77,6 @@ class TestClosed:
     def test_one_that_departs_from_the_path_is_rejected(self):
         # It would be measured: GICP starts within 2 m.
         assert not closed(self.scans(), [self.loop], self.known(0.6))
-
-    def test_a_long_way_lets_it_depart_by_more(self):
-        T = self.known(0.6)
-        T[30:31, 2, 3] = 30.0  # up and down again
-        assert closed(self.scans(), [self.loop], T)
 
     def test_scans_without_points_and_the_last_scan_have_none(self):
         n = len(self.at)

@@ -2,14 +2,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pytest
 from made_passes import straight
 from made_references import made_of
-from pictures import texts
 
 from adaptune.reference.stored import Registrations, StoredEstimate, estimate_chart
 from adaptune.report.charts import Line, Points, Spans
-from adaptune.report.drawing import draw_chart
 
 NAN = float("nan")
 
@@ -41,22 +38,6 @@ def test_registrations_are_counted_by_what_became_of_them():
     assert [line.name for line in drawn(found, Line)] == ["path", "unknown path"]
 
 
-@pytest.mark.parametrize(
-    ("accepted", "residual", "named"),
-    [
-        ([1], [0.01], ["1 agree"]),
-        ([0], [0.3], ["1 differ"]),
-        ([0, 0], [NAN, NAN], ["2 failed"]),
-        ([], [], []),
-    ],
-)
-def test_what_there_is_not_is_not_in_the_legend(accepted, residual, named):
-    found = reference(accepted=accepted, residual=residual)
-    assert [points.name for points in drawn(found, Points)] == ["start", *named]
-    assert not drawn(found, Spans)
-    assert [line.name for line in drawn(found, Line)] == ["path"]
-
-
 def test_the_title_says_how_accurate_it_is_and_what_is_unknown():
     found = reference(lost=[100])
     assert chart_of(found, "the drive").title == (
@@ -68,9 +49,3 @@ def test_the_title_says_how_accurate_it_is_and_what_is_unknown():
     assert "unknown" not in chart_of(reference()).title
     # A little is not nothing.
     assert "unknown for 0.1 % of the scans" in chart_of(reference(4001, lost=[3999])).title
-
-
-def test_a_picture_is_drawn(tmp_path):
-    found = reference(accepted=[1, 0], residual=[0.01, NAN], lost=[3])
-    draw_chart(chart_of(found), tmp_path / "a.svg")
-    assert {"path", "1 agree", "1 failed", "unknown", "start"} <= set(texts(tmp_path / "a.png"))

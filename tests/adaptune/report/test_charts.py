@@ -19,7 +19,7 @@ from adaptune.report.charts import (
     Shares,
     Spans,
 )
-from adaptune.report.drawing import MODES, draw_chart, looks, spec, thinned, ticks, wrapped
+from adaptune.report.drawing import MODES, draw_chart, looks, spec, thinned, ticks
 
 
 def drawn(chart, folder):
@@ -129,7 +129,7 @@ def test_panels_that_share_an_axis_begin_and_end_alike():
     panels = spec(over_time())["vconcat"][0]["concat"]
     axes = [panel["layer"][0]["encoding"]["x"] for panel in panels]
     assert len({tuple(x["scale"]["domain"]) for x in axes}) == 1
-    assert [x["title"] is not None for x in axes] == [False, False, False, True]
+    assert [x["title"] is not None for x in axes] == [False, False, True]
 
 
 def test_modes_keep_their_colours_and_others_differ():
@@ -163,8 +163,3 @@ def test_long_lines_are_thinned_and_keep_peaks_and_gaps():
 )
 def test_logarithmic_axes_name_round_numbers(ends, named):
     assert ticks(*ends) == named
-
-
-def test_long_names_are_broken_after_underscores():
-    assert wrapped("max_correspondence_distance [m]", 20) == ["max_correspondence_", "distance [m]"]
-    assert wrapped("", 20) == [""]

@@ -28,13 +28,6 @@ def test_numbers_have_three_digits_or_so(value, cell):
     assert cell in shown([{"a": value}]).split()
 
 
-def test_long_headings_break_at_underscores():
-    row = {"max_correspondence_distance": 1.0, "voxel_size": 3.0}
-    text = shown([row | {f"column {i}": 0.5 for i in range(7)}])
-    for word in ("max_", "correspondence_", "distance", "voxel_", "size"):
-        assert word in text.split()
-
-
 def test_columns_that_have_no_room_go_on_below():
     row = {"mode": "oracle, sequence", "_file": 1} | {f"{i} of_all [%]": 0.1234 for i in range(12)}
     said = shown_within(Listing("title", [row] * 2, "The caption, on a line."), 60)
@@ -45,12 +38,6 @@ def test_columns_that_have_no_room_go_on_below():
     assert said.split().count("all") == 12
     # A column that is too wide alone stands alone.
     assert shown_within(Listing("t", [{"a": "b", "c": "d" * 90, "e": 1.0}]), 60).count("a") == 2
-
-
-def test_tables_that_have_room_are_whole():
-    said = shown_within(Listing("t", [{"a": 0.5, "better or worse": 1}], "c"), 60)
-    assert "better or worse" in said
-    assert len(tables_within(Listing("t", []), 60)) == 1
 
 
 def shown_within(listing, width):

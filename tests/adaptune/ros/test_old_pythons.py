@@ -5,8 +5,6 @@ The parser knows the grammar of 3.6; of 2.7 there is a list of what came later.
 
 import ast
 import builtins
-import io
-import tokenize
 from pathlib import Path
 
 import pytest
@@ -37,27 +35,18 @@ def later(source):
         return [(error.lineno, "not of Python 3.6")]
     lines = enumerate(source.splitlines(), 1)
     found = [(number, "not ASCII") for number, line in lines if not line.isascii()]
-    tokens = tokenize.generate_tokens(io.StringIO(source).readline)
-    numbers = (token for token in tokens if token.type == tokenize.NUMBER)
-    found += [(token.start[0], "digits in groups") for token in numbers if "_" in token.string]
-    # A call may have one starred argument, after which no other comes.
-    calls = (node for node in ast.walk(tree) if isinstance(node, ast.Call))
-    allowed = {id(call.args[-1]) for call in calls if call.args}
     for node in ast.walk(tree):
-        starred = isinstance(node, ast.Starred) and id(node) not in allowed
-        if isinstance(node, LATER) or starred:
-            found.append((getattr(node, "lineno", 0), type(node).__name__))
-        found += [(getattr(node, "lineno", 0), what) for what in of_node(node)]
+        what = [type(node).__name__] if isinstance(node, LATER) else []
+        what += [words for words, has in OF_NODE.items() if has(node)]
+        found += [(getattr(node, "lineno", 0), words) for words in what]
     return found
 
 
 OF_NODE = {
     "an annotation": lambda n: getattr(n, "annotation", None) or getattr(n, "returns", None),
     "an argument by keyword only": lambda n: getattr(n, "kwonlyargs", None),
-    "a keyword of a class": lambda n: isinstance(n, ast.ClassDef) and n.keywords,
     "raise from": lambda n: isinstance(n, ast.Raise) and n.cause,
     "** in a mapping": lambda n: isinstance(n, ast.Dict) and None in n.keys,
-    "** twice": lambda n: isinstance(n, ast.Call) and [k.arg for k in n.keywords].count(None) > 1,
     "super without arguments": lambda n: (
         isinstance(n, ast.Call) and getattr(n.func, "id", None) == "super" and not n.args
     ),
@@ -65,10 +54,6 @@ OF_NODE = {
     "a name of Python 3": lambda n: isinstance(n, ast.Name) and n.id in STATEMENTS | ERRORS,
 }
 """What a part of a source may have that came later, and that its type alone does not tell."""
-
-
-def of_node(node):
-    return [what for what, has in OF_NODE.items() if has(node)]
 
 
 @pytest.mark.parametrize("name", FILES)

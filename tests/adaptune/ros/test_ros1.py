@@ -152,11 +152,6 @@ def test_a_node_that_is_killed_is_noticed(link):
     assert link.alive
 
 
-def test_a_python_without_rospy_is_named():
-    with pytest.raises(LinkError, match="cannot import ROS"):
-        local_ros1(sys.executable)
-
-
 @pytest.mark.parametrize("steers", [False, True])
 def test_the_command_drives_until_ctrl_c(link, robot, study_file, trained_folder, tmp_path, steers):
     """A bag is played to `adaptune online --ros`."""

@@ -48,18 +48,6 @@ print(json.dumps({
     "variable": os.environ["VARIABLE"],
 }))
 """
-FORKS = """
-import os, sys, time
-n = 0
-try:
-    while n < 200:
-        if os.fork() == 0:
-            time.sleep(30)
-            os._exit(0)
-        n += 1
-except OSError as error:
-    print(n, error.strerror)
-"""
 
 
 @pytest.fixture(scope="module")
@@ -139,30 +127,6 @@ def test_its_limits_are_those_that_were_given(settings):
         assert 0.0 < used.memory < 250.0
 
 
-def test_the_cores_are_shared_out(settings):
-    with closing(started(settings, "python3", "-c", "while True: pass")) as container:
-        begin, end = time.monotonic(), time.monotonic() + 60.0
-        while container.used().cpu < 0.5 and time.monotonic() < end:
-            time.sleep(0.1)
-        # It may take half a core; some was used before the limit held.
-        used = container.used().cpu
-        assert 0.5 <= used < 0.5 * (time.monotonic() - begin) + 0.7
-
-
-def test_processes_are_limited(settings):
-    code, said = run(settings, "python3", "-c", FORKS)
-    assert code == 0
-    n, _, why = said.strip().partition(" ")
-    assert 20 < int(n) < 40
-    assert why == "Resource temporarily unavailable"
-
-
-def test_memory_is_limited(settings):
-    with closing(started(settings, "python3", "-c", "bytearray(10**9)", memory=0.1)) as container:
-        assert wait(container) == -9
-        assert container.out_of_memory
-
-
 @pytest.mark.parametrize(
     ("script", "code"), [("exit 7", 7), ("kill -ABRT $$", -6), ("nonsense", 127)]
 )
@@ -231,18 +195,6 @@ def test_without_an_engine_it_says_what_to_do(fresh, monkeypatch):
     )
 
 
-def test_without_permission_it_says_what_to_do(fresh, monkeypatch):
-    import docker
-
-    def from_env():
-        said = "Error while fetching server API version: ('Connection aborted.', "
-        raise docker.errors.DockerException(f"{said}PermissionError(13, 'Permission denied'))")
-
-    monkeypatch.setattr(docker.DockerClient, "from_env", from_env)
-    with pytest.raises(EngineError, match=r"this user may not use the Docker engine at unix:.*-aG"):
-        fresh()
-
-
 class Gone:
     """An engine that was stopped."""
 
@@ -274,14 +226,6 @@ def test_an_engine_that_ends_on_the_way(settings, monkeypatch):
             assert container.log() == b""
             assert container.used() == (0, 0.0, 0.0)
             engine_module.Container.close(copy.copy(container))
-
-
-def test_images_that_are_not_there(settings):
-    with pytest.raises(EngineError, match="there is no image 'no-such' on this machine: `docker p"):
-        image_digest("no-such")
-    with pytest.raises(EngineError, match="image 'No Such'"):
-        image_digest("No Such")
-    assert image_digest(settings.image).startswith("sha256:")
 
 
 def test_what_cannot_be_started(settings, tmp_path):
