@@ -44,7 +44,6 @@ def scans():
 
 
 def truth():
-    """Poses of the scans, of shape (n, 4, 4)."""
     T = np.tile(np.eye(4), (N_SCANS, 1, 1))
     T[:, 0, 3] = 0.3 * np.arange(N_SCANS)
     return T
@@ -59,19 +58,16 @@ def recording(folder, logs=None):
 
 
 def template(path, sim="true", points="/points", **imitate):
-    """Write the reference image's parameter file."""
     path.write_text(TEMPLATE.format(sim=sim, points=points, imitate=json.dumps(imitate)))
     return path
 
 
 def rustle(file, **settings):
-    """Settings of the reference image's system, with a parameter file."""
     given = {"image": reference_image(), "odometry": "/Odometry", "rate": 4.0, "drain": 60.0}
     return RustleSettings(template=str(file), **(given | settings))
 
 
 def drive(odometry, first=0, T=None):
-    """Start with a scan and register those after it; poses of shape (n, 4, 4)."""
     T = np.eye(4) if T is None else T
     prepared = [odometry.prepare(scan) for scan in scans()[first:]]
     odometry.start(prepared[0], T)

@@ -19,13 +19,11 @@ REACHES = (6, 12, 24)
 
 @cache
 def course():
-    """Scans of a street of 25 m."""
     return list(simulate(Course(scenes=("street",), length=25.0, seed=3, columns=160)))
 
 
 @cache
 def passed():
-    """What a pass over them finds."""
     return pass_over(course())
 
 
@@ -51,7 +49,6 @@ def winding(n, step=STEP):
 
 
 def straight(n, step=STEP):
-    """A path of n poses along x."""
     return chained([moved(x=step)] * (n - 1))
 
 
@@ -77,7 +74,6 @@ def pairs(n, reaches=REACHES, every=3):
 
 
 def guesses(T, of=None, member=-1):
-    """Registrations that are right."""
     return [Guess(start, end, member, hop(T, start, end)) for start, end in of or pairs(len(T))]
 
 

@@ -5,7 +5,6 @@ import numpy as np
 from adaptune.recording.scan import Scan
 
 REACH = 18.0
-"""Metres that the sensor sees."""
 
 
 def street(length=60.0, seed=0):
@@ -40,7 +39,6 @@ def scan_at(world, x, stamp=0, seed=None):
 
 
 def moved(x=0.0, y=0.0, z=0.0, yaw=0.0):
-    """A motion: a turn about z, then a translation."""
     T = np.eye(4)
     T[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
     T[:3, 3] = x, y, z

@@ -64,7 +64,6 @@ def trials(n: int = 2000) -> Chart:
 
 
 def comparison() -> Chart:
-    """Bars and points at names."""
     names = ("campus, morning", "campus, evening", "tunnel <b>north</b>", "forest_$x_1$")
     points = Points(np.arange(4.0), [1.0, 2.0, 0.7, np.nan], "kiss & tell")
     return Chart(
@@ -83,7 +82,6 @@ def comparison() -> Chart:
 
 
 def from_above() -> Chart:
-    """Trajectories on axes of equal scale."""
     a = np.linspace(0.0, 2.0 * np.pi, 5000)
     x, y = 40.0 * np.cos(a), 15.0 * np.sin(2.0 * a)
     drawn = (
@@ -96,7 +94,6 @@ def from_above() -> Chart:
 
 
 def empty() -> Chart:
-    """Nothing in it."""
     drawn = (
         Line([], [], "fixed"),
         Points([1.0], [np.nan], "trials", [np.nan], "size [m]", log_colour=True),
@@ -110,7 +107,6 @@ def empty() -> Chart:
 
 
 def samples() -> tuple[Chart, ...]:
-    """One of each."""
     return over_time(), trials(), comparison(), from_above(), empty()
 
 

@@ -25,7 +25,6 @@ from adaptune.recording import Scan
 from adaptune.space import Float, ParameterSpace
 
 STEP = 0.4
-"""Metres between scans."""
 N_SCANS = 16
 START = 10**10
 """Nanoseconds; ROS has no stamp of zero."""
@@ -115,7 +114,6 @@ def is_live(name):
 
 @cache
 def served():
-    """How to reach keyframe GICP behind a socket."""
     there, ready = [], threading.Event()
 
     def tell(at):
@@ -162,7 +160,6 @@ def street():
 
 @cache
 def scan(i):
-    """Scan `i` of a drive straight ahead."""
     rng = np.random.default_rng(i)
     points = street()[rng.random(len(street())) < 0.5] - [STEP * i, 0.0, 0.0]
     points += rng.normal(0, 0.01, points.shape)
@@ -184,7 +181,6 @@ def prepared_drive(name):
 
 
 def drive(odometry, prepared, T_odom_sensor=None):
-    """Start with the first scan and register the others; poses of shape (n, 4, 4)."""
     T = np.eye(4) if T_odom_sensor is None else T_odom_sensor
     odometry.start(prepared[0], T)
     return np.array([T, *(odometry.register(p).T_odom_sensor for p in prepared[1:])])

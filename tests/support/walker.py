@@ -61,12 +61,10 @@ def x_of(odometry, seconds, switches=()):
 
 
 def x_on(odometry, seconds):
-    """Where an odometry that has begun is along x at further scans."""
     return [float(odometry.register(odometry.prepare(at(s))).T_odom_sensor[0, 3]) for s in seconds]
 
 
 def makes(scripts=None):
-    """What makes instances of walkers, and the list of the walkers it made."""
     made = []
 
     def make(parameters):
@@ -77,7 +75,6 @@ def makes(scripts=None):
 
 
 def kept(make):
-    """`make`, and the list of the instances it made."""
     instances = []
 
     def keep(parameters):

@@ -7,7 +7,6 @@ EVEN = np.full(4, 0.25)
 
 
 def motions(*steps, turns=0.0):
-    """Motions over a scan: steps along x, and turns to the left."""
     T = np.tile(np.eye(4), (len(steps), 1, 1))
     T[:, 0, 3] = steps
     angles = np.broadcast_to(turns, len(steps))
@@ -18,7 +17,6 @@ def motions(*steps, turns=0.0):
 
 
 def judged(each, seconds=0.1, weights=EVEN, lost_track=3.0, **others):
-    """Which members agree at each scan."""
     agreement = Agreement(len(weights), lost_track)
     return np.array([agreement.judge(T, seconds, weights, **others) for T in each])
 

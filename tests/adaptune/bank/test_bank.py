@@ -4,6 +4,7 @@ import faulty
 import numpy as np
 import pytest
 import turns
+from rooms import moved
 from walker import at, kept, makes, selected, x_of, x_on
 
 from adaptune.bank.bank import Bank
@@ -22,7 +23,6 @@ def gicp(parameters):
 
 
 def weigh(bank, *weights):
-    """Apply weights of the members, in their order."""
     bank.apply(Selection(bank.trials[0], {}, dict(zip(bank.trials, weights, strict=True))))
 
 
@@ -141,8 +141,7 @@ def test_no_pose_at_all_is_told():
     x = x_of(odometry, range(4))
     assert np.isnan(x[3])
     # The caller starts it anew.
-    T = np.eye(4)
-    T[0, 3] = 7.0
+    T = moved(7.0)
     odometry.start(odometry.prepare(at(3)), T)
     assert odometry.register(odometry.prepare(at(4))).T_odom_sensor[0, 3] == 8.0
 
@@ -166,8 +165,7 @@ def test_motions_of_the_members_by_trial_number():
     # The motion of the lost member before it was restarted.
     assert [T[0, 3] for T in members.values()] == pytest.approx([1.0, 4.0, 1.06])
     assert whole[0, 3] == pytest.approx(1.0)
-    motion = np.eye(4)
-    motion[0, 3] = 0.3
+    motion = moved(0.3)
     bank.start(bank.prepare(at(6)), np.eye(4), motion)
     assert [T[0, 3] for T in (bank.motions[0], *bank.motions[1].values())] == [0.3] * 4
     made[0].faults, made[2].faults = ["lost"], ["lost, too"]

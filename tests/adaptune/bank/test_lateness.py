@@ -270,7 +270,6 @@ def test_where_all_restart_it_waits_for_them(clock):
 
 
 def tell(what):
-    """Send a signal to the process with the member."""
 
     def children(process):
         path = Path(f"/proc/{process}/task/{process}/children")

@@ -29,7 +29,6 @@ SETS = [
     {"odometry": "gicp", "keyframe_interval": 3.0, "downsampling": 1.0},
 ]
 STEP = 0.25
-"""Metres between scans."""
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +46,6 @@ def bank(n_cores, seconds=1.0):
 
 
 def run(odometry, scans, before=lambda _: None):
-    """Poses and motions of the members at each scan, with even weights."""
     trials = odometry.trials
     odometry.apply(Selection(trials[0], {}, dict.fromkeys(trials, 1.0 / len(trials))))
     poses, moved = [], []

@@ -36,8 +36,6 @@ def smeared(i):
 
 
 class Numbered:
-    """In place of a cloud."""
-
     def __init__(self, scan, T_previous_current, seconds):  # noqa: ARG002 - as `HopCloud`
         self.number = scan.stamp // 10**8
 
@@ -76,7 +74,6 @@ def bank(*factors):
 
 
 def test_the_weights_leave_a_member_that_drifts():
-    """By registrations of scans."""
     live = LiveEvidence((0, 1, 2))
     found = drive(live, 31, bank(1.0, 1.005, 1.03), scan)
     assert [round((one.end - one.start) / 1e8) for one in found] == [5, 10, 10]

@@ -8,13 +8,6 @@ from adaptune.live.hops import SECONDS, Hop
 KNOWN = np.eye(3)
 
 
-def turned(degrees):
-    angle = np.radians(degrees)
-    T = np.eye(4)
-    T[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
-    return T
-
-
 def link(start, end, believed, projection=KNOWN):
     """A hop that is right, and what was believed: poses as a function of the metres driven."""
     hop = Hop(moved(end - start), projection)
@@ -40,7 +33,7 @@ def test_errors_of_the_rotation_add_up_over_a_chain():
     per_metre = 0.05  # degrees
     poses = [np.eye(4)]
     for _ in range(1000):
-        poses.append(poses[-1] @ moved(0.1) @ turned(0.1 * per_metre))
+        poses.append(poses[-1] @ moved(0.1, yaw=np.radians(0.1 * per_metre)))
 
     def believed(metres):
         return poses[round(10 * metres)]

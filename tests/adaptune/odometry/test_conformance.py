@@ -11,6 +11,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from rooms import moved
 from scipy.spatial.transform import Rotation
 from street import (
     LOCKSTEP,
@@ -155,8 +156,7 @@ def test_it_goes_on_from_a_pose_and_a_motion(name):
     T = np.eye(4)
     T[:3, :3] = Rotation.from_euler("z", np.pi / 2).as_matrix()
     T[:3, 3] = 5.0, 6.0, 7.0
-    T_previous_current = np.eye(4)
-    T_previous_current[0, 3] = STEP
+    T_previous_current = moved(STEP)
     odometry = make(name)
     odometry.start(prepared[4], T, T_previous_current)
     # With nothing to register, the motion it was given goes on.
@@ -199,8 +199,7 @@ def test_a_poor_scan_keeps_the_last_motion(name, n):
 def test_a_poor_first_scan(name, n):
     prepared = prepared_drive(name)
     odometry = make(name)
-    T = np.eye(4)
-    T[:3, 3] = 1.0, 2.0, 3.0
+    T = moved(1.0, 2.0, 3.0)
     odometry.start(odometry.prepare(poor_scan(n)), T)
     poses = np.array([odometry.register(p).T_odom_sensor for p in prepared])
     assert_rigid(poses)

@@ -5,6 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 from needs import lacking
+from rooms import moved
 from turns import STEP, measured
 
 from adaptune.geometry import invert
@@ -39,13 +40,15 @@ def isolated(name, parameters=None):
     )
 
 
-def drive(odometry, T_odom_sensor=None, n=N_SCANS):
-    """Start with the first scan and register the others; poses of shape (n, 4, 4)."""
-    T = np.eye(4) if T_odom_sensor is None else T_odom_sensor
-    moved = np.eye(4)
-    moved[0, 3] = STEP
+def begin(odometry, T):
     # LIO-SAM waits for two scans more before its first pose.
-    odometry.start(odometry.prepare(measured(0)), T, moved if odometry.name == "lio_sam" else None)
+    motion = moved(STEP) if odometry.name == "lio_sam" else None
+    odometry.start(odometry.prepare(measured(0)), T, motion)
+
+
+def drive(odometry, T_odom_sensor=None, n=N_SCANS):
+    T = np.eye(4) if T_odom_sensor is None else T_odom_sensor
+    begin(odometry, T)
     registrations = (odometry.register(odometry.prepare(measured(i))) for i in range(1, n))
     return np.array([T, *(registration.T_odom_sensor for registration in registrations)])
 
@@ -79,9 +82,7 @@ def test_a_new_start_is_fresh_and_the_same_to_the_last_bit(name):
 
 @every_odometry
 def test_where_it_starts_does_not_matter(name):
-    T = np.eye(4)
-    T[:3, :3] = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
-    T[:3, 3] = 20.0, -30.0, 4.0
+    T = moved(20.0, -30.0, 4.0, yaw=np.pi / 2)
     np.testing.assert_allclose(
         invert(T) @ drive(isolated(name), T), usual_drive(name), atol=REPEATS.get(name, 1e-9)
     )
@@ -106,8 +107,7 @@ def test_a_poor_scan_keeps_the_last_motion(name, poor):
 @every_odometry
 def test_a_poor_first_scan(name):
     odometry = isolated(name)
-    T, T_previous_current = np.eye(4), np.eye(4)
-    T[1, 3], T_previous_current[0, 3] = 5.0, 0.3
+    T, T_previous_current = moved(y=5.0), moved(0.3)
     few = measured(0).select(np.arange(10))
     odometry.start(odometry.prepare(few), T, T_previous_current)
     T_next, _ = odometry.register(odometry.prepare(measured(1)))
@@ -123,14 +123,11 @@ def test_two_instances_side_by_side_do_not_meet(name):
     there, other = isolated(name), isolated(name)
     other.start(other.prepare(measured(9)), np.eye(4))
     poses = []
-    drive_there = usual_drive(name)
-    moved = np.eye(4)
-    moved[0, 3] = STEP
-    there.start(there.prepare(measured(0)), np.eye(4), moved if name == "lio_sam" else None)
+    begin(there, np.eye(4))
     for i in range(1, N_SCANS):
         other.register(other.prepare(measured(9 + i)))
         poses.append(there.register(there.prepare(measured(i))).T_odom_sensor)
-    np.testing.assert_allclose(poses, drive_there[1:], rtol=0.0, atol=REPEATS.get(name, 0.0))
+    np.testing.assert_allclose(poses, usual_drive(name)[1:], rtol=0.0, atol=REPEATS.get(name, 0.0))
 
 
 @every_odometry

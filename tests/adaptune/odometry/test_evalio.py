@@ -20,8 +20,6 @@ def _evalio():
 
 
 class Listener:
-    """A pipeline that keeps what it is given."""
-
     def __init__(self):
         self.given = []
 

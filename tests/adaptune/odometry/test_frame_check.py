@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
+from made_passes import chained
+from rooms import moved
 
 from adaptune.geometry import invert
 from adaptune.metrics import sub_trajectory_rte
@@ -20,16 +21,12 @@ def integrated(lengths, degrees):
     """Poses of a drive by its steps and its turns about z."""
     T = np.tile(np.eye(4), (len(lengths) + 1, 1, 1))
     for i, (length, angle) in enumerate(zip(lengths, degrees, strict=True)):
-        step = yaw(angle)
-        step[0, 3] = length
-        T[i + 1] = T[i] @ step
+        T[i + 1] = T[i] @ moved(length, yaw=np.radians(angle))
     return T
 
 
 def yaw(degrees):
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
-    return T
+    return moved(yaw=np.radians(degrees))
 
 
 def drive(speed):
@@ -44,14 +41,6 @@ def noisy(T, rng, metres, degrees):
     steps[:, :3, 3] += rng.normal(0.0, metres, (len(steps), 3))
     turns = rng.normal(0.0, degrees, len(steps))
     return steps @ np.array([yaw(angle) for angle in turns])
-
-
-def joined(steps):
-    """Poses of steps."""
-    made = [np.eye(4)]
-    for step in steps:
-        made.append(made[-1] @ step)
-    return np.array(made)
 
 
 MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
@@ -73,7 +62,7 @@ WRONG = {
 def test_what_a_wrong_reference_looks_like(speed, words, spoil):
     T_ref_sensor = drive(speed)
     rng = np.random.default_rng(0)
-    T_odom_sensor = joined(noisy(T_ref_sensor, rng, 0.05 * speed, 0.02))
+    T_odom_sensor = chained(noisy(T_ref_sensor, rng, 0.05 * speed, 0.02))
     assert contradiction(T_odom_sensor, T_ref_sensor) is None
     assert words in contradiction(T_odom_sensor, spoil(T_ref_sensor))
     # Where nothing is known nothing is said.
@@ -99,7 +88,7 @@ def test_a_bad_odometry_is_not_the_references_fault(seed):
     for begin in range(50, N, 100):
         lost[begin : begin + 50] = yaw(5.0 * (seed % 2))
         lost[begin : begin + 50, 0, 3] = 0.2 * (seed % 3)
-    for T_odom_sensor in (joined(wild), joined(lost)):
+    for T_odom_sensor in (chained(wild), chained(lost)):
         assert np.nanmean(sub_trajectory_rte(T_ref_sensor, T_odom_sensor, 10.0)) > 10.0
         assert contradiction(T_odom_sensor, T_ref_sensor) is None
     assert contradiction(np.tile(np.eye(4), (N + 1, 1, 1)), T_ref_sensor) is None

@@ -1,5 +1,3 @@
-"""Keyframe GICP on a recording."""
-
 import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
@@ -11,7 +9,6 @@ from adaptune.recording import clouds
 
 
 def recording(path):
-    """Scans and the poses recorded with them, in one pass over the bag."""
     scans, translations, quaternions = [], [], []
     with AnyReader([path]) as reader:
         for connection, _, data in reader.messages():

@@ -1,8 +1,7 @@
-"""The check of an odometry's poses."""
-
 import numpy as np
 import pytest
 from pydantic import ValidationError
+from rooms import moved
 
 from adaptune.odometry.tracker import Guard, HealthCheck, unhealthy
 
@@ -47,14 +46,6 @@ def test_turning(degrees, healthy, monkeypatch):
     monkeypatch.setattr(HealthCheck, "max_turn_rate", 90.0)
     said = HealthCheck().exceeded(np.zeros(3), np.zeros(3), 0.1, np.radians(degrees))
     assert said == (None if healthy else "max_turn_rate")
-
-
-def moved(x, degrees=0.0):
-    T = np.eye(4)
-    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
-    T[:2, :2] = [[c, -s], [s, c]]
-    T[0, 3] = x
-    return T
 
 
 @pytest.mark.parametrize(
@@ -121,7 +112,6 @@ def test_a_jump_that_came_back_is_not_undone_where_scans_do_not_register(monkeyp
 
 
 def drive(elapsed, steps):
-    """What a guard of a vehicle says of steps in metres that are stamped so many seconds apart."""
     guard = Guard(HealthCheck())
     return [guard.check(moved(x), t) for x, t in zip(steps, elapsed, strict=True)]
 
@@ -167,8 +157,7 @@ def test_a_restart_takes_back_the_jump():
     guard = Guard(HealthCheck())
     assert {guard.check(moved(1.0), 0.1) for _ in range(12)} == {None}
     # Nine steps aside in doubt, and the tenth is one too many.
-    aside = moved(1.0)
-    aside[1, 3] = 0.6
+    aside = moved(1.0, 0.6)
     assert [guard.check(aside, 0.1) for _ in range(10)] == [*[None] * 9, "max_acceleration"]
     T_previous_healthy, T_healthy = guard.go_on(0.1)
     np.testing.assert_allclose(T_healthy, moved(1.0), atol=1e-12)

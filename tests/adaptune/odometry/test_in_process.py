@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from rooms import moved
 from walker import Walker, at, x_on
 
 from adaptune.odometry import InProcess, OdometryError
@@ -20,8 +21,7 @@ class Plain(Walker):
 
 def test_motions_chain_whatever_an_adapter_returns():
     odometry = InProcess(Plain({"speed": 2.0}))
-    given = np.eye(4)
-    given[0, 3] = 0.5
+    given = moved(0.5)
     odometry.start(odometry.prepare(at(0)), np.eye(4), given)
     assert odometry.motions.T_previous_current[0, 3] == 0.5
     for second in (1, 2, 3):

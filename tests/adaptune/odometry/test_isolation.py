@@ -7,6 +7,7 @@ import drives
 import faulty
 import numpy as np
 import pytest
+from rooms import moved
 from setups import setup_of
 
 from adaptune import processes
@@ -77,8 +78,7 @@ def test_every_fault_is_told_and_another_start_goes_on(fault, here):
     assert np.isnan(x[n:]).all()
     (told,) = odometry.faults
     assert re.search((TOLD | HERE)[fault], told), told
-    T = np.eye(4)
-    T[1, 3] = 4.0
+    T = moved(y=4.0)
     odometry.start(odometry.prepare(scan(6)), T)
     T, registered = odometry.register(odometry.prepare(scan(7)))
     if n:
@@ -188,7 +188,6 @@ def test_a_replay_goes_on_at_the_last_healthy_motion():
 
 
 def exchange(*messages):
-    """What a server answers to messages."""
     sent, answered = io.BytesIO(), io.BytesIO()
     for header, arrays in messages:
         processes.send(sent, header, **arrays)

@@ -1,5 +1,3 @@
-"""What the keyframe odometries share."""
-
 from types import SimpleNamespace
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""Several odometries in one study."""
-
 import pickle
 
 import pytest

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import server
 import turns
+from rooms import moved
 
 from adaptune.odometry import OdometryError
 from adaptune.odometry.base import MOST_FAULTS, InProcess
@@ -37,8 +38,7 @@ def test_it_drives_and_changes_its_parameters():
     assert odometry.register(scan(1)).T_odom_sensor[0, 3] == 0.5
     odometry.apply(Selection(0, {"speed": 2.0}))
     assert odometry.register(scan(2)).T_odom_sensor[0, 3] == 2.5
-    T = np.eye(4)
-    T[0, 3] = 7.0
+    T = moved(7.0)
     odometry.start(scan(3), T)
     assert odometry.register(scan(4)).T_odom_sensor[0, 3] == 9.0
     assert not odometry.faults
@@ -105,7 +105,6 @@ def test_programs_that_do_not_serve(settings, message):
 
 @pytest.fixture
 def listening():
-    """Begins to serve in a thread, and tells where."""
 
     def begin(address, name):
         there, ready = [], threading.Event()

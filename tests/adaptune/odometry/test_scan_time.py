@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 import turns
 from needs import needs_evalio
+from rooms import moved
 
 from adaptune.odometry.base import END, MIDDLE, START, AtStamp, duration_of
 from adaptune.odometry.registry import odometry_class
@@ -10,26 +11,20 @@ from adaptune.recording.scan import Scan
 TURN = 10**8
 
 
-def at(x):
-    T = np.eye(4)
-    T[0, 3] = x
-    return T
-
-
 def carried(share, way, scans, T_previous_current=None):
     """What comes of exact poses along x, in metres, after that share of the scans."""
     carry = AtStamp(share)
     first, *others = scans
-    begun = carry.begin(first * TURN, TURN, at(way(first)), T_previous_current)
+    begun = carry.begin(first * TURN, TURN, moved(way(first)), T_previous_current)
     offset = begun[0, 3] - way(first + share)
-    poses = [carry(i * TURN, TURN, at(way(i + share) + offset)) for i in others]
+    poses = [carry(i * TURN, TURN, moved(way(i + share) + offset)) for i in others]
     return [T[0, 3] for T in poses]
 
 
 @pytest.mark.parametrize("share", [START, MIDDLE, END])
 @pytest.mark.parametrize("known", [True, False])
 def test_at_constant_velocity_nothing_is_lost(share, known):
-    motion = at(0.3) if known else None
+    motion = moved(0.3) if known else None
     scans = (0, 1, 2, 4, 5, 9)  # some are missing
     np.testing.assert_allclose(
         carried(share, lambda t: 0.3 * t, scans, motion), [0.3 * i for i in scans[1:]], atol=1e-9
@@ -38,15 +33,13 @@ def test_at_constant_velocity_nothing_is_lost(share, known):
 
 def test_a_pose_at_the_end_is_that_of_the_next_stamp():
     """Where scans follow each other without a gap, whatever the velocity."""
-    found = np.array(carried(END, lambda t: t**3, range(8), at(0.0)))
+    found = np.array(carried(END, lambda t: t**3, range(8), moved(0.0)))
     np.testing.assert_allclose(np.diff(found)[1:], np.diff(np.arange(1, 8) ** 3)[1:])
 
 
 def test_turns_are_carried_back_too():
     def turned(i):
-        T = at(0.0)
-        T[:2, :2] = [[np.cos(0.1 * i), -np.sin(0.1 * i)], [np.sin(0.1 * i), np.cos(0.1 * i)]]
-        return T
+        return moved(yaw=0.1 * i)
 
     carry = AtStamp(MIDDLE)
     carry.begin(0, TURN, np.eye(4), turned(1))
@@ -55,17 +48,17 @@ def test_turns_are_carried_back_too():
 
 def test_a_scan_without_duration_stays():
     carry = AtStamp(END)
-    begun = carry.begin(0, 0, at(1.0), at(0.5))
-    np.testing.assert_array_equal(begun, at(1.0))
-    np.testing.assert_array_equal(carry(TURN, 0, at(1.5)), at(1.5))
+    begun = carry.begin(0, 0, moved(1.0), moved(0.5))
+    np.testing.assert_array_equal(begun, moved(1.0))
+    np.testing.assert_array_equal(carry(TURN, 0, moved(1.5)), moved(1.5))
 
 
 @pytest.mark.parametrize("faulty", [np.full((4, 4), np.nan), np.diag([2.0, 1, 1, 1]), np.eye(3)])
 def test_a_faulty_pose_is_left_to_those_who_tell_of_it(faulty):
     carry = AtStamp(END)
-    carry.begin(0, TURN, at(0.0), at(0.5))
+    carry.begin(0, TURN, moved(0.0), moved(0.5))
     assert carry(TURN, TURN, faulty) is faulty
-    np.testing.assert_allclose(carry(2 * TURN, TURN, at(1.5)), at(1.0), atol=1e-9)
+    np.testing.assert_allclose(carry(2 * TURN, TURN, moved(1.5)), moved(1.0), atol=1e-9)
 
 
 def test_how_long_a_scan_takes():

@@ -33,14 +33,11 @@ SHORT, MIDDLE, LONG = REACHES
 
 
 def equal_members():
-    """Motions of members that all move as the truth."""
     motions = np.concatenate([np.eye(4)[None], steps(TRUTH)])
     return np.repeat(motions[:, None], Consensus.n_members, axis=1)
 
 
 class Recorded(list):
-    """Scans as a recording."""
-
     name = "some.bag"
     n_messages = 3  # not that many
 

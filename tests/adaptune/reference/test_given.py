@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from made_passes import straight
 from rooms import moved, scan_at, street
 
 from adaptune.live.hops import Hops
@@ -11,14 +12,7 @@ from adaptune.trajectory import Trajectory
 WORLD = street()
 
 
-def straight(n, step=1.0):
-    T = np.tile(np.eye(4), (n, 1, 1))
-    T[:, 0, 3] = step * np.arange(n)
-    return T
-
-
 def hops_of(T, starts, reach=10):
-    """Registrations that are right, when `T` is the truth."""
     ends = [start + reach for start in starts]
     true = [np.linalg.inv(T[start]) @ T[end] for start, end in zip(starts, ends, strict=True)]
     return Hops(
@@ -37,7 +31,7 @@ def measured(T_ref, T_true, starts):
 @given(st.floats(0.9, 1.1), st.sampled_from([10.0, 20.0, 40.0]))
 @settings(max_examples=30, deadline=None)
 def test_a_reference_of_wrong_scale_is_wrong_by_it_over_every_length(scale, length):
-    T = straight(121)
+    T = straight(121, 1.0)
     T_ref = straight(121, scale)
     found = measured(T_ref, T, range(110)).error(length)
     # The share of what it says, not of what is true.
@@ -46,7 +40,7 @@ def test_a_reference_of_wrong_scale_is_wrong_by_it_over_every_length(scale, leng
 
 
 def test_noise_counts_less_over_a_longer_way():
-    T, rng = straight(400), np.random.default_rng(0)
+    T, rng = straight(400, 1.0), np.random.default_rng(0)
     T_ref = T.copy()
     T_ref[:, :3, 3] += rng.normal(0.0, 0.1, (400, 3))
     of = measured(T_ref, T, range(0, 390, 5))
@@ -59,7 +53,7 @@ def test_noise_counts_less_over_a_longer_way():
 
 
 def test_no_chain_leads_over_poses_that_are_unknown():
-    T = straight(60)
+    T = straight(60, 1.0)
     T_ref = T.copy()
     T_ref[30:, 1, 3] += 5.0
     T_ref[30] = np.nan
@@ -80,7 +74,7 @@ def recording(n, every=10**8):
 def test_scans_tell_how_wrong_a_reference_is():
     scans, told = recording(55), []
     stamps = np.array([scan.stamp for scan in scans])
-    right, wrong = straight(55), straight(55, 1.02)
+    right, wrong = straight(55, 1.0), straight(55, 1.02)
     errors = []
     for T in (right, wrong):
         # Stamps between those of the scans: poses are interpolated.
@@ -103,7 +97,7 @@ def _half_a_step_back(T):
 
 
 def test_the_difference_of_two_is_their_mean_error_where_both_are_known():
-    one = straight(50)
+    one = straight(50, 1.0)
     other = moved(x=3.0, y=1.0, yaw=0.4) @ straight(50, 1.03)
     assert mean_difference(one, other, 10.0) == pytest.approx(3.3, abs=0.01)  # over 11 m
     other[20] = np.nan

@@ -9,7 +9,6 @@ from adaptune.reference.graph import EVERY, LATER, MOST, NEAR, Loop, closed, loo
 
 
 def circle(metres, laps, step=0.5):
-    """A path that goes round and round."""
     n = round(metres / step)
     return chained([moved(x=step, yaw=2.0 * np.pi / n)] * (n * laps))
 

@@ -21,7 +21,6 @@ def reference(n=201, lost=(50,)):
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
-    """An estimate, and what was stored of it."""
     path = tmp_path_factory.mktemp("estimates") / "new" / "drive.tum"
     return path, write_estimate(path, reference(), ABOUT)
 

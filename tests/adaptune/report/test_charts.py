@@ -23,7 +23,6 @@ from adaptune.report.drawing import MODES, draw_chart, looks, spec, thinned, tic
 
 
 def drawn(chart, folder):
-    """The texts of a chart's SVG, and all of it."""
     draw_chart(chart, folder / "chart.png", folder / "chart.svg")
     assert (folder / "chart.png").read_bytes().startswith(b"\x89PNG")
     text = (folder / "chart.svg").read_text("utf-8")

@@ -14,8 +14,6 @@ from adaptune.report.tables import Listing
 
 
 class Seen(HTMLParser):
-    """The tags of a page with their attributes, and its texts by the innermost tag."""
-
     def __init__(self, text):
         super().__init__()
         self.tags, self.texts, self.inside = [], {}, []
@@ -106,7 +104,6 @@ def test_any_key_names_files_of_its_own_beside_the_page(tmp_path):
 
 @pytest.fixture(scope="module")
 def opened(tmp_path_factory):
-    """The page in a browser, and what it told the console or requested."""
     chromium, told = needs_browser(), []
     from playwright.sync_api import sync_playwright
 

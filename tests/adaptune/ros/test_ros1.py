@@ -1,5 +1,3 @@
-"""Against a real roscore."""
-
 import json
 import os
 import queue
@@ -30,7 +28,6 @@ ROBOT = Path(drives.__file__).with_name("ros1_robot.py")
 
 @pytest.fixture(scope="module", autouse=True)
 def master():
-    """A roscore, and its address in the environment."""
     needs_ros1()
     with socket.socket() as bound:
         bound.bind(("127.0.0.1", 0))
@@ -64,7 +61,6 @@ def link(master):
 
 @pytest.fixture(scope="module")
 def robot(link):  # noqa: ARG001
-    """A node of somebody else's."""
     process = subprocess.Popen(
         [ros_python(), str(ROBOT)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
     )
@@ -154,7 +150,6 @@ def test_a_node_that_is_killed_is_noticed(link):
 
 @pytest.mark.parametrize("steers", [False, True])
 def test_the_command_drives_until_ctrl_c(link, robot, study_file, trained_folder, tmp_path, steers):
-    """A bag is played to `adaptune online --ros`."""
     folder = shutil.copytree(trained_folder, tmp_path / "run")
     extra = ["-o", "online.ros.points=/velodyne", "-o", "online.ros.odometry=/found"]
     # Nothing is too late, also where the tests share a core.

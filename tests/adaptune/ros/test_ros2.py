@@ -101,7 +101,6 @@ def link(robot):
 
 
 def taken(link, topic, kind, n):
-    """The first messages that come, and the threads that bring them."""
     messages = queue.SimpleQueue()
     link.subscribe(topic, kind, lambda m: messages.put((m, threading.current_thread())))
     return zip(*(messages.get(timeout=5.0) for _ in range(n)), strict=True)
@@ -275,7 +274,6 @@ def test_a_router_must_answer():
 
 
 def test_it_drives_over_zenoh(link, robot, study_file, trained_folder, tmp_path):
-    """Scans come from another session, and poses go to it."""
     folder = shutil.copytree(trained_folder, tmp_path / "run")
     patient = ["online.real_time={deadline: 60, queue: 0}", "online.ros.points=/velodyne"]
     study = load_study(study_file, patient, folder)
@@ -309,7 +307,6 @@ def test_it_drives_over_zenoh(link, robot, study_file, trained_folder, tmp_path)
 
 
 def of_ros_2(cloud):
-    """A cloud with the types of ROS 2."""
     types, kind = STORE.types, "sensor_msgs/msg/PointCloud2"
     stamp = types["builtin_interfaces/msg/Time"](cloud.header.stamp.sec, cloud.header.stamp.nanosec)
     header = types["std_msgs/msg/Header"](stamp, cloud.header.frame_id)

@@ -16,6 +16,7 @@ from contained import (
     truth,
 )
 from needs import reference_image
+from rooms import moved
 from setups import setup_of
 
 from adaptune.odometry.docker.engine import Container, EngineError
@@ -75,8 +76,7 @@ def test_the_poses_are_those_of_the_program_on_this_machine(tmp_path, given):
     assert 0.0 < odometry.usage.seconds < 60.0 / N_SCANS
     # Later starts run nothing.
     begun = odometry.usage.cpu
-    T = np.eye(4)
-    T[:3, 3] = 5.0, 6.0, 7.0
+    T = moved(5.0, 6.0, 7.0)
     np.testing.assert_allclose(drive(odometry, T=T)[-1], T @ poses[-1], atol=1e-9)
     assert odometry.usage.cpu == begun
 

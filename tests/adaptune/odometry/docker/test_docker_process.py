@@ -41,7 +41,6 @@ def make():
 
 
 def changing(odometry):
-    """Poses of a drive with other parameters on the way."""
     poses = []
     odometry.start(odometry.prepare(scans()[0]), np.eye(4))
     for i, scan in enumerate(scans()[1:20]):

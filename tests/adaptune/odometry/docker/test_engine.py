@@ -57,7 +57,6 @@ def settings():
 
 @pytest.fixture
 def fresh(monkeypatch):
-    """The engine, as at its first use."""
     renewed = cache(engine_module.engine.__wrapped__)
     monkeypatch.setattr(engine_module, "engine", renewed)
     return renewed
@@ -76,7 +75,6 @@ def wait(container):
 
 
 def run(settings, *command, **more):
-    """Exit code of a command, and what it wrote."""
     with closing(started(settings, *command, **more)) as container:
         return wait(container), container.log().decode()
 
@@ -196,8 +194,6 @@ def test_without_an_engine_it_says_what_to_do(fresh, monkeypatch):
 
 
 class Gone:
-    """An engine that was stopped."""
-
     def __getattr__(self, name):
         if name == "api":
             return self

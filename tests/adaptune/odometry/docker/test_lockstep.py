@@ -18,6 +18,7 @@ from contained import (
     template,
 )
 from needs import reference_image
+from rooms import moved
 
 from adaptune.odometry import OdometryError
 from adaptune.odometry.base import InProcess
@@ -47,7 +48,6 @@ def _image():
 
 @pytest.fixture
 def systems(monkeypatch):
-    """The systems that are started."""
     started = []
 
     class Noted(RosSystem):
@@ -76,7 +76,6 @@ def make(tmp_path):
 
 
 def on(odometry, first, end):
-    """Register more scans."""
     given = [odometry.prepare(scan) for scan in scans()[first:end]]
     return [odometry.register(prepared) for prepared in given]
 
@@ -90,8 +89,7 @@ def test_the_poses_are_those_of_a_played_bag_and_it_starts_again_on_the_way(make
     assert 0.0 < odometry.usage.memory < 1000.0
     # A start has a container of its own, a frame of its own, and forgets what was before.
     (before,) = containers()
-    T = np.eye(4)
-    T[:3, 3] = 5.0, 6.0, 7.0
+    T = moved(5.0, 6.0, 7.0)
     again = drive(odometry, N_SCANS - 10, T)
     (after,) = containers()
     assert after != before

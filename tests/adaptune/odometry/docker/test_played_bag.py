@@ -51,7 +51,6 @@ TRIALS = {
         "settings": {"rate": 0.1, "arguments": ("required:=false",)},
     },
 }
-"""What is imitated and set in each trial."""
 
 
 class Ran(NamedTuple):
@@ -69,7 +68,6 @@ def run(
     points="/points",
     settings=(),
 ):
-    """Run a trial."""
     folder.mkdir(parents=True)
     given = recording(folder, folder / "logs")
     given.logs.mkdir()
@@ -91,7 +89,6 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def ran(folder):
-    """The outcome of a trial; all of them begin with the first that is asked for."""
     reference_image()
     with pytest.MonkeyPatch.context() as patch, ThreadPoolExecutor(SIDE_BY_SIDE) as pool:
         patch.setattr(ros_container, "_OTHERS_ONLY", 2.0)
@@ -146,7 +143,6 @@ def test_what_is_kept_of_a_trial(ran, folder):
 
 
 def test_it_waits_for_one_that_is_late_and_sleeps_by_the_clock(ran):
-    """And it renames topics."""
     assert_good(ran("late"))
 
 

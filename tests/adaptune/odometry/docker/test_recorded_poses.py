@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from rooms import moved
 from rosbags.highlevel import AnyReader
 
 from adaptune.odometry import OdometryError
@@ -95,9 +96,7 @@ class Recorded:
 
 
 def odometry(i, x=0.0):
-    T = np.eye(4)
-    T[0, 3] = x
-    return local_link.odometry(int(SCANS[i]), T)
+    return local_link.odometry(int(SCANS[i]), moved(x))
 
 
 @pytest.fixture

@@ -1,5 +1,3 @@
-"""What needs no container."""
-
 import pytest
 from contained import template
 from pydantic import ValidationError
