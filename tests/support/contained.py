@@ -4,9 +4,7 @@ Nothing here starts a container when it is imported.
 """
 
 import json
-import logging
 import os
-import threading
 from functools import cache
 
 import drives
@@ -85,27 +83,3 @@ def containers():
     labelled = engine().api.containers(all=True, filters={"label": LABEL})
     pid = f".{os.getpid()}."
     return [found["Id"] for found in labelled if pid in found["Labels"][LABEL]]
-
-
-class Said(logging.Handler):
-    """What this thread logs meanwhile, one message a line."""
-
-    def __init__(self):
-        super().__init__(logging.INFO)
-        self._thread, self._lines = threading.get_ident(), []
-
-    def emit(self, record):
-        if record.thread == self._thread:
-            self._lines.append(record.getMessage())
-
-    def __enter__(self):
-        log = logging.getLogger("adaptune")
-        log.addHandler(self)
-        log.setLevel(logging.INFO)
-        return self
-
-    def __exit__(self, *_):
-        logging.getLogger("adaptune").removeHandler(self)
-
-    def __str__(self):
-        return "\n".join(self._lines)

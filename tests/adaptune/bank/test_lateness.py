@@ -186,14 +186,6 @@ def test_a_gap_does_not_make_it_wait_as_long(clock):
     assert known == [False] + [True] * 5
 
 
-def test_in_lockstep_nobody_is_late(clock):
-    bank, _ = bank_of(clock, None, of_5=0.5)
-    x, moved = run(bank, clock)
-    assert not bank.late.scans.any()
-    assert np.isfinite(moved).all()
-    np.testing.assert_allclose(x, STEP * np.arange(30))
-
-
 @pytest.mark.parametrize("rate", [None, 1.0])
 def test_a_member_that_restarts_sees_the_past_bit_by_bit(clock, rate):
     bank, _ = bank_of(clock, rate)

@@ -296,26 +296,6 @@ def test_a_slip_counts_at_any_speed(exactly, speed):
     assert not live.lost
 
 
-@pytest.mark.parametrize("speed", [5.0, 10.0, 20.0])
-def test_an_odometry_that_is_wrong_in_changing_directions_is_lost(exactly, speed):
-    step = 0.1 * speed
-
-    def weaving(i):
-        T = moved(step)
-        T[1, 3] = 0.4 * step * (1.0 if i // 10 % 2 else -1.0)
-        return Motions(T, {})
-
-    exactly(at(step))
-    live, states = LiveEvidence(), []
-    for i in range(0, 200, 10):
-        drive(live, 10, weaving, first=i)
-        states.append(live.lost)
-    if speed >= 10.0:
-        assert all(states[4:])
-    else:  # left and right cancel over a hop
-        assert live.own_error().mean > 1.5
-
-
 def test_what_a_hop_cannot_tell_counts_for_nothing(exactly):
     blind = np.diag([0.0, 1.0, 1.0])
     exactly(lambda *hop: exact(*hop)._replace(projection=blind))

@@ -1,30 +1,18 @@
 import numpy as np
 import pytest
-from rosbags.highlevel import AnyReader
 
-from adaptune.geometry import from_quaternions
 from adaptune.metrics import sub_trajectory_rte
 from adaptune.odometry.registry import odometry_class
-from adaptune.recording import clouds
-
-
-def recording(path):
-    scans, translations, quaternions = [], [], []
-    with AnyReader([path]) as reader:
-        for connection, _, data in reader.messages():
-            if connection.topic == "/velodyne_points":
-                scans.append(clouds.decode_cloud(data, cdr=False))
-            elif connection.topic == "/gt_poses":
-                message = reader.deserialize(data, connection.msgtype)
-                p, q = message.pose.position, message.pose.orientation
-                translations.append((p.x, p.y, p.z))
-                quaternions.append((q.x, q.y, q.z, q.w))
-    return scans, from_quaternions(translations, quaternions)
+from adaptune.recording.config import SequenceConfig
+from adaptune.recording.recording import open_sequence
 
 
 def test_parameters_matter_as_much_as_is_known(recorded):
     """A loop through a hall at two scans a second; the figures come with the recording."""
-    scans, T_ref_sensor = recording(recorded / "hall.bag")
+    topics = {"points": "/velodyne_points", "reference": "/gt_poses"}
+    sequence = open_sequence(SequenceConfig(bag=str(recorded / "hall.bag"), **topics, cache=False))
+    scans = list(sequence)
+    T_ref_sensor = sequence.reference().at(np.array([scan.stamp for scan in scans]))
     cls = odometry_class("gicp")
     settings = cls.settings_type(downsampling=0.25, min_range=1.0, iterations=30)
     prepared = [cls(settings=settings).prepare(scan) for scan in scans]

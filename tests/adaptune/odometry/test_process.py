@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import server
 import turns
-from rooms import moved
 
 from adaptune.odometry import OdometryError
 from adaptune.odometry.base import MOST_FAULTS, InProcess
@@ -30,18 +29,6 @@ def program(fault="none"):
 
 def scan(i):
     return Scan(i * 10**8, np.zeros((5, 3), np.float32))
-
-
-def test_it_drives_and_changes_its_parameters():
-    odometry = Process({"speed": 0.5}, program(), LIMITS)
-    odometry.start(scan(0), np.eye(4))
-    assert odometry.register(scan(1)).T_odom_sensor[0, 3] == 0.5
-    odometry.apply(Selection(0, {"speed": 2.0}))
-    assert odometry.register(scan(2)).T_odom_sensor[0, 3] == 2.5
-    T = moved(7.0)
-    odometry.start(scan(3), T)
-    assert odometry.register(scan(4)).T_odom_sensor[0, 3] == 9.0
-    assert not odometry.faults
 
 
 FAULTS = {
