@@ -109,7 +109,6 @@ def test_a_trial_of_a_study(tmp_path, study_file):
     assert f"{tmp_path}/params.yaml" in content
     for override, words in (
         ("odometry.settings.image=no-such", "there is no image 'no-such' on this machine"),
-        ("odometry.settings.image=", "odometry.settings.image: give text, not nothing"),
         ("odometry.settings.cpus=0", "odometry.settings.cpus"),
         ("odometry.settings.command=[x, '{ouput}']", "{ouput} is nothing; did you mean 'output'?"),
         ("odometry.parameters.voxl={type: float, low: 1, high: 2, baseline: 1}", "voxl: no argum"),

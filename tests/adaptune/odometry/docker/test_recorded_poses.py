@@ -123,7 +123,7 @@ def test_poses_are_kept_as_they_come(link, tmp_path):
 
 @pytest.mark.parametrize(
     ("drain", "interval", "pause"),
-    [(2.0, 0.1, 2.0), (60.0, 0.1, 60.0), (2.0, 1.5, 4.5), (2.0, 9, 10)],
+    [(2.0, 0.1, 2.0), (2.0, 1.5, 4.5), (2.0, 9, 10)],
 )
 def test_a_system_is_waited_for_until_nothing_comes(link, monkeypatch, drain, interval, pause):
     now = [0.0]
@@ -163,11 +163,8 @@ GIVEN = ProgramInput(Path("drive.bag"), "/points", "", SCANS, None)
 @pytest.mark.parametrize(
     ("topics", "words"),
     [
-        (
-            ["/odom", "/clock"],
-            "nothing was published on /Odometry, but on /odom; name its topic as",
-        ),
-        (["/Odometry"], r"nothing was published on /Odometry until 2 s after the bag, though a"),
+        (["/odom", "/clock"], "on /Odometry, but on /odom; name its topic as"),
+        (["/Odometry"], "on /Odometry until 2 s after the bag, though a"),
     ],
 )
 def test_a_topic_without_poses_is_told_with_the_others(link, played, topics, words):
