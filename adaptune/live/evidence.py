@@ -77,14 +77,9 @@ class _Chain(NamedTuple):
 
 
 class OwnErrors:
-    """Chains of the last hops.
+    """Chains of the last hops, or of a whole recording.
 
-    Parameters
-    ----------
-    length
-        Metres of the sub-trajectories whose mean error is estimated.
-    whole
-        Whether to keep the chains of a whole recording, not only the last ones.
+    `length` is that of the sub-trajectories whose mean error is estimated, in metres.
     """
 
     def __init__(self, length: float, whole: bool = False):
@@ -314,12 +309,7 @@ class LiveEvidence:
         Nothing is measured before the first hop is complete, nor where the sensor has moved less
         than a metre since the last one. A hop that contradicts the odometry counts only if a
         registration to another scan says the same: where a scene repeats itself, one can be wrong
-        by metres.
-
-        Returns
-        -------
-        Measured or None
-            None if no registration was accepted.
+        by metres. None if no registration was accepted.
         """
         end = self._newest
         if end is None or end.metres - self._measured < SPACING:
@@ -354,9 +344,8 @@ class LiveEvidence:
     def _register(self, starts: Sequence[_Anchor], end: _Anchor) -> _Found | None:
         """The first registration that is accepted.
 
-        The odometry's own motion is the guess. Only where the last registration was rejected, too,
-        members that disagree with it are asked: where a scene repeats itself, one that is lost
-        finds a registration as well.
+        Only where the last one was rejected, members that disagree with the odometry are asked,
+        too: where a scene repeats itself, one that is lost finds a registration as well.
         """
         guesses = [self._guesses(start, end) for start in starts]
         for first, stop in ((0, 1), (1, _GUESSES))[: 2 if self._rejected else 1]:
@@ -439,13 +428,7 @@ class LiveEvidence:
         return present if present.any() else ~present
 
     def squares(self, members: Collection[int] | None = None) -> LiveSquares | None:
-        """What the last hops say of members, or of a single odometry; None without any.
-
-        Parameters
-        ----------
-        members
-            Trial numbers of some of the bank's; None for all.
-        """
+        """What the last hops say of some members, by trial, or of all, or of a single odometry."""
         chosen = self.members if members is None else members
         columns = [i for i, trial in enumerate(self.members, 1) if trial in chosen] or [0]
         return live_squares(self._hops._replace(errors=self._hops.errors[:, columns]))
@@ -504,15 +487,9 @@ def hops_along(
 ) -> Hops:
     """Register scans directly to those some metres before, once a second.
 
-    The known poses take the odometry's place: they give each registration its first guess. Where
-    they are unknown, nothing is measured.
-
-    Parameters
-    ----------
-    scans
-        Scans with their poses, each of shape (4, 4), NaN where it is unknown.
-    advance
-        Called after every scan with how many are done.
+    The known poses, of shape (4, 4), take the odometry's place: they give each registration its
+    first guess. Where they are unknown (NaN), nothing is measured. `advance` is called after every
+    scan with how many are done.
     """
     live = LiveEvidence()
     found: list[tuple[int, int, Hop]] = []

@@ -123,19 +123,8 @@ def register(
 ) -> Hop | None:
     """Register two scans; the first guess that leads to a sound registration wins.
 
-    Parameters
-    ----------
-    start, end
-        The scans.
-    guesses
-        Of ``T_start_end``, each of shape (4, 4).
-    min_inliers
-        Least share of points near a point of the other scan.
-
-    Returns
-    -------
-    Hop or None
-        None if all of them are rejected.
+    Guesses are of ``T_start_end``, each of shape (4, 4). Sound is one with a share of
+    `min_inliers` of its points near a point of the other scan; None if none is.
     """
     if start.prepared is None or end.prepared is None:
         return None
@@ -164,13 +153,7 @@ def _align(target: Any, source: Any, tree: Any, T_target_guess: Poses) -> Any:
 
 
 def _known_directions(result: Any) -> NDArray[np.float64]:
-    """Projection, in the end's frame, on the directions of translation that are well determined.
-
-    Parameters
-    ----------
-    result
-        What small_gicp found.
-    """
+    """Projection, in the end's frame, on the directions of translation that are well determined."""
     information = np.asarray(result.H)
     of_rotation = information[:3, :3] + 1e-9 * np.eye(3)
     # What is known of the translation if the rotation is not.
@@ -216,14 +199,9 @@ class HopErrors(NamedTuple):
         return added.recent(end, seconds)
 
     def filled(self, members: NDArray[np.bool_]) -> "HopErrors":
-        """Let some members be as wrong as the worst one was, where they gave no pose.
+        """Let members, of shape (n_members,), be as wrong as the worst where they gave no pose.
 
         So they are neither lost nor at an advantage over hops that say nothing of them.
-
-        Parameters
-        ----------
-        members
-            Of shape (n_members,).
         """
         lengths = np.linalg.norm(self.errors, axis=-1)
         missing = np.isnan(lengths)
@@ -267,10 +245,7 @@ def live_squares(hops: HopErrors) -> LiveSquares | None:
 def windows(start: NDArray[np.float64], end: NDArray[np.float64]) -> float:
     """How many stretches of a path that overlap amount to as much as if they did not.
 
-    Parameters
-    ----------
-    start, end
-        Metres driven, of shape (n,).
+    Their starts and ends are metres driven, of shape (n,).
     """
     order = np.argsort(start)
     start, end = start[order], end[order]
@@ -285,17 +260,8 @@ def clip_to_best(
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Clip errors at `CLIP` from those of the member with the least error of each hop.
 
-    Parameters
-    ----------
-    errors
-        Of shape (n_hops, n_members, 3); NaN where a member gave no pose.
-
-    Returns
-    -------
-    errors : ndarray of the same shape
-        The best member's where there was none.
-    missing : ndarray of shape (n_hops, n_members)
-        Where there was none.
+    They are of shape (n_hops, n_members, 3), NaN where a member gave no pose. Returned are the
+    errors, the best member's where there was none, and where there was none.
     """
     missing = np.asarray(~np.isfinite(errors).all(axis=-1))
     known = np.where(missing[..., None], np.nan, errors)
@@ -314,16 +280,7 @@ def blend(
 
     What is measured is scaled to the prior: only how members compare counts, as in the prior, and
     not how hard the place is for all of them. Without the registrations' own part, the harmonic
-    means of the members' squares are then the same.
-
-    Parameters
-    ----------
-    prior
-        Of shape (n_members, n_members).
-    prior_windows
-        How many windows it counts as.
-    live
-        None if nothing was measured.
+    means of the members' squares are then the same. Products are of shape (n_members, n_members).
     """
     if live is None:
         return prior

@@ -34,20 +34,11 @@ class MeasuredReference:
     hops: Hops  # direct registrations of the same scans
 
     def error(self, length: float) -> OwnError | None:
-        """Mean error of the reference, in percent of the sub-trajectories' length.
+        """Mean error of the reference, in percent of sub-trajectories of `length` metres.
 
         What the registrations themselves are wrong by is part of it. A registration is `HOPS`
-        metres long at most; over less, the reference counts as wrong by as many metres.
-
-        Parameters
-        ----------
-        length
-            Metres of the sub-trajectories.
-
-        Returns
-        -------
-        OwnError, optional
-            None if the registrations that follow each other reach nowhere over the length.
+        metres long at most; over less, the reference counts as wrong by as many metres. None if
+        the registrations that follow each other reach nowhere over the length.
         """
         longer = max(length, HOPS[0])
         metres, reach = self._metres(), 0.0
@@ -88,16 +79,9 @@ class MeasuredReference:
 def measure_reference(
     scans: Recording, reference: Trajectory, advance: "Advance" = lambda *_: None
 ) -> MeasuredReference:
-    """Register the scans of a recording to find how wrong its reference is.
+    """Register the scans of a recording to find how wrong a reference of its LiDAR is.
 
-    Parameters
-    ----------
-    scans
-        The recording.
-    reference
-        Poses of its LiDAR.
-    advance
-        Called after every scan.
+    `advance` is called after every scan.
     """
     stamps, poses = [], []
     n = scans.n_messages
@@ -122,19 +106,10 @@ def _pose_at(reference: Trajectory, stamp: int) -> Poses:
 
 
 def mean_difference(T_one: Poses, T_other: Poses, length: float) -> float:
-    """Mean RTE of one reference by another, in percent.
+    """Mean RTE in percent of one reference by another, over `length` metres.
 
-    Parameters
-    ----------
-    T_one, T_other
-        Poses at the same stamps, each of shape (n, 4, 4); NaN where they are unknown.
-    length
-        Metres of the sub-trajectories.
-
-    Returns
-    -------
-    float
-        NaN where both together hold no sub-trajectory.
+    The poses are of shape (n, 4, 4), at the same stamps, and NaN where they are unknown. The
+    result is NaN where both together hold no sub-trajectory.
     """
     known = np.isfinite(T_one + T_other).all(axis=(1, 2), keepdims=True)
     T_one, T_other = (np.where(known, T, np.nan) for T in (T_one, T_other))
@@ -166,22 +141,15 @@ def proposed_sub_trajectory(
 ) -> float:
     """Metres of the sub-trajectories that a study of a recording alone should judge by.
 
-    Parameters
-    ----------
-    reference
-        Of the recording.
-    measured
-        Registrations along it, if its scans were registered.
-
-    Returns
-    -------
-    float
-        The first of `LENGTHS` for which the test's part of the path is long enough, 1 m if none is,
-        or a longer one if that does not last `SECONDS`. Where the reference is too noisy for it,
-        the first longer one that fits and for which it is not; where it is for all, the longest
-        that fits, up to the greatest of `LENGTHS`.
+    The first of `LENGTHS` for which the test's part of the path is long enough, 1 m if none is,
+    or a longer one if that does not last `SECONDS`. Where registrations say that the reference is
+    too noisy for it, the first longer one that fits and for which it is not; where it is for all,
+    the longest that fits, up to the greatest of `LENGTHS`.
     """
-    path, seconds = _tested(reference)
+    first, last = reference.stamps[[0, -1]]
+    tested = reference.stamps >= first + TRAINING * (last - first)
+    seconds = float(last - reference.stamps[tested][0]) * 1e-9
+    path = float(travelled(reference.T_world_sensor[tested])[-1])
     usual = next((length for length, n in LENGTHS.items() if n * length <= path), 1.0)
     least = min(SECONDS * path / seconds, max(LENGTHS)) if seconds else 0.0
     fit = [usual, *(length for length in LONGER if length > usual and FEWEST * length <= path)]
@@ -195,14 +163,6 @@ def proposed_sub_trajectory(
     return max(length for length in fit if length <= max(LENGTHS))
 
 
-def _tested(reference: Trajectory) -> tuple[float, float]:
-    """Metres and seconds of the path that is proposed for the test."""
-    first, last = reference.stamps[[0, -1]]
-    tested = reference.stamps >= first + TRAINING * (last - first)
-    seconds = float(last - reference.stamps[tested][0]) * 1e-9
-    return float(travelled(reference.T_world_sensor[tested])[-1]), seconds
-
-
 def is_noisy(error: OwnError | None) -> bool:
     """Whether a reference is surely wrong by more than `NOISY`; False where nothing is known."""
     return error is not None and error.low > NOISY
@@ -210,18 +170,15 @@ def is_noisy(error: OwnError | None) -> bool:
 
 def accuracy_words(measured: MeasuredReference, *lengths: float) -> str:
     """How wrong a reference is over some metres, in words."""
-    told = [_error_words(measured, length) for length in dict.fromkeys(lengths)]
-    if not (known := [words for words in told if words]):
+    words = []
+    for length in dict.fromkeys(lengths):
+        if (error := measured.error(length)) is not None:
+            most = "at most " if length < HOPS[0] else ""
+            interval = f"({error.low:.2g}-{error.high:.2g})"
+            words.append(f"{most}{error.mean:.2g} % {interval} over {length:g} m")
+    if not words:
         return f"its error over {lengths[0]:g} m cannot be measured: too few scans agree"
-    return f"wrong by {', '.join(known)}, as registrations of scans tell"
-
-
-def _error_words(measured: MeasuredReference, length: float) -> str:
-    error = measured.error(length)
-    if error is None:
-        return ""
-    most = "at most " if length < HOPS[0] else ""
-    return f"{most}{error.mean:.2g} % ({error.low:.2g}-{error.high:.2g}) over {length:g} m"
+    return f"wrong by {', '.join(words)}, as registrations of scans tell"
 
 
 def advice(measured: MeasuredReference, reference: Trajectory) -> str:
@@ -243,17 +200,8 @@ def recording_config(
 ) -> SequenceConfig:
     """The sequence that an inspected recording is.
 
-    Parameters
-    ----------
-    found
-        What `adaptune inspect` finds in it.
-    points, reference
-        Topics in place of those that were found; the reference may be a file, too.
-
-    Raises
-    ------
-    EstimateError
-        If there are no scans.
+    `points` and `reference` are topics in place of those that were found; the reference may be a
+    file, too. There is an `EstimateError` if there are no scans.
     """
     if not found.name:
         raise EstimateError(f"{found.path}: is a file of poses; give a recording of scans")
@@ -268,10 +216,7 @@ def recording_config(
 def read_prior(config: SequenceConfig, source: str) -> Trajectory:
     """Positions that are right over long distances, from a topic of the recording or a file.
 
-    Raises
-    ------
-    AdaptuneError
-        If there are none, or they are of another time.
+    There is an `AdaptuneError` if there are none, or they are of another time.
     """
     given = config.model_dump(exclude_unset=True, exclude={"max_gap"})
     joined = {"reference": ESTIMATED, "position_prior": source}
@@ -297,20 +242,9 @@ def beside_given(
     length: float,
     advance: "Advance" = lambda *_: None,
 ) -> Comparison:
-    """Compare an estimated reference with a given one, and measure the given one.
+    """Compare an estimated reference with the one that came with the recording, and measure that.
 
-    Parameters
-    ----------
-    scans
-        The recording.
-    given
-        The reference that came with it.
-    found
-        The estimated one.
-    length
-        Metres of the sub-trajectories.
-    advance
-        Called after every scan.
+    The sub-trajectories are `length` metres long; `advance` is called after every scan.
     """
     measured = measure_reference(scans, given, advance)
     T = np.where(found.known[:, None, None], found.T_world_sensor, np.nan)
@@ -320,10 +254,8 @@ def beside_given(
 def check_writable(path: Path) -> None:
     """Make sure that an estimate can be written, and that nothing of the user's is overwritten.
 
-    Raises
-    ------
-    EstimateError
-        If the folder of the TUM file cannot be written to, or there is a file that is no estimate.
+    There is an `EstimateError` if the folder of the TUM file cannot be written to, or there is a
+    file that is no estimate.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

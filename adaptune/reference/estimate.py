@@ -6,7 +6,6 @@ also registered directly to scans some metres before. A pose graph brings both t
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import count
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,15 +54,13 @@ Advance = Callable[[int, int], None]
 def estimate_reference(
     scans: Recording, advance: Advance = lambda *_: None, priors: Trajectory | None = None
 ) -> EstimatedReference:
-    """Estimate the reference of a recording.
+    """Estimate the reference of a recording; its own is not used.
 
     Neither a reference nor the trials of a study are used: what judges an odometry is made by a
     pool of others. Only the scans of the last metres are kept in memory.
 
     Parameters
     ----------
-    scans
-        The recording; its own reference is not used.
     advance
         Called after every scan, and after each of `N_GRAPHS` pose graphs.
     priors
@@ -99,42 +96,27 @@ def estimated(
     scans: Iterable[Scan] = (),
     advance: Callable[[], None] = lambda: None,
 ) -> EstimatedReference:
-    """The reference that follows from a pass over a recording.
+    """The reference that follows from a pass over a recording, see `estimate_reference`.
 
-    Parameters
-    ----------
-    name
-        Of the recording, for messages.
-    found
-        What the pass has found.
-    priors
-        See `estimate_reference`.
-    scans
-        The recording, which is read again if the path comes by again; by default it is not.
-    advance
-        Called after each of `N_GRAPHS` pose graphs.
-
-    Raises
-    ------
-    EstimateError
-        See `estimate_reference`.
+    The scans are read again if the path comes by again; by default it is not. `advance` is called
+    after each of `N_GRAPHS` pose graphs.
     """
     _check(name, found)
-    revised = _revised(found)
-    T = optimised(revised.T_odom_sensor, revised.edges)
+    T_odom_sensor, edges = _revised(found)
+    T = optimised(T_odom_sensor, edges)
     places = None if priors is None else positions(priors, found.stamps, T)
-    again = loops(T, np.unique([edge.end for edge in revised.edges]))
+    again = loops(T, np.unique([edge.end for edge in edges]))
     by_loops = closed(scans, again, T) if again else []
     advance()
     if places is not None or by_loops:
-        T = optimised(revised.T_odom_sensor, [*revised.edges, *by_loops], places, T)
+        T = optimised(T_odom_sensor, [*edges, *by_loops], places, T)
     advance()
-    registrations = _judged(found.guesses, revised.edges, T)
+    registrations = _judged(found.guesses, edges, T)
     reference = EstimatedReference(
         found.stamps,
         T,
-        _trusted(T, registrations, revised.edges),
-        _halves(found, [*revised.edges, *by_loops], places, T, advance),
+        _trusted(T, registrations, edges),
+        _halves(found, [*edges, *by_loops], places, T, advance),
         registrations,
     )
     if (share := reference.unknown_share()) > MOST_UNKNOWN:
@@ -144,13 +126,6 @@ def estimated(
             f"long corridor), or too much may move in it"
         )
     return reference
-
-
-class _Revised(NamedTuple):
-    """What goes into the pose graph."""
-
-    T_odom_sensor: Poses  # (n, 4, 4)
-    edges: list[Edge]
 
 
 def _check(name: str, found: Pass) -> None:
@@ -179,8 +154,11 @@ def _way(positions: NDArray[np.float64]) -> float:
     return way
 
 
-def _revised(found: Pass) -> _Revised:
-    """Replace the consensus by a member where registrations confirm that one, and not the other."""
+def _revised(found: Pass) -> tuple[Poses, list[Edge]]:
+    """Replace the consensus by a member where registrations confirm that one, and not the other.
+
+    Poses of shape (n, 4, 4), and registrations, for the pose graph.
+    """
     edges = _edges(found.guesses, -1)
     motions = steps(found.T_odom_sensor)
     weak = _support(len(found.stamps), edges) < FEWEST
@@ -196,7 +174,7 @@ def _revised(found: Pass) -> _Revised:
         edges += near[best]
     # One that spans two such runs was found twice.
     once = {(edge.start, edge.end): edge for edge in edges}
-    return _Revised(_chained(found.T_odom_sensor[0], motions), list(once.values()))
+    return _chained(found.T_odom_sensor[0], motions), list(once.values())
 
 
 def _edges(guesses: Iterable[Guess], member: int) -> list[Edge]:
@@ -259,8 +237,7 @@ def _trusted(
     """Which motions from scan to scan can be trusted, of shape (n - 1,).
 
     Enough registrations must confirm a motion, in every direction, and no more speak against it:
-    those that differ, and those over short ways that fail. Over the longest way, scans may have too
-    little in common.
+    those that differ, and those over short ways that fail.
     """
     n = len(T_world_sensor)
     way = (invert(T_world_sensor[found.start]) @ T_world_sensor[found.end])[:, :3, 3]
@@ -276,10 +253,7 @@ def _trusted(
 def _in_every_direction(
     T_world_sensor: Poses, found: Registrations, edges: Sequence[Edge]
 ) -> NDArray[np.float64]:
-    """How many registrations confirm the motion from each scan to the next where it is least known.
-
-    A registration along a bare corridor does not tell how far it went.
-    """
+    """How many registrations confirm each motion where it is least known, as along a corridor."""
     known = {(edge.start, edge.end): edge.hop.projection for edge in edges}
     changes = np.zeros((len(T_world_sensor), 3, 3))
     for start, end in zip(found.start[found.accepted], found.end[found.accepted], strict=True):
@@ -309,11 +283,7 @@ def _halves(
 
 
 def _steps_of(found: Pass, T_world_sensor: Poses, members: Sequence[int]) -> Poses:
-    """Mean motions of some members.
-
-    Those far from the reference are left out where others are near; one without a motion moves as
-    the reference.
-    """
+    """Mean motions of some members; those far from the reference count only where none is near."""
     whole = steps(T_world_sensor)[:, None]
     theirs = found.T_previous_current[1:, list(members)]
     apart = np.linalg.norm((theirs - whole)[..., :3, 3], axis=-1)

@@ -16,7 +16,7 @@ from adaptune.bank.bank import Bank
 from adaptune.geometry import Poses, invert, rectify, rotation_angle, steps
 from adaptune.live.hops import Hop, HopCloud, register
 from adaptune.metrics import travelled
-from adaptune.odometry.base import InProcess, Odometry
+from adaptune.odometry.base import InProcess
 from adaptune.odometry.registry import odometry_class
 from adaptune.odometry.tracker import HealthCheck, Tracker
 from adaptune.recording.scan import Scan
@@ -42,10 +42,8 @@ _WARM_UP = 2.0
 """Seconds. Odometries that register to a keyframe have no map to build."""
 HALVES = ((0, 1, 2), (3, 4))
 """Members of either half, which have no algorithm in common."""
-_SETTINGS: Mapping[str, Mapping[str, float]] = {
-    "gicp": {"downsampling": 0.45},
-    "vgicp": {"downsampling": 0.45},
-}
+_DOWNSAMPLING = 0.45
+"""Metres between points of their clouds."""
 
 
 class Consensus:
@@ -53,23 +51,15 @@ class Consensus:
 
     A bank of even weights: members that agree move it by their mean, others are warmed up on the
     last scans at its pose.
-
-    Attributes
-    ----------
-    n_members : int
-        Size of the pool.
     """
 
     n_members = len(POOL)
 
     def __init__(self) -> None:
-        def adapter(kind: str, parameters: Mapping[str, float]) -> Odometry:
-            cls: Any = odometry_class(kind)
-            made: Odometry = cls(dict(parameters), cls.settings_type(**_SETTINGS[kind]))
-            return made
-
         def make(parameters: Mapping[str, Any]) -> InProcess:
-            return InProcess(adapter(*POOL[int(parameters["number"])]))
+            kind, given = POOL[int(parameters["number"])]
+            cls: Any = odometry_class(kind)
+            return InProcess(cls(dict(given), cls.settings_type(downsampling=_DOWNSAMPLING)))
 
         sets: dict[int, ParameterSet] = {n: {"number": n} for n in range(len(POOL))}
         self._bank = Bank(make, sets, _WARM_UP)
@@ -80,18 +70,12 @@ class Consensus:
     def register(self, scan: Scan) -> tuple[Poses, Poses, bool]:
         """Register the next scan.
 
-        Returns
-        -------
-        T_odom_sensor : ndarray of shape (4, 4)
-            Of the consensus.
-        T_previous_current : ndarray of shape (n_members, 4, 4)
-            Motions of the members; NaN where one has none.
-        registered : bool
-            False where no member could register the scan.
+        Returns the consensus's pose, of shape (4, 4); the motions of the members, of shape
+        (n_members, 4, 4), NaN where one has none; and whether any member could register the scan.
         """
         found = self._tracker.register(scan)
         members = self._bank.motions.members
-        T_previous_current = np.array([members[i] for i in range(self.n_members)])
+        T_previous_current = np.array([members[i] for i in range(len(POOL))])
         return found.T_odom_sensor, T_previous_current, found.registered
 
 
@@ -147,14 +131,8 @@ class _Anchor(NamedTuple):
 def pass_over(scans: Iterable[Scan], advance: Callable[[], None] = lambda: None) -> Pass:
     """Run the consensus along a recording, and register scans directly to those before them.
 
-    Only the scans of the last metres and seconds are kept in memory.
-
-    Parameters
-    ----------
-    scans
-        The recording.
-    advance
-        Called after every scan.
+    Only the scans of the last metres and seconds are kept in memory. `advance` is called after
+    every scan.
     """
     consensus, registering = Consensus(), _Registering(Consensus.n_members)
     stamps: list[int] = []
@@ -296,10 +274,7 @@ _ITERATIONS = 50
 
 
 class Edge(NamedTuple):
-    """A registration between two scans, by their numbers.
-
-    `again` says whether the path came by again, and so the scans are no few metres of it apart.
-    """
+    """A registration of two scans, by their numbers; `again` if the path came by again."""
 
     start: int
     end: int
@@ -472,15 +447,7 @@ class Loop(NamedTuple):
 
 
 def loops(T_world_sensor: Poses, numbers: NDArray[np.intp]) -> list[Loop]:
-    """Find where a path comes by again.
-
-    Parameters
-    ----------
-    T_world_sensor
-        The path, of shape (n, 4, 4).
-    numbers
-        The poses to choose from, of shape (m,), in order.
-    """
+    """Find where a path of shape (n, 4, 4) comes by again, among the poses of these numbers."""
     from scipy.spatial import cKDTree
 
     if not len(numbers):
@@ -503,14 +470,7 @@ def loops(T_world_sensor: Poses, numbers: NDArray[np.intp]) -> list[Loop]:
 def closed(scans: Iterable[Scan], wanted: Sequence[Loop], T_world_sensor: Poses) -> list[Edge]:
     """Register the scans of loops, which takes another pass over the recording.
 
-    Parameters
-    ----------
-    scans
-        The recording.
-    wanted
-        The loops.
-    T_world_sensor
-        The path as it is known so far, of shape (n, 4, 4).
+    `T_world_sensor`, of shape (n, 4, 4), is the path as it is known so far.
     """
     numbers, motions = {number for loop in wanted for number in loop}, steps(T_world_sensor)
     clouds: dict[int, HopCloud] = {}
@@ -539,17 +499,7 @@ _log = logging.getLogger(__name__)
 
 
 def warn_of_unused(name: str, prior: Trajectory | None, found: EstimatedReference) -> None:
-    """Warn if there was a prior, and too few scans have a position by it.
-
-    Parameters
-    ----------
-    name
-        Of the recording.
-    prior
-        The positions that the estimate was to join, if any.
-    found
-        The estimate.
-    """
+    """Warn if there was a prior, and too few scans have a position by it."""
     if prior is None or positions(prior, found.stamps, found.T_world_sensor) is not None:
         return
     _log.warning(

@@ -116,17 +116,9 @@ class EstimatedReference:
         return 1.0 - float(self.known.mean())
 
     def error(self, length: float) -> float:
-        """Estimated mean RTE of the reference itself.
+        """Estimated mean RTE of the reference itself, in percent over `length` metres.
 
-        Parameters
-        ----------
-        length
-            Metres of the sub-trajectories.
-
-        Returns
-        -------
-        float
-            Percent; NaN where no sub-trajectory is as long.
+        NaN where no sub-trajectory is as long.
         """
         known = self.known[:, None, None]
         one, other = (np.where(known, half, np.nan) for half in self.halves)
@@ -159,14 +151,8 @@ class StoredEstimate(NamedTuple):
         """What is known about an estimate that is to be written to `path`."""
         by_length = {length: found.error(length) for length in LENGTHS}
         errors = {length: round(e, 4) for length, e in by_length.items() if math.isfinite(e)}
-        return cls(
-            path,
-            about,
-            len(found.stamps),
-            round(found.path(), 3),
-            round(found.unknown_share(), 4),
-            errors,
-        )
+        metres, share = round(found.path(), 3), round(found.unknown_share(), 4)
+        return cls(path, about, len(found.stamps), metres, share, errors)
 
     def error(self, length: float) -> float:
         """Estimated mean RTE of the reference in percent over `length` metres; NaN if unknown."""
@@ -182,12 +168,8 @@ class StoredEstimate(NamedTuple):
     def read(cls, path: Path) -> "StoredEstimate | None":
         """What is known about the estimated reference in a TUM file; None if it is not one.
 
-        Nor is it one where an estimate was refused, see `Refusal`.
-
-        Raises
-        ------
-        EstimateError
-            If the file beside it is damaged.
+        Nor is it one where an estimate was refused, see `Refusal`. There is an `EstimateError` if
+        the file beside it is damaged.
         """
         beside = path.with_suffix(".json")
         try:
@@ -209,20 +191,9 @@ class StoredEstimate(NamedTuple):
 def write_estimate(
     path: Path, found: EstimatedReference, about: dict[str, Any], length: float = 25.0
 ) -> StoredEstimate:
-    """Write ``.png``, ``.tum`` and, last, ``.json``.
+    """Write ``.png``, which tells the error over `length` metres, ``.tum`` and, last, ``.json``.
 
     If it is interrupted, no ``.json`` is there, and so nothing that counts as an estimate.
-
-    Parameters
-    ----------
-    path
-        The TUM file.
-    found
-        The reference.
-    about
-        What it was estimated from, as plain data.
-    length
-        Metres over which the picture tells its error.
     """
     stored = StoredEstimate.of(path, found, about)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -273,17 +244,7 @@ _LONGEST_BREAK = 20.0
 def estimate_chart(
     title: str, found: EstimatedReference, stored: StoredEstimate, length: float
 ) -> Chart:
-    """The path, the residuals of the registrations, and where it is not to be trusted.
-
-    Parameters
-    ----------
-    title
-        First words.
-    found, stored
-        The reference, and what is known about it.
-    length
-        Metres over which the title tells the error.
-    """
+    """The path, the residuals of the registrations, and where it is not to be trusted."""
     panels = _path_panel(found), _residual_panel(found)
     return Chart("estimate", f"{title}: {_in_words(stored, length)}", panels)
 
