@@ -40,15 +40,8 @@ def adopt_orphans() -> None:
 def keep(child: int, connection: int, sampled: bool = False) -> Ended:
     """Wait until a child has ended, or the other side of a connection has gone; then end its rest.
 
-    Parameters
-    ----------
-    child
-        It leads a session of its own.
-    connection
-        File descriptor of a socket.
-    sampled
-        Whether to look at the memory of the child and its descendants a few times a second.
-        Otherwise the memory is that of the largest single process.
+    The child leads a session of its own. If sampled, the memory of it and its descendants is
+    looked at a few times a second; otherwise it is that of the largest single process.
     """
     woken, wake = os.pipe()
     os.set_blocking(wake, False)

@@ -59,10 +59,7 @@ class Writable(Protocol):
 
 
 class SocketStream:
-    """A socket as a stream of messages, which tells whether one has come.
-
-    Nothing is read ahead, so that what has come can be seen at the socket.
-    """
+    """A socket as a stream of messages, which tells whether one has come: nothing is read ahead."""
 
     def __init__(self, connection: socket.socket):
         self._socket = connection
@@ -205,8 +202,6 @@ class Program:
 
     Parameters
     ----------
-    command
-        The program and its arguments.
     memory
         Limit on the address space of each of its processes, in gigabytes.
     core
@@ -386,13 +381,7 @@ class Transport(Protocol):
 
 
 class Conversation:
-    """Messages to another process, and its answers.
-
-    Attributes
-    ----------
-    transport : Transport
-        The other process.
-    """
+    """Messages to another process, and its answers."""
 
     def __init__(self, transport: Transport):
         self.transport = transport
@@ -425,9 +414,8 @@ class Conversation:
         Raises
         ------
         HostError
-            It says why there is none. The conversation is over then.
-        RefusedError
-            What the other process refuses.
+            It says why there is none; the conversation is over then. A `RefusedError` says what the
+            other process refuses, and does not end it.
         """
         return accepted(self.next_message())
 
@@ -451,14 +439,9 @@ class Conversation:
         raise HostError(what)
 
     def ask(self, header: Mapping[str, Any], **arrays: Any) -> Message:
-        """Send a message, to a new process if there is none, and wait for the answer.
+        """Send a message, to a new process if there is none, and `receive` the answer.
 
-        Raises
-        ------
-        HostError
-            It names the process, and says why there is no answer.
-        RefusedError
-            What the other process refuses.
+        A `HostError` names the process.
         """
         self.open()
         self.send(header, **arrays)
@@ -691,14 +674,8 @@ def pin(core: int, alone: bool = False) -> Callable[[], None]:
 
     Open3D sums in an order that depends on its threads. Only on one core do its results repeat bit
     by bit. Running threads keep their cores: call this before the first use of Open3D. Numbers
-    beyond the last core restart at the first.
-
-    Parameters
-    ----------
-    core
-        Number of the core, among those of this process.
-    alone
-        Whether this process is the only one at work: then `next_core` gives others the rest.
+    beyond the last core restart at the first. `alone` says that this process is the only one at
+    work: then `next_core` gives others the rest.
     """
     global _before  # noqa: PLW0603 - the cores are those of the process
     if not hasattr(os, "sched_setaffinity"):
@@ -740,19 +717,10 @@ def other_core(number: int) -> int | None:
 
 @contextmanager
 def processes(most: int, preload: Sequence[str] = ()) -> Iterator[Executor]:
-    """Processes to compute in, one a core; those of the block's tasks that wait end with it.
+    """At most so many processes to compute in, one a core; tasks that wait end with the block.
 
-    Parameters
-    ----------
-    most
-        No more processes than this.
-    preload
-        Modules that all of them need: they are imported once.
-
-    Raises
-    ------
-    AdaptuneError
-        If a process ends before its time.
+    All of them need the modules to preload, which are imported once. There is an `AdaptuneError`
+    if a process ends before its time.
     """
     # A process forked from one with threads may deadlock.
     context = get_context("forkserver")

@@ -62,15 +62,7 @@ def engine() -> docker.DockerClient:
 
 
 def build(name: str, tag: str | None = None) -> str:
-    """Build an image and return its tag; where nothing changed, that takes a few seconds.
-
-    Parameters
-    ----------
-    name
-        ``reference`` or ``adaptune``.
-    tag
-        By default ``adaptune-reference`` or ``adaptune``.
-    """
+    """Build an image and return its tag; where nothing changed, that takes a few seconds."""
     tag = tag or TAGS[name]
     with closing(engine()) as client:
         make_base(client)

@@ -43,13 +43,7 @@ class PastScan(NamedTuple):
 
 
 class RecentScans:
-    """The scans of the last seconds.
-
-    Parameters
-    ----------
-    seconds
-        How far back they go.
-    """
+    """The scans of the last seconds."""
 
     def __init__(self, seconds: float):
         self._seconds = seconds
@@ -296,14 +290,9 @@ class Lateness:
         return None
 
     def collect(self, order: Sequence[int], interval: float) -> list[Registration]:
-        """The poses of all members; NaN for those that are absent, or late.
+        """The poses of all members, in this order; NaN for those that are absent, or late.
 
-        Parameters
-        ----------
-        order
-            Numbers of the members, in the order in which they are collected.
-        interval
-            Seconds from the scan before to this one.
+        `interval` is the seconds from the scan before to this one.
         """
         self._intervals.append(interval)
         found = [Registration(np.full((4, 4), np.nan), registered=False)] * len(self._members)
@@ -340,16 +329,10 @@ class Lateness:
             _log.warning(what, self._names[i], MAX_LATE_SECONDS)
 
     def motion(self, i: int, T_odom_previous: Poses) -> Poses:
-        """A member's motion over the newest scan, of shape (4, 4); NaN if it is absent or late.
+        """Motion of member `i` over the newest scan, of shape (4, 4); NaN if it is absent or late.
 
-        Where the member has missed scans, it moved there as the bank did.
-
-        Parameters
-        ----------
-        i
-            Number of the member.
-        T_odom_previous
-            The bank's pose at the scan before.
+        Where the member has missed scans, it moved there as the bank did. `T_odom_previous` is the
+        bank's pose at the scan before.
         """
         if self.absent[i] or self._owing[i]:
             return np.full((4, 4), np.nan)

@@ -50,12 +50,7 @@ class SentScan(NamedTuple):
 class MemberProcess:
     """A process with members, which the first start of one begins.
 
-    Parameters
-    ----------
-    name
-        An odometry that is imported before the process is forked.
-    bounds
-        Its limits.
+    `name` is an odometry that is imported before the process is forked.
     """
 
     def __init__(self, name: str, bounds: processes.Bounds):
@@ -171,19 +166,7 @@ class _Channel(processes.Conversation):
 
 
 class Member(Isolated):
-    """A member of a bank in another process.
-
-    Parameters
-    ----------
-    process
-        Where it lives.
-    number
-        Its number there.
-    factory
-        Of its odometry.
-    parameters
-        All of them.
-    """
+    """A member of a bank in another process, under a number there."""
 
     def __init__(
         self,
@@ -287,15 +270,6 @@ def spread(make: Factory, sets: Sequence[ParameterSet], cores: int) -> list[Odom
     Some members run in this process, and the others in one more process for each further core.
     Those that prepare scans in the same way run together. Members that have processes of their own
     keep them.
-
-    Parameters
-    ----------
-    make
-        Makes members in this process.
-    sets
-        Of the members.
-    cores
-        That all of them may use.
     """
     made = [make(parameters) for parameters in sets]
     alike: dict[Any, list[int]] = {}

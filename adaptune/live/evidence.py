@@ -231,11 +231,6 @@ class LiveEvidence:
         Trial numbers of a bank's members, as in `Motions`; empty for a single odometry.
     length
         Metres of the sub-trajectories whose mean error `own_error` estimates.
-
-    Attributes
-    ----------
-    lost : bool
-        Whether the odometry or bank has lost track, as far as the last hops tell.
     """
 
     def __init__(self, members: tuple[int, ...] = (), length: float = 25.0):

@@ -153,17 +153,9 @@ class OdometryInstance(Protocol):
     def start(
         self, prepared: Any, T_odom_sensor: Poses, T_previous_current: Poses | None = None
     ) -> None:
-        """Forget all scans and begin with this one.
+        """Forget all scans and begin with this one, at a pose of shape (4, 4).
 
-        Parameters
-        ----------
-        prepared
-            A prepared scan.
-        T_odom_sensor
-            Pose of the sensor, of shape (4, 4).
-        T_previous_current
-            The last motion, of shape (4, 4), for odometries that predict by it; None if the sensor
-            stood still.
+        Odometries predict by the last motion, of shape (4, 4); None if the sensor stood still.
         """
 
     def submit(self, prepared: Any) -> None:
@@ -360,12 +352,7 @@ class Preparations:
 
 
 class PreparedScan:
-    """A scan with what it was prepared to.
-
-    Attributes
-    ----------
-    scan : Scan
-    """
+    """A scan with what it was prepared to."""
 
     def __init__(self, scan: Scan, preparations: Preparations):
         self.scan = scan
@@ -392,13 +379,7 @@ class PreparedScan:
 
 
 class InProcess(OdometryInstance):
-    """Runs an adapter in this process, and records its motion and its CPU time.
-
-    Parameters
-    ----------
-    odometry
-        The adapter, which nothing else may use.
-    """
+    """Runs an adapter, which nothing else may use, in this process, and notes what it takes."""
 
     faults: Sequence[str] = ()
 
@@ -460,13 +441,7 @@ class FaultError(AdaptuneError):
 
 
 class Faulting(OdometryInstance):
-    """An instance that may go wrong, and notes it.
-
-    Parameters
-    ----------
-    name, parameters
-        The odometry.
-    """
+    """An instance that may go wrong, and notes it."""
 
     faults: Sequence[str] = ()
 
@@ -529,12 +504,8 @@ def duration_of(scan: Scan) -> int:
 class AtStamp:
     """Carries an odometry's poses back to the stamps of scans.
 
-    Between two poses of the odometry, the velocity is taken as constant.
-
-    Parameters
-    ----------
-    share
-        Of a scan's duration, after which its pose belongs.
+    Between two poses of the odometry, the velocity is taken as constant. A pose belongs to the
+    moment after this share of a scan's duration.
     """
 
     def __init__(self, share: float):
@@ -548,15 +519,8 @@ class AtStamp:
     ) -> Poses:
         """Begin with a scan, and return where the odometry has to believe it is.
 
-        Parameters
-        ----------
-        stamp, duration
-            Of the scan, in nanoseconds.
-        T_odom_sensor
-            Pose at the stamp.
-        T_previous_current
-            Motion from the scan before, which goes on. If it is None, the first motion that the
-            odometry finds is taken for that during the first scan.
+        Stamp and duration are in nanoseconds. The motion from the scan before goes on; if it is
+        None, the first motion that the odometry finds is taken for that during the first scan.
         """
         then, T_odom_then = stamp + self._share * duration, T_odom_sensor
         self._T_odom_begun = np.eye(4)

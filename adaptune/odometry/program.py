@@ -62,16 +62,12 @@ _Place = tuple[tuple[str, ...], Any, Any, tuple[Any, ...]]
 
 
 class Template:
-    """A parameter file with values to be replaced.
+    """A parameter file with values to be replaced, in the format of its suffix.
 
     A parameter's name is its keys from the outermost on, with points or slashes between them.
     Leading keys may be left out if the rest names one value only. Points and slashes within a key,
-    as in ROS, separate keys too; ROS 2's ``ros__parameters`` does not count.
-
-    Parameters
-    ----------
-    path
-        Its suffix gives the format. There is an `OdometryError` if it cannot be read.
+    as in ROS, separate keys too; ROS 2's ``ros__parameters`` does not count. There is an
+    `OdometryError` if the file cannot be read.
     """
 
     def __init__(self, path: Path):
@@ -237,14 +233,8 @@ def program_input(
 ) -> ProgramInput:
     """Find or write the recording of a sequence for a program that reads `layout`.
 
-    Parameters
-    ----------
-    sequence, config
-        The sequence and its description.
-    about
-        All that the sequence depends on, as plain data. A recording with another is replaced.
-    folder
-        Where to keep what is written. Processes wait for each other.
+    `about` is all that the sequence depends on, as plain data: a recording with another is
+    replaced. What is written is kept in `folder`; processes wait for each other.
     """
     folder.parent.mkdir(parents=True, exist_ok=True)
     own = _own_bag(config, layout)
@@ -354,14 +344,8 @@ def contradiction(T_odom_sensor: Poses, T_ref_sensor: Poses) -> str | None:
     """What a reference looks like whose motions contradict an odometry's nearly everywhere.
 
     Directions over a metre, not their lengths, are compared, and turns: a rotation (Kabsch) must
-    explain most of what they differ by. Noise and lost tracks are not explained by any.
-
-    Parameters
-    ----------
-    T_odom_sensor
-        Poses of shape (n, 4, 4), which owe nothing to the reference.
-    T_ref_sensor
-        The reference's, of shape (n, 4, 4); NaN where it is unknown.
+    explain most of what they differ by. Noise and lost tracks are not explained by any. Poses are
+    of shape (n, 4, 4); the odometry's owe nothing to the reference, whose are NaN where unknown.
 
     Returns
     -------
@@ -465,17 +449,8 @@ class WholeRun(OdometryInstance):
     """An odometry that runs once on a whole recording, and its trajectory.
 
     It cannot restart on the way: where `start` places it elsewhere, its motions go on from there.
-
-    Parameters
-    ----------
-    parameters
-        A value for every parameter.
-    settings
-        What is set once.
-    limits
-        What it may use: memory, and time for all scans together.
-    read
-        Gives the recording at the first start; None if scans are only prepared.
+    Of the limits, the time is for all scans together. `read` gives the recording at the first
+    start; None if scans are only prepared.
     """
 
     faults: Sequence[str] = ()
@@ -744,10 +719,7 @@ class Command(WholeRun):
 def read_output(folder: Path, settings: FileSettings, stamps: NDArray[np.int64]) -> Trajectory:
     """Read the trajectory that a program left in a folder; `stamps` of shape (n,) are the scans'.
 
-    Raises
-    ------
-    OdometryError, TrajectoryError
-        If there is none, or it holds something else.
+    There is an `OdometryError` or a `TrajectoryError` if there is none, or it holds something else.
     """
     path = folder / settings.output
     if not path.exists():

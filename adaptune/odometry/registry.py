@@ -69,10 +69,7 @@ def is_user_class(name: str) -> bool:
 def where(name: str) -> str:
     """Where the class of an odometry is, as ``module:Class``, without importing it.
 
-    Raises
-    ------
-    OdometryError
-        If there is no such odometry, with the nearest name.
+    An `OdometryError` names the nearest one if there is none.
     """
     try:
         return strict.path_of(name, "odometry", ODOMETRIES | PROGRAMS, ENTRY_POINTS, "Class")
@@ -81,7 +78,7 @@ def where(name: str) -> str:
 
 
 def odometry_class(name: str) -> type[Any]:
-    """Class of an odometry; see `adaptune.odometry.registry` for a user's.
+    """Class of an odometry.
 
     Parameters
     ----------
@@ -173,13 +170,7 @@ class Declaration:
     module: str  # module in which its class is written
 
     def sound(self, name: str) -> tuple[Any, Description]:
-        """Settings and description.
-
-        Raises
-        ------
-        OdometryError
-            If the settings have mistakes.
-        """
+        """Settings and description; an `OdometryError` if the settings have mistakes."""
         if self.settings is None or self.description is None:
             said = "; ".join(f"{'.'.join(map(str, m.key))}: {m.message}" for m in self.mistakes)
             raise OdometryError(f"{name}: settings: {said}")
@@ -187,21 +178,10 @@ class Declaration:
 
 
 def declare(name: str, settings: Any, folder: Path | None = None) -> Declaration:
-    """Let an odometry check its settings and describe itself.
+    """Let an odometry check its settings, a mapping or a model, and describe itself.
 
-    Parameters
-    ----------
-    name
-        The odometry, see `adaptune.odometry.registry.odometry_class`.
-    settings
-        A mapping, or a model.
-    folder
-        Where relative paths in the settings begin.
-
-    Raises
-    ------
-    OdometryError
-        If there is no such odometry, or it does not answer.
+    Relative paths in the settings begin at `folder`. There is an `OdometryError` if there is no
+    such odometry, or it does not answer.
     """
     if not is_user_class(name):
         return declare_here(name, settings, folder)
@@ -254,14 +234,8 @@ Content = dict[str, str]
 def odometry_content(name: str, settings: Any, module: str = "") -> Content:
     """What the poses of an odometry depend on besides its name, settings and parameters.
 
-    Parameters
-    ----------
-    name
-        See `adaptune.odometry.registry.odometry_class`.
-    settings
-        Its settings, which name the files of a program.
-    module
-        Module in which the class is written, if another one exports it.
+    The settings name the files of a program. `module` is the one in which a class is written, if
+    another one exports it.
     """
     if name in PROGRAMS:
         return _program(settings)
@@ -274,14 +248,8 @@ def odometry_content(name: str, settings: Any, module: str = "") -> Content:
 def python_content(name: str, group: str, written_in: str = "") -> Content:
     """Source of a module, and version of the distribution that it is from.
 
-    Parameters
-    ----------
-    name
-        ``module:attribute``, or what a distribution calls it in an entry-point group.
-    group
-        The group.
-    written_in
-        Another module whose source counts.
+    `name` is ``module:attribute``, or what a distribution calls it in an entry-point group. The
+    source of `written_in` counts, too.
     """
     from adaptune.recording.cache import fingerprint
 
@@ -413,12 +381,10 @@ class OdometryFactory:
         sequence: str | None = None,
         isolated: bool = False,
     ) -> OdometryInstance:
-        """Make a new instance.
+        """Make a new instance; parameters not given keep their baseline.
 
         Parameters
         ----------
-        parameters
-            Parameters not given keep their baseline.
         sequence
             Name of the sequence on which the instance will run; programs that run whole recordings
             need it.
@@ -446,9 +412,9 @@ class OdometryFactory:
 
 @dataclass(frozen=True)
 class OdometryPool:
-    """Makes instances of several odometries, in any process: it pickles.
+    """Makes instances of several odometries, as `OdometryFactory` does of one: it pickles.
 
-    It offers what `OdometryFactory` does. Parameter sets are those of a `PooledSpace`.
+    Parameter sets are those of a `PooledSpace`.
     """
 
     factories: Mapping[str, OdometryFactory]  # by label, what makes each odometry

@@ -80,10 +80,8 @@ class Isolated(Faulting):
 
     Parameters
     ----------
-    name
-        The odometry.
-    parameters, settings
-        See `Odometry`; or the settings as the other process receives them.
+    settings
+        Checked settings, or these as the other process receives them.
     limits
         What each process may use.
     transport
@@ -148,10 +146,7 @@ class Isolated(Faulting):
     def begin(self) -> processes.Message | None:
         """Begin a process that is this odometry; its answer, None if there is a fault.
 
-        Raises
-        ------
-        OdometryError
-            If there has never been such a process.
+        There is an `OdometryError` if there has never been such a process.
         """
         self._cpu_before = self._cpu
         try:
@@ -338,17 +333,7 @@ def _reached(address: str) -> socket.socket:
 
 
 class UserProgram(Isolated):
-    """An odometry in a program of the user, wherever that runs.
-
-    Each instance has its own program or connection.
-
-    Parameters
-    ----------
-    parameters, limits
-        See `Isolated`.
-    settings
-        How to reach the program.
-    """
+    """An odometry in a program of the user, each instance with its own program or connection."""
 
     transport_type: ClassVar[Any]
 
@@ -405,16 +390,8 @@ class _LateError(BaseException):
 class Guarded(Faulting):
     """A clean class of the user in this process, with the faults that `Isolated` would have.
 
-    Parameters
-    ----------
-    name, parameters
-        The odometry.
-    find
-        Imports the class of a name.
-    settings
-        Its checked settings.
-    seconds
-        Time for one scan. It holds for Python code in the main thread; other code is trusted.
+    `find` imports the class of a name. The limit of seconds for one scan holds for Python code in
+    the main thread; other code is trusted.
     """
 
     def __init__(

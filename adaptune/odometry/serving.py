@@ -64,14 +64,8 @@ def _check(name: str) -> None:
 def listen(address: str, name: str, ready: Callable[[str], None]) -> None:
     """Serve an odometry until interrupted, an instance of its own for each connection.
 
-    Parameters
-    ----------
-    address
-        ``tcp://HOST:PORT``, any free port if that is 0, or ``unix:PATH``.
-    name
-        The odometry, not a program of the user.
-    ready
-        Called with the address when connections are accepted.
+    The address is ``tcp://HOST:PORT``, any free port if that is 0, or ``unix:PATH``. `ready` is
+    called with it when connections are accepted.
     """
     _check(name)
     family, where = parse_address(address)

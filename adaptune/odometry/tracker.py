@@ -77,10 +77,9 @@ class HealthCheck(StrictModel):
 
         Parameters
         ----------
-        velocity
-            Metres a second in the sensor's frame, of shape (3,).
-        last_velocity
-            The last healthy one; None if there is none yet.
+        velocity, last_velocity
+            Metres a second in the sensor's frame, of shape (3,); the last healthy one, None if
+            there is none yet.
         elapsed
             Seconds since `last_velocity`.
         turn_rate
@@ -131,14 +130,8 @@ class Guard:
     ) -> str | None:
         """What is wrong with a motion: `no_pose`, or the name of a bound; None if it is healthy.
 
-        Parameters
-        ----------
-        T_previous_current
-            The motion, of shape (4, 4); not finite where the odometry gave no pose.
-        elapsed
-            Seconds that it took.
-        registered
-            Whether the odometry registered the scan.
+        The motion, of shape (4, 4), took so many seconds. It is not finite where the odometry gave
+        no pose.
         """
         self._since += elapsed
         self._age += elapsed
@@ -192,8 +185,7 @@ class Guard:
         """The share of an interval by which its stamps are irregular.
 
         A recording that stamps scans on arrival says 0.08 s and 0.13 s where a laser turned at a
-        regular 10 Hz. The usual interval, or a multiple of it where scans are missing, is
-        then as likely as what the stamps say.
+        regular 10 Hz. The usual interval, or a multiple of it, is then as likely as what they say.
         """
         usual = median(self._intervals)
         turns = max(1, round(elapsed / usual))
@@ -214,14 +206,10 @@ class Guard:
         return True
 
     def go_on(self, elapsed: float) -> tuple[Poses, Poses]:
-        """How the last healthy motion goes on.
+        """How the last healthy motion goes on, in two motions of shape (4, 4).
 
-        Returns
-        -------
-        T_previous_healthy : ndarray of shape (4, 4)
-            From the pose before to where it would have been: takes back a jump of the last scans.
-        T_healthy_current : ndarray of shape (4, 4)
-            The motion from there, for so many seconds.
+        The first leads from the pose before to where it would have been: it takes back a jump of
+        the last scans. The second is the motion from there, for so many seconds.
         """
         T_previous_current, seconds = np.eye(4), 0.0
         for T, of in self._recent:
@@ -244,14 +232,7 @@ def unhealthy(
 ) -> dict[str, int]:
     """How often a `Guard` finds each fault in a trajectory of n poses.
 
-    Parameters
-    ----------
-    check
-        The bounds.
-    T_previous_current
-        Motions of shape (n - 1, 4, 4).
-    stamps, registered
-        Of shape (n,); stamps in nanoseconds.
+    Motions are of shape (n - 1, 4, 4), stamps (nanoseconds) and registered of shape (n,).
     """
     guard = Guard(check)
     elapsed = (np.diff(stamps) * 1e-9).tolist()
@@ -311,10 +292,7 @@ class Tracker:
     def register_prepared(
         self, stamp: int, prepared: Any, prepare_seconds: float = 0.0, scan: Scan | None = None
     ) -> RegisteredScan:
-        """Find the pose of the next scan, which such an odometry has prepared.
-
-        A warm-up needs the scan as well.
-        """
+        """Find the pose of the next prepared scan; a warm-up needs the scan, too."""
         begin = time.perf_counter()
         registered, unhealthy = True, None
         if self._last is None:

@@ -117,15 +117,7 @@ def announced(answer: Message) -> Description:
 
 
 def conversation(name: str | None, make: Make) -> Answer:
-    """Answer messages with an odometry.
-
-    Parameters
-    ----------
-    name
-        The only odometry to serve; otherwise each hello names one.
-    make
-        Makes it.
-    """
+    """Answer messages with an odometry: this one only, or the one that each hello names."""
     odometry: Served | None = None
 
     def answer(message: Message) -> dict[str, Any]:
@@ -184,10 +176,7 @@ def unpacked(found: Any) -> Registration:
 
 
 def answered(odometry: Served, message: Message, prepared: Any = None) -> dict[str, Any]:
-    """Do what a message asks of an odometry; the answer.
-
-    The scan is the message's, if it has not been prepared.
-    """
+    """Do what a message asks of an odometry, with its own scan if none is prepared; the answer."""
     header, arrays = message
     if header["type"] == "configure":
         odometry.configure(header["parameters"])

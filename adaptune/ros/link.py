@@ -95,12 +95,8 @@ class Steering:
     def apply(self, parameters: ParameterSet) -> None:
         """Set the parameters, and make sure that the node holds them where it tells.
 
-        Raises
-        ------
-        OdometryError
-            If it cannot be reached, or holds other values.
-        LinkError
-            If it refuses them.
+        There is an `OdometryError` if it cannot be reached or holds other values, and a `LinkError`
+        if it refuses them.
         """
         if self._command is not None:
             for name, value in parameters.items():

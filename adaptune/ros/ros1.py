@@ -33,10 +33,7 @@ _log = logging.getLogger(__name__)
 def ros_python() -> str:
     """The Python that imports ROS 1: the first ``python3`` of the system's that does.
 
-    Raises
-    ------
-    LinkError
-        If there is none.
+    There is a `LinkError` if none does.
     """
     found = [shutil.which("python3", path=folder) for folder in os.get_exec_path()]
     for python in dict.fromkeys([*filter(None, found), "/usr/bin/python3"]):
@@ -52,15 +49,8 @@ def ros_python() -> str:
 def local_ros1(python: str | None = None) -> "Ros1":
     """A node in the ROS 1 that runs on this machine, or that ROS_MASTER_URI names.
 
-    Parameters
-    ----------
-    python
-        The Python that imports ROS; found if left out, see `ros_python`.
-
-    Raises
-    ------
-    LinkError
-        If ROS cannot be imported, or no roscore answers.
+    `python` imports ROS; it is found if left out. There is a `LinkError` if none can import it, or
+    no roscore answers.
     """
     here, there = socket.socketpair()
     command = [python or ros_python(), ros1_node.__file__, str(there.fileno())]

@@ -115,14 +115,9 @@ class Ros2:
         self._threads: list[threading.Thread] = []
 
     def subscribe(self, topic: str, kind: str, take: Callable[[Any], None]) -> None:
-        """Have every message of a topic taken, one after the other, in a thread of its own.
+        """See `RosLink.subscribe`; an error in `take` is logged, and the next message is taken.
 
-        An error in `take` is logged, and the next message is taken.
-
-        Raises
-        ------
-        LinkError
-            If the topic is published, but not with this type as it is known here.
+        There is a `LinkError` if the topic is published with another type than this as known here.
         """
         self._check_type(topic, kind)
         with self._naming(topic):
@@ -161,7 +156,7 @@ class Ros2:
         return self.store.deserialize_cdr(memoryview(payload.to_bytes()), kind)
 
     def advertise(self, topic: str, kind: str) -> Callable[[Any], None]:
-        """Announce a topic; what is returned publishes a message on it."""
+        """See `RosLink.advertise`."""
         with self._naming(topic):
             publisher = self._session.declare_publisher(
                 self._key(topic, kind), encoding="application/cdr"
@@ -178,15 +173,9 @@ class Ros2:
         return publish
 
     def set_parameters(self, node: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Set parameters of another node; what it then holds, as far as it tells.
+        """See `RosLink.set_parameters`; what the node does not tell is as given.
 
-        What it does not tell is as given.
-
-        Raises
-        ------
-        LinkError
-            If the node is not there, does not answer, or refuses a value. It may hold the other
-            values then.
+        If it refuses a value, it may hold the other values then.
         """
         node = _full(node)
         given = [_parameter(self.store, name, value) for name, value in values.items()]
@@ -209,10 +198,7 @@ class Ros2:
         }
 
     def _call(self, node: str, name: str, patient: bool, **fields: Any) -> Any:
-        """Call a service of a node on its parameters, and return the response.
-
-        One that is patient waits until there is such a service.
-        """
+        """Call a service of a node; a patient call waits until there is such a one."""
         service = self._services[name]
         place = f"{node}/{'set' if name == 'SetParameters' else 'get'}_parameters"
         request = self.store.types[service.request](**fields)
@@ -256,7 +242,7 @@ class Ros2:
         return f"{node} {silent}: {service} in ROS domain {self._domain}; {there}"
 
     def topics(self) -> Mapping[str, str]:
-        """The topics that somebody publishes now, and their types."""
+        """See `RosLink.topics`."""
         return {name: kind for name, kind, _ in self._tokens("PUBLISHER")}
 
     def _tokens(self, kind: str) -> list[tuple[str, str, str]]:

@@ -80,10 +80,7 @@ class Mount(NamedTuple):
 def engine() -> Any:
     """A client of the Docker engine; containers that ended processes have left are removed.
 
-    Raises
-    ------
-    EngineError
-        If no engine answers, or this user may not use it.
+    There is an `EngineError` if no engine answers, or this user may not use it.
     """
     from docker import DockerClient
     from docker.errors import DockerException
@@ -161,13 +158,7 @@ def _owner() -> tuple[str, Any]:
 
 
 def image_digest(name: str) -> str:
-    """Digest of an image.
-
-    Raises
-    ------
-    EngineError
-        If it is not here, or no engine is.
-    """
+    """Digest of an image; an `EngineError` if it is not here, or no engine is."""
     return str(_image(name)["Id"])
 
 
@@ -218,30 +209,20 @@ class Container:
     """A running container.
 
     It has no network, no privileges and no new ones, and sees nothing of the host but its mounts.
+    There is an `OdometryError` if it cannot be started.
 
     Parameters
     ----------
-    settings
-        The image, and what it may use.
     memory
         Gigabytes.
     command
         Program and arguments; those of the image if empty.
-    mounts
-        Files and folders of the host.
     user
         See `ContainerSettings`.
-    environment
-        Variables.
     bare
         Whether the command takes the place of the image's entry point, too.
     hurried
         Whether it may use all cores until `hold_to_cores`.
-
-    Raises
-    ------
-    OdometryError
-        If it cannot be started.
     """
 
     def __init__(
@@ -459,14 +440,7 @@ def kept_log(
 ) -> Iterator[Path | None]:
     """A folder for the block to fill, which then replaces that of the same set; None if not kept.
 
-    Parameters
-    ----------
-    logs
-        Folder of the sequence's logs.
-    settings, parameters
-        Of the trial.
-    about
-        What ``trial.yaml`` says besides.
+    `logs` is the folder of the sequence's logs. ``trial.yaml`` says what `about` does, too.
     """
     if logs is None:
         yield None

@@ -15,12 +15,7 @@ _LOOKS, _BETWEEN = 3, 1.0
 def main(label: str, prefix: str) -> None:
     """Wait until the other side of the standard input has ended, then remove what it has left.
 
-    Parameters
-    ----------
-    label
-        Of its containers.
-    prefix
-        Path with which its folders begin.
+    That is containers with a label, and folders whose path begins with a prefix.
     """
     sys.stdin.buffer.read()
     from docker import DockerClient

@@ -94,6 +94,8 @@ _log = logging.getLogger(__name__)
 class RosSystem:
     """A container with the nodes that a launch file starts.
 
+    There is an `OdometryError` if there is no such image, or it holds no ROS 1.
+
     Parameters
     ----------
     settings
@@ -104,13 +106,6 @@ class RosSystem:
         Text of the parameter file.
     folder
         An empty folder, which the caller removes.
-    mounts
-        More files and folders of the host.
-
-    Raises
-    ------
-    OdometryError
-        If there is no such image, or it holds no ROS 1.
     """
 
     def __init__(
@@ -199,13 +194,7 @@ class RosSystem:
         return OdometryError(f"no roscore: {processes.how_it_ended(code)}: {words}")
 
     def state(self) -> dict[str, Any]:
-        """What adaptune's node sees, see `ros1_node`; an error where the system has ended.
-
-        Raises
-        ------
-        OdometryError
-            It names the node that has died.
-        """
+        """What `ros1_node` sees; an `OdometryError` where the system has ended."""
         found: dict[str, Any] = self.link.ask("state", topics=self._topics)
         nodes = found["nodes"].values()
         self.usage = Usage(sum(cpu for cpu, _ in nodes), sum(memory for _, memory in nodes))
@@ -216,19 +205,9 @@ class RosSystem:
         return found
 
     def wait(self, topic: str, sent: Sequence[str] = ()) -> None:
-        """Wait until a node subscribes to a topic, and is connected to what adaptune sends.
+        """Wait until a node subscribes to the clouds' topic, and hears what adaptune sends.
 
-        Parameters
-        ----------
-        topic
-            That of the clouds.
-        sent
-            Topics that adaptune publishes.
-
-        Raises
-        ------
-        OdometryError
-            If none does in time; it names the topics to which nodes subscribe.
+        An `OdometryError` names the topics to which nodes subscribe if none does in time.
         """
         self._topics.append(topic)
         begin = changed = time.monotonic()
@@ -326,14 +305,7 @@ class RosSystem:
 class SimClock:
     """Publishes ``/clock``, and goes on by itself, so that nodes that sleep by it wake up.
 
-    Parameters
-    ----------
-    link
-        A node in the system's ROS.
-    stamp
-        Nanoseconds at which it begins.
-    rate
-        Seconds of it in a second.
+    It begins at a stamp in nanoseconds; `rate` is seconds of it in a second.
     """
 
     def __init__(self, link: Ros1, stamp: int, rate: float):
@@ -404,19 +376,8 @@ def server_keys(
 ) -> Mapping[str, Sequence[str]]:
     """Keys of the parameter server that hold each parameter, by its whole name.
 
-    Parameters
-    ----------
-    template
-        The system's parameter file.
-    parameters
-        What was put into it.
-    held
-        All that the parameter server holds.
-
-    Raises
-    ------
-    OdometryError
-        If it does not hold a parameter, or another value.
+    `held` is all that the server holds. There is an `OdometryError` if it does not hold a
+    parameter that was put into the template, or another value.
     """
     every = dict(_flat(held))
     keys = {}

@@ -153,13 +153,6 @@ class Lockstep(Faulting):
     """A ROS 1 system that hears a scan, and then waits for the next one until its pose is there.
 
     It begins in a new container. Where a scan gets no pose, the last motion goes on.
-
-    Parameters
-    ----------
-    parameters, limits
-        See `Isolated`.
-    settings
-        A `RustleSettings`.
     """
 
     apart = True
@@ -437,13 +430,7 @@ class PoseRecorder:
         self.received.append((kind, data))
 
     def poses(self) -> list[Pose]:
-        """Poses in the order in which they came, see `adaptune.recording.clouds`.
-
-        Raises
-        ------
-        OdometryError
-            If the messages hold no poses.
-        """
+        """Poses in the order in which they came; an `OdometryError` if the messages hold none."""
         messages = self.received
         if messages and (kind := messages[0][0]) not in POSES:
             raise OdometryError(
@@ -479,18 +466,10 @@ def write_poses(
 
 
 def drained(recorder: PoseRecorder, over: float, last: int, drain: float) -> bool:
-    """Whether the pose of the last scan is there, or nothing came for a while.
+    """Whether the pose of the last scan is there, or nothing came for `drain` seconds.
 
-    Parameters
-    ----------
-    recorder
-        Has recorded the poses.
-    over
-        Time at which the bag was over.
-    last
-        Stamp of the last scan.
-    drain
-        Seconds for which nothing has come. They are more where poses came in longer intervals.
+    They are more where poses came in longer intervals. `over` is the time at which the bag was
+    over, `last` the stamp of the last scan.
     """
     # Stamps of a clock of its own say nothing.
     if last <= recorder.newest() < last + 10**9:
@@ -653,20 +632,11 @@ _OWN_CLOCK = "the system stamps poses by its own clock, not by the scans"
 
 
 def check_stamps(stamps: NDArray[np.int64], scans: NDArray[np.int64]) -> float:
-    """Refuse stamps of poses that are not those of the scans.
+    """Refuse stamps of poses that are not those of the scans, in nanoseconds, shapes (m,) and (n,).
 
     A system that publishes one pose for a scan stamps it with the scan's start, its end, or
-    anything fixed between. One that publishes more is judged by begin and end only.
-
-    Parameters
-    ----------
-    stamps, scans
-        Nanoseconds, of shapes (m,) and (n,).
-
-    Returns
-    -------
-    float
-        Seconds by which stamps scatter around those of the scans; 0 if they do not.
+    anything fixed between. One that publishes more is judged by begin and end only. Returns the
+    seconds by which stamps scatter around those of the scans; 0 if they do not.
 
     Raises
     ------
