@@ -1,11 +1,17 @@
-from typing import Annotated
+import datetime
+import enum
+import re
+import uuid
+from collections.abc import Callable
+from decimal import Decimal
+from typing import Annotated, Literal
 
 import pytest
-from pydantic import Field, ValidationError
+from pydantic import AnyUrl, BaseModel, Field, StringConstraints, TypeAdapter, ValidationError
 
 from adaptune.odometry.registry import ODOMETRIES, PROGRAMS, odometry_class
 from adaptune.space import Value
-from adaptune.strict import StrictModel, plain_words
+from adaptune.strict import StrictModel, in_one_line, plain_words
 from offline.config import SETTINGS, OfflineStudyConfig
 
 
@@ -82,3 +88,44 @@ def test_every_count_of_a_sampler_has_bounds(name):
     counts = {"chains", "count", "delta_max", "stall_best"}
     found = [path.split(".") for path in unbounded(schema, schema.get("$defs", {}))]
     assert not [path for path in found if counts & set(path)]
+
+
+class Colour(enum.Enum):
+    RED = "red"
+
+
+class Settings(BaseModel):
+    a: int
+
+
+TYPES = [
+    *(int, float, bool, str, bytes, list, dict, set, tuple, Colour, uuid.UUID, Decimal),
+    *(datetime.date, datetime.time, datetime.datetime, datetime.timedelta, AnyUrl, Settings, None),
+    *(Literal["a", "b"], Callable, type[int], tuple[int, int], list[int], int | str | None),
+    Annotated[str, StringConstraints(min_length=3, max_length=4, pattern="^x")],
+    Annotated[int, Field(gt=3, lt=5, multiple_of=2)],
+    Annotated[tuple[int, ...], Field(min_length=2, max_length=2)],
+]
+GIVEN = [None, True, 4, 9, 2.5, "", "y", "yyyyyy", b"x", [], [1, 2, 3], ["a"], {}, {"b": 1}]
+
+
+@pytest.mark.parametrize("type_", TYPES, ids=str)
+def test_nothing_of_pydantic_is_left(type_):
+    told = 0
+    for given in GIVEN:
+        try:
+            TypeAdapter(type_).validate_python(given)
+        except ValidationError as error:
+            for message in (*plain_words(error, given).values(), in_one_line(error)):
+                assert not re.search(
+                    "pydantic|https://|Input should|validation|Value error", message
+                )
+                told += 1
+    assert told
+
+
+def test_an_error_in_one_line_names_every_key():
+    with pytest.raises(ValidationError) as caught:
+        Settings.model_validate({"a": "x", "b": 1})
+    assert in_one_line(caught.value, {"a": "x", "b": 1}) == "a: give a whole number, not 'x'"
+    assert in_one_line(ValueError("two\n  lines")) == "two lines"

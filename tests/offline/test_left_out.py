@@ -25,7 +25,14 @@ from offline.config import load_study
 from offline.labelled import LabelledSequence
 from offline.train import fit, tuned
 from offline.tuning import DO_NOT_ADAPT, NO_BANK, PairedSettings
-from offline.validate import ValidationError, leave_one_out, validate
+from offline.validate import (
+    LeftOut,
+    Validation,
+    ValidationError,
+    baseline_in_words,
+    leave_one_out,
+    validate,
+)
 
 
 @pytest.fixture(autouse=True)
@@ -236,3 +243,16 @@ def test_stretches_of_one_recording_are_left_out():
         fixed = one.errors[of, SETS.column(others.fixed())]
         np.testing.assert_allclose(left_out.errors["fixed"][of], fixed, rtol=1e-6)
         assert len(left.errors) == of.sum()
+
+
+@pytest.mark.parametrize(
+    ("errors", "better"), [((0.5, 0.51), True), ((0.5, 1.0), False), ((1.5, 1.51), False)]
+)
+def test_the_baseline_is_better_only_where_the_interval_shows_it(errors, better):
+    left_out = [
+        LeftOut(f"s{i}", {"baseline": np.full(9, e), "fixed": np.ones(9)}, {}, np.empty(0))
+        for i, e in enumerate(errors)
+    ]
+    said = baseline_in_words(Validation(left_out))
+    assert " times the error of the sets that are chosen without what is left out, over 2 " in said
+    assert said.endswith("): there the baseline is better.") == better

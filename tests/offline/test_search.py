@@ -1,19 +1,28 @@
+import csv
+import dataclasses
 import itertools
+import json
+import math
+import os
+import re
 from functools import partial
 
 import drawn
+import drives
 import numpy as np
 import pytest
 
 from adaptune.archive import Archive, Summary
+from adaptune.model import ErrorModel
 from adaptune.space import Categorical, ParameterSets, ParameterSpace
 from offline.campaign import run_batches
 from offline.config import OfflineConfig, load_study
 from offline.labelled import labelled_data
-from offline.objective import best_by_trials
+from offline.objective import Verdict, best_by_trials
 from offline.samplers import make_sampler
-from offline.search import Search, owner
-from offline.validate import leave_one_out
+from offline.search import Clock, Search, has_ended, owner, spent, survivors
+from offline.train import train
+from offline.validate import leave_one_out, validate
 
 NAMES = ["one", "two", "three"]
 
@@ -207,3 +216,151 @@ def test_verdicts_belong_to_their_trials_where_numbers_are_left_out():
     assert {n: v.parameters for n, v in search.done.items()} == {
         n: run.parameters for n, run in finished["one"].items()
     }
+
+
+def verdicts(*values):
+    return [Verdict({"x": float(i)}, (value,)) for i, value in enumerate(values)]
+
+
+@pytest.mark.parametrize(
+    ("budget", "errors", "hours", "reason"),
+    [
+        ({"trials": 3}, [1.0, 2.0, 3.0], 0.0, "3 trials are done"),
+        ({}, [1.0] * 64, 9.0, "64 trials"),
+        ({"hours": 2.0}, [1.0], 2.0, "2.00 hours have passed"),
+        ({"stagnation": 3}, [5.0, 2.0, 3.0, 3.0], 0.0, None),
+        ({"stagnation": 3}, [5.0, 2.0, 3.0, 3.0, 2.0], 0.0, "none of 3 trials .* than trial 1"),
+        ({"sampler": "grid"}, [1.0] * 1000, 0.0, None),
+    ],
+)
+def test_stops_when_the_first_budget_is_used_up(budget, errors, hours, reason):
+    best = errors.index(min(errors)) if errors else 0
+    found = spent(OfflineConfig(**budget), verdicts(*errors), best, hours, best)
+    assert (found is None) == (reason is None)
+    assert reason is None or re.search(reason, found)
+
+
+def test_the_clock_goes_on_counting(tmp_path):
+    path = tmp_path / "elapsed.json"
+    clock = Clock(path)
+    assert clock.hours(5) == 0.0
+    with pytest.raises(KeyboardInterrupt), clock.running(0):
+        raise KeyboardInterrupt
+    with clock.running(1):
+        pass
+    seconds = json.loads(path.read_text())
+    assert set(seconds) == {"0", "1"}
+    path.write_text('{"0": 3600, "1": 1800.0, "2": 9}')
+    assert Clock(path).hours(2) == 1.5
+
+
+def trials(folder):
+    files = folder.glob("trials/*/*.npz")
+    return {f: f.stat().st_mtime_ns for f in files if f.stem.isdigit()}
+
+
+GRID = (
+    "offline.sampler_settings={grid: {max_correspondence_distance: [1.0, 2.0, 2],"
+    " keyframe_interval: [1.0, 4.0, 3]}}"
+)
+
+
+def test_a_search_ends_where_its_budget_does_and_again_when_resumed(study_file, tmp_path, caplog):
+    caplog.set_level("INFO")
+    folder = tmp_path / "run"
+    train(load_study(study_file, ["offline.trials=8"], folder))
+    before = trials(folder)
+    assert len(before) == 2 * 8
+    # The trials are there: a budget that ends the search before finds them, and runs none.
+    for budget in ("offline.stagnation=1", "offline.hours=1e-9"):
+        training = train(load_study(study_file, ["offline.trials=", budget], folder))
+        assert len(training.model.sets) in (4, 8)
+    assert trials(folder) == before
+    assert "the search ends: none of" in caplog.text
+
+
+def test_a_grid_is_walked_to_its_end(study_file, tmp_path, caplog):
+    caplog.set_level("INFO")
+    given = ["offline.sampler=grid", GRID, "offline.trials="]
+    training = train(load_study(study_file, given, tmp_path / "run"))
+    pairs = [tuple(s.values()) for s in training.model.sets.parameters]
+    assert pairs[0] == (2.0, 1.0)
+    assert pairs[1:] == [(d, k) for d in (1.0, 3.0) for k in (1.0, 5.0, 9.0)]
+    assert "the search ends: there is nothing else to try" in caplog.text
+    again = train(load_study(study_file, given, tmp_path / "run"))
+    assert again.model.sets.parameters == training.model.sets.parameters
+
+
+def test_a_study_has_ended_when_its_table_is_newer_than_all_trials(tmp_path):
+    trial, table = tmp_path / "trials/one/00001.npz", tmp_path / "trials.csv"
+    trial.parent.mkdir(parents=True)
+    trial.touch()
+    assert not has_ended(tmp_path)
+    table.touch()
+    assert has_ended(tmp_path)
+    os.utime(trial, ns=(0, table.stat().st_mtime_ns + 1))
+    assert not has_ended(tmp_path)
+
+
+def test_what_cannot_win_any_more_is_given_up():
+    before = {0: [3.0, 2.0, 2.0, 1.0], 1: [9.0, 9.0, 9.0, 9.0], 2: [0.1, 0.1]}
+    assert survivors({4: [7.0, 1.1], 5: [0.0, 0.1]}, before) == [5]
+    assert survivors({4: [7.0, 1.1]}, {}) == [4]
+
+
+def test_what_is_surely_worse_than_the_best_is_given_up():
+    rng = np.random.default_rng(0)
+    best = rng.uniform(0.5, 1.0, 8)
+    before = {0: (best + 1.0).tolist(), 1: best.tolist(), 2: [0.0]}
+    batch = {3: (best[:6] + 0.1).tolist(), 4: (best[:6] - 0.1).tolist()}
+    assert survivors(batch, before) == [4]
+    # Two sequences cannot tell.
+    assert survivors({5: (best[:2] + 1.0).tolist()}, before) == [5]
+
+
+@pytest.fixture(scope="module")
+def study_file(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("pruned")
+    names = [f"s{i}" for i in range(4)]
+    for i, name in enumerate(names):
+        drives.write_bag(folder / f"{name}.bag", drives.scans(i, 16))
+    bags = "\n".join(f"  {n}: {{bag: {n}.bag, points: /points, reference: /truth}}" for n in names)
+    (folder / "pruned.yaml").write_text(
+        f"odometry:\n  name: gicp\n  settings: {{downsampling: 0.5, min_range: 0.5}}\n"
+        f"  parameters:\n    max_correspondence_distance: {{low: 0.05, high: 5.0, log: true}}\n"
+        f"    keyframe_interval: {{low: 0.5, high: 15.0, baseline: 1.0, log: true}}\n"
+        f"sequences:\n{bags}\ntraining: [{', '.join(names)}]\nsub_trajectory: 3.0\n"
+        f"offline: {{trials: 9, initial: 6, batch: 3, seed: 3, workers: 2, pruning: wilcoxon}}\n"
+    )
+    return folder / "pruned.yaml"
+
+
+def test_what_a_pruned_trial_has_seen_feeds_the_model(study_file, tmp_path):
+    study = load_study(study_file, [], tmp_path / "study")
+    training = train(study)
+    archive = Archive(study.folder / "trials")
+    seen = [[n in archive.finished(name) for name in study.training] for n in range(9)]
+    n_seen = np.sum(seen, axis=1)
+    assert (n_seen[:3] == 4).all()
+    assert 2 <= n_seen.min() < 4
+    model = ErrorModel.load(study.folder / "model.safetensors")
+    for s, (row, means) in enumerate(zip(np.transpose(seen), training.means.values(), strict=True)):
+        errors = model.errors[model.sequence == s]
+        assert (np.isnan(errors).all(axis=0) == ~row).all()
+        assert (np.isnan(errors).any(axis=0) == ~row).all()
+        assert [math.isnan(mean) for mean in means] == (~row).tolist()
+    assert n_seen[training.fixed] == 4
+    rows = list(csv.DictReader((study.folder / "trials.csv").open()))
+    assert [row["mean"] == "" for row in rows] == (n_seen < 4).tolist()
+    validation = validate(study).validation
+    assert len(validation.left_out) == 4
+    before = (study.folder / "model.safetensors").read_bytes()
+
+    # Some of it lost, as to a killed driver, and made again.
+    for number in (4, 7):
+        for name in study.training[:2]:
+            archive.trial_path(name, number).unlink(missing_ok=True)
+    train(dataclasses.replace(study))
+    assert (study.folder / "model.safetensors").read_bytes() == before
+    again = Archive(study.folder / "trials")
+    assert [[n in again.finished(name) for name in study.training] for n in range(9)] == seen

@@ -1,7 +1,9 @@
+import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from adaptune.simulation import Course
+from adaptune.simulation import SENSORS, Course
+from adaptune.simulation.course import directions
 
 
 @pytest.mark.parametrize(
@@ -27,3 +29,44 @@ def test_legs_take_the_courses_length_unless_they_have_their_own():
     assert course.legs == [("cave", 40.0), ("street", 25.0), ("open", 40.0)]
     assert course.turns == 10.0
     assert Course(scenes=("cave",), rate=20.0).turns == 20.0
+
+
+@pytest.mark.parametrize(
+    ("name", "rings", "first", "second", "last"),
+    [
+        ("vlp16", 16, -15.0, -13.0, 15.0),
+        ("hdl32e", 32, -30.67, -29.33, 10.67),
+        ("hdl64e", 64, -24.33, -23.83, 2.0),
+        ("os0-64", 64, 45.0, 45.0 - 90.0 / 63.0, -45.0),
+        ("os1-128", 128, 22.5, 22.5 - 45.0 / 127.0, -22.5),
+    ],
+)
+def test_elevations_are_those_of_the_data_sheet(name, rings, first, second, last):
+    sensor = SENSORS[name]
+    assert sensor.rings == rings
+    looks = directions(name, sensor.columns, 0.0, sensor.rate)
+    assert looks.shape == (sensor.columns, rings, 3)
+    assert looks.dtype == np.float32
+    elevations = np.degrees(np.arcsin(looks[7, :, 2].astype(float)))
+    np.testing.assert_allclose(elevations[[0, 1, -1]], [first, second, last], atol=0.01)
+
+
+def test_spinning_sensors_turn_once_clockwise_from_behind():
+    looks = directions("vlp16", 360, 0.0, 10.0).astype(float)
+    azimuth = np.unwrap(np.arctan2(looks[:, 0, 1], looks[:, 0, 0]))
+    np.testing.assert_allclose(np.degrees(np.diff(azimuth)), -1.0, atol=1e-3)
+    assert looks[0, 0, 0] < 0.0
+    assert looks[90, 0, 1] > 0.0
+
+
+def test_the_avia_looks_ahead_and_never_the_same_way_twice():
+    first, second = (directions("avia", 4000, start, 10.0).astype(float) for start in (0.0, 0.1))
+    for looks in (first, second):
+        np.testing.assert_allclose(np.linalg.norm(looks, axis=2), 1.0, atol=1e-6)
+        azimuth = np.degrees(np.arctan2(looks[..., 1], looks[..., 0]))
+        elevation = np.degrees(np.arcsin(looks[..., 2]))
+        assert 34.0 < np.abs(azimuth).max() <= 35.21
+        assert 36.0 < np.abs(elevation).max() <= 38.61
+    # Another part of the view is covered: most directions have no near one in the other scan.
+    gap = np.linalg.norm(first[::40, None, 2] - second[None, :, 2], axis=2).min(axis=1)
+    assert np.median(gap) > np.radians(0.05)

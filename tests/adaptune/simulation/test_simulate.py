@@ -4,7 +4,10 @@ import numpy as np
 import pytest
 
 from adaptune import files
+from adaptune.metrics import sub_trajectory_rte
+from adaptune.odometry.registry import odometry_class
 from adaptune.simulation import SCENES, SENSORS, Course, SceneLeg
+from adaptune.simulation.mesh import fractal
 from adaptune.simulation.record import EPOCH, Drive, simulate
 from adaptune.simulation.world import World, populate
 
@@ -128,3 +131,45 @@ def test_a_robot_can_drive_through_every_scene_into_every_other(seed):
     station = float(drive.road.station(T[worst, 0, 3]))
     leg = next(leg for leg in drive.road.legs if leg.start <= station <= leg.stop)
     assert clearance[worst] > 0.35, (station, leg.scene.summary)
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_odometry_survives(scene):
+    cls = odometry_class("gicp")
+    odometry = cls({"max_correspondence_distance": 1.5, "keyframe_interval": 3.0})
+    T_world_sensor, poses = [], []
+    for scan in simulate(Course(scenes=(scene,), length=26.0, columns=300)):
+        prepared = odometry.prepare(scan)
+        if poses:
+            poses.append(odometry.register(prepared).T_odom_sensor)
+        else:
+            odometry.start(prepared, scan.T_world_sensor)
+            poses.append(scan.T_world_sensor)
+        T_world_sensor.append(scan.T_world_sensor)
+    errors = sub_trajectory_rte(np.array(T_world_sensor), np.array(poses), 25.0)
+    assert np.nanmean(errors) < 4.0
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_the_last_tile_of_a_scene_may_be_short(scene):
+    scan = next(simulate(Course(scenes=(scene, "cave"), length=22.0, columns=16)))
+    assert len(scan) > 100
+
+
+RNG = np.random.default_rng(0)
+
+
+def test_noise_is_bounded_smooth_and_centred():
+    points = RNG.uniform(-1e3, 1e3, (20_000, 3))
+    values = fractal(points, 3.0, seed=5)
+    assert np.abs(values).max() <= 1.0
+    assert abs(values.mean()) < 0.02
+    assert values.std() > 0.2
+    assert np.abs(fractal(points + 1e-4, 3.0, seed=5) - values).max() < 1e-3
+
+
+def test_noise_depends_on_place_and_seed_alone():
+    points = RNG.uniform(-50.0, 50.0, (100, 3))
+    whole = fractal(points, 2.0, seed=1, octaves=3)
+    np.testing.assert_array_equal(fractal(points[40:60], 2.0, seed=1, octaves=3), whole[40:60])
+    assert np.abs(fractal(points, 2.0, seed=2, octaves=3) - whole).max() > 0.1

@@ -1,0 +1,198 @@
+import json
+
+import numpy as np
+import pytest
+from made_trials import SPACE, made_table, write_trials
+
+from adaptune import files
+from adaptune.archive import Summary
+from adaptune.errors import AdaptuneError
+from adaptune.report.charts import Axis, Band, Line, Points
+from offline.charts import (
+    charts_of_trials,
+    charts_of_validation,
+    importances,
+    iteration_chart,
+    pareto_chart,
+    read_trials,
+    scatter_chart,
+    stretch_chart,
+    trial_table,
+)
+from offline.config import OfflineConfig, load_study
+from offline.tuning import figures
+
+
+def error(name, parameters):
+    """Small distances do well on `one`, large ones on `two`."""
+    best = 2.0 if name == "one" else 8.0
+    return 0.5 + abs(np.log(parameters["distance"] / best))
+
+
+def of_kind(panel, kind, name=None):
+    return [d for d in panel.drawn if isinstance(d, kind) and (name is None or d.name == name)]
+
+
+def test_a_scatter_has_a_panel_for_each_sequence_and_the_mean():
+    table = made_table(error, fixed=3)
+    chart = scatter_chart(table, ["distance", "points"], ["one", "two"])
+    assert [panel.title for panel in chart.panels] == ["one", "two", "mean over all sequences"]
+    for panel, values in zip(
+        chart.panels, [*table.by_sequence.values(), table.values], strict=True
+    ):
+        (best,) = of_kind(panel, Points, "best trial here")
+        assert best.x[0] == table.column("distance")[int(np.argmin(values))]
+        (fixed,) = of_kind(panel, Points, "fixed")
+        assert list(fixed.x) == [table.column("distance")[3]]
+        (trials,) = of_kind(panel, Points, "trial")
+        assert trials.log_colour
+        assert min(trials.colour) == values.min()
+    assert scatter_chart(table, ["distance"], ["one"]) is None
+
+
+def test_a_trial_beyond_a_limit_is_no_best():
+    config = OfflineConfig.model_validate({"limits": {"ms_per_scan": {"max": 5.0}}})
+    runs = {
+        i: Summary(SPACE.baseline | {"points": i + 1}, 1.0 - 0.1 * i, 0, 0, 9.0 if i == 2 else 1.0)
+        for i in range(4)
+    }
+    (panel,) = iteration_chart(trial_table(config, SPACE, {"one": runs})).panels
+    np.testing.assert_allclose(of_kind(panel, Line)[0].y, [1.0, 0.9, 0.9, 0.7])
+
+
+def test_a_front_is_a_line_of_two_objectives_and_none_of_three():
+    values = np.array([[0.5, 9.0, 1.0], [0.7, 5.0, 2.0], [4.0, 2.0, 3.0], [30.0, 7.0, 4.0]])
+    names, marked = ["rte [%]", "memory [MB]", "cpu [% of a core]"], {"fixed": (0.5, 9.0, 1.0)}
+    (panel,) = pareto_chart(names[:2], values[:, :2], values[:3, :2], {"fixed": (0.5, 9.0)}).panels
+    named = [d.name for d in panel.drawn]
+    assert named == ["tried", "Pareto front", "Pareto front", "fixed"]
+    assert (panel.x, panel.y) == (Axis("rte [%]", log=True), Axis("memory [MB]"))
+    first, second = pareto_chart(names, values, values[:3], marked).panels
+    assert (first.x.label, first.y.label, second.y.label) == tuple(names)
+    assert not any(isinstance(d, Line) for panel in (first, second) for d in panel.drawn)
+
+
+def test_a_study_is_read(study_file, tmp_path):
+    study = load_study(study_file, [], tmp_path / "study")
+    assert not len(read_trials(study))
+    write_trials(study, lambda _, p: p["keyframe_interval"], 5)
+    table = read_trials(study)
+    intervals = table.column("keyframe_interval")
+    np.testing.assert_allclose(table.values, intervals, rtol=1e-6)
+    assert table.fixed is None
+    (study.folder / "fixed.yaml").write_text(files.dump(table.sets[2]), "utf-8")
+    assert read_trials(study).fixed == 2
+
+
+def error_of_kernels(_, parameters):
+    slow = 1.0 if parameters["kernel"] == "none" else 1.3
+    return slow * (0.2 + abs(np.log(parameters["distance"] / 3.0)))
+
+
+def test_what_changes_the_error_matters_most():
+    found = importances(made_table(error_of_kernels, 120))
+    assert list(found) == ["distance", "kernel", "points"]
+    assert sum(found.values()) == pytest.approx(1.0)
+    assert found["distance"] > 0.9
+    assert importances(made_table(error_of_kernels, 120)) == found
+
+
+def test_few_trials_and_equal_errors_say_nothing():
+    assert importances(made_table(error_of_kernels, 7)) == {}
+    assert importances(made_table(lambda *_: 1.0, 40)) == {}
+
+
+BOTH = """\
+odometry: [{name: gicp}, {name: ndt}]
+courses: {a: {scenes: [cave]}}
+training: [a]
+"""
+
+
+@pytest.fixture
+def study(study_file, tmp_path):
+    return load_study(study_file, [], tmp_path / "study")
+
+
+def test_trials_have_their_charts(study):
+    assert charts_of_trials(study) == ([], ["No trials: run `adaptune offline`."])
+    write_trials(study, lambda _, p: p["keyframe_interval"], 20)
+    charts, notes = charts_of_trials(study)
+    assert [chart.key for chart in charts] == [
+        "iterations",
+        "importance",
+        "sensitivity",
+        "parameter-scatter",
+    ]
+    assert [note.split(":")[0] for note in notes] == ["No costs of trials"]
+    # The most important one comes first.
+    assert charts[-1].panels[0].x.label == "keyframe_interval [m]"
+
+
+def test_each_of_several_odometries_has_a_scatter(tmp_path):
+    (tmp_path / "both.yaml").write_text(BOTH, "utf-8")
+    study = load_study(tmp_path / "both.yaml", [], tmp_path / "study")
+    write_trials(study, lambda _, p: p.get("keyframe_interval", 1.0), 40)
+    charts, notes = charts_of_trials(study)
+    assert any(note.startswith("No costs") for note in notes)
+    keys = [chart.key for chart in charts]
+    assert keys.count("parameter-scatter-gicp") == keys.count("parameter-scatter-ndt") == 1
+    assert len(set(keys)) == len(keys)
+    importance = charts[keys.index("importance")]
+    assert {panel.title for panel in importance.panels} <= {"gicp", "ndt"}
+
+
+def test_validation_is_read_or_missed(study):
+    assert charts_of_validation(study) == ([], ["No validation: run `adaptune validate`."])
+    study.folder.mkdir()
+    row = {"recording": "one", "fixed [%]": 0.5}
+    rows = [row | {"stretch": i, "adaptive": 0.8 + 0.01 * i} for i in range(4)]
+    (study.folder / "stretches.json").write_text(json.dumps(rows), "utf-8")
+    charts, notes = charts_of_validation(study)
+    assert [chart.key for chart in charts] == ["stretches"]
+    assert notes == []
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "[{",
+        '[{"a": 1}]',
+    ],
+)
+def test_a_damaged_validation_is_named(study, text):
+    (study.folder).mkdir(exist_ok=True)
+    (study.folder / "stretches.json").write_text(text, "utf-8")
+    with pytest.raises(AdaptuneError, match=r"stretches\.json: is damaged .*adaptune validate"):
+        charts_of_validation(study)
+
+
+def stretches(n_recordings=2, n=6):
+    rng = np.random.default_rng(0)
+    return [
+        {
+            "recording": f"drive_{r}",
+            "stretch": i,
+            "fixed [%]": 0.5,
+            "one set": 1.0,
+            "adaptive": float(np.exp(rng.normal(-0.2, 0.1))),
+        }
+        for r in range(n_recordings)
+        for i in range(n)
+    ]
+
+
+def test_stretches_are_sorted_and_have_the_interval_of_their_mean():
+    rows = stretches()
+    (panel,) = stretch_chart(rows).panels  # one set is the fixed set
+    points = [d for d in panel.drawn if isinstance(d, Points)]
+    assert [p.name for p in points] == ["drive_0", "drive_1"]
+    ranks = np.concatenate([p.x for p in points])
+    ratios = np.concatenate([p.y for p in points])
+    np.testing.assert_array_equal(np.argsort(ranks), np.argsort(ratios))
+    of = figures(np.log([r["adaptive"] for r in rows]), [r["recording"] for r in rows])
+    (band,) = (d for d in panel.drawn if isinstance(d, Band))
+    assert (band.low[0], band.high[0]) == (of.low, of.high)
+    mean = next(d for d in panel.drawn if isinstance(d, Line))
+    assert mean.y[0] == pytest.approx(np.exp(np.log(ratios).mean()))
+    assert panel.title == f"adaptive: {of.geometric:.2f} ({of.low:.2f}-{of.high:.2f})"
