@@ -283,11 +283,3 @@ def test_mistakes_are_named_with_file_line_and_key(rustle, name, old, new, told)
     assert done.exit_code == 2
     assert told in done.stderr
     assert not list(rustle.glob("study*"))
-
-
-def test_keys_that_rustle_does_not_have_are_told(rustle, caplog):
-    (rustle / "tuning.yaml").write_text(TUNING + "tuning_algorithm: grid\n")
-    (rustle / "datasets.yaml").write_text(DATASETS.replace("tag:", "tags:"))
-    assert run("tuning.yaml").exit_code == 0
-    assert "tuning.yaml: tuning_algorithm is not known here" in caplog.text
-    assert "datasets.yaml: datasets.0.tags is not known here" in caplog.text

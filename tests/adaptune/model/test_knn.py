@@ -1,5 +1,3 @@
-import dataclasses
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -66,17 +64,6 @@ def test_the_least_prediction_is_chosen(seed):
     assert selection.predicted_error == predicted.min()
     assert selection.predicted_fixed == predicted[data.fixed]
     assert isinstance(selection.trial, int)
-
-
-def test_it_chooses_among_those_named_on_the_evidence_of_all():
-    data = random_data(2, 25, 9)
-    named = (data.fixed, (data.fixed + 4) % 9)
-    of_all = NearestNeighbours().fit(data).predict(np.zeros(4))
-    rule = NearestNeighbours().fit(dataclasses.replace(data, candidates=named))
-    predicted = rule.predict(np.zeros(4))
-    np.testing.assert_array_equal(predicted[[*named]], of_all[[*named]])
-    assert np.isinf(np.delete(predicted, [*named])).all()
-    assert rule.select(np.zeros(4)).trial == min(named, key=lambda j: of_all[j])
 
 
 @parametrize_with_checks([ProductKNeighborsRegressor()])

@@ -6,7 +6,7 @@ import pytest
 from typer.testing import CliRunner
 
 from adaptune.commands.cli import app
-from adaptune.model import BankSettings, ErrorModel, PairedSettings
+from adaptune.model import BankSettings, ErrorModel
 from adaptune.model.rules import Costs, SetCost
 from adaptune.space import Categorical, Float, ParameterSets, ParameterSpace
 from offline.config import Limit, OfflineConfig
@@ -70,39 +70,24 @@ def test_a_model_is_explained(model, tmp_path):
 LITERAL = ("my[v2]", "[/b]", ":x:", "[red]")
 
 
-def kinds(model):
-    """Models as all stages and settings store them."""
-    vectors = np.zeros((4, 2, 3), np.float32)
-    bank = dataclasses.replace(model, bank=[0, 2], vectors=vectors)
+def test_no_model_shows_raw_data(model, tmp_path):
     summary = dict.fromkeys(("geometric", "low", "high", "worst", "arithmetic"), 0.9)
     augment = [{"name": "noise", "sigma": 0.1}, {"name": "cut", "start": None}]
-    config = OfflineConfig(
-        objective=({"rte": 1.0, "ape": 0.5}, "memory"), limits={"rte": Limit(max=3.0)}, repeats=2
-    ).model_dump(mode="json")
-    settings = {
-        "command": ["slam", "--fast"],
-        "extrinsic": {"translation": [0, 0.5, 1]},
-        "gpu": True,
-    }
-    return [
-        model,
-        bank,
-        dataclasses.replace(bank, bank_settings=BankSettings(adapt=False)),
-        dataclasses.replace(model, paired=PairedSettings(adapt=False)),
-        dataclasses.replace(bank, validation={"bank": summary, "paper": summary | {"low": np.nan}}),
-        dataclasses.replace(model, validation={"adaptive": {"kept": ["a", {"b": None}]}, "x": "y"}),
-        dataclasses.replace(model, provenance={"versions": {"numpy": "2"}, "augment": augment}),
-        dataclasses.replace(model, provenance=config),
-        dataclasses.replace(model, odometry={"name": "command", "settings": settings}),
-        dataclasses.replace(model, odometry={"name": "bare"}, provenance={}),
-    ]
-
-
-@pytest.mark.parametrize("i", range(10))
-def test_no_model_shows_raw_data(model, tmp_path, i):
-    text = shown(kinds(model)[i], tmp_path)
-    for raw in ("{", "}", "['", "': ", "None", "True"):
-        assert raw not in text, raw
+    limits = {"rte": Limit(max=3.0)}
+    config = OfflineConfig(objective=({"rte": 1.0, "ape": 0.5}, "memory"), limits=limits)
+    extrinsic = {"translation": [0, 0.5, 1]}
+    settings = {"command": ["slam", "--fast"], "extrinsic": extrinsic, "gpu": True}
+    for changes in (
+        {"validation": {"bank": summary, "paper": summary | {"low": np.nan}}},
+        {"validation": {"adaptive": {"kept": ["a", {"b": None}]}, "x": "y"}},
+        {"provenance": {"versions": {"numpy": "2"}, "augment": augment}},
+        {"provenance": config.model_dump(mode="json")},
+        {"odometry": {"name": "command", "settings": settings}},
+        {"odometry": {"name": "bare"}, "provenance": {}},
+    ):
+        text = shown(dataclasses.replace(model, **changes), tmp_path)
+        for raw in ("{", "}", "['", "': ", "None", "True"):
+            assert raw not in text, raw
 
 
 def test_text_of_a_file_is_shown_literally(model, tmp_path):
