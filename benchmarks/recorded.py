@@ -107,9 +107,8 @@ def definition(
         "offline": {"initial": n_sets, "trials": n_sets, "seed": seed, "workers": 1},
         # All modes but `paper`, with a bank, though the benchmark is bound to one core.
         "online": {
-            "rules": ["adaptive"],
+            "modes": ["adaptive", *also],
             "switching": {"mechanism": "bank"},
-            "also": list(also),
         },
     }
     with_campus = any("campus" in role for role in (*direction.training, *direction.test))

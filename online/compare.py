@@ -559,7 +559,7 @@ def compare(study: Study) -> ComparedReplays:
             oracles += oracle_rows(judged[-1], oracle, model.fixed, period)
     rows = _rows(judged, oracles)
     words = [*remarks(rows), *_equal_cost(model, modes), *compared.words(study)]
-    words += _missing_repeats(judged, study.config.online.repeats)
+    words += _missing_repeats(judged)
     words += _without_oracle(judged, oracles) if model is not None else []
     folder = study.folder / "comparison"
     report.write_rows(folder, "comparison", [row.columns() for row in rows])
@@ -577,15 +577,17 @@ def _equal_cost(model: ErrorModel | None, modes: Sequence[str]) -> list[str]:
     ]
 
 
-def _missing_repeats(judged: Sequence[JudgedModes], repeats: int) -> list[str]:
-    """Which replays were repeated less often than the study says."""
+def _missing_repeats(judged: Sequence[JudgedModes]) -> list[str]:
+    """Which replays were repeated less often than others."""
+    repeats = max(row.repeats for one in judged for row in one.rows)
     few = [
         f"{row.mode} on {one.name} {row.repeats}"
         for one in judged
         for row in one.rows
         if row.repeats < repeats
     ]
-    what = f"Replayed less often than {repeats} times (`adaptune online` goes on)"
+    command = f"`adaptune online --repeats {repeats}` goes on"
+    what = f"Replayed less often than {repeats} times ({command})"
     return [f"{what}: {', '.join(few)}."] if few else []
 
 

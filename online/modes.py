@@ -108,7 +108,6 @@ class ReplaySetup:
     rules: tuple[str, ...]  # selection rules to compare
     switching: SwitchingConfig
     mechanism: Mechanism | None  # how the odometry changes its parameters
-    warm_up: float  # seconds of scans that a member of a bank sees when it restarts
     sub_trajectory: float  # metres
     lost_track: float  # metres a second by which the members of a bank may differ and agree
     descriptors: tuple[str, ...]  # those that the study names
@@ -125,7 +124,6 @@ class ReplaySetup:
             study.rules,
             config.online.switching,
             study.mechanism,
-            study.warm_up,
             config.sub_trajectory,
             config.lost_track,
             config.descriptor,
@@ -214,8 +212,8 @@ class ReplaySetup:
         # Where no scan is dropped, no member is left behind either.
         waits = self.real_time is None or not self.real_time.queue
         rate = None if self.real_time is None or waits else self.real_time.rate
-        given = self.odometry, mode.sets, self.warm_up, self.lost_track, self._cores, rate
-        return Bank(*given)
+        warm_up = self.odometry.description.warm_up
+        return Bank(self.odometry, mode.sets, warm_up, self.lost_track, together(), rate)
 
     def identity(
         self, name: str, model: ErrorModel | None = None, digest: str = ""
@@ -225,7 +223,8 @@ class ReplaySetup:
         if name in (BASELINE, FIXED, *RIVALS):
             mode = self.mode(name, model)
             return about | {"parameters": mode.sets[mode.fixed]}
-        switching: dict[str, Any] = {"mechanism": "bank", "warm_up": self.warm_up}
+        warm_up = self.odometry.description.warm_up
+        switching: dict[str, Any] = {"mechanism": "bank", "warm_up": warm_up}
         if name == UNTRAINED:
             members = list(self._untrained_sets().parameters)
             return about | {"switching": switching | {"members": members}}
@@ -271,11 +270,6 @@ class ReplaySetup:
     def _untrained_sets(self) -> ParameterSets:
         """The members of the bank that needs no model."""
         return untrained_sets(self.odometry.space, self.switching.size)
-
-    @property
-    def _cores(self) -> int:
-        """Cores that the members of a bank may use."""
-        return min(self.switching.cores or together(), together())
 
 
 def needed(name: str, model: ErrorModel | None) -> ErrorModel:
@@ -327,6 +321,7 @@ def run_replays(
     model_path: Path,
     progress: Progress = unseen,
     look: Look = lambda *_: None,
+    repeats: int = 1,
 ) -> int:
     """Replay every test sequence in every mode, as often as asked, unless that was done before.
 
@@ -340,7 +335,9 @@ def run_replays(
     progress
         Called about every scan.
     look
-        Sees every scan, see `online.dashboard.Dashboard.look`.
+        Sees every scan, see `adaptune.commands.dashboard.Dashboard.look`.
+    repeats
+        How often each mode is replayed on a sequence.
 
     Returns
     -------
@@ -357,12 +354,12 @@ def run_replays(
     model = setup.model(study, model_path)
     if not study.config.test:
         raise ReplayError("test: name at least one sequence to replay")
-    asked = (*study.config.online.rules, *setup.also)
+    asked = study.config.online.modes
     obstacles = {name: setup.obstacle(name, model) for name in asked}
     for why in dict.fromkeys(filter(None, obstacles.values())):
         names = " and ".join(name for name in asked if obstacles[name] == why)
         _log.warning("not replayed: %s, because %s", names, why)
-    modes = _Modes(setup, setup.modes(model), progress, look, model, model_path)
+    modes = _Modes(setup, setup.modes(model), progress, look, repeats, model, model_path)
     return _replay_all(study, study.config.test, modes)
 
 
@@ -370,6 +367,7 @@ def run_untrained(
     study: Study,
     progress: Progress = unseen,
     look: Look = lambda *_: None,
+    repeats: int = 1,
 ) -> int:
     """Replay sequences with the baseline, and with a bank that needs no model.
 
@@ -383,7 +381,7 @@ def run_untrained(
     """
     setup = ReplaySetup.of(study)
     setup.mode(UNTRAINED)  # or an error
-    modes = _Modes(setup, WITHOUT_MODEL, progress, look)
+    modes = _Modes(setup, WITHOUT_MODEL, progress, look, repeats)
     return _replay_all(study, sequences_without_model(study.config), modes)
 
 
@@ -406,6 +404,7 @@ class _Modes(NamedTuple):
     names: tuple[str, ...]
     progress: Progress
     look: Look
+    repeats: int
     model: ErrorModel | None = None
     model_path: Path | None = None
 
@@ -463,7 +462,7 @@ def _inputs(study: Study, name: str, modes: _Modes) -> dict[_Run, dict[str, Any]
     about = {mode: modes.setup.identity(mode, modes.model, digest) | shared for mode in modes.names}
     return {
         _Run(name, mode, repeat): manifest.plain(of | {"repeat": repeat})
-        for repeat in range(1, study.config.online.repeats + 1)
+        for repeat in range(1, modes.repeats + 1)
         for mode, of in about.items()
     }
 

@@ -26,14 +26,14 @@ def folder(tmp_path_factory):
     (folder / "my.yaml").write_text(re.sub(r"\bthree:", "home:", text).replace("[three]", "[home]"))
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        train(load_study("my.yaml", ["offline.trials=6", "online.switching.cores=2"]))
+        train(load_study("my.yaml", ["offline.trials=6", "online.switching.mechanism=bank"]))
     return folder
 
 
 @pytest.mark.parametrize("bank", [True, False])
 def test_the_example_is_what_adaptune_online_does(folder, monkeypatch, bank):
     monkeypatch.chdir(folder)
-    overrides = ["offline.trials=6", "online.switching.cores=2"]
+    overrides = ["offline.trials=6", "online.switching.mechanism=bank"]
     study = load_study("my.yaml", overrides)
     model = ErrorModel.load(study.model_path)
     settings = BankSettings() if bank else BankSettings(adapt=False)

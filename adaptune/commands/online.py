@@ -51,7 +51,7 @@ Mode = Annotated[
     str | None,
     typer.Option(
         help="On a robot, what to drive: baseline, fixed, adaptive or paper.",
-        show_default="the first of online.rules",
+        show_default="adaptive, or the first of online.modes",
     ),
 ]
 
@@ -65,6 +65,9 @@ Untrained = Annotated[
 ]
 Thorough = Annotated[
     bool, typer.Option("--thorough", help="All modes that there are to compare with, too.")
+]
+Repeats = Annotated[
+    int, typer.Option(help="How often to replay each mode on a sequence.", min=1, max=20)
 ]
 Ros2 = Annotated[bool, typer.Option("--ros2", help="Drive on a robot with ROS 2 over Zenoh.")]
 Oracle = Annotated[
@@ -80,6 +83,7 @@ def online(
     rate: Rate = None,
     untrained: Untrained = False,
     thorough: Thorough = False,
+    repeats: Repeats = 1,
     ros: Annotated[bool, typer.Option("--ros", help="Drive on a robot with ROS 1.")] = False,
     ros2: Ros2 = False,
     mode: Mode = None,
@@ -95,7 +99,7 @@ def online(
     With `--untrained`, it needs no trials, no model and no ground truth. It replays all sequences
     if the study names no test.
 
-    With `--thorough`, it replays all modes to compare with (`online.also`): the bank with even
+    With `--thorough`, it replays all modes to compare with (`online.modes`): the bank with even
     weights, and the untrained bank.
 
     With `--rate 1`, scans come when the sensor gave them. A selection that is late is dropped, and
@@ -126,7 +130,7 @@ def online(
         return
     if mode is not None:
         raise AdaptuneError(f"--mode {mode} is for a robot (--ros, --ros2); all modes are replayed")
-    made, n = _replay(loaded, model, untrained)
+    made, n = _replay(loaded, model, repeats, untrained=untrained)
     there = f"{made} of {n} replays made" if made else f"All {n} replays were there already"
     say(f"{there}: {loaded.folder / 'replays'}/")
     say_next_of_study("table and pictures of the modes", "compare", study, override, folder)
@@ -159,7 +163,7 @@ def _check_untrained(model: Path | None, mode: str | None) -> None:
 
 def _as_overrides(rate: float | None, *, thorough: bool) -> list[str]:
     """The options that stand for keys of the study."""
-    given = ["online.also=all"] if thorough else []
+    given = ["online.modes=all"] if thorough else []
     return given + ([] if rate is None else [f"online.real_time.rate={rate:g}"])
 
 
@@ -177,7 +181,9 @@ def _on_one_core(study: "OfflineStudy") -> Iterator[None]:
         unbind()
 
 
-def _replay(loaded: "OfflineStudy", model: Path | None, untrained: bool) -> tuple[int, int]:
+def _replay(
+    loaded: "OfflineStudy", model: Path | None, repeats: int, *, untrained: bool
+) -> tuple[int, int]:
     """Make the replays that are missing; how many were made, and how many there are."""
     from adaptune.commands.dashboard import Dashboard
     from adaptune.model import ErrorModel
@@ -192,10 +198,9 @@ def _replay(loaded: "OfflineStudy", model: Path | None, untrained: bool) -> tupl
     dashboard, path = Dashboard(), model or loaded.model_path
     with _on_one_core(loaded), progress(dashboard) as show:
         if untrained:
-            made = run_untrained(loaded, show, dashboard.look)
+            made = run_untrained(loaded, show, dashboard.look, repeats)
         else:
-            made = run_replays(loaded, path, show, dashboard.look)
-    repeats = loaded.config.online.repeats
+            made = run_replays(loaded, path, show, dashboard.look, repeats)
     if untrained:
         return made, len(sequences_without_model(loaded.config)) * len(WITHOUT_MODEL) * repeats
     modes = ReplaySetup.of(loaded).modes(ErrorModel.load(path))
@@ -212,7 +217,7 @@ def _drive(
     from online.modes import UNTRAINED, WITHOUT_MODEL
     from online.robot import RobotDrive
 
-    mode = UNTRAINED if untrained else mode or loaded.rules[0]
+    mode = UNTRAINED if untrained else mode or next(iter(loaded.config.online.rules), "adaptive")
     path = None if mode in WITHOUT_MODEL else model or loaded.model_path
     drive = RobotDrive(loaded, mode, path)
     link, dashboard = Ros2(loaded.config.online.ros.router) if ros2 else local_ros1(), Dashboard()

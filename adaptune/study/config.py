@@ -108,14 +108,11 @@ class SwitchingConfig(StrictModel):
     """
 
     mechanism: Annotated[Literal["auto", "live", "bank"], BeforeValidator(_mechanism)] = "auto"
-    warm_up: float | None = Field(None, gt=0, le=3600)
     size: int = Field(4, ge=2, le=MOST_MEMBERS)
     sets: Annotated[
         tuple[Annotated[int, Field(ge=0, le=10**9)] | dict[str, Value], ...] | None,
         Field(min_length=2, max_length=MOST_MEMBERS),
     ] = None
-    cores: int | None = Field(None, ge=1, le=10_000)
-    memory: float = Field(16.0, gt=0, le=1e6)
 
 
 class RealTimeConfig(StrictModel):
@@ -216,42 +213,49 @@ def _mode_name(name: Any) -> Any:
     return name
 
 
-Rule = Annotated[Literal["adaptive", "paper"], BeforeValidator(_mode_name)]
-"""Selects parameters in a replay."""
-Also = Annotated[Literal["even", "untrained"], BeforeValidator(_mode_name)]
-
+RULES = ("adaptive", "paper")
+"""Modes that select parameters with the error model."""
 ALSO = ("even", "untrained")
 """Modes that are replayed only on demand, to compare with."""
+Mode = Annotated[Literal["adaptive", "paper", "even", "untrained"], BeforeValidator(_mode_name)]
 
 
 class OnlineConfig(StrictModel):
-    """How to replay: seconds between selections, selection rules, switching, and what it may cost.
+    """How to replay: seconds between selections, modes, switching, and what it may cost.
 
-    `also` names modes that are replayed besides, or `all`. Each mode is replayed `repeats` times.
+    `modes` are replayed besides baseline, fixed set and rivals; `all` of them is a choice, too.
     The budget is in milliseconds of CPU time a scan, all members and live evidence together.
     Without `real_time`, a replay is as fast as it goes and always the same.
     """
 
     period: float = Field(1.0, ge=0.01, le=3600)
-    rules: tuple[Rule, ...] = ("adaptive", "paper")
-    also: tuple[Also, ...] = ()
-    repeats: int = Field(1, ge=1, le=20)
+    modes: tuple[Mode, ...] = ("adaptive", "paper")
     switching: SwitchingConfig = SwitchingConfig()
     budget: float | None = Field(None, gt=0, le=1e6)
     real_time: RealTimeConfig | None = None
     ros: RosConfig = RosConfig()
 
-    @field_validator("also", mode="before")
+    @field_validator("modes", mode="before")
     @classmethod
-    def _all(cls, also: Any) -> Any:
-        return ALSO if also == "all" else also
+    def _all(cls, modes: Any) -> Any:
+        return (*RULES, *ALSO) if modes == "all" else modes
 
-    @field_validator("also")
+    @field_validator("modes")
     @classmethod
-    def _once(cls, also: tuple[str, ...]) -> tuple[str, ...]:
-        if len(set(also)) < len(also):
+    def _once(cls, modes: tuple[str, ...]) -> tuple[str, ...]:
+        if len(set(modes)) < len(modes):
             raise ValueError("a mode is named twice")
-        return also
+        return modes
+
+    @property
+    def rules(self) -> tuple[str, ...]:
+        """The modes that select parameters with the error model."""
+        return tuple(mode for mode in self.modes if mode in RULES)
+
+    @property
+    def also(self) -> tuple[str, ...]:
+        """The other modes."""
+        return tuple(mode for mode in self.modes if mode in ALSO)
 
 
 class StudyConfig(StrictModel):

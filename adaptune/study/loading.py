@@ -15,7 +15,7 @@ from adaptune.recording.config import SequenceConfig
 from adaptune.recording.recording import check_sequence, interval_of, sequence_files
 from adaptune.space import ODOMETRY, Categorical, Float, Integer, ParameterSpace, PooledSpace
 from adaptune.strict import ConfigurationError, Key, Mistake, validated, validated_rest
-from adaptune.study.config import OdometryConfig, StudyConfig, settle_roles
+from adaptune.study.config import RULES, OdometryConfig, StudyConfig, settle_roles
 from adaptune.study.study import Study, describe_odometry, tuned_space, whole_definition
 
 # Mistakes in the odometries of a study that only the odometries show.
@@ -221,9 +221,9 @@ def _check_switching(
             yield from _check_set((*key, "sets", i), given, space)
     whole, names = any(one.whole for one in described), ", ".join(config.odometries)
     # A study's folder holds the defaults, too.
-    if whole and online.rules and online.rules != type(online)().rules:
+    if whole and online.rules and online.rules != RULES:
         message = f"{names} runs whole recordings and cannot adapt; leave this out"
-        yield Mistake(("online", "rules"), message)
+        yield Mistake(("online", "modes"), message)
     live = len(described) == 1 and described[0].live
     if whole and online.switching.mechanism != "auto":
         message = f"{names} runs whole recordings and cannot change parameters; leave this out"

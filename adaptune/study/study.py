@@ -228,6 +228,9 @@ MODEL = "model.safetensors"
 WINDOW = 3.0
 """Seconds over which a selector averages descriptors."""
 
+BANK_MEMORY = 16.0
+"""Gigabytes that the members of a bank may take where nobody asks for one."""
+
 _locks: dict[str, IO[str]] = {}
 """Open files whose locks last as long as the process."""
 
@@ -342,17 +345,9 @@ class Study(Generic[C_co]):
         instances = switching.size if switching.sets is None else len(switching.sets)
         if switching.sets is None and self.config.online.budget is not None:
             instances = MOST_MEMBERS
-        cores = available() if switching.cores is None else switching.cores
-        enough = instances * self.config.isolation.memory <= switching.memory
-        if cores > 1 and enough:
+        if available() > 1 and instances * self.config.isolation.memory <= BANK_MEMORY:
             return "bank"
         return "live" if described.live else None
-
-    @property
-    def warm_up(self) -> float:
-        """Seconds of the last scans that a member of a bank sees when it restarts."""
-        own = self.config.online.switching.warm_up
-        return self.odometry.description.warm_up if own is None else own
 
     @property
     def odometry_inputs(self) -> dict[str, Any]:
@@ -515,9 +510,9 @@ def driven(study: Study, model: ErrorModel) -> str:
     if study.mechanism is None:
         return f"{fixed} only, because {cannot_adapt(study.odometry, None)}."
     if not study.rules:
-        return f"{fixed} only, because no rule is named (online.rules)."
+        return f"{fixed} only, because no rule is named (online.modes)."
     if "adaptive" not in study.rules:
-        return "`online` will drive `paper`, and not `adaptive` (online.rules)."
+        return "`online` will drive `paper`, and not `adaptive` (online.modes)."
     mechanism = mechanism_of("adaptive", model, study.mechanism, live)
     joining = _who_joins_in(switching, model) if mechanism == "bank" else ""
     if mechanism == "bank" and model.bank_adapts:

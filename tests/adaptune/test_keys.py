@@ -24,7 +24,7 @@ def test_keys_and_values_are_completed(incomplete, completed):
     )
 
 
-MOST_KEYS = 50
+MOST_KEYS = 45
 """Outside of odometries, sequences and courses."""
 
 

@@ -56,7 +56,7 @@ def failure(file, *overrides):
         ("health.max_speed=.nan", "health.max_speed: give a finite number, not NaN"),
         ("health.max_speed=1" + "0" * 400, "health.max_speed: give a number of at most 1"),
         ("descriptor.window=3", "window is gone, they are averaged over 3 s"),
-        ("online.rules=[paired]", "online.rules.0: paired is now called adaptive"),
+        ("online.modes=[paired]", "online.modes.0: paired is now called adaptive"),
         (
             "online.switching.sets=[true, 3]",
             "online.switching.sets.0: give a whole number or keys with values, not true",

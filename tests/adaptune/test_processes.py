@@ -111,7 +111,7 @@ def test_the_driver_imports_no_code_of_the_user_s(mine, study_file, tmp_path, ca
     ]
     study = load_study(study_file, overrides, tmp_path / "study")
     assert study.odometry.settings.model_dump() == {"step": 0.3}
-    assert study.warm_up == 0.5
+    assert study.odometry.description.warm_up == 0.5
     model = train(study).model
     assert len(model.sets) == 4
     assert run_replays(study, study.model_path) == 4

@@ -36,9 +36,7 @@ def test_a_bank_has_a_budget(study_file, monkeypatch):
     needs_evalio()
     monkeypatch.setattr("adaptune.study.study.available", lambda: 4)
     for given, mechanism in (
-        ("online.switching.memory=16", "bank"),
-        ("online.switching.memory=15", None),
-        ("online.switching.cores=1", None),
+        ("online.switching.size=4", "bank"),
         ("online.switching.size=5", None),
         ("isolation.memory=5", None),
     ):
@@ -99,7 +97,7 @@ def test_reads_a_study(gicp_study_file, tmp_path):
         ("offline.objective=[rte, {rte: 1.0}]", ["offline.objective: names an objective twice"]),
         ("offline.trial=3", ["offline.trial", "did you mean 'trials'?"]),
         ("online.switching.mechanism=hand_over", ["hand_over is gone", "give auto, live or bank"]),
-        ("online.switching.warmup=5", ["did you mean 'warm_up'?"]),
+        ("online.switching.sizes=5", ["did you mean 'size'?"]),
         (
             "online.switching.sets=[0, {keyframe_intervall: 1.0}]",
             ["online.switching.sets.1", "did you mean 'keyframe_interval'?"],

@@ -36,7 +36,7 @@ def load(study_file, trained_folder, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def replayed(load):
-    study = load("online.also=all")
+    study = load("online.modes=all")
     assert run_replays(study, study.model_path) == len(EVERY)
     return study
 
@@ -77,7 +77,7 @@ def test_they_do_what_their_names_say(replayed):
 
 
 def test_they_are_made_once_and_again_for_another_model(own):
-    study = own("online.also=all")
+    study = own("online.modes=all")
     before = selections(study, "adaptive")
     assert run_replays(study, study.model_path) == 0
     shutil.rmtree(study.folder / "replays/three/adaptive")
@@ -97,7 +97,7 @@ def test_they_are_made_once_and_again_for_another_model(own):
 def test_what_is_missing_somewhere_is_told_and_left_out(own, tmp_path):
     bag = drives.write_bag(tmp_path / "four.bag", drives.scans(4, 40))
     four = f"sequences.four={{bag: {bag}, points: /points, reference: /truth}}"
-    both = own("test=[three, four]", four, "online.also=[even]")
+    both = own("test=[three, four]", four, "online.modes=[adaptive, paper, even]")
     run_replays(both, both.model_path)
     shutil.rmtree(both.folder / "replays/four/paper")
     shutil.rmtree(both.folder / "replays/three/baseline")
@@ -146,10 +146,10 @@ def test_where_only_some_were_replayed_without_a_model_those_are_compared(own, t
 
 
 def test_every_mode_is_repeated(own):
-    study = own("online.repeats=3")
+    study = own()
     kept = study.folder / "replays/three"
-    assert run_replays(study, study.model_path) == 8
-    assert run_replays(study, study.model_path) == 0
+    assert run_replays(study, study.model_path, repeats=3) == 8
+    assert run_replays(study, study.model_path, repeats=3) == 0
     adaptive = read_repeats(kept / "adaptive")
     assert [replay.summary.inputs["repeat"] for replay in adaptive] == [1, 2, 3]
     for replay in adaptive[1:]:
@@ -160,14 +160,15 @@ def test_every_mode_is_repeated(own):
     # What is left of an interrupted run is made again, and nothing else.
     (repeat_folder(kept / "paper", 2) / "frames.csv").unlink()
     assert len(read_repeats(kept / "paper")) == 1
-    assert run_replays(study, study.model_path) == 1
+    assert run_replays(study, study.model_path, repeats=3) == 1
     shutil.rmtree(kept / "fixed/repeat_3")
     (said,) = (said for said in compare(study).words if said.startswith("Replayed less often"))
-    assert said.startswith("Replayed less often than 3 times (`adaptune online` goes on): ")
+    assert "less often than 3 times (`adaptune online --repeats 3` goes on): " in said
     assert "fixed on three 2" in said
     assert "paper" not in said
+    assert "even on three 1" in said
     # Repeats of something else do not count.
-    other = own("online.period=2", "online.rules=[adaptive]")
+    other = own("online.period=2", "online.modes=[adaptive]")
     run_replays(other, other.model_path)
     assert len(read_repeats(kept / "adaptive")) == 1
     with pytest.raises(StoredReplayError, match="there is no replay"):
@@ -180,7 +181,7 @@ def test_the_command_line(own, study_file):
     done = CliRunner().invoke(app, ["online", *words, "--thorough"])
     assert done.exit_code == 0, done.output
     assert f"All {len(EVERY)} replays were there already" in done.stdout
-    assert "-o online.also=all" in done.stdout.splitlines()[-1]
+    assert "-o online.modes=all" in done.stdout.splitlines()[-1]
     shutil.rmtree(folder / "replays/three/paper")
     done = CliRunner().invoke(app, ["compare", *words])
     assert done.exit_code == 0, done.output
@@ -190,7 +191,7 @@ def test_the_command_line(own, study_file):
         assert done.exit_code == 2
         assert "--thorough is for replays with a model" in done.stderr
     for value, words_ in (("[even, even]", "a mode is named twice"), ("[odd]", "not 'odd'")):
-        done = CliRunner().invoke(app, ["online", *words, "-o", f"online.also={value}"])
+        done = CliRunner().invoke(app, ["online", *words, "-o", f"online.modes={value}"])
         assert done.exit_code == 2
         assert words_ in done.stderr
     assert set(ALSO) < set(EVERY)

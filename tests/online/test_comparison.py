@@ -92,7 +92,7 @@ def test_values_that_stay_read_as_those_that_change(own):
 @pytest.mark.parametrize("mechanism", ["live", "bank"])
 def test_one_set_at_a_time_is_driven_where_a_bank_does_not_pay(own, study_file, mechanism):
     model = ErrorModel.load(own.folder / "model.safetensors")
-    given = [f"online.switching.mechanism={mechanism}", "online.switching.warm_up=0.5"]
+    given = [f"online.switching.mechanism={mechanism}"]
     study = load_study(study_file, [*given, "online.period=0.5"], own.folder)
     path = own.folder / "unpaying.safetensors"
     one_set = replace(model, paired=PairedSettings(), bank_settings=BankSettings(adapt=False))
@@ -108,7 +108,6 @@ def test_one_set_at_a_time_is_driven_where_a_bank_does_not_pay(own, study_file, 
         for mode in ("adaptive", "paper")
     }
     assert about["paper"]["mechanism"] == mechanism
-    assert about["paper"].get("warm_up") == (0.5 if mechanism == "bank" else None)
     assert about["adaptive"]["mechanism"] == "live"
     with (folder / "selections.csv").open() as file:
         rows = list(csv.DictReader(file))

@@ -23,7 +23,6 @@ def setup(budget=None):
         ("adaptive", "paper"),
         SwitchingConfig(mechanism="live"),
         "live",
-        factory.description.warm_up,
         25.0,
         3.0,
         ("ndt",),

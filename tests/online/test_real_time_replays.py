@@ -19,14 +19,14 @@ from online.tables import remarks
 
 RATE = "online.real_time.rate=5"
 WAITS = "online.real_time.deadline=60"
-TWO_CORES = "online.switching.cores=2"
+BANK = "online.switching.mechanism=bank"
 
 
 @pytest.fixture(scope="module")
 def study(study_file, trained_folder, tmp_path_factory):
     """With a bank, and replays in real time."""
     folder = shutil.copytree(trained_folder, tmp_path_factory.mktemp("real_time") / "run")
-    overrides = ["online.rules=[adaptive]", TWO_CORES, "online.real_time.queue=0", RATE, WAITS]
+    overrides = ["online.modes=[adaptive]", BANK, "online.real_time.queue=0", RATE, WAITS]
     study = load_study(study_file, overrides, folder)
     model = ErrorModel.load(study.model_path)
     replace(model, bank_settings=BankSettings()).save(study.model_path)
@@ -59,7 +59,7 @@ def test_it_is_recorded_how_a_replay_kept_up(study):
 
 def test_without_a_miss_it_is_what_lockstep_gives(study, study_file):
     in_real_time = StoredReplay.read(study.folder / "replays/three/adaptive")
-    overrides = ["online.rules=[adaptive]", TWO_CORES]
+    overrides = ["online.modes=[adaptive]", BANK]
     lockstep = load_study(study_file, overrides, study.folder.parent / "lockstep")
     shutil.copytree(study.folder, lockstep.folder)
     assert run_replays(lockstep, lockstep.model_path) == 3  # those in real time are others
@@ -78,7 +78,7 @@ def test_without_a_miss_it_is_what_lockstep_gives(study, study_file):
 
 def test_replays_in_real_time_are_compared_as_they_are(study, study_file):
     """Also by a study that does not say that they were, and where scans were dropped."""
-    asks = load_study(study_file, ["online.rules=[adaptive]", TWO_CORES], study.folder)
+    asks = load_study(study_file, ["online.modes=[adaptive]", BANK], study.folder)
     assert "Replayed at 5 times the recorded rate: nothing came too late." in remarks(
         compare(asks).rows
     )
@@ -103,7 +103,7 @@ def test_replays_in_real_time_are_compared_as_they_are(study, study_file):
 
 def test_the_command_takes_a_rate(study_file, trained_folder, tmp_path):
     folder = shutil.copytree(trained_folder, tmp_path / "run")
-    given = [study_file, "--folder", folder, "-o", "online.rules=[adaptive]"]
+    given = [study_file, "--folder", folder, "-o", "online.modes=[adaptive]"]
     first, again = (call("online", *given, "--rate", "20") for _ in range(2))
     assert "3 of 3 replays made" in first.output
     assert json.loads((folder / "replays/three/fixed/replay.json").read_text())["real_time"]

@@ -31,7 +31,7 @@ def load(study_file, tmp_path_factory):
     rest = STUDY[STUDY.index("sequences:") :].replace("bag: ", f"bag: {study_file.parent}/")
     path = folder / "several.yaml"
     path.write_text(
-        ODOMETRIES + rest + "online: {rules: [adaptive], switching: {mechanism: bank}}\n"
+        ODOMETRIES + rest + "online: {modes: [adaptive], switching: {mechanism: bank}}\n"
     )
     return lambda *overrides: load_study(path, list(overrides), folder / "study")
 

@@ -32,7 +32,7 @@ def replayed(study_file, trained_folder, tmp_path_factory):
         "{bag: three.bag, points: /points, reference: /truth}",
         "{bag: three.bag, points: /points, reference: three.tum}",
     )
-    (folder / "small.yaml").write_text(text + "online: {rules: [adaptive]}\n")
+    (folder / "small.yaml").write_text(text + "online: {modes: [adaptive]}\n")
     run(load_at(folder))
     return folder
 
@@ -154,7 +154,7 @@ def test_replays_with_two_models_are_not_compared(load):
     twice = study.folder / "replays/three/paper"
     shutil.copytree(path.parent, twice)
     rewrite(twice, mode="paper", model="a third")
-    both = load("online.rules=[adaptive, paper]")
+    both = load("online.modes=[adaptive, paper]")
     with pytest.raises(StoredReplayError, match=r"different models .*run `adaptune online` again"):
         compare(both)
 
@@ -167,7 +167,7 @@ def test_what_is_refused_is_told_and_not_drawn(load):
     folder = study.folder / "replays/three"
     shutil.copytree(folder / "adaptive", folder / "paper")
     assert "paper" not in current_modes(study, "three").modes
-    other = load("online.switching.mechanism=bank", "online.switching.warm_up=3")
+    other = load("online.switching.mechanism=bank", "online.switching.size=2")
     modes, refused = current_modes(other, "three")
     assert modes == ("baseline", "fixed")
     with pytest.raises(StoredReplayError) as caught:
@@ -193,7 +193,7 @@ def test_all_that_is_refused_for_one_reason_is_told_at_once(load):
 
 
 def test_of_replays_with_different_models_those_with_the_own_one_are_drawn(load):
-    study = load("online.also=[even]")
+    study = load("online.modes=[adaptive, even]")
     run(study)
     rewrite(study.folder / "replays/three/even", model="another")
     with pytest.raises(StoredReplayError, match="different models"):
@@ -218,7 +218,7 @@ def test_replays_of_another_rate_or_reference_are_not_drawn(load):
 
 
 def test_other_ways_to_switch_are_not_compared(load):
-    other = load("online.switching.mechanism=bank", "online.switching.warm_up=3")
+    other = load("online.switching.mechanism=bank", "online.switching.size=2")
     with pytest.raises(StoredReplayError, match="was made from other inputs: switching"):
         compare(other)
     assert run(other) == 1
