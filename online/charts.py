@@ -27,12 +27,12 @@ from adaptune.report.charts import (
 )
 from adaptune.report.drawing import plain
 from adaptune.space import ParameterSpace
-from adaptune.study.study import Study, named
+from adaptune.study.study import Study, StudySequences, named
 from adaptune.trajectory import Trajectory, read_tum
 from online.compare import current_modes
 from online.modes import UNTRAINED
 from online.record import StoredReplay, damaged, read_applied, read_columns
-from online.statistics import ALL, ComparisonRow, Reference, reference_of
+from online.statistics import ALL, ComparisonRow, Reference
 from online.tables import of_lengths, short_replays
 
 # The chart of a comparison: the ratio of each mode's error, over all sequences and on each.
@@ -200,7 +200,7 @@ class ReplayedSequence:
 def read_replays(study: Study, name: str) -> ReplayedSequence:
     """Read the replays of a sequence that are finished and drawn; there may be none.
 
-    Those that `compare` refuses are not, see `online.stale_replays.current_modes`, and neither are
+    Those that `compare` refuses are not, see `online.compare.current_modes`, and neither are
     those that are too short.
 
     Raises
@@ -208,8 +208,8 @@ def read_replays(study: Study, name: str) -> ReplayedSequence:
     AdaptuneError
         If a file is damaged, or if `compare` refuses all of them.
     """
-    folder = study.folder / "replays" / name
-    space, reference = study.odometry.space, reference_of(study, name)
+    folder, length = study.folder / "replays" / name, study.config.sub_trajectory
+    space, reference = study.odometry.space, Reference.of(study.sequences, name, folder, length)
     # Of a single odometry, numbers name the members of a bank.
     several = len(space.baselines) > 1 and study.model_path.exists()
     model = ErrorModel.load(study.model_path) if several else None
@@ -222,10 +222,11 @@ def read_replays(study: Study, name: str) -> ReplayedSequence:
     }
     scenes = None
     if replays:
-        scenes = scenes_along(study, name, next(iter(replays.values())).trajectory.stamps)
+        stamps = next(iter(replays.values())).trajectory.stamps
+        scenes = scenes_along(study.sequences, name, stamps)
     return ReplayedSequence(
         name,
-        study.config.sub_trajectory,
+        length,
         modes,
         space,
         scenes,
@@ -250,12 +251,12 @@ def _whole(
     return whole, [of_lengths(name, scans, short)] if short else []
 
 
-def scenes_along(study: Study, name: str, stamps: NDArray[np.int64]) -> Spans | None:
+def scenes_along(sequences: StudySequences, name: str, stamps: NDArray[np.int64]) -> Spans | None:
     """The scenes of a simulated course at scans of these stamps; None of another recording."""
-    course = study.config.courses.get(name)
+    course = sequences.courses.get(name)
     if course is None:
         return None
-    path = study.sequences.recording(name).with_suffix(".tum")
+    path = sequences.recording(name).with_suffix(".tum")
     return scene_spans(course.legs, read_tum(path), stamps) if path.exists() else None
 
 
@@ -446,15 +447,9 @@ _BESIDE = 0.5
 _RESTARTED = "restarted by the health check"
 
 
-def charts_of_replays(study: Study, sequence: str) -> Charts:
-    """Charts of the replays of a sequence, in all modes that there are, and what is missing.
-
-    Raises
-    ------
-    AdaptuneError
-        If a file of a replay is damaged, or all are of something else than the study.
-    """
-    replayed = read_replays(study, sequence)
+def charts_of_replays(replayed: ReplayedSequence) -> Charts:
+    """Charts of the replays of a sequence, in all modes that there are, and what is missing."""
+    sequence = replayed.name
     if not replayed.modes:
         none = [f"No replays of {sequence}: run `adaptune online`."]
         return Charts([], [*replayed.refused] or none)

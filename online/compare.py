@@ -29,7 +29,6 @@ from online.modes import (
     WITHOUT_MODEL,
     ReplaySetup,
     sequences_without_model,
-    shared_identity,
 )
 from online.record import (
     ReplaySummary,
@@ -46,13 +45,13 @@ from online.statistics import (
     ComparisonRow,
     JudgedModes,
     Ratio,
+    Reference,
     Repeats,
     StandardErrors,
     allowing_for,
     compare_modes,
     mean_of,
     oracle_rows,
-    reference_of,
 )
 from online.tables import CONTROLS, remarks, tables
 
@@ -68,9 +67,9 @@ class ComparedModes(NamedTuple):
     missing: Mapping[str, Sequence[str]]
     unfinished: Sequence[str] = ()  # sequences that are not compared, for want of replays
 
-    def words(self, study: Study) -> list[str]:
-        """Sentences about what is not shown because it is missing."""
-        said, replays, asked = [], study.folder / "replays", study.config.online.also
+    def words(self, replays: Path, asked: Sequence[str]) -> list[str]:
+        """Sentences about what is not shown because it is missing; `asked` as `replayed_by`."""
+        said = []
         if self.unfinished:
             there = [m for m in self.modes if m not in ALSO or self.modes == WITHOUT_MODEL]
             lacking = (
@@ -374,15 +373,18 @@ def check_replays(
         for name in names
         for mode in modes
     }
-    path, model = _model_of(study, made.values())
-    # Both read what they are about.
-    shared = {name: shared_identity(study, name) for name in names}
-    _check_rates(study.folder / "replays", made.values())
+    replays, own = study.folder / "replays", study.model_path.resolve()
+    path = _model_file(replays, made.values(), own, setup.also)
+    model = _load(study, path)
+    shared = {name: study.replay_inputs(name) for name in names}
+    _check_rates(replays, made.values())
     for (name, mode), summary in made.items():
         if differing := _differing(study.sequences, setup, summary, model, shared[name]):
-            raise StoredReplayError(_refusal(study, name, [mode], differing, path))
+            raise StoredReplayError(
+                _refusal(replays / name, [mode], differing, setup.also, _other(path, own))
+            )
     for name in names:
-        _check_reference(study, name, modes)
+        _check_reference(replays / name, study.sequences.reference(name), modes)
     return model
 
 
@@ -402,16 +404,15 @@ def current_modes(study: Study, name: str) -> CurrentModes:
     if not made:
         return CurrentModes((), ())
     own = study.model_path.resolve()
-    if len(_files(made.values())) > 1 and own.exists():
-        of: tuple[Path, ErrorModel | None] = own, _load(study, own)
-    else:
-        of = _model_of(study, made.values())
-    path, model = of
+    path = own
+    if len(_files(made.values())) < 2 or not own.exists():
+        path = _model_file(folder.parent, made.values(), own, setup.also)
+    model = _load(study, path)
     considered = _considered(setup, model)
     made = {mode: summary for mode, summary in made.items() if mode in considered}
-    _check_rates(study.folder / "replays", made.values())
-    _check_reference(study, name, list(made))
-    shared = shared_identity(study, name)
+    _check_rates(folder.parent, made.values())
+    _check_reference(folder, study.sequences.reference(name), list(made))
+    shared = study.replay_inputs(name)
     current, refused = [], dict[tuple[Any, ...], list[str]]()
     for mode, summary in made.items():
         if differing := _differing(study.sequences, setup, summary, model, shared):
@@ -420,7 +421,7 @@ def current_modes(study: Study, name: str) -> CurrentModes:
         else:
             current.append(mode)
     said = (
-        f"{_refusal(study, name, modes, differing, path)}."
+        f"{_refusal(folder, modes, differing, setup.also, _other(path, own))}."
         for (_, _, *differing), modes in refused.items()
     )
     return CurrentModes(tuple(current), tuple(said))
@@ -459,15 +460,21 @@ def _differing(
     return manifest.changes({key: about.get(key) for key in now}, now, files)
 
 
+def _other(path: Path, own: Path) -> Path | None:
+    """A model's file, if it is not the study's own."""
+    return None if path == own else path
+
+
 def _refusal(
-    study: Study, name: str, modes: Sequence[str], differing: Sequence[str], path: Path
+    folder: Path,
+    modes: Sequence[str],
+    differing: Sequence[str],
+    asked: Sequence[str],
+    path: Path | None,
 ) -> str:
     """Why replays of a sequence are refused, and the command that makes them with a model."""
-    folder, command = (
-        study.folder / "replays" / name,
-        replayed_by(study.config.online.also, modes[0]),
-    )
-    if modes[0] != UNTRAINED and path != study.model_path.resolve():
+    command = replayed_by(asked, modes[0])
+    if modes[0] != UNTRAINED and path is not None:
         command = f"{command[:-1]} --model {path}`"
     what = f"{folder / modes[0]}: was" if len(modes) == 1 else f"{folder}: {', '.join(modes)} were"
     return f"{what} made from other inputs: {'; '.join(differing)}; run {command} with this study"
@@ -481,9 +488,9 @@ def _check_rates(replays: Path, summaries: Collection[ReplaySummary]) -> None:
         )
 
 
-def _check_reference(study: Study, name: str, modes: Sequence[str]) -> None:
+def _check_reference(folder: Path, poses: manifest.Inputs, modes: Sequence[str]) -> None:
     option = " --untrained" if UNTRAINED in modes and "fixed" not in modes else ""
-    check_reference(study.folder / "replays" / name, study.sequences.reference(name), option)
+    check_reference(folder, poses, option)
 
 
 def _files(summaries: Iterable[ReplaySummary]) -> dict[str, str]:
@@ -492,23 +499,24 @@ def _files(summaries: Iterable[ReplaySummary]) -> dict[str, str]:
     return {digest: file for digest, file in models if digest and file}
 
 
-def _model_of(study: Study, summaries: Collection[ReplaySummary]) -> tuple[Path, ErrorModel | None]:
-    """File of the model that all replays are of, and the model if the file is still there."""
+def _model_file(
+    replays: Path, summaries: Collection[ReplaySummary], own: Path, asked: Sequence[str]
+) -> Path:
+    """File of the model that all replays are of."""
     files = _files(summaries)
     if len(files) > 1:
-        commands = {
-            replayed_by(study.config.online.also, s.mode) for s in summaries if s.inputs["model"]
-        }
+        commands = {replayed_by(asked, s.mode) for s in summaries if s.inputs["model"]}
         raise StoredReplayError(
-            f"{study.folder / 'replays'}: holds replays with different models "
+            f"{replays}: holds replays with different models "
             f"({' and '.join(sorted(set(files.values())))}); run {max(commands, key=len)} again"
         )
-    path = Path(next(iter(files.values()), study.model_path.resolve()))
-    return path, _load(study, path) if path.exists() else None
+    return Path(next(iter(files.values()), own))
 
 
-def _load(study: Study, path: Path) -> ErrorModel:
-    """A model; the study's own is still of its recordings."""
+def _load(study: Study, path: Path) -> ErrorModel | None:
+    """A model if its file is still there; the study's own is still of its recordings."""
+    if not path.exists():
+        return None
     own = path == study.model_path.resolve()
     return study.model(path) if own else ErrorModel.load(path)
 
@@ -549,7 +557,8 @@ def compare(study: Study) -> ComparedReplays:
     for name in names:
         folder = study.folder / "replays" / name
         replays = {mode: read_repeats(folder / mode) for mode in modes}
-        reference = reference_of(study, name)
+        length = study.config.sub_trajectory
+        reference = Reference.of(study.sequences, name, folder, length)
         every = _with_fixed_rivals(replays, model)
         of_modes = compare_modes(name, every, reference)
         judged.append(of_modes._replace(recording=study.sequences.recorded_in(name)))
@@ -558,7 +567,11 @@ def compare(study: Study) -> ComparedReplays:
             period = study.config.online.period
             oracles += oracle_rows(judged[-1], oracle, model.fixed, period)
     rows = _rows(judged, oracles)
-    words = [*remarks(rows), *_equal_cost(model, modes), *compared.words(study)]
+    words = [
+        *remarks(rows),
+        *_equal_cost(model, modes),
+        *compared.words(study.folder / "replays", setup.also),
+    ]
     words += _missing_repeats(judged)
     words += _without_oracle(judged, oracles) if model is not None else []
     folder = study.folder / "comparison"

@@ -233,19 +233,6 @@ class ReplaySetup:
         named = self.switching.model_dump(mode="json", include={"size", "sets"})
         return about | {"model": digest, "switching": switching | named}
 
-    def model(self, study: Study, path: Path) -> ErrorModel:
-        """Load an error model.
-
-        Raises
-        ------
-        AdaptuneError
-            If it is of another odometry, other parameters or other sub-trajectories, or what the
-            study's own model was fitted to has changed.
-        """
-        model = study.model(path)
-        self.check(model, path)
-        return model
-
     def check(self, model: ErrorModel, path: Path) -> None:
         """Refuse a model for another bank, or with a descriptor of somebody else's, from `path`."""
         model.check_descriptors(self.descriptors, path)
@@ -351,7 +338,8 @@ def run_replays(
         sub-trajectories, or what the study's own model was fitted to has changed.
     """
     setup = ReplaySetup.of(study)
-    model = setup.model(study, model_path)
+    model = study.model(model_path)
+    setup.check(model, model_path)
     if not study.config.test:
         raise ReplayError("test: name at least one sequence to replay")
     asked = study.config.online.modes
@@ -420,8 +408,13 @@ def _replay_all(study: Study, sequences: Sequence[str], modes: _Modes) -> int:
         _log.warning("%s; it is replayed without a reference, and not judged", why)
     made = 0
     for name in sequences:
-        folder, every = study.folder / "replays" / name, _inputs(study, name, modes)
-        due = {run: inputs for run, inputs in every.items() if _is_due(study, run, inputs)}
+        folder, every = study.folder / "replays" / name, _inputs(study.replay_inputs(name), modes)
+        files = study.sequences.sources(name)
+        due = {
+            _Run(name, *run): inputs
+            for run, inputs in every.items()
+            if _is_due(study.folder, _Run(name, *run), inputs, files)
+        }
         poses = study.sequences.reference(name)
         if not due and is_reference_of(folder, poses):
             continue
@@ -440,28 +433,30 @@ def _replay_all(study: Study, sequences: Sequence[str], modes: _Modes) -> int:
     return made
 
 
-def _is_due(study: Study, run: _Run, inputs: manifest.Inputs) -> bool:
+def _is_due(
+    study: Path, run: _Run, inputs: manifest.Inputs, files_of: Mapping[str, Sequence[Path]]
+) -> bool:
     """Whether a replay is to be made; one of other inputs is set aside, an earlier one kept."""
-    folder = repeat_folder(study.folder / "replays" / run.sequence / run.mode, run.repeat)
-    files_of = study.sequences.sources(run.sequence)
+    folder = repeat_folder(study / "replays" / run.sequence / run.mode, run.repeat)
     changes = replay_changes(folder, inputs, files_of)
     if changes:
         _log.info("%s: replayed again: %s", run, "; ".join(changes))
         before, files = manifest.recorded(folder / manifest.FILE), folder.iterdir()
-        manifest.set_aside(study.folder, folder, before, [file for file in files if file.is_file()])
-    if changes != [] and manifest.bring_back(study.folder, folder, inputs):
+        manifest.set_aside(study, folder, before, [file for file in files if file.is_file()])
+    if changes != [] and manifest.bring_back(study, folder, inputs):
         _log.info("%s: the earlier replay of these inputs counts again", run)
         changes = replay_changes(folder, inputs)
     return changes != []
 
 
-def _inputs(study: Study, name: str, modes: _Modes) -> dict[_Run, dict[str, Any]]:
-    """What all replays of a sequence are made from; each mode has its first before any second."""
-    shared = shared_identity(study, name)
+def _inputs(shared: Mapping[str, Any], modes: _Modes) -> dict[tuple[str, int], dict[str, Any]]:
+    """What all replays of a sequence are made from, by mode and repeat: first all first ones."""
     digest = "" if modes.model is None else modes.model.digest
-    about = {mode: modes.setup.identity(mode, modes.model, digest) | shared for mode in modes.names}
+    about = {
+        mode: modes.setup.identity(mode, modes.model, digest) | dict(shared) for mode in modes.names
+    }
     return {
-        _Run(name, mode, repeat): manifest.plain(of | {"repeat": repeat})
+        (mode, repeat): manifest.plain(of | {"repeat": repeat})
         for repeat in range(1, modes.repeats + 1)
         for mode, of in about.items()
     }
@@ -541,15 +536,3 @@ def warn_of_scant_evidence(what: str, selections: Iterable[Selection], fixed: in
             scant,
             len(others),
         )
-
-
-def shared_identity(study: Study, name: str) -> dict[str, Any]:
-    """What the replays of a sequence depend on in all modes."""
-    in_real_time = study.config.online.real_time
-    return {
-        "period": study.config.online.period,
-        "real_time": in_real_time and in_real_time.model_dump(mode="json"),
-        "health": study.config.health.model_dump(mode="json"),
-        **study.odometry_inputs,
-        **study.sequences.identity(name),
-    }

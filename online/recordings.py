@@ -18,6 +18,7 @@ from adaptune.progress import Progress, unseen
 from adaptune.recording.export import Message, Messages
 from adaptune.recording.scan import Recording
 from adaptune.selector import Schedule
+from adaptune.study.config import StudyConfig
 from adaptune.study.study import Study
 from adaptune.trajectory import Trajectory
 from online.modes import MODES, sequences_without_model
@@ -60,13 +61,12 @@ _NUMBER = "std_msgs/msg/Float64"
 _TEXT = "std_msgs/msg/String"
 
 
-def replayed_modes(study: Study, name: str) -> list[str]:
+def replayed_modes(folder: Path) -> list[str]:
     """The modes in which a sequence was replayed, in the order of their lines in pictures."""
-    folder = study.folder / "replays" / name
     return [mode for mode in MODES if (folder / mode / "replay.json").exists()]
 
 
-def replayed_sequences(study: Study, wanted: Sequence[str] = ()) -> list[str]:
+def replayed_sequences(replays: Path, config: StudyConfig, wanted: Sequence[str] = ()) -> list[str]:
     """The sequences of a study that were replayed, or those of them that are wanted.
 
     Raises
@@ -74,10 +74,9 @@ def replayed_sequences(study: Study, wanted: Sequence[str] = ()) -> list[str]:
     StoredReplayError
         If there is none, or not one that is wanted.
     """
-    config = study.config
-    default = sequences_without_model(study.config)
+    default = sequences_without_model(config)
     every = dict.fromkeys([*default, *config.sequences, *config.courses])
-    there = [name for name in every if replayed_modes(study, name)]
+    there = [name for name in every if replayed_modes(replays / name)]
     for name in wanted:
         if name not in every:
             raise StoredReplayError(
@@ -91,8 +90,7 @@ def replayed_sequences(study: Study, wanted: Sequence[str] = ()) -> list[str]:
     found = list(dict.fromkeys(wanted)) or [name for name in default if name in there]
     if not found:
         raise StoredReplayError(
-            f"{study.folder / 'replays'}: there is no replay; run `adaptune online` with this "
-            f"study first"
+            f"{replays}: there is no replay; run `adaptune online` with this study first"
         )
     return found
 
@@ -111,7 +109,8 @@ def record_replays(study: Study, name: str, progress: Progress = unseen) -> Path
         If a replay is damaged, or of another recording than the sequence is now, or the disk is
         full.
     """
-    folder, modes = study.folder / "replays" / name, replayed_modes(study, name)
+    folder = study.folder / "replays" / name
+    modes = replayed_modes(folder)
     replays = {mode: StoredReplay.read(folder / mode) for mode in modes}
     now = study.sequences.identity(name)
     for mode, replay in replays.items():

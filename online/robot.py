@@ -315,7 +315,9 @@ class RobotDrive:
         setup = replace(ReplaySetup.of(study), real_time=real_time, also=())
         self._study, self._setup, self._settings = study, setup, real_time
         self._ros = config.online.ros
-        self._model = None if model_path is None else setup.model(study, model_path)
+        self._model = None if model_path is None else study.model(model_path)
+        if self._model is not None and model_path is not None:
+            setup.check(self._model, model_path)
         self._like = _like(config, study.sequences)
         self._scans: LiveScans | None = None
         self._stopped = False

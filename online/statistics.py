@@ -25,7 +25,7 @@ from adaptune.metrics import (
     window_ends,
 )
 from adaptune.reference.stored import StoredEstimate
-from adaptune.study.study import OracleErrors, Study
+from adaptune.study.study import OracleErrors, StudySequences
 from adaptune.trajectory import Trajectory, read_tum
 from online.record import ReplaySummary, StoredReplay
 
@@ -242,6 +242,11 @@ class Reference(NamedTuple):
         trajectory = read_tum(path) if path.exists() else None
         error = math.nan if stored is None else stored.error(length)
         return cls(trajectory, length, stored is not None, None if math.isnan(error) else error)
+
+    @classmethod
+    def of(cls, sequences: StudySequences, name: str, folder: Path, length: float) -> "Reference":
+        """What judges the replays of a sequence, which are in a folder; for the rest see `read`."""
+        return cls.read(folder, length, sequences.estimate(name))
 
     @property
     def kind(self) -> str:
@@ -535,15 +540,3 @@ def oracle_rows(
         )
         for mode, of in zip(ORACLES, map(float, best), strict=True)
     ]
-
-
-# From stored replays to what is drawn of them.
-
-
-def reference_of(study: Study, name: str) -> Reference:
-    """What judges the replays of a sequence.
-
-    An estimated one is computed with odometries of its own, never with the members of a bank.
-    """
-    folder, stored = study.folder / "replays" / name, study.sequences.estimate(name)
-    return Reference.read(folder, study.config.sub_trajectory, stored)

@@ -28,7 +28,7 @@ from adaptune.errors import AdaptuneError
 if TYPE_CHECKING:
     from adaptune.report.charts import Charts
     from adaptune.report.page import PageSection
-    from offline.config import OfflineStudy
+    from offline.config import OfflineStudy, OfflineStudyConfig
     from online.compare import ComparedReplays
     from online.statistics import ComparisonRow
 
@@ -322,15 +322,23 @@ def _write_page(study: "OfflineStudy", found: "ComparedReplays | str") -> None:
         The comparison, or why there is none.
     """
     from adaptune.report.page import Page, write_page
+    from offline.charts import charts_of_validation
+    from online.charts import charts_of_replays, read_replays
     from online.modes import sequences_without_model
+
+    def along(name: str) -> "Charts":
+        return charts_of_replays(read_replays(study, name))
 
     config = study.config
     # Without a test, some may have been replayed without a model.
     others = sequences_without_model(config)
     replayed = [name for name in others if (study.folder / "replays" / name).exists()]
-    sections = [_comparison(study, found)]
-    sections += [_along(study, name) for name in config.test or replayed]
-    sections += [_search(study), _validation(study), _settings(study)]
+    sections = [_comparison(found, config.sub_trajectory)]
+    names = config.test or replayed
+    sections += [_of_charts(f"Along {name}", partial(along, name)) for name in names]
+    sections.append(_search(study))
+    validation = partial(charts_of_validation, study)
+    sections += [_of_charts("With recordings left out", validation), _settings(config)]
     subtitle = (
         f"{', '.join(config.odometries)}: trained on {len(config.training)} sequences, tested on "
         f"{len(config.test)}, errors over {config.sub_trajectory:g} m, seed {config.offline.seed}"
@@ -341,7 +349,7 @@ def _write_page(study: "OfflineStudy", found: "ComparedReplays | str") -> None:
     say(f"Page: {path}; its charts as PNG and SVG: {path.parent}/figures/")
 
 
-def _comparison(study: "OfflineStudy", found: "ComparedReplays | str") -> "PageSection":
+def _comparison(found: "ComparedReplays | str", length: float) -> "PageSection":
     from adaptune.report.page import PageSection
     from online.charts import comparison_chart
     from online.tables import modes_in_words, tables
@@ -351,15 +359,8 @@ def _comparison(study: "OfflineStudy", found: "ComparedReplays | str") -> "PageS
         return PageSection(title, missing=(found,))
     chart = comparison_chart(found.rows)
     missing = () if chart else ("No ratios of errors: no sequence has a reference.",)
-    made = [*tables(found.rows, study.config.sub_trajectory), modes_in_words(found.rows)]
+    made = [*tables(found.rows, length), modes_in_words(found.rows)]
     return PageSection(title, (), missing, (chart,) if chart else (), tuple(made))
-
-
-def _along(study: "OfflineStudy", sequence: str) -> "PageSection":
-    """The section of a test sequence."""
-    from online.charts import charts_of_replays
-
-    return _of_charts(f"Along {sequence}", partial(charts_of_replays, study, sequence))
 
 
 def _search(study: "OfflineStudy") -> "PageSection":
@@ -381,13 +382,7 @@ def _search(study: "OfflineStudy") -> "PageSection":
     return replace(section, tables=(Listing(title, listed),))
 
 
-def _validation(study: "OfflineStudy") -> "PageSection":
-    from offline.charts import charts_of_validation
-
-    return _of_charts("With recordings left out", partial(charts_of_validation, study))
-
-
-def _settings(study: "OfflineStudy") -> "PageSection":
+def _settings(config: "OfflineStudyConfig") -> "PageSection":
     """The study's settings, a row each."""
     from adaptune.report.page import PageSection
     from adaptune.report.tables import Listing
@@ -399,7 +394,7 @@ def _settings(study: "OfflineStudy") -> "PageSection":
         elif value is not None:
             yield key, value
 
-    rows = [{"key": key, "value": str(v)} for key, v in leaves(study.config.resolved(), "")]
+    rows = [{"key": key, "value": str(v)} for key, v in leaves(config.resolved(), "")]
     return PageSection("Settings", tables=(Listing("The study's YAML, with its defaults", rows),))
 
 
@@ -460,7 +455,7 @@ def record(
     from online.recordings import record_replays, replayed_sequences
 
     with progress() as show:
-        names = replayed_sequences(loaded, sequences or ())
+        names = replayed_sequences(loaded.folder / "replays", loaded.config, sequences or ())
         written = [record_replays(loaded, name, show) for name in names]
     for path in written:
         say(f"{path} ({path.stat().st_size / 1e6:.1f} MB)")

@@ -5,7 +5,6 @@ import math
 import os
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 from adaptune import manifest
@@ -82,58 +81,47 @@ def ensure_references(
     refused = {}
     for name in to_estimate(study.sequences, names):
         path, before = study.sequences.estimate_path(name), study.sequences.estimate(name)
+        length = study.config.sub_trajectory
         try:
             shown = partial(progress, f"{name}, estimating its reference")
-            stored = estimated_at(study, name, path, shown)
+            stored = _estimated(study.sequences, name, length, study.open, shown)
         except EstimateError as error:
             if required:
                 raise
             refused[name] = str(error)
             continue
         if stored != before:
-            accuracy = accuracy_in_words(stored, study.config.sub_trajectory)
+            accuracy = accuracy_in_words(stored, length)
             message = "%s: its reference is estimated, %.0f m; %s (%s)"
             _log.info(message, name, stored.metres, accuracy, path)
     return refused
 
 
-def estimated_at(
-    study: Study, name: str, path: Path, advance: Callable[[int, int], None]
+def _estimated(
+    sequences: StudySequences,
+    name: str,
+    length: float,
+    begin: Callable[[], None],
+    advance: Callable[[int, int], None],
 ) -> StoredEstimate:
-    """The estimated reference of a sequence or a course in a file, made unless it is there.
-
-    Parameters
-    ----------
-    study
-        The study.
-    name
-        Of the sequence, not of a view.
-    path
-        The TUM file.
-    advance
-        Called about every scan, if it is made.
-
-    Raises
-    ------
-    EstimateError
-        If it cannot be estimated, now or when it was tried with the same scans.
-    """
+    """The estimated reference of a sequence, made unless it is there, after calling `begin`."""
+    path = sequences.estimate_path(name)
     stored, refusal = StoredEstimate.read(path), Refusal.read(path)
-    about, before = _about(study.sequences, name), stored or refusal
-    files = study.sequences.sources(name)
+    about, before = _about(sequences, name), stored or refusal
+    files = sequences.sources(name)
     changes = [] if before is None else manifest.changes(before.about, about, files)
     if changes:
         _log.info("%s: its reference is estimated again: %s", name, "; ".join(changes))
     elif stored is not None and path.exists():
         return stored
     if refusal is None or changes:
-        study.open()
-        found = _estimate(study.sequences, name, advance)
+        begin()
+        found = _estimate(sequences, name, advance)
         if isinstance(found, EstimatedReference):
-            return write_estimate(path, found, about, study.config.sub_trajectory)
+            return write_estimate(path, found, about, length)
         refusal = Refusal(about, found)
         refusal.write(path)
-    raise EstimateError(f"{study.sequences.key(name)}: {refusal.refused}")
+    raise EstimateError(f"{sequences.key(name)}: {refusal.refused}")
 
 
 def _about(sequences: StudySequences, name: str) -> dict[str, Any]:

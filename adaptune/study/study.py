@@ -359,6 +359,17 @@ class Study(Generic[C_co]):
         inputs: dict[str, Any] = manifest.plain(about | limits)
         return inputs
 
+    def replay_inputs(self, name: str) -> dict[str, Any]:
+        """What the replays of a sequence depend on in all modes, as plain data."""
+        in_real_time = self.config.online.real_time
+        return {
+            "period": self.config.online.period,
+            "real_time": in_real_time and in_real_time.model_dump(mode="json"),
+            "health": self.config.health.model_dump(mode="json"),
+            **self.odometry_inputs,
+            **self.sequences.identity(name),
+        }
+
     def archive(self, kind: str = "trials", more: Mapping[str, Any] | None = None) -> Archive:
         """The archive of the trials, or of other ones, which records what they depend on.
 

@@ -63,7 +63,10 @@ def test_all_are_compared_in_the_order_of_their_lines(replayed):
     rows = compare(replayed).rows
     assert [row.mode for row in rows] == EVERY
     assert {row.yardstick for row in rows} == {"fixed"}
-    assert compared_modes(replayed).words(replayed) == []
+    assert (
+        compared_modes(replayed).words(replayed.folder / "replays", replayed.config.online.also)
+        == []
+    )
 
 
 def test_they_do_what_their_names_say(replayed):
@@ -102,7 +105,7 @@ def test_what_is_missing_somewhere_is_told_and_left_out(own, tmp_path):
     shutil.rmtree(both.folder / "replays/four/paper")
     shutil.rmtree(both.folder / "replays/three/baseline")
     assert {row.mode for row in compare(both).rows} == {"fixed", "adaptive", "even"}
-    said = compared_modes(both).words(both)
+    said = compared_modes(both).words(both.folder / "replays", both.config.online.also)
     assert said == [
         "`baseline` is not compared: there is no replay on three; `adaptune online` makes what is "
         "missing.",
@@ -124,7 +127,7 @@ def test_what_is_missing_somewhere_is_told_and_left_out(own, tmp_path):
         ("untrained", "baseline"),
     }
     assert not any("`equal_cost` is the fixed set" in said for said in compare(both).words)
-    (said,) = compared_modes(both).words(both)
+    (said,) = compared_modes(both).words(both.folder / "replays", both.config.online.also)
     assert said.startswith("`fixed` is not compared: there is no replay on any sequence; `adaptune")
     shutil.rmtree(both.folder / "replays/four/untrained")
     with pytest.raises(StoredReplayError, match=r"three/fixed: there is no replay; run"):

@@ -15,7 +15,6 @@ from adaptune.odometry.tracker import RegisteredScan
 from adaptune.space import Selection
 from adaptune.trajectory import Trajectory
 from offline.config import load_study
-from online.modes import shared_identity
 from online.record import StoredReplayError, write_reference, write_replay
 from online.recordings import record_replays, topic
 from online.replay import Choice, ReplayRecord
@@ -66,7 +65,7 @@ def study(study_file, tmp_path):
     """A study with replays that were made up."""
     study = load_study(study_file, [], tmp_path / "run")
     folder = study.folder / "replays/three"
-    shared = shared_identity(study, "three")
+    shared = study.replay_inputs("three")
     in_time = {"rate": 1.0, "late": [0.02] * N}
     for mode, made, kept in (
         ("baseline", replay_of(along_x(0.02)), {"max_correspondence_distance": 2.0}),

@@ -12,6 +12,7 @@ from online.charts import (
     error_chart,
     map_chart,
     path_chart,
+    read_replays,
     switches,
 )
 
@@ -123,4 +124,4 @@ def test_the_map_shows_what_was_applied_where():
 def test_a_sequence_without_replays_says_so(study_file, tmp_path):
     study = load_study(study_file, [], tmp_path / "study")
     missing = ["No replays of three: run `adaptune online`."]
-    assert charts_of_replays(study, "three") == ([], missing)
+    assert charts_of_replays(read_replays(study, "three")) == ([], missing)

@@ -51,7 +51,7 @@ def test_replays_are_read_with_what_was_measured(study):
 
 
 def test_all_charts_are_made(study):
-    charts, notes = charts_of_replays(study, "three")
+    charts, notes = charts_of_replays(read_replays(study, "three"))
     keys = {chart.key for chart in charts}
     assert {"three-errors", "three-choices", "three-latency", "three-familiarity"} <= keys
     assert all(chart.caption and chart.title.startswith("three: ") for chart in charts)
@@ -80,7 +80,7 @@ def test_a_replay_that_is_too_short_is_told_and_not_drawn(study, study_file, tmp
     assert list(replayed.modes) == ["baseline", "fixed", "adaptive"]
     (said,) = replayed.refused
     assert said in compare(own).words
-    assert said in charts_of_replays(own, "three").notes
+    assert said in charts_of_replays(read_replays(own, "three")).notes
 
 
 def test_scenes_of_a_part_of_a_course_are_those_of_that_part(tmp_path):
@@ -89,10 +89,10 @@ def test_scenes_of_a_part_of_a_course_are_those_of_that_part(tmp_path):
     (name,) = study.config.test
     recording = study.sequences.recording(name).with_suffix(".tum")
     stamps = 10**9 * np.arange(41)
-    assert scenes_along(study, name, stamps) is None  # it is not recorded yet
+    assert scenes_along(study.sequences, name, stamps) is None  # it is not recorded yet
     recording.parent.mkdir(parents=True)
     recording.write_text("".join(f"{i}.000000000 {i}.0 0 0 0 0 0 1\n" for i in range(41)), "utf-8")
-    spans = scenes_along(study, name, stamps[15:])
+    spans = scenes_along(study.sequences, name, stamps[15:])
     assert spans.names == ("cave", "street")
     np.testing.assert_allclose(spans.edges, [0.0, 5.0, 25.0])
-    assert scenes_along(study, "unknown", stamps) is None
+    assert scenes_along(study.sequences, "unknown", stamps) is None

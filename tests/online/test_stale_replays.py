@@ -14,7 +14,7 @@ from adaptune.trajectory import Trajectory, write_tum
 from offline.config import load_study
 from offline.train import train
 from offline.validate import validate
-from online.charts import charts_of_replays
+from online.charts import charts_of_replays, read_replays
 from online.compare import compare, current_modes
 from online.modes import run_replays
 from online.record import StoredReplayError, check_reference
@@ -173,7 +173,7 @@ def test_what_is_refused_is_told_and_not_drawn(load):
     with pytest.raises(StoredReplayError) as caught:
         compare(other)
     assert refused == (f"{caught.value}.",)
-    charts, notes = charts_of_replays(other, "three")
+    charts, notes = charts_of_replays(read_replays(other, "three"))
     assert refused[0] in notes
     lines = {line.name for panel in charts[0].panels for line in panel.drawn}
     assert {"baseline", "fixed"} <= lines
@@ -183,7 +183,7 @@ def test_what_is_refused_is_told_and_not_drawn(load):
 def test_all_that_is_refused_for_one_reason_is_told_at_once(load):
     study = load()
     change(study.folder.parent / "three.bag")
-    charts, (said,) = charts_of_replays(study, "three")
+    charts, (said,) = charts_of_replays(read_replays(study, "three"))
     assert not charts
     assert said == (
         f"{study.folder / 'replays/three'}: baseline, fixed, adaptive were made from other "
@@ -203,7 +203,7 @@ def test_of_replays_with_different_models_those_with_the_own_one_are_drawn(load)
     assert "three/even: was made from other inputs: model changed from another to " in said
     study.model_path.unlink()
     with pytest.raises(StoredReplayError, match="different models"):
-        charts_of_replays(study, "three")
+        charts_of_replays(read_replays(study, "three"))
 
 
 def test_replays_of_another_rate_or_reference_are_not_drawn(load):
@@ -211,10 +211,10 @@ def test_replays_of_another_rate_or_reference_are_not_drawn(load):
     folder = study.folder / "replays/three/adaptive"
     rewrite(folder, real_time={"rate": 1.0})
     with pytest.raises(StoredReplayError, match="some were made in real time"):
-        charts_of_replays(study, "three")
+        charts_of_replays(read_replays(study, "three"))
     rewrite(folder, real_time=None)
     with pytest.raises(StoredReplayError, match="judged by another reference"):
-        charts_of_replays(load("sequences.three.clock_offset=0.05"), "three")
+        charts_of_replays(read_replays(load("sequences.three.clock_offset=0.05"), "three"))
 
 
 def test_other_ways_to_switch_are_not_compared(load):
