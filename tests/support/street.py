@@ -5,6 +5,7 @@ import tempfile
 import threading
 from functools import cache
 from pathlib import Path
+from queue import SimpleQueue
 
 import drives
 import numpy as np
@@ -47,17 +48,16 @@ def space_of(name):
     return Process.describe(served()).space if name == "process" else odometry_class(name).space
 
 
+def listening(where, name):
+    """Serve an odometry in a thread; returns its address."""
+    there = SimpleQueue()
+    threading.Thread(target=listen, args=(where, name, there.put), daemon=True).start()
+    return there.get(timeout=10.0)
+
+
 @cache
 def served():
-    there, ready = [], threading.Event()
-
-    def tell(at):
-        there.append(at)
-        ready.set()
-
-    threading.Thread(target=listen, args=("tcp://127.0.0.1:0", "gicp", tell), daemon=True).start()
-    assert ready.wait(10.0)
-    return Process.settings_type(address=there[0])
+    return Process.settings_type(address=listening("tcp://127.0.0.1:0", "gicp"))
 
 
 @cache

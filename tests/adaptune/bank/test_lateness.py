@@ -262,7 +262,6 @@ def test_where_all_restart_it_waits_for_them(clock):
 
 
 def tell(what):
-
     def children(process):
         path = Path(f"/proc/{process}/task/{process}/children")
         return map(int, path.read_text().split())
