@@ -1,6 +1,5 @@
 import numpy as np
 import pytest
-import turns
 
 from adaptune.bank.bank import ShortRegistrations
 
@@ -78,11 +77,3 @@ def test_scans_of_the_last_second_are_kept_and_no_others():
     for i in range(5):
         rare.add(i * 10 * SECOND, room(0.1 * i, i))
     assert np.isfinite(rare(np.array([along_x(0.1)]), (1,))).all()
-
-
-def test_real_scans():
-    short = ShortRegistrations()
-    for i in range(5):
-        short.add(i * SECOND // 10, turns.turn(i).points)
-    T = np.array([along_x(turns.STEP, 0.0, 3 * turns.STEP)])
-    assert short(T, (1,)).argmin() == 0

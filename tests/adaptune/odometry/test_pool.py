@@ -3,10 +3,11 @@ import pickle
 import pytest
 
 from adaptune.odometry import OdometryError
-from adaptune.odometry.keyframe import KeyframeGicp, KeyframeNdt
+from adaptune.odometry.base import InProcess
+from adaptune.odometry.keyframe import KeyframeGicp, KeyframeNdt, KeyframeSettings
 from adaptune.odometry.registry import OdometryFactory, OdometryPool, odometry_class
 from adaptune.odometry.remote import Limits
-from adaptune.space import ODOMETRY, SpaceError
+from adaptune.space import ODOMETRY, Float, ParameterSpace, SpaceError
 
 
 def factory(name, **settings):
@@ -42,3 +43,25 @@ def test_it_pickles():
     assert copy.space == both.space
     assert copy.space.baselines == both.space.baselines
     assert type(copy(both.space.baselines[1]).odometry) is KeyframeNdt
+
+
+SPACE = ParameterSpace({"keyframe_interval": Float(low=1.0, high=9.0, baseline=2.0)})
+
+
+def test_it_makes_what_the_name_says():
+    gicp = OdometryFactory("gicp", {"downsampling": 0.3}, SPACE, Limits())
+    instance = gicp({"keyframe_interval": 4.0})
+    assert isinstance(instance, InProcess)
+    odometry = instance.odometry
+    assert type(odometry) is KeyframeGicp
+    assert odometry.settings == gicp.settings == KeyframeSettings(downsampling=0.3)
+    given = {"keyframe_interval": 4.0, "downsampling": 0.3}
+    assert odometry.parameters == KeyframeGicp.space.baseline | given
+    # The baseline of the study's space, not the odometry's own.
+    assert gicp().odometry.parameters["keyframe_interval"] == 2.0
+    assert gicp.description == KeyframeGicp.describe(gicp.settings)
+    assert gicp.identity == {"name": "gicp", "settings": gicp.settings.model_dump(mode="json")}
+    assert "small_gicp" in gicp.versions
+    assert gicp(isolated=True).usage.memory == 0.0
+    with pytest.raises(OdometryError, match="did you mean 'gicp'"):
+        _ = OdometryFactory("gipc", {}, SPACE, Limits()).description

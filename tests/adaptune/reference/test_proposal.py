@@ -2,7 +2,9 @@ import numpy as np
 import pytest
 
 from adaptune.live.evidence import OwnError
-from adaptune.reference.check import advice, proposed_sub_trajectory
+from adaptune.recording.inspect import inspect
+from adaptune.reference.check import advice, proposed_sub_trajectory, recording_config
+from adaptune.reference.stored import EstimateError
 from adaptune.trajectory import Trajectory
 
 
@@ -53,3 +55,15 @@ def test_a_noisy_reference_needs_longer_sub_trajectories(metres, wrong, length, 
 )
 def test_who_is_fast_gets_longer_ones(metres, seconds, length):
     assert proposed_sub_trajectory(path(metres, seconds)) == length
+
+
+def test_the_sequence_is_the_one_that_inspect_proposes(study_file, tmp_path):
+    found = inspect(study_file.parent / "one.bag")
+    config = recording_config(found)
+    assert (config.points, config.reference) == ("/points", "/truth")
+    assert recording_config(found, "/other", "/gps").points == "/other"
+    assert recording_config(found, "/other", "/gps").reference == "/gps"
+    poses = tmp_path / "poses.tum"
+    poses.write_text("1 0 0 0 0 0 0 1\n2 1 0 0 0 0 0 1\n")
+    with pytest.raises(EstimateError, match="file of poses"):
+        recording_config(inspect(poses))
