@@ -420,13 +420,7 @@ def _scan_period(modes: Mapping[str, ModeReplay]) -> float:
 
 
 def histograms(times: Mapping[str, NDArray[np.float64]]) -> list[Line]:
-    """Share of each mode's times in bins that all modes have, in percent, as steps.
-
-    Parameters
-    ----------
-    times
-        By mode, positive numbers.
-    """
+    """Share of each mode's times in bins that all modes have, in percent, as steps."""
     every = np.concatenate(list(times.values()))
     edges = np.geomspace(0.99 * every.min(), 1.01 * every.max(), _BINS + 1)
     made = []

@@ -189,12 +189,7 @@ def pooled(
 ) -> list[ComparisonRow]:
     """For every mode the mean errors over all sequences, and the geometric mean of the ratios.
 
-    Parameters
-    ----------
-    judged
-        The sequences; those without a reference do not count.
-    oracles
-        Rows of the best set in hindsight, where it is known.
+    Sequences without a reference do not count. `oracles` are rows of the best set in hindsight.
     """
     known = [one for one in judged if one.rows[0].rte is not None]
     modes = [row.mode for row in known[0].rows]
@@ -258,14 +253,7 @@ def ratio_to(judged: Sequence[JudgedModes], mode: str, other: str | None = None)
     recordings are drawn, too, and it speaks of others like these. With fewer it speaks of these,
     and there is none unless each holds `MIN_BLOCKS` blocks. (The parts of one recording are one.)
     Means of few recordings vary too little in a bootstrap, hence the factor. What an estimated
-    reference errs is allowed for as on a sequence.
-
-    Parameters
-    ----------
-    judged
-        Sequences with a reference.
-    mode, other
-        Of which the errors are compared; with the yardstick's by default.
+    reference errs is allowed for as on a sequence. `other` is by default the yardstick.
     """
     pairs = [(one.pair(mode, other), one.block) for one in judged]
     value = float(np.exp(np.mean([_log(errors) for errors, _ in pairs])))

@@ -175,16 +175,7 @@ def write_replay(
 ) -> None:
     """Write ``trajectory.tum``, ``selections.csv``, ``frames.csv`` and, last, ``replay.json``.
 
-    Parameters
-    ----------
-    folder
-        Where to.
-    replay
-        The replay.
-    inputs
-        What it was made from.
-    model_file
-        The model that it was made with, if any.
+    `inputs` is what it was made from, `model_file` the model that it was made with, if any.
     """
     write_tum(folder / "trajectory.tum", replay.trajectory)
     _write_selections(folder / "selections.csv", replay)
@@ -418,16 +409,7 @@ def is_reference_of(folder: Path, about: manifest.Inputs) -> bool:
 
 
 def check_reference(folder: Path, about: manifest.Inputs, option: str = "") -> None:
-    """Refuse a reference that was made from something else.
-
-    Parameters
-    ----------
-    folder
-        Of the sequence's replays.
-    about
-        What the reference should be made from.
-    option
-        Of the command that makes it again.
+    """Refuse a reference that was made from something else; the command with `option` makes it.
 
     Raises
     ------
@@ -443,18 +425,9 @@ def check_reference(folder: Path, about: manifest.Inputs, option: str = "") -> N
 def write_reference(
     folder: Path, reference: Trajectory | None, odometry: Trajectory, about: manifest.Inputs
 ) -> None:
-    """Write ``reference.tum``, at the scans' stamps; remove it if there is none.
+    """Write ``reference.tum``, at the stamps of a replay; remove it if there is none.
 
-    Parameters
-    ----------
-    folder
-        Of the sequence's replays.
-    reference
-        Of the sequence.
-    odometry
-        A replay, which has the stamps.
-    about
-        What the reference is made from, see `adaptune.manifest`.
+    `about` is what the reference is made from, see `adaptune.manifest`.
     """
     path = folder / "reference.tum"
     if reference is None:

@@ -227,16 +227,9 @@ class Reference(NamedTuple):
 
     @classmethod
     def read(cls, folder: Path, length: float, stored: StoredEstimate | None = None) -> "Reference":
-        """Read the reference of a replayed sequence, if it has one.
+        """Read the reference of a replayed sequence, if it has one, from the folder of its replays.
 
-        Parameters
-        ----------
-        folder
-            Of its replays.
-        length
-            Metres of a sub-trajectory.
-        stored
-            What is known about the reference if it is an estimated one.
+        `stored` is what is known about an estimated one.
         """
         path = folder / "reference.tum"
         trajectory = read_tum(path) if path.exists() else None
@@ -323,17 +316,7 @@ Repeats = Mapping[str, Sequence[StoredReplay]]
 
 
 def compare_modes(name: str, replays: Repeats, reference: Reference) -> JudgedModes:
-    """Compare the modes on a sequence with `fixed`, or where it is not among them, `baseline`.
-
-    Parameters
-    ----------
-    name
-        Of the sequence.
-    replays
-        By mode, each with its repeats.
-    reference
-        Of the sequence.
-    """
+    """Compare the modes on a sequence with `fixed`, or where it is not among them, `baseline`."""
     yardstick = "fixed" if "fixed" in replays else "baseline"
     empty = [
         ComparisonRow(name, mode, None, None, 0, 0, 0, yardstick=yardstick) for mode in replays

@@ -25,12 +25,7 @@ _ERRORS = ("RTE [%]", "APE [m]", "RPE [m]", "height [%]", "KITTI [%]", "[deg/100
 def tables(rows: Sequence[ComparisonRow], length: float) -> list[Listing]:
     """The modes over all sequences, their errors on each, and errors as other tools define them.
 
-    Parameters
-    ----------
-    rows
-        Of one study.
-    length
-        Metres of a sub-trajectory.
+    `length` is a sub-trajectory's, in metres.
     """
     made = [_of_modes(rows, length)]
     if rows[-1].sequence == ALL:
@@ -64,10 +59,7 @@ def modes_in_words(rows: Sequence[ComparisonRow]) -> Listing:
 def side_by_side(studies: Mapping[str, Sequence[ComparisonRow]]) -> list[Listing]:
     """Errors of several studies on each sequence, and over all, as in the paper's Table II.
 
-    Parameters
-    ----------
-    studies
-        The rows of each by its name. Sub-trajectories of all have the same length.
+    Sub-trajectories of all have the same length.
     """
     found = {
         (name, row.sequence, row.mode): row.rte for name, rows in studies.items() for row in rows
@@ -237,10 +229,7 @@ _NOT_ADAPTIVE = ("baseline", "fixed", *RIVALS, *ORACLES, *CONTROLS)
 def verdict(rows: Sequence[ComparisonRow]) -> list[str]:
     """What the comparison says, in the order in which a user asks.
 
-    Parameters
-    ----------
-    rows
-        Of all sequences and modes, those over all sequences last.
+    The rows over all sequences come last.
     """
     last = {row.mode: row for row in rows if row.sequence == rows[-1].sequence}
     if all(row.ratio is None for row in last.values()):

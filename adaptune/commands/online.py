@@ -312,15 +312,7 @@ _BEST = 50
 
 
 def _write_page(study: "OfflineStudy", found: "ComparedReplays | str") -> None:
-    """Write all that is known of a study as one page.
-
-    Parameters
-    ----------
-    study
-        Finished, or as far as it is.
-    found
-        The comparison, or why there is none.
-    """
+    """Write all that is known of a study as one page; `found` may be why nothing is compared."""
     from adaptune.report.page import Page, write_page
     from offline.charts import charts_of_validation
     from online.charts import charts_of_replays, read_replays
