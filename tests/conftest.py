@@ -17,8 +17,6 @@ from offline import train as training
 from offline.config import load_study
 from offline.train import train
 from offline.workers import Workers
-from online.compare import compare
-from online.modes import run_replays
 
 Factory = pytest.TempPathFactory
 SUPPORT = Path(__file__).parent / "support"
@@ -106,16 +104,3 @@ def trained_folder(study_file: Path, tmp_path_factory: Factory) -> Path:
         train(load_study(study_file, [], folder))
 
     return shared(tmp_path_factory, "trained", make)
-
-
-@pytest.fixture(scope="session")
-def replayed_folder(study_file: Path, trained_folder: Path, tmp_path_factory: Factory) -> Path:
-    """The same with the replays of all modes, and their comparison; not to be changed."""
-
-    def make(folder: Path) -> None:
-        shutil.copytree(trained_folder, folder)
-        study = load_study(study_file, [], folder)
-        run_replays(study, study.model_path)
-        compare(study)
-
-    return shared(tmp_path_factory, "replayed", make)

@@ -1,7 +1,6 @@
 import json
 import os
 import queue
-import shutil
 import signal
 import socket
 import subprocess
@@ -19,6 +18,8 @@ from adaptune.keeper import descendants
 from adaptune.ros.link import LinkError
 from adaptune.ros.ros1 import local_ros1, ros_python
 from adaptune.trajectory import read_tum
+from offline.config import load_study
+from offline.train import train
 
 pytestmark = pytest.mark.services
 
@@ -148,15 +149,25 @@ def test_a_node_that_is_killed_is_noticed(link):
     assert link.alive
 
 
-def test_the_command_drives_until_ctrl_c(link, study_file, trained_folder, tmp_path):
-    folder = shutil.copytree(trained_folder, tmp_path / "run")
+def test_the_command_drives_until_ctrl_c(link, gicp_study_file, tmp_path):
+    folder = tmp_path / "run"
+    train(load_study(gicp_study_file, ["offline.trials=4"], folder))
     extra = ["-o", "online.ros.points=/velodyne", "-o", "online.ros.odometry=/found"]
     # Nothing is too late, also where the tests share a core.
     extra += ["-o", "online.real_time={deadline: 60, queue: 0}"]
     poses = taken(link, "/found", "nav_msgs/msg/Odometry")
     chosen = taken(link, "/adaptune/selection", "std_msgs/msg/String")
     cloud = link.advertise("/velodyne", "sensor_msgs/msg/PointCloud2")
-    command = [sys.executable, "-m", "adaptune", "online", str(study_file), "--ros"]
+    command = [
+        sys.executable,
+        "-m",
+        "adaptune",
+        "online",
+        str(gicp_study_file),
+        "--ros",
+        "-o",
+        "offline.trials=4",
+    ]
     process = subprocess.Popen(
         [*command, "--folder", str(folder), *extra],
         stderr=subprocess.PIPE,
