@@ -241,10 +241,7 @@ class Uncertainty:
     the squared error times the length of a sub-trajectory. The heading is taken to err by as much,
     in radians, over a sub-trajectory.
 
-    Parameters
-    ----------
-    length
-        Metres of a sub-trajectory.
+    `length` is a sub-trajectory's, in metres.
     """
 
     def __init__(self, length: float):
@@ -270,12 +267,7 @@ class Uncertainty:
 class RosMessages:
     """Makes messages of one ROS.
 
-    Parameters
-    ----------
-    store
-        Its types.
-    frame
-        Name of the odometry's frame.
+    `frame` is the name of the odometry's frame.
     """
 
     def __init__(self, store: Typestore, frame: str):

@@ -258,14 +258,7 @@ def arrivals(
 
     What an IMU measured before a scan that is dropped goes to the scan after it.
 
-    Parameters
-    ----------
-    scans
-        In order of time.
-    rate, queue
-        See `RealTimeConfig`.
-    clock
-        That the sensor goes by.
+    For `rate` and `queue` see `RealTimeConfig`; the sensor goes by `clock`.
     """
     source = iter(scans)
     ahead = next(source, None)
@@ -334,20 +327,8 @@ def replay_in_real_time(
 ) -> ReplayRecord:
     """Replay a recording at the sensor's rate.
 
-    While the odometry prepares a scan, the selector's process describes it.
-
-    Parameters
-    ----------
-    scans, odometry, health, what
-        See `online.replay.replay`.
-    settings
-        Rate, deadline and queue.
-    selector
-        Chooses the parameters; without one they stay. What is late is dropped.
-    watch
-        Called after every scan.
-    clock
-        That the sensor goes by.
+    While the odometry prepares a scan, the selector's process describes it. A selection that is
+    late is dropped. The sensor goes by `clock`; for the rest see `online.replay.replay`.
 
     Raises
     ------
@@ -368,14 +349,8 @@ def replay_in_real_time(
 class RealTimeDrive:
     """Takes scans as they come, and applies what is selected in time.
 
-    A scan is described while it is prepared.
-
-    Parameters
-    ----------
-    odometry, health, settings, selector, what, clock
-        See `replay_in_real_time`.
-    record
-        Receives what becomes of each scan and each selection.
+    A scan is described while it is prepared. `record` receives what becomes of each scan and each
+    selection; for the rest see `replay_in_real_time`.
     """
 
     def __init__(

@@ -46,14 +46,8 @@ class DriveLog:
 
     Where the disk is full, the log ends and the drive goes on.
 
-    Parameters
-    ----------
-    folder
-        Where to; it is made.
-    names
-        Of the parameters, for the columns of ``selections.csv``.
-    goes_on
-        Whether the drive goes on where nothing can be recorded from the start.
+    `names` are those of the parameters, columns of ``selections.csv``. With `goes_on`, the drive
+    goes on where nothing can be recorded from the start.
 
     Attributes
     ----------
@@ -148,15 +142,7 @@ _GAP = 1.0
 
 
 class SteeredNode(OdometryInstance):
-    """An odometry that runs elsewhere and publishes its poses.
-
-    Parameters
-    ----------
-    link
-        To the robot.
-    settings
-        The node, its topic, and how its parameters are set.
-    """
+    """An odometry that runs elsewhere and publishes its poses."""
 
     faults = ()
     rewinds = False
@@ -348,12 +334,7 @@ class RobotDrive:
 
         Where the clock goes back, all begins anew.
 
-        Parameters
-        ----------
-        link
-            To the robot.
-        look
-            Called after every scan, see `online.dashboard.Dashboard.look`.
+        `look` is called after every scan, see `adaptune.commands.dashboard.Dashboard.look`.
         """
         done = 0
         with ExitStack() as stack:
