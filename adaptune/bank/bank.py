@@ -214,29 +214,16 @@ class Lateness:
 
     A member in another process has until the next scan is due. One that needs longer is late: it
     has no motion over that scan, and takes part again as soon as it is done. Members of this
-    process are never late, for everything waits for them.
-
-    Parameters
-    ----------
-    members, names
-        Of the bank.
-    rate
-        Times as fast as recorded at which scans come; None if the bank waits for everybody.
-    clock
-        By which members are late.
+    process are never late, for everything waits for them. Scans come `rate` times as fast as
+    recorded; if that is None, the bank waits for everybody.
 
     Attributes
     ----------
     scans : ndarray of shape (n_members,)
         At how many scans each member was late.
-    removed : ndarray of shape (n_members,)
-        Members that were always late: they take no part any more.
-    away : ndarray of shape (n_members,)
-        Members that are restarting.
-    resting : ndarray of shape (n_members,)
-        Members that are given no scans; the bank says which, before each scan.
-    absent : ndarray of shape (n_members,)
-        Members that have no motion over the newest scan.
+    removed, away, resting, absent : ndarray of shape (n_members,)
+        Members that were always late and take no part any more; that are restarting; that are
+        given no scans, as the bank says before each; that have no motion over the newest scan.
     """
 
     def __init__(
@@ -372,12 +359,10 @@ class Bank(OdometryInstance):
     others restart on the scans of the last seconds, at most once a second. So does a member that a
     fault has ended, until it has had too many of them: it costs its weight, and nothing else.
     Members that rest see no scans; when they are to work again, they begin on those of the last
-    seconds, too.
+    seconds, too. `restarts` counts how often a member was restarted.
 
     Parameters
     ----------
-    make
-        Makes instances.
     sets
         Parameter sets by trial number. The first is the fixed one: it begins with all the weight.
     warm_up
@@ -390,15 +375,6 @@ class Bank(OdometryInstance):
         Times as fast as recorded at which scans come: members that are late are not waited for,
         see `Lateness`, and those that restart see scans of the past `CATCH_UP` at a time. None
         waits for all.
-    clock
-        By which members are late.
-
-    Attributes
-    ----------
-    restarts : int
-        How often a member was restarted.
-    late : Lateness
-        Which members were late.
     """
 
     def __init__(

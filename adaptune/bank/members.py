@@ -343,12 +343,9 @@ class Agreement:
     half second, the newest scan alone counts. The heaviest group of members that are all near each
     other agrees. Every member votes with its weight.
 
-    Parameters
-    ----------
-    n_members
-        Size of the bank.
-    lost_track
-        Metres a second by which motions may never differ and agree.
+    A simulation along recorded motions calls `judge` for every scan but the first, and moves by
+    `T_previous_current`. It restarts the members that are `due` as far as it can, says so by
+    `restarted`, and calls `start` where the bank itself begins anew.
 
     Attributes
     ----------
@@ -361,12 +358,6 @@ class Agreement:
         second.
     judged : bool
         Whether the short registrations decided at the last scan.
-
-    Notes
-    -----
-    A simulation along recorded motions calls `judge` for every scan but the first, and moves by
-    `T_previous_current`. It restarts the members that are `due` as far as it can, says so by
-    `restarted`, and calls `start` where the bank itself begins anew.
     """
 
     def __init__(self, n_members: int, lost_track: float):
@@ -393,7 +384,7 @@ class Agreement:
         alignment: Alignment | None = None,
         lost: bool = False,
     ) -> NDArray[np.bool_]:
-        """Which members agree at the next scan.
+        """Which members agree at the next scan, of shape (n_members,); none if none has a motion.
 
         Parameters
         ----------
@@ -409,11 +400,6 @@ class Agreement:
             believed.
         lost
             Whether the bank is known to be lost: then they are asked wherever members disagree.
-
-        Returns
-        -------
-        ndarray of shape (n_members,)
-            All False if there is no motion at all.
         """
         known = np.asarray((np.abs(T_previous_current) < _ENDLESS).all(axis=(1, 2)))
         moved = np.where(known[:, None, None], T_previous_current, np.eye(4))

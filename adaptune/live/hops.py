@@ -76,15 +76,8 @@ class Hops(NamedTuple):
 class HopCloud:
     """A scan, prepared for registrations when it is first needed.
 
-    Parameters
-    ----------
-    scan
-        The scan.
-    T_previous_current
-        The sensor's motion from the scan before, or to the next one where that is known, of shape
-        (4, 4), for motion compensation.
-    seconds
-        How long that motion took; 0 for no compensation.
+    It is motion-compensated by the sensor's motion from the scan before, of shape (4, 4), or to the
+    next one where that is known, which took so many seconds; 0 for no compensation.
     """
 
     def __init__(self, scan: Scan, T_previous_current: Poses, seconds: float):

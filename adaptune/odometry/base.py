@@ -218,24 +218,25 @@ class Odometry(ABC):
 
     A new instance knows nothing; `start` places it, `register` moves it on scan by scan. All of
     it runs on one thread, so that the same scans give the same poses. An adapter implements
-    `prepare`, `start` and `register`, and `configure` if it is `live`.
+    `prepare`, `start` and `register`, and `configure` if it is `live`. All attributes but the last
+    are of the class.
 
     Attributes
     ----------
     space : ParameterSpace
-        The parameters that can be tuned, with sensible ranges; class attribute.
+        The parameters that can be tuned, with sensible ranges.
     settings_type : type
-        Pydantic model of what is set once; class attribute.
+        Pydantic model of what is set once.
     live : bool
-        Whether `configure` may be called between scans; class attribute.
+        Whether `configure` may be called between scans.
     clean : bool
         Whether a second instance in the same process knows nothing of the first, and no scan ends
-        the process; class attribute. Others run in a process of their own.
+        the process. Others run in a process of their own.
     needs_imu : bool
-        Whether scans must bring along what an IMU measured; class attribute.
+        Whether scans must bring along what an IMU measured.
     warm_up : float
         Seconds of the last scans that a member of a bank sees when it restarts, unless a study says
-        otherwise; class attribute.
+        otherwise.
     parameters : dict
         The present value of every parameter in `space`.
 
@@ -243,14 +244,9 @@ class Odometry(ABC):
     ----------
     parameters
         Values of any of the parameters in `space`; the others keep their baseline. The caller
-        checks ranges.
+        checks ranges. There is an `OdometryError` if there is no such parameter.
     settings
         An instance of `settings_type`.
-
-    Raises
-    ------
-    OdometryError
-        If there is no such parameter.
     """
 
     space: ClassVar[ParameterSpace]

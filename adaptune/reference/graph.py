@@ -288,7 +288,7 @@ def optimised(
     places: "Positions | None" = None,
     T_first_guess: Poses | None = None,
 ) -> Poses:
-    """The poses on which motions and registrations agree best.
+    """The poses, of shape (n, 4, 4), on which motions and registrations agree best.
 
     All have robust weights: a wrong one hardly counts.
 
@@ -296,17 +296,10 @@ def optimised(
     ----------
     T_odom_sensor
         Poses of shape (n, 4, 4) whose motions from scan to scan count.
-    edges
-        The registrations.
     places
         Where scans are by other means, in about the same frame.
     T_first_guess
         Where the search begins, of shape (n, 4, 4); `T_odom_sensor` when left out.
-
-    Returns
-    -------
-    ndarray of shape (n, 4, 4)
-        The first is the identity.
     """
     import gtsam
 
@@ -348,21 +341,10 @@ class Positions(NamedTuple):
 def positions(
     priors: Trajectory, stamps: NDArray[np.int64], T_world_sensor: Poses
 ) -> Positions | None:
-    """Positions of scans once a second, such as those of a GPS, brought near to their poses.
+    """Positions of scans once a second, brought near to their poses; None if there are too few.
 
-    Parameters
-    ----------
-    priors
-        Poses of the LiDAR in any frame; only their positions count.
-    stamps
-        Of the scans, of shape (n,), in nanoseconds.
-    T_world_sensor
-        Where the scans are without them, of shape (n, 4, 4).
-
-    Returns
-    -------
-    Positions or None
-        None if there are too few.
+    Of the priors, such as those of a GPS, only positions count, in any frame. Stamps of the scans
+    are of shape (n,), in nanoseconds; their poses without priors of shape (n, 4, 4).
     """
     at = priors.at(stamps)[:, :3, 3]
     due = np.diff((stamps - stamps[0]) // _PRIORS_EVERY, prepend=-1) > 0

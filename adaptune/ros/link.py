@@ -66,19 +66,9 @@ _log = logging.getLogger(__name__)
 
 
 class Steering:
-    """Sets parameters of a node.
+    """Sets parameters of a node, through ROS, or by a program that `run` runs in place of it.
 
-    Parameters
-    ----------
-    node
-        Its name.
-    set_parameters
-        Sets them through ROS, see `adaptune.ros.link.RosLink.set_parameters`.
-    command
-        A program that sets a parameter in place of ROS, and its arguments, with ``{node}``,
-        ``{name}`` and ``{value}``.
-    run
-        Runs it.
+    The command is the program and its arguments, with ``{node}``, ``{name}`` and ``{value}``.
     """
 
     def __init__(

@@ -78,21 +78,8 @@ class Ros1:
     """A node in a running ROS 1, see `adaptune.ros.link.RosLink`.
 
     A process of its own imports ROS, so any Python that ROS was built for will do. Messages pass
-    through it as bytes.
-
-    Parameters
-    ----------
-    connection
-        Socket to the node.
-    running
-        Whether the node's process runs.
-    end
-        Waits for the process, or ends it.
-
-    Raises
-    ------
-    LinkError
-        If the node does not start, with its reason.
+    through it as bytes. `running` says whether it runs, `end` waits for it or ends it. There is a
+    `LinkError` with its reason if the node does not start.
     """
 
     def __init__(

@@ -71,7 +71,8 @@ class Ros2:
     """A `RosLink` to a robot whose ROS 2 runs on rmw_zenoh.
 
     It is a client of the robot's router. A router passes messages on to its clients, which may be
-    on any machine; the nodes on the robot reach each other without it.
+    on any machine; the nodes on the robot reach each other without it. There is a `LinkError` if
+    the extra ``ros2`` is not installed, or no router answers.
 
     Parameters
     ----------
@@ -80,16 +81,6 @@ class Ros2:
         (``tls/host:port``).
     domain
         The robot's ROS domain; None for that of the environment (``ROS_DOMAIN_ID``), or 0.
-
-    Attributes
-    ----------
-    store : Typestore
-        The types of all messages; more may be registered.
-
-    Raises
-    ------
-    LinkError
-        If the extra ``ros2`` is not installed, or no router answers.
     """
 
     store: Typestore
