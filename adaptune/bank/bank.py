@@ -47,27 +47,23 @@ class RecentScans:
 
     def __init__(self, seconds: float):
         self._seconds = seconds
-        self._past: deque[PastScan] = deque()
+        self.past: deque[PastScan] = deque()
 
     def start(self, scan: PreparedScan, T_odom_sensor: Poses, motion: Poses | None) -> None:
         """Forget all scans and begin with this one."""
-        self._past = deque([PastScan(scan, T_odom_sensor, motion)])
+        self.past = deque([PastScan(scan, T_odom_sensor, motion)])
 
     def add(self, scan: PreparedScan, T_odom_sensor: Poses) -> None:
         """Add the newest scan and drop those that are too old."""
         T_previous_current = invert(self.last.T_odom_sensor) @ T_odom_sensor
-        self._past.append(PastScan(scan, T_odom_sensor, T_previous_current))
-        while (scan.stamp - self._past[0].scan.stamp) * 1e-9 > self._seconds:
-            self._past.popleft()
+        self.past.append(PastScan(scan, T_odom_sensor, T_previous_current))
+        while (scan.stamp - self.past[0].scan.stamp) * 1e-9 > self._seconds:
+            self.past.popleft()
 
     @property
     def last(self) -> PastScan:
         """The newest scan."""
-        return self._past[-1]
-
-    def replay_to(self, odometry: OdometryInstance) -> "Successor":
-        """Start an instance with the first of these scans; the others wait for it."""
-        return Successor(odometry, self._past)
+        return self.past[-1]
 
 
 class Successor:
@@ -533,7 +529,7 @@ class Bank(OdometryInstance):
         members = members & ~np.array([member.given_up for member in self._members])
         members &= ~self.late.working
         due = [self._members[i] for i in self._apart_first if members[i]]
-        successors = [self._recent.replay_to(member) for member in due]
+        successors = [Successor(member, self._recent.past) for member in due]
         # Somebody has to go on meanwhile.
         if self._rate is None or (self.late.absent | members).all():
             catch_up_together(successors)

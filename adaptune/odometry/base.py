@@ -366,10 +366,6 @@ class PreparedScan:
             self._prepared |= [self._preparations.prepare(self.scan, instance)]
         return self._prepared[key]
 
-    def with_scan(self, scan: Scan) -> "PreparedScan":
-        """Another scan, which the same instances prepare."""
-        return PreparedScan(scan, self._preparations)
-
 
 # An odometry in this process, as an instance that can be driven.
 

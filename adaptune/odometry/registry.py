@@ -18,7 +18,6 @@ from adaptune import processes, strict
 from adaptune.errors import OdometryError
 from adaptune.odometry.base import Description, InProcess, Odometry, OdometryInstance
 from adaptune.odometry.remote import SERVICE, Guarded, Isolated, Limits
-from adaptune.odometry.wire import Served
 from adaptune.space import ParameterSet, ParameterSpace, PooledSpace
 from adaptune.strict import Mistake, in_one_line, validated
 
@@ -104,7 +103,7 @@ def odometry_class(name: str) -> type[Any]:
     return found
 
 
-def make_here(name: str, parameters: ParameterSet, settings: Any) -> tuple[Served, Description]:
+def make_here(name: str, parameters: ParameterSet, settings: Any) -> tuple[Any, Description]:
     """Make an odometry in this process."""
     cls: Any = odometry_class(check_served(name))
     try:

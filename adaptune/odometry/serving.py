@@ -4,7 +4,6 @@ import logging
 import socket
 import threading
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -45,20 +44,16 @@ def serve(reader: processes.Readable, writer: BinaryIO, name: str | None = None)
     One that is not clean runs in a process of its own.
     """
     if name is not None:
-        _check(name)
+        declare(check_served(name), {})
     processes.answer_all(reader, writer, wire.conversation(name, _make))
 
 
-def _make(name: str, parameters: ParameterSet, settings: Any) -> tuple[wire.Served, Description]:
+def _make(name: str, parameters: ParameterSet, settings: Any) -> tuple[Any, Description]:
     declared = declare(check_served(name), settings)
     if declared.clean and not is_user_class(name):
         return make_here(name, parameters, settings)
     checked, described = declared.sound(name)
     return _Guarding(name, parameters, checked, Limits()), described
-
-
-def _check(name: str) -> None:
-    declare(check_served(name), {})
 
 
 def listen(address: str, name: str, ready: Callable[[str], None]) -> None:
@@ -67,7 +62,7 @@ def listen(address: str, name: str, ready: Callable[[str], None]) -> None:
     The address is ``tcp://HOST:PORT``, any free port if that is 0, or ``unix:PATH``. `ready` is
     called with it when connections are accepted.
     """
-    _check(name)
+    declare(check_served(name), {})
     family, where = parse_address(address)
     with socket.socket(family) as server:
         server.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -115,19 +110,19 @@ def converse(name: str) -> processes.Answer:
 
 def describe(name: str) -> processes.Answer:
     """Answer what `adaptune.odometry.registry.declare` asks."""
-    return partial(_declared, name)
 
+    def answer(message: processes.Message) -> dict[str, Any]:
+        folder = message.header["folder"]
+        found = declare_here(name, message.header["settings"], Path(folder) if folder else None)
+        described = found.description
+        assert described is not None  # it is a class
+        return wire.about(described) | {
+            "warm_up": described.warm_up,
+            "whole": described.whole,
+            "clean": found.clean,
+            "module": found.module,
+            "settings": found.settings and found.settings.model_dump(mode="json"),
+            "mistakes": [[list(mistake.key), mistake.message] for mistake in found.mistakes],
+        }
 
-def _declared(name: str, message: processes.Message) -> dict[str, Any]:
-    folder = message.header["folder"]
-    found = declare_here(name, message.header["settings"], Path(folder) if folder else None)
-    described = found.description
-    assert described is not None  # it is a class
-    return wire.about(described) | {
-        "warm_up": described.warm_up,
-        "whole": described.whole,
-        "clean": found.clean,
-        "module": found.module,
-        "settings": found.settings and found.settings.model_dump(mode="json"),
-        "mistakes": [[list(mistake.key), mistake.message] for mistake in found.mistakes],
-    }
+    return answer

@@ -33,7 +33,7 @@ see `adaptune.recording.scan.ImuNoise`. The other side ends by closing the strea
 
 import resource
 from collections.abc import Callable, Mapping
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,22 +79,9 @@ def to_scan(message: Message) -> Scan:
     return Scan(message.header["stamp"], imu=imu, **columns)
 
 
-class Served(Protocol):
-    """What a served odometry does, as `Odometry` describes it; a fault is a `FaultError`."""
-
-    def prepare(self, scan: Scan) -> Any: ...
-
-    def start(
-        self, prepared: Any, T_odom_sensor: Poses, T_previous_current: Poses | None = None
-    ) -> None: ...
-
-    def register(self, prepared: Any) -> Registration: ...
-
-    def configure(self, parameters: ParameterSet) -> None: ...
-
-
-Make = Callable[[str, ParameterSet, Any], tuple[Served, Description]]
-"""Makes an odometry by its name and settings, and describes it."""
+Make = Callable[[str, ParameterSet, Any], tuple[Any, Description]]
+"""Makes an odometry by its name and settings, and describes it; what is made does what `Odometry`
+does, and a fault of it is a `FaultError`."""
 
 
 def hello(odometry: str | None, parameters: ParameterSet, settings: Any) -> dict[str, Any]:
@@ -118,7 +105,7 @@ def announced(answer: Message) -> Description:
 
 def conversation(name: str | None, make: Make) -> Answer:
     """Answer messages with an odometry: this one only, or the one that each hello names."""
-    odometry: Served | None = None
+    odometry = None
 
     def answer(message: Message) -> dict[str, Any]:
         nonlocal odometry
@@ -148,7 +135,7 @@ def _check(message: Message) -> None:
         raise OdometryError(f"the message {kind} lacks {', '.join(lacking)}")
 
 
-def _make(hello: Mapping[str, Any], only: str | None, make: Make) -> tuple[Served, dict[str, Any]]:
+def _make(hello: Mapping[str, Any], only: str | None, make: Make) -> tuple[Any, dict[str, Any]]:
     """The odometry that a hello asks for, and what the answer reports about it."""
     if (version := hello["version"]) != VERSION:
         raise OdometryError(f"adaptune speaks version {VERSION} of the protocol, not {version}")
@@ -175,7 +162,7 @@ def unpacked(found: Any) -> Registration:
         raise TypeError(f"register returned {found!r:.100}, not a Registration") from error
 
 
-def answered(odometry: Served, message: Message, prepared: Any = None) -> dict[str, Any]:
+def answered(odometry: Any, message: Message, prepared: Any = None) -> dict[str, Any]:
     """Do what a message asks of an odometry, with its own scan if none is prepared; the answer."""
     header, arrays = message
     if header["type"] == "configure":

@@ -198,14 +198,6 @@ class Ros1:
         except (OSError, ValueError) as error:
             raise LinkError("ROS 1: adaptune's node has ended") from error
 
-    def _pass_on(
-        self, take: Callable[[str, bytes], None], header: Mapping[str, Any], data: bytes
-    ) -> None:
-        try:
-            take(header["kind"].replace("/", "/msg/"), data)
-        except Exception as error:
-            _log.warning("a message on %s is lost: %s", header["topic"], in_a_line(error))
-
     def _receive(self) -> None:
         """Pass on what the node sends, until it ends."""
         try:
@@ -216,7 +208,11 @@ class Ros1:
                         waiting.put(header)
                     continue
                 if (take := self._recorded.get(header["topic"])) is not None:
-                    self._pass_on(take, header, message.arrays["data"].tobytes())
+                    try:
+                        take(header["kind"].replace("/", "/msg/"), message.arrays["data"].tobytes())
+                    except Exception as error:
+                        what = in_a_line(error)
+                        _log.warning("a message on %s is lost: %s", header["topic"], what)
                     continue
                 kind, received = self._takes[header["topic"]]
                 if header["kind"].replace("/", "/msg/") == kind:
