@@ -32,9 +32,7 @@ from adaptune.progress import Progress
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from adaptune.recording.config import SequenceConfig
     from adaptune.recording.scan import Recording
-    from adaptune.reference.check import Comparison
     from adaptune.reference.stored import Gap, StoredEstimate
     from adaptune.trajectory import Trajectory
     from offline.config import OfflineStudy
@@ -336,10 +334,16 @@ def _of_recording(
         stored = write_estimate(path, found, about, metres)
         if there is not None:
             advance = _advance(show, "given reference")
-            comparison = of_recording.beside_given(scans, there, found, metres, advance)
+            measured = of_recording.measure_reference(scans, there, advance)
     _say_estimate(stored, found.gaps(), metres)
     if there is not None:
-        _say_comparison(comparison, config, metres)
+        of = "" if config.reference is None else f" ({config.reference})"
+        say(f"Given reference{of}: {of_recording.accuracy_words(measured, metres)}.")
+        difference = of_recording.mean_difference(there.at(found.stamps), found.known_poses, metres)
+        if math.isnan(difference):
+            say(f"The two share no stretch of {metres:g} m.")
+        else:
+            say(f"The two differ by {difference:.2g} % over {metres:g} m.")
     say(f"Files: {path}, {path.with_suffix('.json').name}, {path.with_suffix('.png').name}")
     first = f"write `reference: {path}` under this sequence in a study; then "
     why = "train with it, as with a given one"
@@ -371,18 +375,6 @@ def _say_estimate(stored: "StoredEstimate", unknown: "list[Gap]", length: float)
     where = ", ".join(f"{gap.begin:.1f}-{gap.end:.1f} s ({gap.reason})" for gap in unknown)
     share = f"{100.0 * stored.unknown_share:.1f} % of the scans"
     say(f"It is unknown for {share}, which have no pose: {where} after the first scan.")
-
-
-def _say_comparison(comparison: "Comparison", config: "SequenceConfig", length: float) -> None:
-    """What the given reference is worth, and how far the two differ."""
-    from adaptune.reference.check import accuracy_words
-
-    of = "" if config.reference is None else f" ({config.reference})"
-    say(f"Given reference{of}: {accuracy_words(comparison.measured, length)}.")
-    if math.isnan(comparison.difference):
-        say(f"The two share no stretch of {length:g} m.")
-    else:
-        say(f"The two differ by {comparison.difference:.2g} % over {length:g} m.")
 
 
 def _of_study(study: "OfflineStudy") -> None:

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,7 @@ from adaptune.recording.config import ESTIMATED, SequenceConfig
 from adaptune.recording.inspect import Inspection
 from adaptune.recording.recording import position_prior
 from adaptune.recording.scan import Recording, Scan
-from adaptune.reference.stored import EstimatedReference, EstimateError, StoredEstimate
+from adaptune.reference.stored import EstimateError, StoredEstimate
 from adaptune.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -226,29 +226,6 @@ def read_prior(config: SequenceConfig, source: str) -> Trajectory:
             f"--position-prior {source}: holds no pose; name a topic or a file of poses"
         )
     return prior
-
-
-class Comparison(NamedTuple):
-    """The reference that came with a recording beside the estimated one."""
-
-    difference: float  # mean RTE of one by the other in percent; NaN without a sub-trajectory
-    measured: MeasuredReference
-
-
-def beside_given(
-    scans: Recording,
-    given: Trajectory,
-    found: EstimatedReference,
-    length: float,
-    advance: "Advance" = lambda *_: None,
-) -> Comparison:
-    """Compare an estimated reference with the one that came with the recording, and measure that.
-
-    The sub-trajectories are `length` metres long; `advance` is called after every scan.
-    """
-    measured = measure_reference(scans, given, advance)
-    T = np.where(found.known[:, None, None], found.T_world_sensor, np.nan)
-    return Comparison(mean_difference(given.at(found.stamps), T, length), measured)
 
 
 def check_writable(path: Path) -> None:

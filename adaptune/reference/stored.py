@@ -106,10 +106,14 @@ class EstimatedReference:
         known = self.known
         return Trajectory(self.stamps[known], self.T_world_sensor[known], BREAK)
 
+    @property
+    def known_poses(self) -> Poses:
+        """The poses, of shape (n, 4, 4), NaN where they are unknown."""
+        return np.asarray(np.where(self.known[:, None, None], self.T_world_sensor, np.nan))
+
     def path(self) -> float:
         """Metres travelled, as far as it is known."""
-        T = np.where(self.known[:, None, None], self.T_world_sensor, np.nan)
-        return float(travelled(T)[-1])
+        return float(travelled(self.known_poses)[-1])
 
     def unknown_share(self) -> float:
         """Share of the scans whose pose is unknown."""
