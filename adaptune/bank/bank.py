@@ -42,30 +42,6 @@ class PastScan(NamedTuple):
     T_previous_current: Poses | None
 
 
-class RecentScans:
-    """The scans of the last seconds."""
-
-    def __init__(self, seconds: float):
-        self._seconds = seconds
-        self.past: deque[PastScan] = deque()
-
-    def start(self, scan: PreparedScan, T_odom_sensor: Poses, motion: Poses | None) -> None:
-        """Forget all scans and begin with this one."""
-        self.past = deque([PastScan(scan, T_odom_sensor, motion)])
-
-    def add(self, scan: PreparedScan, T_odom_sensor: Poses) -> None:
-        """Add the newest scan and drop those that are too old."""
-        T_previous_current = invert(self.last.T_odom_sensor) @ T_odom_sensor
-        self.past.append(PastScan(scan, T_odom_sensor, T_previous_current))
-        while (scan.stamp - self.past[0].scan.stamp) * 1e-9 > self._seconds:
-            self.past.popleft()
-
-    @property
-    def last(self) -> PastScan:
-        """The newest scan."""
-        return self.past[-1]
-
-
 class Successor:
     """A new instance on its way through scans of the past, of which some are still waiting.
 
@@ -410,7 +386,8 @@ class Bank(OdometryInstance):
         self._lost = False
         self._asked, self._resting, self._waking = np.zeros((3, len(sets)), np.bool_)
         self._preparations = Preparations()
-        self._recent = RecentScans(warm_up)
+        self._past: deque[PastScan] = deque()  # of the last seconds
+        self._warm_up = warm_up
         self._last_motion = LastMotion()
 
     @property
@@ -473,7 +450,7 @@ class Bank(OdometryInstance):
         self.late.given(T_odom_sensor)
         self._agreement.start()
         self._short.start(prepared.stamp, prepared.scan.points)
-        self._recent.start(prepared, T_odom_sensor, T_previous_current)
+        self._past = deque([PastScan(prepared, T_odom_sensor, T_previous_current)])
         self._last_motion.start(T_odom_sensor, T_previous_current)
         self._asked[:] = self._waking[:] = False
         self._tell()
@@ -493,7 +470,7 @@ class Bank(OdometryInstance):
             member.submit(prepared.by(member))
 
     def collect(self) -> Registration:
-        scan, before = self._submitted, self._recent.last
+        scan, before = self._submitted, self._past[-1]
         seconds = (scan.stamp - before.scan.stamp) * 1e-9
         registrations = self.late.collect(self._apart_first[::-1], seconds)
         self._tell()
@@ -508,8 +485,11 @@ class Bank(OdometryInstance):
             self._last_motion.move(T_odom_sensor)
             return Registration(T_odom_sensor, registered=False)
         T_moved = self._agreement.T_previous_current
-        T_odom_sensor = rectify(self._recent.last.T_odom_sensor @ T_moved)
-        self._recent.add(scan, T_odom_sensor)
+        T_odom_sensor = rectify(before.T_odom_sensor @ T_moved)
+        T_before_now = invert(before.T_odom_sensor) @ T_odom_sensor
+        self._past.append(PastScan(scan, T_odom_sensor, T_before_now))
+        while (scan.stamp - self._past[0].scan.stamp) * 1e-9 > self._warm_up:
+            self._past.popleft()
         self.late.given(T_odom_sensor)
         self._last_motion.move(T_odom_sensor)
         self._catch_up()
@@ -529,12 +509,12 @@ class Bank(OdometryInstance):
         members = members & ~np.array([member.given_up for member in self._members])
         members &= ~self.late.working
         due = [self._members[i] for i in self._apart_first if members[i]]
-        successors = [Successor(member, self._recent.past) for member in due]
+        successors = [Successor(member, self._past) for member in due]
         # Somebody has to go on meanwhile.
         if self._rate is None or (self.late.absent | members).all():
             catch_up_together(successors)
             for i in np.flatnonzero(members).tolist():
-                self.late.back(i, self._recent.last.T_odom_sensor)
+                self.late.back(i, self._past[-1].T_odom_sensor)
         else:
             self._returning += successors
             self.late.away |= members
@@ -546,14 +526,14 @@ class Bank(OdometryInstance):
     def _catch_up(self) -> None:
         """Let those that restart see the newest scan, and one of them scans of the past."""
         for one in self._returning:
-            one.waiting.append(self._recent.last)
+            one.waiting.append(self._past[-1])
         if not self._returning or self._returning[0].odometry.busy:
             return
         first = self._returning[0]
         first.catch_up(CATCH_UP)
         if not first.waiting:
             i = self._members.index(first.odometry)
-            self.late.back(i, self._recent.last.T_odom_sensor)
+            self.late.back(i, self._past[-1].T_odom_sensor)
             self._agreement.restarted(np.arange(len(self._members)) == i)
             del self._returning[0]
 
