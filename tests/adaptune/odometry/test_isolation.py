@@ -174,9 +174,9 @@ def test_a_class_that_ends_the_worker_then_runs_apart(study_file, tmp_path, faul
     study = load_study(study_file, overrides, tmp_path / "study")
     with Workers(setup_of(study, factory(fault, here=True)), 1, 1e9) as workers:
         ((_, result, _),) = run(workers, [Task("one", (0,), ({"x": 0.5},), frames=True)])
-        (worker,) = workers._workers.values()
+        ((process, _),) = workers._workers.values()
         # It may end its process group.
-        assert os.getpgid(worker.process.pid) == worker.process.pid
+        assert os.getpgid(process.pid) == process.pid
     assert result.frames is not None
     assert words in result.trials[0].faults[0]
 
