@@ -96,7 +96,7 @@ def test_a_killed_worker_is_replaced(trained, study_file, tmp_path, monkeypatch)
 
     def remember(self, w):
         worker = spawn(self, w)
-        spawned.append(worker.process)
+        spawned.append(worker[0])
         return worker
 
     monkeypatch.setattr(Workers, "_spawn", remember)
@@ -118,8 +118,8 @@ def test_a_task_that_kills_every_worker_is_told(study_file, tmp_path, monkeypatc
 
     def doomed(self, w):
         worker = spawn(self, w)
-        worker.process.kill()
-        worker.process.join()
+        worker[0].kill()
+        worker[0].join()
         return worker
 
     monkeypatch.setattr(Workers, "_spawn", doomed)
