@@ -24,18 +24,15 @@ from offline.workers import Pool, Task, TaskProgress, TaskResult, run
 _log = logging.getLogger(__name__)
 
 
-def run_batches(
-    study: OfflineStudy, archive: Archive, workers: Pool[Any], progress: Progress = unseen
-) -> dict[int, Verdict]:
-    """Run all trials that are not in the archive yet, and judge all of them by trial number."""
-    return _Campaign(study, archive, workers, progress).run()
-
-
-class _Campaign:
+class Campaign:
     """Runs the searches of a study, side by side."""
 
     def __init__(
-        self, study: OfflineStudy, archive: Archive, workers: Pool[Any], progress: Progress
+        self,
+        study: OfflineStudy,
+        archive: Archive,
+        workers: Pool[Any],
+        progress: Progress = unseen,
     ):
         self._study, self._archive, self._workers = study, archive, workers
         self._progress = progress
@@ -53,6 +50,7 @@ class _Campaign:
         self._counted: dict[int, Sequence[str]] = {}
 
     def run(self) -> dict[int, Verdict]:
+        """Run all trials that are not in the archive yet, and judge all of them by number."""
         clock = Clock(self._study.folder / "elapsed.json")
         batch = 0
         while at_work := [s for s in self._searches if s.begin(clock.hours(batch))]:
@@ -156,7 +154,6 @@ def trial_tasks(
 
 
 def _mirrored(config: OfflineConfig, verdict: Verdict, finished: Finished, n: int) -> MirrorRow:
-    """A trial as the mirror receives it."""
     trials = {name: finished[name][n] for name in verdict.sequences}
     attributes = {name: trial.mean_error for name, trial in trials.items()}
     attributes["lost"] = sum(trial.lost for trial in trials.values())
@@ -262,9 +259,6 @@ def _store(archive: Archive, task: Task, result: TaskResult) -> None:
         archive.write(task.sequence, number, trial, task.whole)
 
 
-# Whole runs: the sets that may become the fixed one, driven as `adaptune online` drives them.
-
-
 WholeRuns = Mapping[str, Mapping[int, Summary]]
 """By sequence, whole runs by trial number."""
 
@@ -355,9 +349,6 @@ def baseline_warning(
     if fixed == 0:
         return f"{beaten}. So the fixed set is the baseline."
     return f"{beaten}. So the fixed set is trial {fixed}, with {whole[fixed]:.3g}."
-
-
-# Run the baselines before anything else: a setup in which one fails is stopped at once.
 
 
 MAX_SHARE_WITHOUT_POSE = 0.1

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,13 +27,10 @@ from adaptune.report.charts import (
 )
 from adaptune.space import ODOMETRY, Categorical, Float, Integer, ParameterSet, ParameterSpace
 from adaptune.space import label as parameter_label
-from adaptune.study.study import Study
 from offline.config import OfflineConfig, OfflineStudy
 from offline.objective import judge, label, pareto_front, weighted
 from offline.storage import distribution
 from offline.tuning import figures
-
-# The finished trials of a study as columns, for charts.
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +81,9 @@ def read_trials(study: OfflineStudy) -> TrialTable:
     """Read the finished trials of a study on its training sequences; there may be none."""
     archive = Archive(study.folder / "trials")
     finished = {name: archive.finished(name) for name in study.training}
-    return trial_table(study.config.offline, study.odometry.space, finished, fixed_set(study))
+    path = study.folder / "fixed.yaml"  # which the offline stage writes at its end
+    fixed = files.Document.of_file(path).data if path.exists() else None
+    return trial_table(study.config.offline, study.odometry.space, finished, fixed)
 
 
 def trial_table(
@@ -92,18 +92,9 @@ def trial_table(
     finished: Mapping[str, Mapping[int, Summary]],
     fixed: ParameterSet | None = None,
 ) -> TrialTable:
-    """Finished trials as columns.
+    """Finished trials as columns: by training sequence, `finished` has them by their numbers.
 
-    Parameters
-    ----------
-    config
-        Its first objective and its limits count.
-    space
-        The parameters.
-    finished
-        By training sequence the finished trials by their numbers.
-    fixed
-        The fixed set, if it is chosen.
+    Of `config`, the first objective and the limits count; `fixed` is the fixed set, once chosen.
     """
     numbers = sorted({number for trials in finished.values() for number in trials})
     n, objective = len(numbers), config.objective[0]
@@ -127,12 +118,6 @@ def trial_table(
     )
 
 
-def fixed_set(study: Study) -> ParameterSet | None:
-    """The fixed set that the offline stage has chosen; None before."""
-    path = study.folder / "fixed.yaml"
-    return files.Document.of_file(path).data if path.exists() else None
-
-
 _SPREAD = 20.0
 """Largest over least value from which on an axis of a Pareto front is logarithmic."""
 FEW = 8
@@ -146,17 +131,7 @@ _COLOURED = 4.0
 def scatter_chart(
     table: TrialTable, parameters: Sequence[str], sequences: Sequence[str]
 ) -> Chart | None:
-    """Two parameters of all trials, coloured by the error: on each sequence, and in the mean.
-
-    Parameters
-    ----------
-    table
-        The trials.
-    parameters
-        The names of two.
-    sequences
-        Names of training sequences.
-    """
+    """Two parameters of all trials, coloured by the error: on each sequence, and in the mean."""
     if len(parameters) != 2:
         return None
     x_axis, y_axis = (parameter_axis(name, table.space.parameters[name]) for name in parameters)
@@ -210,7 +185,8 @@ def iteration_chart(table: TrialTable) -> Chart | None:
         values, title = table.values, ""
         if slot:
             # A search of its own is on one sequence.
-            of = max(table.by_sequence, key=lambda n: _n_known(table.by_sequence[n][slots == slot]))
+            n_known = {n: np.isfinite(v[slots == slot]).sum() for n, v in table.by_sequence.items()}
+            of = max(n_known, key=n_known.__getitem__)
             values, title = table.by_sequence[of], f"{of} alone"
         kept = (slots == slot) & np.isfinite(values)
         number, errors = table.numbers[kept] - OF_SLOT * slot, values[kept]
@@ -236,10 +212,6 @@ def iteration_chart(table: TrialTable) -> Chart | None:
         "limits. A flat end means that more trials promise little.",
         columns=min(2, len(panels)),
     )
-
-
-def _n_known(values: NDArray[np.float64]) -> int:
-    return int(np.isfinite(values).sum())
 
 
 def sensitivity_chart(table: TrialTable) -> Chart | None:
@@ -299,16 +271,9 @@ def pareto_chart(
 ) -> Chart:
     """The Pareto front and all sets, one panel for each two consecutive objectives.
 
-    Parameters
-    ----------
-    names
-        Of the objectives, with their units.
-    values
-        Of all sets that keep the limits, of shape (n, n_objectives).
-    front
-        Of those on the front, by a rising first objective.
-    marked
-        By name the values of the sets to mark.
+    `names` has the objectives with their units, `values` those of all sets that keep the limits, of
+    shape (n, n_objectives), `front` the same by a rising first objective, `marked` by name those of
+    the sets to mark.
     """
     panels = []
     for i in range(len(names) - 1):
@@ -326,9 +291,6 @@ def pareto_chart(
     return Chart("pareto", title, tuple(panels), columns=2)
 
 
-# Axes of parameters: their unit, their scale, and their categories.
-
-
 Parameter = Float | Integer | Categorical
 
 
@@ -340,20 +302,9 @@ def parameter_axis(name: str, parameter: Parameter) -> Axis:
 
 
 def on_axis(values: Sequence[Any], parameter: Parameter) -> NDArray[np.float64]:
-    """Where values are on this axis, of shape (n,); NaN for None.
-
-    Parameters
-    ----------
-    values
-        Values of the parameter; None where a set has none.
-    parameter
-        The parameter.
-    """
+    """Where values of a parameter are on its axis, of shape (n,); NaN where a set has none."""
     at = parameter.index if isinstance(parameter, Categorical) else float
     return np.array([np.nan if value is None else at(value) for value in values], np.float64)
-
-
-# Which parameters matter: importances by Optuna, and what is drawn of them.
 
 
 FOREST: Any = {"n_trees": 16, "max_depth": 8, "seed": 0}
@@ -364,17 +315,8 @@ def importances(table: TrialTable) -> dict[str, float]:
     """Share of each parameter in the variance of the error's logarithm, by falling share.
 
     It is functional ANOVA, Optuna's default, on a small forest: Optuna's own takes minutes for some
-    thousand trials, and gives the same shares.
-
-    Parameters
-    ----------
-    table
-        Trials of one odometry.
-
-    Returns
-    -------
-    dict
-        Empty with fewer than `FEW` finished trials, one parameter, or equal errors.
+    thousand trials, and gives the same shares. The trials are of one odometry. There is none with
+    fewer than `FEW` finished trials, one parameter, or equal errors.
     """
     known = table.some(np.isfinite(table.values) & (table.values > 0.0))
     parameters = {
@@ -406,13 +348,7 @@ def importances(table: TrialTable) -> dict[str, float]:
 
 
 def importance_chart(by_odometry: Mapping[str, Mapping[str, float]]) -> Chart | None:
-    """Importance of each parameter, a panel for each odometry.
-
-    Parameters
-    ----------
-    by_odometry
-        What `importances` found, by the name of the odometry; "" if there is only one.
-    """
+    """What `importances` found, a panel for each odometry; "" if there is only one."""
     panels = []
     for odometry, shares in by_odometry.items():
         if not shares:
@@ -434,9 +370,6 @@ def importance_chart(by_odometry: Mapping[str, Mapping[str, float]]) -> Chart | 
     )
 
 
-# Charts of what `adaptune validate` found.
-
-
 MOST_NAMED = 8
 """With more recordings, stretches do not show of which they are."""
 RATIO = "error over the fixed set's [-]"
@@ -444,13 +377,7 @@ _FACTS = ("recording", "stretch", "fixed [%]")
 
 
 def stretch_chart(rows: Sequence[Mapping[str, Any]]) -> Chart | None:
-    """Ratio to the fixed set's error on every stretch left out, sorted: a panel for each mode.
-
-    Parameters
-    ----------
-    rows
-        Of ``stretches.json``.
-    """
+    """Ratio to the fixed set's error on every stretch left out, sorted: a panel for each mode."""
     recordings = [str(row["recording"]) for row in rows]
     panels = []
     for mode in (key for key in (rows[0] if rows else {}) if key not in _FACTS):
@@ -501,11 +428,11 @@ def charts_of_trials(study: OfflineStudy) -> Charts:
     table = read_trials(study)
     if not len(table):
         return Charts([], ["No trials: run `adaptune offline`."])
-    return charts_of(_of_trials(study, table))
+    return charts_of(_of_trials(table))
 
 
-def _of_trials(study: OfflineStudy, table: TrialTable) -> Iterator[Chart | str | None]:
-    names = [name for name in study.training if OF_VIEW not in name]
+def _of_trials(table: TrialTable) -> Iterator[Chart | str | None]:
+    names = [name for name in table.by_sequence if OF_VIEW not in name]
     if (n := len(table.space.parameters)) > MOST_PANELS:
         yield f"Of {n} parameters, the charts show the first {MOST_PANELS}."
     found = {name: importances(of) for name, of in table.shared().odometries().items()}
@@ -533,7 +460,7 @@ def most_important(table: TrialTable, shares: Mapping[str, float]) -> list[str]:
     return [*shares, *(name for name in every if name not in shares)][:2]
 
 
-def charts_of_validation(study: Study) -> Charts:
+def charts_of_validation(folder: Path) -> Charts:
     """The chart of what `adaptune validate` found, or what is missing.
 
     Raises
@@ -541,7 +468,7 @@ def charts_of_validation(study: Study) -> Charts:
     AdaptuneError
         If its file is not as `adaptune validate` wrote it.
     """
-    path = study.folder / "stretches.json"
+    path = folder / "stretches.json"
     if not path.exists():
         return Charts([], ["No validation: run `adaptune validate`."])
     try:

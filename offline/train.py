@@ -1,10 +1,11 @@
 """The offline stage: run the trials, choose the fixed set, fit the error model."""
 
+import contextlib
 import hashlib
 import json
 import logging
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from adaptune import files, manifest
-from adaptune.archive import Archive, Summary
+from adaptune.archive import Archive
 from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
 from adaptune.metrics import cap
@@ -34,19 +35,19 @@ from adaptune.study.references import (
 )
 from adaptune.study.study import BANK, ONE_SET, OracleErrors, expected_in_words, oracle_errors
 from offline.campaign import (
+    Campaign,
     WholeRuns,
     baseline_warning,
     mean_values,
     run_baseline,
-    run_batches,
     run_whole,
     trial_tasks,
     watch_tasks,
     whole_values,
 )
 from offline.charts import pareto_chart
-from offline.config import TIMED, Metric, OfflineConfig, OfflineStudy
-from offline.labelled import LabelledData, measured_costs
+from offline.config import TIMED, Metric, OfflineConfig, OfflineStudy, OfflineStudyConfig
+from offline.labelled import LabelledData, labelled_data, measured_costs
 from offline.objective import (
     Verdict,
     affordable,
@@ -130,11 +131,7 @@ def doubts(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     ]
 
 
-def train(
-    study: OfflineStudy,
-    progress: Progress = unseen,
-    cluster: str | None = None,
-) -> Training:
+def train(study: OfflineStudy, progress: Progress = unseen, cluster: str | None = None) -> Training:
     """Estimate the references that are lacking, run the trials that are, and fit the model.
 
     The study's folder receives the archive, the error model, the fixed set (``fixed.yaml``),
@@ -147,16 +144,14 @@ def train(
     AdaptuneError
         If a sequence, its reference or the odometry cannot be used, or no set keeps the limits.
     """
-    _ensure_references(study, progress)
-    study.open()
+    archive = _ready_archive(study, progress)
     config = study.config.offline
     if timed := " and ".join(sorted(config.metrics & set(TIMED))):
         _log.warning("%s differ from run to run: another run will not find the same sets", timed)
-    archive = _renewed_archive(study)
     names, space = study.training, study.odometry.space
     with trial_workers(study, names, cluster) as workers:
         run_baseline(study, archive, workers, progress)
-        verdicts = run_batches(study, archive, workers, progress)
+        verdicts = Campaign(study, archive, workers, progress).run()
         finished = {
             name: {n: archive.finished(name)[n] for n, v in verdicts.items() if name in v.sequences}
             for name in names
@@ -171,7 +166,9 @@ def train(
         sets = {n: verdicts[n].parameters for n in sorted({0, *best, *rivals})}
         whole = run_whole(names, sets, study.config.health, archive, workers, progress)
     fixed, remark = _fixed(config, verdicts, best, whole)
-    before = _stored_model(study.model_path)
+    before = None
+    with contextlib.suppress(ModelError):
+        before = ErrorModel.load(study.model_path)
     model = _fitted(study, archive, verdicts, fixed, before)
     write_text(study.folder / "fixed.yaml", files.dump(verdicts[fixed].parameters))
     table = _trial_rows(config, space, verdicts, finished)
@@ -186,12 +183,24 @@ def train(
     said += [*estimates_in_words(estimates, model.length, intervals=True)]
     said += doubts(rows)
     said += baseline_words(config, [trials[0] for trials in finished.values()])
-    means = {name: _means(trials, verdicts) for name, trials in finished.items()}
+    means = {
+        name: [trials[n].mean_error if n in trials else np.nan for n in verdicts]
+        for name, trials in finished.items()
+    }
     return Training(model, means, fixed, rows, remark, said)
 
 
-def _renewed_archive(study: OfflineStudy) -> Archive:
-    """The archive, without trials of other inputs than now."""
+def _ready_archive(study: OfflineStudy, progress: Progress) -> Archive:
+    """The archive without trials of other inputs than now; references are there, or estimated."""
+    for name in study.config.training:
+        of = study.sequences.recordings.get(name)
+        if of is not None and of.reference == NO_REFERENCE:
+            raise AdaptuneError(
+                f"{study.sequences.key(name)}: training needs a reference trajectory; name its "
+                f"topic or file, or leave `reference` out to have it estimated"
+            )
+    ensure_references(study, study.training, progress)
+    study.open()
     archive = study.archive(more={"offline": study.config.search_inputs})
     if archive.renew(study.training):
         # The search is told again what has been run; where nothing has, its time begins anew.
@@ -200,18 +209,6 @@ def _renewed_archive(study: OfflineStudy) -> Archive:
             path.unlink()
     archive.tidy()
     return archive
-
-
-def _means(trials: Mapping[int, Summary], numbers: Iterable[int]) -> list[float]:
-    """Mean errors of trials in percent, NaN of those that were not run."""
-    return [trials[n].mean_error if n in trials else np.nan for n in numbers]
-
-
-def _stored_model(path: Path) -> ErrorModel | None:
-    try:
-        return ErrorModel.load(path)
-    except ModelError:
-        return None
 
 
 def changes(before: ErrorModel, after: ErrorModel) -> list[str]:
@@ -239,18 +236,6 @@ def _driven(model: ErrorModel) -> tuple[str, str]:
     }
     expected = model.expected.get(way) if way else None
     return of[way], "no gain" if expected is None else expected_in_words(expected)
-
-
-def _ensure_references(study: OfflineStudy, progress: Progress) -> None:
-    """Estimate what is lacking; refuse what is without, before any stored trial is removed."""
-    for name in study.config.training:
-        of = study.sequences.recordings.get(name)
-        if of is not None and of.reference == NO_REFERENCE:
-            raise AdaptuneError(
-                f"{study.sequences.key(name)}: training needs a reference trajectory; name its "
-                f"topic or file, or leave `reference` out to have it estimated"
-            )
-    ensure_references(study, study.training, progress)
 
 
 def _sets_of(space: ParameterSpace, verdicts: Mapping[int, Verdict]) -> ParameterSets:
@@ -290,18 +275,32 @@ def _fitted(
     before: ErrorModel | None,
 ) -> ErrorModel:
     """The study's error model: the one before, if that was fitted to just this, or fitted now."""
-    settings = study.config.offline.model_dump(mode="json", exclude={*BUDGETS, "workers"})
+    config, inputs = study.config, study.model_inputs
+    settings = config.offline.model_dump(mode="json", exclude={*BUDGETS, "workers"})
     provenance = {"versions": study.odometry.versions} | settings
-    inputs = study.model_inputs
     provenance |= {"inputs": manifest.digest(inputs)}
     estimates = estimates_of(study.sequences, study.training)
-    if judged := estimates_as_data(estimates, study.config.sub_trajectory):
+    if judged := estimates_as_data(estimates, config.sub_trajectory):
         provenance |= {"estimated_references": judged}
-    provenance |= {"evidence": _evidence(study, archive, verdicts, fixed, provenance)}
+    provenance["evidence"] = _evidence(
+        config, study.window, archive, study.training, verdicts, fixed, provenance
+    )
     if before is not None and before.provenance == provenance:
         manifest.record(study.model_inputs_path, inputs)
         return before
-    model = _fit(study, archive, verdicts, fixed, provenance)
+    feasible = {n: verdict for n, verdict in verdicts.items() if verdict.feasible}
+    data = labelled_data(
+        archive,
+        {name: [n for n, v in feasible.items() if name in v.sequences] for name in study.training},
+        _sets_of(study.odometry.space, feasible),
+        config,
+        study.window,
+        study.sequences.recorded_in,
+        study.odometry,
+    )
+    identity, length = study.odometry.identity, config.sub_trajectory
+    model = fit(data, fixed, identity, length, study.window, provenance)
+    model = tuned(model, data, config.online.switching)
     if before is not None and before.digest == model.digest:
         model = replace(model, validation=before.validation)
     model.save(study.model_path)
@@ -310,63 +309,36 @@ def _fitted(
 
 
 def _evidence(
-    study: OfflineStudy,
+    config: OfflineStudyConfig,
+    window: int,
     archive: Archive,
+    names: Sequence[str],
     verdicts: Mapping[int, Verdict],
     fixed: int,
     provenance: Mapping[str, Any],
 ) -> str:
     """Digest of everything that a model of the study depends on."""
-    config = study.config
     trials = {
         name: [
             (n, run.parameters, run.mean_error, run.lost, judge(config.offline, [run]).values)
             for n, run in sorted(archive.finished(name).items())
             if n in verdicts and name in verdicts[n].sequences
         ]
-        for name in study.training
+        for name in names
     }
-    settings = (config.sub_trajectory, config.lost_track, study.window, config.online.period)
+    settings = (config.sub_trajectory, config.lost_track, window, config.online.period)
     switching = config.online.switching.model_dump(mode="json", include={"size", "sets"})
     feasible = [n for n, verdict in verdicts.items() if verdict.feasible]
     budget = config.online.budget
-    about = [provenance, trials, settings, switching, budget, feasible, fixed, list(study.training)]
+    about = [provenance, trials, settings, switching, budget, feasible, fixed, list(names)]
     found = hashlib.blake2b(json.dumps(about).encode(), digest_size=16)
-    for name in study.training:
+    for name in names:
         frames = archive.read_frames(name)
         described = (frames.stamps, frames.T_ref_sensor, frames.descriptors, frames.elevations)
         # Not the time that hops took, which differs from run to run.
         for array in (*described, *frames.hops):
             found.update(np.ascontiguousarray(array).tobytes())
     return found.hexdigest()
-
-
-def _fit(
-    study: OfflineStudy,
-    archive: Archive,
-    verdicts: Mapping[int, Verdict],
-    fixed: int,
-    provenance: dict[str, Any],
-) -> ErrorModel:
-    """Fit the error model to the trials of all sets that keep the limits."""
-    # They import scikit-learn and compiled code.
-    from offline.labelled import labelled_data
-
-    feasible = {n: verdict for n, verdict in verdicts.items() if verdict.feasible}
-    sets = _sets_of(study.odometry.space, feasible)
-    run = {name: [n for n, v in feasible.items() if name in v.sequences] for name in study.training}
-    data = labelled_data(
-        archive,
-        run,
-        sets,
-        study.config,
-        study.window,
-        study.sequences.recorded_in,
-        study.odometry,
-    )
-    length = study.config.sub_trajectory
-    model = fit(data, fixed, study.odometry.identity, length, study.window, provenance)
-    return tuned(model, data, study.config.online.switching)
 
 
 def _trial_rows(
@@ -450,9 +422,6 @@ def _write_pareto(
     draw_chart(chart, folder / "pareto.png", folder / "pareto.svg")
 
 
-# Fit the error model to the labelled data set.
-
-
 def fit(
     data: LabelledData,
     fixed: int,
@@ -524,9 +493,6 @@ def named_members(
         "twice; the bank is chosen without them (trials.csv lists the sets)"
     )
     return []
-
-
-# Trials of a model's sets on the test sequences, to know the best choice in hindsight.
 
 
 def run_oracle(

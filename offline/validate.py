@@ -60,9 +60,6 @@ PAIRED = RULES[0]
 BANK_SIZE = 4
 """Its members, unless the study says otherwise."""
 
-Interval = tuple[float, float] | None
-"""The ends, where they are known."""
-
 
 class ValidationError(AdaptuneError):
     """A study that cannot be validated."""
@@ -91,7 +88,7 @@ class LeftOut(NamedTuple):
             return np.zeros(len(self.errors["fixed"]), np.intp)
         return self.stretch
 
-    def interval(self, mode: str) -> Interval:
+    def interval(self, mode: str) -> tuple[float, float] | None:
         """95 % interval of the ratio to the fixed set's error, see `bootstrap`.
 
         It is about this sequence, and says nothing about other places.
@@ -169,11 +166,6 @@ class Validation:
     def modes(self) -> list[str]:
         """`PAIRED`, and what it is compared with."""
         return [mode for mode in dict.fromkeys((PAIRED, ONE_SET, *RULES)) if mode in self.ratios]
-
-    @property
-    def default(self) -> str:
-        """The first of them."""
-        return (*self.modes, RULES[0])[0]
 
     def figures(self, mode: str, other: str = "fixed") -> Figures:
         """What is expected of a mode elsewhere, compared with another one."""
@@ -331,7 +323,9 @@ def leave_out(
     costs, of_rivals = _rivals(others, chosen, data.fixed, adapted)
     errors |= {name: capped[:, data.sets.column(trial)] for name, trial in of_rivals.items()}
     of_periods = np.array([capped[period == p].mean(axis=0) for p in range(len(first))])
-    errors |= _oracles(capped, of_periods[period])
+    # The best set in hindsight, of the whole sequence and of each frame's period.
+    errors["oracle, sequence"] = capped[:, int(np.argmin(capped.mean(axis=0)))]
+    errors["oracle, period"] = capped[frames, of_periods[period].argmin(axis=1)]
     return LeftOut(
         sequence.name,
         errors,
@@ -358,17 +352,6 @@ def _rivals(
     return of | {name: costs.alone(trial) for name, trial in found.items()}, found
 
 
-def _oracles(
-    capped: NDArray[np.float64], of_periods: NDArray[np.float64]
-) -> dict[str, NDArray[np.float64]]:
-    """Errors of the best set in hindsight, of a whole sequence and of each frame's period."""
-    frames = np.arange(len(capped))
-    return {
-        "oracle, sequence": capped[:, int(np.argmin(capped.mean(axis=0)))],
-        "oracle, period": capped[frames, of_periods.argmin(axis=1)],
-    }
-
-
 def _simulate(
     sequence: LabelledSequence,
     others: LabelledData,
@@ -383,9 +366,6 @@ def _simulate(
     return bank_errors(sequence, weights), float(1.0 - weights.weights[:, 0].mean())
 
 
-# The command `adaptune validate`.
-
-
 class Validated(NamedTuple):
     """Result of `validate`."""
 
@@ -396,10 +376,7 @@ class Validated(NamedTuple):
     verdicts: list[str]
 
 
-def validate(
-    study: OfflineStudy,
-    progress: Progress = unseen,
-) -> Validated:
+def validate(study: OfflineStudy, progress: Progress = unseen) -> Validated:
     """Validate the selection rules on a study's training sequences.
 
     The study's folder receives ``validation`` (CSV, JSON and a picture) and ``stretches`` (CSV,
@@ -412,7 +389,12 @@ def validate(
     ValidationError
         If there is only one stretch.
     """
-    model = _checked_model(study)
+    model = study.model()
+    if (study.training, study.window) != (model.sequences, model.window):
+        raise ModelError(
+            f"{study.model_path}: was fitted to other training sequences or descriptors than the "
+            f"study's; run `adaptune offline` again"
+        )
     data = _labelled(study, model)
     online = driven(study, model)
     bank: int | list[int] = 0
@@ -470,11 +452,9 @@ def _labelled(study: OfflineStudy, model: ErrorModel) -> LabelledData:
     """The labelled data set of the sets that were run on all training sequences."""
     complete = np.flatnonzero(~np.isnan(model.errors).any(axis=0))
     sets = model.sets.subset([model.sets.trials[column] for column in complete])
-    run = {name: list(sets) for name in model.sequences}
-    archive = Archive(study.folder / "trials")
     data = labelled_data(
-        archive,
-        run,
+        Archive(study.folder / "trials"),
+        {name: list(sets) for name in model.sequences},
         sets,
         study.config,
         study.window,
@@ -489,16 +469,6 @@ def _labelled(study: OfflineStudy, model: ErrorModel) -> LabelledData:
     return data
 
 
-def _checked_model(study: OfflineStudy) -> ErrorModel:
-    path, model = study.model_path, study.model()
-    if (study.training, study.window) != (model.sequences, model.window):
-        raise ModelError(
-            f"{path}: was fitted to other training sequences or descriptors than the study's; run "
-            f"`adaptune offline` again"
-        )
-    return model
-
-
 def _rate(data: LabelledData) -> float:
     """Scans a second."""
     stamps = [s.simulation.stamps for s in data.sequences if s.simulation is not None]
@@ -511,11 +481,16 @@ def _rows(validation: Validation, rate: float) -> list[dict[str, Any]]:
 
     Costs become cores by the `rate` in scans a second.
     """
-    default = validation.default
+    default = (*validation.modes, PAIRED)[0]
     modes = [mode for mode in validation.ratios if mode != "fixed"]
     rows: list[dict[str, Any]] = []
 
-    def add(name: str, fixed: float | None, of: dict[str, float], interval: Interval) -> None:
+    def add(
+        name: str,
+        fixed: float | None,
+        of: dict[str, float],
+        interval: tuple[float, float] | None = None,
+    ) -> None:
         rows.append({"left out": name, "fixed [%]": fixed})
         for mode in modes:
             rows[-1][mode] = of[mode]
@@ -528,9 +503,9 @@ def _rows(validation: Validation, rate: float) -> list[dict[str, Any]]:
         add(sequence.name, sequence.errors["fixed"].mean(), of, sequence.interval(default))
     costs = {mode: validation.cost(mode) for mode in ["fixed", *modes]}
     if np.isfinite(list(costs.values())).any():
-        add("ms a scan", costs["fixed"], costs, None)
+        add("ms a scan", costs["fixed"], costs)
         cores = {mode: 1e-3 * rate * cost for mode, cost in costs.items()}
-        add("cores", cores["fixed"], cores, None)
+        add("cores", cores["fixed"], cores)
     summaries = {mode: validation.summary(mode) for mode in modes}
     for key in ("geometric", "arithmetic", "worst_tenth", "worst"):
         ends = summaries[default]["low"], summaries[default]["high"]

@@ -329,7 +329,7 @@ def _write_page(study: "OfflineStudy", found: "ComparedReplays | str") -> None:
     names = config.test or replayed
     sections += [_of_charts(f"Along {name}", partial(along, name)) for name in names]
     sections.append(_search(study))
-    validation = partial(charts_of_validation, study)
+    validation = partial(charts_of_validation, study.folder)
     sections += [_of_charts("With recordings left out", validation), _settings(config)]
     subtitle = (
         f"{', '.join(config.odometries)}: trained on {len(config.training)} sequences, tested on "

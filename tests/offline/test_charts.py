@@ -143,12 +143,12 @@ def test_each_of_several_odometries_has_a_scatter(tmp_path):
 
 
 def test_validation_is_read_or_missed(study):
-    assert charts_of_validation(study) == ([], ["No validation: run `adaptune validate`."])
+    assert charts_of_validation(study.folder) == ([], ["No validation: run `adaptune validate`."])
     study.folder.mkdir()
     row = {"recording": "one", "fixed [%]": 0.5}
     rows = [row | {"stretch": i, "adaptive": 0.8 + 0.01 * i} for i in range(4)]
     (study.folder / "stretches.json").write_text(json.dumps(rows), "utf-8")
-    charts, notes = charts_of_validation(study)
+    charts, notes = charts_of_validation(study.folder)
     assert [chart.key for chart in charts] == ["stretches"]
     assert notes == []
 
@@ -164,7 +164,7 @@ def test_a_damaged_validation_is_named(study, text):
     (study.folder).mkdir(exist_ok=True)
     (study.folder / "stretches.json").write_text(text, "utf-8")
     with pytest.raises(AdaptuneError, match=r"stretches\.json: is damaged .*adaptune validate"):
-        charts_of_validation(study)
+        charts_of_validation(study.folder)
 
 
 def stretches(n_recordings=2, n=6):

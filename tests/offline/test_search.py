@@ -15,7 +15,7 @@ import pytest
 from adaptune.archive import Archive, Summary
 from adaptune.model import ErrorModel
 from adaptune.space import Categorical, ParameterSets, ParameterSpace
-from offline.campaign import run_batches
+from offline.campaign import Campaign
 from offline.config import OfflineConfig, load_study
 from offline.labelled import labelled_data
 from offline.objective import Verdict, best_by_trials
@@ -56,7 +56,7 @@ def error(sequence, parameters):
 def run(study):
     pool = drawn.Drawn(error)
     archive = Archive(study.folder / "trials")
-    verdicts = run_batches(study, archive, pool)
+    verdicts = Campaign(study, archive, pool).run()
     seen = {
         n: [name for name in NAMES if n in archive.finished(name)]
         for n in sorted(set().union(*(archive.finished(name) for name in NAMES)))
@@ -140,7 +140,7 @@ def test_sequences_are_added_and_removed(study_of, sampler, kind):
     def run_on(names, trials, folder=None):
         study = study_of(folder, trials=trials, training=names, **given)
         pool = drawn.Drawn(error)
-        verdicts = run_batches(study, Archive(study.folder / "trials"), pool)
+        verdicts = Campaign(study, Archive(study.folder / "trials"), pool).run()
         return study.folder, verdicts, {(t.sequence, n) for t in pool.tasks for n in t.numbers}
 
     folder, first, _ = run_on(["two", "one"], 10)

@@ -5,7 +5,7 @@ from drives import STUDY
 
 from adaptune.archive import Archive
 from adaptune.space import ODOMETRY
-from offline.campaign import run_batches
+from offline.campaign import Campaign
 from offline.config import load_study
 
 NAMES = ["one", "two", "three"]
@@ -45,7 +45,7 @@ def study_of(study_file, tmp_path):
 
 def run(study):
     archive = Archive(study.folder / "trials")
-    verdicts = run_batches(study, archive, Drawn(error))
+    verdicts = Campaign(study, archive, Drawn(error)).run()
     return verdicts, {n: verdict.parameters for n, verdict in verdicts.items()}
 
 
