@@ -26,9 +26,6 @@ from adaptune.strict import Mistake, StrictModel, validated
 from adaptune.study.config import StudyConfig
 from adaptune.study.study import Study
 
-# The samplers by name, and the settings of each.
-
-
 OPTUNA = {
     "cmaes": "optuna.samplers:CmaEsSampler",
     "gp": "optuna.samplers:GPSampler",
@@ -180,9 +177,6 @@ SETTINGS: dict[str, type[BaseModel]] = {
 """Settings of adaptune's own samplers."""
 
 
-# Grids of parameter sets, whose points are made when they are asked for.
-
-
 MAX_UNBUDGETED_POINTS = 10_000
 """Points of the largest grid that a search without a budget may try."""
 
@@ -307,13 +301,7 @@ def _steps(parameter: Float | Integer, given: Sequence[Value]) -> list[float]:
 def check_grid(
     axes: Mapping[str, Span | Sequence[Value]], space: ParameterSpace, bounded: bool
 ) -> Iterable[Mistake]:
-    """Find mistakes in a grid.
-
-    Yields
-    ------
-    Mistake
-        Its key begins below the sampler's settings.
-    """
+    """Find mistakes in a grid; their keys begin below the sampler's settings."""
     for name in axes:
         if name not in space.names:
             help_ = nearest(name, space.names)
@@ -338,9 +326,6 @@ def check_grid(
         yield Mistake(("grid",), "has more points than can be numbered; give a coarser grid")
 
 
-# Mistakes in a sampler's settings that only the sampler and the parameters show.
-
-
 _SET_BY_KEY = {"seed": "seed", "n_startup_trials": "initial", "constraints_func": "limits"}
 """Settings of Optuna's samplers that adaptune sets, and from which key."""
 _BOX = ("low", "high")
@@ -349,12 +334,7 @@ _MAX_SETTING = 100_000
 
 
 def check_class(name: str) -> None:
-    """Refuse a name that leads to no Optuna sampler; the user's are imported elsewhere.
-
-    Raises
-    ------
-    SamplerError
-    """
+    """Refuse a name that leads to no Optuna sampler; the user's are imported elsewhere."""
     if not is_user_sampler(name):
         optuna_class(name)
         return
@@ -367,12 +347,9 @@ def check_class(name: str) -> None:
 def check_sampler(
     name: str, settings: Mapping[str, Any], space: ParameterSpace | None, budgeted: bool
 ) -> Iterable[Mistake]:
-    """Find mistakes in a sampler's settings, where `space` is None without the parameters.
+    """Find mistakes in a sampler's settings; their keys begin below the settings.
 
-    Yields
-    ------
-    Mistake
-        Its key begins below the settings.
+    Without a `space`, those that only the parameters show are not found.
     """
     if name == "tpe" and not settings:
         return  # a look at Optuna would take long
@@ -465,12 +442,7 @@ def _allowed(parameter: Float | Integer | Categorical) -> tuple[str, ...]:
 
 
 def _make_elsewhere(name: str, settings: Mapping[str, Any], seed: int) -> None:
-    """Try whether a sampler of the user takes its settings.
-
-    Raises
-    ------
-    SamplerError
-    """
+    """Try whether a sampler of the user takes its settings."""
     seconds = processes.IMPORT_SECONDS
     bounds = processes.Bounds(seconds, late=f"it took longer than {seconds:g} s to begin")
     process = processes.Conversation(processes.Forked(SERVICE, name, "make", bounds))
@@ -653,9 +625,6 @@ class OfflineStudyConfig(StudyConfig):
         """What makes the trials of a study those that they are: another search has others."""
         offline = self.resolved()["offline"]
         return {key: value for key in _SEARCH if (value := offline.get(key))}
-
-
-# A study with the settings of the offline stage.
 
 
 OfflineStudy = Study[OfflineStudyConfig]

@@ -23,7 +23,14 @@ from adaptune.metrics import (
 )
 from adaptune.model import ModelError, TrainingData
 from adaptune.model.descriptor import averaged
-from adaptune.model.rules import BASELINE, Costs, SetCost, Spending, mean_errors
+from adaptune.model.rules import (
+    BASELINE,
+    Costs,
+    SetCost,
+    Spending,
+    allowed_sets,
+    mean_errors,
+)
 from adaptune.model.weights import MEMBER_POOL_SIZE, MemberWeights
 from adaptune.odometry.registry import Factory
 from adaptune.recording.scan import origin, places, stretch_numbers
@@ -44,9 +51,6 @@ from offline.search import owner
 
 if TYPE_CHECKING:
     from adaptune.model.pca import ScaledPCA
-
-
-# A bank on a training sequence, simulated from the motions that its members made alone.
 
 
 SECONDS_UNTIL_NOTICED = 1.0
@@ -191,18 +195,13 @@ def recorded_motions(frames: Frames, trials: Sequence[Trial]) -> Poses:
     Returns shape (n_frames - 1, n_trials, 4, 4).
     """
     motions = np.empty((len(frames.stamps) - 1, len(trials), 4, 4))
+    begins = frames.stamps[:-1]
     for k, trial in enumerate(trials):
-        T = steps(trial.T_odom_sensor)
-        T[_for_a_while(trial.restarted[1:], frames.stamps)] = np.eye(4)
-        motions[:, k] = T
+        motions[:, k] = steps(trial.T_odom_sensor)
+        lost = np.where(trial.restarted[1:], begins, np.iinfo(np.int64).min // 2)
+        since = begins - np.maximum.accumulate(lost)  # the last step that was lost began
+        motions[since < SECONDS_UNTIL_NOTICED * 1e9, k] = np.eye(4)
     return motions
-
-
-def _for_a_while(lost: NDArray[np.bool_], stamps: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Steps that begin less than `SECONDS_UNTIL_NOTICED` after the begin of one that is lost."""
-    begins = stamps[:-1]
-    last = np.maximum.accumulate(np.where(lost, begins, np.iinfo(np.int64).min // 2))
-    return np.asarray(begins - last < SECONDS_UNTIL_NOTICED * 1e9)
 
 
 def motions_from_archive(
@@ -220,9 +219,6 @@ def motions_from_archive(
         return recorded_motions(frames, [read(trial) for trial in trials])
 
     return motions
-
-
-# Stretches: recordings are cut into them, and one after the other is left out.
 
 
 MARGIN_FRAMES = 2
@@ -539,14 +535,15 @@ class LabelledData(NamedTuple):
         whole = {n: value for n, value in self.whole().items() if n in trials}
         if not set(whole) - {0}:
             return min(bounds, key=lambda n: bounds[n])
-        unlost = {n: bounds[n] for n in best_candidates(bounds) if self._never_lost(n)}
-        known = {n: value for n, value in (unlost | whole).items() if n in best_candidates(bounds)}
+        best = best_candidates(bounds)
+        columns = {n: self.sets.column(n) for n in best}
+        unlost = {
+            n: bounds[n]
+            for n, c in columns.items()
+            if all(np.isfinite(s.errors[:, c]).all() for s in self.sequences)
+        }
+        known = {n: value for n, value in (unlost | whole).items() if n in best}
         return choose_fixed(known or whole, bounds)
-
-    def _never_lost(self, trial: int) -> bool:
-        """Whether a set lost track in no trial on these sequences."""
-        column = self.sets.column(trial)
-        return all(bool(np.isfinite(s.errors[:, column]).all()) for s in self.sequences)
 
     def training_data(self) -> tuple[TrainingData, "ScaledPCA"]:
         """What selection rules are fitted to, and the transformation of descriptors for them."""
@@ -561,16 +558,14 @@ class LabelledData(NamedTuple):
             np.concatenate([s.errors for s in self.sequences]),
             self.sets,
             fixed := self.fixed(),
-            allowed=self.allowed(fixed),
+            allowed=allowed_sets(self.spending, self.sets, fixed),
         )
         return data, pca
 
-    def allowed(self, fixed: int) -> tuple[int, ...] | None:
-        """The sets that the budget allows one at a time, the fixed one included; None for all."""
-        if self.costs is None or self.budget is None:
-            return None
-        spending = Spending(self.costs, self.budget)
-        return tuple(t for t in self.sets if t == fixed or spending.allows([t]))
+    @property
+    def spending(self) -> Spending | None:
+        """How a bank may spend the budget; None without a budget."""
+        return Spending.of(self.costs, self.budget)
 
     def vectors(self, members: Sequence[int]) -> NDArray[np.float32]:
         """Error vectors of some sets on the frames of all sequences, of shape (n, n_members, 3)."""
@@ -605,9 +600,6 @@ def periods(period: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArray[np.int
     return first, number
 
 
-# What the sets of a study cost, as it was measured in their trials.
-
-
 def measured_costs(
     archive: Archive, run: Mapping[str, Iterable[int]], sets: ParameterSets, odometry: Factory
 ) -> Costs:
@@ -636,9 +628,6 @@ def measured_costs(
     return Costs(found, float(np.mean(evidence)))
 
 
-# Reads the labelled data set of a study from its archive.
-
-
 def labelled_data(
     archive: Archive,
     run: Mapping[str, Sequence[int]],
@@ -658,7 +647,12 @@ def labelled_data(
     ModelError
         If a trial is missing.
     """
-    _check_finished(archive, run)
+    for name, counted in run.items():
+        if missing := set(counted) - set(archive.finished(name)):
+            raise ModelError(
+                f"{archive.folder}: lacks trial {min(missing)} on {name}, which the model was "
+                f"fitted to; run `adaptune offline` again"
+            )
     read = [_labelled(archive, name, set(run[name]), sets, config, window) for name in run]
     number = np.repeat(np.arange(len(read)), [len(s.errors) for s, _, _ in read])
     means = mean_errors(np.concatenate([s.errors for s, _, _ in read]), number)
@@ -684,16 +678,6 @@ def labelled_data(
     cut_up = _with_cuts(_with_whole_runs(archive, labelled, sets, config))
     costs = measured_costs(archive, run, sets, odometry)
     return LabelledData(cut_up, sets, costs, config.online.budget, odometry.description.live)
-
-
-def _check_finished(archive: Archive, run: Mapping[str, Sequence[int]]) -> None:
-    """Refuse an archive that lacks a trial."""
-    for name, counted in run.items():
-        if missing := set(counted) - set(archive.finished(name)):
-            raise ModelError(
-                f"{archive.folder}: lacks trial {min(missing)} on {name}, which the model was "
-                f"fitted to; run `adaptune offline` again"
-            )
 
 
 def _with_whole_runs(

@@ -199,10 +199,7 @@ def penalised(history: Sequence[SamplerResult]) -> list[SamplerResult]:
 
 
 def best_by_trials(config: OfflineConfig, verdicts: Mapping[int, Verdict]) -> int:
-    """Trial number of the set with the least first objective among those that keep all limits.
-
-    See `candidates`, of which it is the first.
-    """
+    """Trial number of the first of `candidates`."""
     return candidates(config, verdicts)[0]
 
 

@@ -107,9 +107,6 @@ def key(parameters: ParameterSet) -> str:
     return repr(sorted(parameters.items()))
 
 
-# Samplers that do not learn: they need only the number of a trial.
-
-
 _SHUFFLED = 1 << 20
 """Points of a grid that are shuffled as a whole; of larger ones, points are drawn."""
 
@@ -181,9 +178,6 @@ def _shuffled(size: int, seed: int, n: int) -> Iterator[int]:
     drawn: NDArray[np.int64] = rng.integers(size, size=2 * n + 64)
     _, at = np.unique(drawn, return_index=True)
     yield from drawn[np.sort(at)].tolist()
-
-
-# Optuna's samplers, through its ask-and-tell interface.
 
 
 optuna.logging.set_verbosity(optuna.logging.WARNING)
@@ -376,9 +370,6 @@ def _distribution(parameter: Float | Integer | Categorical) -> Any:
     return distribution(parameter)
 
 
-# Proposals for several odometries: a sampler for each, which share the batches.
-
-
 class PooledSampler(Sampler):
     """A sampler for each odometry, over its own parameters and with the results of its own sets.
 
@@ -395,7 +386,8 @@ class PooledSampler(Sampler):
         n = len(space.spaces)
         self._n_initial = max(config.initial, n)
         turns = [len(range(i, self._n_initial, n)) for i in range(n)]
-        of_each = zip(space.spaces.items(), turns, _seeds(config, n), strict=True)
+        seeds = np.random.SeedSequence((config.seed, 1)).generate_state(n).tolist()
+        of_each = zip(space.spaces.items(), turns, seeds, strict=True)
         self._samplers = {
             label: make_sampler(own, config.model_copy(update={"initial": initial, "seed": seed}))
             for (label, own), initial, seed in of_each
@@ -460,21 +452,12 @@ def _best(history: Sequence[SamplerResult]) -> float:
     return min((float(np.atleast_1d(value)[0]) for value in kept), default=np.inf)
 
 
-def _seeds(config: OfflineConfig, n: int) -> list[int]:
-    """A seed for each of `n` odometries."""
-    state = np.random.SeedSequence((config.seed, 1)).generate_state(n)
-    return [int(seed) for seed in state]
-
-
 def _spread(sets: dict[str, list[ParameterSet]], first: int) -> list[ParameterSet]:
     """The sets of a batch, those of each odometry evenly; trial `first` says who begins."""
     labels = list(sets)
     order = [*labels[first % len(labels) :], *labels[: first % len(labels)]]
     placed = [(k / len(sets[label]), own) for label in order for k, own in enumerate(sets[label])]
     return [own for _, own in sorted(placed, key=itemgetter(0))]
-
-
-# Samplers of the user, in processes of their own, see `adaptune.processes`.
 
 
 class HostedSampler(Sampler):
@@ -485,10 +468,7 @@ class HostedSampler(Sampler):
     def __init__(self, space: ParameterSpace, config: OfflineConfig):
         super().__init__(space, config)
         self._process = Conversation(Forked(SERVICE, config.sampler, "propose"))
-        self._about = {
-            "space": space.dump(),
-            "config": config.model_dump(mode="json"),
-        }
+        self._about = {"space": space.dump(), "config": config.model_dump(mode="json")}
 
     def _propose(self, numbers: range, history: Sequence[SamplerResult]) -> list[ParameterSet]:
         try:

@@ -79,9 +79,6 @@ def estimate(values: Values, baseline: Values) -> float:
     return float(np.mean(values)) * (float(np.mean(baseline)) / seen if seen > 0.0 else 1.0)
 
 
-# When a search stops.
-
-
 TRIALS = 64
 """Trials of a search without a budget."""
 BUDGETS = ("trials", "hours", "stagnation")
@@ -98,14 +95,9 @@ def max_trials(config: OfflineConfig) -> int | None:
 def spent(
     config: OfflineConfig, verdicts: Sequence[Verdict], best: int, hours: float, number: int
 ) -> str | None:
-    """Why a search stops after a batch.
+    """The budget that is used up after a batch, in words; None if the search continues.
 
-    None if it continues. `best` is the index of the best verdict, `number` its trial number.
-
-    Returns
-    -------
-    str or None
-        The budget that is used up; None if the search continues.
+    `best` is the index of the best verdict, `number` its trial number.
     """
     limit = max_trials(config)
     if limit is not None and len(verdicts) >= limit:
@@ -214,11 +206,6 @@ class Search:
             return self._closed[i]
         return OF_SLOT * self._slot + i if i else 0
 
-    def _next_numbers(self, n: int) -> list[int]:
-        """Numbers for the next trials: of a finite space, later ones may have been run before."""
-        every = map(self.number, count(len(self._closed)))
-        return list(islice((number for number in every if number not in self._closed), n))
-
     @property
     def done(self) -> dict[int, Verdict]:
         """The verdicts by trial number."""
@@ -233,7 +220,9 @@ class Search:
             return False
         first, size = len(self.verdicts), self._config.batch
         stop = first + size if self._limit is None else min(first + size, self._limit)
-        self.numbers = self._next_numbers(stop - first)
+        # Of a finite space, later ones may have been run before.
+        numbers = (n for n in map(self.number, count(first)) if n not in self._closed)
+        self.numbers = list(islice(numbers, stop - first))
         self._sets = {n: self._known[n] for n in self.numbers if n in self._known}
         if first and self._config.pruning == "wilcoxon":
             self.order = self._hardest_first()
@@ -273,8 +262,8 @@ class Search:
         of = (self._config, self.sequences, self._finished)
         self.verdicts += [assess(n, self.sequences, *of) for n in self.numbers]
         self._closed += self.numbers
-        candidates = (self.best, *range(first, len(self.verdicts)))
-        self.best = min(candidates, key=lambda i: _rank(self.verdicts[i]))
+        ranks = [(not v.complete, v.excess, v.values[0]) for v in self.verdicts]
+        self.best = min((self.best, *range(first, len(ranks))), key=ranks.__getitem__)
         if len(self.numbers) < self._config.batch and len(self.verdicts) != self._limit:
             self.end = self._sampler.end
         self.numbers = []
@@ -330,10 +319,6 @@ def assess(
         for weights in config.objective
     )
     return found._replace(values=values, complete=False, sequences=seen)
-
-
-def _rank(verdict: Verdict) -> tuple[bool, float, float]:
-    return not verdict.complete, verdict.excess, verdict.values[0]
 
 
 def make_searches(

@@ -29,15 +29,11 @@ from adaptune.study.study import (
     EQUAL_COST,
     MIN_RECORDINGS,
     ONE_SET,
-    RELIES_ON_LIVE,
 )
 from offline.labelled import LabelledData, LabelledSequence, comparable, periods
 
 if TYPE_CHECKING:
     from adaptune.model.pca import ScaledPCA
-
-
-# Expected loss: one number by which all ways to adapt are compared with the fixed set.
 
 
 WORST_TENTH_WEIGHT = 0.5
@@ -219,7 +215,9 @@ def choose(
     fixed = data.fixed() if fixed is None else fixed
     simulable = all(s.simulation is not None for s in data.sequences)
     choosers = _choosers(bank, data) if simulable else {}
-    one_set = one_set and data.live and _may_measure(data, fixed)
+    spending = data.spending
+    # Whether the budget allows live evidence beside the fixed set.
+    one_set = one_set and data.live and (spending is None or spending.allows([fixed]))
     banks = {way: make(data, fixed) for way, make in choosers.items()}
     banks = {way: members for way, members in banks.items() if len(members) > 1}
     members = next(iter(banks.values()), [])
@@ -232,8 +230,8 @@ def choose(
             logs.append(of_fold)
             recordings += [left_out.recording] * len(of_fold)
     if len(recordings) < 2 or not logs[0].shape[1]:
-        unknown = BankSettings(adapt=RELIES_ON_LIVE and len(members) > 1)
-        return Policy(DO_NOT_ADAPT, unknown, members, {})
+        # A bank measures the errors of its members while it drives.
+        return Policy(DO_NOT_ADAPT, BankSettings(adapt=len(members) > 1), members, {})
     return least_loss(
         np.concatenate(logs), recordings, banks, len(PAIRED_SETTINGS) if one_set else 0
     )
@@ -252,8 +250,10 @@ def least_loss(
     """
     losses = np.array([expected_loss(column, recordings) for column in logs.T])
     losses[~(np.abs(losses) > ROUNDING)] = 0.0
-    if RELIES_ON_LIVE:
-        losses[n_single:] = _with_elsewhere(losses[n_single:], len(logs))
+    # Banks are drawn to what they are elsewhere; one that never adapts has 0.
+    drawn = len(logs) * losses + STRETCHES_ELSEWHERE * LOSS_ELSEWHERE
+    drawn = np.where(losses == 0.0, 0.0, drawn / (len(logs) + STRETCHES_ELSEWHERE))
+    losses[n_single:] = drawn[n_single:]
     expected: dict[str, Figures] = {}
     one_set, bank, members = DO_NOT_ADAPT, NO_BANK, next(iter(banks.values()), [])
     if n_single:
@@ -271,21 +271,6 @@ def least_loss(
     return Policy(one_set, bank, members, expected)
 
 
-def _with_elsewhere(losses: NDArray[np.float64], n_stretches: int) -> NDArray[np.float64]:
-    """Expected losses of banks, drawn to what they are elsewhere; one that never adapts has 0."""
-    drawn = (n_stretches * losses + STRETCHES_ELSEWHERE * LOSS_ELSEWHERE) / (
-        n_stretches + STRETCHES_ELSEWHERE
-    )
-    return np.where(losses == 0.0, 0.0, drawn)
-
-
-def _may_measure(data: LabelledData, fixed: int) -> bool:
-    """Whether the budget allows live evidence beside the fixed set."""
-    if data.costs is None or data.budget is None:
-        return True
-    return Spending(data.costs, data.budget).allows([fixed])
-
-
 def _choosers(
     bank: int | Sequence[int], data: LabelledData
 ) -> dict[str, Callable[[LabelledData, int], list[int]]]:
@@ -301,10 +286,9 @@ def _choosers(
     ) -> Callable[[LabelledData, int], list[int]]:
         return lambda data, fixed: way(data, fixed, size, spending)
 
-    if data.costs is None or data.budget is None:
+    if (spending := data.spending) is None:
         return {name: of_size(way) for name, way in WAYS.items()}
     # A budget may be spent on more members, on dearer ones, or on those that gain most for it.
-    spending = Spending(data.costs, data.budget)
     thrifty = spending._replace(thrifty=True)
     ways = {
         f"{name}, {n}": of_size(way, n, spending)
@@ -432,10 +416,8 @@ def reserve(members: Sequence[int], data: LabelledData) -> list[int]:
     known = all(BASELINE in s.vectors for s in data.sequences)
     if len(members) < 2 or BASELINE in members or not known:
         return []
-    if data.costs is not None and data.budget is not None:
-        allowed = Spending(data.costs, data.budget).allows([*members, BASELINE])
-        return [BASELINE] if allowed else []
-    return [BASELINE]
+    spending = data.spending
+    return [BASELINE] if spending is None or spending.allows([*members, BASELINE]) else []
 
 
 WAYS: dict[str, Chooser] = {
@@ -480,9 +462,6 @@ def bank_errors(
     assert sequence.simulation is not None
     errors = sequence.simulation.errors(weights, votes)
     return errors[~np.isnan(errors) if sequence.extent is None else sequence.extent.frames]
-
-
-# Rivals of what is driven: what a user could have without adapting.
 
 
 def driven_cost(data: LabelledData, policy: Policy, fixed: int) -> float:

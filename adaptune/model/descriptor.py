@@ -13,9 +13,6 @@ from adaptune.odometry import wire
 from adaptune.odometry.registry import python_content
 from adaptune.recording.scan import Scan
 
-# The motion of the sensor, computed from the poses of the scans before.
-
-
 MOTION = "motion"
 """Name of the descriptor that is filled in from poses."""
 SECOND = 10**9

@@ -23,7 +23,14 @@ from adaptune.errors import AdaptuneError
 from adaptune.files import replacing
 from adaptune.metrics import cap
 from adaptune.model.descriptor import DESCRIPTORS
-from adaptune.model.rules import Costs, PairedSettings, Spending, TrainingData, mean_errors
+from adaptune.model.rules import (
+    Costs,
+    PairedSettings,
+    Spending,
+    TrainingData,
+    allowed_sets,
+    mean_errors,
+)
 from adaptune.model.weights import BankSettings
 from adaptune.recording.scan import places, stretch_numbers
 from adaptune.report import tables
@@ -32,9 +39,6 @@ from adaptune.strict import in_one_line
 
 if TYPE_CHECKING:
     from adaptune.model.pca import ScaledPCA
-
-# Files of error models: arrays and text in the safetensors format, which runs no code on load.
-
 
 FORMAT = 6
 """Raised whenever an older adaptune could not read the file, or would read it wrongly."""
@@ -223,8 +227,6 @@ class ErrorModel:
 
     def pca(self) -> "ScaledPCA":
         """Principal components of the training frames' descriptors."""
-        # not needed to load a model
-
         from adaptune.model.pca import ScaledPCA  # not needed to load a model
 
         return ScaledPCA(blocks=tuple(self.blocks.values())).fit(self.descriptors)
@@ -264,10 +266,7 @@ class ErrorModel:
 
     def allowed(self) -> tuple[int, ...] | None:
         """The sets that the budget allows one at a time, the fixed one included; None for all."""
-        if self.costs is None or self.budget is None:
-            return None
-        spending = Spending(self.costs, self.budget)
-        return tuple(t for t in self.sets if t == self.fixed or spending.allows([t]))
+        return allowed_sets(Spending.of(self.costs, self.budget), self.sets, self.fixed)
 
     def trial(self, named: int | ParameterSet) -> int | None:
         """Trial number of a set that is named by it, or by its values that are not the baseline's.
@@ -415,9 +414,6 @@ class ErrorModel:
             raise ValueError("a rival is no set of the model")
         for parameters in self.sets.parameters:
             self.sets.space.check(parameters)
-
-
-# Descriptions of error models, for people.
 
 
 N_BEST = 5

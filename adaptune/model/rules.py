@@ -12,9 +12,6 @@ from pydantic import BaseModel, ConfigDict, Field, NonNegativeFloat, PositiveFlo
 from adaptune.metrics import FAILURE, cap
 from adaptune.space import ParameterSets, Selection
 
-# The evidence about a scene: the training frames that look like it.
-
-
 NOVEL_FAMILIARITY = 0.1
 """Familiarity below which evidence counts less and less."""
 _QUANTILES = 10
@@ -34,8 +31,8 @@ class Evidence(NamedTuple):
 
     @property
     def trust(self) -> NDArray[np.float64]:
-        """See `trust_in`."""
-        return trust_in(self.familiarity)
+        """How far it counts for each scan, from 0 to 1: fully where familiarity is unknown."""
+        return np.asarray(np.fmin(1.0, self.familiarity / NOVEL_FAMILIARITY))
 
     def weights(self, sharpness: float) -> NDArray[np.float64]:
         """Weights of the training sequences: the nearer their frames, the larger.
@@ -63,11 +60,6 @@ class Evidence(NamedTuple):
             of = values[frames[:1]] if same else values[frames]
             means[:, s] = of.mean(axis=1, dtype=np.float64)
         return means
-
-
-def trust_in(familiarity: NDArray[np.float64]) -> NDArray[np.float64]:
-    """How far evidence counts, from 0 to 1: fully where familiarity is unknown."""
-    return np.asarray(np.fmin(1.0, familiarity / NOVEL_FAMILIARITY))
 
 
 class NearestFrames:
@@ -137,9 +129,6 @@ def _nearest(
     return np.take_along_axis(squared, nearest, axis=1).mean(axis=1), nearest
 
 
-# What parameter sets cost: CPU time a scan, alone and together.
-
-
 ROUNDING = 1e-9
 """By how much a sum of costs may exceed a budget."""
 
@@ -206,6 +195,11 @@ class Spending(NamedTuple):
     budget: float = np.inf  # milliseconds of CPU time a scan, with all members and live evidence
     thrifty: bool = False  # whether the next member is the one that gains most for its cost
 
+    @classmethod
+    def of(cls, costs: Costs | None, budget: float | None) -> Self | None:
+        """How a budget may be spent, if there is one and the costs are known."""
+        return None if costs is None or budget is None else cls(costs, budget)
+
     def allows(self, members: Sequence[int]) -> bool:
         """Whether a bank of these trials stays within the budget; of unknown cost, none does."""
         return self.costs.adaptive(members) <= self.budget + ROUNDING
@@ -214,6 +208,15 @@ class Spending(NamedTuple):
         """What another member adds to the cost of a bank, one microsecond at least."""
         together = self.costs.adaptive([*members, more]) - self.costs.adaptive(members)
         return max(together, 1e-3)
+
+
+def allowed_sets(
+    spending: Spending | None, sets: Iterable[int], fixed: int
+) -> tuple[int, ...] | None:
+    """The sets that a budget allows one at a time, the fixed one included; None for all."""
+    if spending is None:
+        return None
+    return tuple(trial for trial in sets if trial == fixed or spending.allows([trial]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -319,9 +322,6 @@ class Rule(ABC):
     @abstractmethod
     def select(self, feature: NDArray[np.float64]) -> Selection:
         """Choose a set, or weights, for one scan's scaled descriptor of shape (n_features,)."""
-
-
-# Selection by the paired expected ratio.
 
 
 ERROR_FLOOR = 0.02

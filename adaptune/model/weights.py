@@ -249,9 +249,7 @@ def renormalised(weights: NDArray[np.float64], present: NDArray[np.bool_]) -> ND
 def smooth_weights(weights: NDArray[np.float64]) -> NDArray[np.float64]:
     """Mean of the weights at each selection and at those before it, `SMOOTHED_SELECTIONS` at most.
 
-    They are of shape (n_selections, n_members).
-
-    Returns shape (n_selections, n_members).
+    Both are of shape (n_selections, n_members).
     """
     total = weights.copy()
     for k in range(1, SMOOTHED_SELECTIONS):

@@ -498,9 +498,6 @@ RIVAL_WORDS = {
     BEST_DEFAULT: "the best odometry with its own parameters",
     EQUAL_COST: "the best set that costs no more",
 }
-RELIES_ON_LIVE = True
-"""Whether a bank adapts where too little is known to compare it: only if it measures the errors of
-its members while it drives."""
 
 
 class ModeError(AdaptuneError):

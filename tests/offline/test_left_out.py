@@ -179,7 +179,8 @@ def judged(data, study, monkeypatch, given=()):
     model = fit(data, data.fixed(), {}, 10.0, 1, {})
     model = tuned(replace(model, blocks={"ndt": 90}), data, switching)
     model = replace(model, **dict(given))
-    monkeypatch.setattr(validation, "_checked_model", lambda _: model)
+    its_own = replace(model, sequences=study.training, window=study.window)
+    monkeypatch.setattr(type(study), "model", lambda _: its_own)
     monkeypatch.setattr(validation, "_labelled", lambda *_: data)
     return model, validate(study)
 

@@ -4,7 +4,7 @@ from labelled_places import TRIALS, labelled, two_kinds, with_motions
 
 from adaptune.errors import AdaptuneError
 from adaptune.model import BankSettings, PairedSettings
-from adaptune.model.rules import Costs, SetCost
+from adaptune.model.rules import Costs, SetCost, allowed_sets
 from adaptune.space import ODOMETRY, Float, ParameterSets, ParameterSpace, PooledSpace
 from adaptune.study.study import BEST_DEFAULT, EQUAL_COST
 from offline.tuning import NO_BANK, Policy, driven_cost, rivals
@@ -65,8 +65,9 @@ def test_a_budget_bounds_the_fixed_set_and_what_is_selected(places):
     cheap = data(places, budget=15.0)
     assert cheap.fixed() in TRIALS[:2]
     # Live evidence does not fit beside the second one.
-    assert data(places, budget=12.0).allowed(TRIALS[1]) == TRIALS[:2]
-    assert data(places).allowed(TRIALS[1]) is None
+    frugal = data(places, budget=12.0)
+    assert allowed_sets(frugal.spending, frugal.sets, TRIALS[1]) == TRIALS[:2]
+    assert data(places).spending is None
     unknown = Costs({t: SetCost(np.nan, np.nan, 0) for t in TRIALS}, np.nan)
     with pytest.raises(AdaptuneError, match="older adaptune"):
         data(places, budget=12.0)._replace(costs=unknown).fixed()

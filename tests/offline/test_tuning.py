@@ -83,7 +83,7 @@ def test_a_bank_that_gains_nothing_does_not_adapt():
     assert choose(labelled(sequences[:3]), [0, 8], one_set=False).bank.adapt
 
 
-def test_the_least_loss_wins(monkeypatch):
+def test_the_least_loss_wins():
     logs = np.zeros((8, len(PAIRED_SETTINGS) + 2 * len(BANK_SETTINGS)))
     names = [str(i) for i in range(8)]
     banks = {"first": [0, 1], "second": [0, 2]}
@@ -116,7 +116,6 @@ def test_the_least_loss_wins(monkeypatch):
     logs[:] = 0.0
     logs[:, second + 3] = -1e-9
     assert (best().one_set, best().bank) == (DO_NOT_ADAPT, NO_BANK)
-    monkeypatch.setattr(tuning, "RELIES_ON_LIVE", True)
     rng = np.random.default_rng(7)
     alone = labelled([with_motions("s", rng, 100)])
     assert choose(alone, 2).bank == BankSettings()
