@@ -1,5 +1,9 @@
-"""Odometries by name on a drive straight ahead along a street."""
+"""Odometries by name on a drive straight ahead along a street.
 
+Those in containers run the reference image, which is there only when one of them is made.
+"""
+
+import copy
 import sys
 import tempfile
 import threading
@@ -10,8 +14,10 @@ from queue import SimpleQueue
 import drives
 import numpy as np
 import program
+from needs import reference_image
 
 from adaptune.odometry.base import InProcess
+from adaptune.odometry.keyframe import KeyframeGicp
 from adaptune.odometry.program import Command, ProgramInput
 from adaptune.odometry.registry import odometry_class
 from adaptune.odometry.remote import Limits, Process
@@ -23,10 +29,24 @@ STEP = 0.4
 N_SCANS = 16
 START = 10**10
 """Nanoseconds; ROS has no stamp of zero."""
+LOCKSTEP = "rustle, lockstep"
+"""The other way to run `rustle`."""
+TEMPLATE = """\
+use_sim_time: true
+gicp: {max_correspondence_distance: 1.0, keyframe_interval: 1.0, downsampling: 0.5, iterations: 20}
+"""
 
 
 def make(name, parameters=None):
     """A new instance; of programs, keyframe GICP that is served and program.py."""
+    if name in ("docker_command", "rustle"):
+        given = space_of(name).baseline | (parameters or {})
+        return copy.deepcopy(_that_has_run(name, tuple(given.items())))
+    if name in ("docker_process", LOCKSTEP):
+        given = parameters or {}
+        return _contained(
+            name, given if name == "docker_process" else space_of(name).baseline | given
+        )
     if name == "process":
         return Process(parameters or {}, served(), Limits(seconds=60.0))
     if name == "command":
@@ -37,6 +57,40 @@ def make(name, parameters=None):
     return InProcess(odometry_class(name)(parameters))
 
 
+@cache
+def _that_has_run(name, parameters):
+    """One that has run on the drive, which takes seconds."""
+    odometry = _contained(name, dict(parameters))
+    odometry.start(odometry.prepare(scan(0)), np.eye(4))
+    return odometry
+
+
+def _contained(name, parameters):
+    """A new instance whose program is in a container."""
+    from adaptune.odometry.docker.programs import DockerProcess
+
+    kind = odometry_class("rustle" if name == LOCKSTEP else name)
+    image, file = reference_image(), Path(_folder.name) / "params.yaml"
+    file.write_text(TEMPLATE)
+    given = {
+        "docker_command": {"command": ("odometry-plain", "{points}"), "template": str(file)},
+        "docker_process": {"command": ("odometry-serve", "{socket}")},
+        "rustle": {"template": str(file), "odometry": "/Odometry", "rate": 4.0},
+        LOCKSTEP: {"play": "lockstep", "node": "/gicp", "patience": 60.0},
+    }
+    given[LOCKSTEP] |= {"template": str(file), "odometry": "/Odometry"}
+    settings = kind.settings_type(image=image, **given[name])
+    if kind is not DockerProcess:
+        kind.check(settings, parameters)
+    recording = command_on_the_street()[1]
+    return kind.instance(parameters, settings, Limits(seconds=60.0), lambda: recording)
+
+
+def parameters_of(odometry):
+    """The present parameters of what `make` has made."""
+    return (odometry.odometry if isinstance(odometry, InProcess) else odometry).parameters
+
+
 def space_of(name):
     if name == "command":
         return ParameterSpace(
@@ -45,6 +99,11 @@ def space_of(name):
                 "registration.distance": Float(low=0.5, high=4.0, baseline=2.0, log=True),
             }
         )
+    if name in ("docker_command", "rustle", LOCKSTEP):
+        tuned = ("max_correspondence_distance", "keyframe_interval")
+        return ParameterSpace({key: KeyframeGicp.space.parameters[key] for key in tuned})
+    if name == "docker_process":
+        return KeyframeGicp.space
     return Process.describe(served()).space if name == "process" else odometry_class(name).space
 
 
@@ -53,6 +112,12 @@ def listening(where, name):
     there = SimpleQueue()
     threading.Thread(target=listen, args=(where, name, there.put), daemon=True).start()
     return there.get(timeout=10.0)
+
+
+def is_live(name):
+    if name in ("command", "docker_command", "rustle"):
+        return False
+    return name in ("process", "docker_process", LOCKSTEP) or odometry_class(name).live
 
 
 @cache

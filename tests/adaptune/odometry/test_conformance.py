@@ -14,10 +14,13 @@ import pytest
 from rooms import moved
 from scipy.spatial.transform import Rotation
 from street import (
+    LOCKSTEP,
     N_SCANS,
     STEP,
     drive,
+    is_live,
     make,
+    parameters_of,
     poor_scan,
     prepared_drive,
     scan,
@@ -29,15 +32,23 @@ from adaptune import processes
 from adaptune.geometry import invert
 from adaptune.odometry import OdometryError
 from adaptune.odometry.base import prepared_bytes
-from adaptune.odometry.registry import ODOMETRIES, odometry_class
+from adaptune.odometry.registry import CONTAINERS, ODOMETRIES, PROGRAMS, odometry_class
 from adaptune.recording import Scan
 from adaptune.space import Selection
 
 CLEAN = [name for name in ODOMETRIES if odometry_class(name).clean]
 """Those that live in this process; test_conformance_isolated.py holds what the others must do."""
 
-# Those in containers are compared with the same odometry in this process; see docker/.
-every_odometry = pytest.mark.parametrize("name", [*CLEAN, "process", "command"])
+# Programs are reached in many ways, but what they do is theirs.
+programs = [
+    pytest.param(name, marks=pytest.mark.services) if name in CONTAINERS else name
+    for name in PROGRAMS
+]
+in_lockstep = pytest.param(LOCKSTEP, marks=pytest.mark.services)
+every_odometry = pytest.mark.parametrize("name", [*CLEAN, *programs, in_lockstep])
+
+# A node's clock does not go back; test_lockstep.py holds more of it.
+but_lockstep = pytest.mark.parametrize("name", [*CLEAN, *programs])
 
 in_python = pytest.mark.parametrize("name", CLEAN)
 
@@ -104,7 +115,7 @@ def print_digests():
         sys.stdout.write(f"{name} {' '.join(found)}\n")
 
 
-@every_odometry
+@but_lockstep
 def test_a_second_instance_is_fresh(name):
     prepared = prepared_drive(name)
     first, second = make(name), make(name)
@@ -155,6 +166,15 @@ def test_it_goes_on_from_a_pose_and_a_motion(name):
     for i in range(6, N_SCANS):
         T_next = odometry.register(prepared[i]).T_odom_sensor
         np.testing.assert_allclose(T_next[:3, 3], [5.0, 6.0 + STEP * (i - 4), 7.0], atol=0.1)
+
+
+@in_python
+def test_without_a_motion_it_stood_still(name):
+    odometry = make(name)
+    odometry.start(prepared_drive(name)[0], np.eye(4))
+    T_odom_sensor, registered = odometry.register(odometry.prepare(poor_scan(3)))
+    assert not registered
+    np.testing.assert_allclose(T_odom_sensor, np.eye(4), atol=1e-12)
 
 
 @in_python
@@ -212,7 +232,11 @@ def test_prepared_scans_say_what_they_take(name):
 
 def parameter_cases():
     cases = [(name, parameter) for name in CLEAN for parameter in odometry_class(name).space.names]
-    return [*cases, *((name, space_of(name).names[0]) for name in ("process", "command"))]
+    # Tests of their own compare whole runs in containers with those of this process.
+    one_each = [
+        (name, space_of(name).names[0]) for name in ("process", "command", "docker_process")
+    ]
+    return [*cases, *one_each]
 
 
 @pytest.mark.parametrize(("name", "parameter"), parameter_cases())
@@ -257,7 +281,7 @@ def test_parameters_change_between_scans(name):
     odometry = make(name, space.baseline)
     T = drive(odometry, prepared[:6])[-1]
     odometry.apply(Selection(0, other))
-    assert odometry.odometry.parameters == other
+    assert parameters_of(odometry) == other
     poses = np.array([odometry.register(p).T_odom_sensor for p in prepared[6:]])
     # From here on it is another odometry, at the same place.
     assert np.abs(poses - usual_drive(name)[6:]).max() > 1e-5
@@ -284,11 +308,11 @@ def test_preparing_leaves_the_scan_and_serves_all_instances(name):
 
 @every_odometry
 def test_parameters_that_do_not_exist_are_refused(name):
-    words = "voxl: no argument holds|has no parameter 'voxl'"
+    words = "voxl: (no argument holds|params.yaml has no)|has no parameter 'voxl'"
     with pytest.raises(OdometryError, match=words):  # noqa: PT012 - a program is asked at its start
         odometry = make(name, space_of(name).baseline | {"voxl": 1.0})
         odometry.start(prepared_drive(name)[0], np.eye(4))
-    if name != "command":
+    if is_live(name):
         odometry = make(name)
         odometry.start(prepared_drive(name)[0], np.eye(4))
         with pytest.raises(OdometryError, match="has no parameter 'voxl'"):

@@ -126,12 +126,3 @@ def test_one_that_answers_nothing(make, monkeypatch):
     (told,) = odometry.faults
     assert told.startswith("a scan took longer than isolation.seconds = 0.5")
     assert not containers()
-
-
-def test_what_it_refuses(make):
-    with pytest.raises(OdometryError, match="has no parameter 'voxl'"):
-        make(parameters={"voxl": 1.0}).start(scans()[0], np.eye(4))
-    odometry = make()
-    odometry.start(scans()[0], np.eye(4))
-    with pytest.raises(OdometryError, match="has no parameter 'voxl'"):
-        odometry.apply(Selection(0, {"voxl": 1.0}))
