@@ -472,7 +472,7 @@ def _check_rates(replays: Path, summaries: Collection[ReplaySummary]) -> None:
     if len({str(summary.inputs["real_time"]) for summary in summaries}) > 1:
         raise StoredReplayError(
             f"{replays}: some were made in real time, and others not, or not so; "
-            f"run `adaptune online` again, with --rate or without"
+            f"run `adaptune online` again, with online.real_time.rate or without"
         )
 
 

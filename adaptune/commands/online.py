@@ -38,14 +38,6 @@ log = logging.getLogger(__name__)
 ORACLE_SETS = 16
 """Sets that run on the test sequences in hindsight."""
 
-Rate = Annotated[
-    float | None,
-    typer.Option(
-        help="Replay in real time, so many times as fast as it was recorded.",
-        show_default="as fast as it goes, no scan dropped",
-    ),
-]
-
 
 Mode = Annotated[
     str | None,
@@ -80,7 +72,6 @@ def online(
     override: Override = [],  # noqa: B006
     folder: Folder = None,
     model: Model = None,
-    rate: Rate = None,
     untrained: Untrained = False,
     thorough: Thorough = False,
     repeats: Repeats = 1,
@@ -102,8 +93,8 @@ def online(
     With `--thorough`, it replays all modes to compare with (`online.modes`): the bank with even
     weights, and the untrained bank.
 
-    With `--rate 1`, scans come when the sensor gave them. A selection that is late is dropped, and
-    so are scans that wait too long.
+    With `-o online.real_time.rate=1`, scans come when the sensor gave them. A selection that is
+    late is dropped, and so are scans that wait too long.
 
     With `--ros` or `--ros2`, scans come from a topic of a robot, until Ctrl-C.
 
@@ -121,11 +112,12 @@ def online(
         _check_untrained(model, mode)
     if thorough and (untrained or ros or ros2):
         raise AdaptuneError("--thorough is for replays with a model; leave out the other option")
-    override = [*override, *_as_overrides(rate, thorough=thorough)]
+    if thorough:
+        override = [*override, "online.modes=all"]
     loaded = load(study, override, folder)
     if ros or ros2:
-        if (ros and ros2) or rate is not None:
-            raise AdaptuneError("give only one of --ros, --ros2 and --rate")
+        if ros and ros2:
+            raise AdaptuneError("give only one of --ros and --ros2")
         _drive(loaded, mode, model, untrained=untrained, ros2=ros2)
         return
     if mode is not None:
@@ -159,12 +151,6 @@ def _check_untrained(model: Path | None, mode: str | None) -> None:
         raise AdaptuneError(f"--untrained uses no model; leave out --model {model}")
     if mode is not None:
         raise AdaptuneError(f"--untrained is a mode of its own; leave out --mode {mode}")
-
-
-def _as_overrides(rate: float | None, *, thorough: bool) -> list[str]:
-    """The options that stand for keys of the study."""
-    given = ["online.modes=all"] if thorough else []
-    return given + ([] if rate is None else [f"online.real_time.rate={rate:g}"])
 
 
 @contextmanager

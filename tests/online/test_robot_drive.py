@@ -189,8 +189,7 @@ def test_what_does_not_go_together_is_refused(make, monkeypatch):
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["--ros", "--ros2"], "give only one of --ros, --ros2 and --rate"),
-        (["--ros", "--rate", "1"], "give only one of --ros, --ros2 and --rate"),
+        (["--ros", "--ros2"], "give only one of --ros and --ros2"),
         (["--mode", "fixed"], "--mode fixed is for a robot"),
         (["--ros", "--untrained", "--mode", "fixed"], "--untrained is a mode of its own"),
         (["--ros", "-o", "online.ros.points=a b"], "online.ros.points: is no name in ROS: give"),
