@@ -319,7 +319,7 @@ def test_what_is_surely_worse_than_the_best_is_given_up():
 
 
 @pytest.fixture(scope="module")
-def study_file(tmp_path_factory):
+def pruning_study(tmp_path_factory):
     folder = tmp_path_factory.mktemp("pruned")
     names = [f"s{i}" for i in range(4)]
     for i, name in enumerate(names):
@@ -335,8 +335,8 @@ def study_file(tmp_path_factory):
     return folder / "pruned.yaml"
 
 
-def test_what_a_pruned_trial_has_seen_feeds_the_model(study_file, tmp_path):
-    study = load_study(study_file, [], tmp_path / "study")
+def test_what_a_pruned_trial_has_seen_feeds_the_model(pruning_study, tmp_path):
+    study = load_study(pruning_study, [], tmp_path / "study")
     training = train(study)
     archive = Archive(study.folder / "trials")
     seen = [[n in archive.finished(name) for name in study.training] for n in range(9)]
