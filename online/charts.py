@@ -1,8 +1,7 @@
 """Charts of the online stage: of a comparison, and of the replays of a sequence."""
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,9 +28,9 @@ from adaptune.report.drawing import plain
 from adaptune.space import ParameterSpace
 from adaptune.study.study import Study, StudySequences, named
 from adaptune.trajectory import Trajectory, read_tum
-from online.compare import current_modes
+from online.compare import current_replays
 from online.modes import UNTRAINED
-from online.record import StoredReplay, damaged, read_applied, read_columns
+from online.record import StoredReplay, check_reference
 from online.statistics import ALL, ComparisonRow, Reference
 from online.tables import of_lengths, short_replays
 
@@ -144,7 +143,7 @@ class ModeReplay(NamedTuple):
     lost: NDArray[np.bool_]  # of shape (m,): whether the bank was lost
     places: NDArray[np.float64]  # (n, 2): metres, by the reference where there is one
     familiarity: NDArray[np.float64]  # (m,): of each selection, see `Selection`; NaN if unknown
-    selection_ms: NDArray[np.float64]  # (m,): that it took; empty where none was made
+    selection_ms: NDArray[np.float64]  # (m,): that it took; NaN where none was made
     scan_ms: NDArray[np.float64]  # (n,): to prepare and register a scan
     late_ms: NDArray[np.float64]  # (n,): from a scan to its pose, in real time; empty otherwise
 
@@ -200,7 +199,7 @@ class ReplayedSequence:
 def read_replays(study: Study, name: str) -> ReplayedSequence:
     """Read the replays of a sequence that are finished and drawn; there may be none.
 
-    Those that `compare` refuses are not, see `online.compare.current_modes`, and neither are
+    Those that `compare` refuses are not, see `online.compare.current_replays`, and neither are
     those that are too short.
 
     Raises
@@ -209,17 +208,17 @@ def read_replays(study: Study, name: str) -> ReplayedSequence:
         If a file is damaged, or if `compare` refuses all of them.
     """
     folder, length = study.folder / "replays" / name, study.config.sub_trajectory
-    space, reference = study.odometry.space, Reference.of(study.sequences, name, folder, length)
+    space = study.odometry.space
+    reference = Reference.read(folder, length, study.sequences.estimate(name))
     # Of a single odometry, numbers name the members of a bank.
     several = len(space.baselines) > 1 and study.model_path.exists()
     model = ErrorModel.load(study.model_path) if several else None
-    current = current_modes(study, name)
+    current = current_replays(study, [name])
+    if current.modes:
+        check_reference(folder, study.sequences.reference(name))
     replays = {mode: StoredReplay.read(folder / mode) for mode in current.modes}
     replays, short = _whole(name, replays)
-    modes = {
-        mode: _read_mode(folder / mode, replay, reference, model)
-        for mode, replay in replays.items()
-    }
+    modes = {mode: _read_mode(replay, reference, model) for mode, replay in replays.items()}
     scenes = None
     if replays:
         stamps = next(iter(replays.values())).trajectory.stamps
@@ -260,9 +259,7 @@ def scenes_along(sequences: StudySequences, name: str, stamps: NDArray[np.int64]
     return scene_spans(course.legs, read_tum(path), stamps) if path.exists() else None
 
 
-def _read_mode(
-    folder: Path, replay: StoredReplay, reference: Reference, model: ErrorModel | None
-) -> ModeReplay:
+def _read_mode(replay: StoredReplay, reference: Reference, model: ErrorModel | None) -> ModeReplay:
     """Read a replay; `model` names the members of a bank."""
     stamps, truth = replay.trajectory.stamps, reference.trajectory
     # The odometry's own frame begins elsewhere: both are drawn from the first common pose.
@@ -272,14 +269,6 @@ def _read_mode(
     if truth is not None and len(known := np.flatnonzero(np.isin(stamps, truth.stamps))):
         places = np.full((len(stamps), 2), np.nan)
         places[known] = _seen_from(truth)[np.searchsorted(truth.stamps, stamps[known])]
-    applied, frames = read_applied(folder / "selections.csv"), read_columns(folder / "frames.csv")
-    try:
-        familiarity = _numbers(applied.get("familiarity", []))
-        selection_ms = _numbers(applied.get("ms", []))
-        scan_ms = _numbers(frames["prepare_ms"]) + _numbers(frames["register_ms"])
-        late_ms = _numbers(frames.get("late_ms", []))
-    except (KeyError, ValueError) as error:
-        raise damaged(folder, error) from error
     return ModeReplay(
         (stamps - stamps[0]) * 1e-9,
         xy,
@@ -292,16 +281,16 @@ def _read_mode(
         replay.estimated,
         replay.lost,
         places,
-        familiarity if len(familiarity) else np.full(len(replay.choice_stamps), np.nan),
-        selection_ms,
-        scan_ms,
-        late_ms,
+        replay.selections["familiarity"],
+        replay.selections["ms"],
+        replay.frames["prepare_ms"] + replay.frames["register_ms"],
+        replay.frames["late_ms"],
     )
 
 
 def _member(replay: StoredReplay, model: ErrorModel | None, number: int) -> str:
     """What a member of a bank is called. Those of a bank without a model are no trials."""
-    if replay.summary.mode == UNTRAINED:
+    if replay.summary.inputs["mode"] == UNTRAINED:
         return f"untrained set {number}" if number else "baseline's set"
     if model is None or number not in model.sets:
         return f"trial {number}"
@@ -312,10 +301,6 @@ def _seen_from(trajectory: Trajectory, start: int = 0) -> NDArray[np.float64]:
     """Positions in the plane of the sensor at a pose: x forward, y to the left."""
     T = trajectory.T_world_sensor
     return np.asarray((invert(T[start]) @ T)[:, :2, 3])
-
-
-def _numbers(texts: Collection[str]) -> NDArray[np.float64]:
-    return np.array([float(text or "nan") for text in texts])
 
 
 # Charts of selections: how familiar the surroundings were, and how long all took.

@@ -1,9 +1,9 @@
 """The comparison of baseline, fixed and adaptive on the replayed sequences."""
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,10 +24,12 @@ from adaptune.study.study import (
 )
 from online.modes import (
     BASELINE,
+    EVEN,
     MODES,
     UNTRAINED,
     WITHOUT_MODEL,
     ReplaySetup,
+    replayed_modes,
     sequences_without_model,
 )
 from online.record import (
@@ -53,7 +55,7 @@ from online.statistics import (
     mean_of,
     oracle_rows,
 )
-from online.tables import CONTROLS, remarks, tables
+from online.tables import remarks, tables
 
 # Which replays are compared: the modes that were replayed on every sequence.
 
@@ -63,44 +65,8 @@ class ComparedModes(NamedTuple):
 
     sequences: tuple[str, ...]
     modes: tuple[str, ...]  # replayed on all of them, in the order of `MODES`
-    # By mode that somebody may expect, the sequences on which it was not replayed.
-    missing: Mapping[str, Sequence[str]]
-    unfinished: Sequence[str] = ()  # sequences that are not compared, for want of replays
-
-    def words(self, replays: Path, asked: Sequence[str]) -> list[str]:
-        """Sentences about what is not shown because it is missing; `asked` as `replayed_by`."""
-        said = []
-        if self.unfinished:
-            there = [m for m in self.modes if m not in ALSO or self.modes == WITHOUT_MODEL]
-            lacking = (
-                f"{name} ({', '.join(f'`{m}`' for m in there if not _is_there(replays, name, m))})"
-                for name in self.unfinished
-            )
-            command = replayed_by(asked, UNTRAINED if self.modes == WITHOUT_MODEL else "fixed")
-            said.append(
-                f"Not compared, because replays are missing: {', '.join(lacking)}; "
-                f"{command} makes them."
-            )
-        where: dict[tuple[str, ...], list[str]] = {}
-        for mode, names in self.missing.items():
-            where.setdefault(tuple(names), []).append(mode)
-        for names, modes in where.items():
-            are = "are" if len(modes) > 1 else "is"
-            each = " and ".join(f"`{mode}`" for mode in modes)
-            on = "any sequence" if names == self.sequences else " and ".join(names)
-            command = " or ".join(dict.fromkeys(replayed_by(asked, mode) for mode in modes))
-            said.append(
-                f"{each} {are} not compared: there is no replay on {on}; {command} makes what "
-                f"is missing."
-            )
-        return said
-
-
-def replayed_by(asked: Sequence[str], mode: str) -> str:
-    """The command that replays a mode, given those on demand that the study asks for."""
-    on_demand = mode in ALSO and mode not in asked
-    option = "--untrained" if mode == UNTRAINED else "--thorough"
-    return f"`adaptune online{f' {option}' if on_demand else ''}`"
+    unfinished: tuple[str, ...]  # sequences that are not compared, for want of replays
+    words: list[str]  # sentences about what is not shown because it is missing
 
 
 def compared_modes(study: Study) -> ComparedModes:
@@ -109,70 +75,76 @@ def compared_modes(study: Study) -> ComparedModes:
     Raises
     ------
     StoredReplayError
-        If the fixed set was replayed on none of them, and baseline and untrained bank not on all.
+        If the fixed set was replayed on none of them, and the untrained bank neither.
     """
-    setup, replays = ReplaySetup.of(study), study.folder / "replays"
-    names, without_model = study.config.test, sequences_without_model(study.config)
-    of_model = [mode for mode in MODES if mode not in WITHOUT_MODEL]
-    if not _any(replays, names, of_model) and _any(replays, without_model, [UNTRAINED]):
-        made, unfinished = _finished(replays, without_model, WITHOUT_MODEL)
-        if made:
-            return ComparedModes(made, WITHOUT_MODEL, {}, unfinished)
-    if not names:
+    setup, replays, names = ReplaySetup.of(study), study.folder / "replays", study.config.test
+    made = {n: replayed_modes(replays / n) for n in sequences_without_model(study.config)}
+    every = {mode for modes in made.values() for mode in modes}
+    if names and "fixed" in every:
+        model = ErrorModel.load(study.model_path) if study.model_path.exists() else None
+        modes = replace(setup, also=ALSO).modes(model)
+        due = every.intersection(("fixed", BASELINE, *setup.rules))
+    else:
+        modes, due = WITHOUT_MODEL, set(WITHOUT_MODEL)
+    finished = [name for name, there in made.items() if due.issubset(there)]
+    # No mode is everywhere: those with the fixed set are compared.
+    finished = finished or [name for name, there in made.items() if "fixed" in there]
+    if not finished and not names:
         raise StoredReplayError("test: name at least one sequence to compare on")
-    unfixed = [name for name in names if not _is_there(replays, name, "fixed")]
-    if len(unfixed) == len(names):
-        if all(_is_there(replays, name, m) for name in names for m in WITHOUT_MODEL):
-            return ComparedModes(names, WITHOUT_MODEL, {"fixed": unfixed})
+    if not finished:
         ReplaySummary.read(replays / names[0] / "fixed")
-    names, unfinished = _finished(replays, names, ("fixed", BASELINE, *setup.rules))
-    model = _model(replays, names[0], study.model_path)
-    asked = [m for m in ALSO if m in setup.also or _any(replays, study.config.test, [m])]
-    also = [mode for mode in asked if not setup.obstacle(mode, model)]
-    there = {
-        mode: [name for name in names if _is_there(replays, name, mode)]
-        for mode in MODES
-        if mode in (BASELINE, *RIVALS, "fixed", *setup.rules, *also)
-    }
-    expected = (BASELINE, *setup.rules, *also)
-    return ComparedModes(
-        names,
-        tuple(mode for mode, on in there.items() if len(on) == len(names)),
-        {
-            mode: [name for name in names if name not in on]
-            for mode, on in there.items()
-            if len(on) < len(names) and mode in expected
-        },
-        unfinished,
+    lacking = {mode: tuple(n for n in finished if mode not in made[n]) for mode in modes}
+    compared = tuple(mode for mode in modes if not lacking[mode])
+    unasked = {*RIVALS, *ALSO} - every.intersection(ALSO) - {*setup.also}
+    missing = {mode: on for mode, on in lacking.items() if on and mode not in unasked}
+    if modes == WITHOUT_MODEL and not every.issubset(WITHOUT_MODEL):
+        missing = {"fixed": tuple(finished)}
+    unfinished = {n: there for n, there in made.items() if n not in finished}
+    words = _unfinished(unfinished, compared, setup.also)
+    words += _missing(missing, tuple(finished), setup.also)
+    return ComparedModes(tuple(finished), compared, tuple(unfinished), words)
+
+
+def _unfinished(
+    unfinished: Mapping[str, Sequence[str]], modes: Sequence[str], asked: Sequence[str]
+) -> list[str]:
+    """A sentence about sequences that lack replays, given the modes that each has."""
+    if not unfinished:
+        return []
+    due = [m for m in modes if m not in ALSO or modes == WITHOUT_MODEL]
+    lacking = (
+        f"{name} ({', '.join(f'`{mode}`' for mode in due if mode not in there)})"
+        for name, there in unfinished.items()
     )
+    command = replayed_by(asked, UNTRAINED if modes == WITHOUT_MODEL else "fixed")
+    return [
+        f"Not compared, because replays are missing: {', '.join(lacking)}; {command} makes them."
+    ]
 
 
-def _finished(
-    replays: Path, names: Sequence[str], modes: Sequence[str]
-) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Sequences that were replayed in all modes that any was, and those that were not yet."""
-    made = [mode for mode in modes if _any(replays, names, [mode])]
-    finished = tuple(n for n in names if all(_is_there(replays, n, mode) for mode in made))
-    if not finished:  # no mode is everywhere: those with the fixed set are compared
-        finished = tuple(n for n in names if _is_there(replays, n, "fixed"))
-    return finished, tuple(name for name in names if name not in finished)
+def _missing(
+    missing: Mapping[str, tuple[str, ...]], sequences: tuple[str, ...], asked: Sequence[str]
+) -> list[str]:
+    """Sentences about modes that were not replayed, given on which sequences."""
+    said = []
+    for names in dict.fromkeys(missing.values()):
+        modes = [mode for mode, on in missing.items() if on == names]
+        are = "are" if len(modes) > 1 else "is"
+        each = " and ".join(f"`{mode}`" for mode in modes)
+        on = "any sequence" if names == sequences else " and ".join(names)
+        command = " or ".join(dict.fromkeys(replayed_by(asked, mode) for mode in modes))
+        said.append(
+            f"{each} {are} not compared: there is no replay on {on}; {command} makes what is "
+            f"missing."
+        )
+    return said
 
 
-def _model(replays: Path, name: str, own: Path) -> ErrorModel | None:
-    """The model of the replays of a sequence; None if its file is gone, or they need none."""
-    there = (mode for mode in MODES if _is_there(replays, name, mode))
-    summaries = (ReplaySummary.read(replays / name / mode) for mode in there)
-    files = [s.model_file for s in summaries if s.model_file and s.inputs["model"]]
-    path = Path(files[0]) if files else own
-    return ErrorModel.load(path) if path.exists() else None
-
-
-def _any(replays: Path, names: Iterable[str], modes: Sequence[str]) -> bool:
-    return any(_is_there(replays, name, mode) for name in names for mode in modes)
-
-
-def _is_there(replays: Path, name: str, mode: str) -> bool:
-    return (replays / name / mode / "replay.json").exists()
+def replayed_by(asked: Sequence[str], mode: str) -> str:
+    """The command that replays a mode, given those on demand that the study asks for."""
+    on_demand = mode in ALSO and mode not in asked
+    option = "--untrained" if mode == UNTRAINED else "--thorough"
+    return f"`adaptune online{f' {option}' if on_demand else ''}`"
 
 
 # The comparison over all sequences.
@@ -335,178 +307,108 @@ def with_gaps(
 # Replays that are not of what the study is now: neither compared nor drawn.
 
 
-class CurrentModes(NamedTuple):
-    """The modes whose replays of a sequence are of what the study is now."""
+class CurrentReplays(NamedTuple):
+    """The replays that are of what the study is now."""
 
-    modes: tuple[str, ...]  # in the order of `MODES`
+    model: ErrorModel | None  # what they are of; None if its file is not there any more
+    modes: tuple[str, ...]  # all of whose replays are current, in the order of `MODES`
     refused: tuple[str, ...]  # sentences about the others
 
 
-def check_replays(
-    study: Study, setup: ReplaySetup, names: Sequence[str], modes: Sequence[str]
-) -> ErrorModel | None:
-    """Refuse replays that are missing, or of another recording, model or configuration.
+def current_replays(
+    study: Study, names: Sequence[str], modes: Sequence[str] | None = None
+) -> CurrentReplays:
+    """Tell replays of another recording, model or configuration from the others.
 
-    Returns
-    -------
-    ErrorModel or None
-        What the replays are of; None if its file is not there any more.
+    Of replays with different models, those with the study's own are current.
+
+    Parameters
+    ----------
+    study
+        The study.
+    names
+        Of the sequences.
+    modes
+        To look at; by default all that were replayed and that the study may have.
 
     Raises
     ------
     StoredReplayError
+        If a replay is missing or damaged, or if they do not go together.
     """
+    setup, replays = ReplaySetup.of(study), study.folder / "replays"
     made = {
-        (name, mode): ReplaySummary.read(study.folder / "replays" / name / mode)
+        (name, mode): ReplaySummary.read(replays / name / mode)
         for name in names
-        for mode in modes
+        for mode in modes or replayed_modes(replays / name)
     }
-    replays, own = study.folder / "replays", study.model_path.resolve()
-    path = _model_file(replays, made.values(), own, setup.also)
-    model = _load(study, path)
-    shared = {name: study.replay_inputs(name) for name in names}
-    _check_rates(replays, made.values())
-    for (name, mode), summary in made.items():
-        if differing := _differing(study.sequences, setup, summary, model, shared[name]):
-            raise StoredReplayError(
-                _refusal(replays / name, [mode], differing, setup.also, _other(path, own))
-            )
-    for name in names:
-        _check_reference(replays / name, study.sequences.reference(name), modes)
-    return model
-
-
-def current_modes(study: Study, name: str) -> CurrentModes:
-    """Tell the replays of a sequence that `check_replays` would refuse from the others.
-
-    Of replays with different models, those with the study's own are the others.
-
-    Raises
-    ------
-    AdaptuneError
-        If it would refuse all of them.
-    """
-    folder, setup = study.folder / "replays" / name, ReplaySetup.of(study)
-    there = [mode for mode in MODES if (folder / mode / "replay.json").exists()]
-    made = {mode: ReplaySummary.read(folder / mode) for mode in there}
-    if not made:
-        return CurrentModes((), ())
     own = study.model_path.resolve()
-    path = own
-    if len(_files(made.values())) < 2 or not own.exists():
-        path = _model_file(folder.parent, made.values(), own, setup.also)
-    model = _load(study, path)
-    considered = _considered(setup, model)
-    made = {mode: summary for mode, summary in made.items() if mode in considered}
-    _check_rates(folder.parent, made.values())
-    _check_reference(folder, study.sequences.reference(name), list(made))
-    shared = study.replay_inputs(name)
-    current, refused = [], dict[tuple[Any, ...], list[str]]()
-    for mode, summary in made.items():
-        if differing := _differing(study.sequences, setup, summary, model, shared):
-            on_demand = replayed_by(setup.also, mode), mode == UNTRAINED
-            refused.setdefault((*on_demand, *differing), []).append(mode)
-        else:
-            current.append(mode)
-    said = (
-        f"{_refusal(folder, modes, differing, setup.also, _other(path, own))}."
-        for (_, _, *differing), modes in refused.items()
-    )
-    return CurrentModes(tuple(current), tuple(said))
+    path = _model_file(replays, made.values(), own)
+    model = None
+    if path.exists():
+        model = study.model(path) if path == own else ErrorModel.load(path)
+    if modes is None:
+        possible = replace(setup, also=ALSO).modes(model)
+        made = {key: summary for key, summary in made.items() if key[1] in possible}
+    if len({str(summary.inputs["real_time"]) for summary in made.values()}) > 1:
+        raise StoredReplayError(
+            f"{replays}: some were made in real time, and others not, or not so; "
+            f"run `adaptune online` again, with online.real_time.rate or without"
+        )
+    shared = {name: study.replay_inputs(name) for name in names}
+    refused: dict[tuple[str, ...], list[str]] = {}
+    for (name, mode), summary in made.items():
+        if said := _differing(study.sequences, setup, summary.inputs, model, shared[name]):
+            command = replayed_by(setup.also, mode)
+            if mode != UNTRAINED and path != own:
+                command = f"{command[:-1]} --model {path}`"
+            refused.setdefault((name, command, *said), []).append(mode)
+    stale = {mode for those in refused.values() for mode in those}
+    current = tuple(dict.fromkeys(mode for _, mode in made if mode not in stale))
+    words = (_refusal(replays / key[0], those, *key[1:]) for key, those in refused.items())
+    return CurrentReplays(model, current, tuple(words))
 
 
-def _considered(setup: ReplaySetup, model: ErrorModel | None) -> set[str]:
-    """The modes that the study may have; a replay that is left of another one is not looked at."""
-    rivals: Iterable[str] = RIVALS
-    also: Iterable[str] = ALSO
-    if model is not None:
-        rivals = [mode for mode in RIVALS if mode in model.rivals]
-        also = [mode for mode in ALSO if not setup.obstacle(mode, model)]
-    return {BASELINE, *rivals, "fixed", *setup.rules, *also}
+def _refusal(folder: Path, modes: Sequence[str], command: str, *differing: str) -> str:
+    """Why replays of a sequence are refused, and the command that makes them again."""
+    what = f"{folder / modes[0]}: was" if len(modes) == 1 else f"{folder}: {', '.join(modes)} were"
+    return f"{what} made from other inputs: {'; '.join(differing)}; run {command} with this study."
 
 
 def _differing(
     sequences: StudySequences,
     setup: ReplaySetup,
-    summary: ReplaySummary,
+    inputs: manifest.Inputs,
     model: ErrorModel | None,
-    shared: Mapping[str, Any],
+    shared: manifest.Inputs,
 ) -> list[str]:
     """In what a replay differs from one that would be made now, given what all modes share."""
     # What was made in real time may be compared without saying so.
-    now, about = {**shared, "real_time": None}, summary.inputs | {"real_time": None}
-    mode = summary.mode
+    now, mode = {**shared, "real_time": inputs["real_time"]}, inputs["mode"]
     if model is not None or mode in WITHOUT_MODEL:
-        whole = setup.identity(mode, model, "" if model is None else model.digest)
-        now |= {key: whole[key] for key in ("model", "parameters")}
-        both = whole["switching"], about["switching"]
+        own = setup.identity(mode, model, "" if model is None else model.digest)
+        now |= {key: own[key] for key in ("model", "parameters")}
+        both = own["switching"], inputs["switching"]
         automatic = setup.switching.mechanism == "auto" and None not in both
         # Another machine would choose another mechanism.
         if not automatic or both[0]["mechanism"] == both[1]["mechanism"]:
-            now["switching"] = whole["switching"]
+            now["switching"] = own["switching"]
     files = sequences.sources(next(iter(shared["recording"])))
-    return manifest.changes({key: about.get(key) for key in now}, now, files)
+    return manifest.changes({key: inputs.get(key) for key in now}, now, files)
 
 
-def _other(path: Path, own: Path) -> Path | None:
-    """A model's file, if it is not the study's own."""
-    return None if path == own else path
-
-
-def _refusal(
-    folder: Path,
-    modes: Sequence[str],
-    differing: Sequence[str],
-    asked: Sequence[str],
-    path: Path | None,
-) -> str:
-    """Why replays of a sequence are refused, and the command that makes them with a model."""
-    command = replayed_by(asked, modes[0])
-    if modes[0] != UNTRAINED and path is not None:
-        command = f"{command[:-1]} --model {path}`"
-    what = f"{folder / modes[0]}: was" if len(modes) == 1 else f"{folder}: {', '.join(modes)} were"
-    return f"{what} made from other inputs: {'; '.join(differing)}; run {command} with this study"
-
-
-def _check_rates(replays: Path, summaries: Collection[ReplaySummary]) -> None:
-    if len({str(summary.inputs["real_time"]) for summary in summaries}) > 1:
-        raise StoredReplayError(
-            f"{replays}: some were made in real time, and others not, or not so; "
-            f"run `adaptune online` again, with online.real_time.rate or without"
-        )
-
-
-def _check_reference(folder: Path, poses: manifest.Inputs, modes: Sequence[str]) -> None:
-    option = " --untrained" if UNTRAINED in modes and "fixed" not in modes else ""
-    check_reference(folder, poses, option)
-
-
-def _files(summaries: Iterable[ReplaySummary]) -> dict[str, str]:
-    """The files of the models of replays, by digest."""
-    models = ((s.inputs["model"], s.model_file) for s in summaries)
-    return {digest: file for digest, file in models if digest and file}
-
-
-def _model_file(
-    replays: Path, summaries: Collection[ReplaySummary], own: Path, asked: Sequence[str]
-) -> Path:
-    """File of the model that all replays are of."""
-    files = _files(summaries)
-    if len(files) > 1:
-        commands = {replayed_by(asked, s.mode) for s in summaries if s.inputs["model"]}
+def _model_file(replays: Path, summaries: Collection[ReplaySummary], own: Path) -> Path:
+    """File of the model of replays, by default the study's own."""
+    models = ((summary.inputs["model"], summary.model_file) for summary in summaries)
+    files = {digest: file for digest, file in models if digest and file}
+    if len(files) == 1:
+        return Path(*files.values())
+    if files and not own.exists():
         raise StoredReplayError(
             f"{replays}: holds replays with different models "
-            f"({' and '.join(sorted(set(files.values())))}); run {max(commands, key=len)} again"
+            f"({' and '.join(sorted(set(files.values())))}); run `adaptune online` again"
         )
-    return Path(next(iter(files.values()), own))
-
-
-def _load(study: Study, path: Path) -> ErrorModel | None:
-    """A model if its file is still there; the study's own is still of its recordings."""
-    if not path.exists():
-        return None
-    own = path == study.model_path.resolve()
-    return study.model(path) if own else ErrorModel.load(path)
+    return own
 
 
 class ComparedReplays(NamedTuple):
@@ -537,16 +439,20 @@ def compare(study: Study) -> ComparedReplays:
         If that of the fixed set is missing, or one is damaged, or of another recording or
         configuration.
     """
-    setup, compared = ReplaySetup.of(study), compared_modes(study)
+    compared = compared_modes(study)
     names, modes = compared.sequences, compared.modes
-    model = check_replays(study, setup, names, modes)
+    model, _, refused = current_replays(study, names, modes)
+    if refused:
+        raise StoredReplayError(refused[0][:-1])
+    for name in names:
+        check_reference(study.folder / "replays" / name, study.sequences.reference(name))
     judged: list[JudgedModes] = []
     oracles: list[ComparisonRow] = []
     for name in names:
         folder = study.folder / "replays" / name
         replays = {mode: read_repeats(folder / mode) for mode in modes}
-        length = study.config.sub_trajectory
-        reference = Reference.of(study.sequences, name, folder, length)
+        stored = study.sequences.estimate(name)
+        reference = Reference.read(folder, study.config.sub_trajectory, stored)
         every = _with_fixed_rivals(replays, model)
         of_modes = compare_modes(name, every, reference)
         judged.append(of_modes._replace(recording=study.sequences.recorded_in(name)))
@@ -558,9 +464,9 @@ def compare(study: Study) -> ComparedReplays:
     words = [
         *remarks(rows),
         *_equal_cost(model, modes),
-        *compared.words(study.folder / "replays", setup.also),
+        *compared.words,
+        *_missing_repeats(judged),
     ]
-    words += _missing_repeats(judged)
     words += _without_oracle(judged, oracles) if model is not None else []
     folder = study.folder / "comparison"
     report.write_rows(folder, "comparison", [row.columns() for row in rows])
@@ -624,7 +530,7 @@ def _against(
     """Compare a mode that adapts with controls and rivals, too, on the same frames."""
     if row.mode not in ("adaptive", UNTRAINED):
         return row
-    others = [other.mode for other in rows if other.mode in (*CONTROLS, *RIVALS)]
+    others = [other.mode for other in rows if other.mode in (EVEN, *RIVALS)]
     return replace(row, against={other: ratio_to(judged, row.mode, other) for other in others})
 
 

@@ -6,7 +6,7 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
@@ -58,10 +58,10 @@ class LiveScans:
     ----------
     ignored : int
         Scans that came twice, or after a newer one.
-    damaged : int
-        Messages that held no scan.
     frame : str
         Name of the sensor's frame, by the newest cloud.
+    stopped : bool
+        Whether `stop` was called.
     """
 
     def __init__(
@@ -72,16 +72,17 @@ class LiveScans:
         queue: int = 1,
         imu: ImuConfig | None = None,
     ):
-        self.ignored = self.damaged = 0
+        self.ignored = 0
         self.frame = "sensor"
         self._link, self._points, self._timing, self._queue = link, points, timing, queue
         self._settings = imu
-        _warm_up(timing)
+        # Load compiled code, for which the first scans should not wait.
+        from_fields(dict.fromkeys("xyz", np.ones(1, np.float32)), 0, timing)
         self._news = threading.Condition()
         self._waiting: deque[tuple[Scan, float]] = deque()
         self._measured: deque[tuple[int, tuple[float, ...]]] = deque(maxlen=_MAX_IMU)
         self._dropped = 0
-        self._stopped = False
+        self.stopped = False
         if imu is not None and imu.topic is not None:
             link.subscribe(imu.topic, IMU, self._take_imu)
         link.subscribe(points, CLOUD, self._take)
@@ -89,7 +90,7 @@ class LiveScans:
     def stop(self) -> None:
         """End all iterations."""
         with self._news:
-            self._stopped = True
+            self.stopped = True
             self._news.notify()
 
     def arrivals(self) -> Iterator[Arrival]:
@@ -106,11 +107,6 @@ class LiveScans:
             before, last = last, scan.stamp
             yield Arrival(self._with_imu(scan, before), came, dropped)
 
-    @property
-    def stopped(self) -> bool:
-        """Whether `stop` was called."""
-        return self._stopped
-
     def _next(self, last: int | None) -> tuple[tuple[Scan, float], int] | None:
         """The next scan, and how many were dropped before it; None at the end."""
         silent = 0.0
@@ -122,7 +118,7 @@ class LiveScans:
             if np.log2(silent / SILENCE) % 1.0 == 0.0:
                 self._tell_of_silence(silent)
         with self._news:
-            if self._stopped:
+            if self.stopped:
                 return None
             stamp = self._waiting[0][0].stamp
             if last is not None and stamp < last - BACK:
@@ -137,7 +133,7 @@ class LiveScans:
     def _is_there(self) -> bool:
         """Whether there is a scan, or the end, before the silence is too long."""
         with self._news:
-            return self._news.wait_for(lambda: bool(self._waiting or self._stopped), SILENCE)
+            return self._news.wait_for(lambda: bool(self._waiting or self.stopped), SILENCE)
 
     def _tell_of_silence(self, seconds: float) -> None:
         hint = ""
@@ -156,7 +152,6 @@ class LiveScans:
         try:
             scan = to_scan(message, self._timing)
         except AdaptuneError as error:
-            self.damaged += 1
             _log.warning("%s: %s; the scan is left out", self._points, error)
             return
         with self._news:
@@ -183,7 +178,7 @@ class LiveScans:
         end = scan.stamp + scan.span
         with self._news:
             self._news.wait_for(
-                lambda: self._stopped or (self._measured and self._measured[-1][0] >= end),
+                lambda: self.stopped or (self._measured and self._measured[-1][0] >= end),
                 IMU_WAIT,
             )
             # The first scan gets those during it, and the one before.
@@ -196,12 +191,6 @@ class LiveScans:
         values = np.array([values for _, values in taken], np.float64).reshape(-1, 6)
         imu = self._settings.in_si(Imu(stamps, values[:, :3], values[:, 3:]))
         return replace(scan, imu=imu)
-
-
-def _warm_up(timing: Timing) -> None:
-    """Load compiled code, for which the first scans should not wait."""
-    numbers = np.ones(1, np.float32)
-    from_fields(dict.fromkeys("xyz", numbers), 0, timing)
 
 
 def to_scan(message: Any, timing: Timing) -> Scan:
@@ -264,6 +253,15 @@ class Uncertainty:
             self.rotation += self._share**2 * metres / self._length
 
 
+Placed = tuple[list[float], list[float]]
+"""Position and quaternion of a pose."""
+
+
+def placed(T: Poses) -> list[Placed]:
+    """Positions and quaternions of poses of shape (n, 4, 4)."""
+    return list(zip(T[:, :3, 3].tolist(), to_quaternions(T).tolist(), strict=True))
+
+
 class RosMessages:
     """Makes messages of one ROS.
 
@@ -276,60 +274,51 @@ class RosMessages:
     def _make(self, kind: str, **fields: Any) -> Any:
         return self._types[kind](**fields)
 
-    def _header(self, stamp: int, frame: str) -> Any:
-        seconds, nanoseconds = divmod(stamp, 10**9)
-        time = self._make("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
+    def header(self, stamp: int, frame: str | None = None) -> Any:
+        """A header in a frame, by default the odometry's."""
+        time = self._types["builtin_interfaces/msg/Time"](*divmod(stamp, 10**9))
         kind: Any = self._types["std_msgs/msg/Header"]
         # ROS 1 counts messages.
         numbered = {"seq": 0} if "seq" in kind.__dataclass_fields__ else {}
-        return kind(stamp=time, frame_id=frame, **numbered)
+        return kind(stamp=time, frame_id=self._frame if frame is None else frame, **numbered)
 
-    def _vector(self, kind: str, values: Any) -> Any:
-        x, y, z = map(float, values)
-        return self._make(f"geometry_msgs/msg/{kind}", x=x, y=y, z=z)
+    def _vector(self, kind: str, values: Iterable[float]) -> Any:
+        return self._types[f"geometry_msgs/msg/{kind}"](*values)
 
-    def _quaternion(self, T: Poses) -> Any:
-        x, y, z, w = to_quaternions(T[None])[0].tolist()
-        return self._make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
+    def pose(self, at: Placed) -> Any:
+        """geometry_msgs/Pose."""
+        position, orientation = self._vector("Point", at[0]), self._vector("Quaternion", at[1])
+        return self._make("geometry_msgs/msg/Pose", position=position, orientation=orientation)
 
     def odometry(
-        self, stamp: int, T_odom_sensor: Poses, child: str, uncertainty: Uncertainty
+        self, stamp: int, at: Placed, child: str, variances: tuple[float, float] = (0.0, 0.0)
     ) -> Any:
-        """nav_msgs/Odometry; the twist is not known."""
-        position = self._vector("Point", T_odom_sensor[:3, 3])
-        pose = self._make(
-            "geometry_msgs/msg/Pose", position=position, orientation=self._quaternion(T_odom_sensor)
-        )
-        variances = np.repeat([uncertainty.position, uncertainty.rotation], 3)
+        """nav_msgs/Odometry with variances of position and rotation; the twist is not known."""
         zero = self._vector("Vector3", (0.0, 0.0, 0.0))
         twist = self._make("geometry_msgs/msg/Twist", linear=zero, angular=zero)
         # By convention -1 says that a value is not known.
         unknown = np.zeros(36)
         unknown[0] = -1.0
+        certain = np.diag(np.repeat(variances, 3)).ravel()
+        with_covariance = "geometry_msgs/msg/{}WithCovariance".format
         return self._make(
             "nav_msgs/msg/Odometry",
-            header=self._header(stamp, self._frame),
+            header=self.header(stamp),
             child_frame_id=child,
-            pose=self._make(
-                "geometry_msgs/msg/PoseWithCovariance",
-                pose=pose,
-                covariance=np.diag(variances).ravel(),
-            ),
-            twist=self._make(
-                "geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=unknown
-            ),
+            pose=self._make(with_covariance("Pose"), pose=self.pose(at), covariance=certain),
+            twist=self._make(with_covariance("Twist"), twist=twist, covariance=unknown),
         )
 
-    def transform(self, stamp: int, T_odom_sensor: Poses, child: str) -> Any:
+    def transform(self, stamp: int, at: Placed, child: str) -> Any:
         """tf2_msgs/TFMessage."""
         moved = self._make(
             "geometry_msgs/msg/Transform",
-            translation=self._vector("Vector3", T_odom_sensor[:3, 3]),
-            rotation=self._quaternion(T_odom_sensor),
+            translation=self._vector("Vector3", at[0]),
+            rotation=self._vector("Quaternion", at[1]),
         )
         one = self._make(
             "geometry_msgs/msg/TransformStamped",
-            header=self._header(stamp, self._frame),
+            header=self.header(stamp),
             child_frame_id=child,
             transform=moved,
         )
@@ -382,7 +371,7 @@ class RosMessages:
             hardware_id="",
             values=[self._make(kind, key=key, value=value) for key, value in values.items()],
         )
-        header = self._header(stamp, "")
+        header = self.header(stamp, "")
         return self._make("diagnostic_msgs/msg/DiagnosticArray", header=header, status=[found])
 
 

@@ -41,7 +41,7 @@ from online.record import (
     write_reference,
     write_replay,
 )
-from online.replay import Look, ReplayRecord, Watch, replay
+from online.replay import Look, ReplayRecord, replay
 
 BASELINE, FIXED, ADAPTIVE, PAPER = "baseline", "fixed", "adaptive", "paper"
 EVEN, UNTRAINED = "even", "untrained"
@@ -180,22 +180,16 @@ class ReplaySetup:
             return cannot_adapt(self.odometry, self.mechanism)
         return ""
 
-    def modes(self, model: ErrorModel) -> tuple[str, ...]:
+    def modes(self, model: ErrorModel | None) -> tuple[str, ...]:
         """What is replayed with a model, in the order of `MODES`: what is possible of all modes.
 
-        A rival that is the fixed set is not replayed again.
+        A rival that is the fixed set is not replayed again. Without the model, all is possible that
+        is with any.
         """
-        rivals = [rival for rival in RIVALS if model.rivals.get(rival, model.fixed) != model.fixed]
-        modes = {BASELINE, *rivals, FIXED, *self.rules, *self.also}
+        modes = {BASELINE, *RIVALS, FIXED, *self.rules, *self.also}
+        if model is not None:
+            modes -= {r for r in RIVALS if model.rivals.get(r, model.fixed) == model.fixed}
         return tuple(name for name in MODES if name in modes and not self.obstacle(name, model))
-
-    def start(
-        self, name: str, model: ErrorModel | None = None, sequence: str | None = None
-    ) -> tuple[OdometryInstance, AnySelector | None]:
-        """Make a new odometry, or a bank, and its selector; None if its parameters stay."""
-        mode = self.mode(name, model)
-        selector = None if mode.selector is None else mode.selector()
-        return self.instance(mode, sequence), selector
 
     def instance(self, mode: Mode, sequence: str | None = None) -> OdometryInstance:
         """Make the odometry of a mode, or the bank.
@@ -270,6 +264,11 @@ def needed(name: str, model: ErrorModel | None) -> ErrorModel:
     if model is None:
         raise ModeError(f"{name}: needs an error model; run `adaptune offline`, which fits one")
     return model
+
+
+def replayed_modes(folder: Path) -> tuple[str, ...]:
+    """The modes in which a sequence was replayed, in the order of `MODES`, from their folder."""
+    return tuple(mode for mode in MODES if (folder / mode / "replay.json").exists())
 
 
 def sequences_without_model(config: StudyConfig) -> tuple[str, ...]:
@@ -471,56 +470,24 @@ def _replayed(config: StudyConfig, recording: Recording, run: _Run, modes: _Mode
         modes.progress(what, record.done, n)
         modes.look(what, n, record)
 
+    mode = modes.setup.mode(run.mode, modes.model)
+    online, make = config.online, mode.selector
     try:
-        drive = _in_lockstep if config.online.real_time is None else _in_real_time
-        record = drive(config, recording, run, modes, watch)
+        with closing(modes.setup.instance(mode, run.sequence)) as odometry, ExitStack() as stack:
+            given = recording, odometry, config.health
+            if online.real_time is not None:
+                there = make and stack.enter_context(closing(SelectorProcess(make, online.period)))
+                record = replay_in_real_time(*given, online.real_time, there, watch, what)
+            else:
+                selector = make and make()
+                fixed = selector and selector.fall_back()
+                record = replay(*given, selector, online.period, watch, what, fixed)
     except DescriptorError as error:
         raise ReplayError(f"sequences.{run.sequence}: {error}") from error
     modes.progress(what, n, n)
     if modes.model is not None and record.choices:
-        selections = [choice.selection for choice in record.choices]
-        fixed = modes.setup.mode(run.mode, modes.model).fixed
-        warn_of_scant_evidence(what, selections, fixed)
+        warn_of_scant_evidence(what, [choice.selection for choice in record.choices], mode.fixed)
     return record
-
-
-def _in_lockstep(
-    config: StudyConfig, recording: Recording, run: _Run, modes: _Modes, watch: Watch
-) -> ReplayRecord:
-    odometry, selector = modes.setup.start(run.mode, modes.model, run.sequence)
-    with closing(odometry):
-        return replay(
-            recording,
-            odometry,
-            config.health,
-            selector,
-            config.online.period,
-            watch,
-            str(run),
-            None if selector is None else selector.fall_back(),
-        )
-
-
-def _in_real_time(
-    config: StudyConfig, recording: Recording, run: _Run, modes: _Modes, watch: Watch
-) -> ReplayRecord:
-    assert config.online.real_time is not None
-    mode = modes.setup.mode(run.mode, modes.model)
-    odometry = modes.setup.instance(mode, run.sequence)
-    selector = None
-    with closing(odometry), ExitStack() as stack:
-        if mode.selector is not None:
-            selector = SelectorProcess(mode.selector, config.online.period)
-            stack.enter_context(closing(selector))
-        return replay_in_real_time(
-            recording,
-            odometry,
-            config.health,
-            config.online.real_time,
-            selector,
-            watch,
-            str(run),
-        )
 
 
 def warn_of_scant_evidence(what: str, selections: Iterable[Selection], fixed: int) -> None:

@@ -15,8 +15,6 @@ from multiprocessing.connection import Connection
 from queue import Queue
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from adaptune.bank.bank import CLOCK, Bank, Clock
 from adaptune.errors import AdaptuneError
 from adaptune.odometry.base import Motions, OdometryInstance
@@ -387,10 +385,9 @@ class RealTimeDrive:
         if self._selector is not None:
             self.record.unseen = self._selector.unseen
         if isinstance(self._odometry, Bank):
-            late, trials = self._odometry.late, self._odometry.trials
-            pairs = zip(trials, late.scans.tolist(), strict=True)
-            self.record.late_members = {trial: scans for trial, scans in pairs if scans}
-            self.record.removed = tuple(np.array(trials)[late.removed].tolist())
+            late = self._odometry.late
+            self.record.late_members = int(late.scans.sum())
+            self.record.removed = int(late.removed.sum())
 
     def _prepare(self, scan: Scan, due: float) -> Any:
         """Prepare a scan with the parameters that it is registered with.

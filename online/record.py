@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,8 +22,6 @@ from online.replay import Choice, ReplayRecord
 
 _TABLES = ("frames.csv", "selections.csv")
 """Files of a replay besides its trajectory."""
-_TIMES = ("prepare_ms", "register_ms")
-"""Columns of ``frames.csv``: milliseconds of a scan."""
 
 
 class StoredReplayError(AdaptuneError):
@@ -41,18 +39,11 @@ class ReplaySummary(BaseModel):
     poor_scans: int  # scans that were too poor to register
     selections: int
     lost_seconds: float = 0.0  # how long the bank was lost
-    # Percent: mean of the odometry's own error as it was measured without ground truth.
-    mean_estimated_error: float | None = None
     cpu_ms: float | None = None  # milliseconds of CPU time a scan, without reading it
     memory_mb: float | None = None  # most megabytes of all processes
     real_time: dict[str, float] | None = None  # how it kept up, see `kept_up`
     model_file: str | None  # of the model that it was made with; None if it needed none
     inputs: dict[str, Any] = Field({}, exclude=True)  # see `adaptune.manifest`
-
-    @property
-    def mode(self) -> str:
-        """Which mode was replayed."""
-        return str(self.inputs["mode"])
 
     @classmethod
     def read(cls, folder: Path) -> Self:
@@ -122,18 +113,35 @@ class StoredReplay:
 
     summary: ReplaySummary
     trajectory: Trajectory
-    restarted: NDArray[np.bool_]  # (n,): frames at which the health check restarted the odometry
-    seconds: float  # that the odometry took to prepare and register all scans
+    # Columns of ``frames.csv``, of shape (n,); `late_ms` is empty where it was not in real time.
+    frames: Mapping[str, NDArray[np.float64]]
     # (m,): nanoseconds, of the scans that selections were made from; the first one of a mode that
     # keeps its parameters.
     choice_stamps: NDArray[np.int64]
     # For every parameter its values, of shape (m,); in a bank those of the heaviest member.
-    choices: dict[str, Sequence[Any]]
-    weights: dict[int, Sequence[float]]  # in a bank, by trial, of shape (m,); empty without one
-    # (m, 3): the odometry's own error as it was measured while driving, and the ends of its
-    # interval, in percent; NaN where it is unknown.
-    estimated: NDArray[np.float64]
-    lost: NDArray[np.bool_]  # (m,): whether the bank was lost
+    choices: Mapping[str, Sequence[Any]]
+    weights: Mapping[int, Sequence[float]]  # in a bank, by trial, of shape (m,); empty without one
+    # Other columns of ``selections.csv``, of shape (m,): NaN where they are unknown, and of a mode
+    # that keeps its parameters.
+    selections: Mapping[str, NDArray[np.float64]]
+
+    @property
+    def restarted(self) -> NDArray[np.bool_]:
+        """Frames at which the health check restarted the odometry, of shape (n,)."""
+        return self.frames["restarted"] == 1.0
+
+    @property
+    def lost(self) -> NDArray[np.bool_]:
+        """Whether the bank was lost, of shape (m,)."""
+        return self.selections["lost"] == 1.0
+
+    @property
+    def estimated(self) -> NDArray[np.float64]:
+        """The odometry's own error as measured while driving, in percent, of shape (m, 3).
+
+        It is followed by the ends of its interval; NaN where it is unknown.
+        """
+        return np.column_stack([self.selections[name] for name in _ESTIMATED])
 
     @classmethod
     def read(cls, folder: Path) -> Self:
@@ -149,25 +157,26 @@ class StoredReplay:
             trajectory = read_tum(folder / "trajectory.tum")
         except TrajectoryError as error:
             raise StoredReplayError(f"{error}; {_made_again(folder)}") from error
-        frames = read_columns(folder / "frames.csv")
-        restarted = np.array(frames.get("restarted", [])) == "1"
-        if len(restarted) != len(trajectory):
+        path = folder / "frames.csv"
+        try:
+            columns = _columns(path)
+            frames = {name: _floats(columns.get(name, [])) for name in FRAME_COLUMNS[1:]}
+            path = folder / "selections.csv"
+            columns = _applied(_columns(path), summary.selections)
+            stamps = np.array(list(map(int, columns.pop("stamp_ns"))), np.int64)
+            weights = _weights(columns.pop("weights"))
+            selections = {name: _floats(columns.pop(name)) for name in _NUMBERS}
+        except (OSError, KeyError, ValueError) as error:
+            raise damaged(path, error) from error
+        if {len(frames[name]) for name in FRAME_COLUMNS[1:-1]} != {len(trajectory)}:
             cut = "frames.csv" if len(trajectory) == summary.scans else "trajectory.tum"
             raise damaged(folder / cut, ValueError("not a row for every scan"))
-        try:
-            seconds = 1e-3 * sum(float(ms) for key in _TIMES for ms in frames[key])
-        except (KeyError, ValueError) as error:
-            raise damaged(folder / "frames.csv", error) from error
-        chosen = _choices(folder / "selections.csv", summary.selections)
-        if not len(chosen.stamps):
+        if not len(stamps):
             kept = summary.inputs["parameters"] or {}
-            chosen = chosen._replace(
-                stamps=trajectory.stamps[:1],
-                parameters={name: _numbers([str(value)]) for name, value in kept.items()},
-                estimated=np.full((1, 3), np.nan),
-                lost=np.zeros(1, bool),
-            )
-        return cls(summary, trajectory, restarted, seconds, *chosen)
+            columns = {name: [str(value)] for name, value in kept.items()}
+            stamps, selections = trajectory.stamps[:1], dict.fromkeys(_NUMBERS, np.full(1, np.nan))
+        choices = {name: _numbers(values) for name, values in columns.items()}
+        return cls(summary, trajectory, frames, stamps, choices, weights, selections)
 
 
 def write_replay(
@@ -179,12 +188,10 @@ def write_replay(
     """
     write_tum(folder / "trajectory.tum", replay.trajectory)
     _write_selections(folder / "selections.csv", replay)
-    rows = [frame_row(step, math.nan) for step in replay.steps]
-    columns: tuple[str, ...] = FRAME_COLUMNS[:-1]
-    if replay.rate is not None:
-        columns, late = FRAME_COLUMNS, replay.late
-        rows = [frame_row(*pair) for pair in zip(replay.steps, late, strict=True)]
-    _write_csv(folder / "frames.csv", columns, (row[: len(columns)] for row in rows))
+    columns = FRAME_COLUMNS if replay.rate is not None else FRAME_COLUMNS[:-1]
+    late = replay.late if replay.rate is not None else itertools.repeat(math.nan)
+    rows = (frame_row(*pair)[: len(columns)] for pair in zip(replay.steps, late, strict=False))
+    _write_csv(folder / "frames.csv", columns, rows)
     stamps = replay.trajectory.stamps
     summary = ReplaySummary(
         scans=len(stamps),
@@ -195,7 +202,6 @@ def write_replay(
         poor_scans=int((~replay.registered).sum()),
         selections=len(replay.choices),
         lost_seconds=round(_lost_seconds(replay), 3),
-        mean_estimated_error=_mean_estimated(replay),
         cpu_ms=round(replay.cpu_ms, 3),
         memory_mb=round(replay.memory, 1),
         real_time=kept_up(replay),
@@ -214,8 +220,8 @@ def kept_up(replay: ReplayRecord) -> dict[str, float] | None:
         "dropped_scans": replay.dropped,
         "missed_selections": replay.missed,
         "unseen_scans": replay.unseen,
-        "late_members_scans": sum(replay.late_members.values()),
-        "removed_members": len(replay.removed),
+        "late_members_scans": replay.late_members,
+        "removed_members": replay.removed,
     }
     latencies = [choice.seconds for choice in replay.choices]
     named = {"pose": replay.late, "selection": latencies, "waited": replay.waited}
@@ -233,18 +239,12 @@ def _lost_seconds(replay: ReplayRecord) -> float:
     return 1e-9 * sum(end - start for choice, (start, end) in spans if choice.selection.lost)
 
 
-def _mean_estimated(replay: ReplayRecord) -> float | None:
-    """Mean of the estimated errors, where there are any."""
-    errors = [choice.selection.estimated_error for choice in replay.choices]
-    known = [error for error in errors if math.isfinite(error)]
-    return round(float(np.mean(known)), 4) if known else None
-
-
 _ESTIMATED = ("estimated_error_percent", "estimated_low_percent", "estimated_high_percent")
-SELECTION_COLUMNS = (
-    *("stamp_ns", "trial", "predicted_error_percent", "predicted_fixed_percent"),
-    *("familiarity", "sequences", *_ESTIMATED, "lost", "weights", "ms", "why_not", "fallen_back"),
+_NUMBERS = (
+    *("trial", "predicted_error_percent", "predicted_fixed_percent", "familiarity", "sequences"),
+    *(*_ESTIMATED, "lost", "ms"),
 )
+SELECTION_COLUMNS = (*("stamp_ns", *_NUMBERS[:-1], "weights", "ms", "why_not", "fallen_back"),)
 """Columns of ``selections.csv`` before the parameters."""
 FRAME_COLUMNS = ("stamp_ns", "registered", "restarted", "prepare_ms", "register_ms", "late_ms")
 """Columns of ``frames.csv``."""
@@ -295,53 +295,23 @@ def _write_csv(path: Path, columns: Sequence[str], rows: Any) -> None:
         writer.writerows(rows)
 
 
-class _Choices(NamedTuple):
-    """The columns of ``selections.csv``, see `StoredReplay`."""
-
-    stamps: NDArray[np.int64]
-    parameters: dict[str, Sequence[Any]]
-    weights: dict[int, Sequence[float]]
-    estimated: NDArray[np.float64]
-    lost: NDArray[np.bool_]
-
-
-def _choices(path: Path, n: int) -> _Choices:
-    """Read the selections that were applied, `n` of them."""
-    every = read_columns(path)
-    columns = _applied(every)
-    try:
-        stamps = np.array([int(stamp) for stamp in columns.get("stamp_ns", [])], np.int64)
-        weights = _weights(columns.get("weights", []))
-        # Replays of an older adaptune have no estimates.
-        estimated = np.full((len(stamps), 3), np.nan)
-        for i, name in enumerate(_ESTIMATED):
-            if name in columns:
-                estimated[:, i] = np.array(columns[name], np.float64)
-        lost = np.array([text == "1" for text in columns.get("lost", ["0"] * len(stamps))], bool)
-    except (TypeError, ValueError) as error:
-        raise damaged(path, error) from error
-    if sum(not why for why in _whys(every)) != n:
-        raise damaged(path, ValueError("not a row for every selection"))
-    parameters: dict[str, Sequence[Any]] = {
-        name: _numbers(values) for name, values in columns.items() if name not in SELECTION_COLUMNS
-    }
-    return _Choices(stamps, parameters, weights, estimated, lost)
+def _columns(path: Path) -> dict[str, list[str]]:
+    """Columns of a table of a replay as they are written."""
+    with path.open(newline="", encoding="utf-8") as file:
+        table = list(csv.reader(file))
+    if len(set(map(len, table))) > 1:
+        raise ValueError("rows of other lengths than its header")
+    return {name: values for name, *values in zip(*table, strict=True)}
 
 
-def read_applied(path: Path) -> dict[str, list[str]]:
-    """The columns of ``selections.csv``, of what was applied; of the same scan, the last one."""
-    return _applied(read_columns(path))
-
-
-def _applied(columns: Mapping[str, list[str]]) -> dict[str, list[str]]:
-    stamps = columns.get("stamp_ns", [])
-    rows = list({stamps[i]: i for i, why in enumerate(_whys(columns)) if not why}.values())
-    return {name: [values[i] for i in rows] for name, values in columns.items()}
-
-
-def _whys(columns: Mapping[str, list[str]]) -> list[str]:
-    """Why each row of ``selections.csv`` was not applied; empty where it was."""
-    return columns.get("why_not", [""] * len(columns.get("stamp_ns", [])))
+def _applied(columns: Mapping[str, list[str]], n: int) -> dict[str, list[str]]:
+    """The `n` selections that were applied, without those columns; of a scan, the last one."""
+    rows = [i for i, why in enumerate(columns["why_not"]) if not why]
+    if len(rows) != n:
+        raise ValueError("not a row for every selection")
+    last = {columns["stamp_ns"][i]: i for i in rows}.values()
+    texts = ("why_not", "fallen_back")
+    return {name: [of[i] for i in last] for name, of in columns.items() if name not in texts}
 
 
 def _weights(texts: Sequence[str]) -> dict[int, Sequence[float]]:
@@ -352,28 +322,14 @@ def _weights(texts: Sequence[str]) -> dict[int, Sequence[float]]:
     return {int(trial): [float(row[trial]) for row in rows] for trial in (rows[0] if rows else {})}
 
 
-def read_columns(path: Path) -> dict[str, list[str]]:
-    """Columns of a table of a replay as they are written; none if it has no rows.
-
-    Raises
-    ------
-    StoredReplayError
-        If it is missing or damaged.
-    """
-    try:
-        with path.open(newline="", encoding="utf-8") as file:
-            rows = list(csv.DictReader(file))
-    except (OSError, UnicodeDecodeError) as error:
-        raise damaged(path, error) from error
-    if any(None in row or None in row.values() for row in rows):
-        raise damaged(path, ValueError("rows of other lengths than its header"))
-    return {key: [row[key] for row in rows] for key in (rows[0] if rows else {})}
+def _floats(values: Sequence[str]) -> NDArray[np.float64]:
+    return np.array([float(value or "nan") for value in values])
 
 
 def _numbers(values: Sequence[str]) -> list[Any]:
     """Numbers if all are, NaN where the set of another odometry has no value; texts otherwise."""
     try:
-        return [float(value or "nan") for value in values]
+        return _floats(values).tolist()
     except ValueError:
         return list(values)
 
@@ -408,14 +364,15 @@ def is_reference_of(folder: Path, about: manifest.Inputs) -> bool:
     return made is not None and not manifest.changes(made, {**about, "known": known})
 
 
-def check_reference(folder: Path, about: manifest.Inputs, option: str = "") -> None:
-    """Refuse a reference that was made from something else; the command with `option` makes it.
+def check_reference(folder: Path, about: manifest.Inputs) -> None:
+    """Refuse a reference that was made from something else.
 
     Raises
     ------
     StoredReplayError
     """
     if not is_reference_of(folder, about):
+        option = "" if (folder / "fixed").exists() else " --untrained"
         raise StoredReplayError(
             f"{folder}: was judged by another reference; run `adaptune online{option}` with this "
             f"study, which replays nothing for it"

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune import geometry, manifest
+from adaptune import manifest
 from adaptune.errors import nearest
 from adaptune.files import replacing_folder
 from adaptune.geometry import invert
@@ -21,14 +21,12 @@ from adaptune.selector import Schedule
 from adaptune.study.config import StudyConfig
 from adaptune.study.study import Study
 from adaptune.trajectory import Trajectory
-from online.modes import MODES, sequences_without_model
+from online.live import Placed, RosMessages, placed
+from online.modes import replayed_modes, sequences_without_model
 from online.record import (
     StoredReplay,
     StoredReplayError,
     check_reference,
-    damaged,
-    read_applied,
-    read_columns,
 )
 from online.statistics import Reference
 
@@ -59,11 +57,6 @@ _ODOMETRY = "nav_msgs/msg/Odometry"
 _PATH = "nav_msgs/msg/Path"
 _NUMBER = "std_msgs/msg/Float64"
 _TEXT = "std_msgs/msg/String"
-
-
-def replayed_modes(folder: Path) -> list[str]:
-    """The modes in which a sequence was replayed, in the order of their lines in pictures."""
-    return [mode for mode in MODES if (folder / mode / "replay.json").exists()]
 
 
 def replayed_sequences(replays: Path, config: StudyConfig, wanted: Sequence[str] = ()) -> list[str]:
@@ -137,7 +130,7 @@ def record_replays(study: Study, name: str, progress: Progress = unseen) -> Path
         composer.add(topic(mode, "path"), _PATH, composer.path(placed[mode], start))
         child = SENSOR if mode == placing else f"{SENSOR}_{mode}"
         composer.add(topic(mode, "odometry"), _ODOMETRY, composer.odometry(placed[mode], child))
-        composer.add_mode(folder / mode, replay, reference)
+        composer.add_mode(mode, replay, reference)
     path = study.folder / "recordings" / name
     with replacing_folder(path) as new:
         messages = heapq.merge(*composer.streams, key=itemgetter(1))
@@ -170,30 +163,23 @@ class _Composer:
         self.topics: dict[str, str] = {}
         self.streams: list[Iterator[Message]] = []
         self._types = self.messages.types
+        self._made = RosMessages(self.messages.typestore, ODOM)
 
     def add(self, name: str, kind: str, stamped: Iterable[tuple[int, Any]]) -> None:
         """Add a topic, with its messages in order of time."""
         self.topics[name] = kind
         self.streams.append((name, stamp, message) for stamp, message in stamped)
 
-    def add_mode(self, folder: Path, replay: StoredReplay, reference: Reference) -> None:
+    def add_mode(self, mode: str, replay: StoredReplay, reference: Reference) -> None:
         """Add what a mode selected, its errors and its times."""
-        mode, trajectory, made = folder.name, replay.trajectory, replay.choice_stamps
+        trajectory, made = replay.trajectory, replay.choice_stamps
         stamps, end = trajectory.stamps, trajectory.stamps[-1:]
-        for table, read, at, names in (
-            ("selections.csv", read_applied, made, _ERRORS),
-            ("frames.csv", read_columns, stamps, dict(zip(_TIMES, _TIMES, strict=True))),
-        ):
-            columns = read(folder / table)
-            for name, column in names.items():
-                try:
-                    values = np.array(columns.get(column, []), np.float64)
-                except (TypeError, ValueError) as error:
-                    raise damaged(folder / table, error) from error
-                self._numbers(topic(mode, name), at[: len(values)], values)
-            if table == "selections.csv":
-                said = _in_words(replay, columns.get("trial"))
-                self._add_data(topic(mode, "selection"), _TEXT, made, said)
+        for name, column in _ERRORS.items():
+            self._numbers(topic(mode, name), made, replay.selections[column])
+        self._add_data(topic(mode, "selection"), _TEXT, made, _in_words(replay))
+        for name in _TIMES:
+            values = replay.frames[name]
+            self._numbers(topic(mode, name), stamps[: len(values)], values)
         # The one looks ahead, as predictions do, the other back, as estimates do.
         self._numbers(topic(mode, "true_error"), stamps, reference.errors(trajectory))
         self._numbers(topic(mode, "true_error_behind"), stamps, reference.errors_behind(trajectory))
@@ -240,59 +226,29 @@ class _Composer:
             if due and np.isfinite(trajectory.at(np.array([scan.stamp]))).all():
                 points = np.ascontiguousarray(_thinned(scan.points), "<f4")
                 structured = points.view([(axis, "<f4") for axis in "xyz"]).reshape(-1)
-                header = self.messages.header(POINTS, scan.stamp, SENSOR)
+                header = self._made.header(scan.stamp, SENSOR)
                 yield scan.stamp, self.messages.cloud(header, structured)
             progress(name, number, n)
         progress(name, n, n)
 
-    def transforms(self, trajectory: Trajectory) -> Iterator[tuple[int, Any]]:
-        """Where the sensor is."""
-        types = self._types
-        vector, transform = types["geometry_msgs/msg/Vector3"], types["geometry_msgs/msg/Transform"]
-        for stamp, xyz, turn in _poses(trajectory):
-            moved = types["geometry_msgs/msg/TransformStamped"](
-                header=self.messages.header(TF, stamp, ODOM),
-                child_frame_id=SENSOR,
-                transform=transform(translation=vector(*xyz), rotation=self._quaternion(turn)),
-            )
-            yield stamp, types[_TRANSFORM](transforms=[moved])
-
     def path(self, trajectory: Trajectory, start: int) -> Iterator[tuple[int, Any]]:
         """The whole path, which is there from the start."""
-        stamped = self._types["geometry_msgs/msg/PoseStamped"]
-        poses = [
-            stamped(header=self.messages.header("", stamp, ODOM), pose=self._pose(xyz, turn))
-            for stamp, xyz, turn in _poses(trajectory)
-        ]
-        header = self.messages.header("", start, ODOM)
-        yield start, self._types[_PATH](header=header, poses=poses)
+        stamped, header = self._types["geometry_msgs/msg/PoseStamped"], self._made.header
+        poses = [stamped(header(stamp), self._made.pose(at)) for stamp, at in _poses(trajectory)]
+        yield start, self._types[_PATH](header=header(start), poses=poses)
+
+    def transforms(self, trajectory: Trajectory) -> Iterator[tuple[int, Any]]:
+        """Where the sensor is."""
+        return ((s, self._made.transform(s, at, SENSOR)) for s, at in _poses(trajectory))
 
     def odometry(self, trajectory: Trajectory, child: str) -> Iterator[tuple[int, Any]]:
         """Its pose at every scan, in a frame of its own."""
-        types, unknown = self._types, np.zeros(36)
-        vector = types["geometry_msgs/msg/Vector3"]
-        twist = types["geometry_msgs/msg/Twist"](vector(0.0, 0.0, 0.0), vector(0.0, 0.0, 0.0))
-        still = types["geometry_msgs/msg/TwistWithCovariance"](twist, unknown)
-        uncertain = types["geometry_msgs/msg/PoseWithCovariance"]
-        for stamp, xyz, turn in _poses(trajectory):
-            header = self.messages.header("", stamp, ODOM)
-            pose = uncertain(self._pose(xyz, turn), unknown)
-            yield stamp, types[_ODOMETRY](header, child, pose, still)
-
-    def _pose(self, xyz: list[float], turn: list[float]) -> Any:
-        point = self._types["geometry_msgs/msg/Point"]
-        pose = self._types["geometry_msgs/msg/Pose"]
-        return pose(position=point(*xyz), orientation=self._quaternion(turn))
-
-    def _quaternion(self, turn: list[float]) -> Any:
-        return self._types["geometry_msgs/msg/Quaternion"](*turn)
+        return ((s, self._made.odometry(s, at, child)) for s, at in _poses(trajectory))
 
 
-def _poses(trajectory: Trajectory) -> Iterator[tuple[int, list[float], list[float]]]:
+def _poses(trajectory: Trajectory) -> Iterator[tuple[int, Placed]]:
     """Stamps, positions and quaternions."""
-    xyz: NDArray[np.float64] = trajectory.T_world_sensor[:, :3, 3]
-    turns = geometry.to_quaternions(trajectory.T_world_sensor)
-    return zip(trajectory.stamps.tolist(), xyz.tolist(), turns.tolist(), strict=True)
+    return zip(trajectory.stamps.tolist(), placed(trajectory.T_world_sensor), strict=True)
 
 
 def _thinned(points: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -303,7 +259,7 @@ def _thinned(points: NDArray[np.float32]) -> NDArray[np.float32]:
     return points[np.sort(chosen)]
 
 
-def _in_words(replay: StoredReplay, trials: Sequence[str] | None) -> list[str]:
+def _in_words(replay: StoredReplay) -> list[str]:
     """Every selection in words: the members' weights, or the parameters."""
     said = []
     for i, lost in enumerate(replay.lost.tolist()):
@@ -315,7 +271,8 @@ def _in_words(replay: StoredReplay, trials: Sequence[str] | None) -> list[str]:
             # Sets of several odometries have other parameters, which are NaN or empty.
             known = {name: _plainly(value) for name, value in chosen.items()}
             what = ", ".join(f"{k} {v}" for k, v in known.items() if v) or "no parameters"
-            what = what if trials is None else f"trial {trials[i]}: {what}"
+            trial = replay.selections["trial"][i]
+            what = f"trial {trial:.0f}: {what}" if np.isfinite(trial) else what
         said.append(f"{what} (lost)" if lost else what)
     return said
 

@@ -182,8 +182,8 @@ class ReplayRecord:
     # (n,): seconds from a scan's arrival to its pose
     late: MutableSequence[float] = field(default_factory=list)
     waited: MutableSequence[float] = field(default_factory=list)  # seconds for each selection
-    late_members: dict[int, int] = field(default_factory=dict)  # scans at which they were, by trial
-    removed: tuple[int, ...] = ()  # trials of members that were always late
+    late_members: int = 0  # scans at which members of a bank were late, over all members
+    removed: int = 0  # members that were always late
 
     def __post_init__(self) -> None:
         self._cpu, self._n = 0.0, 0

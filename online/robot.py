@@ -32,7 +32,7 @@ from adaptune.strict import in_one_line
 from adaptune.study.config import RealTimeConfig, RosConfig, SteerConfig, StudyConfig
 from adaptune.study.study import ModeError, Study, StudySequences
 from adaptune.trajectory import Trajectory, tum_lines
-from online.live import CLOUD, IMU, LiveScans, RosMessages, Status, Uncertainty
+from online.live import CLOUD, IMU, LiveScans, RosMessages, Status, Uncertainty, placed
 from online.modes import UNTRAINED, WITHOUT_MODEL, Mode, ReplaySetup, needed
 from online.real_time import RealTimeDrive, SelectorProcess
 from online.record import FRAME_COLUMNS, SELECTION_COLUMNS, frame_row, selection_row
@@ -64,28 +64,22 @@ class DriveLog:
         self.folder, self.lost = folder, ""
         self._names = names
         self._files: dict[str, IO[str]] = {}
-        try:
-            self._open()
-        except OSError as error:
-            if not goes_on:
-                raise
-            self._end(error)
-
-    def _open(self) -> None:
-        folder, names = self.folder, self._names
-        folder.mkdir(parents=True)
         heads = {
             "trajectory.tum": "",
             "frames.csv": _csv(FRAME_COLUMNS),
             "selections.csv": _csv((*SELECTION_COLUMNS, *names)),
         }
-        # A line is on disk when it is written: the robot may be switched off.
-        self._files |= {
-            name: (folder / name).open("w", buffering=1, newline="", encoding="utf-8")
-            for name in heads
-        }
-        for name, head in heads.items():
-            self._write(name, head)
+        try:
+            folder.mkdir(parents=True)
+            for name, head in heads.items():
+                # A line is on disk when it is written: the robot may be switched off.
+                file = (folder / name).open("w", buffering=1, newline="", encoding="utf-8")
+                self._files[name] = file
+                self._write(name, head)
+        except OSError as error:
+            if not goes_on:
+                raise
+            self._end(error)
 
     def scan(self, step: RegisteredScan, late: float) -> None:
         """Note a scan: its pose, and how late that was in seconds."""
@@ -190,7 +184,10 @@ class SteeredNode(OdometryInstance):
         T_node = self._pose(self._submitted, PATIENCE)
         T_odom_sensor = np.full((4, 4), np.nan)
         known = bool(np.isfinite(T_node).all())
-        self._tell_of_silence(known)
+        self._silent = 0 if known else self._silent + 1
+        if self._silent == SILENT:
+            what = "%s: no pose of %s for %d scans; is it the topic, and does the node run?"
+            _log.warning(what, self._settings.odometry, self._settings.node, SILENT)
         if known:
             if self._T_odom_node is None:
                 assert self._begun is not None
@@ -201,13 +198,6 @@ class SteeredNode(OdometryInstance):
             T_odom_sensor = self._T_odom_node @ T_node
         self._last_motion.move(T_odom_sensor)
         return Registration(T_odom_sensor, known)
-
-    def _tell_of_silence(self, known: bool) -> None:
-        """Log that the node gives no poses, or gives some again."""
-        self._silent = 0 if known else self._silent + 1
-        if self._silent == SILENT:
-            what = "%s: no pose of %s for %d scans; is it the topic, and does the node run?"
-            _log.warning(what, self._settings.odometry, self._settings.node, SILENT)
 
     def apply(self, selection: Selection) -> None:
         """Set the parameters, see `adaptune.ros.link.Steering.apply`."""
@@ -454,9 +444,11 @@ class _Publisher:
         if self._last is not None:
             self._uncertainty.move(invert(self._last.T_odom_sensor) @ step.T_odom_sensor)
         self._last = step
-        where = step.stamp, step.T_odom_sensor, self._scans.frame
+        (at,) = placed(step.T_odom_sensor[None])
+        where = step.stamp, at, self._scans.frame
         if self._odometry is not None:
-            self._odometry(self._messages.odometry(*where, self._uncertainty))
+            variances = self._uncertainty.position, self._uncertainty.rotation
+            self._odometry(self._messages.odometry(*where, variances))
         if self._tf is not None:
             self._tf(self._messages.transform(*where))
         self._status.restarts += step.unhealthy is not None

@@ -25,7 +25,7 @@ from adaptune.metrics import (
     window_ends,
 )
 from adaptune.reference.stored import StoredEstimate
-from adaptune.study.study import OracleErrors, StudySequences
+from adaptune.study.study import OracleErrors
 from adaptune.trajectory import Trajectory, read_tum
 from online.record import ReplaySummary, StoredReplay
 
@@ -46,6 +46,14 @@ ORACLES = ("oracle, sequence", "oracle, period")
 """Rows of what the best set of each sequence, and of each period, has in its trials."""
 Interval = tuple[float, float] | None
 """Ends of a 95 % interval, where it is known."""
+
+
+_FOR_FILES = (
+    *("reference_error", "poor_scans", "rte_interval", "ratio_interval", "blocks", "median"),
+    *("estimated_interval", "repeats", "worst_tenth", "stretches", "better", "worse"),
+    *("surely_better", "surely_worse", "gap_closed"),
+)
+"""What only files have of a row; intervals are columns of their ends."""
 
 
 class Ratio(NamedTuple):
@@ -90,7 +98,6 @@ class ComparisonRow:
     median: float | None = None  # of the sub-trajectory RTE, percent
     standard: StandardErrors | None = None
     blocks: int | None = None  # independent pieces of the recording
-    x_real_time: float | None = None  # speed of the odometry
     first_restart: float | None = None  # seconds from the start
     unhealthy: tuple[str, ...] = ()  # what the health check found
     yardstick: str = "fixed"  # the mode that others are compared with
@@ -122,15 +129,23 @@ class ComparisonRow:
 
     def columns(self) -> dict[str, Any]:
         """The row of a table; columns that begin with an underscore are for files only."""
-        rte_low, rte_high = self.rte_interval or (None, None)
-        low, high = self.ratio_interval or (None, None)
-        estimated_low, estimated_high = self.estimated_interval or (None, None)
+        more: dict[str, Any] = {}
+        for name in _FOR_FILES:
+            value = getattr(self, name)
+            if (stem := name.removesuffix("interval")) != name:
+                more[f"{stem}low"], more[f"{stem}high"] = value or (None, None)
+            else:
+                more[name] = value
+        more |= self._standard() | dict(self.real_time or {})
+        return {"sequence": self.sequence, **self._shown()} | {f"_{k}": v for k, v in more.items()}
+
+    def _shown(self) -> dict[str, Any]:
+        ends = self.ratio_interval
         return {
-            "sequence": self.sequence,
             "mode": self.mode,
             "RTE [%]": self.rte,
             f"vs {self.yardstick}": self.ratio,
-            "95 %": None if low is None else f"{low:.2f}-{high:.2f}",
+            "95 %": None if ends is None else f"{ends[0]:.2f}-{ends[1]:.2f}",
             ESTIMATED: self.estimated,
             LOST: self.lost_seconds,
             "restarts": self.restarts,
@@ -139,78 +154,48 @@ class ComparisonRow:
             "cores": self.cores,
             "memory [MB]": self.memory_mb,
             REFERENCE: self.reference,
-            "_reference_error": self.reference_error,
-            "_poor_scans": self.poor_scans,
-            "_x_real_time": self.x_real_time,
-            "_rte_low": rte_low,
-            "_rte_high": rte_high,
-            "_ratio_low": low,
-            "_ratio_high": high,
-            "_blocks": self.blocks,
-            "_median": self.median,
-            "_estimated_low": estimated_low,
-            "_estimated_high": estimated_high,
-            "_repeats": self.repeats,
-            "_worst_tenth": self.worst_tenth,
-            "_stretches": self.stretches,
-            "_better": self.better,
-            "_worse": self.worse,
-            "_surely_better": self.surely_better,
-            "_surely_worse": self.surely_worse,
-            "_gap_closed": self.gap_closed,
-            **{f"_{key}": value for key, value in self._standard().items()},
-            **{f"_{key}": value for key, value in (self.real_time or {}).items()},
         }
 
     def _standard(self) -> dict[str, Any]:
-        found = dict.fromkeys(
-            ("ape_m", "rpe_m", "height_percent", "kitti_percent", "kitti_deg_per_m")
-        ) | {"kitti_lengths_m": None}
-        if self.standard is None:
-            return found
-        ape, rpe, kitti, height = self.standard
-        found |= {"ape_m": ape, "rpe_m": rpe, "height_percent": height}
-        if kitti.lengths:
-            lengths = " ".join(f"{length:g}" for length in kitti.lengths)
-            found |= {"kitti_percent": kitti.translation, "kitti_deg_per_m": kitti.rotation}
-            found["kitti_lengths_m"] = lengths
-        return found
+        known = self.standard
+        kitti = known.kitti if known is not None and known.kitti.lengths else None
+        return {
+            "ape_m": known and known.ape,
+            "rpe_m": known and known.rpe,
+            "height_percent": known and known.height,
+            "kitti_percent": kitti and kitti.translation,
+            "kitti_deg_per_m": kitti and kitti.rotation,
+            "kitti_lengths_m": kitti and " ".join(f"{length:g}" for length in kitti.lengths),
+        }
 
     def standard_columns(self, kitti: bool = True) -> dict[str, Any]:
         """The row of a table of the errors that other tools give, with KITTI's or without."""
         ape, rpe, height, percent, degrees, listed = self._standard().values()
-        of_evo = {"sequence": self.sequence, "mode": self.mode, "APE [m]": ape, "RPE [m]": rpe}
-        of_evo["height [%]"] = height
-        if not kitti:
-            return of_evo
+        of_evo = {"mode": self.mode, "APE [m]": ape, "RPE [m]": rpe, "height [%]": height}
         lengths = (listed or "").split()
-        return of_evo | {
+        of_kitti = {
             "KITTI [%]": percent,
             "[deg/100 m]": None if degrees is None else 100.0 * degrees,
             "over [m]": "-".join(dict.fromkeys([*lengths[:1], *lengths[-1:]])) or None,
         }
+        return of_evo | of_kitti if kitti else of_evo
 
     def summary_columns(self) -> dict[str, Any]:
         """The row of the table of the modes, over all sequences or on the only one."""
-        low, high = self.ratio_interval or (None, None)
-        driven = self.mode not in ORACLES
-        return {
-            "mode": self.mode,
-            "RTE [%]": self.rte,
-            f"vs {self.yardstick}": self.ratio,
-            "95 %": None if low is None else f"{low:.2f}-{high:.2f}",
+        shown, driven = self._shown(), self.mode not in ORACLES
+        head = {key: shown.pop(key) for key in list(shown)[:4]}
+        over_all = {
             "worst tenth": self.worst_tenth,
             "better / worse": None if self.better is None else f"{self.better} / {self.worse}",
             GAP: None if self.gap_closed is None else f"{100.0 * self.gap_closed:.0f}",
-            ESTIMATED: self.estimated,
+        }
+        changed = {
             LOST: self.lost_seconds or None,
             "restarts": self.restarts if driven else None,
             "switches": self.switches if driven else None,
-            "ms a scan": self.cpu_ms,
-            "cores": self.cores,
-            "memory [MB]": self.memory_mb,
             REFERENCE: None if self.reference == "given" else self.reference,
         }
+        return head | over_all | shown | changed
 
 
 ERROR_FACTOR = 1.5
@@ -235,11 +220,6 @@ class Reference(NamedTuple):
         trajectory = read_tum(path) if path.exists() else None
         error = math.nan if stored is None else stored.error(length)
         return cls(trajectory, length, stored is not None, None if math.isnan(error) else error)
-
-    @classmethod
-    def of(cls, sequences: StudySequences, name: str, folder: Path, length: float) -> "Reference":
-        """What judges the replays of a sequence, which are in a folder; for the rest see `read`."""
-        return cls.read(folder, length, sequences.estimate(name))
 
     @property
     def kind(self) -> str:
@@ -340,9 +320,6 @@ def _measured(
     """
     summaries = [repeat.summary for repeat in repeats]
     first = min((t for r in repeats if (t := _first_restart(r)) is not None), default=None)
-    speeds = [
-        s.duration_s / r.seconds for s, r in zip(summaries, repeats, strict=True) if r.seconds
-    ]
     estimated, interval = _estimated(repeats)
     of_common = (_at(repeat.trajectory, common) for repeat in repeats)
     known = [errors for t in of_common if (errors := reference.standard(t)) is not None]
@@ -352,7 +329,6 @@ def _measured(
         switches=sum(map(_switches, repeats)),
         poor_scans=sum(summary.poor_scans for summary in summaries),
         standard=StandardErrors.pooled(known),
-        x_real_time=round(float(np.mean(speeds)), 2) if speeds else None,
         first_restart=first,
         unhealthy=tuple(dict.fromkeys(found for s in summaries for found in s.unhealthy)),
         estimated=estimated,

@@ -6,6 +6,7 @@ from typing import Any
 from adaptune.metrics import MIN_BLOCKS
 from adaptune.report.tables import Listing
 from adaptune.study.study import MIN_RECORDINGS, RIVAL_WORDS, RIVALS
+from online.modes import EVEN
 from online.statistics import (
     ALL,
     ERROR_FACTOR,
@@ -125,7 +126,7 @@ def _caption(rows: Sequence[ComparisonRow], shown: Mapping[str, Any]) -> str:
     said = [
         "Intervals of 95 %: paired block bootstrap, seed 0, where there is enough to draw from."
     ]
-    yardstick = {"fixed": "fixed set", "baseline": "baseline"}[rows[0].yardstick]
+    yardstick = _YARDSTICKS[rows[0].yardstick]
     if rows[-1].sequence == ALL:
         said.append(
             f"vs {rows[0].yardstick}: geometric mean of the ratios to the {yardstick}'s RTE."
@@ -184,8 +185,6 @@ def _standard(rows: Sequence[ComparisonRow]) -> Listing | None:
             "; KITTI over the sub-trajectories of all sequences." if kitti else "."
         )
     cells = [row.standard_columns(kitti) for row in last]
-    for row in cells:
-        del row["sequence"]
     return Listing(title, cells, caption, _ERRORS)
 
 
@@ -211,19 +210,11 @@ def _change(row: ComparisonRow, rows: Sequence[ComparisonRow]) -> dict[str, Any]
 
 NEARLY = 0.05
 """Where a whole interval lies within this share of 1, there is no difference."""
-CONTROLS = {
-    "even": "The study's bank with even weights",
-}
-"""Modes that choose nothing, in words."""
 ROUNDING = 1e-6
 """A ratio that differs less from 1 is 1."""
-_SAME_COST = 0.2
-"""Costs that differ by a smaller share are not worth a sentence."""
-ENOUGH_STRETCHES = 20
-"""Fewer stretches say little about the worst tenth of others."""
 _UNSURE = "nothing can be said of how sure that is"
 _YARDSTICKS = {"fixed": "fixed set", "baseline": "baseline"}
-_NOT_ADAPTIVE = ("baseline", "fixed", *RIVALS, *ORACLES, *CONTROLS)
+_NOT_ADAPTIVE = ("baseline", "fixed", *RIVALS, *ORACLES, EVEN)
 
 
 def verdict(rows: Sequence[ComparisonRow]) -> list[str]:
@@ -237,7 +228,7 @@ def verdict(rows: Sequence[ComparisonRow]) -> list[str]:
     adaptive = [row for mode, row in last.items() if mode not in _NOT_ADAPTIVE]
     tuned = []
     if {"fixed", "baseline"} <= last.keys():
-        tuned = [*_of_baseline(last["baseline"], rows), *_cost_of_tuning(last)]
+        tuned = [_of_baseline(last["baseline"], rows)]
     if not adaptive:
         return [*tuned, _advice(last)]
     # `adaptive` comes first; without a model there is the untrained bank.
@@ -252,8 +243,7 @@ def verdict(rows: Sequence[ComparisonRow]) -> list[str]:
         for mode in RIVALS
         if mode in main.against
     ]
-    said += _controls(main, last)
-    said += _nothing_to_choose(last)
+    said += _even(main, last)
     said += [_other(row) for row in adaptive if row is not main and not _is_yardstick(row)]
     return [*said, *tuned, _advice(last)]
 
@@ -306,47 +296,35 @@ def _surely(ratio: Ratio) -> str:
 
 
 def _gain(row: ComparisonRow, rows: Sequence[ComparisonRow]) -> str:
-    ratio = _ratio(row)
-    has, how = f"`{row.mode}` has {_times(row)}", _surely(ratio)
+    ratio, where = _ratio(row), _where(rows)
     # The parts of one recording are one.
     n = row.recordings or len(_judged(rows))
     few = rows[-1].sequence != ALL or n < MIN_RECORDINGS
-    alone = " The interval speaks of these recordings alone." if few else ""
-    if how == "unknown":
-        return f"Whether adapting gains is not known, {_where(rows)}: {has}; {_UNSURE}."
-    if how == "open":
-        return f"Whether adapting gains is open, {_where(rows)}: {has}.{alone}"
-    if how == "equal":
-        return f"Adapting changed nothing that counts {_where(rows)}: {has}.{alone}"
-    what = "gained" if how == "less" else "lost"
+    has = f"`{row.mode}` has {_times(row)}"
+    alone = ". The interval speaks of these recordings alone." if few else "."
     percent = 100.0 * abs(ratio.value - 1.0)
-    return f"Adapting {what} {percent:.0f} % {_where(rows)}: {has}.{alone}"
+    return {
+        "unknown": f"Whether adapting gains is not known, {where}: {has}; {_UNSURE}.",
+        "open": f"Whether adapting gains is open, {where}: {has}{alone}",
+        "equal": f"Adapting changed nothing that counts {where}: {has}{alone}",
+        "less": f"Adapting gained {percent:.0f} % {where}: {has}{alone}",
+        "more": f"Adapting lost {percent:.0f} % {where}: {has}{alone}",
+    }[_surely(ratio)]
 
 
 def _how_surely(row: ComparisonRow, rows: Sequence[ComparisonRow]) -> list[str]:
-    """On how many sequences it is better, on which it is worse, and the worst tenth."""
-    said = []
-    if row.better is not None:
-        of = [r for r in rows if r.mode == row.mode and r.ratio is not None and r.sequence != ALL]
-        worse = [r.sequence for r in of if r.ratio is not None and r.ratio > 1.0 + NO_DIFFERENCE]
-        on = f"on {row.worse} ({', '.join(worse)})" if worse else "on none"
-        surely = ""
-        if row.surely_better is not None:
-            known = sum(r.ratio_interval is not None for r in of)
-            which = "" if known == len(of) else f", of {known} long enough to tell"
-            surely = f"; surely better on {row.surely_better}, surely worse on {row.surely_worse}"
-            surely += which
-        less = f"By more than 1 %, it has less error on {row.better} of {len(of)} sequences"
-        said.append(f"{less}, and more {on}{surely}.")
-    if row.worst_tenth is not None:
-        said.append(
-            f"In the worst tenth of {row.stretches} stretches it has {row.worst_tenth:.2f} times "
-            f"the {_YARDSTICKS[row.yardstick]}'s error."
-        )
-    if row.gap_closed is not None and row.gap_closed > 0.0:
-        share = f"It gains {100 * row.gap_closed:.0f} %"
-        said.append(f"{share} of what the best set of each sequence would gain in hindsight.")
-    return said
+    """On how many sequences it is better, and on which it is worse."""
+    if row.better is None:
+        return []
+    of = [r for r in rows if r.mode == row.mode and r.ratio is not None and r.sequence != ALL]
+    worse = [r.sequence for r in of if _ratio(r).value > 1.0 + NO_DIFFERENCE]
+    said = f"By more than 1 %, it has less error on {row.better} of {len(of)} sequences, and more "
+    said += f"on {row.worse} ({', '.join(worse)})" if worse else "on none"
+    if row.surely_better is not None:
+        known = sum(r.ratio_interval is not None for r in of)
+        said += f"; surely better on {row.surely_better}, surely worse on {row.surely_worse}"
+        said += "" if known == len(of) else f", of {known} long enough to tell"
+    return [f"{said}."]
 
 
 def _cost(row: ComparisonRow, yardstick: ComparisonRow) -> list[str]:
@@ -356,17 +334,6 @@ def _cost(row: ComparisonRow, yardstick: ComparisonRow) -> list[str]:
     return [
         f"It takes {row.cpu_ms:.1f} ms of CPU time a scan{cores}: "
         f"{row.cpu_ms / yardstick.cpu_ms:.1f} times what the {_YARDSTICKS[row.yardstick]} takes."
-    ]
-
-
-def _cost_of_tuning(last: Mapping[str, ComparisonRow]) -> list[str]:
-    """What the fixed set costs, if that differs from the baseline."""
-    fixed, baseline = last["fixed"].cpu_ms, last["baseline"].cpu_ms
-    if not fixed or not baseline or abs(fixed / baseline - 1.0) < _SAME_COST:
-        return []
-    return [
-        f"The fixed set takes {fixed:.1f} ms of CPU time a scan, {fixed / baseline:.1f} times what "
-        f"the baseline takes."
     ]
 
 
@@ -381,63 +348,45 @@ def _against(
     return f"{has} ({_interval(ratio)}){cost}."
 
 
-def _controls(main: ComparisonRow, last: Mapping[str, ComparisonRow]) -> list[str]:
-    """What the same sets give if nothing is chosen, and what choosing adds."""
-    added = {
-        "less": "Choosing added to that",
-        "more": "Choosing took from that",
-        "equal": "Choosing added nothing to that",
-        "open": "Whether choosing adds to that is open",
-        "unknown": "Whether choosing adds to that is not known",
-    }
-    said = []
-    for mode, what in CONTROLS.items():
-        row, ratio = last.get(mode), main.against.get(mode)
-        if row is not None and row.ratio is not None:
-            said.append(f"{what} has {_times(row)}.")
-            if ratio is not None and not _is_yardstick(main):
-                how = added[_surely(ratio)]
-                said.append(f"{how}: {_against(main, mode, ratio)}")
+def _even(main: ComparisonRow, last: Mapping[str, ComparisonRow]) -> list[str]:
+    """What the bank with even weights gives, which chooses nothing, and what choosing adds."""
+    row, ratio = last.get(EVEN), main.against.get(EVEN)
+    if row is None or row.ratio is None:
+        return []
+    said = [f"The study's bank with even weights has {_times(row)}."]
+    if ratio is not None and not _is_yardstick(main):
+        how = {
+            "less": "Choosing added to that",
+            "more": "Choosing took from that",
+            "equal": "Choosing added nothing to that",
+            "open": "Whether choosing adds to that is open",
+            "unknown": "Whether choosing adds to that is not known",
+        }[_surely(ratio)]
+        said.append(f"{how}: {_against(main, EVEN, ratio)}")
     return said
 
 
-def _nothing_to_choose(last: Mapping[str, ComparisonRow]) -> list[str]:
-    """That no choice of one set could gain, if that is so."""
-    best = last.get(ORACLES[0])
-    if best is None or best.ratio is None or best.ratio <= 1.0 - NO_DIFFERENCE:
-        return []
-    return [
-        "In hindsight, the best set of each sequence would gain less than 1 %: one set for all is "
-        "as good as any choice of one set for each."
-    ]
-
-
 def _other(row: ComparisonRow) -> str:
-    how = {
-        "less": "is better",
-        "more": "is worse",
-        "equal": "changed nothing that counts",
-        "open": "does not surely differ",
-    }
-    if (sure := _surely(_ratio(row))) in how:
-        return f"`{row.mode}` {how[sure]}: {_times(row)}."
-    return f"`{row.mode}` has {_times(row)}; {_UNSURE}."
+    times = _times(row)
+    return {
+        "less": f"`{row.mode}` is better: {times}.",
+        "more": f"`{row.mode}` is worse: {times}.",
+        "equal": f"`{row.mode}` changed nothing that counts: {times}.",
+        "open": f"`{row.mode}` does not surely differ: {times}.",
+        "unknown": f"`{row.mode}` has {times}; {_UNSURE}.",
+    }[_surely(_ratio(row))]
 
 
-def _of_baseline(row: ComparisonRow, rows: Sequence[ComparisonRow]) -> list[str]:
-    if row.ratio is None:
-        return []
-    has, how = f"the baseline has {_times(row)}", _surely(_ratio(row))
-    if how == "unknown":
-        return [f"Whether tuning gains is not known, {_where(rows)}: {has}."]
-    if how == "open":
-        return [f"Whether tuning gains is open, {_where(rows)}: {has}."]
-    if how == "equal":
-        return [f"No difference that counts between baseline and fixed set: {has}."]
-    if how == "less":
-        return [f"The baseline is better than the fixed set: {has}."]
-    gained = 100.0 * (1.0 - 1.0 / row.ratio)
-    return [f"Tuning alone gained {gained:.0f} % of the baseline's error: {has}."]
+def _of_baseline(row: ComparisonRow, rows: Sequence[ComparisonRow]) -> str:
+    ratio, where, has = _ratio(row), _where(rows), f"the baseline has {_times(row)}"
+    gained = 100.0 * (1.0 - 1.0 / max(ratio.value, 1e-12))
+    return {
+        "unknown": f"Whether tuning gains is not known, {where}: {has}.",
+        "open": f"Whether tuning gains is open, {where}: {has}.",
+        "equal": f"No difference that counts between baseline and fixed set: {has}.",
+        "less": f"The baseline is better than the fixed set: {has}.",
+        "more": f"Tuning alone gained {gained:.0f} % of the baseline's error: {has}.",
+    }[_surely(ratio)]
 
 
 def _preferred(row: ComparisonRow) -> float:
@@ -449,16 +398,13 @@ def _advice(last: Mapping[str, ComparisonRow]) -> str:
 
     The best of several is so by chance, too: `adaptive` is kept if it is nearly as good.
     """
-    drivable = {m: r for m, r in last.items() if m not in (*ORACLES, *CONTROLS) and r.ratio}
+    drivable = {m: r for m, r in last.items() if m not in (*ORACLES, EVEN) and r.ratio}
     better = [row for row in drivable.values() if _surely(_ratio(row)) == "less"]
     yardstick = _YARDSTICKS[next(iter(last.values())).yardstick]
     if better:
         best = min(better, key=_preferred)
         called = RIVAL_WORDS.get(best.mode, f"`{best.mode}`")
-        look = ""
-        if best.worst_tenth is not None and (best.stretches or 0) >= ENOUGH_STRETCHES:
-            look = ", and look at where it is worse (pictures)" if best.worst_tenth > 1.1 else ""
-        return f"What to do: drive {called}{look}."
+        return f"What to do: drive {called}."
     others = [r for r in drivable.values() if r.mode != r.yardstick and not _is_yardstick(r)]
     if any(_surely(_ratio(row)) == "unknown" for row in others):
         return (
