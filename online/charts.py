@@ -32,7 +32,6 @@ from online.compare import current_replays
 from online.modes import UNTRAINED
 from online.record import StoredReplay, check_reference
 from online.statistics import ALL, ComparisonRow, Reference
-from online.tables import of_lengths, short_replays
 
 # The chart of a comparison: the ratio of each mode's error, over all sequences and on each.
 
@@ -122,10 +121,6 @@ def scene_spans(
 # The replays of a sequence in all modes that there are, as charts need them.
 
 
-_MOST_RESTARTS = 60
-"""Most restarts that are marked."""
-
-
 class ModeReplay(NamedTuple):
     """Errors, selections and times of one mode along a sequence: n scans, m selections."""
 
@@ -151,25 +146,6 @@ class ModeReplay(NamedTuple):
     def span(self) -> NDArray[np.float64]:
         """When each choice was made, and the end, until which the last one holds."""
         return np.append(self.choice_seconds, self.seconds[-1])
-
-    @property
-    def lost_spans(self) -> list[tuple[float, float]]:
-        """When the bank was lost, from a selection to the first one at which it was not."""
-        spans: list[tuple[float, float]] = []
-        for begin, end in np.column_stack([self.span[:-1], self.span[1:]])[self.lost].tolist():
-            goes_on = spans and spans[-1][1] == begin
-            spans.append((spans.pop()[0] if goes_on else begin, end))
-        return spans
-
-    @property
-    def restarts(self) -> list[int]:
-        """Frames of the restarts to mark: of those in close succession the first."""
-        marked: list[int] = []
-        apart = self.seconds[-1] / _MOST_RESTARTS
-        for i in np.flatnonzero(self.restarted).tolist():
-            if not marked or self.seconds[i] - self.seconds[marked[-1]] > apart:
-                marked.append(i)
-        return marked
 
     def selection_at(self) -> NDArray[np.intp]:
         """Number of the selection that holds at each frame, of shape (n,)."""
@@ -199,8 +175,7 @@ class ReplayedSequence:
 def read_replays(study: Study, name: str) -> ReplayedSequence:
     """Read the replays of a sequence that are finished and drawn; there may be none.
 
-    Those that `compare` refuses are not, see `online.compare.current_replays`, and neither are
-    those that are too short.
+    Those that `compare` refuses are not, see `online.compare.current_replays`.
 
     Raises
     ------
@@ -217,7 +192,6 @@ def read_replays(study: Study, name: str) -> ReplayedSequence:
     if current.modes:
         check_reference(folder, study.sequences.reference(name))
     replays = {mode: StoredReplay.read(folder / mode) for mode in current.modes}
-    replays, short = _whole(name, replays)
     modes = {mode: _read_mode(replay, reference, model) for mode, replay in replays.items()}
     scenes = None
     if replays:
@@ -231,23 +205,8 @@ def read_replays(study: Study, name: str) -> ReplayedSequence:
         scenes,
         None if reference.trajectory is None else _seen_from(reference.trajectory),
         reference.estimated,
-        [*current.refused, *short],
+        current.refused,
     )
-
-
-def _whole(
-    name: str, replays: Mapping[str, StoredReplay]
-) -> tuple[dict[str, StoredReplay], list[str]]:
-    """The replays of a sequence that are not too short, and a sentence about the others."""
-    # In real time, the scans that are dropped tell something.
-    scans = {
-        mode: len(replay.trajectory)
-        for mode, replay in replays.items()
-        if replay.summary.inputs["real_time"] is None
-    }
-    short = short_replays(scans)
-    whole = {mode: replay for mode, replay in replays.items() if mode not in short}
-    return whole, [of_lengths(name, scans, short)] if short else []
 
 
 def scenes_along(sequences: StudySequences, name: str, stamps: NDArray[np.int64]) -> Spans | None:
@@ -458,9 +417,9 @@ def path_chart(replayed: ReplayedSequence) -> Chart:
         name = "estimated reference" if replayed.estimated else "reference"
         drawn.append(Points(some[:, 0], some[:, 1], name, shape="circle"))
     for mode, of in replayed.modes.items():
-        if restarts := of.restarts:
-            texts = [f"{mode}, {seconds:.1f} s" for seconds in of.seconds[restarts]]
-            x, y = of.xy[restarts].T
+        if of.restarted.any():
+            texts = [f"{mode}, {seconds:.1f} s" for seconds in of.seconds[of.restarted]]
+            x, y = of.xy[of.restarted].T
             drawn.append(Points(x, y, _RESTARTED, texts=texts, shape="triangle-down"))
     drawn.append(Points([0.0], [0.0], "start", shape="cross"))
     x_limits, y_limits = _path_limits(replayed).tolist()
@@ -520,8 +479,8 @@ def _errors(replayed: ReplayedSequence) -> Panel:
         if len(at):
             drawn.append(Points(track.seconds[at], track.errors[at], mode))
     for mode, track in replayed.modes.items():
-        if restarts := track.restarts:
-            x, y = track.seconds[restarts], track.errors[restarts]
+        if track.restarted.any():
+            x, y = track.seconds[track.restarted], track.errors[track.restarted]
             texts = [f"{mode}, {seconds:.1f} s" for seconds in x]
             drawn.append(Points(x, y, _RESTARTED, texts=texts, shape="triangle-down"))
     axis = Axis(f"RTE over the next {replayed.length:g} m [%]", log=True)
@@ -541,11 +500,11 @@ def switches(track: ModeReplay) -> NDArray[np.float64]:
 def _estimates(mode: str, track: ModeReplay, replayed: ReplayedSequence) -> Panel:
     seconds, (estimated, low, high) = track.choice_seconds, track.estimated.T
     drawn: list[Drawn] = []
-    if spans := track.lost_spans:
-        # Between two stretches in which it was lost lies one without a name.
-        edges = [edge for span in spans for edge in span]
-        names = [name for _ in spans for name in ("lost", "")][:-1]
-        drawn.append(Spans(edges, tuple(names), "lost"))
+    if track.lost.any():
+        # From a selection at which that changes to the next; what is not shaded has no name.
+        begins = np.flatnonzero(np.diff(track.lost, prepend=~track.lost[0]))
+        names = tuple("lost" if lost else "" for lost in track.lost[begins])
+        drawn.append(Spans([*seconds[begins], track.seconds[-1]], names, "lost"))
     if np.isfinite(track.errors_behind).any():
         judge = "by the estimated reference" if replayed.estimated else "true"
         drawn.append(Line(track.seconds, track.errors_behind, judge))

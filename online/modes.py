@@ -1,5 +1,6 @@
 """The modes of a replay: what each one runs, and what chooses its parameters."""
 
+import itertools
 import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack, closing
@@ -346,8 +347,8 @@ def run_replays(
     for why in dict.fromkeys(filter(None, obstacles.values())):
         names = " and ".join(name for name in asked if obstacles[name] == why)
         _log.warning("not replayed: %s, because %s", names, why)
-    modes = _Modes(setup, setup.modes(model), progress, look, repeats, model, model_path)
-    return _replay_all(study, study.config.test, modes)
+    modes = setup.modes(model)
+    return _replay_all(study, study.config.test, modes, progress, look, repeats, model_path)
 
 
 def run_untrained(
@@ -366,126 +367,112 @@ def run_untrained(
     AdaptuneError
         If a bank of the odometry is not possible.
     """
-    setup = ReplaySetup.of(study)
-    setup.mode(UNTRAINED)  # or an error
-    modes = _Modes(setup, WITHOUT_MODEL, progress, look, repeats)
-    return _replay_all(study, sequences_without_model(study.config), modes)
+    ReplaySetup.of(study).mode(UNTRAINED)  # or an error
+    names = sequences_without_model(study.config)
+    return _replay_all(study, names, WITHOUT_MODEL, progress, look, repeats)
 
 
 class _Run(NamedTuple):
     """A replay to make."""
 
-    sequence: str
+    what: str  # in words
     mode: str
-    repeat: int = 1
-
-    def __str__(self) -> str:
-        again = "" if self.repeat == 1 else f", repeat {self.repeat}"
-        return f"{self.sequence}, {self.mode}{again}"
+    folder: Path
+    inputs: manifest.Inputs
 
 
-class _Modes(NamedTuple):
-    """The modes to replay, who looks on, and the model of those that need one."""
-
-    setup: ReplaySetup
-    names: tuple[str, ...]
-    progress: Progress
-    look: Look
-    repeats: int
-    model: ErrorModel | None = None
-    model_path: Path | None = None
-
-
-def _replay_all(study: Study, sequences: Sequence[str], modes: _Modes) -> int:
+def _replay_all(
+    study: Study,
+    sequences: Sequence[str],
+    modes: Sequence[str],
+    progress: Progress,
+    look: Look,
+    repeats: int,
+    model_path: Path | None = None,
+) -> int:
     """Replay what was not replayed before; the number of replays that were made.
 
     Sequences without a reference get an estimated one before, where that is possible.
     """
     study.open()
-    refused = ensure_references(study, sequences, modes.progress, required=False)
+    refused = ensure_references(study, sequences, progress, required=False)
     for why in refused.values():
         _log.warning("%s; it is replayed without a reference, and not judged", why)
-    made = 0
+    setup, made = ReplaySetup.of(study), 0
+    model = None if model_path is None else study.model(model_path)
+    digest = "" if model is None else model.digest
     for name in sequences:
-        folder, every = study.folder / "replays" / name, _inputs(study.replay_inputs(name), modes)
-        files = study.sequences.sources(name)
-        due = {
-            _Run(name, *run): inputs
-            for run, inputs in every.items()
-            if _is_due(study.folder, _Run(name, *run), inputs, files)
-        }
-        poses = study.sequences.reference(name)
+        shared = study.replay_inputs(name)
+        about = [setup.identity(mode, model, digest) | shared for mode in modes]
+        runs = itertools.product(range(1, repeats + 1), about)  # first all first ones
+        every = (_due(study, name, manifest.plain(of | {"repeat": n})) for n, of in runs)
+        due = [run for run in every if run is not None]
+        folder, poses = study.folder / "replays" / name, study.sequences.reference(name)
         if not due and is_reference_of(folder, poses):
             continue
         recording = study.sequences.open(name)
-        for i, (run, inputs) in enumerate(due.items()):
-            record = _replayed(study.config, recording, run, modes)
+        for i, run in enumerate(due):
+            mode = setup.mode(run.mode, model)
+            release_memory()
+            try:
+                with closing(setup.instance(mode, name)) as odometry:
+                    record = _replayed(study, recording, odometry, mode, run.what, progress, look)
+            except DescriptorError as error:
+                raise ReplayError(f"sequences.{name}: {error}") from error
             if i == 0:
                 write_reference(folder, recording.reference(), record.trajectory, poses)
-            of_run = repeat_folder(folder / run.mode, run.repeat)
-            write_replay(of_run, record, inputs, modes.model_path)
+            write_replay(run.folder, record, run.inputs, model_path)
         if not due:
-            trajectory = StoredReplay.read(folder / modes.names[0]).trajectory
+            trajectory = StoredReplay.read(folder / modes[0]).trajectory
             write_reference(folder, recording.reference(), trajectory, poses)
             _log.info("%s: the reference has changed; no replay depends on it", name)
         made += len(due)
     return made
 
 
-def _is_due(
-    study: Path, run: _Run, inputs: manifest.Inputs, files_of: Mapping[str, Sequence[Path]]
-) -> bool:
-    """Whether a replay is to be made; one of other inputs is set aside, an earlier one kept."""
-    folder = repeat_folder(study / "replays" / run.sequence / run.mode, run.repeat)
-    changes = replay_changes(folder, inputs, files_of)
+def _due(study: Study, name: str, inputs: manifest.Inputs) -> _Run | None:
+    """A replay that is to be made; one of other inputs is set aside, an earlier one kept."""
+    mode, repeat = inputs["mode"], inputs["repeat"]
+    folder = repeat_folder(study.folder / "replays" / name / mode, repeat)
+    what = f"{name}, {mode}" + ("" if repeat == 1 else f", repeat {repeat}")
+    changes = replay_changes(folder, inputs, study.sequences.sources(name))
     if changes:
-        _log.info("%s: replayed again: %s", run, "; ".join(changes))
+        _log.info("%s: replayed again: %s", what, "; ".join(changes))
         before, files = manifest.recorded(folder / manifest.FILE), folder.iterdir()
-        manifest.set_aside(study, folder, before, [file for file in files if file.is_file()])
-    if changes != [] and manifest.bring_back(study, folder, inputs):
-        _log.info("%s: the earlier replay of these inputs counts again", run)
+        manifest.set_aside(study.folder, folder, before, [file for file in files if file.is_file()])
+    if changes != [] and manifest.bring_back(study.folder, folder, inputs):
+        _log.info("%s: the earlier replay of these inputs counts again", what)
         changes = replay_changes(folder, inputs)
-    return changes != []
+    return None if changes == [] else _Run(what, mode, folder, inputs)
 
 
-def _inputs(shared: Mapping[str, Any], modes: _Modes) -> dict[tuple[str, int], dict[str, Any]]:
-    """What all replays of a sequence are made from, by mode and repeat: first all first ones."""
-    digest = "" if modes.model is None else modes.model.digest
-    about = {
-        mode: modes.setup.identity(mode, modes.model, digest) | dict(shared) for mode in modes.names
-    }
-    return {
-        (mode, repeat): manifest.plain(of | {"repeat": repeat})
-        for repeat in range(1, modes.repeats + 1)
-        for mode, of in about.items()
-    }
-
-
-def _replayed(config: StudyConfig, recording: Recording, run: _Run, modes: _Modes) -> ReplayRecord:
+def _replayed(
+    study: Study,
+    recording: Recording,
+    odometry: OdometryInstance,
+    mode: Mode,
+    what: str,
+    progress: Progress,
+    look: Look,
+) -> ReplayRecord:
     """Make a replay."""
-    what, n = str(run), recording.n_messages
-    release_memory()
+    online, make, n = study.config.online, mode.selector, recording.n_messages
 
     def watch(record: ReplayRecord) -> None:
-        modes.progress(what, record.done, n)
-        modes.look(what, n, record)
+        progress(what, record.done, n)
+        look(what, n, record)
 
-    mode = modes.setup.mode(run.mode, modes.model)
-    online, make = config.online, mode.selector
-    try:
-        with closing(modes.setup.instance(mode, run.sequence)) as odometry, ExitStack() as stack:
-            given = recording, odometry, config.health
-            if online.real_time is not None:
-                there = make and stack.enter_context(closing(SelectorProcess(make, online.period)))
-                record = replay_in_real_time(*given, online.real_time, there, watch, what)
-            else:
-                selector = make and make()
-                fixed = selector and selector.fall_back()
-                record = replay(*given, selector, online.period, watch, what, fixed)
-    except DescriptorError as error:
-        raise ReplayError(f"sequences.{run.sequence}: {error}") from error
-    modes.progress(what, n, n)
-    if modes.model is not None and record.choices:
+    given = recording, odometry, study.config.health
+    if online.real_time is None:
+        selector = make and make()
+        fixed = selector and selector.fall_back()
+        record = replay(*given, selector, online.period, watch, what, fixed)
+    else:
+        with ExitStack() as stack:
+            process = make and stack.enter_context(closing(SelectorProcess(make, online.period)))
+            record = replay_in_real_time(*given, online.real_time, process, watch, what)
+    progress(what, n, n)
+    if record.choices:
         warn_of_scant_evidence(what, [choice.selection for choice in record.choices], mode.fixed)
     return record
 

@@ -350,10 +350,6 @@ def _made_again(folder: Path) -> str:
 _REFERENCE_INPUTS = f"reference.{manifest.FILE}"
 
 
-class StoredReferenceError(AdaptuneError):
-    """A reference that does not go with a replay."""
-
-
 def is_reference_of(folder: Path, about: manifest.Inputs) -> bool:
     """Whether the reference in a folder was made from just this."""
     known = (folder / "reference.tum").exists()
@@ -393,7 +389,7 @@ def write_reference(
         T = reference.at(odometry.stamps)
         known = ~np.isnan(T[:, 0, 0])
         if not known.any():
-            raise StoredReferenceError(
+            raise StoredReplayError(
                 f"{folder.name}: the reference does not overlap the scans in time; check that both "
                 f"are of the same recording and clock"
             )

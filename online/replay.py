@@ -140,13 +140,7 @@ class Driver:
         return 0.0 if self._first is None else (stamp - self._first) * 1e-9
 
     def _tell(self, choice: Choice) -> None:
-        """Log what has changed since the last selection: who rests, and whether it is lost."""
-        before = frozenset() if self._applied is None else self._applied.resting
-        now = choice.selection.resting
-        for trial in sorted(before ^ now):
-            does = "rests" if trial in now else "joins in"
-            seconds = self._seconds(choice.stamp)
-            _log.info("%s: trial %d %s at %.1f s", self._what, trial, does, seconds)
+        """Log whether it is lost, where that has changed since the last selection."""
         lost = choice.selection.lost
         if lost != (self._applied is not None and self._applied.lost):
             who = "odometry" if choice.selection.weights is None else "bank"

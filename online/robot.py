@@ -299,7 +299,7 @@ class RobotDrive:
         self._stopped = False
         modes: tuple[str, ...] = WITHOUT_MODEL
         if self._model is not None:
-            rules = config.online.rules if self._steers else ()
+            rules = () if self._ros.steer is None else config.online.rules
             modes = (*dict.fromkeys((*setup.modes(self._model), *rules)), UNTRAINED)
         if mode not in modes:
             raise ModeError(f"--mode: there is no mode {mode!r}; {nearest(mode, modes)}")
@@ -350,16 +350,11 @@ class RobotDrive:
         if self._scans is not None:
             self._scans.stop()
 
-    @property
-    def _steers(self) -> bool:
-        return self._ros.steer is not None
-
     def _topics(self, link: RosLink) -> LiveScans:
         """Subscribe to scans, and to an IMU if the odometry needs one."""
         like, imu = self._like, None
         timing = Timing(like.stamp, like.time_unit, like.period)
-        needs = self._study.odometry.description.needs_imu and not self._steers
-        if needs:
+        if self._study.odometry.description.needs_imu and self._ros.steer is None:
             imu = like.imu or ImuConfig()
             imu = imu.model_copy(update={"topic": _topic(link, imu.topic, IMU, "imu.topic")})
         points = _topic(link, self._ros.points or like.points, CLOUD, "online.ros.points")
@@ -379,8 +374,13 @@ class RobotDrive:
         # A robot that drives goes on, whatever happens to its disk.
         with closing(DriveLog(folder, list(names), goes_on=done > 0)) as log:
             publisher.begin(log)
-            if selector is not None:
-                self._begin_with(odometry, selector.fixed, goes_on=done > 0)
+            try:
+                if selector is not None:
+                    odometry.apply(selector.fixed)
+            except AdaptuneError as error:
+                if not done:
+                    raise
+                _log.warning("the fixed set cannot be applied: %s", error)
             record = ReplayRecord(1.0, publisher.choice)
             for name in ("steps", "choices", "rejected", "late", "waited"):
                 setattr(record, name, deque(maxlen=_KEPT))
@@ -396,15 +396,6 @@ class RobotDrive:
                 self._scans.stop()
             drive.finish()
             return DriveRecord(folder, done + record.done, record, self._scans.ignored)
-
-    def _begin_with(self, odometry: OdometryInstance, fixed: Selection, *, goes_on: bool) -> None:
-        """Apply the fixed set; an error at the start of the drive if that fails."""
-        try:
-            odometry.apply(fixed)
-        except AdaptuneError as error:
-            if not goes_on:
-                raise
-            _log.warning("the fixed set cannot be applied: %s", error)
 
 
 class _Publisher:

@@ -112,7 +112,6 @@ class ComparisonRow:
     memory_mb: float | None = None  # most megabytes of all processes
     real_time: Mapping[str, float] | None = None  # see `ReplaySummary`
     repeats: int = 1  # replays of which errors are means
-    scans: int | None = None  # of the shortest replay
     # Over all sequences: geometric mean of the ratios over the worst tenth of the stretches, on how
     # many sequences the mode has less and more error by what counts, on how many of them surely,
     # and the share of what the best set of each sequence would gain.
@@ -341,7 +340,6 @@ def _measured(
         memory_mb=max((s.memory_mb for s in summaries if s.memory_mb is not None), default=None),
         real_time=summaries[0].real_time,
         repeats=len(repeats),
-        scans=min(len(repeat.trajectory) for repeat in repeats),
     )
 
 

@@ -421,45 +421,15 @@ def _advice(last: Mapping[str, ComparisonRow]) -> str:
 # A comparison in words.
 
 
-_WHOLE = 0.95
-"""Share of the longest replay's scans that a whole replay has at least."""
-
-
 def remarks(rows: Sequence[ComparisonRow]) -> list[str]:
     """In words: what was gained, and what must be known to trust it."""
     return (
         verdict(rows)
-        + _lengths(rows)
         + _judges(rows)
         + _estimates(rows)
         + _losses(rows)
         + _kept_up(rows)
         + _restarts(rows)
-    )
-
-
-def _lengths(rows: Sequence[ComparisonRow]) -> list[str]:
-    """A sentence about every sequence whose replays have different lengths."""
-    said = []
-    for name in dict.fromkeys(row.sequence for row in rows if row.sequence != ALL):
-        scans = {row.mode: row.scans for row in rows if row.sequence == name and row.scans}
-        if short := short_replays(scans):
-            said.append(of_lengths(name, scans, short))
-    return said
-
-
-def short_replays(scans: Mapping[str, int]) -> list[str]:
-    """The modes whose replays of a sequence are shorter than the longest, given their scans."""
-    # In real time, some scans are dropped.
-    return [mode for mode, n in scans.items() if n < _WHOLE * max(scans.values())]
-
-
-def of_lengths(name: str, scans: Mapping[str, int], short: Sequence[str]) -> str:
-    """A sentence about the replays of a sequence of which some are short, given their scans."""
-    listed = ", ".join(f"{mode} {scans[mode]}" for mode in short)
-    return (
-        f"On {name} the replays have different lengths ({listed} of {max(scans.values())} scans); "
-        f"errors are compared where all have scans. Remove them and run `adaptune online`."
     )
 
 

@@ -63,10 +63,7 @@ def test_all_are_compared_in_the_order_of_their_lines(replayed):
     rows = compare(replayed).rows
     assert [row.mode for row in rows] == EVERY
     assert {row.yardstick for row in rows} == {"fixed"}
-    assert (
-        compared_modes(replayed).words(replayed.folder / "replays", replayed.config.online.also)
-        == []
-    )
+    assert compared_modes(replayed).words == []
 
 
 def test_they_do_what_their_names_say(replayed):
@@ -91,7 +88,7 @@ def test_they_are_made_once_and_again_for_another_model(own):
     other.save(study.model_path)
     plain = own()
     assert run_replays(plain, plain.model_path) == 2
-    with pytest.raises(StoredReplayError, match=r"different models .* --thorough` again"):
+    with pytest.raises(StoredReplayError, match=r"even: was .*: model changed .* --thorough` with"):
         compare(plain)
     assert run_replays(study, study.model_path) == 1
     assert {row.mode for row in compare(plain).rows} == set(EVERY)
@@ -105,8 +102,7 @@ def test_what_is_missing_somewhere_is_told_and_left_out(own, tmp_path):
     shutil.rmtree(both.folder / "replays/four/paper")
     shutil.rmtree(both.folder / "replays/three/baseline")
     assert {row.mode for row in compare(both).rows} == {"fixed", "adaptive", "even"}
-    said = compared_modes(both).words(both.folder / "replays", both.config.online.also)
-    assert said == [
+    assert compared_modes(both).words == [
         "`baseline` is not compared: there is no replay on three; `adaptune online` makes what is "
         "missing.",
         "`untrained` and `paper` are not compared: there is no replay on four; `adaptune online "
@@ -127,9 +123,11 @@ def test_what_is_missing_somewhere_is_told_and_left_out(own, tmp_path):
         ("untrained", "baseline"),
     }
     assert not any("`equal_cost` is the fixed set" in said for said in compare(both).words)
-    (said,) = compared_modes(both).words(both.folder / "replays", both.config.online.also)
+    (said,) = compared_modes(both).words
     assert said.startswith("`fixed` is not compared: there is no replay on any sequence; `adaptune")
     shutil.rmtree(both.folder / "replays/four/untrained")
+    assert compared_modes(both).sequences == ("three",)
+    shutil.rmtree(both.folder / "replays/three/untrained")
     with pytest.raises(StoredReplayError, match=r"three/fixed: there is no replay; run"):
         compare(both)
 

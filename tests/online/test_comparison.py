@@ -19,7 +19,7 @@ from offline.config import load_study
 from online.compare import compare
 from online.modes import run_replays, warn_of_scant_evidence
 from online.record import StoredReplay, StoredReplayError
-from online.statistics import ComparisonRow, Reference
+from online.statistics import ComparisonRow
 from online.tables import remarks
 
 MODES = ["baseline", "fixed", "adaptive", "paper"]
@@ -322,23 +322,6 @@ def test_restarts_are_told_with_their_reason():
     )
 
 
-def test_replays_of_different_lengths_are_told_and_compared_where_both_have_scans(own):
-    folder = own.folder / "replays/three/paper"
-    for name, n in {"trajectory.tum": 30, "frames.csv": 31}.items():  # the latter has a header
-        lines = (folder / name).read_text().splitlines(keepends=True)
-        (folder / name).write_text("".join(lines[:n]))
-    rows = compare(own).rows
-    (said,) = [said for said in remarks(rows) if "lengths" in said]
-    assert said.startswith("On three the replays have different lengths (paper 30 of 40 scans)")
-    assert [row.mode for row in rows if row.rte is not None] == MODES
-    # So are the errors of whole trajectories: those of the shorter ones are less.
-    fixed = next(row for row in rows if row.mode == "fixed")
-    of_fixed = StoredReplay.read(folder.parent / "fixed").trajectory
-    judge = Reference.read(folder.parent, own.config.sub_trajectory)
-    shorter = Trajectory(of_fixed.stamps[:30], of_fixed.T_world_sensor[:30])
-    assert fixed.standard.ape == judge.standard(shorter).ape != judge.standard(of_fixed).ape
-
-
 def test_what_was_possible_in_hindsight_is_not_known_without_the_oracle(replayed, monkeypatch):
     (said,) = (said for said in compare(replayed).words if "`adaptune online --oracle`" in said)
     assert said.startswith("What the best set would have gained is not known")
@@ -348,23 +331,20 @@ def test_what_was_possible_in_hindsight_is_not_known_without_the_oracle(replayed
     assert not any("`adaptune online --oracle`" in said for said in compare(replayed).words)
 
 
-def test_restarts_and_speed_are_those_of_the_stored_replay(own):
+def test_restarts_are_those_of_the_stored_replay(own):
     folder = own.folder / "replays/three/adaptive"
     lines = (folder / "frames.csv").read_text().splitlines()
     head = lines[0].split(",")
     rows = [dict(zip(head, line.split(","), strict=True)) for line in lines[1:]]
     for i, row in enumerate(rows):
-        row |= {"restarted": str(int(i in (5, 9))), "prepare_ms": "4.0", "register_ms": "6.0"}
+        row |= {"restarted": str(int(i in (5, 9)))}
     (folder / "frames.csv").write_text(
         "\n".join([lines[0], *(",".join(row.values()) for row in rows)]) + "\n"
     )
     summary = json.loads((folder / "replay.json").read_text())
-    # Reading took long.
-    summary |= {"restarts": 2, "unhealthy": {"max_speed": 2}, "replay_s": 1000.0}
+    summary |= {"restarts": 2, "unhealthy": {"max_speed": 2}}
     (folder / "replay.json").write_text(json.dumps(summary))
     found = compare(own).rows
-    row = next(row for row in found if row.mode == "adaptive")
-    assert row.x_real_time == pytest.approx(3.9 / 0.4, abs=0.01)
     assert remarks(found)[-1] == (
         "On three the health check restarted adaptive 2 times, first at 0.5 s (max_speed)."
     )

@@ -54,11 +54,9 @@ def test_a_rival_keeps_its_parameters():
     rng = np.random.default_rng(0)
     own = tuple(gicp.from_unit(rng.random((len(model.sets), len(gicp)))))
     sets = replace(model.sets, space=gicp, parameters=own)
-    odometry, selector = setup().start(
-        "equal_cost", replace(model, sets=sets, rivals={"equal_cost": 6})
-    )
-    assert selector is None
-    assert odometry.odometry.parameters == sets[6]
+    mode = setup().mode("equal_cost", replace(model, sets=sets, rivals={"equal_cost": 6}))
+    assert mode.selector is None
+    assert setup().instance(mode).odometry.parameters == sets[6]
 
 
 def test_a_model_for_another_budget_is_refused(tmp_path):

@@ -221,7 +221,6 @@ def test_the_log_says_when_an_odometry_is_lost_and_when_it_goes_on(tmp_path, cap
     write_replay(tmp_path, result, ABOUT, None)
     summary = json.loads((tmp_path / "replay.json").read_text())
     assert summary["lost_seconds"] == 2.5  # the last selection holds until the end
-    assert summary["mean_estimated_error"] is None
     assert summary["model_file"] is None
 
 

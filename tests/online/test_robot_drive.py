@@ -74,7 +74,8 @@ def test_it_drives_as_a_replay_in_lockstep(make, mode):
     found, link, _ = drive(study, mode, clouds(), len(SCANS), model=mode != "untrained")
     setup = ReplaySetup.of(study)
     model = None if mode == "untrained" else ErrorModel.load(study.model_path)
-    odometry, selector = setup.start(mode, model)
+    made = setup.mode(mode, model)
+    odometry, selector = setup.instance(made), made.selector and made.selector()
     scans = [Scan(stamp, points) for stamp, points, _ in SCANS]
     expected = replay(scans, odometry, study.config.health, selector)
     odometry.close()

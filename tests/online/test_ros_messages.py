@@ -7,7 +7,7 @@ import pytest
 from rosbags.typesys import Stores, get_typestore
 
 from adaptune.space import Selection
-from online.live import UNKNOWN_ERROR, RosMessages, Status, Uncertainty
+from online.live import UNKNOWN_ERROR, RosMessages, Status, Uncertainty, placed
 from online.replay import ReplayRecord
 
 MESSAGES = RosMessages(local_link.STORE, "odom")
@@ -47,7 +47,7 @@ def test_a_pose_with_its_stamp():
     T = ahead(3.0)
     T[:2, :2] = [[0.0, -1.0], [1.0, 0.0]]
     stamp = 1_700_000_000_123_456_789
-    found = MESSAGES.odometry(stamp, T, "lidar", Uncertainty(25.0))
+    found = MESSAGES.odometry(stamp, *placed(T[None]), "lidar")
     assert (found.header.stamp.sec, found.header.stamp.nanosec) == divmod(stamp, 10**9)
     q = found.pose.pose.orientation
     np.testing.assert_allclose([q.x, q.y, q.z, q.w], [0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)])
@@ -58,8 +58,8 @@ def test_all_messages_are_those_of_ros_2_too():
     store = get_typestore(Stores.ROS2_JAZZY)
     messages, selection = RosMessages(store, "odom"), Selection(3, {"voxel": 0.5}, lost=True)
     for made in (
-        messages.odometry(5, np.eye(4), "lidar", Uncertainty(25.0)),
-        messages.transform(5, np.eye(4), "lidar"),
+        messages.odometry(5, *placed(np.eye(4)[None]), "lidar", (0.1, 0.2)),
+        messages.transform(5, *placed(np.eye(4)[None]), "lidar"),
         messages.selection(5, selection, ""),
         messages.diagnostics(5, selection, Status(), Status()),
     ):

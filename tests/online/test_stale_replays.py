@@ -15,7 +15,7 @@ from offline.config import load_study
 from offline.train import train
 from offline.validate import validate
 from online.charts import charts_of_replays, read_replays
-from online.compare import compare, current_modes
+from online.compare import compare, current_replays
 from online.modes import run_replays
 from online.record import StoredReplayError, check_reference
 
@@ -155,20 +155,23 @@ def test_replays_with_two_models_are_not_compared(load):
     shutil.copytree(path.parent, twice)
     rewrite(twice, mode="paper", model="a third")
     both = load("online.modes=[adaptive, paper]")
+    with pytest.raises(StoredReplayError, match=r"model changed from another to .*; run `adaptune"):
+        compare(both)
+    both.model_path.unlink()
     with pytest.raises(StoredReplayError, match=r"different models .*run `adaptune online` again"):
         compare(both)
 
 
 def test_what_is_refused_is_told_and_not_drawn(load):
     study = load()
-    assert current_modes(study, "three") == (("baseline", "fixed", "adaptive"), ())
-    assert current_modes(study, "one") == ((), ())
+    assert current_replays(study, ["three"])[1:] == (("baseline", "fixed", "adaptive"), ())
+    assert current_replays(study, ["one"])[1:] == ((), ())
     # What is left of a mode that the study does not have any more is not looked at.
     folder = study.folder / "replays/three"
     shutil.copytree(folder / "adaptive", folder / "paper")
-    assert "paper" not in current_modes(study, "three").modes
+    assert "paper" not in current_replays(study, ["three"]).modes
     other = load("online.switching.mechanism=bank", "online.switching.size=2")
-    modes, refused = current_modes(other, "three")
+    _, modes, refused = current_replays(other, ["three"])
     assert modes == ("baseline", "fixed")
     with pytest.raises(StoredReplayError) as caught:
         compare(other)
@@ -196,9 +199,9 @@ def test_of_replays_with_different_models_those_with_the_own_one_are_drawn(load)
     study = load("online.modes=[adaptive, even]")
     run(study)
     rewrite(study.folder / "replays/three/even", model="another")
-    with pytest.raises(StoredReplayError, match="different models"):
+    with pytest.raises(StoredReplayError, match="even: was made from other inputs: model changed"):
         compare(study)
-    modes, (said,) = current_modes(study, "three")
+    _, modes, (said,) = current_replays(study, ["three"])
     assert modes == ("baseline", "fixed", "adaptive")
     assert "three/even: was made from other inputs: model changed from another to " in said
     study.model_path.unlink()

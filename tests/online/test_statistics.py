@@ -83,7 +83,7 @@ def test_scans_without_reference_do_not_count():
 
 def test_a_sequence_without_reference_has_empty_cells():
     cells = row("street", None).standard_columns()
-    assert set(list(cells.values())[2:]) == {None}
+    assert set(list(cells.values())[1:]) == {None}
 
 
 def test_all_sequences_have_mean_errors_and_kittis_over_all_sub_trajectories():

@@ -79,14 +79,6 @@ def test_without_a_mode_that_adapts_tuning_is_the_result():
     assert len(said) == 2
 
 
-@pytest.mark.parametrize(("fixed", "counts"), [(80.0, True), (42.0, False)])
-def test_what_tuning_costs_is_told_if_it_costs_something(fixed, counts):
-    costs = {"fixed": fixed, "baseline": 40.0}
-    rows = [replace(row, cpu_ms=costs[row.mode]) for row in every(baseline=1.25)]
-    told = "The fixed set takes 80.0 ms of CPU time a scan, 2.0 times what the baseline takes."
-    assert (told in verdict(rows)) == counts
-
-
 @pytest.mark.parametrize("ratio", [0.4, 1.0, 1.6])
 def test_without_an_interval_nothing_is_claimed(ratio):
     few = every(3, adaptive=ratio, paper=1.3 * ratio, even=1.1)
@@ -146,10 +138,7 @@ def test_losses_costs_controls_and_rivals_are_told():
         "worse": 1,
         "surely_better": 9,
         "surely_worse": 1,
-        "worst_tenth": 1.25,
-        "gap_closed": 0.4,
         "cpu_ms": 20.0,
-        "stretches": 24,
         "against": {"even": Ratio(0.69, (0.6, 0.8)), "equal_cost": Ratio(0.8, (0.7, 0.9))},
     }
     rows = [replace(r, **sure) if (r.sequence, r.mode) == (ALL, "adaptive") else r for r in rows]
@@ -160,15 +149,13 @@ def test_losses_costs_controls_and_rivals_are_told():
     for sentence in (
         "By more than 1 %, it has less error on 11 of 12 sequences, and more on 1 (s3); surely "
         "better on 9, surely worse on 1.",
-        "In the worst tenth of 24 stretches it has 1.25 times the fixed set's error.",
-        "It gains 40 % of what the best set of each sequence would gain in hindsight.",
         "It takes 20.0 ms of CPU time a scan: 4.0 times what the fixed set takes.",
         "`adaptive` has 0.80 times the error of the best set that costs no more (95 % interval "
         "0.70 to 0.90).",
         "Choosing added to that: `adaptive` has 0.69 times the error of `even` (95 % interval 0.60 "
         "to 0.80).",
         "`paper` is worse: 1.40 times the fixed set's error (95 % interval 1.36 to 1.44).",
-        "What to do: drive `adaptive`, and look at where it is worse (pictures).",
+        "What to do: drive `adaptive`.",
     ):
         assert sentence in said
     assert any(s.startswith("The study's bank with even weights has 1.02 times") for s in said)
@@ -218,15 +205,6 @@ def test_nothing_is_said_where_nothing_is_known():
     assert verdict(rows) == ["No test sequence has a reference: nobody can say what was gained."]
     oracle = ComparisonRow(ALL, ORACLES[0], 0.5, 0.5, 0, 0, 0)
     assert not any(ORACLES[0] in said for said in verdict([*every(adaptive=0.7), oracle]))
-
-
-@pytest.mark.parametrize(("best", "told"), [(1.0, True), (0.995, True), (0.8, False)])
-def test_it_is_told_where_no_choice_of_one_set_could_gain(best, told):
-    oracle = ComparisonRow(ALL, ORACLES[0], best, best, 0, 0, 0)
-    said = verdict([*every(adaptive=0.9), oracle])
-    what = "In hindsight, the best set of each sequence would gain less than 1 %"
-    assert any(sentence.startswith(what) for sentence in said) == told
-    assert said[-1].startswith("What to do: ")
 
 
 def test_an_end_near_1_shows_on_which_side_it_lies():
