@@ -465,7 +465,7 @@ def _replayed(
     given = recording, odometry, study.config.health
     if online.real_time is None:
         selector = make and make()
-        fixed = selector and selector.fall_back()
+        fixed = None if selector is None else selector.fall_back()
         record = replay(*given, selector, online.period, watch, what, fixed)
     else:
         with ExitStack() as stack:

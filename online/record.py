@@ -128,12 +128,12 @@ class StoredReplay:
     @property
     def restarted(self) -> NDArray[np.bool_]:
         """Frames at which the health check restarted the odometry, of shape (n,)."""
-        return self.frames["restarted"] == 1.0
+        return np.asarray(self.frames["restarted"] == 1.0)
 
     @property
     def lost(self) -> NDArray[np.bool_]:
         """Whether the bank was lost, of shape (m,)."""
-        return self.selections["lost"] == 1.0
+        return np.asarray(self.selections["lost"] == 1.0)
 
     @property
     def estimated(self) -> NDArray[np.float64]:
@@ -329,7 +329,7 @@ def _floats(values: Sequence[str]) -> NDArray[np.float64]:
 def _numbers(values: Sequence[str]) -> list[Any]:
     """Numbers if all are, NaN where the set of another odometry has no value; texts otherwise."""
     try:
-        return _floats(values).tolist()
+        return [float(value or "nan") for value in values]
     except ValueError:
         return list(values)
 

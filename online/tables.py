@@ -423,14 +423,7 @@ def _advice(last: Mapping[str, ComparisonRow]) -> str:
 
 def remarks(rows: Sequence[ComparisonRow]) -> list[str]:
     """In words: what was gained, and what must be known to trust it."""
-    return (
-        verdict(rows)
-        + _judges(rows)
-        + _estimates(rows)
-        + _losses(rows)
-        + _kept_up(rows)
-        + _restarts(rows)
-    )
+    return verdict(rows) + _judges(rows) + _estimates(rows) + _kept_up(rows) + _restarts(rows)
 
 
 def _judges(rows: Sequence[ComparisonRow]) -> list[str]:
@@ -465,35 +458,16 @@ def _estimates(rows: Sequence[ComparisonRow]) -> list[str]:
                 f"{row.estimated:.3f} %{interval and f' ({interval})'}."
             )
         elif ends is not None and not ends[0] <= row.rte <= ends[1]:
+            judge = "estimated reference" if row.reference == "estimated" else "reference"
             contradicted.setdefault(row.mode, []).append(
-                f"{row.estimated:.3f} % ({interval}) on {row.sequence}, where by the "
-                f"{_called(row)} it is {row.rte:.3f} %"
+                f"{row.estimated:.3f} % ({interval}) on {row.sequence}, where by the {judge} it is "
+                f"{row.rte:.3f} %"
             )
     for mode, those in contradicted.items():
         said.append(
             f"`{mode}` estimates its own mean RTE at {'; '.join(those)}. "
             f"Either the estimate or the reference is wrong there over this length."
         )
-    return said
-
-
-def _called(row: ComparisonRow) -> str:
-    """What the reference of a row is called in a sentence."""
-    return "estimated reference" if row.reference == "estimated" else "reference"
-
-
-def _losses(rows: Sequence[ComparisonRow]) -> list[str]:
-    """A sentence about every mode that was lost for a while."""
-    said = []
-    for mode in dict.fromkeys(row.mode for row in rows):
-        lost = {
-            row.sequence: row.lost_seconds
-            for row in rows
-            if row.mode == mode and row.lost_seconds and row.sequence != ALL
-        }
-        if lost:
-            on = ", ".join(f"{name} ({seconds:.1f} s)" for name, seconds in lost.items())
-            said.append(f"`{mode}` was lost for {sum(lost.values()):.1f} s: on {on}.")
     return said
 
 
