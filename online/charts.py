@@ -30,7 +30,7 @@ from adaptune.study.study import Study, StudySequences, named
 from adaptune.trajectory import Trajectory, read_tum
 from online.compare import current_replays
 from online.modes import UNTRAINED
-from online.record import StoredReplay, check_reference
+from online.record import StoredReplay, check_reference, switched
 from online.statistics import ALL, ComparisonRow, Reference
 
 # The chart of a comparison: the ratio of each mode's error, over all sequences and on each.
@@ -489,12 +489,9 @@ def _errors(replayed: ReplayedSequence) -> Panel:
 
 def switches(track: ModeReplay) -> NDArray[np.float64]:
     """Seconds of the selections that changed a parameter; none of a bank, which changes weights."""
-    if track.weights or len(track.choice_seconds) < 2:
+    if track.weights or not track.choices:
         return np.empty(0)
-    rows = list(zip(*track.choices.values(), strict=True))
-    # As texts, because NaN does not equal itself.
-    changed = [i for i in range(1, len(rows)) if repr(rows[i]) != repr(rows[i - 1])]
-    return track.choice_seconds[changed]
+    return track.choice_seconds[switched(track.choices)]
 
 
 def _estimates(mode: str, track: ModeReplay, replayed: ReplayedSequence) -> Panel:
@@ -536,7 +533,9 @@ def _parameters(replayed: ReplayedSequence) -> Iterator[Panel]:
     single = {mode: of for mode, of in replayed.modes.items() if not of.weights}
     for name in dict.fromkeys(name for track in single.values() for name in track.choices):
         chosen = {mode: t.choices[name] for mode, t in single.items() if name in t.choices}
-        names = _names(v for values in chosen.values() for v in values)
+        every = [value for values in chosen.values() for value in values]
+        is_named = any(isinstance(value, str) for value in every)
+        names = tuple(sorted({_name(value) for value in every} - {""})) if is_named else None
         drawn = _scenes(replayed)
         for mode, values in chosen.items():
             y = [_place(value, names) for value in values]
@@ -544,14 +543,6 @@ def _parameters(replayed: ReplayedSequence) -> Iterator[Panel]:
         log = name in replayed.space.logarithmic and names is None
         axis = Axis(replayed.space.labels[name], log=log, names=names)
         yield Panel(TIME, axis, tuple(drawn), name)
-
-
-def _names(values: Iterator[Any]) -> tuple[str, ...] | None:
-    """The names on an axis of these values; None if all are numbers."""
-    every = list(values)
-    if not any(isinstance(value, str) for value in every):
-        return None
-    return tuple(sorted({_name(value) for value in every} - {""}))
 
 
 def _name(value: Any) -> str:

@@ -7,8 +7,8 @@ import threading
 import time
 from collections import deque
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
-from typing import Any, Self
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from rosbags.typesys.store import Typestore
@@ -340,21 +340,23 @@ class RosMessages:
         return self._make("std_msgs/msg/String", data=json.dumps(found))
 
     def diagnostics(
-        self, stamp: int, selection: Selection | None, status: "Status", before: "Status"
+        self, stamp: int, record: ReplayRecord, ignored: int, *, late: bool, restarted: bool
     ) -> Any:
-        """diagnostic_msgs/DiagnosticArray: what happened since the message before."""
-        level, said = _OK, "keeps up"
-        if (status.dropped, status.missed) != (before.dropped, before.missed):
-            level, said = _WARN, "was too late"
-        if before.restarts:
+        """diagnostic_msgs/DiagnosticArray of a drive so far, in which so many scans were ignored.
+
+        It warns where something was too late since the message before, or the odometry restarted.
+        """
+        selection = None if record.newest is None else record.newest.selection
+        level, said = (_WARN, "was too late") if late else (_OK, "keeps up")
+        if restarted:
             level, said = _ERROR, "restarts for want of healthy poses"
         if selection is not None and selection.lost:
             level, said = _ERROR, "is lost"
         values = {
-            "pose after the scan [ms]": f"{1e3 * status.late:.1f}",
-            "dropped scans": str(status.dropped),
-            "ignored scans": str(status.ignored),
-            "missed selections": str(status.missed),
+            "pose after the scan [ms]": f"{1e3 * record.late[-1]:.1f}",
+            "dropped scans": str(record.dropped),
+            "ignored scans": str(ignored),
+            "missed selections": str(record.missed),
         }
         if selection is not None:
             values |= {
@@ -373,23 +375,6 @@ class RosMessages:
         )
         header = self.header(stamp, "")
         return self._make("diagnostic_msgs/msg/DiagnosticArray", header=header, status=[found])
-
-
-@dataclass
-class Status:
-    """Counts since the start, and restarts since a message."""
-
-    dropped: int = 0
-    missed: int = 0
-    ignored: int = 0
-    late: float = 0.0  # seconds from the newest scan to its pose
-    restarts: int = 0
-
-    @classmethod
-    def of(cls, record: ReplayRecord, ignored: int) -> Self:
-        """The counts of a drive."""
-        late = record.late[-1] if record.late else 0.0
-        return cls(record.dropped, record.missed, ignored, late)
 
 
 def _number(value: float) -> float | None:

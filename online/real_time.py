@@ -288,29 +288,14 @@ def arrivals(
 
 def _read_ahead(scans: Iterable[Scan]) -> Iterator[Scan]:
     """Read in a thread; an error is raised here."""
-    read: Queue[Scan | BaseException | None] = Queue(_AHEAD)
-    stop = threading.Event()
-
-    def work() -> None:
-        try:
-            for scan in scans:
-                if stop.is_set():
-                    return
-                read.put(scan)
-            read.put(None)
-        except BaseException as error:
-            read.put(error)
-
-    threading.Thread(target=work, daemon=True).start()
+    source, pool = iter(scans), ThreadPoolExecutor(1)
     try:
-        while (found := read.get()) is not None:
-            if isinstance(found, BaseException):
-                raise found
-            yield found
+        read = deque(pool.submit(next, source, None) for _ in range(_AHEAD))
+        while (scan := read.popleft().result()) is not None:
+            read.append(pool.submit(next, source, None))
+            yield scan
     finally:
-        stop.set()
-        while not read.empty():
-            read.get_nowait()
+        pool.shutdown(wait=False, cancel_futures=True)
 
 
 def replay_in_real_time(

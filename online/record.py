@@ -179,6 +179,13 @@ class StoredReplay:
         return cls(summary, trajectory, frames, stamps, choices, weights, selections)
 
 
+def switched(choices: Mapping[str, Sequence[Any]]) -> NDArray[np.bool_]:
+    """Which of m selections changed a parameter, of shape (m,), from their values by name."""
+    # As texts, because NaN does not equal itself.
+    rows = list(map(repr, zip(*choices.values(), strict=True)))
+    return np.array([False, *(a != b for a, b in itertools.pairwise(rows))])
+
+
 def write_replay(
     folder: Path, replay: ReplayRecord, inputs: manifest.Inputs, model_file: Path | None
 ) -> None:

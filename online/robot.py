@@ -26,13 +26,13 @@ from adaptune.recording.clouds import POSES
 from adaptune.recording.config import ImuConfig, SequenceConfig
 from adaptune.recording.scan import Scan, Timing
 from adaptune.ros.link import RosLink, Steering
-from adaptune.selector import BACK, Selector
+from adaptune.selector import BACK, Schedule, Selector
 from adaptune.space import Selection
 from adaptune.strict import in_one_line
 from adaptune.study.config import RealTimeConfig, RosConfig, SteerConfig, StudyConfig
 from adaptune.study.study import ModeError, Study, StudySequences
 from adaptune.trajectory import Trajectory, tum_lines
-from online.live import CLOUD, IMU, LiveScans, RosMessages, Status, Uncertainty, placed
+from online.live import CLOUD, IMU, LiveScans, RosMessages, Uncertainty, placed
 from online.modes import UNTRAINED, WITHOUT_MODEL, Mode, ReplaySetup, needed
 from online.real_time import RealTimeDrive, SelectorProcess
 from online.record import FRAME_COLUMNS, SELECTION_COLUMNS, frame_row, selection_row
@@ -263,7 +263,6 @@ class DriveRecord(NamedTuple):
     folder: Path  # of its trajectory, selections and scans
     scans: int
     record: ReplayRecord  # of its last part, where the clock went back
-    ignored: int  # scans that came twice or too late
 
 
 class RobotDrive:
@@ -395,7 +394,7 @@ class RobotDrive:
             except KeyboardInterrupt:
                 self._scans.stop()
             drive.finish()
-            return DriveRecord(folder, done + record.done, record, self._scans.ignored)
+            return DriveRecord(folder, done + record.done, record)
 
 
 class _Publisher:
@@ -419,8 +418,8 @@ class _Publisher:
         self._log = log
         self._uncertainty = Uncertainty(self._length)
         self._last: RegisteredScan | None = None
-        self._told: int | None = None
-        self._status = Status()
+        self._due = Schedule(_EVERY)
+        self._late, self._restarted = (0, 0), False
 
     def choice(self, choice: Choice) -> None:
         """Tell of a selection."""
@@ -442,13 +441,13 @@ class _Publisher:
             self._odometry(self._messages.odometry(*where, variances))
         if self._tf is not None:
             self._tf(self._messages.transform(*where))
-        self._status.restarts += step.unhealthy is not None
-        if self._told is None or step.stamp - self._told >= _EVERY:
-            self._told = step.stamp
-            selection = None if record.newest is None else record.newest.selection
-            before, self._status = self._status, Status.of(record, self._scans.ignored)
-            message = self._messages.diagnostics(step.stamp, selection, self._status, before)
-            self._diagnostics(message)
+        self._restarted |= step.unhealthy is not None
+        if self._due.due(step.stamp):
+            before, self._late = self._late, (record.dropped, record.missed)
+            since = {"late": self._late != before, "restarted": self._restarted}
+            given = step.stamp, record, self._scans.ignored
+            self._diagnostics(self._messages.diagnostics(*given, **since))
+            self._restarted = False
 
 
 def _like(config: StudyConfig, sequences: StudySequences) -> SequenceConfig:

@@ -1,6 +1,5 @@
 """Statistics of stored replays: errors, intervals, and ratios to those of another mode."""
 
-import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -27,7 +26,7 @@ from adaptune.metrics import (
 from adaptune.reference.stored import StoredEstimate
 from adaptune.study.study import OracleErrors
 from adaptune.trajectory import Trajectory, read_tum
-from online.record import ReplaySummary, StoredReplay
+from online.record import ReplaySummary, StoredReplay, switched
 
 # A row of the comparison: what a mode did on a sequence, or on all of them.
 
@@ -325,7 +324,7 @@ def _measured(
     return replace(
         row,
         restarts=sum(summary.restarts for summary in summaries),
-        switches=sum(map(_switches, repeats)),
+        switches=int(sum(switched(repeat.choices).sum() for repeat in repeats)),
         poor_scans=sum(summary.poor_scans for summary in summaries),
         standard=StandardErrors.pooled(known),
         first_restart=first,
@@ -449,13 +448,6 @@ def _first_restart(replay: StoredReplay) -> float | None:
     stamps = replay.trajectory.stamps
     restarts = stamps[replay.restarted]
     return float(restarts[0] - stamps[0]) * 1e-9 if len(restarts) else None
-
-
-def _switches(replay: StoredReplay) -> int:
-    if len(replay.choice_stamps) < 2:
-        return 0
-    values = zip(*replay.choices.values(), strict=True)
-    return sum(a != b for a, b in itertools.pairwise(values))
 
 
 # What the best choice in hindsight would have had, from trials on the test sequences.

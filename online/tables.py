@@ -123,33 +123,32 @@ def _of_modes(rows: Sequence[ComparisonRow], length: float) -> Listing:
 
 
 def _caption(rows: Sequence[ComparisonRow], shown: Mapping[str, Any]) -> str:
-    said = [
-        "Intervals of 95 %: paired block bootstrap, seed 0, where there is enough to draw from."
-    ]
-    yardstick = _YARDSTICKS[rows[0].yardstick]
-    if rows[-1].sequence == ALL:
-        said.append(
-            f"vs {rows[0].yardstick}: geometric mean of the ratios to the {yardstick}'s RTE."
-        )
-    if "worst tenth" in shown:
-        said.append("Worst tenth: that mean over the worst tenth of the stretches.")
-    if "better / worse" in shown:
-        said.append("Better / worse: sequences on which the error is less or more by 1 %.")
-    if any(row.mode in ORACLES for row in rows):
-        said.append(
-            "Oracles know the errors: the best set of each sequence, and of every period. Much of "
-            "the latter is chance, out of reach of any choice."
-        )
-    if GAP in shown:
-        said.append("Gap closed: share of what the best set of each sequence, in hindsight, gains.")
-    if any(row.estimated is not None for row in rows):
-        said.append("Estimated: by the odometry itself while driving, without the reference.")
-    if any(row.reference == "estimated" for row in rows):
-        said.append(
-            f"The error of an estimated reference pulls ratios towards 1, or hides what a mode has "
-            f"in common with it; intervals allow for {ERROR_FACTOR:g} times its estimate."
-        )
-    return " ".join(said)
+    yardstick = rows[0].yardstick
+    sentences = {
+        "Intervals of 95 %: paired block bootstrap, seed 0, where there is enough to draw from.": (
+            True
+        ),
+        f"vs {yardstick}: geometric mean of the ratios to the {_YARDSTICKS[yardstick]}'s RTE.": (
+            rows[-1].sequence == ALL
+        ),
+        "Worst tenth: that mean over the worst tenth of the stretches.": "worst tenth" in shown,
+        "Better / worse: sequences on which the error is less or more by 1 %.": (
+            "better / worse" in shown
+        ),
+        "Oracles know the errors: the best set of each sequence, and of every period. Much of the "
+        "latter is chance, out of reach of any choice.": any(r.mode in ORACLES for r in rows),
+        "Gap closed: share of what the best set of each sequence, in hindsight, gains.": (
+            GAP in shown
+        ),
+        "Estimated: by the odometry itself while driving, without the reference.": (
+            any(row.estimated is not None for row in rows)
+        ),
+        f"The error of an estimated reference pulls ratios towards 1, or hides what a mode has in "
+        f"common with it; intervals allow for {ERROR_FACTOR:g} times its estimate.": (
+            any(row.reference == "estimated" for row in rows)
+        ),
+    }
+    return " ".join(sentence for sentence, tells in sentences.items() if tells)
 
 
 def _of_sequences(rows: Sequence[ComparisonRow], length: float) -> Listing:
@@ -191,17 +190,14 @@ def _standard(rows: Sequence[ComparisonRow]) -> Listing | None:
 def _change(row: ComparisonRow, rows: Sequence[ComparisonRow]) -> dict[str, Any]:
     """Errors of a mode, and by how many percent they differ from the baseline's."""
     (before,) = [other for other in _last(rows) if other.mode == "baseline"]
-    assert row.standard is not None
-    assert before.standard is not None
+    mine, others = (of.summary_columns() | of.standard_columns() for of in (row, before))
     cells: dict[str, Any] = {"mode": row.mode}
-    pairs = {
-        "RTE [%]": (row.rte, before.rte),
-        "RPE [m]": (row.standard.rpe, before.standard.rpe),
-        "APE [m]": (row.standard.ape, before.standard.ape),
-    }
-    for key, (mine, others) in pairs.items():
-        cells[key], change = mine, f"{key[:3]} change [%]"
-        cells[change] = f"{100 * (mine / others - 1):+.1f}" if mine and others else None
+    for key in ("RTE [%]", "RPE [m]", "APE [m]"):
+        known = mine[key] and others[key]
+        cells[key] = mine[key]
+        cells[f"{key[:3]} change [%]"] = (
+            f"{100 * (mine[key] / others[key] - 1):+.1f}" if known else None
+        )
     return cells
 
 

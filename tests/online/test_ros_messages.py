@@ -7,10 +7,17 @@ import pytest
 from rosbags.typesys import Stores, get_typestore
 
 from adaptune.space import Selection
-from online.live import UNKNOWN_ERROR, RosMessages, Status, Uncertainty, placed
-from online.replay import ReplayRecord
+from online.live import UNKNOWN_ERROR, RosMessages, Uncertainty, placed
+from online.replay import Choice, ReplayRecord
 
 MESSAGES = RosMessages(local_link.STORE, "odom")
+
+
+def record(selection):
+    made = ReplayRecord(1.0, dropped=3, late=[0.5, 0.0123])
+    if selection is not None:
+        made.note(Choice(0, selection, 0.0))
+    return made
 
 
 def ahead(metres):
@@ -61,7 +68,7 @@ def test_all_messages_are_those_of_ros_2_too():
         messages.odometry(5, *placed(np.eye(4)[None]), "lidar", (0.1, 0.2)),
         messages.transform(5, *placed(np.eye(4)[None]), "lidar"),
         messages.selection(5, selection, ""),
-        messages.diagnostics(5, selection, Status(), Status()),
+        messages.diagnostics(5, record(selection), 0, late=True, restarted=False),
     ):
         raw = store.serialize_cdr(made, made.__msgtype__)
         found = store.deserialize_cdr(raw, made.__msgtype__)
@@ -80,27 +87,21 @@ def test_what_is_not_known_is_null():
 
 
 @pytest.mark.parametrize(
-    ("selection", "status", "before", "level", "said"),
+    ("selection", "since", "level", "said"),
     [
-        (None, {}, {}, 0, "keeps up"),
-        (None, {"dropped": 1}, {}, 1, "was too late"),
-        (None, {"missed": 1}, {}, 1, "was too late"),
-        (None, {"dropped": 1, "missed": 2}, {"dropped": 1, "missed": 2}, 0, "keeps up"),
-        (None, {"dropped": 1}, {"restarts": 1}, 2, "restarts for want of healthy poses"),
-        (Selection(3, {}, lost=True), {"missed": 1}, {"restarts": 1}, 2, "is lost"),
+        (None, (False, False), 0, "keeps up"),
+        (None, (True, False), 1, "was too late"),
+        (None, (True, True), 2, "restarts for want of healthy poses"),
+        (Selection(3, {}, lost=True), (True, True), 2, "is lost"),
     ],
 )
-def test_diagnostics(selection, status, before, level, said):
-    status = Status(late=0.0123, ignored=4, **status)
-    (found,) = MESSAGES.diagnostics(0, selection, status, Status(**before)).status
+def test_diagnostics(selection, since, level, said):
+    late, restarted = since
+    message = MESSAGES.diagnostics(0, record(selection), 4, late=late, restarted=restarted)
+    (found,) = message.status
     assert (found.level, found.message) == (level, said)
     values = {one.key: one.value for one in found.values}
     assert values["pose after the scan [ms]"] == "12.3"
     assert values["ignored scans"] == "4"
+    assert values["dropped scans"] == "3"
     assert ("trial" in values) == (selection is not None)
-
-
-def test_the_status_of_a_drive():
-    record = ReplayRecord(1.0, dropped=3, missed=2, late=[0.5, 0.25])
-    assert Status.of(record, 7) == Status(3, 2, 7, 0.25)
-    assert Status.of(ReplayRecord(1.0), 0) == Status()

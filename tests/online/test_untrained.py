@@ -89,7 +89,6 @@ def test_nothing_but_a_recording_is_needed(load, caplog):
         "No test sequence has a reference: nobody can say what was gained.",
         "three has no reference. `untrained` estimates its own mean RTE there: 6.000 % (95 % "
         "interval 5.000-9.000 %).",
-        "`untrained` was lost for 1.0 s: on three (1.0 s).",
     ]
     assert caplog.messages == [
         "three, untrained: the bank is lost at 1.0 s",
