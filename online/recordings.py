@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune import manifest
 from adaptune.errors import nearest
 from adaptune.files import replacing_folder
 from adaptune.geometry import invert
@@ -21,6 +20,7 @@ from adaptune.selector import Schedule
 from adaptune.study.config import StudyConfig
 from adaptune.study.study import Study
 from adaptune.trajectory import Trajectory
+from online.compare import current_replays
 from online.live import Placed, RosMessages, placed
 from online.modes import replayed_modes, sequences_without_model
 from online.record import (
@@ -99,37 +99,31 @@ def record_replays(study: Study, name: str, progress: Progress = unseen) -> Path
     Raises
     ------
     AdaptuneError
-        If a replay is damaged, or of another recording than the sequence is now, or the disk is
+        If a replay is damaged, or of other inputs than it would be made from now, or the disk is
         full.
     """
     folder = study.folder / "replays" / name
-    modes = replayed_modes(folder)
+    _, modes, refused = current_replays(study, [name])
+    if refused:
+        raise StoredReplayError(refused[0][:-1])
     replays = {mode: StoredReplay.read(folder / mode) for mode in modes}
-    now = study.sequences.identity(name)
-    for mode, replay in replays.items():
-        before = {key: replay.summary.inputs.get(key) for key in now}
-        if said := manifest.changes(before, now, study.sequences.sources(name)):
-            raise StoredReplayError(
-                f"{folder / mode}: is of other inputs: {'; '.join(said)}; run `adaptune online` "
-                f"with this study"
-            )
     check_reference(folder, study.sequences.reference(name))
     reference = Reference.read(folder, study.config.sub_trajectory)
     known = reference.trajectory
-    placed = {mode: _placed(replay.trajectory, known) for mode, replay in replays.items()}
+    paths = {mode: _placed(replay.trajectory, known) for mode, replay in replays.items()}
     placing = next((mode for mode in _PLACING if mode in modes), modes[0])
-    start = min(int(trajectory.stamps[0]) for trajectory in placed.values())
+    start = min(int(trajectory.stamps[0]) for trajectory in paths.values())
     composer = _Composer()
-    clouds = composer.clouds(study.sequences.open(name), placed[placing], name, progress)
+    clouds = composer.clouds(study.sequences.open(name), paths[placing], name, progress)
     composer.add(POINTS, _CLOUD, clouds)
-    composer.add(TF, _TRANSFORM, composer.transforms(placed[placing]))
+    composer.add(TF, _TRANSFORM, composer.transforms(paths[placing]))
     if known is not None:
         first = Trajectory(known.stamps, invert(known.T_world_sensor[0]) @ known.T_world_sensor)
         composer.add(REFERENCE, _PATH, composer.path(first, start))
     for mode, replay in replays.items():
-        composer.add(topic(mode, "path"), _PATH, composer.path(placed[mode], start))
+        composer.add(topic(mode, "path"), _PATH, composer.path(paths[mode], start))
         child = SENSOR if mode == placing else f"{SENSOR}_{mode}"
-        composer.add(topic(mode, "odometry"), _ODOMETRY, composer.odometry(placed[mode], child))
+        composer.add(topic(mode, "odometry"), _ODOMETRY, composer.odometry(paths[mode], child))
         composer.add_mode(mode, replay, reference)
     path = study.folder / "recordings" / name
     with replacing_folder(path) as new:

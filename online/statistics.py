@@ -87,11 +87,12 @@ class ComparisonRow:
 
     sequence: str
     mode: str
-    rte: float | None  # mean sub-trajectory RTE in percent; None where the reference is unknown
-    ratio: float | None  # to that of the yardstick
-    restarts: int  # by the health check, in all repeats
-    switches: int  # changes of the parameters, in all repeats
-    poor_scans: int  # too poor to register
+    # Mean sub-trajectory RTE in percent; None where the reference is unknown.
+    rte: float | None = None
+    ratio: float | None = None  # to that of the yardstick
+    restarts: int = 0  # by the health check, in all repeats
+    switches: int = 0  # changes of the parameters, in all repeats
+    poor_scans: int = 0  # too poor to register
     rte_interval: Interval = None
     ratio_interval: Interval = None
     median: float | None = None  # of the sub-trajectory RTE, percent
@@ -296,9 +297,7 @@ Repeats = Mapping[str, Sequence[StoredReplay]]
 def compare_modes(name: str, replays: Repeats, reference: Reference) -> JudgedModes:
     """Compare the modes on a sequence with `fixed`, or where it is not among them, `baseline`."""
     yardstick = "fixed" if "fixed" in replays else "baseline"
-    empty = [
-        ComparisonRow(name, mode, None, None, 0, 0, 0, yardstick=yardstick) for mode in replays
-    ]
+    empty = [ComparisonRow(name, mode, yardstick=yardstick) for mode in replays]
     every = [replay.trajectory.stamps for repeats in replays.values() for replay in repeats]
     common = reduce(np.intersect1d, every)
     judged = JudgedModes(name, empty, _errors(replays, reference, common), reference.block)
@@ -317,7 +316,7 @@ def _measured(
     The latter are those of the scans with the stamps that all replays have in `common`.
     """
     summaries = [repeat.summary for repeat in repeats]
-    first = min((t for r in repeats if (t := _first_restart(r)) is not None), default=None)
+    restarts = [r.trajectory.stamps[r.restarted] - r.trajectory.stamps[0] for r in repeats]
     estimated, interval = _estimated(repeats)
     of_common = (_at(repeat.trajectory, common) for repeat in repeats)
     known = [errors for t in of_common if (errors := reference.standard(t)) is not None]
@@ -327,7 +326,7 @@ def _measured(
         switches=int(sum(switched(repeat.choices).sum() for repeat in repeats)),
         poor_scans=sum(summary.poor_scans for summary in summaries),
         standard=StandardErrors.pooled(known),
-        first_restart=first,
+        first_restart=min((float(at[0]) * 1e-9 for at in restarts if len(at)), default=None),
         unhealthy=tuple(dict.fromkeys(found for s in summaries for found in s.unhealthy)),
         estimated=estimated,
         estimated_interval=interval,
@@ -444,12 +443,6 @@ def _estimated(repeats: Sequence[StoredReplay]) -> tuple[float | None, Interval]
     return mean, (low, high) if np.isfinite([low, high]).all() else None
 
 
-def _first_restart(replay: StoredReplay) -> float | None:
-    stamps = replay.trajectory.stamps
-    restarts = stamps[replay.restarted]
-    return float(restarts[0] - stamps[0]) * 1e-9 if len(restarts) else None
-
-
 # What the best choice in hindsight would have had, from trials on the test sequences.
 
 
@@ -484,8 +477,6 @@ def oracle_rows(
     # Trials restart at the reference, and replays do not: only the ratio carries over.
     of_fixed = max(float(errors[:, oracle.trials.index(fixed)].mean()), 1e-12)
     return [
-        ComparisonRow(
-            judged.name, mode, rte * of / of_fixed, of / of_fixed, 0, 0, 0, yardstick=yardstick
-        )
+        ComparisonRow(judged.name, mode, rte * of / of_fixed, of / of_fixed, yardstick=yardstick)
         for mode, of in zip(ORACLES, map(float, best), strict=True)
     ]

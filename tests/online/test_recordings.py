@@ -68,7 +68,7 @@ def study(study_file, tmp_path):
     shared = study.replay_inputs("three")
     in_time = {"rate": 1.0, "late": [0.02] * N}
     for mode, made, kept in (
-        ("baseline", replay_of(along_x(0.02)), {"max_correspondence_distance": 2.0}),
+        ("baseline", replay_of(along_x(0.02)), study.odometry.space.baseline),
         ("fixed", replay_of(along_x(0.01)), FIXED),
         ("adaptive", replay_of(along_x(0.005), list(selections()), **in_time), None),
     ):
@@ -242,7 +242,7 @@ def test_sequences_that_were_not_replayed_are_refused(study, study_file, tmp_pat
 
 def test_replays_of_something_else_are_refused(study, study_file):
     other = load_study(study_file, ["sequences.three.stop=2"], study.folder)
-    with pytest.raises(StoredReplayError, match=r"is of other inputs: sequences\.three.*; run"):
+    with pytest.raises(StoredReplayError, match=r"from other inputs: .*sequences\.three.*; run"):
         record_replays(other, "three")
     other = load_study(study_file, ["sequences.three.reference=none"], study.folder)
     with pytest.raises(StoredReplayError, match="was judged by another reference; run"):
