@@ -266,58 +266,23 @@ def _seen_from(trajectory: Trajectory, start: int = 0) -> NDArray[np.float64]:
 
 
 _BINS = 40
-_RATIO = "error over the fixed set's [-]"
 
 
 def familiarity_chart(replayed: ReplayedSequence) -> Chart | None:
-    """Familiarity of the surroundings at each selection, over time and against the gain."""
+    """Familiarity of the surroundings at each selection, over time."""
     known = {mode: of for mode, of in replayed.modes.items() if np.isfinite(of.familiarity).any()}
     if not known:
         return None
-    drawn: list[Drawn] = [] if replayed.scenes is None else [replayed.scenes]
-    drawn += [Line(of.choice_seconds, of.familiarity, mode) for mode, of in known.items()]
+    lines = [Line(of.choice_seconds, of.familiarity, mode) for mode, of in known.items()]
     y = Axis("familiarity [-]", limits=(0.0, 1.02))
-    panels = [Panel(Axis("time [s]"), y, tuple(drawn))]
-    fixed = replayed.modes.get("fixed")
-    if fixed is not None:
-        ratios = {m: period_ratios(of, fixed) for m, of in known.items() if m != "fixed"}
-        points = tuple(
-            Points(known[mode].familiarity, of, mode)
-            for mode, of in ratios.items()
-            if np.isfinite(of).any()
-        )
-        if points:
-            x = Axis("familiarity [-]", limits=(-0.02, 1.02))
-            panels.append(Panel(x, Axis(_RATIO, log=True), (*points, Mark(1.0))))
     return Chart(
         f"{replayed.name}-familiarity",
         f"{replayed.name}: how familiar the surroundings were",
-        tuple(panels),
+        (Panel(TIME, y, (*_scenes(replayed), *lines)),),
         "How much the training knows about surroundings like those at each selection: 0 means "
-        "unlike all training. Below, the error until the next selection over the fixed set's on "
-        "the same scans: a mode that loses where familiarity is low should not trust its training "
-        "there.",
+        "unlike all training. A mode that loses where familiarity is low should not trust its "
+        "training there.",
     )
-
-
-def period_ratios(of: ModeReplay, fixed: ModeReplay) -> NDArray[np.float64]:
-    """Mean error from each selection to the next over that of the fixed set, of shape (m,).
-
-    NaN where either is unknown.
-    """
-    edges = of.span
-
-    def means(one: ModeReplay) -> NDArray[np.float64]:
-        kept = np.isfinite(one.errors)
-        seconds, errors = one.seconds[kept], one.errors[kept]
-        number = np.searchsorted(edges, seconds, side="right") - 1
-        number = np.clip(number, 0, len(edges) - 2)
-        counts = np.bincount(number, minlength=len(edges) - 1)
-        with np.errstate(invalid="ignore"):
-            return np.asarray(np.bincount(number, errors, len(edges) - 1) / counts)
-
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(means(of) / means(fixed))
 
 
 def latency_chart(replayed: ReplayedSequence) -> Chart | None:

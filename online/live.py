@@ -110,7 +110,10 @@ class LiveScans:
     def _next(self, last: int | None) -> tuple[tuple[Scan, float], int] | None:
         """The next scan, and how many were dropped before it; None at the end."""
         silent = 0.0
-        while not self._is_there():
+        while True:
+            with self._news:
+                if self._news.wait_for(lambda: bool(self._waiting or self.stopped), SILENCE):
+                    break
             silent += SILENCE
             if not self._link.alive:
                 raise LinkError("adaptune's node in ROS has ended; start again")
@@ -129,11 +132,6 @@ class LiveScans:
                 _log.warning("%s: scans come again, after %.0f s", self._points, silent)
             dropped, self._dropped = self._dropped, 0
             return self._waiting.popleft(), dropped
-
-    def _is_there(self) -> bool:
-        """Whether there is a scan, or the end, before the silence is too long."""
-        with self._news:
-            return self._news.wait_for(lambda: bool(self._waiting or self.stopped), SILENCE)
 
     def _tell_of_silence(self, seconds: float) -> None:
         hint = ""

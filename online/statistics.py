@@ -221,13 +221,6 @@ class Reference(NamedTuple):
         return cls(trajectory, length, stored is not None, None if math.isnan(error) else error)
 
     @property
-    def kind(self) -> str:
-        """Where it comes from, in a word."""
-        if self.trajectory is None:
-            return "none"
-        return "estimated" if self.estimated else "given"
-
-    @property
     def block(self) -> int:
         """Frames of a sub-trajectory."""
         return 1 if self.trajectory is None else span(self.trajectory.T_world_sensor, self.length)
@@ -315,6 +308,7 @@ def _measured(
 
     The latter are those of the scans with the stamps that all replays have in `common`.
     """
+    kind = "estimated" if reference.estimated else "given"
     summaries = [repeat.summary for repeat in repeats]
     restarts = [r.trajectory.stamps[r.restarted] - r.trajectory.stamps[0] for r in repeats]
     estimated, interval = _estimated(repeats)
@@ -331,7 +325,7 @@ def _measured(
         estimated=estimated,
         estimated_interval=interval,
         lost_seconds=sum(summary.lost_seconds for summary in summaries),
-        reference=reference.kind,
+        reference="none" if reference.trajectory is None else kind,
         reference_error=reference.error,
         cpu_ms=mean_of([summary.cpu_ms for summary in summaries]),
         cores=mean_of(list(map(_cores, summaries))),

@@ -123,32 +123,24 @@ def _of_modes(rows: Sequence[ComparisonRow], length: float) -> Listing:
 
 
 def _caption(rows: Sequence[ComparisonRow], shown: Mapping[str, Any]) -> str:
-    yardstick = rows[0].yardstick
-    sentences = {
-        "Intervals of 95 %: paired block bootstrap, seed 0, where there is enough to draw from.": (
-            True
-        ),
-        f"vs {yardstick}: geometric mean of the ratios to the {_YARDSTICKS[yardstick]}'s RTE.": (
-            rows[-1].sequence == ALL
-        ),
-        "Worst tenth: that mean over the worst tenth of the stretches.": "worst tenth" in shown,
-        "Better / worse: sequences on which the error is less or more by 1 %.": (
-            "better / worse" in shown
-        ),
+    of, to = rows[0].yardstick, _YARDSTICKS[rows[0].yardstick]
+    said = [
+        "Intervals of 95 %: paired block bootstrap, seed 0, where there is enough to draw from.",
+        f"vs {of}: geometric mean of the ratios to the {to}'s RTE." * (rows[-1].sequence == ALL),
+        "Worst tenth: that mean over the worst tenth of the stretches." * ("worst tenth" in shown),
+        "Better / worse: sequences on which the error is less or more by 1 %."
+        * ("better / worse" in shown),
         "Oracles know the errors: the best set of each sequence, and of every period. Much of the "
-        "latter is chance, out of reach of any choice.": any(r.mode in ORACLES for r in rows),
-        "Gap closed: share of what the best set of each sequence, in hindsight, gains.": (
-            GAP in shown
-        ),
-        "Estimated: by the odometry itself while driving, without the reference.": (
-            any(row.estimated is not None for row in rows)
-        ),
+        "latter is chance, out of reach of any choice." * any(r.mode in ORACLES for r in rows),
+        "Gap closed: share of what the best set of each sequence, in hindsight, gains."
+        * (GAP in shown),
+        "Estimated: by the odometry itself while driving, without the reference."
+        * any(row.estimated is not None for row in rows),
         f"The error of an estimated reference pulls ratios towards 1, or hides what a mode has in "
-        f"common with it; intervals allow for {ERROR_FACTOR:g} times its estimate.": (
-            any(row.reference == "estimated" for row in rows)
-        ),
-    }
-    return " ".join(sentence for sentence, tells in sentences.items() if tells)
+        f"common with it; intervals allow for {ERROR_FACTOR:g} times its estimate."
+        * any(row.reference == "estimated" for row in rows),
+    ]
+    return " ".join(filter(None, said))
 
 
 def _of_sequences(rows: Sequence[ComparisonRow], length: float) -> Listing:
@@ -171,18 +163,18 @@ def _standard(rows: Sequence[ComparisonRow]) -> Listing | None:
     last = [row for row in _last(rows) if row.standard is not None]
     if not last:
         return None
-    kitti = any(row.standard is not None and row.standard.kitti.lengths for row in last)
+    kitti = any(row.standard is not None and bool(row.standard.kitti.lengths) for row in last)
     title = "Errors as evo" + (" and KITTI's benchmark define them" if kitti else " defines them")
-    caption = "APE after alignment, RPE from scan to scan: root mean squares."
-    caption += " Height: mean drift over the sub-trajectories, in percent of their length."
-    if any(row.reference == "estimated" for row in rows):
-        caption += " An estimated reference counts as if it were true."
-    if kitti:
-        caption += " KITTI: mean over the lengths in the last column; needs 100 m."
-    if last[0].sequence == ALL:
-        caption += " Means over the sequences" + (
-            "; KITTI over the sub-trajectories of all sequences." if kitti else "."
-        )
+    of_all, judged = last[0].sequence == ALL, any(row.reference == "estimated" for row in rows)
+    caption = (
+        "APE after alignment, RPE from scan to scan: root mean squares. Height: mean drift over "
+        "the sub-trajectories, in percent of their length."
+        + " An estimated reference counts as if it were true." * judged
+        + " KITTI: mean over the lengths in the last column; needs 100 m." * kitti
+        + " Means over the sequences" * of_all
+        + "; KITTI over the sub-trajectories of all sequences" * (of_all and kitti)
+        + "." * of_all
+    )
     cells = [row.standard_columns(kitti) for row in last]
     return Listing(title, cells, caption, _ERRORS)
 
@@ -193,11 +185,9 @@ def _change(row: ComparisonRow, rows: Sequence[ComparisonRow]) -> dict[str, Any]
     mine, others = (of.summary_columns() | of.standard_columns() for of in (row, before))
     cells: dict[str, Any] = {"mode": row.mode}
     for key in ("RTE [%]", "RPE [m]", "APE [m]"):
+        cells[key], change = mine[key], f"{key[:3]} change [%]"
         known = mine[key] and others[key]
-        cells[key] = mine[key]
-        cells[f"{key[:3]} change [%]"] = (
-            f"{100 * (mine[key] / others[key] - 1):+.1f}" if known else None
-        )
+        cells[change] = f"{100 * (mine[key] / others[key] - 1):+.1f}" if known else None
     return cells
 
 
