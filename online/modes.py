@@ -48,7 +48,7 @@ BASELINE, FIXED, ADAPTIVE, PAPER = "baseline", "fixed", "adaptive", "paper"
 EVEN, UNTRAINED = "even", "untrained"
 MODES = (BASELINE, *RIVALS, FIXED, ADAPTIVE, UNTRAINED, EVEN, PAPER)
 """All modes, in the order of tables and of lines that lie on each other."""
-WITHOUT_MODEL = (BASELINE, UNTRAINED)
+WITHOUT_MODEL: tuple[str, ...] = (BASELINE, UNTRAINED)
 """The modes that need neither trials nor a model."""
 
 

@@ -229,10 +229,7 @@ class SteeredNode(OdometryInstance):
         if not poses:
             return np.full((4, 4), np.nan)
         stamps, T = zip(*poses, strict=True)
-        # Only the poses around it are needed.
-        i = int(np.searchsorted(stamps, stamp))
-        part = slice(max(i - 1, 0), i + 2)
-        known = Trajectory(np.array(stamps[part], np.int64), np.array(T[part]))
+        known = Trajectory(np.array(stamps, np.int64), np.array(T))
         found: Poses = known.at(np.array([stamp], np.int64), _GAP)[0]
         return found
 
@@ -290,22 +287,21 @@ class RobotDrive:
         setup = replace(ReplaySetup.of(study), real_time=real_time, also=())
         self._study, self._setup, self._settings = study, setup, real_time
         self._ros = config.online.ros
-        self._model = None if model_path is None else study.model(model_path)
-        if self._model is not None and model_path is not None:
-            setup.check(self._model, model_path)
         self._like = _like(config, study.sequences)
         self._scans: LiveScans | None = None
         self._stopped = False
-        modes: tuple[str, ...] = WITHOUT_MODEL
-        if self._model is not None:
+        model = None if model_path is None else study.model(model_path)
+        modes = WITHOUT_MODEL
+        if model is not None and model_path is not None:
+            setup.check(model, model_path)
             rules = () if self._ros.steer is None else config.online.rules
-            modes = (*dict.fromkeys((*setup.modes(self._model), *rules)), UNTRAINED)
+            modes = (*dict.fromkeys((*setup.modes(model), *rules)), UNTRAINED)
         if mode not in modes:
             raise ModeError(f"--mode: there is no mode {mode!r}; {nearest(mode, modes)}")
         if self._ros.steer is not None:
             if mode not in config.online.rules:
                 raise ModeError(f"online.ros.steer: in the mode {mode} nothing is selected")
-            model = needed(mode, self._model)
+            model = needed(mode, model)
             fixed = {model.fixed: model.sets[model.fixed]}
             # A node that is steered has one set at a time.
             make = partial(Selector, model, mode, (), setup.descriptors)
@@ -316,7 +312,7 @@ class RobotDrive:
                 f"robot (online.ros.steer)"
             )
         else:
-            self._mode = setup.mode(mode, self._model)
+            self._mode = setup.mode(mode, model)
 
     def run(self, link: RosLink, look: Look = lambda *_: None) -> DriveRecord:
         """Drive until Ctrl-C, or until `stop` is called.
