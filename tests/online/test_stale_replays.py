@@ -102,12 +102,6 @@ def test_another_reference_replays_nothing(load, caplog):
     assert run(shifted) == 0
 
 
-def test_another_health_check_replays_all(load, caplog):
-    study = load("health.max_speed=20")
-    assert run(study) == 3
-    assert "three, baseline: replayed again: health.max_speed changed from " in caplog.text
-
-
 def test_a_training_recording_that_was_replaced(load):
     study = load()
     change(study.folder.parent / "one.bag")

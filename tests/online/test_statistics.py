@@ -81,11 +81,6 @@ def test_scans_without_reference_do_not_count():
     assert Reference(trajectory(truth[:1], 20), 25.0).standard(odometry) is None
 
 
-def test_a_sequence_without_reference_has_empty_cells():
-    cells = row("street", None).standard_columns()
-    assert set(list(cells.values())[1:]) == {None}
-
-
 def test_all_sequences_have_mean_errors_and_kittis_over_all_sub_trajectories():
     truth = straight(400)
     truth[:, 1, 3] = np.sin(0.05 * np.arange(400))
