@@ -88,7 +88,7 @@ def compared_modes(study: Study) -> ComparedModes:
         modes, due = WITHOUT_MODEL, set(WITHOUT_MODEL)
     finished = [name for name, there in made.items() if due.issubset(there)]
     # No mode is everywhere: those with the fixed set are compared.
-    finished = finished or [name for name, there in made.items() if "fixed" in there]
+    finished = finished or [name for name in names if "fixed" in made[name]]
     if not finished and not names:
         raise StoredReplayError("test: name at least one sequence to compare on")
     if not finished:
