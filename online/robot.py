@@ -440,9 +440,14 @@ class _Publisher:
         self._restarted |= step.unhealthy is not None
         if self._due.due(step.stamp):
             before, self._late = self._late, (record.dropped, record.missed)
-            since = {"late": self._late != before, "restarted": self._restarted}
-            given = step.stamp, record, self._scans.ignored
-            self._diagnostics(self._messages.diagnostics(*given, **since))
+            message = self._messages.diagnostics(
+                step.stamp,
+                record,
+                self._scans.ignored,
+                late=self._late != before,
+                restarted=self._restarted,
+            )
+            self._diagnostics(message)
             self._restarted = False
 
 
