@@ -128,14 +128,6 @@ def test_what_a_bank_measures_of_itself_is_kept_and_compared(load):
     said = remarks(compared)
     assert said[0].startswith("Whether adapting gains is not known, on three: `untrained` has ")
     assert not any("fixed" in one or "no reference" in one for one in said)
-    # Replays of before are read without them.
-    path = folder / "selections.csv"
-    kept = [k for k in rows[0] if not k.startswith("estimated") and k != "lost"]
-    path.write_text("\n".join([",".join(kept), *(",".join(r[k] for k in kept) for r in rows)]))
-    before = StoredReplay.read(folder)
-    assert before.estimated.shape == (4, 3)
-    assert np.isnan(before.estimated).all()
-    assert not before.lost.any()
 
 
 def test_it_is_compared_with_the_trained_modes_too(load, trained_folder):
