@@ -20,7 +20,7 @@ _UNTIL_DEAD = 0.001
 """Seconds between looks for processes that have not ended yet."""
 _SUBREAPER = 36
 """Linux's PR_SET_CHILD_SUBREAPER."""
-_HANG_UP = select.POLLHUP | getattr(select, "POLLRDHUP", 0)
+_HANG_UP = select.POLLHUP | select.POLLRDHUP
 
 
 class Ended(NamedTuple):
@@ -32,9 +32,8 @@ class Ended(NamedTuple):
 
 
 def adopt_orphans() -> None:
-    """Let this process be the parent of what its descendants leave behind, if the system can."""
-    with contextlib.suppress(OSError, AttributeError):
-        ctypes.CDLL(None).prctl(_SUBREAPER, 1, 0, 0, 0)
+    """Let this process be the parent of what its descendants leave behind."""
+    ctypes.CDLL(None).prctl(_SUBREAPER, 1, 0, 0, 0)
 
 
 def keep(child: int, connection: int, sampled: bool = False) -> Ended:
@@ -86,7 +85,7 @@ def _kill(processes: list[int]) -> None:
 
 
 def descendants(ancestor: int) -> list[int]:
-    """Descendants of a process; none where there is no /proc."""
+    """Descendants of a process."""
     found = [ancestor]
     for process in found:
         with contextlib.suppress(OSError):

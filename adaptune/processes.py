@@ -268,9 +268,6 @@ class Bounds(NamedTuple):
     core: int | None = None  # the only core that it may use
 
 
-UNBOUNDED = Bounds()
-
-
 class Server(NamedTuple):
     """A process that has imported user code, and the socket that asks it to fork."""
 
@@ -338,7 +335,7 @@ class Forked(NamedTuple):
     service: Service
     name: str
     do: str
-    bounds: Bounds = UNBOUNDED
+    bounds: Bounds = Bounds()  # noqa: RUF009
 
     def connect(self) -> SocketStream:
         """Fork it; a `HostError` if the user code cannot be imported."""
@@ -558,8 +555,7 @@ def _run(
         if bounds.core is not None:
             os.sched_setaffinity(0, {bounds.core})
         if bounds.memory:
-            statm = Path("/proc/self/statm")
-            pages = int(statm.read_text().split()[0]) if statm.exists() else 0
+            pages = int(Path("/proc/self/statm").read_text().split()[0])
             bound = pages * resource.getpagesize() + int(bounds.memory * 1e9)
             resource.setrlimit(resource.RLIMIT_AS, (bound, bound))
         with connection.makefile("rb") as reader, connection.makefile("wb") as writer:
@@ -595,14 +591,8 @@ class _Timed:
 
 
 def resident_megabytes() -> float:
-    """Memory that this process takes at present, without the files that it maps.
-
-    Where the system does not tell, the most so far.
-    """
-    try:
-        _, resident, shared, *_ = Path("/proc/self/statm").read_text(encoding="ascii").split()
-    except OSError:
-        return 1e-3 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    """Memory that this process takes at present, without the files that it maps."""
+    _, resident, shared, *_ = Path("/proc/self/statm").read_text(encoding="ascii").split()
     return 1e-6 * (int(resident) - int(shared)) * os.sysconf("SC_PAGE_SIZE")
 
 
@@ -612,9 +602,7 @@ def release_memory() -> None:
     Threads that prepare scans leave hundreds of megabytes to the C library, which keeps them.
     """
     gc.collect()
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
-    if trim is not None:  # glibc has it
-        trim(0)
+    ctypes.CDLL(None).malloc_trim(0)
 
 
 @contextmanager
@@ -626,10 +614,7 @@ def apart() -> Iterator[None]:
     then take several times what they hold. It costs some time for each array.
     """
     global _apart  # noqa: PLW0603 - the setting is that of the process
-    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
-    if mallopt is None:  # only glibc has it
-        yield
-        return
+    mallopt = ctypes.CDLL(None).mallopt
     _apart += 1
     mallopt(_M_MMAP_THRESHOLD, _LARGE)
     try:
@@ -652,25 +637,16 @@ _numbers = itertools.count(1)
 
 def available() -> int:
     """Number of cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    return len(os.sched_getaffinity(0))
 
 
 def shared_cores() -> set[int]:
-    """The cores of this process and of those that work beside it, see `pin`; empty if unknown."""
-    if _before is None and hasattr(os, "sched_getaffinity"):
-        return os.sched_getaffinity(0)
-    return set(_before or ())
-
-
-def together() -> int:
-    """How many they are."""
-    return len(shared_cores()) or available()
+    """The cores of this process and of those that work beside it, see `pin`."""
+    return os.sched_getaffinity(0) if _before is None else _before
 
 
 def pin(core: int, alone: bool = False) -> Callable[[], None]:
-    """Keep this process on one core, if the system can, and return a function that undoes it.
+    """Keep this process on one core, and return a function that undoes it.
 
     Open3D sums in an order that depends on its threads. Only on one core do its results repeat bit
     by bit. Running threads keep their cores: call this before the first use of Open3D. Numbers
@@ -678,8 +654,6 @@ def pin(core: int, alone: bool = False) -> Callable[[], None]:
     work: then `next_core` gives others the rest.
     """
     global _before  # noqa: PLW0603 - the cores are those of the process
-    if not hasattr(os, "sched_setaffinity"):
-        return lambda: None
     cores = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {sorted(cores)[core % len(cores)]})
     _before = cores if alone else None
@@ -692,25 +666,21 @@ def pin(core: int, alone: bool = False) -> Callable[[], None]:
     return unpin
 
 
-def next_core() -> int | None:
-    """Core for another process that works beside this one; None if the system cannot keep it there.
+def next_core() -> int:
+    """Core for another process that works beside this one.
 
     Each call gives the next core, after the one that `pin` gives to the number of this process.
     """
-    if not hasattr(os, "sched_getaffinity"):
-        return None
-    cores = sorted(_before or os.sched_getaffinity(0))
+    cores = sorted(shared_cores())
     return cores[(os.getpid() + next(_numbers)) % len(cores)]
 
 
-def other_core(number: int) -> int | None:
+def other_core(number: int) -> int:
     """Core for the process of this number, from 0, of those that work for this one; see `pin`.
 
     They get the cores that this process does not use, as far as there are any.
     """
     cores = sorted(shared_cores())
-    if not cores:
-        return None
     others = sorted(set(cores) - os.sched_getaffinity(0)) or cores[1:] or cores
     return others[number % len(others)]
 

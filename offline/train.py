@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from adaptune import files, manifest
+from adaptune import __version__, files, manifest
 from adaptune.archive import Archive
 from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
@@ -261,7 +261,7 @@ def trial_workers(
     n = config.workers or available()
     where = cluster or f"{n} worker{'s' if n > 1 else ''}"
     _log.info("trials run on %s; each sequence is prepared before its first one", where)
-    odometry = study.odometry.allowing(user_code=True)
+    odometry = study.odometry.changed(user_code=True)
     setup = TrialSetup(TrialSettings.of(study.config), odometry, study.sequences)
     memory = 0.25 * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     return Cluster(setup, names, memory, cluster) if cluster else Workers(setup, n, memory)
@@ -277,7 +277,8 @@ def _fitted(
     """The study's error model: the one before, if that was fitted to just this, or fitted now."""
     config, inputs = study.config, study.model_inputs
     settings = config.offline.model_dump(mode="json", exclude={*BUDGETS, "workers"})
-    provenance = {"versions": study.odometry.versions} | settings
+    versions = {"adaptune": __version__, "numpy": np.__version__} | study.odometry.content
+    provenance = {"versions": versions} | settings
     provenance |= {"inputs": manifest.digest(inputs)}
     estimates = estimates_of(study.sequences, study.training)
     if judged := estimates_as_data(estimates, config.sub_trajectory):

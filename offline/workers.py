@@ -215,7 +215,7 @@ class Sequences:
 
     def __init__(self, setup: TrialSetup, memory: float):
         self._setup = setup
-        self._apart = replace(setup, odometry=setup.odometry.allowing(user_code=False))
+        self._apart = replace(setup, odometry=setup.odometry.changed(user_code=False))
         self._memory = memory
         self._ready: dict[tuple[str, bool], PreparedSequence] = {}
 
@@ -557,7 +557,7 @@ def _away(setup: TrialSetup, digests: Mapping[str, str]) -> TrialSetup:
     given = {f.name: getattr(setup.sequences, f.name) for f in dataclasses.fields(StudySequences)}
     given["folder"] = setup.sequences.folder.absolute()
     sequences = AwaySequences(**given, digests=digests)
-    odometry = setup.odometry.reading(sequences.program_input)
+    odometry = setup.odometry.changed(program_input=sequences.program_input)
     return TrialSetup(setup.settings, odometry, sequences)
 
 

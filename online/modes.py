@@ -17,7 +17,7 @@ from adaptune.model.descriptor import DescriptorError
 from adaptune.model.weights import weighted_selection
 from adaptune.odometry.base import Motions, OdometryInstance
 from adaptune.odometry.registry import Factory
-from adaptune.processes import release_memory, together
+from adaptune.processes import release_memory, shared_cores
 from adaptune.progress import Progress, unseen
 from adaptune.recording.scan import Recording, Scan, part_name
 from adaptune.selector import AnySelector, Selector, UntrainedSelector, untrained_sets
@@ -208,7 +208,8 @@ class ReplaySetup:
         waits = self.real_time is None or not self.real_time.queue
         rate = None if self.real_time is None or waits else self.real_time.rate
         warm_up = self.odometry.description.warm_up
-        return Bank(self.odometry, mode.sets, warm_up, self.lost_track, together(), rate)
+        cores = len(shared_cores())
+        return Bank(self.odometry, mode.sets, warm_up, self.lost_track, cores, rate)
 
     def identity(
         self, name: str, model: ErrorModel | None = None, digest: str = ""

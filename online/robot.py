@@ -20,7 +20,7 @@ import numpy as np
 
 from adaptune.errors import AdaptuneError, OdometryError, nearest
 from adaptune.geometry import Poses, invert, to_pose
-from adaptune.odometry.base import LastMotion, Motions, OdometryInstance, Registration, Usage
+from adaptune.odometry.base import OdometryInstance, Registration
 from adaptune.odometry.tracker import RegisteredScan
 from adaptune.recording.clouds import POSES
 from adaptune.recording.config import ImuConfig, SequenceConfig
@@ -147,7 +147,6 @@ class SteeredNode(OdometryInstance):
         self._T_base_sensor = np.eye(4) if extrinsic is None else to_pose(extrinsic)
         self._news = threading.Condition()
         self._poses: deque[tuple[int, Poses]] = deque(maxlen=_KEPT)
-        self._last_motion = LastMotion()
         self._begun: tuple[int, Poses] | None = None
         self._T_odom_node: Poses | None = None
         self._steering = Steering(
@@ -158,14 +157,6 @@ class SteeredNode(OdometryInstance):
         )
         self._silent = 0
         link.subscribe(settings.odometry, ODOMETRY, self._take)
-
-    @property
-    def usage(self) -> Usage:
-        return Usage(0.0, None)
-
-    @property
-    def motions(self) -> Motions:
-        return self._last_motion.motions
 
     def prepare(self, scan: Scan) -> Scan:
         return scan
@@ -202,9 +193,6 @@ class SteeredNode(OdometryInstance):
     def apply(self, selection: Selection) -> None:
         """Set the parameters, see `adaptune.ros.link.Steering.apply`."""
         self._steering.apply(selection.parameters)
-
-    def close(self) -> None:
-        return  # it runs on without adaptune
 
     def _take(self, message: Any) -> None:
         for stamp, _, position, orientation in POSES[ODOMETRY](message):

@@ -3,7 +3,7 @@
 import logging
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from functools import cached_property
 from statistics import median
 from typing import Any, NamedTuple
@@ -16,10 +16,8 @@ from adaptune.bank.members import Agreement, spread
 from adaptune.errors import OdometryError
 from adaptune.geometry import Poses, invert, rectify, squared_ranges
 from adaptune.odometry.base import (
-    LastMotion,
     Motions,
     OdometryInstance,
-    Preparations,
     PreparedScan,
     Registration,
     Usage,
@@ -385,10 +383,9 @@ class Bank(OdometryInstance):
         self._short = ShortRegistrations()
         self._lost = False
         self._asked, self._resting, self._waking = np.zeros((3, len(sets)), np.bool_)
-        self._preparations = Preparations()
+        self._first: dict[Hashable, OdometryInstance] = {}
         self._past: deque[PastScan] = deque()  # of the last seconds
         self._warm_up = warm_up
-        self._last_motion = LastMotion()
 
     @property
     def faults(self) -> list[str]:
@@ -411,7 +408,7 @@ class Bank(OdometryInstance):
         return self._last_motion.motions._replace(members=members)
 
     def prepare(self, scan: Scan) -> PreparedScan:
-        prepared = self._preparations.of(scan)
+        prepared = PreparedScan(scan, self._first)
         self.late.resting = self._resting
         self.late.begin()
         for member in self._present:

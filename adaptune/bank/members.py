@@ -9,7 +9,7 @@ import itertools
 import time
 from bisect import bisect_left, insort
 from collections import OrderedDict, defaultdict, deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -20,7 +20,7 @@ from adaptune import processes
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses, invert, mean_motion
 from adaptune.odometry import wire
-from adaptune.odometry.base import InProcess, OdometryInstance, Preparations, PreparedScan, Usage
+from adaptune.odometry.base import InProcess, OdometryInstance, PreparedScan, Usage
 from adaptune.odometry.registry import Factory, OdometryFactory, make_here, odometry_class
 from adaptune.odometry.remote import Isolated
 from adaptune.processes import other_core
@@ -231,7 +231,7 @@ def members(_: str) -> processes.Answer:
     """
     made: dict[int, Any] = {}
     scans: OrderedDict[int, PreparedScan] = OrderedDict()
-    preparations = Preparations()
+    first: dict[Hashable, Any] = {}
     spent, used = defaultdict[int, float](float), 0.0  # CPU seconds of each member, and of all
 
     def done(message: processes.Message) -> dict[str, Any]:
@@ -247,7 +247,7 @@ def members(_: str) -> processes.Answer:
     def answer(message: processes.Message) -> dict[str, Any] | None:
         nonlocal used
         if message.header["type"] == "scan":
-            scan = preparations.of(wire.to_scan(message))
+            scan = PreparedScan(wire.to_scan(message), first)
             _keep(scans, message.header["number"], scan)
             for member in made.values():
                 scan.by(member)

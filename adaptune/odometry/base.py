@@ -4,7 +4,8 @@ import logging
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
-from typing import Any, ClassVar, NamedTuple, Protocol
+from functools import cached_property
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -89,7 +90,35 @@ class Description(NamedTuple):
     whole: bool = False
 
 
-class OdometryInstance(Protocol):
+class LastMotion:
+    """The motion over the last scan, from one pose to the next."""
+
+    def __init__(self) -> None:
+        self._starts = -1
+        self.start(np.eye(4))
+
+    def start(self, T_odom_sensor: Poses, T_previous_current: Poses | None = None) -> None:
+        """Begin at a pose, with the motion that led there; None if the sensor stood still."""
+        self._starts += 1
+        self._started_with = np.eye(4) if T_previous_current is None else T_previous_current
+        self._T_before: Poses | None = None
+        self._T_now = np.array(T_odom_sensor, order="C")
+
+    def move(self, T_odom_sensor: Poses) -> None:
+        """Move to the pose of the next scan."""
+        # A copy, in case the odometry changes its pose in place. Products of matrices round by
+        # their layout in memory, which must not depend on where the odometry runs.
+        self._T_before, self._T_now = self._T_now, np.array(T_odom_sensor, order="C")
+
+    @property
+    def motions(self) -> Motions:
+        """The motion, without members."""
+        if self._T_before is None:
+            return Motions(self._started_with, {}, self._starts)
+        return Motions(invert(self._T_before) @ self._T_now, {}, self._starts)
+
+
+class OdometryInstance(ABC):
     """An odometry that runs along a sequence: in this process, in another one, or a bank of them.
 
     `submit` and `collect` let several instances in other processes work at the same time. After
@@ -109,14 +138,21 @@ class OdometryInstance(Protocol):
     @property
     def faults(self) -> Sequence[str]:
         """What went wrong so far. The poses of scans with a fault are NaN."""
+        return ()
 
     @property
     def usage(self) -> Usage:
         """CPU time and memory so far."""
+        return Usage(0.0, None)
+
+    @cached_property
+    def _last_motion(self) -> LastMotion:
+        return LastMotion()
 
     @property
     def motions(self) -> Motions:
         """Motions over the last scan."""
+        return self._last_motion.motions
 
     @property
     def preparation(self) -> Hashable:
@@ -160,9 +196,11 @@ class OdometryInstance(Protocol):
 
     def submit(self, prepared: Any) -> None:
         """Begin to register the next scan."""
+        self._submitted = prepared
 
     def collect(self) -> Registration:
         """Wait for the pose of the submitted scan."""
+        raise NotImplementedError
 
     def register(self, prepared: Any) -> Registration:
         """Find the pose of the next scan: submit it, then collect."""
@@ -180,37 +218,10 @@ class OdometryInstance(Protocol):
         OdometryError
             If the odometry cannot change its parameters, or a bank does not hold the set.
         """
+        raise NotImplementedError
 
-    def close(self) -> None:
+    def close(self) -> None:  # noqa: B027 - most have none
         """End all processes of this odometry."""
-
-
-class LastMotion:
-    """The motion over the last scan, from one pose to the next."""
-
-    def __init__(self) -> None:
-        self._starts = -1
-        self.start(np.eye(4))
-
-    def start(self, T_odom_sensor: Poses, T_previous_current: Poses | None = None) -> None:
-        """Begin at a pose, with the motion that led there; None if the sensor stood still."""
-        self._starts += 1
-        self._started_with = np.eye(4) if T_previous_current is None else T_previous_current
-        self._T_before: Poses | None = None
-        self._T_now = np.array(T_odom_sensor, order="C")
-
-    def move(self, T_odom_sensor: Poses) -> None:
-        """Move to the pose of the next scan."""
-        # A copy, in case the odometry changes its pose in place. Products of matrices round by
-        # their layout in memory, which must not depend on where the odometry runs.
-        self._T_before, self._T_now = self._T_now, np.array(T_odom_sensor, order="C")
-
-    @property
-    def motions(self) -> Motions:
-        """The motion, without members."""
-        if self._T_before is None:
-            return Motions(self._started_with, {}, self._starts)
-        return Motions(invert(self._T_before) @ self._T_now, {}, self._starts)
 
 
 class Odometry(ABC):
@@ -327,32 +338,15 @@ def prepared_bytes(prepared: Any) -> int:
 # Prepared scans that several instances share.
 
 
-class Preparations:
-    """Prepares scans for several instances, once for all with the same preparation.
+class PreparedScan:
+    """A scan that is prepared for several instances, once for all with the same preparation.
 
-    The first instance with each preparation prepares for all of them: they share what it learned
-    from the first scan's layout.
+    `first` is shared by the scans: the first instance with each preparation, which prepares for all
+    of them. They share what it learned from the first scan's layout.
     """
 
-    def __init__(self) -> None:
-        self._first: dict[Hashable, OdometryInstance] = {}
-
-    def of(self, scan: Scan) -> "PreparedScan":
-        """A scan that is prepared for whoever asks."""
-        return PreparedScan(scan, self)
-
-    def prepare(self, scan: Scan, instance: OdometryInstance) -> tuple[Hashable, Any]:
-        """Prepare a scan for an instance; what it was prepared by, and the result."""
-        key = instance.preparation
-        return key, self._first.setdefault(key, instance).prepare(scan)
-
-
-class PreparedScan:
-    """A scan with what it was prepared to."""
-
-    def __init__(self, scan: Scan, preparations: Preparations):
-        self.scan = scan
-        self._preparations = preparations
+    def __init__(self, scan: Scan, first: dict[Hashable, Any]):
+        self.scan, self._first = scan, first
         self._prepared: dict[Hashable, Any] = {}
 
     @property
@@ -363,7 +357,8 @@ class PreparedScan:
     def by(self, instance: OdometryInstance) -> Any:
         """The scan as an instance takes it; it is prepared where nobody has asked before."""
         if (key := instance.preparation) not in self._prepared:
-            self._prepared |= [self._preparations.prepare(self.scan, instance)]
+            first = self._first.setdefault(key, instance)
+            self._prepared[key] = first.prepare(self.scan)
         return self._prepared[key]
 
 
@@ -373,21 +368,14 @@ class PreparedScan:
 class InProcess(OdometryInstance):
     """Runs an adapter, which nothing else may use, in this process, and notes what it takes."""
 
-    faults: Sequence[str] = ()
-
     def __init__(self, odometry: Odometry):
         self.odometry = odometry
         self._cpu = 0.0
-        self._last_motion = LastMotion()
 
     @property
     def usage(self) -> Usage:
         """CPU time of the registrations; the memory is that of this process."""
         return Usage(self._cpu, None)
-
-    @property
-    def motions(self) -> Motions:
-        return self._last_motion.motions
 
     @property
     def preparation(self) -> Hashable:
@@ -402,9 +390,6 @@ class InProcess(OdometryInstance):
         self.odometry.start(prepared, T_odom_sensor, T_previous_current)
         self._last_motion.start(T_odom_sensor, T_previous_current)
 
-    def submit(self, prepared: Any) -> None:
-        self._submitted = prepared
-
     def collect(self) -> Registration:
         begin = time.process_time()
         registration = Registration(*self.odometry.register(self._submitted))
@@ -414,9 +399,6 @@ class InProcess(OdometryInstance):
 
     def apply(self, selection: Selection) -> None:
         self.odometry.configure(selection.parameters)
-
-    def close(self) -> None:
-        pass  # there is no other process
 
 
 # An odometry that may go wrong.
@@ -440,11 +422,6 @@ class Faulting(OdometryInstance):
     def __init__(self, name: str, parameters: ParameterSet):
         self.name = name
         self.parameters = dict(parameters)
-        self._last_motion = LastMotion()
-
-    @property
-    def motions(self) -> Motions:
-        return self._last_motion.motions
 
     @property
     def given_up(self) -> bool:

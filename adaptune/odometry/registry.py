@@ -5,7 +5,6 @@ import os
 import shutil
 import sys
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, partial
 from importlib import metadata
@@ -120,34 +119,6 @@ def check_served(name: str) -> str:
     return name
 
 
-def package_of(name: str) -> str:
-    """The package that one of our odometries runs on."""
-    module = where(name).partition(":")[0]
-    return PACKAGES.get(name, module.removeprefix(f"{__package__}.").partition(".")[0])
-
-
-def versions(name: str) -> dict[str, str]:
-    """Versions of what a trial's outcome may depend on: adaptune, numpy, the odometry's package."""
-    names = {"adaptune", "numpy"}
-    module = where(name).partition(":")[0]
-    if module.startswith(f"{__package__}."):
-        names.add(package_of(name))
-    else:
-        names |= set(_distributions().get(module.partition(".")[0], ()))
-    found = {}
-    for package in sorted(names):
-        with suppress(metadata.PackageNotFoundError):  # written by the user, or built in
-            found[package] = metadata.version(package)
-    return found
-
-
-_distributions = cache(metadata.packages_distributions)
-"""The packages by the modules that they bring, which takes a third of a second to find."""
-
-
-# Make an odometry from its name, wherever it runs.
-
-
 # What an odometry says of itself. A class of the user is asked in a process of its own.
 
 
@@ -239,7 +210,8 @@ def odometry_content(name: str, settings: Any, module: str = "") -> Content:
     if name in PROGRAMS:
         return _program(settings)
     if name in ODOMETRIES:
-        package = package_of(name)
+        module = ODOMETRIES[name].partition(":")[0]
+        package = PACKAGES.get(name, module.rpartition(".")[2])
         return {f"version of {package}": _version(package)}
     return python_content(name, ENTRY_POINTS, module)
 
@@ -329,13 +301,8 @@ class OdometryFactory:
     def __post_init__(self) -> None:
         declared = declare(self.name, self.settings)
         settings, description = declared.sound(self.name)
-        for name, value in (
-            ("settings", settings),
-            ("description", description),
-            ("_clean", declared.clean),
-            ("module", declared.module),
-        ):
-            object.__setattr__(self, name, value)
+        found = {"_clean": declared.clean, "module": declared.module}
+        vars(self).update(settings=settings, description=description, **found)
 
     @property
     def identity(self) -> dict[str, Any]:
@@ -347,13 +314,9 @@ class OdometryFactory:
         """What the poses depend on besides name, settings and parameters."""
         return odometry_content(self.name, self.settings, self.module)
 
-    def allowing(self, user_code: bool) -> "OdometryFactory":
-        """The same where classes of the user may, or may not, run in this process."""
-        return replace(self, user_code=user_code)
-
-    def reading(self, program_input: Callable[[str], "ProgramInput"]) -> "OdometryFactory":
-        """The same with another source of whole recordings, if it reads any."""
-        return self if self.program_input is None else replace(self, program_input=program_input)
+    def changed(self, **changes: Any) -> "OdometryFactory":
+        """The same with another `user_code` or `program_input`."""
+        return replace(self, **changes)
 
     @property
     def apart(self) -> bool:
@@ -364,11 +327,6 @@ class OdometryFactory:
     def one_by_one(self) -> bool:
         """Whether trials gain nothing from sharing a pass: what runs them shares nothing."""
         return self.description.whole or self.name in CONTAINERS
-
-    @property
-    def versions(self) -> dict[str, str]:
-        """Versions of the packages that the poses depend on."""
-        return versions(self.name)
 
     def alone(self, parameters: ParameterSet) -> tuple["OdometryFactory", ParameterSet]:
         """What makes the odometry that a set is for, and all parameters that it takes."""
@@ -461,24 +419,13 @@ class OdometryPool:
         return any(factory.one_by_one for factory in self.factories.values())
 
     @property
-    def versions(self) -> dict[str, str]:
-        """Versions of the packages that the poses depend on."""
-        every = (factory.versions for factory in self.factories.values())
-        return {package: version for one in every for package, version in sorted(one.items())}
-
-    @property
     def content(self) -> Content:
         """See `OdometryFactory`."""
         return {k: v for factory in self.factories.values() for k, v in factory.content.items()}
 
-    def allowing(self, user_code: bool) -> "OdometryPool":
-        """The same where classes of the user may, or may not, run in this process."""
-        return OdometryPool({k: replace(f, user_code=user_code) for k, f in self.factories.items()})
-
-    def reading(self, program_input: Any) -> "OdometryPool":
-        """The same with another source of whole recordings."""
-        given = {k: f.reading(program_input) for k, f in self.factories.items()}
-        return OdometryPool(given)
+    def changed(self, **changes: Any) -> "OdometryPool":
+        """See `OdometryFactory.changed`."""
+        return OdometryPool({k: f.changed(**changes) for k, f in self.factories.items()})
 
     def alone(self, parameters: ParameterSet) -> tuple[OdometryFactory, ParameterSet]:
         """See `OdometryFactory.alone`."""

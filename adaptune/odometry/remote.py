@@ -335,6 +335,7 @@ def _reached(address: str) -> socket.socket:
 class UserProgram(Isolated):
     """An odometry in a program of the user, each instance with its own program or connection."""
 
+    settings_type: ClassVar[type[BaseSettings]]
     transport_type: ClassVar[Any]
 
     def __init__(self, parameters: ParameterSet, settings: Any, limits: Limits):
@@ -352,32 +353,28 @@ class UserProgram(Isolated):
         """Make an instance, as all programs of the user are made; it reads no recording."""
         return cls(parameters, settings, limits)
 
-
-class Process(UserProgram):
-    """An odometry in a program of the user on this machine."""
-
-    settings_type = ProcessSettings
-    transport_type = ProgramTransport
-
-    @staticmethod
-    def describe(settings: ProcessSettings) -> Description:
+    @classmethod
+    def describe(cls, settings: Any) -> Description:
         """What the program reports about itself; an error if it cannot be reached."""
-        return _describe(settings.model_dump_json())
+        return _describe(cls, settings.model_dump_json())
 
 
 @cache
-def _describe(settings: str) -> Description:
-    return announced_by(Process({}, ProcessSettings.model_validate_json(settings), Limits()))
-
-
-def announced_by(program: Isolated) -> Description:
-    """What a program reports about itself; it is ended then."""
+def _describe(cls: type[UserProgram], settings: str, version: str = "") -> Description:  # noqa: ARG001
+    program = cls({}, cls.settings_type.model_validate_json(settings), Limits())
     try:
         if (answer := program.begin()) is None:
             raise OdometryError(program.faults[-1])
         return wire.announced(answer)
     finally:
         program.close()
+
+
+class Process(UserProgram):
+    """An odometry in a program of the user on this machine."""
+
+    settings_type = ProcessSettings
+    transport_type = ProgramTransport
 
 
 # A class of the user in this process: where it goes wrong, this is a fault and nothing else.

@@ -314,13 +314,13 @@ def test_others_get_the_rest_only_where_this_process_is_alone(allowed):
 def test_those_that_work_for_this_process_get_other_cores(allowed):
     assert [processes.other_core(i) for i in range(4)] == [3, 5, 7, 3]
     unpin = processes.pin(1, alone=True)
-    assert processes.together() == 4
+    assert processes.shared_cores() == {2, 3, 5, 7}
     assert [processes.other_core(i) for i in range(4)] == [2, 5, 7, 2]
     unpin()
     allowed.clear()
     allowed.add(7)
     assert [processes.other_core(i) for i in range(2)] == [7, 7]
-    assert processes.together() == 1
+    assert processes.shared_cores() == {7}
 
 
 def test_mapped_files_are_no_memory_of_the_process(tmp_path):
@@ -361,7 +361,6 @@ print(cores.resident_megabytes() - before)
 """
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="no glibc")
 def test_large_arrays_among_small_ones_leave_no_holes():
     def kept(what):
         """Megabytes that a process keeps of 105 that are free."""

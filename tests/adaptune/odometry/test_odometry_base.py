@@ -13,7 +13,7 @@ from adaptune.odometry.base import (
     AtStamp,
     InProcess,
     Odometry,
-    Preparations,
+    PreparedScan,
     Registration,
     duration_of,
 )
@@ -140,7 +140,7 @@ def scan(i):
 
 def test_a_scan_is_prepared_once_for_all_that_are_alike():
     one, alike, other = cell(1.0), cell(1.0), cell(2.0)
-    shared = Preparations().of(scan(3))
+    shared = PreparedScan(scan(3), {})
     assert shared.by(one) is shared.by(alike)
     assert shared.by(other) == (3 * 10**8, 2.0)
     assert Cell.count == 2
