@@ -335,7 +335,7 @@ class Forked(NamedTuple):
     service: Service
     name: str
     do: str
-    bounds: Bounds = Bounds()  # noqa: RUF009
+    bounds: Bounds = Bounds()
 
     def connect(self) -> SocketStream:
         """Fork it; a `HostError` if the user code cannot be imported."""

@@ -58,13 +58,6 @@ class PreparedCloud(NamedTuple):
     tree: Any = None
 
 
-class Alignment(NamedTuple):
-    """Result of a registration of two clouds; `ok` is False if it is not reliable."""
-
-    T_target_source: Poses
-    ok: bool
-
-
 class KeyframeOdometry(Odometry):
     """Scan-to-keyframe odometry with a constant-velocity prediction.
 
@@ -139,8 +132,8 @@ class KeyframeOdometry(Odometry):
         return scale(self._T_previous_current, 1.0 if abs(share - 1.0) <= JITTER else share)
 
     @abstractmethod
-    def align(self, target: Any, source: Any, T_target_guess: Poses) -> Alignment:
-        """Register two usable scans."""
+    def align(self, target: Any, source: Any, T_target_guess: Poses) -> tuple[Poses, bool]:
+        """Register two usable scans: ``T_target_source``, and whether that is reliable."""
 
 
 def crop(scan: Scan, min_range: float) -> Any:
@@ -175,7 +168,7 @@ class _SmallGicp(KeyframeOdometry):
 
     def align(
         self, target: PreparedCloud, source: PreparedCloud, T_target_guess: Poses
-    ) -> Alignment:
+    ) -> tuple[Poses, bool]:
         clouds, distance = self._pair(target, source)
         result = small_gicp.align(
             *clouds,
@@ -184,7 +177,7 @@ class _SmallGicp(KeyframeOdometry):
             max_iterations=self.parameters["iterations"],
             num_threads=1,
         )
-        return Alignment(result.T_target_source, result.num_inliers >= MIN_POINTS)
+        return result.T_target_source, result.num_inliers >= MIN_POINTS
 
 
 class KeyframeGicp(_SmallGicp):
@@ -249,7 +242,7 @@ class KeyframeNdt(KeyframeOdometry):
 
     def align(
         self, target: PreparedCloud, source: PreparedCloud, T_target_guess: Poses
-    ) -> Alignment:
+    ) -> tuple[Poses, bool]:
         from adaptune.files import load
 
         registration = load().pipelines.registration
@@ -262,5 +255,5 @@ class KeyframeNdt(KeyframeOdometry):
             )
         except RuntimeError:
             # No cell of the target holds enough points.
-            return Alignment(T_target_guess, ok=False)
-        return Alignment(result.transformation, len(result.correspondence_set) >= MIN_POINTS)
+            return T_target_guess, False
+        return result.transformation, len(result.correspondence_set) >= MIN_POINTS

@@ -11,7 +11,6 @@ import tomllib
 from abc import abstractmethod
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
-from logging import getLogger
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, Self
 
@@ -29,9 +28,7 @@ from adaptune.metrics import travelled, window_ends
 from adaptune.odometry.base import (
     BaseSettings,
     Description,
-    LastMotion,
-    Motions,
-    OdometryInstance,
+    Faulting,
     Registration,
     Usage,
     pose_fault,
@@ -427,8 +424,6 @@ def _alike(own: Sequence[NDArray[np.float64]], true: Sequence[NDArray[np.float64
 
 # Odometries that run once on a whole recording.
 
-_log = getLogger(__name__)
-
 _COVERAGE = 0.9
 """Least share of the scans, and of the way, for which there must be poses."""
 
@@ -445,7 +440,7 @@ class WholeSettings(BaseSettings):
     extrinsic: Transform | None = None
 
 
-class WholeRun(OdometryInstance):
+class WholeRun(Faulting):
     """An odometry that runs once on a whole recording, and its trajectory.
 
     It cannot restart on the way: where `start` places it elsewhere, its motions go on from there.
@@ -453,7 +448,6 @@ class WholeRun(OdometryInstance):
     start; None if scans are only prepared.
     """
 
-    faults: Sequence[str] = ()
     _words = ""  # the last lines that the program wrote
 
     def __init__(
@@ -463,12 +457,11 @@ class WholeRun(OdometryInstance):
         limits: Limits,
         read: Callable[[], ProgramInput] | None = None,
     ):
-        self.parameters, self.settings = dict(parameters), settings
-        self._limits, self._read_input = limits, read
+        super().__init__(getattr(settings, "image", None) or settings.command[0], parameters)
+        self.settings, self._limits, self._read_input = settings, limits, read
         self._T_own_sensor: dict[int, Poses] | None = None
         self._T_odom_own = np.eye(4)
         self._usage = Usage(0.0, None)
-        self._last_motion = LastMotion()
 
     @staticmethod
     def describe(settings: Any) -> Description:  # noqa: ARG004
@@ -486,13 +479,10 @@ class WholeRun(OdometryInstance):
         return self._usage
 
     @property
-    def motions(self) -> Motions:
-        return self._last_motion.motions
-
-    @property
-    @abstractmethod
-    def called(self) -> str:
-        """What messages call the program."""
+    def too_long(self) -> OdometryError:
+        """What is raised where the program runs too long."""
+        limit = f"isolation.seconds = {self._limits.seconds:g}"
+        return OdometryError(f"it took longer than {limit} for each scan")
 
     @abstractmethod
     def trajectory(self, given: ProgramInput, folder: Path) -> Trajectory:
@@ -516,9 +506,6 @@ class WholeRun(OdometryInstance):
         self._T_odom_own = T_odom_sensor @ invert(self._own(prepared))
         self._last_motion.start(T_odom_sensor, T_previous_current)
 
-    def submit(self, prepared: NDArray[np.int64]) -> None:
-        self._submitted = prepared
-
     def collect(self) -> Registration:
         T_odom_sensor = self._T_odom_own @ self._own(self._submitted)
         self._last_motion.move(T_odom_sensor)
@@ -528,9 +515,6 @@ class WholeRun(OdometryInstance):
         raise OdometryError(
             "a program that runs whole recordings cannot change its parameters: give it one set"
         )
-
-    def close(self) -> None:
-        pass  # the program has ended
 
     def _own(self, stamp: NDArray[np.int64]) -> Poses:
         assert self._T_own_sensor is not None
@@ -552,22 +536,17 @@ class WholeRun(OdometryInstance):
             except (TrajectoryError, OdometryError, LinkError) as error:
                 failure = str(error)
         if failure is not None:
-            self._fault(failure)
+            self.note_fault(self._quoting(failure))
         try:
             check_frame(T_own_sensor, given.T_ref_sensor)
         except OdometryError as error:
-            what = f"{self.called}, with {self.parameters}: {error}"
+            what = f"{self.name}, with {self.parameters}: {error}"
             raise OdometryError(self._quoting(what)) from error
         return T_own_sensor
 
     def _quoting(self, what: str) -> str:
         """What happened, and the last lines that the program wrote, if any."""
         return f"{what}: {self._words}" if self._words else what
-
-    def _fault(self, what: str) -> None:
-        what = self._quoting(what)
-        self.faults = [*self.faults, what]
-        _log.warning("%s with %s: %s", self.called, self.parameters, what)
 
 
 def _lacking(T_own_sensor: Poses, given: ProgramInput) -> str | None:
@@ -654,7 +633,25 @@ class CommandSettings(FileSettings):
     version: str | None = None
 
 
-class Command(WholeRun):
+class FileRun(WholeRun):
+    """A program that is told by arguments, and by a file, where it reads and writes."""
+
+    def filled_template(self, folder: Path) -> Path | None:
+        """A copy of the template with the parameters, if there is a template."""
+        if self.settings.template is None:
+            return None
+        template = Template(Path(self.settings.template))
+        file = folder / template.path.name
+        file.write_text(template.fill(self.parameters), encoding="utf-8")
+        return file
+
+    def arguments(self, given: ProgramInput, **paths: str | Path) -> list[str]:
+        """The command with the paths, topics and parameters that it names."""
+        values = {"points": given.points, "imu": given.imu, **self.parameters, **paths}
+        return [replace(argument, values) for argument in self.settings.command]
+
+
+class Command(FileRun):
     """A program that runs once on a whole recording, and its trajectory; see `WholeRun`."""
 
     settings_type = CommandSettings
@@ -667,32 +664,20 @@ class Command(WholeRun):
             raise OdometryError(f"command: there is no program {program!r}")
         check_arguments(settings.command, settings.template, parameters)
 
-    @property
-    def called(self) -> str:
-        return str(self.settings.command[0])
-
     def trajectory(self, given: ProgramInput, folder: Path) -> Trajectory:
         here = folder / "run"
-        here.mkdir()
         output = here / self.settings.output
+        here.mkdir()
         output.parent.mkdir(parents=True, exist_ok=True)
-        command = self._command(given, output, folder)
-        failure = self._execute(command, here, folder / "output", len(given.stamps))
-        if failure is not None:
-            raise OdometryError(failure)
+        paths = {"input": given.path.resolve(), "output": output}
+        if (file := self.filled_template(folder)) is not None:
+            paths["parameters"] = file
+        command = self.arguments(given, **paths)
+        self._execute(command, here, folder / "output", len(given.stamps))
         return read_output(here, self.settings, given.stamps)
 
-    def _command(self, given: ProgramInput, output: Path, folder: Path) -> list[str]:
-        values: dict[str, Any] = {"input": given.path.resolve(), "output": output}
-        values |= {"points": given.points, "imu": given.imu, **self.parameters}
-        if self.settings.template is not None:
-            template = Template(Path(self.settings.template))
-            values["parameters"] = folder / template.path.name
-            values["parameters"].write_text(template.fill(self.parameters), encoding="utf-8")
-        return [replace(argument, values) for argument in self.settings.command]
-
-    def _execute(self, command: list[str], folder: Path, log: Path, n: int) -> str | None:
-        """Run the program; how it ended if not well."""
+    def _execute(self, command: list[str], folder: Path, log: Path, n: int) -> None:
+        """Run the program; an `OdometryError` says how it ended if not well."""
         begin = time.perf_counter()
         with log.open("wb") as file:
             program = processes.Program(
@@ -712,8 +697,9 @@ class Command(WholeRun):
         if ended is not None:
             self._usage = Usage(ended.cpu, ended.memory, (time.perf_counter() - begin) / n)
         if in_time is None:
-            return f"it took longer than isolation.seconds = {self._limits.seconds:g} for each scan"
-        return processes.how_it_ended(in_time.code) if in_time.code else None
+            raise self.too_long
+        if in_time.code:
+            raise OdometryError(processes.how_it_ended(in_time.code))
 
 
 def read_output(folder: Path, settings: FileSettings, stamps: NDArray[np.int64]) -> Trajectory:

@@ -356,11 +356,12 @@ class UserProgram(Isolated):
     @classmethod
     def describe(cls, settings: Any) -> Description:
         """What the program reports about itself; an error if it cannot be reached."""
-        return _describe(cls, settings.model_dump_json())
+        return described(cls, settings.model_dump_json())
 
 
 @cache
-def _describe(cls: type[UserProgram], settings: str, version: str = "") -> Description:  # noqa: ARG001
+def described(cls: type[UserProgram], settings: str, version: str = "") -> Description:  # noqa: ARG001
+    """What a program of this version reports about itself; it is ended then."""
     program = cls({}, cls.settings_type.model_validate_json(settings), Limits())
     try:
         if (answer := program.begin()) is None:

@@ -75,17 +75,9 @@ class HealthCheck(StrictModel):
     ) -> str | None:
         """The bound that this motion exceeds, if any.
 
-        Parameters
-        ----------
-        velocity, last_velocity
-            Metres a second in the sensor's frame, of shape (3,); the last healthy one, None if
-            there is none yet.
-        elapsed
-            Seconds since `last_velocity`.
-        turn_rate
-            Radians a second.
-        stamp_noise
-            Metres a second by which the change of velocity may come from the stamps.
+        Velocities are in metres a second in the sensor's frame, of shape (3,), the last healthy one
+        is None if there is none yet. `elapsed` is in seconds since then, the turn rate in radians a
+        second. `stamp_noise` is by how much the stamps may change the velocity.
         """
         if not turn_rate <= np.radians(self.max_turn_rate):
             return "max_turn_rate"
@@ -97,15 +89,6 @@ class HealthCheck(StrictModel):
         change = float(np.linalg.norm(velocity - last_velocity))
         most = self.max_acceleration * elapsed + stamp_noise
         return "max_acceleration" if change > most else None
-
-    def still(self, T_previous_current: Poses) -> bool:
-        """Whether a pose of shape (4, 4) stays where it is, to the micrometre."""
-        moved = np.linalg.norm(T_previous_current[:3, 3])
-        return bool(max(moved, rotation_angle(T_previous_current)) < _STILL)
-
-    def frozen(self, seconds: float, speed: float) -> bool:
-        """Whether a pose that stands still for `seconds`, after a step at `speed`, has frozen."""
-        return speed > _WALK and seconds > self.max_freeze
 
 
 class Guard:
@@ -192,14 +175,17 @@ class Guard:
         return min(abs(elapsed - turns * usual) / elapsed, _MOST_JITTER)
 
     def _frozen(self, T_previous_current: Poses, elapsed: float) -> bool:
-        if not self._health.still(T_previous_current):
+        """Whether the pose stays where it is for too long, after a step faster than a walk."""
+        moved = np.linalg.norm(T_previous_current[:3, 3])
+        if max(moved, rotation_angle(T_previous_current)) >= _STILL:
             self._moving, self._still = (T_previous_current, elapsed), 0.0
             return False
         self._still += elapsed
         if self._moving is None:
             return False
         T, seconds = self._moving
-        if not self._health.frozen(self._still, float(np.linalg.norm(T[:3, 3])) / seconds):
+        speed = float(np.linalg.norm(T[:3, 3])) / seconds
+        if speed <= _WALK or self._still <= self._health.max_freeze:
             return False
         self._healthy, self._still = self._moving, 0.0
         self._recent = deque([self._moving])

@@ -8,7 +8,7 @@ import shutil
 import socket
 import subprocess
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from queue import Empty, SimpleQueue
 from typing import Any
 
@@ -93,9 +93,8 @@ class Ros1:
         self._sending = threading.Lock()
         self._numbers = itertools.count()
         self._answers: dict[int, SimpleQueue[dict[str, Any]]] = {}
-        self._takes: dict[str, tuple[str, SimpleQueue[bytes | None]]] = {}
-        self._recorded: dict[str, Callable[[str, bytes], None]] = {}
-        self._mistaken: set[str] = set()
+        self._takes: dict[str, Callable[[str, bytes], None]] = {}
+        self._waiting: list[SimpleQueue[bytes | None]] = []
         ready = processes.receive(self._stream) if self._stream.ready(_START) else None
         if ready is None or ready.header["type"] == "failed":
             self.close()
@@ -104,27 +103,31 @@ class Ros1:
         threading.Thread(target=self._receive, daemon=True).start()
 
     def subscribe(self, topic: str, kind: str, take: Callable[[Any], None]) -> None:
-        """See `RosLink.subscribe`."""
         received: SimpleQueue[bytes | None] = SimpleQueue()
-        self._takes[topic] = kind, received
+        self._waiting.append(received)
+        mistaken = set()
+
+        def put(of: str, data: bytes) -> None:
+            if of != kind and of not in mistaken:
+                mistaken.add(of)
+                _log.warning("%s is %s, not %s: its messages are ignored", topic, of, kind)
+            elif of == kind and received.qsize() < _WAITING:
+                received.put(data)
 
         def work() -> None:
             while (data := received.get()) is not None:
-                try:
+                with _telling(topic):
                     take(self.store.deserialize_ros1(data, kind))
-                except Exception as error:
-                    _log.warning("a message on %s is lost: %s", topic, in_a_line(error))
 
         threading.Thread(target=work, daemon=True).start()
-        self._send({"type": "subscribe", "topic": topic})
+        self.record(topic, put)
 
     def record(self, topic: str, take: Callable[[str, bytes], None]) -> None:
         """Have every message of a topic taken as it comes, as its type and its bytes."""
-        self._recorded[topic] = take
+        self._takes[topic] = take
         self._send({"type": "subscribe", "topic": topic})
 
     def advertise(self, topic: str, kind: str) -> Callable[[Any], None]:
-        """See `RosLink.advertise`."""
         text, md5 = self.store.generate_msgdef(kind, ros_version=1)
         names = {"kind": kind.replace("/msg/", "/"), "text": text, "md5": md5}
         self._send({"type": "advertise", "topic": topic, **names})
@@ -154,7 +157,6 @@ class Ros1:
         return held
 
     def topics(self) -> Mapping[str, str]:
-        """See `RosLink.topics`."""
         try:
             found: dict[str, str] = self.ask("topics")
         except LinkError as error:
@@ -178,12 +180,10 @@ class Ros1:
 
     @property
     def alive(self) -> bool:
-        """See `RosLink.alive`."""
         return self._running()
 
     def close(self) -> None:
-        """See `RosLink.close`."""
-        for _, received in self._takes.values():
+        for received in self._waiting:
             received.put(None)
         # A thread reads; without it the node would not notice.
         self._stream.end()
@@ -207,20 +207,17 @@ class Ros1:
                     if (waiting := self._answers.get(header["number"])) is not None:
                         waiting.put(header)
                     continue
-                if (take := self._recorded.get(header["topic"])) is not None:
-                    try:
-                        take(header["kind"].replace("/", "/msg/"), message.arrays["data"].tobytes())
-                    except Exception as error:
-                        what = in_a_line(error)
-                        _log.warning("a message on %s is lost: %s", header["topic"], what)
-                    continue
-                kind, received = self._takes[header["topic"]]
-                if header["kind"].replace("/", "/msg/") == kind:
-                    if received.qsize() < _WAITING:
-                        received.put(message.arrays["data"].tobytes())
-                elif header["topic"] not in self._mistaken:
-                    self._mistaken.add(header["topic"])
-                    is_not = "%s is %s, not %s: its messages are ignored"
-                    _log.warning(is_not, header["topic"], header["kind"], kind)
+                kind, data = header["kind"].replace("/", "/msg/"), message.arrays["data"].tobytes()
+                with _telling(header["topic"]):
+                    self._takes[header["topic"]](kind, data)
         except (OSError, processes.WireError):
             pass  # it was closed
+
+
+@contextlib.contextmanager
+def _telling(topic: str) -> Iterator[None]:
+    """Log what goes wrong with a message."""
+    try:
+        yield
+    except Exception as error:
+        _log.warning("a message on %s is lost: %s", topic, in_a_line(error))

@@ -83,8 +83,6 @@ class Ros2:
         The robot's ROS domain; None for that of the environment (``ROS_DOMAIN_ID``), or 0.
     """
 
-    store: Typestore
-
     def __init__(self, router: str = f"127.0.0.1:{PORT}", domain: int | None = None):
         self._packages = _packages()
         self._router = _endpoint(router)
@@ -115,8 +113,17 @@ class Ros2:
             channel = self._packages.zenoh.handlers.FifoChannel(_WAITING)
             subscriber = self._session.declare_subscriber(self._key(topic, kind), channel)
             self._announce("SUBSCRIPTION", topic, kind)
-        what = subscriber, topic, kind, take
-        thread = threading.Thread(target=self._take_all, args=what, daemon=True)
+
+        def work() -> None:
+            for sample in subscriber:
+                if self._closed:
+                    return
+                try:
+                    take(self._message(sample.payload, kind))
+                except Exception:
+                    _log.exception("a message on %s is lost", topic)
+
+        thread = threading.Thread(target=work, daemon=True)
         self._threads.append(thread)
         thread.start()
 
@@ -130,24 +137,11 @@ class Ros2:
                 f"{kind} with {type_hash}; known are the types of ROS 2 Jazzy"
             )
 
-    def _take_all(
-        self, subscriber: Any, topic: str, kind: str, take: Callable[[Any], None]
-    ) -> None:
-        """Take messages until the subscriber is closed."""
-        for sample in subscriber:
-            if self._closed:
-                return
-            try:
-                take(self._message(sample.payload, kind))
-            except Exception:
-                _log.exception("a message on %s is lost", topic)
-
     def _message(self, payload: Any, kind: str) -> Any:
         """A message; its arrays are views of the bytes that came."""
         return self.store.deserialize_cdr(memoryview(payload.to_bytes()), kind)
 
     def advertise(self, topic: str, kind: str) -> Callable[[Any], None]:
-        """See `RosLink.advertise`."""
         with self._naming(topic):
             publisher = self._session.declare_publisher(
                 self._key(topic, kind), encoding="application/cdr"
@@ -233,7 +227,6 @@ class Ros2:
         return f"{node} {silent}: {service} in ROS domain {self._domain}; {there}"
 
     def topics(self) -> Mapping[str, str]:
-        """See `RosLink.topics`."""
         return {name: kind for name, kind, _ in self._tokens("PUBLISHER")}
 
     def _tokens(self, kind: str) -> list[tuple[str, str, str]]:

@@ -5,7 +5,6 @@ import socket
 import tempfile
 import time
 from contextlib import closing
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -28,15 +27,14 @@ from adaptune.odometry.docker.engine import (
     remove_shared,
 )
 from adaptune.odometry.program import (
+    FileRun,
     FileSettings,
     ProgramInput,
-    Template,
-    WholeRun,
     check_arguments,
     read_output,
     replace,
 )
-from adaptune.odometry.remote import FIRST_ANSWER, Limits, UserProgram, announced_by
+from adaptune.odometry.remote import FIRST_ANSWER, Limits, UserProgram, described
 from adaptune.space import ParameterSet
 from adaptune.trajectory import Trajectory
 
@@ -57,7 +55,7 @@ class DockerCommandSettings(ContainerSettings, FileSettings):
     command: tuple[str, ...] = ()
 
 
-class DockerCommand(WholeRun):
+class DockerCommand(FileRun):
     """A program in a container, once on a whole recording.
 
     The recording is below ``/data``, the template's copy is ``/parameters`` with the template's
@@ -72,10 +70,6 @@ class DockerCommand(WholeRun):
         image_digest(settings.image)
         check_arguments(settings.command, settings.template, parameters)
 
-    @property
-    def called(self) -> str:
-        return str(self.settings.image)
-
     def trajectory(self, given: ProgramInput, folder: Path) -> Trajectory:
         shared = make_shared(folder / "shared")
         output = make_shared(shared / "output")
@@ -85,15 +79,15 @@ class DockerCommand(WholeRun):
         source = given.path.resolve()
         inside = "/data" if source.is_dir() else f"/data/{source.name}"
         mounts = [Mount(source, inside), Mount(output, _OUTPUT, writable=True)]
-        values: dict[str, Any] = {"input": inside, "output": f"{_OUTPUT}/{self.settings.output}"}
-        values |= {"points": given.points, "imu": given.imu, **self.parameters}
-        if self.settings.template is not None:
-            mounts.append(self._fill(folder))
-            values["parameters"] = mounts[-1].target
+        paths = {"input": inside, "output": f"{_OUTPUT}/{self.settings.output}"}
+        if (file := self.filled_template(folder)) is not None:
+            file.chmod(0o644)
+            paths["parameters"] = f"/parameters{file.suffix}"
+            mounts.append(Mount(file, paths["parameters"]))
         container = Container(
             self.settings,
             self._limits.memory,
-            [replace(argument, values) for argument in self.settings.command],
+            self.arguments(given, **paths),
             mounts,
             user=(user := default_user(self.settings)),
             environment={"ADAPTUNE_POINTS": given.points, "ADAPTUNE_IMU": given.imu},
@@ -107,17 +101,10 @@ class DockerCommand(WholeRun):
                     (kept / "output.log").write_bytes(container.log())
         checked = folder / "checked"
         copy_regular(output / self.settings.output, output, checked / self.settings.output)
-        remove_shared(shared, self.called, user)
+        remove_shared(shared, self.name, user)
         if failure is not None:
             raise OdometryError(failure)
         return read_output(checked, self.settings, given.stamps)
-
-    def _fill(self, folder: Path) -> Mount:
-        template = Template(Path(self.settings.template))
-        file = folder / template.path.name
-        file.write_text(template.fill(self.parameters), encoding="utf-8")
-        file.chmod(0o644)
-        return Mount(file, f"/parameters{template.path.suffix}")
 
     def _watch(self, container: Container, n: int) -> str | None:
         """Wait for the end; how it ended if not well."""
@@ -128,8 +115,7 @@ class DockerCommand(WholeRun):
             seconds = time.perf_counter() - begin
             self._usage = Usage(cpu, memory, seconds / n)
             if seconds > self._limits.seconds * n:
-                limit = f"isolation.seconds = {self._limits.seconds:g}"
-                return f"it took longer than {limit} for each scan"
+                return str(self.too_long)
             time.sleep(_BETWEEN_LOOKS)
         if container.out_of_memory:
             return f"out of isolation.memory = {self._limits.memory:g} GB"
@@ -236,14 +222,6 @@ class DockerProcess(UserProgram):
     settings_type = DockerProcessSettings
     transport_type = ContainerTransport
 
-    @staticmethod
-    def describe(settings: DockerProcessSettings) -> Description:
-        """What the program reports about itself; an error if it cannot be reached."""
-        return _describe(settings.model_dump_json(), image_digest(settings.image))
-
-
-@cache
-def _describe(settings: str, digest: str) -> Description:  # noqa: ARG001 - another image, another
-    return announced_by(
-        DockerProcess({}, DockerProcessSettings.model_validate_json(settings), Limits())
-    )
+    @classmethod
+    def describe(cls, settings: DockerProcessSettings) -> Description:
+        return described(cls, settings.model_dump_json(), image_digest(settings.image))

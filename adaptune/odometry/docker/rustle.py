@@ -481,10 +481,6 @@ def drained(recorder: PoseRecorder, over: float, last: int, drain: float) -> boo
 class PlayedBag(WholeRun):
     """A ROS 1 system that hears a bag, from its beginning to its end."""
 
-    @property
-    def called(self) -> str:
-        return str(self.settings.image)
-
     def trajectory(self, given: ProgramInput, folder: Path) -> Trajectory:
         self._seconds: dict[str, float] = {}
         self._end = time.monotonic() + self._limits.seconds * len(given.stamps)
@@ -502,7 +498,7 @@ class PlayedBag(WholeRun):
                     system.wait(renamed.get(given.points, given.points))
                     keys = server_keys(template, self.parameters, system.link.ask("parameters"))
                 self._play(system, recorder, given, bag.target)
-                warn_of_unread(system.link, self.called, keys)
+                warn_of_unread(system.link, self.name, keys)
                 self._check_published(system, recorder)
                 return self._checked(recorder, given)
             except AdaptuneError as error:
@@ -559,8 +555,7 @@ class PlayedBag(WholeRun):
 
     def _check_time(self) -> None:
         if time.monotonic() > self._end:
-            limit = f"isolation.seconds = {self._limits.seconds:g}"
-            raise OdometryError(f"it took longer than {limit} for each scan")
+            raise self.too_long
 
     def _check_published(self, system: RosSystem, recorder: PoseRecorder) -> None:
         if recorder.received:
@@ -587,7 +582,7 @@ class PlayedBag(WholeRun):
         with self._timed("removed"):
             system.stop()
         steps = ", ".join(f"{name} {value:.1f} s" for name, value in self._seconds.items())
-        _log.info("%s: %s; %.1f s of CPU time", self.called, steps, self._usage.cpu)
+        _log.info("%s: %s; %.1f s of CPU time", self.name, steps, self._usage.cpu)
         limits = {"input": str(given.path), "rate": self.settings.rate, "cpus": self.settings.cpus}
         about = limits | costs(self._usage, self._seconds) | ({"fault": fault} if fault else {})
         with kept_log(given.logs, self.settings, self.parameters, about) as kept:
@@ -606,7 +601,7 @@ class PlayedBag(WholeRun):
             _log.warning(
                 "%s: stamps of poses scatter by up to %.3f s around those of the scans: %s, and "
                 "errors contain it",
-                *(self.called, scatter, _OWN_CLOCK),
+                *(self.name, scatter, _OWN_CLOCK),
             )
         trajectory, unusable = usable(poses)
         if trajectory is None or unusable:
@@ -623,7 +618,7 @@ class PlayedBag(WholeRun):
             _log.warning(
                 "%s: %d of %d scans have no pose at rate %g: it drops scans, so a lower "
                 "odometry.settings.rate gives other results",
-                *(self.called, missing, n, self.settings.rate),
+                *(self.name, missing, n, self.settings.rate),
             )
         return trajectory
 

@@ -49,11 +49,12 @@ def test_turning(degrees, healthy, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("seconds", "speed", "frozen"),
-    [(0.9, 5.0, False), (1.1, 5.0, True), (1.1, 0.4, False), (100.0, 0.0, False)],
+    ("speed", "seconds", "faults"), [(2.5, 0.9, {}), (2.5, 1.3, {"max_freeze": 1}), (0.4, 9.0, {})]
 )
-def test_who_stops_dead_has_frozen(seconds, speed, frozen):
-    assert CHECK.frozen(seconds, speed) is frozen
+def test_who_stops_dead_has_frozen(speed, seconds, faults):
+    motions = [moved(0.1 * speed)] * 20 + [np.eye(4)] * round(10 * seconds)
+    stamps = np.arange(len(motions) + 1) * 10**8
+    assert unhealthy(HealthCheck(), np.array(motions), stamps, np.ones(len(stamps), bool)) == faults
 
 
 @pytest.mark.parametrize("bounds", [{"max_speed": 0}, {"max_freeze": -1}, {"max_jerk": 1}])

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from adaptune.geometry import invert
-from adaptune.odometry.keyframe import Alignment, KeyframeOdometry
+from adaptune.odometry.keyframe import KeyframeOdometry
 from adaptune.space import Float, ParameterSpace
 
 STEP = np.eye(4)
@@ -31,7 +31,7 @@ class Turning(KeyframeOdometry):
     def align(self, target, source, T_target_guess):
         truth = np.linalg.matrix_power(STEP, source.number - target.number)
         self.guesses.append(invert(truth) @ T_target_guess)
-        return Alignment(truth, source.ok)
+        return truth, source.ok
 
 
 def scan(number, stamp=None, usable=True, ok=True):
