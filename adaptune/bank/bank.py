@@ -399,7 +399,7 @@ class Bank(OdometryInstance):
 
     @property
     def usage(self) -> Usage:
-        return Usage.total((member.usage for member in self._members), sum)
+        return Usage.total(member.usage for member in self._members)
 
     @property
     def motions(self) -> Motions:

@@ -3,7 +3,7 @@
 import logging
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from functools import cached_property
 from typing import Any, ClassVar, NamedTuple
 
@@ -58,13 +58,12 @@ class Usage(NamedTuple):
     other_cpu: float = 0.0  # of `cpu`, seconds in other processes
 
     @classmethod
-    def total(cls, usages: Iterable["Usage"], memory: Callable[[list[float]], float]) -> "Usage":
-        """CPU time of all together, and the sum or the maximum of their memory."""
+    def total(cls, usages: Iterable["Usage"]) -> "Usage":
+        """What all together have used."""
         every = list(usages)
         known = [usage.memory for usage in every if usage.memory is not None]
-        peak = memory(known) if known else None
         cpu, other = sum(one.cpu for one in every), sum(one.other_cpu for one in every)
-        return cls(cpu, peak, other_cpu=other)
+        return cls(cpu, sum(known) if known else None, other_cpu=other)
 
 
 class Motions(NamedTuple):
@@ -436,7 +435,12 @@ class Faulting(OdometryInstance):
         self.faults = [*self.faults, what]
         if self.given_up:
             _log.warning("%s: fault number %d, it does not start again", self.name, MOST_FAULTS)
-        return Registration(np.full((4, 4), np.nan), registered=False)
+        return LOST
+
+
+LOST = Registration(np.full((4, 4), np.nan), registered=False)
+"""What an odometry gives where there is no pose."""
+LOST.T_odom_sensor.setflags(write=False)
 
 
 def pose_fault(T_odom_sensor: Poses) -> str | None:

@@ -82,12 +82,8 @@ class Template:
         held = isinstance(self._data, dict | list)
         self._places = list(_places(self._data)) if held else []
 
-    def holds(self, name: str) -> bool:
-        """Whether there is such a value; an error if there are several."""
-        return self._find(name) is not None
-
     def path_of(self, name: str) -> tuple[str, ...]:
-        """Keys of a value, from the outermost on; none if there is no such value."""
+        """Keys of a value, from the outermost on; none if there is no such, an error if several."""
         place = self._find(name)
         return () if place is None else place[0]
 
@@ -202,7 +198,7 @@ def check_names(
     """Raise an `OdometryError` if a parameter is neither in the template nor in the arguments."""
     inside = {name for argument in command for name in placeholders(argument)}
     for name in parameters:
-        if name in inside or (template is not None and template.holds(name)):
+        if name in inside or (template is not None and template.path_of(name)):
             continue
         lacking = "there is no template"
         if template is not None:
@@ -403,23 +399,23 @@ def _turned(degrees: float, T_odom_sensor: Poses, T_ref_sensor: Poses) -> str:
     turned = f"it looks turned by about {5 * round(degrees / 5)} degrees"
     if degrees < _MIN_REVERSED_DEGREES:
         return turned
+    smooth = np.ones(min(10, len(T_ref_sensor) - 1)) / 10.0
     own, true = (
-        np.nan_to_num([np.linalg.norm(T[:, :3, 3], axis=1), rotation_angle(T)])
-        for T in (steps(T_odom_sensor), steps(T_ref_sensor))
+        [np.convolve(v, smooth, "same") for v in np.nan_to_num(speeds)]
+        for speeds in (
+            (np.linalg.norm(T[:, :3, 3], axis=1), rotation_angle(T))
+            for T in (steps(T_odom_sensor), steps(T_ref_sensor))
+        )
     )
-    smooth = np.ones(min(10, own.shape[1])) / 10.0
-    own, true = ([np.convolve(v, smooth, "same") for v in pair] for pair in (own, true))
-    forwards, backwards = _alike(own, true), _alike(own, [v[::-1] for v in true])
-    if backwards > forwards + 0.1:
-        return "it looks reversed in time"
-    return turned if forwards > backwards + 0.1 else f"{turned}, or reversed in time"
-
-
-def _alike(own: Sequence[NDArray[np.float64]], true: Sequence[NDArray[np.float64]]) -> float:
-    """Sum of the correlations between these series."""
     with np.errstate(invalid="ignore", divide="ignore"):
-        each = [np.asarray(np.corrcoef(pair))[0, 1] for pair in zip(own, true, strict=True)]
-    return float(np.nan_to_num(each).sum())
+        forwards, backwards = (
+            np.nan_to_num([np.corrcoef(o, t[::way])[0, 1] for o, t in zip(own, true, strict=True)])
+            for way in (1, -1)
+        )
+    if backwards.sum() > forwards.sum() + 0.1:
+        return "it looks reversed in time"
+    more = "" if forwards.sum() > backwards.sum() + 0.1 else ", or reversed in time"
+    return turned + more
 
 
 # Odometries that run once on a whole recording.

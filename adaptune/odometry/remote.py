@@ -22,6 +22,7 @@ from adaptune.errors import AdaptuneError, OdometryError, UnavailableError, in_a
 from adaptune.geometry import Poses
 from adaptune.odometry import wire
 from adaptune.odometry.base import (
+    LOST,
     BaseSettings,
     Description,
     FaultError,
@@ -177,10 +178,10 @@ class Isolated(Faulting):
 
     def _registration(self) -> Registration:
         """The answer to the submitted scan; NaN if there is none, or a wrong one."""
-        answer, lost = self._receive(), Registration(np.full((4, 4), np.nan), registered=False)
+        answer = self._receive()
         self._busy = False
         if answer is None:
-            return lost
+            return LOST
         try:
             T_odom_sensor = np.asarray(answer.arrays["pose"], np.float64)
             late, registered = answer.header["stamp"] - self._submitted, answer.header["registered"]
@@ -434,47 +435,41 @@ class Guarded(Faulting):
         self, prepared: Any, T_odom_sensor: Poses, T_previous_current: Poses | None = None
     ) -> None:
         self._last_motion.start(T_odom_sensor, T_previous_current)
-        self._running = False
-        if self.given_up:
-            return
         motion = None if T_previous_current is None else T_previous_current.copy()
         given = prepared, T_odom_sensor.copy(), motion
-        try:
-            self._guarded(lambda odometry: odometry.start(*given), prepared)
-            self._running = True
-        except FaultError as fault:
-            self.note_fault(str(fault))
-
-    def submit(self, prepared: Any) -> None:
-        self._submitted = prepared
+        self._running = not self.given_up
+        if self._running:
+            self._noted(lambda odometry: odometry.start(*given), prepared)
 
     def collect(self) -> Registration:
         def register(odometry: Odometry) -> Registration:
             T_odom_sensor, registered = wire.unpacked(odometry.register(self._submitted))
-            return Registration(np.array(T_odom_sensor, np.float64), bool(registered))
+            T_odom_sensor = np.array(T_odom_sensor, np.float64)
+            if wrong := pose_fault(T_odom_sensor):
+                raise FaultError(f"it gave a pose {wrong}")
+            return Registration(T_odom_sensor, bool(registered))
 
-        registration = Registration(np.full((4, 4), np.nan), registered=False)
+        registration = LOST
         if self._running:
             begin = time.process_time()
-            try:
-                registration = self._guarded(register, self._submitted)
-                if wrong := pose_fault(registration.T_odom_sensor):
-                    registration = self.note_fault(f"it gave a pose {wrong}")
-            except FaultError as fault:
-                registration = self.note_fault(str(fault))
+            registration = self._noted(register, self._submitted)
             self._cpu += time.process_time() - begin
         self._last_motion.move(registration.T_odom_sensor)
         return registration
 
     def apply(self, selection: Selection) -> None:
         self.parameters |= selection.parameters
-        try:
-            self._guarded(lambda odometry: odometry.configure(selection.parameters))
-        except FaultError as fault:
-            self.note_fault(str(fault))
+        self._noted(lambda odometry: odometry.configure(selection.parameters))
 
     def close(self) -> None:
         self._odometry, self._running = None, False
+
+    def _noted(self, call: Callable[[Odometry], Any], prepared: Any = None) -> Any:
+        """What a call of user code returns; after a fault, which is noted, it is `LOST`."""
+        try:
+            return self._guarded(call, prepared)
+        except FaultError as fault:
+            return self.note_fault(str(fault))
 
     def _guarded(self, call: Callable[[Odometry], Any], prepared: Any = None) -> Any:
         """What a call of user code returns; a `FaultError` with the place where it raised."""

@@ -1,7 +1,7 @@
 """A ROS 1 node that passes messages on, run by the Python of a ROS installation.
 
 It imports nothing of adaptune's, is written for Python 2.7 (ROS Melodic) and 3, and speaks the
-format of `adaptune.odometry.wire` on a socket.
+format of `adaptune.odometry.wire` on a socket. In a container, it is the roscore, too.
 """
 
 import json
@@ -10,6 +10,7 @@ import socket
 import struct
 import sys
 import threading
+import uuid
 
 try:
     from typing import Any
@@ -250,6 +251,51 @@ def converse(stream, name, more=None):  # type: (Stream, str, dict[str, Any] | N
     rospy.signal_shutdown("adaptune has ended")
 
 
+def _start_master(asked):  # type: (dict[str, set[str]]) -> None
+    """Start a roscore that notes which node asks for which parameter."""
+    import rosmaster.master
+    import rosmaster.master_api as api
+
+    class Noting(api.ROSMasterHandler):  # type: ignore[misc]
+        pass
+
+    def noting(plain):  # type: (Any) -> Any
+        def answer(self, caller, *given):  # type: (Any, str, *str) -> Any
+            asked.setdefault(caller, set()).add(given[-1])  # the key
+            return plain(self, caller, *given)
+
+        return answer
+
+    for name in ("getParam", "hasParam", "searchParam", "subscribeParam"):
+        setattr(Noting, name, noting(getattr(api.ROSMasterHandler, name)))
+    api.ROSMasterHandler = Noting
+    rosmaster.master.Master().start()
+
+
+def contained(path, use_sim_time):  # type: (str, str) -> None
+    """Start a roscore, connect to adaptune, and be a node; a path is that of a socket."""
+    try:
+        import rosgraph
+        import rosmaster
+        import rospy
+    except ImportError:
+        sys.exit(9)  # another Python may
+    asked = {}  # type: dict[str, set[str]]
+    _start_master(asked)
+    master = rosgraph.Master("/adaptune")
+    if use_sim_time:
+        master.setParam("/use_sim_time", use_sim_time == "true")
+    # roslaunch waits for it.
+    master.setParam("/run_id", str(uuid.uuid1()))
+    connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    connection.connect(path)
+
+    def found(_):  # type: (dict[str, Any]) -> dict[str, list[str]]
+        return {caller: sorted(keys) for caller, keys in dict(asked).items()}
+
+    converse(Stream(connection), "adaptune", {"asked": found})
+
+
 def main(number):  # type: (int) -> None
     """Be a node in a running ROS; the number is that of a socket."""
     stream = Stream(socket.fromfd(number, socket.AF_UNIX, socket.SOCK_STREAM))
@@ -269,4 +315,7 @@ def main(number):  # type: (int) -> None
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]))
+    if len(sys.argv) > 2:
+        contained(*sys.argv[1:])
+    else:
+        main(int(sys.argv[1]))

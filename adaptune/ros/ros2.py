@@ -47,17 +47,6 @@ _ARRAYS = {"byte": np.uint8, "bool": np.bool_, "integer": np.int64, "double": np
 _log = logging.getLogger(__name__)
 
 
-class _Packages(NamedTuple):
-    """What the extra installs: Zenoh, and how rmw_zenoh names and describes things."""
-
-    zenoh: ModuleType
-    keys: ModuleType
-    entity: ModuleType
-    qos: ModuleType
-    attachment: ModuleType
-    utils: ModuleType
-
-
 class _Service(NamedTuple):
     """A type of service, and the names of its messages in the store."""
 
@@ -84,22 +73,22 @@ class Ros2:
     """
 
     def __init__(self, router: str = f"127.0.0.1:{PORT}", domain: int | None = None):
-        self._packages = _packages()
+        self._zenoh, self._keys, self._entity, self._qos, self._attachment, self._utils = (
+            _packages()
+        )
         self._router = _endpoint(router)
         try:
-            self._domain = self._packages.utils.resolve_domain_id(domain)
+            self._domain = self._utils.resolve_domain_id(domain)
         except ValueError as error:
             raise LinkError(f"the ROS domain: {error}") from error
         self.store = message_types()
-        self._services = {
-            name: _service(self.store, self._packages.utils, name) for name in _DEFINITIONS
-        }
-        self._session = _session(self._packages.zenoh, self._router)
-        self._node = self._packages.entity.NodeEntity(
+        self._services = {name: _service(self.store, self._utils, name) for name in _DEFINITIONS}
+        self._session = _session(self._zenoh, self._router)
+        self._node = self._entity.NodeEntity(
             self._domain, str(self._session.zid()), node_id=0, node_name=_NODE
         )
         self._numbers, self._closed = itertools.count(1), False
-        token = self._packages.keys.node_liveliness_keyexpr(self._node)
+        token = self._keys.node_liveliness_keyexpr(self._node)
         self._kept: list[Any] = [self._session.liveliness().declare_token(token)]
         self._threads: list[threading.Thread] = []
 
@@ -110,7 +99,7 @@ class Ros2:
         """
         self._check_type(topic, kind)
         with self._naming(topic):
-            channel = self._packages.zenoh.handlers.FifoChannel(_WAITING)
+            channel = self._zenoh.handlers.FifoChannel(_WAITING)
             subscriber = self._session.declare_subscriber(self._key(topic, kind), channel)
             self._announce("SUBSCRIPTION", topic, kind)
 
@@ -187,8 +176,8 @@ class Ros2:
         service = self._services[name]
         place = f"{node}/{'set' if name == 'SetParameters' else 'get'}_parameters"
         request = self.store.types[service.request](**fields)
-        key = self._packages.keys.topic_keyexpr(
-            self._domain, place, _dds(self._packages, service.kind), service.type_hash
+        key = self._keys.topic_keyexpr(
+            self._domain, place, self._dds(service.kind), service.type_hash
         )
         raw = bytes(self.store.serialize_cdr(request, service.request))
         end = time.monotonic() + _ANSWER
@@ -205,15 +194,14 @@ class Ros2:
 
     def _ask(self, key: str, request: bytes, seconds: float) -> Any:
         """Send a request; the replies, which end at once if nobody is there."""
-        zenoh = self._packages.zenoh
         with self._naming(key):
             return self._session.get(
                 key,
                 payload=request,
                 encoding="application/cdr",
                 attachment=self._attachments()(),
-                target=zenoh.QueryTarget.ALL_COMPLETE,
-                consolidation=zenoh.ConsolidationMode.NONE,
+                target=self._zenoh.QueryTarget.ALL_COMPLETE,
+                consolidation=self._zenoh.ConsolidationMode.NONE,
                 timeout=seconds,
             )
 
@@ -231,8 +219,8 @@ class Ros2:
 
     def _tokens(self, kind: str) -> list[tuple[str, str, str]]:
         """Names, types and their hashes of what there is: nodes keep a token for each of theirs."""
-        utils, space = self._packages.utils, self._packages.keys.ADMIN_SPACE
-        kind = self._packages.entity.EntityKind[kind].value
+        utils, space = self._utils, self._keys.ADMIN_SPACE
+        kind = self._entity.EntityKind[kind].value
         pattern = f"{space}/{self._domain}/*/*/*/{kind}/**"
         with self._naming(pattern):
             replies = self._session.liveliness().get(pattern, timeout=_ANSWER)
@@ -260,8 +248,11 @@ class Ros2:
 
     def _key(self, topic: str, kind: str) -> str:
         """Where a topic's messages pass."""
-        dds, type_hash = _dds(self._packages, kind), self._hash(topic, kind)
-        return str(self._packages.keys.topic_keyexpr(self._domain, _full(topic), dds, type_hash))
+        dds, type_hash = self._dds(kind), self._hash(topic, kind)
+        return str(self._keys.topic_keyexpr(self._domain, _full(topic), dds, type_hash))
+
+    def _dds(self, kind: str) -> str:
+        return str(self._utils.ros2_to_dds_type(kind))
 
     def _hash(self, topic: str, kind: str) -> str:
         """What ROS 2 tells versions of a type apart by."""
@@ -271,16 +262,15 @@ class Ros2:
 
     def _announce(self, entity: str, topic: str, kind: str) -> None:
         """Let the robot's nodes see that a topic is published, or subscribed to."""
-        keys, entities, profiles = self._packages.keys, self._packages.entity, self._packages.qos
-        token = keys.endpoint_liveliness_keyexpr(
-            entities.EndpointEntity(
+        token = self._keys.endpoint_liveliness_keyexpr(
+            self._entity.EndpointEntity(
                 node=self._node,
                 entity_id=next(self._numbers),
-                kind=entities.EntityKind[entity],
+                kind=self._entity.EntityKind[entity],
                 name=_full(topic),
-                dds_type_name=_dds(self._packages, kind),
+                dds_type_name=self._dds(kind),
                 type_hash=self.store.hash_rihs01(kind),
-                qos=profiles.DEFAULT_QOS_PROFILE.encode(),
+                qos=self._qos.DEFAULT_QOS_PROFILE.encode(),
             )
         )
         self._kept.append(self._session.liveliness().declare_token(token))
@@ -288,7 +278,7 @@ class Ros2:
     def _attachments(self) -> Callable[[], bytes]:
         """What goes with each message or call of one sender: its number, its time, and whose."""
         sender, numbers = os.urandom(16), itertools.count(1)
-        attachment = self._packages.attachment.Attachment
+        attachment = self._attachment.Attachment
         return lambda: bytes(attachment(next(numbers), time.time_ns(), sender).to_bytes())
 
     @contextlib.contextmanager
@@ -296,18 +286,17 @@ class Ros2:
         """Say what Zenoh cannot do, and why."""
         try:
             yield
-        except self._packages.zenoh.ZError as error:
+        except self._zenoh.ZError as error:
             raise LinkError(f"{what}: {error}") from error
 
 
-def _packages() -> _Packages:
+def _packages() -> tuple[Any, ...]:
+    """What the extra installs: Zenoh, and how rmw_zenoh names and describes things."""
     # A module of the package wants git, to download messages; they are not downloaded here.
     os.environ.setdefault("GIT_PYTHON_REFRESH", "quiet")
     names = ("keyexpr", "entity", "qos", "attachment", "utils")
     try:
-        return _Packages(
-            *import_extra("ros2", "zenoh", *(f"zenoh_ros2_sdk.{name}" for name in names))
-        )
+        return import_extra("ros2", "zenoh", *(f"zenoh_ros2_sdk.{name}" for name in names))
     except NotInstalledError as error:
         raise LinkError(str(error)) from error
 
@@ -381,10 +370,6 @@ def _session(zenoh: ModuleType, router: str) -> Any:
             f"no Zenoh router answers at {router}: run `ros2 run rmw_zenoh_cpp rmw_zenohd` on the "
             f"robot, which listens on port {PORT}, and check the address ({why})"
         ) from error
-
-
-def _dds(packages: _Packages, kind: str) -> str:
-    return str(packages.utils.ros2_to_dds_type(kind))
 
 
 def _full(name: str) -> str:

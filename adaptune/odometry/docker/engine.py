@@ -15,9 +15,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, BinaryIO, Literal, NamedTuple
+from typing import Any, BinaryIO, Literal, NamedTuple
 
-from pydantic import BeforeValidator, Field
+from pydantic import Field
 
 from adaptune import files, processes
 from adaptune.errors import OdometryError, UnavailableError
@@ -36,10 +36,6 @@ _PERIOD = 100_000
 _TAIL = 50
 
 _log = logging.getLogger(__name__)
-
-
-def _text(user: Any) -> Any:
-    return str(user) if isinstance(user, int) and not isinstance(user, bool) else user
 
 
 class ContainerSettings(BaseSettings):
@@ -61,7 +57,7 @@ class ContainerSettings(BaseSettings):
     image: str = Field(min_length=1)
     cpus: float = Field(1.0, ge=0.01, le=4096)
     pids: int = Field(1024, ge=16, le=10**6)
-    user: Annotated[str | None, BeforeValidator(_text)] = None
+    user: str | None = Field(None, coerce_numbers_to_str=True)
 
 
 class EngineError(UnavailableError):

@@ -15,7 +15,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from adaptune import processes, ros
+from adaptune import processes
 from adaptune.errors import OdometryError, UnavailableError
 from adaptune.odometry.base import Usage
 from adaptune.odometry.docker.engine import (
@@ -31,6 +31,7 @@ from adaptune.odometry.docker.engine import (
     remove_shared,
 )
 from adaptune.odometry.program import Template
+from adaptune.ros import ros1_node
 from adaptune.ros.link import LinkError, equal_values
 from adaptune.ros.ros1 import Ros1
 from adaptune.space import ParameterSet
@@ -49,7 +50,7 @@ _SETUP = "command -v roslaunch >/dev/null || . /opt/ros/*/setup.bash; "
 _FIND = 'for package in {packages}; do rospack find "$package" >/dev/null 2>&1 && {then}; done; '
 _MASTER = (
     _SETUP + "for python in python3 python; do "
-    f'"$python" {_PROGRAMS}/ros1_container.py {_FOLDER}/link {{use_sim_time}}; '
+    f'"$python" {_PROGRAMS}/ros1_node.py {_FOLDER}/link {{use_sim_time}}; '
     "code=$?; [ $code = 9 ] || [ $code = 127 ] || exit $code; "
     "done; echo 'no Python of the image imports rospy: is it a ROS 1 image?' >&2; exit 127"
 )
@@ -122,8 +123,7 @@ class RosSystem:
         self._play: str | None = None
         self.folder, given = make_shared(folder / "shared"), folder / "given"
         given.mkdir()
-        for name in ("ros1_node.py", "ros1_container.py"):
-            shutil.copy(Path(ros.__path__[0]) / name, given)
+        shutil.copy(ros1_node.__file__, given)
         self._parameters = given / "params.yaml"
         self._parameters.write_text(parameters, encoding="utf-8")
         for file in given.iterdir():
