@@ -15,10 +15,11 @@ import struct
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
 from multiprocessing import get_context
@@ -43,19 +44,6 @@ class Readable(Protocol):
 
     def read(self, size: int, /) -> bytes:
         """Read so many bytes; fewer only at the end."""
-
-
-class Writable(Protocol):
-    """A stream that takes messages."""
-
-    def write(self, data: bytes, /) -> Any:
-        """Take bytes."""
-
-    def writelines(self, lines: Iterable[Any], /) -> None:
-        """Take several buffers."""
-
-    def flush(self) -> None:
-        """Send what was taken."""
 
 
 class SocketStream:
@@ -107,7 +95,9 @@ class Message(NamedTuple):
     arrays: dict[str, NDArray[Any]]
 
 
-def send(stream: Writable, header: Mapping[str, Any], **arrays: NDArray[Any] | None) -> None:
+def send(
+    stream: "BinaryIO | SocketStream", header: Mapping[str, Any], **arrays: NDArray[Any] | None
+) -> None:
     """Write a message; arrays that are None are left out."""
     given = {name: np.ascontiguousarray(a) for name, a in arrays.items() if a is not None}
     layout = [[name, a.dtype.str, list(a.shape)] for name, a in given.items()]
@@ -191,9 +181,8 @@ def plain_lines(written: bytes) -> str:
     return " | ".join([line.strip() for line in lines if line.strip()][-_LINES:])
 
 
-def quoting(what: str, output: BinaryIO) -> str:
+def quoting(what: str, words: str) -> str:
     """What happened, and the last lines that a process wrote, if any."""
-    words = last_lines(output)
     return f"{what}: {words}" if words else what
 
 
@@ -307,7 +296,7 @@ def server(service: Service, name: str) -> Server:
             raise
         if wrong is not None:
             here.close()
-            raise HostError(f"{name}: {quoting(wrong, output)}")
+            raise HostError(f"{name}: {quoting(wrong, last_lines(output))}")
     return Server(process, here)
 
 
@@ -329,13 +318,32 @@ def _wait_for_import(process: subprocess.Popen[bytes], control: socket.socket) -
     return what
 
 
-class Forked(NamedTuple):
+class Transport:
+    """Another process, and the way to it: forked from a server, behind a socket, in a container."""
+
+    name: str  # what messages call it
+    bounds: Bounds
+
+    def connect(self) -> SocketStream:
+        """Begin the process, or reach it."""
+        raise NotImplementedError
+
+    def why(self, what: str) -> str:
+        """What has happened, and how the process ended, if that is known."""
+        return what
+
+    def close(self) -> None:
+        """End the process, if it does not end with its stream."""
+
+
+@dataclass(frozen=True)
+class Forked(Transport):
     """A fresh process in which a function `do` of a service answers messages."""
 
     service: Service
     name: str
     do: str
-    bounds: Bounds = Bounds()
+    bounds: Bounds = Bounds()  # noqa: RUF009 - it never changes
 
     def connect(self) -> SocketStream:
         """Fork it; a `HostError` if the user code cannot be imported."""
@@ -347,34 +355,6 @@ class Forked(NamedTuple):
             control = server(self.service, self.name).control
             socket.send_fds(control, [request], [there.fileno()])
         return SocketStream(here)
-
-    def why(self, what: str) -> str:
-        """What is known of its end: it has said so itself."""
-        return what
-
-    def close(self) -> None:
-        """It ends with its stream."""
-
-
-class Transport(Protocol):
-    """Another process, and the way to it: forked from a server, behind a socket, in a container."""
-
-    @property
-    def name(self) -> str:
-        """What messages call it."""
-
-    @property
-    def bounds(self) -> Bounds:
-        """Its limits."""
-
-    def connect(self) -> SocketStream:
-        """Begin the process, or reach it."""
-
-    def why(self, what: str) -> str:
-        """What has happened, and how the process ended, if that is known."""
-
-    def close(self) -> None:
-        """End the process."""
 
 
 class Conversation:
@@ -472,7 +452,7 @@ Answer = Callable[[Message], Mapping[str, Any] | None]
 """Gives what the answer to a message holds, arrays as such; None if there is no answer."""
 
 
-def answer_all(reader: Readable, writer: Writable, answer: Answer) -> None:
+def answer_all(reader: Readable, writer: BinaryIO, answer: Answer) -> None:
     """Answer messages until the stream ends; what an `AdaptuneError` says is refused."""
     while (message := receive(reader)) is not None:
         try:
@@ -540,7 +520,7 @@ def _watch(
         code = keep(child, connection.fileno()).code
         if code:
             what = bounds.late if code == -signal.SIGALRM else how_it_ended(code)
-            fault = {"type": "fault", "message": quoting(what, output)}
+            fault = {"type": "fault", "message": quoting(what, last_lines(output))}
             with contextlib.suppress(OSError), connection.makefile("wb") as writer:
                 send(writer, fault)
 

@@ -24,7 +24,7 @@ import small_gicp
 from adaptune import files, processes
 from adaptune.geometry import Poses
 from adaptune.metrics import sub_trajectory_rte
-from adaptune.odometry import InProcess, OdometryInstance
+from adaptune.odometry.base import InProcess, OdometryInstance
 from adaptune.odometry.registry import ODOMETRIES, odometry_class
 from adaptune.odometry.remote import Isolated, Limits
 from adaptune.recording import Scan, SequenceError

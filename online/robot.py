@@ -158,9 +158,6 @@ class SteeredNode(OdometryInstance):
         self._silent = 0
         link.subscribe(settings.odometry, ODOMETRY, self._take)
 
-    def prepare(self, scan: Scan) -> Scan:
-        return scan
-
     def start(
         self, prepared: Scan, T_odom_sensor: Poses, T_previous_current: Poses | None = None
     ) -> None:

@@ -87,6 +87,8 @@ class Description(NamedTuple):
     warm_up: float = 12.0  # seconds of scans that a member of a bank sees when it restarts
     # whether it runs whole recordings only, with one parameter set from end to end
     whole: bool = False
+    clean: bool = False  # whether instances in one process know nothing of each other
+    module: str = ""  # in which a class is written
 
 
 class LastMotion:
@@ -177,12 +179,13 @@ class OdometryInstance(ABC):
         """Whether `collect` has something to give in so many seconds."""
         return True
 
-    @abstractmethod
     def prepare(self, scan: Scan) -> Any:
         """Do to a scan all that does not depend on the pose or on earlier scans.
 
-        All instances with the same `preparation` share the result, and none may change it.
+        All instances with the same `preparation` share the result, and none may change it. By
+        default that is the scan itself, where another process prepares.
         """
+        return scan
 
     @abstractmethod
     def start(
@@ -275,7 +278,8 @@ class Odometry(ABC):
     @classmethod
     def describe(cls, settings: Any) -> Description:  # noqa: ARG003
         """What a study must know of the odometry with these settings."""
-        return Description(cls.space, cls.live, cls.needs_imu, cls.warm_up)
+        known = cls.space, cls.live, cls.needs_imu, cls.warm_up
+        return Description(*known, clean=cls.clean, module=cls.__module__)
 
     @property
     def preparation(self) -> Hashable:
@@ -409,6 +413,11 @@ _TOLERANCE = 1e-3
 """By how much a rotation times its transpose may differ from the identity."""
 
 
+LOST = Registration(np.full((4, 4), np.nan), registered=False)
+"""What an odometry gives where there is no pose."""
+LOST.T_odom_sensor.setflags(write=False)
+
+
 class FaultError(AdaptuneError):
     """An odometry that has ended: one of its user's, or one in another process."""
 
@@ -436,11 +445,6 @@ class Faulting(OdometryInstance):
         if self.given_up:
             _log.warning("%s: fault number %d, it does not start again", self.name, MOST_FAULTS)
         return LOST
-
-
-LOST = Registration(np.full((4, 4), np.nan), registered=False)
-"""What an odometry gives where there is no pose."""
-LOST.T_odom_sensor.setflags(write=False)
 
 
 def pose_fault(T_odom_sensor: Poses) -> str | None:

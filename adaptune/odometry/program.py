@@ -532,17 +532,13 @@ class WholeRun(Faulting):
             except (TrajectoryError, OdometryError, LinkError) as error:
                 failure = str(error)
         if failure is not None:
-            self.note_fault(self._quoting(failure))
+            self.note_fault(processes.quoting(failure, self._words))
         try:
             check_frame(T_own_sensor, given.T_ref_sensor)
         except OdometryError as error:
             what = f"{self.name}, with {self.parameters}: {error}"
-            raise OdometryError(self._quoting(what)) from error
+            raise OdometryError(processes.quoting(what, self._words)) from error
         return T_own_sensor
-
-    def _quoting(self, what: str) -> str:
-        """What happened, and the last lines that the program wrote, if any."""
-        return f"{what}: {self._words}" if self._words else what
 
 
 def _lacking(T_own_sensor: Poses, given: ProgramInput) -> str | None:

@@ -136,8 +136,6 @@ class Declaration:
     mistakes: list[Mistake]
     # None if the odometry cannot be described without sound settings
     description: Description | None
-    clean: bool  # whether instances in one process know nothing of each other, see `Odometry`
-    module: str  # module in which its class is written
 
     def sound(self, name: str) -> tuple[Any, Description]:
         """Settings and description; an `OdometryError` if the settings have mistakes."""
@@ -157,14 +155,12 @@ def declare(name: str, settings: Any, folder: Path | None = None) -> Declaration
         return declare_here(name, settings, folder)
     given = settings.model_dump(mode="json") if isinstance(settings, BaseModel) else settings
     answer = _ask(name, json.dumps(given, default=str), str(folder or ""))
-    space = ParameterSpace.load(answer["space"])
+    described = {key: answer[key] for key in Description._fields}
     complete = answer["settings"]
     return Declaration(
         None if complete is None else UserSettings(complete),
         [Mistake(tuple(key), message) for key, message in answer["mistakes"]],
-        Description(space, answer["live"], answer["needs_imu"], answer["warm_up"], answer["whole"]),
-        answer["clean"],
-        answer["module"],
+        Description(**described | {"space": ParameterSpace.load(answer["space"])}),
     )
 
 
@@ -174,9 +170,8 @@ def declare_here(name: str, settings: Any, folder: Path | None = None) -> Declar
     mistakes: list[Mistake] = []
     context = None if folder is None else {"folder": folder}
     found: Any = validated(cls.settings_type, settings, (), mistakes, context)
-    is_class = issubclass(cls, Odometry)
-    described = cls.describe(found) if is_class or found is not None else None
-    return Declaration(found, mistakes, described, is_class and cls.clean, cls.__module__)
+    describes = found is not None or issubclass(cls, Odometry)
+    return Declaration(found, mistakes, cls.describe(found) if describes else None)
 
 
 @cache
@@ -295,14 +290,10 @@ class OdometryFactory:
     # the user can do without may allow it.
     user_code: bool = False
     description: Description = field(init=False)  # what a study must know of the odometry
-    module: str = field(init=False)  # module in which its class is written
-    _clean: bool = field(init=False)
 
     def __post_init__(self) -> None:
-        declared = declare(self.name, self.settings)
-        settings, description = declared.sound(self.name)
-        found = {"_clean": declared.clean, "module": declared.module}
-        vars(self).update(settings=settings, description=description, **found)
+        settings, description = declare(self.name, self.settings).sound(self.name)
+        vars(self).update(settings=settings, description=description)
 
     @property
     def identity(self) -> dict[str, Any]:
@@ -312,7 +303,7 @@ class OdometryFactory:
     @property
     def content(self) -> Content:
         """What the poses depend on besides name, settings and parameters."""
-        return odometry_content(self.name, self.settings, self.module)
+        return odometry_content(self.name, self.settings, self.description.module)
 
     def changed(self, **changes: Any) -> "OdometryFactory":
         """The same with another `user_code` or `program_input`."""
@@ -321,7 +312,7 @@ class OdometryFactory:
     @property
     def apart(self) -> bool:
         """Whether it runs in processes of their own, which have limits."""
-        return self.name in PROGRAMS or not self._clean or is_user_class(self.name)
+        return not self.description.clean or is_user_class(self.name)
 
     @property
     def one_by_one(self) -> bool:
@@ -356,9 +347,10 @@ class OdometryFactory:
             program: Any = odometry_class(self.name)
             made: OdometryInstance = program.instance(given, self.settings, self.limits, read)
             return made
-        if isolated or not self._clean or (is_user_class(self.name) and not self.user_code):
+        is_users = is_user_class(self.name)
+        if isolated or not self.description.clean or (is_users and not self.user_code):
             return Isolated(self.name, given, self.settings, self.limits)
-        if is_user_class(self.name):
+        if is_users:
             return Guarded(self.name, odometry_class, given, self.settings, self.limits.seconds)
         cls: Any = odometry_class(self.name)
         return InProcess(cls(given, self.settings))

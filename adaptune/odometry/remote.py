@@ -128,9 +128,6 @@ class Isolated(Faulting):
     def ready(self, seconds: float) -> bool:
         return self._conversation.ready(seconds)
 
-    def prepare(self, scan: Scan) -> Scan:
-        return scan  # the other process prepares
-
     def start(
         self, prepared: Scan, T_odom_sensor: Poses, T_previous_current: Poses | None = None
     ) -> None:
@@ -204,12 +201,8 @@ class Isolated(Faulting):
         return pose_fault(T_odom_sensor)
 
     def apply(self, selection: Selection) -> None:
-        self.configure(selection.parameters)
-
-    def configure(self, parameters: ParameterSet) -> None:
-        """Change parameters between scans; the others stay."""
-        self.parameters |= parameters
-        self._ask({"type": "configure", "parameters": parameters})
+        self.parameters |= selection.parameters
+        self._ask({"type": "configure", "parameters": selection.parameters})
 
     def close(self) -> None:
         self._conversation.close()
@@ -276,7 +269,7 @@ class ProcessSettings(BaseSettings):
         return self
 
 
-class ProgramTransport:
+class ProgramTransport(processes.Transport):
     """A program of the user on this machine, which is started, or listens at an address."""
 
     def __init__(self, settings: ProcessSettings, limits: Limits):
@@ -308,12 +301,11 @@ class ProgramTransport:
         return here
 
     def why(self, what: str) -> str:
-        """Add how the program ended, if it did, and the last lines that it wrote."""
         if self._program is None:
             return what.replace("its process ended", "it ended the conversation")
         if (ended := self._program.wait(0.5)) is not None:
             what = processes.how_it_ended(ended.code)
-        return processes.quoting(what, self._written)
+        return processes.quoting(what, processes.last_lines(self._written))
 
     def close(self) -> None:
         if self._program is not None:

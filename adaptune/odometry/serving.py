@@ -23,13 +23,16 @@ from adaptune.odometry.registry import (
 )
 from adaptune.odometry.remote import Isolated, Limits, parse_address
 from adaptune.recording.scan import Scan
-from adaptune.space import ParameterSet
+from adaptune.space import ParameterSet, Selection
 
 _log = logging.getLogger(__name__)
 
 
 class _Guarding(Isolated):
     """An odometry in a process of its own; where it ends, there is a `FaultError`."""
+
+    def configure(self, parameters: ParameterSet) -> None:
+        self.apply(Selection(0, parameters))
 
     def register(self, prepared: Scan) -> Registration:
         registration = super().register(prepared)
@@ -49,10 +52,9 @@ def serve(reader: processes.Readable, writer: BinaryIO, name: str | None = None)
 
 
 def _make(name: str, parameters: ParameterSet, settings: Any) -> tuple[Any, Description]:
-    declared = declare(check_served(name), settings)
-    if declared.clean and not is_user_class(name):
+    checked, described = declare(check_served(name), settings).sound(name)
+    if described.clean and not is_user_class(name):
         return make_here(name, parameters, settings)
-    checked, described = declared.sound(name)
     return _Guarding(name, parameters, checked, Limits()), described
 
 
@@ -116,11 +118,9 @@ def describe(name: str) -> processes.Answer:
         found = declare_here(name, message.header["settings"], Path(folder) if folder else None)
         described = found.description
         assert described is not None  # it is a class
-        return wire.about(described) | {
-            "warm_up": described.warm_up,
-            "whole": described.whole,
-            "clean": found.clean,
-            "module": found.module,
+        return {
+            **described._asdict(),
+            **wire.about(described),
             "settings": found.settings and found.settings.model_dump(mode="json"),
             "mistakes": [[list(mistake.key), mistake.message] for mistake in found.mistakes],
         }

@@ -1,12 +1,14 @@
 """What carries messages between adaptune and a robot: ROS 1, or ROS 2."""
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from adaptune.errors import AdaptuneError, OdometryError
+from adaptune.errors import AdaptuneError, OdometryError, in_a_line
 from adaptune.space import ParameterSet
 
 if TYPE_CHECKING:
@@ -57,12 +59,35 @@ class RosLink(Protocol):
         """Leave."""
 
 
+_log = logging.getLogger(__name__)
+
+
+def take_all(topic: str, messages: Iterable[Any], take: Callable[[Any], None]) -> threading.Thread:
+    """Take message after message of a topic in a thread of its own, until they end."""
+
+    def work() -> None:
+        for message in messages:
+            with telling(topic):
+                take(message)
+
+    thread = threading.Thread(target=work, daemon=True)
+    thread.start()
+    return thread
+
+
+@contextmanager
+def telling(topic: str) -> Iterator[None]:
+    """Log what goes wrong with a message."""
+    try:
+        yield
+    except Exception as error:
+        _log.warning("a message on %s is lost: %s", topic, in_a_line(error))
+
+
 # Parameters of a node that somebody else wrote, set while it runs.
 
 Run = Callable[[list[str]], tuple[int, str]]
 """Runs a command; its exit code, and what it wrote."""
-
-_log = logging.getLogger(__name__)
 
 
 class Steering:

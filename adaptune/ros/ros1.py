@@ -8,7 +8,7 @@ import shutil
 import socket
 import subprocess
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from queue import Empty, SimpleQueue
 from typing import Any
 
@@ -16,9 +16,8 @@ import numpy as np
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from adaptune import processes
-from adaptune.errors import in_a_line
 from adaptune.ros import ros1_node
-from adaptune.ros.link import LinkError
+from adaptune.ros.link import LinkError, take_all, telling
 
 _START = 20.0
 """Seconds in which the node must be ready."""
@@ -114,12 +113,8 @@ class Ros1:
             elif of == kind and received.qsize() < _WAITING:
                 received.put(data)
 
-        def work() -> None:
-            while (data := received.get()) is not None:
-                with _telling(topic):
-                    take(self.store.deserialize_ros1(data, kind))
-
-        threading.Thread(target=work, daemon=True).start()
+        messages = iter(received.get, None)
+        take_all(topic, messages, lambda data: take(self.store.deserialize_ros1(data, kind)))
         self.record(topic, put)
 
     def record(self, topic: str, take: Callable[[str, bytes], None]) -> None:
@@ -208,16 +203,7 @@ class Ros1:
                         waiting.put(header)
                     continue
                 kind, data = header["kind"].replace("/", "/msg/"), message.arrays["data"].tobytes()
-                with _telling(header["topic"]):
+                with telling(header["topic"]):
                     self._takes[header["topic"]](kind, data)
         except (OSError, processes.WireError):
             pass  # it was closed
-
-
-@contextlib.contextmanager
-def _telling(topic: str) -> Iterator[None]:
-    """Log what goes wrong with a message."""
-    try:
-        yield
-    except Exception as error:
-        _log.warning("a message on %s is lost: %s", topic, in_a_line(error))

@@ -17,7 +17,7 @@ from rosbags.typesys.store import Typestore
 
 from adaptune.errors import NotInstalledError, import_extra
 from adaptune.recording import clouds
-from adaptune.ros.link import LinkError
+from adaptune.ros.link import LinkError, take_all
 
 PORT = 7447
 """On which a Zenoh router listens."""
@@ -102,19 +102,9 @@ class Ros2:
             channel = self._zenoh.handlers.FifoChannel(_WAITING)
             subscriber = self._session.declare_subscriber(self._key(topic, kind), channel)
             self._announce("SUBSCRIPTION", topic, kind)
-
-        def work() -> None:
-            for sample in subscriber:
-                if self._closed:
-                    return
-                try:
-                    take(self._message(sample.payload, kind))
-                except Exception:
-                    _log.exception("a message on %s is lost", topic)
-
-        thread = threading.Thread(target=work, daemon=True)
-        self._threads.append(thread)
-        thread.start()
+        samples = (sample for sample in subscriber if not self._closed)
+        take_one = lambda sample: take(self._message(sample.payload, kind))  # noqa: E731
+        self._threads.append(take_all(topic, samples, take_one))
 
     def _check_type(self, topic: str, kind: str) -> None:
         """Refuse what would never bring a message: its place depends on the type's hash."""

@@ -23,9 +23,8 @@ from adaptune import files, processes
 from adaptune.errors import OdometryError, UnavailableError
 from adaptune.files import replacing_folder, temporary_prefix
 from adaptune.keeper import Ended
-from adaptune.odometry.base import BaseSettings, Usage
+from adaptune.odometry.base import BaseSettings
 from adaptune.odometry.docker import remover
-from adaptune.space import ParameterSet
 
 OWNER = "adaptune.owner"
 """Label of every container: the process that has started it."""
@@ -34,6 +33,8 @@ _SIGNALS = {int(one) for one in signal.Signals}
 _PERIOD = 100_000
 """Microseconds over which the use of cores is counted."""
 _TAIL = 50
+_BETWEEN_LOOKS = 0.02
+"""Seconds."""
 
 _log = logging.getLogger(__name__)
 
@@ -291,6 +292,13 @@ class Container:
         code = int(state["ExitCode"])
         return 128 - code if code - 128 in _SIGNALS else code
 
+    def wait(self, seconds: float) -> int | None:
+        """Wait for the end, at most so long, and say how it `ended`."""
+        end = time.monotonic() + seconds
+        while (code := self.ended()) is None and time.monotonic() < end:
+            time.sleep(_BETWEEN_LOOKS)
+        return code
+
     def hold_to_cores(self) -> None:
         """Let it use no more cores than the settings say from now on."""
         quota = int(self._cpus * _PERIOD)
@@ -421,9 +429,7 @@ def remove_shared(folder: Path, image: str, user: str) -> None:
             bare=True,
         )
         with contextlib.closing(container):
-            begin = time.monotonic()
-            while container.ended() is None and time.monotonic() - begin < _SECONDS:
-                time.sleep(0.05)
+            container.wait(_SECONDS)
     shutil.rmtree(folder, ignore_errors=True)
 
 
@@ -432,29 +438,26 @@ def remove_shared(folder: Path, image: str, user: str) -> None:
 
 @contextmanager
 def kept_log(
-    logs: Path | None, settings: Any, parameters: ParameterSet, about: Mapping[str, Any]
+    run: Any, logs: Path | None, fault: str | None, seconds: Mapping[str, float], **about: Any
 ) -> Iterator[Path | None]:
     """A folder for the block to fill, which then replaces that of the same set; None if not kept.
 
-    `logs` is the folder of the sequence's logs. ``trial.yaml`` says what `about` does, too.
+    `logs` is the folder of the sequence's logs. ``trial.yaml`` holds what the run of a recording
+    has used, the seconds of each step, and what `about` says.
     """
     if logs is None:
         yield None
         return
+    settings, parameters, usage = run.settings, run.parameters, run.usage
     whole = json.dumps([settings.model_dump(mode="json"), parameters], sort_keys=True)
     name = hashlib.blake2b(whole.encode(), digest_size=4).hexdigest()
     with replacing_folder(logs / name) as temporary:
         temporary.mkdir()
         digest = image_digest(settings.image)
         note = {"image": settings.image, "digest": digest, "parameters": parameters, **about}
+        note |= {"cpu": round(usage.cpu, 3), "memory": round(usage.memory or 0.0, 1)}
+        note["seconds"] = {name: round(value, 2) for name, value in seconds.items()}
+        if fault:
+            note["fault"] = fault
         (temporary / "trial.yaml").write_text(files.dump(note), encoding="utf-8")
         yield temporary
-
-
-def costs(usage: Usage, seconds: Mapping[str, float]) -> dict[str, Any]:
-    """CPU seconds, peak megabytes and the seconds of each step, as ``trial.yaml`` has them."""
-    return {
-        "cpu": round(usage.cpu, 3),
-        "memory": round(usage.memory or 0.0, 1),
-        "seconds": {name: round(value, 2) for name, value in seconds.items()},
-    }

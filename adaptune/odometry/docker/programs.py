@@ -19,7 +19,6 @@ from adaptune.odometry.docker.engine import (
     ContainerSettings,
     Mount,
     copy_regular,
-    costs,
     default_user,
     image_digest,
     kept_log,
@@ -95,8 +94,7 @@ class DockerCommand(FileRun):
         with closing(container):
             failure = self._watch(container, len(given.stamps))
             self._words = container.last_lines()
-            about = costs(self._usage, {}) | ({"fault": failure} if failure else {})
-            with kept_log(given.logs, self.settings, self.parameters, about) as kept:
+            with kept_log(self, given.logs, failure, {}) as kept:
                 if kept is not None:
                     (kept / "output.log").write_bytes(container.log())
         checked = folder / "checked"
@@ -145,7 +143,7 @@ class DockerProcessSettings(ContainerSettings):
     settings: dict[str, Any] = Field(default_factory=dict)
 
 
-class ContainerTransport:
+class ContainerTransport(processes.Transport):
     """A program in a container, which listens at a socket that the container shares."""
 
     def __init__(self, settings: DockerProcessSettings, limits: Limits):
@@ -175,34 +173,22 @@ class ContainerTransport:
                 connection.settimeout(max(self.bounds.seconds, FIRST_ANSWER))
                 return processes.SocketStream(connection)
             connection.close()
-            if (ended := self._ended()) is not None:
+            if (ended := self._ended(_BETWEEN_SOCKET_LOOKS)) is not None:
                 what = f"{ended} before it listened at its socket"
                 break
-            time.sleep(_BETWEEN_SOCKET_LOOKS)
-        what = f"{self.name}: {self._quoting(what)}"
+        what = processes.quoting(what, self._container.last_lines())
         self.close()
-        raise OdometryError(what)
+        raise OdometryError(f"{self.name}: {what}")
 
     def why(self, what: str) -> str:
-        """Add how the program ended, if it did, and the last lines that it wrote."""
         if self._container is None:
             return what
-        for _ in range(10):
-            if (ended := self._ended()) is not None:
-                what = ended
-                break
-            time.sleep(0.05)
-        return self._quoting(what)
+        return processes.quoting(self._ended(0.5) or what, self._container.last_lines())
 
-    def _quoting(self, what: str) -> str:
+    def _ended(self, seconds: float) -> str | None:
+        """How the program ended; None if it runs longer."""
         assert self._container is not None
-        words = self._container.last_lines()
-        return f"{what}: {words}" if words else what
-
-    def _ended(self) -> str | None:
-        """How the program ended; None while it runs."""
-        assert self._container is not None
-        if (code := self._container.ended()) is None:
+        if (code := self._container.wait(seconds)) is None:
             return None
         return self.bounds.full if self._container.out_of_memory else processes.how_it_ended(code)
 

@@ -358,10 +358,8 @@ def _probed(image: str, user: str, packages: str) -> str:
     limits = ContainerSettings(image=image)
     command = ["/bin/bash", "-l", "-c", _PROBE.format(packages=packages)]
     container = Container(limits, 1.0, command, user=user, environment={"HOME": "/"}, bare=True)
-    begin = time.monotonic()
     with contextlib.closing(container):
-        while (code := container.ended()) is None and time.monotonic() - begin < _START:
-            time.sleep(0.02)
+        code = container.wait(_START)
     if code != 0:
         _log.info("only root finds %s in the image, so root runs it", packages)
         return "0"

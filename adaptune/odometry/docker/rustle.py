@@ -24,6 +24,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag1 import Writer
 from rosbags.typesys.store import Typestore
 
+from adaptune import processes
 from adaptune.errors import AdaptuneError, OdometryError, UnavailableError
 from adaptune.files import temporary_prefix
 from adaptune.geometry import Poses, invert, rectify, to_pose
@@ -35,7 +36,7 @@ from adaptune.odometry.base import (
     Usage,
     pose_fault,
 )
-from adaptune.odometry.docker.engine import ContainerSettings, Mount, costs, image_digest, kept_log
+from adaptune.odometry.docker.engine import ContainerSettings, Mount, image_digest, kept_log
 from adaptune.odometry.docker.ros_container import (
     RosSystem,
     filled,
@@ -180,9 +181,6 @@ class Lockstep(Faulting):
         cpu = self._used_before.cpu + self._used.cpu
         memory = max(self._used_before.memory or 0.0, self._used.memory or 0.0)
         return Usage(cpu, memory, other_cpu=cpu)
-
-    def prepare(self, scan: Scan) -> Scan:
-        return scan  # the system prepares
 
     def start(
         self, prepared: Scan, T_odom_sensor: Poses, T_previous_current: Poses | None = None
@@ -395,7 +393,7 @@ class Lockstep(Faulting):
         if isinstance(error, UnavailableError):
             raise error
         words = "" if self._system is None else self._system.words()
-        return f"{error}: {words}" if words else str(error)
+        return processes.quoting(str(error), words)
 
 
 # A ROS 1 system in a container, on a bag that is played.
@@ -584,8 +582,7 @@ class PlayedBag(WholeRun):
         steps = ", ".join(f"{name} {value:.1f} s" for name, value in self._seconds.items())
         _log.info("%s: %s; %.1f s of CPU time", self.name, steps, self._usage.cpu)
         limits = {"input": str(given.path), "rate": self.settings.rate, "cpus": self.settings.cpus}
-        about = limits | costs(self._usage, self._seconds) | ({"fault": fault} if fault else {})
-        with kept_log(given.logs, self.settings, self.parameters, about) as kept:
+        with kept_log(self, given.logs, fault, self._seconds, **limits) as kept:
             if kept is None:
                 return
             (kept / "roscore.log").write_bytes(written)

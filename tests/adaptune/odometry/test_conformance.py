@@ -233,10 +233,7 @@ def test_prepared_scans_say_what_they_take(name):
 def parameter_cases():
     cases = [(name, parameter) for name in CLEAN for parameter in odometry_class(name).space.names]
     # Tests of their own compare whole runs in containers with those of this process.
-    one_each = [
-        (name, space_of(name).names[0]) for name in ("process", "command", "docker_process")
-    ]
-    return [*cases, *one_each]
+    return [*cases, *((name, space_of(name).names[0]) for name in ("process", "command"))]
 
 
 @pytest.mark.parametrize(("name", "parameter"), parameter_cases())

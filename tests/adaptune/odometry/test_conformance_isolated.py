@@ -119,18 +119,6 @@ def test_a_poor_first_scan(name):
 
 
 @every_odometry
-def test_two_instances_side_by_side_do_not_meet(name):
-    there, other = isolated(name), isolated(name)
-    other.start(other.prepare(measured(9)), np.eye(4))
-    poses = []
-    begin(there, np.eye(4))
-    for i in range(1, N_SCANS):
-        other.register(other.prepare(measured(9 + i)))
-        poses.append(there.register(there.prepare(measured(i))).T_odom_sensor)
-    np.testing.assert_allclose(poses, usual_drive(name)[1:], rtol=0.0, atol=REPEATS.get(name, 0.0))
-
-
-@every_odometry
 def test_what_it_does_not_know_is_refused(name):
     odometry = isolated(name, {"voxl": 1.0})
     with pytest.raises(OdometryError, match="has no parameter 'voxl'"):

@@ -97,7 +97,7 @@ def test_only_who_says_so_runs_clean_classes_here():
     assert isinstance(factory(here=True)(isolated=True), Isolated)
     assert isinstance(factory(here=True, name="faulty:Faulty")(), Isolated)
     assert isinstance(pickle.loads(pickle.dumps(factory(here=True)))(), Guarded)
-    assert factory().module == "faulty"
+    assert factory().description.module == "faulty"
 
 
 def test_a_class_is_the_same_odometry_here_and_there():

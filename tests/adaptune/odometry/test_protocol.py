@@ -6,8 +6,8 @@ from street import N_SCANS, drive, make, scan
 
 from adaptune.bank.bank import Bank
 from adaptune.geometry import invert
-from adaptune.odometry import OdometryError, OdometryInstance, Usage
-from adaptune.odometry.base import InProcess
+from adaptune.odometry import OdometryError
+from adaptune.odometry.base import InProcess, OdometryInstance, Usage
 from adaptune.odometry.keyframe import KeyframeGicp, KeyframeSettings
 from adaptune.odometry.registry import OdometryFactory
 from adaptune.odometry.remote import Isolated, Limits

@@ -107,7 +107,7 @@ def test_messages_of_another_type_are_ignored_and_named(link, caplog):
     other = local_ros1()
     messages, publish = taken(other, "/imu", "sensor_msgs/msg/PointCloud2"), link.advertise
     publish = publish("/imu", "sensor_msgs/msg/Imu")
-    until(lambda: publish(imu) or "/imu is sensor_msgs/Imu, not" in caplog.text)
+    until(lambda: publish(imu) or "/imu is sensor_msgs/msg/Imu, not" in caplog.text)
     assert messages.empty()
     other.close()
 
