@@ -27,15 +27,7 @@ class BaseSettings(StrictModel):
 
 
 class RangeSettings(BaseSettings):
-    """Settings of odometries that crop scans and can deskew them.
-
-    Attributes
-    ----------
-    min_range, max_range : float
-        Metres.
-    deskew : bool
-        Take the motion out of scans whose points have times.
-    """
+    """Settings of odometries that crop scans, in metres, and deskew those with points' times."""
 
     min_range: float = Field(1.0, ge=0, le=1e6)
     max_range: float = Field(100.0, gt=0, le=1e6)

@@ -120,30 +120,19 @@ NO_FIELD = "{} needs to know {}, and the scans do not say; record clouds with a 
 
 
 class EvalioSettings(RangeSettings):
-    """Settings of all pipelines.
+    """Settings of all pipelines."""
 
-    Attributes
-    ----------
-    parameters : dict
-        Values of any of the pipeline's parameters, where they are not tuned.
-    """
-
+    # Values of any of the pipeline's parameters, where they are not tuned.
     parameters: dict[str, Value] = Field(default_factory=dict)
 
 
 class RangeImageSettings(EvalioSettings):
-    """Settings of pipelines that see scans as images.
+    """Settings of pipelines that see scans as images."""
 
-    Attributes
-    ----------
-    rows : int, optional
-        Lasers; by default the smallest power of two that holds those of the first scan.
-    columns : int, optional
-        Firings in a turn; by default as many as the fullest laser of the first scan has points.
-        With more columns than firings the image has holes, around which no features are found.
-    """
-
+    # Lasers; by default the smallest power of two that holds those of the first scan.
     rows: int | None = Field(None, ge=2, le=256)
+    # Firings in a turn; by default as many as the fullest laser of the first scan has points. With
+    # more columns than firings the image has holes, around which no features are found.
     columns: int | None = Field(None, ge=16, le=8192)
 
 

@@ -25,17 +25,7 @@ ITERATIONS = Integer(low=5, high=60, baseline=20, log=True)
 
 
 class KeyframeSettings(BaseSettings):
-    """Settings of keyframe odometries.
-
-    Attributes
-    ----------
-    min_range : float
-        Metres.
-    downsampling : float, optional
-        Metres between the points of a cloud; a parameter that is tuned if left out.
-    iterations : int, optional
-        Of a registration, at most; a parameter that is tuned if left out.
-    """
+    """Settings of keyframe odometries, in metres; parameters that are set are not tuned."""
 
     min_range: float = Field(1.0, ge=0, le=1e6)
     downsampling: float | None = Field(None, ge=1e-3, le=1e3)

@@ -425,15 +425,9 @@ _COVERAGE = 0.9
 
 
 class WholeSettings(BaseSettings):
-    """What all odometries that run whole recordings may set.
+    """What all odometries that run whole recordings may set."""
 
-    Attributes
-    ----------
-    extrinsic : Transform, optional
-        The LiDAR's pose in the frame whose poses the program writes.
-    """
-
-    extrinsic: Transform | None = None
+    extrinsic: Transform | None = None  # the LiDAR's pose in the frame whose poses are written
 
 
 class WholeRun(Faulting):
@@ -586,19 +580,7 @@ _PLACEHOLDERS = ("input", "output", "parameters", "points", "imu")
 
 
 class FileSettings(WholeSettings):
-    """The files of a program that reads a recording.
-
-    Attributes
-    ----------
-    template : str, optional
-        A parameter file: YAML, JSON or TOML, also in the layouts of ROS 1 and ROS 2.
-    output : str
-        Name of the trajectory that it leaves.
-    format : {"tum", "kitti", "evalio"}
-        Format of the trajectory.
-    input : {"bag", "ros2", "kitti"}
-        What the program reads.
-    """
+    """The files of a program that reads a recording; ``docs/your-odometry.md`` describes them."""
 
     template: Annotated[str, AfterValidator(resolve)] | None = None
     output: str = "trajectory.tum"
@@ -607,19 +589,7 @@ class FileSettings(WholeSettings):
 
 
 class CommandSettings(FileSettings):
-    """A program and its files.
-
-    Attributes
-    ----------
-    command : list of str
-        The program and its arguments. In these ``{input}`` is the recording, ``{parameters}`` the
-        file made from the template, ``{output}`` the path of the trajectory, ``{points}`` and
-        ``{imu}`` are topics, ``{study}`` is the folder of the study's file, and the name of any
-        parameter stands for its value.
-    version : str, optional
-        Version of the program. Change it where its file stays the same and the program does not, as
-        with a shared library: results of the version before do not count any more.
-    """
+    """A program with its arguments, and its files; results of another `version` do not count."""
 
     command: Arguments
     version: str | None = None

@@ -51,18 +51,10 @@ Arguments = Annotated[tuple[Annotated[str, AfterValidator(_in_study)], ...], Fie
 
 
 class Limits(StrictModel):
-    """Limits of an odometry in a process of its own.
+    """Limits of an odometry in a process of its own."""
 
-    Attributes
-    ----------
-    seconds : float
-        Time for one scan.
-    memory : float
-        Gigabytes, in addition to what the process begins with.
-    """
-
-    seconds: float = Field(10.0, gt=0, le=1e6)
-    memory: float = Field(4.0, gt=0, le=1e6)
+    seconds: float = Field(10.0, gt=0, le=1e6)  # for one scan
+    memory: float = Field(4.0, gt=0, le=1e6)  # gigabytes, besides what the process begins with
 
     @property
     def bounds(self) -> processes.Bounds:
@@ -242,19 +234,9 @@ def parse_address(address: str) -> tuple[socket.AddressFamily, Any]:
 
 
 class ProcessSettings(BaseSettings):
-    """How to reach a program that speaks `adaptune.odometry.wire`.
+    """How to reach a program that speaks `adaptune.odometry.wire`, see ``docs/your-odometry.md``.
 
-    Attributes
-    ----------
-    command : list of str, optional
-        Starts the program, which uses its standard input and output.
-    address : str, optional
-        Where the program listens: ``tcp://HOST:PORT`` or ``unix:PATH``.
-    settings : dict
-        Settings that the program receives.
-    version : str, optional
-        Version of the program. Change it where its file stays the same and the program does not, as
-        with a container or a shared library: results of the version before do not count any more.
+    A command uses its standard input and output. Results of another `version` do not count.
     """
 
     command: Arguments | None = None

@@ -31,14 +31,9 @@ _LATER = 10**9
 
 
 class RkoLioSettings(RangeSettings):
-    """Settings of RKO-LIO.
+    """Settings of RKO-LIO."""
 
-    Attributes
-    ----------
-    double_downsample : bool
-        Register fewer points than the map receives; sparse LiDARs may do better without.
-    """
-
+    # Register fewer points than the map receives; sparse LiDARs may do better without.
     double_downsample: bool = True
 
 

@@ -41,18 +41,12 @@ class HealthCheck(StrictModel):
 
     An odometry that predicts by constant velocity runs away after a failure and does not come
     back. A step that the platform cannot have made reveals it, unless it is taken back.
-
-    Attributes
-    ----------
-    max_speed : float
-        Metres a second.
-    max_freeze : float
-        Seconds for which the pose may stay where it is to the micrometre, after a step faster than
-        half a metre a second. A robot slows down before it stops, and the noise of its scans moves
-        the pose: only an odometry that has given up stops dead.
     """
 
-    max_speed: float = Field(40.0, gt=0, le=1e9)
+    max_speed: float = Field(40.0, gt=0, le=1e9)  # metres a second
+    # Seconds for which the pose may stay where it is to the micrometre, after a step faster than
+    # half a metre a second. A robot slows down before it stops, and the noise of its scans moves
+    # the pose: only an odometry that has given up stops dead.
     max_freeze: float = Field(1.0, gt=0, le=1e9)
 
     # Metres a second squared, of the step's mean velocity against the last healthy one's; generous

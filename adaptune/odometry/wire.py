@@ -1,34 +1,8 @@
-r"""Messages between a program and an odometry in another process, version 2.
+"""Messages between a program and an odometry in another process, version 2.
 
-Each message is a JSON header and the raw bytes of arrays::
-
-    uint32   bytes of the header, little-endian
-    header   UTF-8 JSON: {"type": ..., "arrays": [[name, dtype, shape], ...], ...}
-    arrays   one after the other, C order, little-endian
-
-The odometry answers each message with one of its own:
-
-=============  =======================================================  =========================
-type           holds                                                    answer
-=============  =======================================================  =========================
-``hello``      version, odometry?, parameters, settings                 ``done``: see below
-``start``      as ``register``, and pose, motion?                       ``done``
-``register``   stamp, points, times?, rings?, intensities?, imu..?      ``pose``: see below
-``configure``  parameters                                               ``done``
-=============  =======================================================  =========================
-
-or with ``refused`` and a ``message`` if it cannot do what is asked, or with ``fault`` and a
-``message`` if it has ended. The answer to a hello holds version, odometry (its name), live,
-needs_imu and space: of every parameter type, low, high, baseline and log, or choices and baseline,
-and unit if it is known. A pose comes with the stamp of its scan, with registered, and if they are
-known with cpu, the seconds of CPU time of the odometry's process, and memory, its peak in
-megabytes. A ``start`` forgets all scans.
-
-Points are float32 of shape (n, 3) in metres, times float32 seconds since the stamp, rings uint16,
-intensities float32, poses and motions float64 of shape (4, 4), stamps integer nanoseconds. Four
-arrays hold what an IMU measured since the scan before: imu_stamps, int64; imu, float64 of shape
-(n, 6), rad/s and m/s^2; imu_pose, its pose in the LiDAR's frame; imu_noise, float64 of shape (4,),
-see `adaptune.recording.scan.ImuNoise`. The other side ends by closing the stream.
+Each is a JSON header and the raw bytes of arrays, see ``docs/your-odometry.md``. The odometry
+answers each with one of its own, with ``refused`` and a ``message`` if it cannot do what is asked,
+or with ``fault`` and a ``message`` if it has ended. The other side ends by closing the stream.
 """
 
 import resource

@@ -40,24 +40,12 @@ _log = logging.getLogger(__name__)
 
 
 class ContainerSettings(BaseSettings):
-    """An image, and what its containers may use besides `isolation.memory`.
-
-    Attributes
-    ----------
-    image : str
-        Name of the image.
-    cpus : float
-        Cores.
-    pids : int
-        Processes and threads.
-    user : str, optional
-        User in the container, a name or a number, as in ``docker run --user``. By default not root
-        where the image allows it.
-    """
+    """An image, and what its containers may use besides `isolation.memory`."""
 
     image: str = Field(min_length=1)
-    cpus: float = Field(1.0, ge=0.01, le=4096)
-    pids: int = Field(1024, ge=16, le=10**6)
+    cpus: float = Field(1.0, ge=0.01, le=4096)  # cores
+    pids: int = Field(1024, ge=16, le=10**6)  # processes and threads
+    # A name or a number, as in ``docker run --user``; by default not root where that is possible.
     user: str | None = Field(None, coerce_numbers_to_str=True)
 
 

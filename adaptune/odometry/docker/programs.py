@@ -43,15 +43,9 @@ _BETWEEN_LOOKS = 0.1
 
 
 class DockerCommandSettings(ContainerSettings, FileSettings):
-    """An image with a program, and its files.
+    """An image with a program, and its files."""
 
-    Attributes
-    ----------
-    command : list of str
-        The program and its arguments, see `CommandSettings`; by default the image's own.
-    """
-
-    command: tuple[str, ...] = ()
+    command: tuple[str, ...] = ()  # by default the image's own
 
 
 class DockerCommand(FileRun):
@@ -130,16 +124,10 @@ _BETWEEN_SOCKET_LOOKS = 0.02
 class DockerProcessSettings(ContainerSettings):
     """An image with a program that speaks `adaptune.odometry.wire`.
 
-    Attributes
-    ----------
-    command : list of str
-        The program and its arguments; by default the image's own. It must listen at the Unix socket
-        ``{socket}``, which the variable ADAPTUNE_SOCKET names, too.
-    settings : dict
-        Settings that the program receives.
+    It must listen at the Unix socket ``{socket}``, which the variable ADAPTUNE_SOCKET names, too.
     """
 
-    command: tuple[str, ...] = ()
+    command: tuple[str, ...] = ()  # by default the image's own
     settings: dict[str, Any] = Field(default_factory=dict)
 
 
