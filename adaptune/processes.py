@@ -189,14 +189,9 @@ def quoting(what: str, words: str) -> str:
 class Program:
     """A program of the user in a session of its own, under a keeper.
 
-    Parameters
-    ----------
-    memory
-        Limit on the address space of each of its processes, in gigabytes.
-    core
-        The only core that it may use; None for those of this process.
-    streams
-        Of `subprocess.Popen`: its input and output, and its folder.
+    The memory limits the address space of each of its processes, in gigabytes. `core` is the only
+    one that it may use; None for those of this process. The streams, and its folder, are those of
+    `subprocess.Popen`.
     """
 
     def __init__(

@@ -76,13 +76,7 @@ def where(name: str) -> str:
 
 
 def odometry_class(name: str) -> type[Any]:
-    """Class of an odometry.
-
-    Parameters
-    ----------
-    name
-        One of `ODOMETRIES` or `PROGRAMS`, one that an installed package announces in the
-        entry-point group ``adaptune.odometries``, or ``module:Class``.
+    """Class of an odometry, by its name as in a study.
 
     Raises
     ------
@@ -331,13 +325,8 @@ class OdometryFactory:
     ) -> OdometryInstance:
         """Make a new instance; parameters not given keep their baseline.
 
-        Parameters
-        ----------
-        sequence
-            Name of the sequence on which the instance will run; programs that run whole recordings
-            need it.
-        isolated
-            Run in a process of its own even if the odometry is clean, to measure its memory.
+        Programs that run whole recordings need the name of the sequence on which it will run. An
+        isolated one runs in a process of its own even if it is clean, to measure its memory.
         """
         given = self.space.complete(parameters or {})
         if self.name in PROGRAMS:

@@ -71,15 +71,9 @@ class Isolated(Faulting):
     NaN, and so are all that follow until a new start. A fault quotes the last lines that the
     odometry wrote.
 
-    Parameters
-    ----------
-    settings
-        Checked settings, or these as the other process receives them.
-    limits
-        What each process may use.
-    transport
-        The other process, if it is not forked from a server that has imported the odometry. It
-        stays from start to start, and needs to be a new one only after a fault.
+    Settings are checked, or as the other process receives them. The limits are those of each
+    process. A `transport` leads to a process that is not forked from a server that has imported the
+    odometry: it stays from start to start, and is a new one only after a fault.
     """
 
     apart = True

@@ -196,18 +196,9 @@ class Container:
     It has no network, no privileges and no new ones, and sees nothing of the host but its mounts.
     There is an `OdometryError` if it cannot be started.
 
-    Parameters
-    ----------
-    memory
-        Gigabytes.
-    command
-        Program and arguments; those of the image if empty.
-    user
-        See `ContainerSettings`.
-    bare
-        Whether the command takes the place of the image's entry point, too.
-    hurried
-        Whether it may use all cores until `hold_to_cores`.
+    Memory is in gigabytes. The command is the image's own if it is empty; a bare one takes the
+    place of the image's entry point, too. A hurried container may use all cores until
+    `hold_to_cores`.
     """
 
     def __init__(

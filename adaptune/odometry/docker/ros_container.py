@@ -95,18 +95,9 @@ _log = logging.getLogger(__name__)
 class RosSystem:
     """A container with the nodes that a launch file starts.
 
-    There is an `OdometryError` if there is no such image, or it holds no ROS 1.
-
-    Parameters
-    ----------
-    settings
-        A `RustleSettings`.
-    memory
-        Gigabytes.
-    parameters
-        Text of the parameter file.
-    folder
-        An empty folder, which the caller removes.
+    There is an `OdometryError` if there is no such image, or it holds no ROS 1. The settings are
+    `RustleSettings`, the memory in gigabytes, the parameters the text of a file. The caller removes
+    the folder, which is empty.
     """
 
     def __init__(
@@ -145,15 +136,18 @@ class RosSystem:
                 server.listen()
                 self._container = self._start(memory, mounts)
                 undo.callback(self.stop)
+                launch = " ".join(("rustle.launch", *settings.arguments))
+                command = _LAUNCH.format(packages=" ".join(settings.packages), launch=launch)
                 try:
-                    self._launch = self._container.run(self._launched(), self._environment)
+                    self._launch = self._container.run(command, self._environment)
                 except UnavailableError:
                     raise
                 except OdometryError as error:
                     time.sleep(_UNTIL_NOTED)
                     raise self._no_roscore() or error from error
                 connection = self._accept(server)
-            self.link = Ros1(connection, self._running, self._container.close)
+            running = lambda: self._container.ended() is None  # noqa: E731
+            self.link = Ros1(connection, running, self._container.close)
             undo.pop_all()
 
     def _start(self, memory: float, mounts: Sequence[Mount]) -> Container:
@@ -168,13 +162,6 @@ class RosSystem:
             bare=True,
             hurried=True,
         )
-
-    def _launched(self) -> str:
-        launch = " ".join(("rustle.launch", *self._settings.arguments))
-        return _LAUNCH.format(packages=" ".join(self._settings.packages), launch=launch)
-
-    def _running(self) -> bool:
-        return self._container.ended() is None
 
     def _accept(self, server: socket.socket) -> socket.socket:
         server.settimeout(_BETWEEN_LOOKS)

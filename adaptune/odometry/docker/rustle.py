@@ -29,6 +29,7 @@ from adaptune.errors import AdaptuneError, OdometryError, UnavailableError
 from adaptune.files import temporary_prefix
 from adaptune.geometry import Poses, invert, rectify, to_pose
 from adaptune.odometry.base import (
+    LOST,
     Description,
     Faulting,
     OdometryInstance,
@@ -217,7 +218,7 @@ class Lockstep(Faulting):
 
     def collect(self) -> Registration:
         self._waiting = False
-        registration = Registration(np.full((4, 4), np.nan), registered=False)
+        registration = LOST
         if self._system is not None:
             try:
                 registration = self._registration()

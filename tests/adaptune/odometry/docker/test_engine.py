@@ -66,17 +66,9 @@ def started(settings, *command, memory=0.3, mounts=(), user=NOBODY, **more):
     return Container(settings, memory, command, mounts, user=user, **more)
 
 
-def wait(container):
-    end = time.monotonic() + 60.0
-    while (code := container.ended()) is None:
-        assert time.monotonic() < end
-        time.sleep(0.02)
-    return code
-
-
 def run(settings, *command, **more):
     with closing(started(settings, *command, **more)) as container:
-        return wait(container), container.log().decode()
+        return container.wait(60.0), container.log().decode()
 
 
 def gone(client, container):
@@ -130,7 +122,7 @@ def test_its_limits_are_those_that_were_given(settings):
 )
 def test_how_it_ended(settings, script, code):
     with closing(started(settings, "sh", "-c", f"echo here; {script}")) as container:
-        assert wait(container) == code
+        assert container.wait(60.0) == code
         assert not container.out_of_memory
         assert "here" in container.last_lines().split(" | ")
     assert container.ended() == -9
