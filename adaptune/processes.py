@@ -234,14 +234,6 @@ class Program:
         self._keeper.wait()
 
 
-class Service(NamedTuple):
-    """What a server does with user code."""
-
-    # Its function ``load(name)`` imports the user code. Others make an `Answer` from the name.
-    module: str
-    environment: tuple[tuple[str, str], ...] = ()  # additional variables
-
-
 class Bounds(NamedTuple):
     """Limits of a process that a server forks."""
 
@@ -260,8 +252,11 @@ class Server(NamedTuple):
 
 
 @cache
-def server(service: Service, name: str) -> Server:
+def server(service: str, name: str) -> Server:
     """Server of a piece of user code, started at the first call.
+
+    The service is a module. Its function ``load(name)`` imports the user code, and others make an
+    `Answer` from the name.
 
     Raises
     ------
@@ -270,7 +265,7 @@ def server(service: Service, name: str) -> Server:
     """
     here, there = socket.socketpair(type=socket.SOCK_SEQPACKET)
     path = os.pathsep.join(folder or str(Path.cwd()) for folder in sys.path)
-    arguments = [str(there.fileno()), str(IMPORT_SECONDS), service.module, name]
+    arguments = [str(there.fileno()), str(IMPORT_SECONDS), service, name]
     with there, tempfile.TemporaryFile() as output:
         process = subprocess.Popen(
             # Modules are found where this process finds them, and nowhere else.
@@ -279,7 +274,7 @@ def server(service: Service, name: str) -> Server:
             stdin=subprocess.DEVNULL,
             stdout=output,
             stderr=output,
-            env=os.environ | dict(service.environment) | {"PYTHONPATH": path},
+            env=os.environ | ONE_THREAD | {"PYTHONPATH": path},
             # Ctrl-C is for this process only.
             start_new_session=True,
         )
@@ -335,7 +330,7 @@ class Transport:
 class Forked(Transport):
     """A fresh process in which a function `do` of a service answers messages."""
 
-    service: Service
+    service: str
     name: str
     do: str
     bounds: Bounds = Bounds()  # noqa: RUF009 - it never changes

@@ -41,7 +41,7 @@ STATELESS = ("tpe", "gp")
 """Samplers that keep no notes: they continue from any list of trials."""
 NEEDS = {"cmaes": "cmaes", "gp": "torch"}
 """Packages that a sampler needs; adaptune's extra has the sampler's name."""
-SERVICE = processes.Service("offline.samplers")
+SERVICE = "offline.samplers"
 """What a server does with a sampler of the user."""
 
 

@@ -31,7 +31,7 @@ KEPT = 160
 """Scans that a process keeps for members that restart: those of a warm-up, at ten a second."""
 
 
-SERVICE = processes.Service(__name__, tuple(processes.ONE_THREAD.items()))
+SERVICE = __name__
 """What a server does with an odometry of which there are several."""
 
 

@@ -75,7 +75,7 @@ class DescriptorError(AdaptuneError):
     """A descriptor that does not exist or does not describe a scan."""
 
 
-_SERVICE = processes.Service("adaptune.model.descriptor")
+_SERVICE = "adaptune.model.descriptor"
 _SECONDS = 60.0
 """A descriptor of the user may take so long for a scan."""
 

@@ -11,14 +11,14 @@ from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pydantic import BaseModel, ConfigDict, RootModel, ValidationError
+from pydantic import BaseModel, ConfigDict, RootModel
 
 from adaptune import processes, strict
 from adaptune.errors import OdometryError
 from adaptune.odometry.base import Description, InProcess, Odometry, OdometryInstance
 from adaptune.odometry.remote import SERVICE, Guarded, Isolated, Limits
 from adaptune.space import ParameterSet, ParameterSpace, PooledSpace
-from adaptune.strict import Mistake, in_one_line, validated
+from adaptune.strict import Mistake, validated
 
 if TYPE_CHECKING:
     from adaptune.odometry.program import ProgramInput
@@ -98,12 +98,8 @@ def odometry_class(name: str) -> type[Any]:
 
 def make_here(name: str, parameters: ParameterSet, settings: Any) -> tuple[Any, Description]:
     """Make an odometry in this process."""
-    cls: Any = odometry_class(check_served(name))
-    try:
-        checked = cls.settings_type.model_validate(settings)
-    except ValidationError as error:
-        raise OdometryError(f"settings: {in_one_line(error, settings)}") from error
-    return cls(parameters, checked), cls.describe(checked)
+    checked, described = declare_here(check_served(name), settings).sound(name)
+    return odometry_class(name)(parameters, checked), described
 
 
 def check_served(name: str) -> str:

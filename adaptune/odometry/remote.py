@@ -37,7 +37,7 @@ from adaptune.recording.scan import Scan
 from adaptune.space import ParameterSet, Selection
 from adaptune.strict import StrictModel
 
-SERVICE = processes.Service("adaptune.odometry.serving", tuple(processes.ONE_THREAD.items()))
+SERVICE = "adaptune.odometry.serving"
 """What a server does with an odometry."""
 
 

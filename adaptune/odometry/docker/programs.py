@@ -110,7 +110,7 @@ class DockerCommand(FileRun):
                 return str(self.too_long)
             time.sleep(_BETWEEN_LOOKS)
         if container.out_of_memory:
-            return f"out of isolation.memory = {self._limits.memory:g} GB"
+            return self._limits.bounds.full
         return processes.how_it_ended(code) if code else None
 
 
