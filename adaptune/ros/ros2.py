@@ -102,6 +102,7 @@ class Ros2:
             channel = self._zenoh.handlers.FifoChannel(_WAITING)
             subscriber = self._session.declare_subscriber(self._key(topic, kind), channel)
             self._announce("SUBSCRIPTION", topic, kind)
+        self._kept.append(subscriber)
         samples = (sample for sample in subscriber if not self._closed)
         take_one = lambda sample: take(self._message(sample.payload, kind))  # noqa: E731
         self._threads.append(take_all(topic, samples, take_one))
