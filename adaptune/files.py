@@ -275,6 +275,11 @@ class Document:
             line = begin.start_mark.line + 1
         return line
 
+    def where(self, file: Path, path: Sequence[str | int]) -> str:
+        """The file of this text, and the line of `path` in it."""
+        line = self.line(path)
+        return f"{file}, line {line}" if line else str(file)
+
 
 def scalar(text: str) -> Any:
     """Value of one line of YAML from the command line."""

@@ -4,7 +4,7 @@ import json
 import re
 import types
 import typing
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from importlib import import_module
 from importlib.metadata import entry_points
@@ -13,7 +13,7 @@ from typing import Annotated, Any, NamedTuple, TypeVar
 from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, ValidationError
 from pydantic_core import CoreSchema, PydanticKnownError, core_schema
 
-from adaptune.errors import DELETED, RENAMED, AdaptuneError, nearest
+from adaptune.errors import AdaptuneError, nearest
 
 # Base class of everything that a user sets: its numbers are numbers.
 
@@ -126,8 +126,7 @@ def in_one_line(error: Exception, data: Any = None) -> str:
     """An error in one line; in plain words where `data`, which may be unknown, are not valid."""
     if not isinstance(error, ValidationError):
         return " ".join(str(error).split())
-    said = plain_words(error, data).items()
-    return "; ".join(": ".join(filter(None, (".".join(map(str, key)), text))) for key, text in said)
+    return "; ".join(str(Mistake(*said)) for said in plain_words(error, data).items())
 
 
 def _path(data: Any, detail: Any) -> Key:
@@ -212,6 +211,9 @@ class Mistake(NamedTuple):
     key: Key
     message: str
 
+    def __str__(self) -> str:
+        return ": ".join(filter(None, (".".join(map(str, self.key)), self.message)))
+
     def below(self, key: Key) -> "Mistake":
         """The mistake as seen from outside the section at `key`."""
         return Mistake(key + self.key, self.message)
@@ -229,8 +231,9 @@ def validated(
         return model.model_validate(data, context=context)
     except ValidationError as error:
         for path, message in plain_words(error, data).items():
-            said = _unknown(model, path, key) if message == UNKNOWN else message
-            mistakes.append(Mistake(key + path, said))
+            if message == UNKNOWN:
+                message += f"; {nearest(str(path[-1]), _keys(model, path[:-1]))}"
+            mistakes.append(Mistake(key + path, message))
         return None
 
 
@@ -267,30 +270,32 @@ def _without(data: dict[str, Any], keys: Iterable[Key]) -> dict[str, Any]:
     return rest
 
 
-def _unknown(model: type[BaseModel], path: Key, key: Key) -> str:
-    old = ".".join(map(str, key + path))
-    if old in RENAMED:
-        return f"is now called {RENAMED[old]}"
-    if old in DELETED:
-        return DELETED[old]
-    return f"{UNKNOWN}; {nearest(str(path[-1]), _keys(model, path[:-1]))}"
+def alternatives(annotation: Any) -> Iterator[Any]:
+    """The types of a union, without what is annotated to them."""
+    origin = typing.get_origin(annotation)
+    if origin is Annotated:
+        yield from alternatives(typing.get_args(annotation)[0])
+    elif origin in (typing.Union, types.UnionType):
+        for one in typing.get_args(annotation):
+            yield from alternatives(one)
+    else:
+        yield annotation
 
 
 def _keys(annotation: Any, path: Sequence[str | int]) -> list[str]:
     """Keys that a model has at a path below it."""
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        if not path:
-            return list(annotation.model_fields)
-        field = annotation.model_fields.get(str(path[0]))
-        return _keys(field.annotation, path[1:]) if field else []
-    arguments = typing.get_args(annotation)
-    if typing.get_origin(annotation) in (dict, list, tuple) and path:
-        # This part of the path is a key or an index; the last argument is the type of the values.
-        return _keys(next(a for a in reversed(arguments) if a is not Ellipsis), path[1:])
-    unions = (types.UnionType, typing.Union, Annotated)
-    if isinstance(annotation, types.UnionType) or typing.get_origin(annotation) in unions:
-        return [key for a in arguments for key in _keys(a, path)]
-    return []
+    keys: list[str] = []
+    for one in alternatives(annotation):
+        if isinstance(one, type) and issubclass(one, BaseModel):
+            if not path:
+                keys += one.model_fields
+            elif field := one.model_fields.get(str(path[0])):
+                keys += _keys(field.annotation, path[1:])
+        elif path and typing.get_origin(one) in (dict, list, tuple):
+            # This part of the path is a key or an index; the last type is that of the values.
+            types_ = [type_ for type_ in typing.get_args(one) if type_ is not Ellipsis]
+            keys += _keys(types_[-1], path[1:])
+    return keys
 
 
 # Import an object by its name: a built-in one, one of another package, or ``module:attribute``.

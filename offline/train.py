@@ -199,8 +199,9 @@ def _ready_archive(study: OfflineStudy, progress: Progress) -> Archive:
                 f"{study.sequences.key(name)}: training needs a reference trajectory; name its "
                 f"topic or file, or leave `reference` out to have it estimated"
             )
-    ensure_references(study, study.training, progress)
     study.open()
+    length = study.config.sub_trajectory
+    ensure_references(study.sequences, study.training, length, progress)
     archive = study.archive(more={"offline": study.config.search_inputs})
     if archive.renew(study.training):
         # The search is told again what has been run; where nothing has, its time begins anew.
@@ -562,7 +563,9 @@ def oracle_sets(model: ErrorModel, n: int) -> list[int]:
 
 def _judged(study: OfflineStudy, progress: Progress) -> list[str]:
     """The test sequences that have a reference, or get an estimated one."""
-    refused = ensure_references(study, study.config.test, progress, required=False)
+    refused = ensure_references(
+        study.sequences, study.config.test, study.config.sub_trajectory, progress, required=False
+    )
     for name, said in refused.items():
         _log.warning("%s; so %s is left out", said, name)
     recordings = study.sequences.recordings

@@ -396,7 +396,7 @@ def validate(study: OfflineStudy, progress: Progress = unseen) -> Validated:
             f"study's; run `adaptune offline` again"
         )
     data = _labelled(study, model)
-    online = driven(study, model)
+    online = driven(model, study.config.online, study.odometry, study.mechanism)
     bank: int | list[int] = 0
     if study.mechanism == "bank" and PAIRED in study.rules:
         switching = study.config.online.switching

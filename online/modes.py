@@ -396,7 +396,8 @@ def _replay_all(
     Sequences without a reference get an estimated one before, where that is possible.
     """
     study.open()
-    refused = ensure_references(study, sequences, progress, required=False)
+    length = study.config.sub_trajectory
+    refused = ensure_references(study.sequences, sequences, length, progress, required=False)
     for why in refused.values():
         _log.warning("%s; it is replayed without a reference, and not judged", why)
     setup, made = ReplaySetup.of(study), 0

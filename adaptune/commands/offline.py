@@ -102,7 +102,7 @@ def offline(
     if len(loaded.config.offline.objective) > 1:
         front = loaded.folder / "pareto"
         say(f"The sets that no other set beats in every objective: {front}.*")
-    say(driven(loaded, model))
+    say(driven(model, loaded.config.online, loaded.odometry, loaded.mechanism))
     say(f"Error model: {loaded.model_path}")
     say_next_of_trained(bool(model.expected), loaded.config.test, study, override, folder)
 
@@ -389,9 +389,9 @@ def _of_study(study: "OfflineStudy") -> None:
             f"is to be estimated"
         )
     study.open()
-    with progress() as show:
-        refused = ensure_references(study, names, show, required=False)
     length = study.config.sub_trajectory
+    with progress() as show:
+        refused = ensure_references(study.sequences, names, length, show, required=False)
     rows = [
         {
             "reference": name,

@@ -130,7 +130,7 @@ class Declaration:
     def sound(self, name: str) -> tuple[Any, Description]:
         """Settings and description; an `OdometryError` if the settings have mistakes."""
         if self.settings is None or self.description is None:
-            said = "; ".join(f"{'.'.join(map(str, m.key))}: {m.message}" for m in self.mistakes)
+            said = "; ".join(map(str, self.mistakes))
             raise OdometryError(f"{name}: settings: {said}")
         return self.settings, self.description
 

@@ -1,10 +1,8 @@
 """The configuration of a study: the settings that both stages share."""
 
 import re
-import types
-import typing
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple, get_args, get_origin
 
 from pydantic import (
     AfterValidator,
@@ -22,7 +20,7 @@ from adaptune.recording.config import SequenceConfig, Transform, ViewConfig
 from adaptune.recording.scan import Fractions, part_name, read_part
 from adaptune.simulation.course import Course
 from adaptune.space import ParameterSpace, Value
-from adaptune.strict import Key, Mistake, StrictModel
+from adaptune.strict import Mistake, StrictModel, alternatives
 
 
 def _file_name(name: str) -> str:
@@ -68,15 +66,14 @@ def _known_descriptor(name: str) -> str:
 
 def _names(given: Any) -> Any:
     if isinstance(given, dict):
-        gone = "" if "window" not in given else "; window is gone, they are averaged over 3 s"
         what = "name the descriptors alone, as in `descriptor: [ndt, motion]`"
-        raise ValueError(f"{what}{gone}")  # noqa: TRY004 - pydantic takes no other
+        raise ValueError(f"{what}; window is gone, they are averaged over 3 s")  # noqa: TRY004
     return (given,) if isinstance(given, str) else given
 
 
 def _once(names: tuple[str, ...]) -> tuple[str, ...]:
     if len(set(names)) < len(names):
-        raise ValueError("a descriptor is named twice")
+        raise ValueError("one of them is named twice")
     return names
 
 
@@ -93,12 +90,6 @@ MOST_MEMBERS = 6
 """Of a bank."""
 
 
-def _mechanism(name: Any) -> Any:
-    if name == "hand_over":
-        raise ValueError("hand_over is gone (it gained nothing); give auto, live or bank")
-    return name
-
-
 class SwitchingConfig(StrictModel):
     """How the odometry changes its parameters during a replay.
 
@@ -107,7 +98,7 @@ class SwitchingConfig(StrictModel):
     the odometry can. ``docs/adapting-live.md`` describes every key.
     """
 
-    mechanism: Annotated[Literal["auto", "live", "bank"], BeforeValidator(_mechanism)] = "auto"
+    mechanism: Literal["auto", "live", "bank"] = "auto"
     size: int = Field(4, ge=2, le=MOST_MEMBERS)
     sets: Annotated[
         tuple[Annotated[int, Field(ge=0, le=10**9)] | dict[str, Value], ...] | None,
@@ -116,20 +107,12 @@ class SwitchingConfig(StrictModel):
 
 
 class RealTimeConfig(StrictModel):
-    """How to replay in real time.
+    """How to replay in real time."""
 
-    Attributes
-    ----------
-    rate : float
-        Times as fast as it was recorded.
-    deadline : float
-        Seconds from a scan's arrival to the selection that is made from it; a later one is dropped.
-    queue : int
-        Scans that may wait for the odometry; the oldest ones are dropped. With 0 all wait.
-    """
-
-    rate: float = Field(1.0, gt=0, le=1e3)
+    rate: float = Field(1.0, gt=0, le=1e3)  # times as fast as it was recorded
+    # Seconds from a scan's arrival to the selection that is made from it; a later one is dropped.
     deadline: float = Field(0.02, gt=0, le=60)
+    # Scans that may wait for the odometry; the oldest ones are dropped. With 0 all wait.
     queue: int = Field(1, ge=0, le=10_000)
 
 
@@ -144,24 +127,12 @@ RosName = Annotated[str, AfterValidator(_ros_name)]
 
 
 class SteerConfig(StrictModel):
-    """Somebody else's odometry node, of which only the parameters are set.
-
-    Attributes
-    ----------
-    node : str
-        Its name.
-    odometry : str
-        Topic of its poses, nav_msgs/Odometry.
-    extrinsic : pose, optional
-        The LiDAR's pose in the frame whose poses the node publishes.
-    command : tuple of str, optional
-        A program that sets a parameter, and its arguments, with ``{node}``, ``{name}`` and
-        ``{value}``; otherwise they are set through ROS.
-    """
+    """Somebody else's odometry node, of which only the parameters are set."""
 
     node: RosName
-    odometry: RosName
-    extrinsic: Transform | None = None
+    odometry: RosName  # topic of its poses, nav_msgs/Odometry
+    extrinsic: Transform | None = None  # the LiDAR's pose in the frame whose poses it publishes
+    # A program that sets a parameter; otherwise they are set through ROS.
     command: Annotated[tuple[str, ...] | None, Field(min_length=1)] = None
 
     @field_validator("command")
@@ -174,30 +145,10 @@ class SteerConfig(StrictModel):
 
 
 class RosConfig(StrictModel):
-    """How to drive on a robot with ROS.
+    """How to drive on a robot with ROS; ``docs/reference-study.md`` describes every key."""
 
-    Attributes
-    ----------
-    points : str, optional
-        Topic of the point clouds; that of `like` if left out.
-    like : str, optional
-        The sequence of the study with the same sensor: its `stamp`, `time_unit`, `period` and `imu`
-        count. The first training sequence if left out.
-    frame : str
-        Name of the odometry's frame.
-    odometry : str
-        Topic to publish poses on.
-    tf : bool
-        Whether to publish the transform from `frame` to the sensor; not where that frame has
-        another parent, such as the robot's base.
-    steer : SteerConfig, optional
-        Set the parameters of this node instead of running an odometry.
-    router : str
-        Address of Zenoh's router, in ROS 2.
-    """
-
-    points: RosName | None = None
-    like: str | None = None
+    points: RosName | None = None  # topic of the point clouds; that of `like` if left out
+    like: str | None = None  # the sequence with the same sensor; by default the first of training
     frame: str = Field("odom", min_length=1)
     odometry: RosName = "adaptune/odometry"
     tf: bool = False
@@ -205,19 +156,15 @@ class RosConfig(StrictModel):
     router: str = "127.0.0.1:7447"
 
 
-def _mode_name(name: Any) -> Any:
-    if name == "paired":
-        raise ValueError("paired is now called adaptive")
-    if name in ("one_set", "bank", "bank_learned", "random"):
-        raise ValueError(f"{name} is gone: a mode that served research; leave it out")
-    return name
-
-
 RULES = ("adaptive", "paper")
 """Modes that select parameters with the error model."""
 ALSO = ("even", "untrained")
 """Modes that are replayed only on demand, to compare with."""
-Mode = Annotated[Literal["adaptive", "paper", "even", "untrained"], BeforeValidator(_mode_name)]
+Mode = Literal["adaptive", "paper", "even", "untrained"]
+
+
+def _modes(given: Any) -> Any:
+    return (*RULES, *ALSO) if given == "all" else given
 
 
 class OnlineConfig(StrictModel):
@@ -229,7 +176,7 @@ class OnlineConfig(StrictModel):
     """
 
     period: float = Field(1.0, ge=0.01, le=3600)
-    modes: tuple[Mode, ...] = ("adaptive", "paper")
+    modes: Annotated[tuple[Mode, ...], BeforeValidator(_modes), AfterValidator(_once)] = RULES
     switching: SwitchingConfig = SwitchingConfig()
     budget: float | None = Field(None, gt=0, le=1e6)
     real_time: RealTimeConfig | None = None
@@ -239,13 +186,6 @@ class OnlineConfig(StrictModel):
     @classmethod
     def _all(cls, modes: Any) -> Any:
         return (*RULES, *ALSO) if modes == "all" else modes
-
-    @field_validator("modes")
-    @classmethod
-    def _once(cls, modes: tuple[str, ...]) -> tuple[str, ...]:
-        if len(set(modes)) < len(modes):
-            raise ValueError("a mode is named twice")
-        return modes
 
     @property
     def rules(self) -> tuple[str, ...]:
@@ -315,37 +255,21 @@ def complete(
 def _keys(model: type[BaseModel], prefix: str) -> Iterator[tuple[str, Sequence[str]]]:
     """Every key below a section that has none below it, and its values if they are listed."""
     for name, field in model.model_fields.items():
-        alternatives = list(_alternatives(field.annotation))
-        sections = [a for a in alternatives if isinstance(a, type) and issubclass(a, BaseModel)]
+        types = list(alternatives(field.annotation))
+        sections = [type_ for type_ in types if isinstance(type_, type(BaseModel))]
         for section in sections:
             yield from _keys(section, f"{prefix}{name}.")
         if not sections:
-            yield prefix + name, [value for a in alternatives for value in _values(a)]
-
-
-def _alternatives(annotation: Any) -> Iterator[Any]:
-    """The types of a union, without what is annotated to them."""
-    origin = typing.get_origin(annotation)
-    if origin is Annotated:
-        yield from _alternatives(typing.get_args(annotation)[0])
-    elif origin in (typing.Union, types.UnionType):
-        for one in typing.get_args(annotation):
-            yield from _alternatives(one)
-    else:
-        yield annotation
-
-
-def _values(annotation: Any) -> list[str]:
-    if annotation is bool:
-        return ["true", "false"]
-    literal = typing.get_origin(annotation) is typing.Literal
-    return [str(value) for value in typing.get_args(annotation)] if literal else []
+            listed = [get_args(type_) for type_ in types if get_origin(type_) is Literal]
+            listed += [("true", "false")] * (bool in types)
+            yield prefix + name, [str(value) for values in listed for value in values]
 
 
 # The sequences that a study names for training and test, and parts of them.
 
 
 ROLES = ("training", "test")
+_KINDS = ("sequences", "courses")
 _WHOLE = (0.0, 1.0)
 
 
@@ -379,54 +303,34 @@ def settle_roles(data: dict[str, Any]) -> tuple[dict[str, str], list[Mistake]]:
     """
     mistakes: list[Mistake] = []
     origins: dict[str, str] = {}
-    if not all(isinstance(data.get(kind, {}), dict) for kind in ("sequences", "courses")):
+    if not all(isinstance(data.get(kind, {}), dict) for kind in _KINDS):
         return origins, mistakes  # the models find it
     found: dict[str, list[_Named]] = {role: [] for role in ROLES}
-    for role, key, entry in _entries(data):
-        try:
-            named = _read(data, entry, origins)
-            _check(role, named, found)
-        except ValueError as error:
-            mistakes.append(Mistake(key, str(error)))
-            data[role][key[1]] = str(next(iter(entry), "")) if isinstance(entry, dict) else entry
-            continue
-        found[role].append(named)
-        data[role][key[1]] = named.name
-        if named.name != named.origin:
-            origins[named.name] = named.origin
-            _add_part(data, named)
-    return origins, mistakes
-
-
-def role_name(entry: Any) -> str | None:
-    """Name of the sequence that an entry of `training` or `test` becomes; None if it is none."""
-    if isinstance(entry, str):
-        return entry
-    try:
-        ((name, part),) = entry.items()
-        return part_name(str(name), read_part(part))
-    except (AttributeError, ValueError):
-        return None
-
-
-def _entries(data: dict[str, Any]) -> Iterator[tuple[str, Key, Any]]:
     for role in ROLES:
-        if isinstance(data.get(role), list):
-            data[role] = list(data[role])
-            for i, entry in enumerate(data[role]):
-                if isinstance(entry, str | dict):
-                    yield role, (role, i), entry
-
-
-def _sections(data: dict[str, Any]) -> Iterator[tuple[str, dict[Any, Any]]]:
-    for kind in ("sequences", "courses"):
-        if isinstance(section := data.get(kind), dict):
-            yield kind, section
+        if not isinstance(data.get(role), list):
+            continue
+        data[role] = list(data[role])
+        for i, entry in enumerate(data[role]):
+            if not isinstance(entry, str | dict):
+                continue
+            try:
+                named = _read(data, entry, origins)
+                _check(role, named, found)
+            except ValueError as error:
+                mistakes.append(Mistake((role, i), str(error)))
+                data[role][i] = str(next(iter(entry), "")) if isinstance(entry, dict) else entry
+                continue
+            found[role].append(named)
+            data[role][i] = named.name
+            if named.name != named.origin:
+                origins[named.name] = named.origin
+                _add_part(data, named)
+    return origins, mistakes
 
 
 def _read(data: dict[str, Any], entry: Any, origins: dict[str, str]) -> _Named:
     """The entry of a list; a ValueError says what is wrong with it."""
-    known = {name: section[name] for _, section in _sections(data) for name in section}
+    known = {name: of for kind in _KINDS for name, of in data.get(kind, {}).items()}
     if isinstance(entry, dict) and len(entry) != 1:
         raise ValueError("each part is an entry of its own, as in [hall: 0-60%, town: 0-60%]")
     name = next(iter(entry)) if isinstance(entry, dict) else entry
@@ -450,24 +354,21 @@ def _read(data: dict[str, Any], entry: Any, origins: dict[str, str]) -> _Named:
 def _check(role: str, named: _Named, found: dict[str, list[_Named]]) -> None:
     """A ValueError says that the same was named before."""
     name = named.origin
-    split = f"to split it, write training: [{name}: 0-60%], test: [{name}: 60-100%]"
+    why = f"and proves nothing here; to split it, write training: [{name}: 0-60%], "
+    why += f"test: [{name}: 60-100%]"
     if named in found[role]:
         raise ValueError(f"{named.name!r} is named twice")
-    if role == "training":
-        for other in filter(named.overlaps, found[role]):
+    if role == "test" and named in found["training"]:
+        raise ValueError(f"{name!r} is a training sequence, {why}")
+    for other in filter(named.overlaps, found["training"]):
+        if role == "training":
             raise ValueError(f"{named.name} overlaps {other.name}; name parts that share no scan")
-        return
-    for other in found["training"]:
-        if named == other:
-            raise ValueError(f"{name!r} is a training sequence, and proves nothing here; {split}")
-        if named.overlaps(other):
-            raise ValueError(
-                f"{named.name} overlaps {other.name} of training, and proves nothing here; {split}"
-            )
+        raise ValueError(f"{named.name} overlaps {other.name} of training, {why}")
 
 
 def _add_part(data: dict[str, Any], named: _Named) -> None:
-    for kind, section in _sections(data):
+    for kind in _KINDS:
+        section = data.get(kind, {})
         if isinstance(entry := section.get(named.origin), dict):
             of = {"of": named.origin} if kind == "courses" else {}
             data[kind] = section | {named.name: entry | of | {"part": list(named.part)}}

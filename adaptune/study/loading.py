@@ -1,22 +1,31 @@
 """Reading a study: its YAML, the overrides, and all mistakes with their lines."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from itertools import combinations
+from functools import reduce
+from itertools import combinations, product
+from operator import getitem
 from pathlib import Path
 from typing import Any, TypeVar
 
 from adaptune import files
 from adaptune.errors import AdaptuneError, NotInstalledError, OdometryError, nearest
 from adaptune.odometry.base import Description
-from adaptune.odometry.registry import PROGRAMS, declare, is_user_class, odometry_class, where
+from adaptune.odometry.registry import (
+    ODOMETRIES,
+    PROGRAMS,
+    declare,
+    is_user_class,
+    odometry_class,
+    where,
+)
 from adaptune.recording import cache
 from adaptune.recording.cache import MANY, fingerprint
 from adaptune.recording.config import SequenceConfig
 from adaptune.recording.recording import check_sequence, interval_of, sequence_files
-from adaptune.space import ODOMETRY, Categorical, Float, Integer, ParameterSpace, PooledSpace
+from adaptune.space import Categorical, Float, Integer, ParameterSpace, PooledSpace, SpaceError
 from adaptune.strict import ConfigurationError, Key, Mistake, validated, validated_rest
 from adaptune.study.config import RULES, OdometryConfig, StudyConfig, settle_roles
-from adaptune.study.study import Study, describe_odometry, tuned_space, whole_definition
+from adaptune.study.study import Study, declared_odometry, tuned_space, whole_definition
 
 # Mistakes in the odometries of a study that only the odometries show.
 
@@ -40,13 +49,17 @@ def check_odometries(data: Any, mistakes: list[Mistake], folder: Path) -> None:
     folder
         Where relative paths begin.
     """
-    if isinstance(data, dict):
-        _check_odometry(data, ("odometry",), mistakes, folder)
-    elif isinstance(data, list):
-        for i, one in enumerate(data):
-            given = {"name": one} if isinstance(one, str) else one
-            if isinstance(given, dict):
-                _check_odometry(given, ("odometry", i), mistakes, folder)
+    for key, one in _entries(data).items():
+        given = {"name": one} if isinstance(one, str) else one
+        if isinstance(given, dict):
+            _check_odometry(given, key, mistakes, folder)
+
+
+def _entries(given: Any) -> dict[Key, Any]:
+    """The odometries of a study by their keys."""
+    if isinstance(given, list | tuple):
+        return {("odometry", i): one for i, one in enumerate(given)}
+    return {("odometry",): given}
 
 
 def check_together(config: StudyConfig) -> tuple[list[Mistake], ParameterSpace | None]:
@@ -58,14 +71,9 @@ def check_together(config: StudyConfig) -> tuple[list[Mistake], ParameterSpace |
     space : ParameterSpace, optional
         The parameters that are tuned; None if an odometry cannot be described.
     """
-    given = config.odometry
-    entries: dict[Key, OdometryConfig] = (
-        {("odometry",): given}
-        if isinstance(given, OdometryConfig)
-        else {("odometry", i): one for i, one in enumerate(given)}
-    )
+    entries: dict[Key, OdometryConfig] = _entries(config.odometry)
     try:
-        described = {key: describe_odometry(one) for key, one in entries.items()}
+        described = {key: declared_odometry(one)[1] for key, one in entries.items()}
         spaces = {key: tuned_space(one, described[key]) for key, one in entries.items()}
     except OdometryError:
         return [], None
@@ -109,16 +117,13 @@ def _check_each_once(
 
 def _have_a_common_set(one: ParameterSpace, other: ParameterSpace) -> bool:
     """Whether two spaces of the same odometry have a set in common."""
-    return all(
-        _meet(p, other.parameters[name])
-        for name, p in one.parameters.items()
-        if name in other.parameters
-    )
+    shared = one.parameters.keys() & other.parameters.keys()
+    return all(_meet(one.parameters[name], other.parameters[name]) for name in shared)
 
 
 def _meet(one: Any, other: Any) -> bool:
     if isinstance(one, Categorical) and isinstance(other, Categorical):
-        return any(one.contains(choice) for choice in other.choices)
+        return any(map(one.contains, other.choices))
     if isinstance(one, Categorical) or isinstance(other, Categorical):
         return True
     return bool(one.low <= other.high and other.low <= one.high)
@@ -126,58 +131,50 @@ def _meet(one: Any, other: Any) -> bool:
 
 def _check_odometry(data: dict[str, Any], at: Key, mistakes: list[Mistake], folder: Path) -> None:
     """Check all that depends on the odometry; make paths in its settings absolute."""
-    name = data.get("name")
-    if not isinstance(name, str):
-        return
-    settings, key = data.get("settings") or {}, (*at, "settings")
-    if not isinstance(settings, dict):
-        return
+    name, settings = data.get("name"), data.get("settings") or {}
+    if not isinstance(name, str) or not isinstance(settings, dict):
+        return  # the models find it
+    at_fault = "name"
     try:
         # A class of the user is imported in a process of its own.
         where(name) if is_user_class(name) else odometry_class(name)
-    except OdometryError as error:
-        mistakes.append(Mistake((*at, "name"), str(error)))
-        return
-    try:
+        at_fault = "name" if is_user_class(name) else "settings"
         declared = declare(name, settings, folder)
-        mistakes += (mistake.below(key) for mistake in declared.mistakes)
+        mistakes += (mistake.below((*at, "settings")) for mistake in declared.mistakes)
         if declared.settings is not None:
             data["settings"] = declared.settings.model_dump(mode="json", exclude_unset=True)
         if (described := declared.description) is None:
             return
-        found: list[Mistake] = []
-        _check_parameters(name, described.space, data.get("parameters"), found)
-        mistakes += (mistake.below(at) for mistake in found)
+        tuned = data.get("parameters")
+        found = _check_parameters(name, described.space, tuned)
+        mistakes += (mistake.below((*at, "parameters")) for mistake in found)
         check = getattr(odometry_class(name), "check", None) if name in PROGRAMS else None
-        if check is not None and isinstance(tuned := data.get("parameters"), dict):
+        if check is not None and isinstance(tuned, dict):
             check(declared.settings, dict.fromkeys(tuned, 0))
     except NotInstalledError as error:
         mistakes.append(Mistake((*at, "name"), str(error)))
     except OdometryError as error:
-        mistakes.append(Mistake((*at, "name") if is_user_class(name) else key, str(error)))
+        mistakes.append(Mistake((*at, at_fault), str(error)))
 
 
-def _check_parameters(
-    name: str, space: ParameterSpace | None, tuned: Any, mistakes: list[Mistake]
-) -> None:
+def _check_parameters(name: str, space: ParameterSpace | None, tuned: Any) -> list[Mistake]:
+    mistakes: list[Mistake] = []
     if space is None and not tuned:
-        message = f"define the parameters: a {name} does not know its own"
-        mistakes.append(Mistake(("parameters",), message))
+        mistakes.append(Mistake((), f"define the parameters: a {name} does not know its own"))
     for parameter, given in tuned.items() if isinstance(tuned, dict) else ():
-        key = ("parameters", parameter)
         if space is not None and parameter not in space.names:
-            mistakes.append(Mistake(key, _why_not_tuned(name, space, parameter)))
+            mistakes.append(Mistake((parameter,), _why_not_tuned(name, space, parameter)))
         elif isinstance(given, dict):
             whole = whole_definition(space, parameter, given)
-            if str(whole.get("type")) not in _KINDS:
-                mistakes.append(Mistake(key, f"give its type, one of {', '.join(_KINDS)}"))
+            if str(whole.get("type")) in _KINDS:
+                validated(_KINDS[whole["type"]], whole, (parameter,), mistakes)
             else:
-                validated(_KINDS[whole["type"]], whole, key, mistakes)
+                mistakes.append(Mistake((parameter,), f"give its type, one of {', '.join(_KINDS)}"))
+    return mistakes
 
 
 def _why_not_tuned(name: str, space: ParameterSpace, parameter: Any) -> str:
-    own: Any = None if is_user_class(name) or name in PROGRAMS else odometry_class(name)
-    if own is not None and parameter in own.space.names:
+    if name in ODOMETRIES and parameter in odometry_class(name).space.names:
         return f"{parameter} is fixed by settings; leave it out there to tune it"
     return f"{name} has no parameter {parameter!r}: {nearest(str(parameter), space.names)}"
 
@@ -193,44 +190,27 @@ def _check_imu(config: StudyConfig, odometry: str) -> Iterable[Mistake]:
             yield Mistake(("courses", name), f"{needs}; simulate one, imu: 200")
 
 
-def _check_set(at: Key, given: Mapping[str, Any], space: ParameterSpace) -> Iterable[Mistake]:
-    """Find what is wrong with the names in a set that the study gives."""
-    own = dict(given)
-    if isinstance(space, PooledSpace):
-        if ODOMETRY not in own:
-            message = f"say which odometry it is for ({ODOMETRY}: {next(iter(space.spaces))})"
-            yield Mistake(at, message)
-            return
-        if (label := own.pop(ODOMETRY)) not in space.spaces:
-            message = f"there is no such odometry; {nearest(str(label), space.spaces)}"
-            yield Mistake((*at, ODOMETRY), message)
-            return
-        space = space.spaces[label]
-    for name in own:
-        if name not in space.names:
-            message = f"there is no such parameter; {nearest(name, space.names)}"
-            yield Mistake((*at, name), message)
-
-
 def _check_switching(
     config: StudyConfig, described: list[Description], space: ParameterSpace
 ) -> Iterable[Mistake]:
-    online, key = config.online, ("online", "switching")
+    online, names = config.online, ", ".join(config.odometries)
+    modes, mechanism = ("online", "modes"), ("online", "switching", "mechanism")
     for i, given in enumerate(online.switching.sets or ()):
         if isinstance(given, dict):
-            yield from _check_set((*key, "sets", i), given, space)
-    whole, names = any(one.whole for one in described), ", ".join(config.odometries)
-    # A study's folder holds the defaults, too.
-    if whole and online.rules and online.rules != RULES:
-        message = f"{names} runs whole recordings and cannot adapt; leave this out"
-        yield Mistake(("online", "modes"), message)
-    live = len(described) == 1 and described[0].live
-    if whole and online.switching.mechanism != "auto":
+            try:
+                space.check(space.complete(given))
+            except SpaceError as error:
+                yield Mistake(("online", "switching", "sets", i), str(error))
+    if any(one.whole for one in described):
         message = f"{names} runs whole recordings and cannot change parameters; leave this out"
-        yield Mistake((*key, "mechanism"), message)
-    elif online.switching.mechanism == "live" and not live:
+        # A study's folder holds the defaults, too.
+        if online.rules not in ((), RULES):
+            yield Mistake(modes, message)
+        if online.switching.mechanism != "auto":
+            yield Mistake(mechanism, message)
+    elif online.switching.mechanism == "live" and not (len(described) == 1 and described[0].live):
         message = f"{names} cannot change parameters between scans; choose auto or bank"
-        yield Mistake((*key, "mechanism"), message)
+        yield Mistake(mechanism, message)
 
 
 # Recordings that a study trains on and tests on under two names.
@@ -245,39 +225,28 @@ def overlaps(config: StudyConfig) -> Iterator[Mistake]:
 
     Files are read only where their sizes agree.
     """
-    for i, test in enumerate(config.test):
-        for training in config.training:
-            if test != training and _overlap(config, test, training):
-                message = (
-                    f"{test!r} is the recording of the training sequence {training!r}, and proves "
-                    f"nothing here; leave one of them out, or give both a `start` or a `stop` so "
-                    f"that they share no scan"
-                )
-                yield Mistake(("test", i), message)
+    for (i, test), training in product(enumerate(config.test), config.training):
+        if test != training and _overlap(config, test, training):
+            message = (
+                f"{test!r} is the recording of the training sequence {training!r}, and proves "
+                f"nothing here; leave one of them out, or give both a `start` or a `stop` so "
+                f"that they share no scan"
+            )
+            yield Mistake(("test", i), message)
 
 
 def _overlap(config: StudyConfig, one: str, other: str) -> bool:
     if one in config.courses and other in config.courses:
         return config.courses[one] == config.courses[other]
     a, b = config.sequences.get(one), config.sequences.get(other)
-    return a is not None and b is not None and share_scans(a, b)
+    if a is None or b is None or not _same_files(_scan_files(a), _scan_files(b)):
+        return False
+    # Sections are compared by the stamps of their recordings.
+    (begin, end), (other_begin, other_end) = interval_of(a), interval_of(b)
+    return begin < other_end and other_begin < end
 
 
-def share_scans(a: SequenceConfig, b: SequenceConfig) -> bool:
-    """Whether two sequences hold the same scans, by the content of their files.
-
-    Raises
-    ------
-    SequenceError
-        If one of them cannot be opened.
-    """
-    return _same_files(a, b) and _same_time(a, b)
-
-
-def _same_files(a: SequenceConfig, b: SequenceConfig) -> bool:
-    if a.evalio is not None and a.evalio == b.evalio:
-        return True
-    mine, others = _scan_files(a), _scan_files(b)
+def _same_files(mine: Sequence[Path], others: Sequence[Path]) -> bool:
     if set(mine) & set(others):
         return True
     if len(mine) >= MANY:
@@ -295,11 +264,38 @@ def _scan_files(config: SequenceConfig) -> Sequence[Path]:
     return [file.resolve() for file in files if file.suffix not in _NOTES]
 
 
-def _same_time(a: SequenceConfig, b: SequenceConfig) -> bool:
-    """Whether sections overlap, by the stamps of their recordings."""
-    (begin, end), (other_begin, other_end) = interval_of(a), interval_of(b)
-    return begin < other_end and other_begin < end
+# The file.
 
+
+_NO_HAND_OVER = "is gone with the hand-over, which gained nothing; leave it out"
+_NO_MODE = "is gone: a mode that served research; leave it out"
+DELETED = {
+    "offline.search": "is gone: a search is always for single sets; leave it out",
+    "online.also": "is gone: name these modes in online.modes, too",
+    "online.repeats": "is gone: give `adaptune online` the option --repeats",
+    "online.rules": "is gone: name these modes in online.modes",
+    "online.dwell": "is gone: selections do not wait; leave it out",
+    "online.pin": "is gone: fix a parameter by its range (odometry.parameters), or leave it out",
+    "online.switching.beside": _NO_HAND_OVER,
+    "online.switching.catch_up_scans": _NO_HAND_OVER,
+    "online.switching.full_rate": _NO_HAND_OVER,
+    "online.switching.stride": _NO_HAND_OVER,
+    "online.switching.cores": "is gone: a bank shares all cores that adaptune may use",
+    "online.switching.memory": "is gone: auto spends 16 GB; give mechanism: bank for more",
+    "online.switching.warm_up": "is gone: the odometry says it; leave it out",
+    "online.switching.mechanism=hand_over": "is gone (it gained nothing); give auto, live or bank",
+    "online.modes=paired": "is now called adaptive",
+    **{f"online.modes={mode}": _NO_MODE for mode in ("one_set", "bank", "bank_learned", "random")},
+    "health.max_acceleration": "is gone: 30 m/s^2 is the bound; leave it out",
+    "health.max_turn_rate": "is gone: 360 degrees a second are the bound; leave it out",
+    "health.max_unregistered": "is gone: 10 scans in a row are the bound; leave it out",
+    "offline.memory": "is gone: workers keep scans in a quarter of the machine's memory",
+    "offline.preset": "is gone; for the paper's, give trials: 256, sets: own, runs: whole",
+    "offline.target": "is gone; give trials, hours or stagnation",
+    "offline.storage": "is gone: the trials are in a journal of Optuna's in the study's folder",
+    "offline.max_frames": "is gone: the error model keeps all frames; leave it out",
+}
+"""Keys, and values of keys, of earlier versions that are gone, and what became of them."""
 
 _MOST_BYTES = 10**6
 
@@ -336,36 +332,35 @@ def read_study(
     # A wrong variable is no mistake of the study.
     cache.folder()
     cache.cap()
-    document, folder = _read(path), folder or runs / path.stem
+    document = _read(path)
     data: Any = document.data
-    if (folder / "learned.yaml").exists():
-        raise ConfigurationError(
-            f"{folder / 'learned.yaml'}: `adaptune learn` is gone; name these drives under "
-            f"`sequences` and `training` of {path}, and remove this file"
-        )
     overridden = [_override(data, text) for text in overrides]
     config, mistakes = _check(config_type, data, path.parent.resolve())
     if mistakes or config is None:
-        lines = _lines(mistakes, path, document, overridden)
-        raise ConfigurationError("\n".join(dict.fromkeys(lines)))
-    return Study(config, folder)
+        mistakes.sort(key=lambda mistake: document.line(mistake.key) or 0)
+        said = dict.fromkeys(_say(_deleted(m, data), path, document, overridden) for m in mistakes)
+        raise ConfigurationError("\n".join(said))
+    return Study(config, folder or runs / path.stem)
 
 
-def _lines(
-    mistakes: Iterable[Mistake], path: Path, document: files.Document, overridden: Sequence[Key]
-) -> Iterable[str]:
-    """A line for every mistake, in the order of the file."""
-    for mistake in sorted(mistakes, key=lambda mistake: document.line(mistake.key) or 0):
-        yield _say(mistake, path, document, overridden)
+def _deleted(mistake: Mistake, data: Any) -> Mistake:
+    """A mistake in a key or a value of an earlier version, with what became of it."""
+    try:
+        value = reduce(getitem, mistake.key, data)
+    except (LookupError, TypeError):
+        return mistake
+    key = ".".join(part for part in mistake.key if isinstance(part, str))
+    if key in DELETED:
+        return mistake._replace(message=DELETED[key])
+    gone = DELETED.get(f"{key}={value}")
+    return mistake if gone is None else mistake._replace(message=f"{value} {gone}")
 
 
 def _read(path: Path) -> files.Document:
+    if path.exists() and not (path.is_file() and path.stat().st_size <= _MOST_BYTES):
+        raise ConfigurationError(f"{path}: a study is a file of YAML, of 1 MB at most")
     try:
-        if path.exists() and not (path.is_file() and path.stat().st_size <= _MOST_BYTES):
-            raise ConfigurationError(f"{path}: a study is a file of YAML, of 1 MB at most")
         document = files.Document.of_file(path)
-    except OSError as error:
-        raise ConfigurationError(f"{path}: cannot be read as text ({error})") from error
     except files.YamlError as error:
         raise ConfigurationError(str(error)) from error
     if not isinstance(document.data, dict):
@@ -395,13 +390,8 @@ def _override(data: dict[str, Any], text: str) -> Key:
 def _say(mistake: Mistake, path: Path, document: files.Document, overridden: Sequence[Key]) -> str:
     key = mistake.key
     # The mistake of a whole section may be the mistake of a value in it.
-    if any(key[: len(o)] == o[: len(key)] for o in overridden):
-        where = "-o"
-    else:
-        line = document.line(key)
-        where = f"{path}, line {line}" if line else str(path)
-    dotted = ".".join(map(str, key))
-    return f"{where}: {dotted + ': ' if dotted else ''}{mistake.message}"
+    by_override = any(key[: len(o)] == o[: len(key)] for o in overridden)
+    return f"{'-o' if by_override else document.where(path, key)}: {mistake}"
 
 
 def _check(

@@ -27,7 +27,7 @@ from adaptune.reference.stored import (
     StoredEstimate,
     write_estimate,
 )
-from adaptune.study.study import Study, StudySequences
+from adaptune.study.study import StudySequences
 
 _OF_VIEWS = ("views", "compensate", "imu")
 """Keys of a sequence on which its scans as they were recorded do not depend."""
@@ -46,8 +46,9 @@ def to_estimate(sequences: StudySequences, names: Iterable[str]) -> list[str]:
 
 
 def ensure_references(
-    study: Study,
+    sequences: StudySequences,
     names: Iterable[str],
+    length: float,
     progress: Callable[[str, int, int], None] = lambda *_: None,
     required: bool = True,
 ) -> dict[str, str]:
@@ -59,10 +60,12 @@ def ensure_references(
 
     Parameters
     ----------
-    study
-        The study; its folder keeps them as ``references/<sequence>.tum``.
+    sequences
+        Those of the study; its folder keeps the estimates as ``references/<sequence>.tum``.
     names
         Of sequences, views, or courses, which have a reference of their own.
+    length
+        Metres of a sub-trajectory, over which their accuracy is told.
     progress
         Called about every scan.
     required
@@ -79,46 +82,37 @@ def ensure_references(
         If the reference of a sequence cannot be estimated, and is required.
     """
     refused = {}
-    for name in to_estimate(study.sequences, names):
-        path, before = study.sequences.estimate_path(name), study.sequences.estimate(name)
-        length = study.config.sub_trajectory
+    for name in to_estimate(sequences, names):
         try:
-            shown = partial(progress, f"{name}, estimating its reference")
-            stored = _estimated(study.sequences, name, length, study.open, shown)
+            _ensure(sequences, name, length, partial(progress, f"{name}, estimating its reference"))
         except EstimateError as error:
             if required:
                 raise
             refused[name] = str(error)
-            continue
-        if stored != before:
-            accuracy = accuracy_in_words(stored, length)
-            message = "%s: its reference is estimated, %.0f m; %s (%s)"
-            _log.info(message, name, stored.metres, accuracy, path)
     return refused
 
 
-def _estimated(
-    sequences: StudySequences,
-    name: str,
-    length: float,
-    begin: Callable[[], None],
-    advance: Callable[[int, int], None],
-) -> StoredEstimate:
-    """The estimated reference of a sequence, made unless it is there, after calling `begin`."""
+def _ensure(
+    sequences: StudySequences, name: str, length: float, advance: Callable[[int, int], None]
+) -> None:
     path = sequences.estimate_path(name)
     stored, refusal = StoredEstimate.read(path), Refusal.read(path)
     about, before = _about(sequences, name), stored or refusal
-    files = sequences.sources(name)
-    changes = [] if before is None else manifest.changes(before.about, about, files)
+    changes = []
+    if before is not None:
+        changes = manifest.changes(before.about, about, sequences.sources(name))
     if changes:
         _log.info("%s: its reference is estimated again: %s", name, "; ".join(changes))
     elif stored is not None and path.exists():
-        return stored
+        return
     if refusal is None or changes:
-        begin()
         found = _estimate(sequences, name, advance)
         if isinstance(found, EstimatedReference):
-            return write_estimate(path, found, about, length)
+            stored = write_estimate(path, found, about, length)
+            accuracy = _accuracy(stored, length)
+            message = "%s: its reference is estimated, %.0f m; %s (%s)"
+            _log.info(message, name, stored.metres, accuracy, path)
+            return
         refusal = Refusal(about, found)
         refusal.write(path)
     raise EstimateError(f"{sequences.key(name)}: {refusal.refused}")
@@ -126,20 +120,16 @@ def _estimated(
 
 def _about(sequences: StudySequences, name: str) -> dict[str, Any]:
     """Everything that an estimated reference depends on, as plain data."""
-    given = sequences.unseen(name)
+    given, prior = sequences.unseen(name), None
     scans = sequences.identity(name)
-    for kind in ("sequences", "courses"):
-        for of in scans.get(kind, {}).values():
-            of.update(dict.fromkeys(_OF_VIEWS))
-    prior = None
+    scans["sequences"][name] |= dict.fromkeys(_OF_VIEWS)
     if given.position_prior is not None:
         files = prior_files(given)
         keys = {"child_frame", "extrinsic", "clock_offset", "max_gap"}
         prior = of_prior(given).model_dump(mode="json", include=keys)
         prior["poses"] = fingerprints(files) if files else given.position_prior
     about = {"estimator": estimate.VERSION, "position_prior": prior} | scans
-    plain: dict[str, Any] = manifest.plain(about)
-    return plain
+    return dict(manifest.plain(about))
 
 
 def _estimate(
@@ -160,7 +150,7 @@ def _estimate(
     return found
 
 
-def accuracy_in_words(stored: StoredEstimate, length: float) -> str:
+def _accuracy(stored: StoredEstimate, length: float) -> str:
     """How accurate an estimated reference is over `length` metres, and for how many scans."""
     error = stored.error(length)
     own = "its own error is not known" if math.isnan(error) else f"its own error is {error:.2g} %"
@@ -181,18 +171,16 @@ def estimates_in_words(
 
     With `intervals`, it stands beside some that do not include the error of a reference.
     """
-    each = [f"{name} ({accuracy_in_words(of, length)})" for name, of in estimates.items()]
+    each = "; ".join(f"{name} ({_accuracy(of, length)})" for name, of in estimates.items())
     excluded = " Intervals do not include its error." if intervals else ""
-    return [f"Judged by an estimated reference: {'; '.join(each)}.{excluded}"] if each else []
+    return [f"Judged by an estimated reference: {each}.{excluded}"] if each else []
 
 
 def estimates_as_data(estimates: Mapping[str, StoredEstimate], length: float) -> dict[str, Any]:
     """The same as plain data, by the names of the sequences."""
-    errors = {name: stored.error(length) for name, stored in estimates.items()}
-    return {
-        name: {
-            "error_percent": None if math.isnan(error) else round(error, 4),
-            "unknown_share": estimates[name].unknown_share,
-        }
-        for name, error in errors.items()
-    }
+    found = {}
+    for name, stored in estimates.items():
+        error = stored.error(length)
+        percent = None if math.isnan(error) else round(error, 4)
+        found[name] = {"error_percent": percent, "unknown_share": stored.unknown_share}
+    return found

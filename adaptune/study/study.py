@@ -1,5 +1,6 @@
 """A study: a checked configuration, and what is made of it."""
 
+import contextlib
 import fcntl
 import json
 import logging
@@ -40,7 +41,13 @@ from adaptune.reference.stored import BREAK, EstimateError, StoredEstimate
 from adaptune.simulation.course import Course
 from adaptune.space import ODOMETRY, ParameterSet, ParameterSpace
 from adaptune.strict import ConfigurationError
-from adaptune.study.config import MOST_MEMBERS, OdometryConfig, StudyConfig, SwitchingConfig
+from adaptune.study.config import (
+    MOST_MEMBERS,
+    OdometryConfig,
+    OnlineConfig,
+    StudyConfig,
+    SwitchingConfig,
+)
 
 # The sequences of a study by name: recordings, simulated courses, and views of them.
 
@@ -78,14 +85,13 @@ class StudySequences:
 
     def config(self, name: str) -> SequenceConfig:
         """Configuration of a sequence, a course, or a view."""
-        if OF_VIEW in name:
-            name, view = name.split(OF_VIEW)
-            config = self.config(name)
-            return config.model_copy(update={"views": (*config.views, self.views[view])})
-        if name in self.recordings:
-            made = self._is_made(name)
-            return self.by_estimate(name, self.estimate_path(name)) if made else self.unseen(name)
-        return self.unseen(name)
+        whole, *views = name.split(OF_VIEW)
+        config = self.unseen(whole)
+        if self._is_made(whole):
+            reference = str(self.estimate_path(whole).absolute())
+            config = config.model_copy(update=_AS_ESTIMATED | {"reference": reference})
+        more = [self.views[view] for view in views]
+        return config.model_copy(update={"views": (*config.views, *more)}) if more else config
 
     def unseen(self, name: str) -> SequenceConfig:
         """Configuration of a sequence, or a course, without an estimate that was made of it."""
@@ -98,11 +104,6 @@ class StudySequences:
     def estimate_path(self, name: str) -> Path:
         """The TUM file of an estimated reference; the views of a sequence share it."""
         return self.folder / "references" / f"{origin(name)}.tum"
-
-    def by_estimate(self, name: str, path: Path) -> SequenceConfig:
-        """Configuration of a sequence, or a course, with an estimate of it as its reference."""
-        reference = str(path.absolute())
-        return self.unseen(name).model_copy(update=_AS_ESTIMATED | {"reference": reference})
 
     def _is_made(self, name: str) -> bool:
         """Whether an estimated reference of a sequence, or a view, is in the study's folder."""
@@ -118,27 +119,19 @@ class StudySequences:
         given = self.recordings.get(origin(name))
         if given is None or not (given.reference or "").endswith(REFERENCE_FILES):
             return None
-        try:
+        # The user's own file of poses may have any file beside it.
+        with contextlib.suppress(EstimateError):
             return StoredEstimate.read(Path(given.reference or ""))
-        except EstimateError:
-            # The user's own file of poses may have any file beside it.
-            return None
+        return None
 
     def key(self, name: str) -> str:
         """The key under which the user finds a sequence: a part has none of its own."""
-        entry = self.entry(origin(name))
-        if isinstance(entry, str):
-            return f"sequences.{name}"
-        ((whole, part),) = entry.items()
-        return f"[{whole}: {part}]"
-
-    def entry(self, name: str) -> str | dict[str, str]:
-        """How `training` or `test` names a sequence: ``{hall: 0-60%}`` for a part."""
+        name = origin(name)
         part = self.config(name).part
         whole = name if part is None else name.removesuffix(part_name("", part))
         if part is None or whole == name:
-            return name
-        return {whole: f"{100.0 * part[0]:.10g}-{100.0 * part[1]:.10g}%"}
+            return f"sequences.{name}"
+        return f"[{whole}: {100.0 * part[0]:.10g}-{100.0 * part[1]:.10g}%]"
 
     def recorded_in(self, name: str) -> str:
         """What a sequence was recorded in: parts of a recording, and views, share it."""
@@ -184,9 +177,9 @@ class StudySequences:
         course = self.courses.get(origin(name))
         others = {*_PATHS, *_AS_ESTIMATED, "cache"}
         config = self.config(name).model_dump(mode="json", exclude=others)
-        own = {} if course is None else course.model_dump(mode="json")
+        config |= {} if course is None else course.model_dump(mode="json")
         recording = fingerprints(self.files(name).recording)
-        return {self._kind(name): {name: config | own}, "recording": {name: recording}}
+        return {self._kind(name): {name: config}, "recording": {name: recording}}
 
     def reference(self, name: str) -> dict[str, Any]:
         """Everything that the reference of a sequence depends on besides its scans."""
@@ -234,36 +227,6 @@ BANK_MEMORY = 16.0
 _locks: dict[str, IO[str]] = {}
 """Open files whose locks last as long as the process."""
 
-
-def open_folder(folder: Path, resolved: Mapping[str, Any]) -> None:
-    """Make a study's folder, lock it while this process lives, and write the configuration.
-
-    Raises
-    ------
-    ConfigurationError
-        If the folder cannot be made, or another process works in it.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigurationError(
-            f"{folder}: the study's folder cannot be made ({error.strerror}); name another with "
-            f"--folder"
-        ) from error
-    if str(folder) not in _locks:
-        lock = (folder / ".lock").open("w")
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            lock.close()
-            raise ConfigurationError(
-                f"{folder}: another adaptune is at work here; wait for it, or give this study "
-                f"another folder (--folder)"
-            ) from error
-        _locks[str(folder)] = lock
-    write_text(folder / CONFIGURATION, files.dump(resolved))
-
-
 C_co = TypeVar("C_co", bound=StudyConfig, covariant=True, default=StudyConfig)
 
 _log = logging.getLogger(__name__)
@@ -291,14 +254,14 @@ class Study(Generic[C_co]):
     @cached_property
     def sequences(self) -> StudySequences:
         """The sequences by name."""
-        config = self.config
-        described = [(one, describe_odometry(one)) for one in config.odometries.values()]
-        # A program that runs whole recordings is the only odometry.
-        whole = [odometry_settings(one) for one, about in described if about.whole]
-        layouts = [getattr(settings, "input", "bag") for settings in whole]
-        layout: Any = layouts[0] if layouts else "bag"
+        config, layout = self.config, "bag"
+        declared = [declared_odometry(one) for one in config.odometries.values()]
+        for settings, described in declared:
+            # A program that runs whole recordings is the only odometry.
+            if described.whole:
+                layout = getattr(settings, "input", layout)
+        needs_imu = any(described.needs_imu for _, described in declared)
         of_study = (config.sequences, config.courses, config.views, self.folder)
-        needs_imu = any(about.needs_imu for _, about in described)
         return StudySequences(*of_study, needs_imu, layout)
 
     @cached_property
@@ -309,10 +272,10 @@ class Study(Generic[C_co]):
         return OdometryPool(factories) if len(factories) > 1 else next(iter(factories.values()))
 
     def _factory(self, config: OdometryConfig) -> OdometryFactory:
-        described = describe_odometry(config)
+        settings, described = declared_odometry(config)
         return OdometryFactory(
             config.name,
-            odometry_settings(config),
+            settings,
             tuned_space(config, described),
             self.config.isolation,
             self.sequences.program_input if described.whole else None,
@@ -439,7 +402,26 @@ class Study(Generic[C_co]):
         ConfigurationError
             If the folder cannot be made, or another process works in it.
         """
-        open_folder(self.folder, self._resolved())
+        folder = self.folder
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ConfigurationError(
+                f"{folder}: the study's folder cannot be made ({error.strerror}); name another "
+                f"with --folder"
+            ) from error
+        if str(folder) not in _locks:
+            lock = (folder / ".lock").open("w")
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError as error:
+                lock.close()
+                raise ConfigurationError(
+                    f"{folder}: another adaptune is at work here; wait for it, or give this study "
+                    f"another folder (--folder)"
+                ) from error
+            _locks[str(folder)] = lock
+        write_text(folder / CONFIGURATION, files.dump(self._resolved()))
 
     def _resolved(self) -> dict[str, Any]:
         """The configuration with nothing left to defaults."""
@@ -453,14 +435,9 @@ class Study(Generic[C_co]):
         return resolved
 
 
-def odometry_settings(config: OdometryConfig) -> Any:
-    """Settings of the odometry."""
-    return declare(config.name, config.settings).sound(config.name)[0]
-
-
-def describe_odometry(config: OdometryConfig) -> Description:
-    """Description of the odometry with its settings."""
-    return declare(config.name, config.settings).sound(config.name)[1]
+def declared_odometry(config: OdometryConfig) -> tuple[Any, Description]:
+    """The odometry's settings, and its description with them."""
+    return declare(config.name, config.settings).sound(config.name)
 
 
 def tuned_space(config: OdometryConfig, described: Description) -> ParameterSpace:
@@ -504,8 +481,12 @@ class ModeError(AdaptuneError):
     """A mode that the model does not allow."""
 
 
-def driven(study: Study, model: ErrorModel) -> str:
-    """What `adaptune online` will drive with the study's model, in a sentence or two.
+def driven(
+    model: ErrorModel, online: OnlineConfig, odometry: Factory, mechanism: Mechanism | None
+) -> str:
+    """What `adaptune online` will drive with a study's model, in a sentence or two.
+
+    `mechanism` is the study's.
 
     Raises
     ------
@@ -514,37 +495,40 @@ def driven(study: Study, model: ErrorModel) -> str:
     """
     fixed = f"`online` will drive the fixed set (trial {named(model, model.fixed)}"
     fixed += ")" if model.fixed else ", the baseline)"
-    switching, live = study.config.online.switching, study.odometry.description.live
-    if study.mechanism is None:
-        return f"{fixed} only, because {cannot_adapt(study.odometry, None)}."
-    if not study.rules:
+    switching = online.switching
+    if mechanism is None:
+        return f"{fixed} only, because {cannot_adapt(odometry, None)}."
+    if not online.rules:
         return f"{fixed} only, because no rule is named (online.modes)."
-    if "adaptive" not in study.rules:
+    if "adaptive" not in online.rules:
         return "`online` will drive `paper`, and not `adaptive` (online.modes)."
-    mechanism = mechanism_of("adaptive", model, study.mechanism, live)
-    joining = _who_joins_in(switching, model) if mechanism == "bank" else ""
-    if mechanism == "bank" and model.bank_adapts:
+    how = mechanism_of("adaptive", model, mechanism, odometry.description.live)
+    joining = _who_joins_in(switching, model) if how == "bank" else ""
+    why = (
+        f"there is too little to compare ways to adapt, which takes "
+        f"{2 * PER_STRETCH * model.length:g} m of recordings, or a smaller sub_trajectory"
+    )
+    expected = {way: expected_in_words(of) for way, of in model.expected.items()}
+    if how == "bank" and model.bank_adapts:
         trials = always_at_work(switching, model)
         members = ", ".join(named(model, trial) for trial in trials)
         words = f"`online` will drive the bank of trials {members} as `adaptive`"
         if model.costs is not None and math.isfinite(cost := model.costs.adaptive(trials)):
             words += f", at {cost:.1f} ms of CPU time a scan"
-        if BANK in model.expected:
-            why = f", because it has the least expected loss: {_expected(model, BANK)}."
+        if BANK in expected:
+            words += f", because it has the least expected loss: {expected[BANK]}"
         else:
-            why = f". It relies on what it measures while it drives, for {_too_little(model)}."
-        return words + why + joining
-    if mechanism == "live" and model.paired.adapt:
+            words += f". It relies on what it measures while it drives, for {why}"
+        return f"{words}.{joining}"
+    if how == "live" and model.paired.adapt:
         words = "`online` will drive one set at a time as `adaptive`, changed live"
-        if ONE_SET in model.expected:
-            words += f", because it has the least expected loss: {_expected(model, ONE_SET)}"
+        if ONE_SET in expected:
+            words += f", because it has the least expected loss: {expected[ONE_SET]}"
         return f"{words}."
-    ways = [BANK, ONE_SET] if study.mechanism == "bank" else [ONE_SET]
-    compared = [way for way in ways if way in model.expected]
-    why = _too_little(model)
-    if compared:
+    compared = [ONE_SET] if mechanism == "live" else [BANK, ONE_SET]
+    if compared := [way for way in compared if way in expected]:
         way = min(compared, key=lambda way: model.expected[way]["loss"])
-        best = f"{'a bank' if way == BANK else 'one set at a time'}: {_expected(model, way)}"
+        best = f"{'a bank' if way == BANK else 'one set at a time'}: {expected[way]}"
         why = f"it has the least expected loss; the best alternative is {best}"
     return f"{fixed} as `adaptive`, because {why}.{joining}"
 
@@ -578,22 +562,6 @@ def named(model: ErrorModel, trial: int) -> str:
     """A trial's number, and its odometry where there are several."""
     odometry = model.sets[trial].get(ODOMETRY)
     return str(trial) if odometry is None else f"{trial} ({odometry})"
-
-
-def _expected(model: ErrorModel, way: str) -> str:
-    return expected_in_words(model.expected[way])
-
-
-def _too_little(model: ErrorModel) -> str:
-    return (
-        f"there is too little to compare ways to adapt, which takes {metres_to_compare(model):g} m "
-        f"of recordings, or a smaller sub_trajectory"
-    )
-
-
-def metres_to_compare(model: ErrorModel) -> float:
-    """Metres of recordings that hold two stretches: one is left out, the other trained on."""
-    return 2 * PER_STRETCH * model.length
 
 
 def expected_in_words(expected: Mapping[str, float]) -> str:
@@ -652,19 +620,17 @@ def bank_members(switching: SwitchingConfig, model: ErrorModel) -> dict[int, Par
     if switching.sets is None and model.budget is not None:
         return {trial: model.sets[trial] for trial in model.bank}
     if switching.sets is None:
-        size = switching.size
         complete = int((~np.isnan(model.errors).any(axis=0)).sum())
         n = len(model.bank) - model.bank_settings.reserve
-        chosen, reserve = model.bank[:n], model.bank[n:]
-        if len(chosen) < min(size, complete):
+        if n < min(switching.size, complete):
             raise _another_bank("size")
         if model.bank[0] != model.fixed:
             raise _another_bank("sets")
-        return {trial: model.sets[trial] for trial in (*chosen[:size], *reserve)}
+        chosen = (*model.bank[:n][: switching.size], *model.bank[n:])
+        return {trial: model.sets[trial] for trial in chosen}
     members: dict[int, ParameterSet] = {}
     for i, named in enumerate(switching.sets):
-        trial = model.trial(named)
-        where = f"online.switching.sets.{i}"
+        trial, where = model.trial(named), f"online.switching.sets.{i}"
         if trial is None:
             raise ModeError(
                 f"{where}: is none of the {len(model.sets)} parameter sets of the model, so "
@@ -713,18 +679,9 @@ class OracleErrors(NamedTuple):
 
 
 def oracle_errors(archive: Archive, name: str, model: ErrorModel) -> OracleErrors | None:
-    """The errors of a model's sets on a test sequence; None where no trials were run.
+    """The errors of a model's sets on a test sequence, from the study's trials on it.
 
-    Trials that were run with something else than there is now are left out, with a warning.
-
-    Parameters
-    ----------
-    archive
-        The study's trials on the test sequences.
-    name
-        Of the sequence.
-    model
-        The sets are those of the model that were run.
+    None where no trials were run; those of other inputs than now are left out, with a warning.
 
     Raises
     ------
@@ -733,14 +690,11 @@ def oracle_errors(archive: Archive, name: str, model: ErrorModel) -> OracleError
     """
     finished = archive.finished(name)
     known = [t for t in model.sets if t in finished and finished[t].parameters == model.sets[t]]
-    if known and (changes := archive.changes(name)):
-        what = "; ".join(changes)
-        _log.warning(
-            "%s: the oracle's trials are of other inputs: %s; run `adaptune online --oracle`",
-            name,
-            what,
-        )
-    if not known or changes:
+    if not known:
+        return None
+    if changes := archive.changes(name):
+        words = "%s: the oracle's trials are of other inputs: %s; run `adaptune online --oracle`"
+        _log.warning(words, name, "; ".join(changes))
         return None
     trials = tuple(sorted(known, key=lambda trial: (trial != model.fixed, trial)))
     stamps = archive.read_frames(name).stamps

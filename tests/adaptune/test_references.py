@@ -9,11 +9,7 @@ from adaptune.recording.config import SequenceConfig
 from adaptune.recording.recording import open_sequence, wants_estimate
 from adaptune.reference.stored import EstimateError
 from adaptune.strict import ConfigurationError
-from adaptune.study.references import (
-    ensure_references,
-    estimates_as_data,
-    estimates_of,
-)
+from adaptune.study.references import ensure_references, estimates_as_data, estimates_of
 from adaptune.trajectory import Trajectory, write_tum
 from offline.config import load_study
 
@@ -23,6 +19,11 @@ EXTRINSIC = "sequences.one.extrinsic=[0, 2, 0, 0, 0, 0, 1]"
 
 def data(study, names):
     return estimates_as_data(estimates_of(study.sequences, names), study.config.sub_trajectory)
+
+
+def ensure(study, names, *given, **more):
+    length = study.config.sub_trajectory
+    return ensure_references(study.sequences, names, length, *given, **more)
 
 
 @pytest.fixture
@@ -40,7 +41,7 @@ def test_only_what_has_no_reference_is_estimated_and_once(estimator, load, caplo
     study = load(LEFT_OUT, "sequences.three.reference=none")
     shown = []
     names = ["one", "one+back", "two", "three"]
-    ensure_references(study, names, lambda *given: shown.append(given))
+    ensure(study, names, lambda *given: shown.append(given))
     assert estimator.names == ["one.bag"]
     assert shown == [("one, estimating its reference", 40, 40)]
     (said,) = caplog.messages
@@ -49,7 +50,7 @@ def test_only_what_has_no_reference_is_estimated_and_once(estimator, load, caplo
     )
     made = {path.name for path in (study.folder / "references").iterdir()}
     assert {"one.json", "one.tum"} <= made <= {"one.json", "one.tum", "one.png"}
-    ensure_references(study, names)
+    ensure(study, names)
     assert len(estimator.asked) == 1
     estimated = [study.sequences.estimate(name) is not None for name in names]
     assert estimated == [True, True, False, False]
@@ -66,7 +67,7 @@ def test_it_is_asked_for_where_there_are_poses(load):
     # What is said of the recorded poses is not of the estimated ones.
     study = load("sequences.one.reference=estimated", EXTRINSIC, "sequences.one.max_gap=9")
     assert study.sequences.open("one").reference() is None
-    ensure_references(study, ["one"])
+    ensure(study, ["one"])
     found = study.sequences.open("one").reference()
     np.testing.assert_allclose(found.T_world_sensor[0], np.eye(4), atol=1e-9)
     assert found.max_gap == 1.0
@@ -78,7 +79,7 @@ def test_it_is_asked_for_where_there_are_poses(load):
 def test_where_it_is_not_trusted_there_is_a_gap(estimator, load, caplog):
     estimator.untrusted = [20]
     study = load(LEFT_OUT)
-    ensure_references(study, ["one"])
+    ensure(study, ["one"])
     reference = study.sequences.open("one").reference()
     assert len(reference) == 30
     at = reference.at(np.array([drives.FIRST_STAMP + 25 * 10**8]))
@@ -92,7 +93,7 @@ def test_where_it_is_not_trusted_there_is_a_gap(estimator, load, caplog):
 @pytest.mark.usefixtures("estimator")
 def test_a_file_that_was_estimated_is_called_so(load, tmp_path):
     study = load(LEFT_OUT)
-    ensure_references(study, ["one"])
+    ensure(study, ["one"])
     known, file = data(study, ["one"]), tmp_path / "my_reference.tum"
     for suffix in (".tum", ".json"):
         made = study.folder / f"references/one{suffix}"
@@ -110,7 +111,7 @@ def test_a_file_that_was_estimated_is_called_so(load, tmp_path):
 def test_it_is_estimated_again_when_something_has_changed(
     estimator, load, tmp_path, monkeypatch, caplog
 ):
-    ensure_references(load(LEFT_OUT), ["one"])
+    ensure(load(LEFT_OUT), ["one"])
     prior = tmp_path / "gps.tum"
     with_prior = (LEFT_OUT, f"sequences.one.position_prior={prior}")
     for overrides, change in (
@@ -120,12 +121,12 @@ def test_it_is_estimated_again_when_something_has_changed(
     ):
         caplog.clear()
         write_tum(prior, truth(len(estimator.asked)))
-        ensure_references(load(*overrides), ["one"])
+        ensure(load(*overrides), ["one"])
         assert caplog.messages[0].startswith(f"one: its reference is estimated again: {change}")
-        ensure_references(load(*overrides), ["one"])
+        ensure(load(*overrides), ["one"])
     assert len(estimator.asked) == 4
     monkeypatch.setattr("adaptune.reference.estimate.VERSION", 0)
-    ensure_references(load(*with_prior), ["one"])
+    ensure(load(*with_prior), ["one"])
     assert "again: estimator changed from 1 to 0" in caplog.text
 
 
@@ -137,7 +138,7 @@ def truth(aside=0.0):
 
 
 def test_a_prior_is_seen_from_the_lidar(estimator, load):
-    ensure_references(load(LEFT_OUT, "sequences.one.position_prior=/truth", EXTRINSIC), ["one"])
+    ensure(load(LEFT_OUT, "sequences.one.position_prior=/truth", EXTRINSIC), ["one"])
     ((_, prior),) = estimator.asked
     assert len(prior) == 40
     np.testing.assert_allclose(prior.T_world_sensor[:, 1, 3], 2.0)
@@ -149,7 +150,7 @@ def test_a_prior_may_have_a_position_every_two_seconds(
 ):
     path, few = tmp_path / "gps.tum", truth()
     write_tum(path, Trajectory(few.stamps[::19], few.T_world_sensor[::19]))
-    ensure_references(load(LEFT_OUT, f"sequences.one.position_prior={path}", *gap), ["one"])
+    ensure(load(LEFT_OUT, f"sequences.one.position_prior={path}", *gap), ["one"])
     ((_, prior),) = estimator.asked
     known = np.isfinite(prior.at(few.stamps[:38])[:, 0, 3])
     assert known.mean() == (1.0 if used else pytest.approx(0.05, abs=0.03))
@@ -196,18 +197,18 @@ def test_a_recording_with_poses_of_its_own_keeps_them(tmp_path, study_file):
 
 def test_a_recording_that_allows_none_is_named_and_not_tried_again(estimator, load, caplog):
     study = load(LEFT_OUT)
-    ensure_references(study, ["one"])
+    ensure(study, ["one"])
     estimator.refusal = EstimateError("the robot hardly moves")
     other = load(LEFT_OUT, "sequences.one.stop=3")
     with pytest.raises(EstimateError, match=r"^sequences\.one: .*one\.bag: the robot hardly moves"):
-        ensure_references(other, ["one"])
+        ensure(other, ["one"])
     # What was estimated of something else is gone.
     assert study.sequences.estimate("one") is None
     # It is not tried again, and said again.
     n = len(estimator.asked)
     with pytest.raises(EstimateError, match=r"^sequences\.one: .*one\.bag: the robot hardly moves"):
-        ensure_references(other, ["one"])
-    refused = ensure_references(other, ["one", "two"], required=False)
+        ensure(other, ["one"])
+    refused = ensure(other, ["one", "two"], required=False)
     assert list(refused) == ["one"]
     assert refused["one"].endswith("one.bag: the robot hardly moves")
     assert len(estimator.asked) == n
@@ -216,7 +217,7 @@ def test_a_recording_that_allows_none_is_named_and_not_tried_again(estimator, lo
     # But when something has changed.
     estimator.refusal = None
     caplog.clear()
-    assert not ensure_references(study, ["one"], required=False)
+    assert not ensure(study, ["one"], required=False)
     assert caplog.messages[0] == "one: its reference is estimated again: sequences.one.stop is gone"
     assert study.sequences.estimate("one") is not None
 
@@ -234,7 +235,7 @@ def test_an_interruption_leaves_those_that_are_done(estimator, load, monkeypatch
 
     monkeypatch.setattr("adaptune.reference.estimate.estimate_reference", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        ensure_references(study, study.training)
+        ensure(study, study.training)
     assert cores == [1, 1]
     assert os.sched_getaffinity(0) == before
     assert study.sequences.estimate("one") is not None
@@ -244,7 +245,7 @@ def test_an_interruption_leaves_those_that_are_done(estimator, load, monkeypatch
 @pytest.mark.usefixtures("estimator")
 def test_a_damaged_note_is_told(load):
     study = load(LEFT_OUT)
-    ensure_references(study, ["one"])
+    ensure(study, ["one"])
     (study.folder / "references/one.json").write_text("{")
     with pytest.raises(EstimateError, match=r"one\.json: is damaged .* remove it and one\.tum"):
-        ensure_references(study, ["one"])
+        ensure(study, ["one"])

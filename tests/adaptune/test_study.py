@@ -3,8 +3,9 @@ import sys
 import pytest
 from needs import needs_evalio
 
-from adaptune.errors import DELETED, RENAMED, import_extra
+from adaptune.errors import import_extra
 from adaptune.strict import ConfigurationError
+from adaptune.study.loading import DELETED
 from offline.config import load_study
 
 STIFF = ["odometry.name=mad_icp", "odometry.parameters=", "odometry.settings={}"]
@@ -169,10 +170,20 @@ def test_names_what_to_install(study_file, monkeypatch):
 
 @pytest.mark.parametrize(
     ("old", "words"),
-    [*((old, f"is now called {new}") for old, new in RENAMED.items()), *DELETED.items()],
+    [(old, words) for old, words in DELETED.items() if "=" not in old],
 )
 def test_an_old_key_is_told_what_became_of_it(study_file, old, words):
     assert failure(study_file, f"{old}=3") == f"-o: {old}: {words}"
+
+
+@pytest.mark.parametrize(
+    ("old", "words"),
+    [(old, words) for old, words in DELETED.items() if "=" in old],
+)
+def test_an_old_value_is_told_what_became_of_it(study_file, old, words):
+    key, _, value = old.partition("=")
+    given = f"{key}=[{value}]" if key == "online.modes" else old
+    assert f": {value} {words}" in failure(study_file, given)
 
 
 def test_a_folder_that_cannot_be_made(study_file, tmp_path):

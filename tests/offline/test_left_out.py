@@ -131,7 +131,9 @@ def test_the_fixed_set_is_chosen_by_what_the_study_judges_by():
 def test_validates_a_study(study_file, trained_folder, tmp_path, caplog):
     study = load_study(study_file, [], shutil.copytree(trained_folder, tmp_path / "study"))
     validation, rows, verdicts = validate(study)
-    assert verdicts[0] == driven(study, ErrorModel.load(study.model_path))
+    assert verdicts[0] == driven(
+        ErrorModel.load(study.model_path), study.config.online, study.odometry, study.mechanism
+    )
     assert all(np.isnan(one.familiarity).all() for one in validation.left_out)
     ends = ["ms a scan", "cores", "geometric", "arithmetic", "worst tenth", "worst"]
     assert [row["left out"] for row in rows] == ["one", "two", *ends]
@@ -196,7 +198,7 @@ def test_validate_judges_what_online_drives(study_file, tmp_path, monkeypatch):
     bank = ", ".join(map(str, model.bank))
     said = f"`online` will drive the bank of trials {bank} as `adaptive`, because it has the least "
     assert found.verdicts[0].startswith(said)
-    assert found.verdicts[0] == driven(study, model)
+    assert found.verdicts[0] == driven(model, study.config.online, study.odometry, study.mechanism)
     expected = "`adaptive`, with the bank where that is best: expected gain "
     assert found.verdicts[1].startswith(expected)
     assert found.validation.bank
@@ -208,7 +210,7 @@ def test_validate_judges_what_online_drives(study_file, tmp_path, monkeypatch):
     said = "`online` will drive one set at a time as `adaptive`, changed live, because it has the "
     assert found.verdicts[0].startswith(said)
     fixed = replace(model, paired=DO_NOT_ADAPT, bank_settings=NO_BANK)
-    said = driven(study, fixed)
+    said = driven(fixed, study.config.online, study.odometry, study.mechanism)
     assert said.startswith("`online` will drive the fixed set (trial ")
     assert "the best alternative is a bank: expected gain" in said
     assert "what is left out, over 6 stretches (" in found.verdicts[2]

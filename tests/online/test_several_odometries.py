@@ -75,7 +75,9 @@ def test_the_model_knows_what_its_sets_cost(trained):
         == len(set(downsampling))
         == len({*zip(numbers, downsampling, strict=True)})
     )
-    assert f"({model.sets[model.fixed][ODOMETRY]})" in driven(study, model)
+    assert f"({model.sets[model.fixed][ODOMETRY]})" in driven(
+        model, study.config.online, study.odometry, study.mechanism
+    )
 
 
 def test_it_is_validated_against_its_rivals(trained):
