@@ -245,35 +245,31 @@ class Document:
 
     def span(self, path: Sequence[str | int]) -> tuple[int, int] | None:
         """Where in the text a single value begins and ends; None if there is none."""
-        node = self._node
-        for part in path:
-            if isinstance(node, yaml.MappingNode):
-                found = [value for key, value in node.value if key.value == str(part)]
-            elif isinstance(node, yaml.SequenceNode) and isinstance(part, int):
-                found = node.value[part : part + 1]
-            else:
-                return None
-            if not found:
-                return None
-            node = found[0]
-        if not isinstance(node, yaml.ScalarNode):
+        found = self._along(path)
+        node = found[-1][1] if found else self._node
+        if len(found) < len(path) or not isinstance(node, yaml.ScalarNode):
             return None
         return node.start_mark.index, node.end_mark.index
 
     def line(self, path: Sequence[str | int]) -> int | None:
         """Line of the deepest part of `path` that is there; none for an empty document."""
-        node, line = self._node, None
+        found = self._along(path)
+        return found[-1][0].start_mark.line + 1 if found else None
+
+    def _along(self, path: Sequence[str | int]) -> list[tuple[Any, Any]]:
+        """The nodes of the keys on a path, as far as they are there, and of their values."""
+        node, found = self._node, list[tuple[Any, Any]]()
         for part in path:
-            found: list[tuple[Any, Any]] = []
+            entries: list[tuple[Any, Any]] = []
             if isinstance(node, yaml.MappingNode):
-                found = [entry for entry in node.value if entry[0].value == str(part)]
+                entries = [entry for entry in node.value if entry[0].value == str(part)]
             elif isinstance(node, yaml.SequenceNode) and isinstance(part, int):
-                found = [(value, value) for value in node.value[part : part + 1]]
-            if not found:
+                entries = [(value, value) for value in node.value[part : part + 1]]
+            if not entries:
                 break
-            begin, node = found[0]
-            line = begin.start_mark.line + 1
-        return line
+            found.append(entries[0])
+            node = entries[0][1]
+        return found
 
     def where(self, file: Path, path: Sequence[str | int]) -> str:
         """The file of this text, and the line of `path` in it."""

@@ -231,9 +231,9 @@ def validated(
         return model.model_validate(data, context=context)
     except ValidationError as error:
         for path, message in plain_words(error, data).items():
-            if message == UNKNOWN:
-                message += f"; {nearest(str(path[-1]), _keys(model, path[:-1]))}"
-            mistakes.append(Mistake(key + path, message))
+            unknown = message == UNKNOWN
+            help_ = f"; {nearest(str(path[-1]), _keys(model, path[:-1]))}" if unknown else ""
+            mistakes.append(Mistake(key + path, message + help_))
         return None
 
 

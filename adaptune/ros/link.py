@@ -4,9 +4,10 @@ import logging
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
 import numpy as np
+from pydantic import AfterValidator, Field
 
 from adaptune.errors import AdaptuneError, OdometryError, in_a_line
 from adaptune.space import ParameterSet
@@ -88,6 +89,17 @@ def telling(topic: str) -> Iterator[None]:
 
 Run = Callable[[list[str]], tuple[int, str]]
 """Runs a command; its exit code, and what it wrote."""
+
+
+def _names_both(command: tuple[str, ...]) -> tuple[str, ...]:
+    words = " ".join(command)
+    if lacking := [key for key in ("{name}", "{value}") if key not in words]:
+        raise ValueError(f"names no {' and no '.join(lacking)} in its arguments")
+    return command
+
+
+SetCommand = Annotated[tuple[str, ...], Field(min_length=1), AfterValidator(_names_both)]
+"""A program that sets a parameter, and its arguments, with ``{node}``, ``{name}``, ``{value}``."""
 
 
 class Steering:

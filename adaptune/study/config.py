@@ -18,6 +18,7 @@ from adaptune.odometry.remote import Limits
 from adaptune.odometry.tracker import HealthCheck
 from adaptune.recording.config import SequenceConfig, Transform, ViewConfig
 from adaptune.recording.scan import Fractions, part_name, read_part
+from adaptune.ros.link import SetCommand
 from adaptune.simulation.course import Course
 from adaptune.space import ParameterSpace, Value
 from adaptune.strict import Mistake, StrictModel, alternatives
@@ -132,16 +133,7 @@ class SteerConfig(StrictModel):
     node: RosName
     odometry: RosName  # topic of its poses, nav_msgs/Odometry
     extrinsic: Transform | None = None  # the LiDAR's pose in the frame whose poses it publishes
-    # A program that sets a parameter; otherwise they are set through ROS.
-    command: Annotated[tuple[str, ...] | None, Field(min_length=1)] = None
-
-    @field_validator("command")
-    @classmethod
-    def _sets(cls, command: tuple[str, ...] | None) -> tuple[str, ...] | None:
-        words = " ".join(command or ("{name} {value}",))
-        if lacking := [key for key in ("{name}", "{value}") if key not in words]:
-            raise ValueError(f"names no {' and no '.join(lacking)} in its arguments")
-        return command
+    command: SetCommand | None = None  # otherwise parameters are set through ROS
 
 
 class RosConfig(StrictModel):

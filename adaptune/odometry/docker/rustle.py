@@ -12,8 +12,9 @@ import tempfile
 import threading
 import time
 import weakref
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -51,7 +52,7 @@ from adaptune.recording.clouds import PATH, POSES, Pose, usable
 from adaptune.recording.config import resolve
 from adaptune.recording.export import IMU, POINTS, Messages, structured
 from adaptune.recording.scan import Scan
-from adaptune.ros.link import LinkError, Steering
+from adaptune.ros.link import LinkError, SetCommand, Steering
 from adaptune.ros.ros1 import Ros1
 from adaptune.space import ParameterSet, Selection
 from adaptune.trajectory import Trajectory
@@ -85,7 +86,7 @@ class RustleSettings(ContainerSettings, WholeSettings):
     drain: float = Field(2.0, ge=0, le=3600)
     patience: float = Field(2.0, gt=0, le=3600)
     node: Topic | None = None
-    set_parameter: tuple[str, ...] | None = Field(None, min_length=1)
+    set_parameter: SetCommand | None = None
 
     @property
     def packages(self) -> tuple[str, ...]:
@@ -94,9 +95,6 @@ class RustleSettings(ContainerSettings, WholeSettings):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        words = " ".join(self.set_parameter or ("{name} {value}",))
-        if lacking := [key for key in ("{name}", "{value}") if key not in words]:
-            raise ValueError(f"set_parameter: names no {' and no '.join(lacking)} in its arguments")
         if self.set_parameter is not None and self.node is None:
             raise ValueError("set_parameter: name the node, too (node)")
         if self.node is not None and self.play == "bag":
@@ -135,8 +133,12 @@ class Rustle:
         """Make an instance, as all programs of the user are made."""
         if settings.play == "bag":
             return PlayedBag(parameters, settings, limits, read)
-
         return Lockstep(parameters, settings, limits)
+
+
+def read_poses(store: Typestore, kind: str, data: bytes) -> list[Pose]:
+    """The poses in a message; none if it is of another type."""
+    return POSES[kind](store.deserialize_ros1(data, kind)) if kind in POSES else []
 
 
 # A ROS 1 system in a container that receives scan after scan, and can change its parameters.
@@ -248,13 +250,9 @@ class Lockstep(Faulting):
             raise OdometryError(f"{self.name} has no parameter {min(unknown)!r}")
         self.parameters |= selection.parameters
         if self._system is not None and self._steering is not None:
+            named = {whole_name(self._template, n): v for n, v in selection.parameters.items()}
             try:
-                self._steering.apply(
-                    {
-                        whole_name(self._template, name): value
-                        for name, value in selection.parameters.items()
-                    }
-                )
+                self._steering.apply(named)
             except LinkError as error:
                 raise OdometryError(str(error)) from error
 
@@ -302,11 +300,8 @@ class Lockstep(Faulting):
         self._keys = keys = server_keys(self._template, self.parameters, link.ask("parameters"))
         self._steering = None
         if (node := self._settings.node) is not None:
-
-            def set_parameters(values: ParameterSet) -> Mapping[str, Any]:
-                return link.set_parameters(node, values, keys)
-
             command = self._settings.set_parameter
+            set_parameters = partial(link.set_parameters, node, keys=keys)
             self._steering = Steering(node, set_parameters, command, system.run)
 
     def _show(self, scan: Scan) -> None:
@@ -377,10 +372,9 @@ class Lockstep(Faulting):
             return self._poses[-1] if self._news.wait_for(there, seconds) else None
 
     def _take(self, kind: str, data: bytes) -> None:
-        if self._system is None or kind not in POSES:
+        if self._system is None:
             return
-        found = POSES[kind](self._system.link.store.deserialize_ros1(data, kind))[-1:]
-        for stamp, _, p, q in found:
+        for stamp, _, p, q in read_poses(self._system.link.store, kind, data)[-1:]:
             try:
                 T = to_pose((p.x, p.y, p.z, q.x, q.y, q.z, q.w))
             except ValueError:
@@ -439,29 +433,19 @@ class PoseRecorder:
 
     def newest(self) -> int:
         """Stamp of the pose that came last; 0 if there is none."""
-        if not self.received or self.received[-1][0] not in POSES:
-            return 0
-        return max((stamp for stamp, *_ in self._poses(*self.received[-1])[-1:]), default=0)
+        poses = self._poses(*self.received[-1]) if self.received else []
+        return poses[-1][0] if poses else 0
 
     def _poses(self, kind: str, data: bytes) -> list[Pose]:
-        return POSES[kind](self.store.deserialize_ros1(data, kind))
+        return read_poses(self.store, kind, data)
 
     def write(self, path: Path) -> None:
-        """Write a ROS 1 bag."""
-        write_poses(path, self.topic, self.received, self.store)
-
-
-def write_poses(
-    path: Path, topic: str, messages: list[tuple[str, bytes]], store: Typestore
-) -> None:
-    """Write messages of one type to a ROS 1 bag, at their poses' stamps."""
-    with Writer(path) as bag:
-        connection = None
-        for kind, data in messages:
-            if connection is None:
-                connection = bag.add_connection(topic, kind, typestore=store)
-            stamps = [stamp for stamp, *_ in POSES[kind](store.deserialize_ros1(data, kind))]
-            bag.write(connection, max(stamps, default=0), data)
+        """Write a ROS 1 bag of them, at their stamps."""
+        with Writer(path) as bag:
+            connection = bag.add_connection(self.topic, self.received[0][0], typestore=self.store)
+            for kind, data in self.received:
+                stamps = [stamp for stamp, *_ in self._poses(kind, data)]
+                bag.write(connection, max(stamps, default=0), data)
 
 
 def drained(recorder: PoseRecorder, over: float, last: int, drain: float) -> bool:
@@ -559,14 +543,14 @@ class PlayedBag(WholeRun):
     def _check_published(self, system: RosSystem, recorder: PoseRecorder) -> None:
         if recorder.received:
             return
-        topic, drain = self.settings.odometry, self.settings.drain
+        topic = self.settings.odometry
         topics = set(system.link.topics()) - {"/clock", "/rosout"}
         others = ", ".join(sorted(topics - {topic})) or "nothing"
         if topic in topics:
             raise OdometryError(
-                f"nothing was published on {topic} until {drain:g} s after the bag, though a node "
-                f"announces it (others publish {others}); a system that is slow to begin needs a "
-                f"longer odometry.settings.drain"
+                f"nothing was published on {topic} until {self.settings.drain:g} s after the bag, "
+                f"though a node announces it (others publish {others}); a system that is slow to "
+                f"begin needs a longer odometry.settings.drain"
             )
         raise OdometryError(
             f"nothing was published on {topic}, but on {others}; name its topic as "
@@ -580,8 +564,6 @@ class PlayedBag(WholeRun):
         self._words, written = system.words(), system.log()
         with self._timed("removed"):
             system.stop()
-        steps = ", ".join(f"{name} {value:.1f} s" for name, value in self._seconds.items())
-        _log.info("%s: %s; %.1f s of CPU time", self.name, steps, self._usage.cpu)
         limits = {"input": str(given.path), "rate": self.settings.rate, "cpus": self.settings.cpus}
         with kept_log(self, given.logs, fault, self._seconds, **limits) as kept:
             if kept is None:

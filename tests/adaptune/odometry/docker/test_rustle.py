@@ -28,7 +28,7 @@ def settings(**given):
         ),
         (
             {"play": "lockstep", "node": "/n", "set_parameter": ("x", "{value}")},
-            "set_parameter: names no {name} in its arguments",
+            "names no {name} in its arguments",
         ),
     ],
 )
