@@ -127,8 +127,6 @@ def optuna_class(name: str) -> type[Any]:
         raise SamplerError(
             f"{name} needs the package {NEEDS[name]}: pip install 'adaptune[{name}]'"
         )
-    if name == "sobol":
-        raise SamplerError("sobol is gone; choose qmc, Optuna's, or tpe, which begins with points")
     if name not in OPTUNA and ":" not in name:
         raise SamplerError(
             f"there is no sampler {name!r}: {nearest(name, NAMES)} (another Optuna sampler is "
@@ -486,27 +484,12 @@ class Limit(StrictModel):
     max: float = Field(gt=0, le=1e9)
 
 
-_GONE = {
-    "halving": "wilcoxon, which saved more",
-    "hyperband": "wilcoxon, which saved more",
-    "both": "shared, or own",
-    "episodes": "restart, or whole",
-}
-"""Values of earlier versions, and what to give instead."""
-
-
-def _present(value: Any) -> Any:
-    if isinstance(value, str) and value in _GONE:
-        raise ValueError(f"{value} is gone; give {_GONE[value]}")
-    return value
-
-
 class OfflineConfig(StrictModel):
     """How to search for parameter sets; ``docs/reference-study.md`` describes every key."""
 
     sampler: str = "tpe"
     sampler_settings: dict[str, Any] = Field(default_factory=dict)
-    sets: Annotated[Literal["shared", "own"], BeforeValidator(_present)] = "shared"
+    sets: Literal["shared", "own"] = "shared"
     trials: int | None = Field(None, ge=1, le=10**6)
     hours: float | None = Field(None, gt=0, le=1e5)
     stagnation: int | None = Field(None, ge=1, le=10**6)
@@ -518,11 +501,11 @@ class OfflineConfig(StrictModel):
         {"rte": 1.0},
     )
     limits: dict[Metric, Limit] = Field(default_factory=dict)
-    runs: Annotated[Literal["restart", "whole"], BeforeValidator(_present)] = "restart"
+    runs: Literal["restart", "whole"] = "restart"
     repeats: int = Field(1, ge=1, le=100)
     baseline_runs: int | None = Field(None, ge=1, le=1000)
     augment: Annotated[tuple[ViewConfig, ...], Field(max_length=MOST_VIEWS)] = ()
-    pruning: Annotated[Literal["none", "wilcoxon"], BeforeValidator(_present)] = "none"
+    pruning: Literal["none", "wilcoxon"] = "none"
 
     @model_validator(mode="after")
     def _check_pruning(self) -> Self:

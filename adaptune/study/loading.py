@@ -269,6 +269,7 @@ def _scan_files(config: SequenceConfig) -> Sequence[Path]:
 
 _NO_HAND_OVER = "is gone with the hand-over, which gained nothing; leave it out"
 _NO_MODE = "is gone: a mode that served research; leave it out"
+_NO_PRUNING = "is gone; give wilcoxon, which saved more"
 DELETED = {
     "offline.search": "is gone: a search is always for single sets; leave it out",
     "online.also": "is gone: name these modes in online.modes, too",
@@ -289,6 +290,11 @@ DELETED = {
     "health.max_acceleration": "is gone: 30 m/s^2 is the bound; leave it out",
     "health.max_turn_rate": "is gone: 360 degrees a second are the bound; leave it out",
     "health.max_unregistered": "is gone: 10 scans in a row are the bound; leave it out",
+    "offline.sampler=sobol": "is gone; choose qmc, Optuna's, or tpe, which begins with points",
+    "offline.sets=both": "is gone; give shared, or own",
+    "offline.runs=episodes": "is gone; give restart, or whole",
+    "offline.pruning=halving": _NO_PRUNING,
+    "offline.pruning=hyperband": _NO_PRUNING,
     "offline.memory": "is gone: workers keep scans in a quarter of the machine's memory",
     "offline.preset": "is gone; for the paper's, give trials: 256, sets: own, runs: whole",
     "offline.target": "is gone; give trials, hours or stagnation",
