@@ -243,9 +243,9 @@ def _annealing(
             raise file.error(key, "give [first, low, high, ...], low below high and first in them")
         # A range must hold the default; the walk keeps RUSTLE's bounds.
         parameters[name] = _range(min(low, default), max(high, default), default)
-        of_step, form = ("mu", "sigma"), "[first, low, high, mean, standard deviation]"
+        of_step, form = ["mu", "sigma"], "[first, low, high, mean, standard deviation]"
         if parameters[name]["type"] == "integer":
-            of_step, form = ("delta_max",), "[first, low, high, longest step]"
+            of_step, form = ["delta_max"], "[first, low, high, longest step]"
         if own and len(own) != len(of_step):
             raise file.error(key, f"{default!r} is its default, so give {form}")
         # A step of its own, or the one of all parameters.

@@ -254,7 +254,8 @@ class Study(Generic[C_co]):
     @cached_property
     def sequences(self) -> StudySequences:
         """The sequences by name."""
-        config, layout = self.config, "bag"
+        config = self.config
+        layout: Any = "bag"
         declared = [declared_odometry(one) for one in config.odometries.values()]
         for settings, described in declared:
             # A program that runs whole recordings is the only odometry.
