@@ -191,7 +191,7 @@ def test_the_command_line(own, study_file):
         done = CliRunner().invoke(app, ["online", *words, *given])
         assert done.exit_code == 2
         assert "--thorough is for replays with a model" in done.stderr
-    for value, words_ in (("[even, even]", "a mode is named twice"), ("[odd]", "not 'odd'")):
+    for value, words_ in (("[even, even]", "one of them is named twice"), ("[odd]", "not 'odd'")):
         done = CliRunner().invoke(app, ["online", *words, "-o", f"online.modes={value}"])
         assert done.exit_code == 2
         assert words_ in done.stderr
