@@ -168,7 +168,10 @@ class OnlineConfig(StrictModel):
     """
 
     period: float = Field(1.0, ge=0.01, le=3600)
-    modes: Annotated[tuple[Mode, ...], BeforeValidator(_modes), AfterValidator(_once)] = RULES
+    modes: Annotated[tuple[Mode, ...], BeforeValidator(_modes), AfterValidator(_once)] = (
+        "adaptive",
+        "paper",
+    )
     switching: SwitchingConfig = SwitchingConfig()
     budget: float | None = Field(None, gt=0, le=1e6)
     real_time: RealTimeConfig | None = None
