@@ -1,100 +1,41 @@
 """Inspect a recording: what it holds, what is odd about it, and how to name it in a study."""
 
 import datetime
-from collections.abc import Iterator, Sequence
-from collections.abc import Sequence as Items
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
+from rosbags.highlevel import AnyReader
 
-from adaptune import files
+from adaptune import files, geometry
 from adaptune.errors import AdaptuneError
 from adaptune.progress import Progress, unseen
 from adaptune.recording import Scan, SequenceConfig, SequenceError, cache
-from adaptune.recording import survey as faults
-from adaptune.recording.clouds import DATATYPES, RING_FIELDS
-from adaptune.recording.config import BAG_SUFFIXES, REFERENCE_FILES
-from adaptune.recording.recording import RecordedSequence, open_sequence
+from adaptune.recording.bag import IMU_TYPES, POINTS_TYPES, BagSource, IndexReader
+from adaptune.recording.clouds import (
+    DATATYPES,
+    PATH,
+    POSES,
+    RING_FIELDS,
+    Pose,
+    header_stamp,
+    usable,
+)
+from adaptune.recording.config import BAG_SUFFIXES, REFERENCE_FILES, bag_paths
+from adaptune.recording.recording import RecordedSequence
 from adaptune.recording.scan import TIME_FIELDS
-from adaptune.recording.survey import Fault, Parts, Reading, Survey, n_valid, survey
 from adaptune.trajectory import Trajectory, is_kitti, read_kitti, read_trajectory
 
-Layout = tuple[tuple[str, str, int], ...]
-"""Name, type and offset of the fields of a point."""
+LEAST_POINTS, FARTHEST = 20, 1000.0
+"""Valid points that an odometry needs, and metres beyond which a point is not valid."""
 
 _KITTI_FOLDERS = ("velodyne", "velodyne_points")
-# Scan files that are read, unless all are to be.
-_FILES = 40
-
-
-@dataclass(frozen=True)
-class Topic:
-    """A topic, the scans of a folder, or the poses of a file."""
-
-    name: str
-    type: str
-    count: int  # messages
-    # Messages per second of their stamps; for topics without stamps, of their recording.
-    rate: float | None = None
-    # Nanoseconds of the first and the last stamp that was read.
-    first: int | None = None
-    last: int | None = None
-    gap: float | None = None  # longest time between one message and the next, in seconds
-
-
-@dataclass(frozen=True, eq=False)
-class ScanSummary:
-    """The first scan."""
-
-    scan: Scan
-    recorded: int  # points in the message, those without a measurement included
-    ranges: tuple[float, float, float] | None  # least, median and greatest distance in metres
-    span: float | None  # seconds from the first point to the last
-    rings: int | None  # how many rings there are
-
-
-@dataclass(frozen=True, eq=False)
-class Inspection:
-    """Content of a recording."""
-
-    path: Path
-    topics: tuple[Topic, ...]
-    complete: bool  # whether it was read to its end or damage, and not only a sample of it
-    n_read: tuple[int, int]  # messages that were read, and clouds among them
-    layout: Layout  # of the first cloud
-    scan: ScanSummary | None  # none where no scan could be read
-    reference: Trajectory | None  # as far as it was read
-    faults: tuple[Fault, ...]
-    # What each stage still needs, by stage; empty if it can run.
-    missing: dict[str, tuple[str, ...]]
-    entry: str  # YAML for a study
-
-    @property
-    def n_messages(self) -> int:
-        """How many messages, scans or poses there are."""
-        return sum(topic.count for topic in self.topics)
-
-    @property
-    def name(self) -> str:
-        """Name of the sequence that is proposed; empty if there is none, as for a file of poses."""
-        document: Any = files.Document(self.entry).data or {}
-        return next(iter(document.get("sequences", {})), "")
-
-    def config(self) -> SequenceConfig:
-        """The sequence that is proposed."""
-        document: Any = files.Document(self.entry).data
-        return SequenceConfig(**document["sequences"][self.name])
-
-    def doubts(self, stage: str) -> bool:
-        """Whether a fault concerns a stage that can run."""
-        return any(fault.of in _INPUTS[stage] for fault in self.faults)
-
-
 # What each stage uses.
 _INPUTS = {
     "offline": ("points", "reference"),
@@ -102,6 +43,140 @@ _INPUTS = {
     "comparison with the reference": ("points", "reference"),
     "motion compensation": ("points", "imu"),
 }
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One thing that is wrong: what it means, and what to do about it."""
+
+    text: str
+    of: str = ""  # `points`, `reference` or `imu`, where one of them is affected
+    lacks: str = ""  # what is missing because of it, where the stages cannot run
+
+
+@dataclass(eq=False)
+class Topic:
+    """What was read of a topic, of the scans of a folder, or of a file of poses."""
+
+    name: str
+    type: str
+    count: int  # messages in the recording
+    stamped: bool = True
+    n_read: int = 0
+    # Nanoseconds of the messages that were read; a list for every part of a sample.
+    stamps: list[list[int]] = field(default_factory=list)
+    recorded: list[list[int]] = field(default_factory=list)  # on the recorder's clock
+    undecoded: list[tuple[float, str]] = field(default_factory=list)  # seconds, and why
+
+    @property
+    def times(self) -> NDArray[np.int64]:
+        """Nanoseconds of the stamps; of the recording, if messages have none."""
+        return _joined(self._parts)
+
+    @property
+    def steps(self) -> NDArray[np.float64]:
+        """Seconds from each message to the next one of its part, where it is later."""
+        steps = [np.diff(np.array(part, np.int64)) * 1e-9 for part in self._parts]
+        joined = np.concatenate([np.empty(0), *steps])
+        return joined[joined > 0]
+
+    @property
+    def rate(self) -> float | None:
+        """Messages per second."""
+        return float(1.0 / np.median(self.steps)) if len(self.steps) else None
+
+    @property
+    def gap(self) -> float | None:
+        """Longest time between one message and the next, in seconds."""
+        return float(self.steps.max()) if len(self.steps) else None
+
+    @property
+    def _parts(self) -> list[list[int]]:
+        return self.stamps if any(self.stamps) else self.recorded
+
+
+def _joined(parts: list[list[int]]) -> NDArray[np.int64]:
+    return np.array([time for part in parts for time in part], np.int64)
+
+
+@dataclass(eq=False)
+class Inspection:
+    """Content of a recording."""
+
+    path: Path
+    given: dict[str, Any]  # the keys of a sequence that name it; for a file of poses, its key
+    topics: dict[str, Topic]
+    # Names of the topics that adaptune would use as `points`, `reference` and `imu`.
+    used: dict[str, str] = field(default_factory=dict)
+    complete: bool = True  # whether it was read to its end or damage, and not only a sample of it
+    scan: Scan | None = None  # the first one; none where no scan could be read
+    recorded: int = 0  # points in its message, those without a measurement included
+    # Name, type and offset of the fields of a point.
+    layout: tuple[tuple[str, str, int], ...] = ()
+    valid: list[int] = field(default_factory=list)  # valid points of each cloud that was read
+    reference: Trajectory | None = None  # as far as it was read
+    faults: list[Fault] = field(default_factory=list)
+
+    @property
+    def n_messages(self) -> int:
+        """How many messages, scans or poses there are."""
+        return sum(topic.count for topic in self.topics.values())
+
+    @property
+    def n_read(self) -> tuple[int, int]:
+        """How many of them were read, and clouds among them that could be decoded."""
+        return sum(topic.n_read for topic in self.topics.values()), len(self.valid)
+
+    @property
+    def name(self) -> str:
+        """Name of the sequence that is proposed; empty for a file of poses."""
+        if "reference" in self.given and len(self.given) == 1:
+            return ""
+        name = "".join(c if c.isalnum() or c in "_.-" else "_" for c in self.path.stem)
+        return name.lstrip(".-") or "recording"
+
+    def config(self) -> SequenceConfig:
+        """The sequence that is proposed."""
+        return SequenceConfig(**self.given)
+
+    @property
+    def missing(self) -> dict[str, tuple[str, ...]]:
+        """What each stage still needs; empty if it can run.
+
+        Where there is no reference, one is estimated.
+        """
+        if not self.name:
+            return {}
+        lacks = {
+            of: [fault.lacks for fault in self.faults if fault.of == of and fault.lacks]
+            for of in ("points", "reference", "imu")
+        }
+        if self.scan is None and not any(fault.of == "points" for fault in self.faults):
+            lacks["points"].append("point clouds that can be read")
+        if self.scan is not None and self.scan.times is None:
+            lacks["imu"].append("a time for each point")
+        return {
+            stage: tuple(dict.fromkeys(what for of in inputs for what in lacks[of]))
+            for stage, inputs in _INPUTS.items()
+        }
+
+    @property
+    def entry(self) -> str:
+        """YAML for a study."""
+        if not self.name:
+            return files.dump(self.given)
+        text = files.dump({"sequences": {self.name: self.given}})
+        if "bag" not in self.given:
+            return text
+        if "reference" not in self.used:
+            text += (
+                "    # reference: a topic, or a TUM, KITTI or EuRoC file; estimated if left out\n"
+            )
+        if self.scan is not None and self.scan.times is not None:
+            text += (
+                "    # stamp: end - if headers mark scans' ends and times count from the start\n"
+            )
+        return text
 
 
 def inspect(path: Path, deep: bool = False, show: Progress = unseen) -> Inspection:
@@ -117,140 +192,296 @@ def inspect(path: Path, deep: bool = False, show: Progress = unseen) -> Inspecti
     path = path.resolve()
     if path.suffix in REFERENCE_FILES and path.is_file():
         return _inspect_poses(path)
-    kind = _kind(path)
-    if kind == "bag":
-        return _inspect_bag(path, survey(path, deep, show))
-    return _inspect_scans(path, kind, deep, show)
-
-
-def _kind(path: Path) -> str:
-    """Key of the `sequences:` entry that opens it."""
     if not path.is_dir():
-        return "bag"
+        return _inspect_bags(path, deep, show)
     if any((path / name).is_dir() for name in _KITTI_FOLDERS):
-        return "kitti"
+        return _inspect_scans(path, "kitti", deep, show)
     # Files of a ROS 2 folder may be compressed, and then have other suffixes.
-    bags = {p.suffix for p in path.iterdir()} & {*BAG_SUFFIXES}
-    return "bag" if bags or (path / "metadata.yaml").exists() else "folder"
-
-
-def _inspect_bag(path: Path, found: Survey) -> Inspection:
-    given: dict[str, Any] = {"bag": str(path)}
-    used = {"points": found.points, "reference": found.reference, "imu": found.imu}
-    given |= {key: name for key, name in used.items() if name is not None}
-    if found.imu is not None:
-        given["imu"] = {"topic": found.imu}
-    reference, problems = found.trajectory(), found.faults
-    for topic in found.topics.values():
-        of = next((key for key, name in used.items() if name == topic.name), "")
-        problems += _topic_faults(topic, of, found.complete, found.apart)
-    if found.points is not None:
-        problems += faults.of_clouds(found.points, found.topics[found.points].count, found.valid)
-    layout: Layout = ()
-    summary = None
-    if found.first is not None:
-        layout, count = _layout(found.first[1])
-        summary = _summary(found.first[0], count)
-    if reference is not None and found.reference is not None:
-        alone = found.topics[found.reference].count == 1
-        problems += faults.of_reference(reference, found.complete or alone)
-        if (scans := _scan_span(found)) is not None and (found.complete or len(reference) > 1):
-            problems += faults.of_overlap(reference, scans, found.slack)
-    readings = found.topics.values()
-    return Inspection(
-        path,
-        topics=tuple(_topic(reading) for reading in readings),
-        complete=found.complete,
-        n_read=(sum(reading.n_read for reading in readings), len(found.valid)),
-        layout=layout,
-        scan=summary,
-        reference=reference,
-        faults=tuple(problems),
-        missing=_missing(summary, problems),
-        entry=_entry(path, given, found),
-    )
-
-
-def _inspect_scans(path: Path, kind: str, deep: bool, show: Progress) -> Inspection:
-    given = {kind: str(path)}
-    sequence = open_sequence(SequenceConfig(**given, cache=False))
-    assert isinstance(sequence, RecordedSequence)
-    frames = list(sequence.source.frames())
-    number = len(frames) if deep else min(_FILES, len(frames))
-    chosen = [frames[i] for i in np.linspace(0, len(frames) - 1, number).astype(int)]
-    reading = Reading(str(path), "scans", len(frames), stamped=True)
-    reading.stamps = [[frame.stamp for frame in frames]]
-    reading.recorded = [[frame.stamp for frame in chosen]]
-    valid, summary, reference = [], None, None
-    for done, frame in enumerate(chosen, start=1):
-        try:
-            scan = frame.load()
-        except AdaptuneError as error:
-            reading.undecoded.append(((frame.stamp - frames[0].stamp) * 1e-9, str(error)))
-            continue
-        valid.append(n_valid(scan))
-        summary = summary or _summary(scan, 0)
-        show("reading", done, number)
-    problems = [
-        *_topic_faults(reading, "points", complete=True),
-        *faults.of_clouds(str(path), len(frames), valid),
-    ]
-    try:
-        reference = sequence.source.poses(None, None)
-    except AdaptuneError as error:
-        problems.append(Fault(str(error), "reference", "a reference trajectory"))
-    if reference is not None:
-        problems += faults.of_reference(reference, complete=True)
-        problems += faults.of_overlap(reference, (frames[0].stamp, frames[-1].stamp), 0.0)
-    return Inspection(
-        path,
-        topics=(_topic(reading),),
-        complete=number == len(frames),
-        n_read=(number, number),
-        layout=(),
-        scan=summary,
-        reference=reference,
-        faults=tuple(problems),
-        missing=_missing(summary, problems),
-        entry=_entry(path, given),
-    )
+    if {p.suffix for p in path.iterdir()} & {*BAG_SUFFIXES} or (path / "metadata.yaml").exists():
+        return _inspect_bags(path, deep, show)
+    return _inspect_scans(path, "folder", deep, show)
 
 
 def _inspect_poses(path: Path) -> Inspection:
-    timed = not is_kitti(path)
-    if timed:
-        reference, kind = read_trajectory(path), "poses with stamps"
+    topic = Topic(path.name, "poses with stamps", 0)
+    if timed := not is_kitti(path):
+        reference = read_trajectory(path)
+        topic.stamps = [reference.stamps.tolist()]
     else:
-        poses, kind = read_kitti(path), "poses, one for each scan"
+        poses = read_kitti(path)
         reference = Trajectory(np.arange(len(poses)), poses)
-    stamps = reference.stamps.tolist() if timed else []
-    reading = Reading(path.name, kind, len(reference), timed, [stamps], [[0] * len(reference)])
-    topic = _topic(reading) if timed else Topic(path.name, kind, len(reference))
-    return Inspection(
-        path,
-        topics=(topic,),
-        complete=True,
-        n_read=(len(reference), 0),
-        layout=(),
-        scan=None,
-        reference=reference,
-        faults=tuple(faults.of_reference(reference, complete=True, timed=timed)),
-        missing={},
-        entry=files.dump({"reference": str(path)}),
+        topic.type = "poses, one for each scan"
+    topic.count = topic.n_read = len(reference)
+    found = Inspection(path, {"reference": str(path)}, {topic.name: topic}, reference=reference)
+    found.faults += _reference_faults(reference, complete=True, timed=timed)
+    return found
+
+
+# Scan files that are read, unless all are to be.
+_FILES = 40
+
+
+def _inspect_scans(path: Path, kind: str, deep: bool, show: Progress) -> Inspection:
+    source = RecordedSequence(SequenceConfig(**{kind: str(path)}, cache=False)).source
+    frames = list(source.frames())
+    number = len(frames) if deep else min(_FILES, len(frames))
+    topic = Topic(str(path), "scans", len(frames), n_read=number)
+    topic.stamps = [[frame.stamp for frame in frames]]
+    found = Inspection(path, {kind: str(path)}, {topic.name: topic}, {"points": topic.name})
+    found.complete = number == len(frames)
+    for done, i in enumerate(np.linspace(0, len(frames) - 1, number).astype(int), start=1):
+        try:
+            _keep_scan(found, frames[i].load())
+        except AdaptuneError as error:
+            topic.undecoded.append(((frames[i].stamp - frames[0].stamp) * 1e-9, str(error)))
+        show("reading", done, number)
+    try:
+        found.reference = source.poses(None, None)
+    except AdaptuneError as error:
+        found.faults.append(Fault(str(error), "reference", "a reference trajectory"))
+    _find_faults(found, apart=False, slack=0.0)
+    return found
+
+
+def _keep_scan(found: Inspection, scan: Scan) -> None:
+    with np.errstate(over="ignore"):
+        found.valid.append(geometry.count_within(scan.points, 0.0, FARTHEST))
+    if found.scan is None:
+        found.scan = scan
+
+
+# Reading bags: a sample of their messages, or all of them.
+
+
+Span = tuple[int | None, int | None]
+"""Nanoseconds on the recorder's clock from which, and up to which, to read."""
+
+# A recording that takes no longer than this is read completely, and a sample takes about as long.
+SECONDS = 1.0
+# Bytes read in a second, with BZ2 and without; seconds that a message takes to decode.
+_SLOW, _FAST, _DECODE = 2.5e6, 2e8, 4e-5
+# Parts of a sample, and messages of a topic in each.
+_FEWEST, _MOST, _EACH = 5, 20, 2.5
+# Seconds. Bags of one drive are not further apart.
+_APART = 60.0
+
+
+def _inspect_bags(path: Path, deep: bool, show: Progress) -> Inspection:
+    about = {"topics": {}, "points": "", "n_messages": 0, "duration": 0, "begins": {}}
+    source = BagSource(bag_paths([str(path)]), about=about)
+    with source.open(by_index=True) as reader:
+        topics = _topics(reader)
+        used = _used(topics)
+        given: dict[str, Any] = {"bag": str(path), **used}
+        if "imu" in used:
+            given["imu"] = {"topic": used["imu"]}
+        found = Inspection(path, given, topics, used)
+        source.topics = {topic.name: topic.type for topic in topics.values()}
+        source.points = used.get("points", "")
+        apart = _apart(reader, source.paths)
+        found.faults += apart
+        survey = _Survey(source, reader, found)
+        survey.read(0 if deep else survey.n_parts(), show)
+        found.reference = survey.trajectory()
+    _find_faults(found, bool(apart), survey.slack)
+    return found
+
+
+def _topics(reader: AnyReader) -> dict[str, Topic]:
+    first = {kind: fields[:1] for kind, (_, fields) in reader.typestore.fielddefs.items()}
+    topics: dict[str, Topic] = {}
+    for c in sorted(reader.connections, key=lambda c: c.topic):
+        stamped = [f[1][1] for f in first.get(c.msgtype, ())] == ["std_msgs/msg/Header"]
+        topics.setdefault(c.topic, Topic(c.topic, c.msgtype, 0, stamped)).count += c.msgcount
+    return topics
+
+
+def _used(topics: dict[str, Topic]) -> dict[str, str]:
+    """Which topics adaptune would use: of several, the densest; others are parts of it."""
+    poses = [kind for kind in POSES if "tf" not in kind]
+    used = {}
+    for of, kinds in (("points", POINTS_TYPES), ("reference", poses), ("imu", IMU_TYPES)):
+        if fit := [t for t in topics.values() if t.type in kinds and t.count]:
+            used[of] = max(fit, key=lambda t: (t.count, t.name)).name
+    return used
+
+
+def _apart(reader: AnyReader, paths: tuple[Path, ...]) -> list[Fault]:
+    """Whether bags do not follow each other: the two with the longest time between them."""
+    readers: Any = reader.readers
+    spans = [(r.start_time, r.end_time, p.name) for r, p in zip(readers, paths, strict=True)]
+    spans = sorted(span for span in spans if span[0] < span[1])
+    ends = np.maximum.accumulate([end for _, end, _ in spans])
+    gaps = [(start - end) * 1e-9 for (start, *_), end in zip(spans[1:], ends, strict=False)]
+    if not gaps or max(gaps) <= _APART:
+        return []
+    longest = int(np.argmax(gaps))
+    days = f" ({gaps[longest] / 86400.0:,.0f} days)" if gaps[longest] > 2.0 * 86400.0 else ""
+    text = (
+        f"the bags do not follow each other: {gaps[longest]:,.0f} s{days} lie between "
+        f"{spans[longest][2]} and {spans[longest + 1][2]}; inspect each recording by itself, and "
+        f"name each as a sequence of its own"
     )
+    return [Fault(text, "points", "bags that follow each other")]
 
 
-def _topic(reading: Reading) -> Topic:
-    parts: Parts = reading.stamps if any(reading.stamps) else reading.recorded
-    times = [time for part in parts for time in part]
-    if not times:
-        return Topic(reading.name, reading.kind, reading.count)
-    steps = faults.inner_steps(parts)
-    positive = steps[steps > 0]
-    rate = float(1.0 / np.median(positive)) if len(positive) else None
-    gap = float(positive.max()) if len(positive) else None
-    return Topic(reading.name, reading.kind, reading.count, rate, min(times), max(times), gap)
+class _Survey:
+    """Reads the messages of open bags, or a sample of them, into an inspection."""
 
+    def __init__(self, source: BagSource, reader: AnyReader, found: Inspection):
+        self._source, self._reader, self._found = source, reader, found
+        self._begin = reader.start_time
+        self._length = reader.end_time - reader.start_time
+        # Whether a part can be read without what is before it: not in mcap files without chunks.
+        storages = [getattr(r, "storage", None) for r in reader.readers]
+        opened = [file for s in storages for file in getattr(s, "storages", [s])]
+        self._indexed = all(getattr(file, "chunks", True) for file in opened)
+        # Number of clouds; where there are none, of messages.
+        points = found.topics.get(source.points)
+        self._usual = found.n_messages if points is None else points.count
+        self._of = {name: of for of, name in found.used.items()}
+        if points is not None:
+            try:
+                source.check(None, None)
+                self._load = source.loader(reader)
+            except SequenceError as error:
+                del self._of[source.points]
+                found.faults.append(Fault(str(error), "points", "point clouds that can be read"))
+        self._poses: list[Pose] = []
+        self._path = b""
+        self.slack = 0.0  # seconds between two parts of the sample
+
+    def n_parts(self) -> int:
+        """Parts of a sample; 0 if the recording is short enough to be read completely."""
+        size = sum(path.stat().st_size for path in self._source.files)
+        try:
+            readers = self._reader.readers
+            slow = any(isinstance(r, IndexReader) and r.is_slow() for r in readers)
+        except Exception:  # damage, which reading reports
+            slow = False
+        speed = _SLOW if slow else _FAST
+        seconds = size / speed + self._found.n_messages * _DECODE
+        if seconds <= SECONDS or self._length <= 0:
+            return 0
+        # Whole chunks are unpacked for each part.
+        cost = size * min(_EACH / max(self._usual, 1), 1.0) + min(size, 5e5)
+        return int(np.clip(SECONDS * speed / cost, _FEWEST, _MOST))
+
+    def _spans(self, number: int, count: int) -> list[Span]:
+        """Parts of the recording in which a topic of so many messages has some each."""
+        if not number or number * _EACH >= count:
+            return [(None, None)]
+        if not self._indexed:
+            return [(self._begin, self._begin + round(self._length * number * _EACH / count))]
+        width = _EACH / count
+        starts = self._begin + np.linspace(0.0, (1.0 - width) * self._length, number).astype(int)
+        return [(start, start + round(width * self._length) + 1) for start in starts.tolist()]
+
+    def read(self, number: int, show: Progress) -> None:
+        """Read so many parts, or everything if it is 0."""
+        found, done = self._found, 0
+        spans = self._spans(number, self._usual)
+        found.complete = spans == [(None, None)]
+        if not found.complete:
+            gaps = len(spans) - 1
+            self.slack = self._length * 1e-9 / gaps if gaps else np.inf
+        # What comes more rarely than the clouds has parts of its own.
+        rare = [t for t in self._of if found.topics[t].count < self._usual and not found.complete]
+        jobs: list[tuple[str | None, Span]] = [(None, span) for span in spans]
+        jobs += [(t, span) for t in rare for span in self._spans(number, found.topics[t].count)]
+        for name, span in jobs:
+            chosen = [name] if name else [t for t in found.topics if t not in rare]
+            for topic in chosen:
+                found.topics[topic].stamps.append([])
+                found.topics[topic].recorded.append([])
+            try:
+                for at, when, data in self._messages(name, span):
+                    if at in chosen:
+                        self._take(found.topics[at], when, data)
+                    done += 1
+                    if done % 100 == 0:
+                        show("reading", done, found.n_messages)
+            except SequenceError as error:
+                fault = Fault(str(error), "points", "a recording that can be read to its end")
+                if fault not in found.faults:
+                    found.faults.append(fault)
+        show("reading", found.n_messages, found.n_messages)
+
+    def _messages(self, topic: str | None, span: Span) -> Iterator[tuple[str, int, bytes]]:
+        asked: Span = span if self._indexed else (None, None)
+        for connection, when, data in self._source.read(self._reader, topic, asked):
+            if span[1] is not None and when >= span[1]:
+                return
+            yield connection.topic, when, data
+
+    def _take(self, topic: Topic, when: int, data: bytes) -> None:
+        """Keep when a message was made and recorded, and decode it where it is used."""
+        topic.n_read += 1
+        topic.recorded[-1].append(when)
+        stamp = header_stamp(data, self._reader.is2) if topic.stamped else None
+        if stamp is not None:
+            topic.stamps[-1].append(stamp)
+        if topic.type == PATH and topic.name in self._of:
+            self._path = data  # each path repeats the one before: the last one will do
+        else:
+            self._decode(topic, when, data)
+
+    def _decode(self, topic: Topic, when: int, data: bytes) -> None:
+        try:
+            match self._of.get(topic.name):
+                case "points":
+                    first = self._found.scan is None
+                    _keep_scan(self._found, self._load(data, "message"))
+                    if first:
+                        _describe(self._found, self._reader.deserialize(data, topic.type))
+                case "reference":
+                    self._poses += POSES[topic.type](self._reader.deserialize(data, topic.type))
+                case "imu":
+                    message: Any = self._reader.deserialize(data, topic.type)
+                    w, a = message.angular_velocity, message.linear_acceleration
+                    np.asarray_chkfinite([w.x, w.y, w.z, a.x, a.y, a.z])
+        except Exception as error:  # deserializers raise whatever damaged data leads them to
+            why = str(error) or type(error).__name__
+            topic.undecoded.append(((when - self._begin) * 1e-9, why))
+
+    def trajectory(self) -> Trajectory | None:
+        """The reference, as far as it was read; its faults are kept."""
+        found = self._found
+        if self._path:
+            topic = found.topics[found.used["reference"]]
+            self._decode(topic, self._reader.end_time, self._path)
+        if not self._poses:
+            return None
+        trajectory, unusable = usable(self._poses)
+        if unusable:
+            what = f"{unusable} of {len(self._poses)} poses are not finite or have no rotation"
+            lacks = "a reference trajectory" if trajectory is None else ""
+            text = f"{found.used['reference']}: {what}: adaptune leaves them out"
+            found.faults.append(Fault(text, "reference", lacks))
+        return trajectory
+
+
+def _describe(found: Inspection, message: Any) -> None:
+    """Keep the fields of a point of a cloud, and how many points it holds."""
+    if not hasattr(message, "fields"):
+        points = getattr(message, "points", ())
+        names = [name for point in points[:1] for name in vars(point) if name[:2] != "__"]
+        found.layout, found.recorded = tuple((name, "", 0) for name in names), len(points)
+        return
+    layout = []
+    for each in sorted(message.fields, key=lambda each: each.offset):
+        kind = np.dtype(DATATYPES[each.datatype]).name if each.datatype in DATATYPES else "?"
+        kind += f"[{each.count}]" if each.count > 1 else ""
+        layout.append((each.name, kind, int(each.offset)))
+    found.layout, found.recorded = tuple(layout), int(message.height) * int(message.width)
+
+
+# What is wrong with a recording: what it means, and what to do about it.
+
+
+_FASTEST = 100.0  # metres per second
+_STILL = 0.01  # metres
+_SUB_TRAJECTORY = 25.0  # metres, where a study sets no other
 
 _UNDECODED = {
     "points": (
@@ -263,96 +494,171 @@ _UNDECODED = {
     ),
     "imu": ("leave `imu` out, or repair the bag", ""),
 }
+_LEFT_OUT = {
+    "points": ": adaptune leaves such scans out",
+    "reference": ": of poses with one stamp the first counts, the others are sorted",
+    "imu": ": of measurements with one stamp the first counts, the others are sorted",
+}
+_GAPS = {
+    "points": ": odometries lose track there; leave them out with `start`, `stop` or `cut`",
+    "reference": ": scans in gaps beyond `max_gap` (1 s) are not labelled",
+}
 
 
-def _topic_faults(topic: Reading, of: str, complete: bool, apart: bool = False) -> Iterator[Fault]:
+def _find_faults(found: Inspection, apart: bool, slack: float) -> None:
+    """Add the faults of what was read.
+
+    Between bags that are `apart` nothing is missing. Scans and reference may both go on for `slack`
+    seconds beyond what was read.
+    """
+    of = {name: key for key, name in found.used.items()}
+    for topic in found.topics.values():
+        found.faults += _topic_faults(topic, of.get(topic.name, ""), found.complete, apart)
+    scans = found.topics.get(found.used.get("points", ""))
+    if scans is not None:
+        found.faults += _cloud_faults(scans, found.valid)
+    if (reference := found.reference) is None:
+        return
+    poses = found.topics.get(found.used.get("reference", ""))
+    complete = poses is None or found.complete or poses.count == 1
+    found.faults += _reference_faults(reference, complete)
+    if scans is not None and any(scans.stamps) and (found.complete or len(reference) > 1):
+        found.faults += _overlap_faults(reference, _scan_span(scans), slack)
+
+
+def _topic_faults(topic: Topic, of: str, complete: bool, apart: bool) -> Iterator[Fault]:
     if topic.undecoded:
         (seconds, why), n = topic.undecoded[0], len(topic.undecoded)
         help_, lacks = _UNDECODED[of]
         many = f"all {n}" if n == topic.n_read else f"{n} of {topic.n_read}"
         what = f"{many} messages do not decode, the first at {seconds:.1f} s ({why})"
         yield Fault(f"{topic.name}: {what}; {help_}", of, lacks)
-    if of and topic.count and not topic.n_read:
-        if complete:
-            what, lacks = "are listed but cannot be found: repair the bag", _UNDECODED[of][1]
-        else:
-            what, lacks = "are not in the sample, `--deep` reads them", ""
-        yield Fault(f"{topic.name}: its {topic.count} messages {what}", of, lacks)
-    # Between bags that do not follow each other nothing is missing.
+    if of and topic.count and not topic.n_read and not complete:
+        what = "are not in the sample, `--deep` reads them"
+        yield Fault(f"{topic.name}: its {topic.count} messages {what}", of)
     if any(topic.stamps) and not apart:
-        yield from faults.of_stamps(topic.name, of, topic.stamps, topic.recorded)
-        if not complete:
-            yield from faults.of_count(topic.name, of, topic.stamps, topic.count)
+        yield from _stamp_faults(topic, of)
+        if sum(map(len, topic.stamps)) < topic.count and not complete:
+            yield from _count_faults(topic, of)
 
 
-def _scan_span(found: Survey) -> tuple[int, int] | None:
+def _stamp_faults(topic: Topic, of: str) -> Iterator[Fault]:
+    name, times, recorded = topic.name, topic.times, _joined(topic.recorded)
+    n = len(times)
+    if n > 1 and len(np.unique(times)) == 1:
+        what = "are zero" if times[0] == 0 else "are the same"
+        lacks = {"points": "scans with stamps", "reference": "poses with stamps"}.get(of, "")
+        help_ = ": the driver or the converter lost them, record or convert again" if lacks else ""
+        yield Fault(f"{name}: all {n} stamps {what}{help_}", of, lacks)
+        return
+    steps = np.diff(times)
+    counts = {
+        "repeat the one before": np.count_nonzero(steps == 0),
+        "go back in time": np.count_nonzero(steps < 0),
+        # Recordings that count from zero begin with it.
+        "are zero": np.count_nonzero(times[1:] == 0),
+    }
+    for what, count in counts.items():
+        if count:
+            yield Fault(f"{name}: {count} of {n} stamps {what}{_LEFT_OUT.get(of, '')}", of)
+    if len(topic.steps):
+        gap, usual = topic.steps.max(), np.median(topic.steps)
+        if gap > 3.5 * usual and gap > 0.2:
+            lost = np.count_nonzero(topic.steps > 3.5 * usual)
+            what = f"{lost} gaps, the longest of {gap:.2f} s{_GAPS.get(of, '')}"
+            yield Fault(f"{name}: {what}", of)
+    if n != len(recorded):  # there is no recorder's clock, or some messages have no stamp
+        return
+    late = (recorded - times) * 1e-9
+    if leaps := np.count_nonzero(np.abs(late - np.median(late)) > 5.0):
+        what = f"{leaps} stamps leap by more than 5 s against the recorder's clock"
+        yield Fault(f"{name}: {what}{_LEFT_OUT['points'] if of == 'points' else ''}", of)
+
+
+def _count_faults(topic: Topic, of: str) -> Iterator[Fault]:
+    """Messages that are missing outside the sample, by their number in the whole recording."""
+    usual = np.median(topic.steps) if len(topic.steps) else np.inf
+    # Only what comes regularly has a number to expect.
+    if len(topic.steps) < 5 or np.mean(np.abs(topic.steps - usual) < 0.2 * usual) < 0.9:
+        return
+    expected = 1 + round(int(np.ptp(topic.times)) * 1e-9 / float(usual))
+    if topic.count < 0.9 * expected:
+        what = f"about {expected - topic.count:,} of {expected:,} messages are missing"
+        help_ = "gaps that the sample does not show, `--deep` finds them"
+        yield Fault(f"{topic.name}: {what}: {help_}", of)
+
+
+def _cloud_faults(topic: Topic, valid: list[int]) -> Iterator[Fault]:
+    """Faults of clouds; those that were read have `valid` points each."""
+    name = topic.name
+    if topic.count == 1:
+        yield Fault(f"{name}: holds a single cloud: no motion", "points", "more than one cloud")
+    n, few = len(valid), sum(points < LEAST_POINTS for points in valid)
+    rule = f"fewer than {LEAST_POINTS} valid points (finite, not zero, within {FARTHEST:g} m)"
+    if few and few == n:
+        help_ = "an odometry cannot use them: look at the driver, or choose another topic"
+        yield Fault(f"{name}: all {n} clouds hold {rule}; {help_}", "points", "clouds with points")
+    elif few:
+        yield Fault(f"{name}: {few} of {n} clouds hold {rule}{_GAPS['points']}", "points")
+
+
+def _reference_faults(reference: Trajectory, complete: bool, timed: bool = True) -> Iterator[Fault]:
+    """Faults of the poses themselves; with `timed` false, the stamps only number them."""
+    of, lacks = "reference", "a reference that moves"
+    if len(reference) < 2:
+        if complete:
+            help_ = "no motion follows from it; name another topic, or a file of poses"
+            yield Fault(f"the reference holds a single pose: {help_}", of, lacks)
+        return
+    positions = reference.T_world_sensor[:, :3, 3]
+    steps = np.linalg.norm(geometry.steps(reference.T_world_sensor)[:, :3, 3], axis=1)
+    if np.linalg.norm(positions - positions[0], axis=1).max() < _STILL:
+        what = f"the reference stands still: all {len(reference)} poses are within 1 cm"
+        help_ = "errors are per metre; drive, or name another topic or a file of poses"
+        yield Fault(f"{what}; {help_}", of, lacks)
+        return
+    if still := np.count_nonzero(steps == 0):
+        what = f"the reference repeats the pose before it {still} times"
+        help_ = "harmless while the robot stood, wrong if the poses came less often than the scans"
+        yield Fault(f"{what}: {help_}", of)
+    seconds = np.diff(reference.stamps) * 1e-9 if timed else np.full(len(steps), 0.1)
+    if jumps := np.count_nonzero(steps > _FASTEST * np.maximum(seconds, 1e-3)):
+        help_ = "errors there are not the odometry's; leave them out with `start`, `stop` or `cut`"
+        yield Fault(f"the reference jumps {jumps} times: {help_}", of)
+    if complete and steps.sum() < _SUB_TRAJECTORY:
+        what = f"the reference is {steps.sum():.1f} m long"
+        help_ = f"set `sub_trajectory` to less than that (it is {_SUB_TRAJECTORY:g} m if left out)"
+        yield Fault(f"{what}: {help_}", of)
+    if complete and timed and (gaps := np.count_nonzero(seconds > reference.max_gap)):
+        what = f"the reference has {gaps} gaps beyond {reference.max_gap:g} s"
+        yield Fault(f"{what}, the longest of {seconds.max():.2f} s: their scans get no label", of)
+
+
+def _overlap_faults(reference: Trajectory, scans: tuple[int, int], slack: float) -> Iterator[Fault]:
+    """Scans outside the reference; both may go on for `slack` seconds beyond what was read."""
+    begin, end = int(reference.stamps[0]), int(reference.stamps[-1])
+    times = [f"{stamp * 1e-9:.3f}" for stamp in (begin, end, *scans)]
+    spans = f"covers {times[0]} to {times[1]} s, the scans cover {times[2]} to {times[3]} s"
+    if (max(begin, scans[0]) - min(end, scans[1])) * 1e-9 > slack:
+        help_ = "set `clock_offset` to the seconds to add to the reference's stamps"
+        more = "if it is of the same drive; `adaptune offline` proposes them"
+        lacks = "a reference of the same time"
+        yield Fault(f"the reference {spans}: {help_}, {more}", "reference", lacks)
+        return
+    seconds = (scans[1] - scans[0]) * 1e-9
+    outside = [(begin - scans[0]) * 1e-9, (scans[1] - end) * 1e-9]
+    lost = sum(s for s in outside if s > slack + 1.0)
+    if lost > 0.05 * seconds:
+        yield Fault(f"the reference {spans}: the scans outside get no label", "reference")
+
+
+def _scan_span(topic: Topic) -> tuple[int, int]:
     """First and last stamp of the scans that were read, without those that leap."""
-    topic = found.topics.get(found.points or "")
-    if topic is None or not any(topic.stamps):
-        return None
-    stamps, recorded = (
-        np.array([t for part in parts for t in part], np.int64)
-        for parts in (topic.stamps, topic.recorded)
-    )
+    stamps, recorded = topic.times, _joined(topic.recorded)
     if len(stamps) == len(recorded):
         late = recorded - stamps
         stamps = stamps[np.abs(late - np.median(late)) < 5e9]
-    return (int(stamps.min()), int(stamps.max())) if len(np.unique(stamps)) > 1 else None
-
-
-def _layout(message: Any) -> tuple[Layout, int]:
-    """Fields of a point of a cloud, and how many points it holds."""
-    if not hasattr(message, "fields"):
-        points = list(getattr(message, "points", ()))
-        names = [name for point in points[:1] for name in vars(point) if name[:2] != "__"]
-        return tuple((name, "", 0) for name in names), len(points)
-    layout = []
-    for field in sorted(message.fields, key=lambda field: field.offset):
-        kind = np.dtype(DATATYPES[field.datatype]).name if field.datatype in DATATYPES else "?"
-        kind += f"[{field.count}]" if field.count > 1 else ""
-        layout.append((field.name, kind, int(field.offset)))
-    return tuple(layout), int(message.height) * int(message.width)
-
-
-def _summary(scan: Scan, recorded: int) -> ScanSummary:
-    ranges, span = None, None
-    if len(scan):
-        away = np.linalg.norm(scan.points, axis=1)
-        ranges = (float(away.min()), float(np.median(away)), float(away.max()))
-        span = None if scan.times is None else float(np.ptp(scan.times))
-    rings = None if scan.rings is None else len(np.unique(scan.rings))
-    return ScanSummary(scan, max(recorded, len(scan)), ranges, span, rings)
-
-
-def _missing(scan: ScanSummary | None, problems: Items[Fault]) -> dict[str, tuple[str, ...]]:
-    """What each stage needs and does not find; where there is no reference, one is estimated."""
-    lacks = {
-        of: tuple({f.lacks: None for f in problems if f.of == of and f.lacks})
-        for of in ("points", "reference")
-    }
-    clouds, truth = lacks["points"], lacks["reference"]
-    if scan is None and not any(f.of == "points" for f in problems):
-        clouds = ("point clouds that can be read",)
-    timeless = scan is not None and scan.scan.times is None
-    times = ("a time for each point",) if timeless else ()
-    return {
-        "offline": (*clouds, *truth),
-        "online": clouds,
-        "comparison with the reference": (*clouds, *truth),
-        "motion compensation": (*clouds, *times),
-    }
-
-
-def _entry(path: Path, given: dict[str, Any], found: Survey | None = None) -> str:
-    name = "".join(c if c.isalnum() or c in "_.-" else "_" for c in path.stem).lstrip(".-")
-    text = files.dump({"sequences": {name or "recording": given}})
-    if found is None:
-        return text
-    if found.reference is None:
-        text += "    # reference: a topic, or a TUM, KITTI or EuRoC file; estimated if left out\n"
-    if found.first is not None and found.first[0].times is not None:
-        text += "    # stamp: end - if headers mark scans' ends and times count from the start\n"
-    return text
+    return int(stamps.min()), int(stamps.max())
 
 
 # Show an inspected recording, and the cache, on a terminal.
@@ -371,9 +677,9 @@ def render_inspection(inspection: Inspection, accuracy: str = "") -> RenderableT
     parts: list[RenderableType] = [Text(str(inspection.path), style="bold")]
     parts.append(_topic_table(inspection))
     if inspection.layout:
-        parts.append(Text(f"point: {_layout_text(inspection.layout)}"))
+        parts.append(Text(f"point: {', '.join(map(_field_text, inspection.layout))}"))
     if inspection.scan is not None:
-        parts.append(Text(f"first scan: {_scan_text(inspection.scan)}"))
+        parts.append(Text(f"first scan: {_scan_text(inspection.scan, inspection.recorded)}"))
     if inspection.reference is not None:
         text = _reference_text(inspection.reference, inspection.complete)
         parts.append(Text(f"reference: {text}"))
@@ -401,7 +707,7 @@ def _read_text(inspection: Inspection) -> str:
 def _stage_text(inspection: Inspection, stage: str) -> Text:
     if lacking := inspection.missing[stage]:
         return Text(f"{stage}: lacks {' and '.join(lacking)}", style="red")
-    if inspection.doubts(stage):
+    if any(fault.of in _INPUTS[stage] for fault in inspection.faults):
         return Text(f"{stage}: can run, but see the lines with ! above", style="yellow")
     limit = "" if inspection.complete else ", as far as the sample shows"
     return Text(f"{stage}: has all it needs{limit}", style="green")
@@ -412,43 +718,35 @@ def _topic_table(inspection: Inspection) -> Table:
     for column in ("topic", "type", "count", "rate", "seconds", "max gap"):
         numeric = column not in ("topic", "type")
         table.add_column(column, justify="right" if numeric else "left", overflow="fold")
-    for topic in inspection.topics:
-        seconds = ""
-        if topic.first is not None and topic.last is not None:
-            seconds = f"{(topic.last - topic.first) * 1e-9:.2f}"
+    for topic in inspection.topics.values():
+        seconds = np.ptp(topic.times) * 1e-9 if len(topic.times) else None
+        figures = ((topic.rate, "{:.2f} Hz"), (seconds, "{:.2f}"), (topic.gap, "{:.3f} s"))
         table.add_row(
             topic.name,
             topic.type.replace("/msg/", "/"),
             str(topic.count),
-            "" if topic.rate is None else f"{topic.rate:.2f} Hz",
-            seconds,
-            "" if topic.gap is None else f"{topic.gap:.3f} s",
+            *("" if value is None else text.format(value) for value, text in figures),
         )
     return table
 
 
-def _layout_text(layout: Sequence[tuple[str, str, int]]) -> str:
-    words = []
-    for name, kind, offset in layout:
-        role = " (time)" if name in TIME_FIELDS else " (ring)" if name in RING_FIELDS else ""
-        words.append(f"{name}{role} {kind}@{offset}" if kind else f"{name}{role}")
-    return ", ".join(words)
+def _field_text(field: tuple[str, str, int]) -> str:
+    name, kind, offset = field
+    role = " (time)" if name in TIME_FIELDS else " (ring)" if name in RING_FIELDS else ""
+    return f"{name}{role} {kind}@{offset}" if kind else f"{name}{role}"
 
 
-def _scan_text(scan: ScanSummary) -> str:
-    words = [f"{len(scan.scan):,} points"]
-    if scan.recorded > len(scan.scan):
-        words[0] += f" of {scan.recorded:,}"
-    if scan.ranges is not None:
-        near, middle, far = scan.ranges
-        words.append(f"{near:.2f} to {far:.2f} m away, half of them within {middle:.2f} m")
-    words.append("no times" if scan.span is None else f"times spanning {scan.span:.4f} s")
-    words.append("no rings" if scan.rings is None else f"{scan.rings} rings")
-    light = scan.scan.intensities
-    if light is None or not len(light):
-        words.append("no intensities")
-    else:
-        words.append(f"intensities from {light.min():g} to {light.max():g}")
+def _scan_text(scan: Scan, recorded: int) -> str:
+    words = [f"{len(scan):,} points" + (f" of {recorded:,}" if recorded > len(scan) else "")]
+    times, rings, light = scan.times, scan.rings, scan.intensities
+    if len(scan):
+        away = np.linalg.norm(scan.points, axis=1)
+        middle = f"half of them within {np.median(away):.2f} m"
+        words.append(f"{away.min():.2f} to {away.max():.2f} m away, {middle}")
+        words.append("no times" if times is None else f"times spanning {np.ptp(times):.4f} s")
+        words.append("no rings" if rings is None else f"{len(np.unique(rings))} rings")
+        span = "" if light is None else f"from {light.min():g} to {light.max():g}"
+        words.append(f"intensities {span}" if span else "no intensities")
     return ", ".join(words)
 
 
