@@ -38,11 +38,6 @@ from adaptune.trajectory import Trajectory
 
 _WORD = struct.Struct("<I").unpack_from
 _NOTHING = Chunk(0, 0, bytes)
-_KINDS = {b"op": "B", b"ver": "I", b"chunk_pos": "Q", b"count": "I"}
-_TIMES = (b"start_time", b"end_time")
-
-Layout = tuple[struct.Struct, list[int]]
-"""How to unpack the header of a record, and which of the values is which."""
 
 
 class IndexReader(Reader):
@@ -54,7 +49,6 @@ class IndexReader(Reader):
 
     def open(self) -> None:
         """Read the list of chunks."""
-        self._layout: Layout | None = None
         super().open()
         counts: Counter[int] = Counter()
         for info in self.chunk_infos:
@@ -70,23 +64,23 @@ class IndexReader(Reader):
         """Nothing, while the bag is opened."""
 
     def read_chunk_info(self) -> ChunkInfo:
-        """Read a record in a sixth of the time, if it is laid out as the one before."""
+        """Read a record without a look at the type of each field, which rosbags takes long for."""
         assert self.bio is not None
-        word = self.bio.read(4)
-        header = self.bio.read(*_WORD(word)) if len(word) == 4 else b""
-        if self._layout is None or len(header) != self._layout[0].size:
-            self._layout = _layout(header)
-            self.bio.seek(-len(header) - len(word), 1)
+        begin = self.bio.tell()
+        try:
+            fields = _fields(self.bio.read(*_WORD(self.bio.read(4))))
+            kind = fields[b"op"], fields[b"ver"]
+            pos, count = (int.from_bytes(fields[n], "little") for n in (b"chunk_pos", b"count"))
+            times = [struct.unpack("<II", fields[n]) for n in (b"start_time", b"end_time")]
+            _, *numbers = struct.unpack(f"<{1 + 2 * count}I", self.bio.read(4 + 8 * count))
+        except (struct.error, KeyError):
+            kind = None
+        if kind != (b"\x06", b"\x01\0\0\0"):
+            self.bio.seek(begin)
             return super().read_chunk_info()
-        values = self._layout[0].unpack(header)
-        op, ver, pos, count, start, start_ns, end, end_ns = [values[i] for i in self._layout[1]]
-        counts = self.bio.read(4 + 8 * count)
-        if (op, ver, len(counts)) != (6, 1, 4 + 8 * count) or not count:
-            self.bio.seek(-len(counts) - len(header) - len(word), 1)
-            return super().read_chunk_info()
-        numbers = struct.unpack_from(f"<{2 * count}I", counts, 4)
-        by_connection = dict(zip(numbers[::2], numbers[1::2], strict=True))
-        return ChunkInfo(pos, start * 10**9 + start_ns, end * 10**9 + end_ns + 1, by_connection)
+        start, end = (seconds * 10**9 + nanoseconds for seconds, nanoseconds in times)
+        counts = dict(zip(numbers[::2], numbers[1::2], strict=True))
+        return ChunkInfo(pos, start, end + 1, counts)
 
     def is_slow(self) -> bool:
         """Whether its first chunk is packed by BZ2, which unpacks a few megabytes a second."""
@@ -117,23 +111,15 @@ class IndexReader(Reader):
         yield from super().messages(connections, start, stop)
 
 
-def _layout(header: bytes) -> Layout | None:
-    """Layout of the records of chunks; none if this header is not one."""
-    text, at, names = "<", 0, list[bytes]()
-    while at + 4 <= len(header):
+def _fields(header: bytes) -> dict[bytes, bytes]:
+    """Values of a record's header by name."""
+    fields, at = {}, 0
+    while at < len(header):
         (size,) = _WORD(header, at)
         name, _, value = header[at + 4 : at + 4 + size].partition(b"=")
-        kind = "II" if name in _TIMES else _KINDS.get(name, f"{len(value)}x")
-        if struct.calcsize("<" + kind) != len(value):
-            return None
-        text += f"{4 + len(name) + 1}x{kind}"
-        names += [name, name + b"_ns"] if name in _TIMES else [name] if name in _KINDS else []
+        fields[name] = value
         at += 4 + size
-    wanted = [*_KINDS, *(each for name in _TIMES for each in (name, name + b"_ns"))]
-    made = struct.Struct(text)
-    if made.size != len(header) or sorted(names) != sorted(wanted):
-        return None
-    return made, [names.index(name) for name in wanted]
+    return fields
 
 
 POINTS_TYPES = ("sensor_msgs/msg/PointCloud2", *clouds.LIVOX_TYPES, *clouds.VELODYNE_TYPES)
@@ -391,24 +377,21 @@ class BagSource:
         kind, definitions = self.topics[self.points], reader.typestore.fielddefs
         if kind in clouds.VELODYNE_TYPES:
             return clouds.decoder(reader.is2)
-        if kind not in clouds.LIVOX_TYPES:
-            self._check_standard(definitions, reader.is2)
-            return partial(clouds.decode_cloud, cdr=reader.is2, timing=self.timing)
-        fields = tuple(definitions[kind][1])
-        point = tuple(definitions[kind.replace("CustomMsg", "CustomPoint")][1])
-        return partial(
-            clouds.decode_livox, message=fields, point=point, cdr=reader.is2, timing=self.timing
-        )
+        livox = kind in clouds.LIVOX_TYPES
+        point = kind.replace("Msg", "Point") if livox else "sensor_msgs/msg/PointField"
+        self._check_standard(definitions, ("std_msgs/msg/Header", point, kind), reader.is2)
+        decode = clouds.decode_livox if livox else clouds.decode_cloud
+        return partial(decode, cdr=reader.is2, timing=self.timing)
 
-    def _check_standard(self, definitions: Any, cdr: bool) -> None:
-        """Make sure that point clouds are laid out as they are decoded."""
+    def _check_standard(self, definitions: Any, names: Iterable[str], cdr: bool) -> None:
+        """Make sure that messages are laid out as they are decoded."""
         standard = _typestore().fielddefs
-        for name in ("std_msgs/msg/Header", "sensor_msgs/msg/PointField", POINTS_TYPES[0]):
+        for name in names:
             _, found = definitions.get(name, ((), ()))
             fields = [field for field in found if cdr or field[0] != "seq"]
             if fields != standard[name][1]:
-                names = ", ".join(field for field, _ in fields)
-                raise SequenceError(f"{self.name}: its {name} is not as ROS defines it ({names})")
+                given = ", ".join(field for field, _ in fields)
+                raise SequenceError(f"{self.name}: its {name} is not as ROS defines it ({given})")
 
 
 def _load(decode: Callable[[bytes], Scan], data: bytes, what: str) -> Scan:

@@ -11,17 +11,16 @@ import logging
 import os
 import shutil
 import tempfile
-import threading
 import time
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO, Self
+from typing import Any, Self
 
 import numpy as np
 import platformdirs
-from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from adaptune.errors import AdaptuneError
@@ -31,21 +30,17 @@ from adaptune.recording.scan import Scan
 _log = logging.getLogger(__name__)
 _NOT_KEPT = "%s: not kept in the cache (%s)"
 
-SMALL = 1 << 24
-"""Bytes below which all of a file's content counts, and is read every time."""
-_VERSION = 5
-_SAMPLE = 1 << 16
+_VERSION = 6
 _CAP_GB, _MOST_GB = 50.0, 1e9
 # Seconds. A writer that has not written for this long is dead.
 _DEAD = 3600.0
-# Fields that a scan may lack.
-_OPTIONAL = ("times", "rings", "intensities")
-_INDEX = np.dtype([("stamp", "<i8"), ("end", "<i8"), *((name, "?") for name in _OPTIONAL)])
-_ARRAYS: dict[str, tuple[str, tuple[int, ...]]] = {
-    "points": ("<f4", (3,)),
-    "times": ("<f4", ()),
-    "rings": ("<u2", ()),
-    "intensities": ("<f4", ()),
+_INDEX, _ABOUT = "index.npy", "about.json"
+# Files of an entry: what they hold of scans one after the other, and in how many columns.
+_ARRAYS = {
+    "points": ("<f4", 3),
+    "times": ("<f4", 1),
+    "rings": ("<u2", 1),
+    "intensities": ("<f4", 1),
 }
 
 
@@ -74,27 +69,13 @@ def cap() -> int:
     )
 
 
-def key(paths: Sequence[Path], settings: Any) -> str:
+def key(files: Sequence[Path], settings: Any) -> str:
     """Digest of files and settings; an OSError if a file cannot be read.
 
-    A small file counts by its content, a large one by its size, its times of change, its beginning
-    and its end, and none by its name. A folder counts by its files.
+    A file counts by all that changes when it is written, moved or replaced, see `status_key`.
     """
-    digest = hashlib.blake2b(f"{_VERSION} {settings!r}".encode(), digest_size=16)
-    for path in paths:
-        files = sorted(p for p in path.iterdir() if p.is_file()) if path.is_dir() else [path]
-        for file in files:
-            status = file.stat()
-            digest.update(f"{status.st_size}".encode())
-            with file.open("rb") as stream:
-                if status.st_size < SMALL:
-                    digest.update(stream.read())
-                    continue
-                digest.update(f" {status.st_mtime_ns} {status.st_ctime_ns}".encode())
-                digest.update(stream.read(_SAMPLE))
-                stream.seek(max(status.st_size - _SAMPLE, 0))
-                digest.update(stream.read(_SAMPLE))
-    return digest.hexdigest()
+    about = f"{_VERSION} {settings!r} {' '.join(map(status_key, files))}"
+    return hashlib.blake2b(about.encode(), digest_size=_SIZE).hexdigest()
 
 
 class CachedScans:
@@ -103,24 +84,23 @@ class CachedScans:
     def __init__(self, path: Path):
         self.path = path
         # Notes on the sequence from when it was decoded.
-        self.about: dict[str, Any] = json.loads((path / "about.json").read_text("utf-8"))
-        self._index = np.load(path / "index.npy")
-        self._ends: list[int] = self._index["end"].tolist()
+        self.about: dict[str, Any] = json.loads((path / _ABOUT).read_text("utf-8"))
+        # Of each scan its stamp, and in each array where it begins and ends; -1 if it has none.
+        self._index = np.load(path / _INDEX)
+        ends = self._index[:, 2::2].max(axis=0, initial=0).tolist()
         # All at once: mapped arrays stay even if another process removes the entry.
-        self._points = self._map("points")
-        self._optional = [self._map(name) for name in _OPTIONAL]
+        self._arrays = [self._map(name, end) for name, end in zip(_ARRAYS, ends, strict=True)]
         # Records when the entry was last used.
-        os.utime(path / "about.json")
+        os.utime(path / _ABOUT)
 
     def __len__(self) -> int:
         return len(self._index)
 
     def __getitem__(self, i: int) -> Scan:
-        stamp, end, *given = self._index[i].item()
-        part = slice(self._ends[i - 1] if i else 0, end)
-        columns = zip(self._optional, given, strict=True)
-        times, rings, intensities = (column[part] if there else None for column, there in columns)
-        return Scan(stamp, self._points[part], times, rings, intensities=intensities)
+        stamp, *bounds = self._index[i].tolist()
+        parts = zip(self._arrays, bounds[::2], bounds[1::2], strict=True)
+        points, times, rings, lights = (a[low:high] if low >= 0 else None for a, low, high in parts)
+        return Scan(stamp, points, times, rings, intensities=lights)
 
     def __iter__(self) -> Iterator[Scan]:
         return (self[i] for i in range(len(self)))
@@ -128,14 +108,15 @@ class CachedScans:
     @property
     def stamps(self) -> NDArray[np.int64]:
         """Stamps of the scans, of shape (n,)."""
-        return np.asarray(self._index["stamp"])
+        return np.asarray(self._index[:, 0])
 
-    def _map(self, name: str) -> NDArray[Any]:
-        # An empty file cannot be mapped.
-        mode: Any = "r" if self._ends and self._ends[-1] else None
-        array: NDArray[Any] = np.load(self.path / f"{name}.npy", mmap_mode=mode)
+    def _map(self, name: str, length: int) -> Any:
+        kind, columns = _ARRAYS[name]
+        shape = (length, columns)[: 2 if columns > 1 else 1]
+        if not length:  # an empty file cannot be mapped
+            return np.empty(shape, kind)
         # A view of the base class: slices of memmap itself are slow to make.
-        return array.view(np.ndarray)
+        return np.memmap(self.path / name, kind, "r", shape=shape).view(np.ndarray)
 
 
 def find(key: str) -> CachedScans | None:
@@ -145,33 +126,10 @@ def find(key: str) -> CachedScans | None:
         return CachedScans(path)
     except FileNotFoundError:
         return None
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, IndexError) as error:
         _log.warning("%s: is damaged and removed (%s)", path, error)
         shutil.rmtree(path, ignore_errors=True)
         return None
-
-
-class _Growing:
-    """A .npy file whose length is not known before it is closed."""
-
-    def __init__(self, path: Path, dtype: np.dtype[Any], shape: tuple[int, ...]):
-        self._dtype, self._shape, self.length = dtype, shape, 0
-        self._file: BinaryIO = path.open("wb")
-        self._header()
-
-    def append(self, array: NDArray[Any]) -> None:
-        self._file.write(np.ascontiguousarray(array, self._dtype).data)
-        self.length += len(array)
-
-    def close(self) -> None:
-        self._file.seek(0)
-        self._header()
-        self._file.close()
-
-    def _header(self) -> None:
-        # numpy leaves room for the first axis to grow, so the header keeps its size.
-        header = {"descr": npy.dtype_to_descr(self._dtype), "fortran_order": False}
-        npy.write_array_header_1_0(self._file, header | {"shape": (self.length, *self._shape)})
 
 
 class Writer:
@@ -187,28 +145,23 @@ class Writer:
         root.mkdir(parents=True, exist_ok=True)
         _sweep(root)
         self._temporary = Path(tempfile.mkdtemp(prefix=".writing-", dir=root))
-        self._arrays = {
-            name: _Growing(self._temporary / f"{name}.npy", np.dtype(kind), shape)
-            for name, (kind, shape) in _ARRAYS.items()
-        }
-        self._index: list[tuple[int | bool, ...]] = []
+        self._files = {name: (self._temporary / name).open("wb") for name in _ARRAYS}
+        self._index: list[list[int]] = []
 
     def __enter__(self) -> Self:
         return self
 
     def append(self, scan: Scan) -> None:
         """Add a scan."""
-        n = len(scan)
-        self._arrays["points"].append(scan.points)
-        given = [getattr(scan, name) for name in _OPTIONAL]
-        for name, values in zip(_OPTIONAL, given, strict=True):
-            array = self._arrays[name]
+        row = [scan.stamp]
+        for name, file in self._files.items():
+            kind, columns = _ARRAYS[name]
+            begin = file.tell() // (np.dtype(kind).itemsize * columns)
+            values = getattr(scan, name)
             if values is not None:
-                # Scans before had none: their share stays empty.
-                array.append(np.zeros(self._arrays["points"].length - n - array.length))
-                array.append(values)
-        there = (values is not None for values in given)
-        self._index.append((scan.stamp, self._arrays["points"].length, *there))
+                file.write(np.ascontiguousarray(values, kind).data)
+            row += [-1, -1] if values is None else [begin, begin + len(values)]
+        self._index.append(row)
 
     def done(self, **about: Any) -> None:
         """Mark the entry as complete, and note more of the sequence."""
@@ -217,12 +170,12 @@ class Writer:
 
     def __exit__(self, kind: object, error: object, trace: object) -> None:
         try:
-            for array in self._arrays.values():
-                array.close()
+            for file in self._files.values():
+                file.close()
             if self._done and error is None:
-                np.save(self._temporary / "index.npy", np.array(self._index, _INDEX))
-                about = json.dumps(self._about, indent=1)
-                (self._temporary / "about.json").write_text(about, "utf-8")
+                index = np.array(self._index, np.int64).reshape(-1, 1 + 2 * len(_ARRAYS))
+                np.save(self._temporary / _INDEX, index)
+                (self._temporary / _ABOUT).write_text(json.dumps(self._about, indent=1), "utf-8")
                 _make_room(_size(self._temporary))
                 # Another process may have been first; its arrays are the same.
                 if not (folder() / self._key).exists():
@@ -235,27 +188,25 @@ class Writer:
 
 def tee(scans: Iterable[Scan], key: str, about: dict[str, Any]) -> Iterator[Scan]:
     """Pass scans on and keep them. Nothing is kept unless all of them are read."""
-    try:
-        writer = Writer(key, about)
-    except OSError as error:
-        _log.warning(_NOT_KEPT, about.get("name"), error)
-        yield from scans
-        return
-    with writer:
-        keeping, total = True, 0
+    with ExitStack() as stack:
+        writer, total = None, 0
+        try:
+            writer = stack.enter_context(Writer(key, about))
+        except OSError as error:
+            _log.warning(_NOT_KEPT, about.get("name"), error)
         for scan in scans:
             total += scan.points.nbytes
-            if keeping and total > cap():
+            if writer is not None and total > cap():
                 _log.warning(_NOT_KEPT, about.get("name"), "larger than the cache may grow")
-                keeping = False
-            if keeping:
-                try:
+                writer = None
+            try:
+                if writer is not None:
                     writer.append(scan)
-                except OSError as error:
-                    _log.warning(_NOT_KEPT, about.get("name"), error)
-                    keeping = False
+            except OSError as error:
+                _log.warning(_NOT_KEPT, about.get("name"), error)
+                writer = None
             yield scan
-        if keeping:
+        if writer is not None:
             writer.done()
 
 
@@ -275,9 +226,9 @@ def list_cache() -> list[CacheEntry]:
     entries = []
     for path in folder().glob("[!.]*"):
         try:
-            about = path / "about.json"
+            about = path / _ABOUT
             name = json.loads(about.read_text("utf-8"))["name"]
-            n_scans = len(np.load(path / "index.npy", mmap_mode="r"))
+            n_scans = len(np.load(path / _INDEX, mmap_mode="r"))
             entry = CacheEntry(name, path, _size(path), about.stat().st_mtime, n_scans)
         except (OSError, ValueError, KeyError):
             continue
@@ -290,7 +241,7 @@ def clear_cache() -> int:
     freed = 0
     for path in folder().glob("*"):
         # Other files in a shared folder stay.
-        if path.name.startswith(".writing-") or (path / "index.npy").exists():
+        if path.name.startswith(".writing-") or (path / _INDEX).exists():
             freed += _size(path)
             shutil.rmtree(path, ignore_errors=True)
     return freed
@@ -322,18 +273,15 @@ def _size(path: Path) -> int:
 
 
 # Hashes of the content of files, remembered on disk.
-#
-# The hash of a large file is kept in the cache's folder, under the file's path, inode, size and
-# times
-# of change. Small files are read every time.
 
 
+SMALL = 1 << 24
+"""Bytes of files below which their content is read every time."""
 FILE = "fingerprints.txt"
 """File in the cache's folder: on every line the hash of a file's status, and of its content."""
 MANY = 64
 """So many files have one hash together."""
 
-_BLOCK = 1 << 20
 _LONG = 1 << 30
 """Bytes that take more than a second to read."""
 _SIZE = 16
@@ -342,23 +290,30 @@ remembered: dict[str, str] = {}
 """Hashes that this process knows, also where the cache's folder cannot be written."""
 
 
-class FingerprintError(AdaptuneError):
-    """A file that cannot be read, or that changes while it is read."""
-
-
-class _StoppedError(Exception):
-    """Nobody waits for the hash any more."""
-
-
 def fingerprints(files: Sequence[Path]) -> list[str]:
     """Hash the content of each file; `MANY` or more files are hashed as one.
 
     Raises
     ------
-    FingerprintError
+    AdaptuneError
         If a file cannot be read, or changes while it is read.
     """
-    found = _fingerprints(files, threading.Event(), tell=True)
+    new: dict[str, str] = {}
+    found = []
+    try:
+        keys = [status_key(file) for file in files]
+        size = sum(file.stat().st_size for file in files)
+        known = _recall(keys) if size >= SMALL else {}
+        if size > _LONG and len(known) < len(keys):
+            _log.info("%s: reading %.1f GB to know it by its content", files[0], size / 1e9)
+        for file, key in zip(files, keys, strict=True):
+            if key not in known:
+                new[key] = hash_file(file, key)
+            found.append(new.get(key) or known[key])
+    except OSError as error:
+        raise AdaptuneError(f"{files[0]}: cannot be read ({error.strerror})") from error
+    if size >= SMALL and new:
+        _remember(new)
     if len(found) < MANY:
         return found
     return [hashlib.blake2b("".join(found).encode(), digest_size=_SIZE).hexdigest()]
@@ -369,62 +324,6 @@ def fingerprint(file: Path) -> str:
     return fingerprints([file])[0]
 
 
-@contextmanager
-def alongside(files: Sequence[Path]) -> Iterator[None]:
-    """Hash large files, if they are not known, in a thread while the block reads them.
-
-    Files are thus read from disk once. A block that ends early ends the thread.
-    """
-    unknown = False
-    with suppress(OSError):
-        unknown = _total(files) >= SMALL and not _known(files)
-    if not unknown:
-        yield
-        return
-    stop = threading.Event()
-
-    def run() -> None:
-        # Whoever asks for the hash reports what is wrong.
-        with suppress(FingerprintError, _StoppedError):
-            _fingerprints(files, stop)
-
-    thread = threading.Thread(target=run, daemon=True)
-    thread.start()
-    try:
-        yield
-    except BaseException:
-        stop.set()
-        raise
-    finally:
-        thread.join()
-
-
-def _fingerprints(files: Sequence[Path], stop: threading.Event, tell: bool = False) -> list[str]:
-    if not files:
-        return []
-    file = files[0]
-    try:
-        remember, keys = _total(files) >= SMALL, [status_key(file) for file in files]
-        known = remember and _known(files)
-        if tell and remember and not known and (size := _total(files)) > _LONG:
-            _log.info("%s: reading %.1f GB to know it by its content", file, size / 1e9)
-        new: dict[str, str] = {}
-        found = []
-        for file, key in zip(files, keys, strict=True):
-            if not remember or key not in remembered:
-                new[key] = hash_file(file, key, stop)
-            found.append(new.get(key) or remembered[key])
-    except OSError as error:
-        raise FingerprintError(f"{file}: cannot be read ({error.strerror})") from error
-    if remember and new:
-        _remember(new)
-    return found
-
-
-def _total(files: Sequence[Path]) -> int:
-    return sum(file.stat().st_size for file in files)
-
-
 def status_key(file: Path) -> str:
     """Hash of all by which a file shows that it is the same as before."""
     status, path = file.stat(), os.fsencode(file.absolute())
@@ -432,29 +331,24 @@ def status_key(file: Path) -> str:
     return hashlib.blake2b(path + times.encode(), digest_size=_SIZE).hexdigest()
 
 
-def hash_file(file: Path, key: str, stop: threading.Event) -> str:
-    """Hash a file whose status has this key, unless somebody stops it."""
-    digest = hashlib.blake2b(digest_size=_SIZE)
-    with file.open("rb", buffering=0) as stream:
-        while block := stream.read(_BLOCK):
-            digest.update(block)
-            if stop.is_set():
-                raise _StoppedError
+def hash_file(file: Path, key: str) -> str:
+    """Hash a file whose status has this key."""
+    with file.open("rb") as stream:
+        digest = hashlib.file_digest(stream, partial(hashlib.blake2b, digest_size=_SIZE))
     if status_key(file) != key:
-        raise FingerprintError(f"{file}: changes while it is read; run again when it is complete")
+        raise AdaptuneError(f"{file}: changes while it is read; run again when it is complete")
     return digest.hexdigest()
 
 
-def _known(files: Sequence[Path]) -> bool:
-    """Whether the hashes of all files are known, here or on disk."""
-    keys = set(map(status_key, files))
-    if not keys <= remembered.keys():
+def _recall(keys: Sequence[str]) -> dict[str, str]:
+    """The hashes that are known for these keys, here or on disk."""
+    if not remembered.keys() >= set(keys):
         with suppress(OSError, UnicodeDecodeError):
             for line in (folder() / FILE).read_text("ascii").splitlines():
                 key, _, found = line.partition(" ")
                 if len(key) == len(found) == 2 * _SIZE:
                     remembered[key] = found
-    return keys <= remembered.keys()
+    return {key: remembered[key] for key in keys if key in remembered}
 
 
 def _remember(new: dict[str, str]) -> None:

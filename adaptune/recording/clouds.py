@@ -2,7 +2,7 @@
 
 import struct
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import cache, lru_cache, partial
+from functools import cache, lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -233,10 +233,8 @@ def from_fields(raw: NDArray[Any] | Mapping[str, NDArray[Any]], stamp: int, timi
         )
     n = len(x)
     made = (np.empty((n, 3), np.float32), *(np.empty(len(v), v.dtype) for v in given))
-    gather, compact = _kernels(given[0].dtype.str)
-    valid, low, high = gather(x, y, z, given, made)
+    valid, low, high = _kernel(given[0].dtype.str)(x, y, z, given, made)
     if valid < n:
-        _, low, high = compact(*made)
         # A copy, so that the other points are not kept in memory with them.
         made = tuple(values[:valid].copy() for values in made)
     points, times, rings, intensities = made
@@ -257,7 +255,7 @@ def _native(values: NDArray[Any]) -> NDArray[Any]:
     return values.astype(values.dtype.newbyteorder("="), copy=False)
 
 
-# Single precision keeps the loops fast.
+# Single precision keeps the loop fast.
 _ZERO, _INFINITE = np.float32(0.0), np.float32(np.inf)
 
 
@@ -268,70 +266,39 @@ def _gather(
     given: tuple[NDArray[Any], NDArray[np.uint16], NDArray[np.float32]],
     made: tuple[NDArray[np.float32], NDArray[Any], NDArray[np.uint16], NDArray[np.float32]],
 ) -> tuple[int, Any, Any]:
-    """Put each field side by side; count the valid points, and find the extent of times."""
+    """Put the valid points side by side; count them, and find the extent of their times."""
     given_times, given_rings, given_intensities = given
     points, times, rings, intensities = made
     timed, ringed, lit = len(given_times) > 0, len(given_rings) > 0, len(given_intensities) > 0
-    low = high = given_times[0] if timed else times.dtype.type(0)
+    low = high = times.dtype.type(0)
     valid = 0
     for i in range(len(x)):
         a, b, c = x[i], y[i], z[i]
-        points[i, 0] = a
-        points[i, 1] = b
-        points[i, 2] = c
         # Not a number or infinite if any coordinate is, zero if all of them are.
         square = a * a + b * b + c * c
         good = (square > _ZERO) & (square < _INFINITE)
+        # What is not valid is overwritten by the next point.
+        points[valid, 0] = a
+        points[valid, 1] = b
+        points[valid, 2] = c
         if timed:
             t = given_times[i]
-            times[i] = t
-            low, high = min(low, t), max(high, t)
             good &= t - t == 0
+            times[valid] = t
+            if good:
+                low, high = (min(low, t), max(high, t)) if valid else (t, t)
         if ringed:
-            rings[i] = given_rings[i]
+            rings[valid] = given_rings[i]
         if lit:
             light = given_intensities[i]
-            intensities[i] = light if light - light == _ZERO else _ZERO
+            intensities[valid] = light if light - light == _ZERO else _ZERO
         valid += good
     return valid, low, high
 
 
-def _compact(
-    points: NDArray[np.float32],
-    times: NDArray[Any],
-    rings: NDArray[np.uint16],
-    intensities: NDArray[np.float32],
-) -> tuple[int, Any, Any]:
-    """Move the valid points to the front; count them, and find the extent of their times."""
-    timed, ringed, lit = len(times) > 0, len(rings) > 0, len(intensities) > 0
-    low = high = times.dtype.type(0)
-    count = 0
-    for i in range(len(points)):
-        x, y, z = points[i, 0], points[i, 1], points[i, 2]
-        square = x * x + y * y + z * z
-        good = (square > _ZERO) & (square < _INFINITE)
-        if timed:
-            t = times[i]
-            good &= t - t == 0
-        if not good:
-            continue
-        points[count, 0] = x
-        points[count, 1] = y
-        points[count, 2] = z
-        if timed:
-            times[count] = t
-            low, high = (min(low, t), max(high, t)) if count else (t, t)
-        if ringed:
-            rings[count] = rings[i]
-        if lit:
-            intensities[count] = intensities[i]
-        count += 1
-    return count, low, high
-
-
 @cache
-def _kernels(kind: str) -> tuple[Callable[..., Any], Callable[..., Any]]:
-    """Gather and compact clouds whose times are of this type."""
+def _kernel(kind: str) -> Callable[..., Any]:
+    """Gather clouds whose times are of this type."""
     # Importing numba takes time, and a bag may never be read.
     import numba
 
@@ -342,12 +309,10 @@ def _kernels(kind: str) -> tuple[Callable[..., Any], Callable[..., Any]]:
     types: Any = numba.types
     real, whole, time = numba.float32, numba.uint16, numba.from_dtype(np.dtype(kind))
     kinds = ((real, 2), (time, 1), (whole, 1), (real, 1))
-    scan = tuple(types.Array(scalar, axes, "C") for scalar, axes in kinds)
-    result = types.Tuple((numba.int64, time, time))
-    compiled = partial(numba.njit, nogil=True, cache=True)
+    scan = types.Tuple([types.Array(scalar, axes, "C") for scalar, axes in kinds])
     given = types.Tuple((column(time), column(whole), column(real)))
-    gather = result(*3 * (column(real),), given, types.Tuple(scan))
-    return compiled(gather)(_gather), compiled(result(*scan))(_compact)
+    signature = types.Tuple((numba.int64, time, time))(*3 * (column(real),), given, scan)
+    return numba.njit(signature, nogil=True, cache=True)(_gather)
 
 
 # livox_ros_driver/CustomMsg to scans.
@@ -355,8 +320,12 @@ def _kernels(kind: str) -> tuple[Callable[..., Any], Callable[..., Any]]:
 
 LIVOX_TYPES = ("livox_ros_driver/msg/CustomMsg", "livox_ros_driver2/msg/CustomMsg")
 
-_POINT = """uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z
-uint8 reflectivity\nuint8 tag\nuint8 line\n"""
+_LIVOX_POINT = {
+    "offset_time": "uint32",
+    **dict.fromkeys("xyz", "float32"),
+    **dict.fromkeys(("reflectivity", "tag", "line"), "uint8"),
+}
+_POINT = "".join(f"{kind} {name}\n" for name, kind in _LIVOX_POINT.items())
 _MESSAGE = """std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 lidar_id
 uint8[3] rsvd\nCustomPoint[] points\n"""
 # For ROS 2 bags without definitions; all others bring their own.
@@ -366,99 +335,29 @@ DEFINITIONS = {
     for name, text in (("CustomPoint", _POINT), ("CustomMsg", _MESSAGE))
 }
 
-_Fields = Sequence[tuple[str, Any]]
 
-
-def decode_livox(
-    data: bytes | memoryview, message: _Fields, point: _Fields, cdr: bool, timing: Timing
-) -> Scan:
+def decode_livox(data: bytes | memoryview, cdr: bool, timing: Timing = AUTO) -> Scan:
     """Decode a serialised message without an object for each of its points.
 
-    Parameters
-    ----------
-    data, cdr
-        The message as it lies in the bag, and whether it is serialised as in ROS 2.
-    message, point
-        Fields of the message and of one point, as rosbags gives them.
-    timing
-        Meaning of its stamps. The points' offsets count from the time base. The stamp marks the
-        same moment, unless it is set to mark the scan's end.
-
-    Raises
-    ------
-    PointCloudError
-        If the message does not match its definition.
+    The points' offsets count from the time base. The stamp marks the same moment, unless `timing`
+    sets it to mark the scan's end. A PointCloudError reports a message that is cut short.
     """
     try:
-        stamp, raw = _parse(Serialized(data, cdr), tuple(message), tuple(point), cdr)
-    except (struct.error, KeyError, ValueError, IndexError) as error:
-        raise PointCloudError(f"a Livox message unlike its definition ({error})") from error
+        body = Serialized(data, cdr)
+        stamp = body.header()
+        body.align(8)
+        body.block(8 + 4 + 1 + 3)  # what comes before the points
+        count = body.uint32()
+        fields = [(n, np.dtype(kind).newbyteorder(body.order)) for n, kind in _LIVOX_POINT.items()]
+        dtype = np.dtype(fields, align=cdr)
+        # Behind the last point there is no padding.
+        size = max(count - 1, 0) * dtype.itemsize + sum(kind.itemsize for _, kind in fields)
+        points = body.block(size if count else 0)
+        raw = np.zeros(count, dtype)
+        raw.view(np.uint8)[: len(points)] = np.frombuffer(points, np.uint8)
+    except (struct.error, ValueError, IndexError) as error:
+        raise PointCloudError(f"not a whole Livox message ({error})") from error
     return from_fields(raw, stamp, timing)
-
-
-def _parse(
-    body: Serialized, message: _Fields, point: _Fields, cdr: bool
-) -> tuple[int, NDArray[Any]]:
-    if message[0][0] != "header":
-        raise ValueError("it does not begin with a header")
-    stamp = body.header()
-    for name, description in message[1:]:
-        if name == "points":
-            break
-        size, number = _extent(description)
-        body.align(size)
-        body.block(size * number)
-    else:
-        raise KeyError("points")
-    count = body.uint32()
-    dtype, used = _point_dtype(point, cdr, body.order)
-    if not count:
-        return stamp, np.empty(0, dtype)
-    data = body.block((count - 1) * dtype.itemsize + used)
-    raw = np.ndarray((count - 1,), dtype, data)
-    last = np.zeros(1, dtype)
-    last.view(np.uint8)[:used] = np.frombuffer(data[-used:], np.uint8)
-    return stamp, np.concatenate([raw, last])
-
-
-@lru_cache(maxsize=8)
-def _point_dtype(point: _Fields, cdr: bool, order: str) -> tuple[np.dtype[Any], int]:
-    """Type of a point, padded to the next one, and where its last byte ends."""
-    names, formats, offsets, at, widest = [], [], [], 0, 1
-    for name, description in point:
-        size, number = _extent(description)
-        kind = description[1][0][:1]
-        if number != 1 or kind not in ("u", "i", "f"):
-            raise ValueError(f"a point's {name} is not a number")
-        at = _aligned(at, size if cdr else 1)
-        widest = max(widest, size)
-        names.append(name)
-        formats.append(f"{order}{kind}{size}")
-        offsets.append(at)
-        at += size
-    if missing := {"x", "y", "z", "offset_time"} - set(names):
-        raise KeyError(", ".join(sorted(missing)))
-    itemsize = _aligned(at, widest if cdr else 1)
-    dtype = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": itemsize})
-    # Behind the last point there is no padding.
-    return dtype, at
-
-
-def _extent(description: Any) -> tuple[int, int]:
-    """Bytes of an element and number of elements of a field of fixed size."""
-    from rosbags.interfaces import Nodetype  # rosbags takes long to import
-
-    if description[0] == Nodetype.ARRAY:
-        inner, number = description[1]
-        return _extent(inner)[0], number
-    if description[0] != Nodetype.BASE or description[1][0] == "string":
-        raise ValueError("a field before the points has no fixed size")
-    name = description[1][0]
-    return {"bool": 1, "byte": 1, "char": 1, "octet": 1}.get(name) or np.dtype(name).itemsize, 1
-
-
-def _aligned(at: int, to: int) -> int:
-    return -(-at // to) * to
 
 
 # velodyne_msgs/VelodyneScan, the raw packets of a turn, to scans.

@@ -14,7 +14,6 @@ from adaptune import geometry
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import to_pose
 from adaptune.recording import cache, compensation, views
-from adaptune.recording.cache import alongside
 from adaptune.recording.config import ESTIMATED, NO_REFERENCE, SequenceConfig, bag_paths, files_of
 from adaptune.recording.scan import (
     Frame,
@@ -200,7 +199,7 @@ def _source(config: SequenceConfig) -> tuple[Source, str | None]:
         return BagSource(paths, config.points, timing), None
     try:
         part = (config.start, config.stop, config.stride, config.part)
-        key = cache.key(paths, (config.points, timing, *part))
+        key = cache.key(files_of(paths), (config.points, timing, *part))
     except OSError as error:
         raise SequenceError(f"{paths[0]}: cannot be read ({error})") from error
     entry = cache.find(key)
@@ -286,8 +285,7 @@ class RecordedSequence:
         else:
             about = self.source.about() | {"left_out": repairs.counts}
             decoded = self._decode(repairs)
-            with alongside(self.source.files):
-                yield from decoded if self.key is None else cache.tee(decoded, self.key, about)
+            yield from decoded if self.key is None else cache.tee(decoded, self.key, about)
         repairs.report(self.name)
 
     def _decode(self, repairs: Repairs) -> Iterator[Scan]:

@@ -16,6 +16,7 @@ import struct
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -31,7 +32,6 @@ from adaptune.recording.clouds import PointCloudError
 from adaptune.recording.export import Messages
 from adaptune.recording.inspect import inspect, render_inspection
 from adaptune.recording.recording import open_sequence
-from adaptune.recording.scan import AUTO
 from offline.config import load_study
 
 SECONDS, BYTES = 10, 2 << 30
@@ -101,19 +101,12 @@ def samples() -> Iterator[tuple[bytes, Decode]]:
         for kind in (*LAYOUTS, LIVOX):
             typename = LIVOX if kind == LIVOX else CLOUD
             sound = message(made, kind, START, rng)
-            decode = decoder(kind, cdr, store.fielddefs)
+            decode = partial(clouds.decode_livox if kind == LIVOX else clouds.decode_cloud, cdr=cdr)
             if cdr:
                 yield bytes(store.serialize_cdr(sound, typename)), decode
                 yield bytes(store.serialize_cdr(sound, typename, little_endian=False)), decode
             else:
                 yield bytes(store.serialize_ros1(sound, typename)), decode
-
-
-def decoder(kind: str, cdr: bool, fields: Any) -> Decode:
-    if kind != LIVOX:
-        return lambda data: clouds.decode_cloud(data, cdr)
-    point = fields[LIVOX.replace("Msg", "Point")][1]
-    return lambda data: clouds.decode_livox(data, fields[LIVOX][1], point, cdr, AUTO)
 
 
 def damage(data: bytes, rng: np.random.Generator) -> bytes:
@@ -258,7 +251,7 @@ def _writer(path: Path, cdr: bool, option: Any) -> Any:
     return folder
 
 
-@patch("adaptune.recording.survey.SECONDS", 0.0)
+@patch("adaptune.recording.inspect.SECONDS", 0.0)
 def fuzz_bags(number: int, seed: int, folder: Path) -> Counter[str]:
     """Read so many damaged bags, and count what became of them; inspect samples of half of them."""
     rng = np.random.default_rng(seed)

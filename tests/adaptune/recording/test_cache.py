@@ -134,7 +134,7 @@ def test_a_damaged_entry_is_made_anew(tmp_path, cache_folder, caplog):
     config = SequenceConfig(bag=str(rec.drive(tmp_path / "a.bag")), cache=True)
     whole = list(open_sequence(config))
     (entry,) = cache_folder.iterdir()
-    for name in ("about.json", "index.npy", "points.npy"):
+    for name in ("about.json", "index.npy", "points"):
         caplog.clear()
         (entry / name).write_bytes(b"{")
         again = list(open_sequence(config))

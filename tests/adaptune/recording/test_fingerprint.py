@@ -6,7 +6,7 @@ import pytest
 import rec
 
 from adaptune.recording import SequenceConfig, cache
-from adaptune.recording.cache import alongside, fingerprints
+from adaptune.recording.cache import fingerprints
 from adaptune.recording.recording import open_sequence
 
 
@@ -87,27 +87,7 @@ def test_many_files_have_one_hash(tmp_path):
     assert fingerprints(files) != [before]
 
 
-def test_a_bag_is_hashed_while_it_is_decoded(tmp_path, hashed, monkeypatch):
-    config = SequenceConfig(bag=str(rec.drive(tmp_path / "a.bag")))
-    for _ in open_sequence(config):
-        pass
-    assert hashed == ["a.bag"]
-    forget(monkeypatch)
-    fingerprints([tmp_path / "a.bag"])
-    assert hashed == ["a.bag"]
-
-
-def test_a_pass_that_ends_early_leaves_no_thread(tmp_path, hashed):
-    file = write(tmp_path / "a", bytes(1 << 25))
-    with pytest.raises(OSError, match="ours"), alongside([file]):
-        raise OSError("ours")
-    assert fingerprints([file])
-    assert hashed == ["a", "a"]
-
-
-@pytest.mark.parametrize("small", [1, 1 << 24])
-def test_a_decoded_bag_is_that_of_its_content(tmp_path, monkeypatch, small):
-    monkeypatch.setattr(cache, "SMALL", small)
+def test_a_decoded_bag_is_that_of_its_content(tmp_path):
     path = rec.drive(tmp_path / "a.bag", n=300)
     config = SequenceConfig(bag=str(path))
     before = [scan.points for scan in open_sequence(config)]
