@@ -29,7 +29,7 @@ from adaptune.odometry.registry import ODOMETRIES, odometry_class
 from adaptune.odometry.remote import Isolated, Limits
 from adaptune.recording import Scan, SequenceError
 from adaptune.recording.recording import open_sequence
-from adaptune.recording.views import WithImu
+from adaptune.recording.views import with_imu
 from adaptune.simulation import Course
 from adaptune.simulation.course import as_sequence
 
@@ -76,7 +76,7 @@ def read(path: Path) -> tuple[list[Scan], Poses]:
     course = Course(scenes=("garden",), imu=200)
     sequence: Any
     try:
-        sequence = WithImu(open_sequence(as_sequence(course, path)))
+        sequence = with_imu(open_sequence(as_sequence(course, path)))
     except SequenceError:
         sequence = open_sequence(as_sequence(course.model_copy(update={"imu": None}), path))
     scans = list(sequence)

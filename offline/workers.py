@@ -33,7 +33,7 @@ from adaptune.recording import Scan, SequenceConfig, cache
 from adaptune.recording.cache import fingerprints
 from adaptune.recording.recording import sequence_files
 from adaptune.recording.scan import Imu, ImuNoise
-from adaptune.recording.views import WithImu
+from adaptune.recording.views import with_imu
 from adaptune.space import ParameterSet
 from adaptune.study.study import StudySequences
 from offline.trial import PreparedSequence, TrialSetup, with_measured_hops
@@ -627,7 +627,7 @@ class AwaySequences(StudySequences):
         if entry is None:
             raise LackingError(name)
         sent: Any = _Sent(entry)
-        return WithImu(sent) if self.with_imu else sent
+        return with_imu(sent) if self.with_imu else sent
 
 
 class _Sent:

@@ -1,9 +1,18 @@
 """Recordings in ROS 1 and ROS 2 bags."""
 
+import logging
 import struct
 import weakref
 from collections import Counter, defaultdict, deque
-from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Sequence
+from collections.abc import (
+    Callable,
+    Collection,
+    Generator,
+    Iterable,
+    Iterator,
+    Mapping,
+    Sequence,
+)
 from contextlib import contextmanager
 from functools import cache, partial
 from importlib.util import find_spec
@@ -30,8 +39,10 @@ from adaptune.recording.clouds import (
     usable,
 )
 from adaptune.recording.config import files_of
-from adaptune.recording.scan import AUTO, Frame, Imu, Repairs, Scan, SequenceError, Timing
+from adaptune.recording.scan import AUTO, Frame, Imu, Scan, SequenceError, Timing
 from adaptune.trajectory import Trajectory
+
+_log = logging.getLogger(__name__)
 
 # ROS 1 bags that are opened by the index at their end alone.
 
@@ -170,7 +181,7 @@ class BagSource:
             self.points: str = about["points"]
             self.n_messages: int = about["n_messages"]
             self._duration: int = about["duration"]
-            self._begins: dict[str, int] = dict(about["begins"])
+            self.begins: Mapping[str, int] = dict(about["begins"])
             return
         reader = self._opened()
         weakref.finalize(self, _close, reader)
@@ -180,7 +191,7 @@ class BagSource:
         self._duration = max(reader.end_time - reader.start_time, 0)
         known = [t for t, kind in self.topics.items() if t == self.points or kind in POSES]
         begins = {topic: self._begin(reader, topic) for topic in known}
-        self._begins = {topic: stamp for topic, stamp in begins.items() if stamp is not None}
+        self.begins = {topic: stamp for topic, stamp in begins.items() if stamp is not None}
         # Opening reads the whole index: once for this and the first pass.
         self._ready = reader
 
@@ -192,7 +203,7 @@ class BagSource:
             "points": self.points,
             "n_messages": self.n_messages,
             "duration": self._duration,
-            "begins": self._begins,
+            "begins": self.begins,
         }
 
     @property
@@ -231,12 +242,8 @@ class BagSource:
 
     def span(self) -> tuple[int, int] | None:
         """First stamp, and the last one if the recorder's clock went as the sensor's."""
-        first = self._begins.get(self.points)
+        first = self.begins.get(self.points)
         return None if first is None else (first, first + self._duration)
-
-    def first_pose(self, name: str) -> int | None:
-        """Stamp of the first pose on a topic."""
-        return self._begins.get(self.topic(name, POSES, "poses"))
 
     def poses(self, name: str | None, child_frame: str | None) -> Trajectory | None:
         """Poses on a topic, those with the same stamp once; of paths, the last one recorded.
@@ -256,9 +263,8 @@ class BagSource:
         unfit = f"poses on {name} that are not finite or have no rotation"
         if trajectory is None:
             raise SequenceError(f"{self.name}: holds only {unfit}")
-        repairs = Repairs()
-        repairs.add(unfit, unusable)
-        repairs.report(self.name)
+        if unusable:
+            _log.warning("%s: left out %d %s", self.name, unusable, unfit)
         return trajectory
 
     def imu(self, name: str | None) -> Imu | None:

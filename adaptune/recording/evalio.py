@@ -1,6 +1,6 @@
 """Sequences of the public data sets that evalio knows, by name."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from importlib import import_module
@@ -98,6 +98,7 @@ class EvalioFiles:
     """A data set in its own format, which evalio converts point by point."""
 
     random_access: ClassVar[bool] = False
+    begins: ClassVar[Mapping[str, int]] = {}
     pose_files: Sequence[Path] = ()
 
     def __init__(self, dataset: Any):
@@ -140,21 +141,12 @@ class EvalioFiles:
         period = self._dataset.lidar_params().delta_time().to_sec()
         return first.stamp, first.stamp + round(self.n_messages * period * 1e9)
 
-    def poses(self, name: str | None, child_frame: str | None) -> Trajectory | None:
+    def poses(self, *_: str | None) -> Trajectory | None:
         """The data set's poses."""
-        if name is not None or child_frame is not None:
-            raise SequenceError(f"{self.name}: has no topics; leave `reference` out or name a file")
         return _poses(self._dataset)
 
-    def first_pose(self, name: str) -> int | None:
-        """There are no topics."""
-        self.poses(name, None)
-        return None
-
-    def imu(self, name: str | None) -> Imu | None:
+    def imu(self, *_: str | None) -> Imu | None:
         """The data set's IMU."""
-        if name is not None:
-            raise SequenceError(f"{self.name}: has no topics; leave `imu.topic` out")
         measured = list(self._dataset.imu())
         stamps = np.array([m.stamp.to_nsec() for m in measured], np.int64)
         unique, index = np.unique(stamps, return_index=True)

@@ -4,7 +4,7 @@ All functions raise a SequenceError that names the file or folder that is missin
 """
 
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from decimal import Decimal, InvalidOperation
 from functools import partial
@@ -41,6 +41,7 @@ class FileSource:
     pose_files: Sequence[Path] = ()  # hold the poses
 
     random_access: ClassVar[bool] = True
+    begins: ClassVar[Mapping[str, int]] = {}
 
     def about(self) -> dict[str, Any]:
         """Its name."""
@@ -71,23 +72,12 @@ class FileSource:
         """First and last stamp."""
         return (int(self.stamps[0]), int(self.stamps[-1])) if len(self.stamps) else None
 
-    def poses(self, name: str | None, child_frame: str | None) -> Trajectory | None:
+    def poses(self, *_: str | None) -> Trajectory | None:
         """The LiDAR's poses stored with the files; a TrajectoryError if they cannot be read."""
-        if name is not None or child_frame is not None:
-            help_ = "`reference` must be a file of poses, or be left out"
-            raise SequenceError(f"{self.name}: has no topics; {help_}")
         return None if self.own_poses is None else self.own_poses()
 
-    def first_pose(self, name: str) -> int | None:
-        """Folders have no topics."""
-        self.poses(name, None)
-        return None
-
-    def imu(self, name: str | None) -> Imu | None:
+    def imu(self, *_: str | None) -> Imu | None:
         """Folders hold none."""
-        if name is not None:
-            raise SequenceError(f"{self.name}: has no topics; leave `imu` out")
-        return None
 
 
 def read_scan(path: Path, stamp: int, timing: Timing = AUTO) -> Scan:
@@ -126,7 +116,9 @@ def _fields(path: Path) -> NDArray[Any] | dict[str, NDArray[Any]]:
     elif path.suffix == ".npy":
         array = np.load(path, allow_pickle=False)
         if array.dtype.names is not None:
-            _require_xyz(array.dtype.names)
+            if missing := [axis for axis in "xyz" if axis not in array.dtype.names]:
+                there = ", ".join(array.dtype.names)
+                raise KeyError(f"no field {', '.join(missing)}; there is {there}")
             return array.reshape(-1)
     else:
         return _open3d_fields(path)
@@ -146,11 +138,6 @@ def _open3d_fields(path: Path) -> dict[str, NDArray[Any]]:
     return columns | {axis: fields["positions"][:, i] for i, axis in enumerate("xyz")}
 
 
-def _require_xyz(names: Sequence[str]) -> None:
-    if missing := [axis for axis in "xyz" if axis not in names]:
-        raise KeyError(f"no field {', '.join(missing)}; there is {', '.join(names)}")
-
-
 def scan_folder(folder: Path, timing: Timing = AUTO) -> FileSource:
     """Scans of a folder of ``.pcd``, ``.ply``, ``.npy`` or ``.bin`` files.
 
@@ -164,19 +151,13 @@ def scan_folder(folder: Path, timing: Timing = AUTO) -> FileSource:
             break
     else:
         raise SequenceError(f"{folder}: holds no scan ({', '.join(SUFFIXES)})")
-    stamp_files: list[Path] = []
-    if (times := folder / "times.txt").exists():
-        stamp_files.append(times)
-        stamps = _seconds(times)
-        if len(stamps) != len(files):
-            raise SequenceError(
-                f"{times}: {len(stamps)} times for {len(files)} scans; give one a scan"
-            )
-    else:
-        named = _named_stamps(files)
-        evenly = np.arange(len(files)) * round(timing.period * 1e9)
-        stamps = evenly if named is None else named
-    return FileSource(str(folder), files, stamps, timing, stamp_files=stamp_files)
+    times = folder / "times.txt"
+    if not times.exists():
+        return FileSource(str(folder), files, _named_stamps(files, timing.period), timing)
+    stamps = _seconds(times)
+    if len(stamps) != len(files):
+        raise SequenceError(f"{times}: {len(stamps)} times for {len(files)} scans; give one a scan")
+    return FileSource(str(folder), files, stamps, timing, stamp_files=[times])
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:
@@ -184,13 +165,13 @@ def _natural(path: Path) -> list[tuple[int, str]]:
     return [(int(n or 0), text) for text, n in re.findall(r"(\D*)(\d*)", path.stem)]
 
 
-def _named_stamps(files: Sequence[Path]) -> NDArray[np.int64] | None:
+def _named_stamps(files: Sequence[Path], period: float) -> NDArray[np.int64]:
     stems = [path.stem for path in files]
     if all(re.fullmatch(r"\d{17,19}", stem) for stem in stems):
         return np.array([int(stem) for stem in stems], np.int64)
     if all(re.fullmatch(r"\d{1,10}\.\d+", stem) for stem in stems):
         return np.array([int(Decimal(stem).scaleb(9)) for stem in stems], np.int64)
-    return None
+    return np.arange(len(files)) * round(period * 1e9)
 
 
 def kitti(folder: Path, elevation: float | None = None) -> FileSource:
@@ -224,7 +205,7 @@ def _kitti_odometry(folder: Path, elevation: float) -> FileSource:
         T_world_camera = read_kitti(found)
         if len(T_world_camera) != len(stamps):
             raise SequenceError(f"{found}: {len(T_world_camera)} poses for {len(stamps)} stamps")
-        T_camera_sensor = calibration(folder / "calib.txt", "Tr")
+        T_camera_sensor = _matrix(folder / "calib.txt", "Tr")
         T = geometry.invert(T_camera_sensor) @ T_world_camera @ T_camera_sensor
         return Trajectory(stamps, T)
 
@@ -250,8 +231,8 @@ def _kitti_drive(folder: Path, elevation: float | None) -> FileSource:
     pose_files: list[Path] = []
     if (folder / "oxts" / "data").is_dir():
         poses = partial(_oxts_poses, folder)
-        pose_files = [*_oxts_files(folder), folder / "oxts" / "timestamps.txt"]
-        pose_files.append(folder.parent / "calib_imu_to_velo.txt")
+        pose_files = sorted((folder / "oxts" / "data").glob("*.txt"))
+        pose_files += [folder / "oxts/timestamps.txt", folder.parent / "calib_imu_to_velo.txt"]
     elif (record := folder.parent.parent / "data_poses" / folder.name).is_dir():
         poses = partial(_kitti_360_poses, record, _dates(path))
         calibrations = record.parent.parent / "calibration"
@@ -270,14 +251,12 @@ def _kitti_drive(folder: Path, elevation: float | None) -> FileSource:
     )
 
 
-def _oxts_files(folder: Path) -> list[Path]:
-    return sorted((folder / "oxts" / "data").glob("*.txt"))
-
-
 def _oxts_poses(folder: Path) -> Trajectory:
-    files = _oxts_files(folder)
+    files = sorted((folder / "oxts" / "data").glob("*.txt"))
     stamps = _by_number(files, _dates(folder / "oxts" / "timestamps.txt"))
-    T_sensor_imu = _calibration_rt(folder.parent / "calib_imu_to_velo.txt")
+    path = folder.parent / "calib_imu_to_velo.txt"
+    rotation, translation = _numbers(path, "R", 9).reshape(3, 3), _numbers(path, "T", 3)
+    T_sensor_imu = _pose(np.column_stack([rotation, translation]))
     T_world_imu = read_oxts(files)
     _, first = np.unique(stamps, return_index=True)
     T = T_sensor_imu @ geometry.invert(T_world_imu[0]) @ T_world_imu @ geometry.invert(T_sensor_imu)
@@ -296,37 +275,31 @@ def _kitti_360_poses(record: Path, stamps: NDArray[np.int64]) -> Trajectory:
     if np.any(np.diff(frames) <= 0) or frames[0] < 0 or frames[-1] >= len(stamps):
         raise TrajectoryError(f"{path}: its frames are not in order, or not those of the drive")
     folder = record.parent.parent / "calibration"
-    T_body_camera = calibration(folder / "calib_cam_to_pose.txt", "image_00")
+    T_body_camera = _matrix(folder / "calib_cam_to_pose.txt", "image_00")
     T_sensor_camera = _matrix(folder / "calib_cam_to_velo.txt")
     T_world_body = _pose(rows[:, 1:].reshape(-1, 3, 4))
     T_world_sensor = T_world_body @ T_body_camera @ geometry.invert(T_sensor_camera)
     return Trajectory(stamps[frames], T_world_sensor)
 
 
-def calibration(path: Path, key: str) -> Poses:
-    """A 3x4 matrix of KITTI's ``key: 12 numbers`` files, as a pose of shape (4, 4)."""
-    numbers = _entries(path).get(key, [])
-    if len(numbers) != 12:
-        raise SequenceError(f"{path}: no line `{key}:` with 12 numbers")
-    return _pose(np.array(numbers).reshape(3, 4))
+def _matrix(path: Path, key: str = "") -> Poses:
+    """A 3x4 matrix of the line `key:` of a file, or of one that holds nothing else, as a pose."""
+    return _pose(_numbers(path, key, 12).reshape(3, 4))
 
 
-def _calibration_rt(path: Path) -> Poses:
-    entries = _entries(path)
-    if len(entries.get("R", [])) != 9 or len(entries.get("T", [])) != 3:
-        raise SequenceError(f"{path}: no lines `R:` and `T:` with 9 and 3 numbers")
-    rotation = np.array(entries["R"]).reshape(3, 3)
-    return _pose(np.column_stack([rotation, entries["T"]]))
-
-
-def _matrix(path: Path) -> Poses:
+def _numbers(path: Path, key: str, count: int) -> NDArray[np.float64]:
+    text = _text(path)
+    if key:
+        lines = (line.partition(":") for line in text.splitlines())
+        text = next((numbers for name, _, numbers in lines if name.strip() == key), "")
     try:
-        numbers = [float(field) for field in _text(path).split()]
+        numbers = np.array([float(field) for field in text.split()])
     except ValueError:
-        numbers = []
-    if len(numbers) != 12:
-        raise SequenceError(f"{path}: must hold the 12 numbers of a 3x4 matrix")
-    return _pose(np.array(numbers).reshape(3, 4))
+        numbers = np.empty(0)
+    if len(numbers) != count:
+        where = f"no line `{key}:` with {count}" if key else f"does not hold {count}"
+        raise SequenceError(f"{path}: {where} numbers")
+    return numbers
 
 
 def _pose(rows: NDArray[np.float64]) -> Poses:
@@ -334,17 +307,6 @@ def _pose(rows: NDArray[np.float64]) -> Poses:
     T = np.zeros((*rows.shape[:-2], 4, 4))
     T[..., :3, :], T[..., 3, 3] = rows, 1.0
     return T
-
-
-def _entries(path: Path) -> dict[str, list[float]]:
-    entries = {}
-    for line in _text(path).splitlines():
-        key, colon, numbers = line.partition(":")
-        try:
-            entries[key.strip()] = [float(field) for field in numbers.split()] if colon else []
-        except ValueError:  # a date, for example
-            continue
-    return entries
 
 
 def _scans(folder: Path) -> list[Path]:

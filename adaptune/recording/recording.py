@@ -2,6 +2,7 @@
 
 import logging
 import math
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import islice
 from pathlib import Path
@@ -19,7 +20,6 @@ from adaptune.recording.scan import (
     Frame,
     Imu,
     Recording,
-    Repairs,
     Scan,
     SequenceError,
     Source,
@@ -27,14 +27,16 @@ from adaptune.recording.scan import (
 )
 from adaptune.trajectory import Trajectory, TrajectoryError, is_kitti, read_kitti, read_trajectory
 
-# What every format of recordings offers, and which of its scans are used.
+_log = logging.getLogger(__name__)
+
+# Which of the scans of a recording are used.
 
 
 BACKWARD = "scans whose stamps do not come after the one before"
 LEAP = "scans whose stamps leap ahead of the recording"
 
 
-def in_order(frames: Iterable[Frame], repairs: Repairs) -> Iterator[Frame]:
+def in_order(frames: Iterable[Frame], left_out: Counter[str]) -> Iterator[Frame]:
     """Leave out the fewest frames so that stamps strictly increase.
 
     If a stamp does not come after the one before it, one of the two is wrong. The one that
@@ -49,13 +51,13 @@ def in_order(frames: Iterable[Frame], repairs: Repairs) -> Iterator[Frame]:
                 yield doubtful
                 last = doubtful
             elif _leap(last, doubtful) > _leap(last, frame):
-                repairs.add(LEAP)
+                left_out[LEAP] += 1
             else:
-                repairs.add(BACKWARD)
+                left_out[BACKWARD] += 1
                 continue
             doubtful = None
         if last is not None and frame.stamp <= last.stamp:
-            repairs.add(BACKWARD)
+            left_out[BACKWARD] += 1
         elif last is None or _leap(last, frame) > _DOUBT:
             # The next frame decides. Other frames pass at once: they are decoded while their bytes
             # are still in the processor's cache.
@@ -90,7 +92,7 @@ def open_sequence(config: SequenceConfig) -> Recording:
 
     A SequenceError says why it cannot be opened as described.
     """
-    sequence: views.Reversible = RecordedSequence(config)
+    sequence: Recording = RecordedSequence(config)
     if config.compensate == "constant_velocity":
         sequence = views.without_motion(sequence)
     elif config.compensate == "gyro":
@@ -211,11 +213,16 @@ def _check_topics(source: Source, config: SequenceConfig) -> None:
     """Find topics that are named and not there."""
     from adaptune.recording.bag import IMU_TYPES, BagSource
 
+    topic = None if config.imu is None else config.imu.topic
     if isinstance(source, BagSource):
-        topic = None if config.imu is None else config.imu.topic
         source.check(config.poses_topic, topic)
         if config.imu is not None and config.bag is not None:
             source.topic(topic, IMU_TYPES, "an IMU's measurements")
+    elif config.poses_topic or config.child_frame or topic:
+        raise SequenceError(
+            f"{source.name}: has no topics; leave `child_frame` and `imu.topic` out, and let "
+            f"`reference` be a file of poses, or leave it out"
+        )
 
 
 # Which part of a recording is used, and its reference and IMU.
@@ -277,23 +284,25 @@ class RecordedSequence:
         Scans whose stamps do not come after the one before are left out, counted, and reported in
         the log.
         """
-        repairs = Repairs()
+        left_out: Counter[str] = Counter()
         kept = None if self.key is None else cache.find(self.key)
         if kept is not None:
             yield from kept
-            repairs.counts = kept.about["left_out"]
+            left_out.update(kept.about["left_out"])
         else:
-            about = self.source.about() | {"left_out": repairs.counts}
-            decoded = self._decode(repairs)
+            about = self.source.about() | {"left_out": left_out}
+            decoded = self._decode(left_out)
             yield from decoded if self.key is None else cache.tee(decoded, self.key, about)
-        repairs.report(self.name)
+        if left_out:
+            what = ", ".join(f"{n} {reason}" for reason, n in left_out.items())
+            _log.warning("%s: left out %s", self.name, what)
 
-    def _decode(self, repairs: Repairs) -> Iterator[Scan]:
+    def _decode(self, left_out: Counter[str]) -> Iterator[Scan]:
         last = None
-        for frame in self._frames(repairs):
+        for frame in self._frames(left_out):
             scan = frame.load()
             if last is not None and scan.stamp <= last:
-                repairs.add(BACKWARD)
+                left_out[BACKWARD] += 1
                 continue
             last = scan.stamp
             yield scan
@@ -304,10 +313,10 @@ class RecordedSequence:
                 f"start, stop or stride"
             )
 
-    def _frames(self, repairs: Repairs) -> Iterator[Frame]:
+    def _frames(self, left_out: Counter[str]) -> Iterator[Frame]:
         """The frames of the part that is used; their stamps strictly increase."""
         first, number = None, 0
-        for frame in in_order(self.source.frames(), repairs):
+        for frame in in_order(self.source.frames(), left_out):
             first = frame.stamp if first is None else first
             seconds = (frame.stamp - first) * 1e-9
             if self.stop is not None and seconds >= self.stop:
@@ -320,7 +329,7 @@ class RecordedSequence:
     def backward(self) -> Iterator[Scan]:
         """Read the scans, the last one first. A bag is decoded to the cache before."""
         if self.source.random_access:
-            frames = list(self._frames(Repairs()))
+            frames = list(self._frames(Counter()))
             yield from (frame.load() for frame in reversed(frames))
             return
         if self.key is not None and cache.find(self.key) is None:
@@ -378,7 +387,7 @@ class RecordedSequence:
             raise SequenceError(f"{self.name}: {what}")
         topic, file = self._config.poses_topic, self._config.poses_file
         if topic is not None:
-            first = self.source.first_pose(topic)
+            first = self.source.begins.get(topic)
             offset = round(self._config.clock_offset * 1e9)
             if first is None or abs(first + offset - span[0]) <= span[1] - span[0]:
                 return
@@ -434,7 +443,7 @@ class RecordedSequence:
             _log.info("%s: comparing how its scans turn with the reference", self.name)
             try:
                 stamps, turning = compensation.turning_of(
-                    islice(self._decode(Repairs()), _MOST_SCANS)
+                    islice(self._decode(Counter()), _MOST_SCANS)
                 )
             except AdaptuneError:
                 return ""
@@ -455,6 +464,3 @@ def _warn_of_jumps(name: str, trajectory: Trajectory) -> None:
         first = trajectory.stamps[jumps[0] + 1] * 1e-9
         message = "%s: the reference jumps %d times, first at %.3f s, faster than %g m/s"
         _log.warning(message, name, len(jumps), first, _FASTEST)
-
-
-_log = logging.getLogger(__name__)

@@ -1,8 +1,7 @@
 """What recordings consist of: scans, measurements of an IMU, and the formats that give them."""
 
-import logging
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Protocol
@@ -14,8 +13,6 @@ from pydantic import BeforeValidator
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses
 from adaptune.trajectory import Trajectory
-
-_log = logging.getLogger(__name__)
 
 # Measurements of an IMU.
 
@@ -154,6 +151,9 @@ class Recording(Protocol):
 
     def __iter__(self) -> Iterator[Scan]:
         """Read the scans; their stamps strictly increase."""
+
+    def backward(self) -> Iterator[Scan]:
+        """Read the scans, the last one first."""
 
     def reference(self) -> Trajectory | None:
         """Poses of the LiDAR, if they are known."""
@@ -370,6 +370,10 @@ class Source(Protocol):
         """At least as many as there are scans."""
 
     @property
+    def begins(self) -> Mapping[str, int]:
+        """Stamps of the first message on the topics of scans and poses, if it has topics."""
+
+    @property
     def files(self) -> Sequence[Path]:
         """All files that its scans and its IMU are read from."""
 
@@ -386,29 +390,8 @@ class Source(Protocol):
     def span(self) -> tuple[int, int] | None:
         """First stamp, and about the last one; none where there is no scan."""
 
-    def poses(self, name: str | None, child_frame: str | None) -> Trajectory | None:
-        """Reference poses of the recording itself, or those of one topic."""
+    def poses(self, name: str | None, child_frame: str | None, /) -> Trajectory | None:
+        """Reference poses of the recording itself, or, of a bag, those of one topic."""
 
-    def first_pose(self, name: str) -> int | None:
-        """Stamp of the first pose on a topic."""
-
-    def imu(self, name: str | None) -> Imu | None:
+    def imu(self, name: str | None, /) -> Imu | None:
         """Measurements of its IMU, in the IMU's own units."""
-
-
-@dataclass
-class Repairs:
-    """Counts of what was left out of a recording, by reason."""
-
-    counts: dict[str, int] = field(default_factory=dict)
-
-    def add(self, reason: str, n: int = 1) -> None:
-        """Count what was left out."""
-        if n:
-            self.counts[reason] = self.counts.get(reason, 0) + n
-
-    def report(self, name: str) -> None:
-        """Log the counts, if there are any."""
-        if self.counts:
-            what = ", ".join(f"{n} {reason}" for reason, n in self.counts.items())
-            _log.warning("%s: left out %s", name, what)

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache as once
 from functools import partial
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,18 +23,11 @@ from adaptune.trajectory import Trajectory
 _LATE = 10 * 10**9
 
 
-class Reversible(Recording, Protocol):
-    """A sequence that can be read from its end."""
-
-    def backward(self) -> Iterator[Scan]:
-        """Read the scans, the last one first."""
-
-
 @dataclass(frozen=True, eq=False)
 class View:
     """A sequence whose scans are changed or left out, and read from its end if `reverse`."""
 
-    inner: Reversible
+    inner: Recording
     # What it does to the scans, to poses, to measurements and to the time of arrival.
     of_scans: Callable[[Iterator[Scan]], Iterable[Scan]] = lambda scans: scans
     of_reference: Callable[[Trajectory], Trajectory] = lambda trajectory: trajectory
@@ -82,7 +75,7 @@ class View:
         return (self.clock or self.inner.played_at)(stamps)
 
 
-def without_motion(sequence: Reversible) -> View:
+def without_motion(sequence: Recording) -> View:
     """Points as if the sensor had kept its place since the scan's start, at constant velocity.
 
     The velocity is that since the scan read before, which is registered for it.
@@ -90,7 +83,7 @@ def without_motion(sequence: Reversible) -> View:
     return View(sequence, lambda scans: compensate_neighbours(_timed(sequence, scans)))
 
 
-def without_rotation(sequence: Reversible) -> View:
+def without_rotation(sequence: Recording) -> View:
     """Points as if the sensor had not turned since the scan's start, by its gyroscope."""
     imu = once(sequence.imu)
 
@@ -102,7 +95,7 @@ def without_rotation(sequence: Reversible) -> View:
     return View(sequence, compensated)
 
 
-def _timed(sequence: Reversible, scans: Iterator[Scan]) -> Iterator[Scan]:
+def _timed(sequence: Recording, scans: Iterator[Scan]) -> Iterator[Scan]:
     for scan in scans:
         if scan.times is None and len(scan):
             raise SequenceError(
@@ -111,7 +104,38 @@ def _timed(sequence: Reversible, scans: Iterator[Scan]) -> Iterator[Scan]:
         yield scan
 
 
-def _is_within(sequence: Reversible) -> Callable[[Scan, float, float | None], bool]:
+def with_imu(sequence: Recording) -> View:
+    """Scans carry the IMU's measurements.
+
+    Reading raises a SequenceError if there is no IMU, or it measured at another time.
+    """
+    measurements = once(sequence.imu)
+
+    def carrying(scans: Iterator[Scan]) -> Iterator[Scan]:
+        imu = measurements()
+        if imu is None or not len(imu):
+            what = "holds no measurements of an IMU; name their topic"
+            raise SequenceError(f"{sequence.name}: {what}")
+        first: int | None = None
+        for scan in scans:
+            if first is None:
+                begin, end = imu.stamps[0], imu.stamps[-1]
+                if not begin - _LATE < scan.stamp < end:
+                    first_scan, *covered = (f"{t * 1e-9:.3f} s" for t in (scan.stamp, begin, end))
+                    raise SequenceError(
+                        f"{sequence.name}: the IMU covers {' to '.join(covered)}, the first scan "
+                        f"is of {first_scan}: record both on the same clock, or leave `imu` out"
+                    )
+                # Those during the first scan, and the one before.
+                first = max(int(imu.stamps.searchsorted(scan.stamp, "right")) - 1, 0)
+            last = max(int(imu.stamps.searchsorted(scan.stamp + scan.span)) + 1, first)
+            yield replace(scan, imu=imu.part(first, last))
+            first = last
+
+    return View(sequence, carrying)
+
+
+def _is_within(sequence: Recording) -> Callable[[Scan, float, float | None], bool]:
     """Whether a scan is in [start, stop) seconds since the first one, to the end if None."""
     first = once(lambda: next(iter(sequence)).stamp)
 
@@ -122,7 +146,7 @@ def _is_within(sequence: Reversible) -> Callable[[Scan, float, float | None], bo
     return within
 
 
-def _cut(sequence: Reversible, parts: Sequence[tuple[float, float]]) -> View:
+def _cut(sequence: Recording, parts: Sequence[tuple[float, float]]) -> View:
     """Only these parts of it; stamps stay as they are."""
     within = _is_within(sequence)
     return View(
@@ -130,7 +154,7 @@ def _cut(sequence: Reversible, parts: Sequence[tuple[float, float]]) -> View:
     )
 
 
-def _drop(sequence: Reversible, given: DropConfig) -> View:
+def _drop(sequence: Recording, given: DropConfig) -> View:
     """Lose a share of the scans of a part, each at random by itself."""
     within = _is_within(sequence)
 
@@ -141,7 +165,7 @@ def _drop(sequence: Reversible, given: DropConfig) -> View:
     return View(sequence, lambda scans: (scan for scan in scans if not lost(scan)))
 
 
-def _speed(sequence: Reversible, given: SpeedConfig) -> View:
+def _speed(sequence: Recording, given: SpeedConfig) -> View:
     """A part of it arrives `given.factor` times faster.
 
     Scans, stamps and poses stay the same. Only `played_at` changes, for odometries that run
@@ -161,7 +185,7 @@ def _speed(sequence: Reversible, given: SpeedConfig) -> View:
     return View(sequence, clock=arrival)
 
 
-def _noise(sequence: Reversible, given: NoiseConfig) -> View:
+def _noise(sequence: Recording, given: NoiseConfig) -> View:
     """Move every point along its ray by a normal error."""
 
     def disturb(scan: Scan) -> Scan:
@@ -174,7 +198,7 @@ def _noise(sequence: Reversible, given: NoiseConfig) -> View:
     return View(sequence, partial(map, disturb))
 
 
-def _transform(sequence: Reversible, given: Any) -> View:
+def _transform(sequence: Recording, given: Any) -> View:
     """See it from another frame, as if the LiDAR were mounted differently."""
     T_seen_sensor = geometry.to_pose(given)
     R = T_seen_sensor[:3, :3].astype(np.float32)
@@ -188,7 +212,7 @@ def _transform(sequence: Reversible, given: Any) -> View:
     )
 
 
-def _reverse(sequence: Reversible, _: Any) -> View:
+def _reverse(sequence: Recording, _: Any) -> View:
     """Played backwards: the last scan comes first, and time still goes forward."""
 
     @once
@@ -220,7 +244,7 @@ def _reverse(sequence: Reversible, _: Any) -> View:
     return View(sequence, partial(map, mirror), poses, measured, clock, reverse=True)
 
 
-VIEWS: dict[str, Callable[[Reversible, Any], View]] = {
+VIEWS: dict[str, Callable[[Recording, Any], View]] = {
     "cut": _cut,
     "drop": _drop,
     "speed": _speed,
@@ -229,37 +253,6 @@ VIEWS: dict[str, Callable[[Reversible, Any], View]] = {
     "transform": _transform,
 }
 """By the names of a study's views, each with its settings."""
-
-
-class WithImu:
-    """A sequence whose scans carry the IMU's measurements."""
-
-    def __init__(self, inner: Recording):
-        self.inner = inner
-        self.name, self.n_messages = inner.name, inner.n_messages
-        self.reference, self.played_at = inner.reference, inner.played_at
-        self.imu = once(inner.imu)
-
-    def __iter__(self) -> Iterator[Scan]:
-        """Read the scans; a SequenceError if there is no IMU, or it measured at another time."""
-        imu = self.imu()
-        if imu is None or not len(imu):
-            raise SequenceError(f"{self.name}: holds no measurements of an IMU; name their topic")
-        first: int | None = None
-        for scan in self.inner:
-            if first is None:
-                begin, end = imu.stamps[0], imu.stamps[-1]
-                if not begin - _LATE < scan.stamp < end:
-                    first_scan, *covered = (f"{t * 1e-9:.3f} s" for t in (scan.stamp, begin, end))
-                    raise SequenceError(
-                        f"{self.name}: the IMU covers {' to '.join(covered)}, the first scan is of "
-                        f"{first_scan}: record both on the same clock, or leave `imu` out"
-                    )
-                # Those during the first scan, and the one before.
-                first = max(int(imu.stamps.searchsorted(scan.stamp, "right")) - 1, 0)
-            last = max(int(imu.stamps.searchsorted(scan.stamp + scan.span)) + 1, first)
-            yield replace(scan, imu=imu.part(first, last))
-            first = last
 
 
 def _rng(seed: int, scan: Scan) -> np.random.Generator:

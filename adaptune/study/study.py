@@ -36,7 +36,7 @@ from adaptune.recording.recording import (
     wants_estimate,
 )
 from adaptune.recording.scan import OF_VIEW, Recording, origin, part_name
-from adaptune.recording.views import WithImu
+from adaptune.recording.views import with_imu
 from adaptune.reference.stored import BREAK, EstimateError, StoredEstimate
 from adaptune.simulation.course import Course
 from adaptune.space import ODOMETRY, ParameterSet, ParameterSpace
@@ -150,7 +150,7 @@ class StudySequences:
         """
         self._check_recorded(name)
         sequence = open_sequence(self.config(name))
-        return WithImu(sequence) if self.with_imu else sequence
+        return with_imu(sequence) if self.with_imu else sequence
 
     def _check_recorded(self, name: str) -> None:
         course = origin(name)

@@ -5,7 +5,7 @@ from pydantic import ValidationError
 
 from adaptune.recording import Imu, Scan, SequenceConfig, SequenceError
 from adaptune.recording.recording import open_sequence
-from adaptune.recording.views import WithImu
+from adaptune.recording.views import with_imu
 
 
 @pytest.fixture(scope="module")
@@ -139,7 +139,7 @@ class Inertial:
 
 
 def hundredths(begin, end):
-    measured = [scan.imu for scan in WithImu(Inertial(begin, end))]
+    measured = [scan.imu for scan in with_imu(Inertial(begin, end))]
     return [(imu.stamps // 10**7).tolist() for imu in measured]
 
 
