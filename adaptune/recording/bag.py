@@ -2,7 +2,6 @@
 
 import logging
 import struct
-import weakref
 from collections import Counter, defaultdict, deque
 from collections.abc import (
     Callable,
@@ -175,7 +174,6 @@ class BagSource:
         about: dict[str, Any] | None = None,
     ):
         self.paths, self.timing = tuple(paths), timing
-        self._ready: AnyReader | None = None
         if about is not None:
             self.topics: dict[str, str] = dict(about["topics"])
             self.points: str = about["points"]
@@ -183,17 +181,14 @@ class BagSource:
             self._duration: int = about["duration"]
             self.begins: Mapping[str, int] = dict(about["begins"])
             return
-        reader = self._opened()
-        weakref.finalize(self, _close, reader)
-        self.topics = {c.topic: c.msgtype for c in reader.connections}
-        self.points = self.topic(points, POINTS_TYPES, "point clouds")
-        self.n_messages = sum(c.msgcount for c in reader.connections if c.topic == self.points)
-        self._duration = max(reader.end_time - reader.start_time, 0)
-        known = [t for t, kind in self.topics.items() if t == self.points or kind in POSES]
-        begins = {topic: self._begin(reader, topic) for topic in known}
+        with self.open() as reader:
+            self.topics = {c.topic: c.msgtype for c in reader.connections}
+            self.points = self.topic(points, POINTS_TYPES, "point clouds")
+            self.n_messages = sum(c.msgcount for c in reader.connections if c.topic == self.points)
+            self._duration = max(reader.end_time - reader.start_time, 0)
+            known = [t for t, kind in self.topics.items() if t == self.points or kind in POSES]
+            begins = {topic: self._begin(reader, topic) for topic in known}
         self.begins = {topic: stamp for topic, stamp in begins.items() if stamp is not None}
-        # Opening reads the whole index: once for this and the first pass.
-        self._ready = reader
 
     def about(self) -> dict[str, Any]:
         """Everything that opening the bags has shown, as plain data."""
@@ -334,13 +329,6 @@ class BagSource:
     @contextmanager
     def open(self, by_index: bool = False) -> Iterator[AnyReader]:
         """Open the bags for reading; `by_index`, without a look at their chunks."""
-        reader, self._ready = self._ready or self._opened(by_index), None
-        try:
-            yield reader
-        finally:
-            reader.close()
-
-    def _opened(self, by_index: bool = False) -> AnyReader:
         try:
             reader = AnyReader(self.paths, default_typestore=_typestore())
             if by_index and not reader.is2:
@@ -352,7 +340,10 @@ class BagSource:
                 f"{self.name}: cannot be opened as a bag ({_say(error)}); if the recording was cut "
                 f"short, repair it first (`rosbag reindex`, `ros2 bag reindex` or `mcap recover`)"
             ) from error
-        return reader
+        try:
+            yield reader
+        finally:
+            reader.close()
 
     def read(
         self,
@@ -407,11 +398,6 @@ def _load(decode: Callable[[bytes], Scan], data: bytes, what: str) -> Scan:
         raise SequenceError(f"{what}: {error}") from error
     except Exception as error:
         raise SequenceError(f"{what}: damaged ({_say(error)})") from error
-
-
-def _close(reader: AnyReader) -> None:
-    if reader.stack is not None:
-        reader.close()
 
 
 def _say(error: Exception) -> str:

@@ -99,7 +99,8 @@ class CachedScans:
     def __getitem__(self, i: int) -> Scan:
         stamp, *bounds = self._index[i].tolist()
         parts = zip(self._arrays, bounds[::2], bounds[1::2], strict=True)
-        points, times, rings, lights = (a[low:high] if low >= 0 else None for a, low, high in parts)
+        columns: list[Any] = [a[low:high] if low >= 0 else None for a, low, high in parts]
+        points, times, rings, lights = columns
         return Scan(stamp, points, times, rings, intensities=lights)
 
     def __iter__(self) -> Iterator[Scan]:

@@ -312,7 +312,8 @@ def _kernel(kind: str) -> Callable[..., Any]:
     scan = types.Tuple([types.Array(scalar, axes, "C") for scalar, axes in kinds])
     given = types.Tuple((column(time), column(whole), column(real)))
     signature = types.Tuple((numba.int64, time, time))(*3 * (column(real),), given, scan)
-    return numba.njit(signature, nogil=True, cache=True)(_gather)
+    compiled: Callable[..., Any] = numba.njit(signature, nogil=True, cache=True)(_gather)
+    return compiled
 
 
 # livox_ros_driver/CustomMsg to scans.
@@ -320,12 +321,14 @@ def _kernel(kind: str) -> Callable[..., Any]:
 
 LIVOX_TYPES = ("livox_ros_driver/msg/CustomMsg", "livox_ros_driver2/msg/CustomMsg")
 
-_LIVOX_POINT = {
-    "offset_time": "uint32",
-    **dict.fromkeys("xyz", "float32"),
-    **dict.fromkeys(("reflectivity", "tag", "line"), "uint8"),
-}
-_POINT = "".join(f"{kind} {name}\n" for name, kind in _LIVOX_POINT.items())
+_POINT = """uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z
+uint8 reflectivity\nuint8 tag\nuint8 line\n"""
+_LIVOX_POINT = (
+    ("offset_time", "u4"),
+    *((axis, "f4") for axis in "xyz"),
+    *((name, "u1") for name in ("reflectivity", "tag", "line")),
+)
+_LIVOX_SIZE = 19  # bytes, without padding
 _MESSAGE = """std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 lidar_id
 uint8[3] rsvd\nCustomPoint[] points\n"""
 # For ROS 2 bags without definitions; all others bring their own.
@@ -348,10 +351,9 @@ def decode_livox(data: bytes | memoryview, cdr: bool, timing: Timing = AUTO) -> 
         body.align(8)
         body.block(8 + 4 + 1 + 3)  # what comes before the points
         count = body.uint32()
-        fields = [(n, np.dtype(kind).newbyteorder(body.order)) for n, kind in _LIVOX_POINT.items()]
-        dtype = np.dtype(fields, align=cdr)
+        dtype = np.dtype([(name, body.order + kind) for name, kind in _LIVOX_POINT], align=cdr)
         # Behind the last point there is no padding.
-        size = max(count - 1, 0) * dtype.itemsize + sum(kind.itemsize for _, kind in fields)
+        size = max(count - 1, 0) * dtype.itemsize + _LIVOX_SIZE
         points = body.block(size if count else 0)
         raw = np.zeros(count, dtype)
         raw.view(np.uint8)[: len(points)] = np.frombuffer(points, np.uint8)

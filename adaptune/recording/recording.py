@@ -4,6 +4,7 @@ import logging
 import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
+from functools import cached_property
 from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
@@ -257,10 +258,9 @@ class RecordedSequence:
         self.start, self.stop, self.stride = config.start, config.stop, config.stride
         self._config = config
         _check_topics(self.source, config)
-        if config.part is not None and (span := self.source.span()) is not None:
+        if config.part is not None and self._seconds:
             begin, end = config.part
-            seconds = (span[1] - span[0]) * 1e-9
-            whole = (seconds if self.stop is None else min(self.stop, seconds)) - self.start
+            whole = self._until - self.start
             self.stop = self.stop if end == 1.0 else self.start + end * whole
             self.start += begin * whole
 
@@ -269,13 +269,21 @@ class RecordedSequence:
         """The recording's file."""
         return self.source.name
 
+    @cached_property
+    def _seconds(self) -> float:
+        """About how long the whole recording lasts."""
+        begin, end = self.source.span() or (0, 0)
+        return (end - begin) * 1e-9
+
+    @property
+    def _until(self) -> float:
+        """Seconds at which the used part ends."""
+        return self._seconds if self.stop is None else min(self.stop, self._seconds)
+
     @property
     def n_messages(self) -> int:
         """About how many scans of the recording it uses."""
-        begin, end = self.source.span() or (0, 0)
-        seconds = (end - begin) * 1e-9
-        stop = seconds if self.stop is None else min(self.stop, seconds)
-        share = max(stop - self.start, 0.0) / seconds if seconds > 0.0 else 1.0
+        share = max(self._until - self.start, 0.0) / self._seconds if self._seconds > 0.0 else 1.0
         return -(-round(self.source.n_messages * share) // self.stride)
 
     def __iter__(self) -> Iterator[Scan]:
@@ -381,9 +389,8 @@ class RecordedSequence:
         span = self.source.span()
         if span is None:
             return
-        seconds = (span[1] - span[0]) * 1e-9
-        if self.start > seconds:
-            what = f"start = {self.start:g} s is beyond its end, it lasts {seconds:.1f} s"
+        if self.start > self._seconds:
+            what = f"start = {self.start:g} s is beyond its end, it lasts {self._seconds:.1f} s"
             raise SequenceError(f"{self.name}: {what}")
         topic, file = self._config.poses_topic, self._config.poses_file
         if topic is not None:
