@@ -286,10 +286,13 @@ class SequenceConfig(_Part):
         is_topic = self.poses_file is None and self.reference not in (ESTIMATED, NO_REFERENCE)
         return self.reference if is_topic else None
 
+    def bags(self) -> list[Path]:
+        """Bags to open; a SequenceError if there is no such bag."""
+        return bag_paths((self.bag,) if isinstance(self.bag, str) else self.bag or ())
+
     def paths(self) -> list[Path]:
         """Files and folders that it is read from; a SequenceError if there is no such bag."""
-        paths = bag_paths((self.bag,) if isinstance(self.bag, str) else self.bag or ())
-        paths = [*paths, *(Path(given) for given in (self.kitti, self.folder) if given)]
+        paths = [*self.bags(), *(Path(given) for given in (self.kitti, self.folder) if given)]
         of_poses = (self.reference, self.position_prior)
         paths += [Path(file) for file in of_poses if file and file.endswith(REFERENCE_FILES)]
         return paths

@@ -110,8 +110,9 @@ class Inspection:
     used: dict[str, str] = field(default_factory=dict)
     complete: bool = True  # whether it was read to its end or damage, and not only a sample of it
     scan: Scan | None = None  # the first one; none where no scan could be read
-    recorded: int = 0  # points in its message, those without a measurement included
-    # Name, type and offset of the fields of a point.
+    # Of a PointCloud2 the points in its message, those without a measurement included, and name,
+    # type and offset of their fields.
+    recorded: int = 0
     layout: tuple[tuple[str, str, int], ...] = ()
     valid: list[int] = field(default_factory=list)  # valid points of each cloud that was read
     reference: Trajectory | None = None  # as far as it was read
@@ -168,15 +169,10 @@ class Inspection:
         text = files.dump({"sequences": {self.name: self.given}})
         if "bag" not in self.given:
             return text
-        if "reference" not in self.used:
-            text += (
-                "    # reference: a topic, or a TUM, KITTI or EuRoC file; estimated if left out\n"
-            )
-        if self.scan is not None and self.scan.times is not None:
-            text += (
-                "    # stamp: end - if headers mark scans' ends and times count from the start\n"
-            )
-        return text
+        hint = "    # reference: a topic, or a TUM, KITTI or EuRoC file; estimated if left out\n"
+        text += hint if "reference" not in self.used else ""
+        hint = "    # stamp: end - if headers mark scans' ends and times count from the start\n"
+        return text + (hint if self.scan is not None and self.scan.times is not None else "")
 
 
 def inspect(path: Path, deep: bool = False, show: Progress = unseen) -> Inspection:
@@ -432,7 +428,7 @@ class _Survey:
                 case "points":
                     first = self._found.scan is None
                     _keep_scan(self._found, self._load(data, "message"))
-                    if first:
+                    if first and topic.type == POINTS_TYPES[0]:
                         _describe(self._found, self._reader.deserialize(data, topic.type))
                 case "reference":
                     self._poses += POSES[topic.type](self._reader.deserialize(data, topic.type))
@@ -463,11 +459,6 @@ class _Survey:
 
 def _describe(found: Inspection, message: Any) -> None:
     """Keep the fields of a point of a cloud, and how many points it holds."""
-    if not hasattr(message, "fields"):
-        points = getattr(message, "points", ())
-        names = [name for point in points[:1] for name in vars(point) if name[:2] != "__"]
-        found.layout, found.recorded = tuple((name, "", 0) for name in names), len(points)
-        return
     layout = []
     for each in sorted(message.fields, key=lambda each: each.offset):
         kind = np.dtype(DATATYPES[each.datatype]).name if each.datatype in DATATYPES else "?"
@@ -733,7 +724,7 @@ def _topic_table(inspection: Inspection) -> Table:
 def _field_text(field: tuple[str, str, int]) -> str:
     name, kind, offset = field
     role = " (time)" if name in TIME_FIELDS else " (ring)" if name in RING_FIELDS else ""
-    return f"{name}{role} {kind}@{offset}" if kind else f"{name}{role}"
+    return f"{name}{role} {kind}@{offset}"
 
 
 def _scan_text(scan: Scan, recorded: int) -> str:

@@ -16,7 +16,7 @@ from adaptune import geometry
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import to_pose
 from adaptune.recording import cache, compensation, views
-from adaptune.recording.config import ESTIMATED, NO_REFERENCE, SequenceConfig, bag_paths, files_of
+from adaptune.recording.config import ESTIMATED, NO_REFERENCE, SequenceConfig, files_of
 from adaptune.recording.scan import (
     Frame,
     Imu,
@@ -160,8 +160,7 @@ def sequence_files(config: SequenceConfig) -> SequenceFiles:
     if config.reference in (ESTIMATED, NO_REFERENCE):
         own = []
     if config.bag is not None:
-        bags = bag_paths((config.bag,) if isinstance(config.bag, str) else config.bag)
-        return SequenceFiles(files_of(bags), own or ())
+        return SequenceFiles(files_of(config.bags()), own or ())
     source, _ = _source(config)
     return SequenceFiles(source.files, source.pose_files if own is None else own)
 
@@ -196,8 +195,7 @@ def _source(config: SequenceConfig) -> tuple[Source, str | None]:
         from adaptune.recording.evalio import evalio_source
 
         return evalio_source(config.evalio), None
-    bags = (config.bag,) if isinstance(config.bag, str) else config.bag or ()
-    paths = bag_paths(bags)
+    paths = config.bags()
     if not config.cache or not cache.cap():
         return BagSource(paths, config.points, timing), None
     try:
