@@ -4,7 +4,7 @@ import logging
 import threading
 from collections import deque
 from collections.abc import Collection, Mapping, Sequence
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,121 +50,11 @@ SELECTIONS_TO_JUDGE_PLACE = 5
 _log = logging.getLogger(__name__)
 
 
-class _Worse(NamedTuple):
-    """What was measured of a set that did worse than predicted."""
-
-    error: float  # percent
-    until: float  # seconds
-
-
-class Selector:
-    """Chooses parameters for an odometry, or weights for a bank, by an error model.
-
-    Show it every scan with `observe`; ask it to `select` whenever a selection is due, usually once
-    a second, and let it `measure` after that: it compares the odometry's motion over the last
-    metres, and that of each member of a bank, with a direct registration, see `adaptune.live`. What
-    is measured counts from the next selection on. The selector reads no clock and no file.
-
-    With the paired rule and a bank, the selections are weights of the bank's members, smoothed over
-    the last selections. A single odometry leaves a set that surely does worse than predicted, if
-    another one, or the baseline, is predicted to do better than that. The reserve of a bank
-    (`ErrorModel.reserve`) rests, except for a minute after a place that training does not know, and
-    after a failure. Scans of a
-    sensor or mount that was not trained with (`ErrorModel.is_foreign`) get the fixed set, or in a
-    bank weights by what is measured alone.
-
-    Parameters
-    ----------
-    model
-        Fitted offline.
-    rule
-        One of `adaptune.model.RULES`.
-    members
-        Trial numbers of the members of the bank that runs, the fixed set first: the paired rule
-        weighs them, others choose among them. None takes the model's bank for the paired rule if
-        that is what is driven; an empty one is for a single odometry.
-    descriptors
-        Descriptors besides adaptune's own that may be used: a model that names another is refused.
-    measures
-        Whether `measure` measures anything; if not, only the training counts.
-
-    Attributes
-    ----------
-    fixed : int
-        Trial number of the set to begin with.
-    members : tuple of int
-        Trial numbers of the bank's members; empty for a single odometry.
-
-    Raises
-    ------
-    ModelError
-        If the model's bank lacks a member, or the model names a descriptor
-        that may not be used.
-    DescriptorError
-        If a descriptor has changed since the model was fitted.
-    """
-
-    def __init__(
-        self,
-        model: ErrorModel,
-        rule: str = RULES[0],
-        members: Sequence[int] | None = None,
-        descriptors: Collection[str] = (),
-        measures: bool = True,
-    ):
-        model.check_descriptors(descriptors)
-        if members is None:
-            drives_bank = rule == "adaptive" and (model.bank_adapts or model.bank_rests)
-            members = model.bank if drives_bank else ()
-        self.members = tuple(members)
-        self.fixed = self.members[0] if self.members else model.fixed
-        self._model = model
-        self._measures = measures
-        self._pca = model.pca()
-        weighs = bool(self.members) and rule == "adaptive"
-        reserve = model.reserve if weighs else []
-        self._reserve = frozenset(reserve).intersection(self.members)
-        self._always = [member for member in self.members if member not in self._reserve]
-        fitted: Rule = PairedExpectedRatio(model.paired)
-        if weighs:
-            # A bank that need not always work weighs its members where it does.
-            fitted = BankRule(model.bank_settings.model_copy(update={"adapt": True}))
-        elif rule == "paper":
-            from adaptune.model.knn import NearestNeighbours  # compiled code, which few need
-
-            fitted = NearestNeighbours()
-        self._rule = fitted.fit(model.training_data(self._pca, self.members or None))
-        self._live = LiveEvidence(self.members, model.length)
-        self._describe = Describer(model.blocks)
-        if self._describe.blocks != model.blocks:
-            raise DescriptorError(
-                f"the model was fitted to descriptors of {model.blocks} numbers, these have "
-                f"{self._describe.blocks}; run `adaptune offline` again"
-            )
-        # The first selection loads compiled code; the robot should not wait for that.
-        self.reset()
-        self.observe(0, Scan(0, np.zeros((0, 3), np.float32)), Motions(np.eye(4), {}))
-        self.select()
-        self.reset()
+class AnySelector(Protocol):
+    """What chooses parameters on the way; see `Selector`."""
 
     def reset(self) -> None:
         """Forget all scans and selections, as before a new recording."""
-        self._scan: Scan | None = None
-        self._descriptors: deque[NDArray[np.float32]] = deque(maxlen=self._model.window)
-        self._found: deque[Selection] = deque(maxlen=SMOOTHED_SELECTIONS)
-        self._current: int | None = None
-        self._stamp = self._switched = 0
-        self._recent: deque[tuple[int, Poses]] = deque()  # registered scans
-        self._elevations: list[float] = []
-        self._warned = False
-        self._live.reset()
-        self._worse: dict[int, _Worse] = {}  # by trial
-        self._at_work = -np.inf  # until when a bank may not rest, in seconds
-        self._resting: frozenset[int] = frozenset()
-        self._familiar: deque[float] = deque(maxlen=SELECTIONS_TO_JUDGE_PLACE)
-        self._starts: int | None = None
-        self._failed = False
-        self._predicted = np.nan
 
     def observe(self, stamp: int, scan: Scan, motions: Motions) -> None:
         """See a scan, before it is registered.
@@ -179,10 +69,169 @@ class Selector:
             What the odometry, or the bank and its members, moved over the scan before; see
             `adaptune.odometry.base.OdometryInstance`.
         """
+
+    def select(self) -> Selection:
+        """Choose what to apply before the newest scan is registered."""
+
+    def measure(self) -> None:
+        """Measure how wrong the odometry was, for the next selections."""
+
+    def fall_back(self) -> Selection:
+        """What to apply where nothing can be chosen."""
+
+
+class _Measuring:
+    """What selectors of a bank, or of a single odometry, have in common: they measure it."""
+
+    def __init__(
+        self, sets: ParameterSets, fixed: int, members: Sequence[int], length: float, weighs: bool
+    ):
+        self.fixed, self.members = fixed, tuple(members)
+        self._sets, self._weighs = sets, weighs
+        self._live = LiveEvidence(self.members, length)
+
+    def reset(self) -> None:
+        """Forget all scans and selections, as before a new recording."""
+        self._live.reset()
+
+    def observe(self, stamp: int, scan: Scan, motions: Motions) -> None:
+        """See `AnySelector.observe`."""
+        self._live.observe(stamp, scan, motions)
+
+    def measure(self) -> None:
+        """Measure how wrong the odometry, or each member of the bank, was over the last metres.
+
+        It takes some tens of milliseconds. Nothing depends on when it is called after `select`,
+        and without it only the training counts.
+        """
+        self._live.measure()
+
+    def fall_back(self) -> Selection:
+        """What to apply where nothing can be chosen: the fixed set, of a bank with all weight."""
+        weights = {member: float(member == self.fixed) for member in self.members}
+        return Selection(self.fixed, self._sets[self.fixed], weights if self._weighs else None)
+
+    def _weighted(self, weights: NDArray[np.float64]) -> Selection:
+        """A selection of the members' weights, shared by those that are present."""
+        weights = renormalised(weights, self._live.present())
+        return weighted_selection(
+            self._sets, dict(zip(self.members, weights.tolist(), strict=True))
+        )
+
+    def _measured(self) -> Selection:
+        """A selection of weights by what is measured alone."""
+        return self._weighted(measured_weights(len(self.members), self._live.squares()))
+
+
+class Selector(_Measuring):
+    """Chooses parameters for an odometry, or weights for a bank, by an error model.
+
+    Show it every scan with `observe`; ask it to `select` whenever a selection is due, usually once
+    a second, and let it `measure` after that: it compares the odometry's motion over the last
+    metres, and that of each member of a bank, with a direct registration, see `adaptune.live`. What
+    is measured counts from the next selection on. The selector reads no clock and no file.
+
+    With the paired rule and a bank, the selections are weights of the bank's members, smoothed over
+    the last selections. A single odometry leaves a set that surely does worse than predicted, if
+    another one, or the baseline, is predicted to do better than that. The reserve of a bank
+    (`ErrorModel.reserve`) rests, except for a minute after a place that training does not know, and
+    after a failure. Scans of a sensor or mount that was not trained with (`ErrorModel.is_foreign`)
+    get the fixed set, or in a bank weights by what is measured alone.
+
+    Parameters
+    ----------
+    model
+        Fitted offline.
+    rule
+        One of `adaptune.model.RULES`.
+    members
+        Trial numbers of the members of the bank that runs, the fixed set first: the paired rule
+        weighs them, others choose among them. None takes the model's bank for the paired rule if
+        that is what is driven; an empty one is for a single odometry.
+    descriptors
+        Descriptors besides adaptune's own that may be used: a model that names another is refused.
+
+    Attributes
+    ----------
+    fixed : int
+        Trial number of the set to begin with.
+    members : tuple of int
+        Trial numbers of the bank's members; empty for a single odometry.
+
+    Raises
+    ------
+    ModelError
+        If the model's bank lacks a member, or the model names a descriptor that may not be used.
+    DescriptorError
+        If a descriptor has changed since the model was fitted.
+    """
+
+    def __init__(
+        self,
+        model: ErrorModel,
+        rule: str = RULES[0],
+        members: Sequence[int] | None = None,
+        descriptors: Collection[str] = (),
+    ):
+        model.check_descriptors(descriptors)
+        if members is None:
+            drives_bank = rule == "adaptive" and (model.bank_adapts or model.bank_rests)
+            members = model.bank if drives_bank else ()
+        weighs = bool(members) and rule == "adaptive"
+        fixed = members[0] if members else model.fixed
+        super().__init__(model.sets, fixed, members, model.length, weighs)
+        self._model = model
+        self._pca = model.pca()
+        self._reserve = frozenset(model.reserve if weighs else ()).intersection(self.members)
+        self._always = [member for member in self.members if member not in self._reserve]
+        fitted: Rule = PairedExpectedRatio(model.paired)
+        if weighs:
+            # A bank that need not always work weighs its members where it does.
+            fitted = BankRule(model.bank_settings.model_copy(update={"adapt": True}))
+        elif rule == "paper":
+            from adaptune.model.knn import NearestNeighbours  # compiled code, which few need
+
+            fitted = NearestNeighbours()
+        self._rule = fitted.fit(model.training_data(self._pca, self.members or None))
+        self._describe = Describer(model.blocks)
+        if self._describe.blocks != model.blocks:
+            raise DescriptorError(
+                f"the model was fitted to descriptors of {model.blocks} numbers, these have "
+                f"{self._describe.blocks}; run `adaptune offline` again"
+            )
+        # The first selection loads compiled code; the robot should not wait for that.
+        self.reset()
+        self.observe(0, Scan(0, np.zeros((0, 3), np.float32)), Motions(np.eye(4), {}))
+        self.select()
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all scans and selections, as before a new recording."""
+        super().reset()
+        self._scan: Scan | None = None
+        self._descriptors: deque[NDArray[np.float32]] = deque(maxlen=self._model.window)
+        self._found: deque[Selection] = deque(maxlen=SMOOTHED_SELECTIONS)
+        self._current: int | None = None
+        self._stamp = self._switched = 0
+        self._recent: deque[tuple[int, Poses]] = deque()  # registered scans
+        self._elevations: list[float] = []
+        self._warned = False
+        # By trial, the error in percent that was measured of a set that did worse than predicted,
+        # and until when it counts, in seconds.
+        self._worse: dict[int, tuple[float, float]] = {}
+        self._at_work = -np.inf  # until when a bank may not rest, in seconds
+        self._resting: frozenset[int] = frozenset()
+        self._familiar: deque[float] = deque(maxlen=SELECTIONS_TO_JUDGE_PLACE)
+        self._starts: int | None = None
+        self._failed = False
+        self._predicted = np.nan
+
+    def observe(self, stamp: int, scan: Scan, motions: Motions) -> None:
+        """See `AnySelector.observe`."""
         if self._scan is not None:
             self._go_on(motions)
         self._scan, self._stamp = scan, stamp
-        self._live.observe(stamp, scan, motions)
+        super().observe(stamp, scan, motions)
 
     def _go_on(self, motions: Motions) -> None:
         """Take note of what was moved, and whether the odometry has failed."""
@@ -230,21 +279,6 @@ class Selector:
         self._resting = selection.resting
         return self._live.estimated(selection)
 
-    def measure(self) -> None:
-        """Measure how wrong the odometry, or each member of the bank, was over the last metres.
-
-        It takes some tens of milliseconds. Nothing depends on when it is called after `select`,
-        and without it only the training counts.
-        """
-        if self._measures:
-            self._live.measure()
-
-    def fall_back(self) -> Selection:
-        """What to apply where nothing can be chosen: the fixed set, of a bank with all weight."""
-        weights = {member: float(member == self.fixed) for member in self.members}
-        is_weighed = isinstance(self._rule, BankRule)
-        return Selection(self.fixed, self._model.sets[self.fixed], weights if is_weighed else None)
-
     def _choose(self, feature: NDArray[np.float64], is_foreign: bool) -> Selection:
         if isinstance(self._rule, BankRule):
             near = self._rule.near(feature[None])
@@ -276,16 +310,16 @@ class Selector:
     def _worse_than_predicted(self) -> Mapping[int, float]:
         """By trial, what was measured of sets that have done worse than predicted, in percent."""
         seconds = self._stamp * 1e-9
-        self._worse = {t: worse for t, worse in self._worse.items() if worse.until > seconds}
+        self._worse = {t: worse for t, worse in self._worse.items() if worse[1] > seconds}
         error = self._live.own_error()
         current = self._current
         if current is not None:
             # One that has just been selected may have begun with an odometry that was lost.
             if self._failed and self._stamp - self._switched > SETTLING:
-                self._worse[current] = _Worse(FAILURE, seconds + REMEMBERED)
+                self._worse[current] = FAILURE, seconds + REMEMBERED
             elif error is not None and error.low > MAX_TIMES_PREDICTED * self._predicted:
-                self._worse[current] = _Worse(error.mean, seconds + REMEMBERED)
-        return {trial: worse.error for trial, worse in self._worse.items()}
+                self._worse[current] = error.mean, seconds + REMEMBERED
+        return {trial: error for trial, (error, _) in self._worse.items()}
 
     def _motion(self) -> NDArray[np.float64]:
         """Speed and turn rate over the last second of registered scans, of shape (2,)."""
@@ -300,15 +334,7 @@ class Selector:
             self._found.clear()
         self._found.append(selection)
         weights = np.array([[(s.weights or {})[m] for m in self.members] for s in self._found])
-        return self._weighted(selection, smooth_weights(weights)[-1])
-
-    def _weighted(self, selection: Selection, weights: NDArray[np.float64]) -> Selection:
-        weights = renormalised(weights, self._live.present())
-        of_members = dict(zip(self.members, weights.tolist(), strict=True))
-        weighted = weighted_selection(self._model.sets, of_members)
-        return selection._replace(
-            trial=weighted.trial, parameters=weighted.parameters, weights=weighted.weights
-        )
+        return _with_weights(selection, self._weighted(smooth_weights(weights)[-1]))
 
     def _of_those_present(self, selection: Selection) -> Selection:
         """Replace a member that gives no poses by the first one that does."""
@@ -316,21 +342,21 @@ class Selector:
         if present[self.members.index(selection.trial)]:
             return selection
         trial = self.members[int(present.argmax())]
-        return selection._replace(trial=trial, parameters=self._model.sets[trial])
+        return selection._replace(trial=trial, parameters=self._sets[trial])
 
     def _without_training(self, selection: Selection) -> Selection:
         """What to do where the training says nothing."""
         fixed = selection.predicted_fixed
         unknown = selection._replace(
             trial=self.fixed,
-            parameters=self._model.sets[self.fixed],
+            parameters=self._sets[self.fixed],
             predicted_error=fixed,
             familiarity=0.0,
             n_sequences=np.nan,
         )
         if not self.members or selection.weights is None:
             return unknown
-        return self._weighted(unknown, measured_weights(len(self.members), self._live.squares()))
+        return _with_weights(unknown, self._measured())
 
     def _is_foreign(self, scan: Scan) -> bool:
         """Whether the scans seen so far come from a sensor that was not trained with."""
@@ -353,35 +379,18 @@ class Selector:
         return True
 
 
+def _with_weights(selection: Selection, weighted: Selection) -> Selection:
+    """Replace what is applied; what is predicted stays as it is."""
+    trial, parameters, weights, *_ = weighted
+    return selection._replace(trial=trial, parameters=parameters, weights=weights)
+
+
 # A selector in a loop that must not stop: one call a scan, and a selection when one is due.
 
 
 BACK = 10**9
 """Nanoseconds. Stamps that go back by more are of another drive: a clock was set, or a bag began
 anew."""
-
-
-class Selects(Protocol):
-    """What chooses parameters on the way; see `Selector`."""
-
-    def observe(self, stamp: int, scan: Scan, motions: Motions) -> None:
-        """See a scan."""
-
-    def select(self) -> Selection:
-        """Choose what to apply."""
-
-    def measure(self) -> None:
-        """Measure how wrong the odometry was, for the next selections."""
-
-
-class AnySelector(Selects, Protocol):
-    """What a drive may rely on: it can begin anew, and knows what to apply where it fails."""
-
-    def reset(self) -> None:
-        """Forget all scans and selections."""
-
-    def fall_back(self) -> Selection:
-        """What to apply where nothing can be chosen."""
 
 
 class Schedule:
@@ -587,7 +596,7 @@ def untrained_sets(space: ParameterSpace, n: int = 4) -> ParameterSets:
     return ParameterSets(space, tuple(range(len(chosen))), tuple(chosen))
 
 
-class UntrainedSelector:
+class UntrainedSelector(_Measuring):
     """Weighs the members of a bank of which nothing is known in advance.
 
     It has the methods of `adaptune.selector.Selector`, and needs no model. The baseline has all the
@@ -609,31 +618,8 @@ class UntrainedSelector:
     """
 
     def __init__(self, sets: ParameterSets, length: float):
-        self.members = sets.trials
-        self.fixed = self.members[0]
-        self._sets = sets
-        self._live = LiveEvidence(self.members, length)
-
-    def reset(self) -> None:
-        """Forget all scans and selections, as before a new recording."""
-        self._live.reset()
-
-    def observe(self, stamp: int, scan: Scan, motions: Motions) -> None:
-        """See a scan, before it is registered; see `adaptune.selector.Selector.observe`."""
-        self._live.observe(stamp, scan, motions)
+        super().__init__(sets, sets.trials[0], sets.trials, length, True)
 
     def select(self) -> Selection:
         """Choose the weights to apply before the newest scan is registered."""
-        weights = measured_weights(len(self.members), self._live.squares())
-        weights = renormalised(weights, self._live.present())
-        of_members = dict(zip(self.members, weights.tolist(), strict=True))
-        return self._live.estimated(weighted_selection(self._sets, of_members))
-
-    def fall_back(self) -> Selection:
-        """See `adaptune.selector.Selector.fall_back`."""
-        weights = {member: float(member == self.fixed) for member in self.members}
-        return Selection(self.fixed, self._sets[self.fixed], weights)
-
-    def measure(self) -> None:
-        """See `adaptune.selector.Selector.measure`."""
-        self._live.measure()
+        return self._live.estimated(self._measured())

@@ -30,7 +30,7 @@ from adaptune.odometry.base import Motions, OdometryInstance
 from adaptune.odometry.registry import OdometryFactory
 from adaptune.odometry.tracker import HealthCheck
 from adaptune.recording.scan import Scan
-from adaptune.selector import Selector, Selects, UntrainedSelector, untrained_sets
+from adaptune.selector import AnySelector, Selector, UntrainedSelector, untrained_sets
 from adaptune.simulation import Course
 from adaptune.simulation.record import SimulatedScan, simulate
 from adaptune.space import Selection
@@ -52,7 +52,7 @@ ORDERS = (
 LENGTH, SUB_TRAJECTORY = 60.0, 25.0
 
 
-Way = tuple[Callable[[], OdometryInstance], Selects | None]
+Way = tuple[Callable[[], OdometryInstance], AnySelector | None]
 """What makes the odometry, and what chooses its parameters."""
 
 

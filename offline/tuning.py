@@ -352,7 +352,7 @@ def _paired_errors(
     left_out: LabelledSequence, data: TrainingData, pca: "ScaledPCA"
 ) -> Iterator[NDArray[np.float64]]:
     """Capped errors of one set at a time with each of `PAIRED_SETTINGS`."""
-    most = max(settings.n_sets or 1 for settings in PAIRED_SETTINGS)
+    most = max(settings.n_sets for settings in PAIRED_SETTINGS)
     rule = PairedExpectedRatio(PairedSettings(n_sets=most)).fit(data)
     first, period = periods(left_out.period)
     near = rule.near(pca.transform(left_out.descriptors[first]))
@@ -361,7 +361,7 @@ def _paired_errors(
         # The complementary sets are chosen one after the other: the first of them are those of
         # fewer sets.
         few = near._replace(errors=near.errors[..., : settings.n_sets])
-        chosen = data.sets.columns(rule.choices(few, settings))
+        chosen = data.sets.columns(rule.choices(few, settings.sharpness))
         yield capped[np.arange(len(capped)), chosen[period]]
 
 
@@ -472,7 +472,7 @@ def driven_cost(data: LabelledData, policy: Policy, fixed: int) -> float:
         return data.costs.adaptive(policy.members)
     if policy.one_set.adapt:
         of_rule, _ = data.training_data()
-        few = complementary(of_rule, policy.one_set.n_sets or len(data.sets))
+        few = complementary(of_rule, policy.one_set.n_sets)
         return max(data.costs.adaptive([trial]) for trial in few)
     return data.costs.alone(fixed)
 

@@ -17,7 +17,7 @@ from adaptune.odometry.base import OdometryInstance, Usage
 from adaptune.odometry.tracker import HealthCheck, RegisteredScan, Tracker
 from adaptune.processes import resident_megabytes
 from adaptune.recording.scan import Scan
-from adaptune.selector import REMEMBERED, SETTLING, Schedule, Selects
+from adaptune.selector import REMEMBERED, SETTLING, AnySelector, Schedule
 from adaptune.space import Selection
 from adaptune.trajectory import Trajectory
 
@@ -253,7 +253,7 @@ def replay(
     scans: Iterable[Scan],
     odometry: OdometryInstance,
     health: HealthCheck,
-    selector: Selects | None = None,
+    selector: AnySelector | None = None,
     period: float = 1.0,
     watch: Watch = lambda _: None,
     what: str = "the replay",

@@ -51,9 +51,9 @@ class Successor:
         self.waiting = deque(past)
         self._start(self.waiting.popleft())
 
-    def catch_up(self, n: int | None = None) -> None:
-        """See at most `n` more scans, or all."""
-        for _ in range(len(self.waiting) if n is None else n):
+    def catch_up(self, n: int) -> None:
+        """See at most `n` more scans."""
+        for _ in range(n):
             if self.waiting:
                 self.submit()
                 self.collect()
@@ -390,12 +390,6 @@ class Bank(OdometryInstance):
     @property
     def faults(self) -> list[str]:
         return [fault for member in self._members for fault in member.faults]
-
-    @property
-    def dead(self) -> frozenset[int]:
-        """Trial numbers of the members that a fault has ended, and that are not back yet."""
-        of_members = zip(self.trials, self._members, self.late.resting, strict=True)
-        return frozenset(t for t, member, rests in of_members if member.ended and not rests)
 
     @property
     def usage(self) -> Usage:

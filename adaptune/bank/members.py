@@ -7,7 +7,6 @@ its process, it ends the others there, too.
 
 import itertools
 import time
-from bisect import bisect_left, insort
 from collections import OrderedDict, defaultdict, deque
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from functools import cache
@@ -362,7 +361,7 @@ class Agreement:
 
     def __init__(self, n_members: int, lost_track: float):
         self._n_members, self._lost_track = n_members, lost_track
-        self._usual = RunningMedian(MEMORY)
+        self._usual: deque[tuple[float, float]] = deque()  # times, and what was usual
         self._times = deque([0.0])
         self.start()
 
@@ -460,7 +459,8 @@ class Agreement:
         ways = sorted(np.linalg.norm(came[known, 9:], axis=1).tolist())
         least = max(FLOOR * scale, SHARE * (ways[len(ways) // 2] if ways else 0.0))
         # As long as nothing is usual, they may differ by the most.
-        usual = SPREAD * self._usual.value * scale if self._usual else np.inf
+        differed = sorted(difference for _, difference in self._usual)
+        usual = SPREAD * differed[len(differed) // 2] * scale if differed else np.inf
         bound = min(max(least, usual), MAX_TIMES_LEAST * least)
         most = self._lost_track * span
         far = ~near | (apart > min(FAR * bound, most))
@@ -527,31 +527,9 @@ class Agreement:
             # Each pair twice, and each member from itself.
             differences = sorted(apart[agreeing][:, agreeing].ravel().tolist())
             n = int(agreeing.sum())
-            self._usual.add(self._times[-1], differences[(n * n + n) // 2 - 1])
-
-
-class RunningMedian:
-    """The median of the values of the last seconds; 0 if there are none."""
-
-    def __init__(self, seconds: float):
-        self._seconds = seconds
-        self._values: deque[tuple[float, float]] = deque()
-        self._sorted: list[float] = []
-
-    def add(self, time: float, value: float) -> None:
-        """Add a value, at a time in seconds that does not fall."""
-        self._values.append((time, value))
-        insort(self._sorted, value)
-        while time - self._values[0][0] > self._seconds:
-            del self._sorted[bisect_left(self._sorted, self._values.popleft()[1])]
-
-    def __bool__(self) -> bool:
-        return bool(self._values)
-
-    @property
-    def value(self) -> float:
-        """The median; of an even number of values the greater of the two in the middle."""
-        return self._sorted[len(self._sorted) // 2] if self._sorted else 0.0
+            self._usual.append((self._times[-1], differences[(n * n + n) // 2 - 1]))
+            while self._times[-1] - self._usual[0][0] > MEMORY:
+                self._usual.popleft()
 
 
 def share(weights: NDArray[np.float64], agreeing: NDArray[np.bool_]) -> NDArray[np.float64]:

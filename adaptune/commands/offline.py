@@ -321,7 +321,7 @@ def _of_recording(
     config = of_recording.recording_config(inspect(target), points, given)
     scans = open_sequence(config)
     joined = None if prior is None else of_recording.read_prior(config, prior)
-    path = out / f"{of_recording.estimated_name(target)}.tum"
+    path = out / f"{target.resolve().stem}_reference.tum"
     # What can fail is found before the estimate, which takes minutes.
     of_recording.check_writable(path)
     there = _given_reference(scans, required=given is not None)

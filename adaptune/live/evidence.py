@@ -30,9 +30,8 @@ from adaptune.space import Selection
 #
 # A hop is shorter than the sub-trajectories whose error is wanted, and an odometry's errors over a
 # few metres are much like the registration's. So hops that follow each other are chained, until
-# they
-# reach over a sub-trajectory. There the odometry's errors, above all those of its rotation, are
-# several times the chain's.
+# they reach over a sub-trajectory. There the odometry's errors, above all those of its rotation,
+# are several times the chain's.
 
 MIN_COVERED = 0.5
 """Least share of a chain that its hops cover; in between, the odometry's own motion is taken."""
@@ -102,11 +101,6 @@ class OwnErrors:
     def interrupt(self) -> None:
         """Let no later chain begin at a hop so far: in between, the poses are unknown."""
         self._links.clear()
-
-    def clear(self) -> None:
-        """Forget the hops so far."""
-        self._links.clear()
-        self._chains.clear()
 
     @property
     def begin(self) -> float:
@@ -183,14 +177,6 @@ _FULL_TURN = 10.0
 """Metres at which a difference in rotation counts as one in translation, in radians."""
 
 
-class Measured(NamedTuple):
-    """A hop, and the stamps of its scans in nanoseconds."""
-
-    start: int
-    end: int
-    hop: Hop
-
-
 @dataclass(frozen=True, eq=False)
 class _Anchor:
     """A scan at which a hop may start or end, and where everybody believed it to be."""
@@ -202,7 +188,7 @@ class _Anchor:
     no_pose: NDArray[np.intp]  # (1 + n_members,): scans without a pose so far
 
 
-class _Found(NamedTuple):
+class Measured(NamedTuple):
     """A hop, and where it starts and ends."""
 
     start: _Anchor
@@ -235,26 +221,34 @@ class LiveEvidence:
 
     def __init__(self, members: tuple[int, ...] = (), length: float = 25.0):
         self.members = members
-        self._own = OwnErrors(length)
+        self._length = length
         self.reset()
 
     def reset(self) -> None:
         """Forget everything, as before a new recording."""
-        self.lost = False
         self._last: tuple[int, Scan] | None = None
         self._T_odom_sensor = np.tile(np.eye(4), (1 + len(self.members), 1, 1))
         self._no_pose = np.zeros(1 + len(self.members), np.intp)
         self._without = np.full(1 + len(self.members), -np.inf)
         self._metres = 0.0
         self._newest: _Anchor | None = None
-        self._anchors: deque[_Anchor] = deque()
-        self._measured = -np.inf
         self._short = 0
-        self._rejected = self._disagreeing = 0
+        self._begin()
+
+    def _begin(self) -> None:
+        """Forget all hops, and where they could start."""
         n = 1 + len(self.members)
         self._hops = HopErrors(np.empty((0, n, 3)), np.empty(0), np.empty(0), np.empty(0))
-        self._own.clear()
-        self._wrong = np.zeros(n, np.intp)
+        self._own = OwnErrors(self._length)
+        self._anchors: deque[_Anchor] = deque()
+        self._measured = -np.inf
+        # Hops in a row that were rejected, and by which each was wrong.
+        self._rejected, self._wrong = 0, np.zeros(n, np.intp)
+
+    @property
+    def lost(self) -> bool:
+        """Whether the last hops say that the odometry, or the bank, has lost track."""
+        return bool(max(self._rejected, self._wrong[0]) >= HOPS_TO_BE_LOST)
 
     def observe(self, stamp: int, scan: Scan, motions: Motions) -> None:
         """See a scan, before it is registered; see `adaptune.selector.Selector.observe`."""
@@ -319,10 +313,9 @@ class LiveEvidence:
             return None
         if found is None or not self._is_confirmed(found):
             self._rejected += 1
-            self._update_lost()
             return None
         self._take(found)
-        return Measured(found.start.stamp, found.end.stamp, found.hop)
+        return found
 
     def _starts(self, end: _Anchor) -> list[_Anchor]:
         """Where a hop may start, in the order in which that is tried."""
@@ -336,7 +329,7 @@ class LiveEvidence:
             first, second = short, long
         return [a for a in (first, second) if a is not None and a.stamp < end.stamp]
 
-    def _register(self, starts: Sequence[_Anchor], end: _Anchor) -> _Found | None:
+    def _register(self, starts: Sequence[_Anchor], end: _Anchor) -> Measured | None:
         """The first registration that is accepted.
 
         Only where the last one was rejected, members that disagree with the odometry are asked,
@@ -349,7 +342,7 @@ class LiveEvidence:
                 if end.metres - start.metres >= LENGTHS[0]:
                     self._short = int(hop is None)
                 if hop is not None:
-                    return _Found(start, end, hop, first == 0)
+                    return Measured(start, end, hop, first == 0)
         return None
 
     def _guesses(self, start: _Anchor, end: _Anchor) -> list[Poses]:
@@ -360,7 +353,7 @@ class LiveEvidence:
                 tried.append(T)
         return tried
 
-    def _is_confirmed(self, found: _Found) -> bool:
+    def _is_confirmed(self, found: Measured) -> bool:
         """Whether a hop agrees with the odometry, or a hop from another scan agrees with it."""
         wrong, end = found.errors()[0], found.end
         if np.linalg.norm(wrong) <= DOUBTFUL:
@@ -375,9 +368,9 @@ class LiveEvidence:
             between = invert(other.T_odom_sensor[0]) @ found.start.T_odom_sensor[0]
             guess = between @ found.hop.T_start_end
         hop = register(other.cloud, end.cloud, [guess])
-        return hop is not None and _alike(wrong, _Found(other, end, hop).errors()[0])
+        return hop is not None and _alike(wrong, Measured(other, end, hop).errors()[0])
 
-    def _take(self, found: _Found) -> None:
+    def _take(self, found: Measured) -> None:
         """Compare with what was measured."""
         start, end, hop, _ = found
         errors = found.errors()
@@ -395,11 +388,6 @@ class LiveEvidence:
         with np.errstate(invalid="ignore"):
             wrong = np.linalg.norm(errors, axis=1) > LOST
         self._wrong = np.where(wrong, self._wrong + 1, 0)
-        self._disagreeing = int(self._wrong[0])
-        self._update_lost()
-
-    def _update_lost(self) -> None:
-        self.lost = max(self._rejected, self._disagreeing) >= HOPS_TO_BE_LOST
 
     def _told_to_restart(self) -> frozenset[int]:
         """Trial numbers of the members that two hops in a row have shown to be lost.
@@ -433,13 +421,7 @@ class LiveEvidence:
 
         The next one begins at the newest scan.
         """
-        self._hops = HopErrors(*(array[:0] for array in self._hops))
-        self._own.clear()
-        self._anchors.clear()
-        self._measured = -np.inf
-        self._wrong[:] = 0
-        self._rejected = self._disagreeing = 0
-        self.lost = False
+        self._begin()
 
     def own_error(self) -> OwnError | None:
         """The odometry's, or the bank's, own error over the last metres; None without any hop."""
@@ -502,7 +484,7 @@ def hops_along(
         if scan.stamp >= due:
             due += (int(scan.stamp - due) // PERIOD + 1) * PERIOD
             if (one := live.measure()) is not None:
-                found.append((frame_of[one.start], frame_of[one.end], one.hop))
+                found.append((frame_of[one.start.stamp], frame_of[one.end.stamp], one.hop))
         last = T
         advance(i + 1)
     return Hops.of(found)

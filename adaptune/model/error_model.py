@@ -2,17 +2,16 @@
 
 import hashlib
 import json
-import zlib
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, PositiveInt
 from rich.console import Group, RenderableType
-from rich.table import Table
 from rich.text import Text
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
@@ -40,20 +39,15 @@ from adaptune.strict import in_one_line
 if TYPE_CHECKING:
     from adaptune.model.pca import ScaledPCA
 
-FORMAT = 6
+FORMAT = 7
 """Raised whenever an older adaptune could not read the file, or would read it wrongly."""
-
-DAMAGED = (SafetensorError, ValueError, TypeError, KeyError, OverflowError)
-"""What is raised on a file whose content does not fit together."""
-
-Arrays = Mapping[str, NDArray[Any]]
 
 
 class ModelError(AdaptuneError):
     """A model file that cannot be used."""
 
 
-def digest(header: Mapping[str, Any], arrays: Arrays) -> str:
+def digest(header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> str:
     """Digest of a header and arrays, in hexadecimal."""
     found = hashlib.sha256(json.dumps(header).encode())
     for name in sorted(arrays):
@@ -61,71 +55,32 @@ def digest(header: Mapping[str, Any], arrays: Arrays) -> str:
     return found.hexdigest()[:16]
 
 
-def checksum(header: Mapping[str, Any], arrays: Arrays) -> int:
-    """CRC-32 of a header and arrays, which shows damage."""
-    found = zlib.crc32(json.dumps(header).encode())
-    for name in sorted(arrays):
-        found = zlib.crc32(np.ascontiguousarray(arrays[name]).data, found)
-    return found
+def _read(path: Path) -> tuple["_Header", dict[str, Any]]:
+    """Read a header and arrays, in about as much memory as the file is large.
 
-
-def write_model_file(path: Path, header: Mapping[str, Any], arrays: Arrays) -> None:
-    """Write a header and arrays.
-
-    The numbers are not compressed: a compressed file would be a tenth smaller, take ten times as
-    long to load, and could demand a thousand times its size in memory.
-    """
-    text = {
-        "format": FORMAT,
-        "version": __version__,
-        "checksum": checksum(header, arrays),
-        "header": header,
-    }
-    # The format keeps no order of several entries, and the same model shall have the same bytes.
-    with replacing(path) as temporary:
-        save_file(dict(arrays), temporary, {"adaptune": json.dumps(text)})
-
-
-def read_model_file(
-    path: Path, types: Mapping[str, tuple[str, ...]]
-) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Read a header and arrays.
-
-    It takes about as much memory as the file is large, whatever the file says.
-
-    `types` has the arrays to read, and the types that each may have.
-
-    Raises
-    ------
-    ModelError
-        If the file is of a newer or older adaptune.
-    OSError, SafetensorError, ValueError, TypeError, KeyError, OverflowError
-        If there is no such file, or it is damaged.
+    A damaged file leads to one of many errors, that of another format to a `ModelError`.
     """
     with path.open("rb"), safe_open(path, "np") as file:
         text = json.loads((file.metadata() or {})["adaptune"])
-        _check_format(path, int(text["format"]), str(text["version"]))
-        header = dict(text["header"])
+        found, version = int(text["format"]), str(text["version"])
+        if found > FORMAT:
+            raise ModelError(
+                f"{path}: written by adaptune {version}, which is newer than this "
+                f"({__version__}); update adaptune, or fit the model again"
+            )
+        if found < FORMAT:
+            raise ModelError(
+                f"{path}: written by an older adaptune ({version}); run `adaptune offline` again, "
+                f"which fits the model to the finished trials"
+            )
         arrays = {name: file.get_tensor(name) for name in sorted(file.keys())}
-    if checksum(header, arrays) != text["checksum"]:
+    if digest(text["header"], arrays) != text["digest"]:
         raise ValueError("its content is not what was written")
-    for name, known in types.items():
+    for name, known in _TYPES.items():
         if arrays[name].dtype.str not in known:
             raise ValueError(f"{name} holds {arrays[name].dtype}, not {' or '.join(known)}")
-    return header, {name: arrays[name] for name in types}
-
-
-def _check_format(path: Path, found: int, version: str) -> None:
-    if found > FORMAT:
-        raise ModelError(
-            f"{path}: written by adaptune {version}, which is newer than this ({__version__}); "
-            f"update adaptune, or fit the model again"
-        )
-    if found < FORMAT:
-        raise ModelError(
-            f"{path}: written by an older adaptune ({version}); run `adaptune offline` again, "
-            f"which fits the model to the finished trials"
-        )
+    # Only in JSON are the trials' numbers texts.
+    return _Header.model_validate_json(json.dumps(text["header"])), arrays
 
 
 SAME_SENSOR = 3.0
@@ -142,7 +97,7 @@ _TYPES = {
 
 
 class _Header(BaseModel):
-    """The text in a file. Later versions may say more in the same format."""
+    """The text in a file, in which another version may say more."""
 
     model_config = ConfigDict(strict=True)
 
@@ -162,9 +117,9 @@ class _Header(BaseModel):
     provenance: dict[str, Any]
     expected: dict[str, dict[str, float]]
     validation: dict[str, Any]
-    budget: float | None = None
-    rivals: dict[str, int] = Field(default_factory=dict)
-    costs: dict[str, Any] | None = None
+    budget: float | None
+    rivals: dict[str, int]
+    costs: Costs | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -314,22 +269,15 @@ class ErrorModel:
         }
 
     def _header(self) -> dict[str, Any]:
+        """All that selections depend on, besides the arrays."""
+        plain = ("odometry", "fixed", "length", "sequences", "blocks", "window", "elevations")
         return {
-            "odometry": self.odometry,
             "space": self.sets.space.definition(),
             "trials": self.sets.trials,
             "sets": self.sets.parameters,
-            "fixed": self.fixed,
-            "length": self.length,
-            "sequences": self.sequences,
-            "blocks": self.blocks,
-            "window": self.window,
-            "elevations": self.elevations,
             "paired": self.paired.model_dump(),
-            "bank": self.bank,
             "bank_settings": self.bank_settings.model_dump(),
-            "budget": self.budget,
-        }
+        } | {name: getattr(self, name) for name in (*plain, "bank", "budget")}
 
     @property
     def digest(self) -> str:
@@ -337,15 +285,24 @@ class ErrorModel:
         return digest(self._header(), self._arrays())
 
     def save(self, path: Path | str) -> None:
-        """Write the model to one file, in the safetensors format. Numbers keep all their bits."""
-        about = {
-            "provenance": self.provenance,
-            "expected": self.expected,
-            "validation": self.validation,
-            "rivals": self.rivals,
-            "costs": None if self.costs is None else self.costs.dump(),
+        """Write the model to one file, in the safetensors format. Numbers keep all their bits.
+
+        They are not compressed: a compressed file would be a tenth smaller, take ten times as long
+        to load, and could demand a thousand times its size in memory.
+        """
+        header, arrays = self._header(), self._arrays()
+        header |= {
+            name: getattr(self, name)
+            for name in ("provenance", "expected", "validation", "rivals", "costs")
         }
-        write_model_file(Path(path), self._header() | about, self._arrays())
+        header["costs"] = None if self.costs is None else asdict(self.costs)
+        # Through JSON, so that the digest is of what is read.
+        header = json.loads(json.dumps(header))
+        text = {"format": FORMAT, "version": __version__, "digest": digest(header, arrays)}
+        # The format keeps no order of several entries, and the same model shall have the same
+        # bytes.
+        with replacing(Path(path)) as temporary:
+            save_file(arrays, temporary, {"adaptune": json.dumps(text | {"header": header})})
 
     @classmethod
     def load(cls, path: Path | str) -> Self:
@@ -358,11 +315,9 @@ class ErrorModel:
         """
         path = Path(path)
         try:
-            content, arrays = read_model_file(path, _TYPES)
-            header = dict(_Header.model_validate(content))
+            content, arrays = _read(path)
+            header = dict(content)
             space = load_space(header.pop("space"))
-            costs = header.pop("costs")
-            header["costs"] = None if costs is None else Costs.load(costs)
             sets = ParameterSets(space, tuple(header.pop("trials")), tuple(header.pop("sets")))
             arrays["descriptors"] = arrays["descriptors"].astype(np.float32)
             for numbers in ("sequence", "stretch"):
@@ -371,7 +326,10 @@ class ErrorModel:
             model.check()
         except FileNotFoundError as error:
             raise ModelError(f"{path}: there is no such model; run `adaptune offline`") from error
-        except (OSError, SpaceError, *DAMAGED) as error:
+        except (
+            *(OSError, SafetensorError, SpaceError),
+            *(ValueError, TypeError, KeyError, OverflowError),
+        ) as error:
             what = in_one_line(error)
             raise ModelError(
                 f"{path}: is not an error model, or damaged ({what}); run `adaptune offline` again"
@@ -437,8 +395,7 @@ def render(model: ErrorModel, path: Path) -> RenderableType:
         tables.table("Sequences", _sequences(model), "Mean capped errors; a lost track is 30 %."),
         tables.table(f"The best sets of {n_sets}", _sets(model), caption),
         Text("\n".join(_driven(model))),
-        *_named("Settings", model.odometry.get("settings", {})),
-        *_named("Where it comes from", model.provenance),
+        Text(_as_yaml({"settings": model.odometry.get("settings"), "from": model.provenance})),
         tables.table("Validation", validated, "Ratios to the fixed set's error on what is left out")
         if validated
         else Text("Not validated yet: `adaptune validate` shows what adapting gains."),
@@ -464,30 +421,17 @@ def _driven(model: ErrorModel) -> Iterator[str]:
         yield f"Budget: {model.budget:g} ms of CPU time a scan."
 
 
-def _named(title: str, data: Mapping[str, Any]) -> list[Table]:
-    """A table of plain data, if there are any."""
-    rows = [{"key": key, "value": value} for key, value in _flat(data)]
-    return [tables.table(title, rows)] if rows else []
+def _as_yaml(data: Mapping[str, Any]) -> str:
+    """Plain data in words; what is not given is left out."""
+    given = _given(data)
+    return yaml.safe_dump(given, allow_unicode=True, sort_keys=False) if given else ""
 
 
-def _flat(data: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, str]]:
-    """Dotted keys and values in words."""
-    for key, value in data.items():
-        if isinstance(value, Mapping):
-            yield from _flat(value, f"{above}{key}.")
-        elif value is not None and value != []:
-            yield f"{above}{key}", _words(value)
-
-
-def _words(value: Any) -> str:
-    if isinstance(value, Mapping):
-        return ", ".join(f"{key} {text}" for key, text in _flat(value))
-    if isinstance(value, list | tuple):
-        nested = any(isinstance(item, Mapping | list | tuple) for item in value)
-        return ("; " if nested else ", ").join(map(_words, value))
-    if isinstance(value, bool):
-        return str(value).lower()  # as in YAML
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
+def _given(data: Any) -> Any:
+    if isinstance(data, Mapping):
+        found = {key: _given(value) for key, value in data.items()}
+        return {key: value for key, value in found.items() if value not in (None, [], {})}
+    return [_given(value) for value in data] if isinstance(data, list | tuple) else data
 
 
 def _numbers(found: Any) -> dict[str, float]:

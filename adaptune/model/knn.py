@@ -1,156 +1,14 @@
 """The published selection: k nearest neighbours over descriptors and parameters."""
 
-from typing import Any, Self
+from typing import Self
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
-from sklearn.utils.validation import check_array, check_is_fitted, validate_data
 
 from adaptune.metrics import FAILURE
 from adaptune.model.rules import Rule, TrainingData
 from adaptune.space import Selection
-
-
-class ProductKNeighborsRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):  # type: ignore[misc]
-    """k-nearest-neighbour regression over pairs of a frame and a parameter set.
-
-    What `sklearn.neighbors.KNeighborsRegressor` predicts when it is fitted on a row
-    ``[frame, set]`` for every pair that was run, with none of these rows made. A squared distance
-    between rows is that between the frames plus that between the sets. So among frames that have
-    seen the same sets, the k nearest pairs are made of the k nearest frames and the k nearest
-    sets; frames that have seen others are searched apart, and their best pairs merged.
-
-    Of pairs at the same distance, the one with the nearer frame comes first, then the one with the
-    earlier frame, then that with the earlier set. (scikit-learn leaves the order to its search.)
-    Where there are fewer than k pairs, all are averaged.
-
-    Parameters
-    ----------
-    sets : array-like of shape (n_sets, n_parameters), optional
-        The parameter sets, in units that are comparable to the frames'. Without them all sets are
-        at one place, as if each frame had been run once with several outcomes.
-    n_neighbors : int
-        k.
-
-    Attributes
-    ----------
-    n_features_in_ : int
-        Numbers that describe a frame.
-    near_squared_, near_sets_ : ndarray of shape (n_groups, n_sets, k)
-        For each group of frames that have seen the same sets, and for each set to be predicted:
-        the nearest of the sets that they have seen. There are as many groups as different
-        patterns of missing pairs; usually a sequence has one.
-    """
-
-    def __init__(self, sets: Any = None, n_neighbors: int = 5):
-        self.sets = sets
-        self.n_neighbors = n_neighbors
-
-    def fit(self, X: Any, y: Any) -> Self:
-        """Learn, and find what does not depend on the frame that is asked for.
-
-        Parameters
-        ----------
-        X : array-like of shape (n_frames, n_features)
-            The frames.
-        y : array-like of shape (n_frames, n_sets) or (n_frames,)
-            Target of every pair, NaN where it was never run.
-
-        Raises
-        ------
-        ValueError
-            If the shapes do not go together, or there is no pair at all.
-        """
-        if self.n_neighbors < 1:
-            raise ValueError(f"n_neighbors must be 1 or more, not {self.n_neighbors}")
-        X, y = validate_data(
-            self,
-            X,
-            y,
-            validate_separately=(
-                {"dtype": np.float64},
-                {
-                    "dtype": (np.float64, np.float32),
-                    "ensure_all_finite": "allow-nan",
-                    "ensure_2d": False,
-                },
-            ),
-        )
-        self._one_set = y.ndim == 1
-        y = y.reshape(len(y), -1)
-        if len(X) != len(y):
-            raise ValueError(f"X has {len(X)} frames, y has {len(y)}: inconsistent numbers")
-        sets = np.zeros((y.shape[1], 1)) if self.sets is None else check_array(self.sets)
-        if len(sets) != y.shape[1]:
-            raise ValueError(f"there are {len(sets)} sets, and targets of {y.shape[1]}")
-        self._sets = np.asarray(sets, np.float64)
-        seen = ~np.isnan(y)
-        if not seen.any():
-            raise ValueError("y holds no target")
-        # Frames of a group lie together, each group's in their order.
-        patterns: dict[bytes, list[int]] = {}
-        for frame, pattern in enumerate(np.packbits(seen, axis=1)):
-            patterns.setdefault(pattern.tobytes(), []).append(frame)
-        groups = [frames for frames in patterns.values() if seen[frames[0]].any()]
-        self._members = np.concatenate(groups)
-        self._bounds = np.cumsum([0, *map(len, groups)])
-        self._seen = [np.flatnonzero(seen[frames[0]]) for frames in groups]
-        self._X = X[self._members]
-        self._y = np.ascontiguousarray(y)
-        self.near_squared_, self.near_sets_ = self._near()
-        return self
-
-    def _near(self) -> tuple[NDArray[Any], NDArray[np.intp]]:
-        """For each group and set the nearest sets, of shape (n_groups, n_sets, k).
-
-        Where a group has seen fewer sets the distance is infinite.
-        """
-        squared = np.zeros((len(self._sets), len(self._sets)))
-        for p in range(self._sets.shape[1]):
-            squared += (self._sets[:, p, None] - self._sets[:, p]) ** 2
-        k = min(self.n_neighbors, len(self._sets))
-        near_squared = np.full((len(self._seen), len(self._sets), k), np.inf)
-        near_sets = np.zeros(near_squared.shape, np.intp)
-        for g, seen in enumerate(self._seen):
-            of_group = squared if len(seen) == len(self._sets) else squared[:, seen]
-            order = np.argsort(of_group, axis=1, kind="stable")[:, :k]
-            n = order.shape[1]
-            near_squared[g, :, :n] = np.take_along_axis(of_group, order, axis=1)
-            near_sets[g, :, :n] = seen[order]
-        return near_squared, near_sets
-
-    def predict(self, X: Any) -> NDArray[np.float64]:
-        """Predict the targets of all sets.
-
-        Parameters
-        ----------
-        X : array-like of shape (n_queries, n_features)
-
-        Returns shape (n_queries, n_sets), or (n_queries,) where `y` was of shape (n_frames,).
-        """
-        check_is_fitted(self)
-        X = validate_data(self, X, dtype=np.float64, order="C", reset=False)
-        predicted = np.array([self.predict_one(x) for x in X])
-        return predicted[:, 0] if self._one_set else predicted
-
-    def predict_one(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Predict the targets of all sets for one frame of shape (n_features,), unchecked."""
-        squared, members, group = nearest_of_groups(self._X, self._bounds, x, self.n_neighbors)
-        frames = self._members[members]
-        # Of equally near frames the earlier one first, whatever group it is of.
-        order = np.lexsort((frames, squared))
-        predicted: NDArray[np.float64] = _mean_of_nearest(
-            squared[order],
-            frames[order],
-            group[order],
-            self.near_squared_,
-            self.near_sets_,
-            self._y,
-            self.n_neighbors,
-        )
-        return predicted
 
 
 class NearestNeighbours(Rule):
@@ -159,6 +17,16 @@ class NearestNeighbours(Rule):
     After Koide et al., IROS 2021: a k-nearest-neighbour regressor on the concatenation of
     descriptor and parameters, here with the parameters in the unit cube, divided by the mean of
     their standard deviations as the descriptor's components are.
+
+    The prediction is that of `sklearn.neighbors.KNeighborsRegressor` on a row ``[frame, set]`` for
+    every pair that was run, with none of these rows made. A squared distance between rows is that
+    between the frames plus that between the sets. So among frames that have seen the same sets,
+    the k nearest pairs are made of the k nearest frames and the k nearest sets; frames that have
+    seen others are searched apart, and their best pairs merged.
+
+    Of pairs at the same distance, the one with the nearer frame comes first, then the one with the
+    earlier frame, then that with the earlier set. (scikit-learn leaves the order to its search.)
+    Where there are fewer than k pairs, all are averaged.
     """
 
     def __init__(self, k: int = 5):
@@ -167,25 +35,44 @@ class NearestNeighbours(Rule):
     def fit(self, data: TrainingData) -> Self:
         """See `Rule.fit`."""
         self.data_ = data
+        self._errors = np.ascontiguousarray(np.minimum(data.errors, np.float32(FAILURE)))
+        self._allowed = data.allows()
+        if data.candidates is not None:
+            self._allowed &= np.isin(data.sets.trials, data.candidates)
+        # Frames that have seen the same sets lie together, usually those of a sequence, each
+        # group's in their order.
+        seen = ~np.isnan(self._errors)
+        patterns: dict[bytes, list[int]] = {}
+        for frame, pattern in enumerate(np.packbits(seen, axis=1)):
+            patterns.setdefault(pattern.tobytes(), []).append(frame)
+        groups = [frames for frames in patterns.values() if seen[frames[0]].any()]
+        self._frames = np.concatenate(groups)
+        self._bounds = np.cumsum([0, *map(len, groups)])
+        self._features = data.features[self._frames]
         unit = data.sets.unit
-        scale = float(unit.std(axis=0).mean()) or 1.0
-        self.regressor_ = ProductKNeighborsRegressor(unit / scale, self.k).fit(
-            data.features, np.minimum(data.errors, np.float32(FAILURE))
-        )
+        sets = unit / (float(unit.std(axis=0).mean()) or 1.0)
+        seen_sets = [np.flatnonzero(seen[frames[0]]) for frames in groups]
+        self._near_squared, self._near_sets = _nearest_sets(sets, seen_sets, self.k)
         return self
 
     def predict(self, feature: NDArray[np.float64]) -> NDArray[np.float64]:
         """Predicted error of every set in percent; infinite for those that may not be chosen."""
-        predicted = self.regressor_.predict_one(feature)
-        some = self.data_.allows()
-        if self.data_.candidates is not None:
-            some &= np.isin(self.data_.sets.trials, self.data_.candidates)
-        return np.where(some, predicted, np.inf)
+        squared, rows, group = _nearest_of_groups(self._features, self._bounds, feature, self.k)
+        frames = self._frames[rows]
+        # Of equally near frames the earlier one first, whatever group it is of.
+        order = np.lexsort((frames, squared))
+        predicted = _mean_of_nearest(
+            squared[order],
+            frames[order],
+            group[order],
+            self._near_squared,
+            self._near_sets,
+            self._errors,
+            self.k,
+        )
+        return np.where(self._allowed, predicted, np.inf)
 
-    def select(
-        self,
-        feature: NDArray[np.float64],
-    ) -> Selection:
+    def select(self, feature: NDArray[np.float64]) -> Selection:
         """See `Rule.select`."""
         sets = self.data_.sets
         predicted = self.predict(feature)
@@ -198,8 +85,28 @@ class NearestNeighbours(Rule):
         )
 
 
+def _nearest_sets(
+    sets: NDArray[np.float64], seen: list[NDArray[np.intp]], k: int
+) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
+    """For each group of frames and each set, the nearest of the sets that the group has seen.
+
+    Squared distances, infinite where it has seen fewer, and sets; of shape (n_groups, n_sets, k).
+    """
+    squared = np.zeros((len(sets), len(sets)))
+    for p in range(sets.shape[1]):
+        squared += (sets[:, p, None] - sets[:, p]) ** 2
+    near_squared = np.full((len(seen), len(sets), min(k, len(sets))), np.inf)
+    near_sets = np.zeros(near_squared.shape, np.intp)
+    for g, of_group in enumerate(seen):
+        order = np.argsort(squared[:, of_group], axis=1, kind="stable")[:, :k]
+        n = order.shape[1]
+        near_squared[g, :, :n] = np.take_along_axis(squared[:, of_group], order, axis=1)
+        near_sets[g, :, :n] = of_group[order]
+    return near_squared, near_sets
+
+
 @numba.njit(cache=True)
-def nearest_of_groups(
+def _nearest_of_groups(
     X: NDArray[np.float64], bounds: NDArray[np.intp], x: NDArray[np.float64], k: int
 ) -> tuple[NDArray[np.float64], NDArray[np.intp], NDArray[np.intp]]:
     """The `k` rows of every group that are nearest to `x`: their squared distances, and groups.

@@ -1,21 +1,22 @@
 """Principal components by which descriptors are compared."""
 
 from collections.abc import Sequence
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.base import BaseEstimator, TransformerMixin
 from sklearn.decomposition import PCA
-from sklearn.utils.validation import check_is_fitted, validate_data
+
+N_COMPONENTS = 10
+"""Of each descriptor."""
 
 
-class ScaledPCA(TransformerMixin, BaseEstimator):  # type: ignore[misc]
+class ScaledPCA:
     """Principal components, divided by the mean of their standard deviations.
 
     One divisor for all keeps the components' shares in a distance, and gives distances a size that
     does not depend on the sensor's number of points. Each of the `blocks` of a descriptor (one if
-    left out) has up to `n_components` components and a divisor of its own.
+    left out) has up to `N_COMPONENTS` components and a divisor of its own.
 
     Attributes
     ----------
@@ -25,13 +26,12 @@ class ScaledPCA(TransformerMixin, BaseEstimator):  # type: ignore[misc]
     scale_ : ndarray of shape (n_components,)
     """
 
-    def __init__(self, n_components: int = 10, blocks: Sequence[int] | None = None):
-        self.n_components = n_components
+    def __init__(self, blocks: Sequence[int] | None = None):
         self.blocks = blocks
 
-    def fit(self, X: NDArray[np.floating], y: Any = None) -> Self:  # noqa: ARG002
+    def fit(self, X: NDArray[np.floating]) -> Self:
         """Learn from descriptors of shape (n_scans, n_features)."""
-        X = validate_data(self, X, dtype=np.float64)
+        X = np.asarray(X, np.float64)
         ends = np.cumsum(X.shape[1:] if self.blocks is None else self.blocks)
         self.mean_ = np.empty(X.shape[1])
         components, scales = [], []
@@ -39,7 +39,7 @@ class ScaledPCA(TransformerMixin, BaseEstimator):  # type: ignore[misc]
             block = X[:, begin:end]
             # Many scans take a tenth of the time by their covariance; few have none.
             solver = "covariance_eigh" if len(block) > block.shape[1] else "full"
-            pca = PCA(min(self.n_components, *block.shape), svd_solver=solver)
+            pca = PCA(min(N_COMPONENTS, *block.shape), svd_solver=solver)
             with np.errstate(invalid="ignore"):  # a block may be constant
                 deviations = pca.fit_transform(block).std(axis=0)
             self.mean_[begin:end] = pca.mean_
@@ -52,6 +52,4 @@ class ScaledPCA(TransformerMixin, BaseEstimator):  # type: ignore[misc]
 
     def transform(self, X: NDArray[np.floating]) -> NDArray[np.float64]:
         """Map descriptors to shape (n_scans, n_components)."""
-        check_is_fitted(self)
-        X = validate_data(self, X, dtype=np.float64, reset=False)
-        return np.asarray((X - self.mean_) @ self.components_.T / self.scale_)
+        return np.asarray((X.astype(np.float64) - self.mean_) @ self.components_.T / self.scale_)

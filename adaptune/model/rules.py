@@ -3,11 +3,11 @@
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, NamedTuple, Self
+from typing import Annotated, ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, NonNegativeFloat, PositiveFloat, PositiveInt
+from pydantic import BaseModel, ConfigDict, Field, NonNegativeFloat, PositiveInt
 
 from adaptune.metrics import FAILURE, cap
 from adaptune.space import ParameterSets, Selection
@@ -109,10 +109,9 @@ class NearestFrames:
             found, _ = _nearest(features, queries[others], self.n_frames)
             squared[others] = np.minimum(squared[others], found)
         at = (np.arange(_QUANTILES) + 0.5) / _QUANTILES
-        quantiles: Sequence[NDArray[np.float64]] = [
-            np.quantile(squared[number == s], at) for s in range(len(some))
-        ]
-        return np.sort(np.concatenate(quantiles))
+        return np.sort(
+            np.concatenate([np.quantile(squared[number == s], at) for s in range(len(some))])
+        )
 
 
 def _nearest(
@@ -170,22 +169,6 @@ class Costs:
         for one in known:
             prepare[one.preparation] = max(one.prepare, prepare.get(one.preparation, 0.0))
         return sum(one.register for one in known) + sum(prepare.values()) + self.evidence
-
-    def dump(self) -> dict[str, Any]:
-        """Plain data, for files."""
-        return {
-            "evidence": self.evidence,
-            "sets": [[trial, *cost] for trial, cost in self.sets.items()],
-        }
-
-    @classmethod
-    def load(cls, data: Mapping[str, Any]) -> Self:
-        """Read what `dump` returned; a ValueError, TypeError or KeyError if it is no such thing."""
-        sets = {
-            int(trial): SetCost(float(register), float(prepare), int(preparation))
-            for trial, register, prepare, preparation in data["sets"]
-        }
-        return cls(sets, float(data["evidence"]))
 
 
 class Spending(NamedTuple):
@@ -328,27 +311,28 @@ ERROR_FLOOR = 0.02
 """Percent, added to both errors of a ratio so that none is divided by zero."""
 BASELINE = 0
 """Trial number of the baseline; of several odometries, that of the first."""
+WIDTH = 0.12
+"""Standard deviation of the Gaussian over parameter sets, in the unit cube."""
+N_FRAMES = 300
+"""Nearest frames of each sequence."""
+THRESHOLD = -0.1
+"""Logarithm of the ratio below which a set is preferred to the fixed one."""
+CAUTION = 0.5
+"""Standard errors, estimated from how much the sequences differ, that are added to a ratio."""
 
 
 class PairedSettings(BaseModel):
     """Settings of the paired rule."""
 
-    # A file of a later version may hold more.
+    # A file of another version may hold more.
     model_config = ConfigDict(extra="ignore", frozen=True)
 
     adapt: bool = True  # if not, the rule keeps the fixed set as long as that does as predicted
-    # Number of complementary sets to choose among, the fixed one included; all sets if None.
-    # Candidates that the training data name come first.
-    n_sets: PositiveInt | None = 3
+    # Number of complementary sets to choose among, the fixed one included. Candidates that the
+    # training data name come first.
+    n_sets: PositiveInt = 3
     # How fast a sequence's weight falls with the distance of its nearest frames.
     sharpness: Annotated[NonNegativeFloat, Field(allow_inf_nan=False)] = 6.0
-    # Standard deviation of the Gaussian over parameter sets, in the unit cube.
-    width: Annotated[PositiveFloat, Field(allow_inf_nan=False)] = 0.12
-    n_frames: PositiveInt = 300  # nearest frames of each sequence
-    # Logarithm of the ratio below which a set is preferred to the fixed one.
-    threshold: Annotated[float, Field(le=0.0, allow_inf_nan=False)] = -0.1
-    # Standard errors, estimated from how much the sequences differ, that are added to a ratio.
-    caution: Annotated[NonNegativeFloat, Field(allow_inf_nan=False)] = 0.5
 
 
 class Near(NamedTuple):
@@ -359,15 +343,6 @@ class Near(NamedTuple):
     # percent, mixed with that of its neighbours.
     errors: NDArray[np.float64]
     fixed: NDArray[np.float64]  # (n_scans, n_sequences): mean error of the fixed set
-
-
-class Ratios(NamedTuple):
-    """Ratios of errors to the fixed set's."""
-
-    expected: NDArray[np.float64]  # (n_scans, n_candidates)
-    cautious: NDArray[np.float64]  # the same with `caution` standard errors added
-    # (n_scans, n_sequences): of the training sequences, adding up to 1.
-    weights: NDArray[np.float64]
 
 
 class PairedExpectedRatio(Rule):
@@ -403,20 +378,15 @@ class PairedExpectedRatio(Rule):
         self._fixed_at = self.candidates_.index(data.fixed)
         self.fixed_errors_ = data.fixed_errors
         self.errors_ = self._mixed_errors()
-        self.nearest_ = NearestFrames(self.settings.n_frames).fit(data.features, data.sequence)
+        self.nearest_ = NearestFrames(N_FRAMES).fit(data.features, data.sequence)
         return self
 
     def _candidates(self) -> tuple[int, ...]:
-        data, n_sets = self.data_, self.settings.n_sets
         if not self.settings.adapt:
-            return (data.fixed,)
-        if data.candidates is not None:
-            return data.candidates
-        if n_sets is None:
-            complete = np.isfinite(mean_errors(data.errors, data.sequence)) & data.allows()
-            complete[data.sets.column(data.fixed)] = True
-            return tuple(data.sets.trials[c] for c in np.flatnonzero(complete))
-        return tuple(complementary(data, n_sets))
+            return (self.data_.fixed,)
+        if self.data_.candidates is not None:
+            return self.data_.candidates
+        return tuple(complementary(self.data_, self.settings.n_sets))
 
     def _with_baseline(self) -> tuple[int, ...]:
         """The candidates, and behind them the baseline if it is none of them but may be chosen."""
@@ -437,7 +407,7 @@ class PairedExpectedRatio(Rule):
         unit = data.sets.unit
         columns = data.sets.columns(self._known)
         squared = ((unit[:, None] - unit[columns]) ** 2).sum(axis=2)
-        kernel = np.exp(-0.5 * squared / self.settings.width**2)
+        kernel = np.exp(-0.5 * squared / WIDTH**2)
         kernel /= kernel.sum(axis=0)
         errors = np.minimum(data.errors, np.float32(FAILURE))
         # Where a set was not run, the fixed one's error makes it neither better nor worse.
@@ -453,28 +423,10 @@ class PairedExpectedRatio(Rule):
         fixed = evidence.means(self.fixed_errors_)
         return Near(evidence, evidence.means(self.errors_), fixed)
 
-    def choices(self, near: Near, settings: PairedSettings) -> list[int]:
-        """Trial number of the best candidate for each scan, by other settings than those fitted.
-
-        The settings may differ in `sharpness`, `threshold` and `caution`.
-        """
-        ratios = self._ratios(near, settings)
-        best = _best(ratios.cautious[:, : len(self.candidates_)], self._fixed_at, settings)
-        return [self.candidates_[position] for position in best]
-
-    def predict(self, feature: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Predicted error of every set for one scan in percent, of shape (n_sets,).
-
-        It is infinite for sets that are not candidates. For the fixed set too, it is the mixed
-        ratio times its error; `select` returns the error itself.
-        """
-        near = self.near(feature[None])
-        predicted = np.full(len(self.data_.sets), np.inf)
-        expected, _, weights = _expected_ratios(near, self.settings)
-        n = len(self.candidates_)
-        columns = self.data_.sets.columns(self.candidates_)
-        predicted[columns] = expected[0, :n] * float(weights[0] @ near.fixed[0])
-        return predicted
+    def choices(self, near: Near, sharpness: float) -> list[int]:
+        """Trial number of the best candidate for each scan, by another sharpness than fitted."""
+        _, cautious, _ = self._ratios(near, sharpness)
+        return [self.candidates_[position] for position in self._best(cautious)]
 
     def select(
         self,
@@ -484,8 +436,8 @@ class PairedExpectedRatio(Rule):
         """See `Rule.select`; `measured` has errors in percent of sets worse than predicted."""
         measured = measured or {}
         near = self.near(feature[None])
-        (expected,), (cautious,), (weights,) = self._ratios(near, self.settings)
-        (best,) = _best(cautious[None, : len(self.candidates_)], self._fixed_at, self.settings)
+        (expected,), (cautious,), (weights,) = self._ratios(near, self.settings.sharpness)
+        (best,) = self._best(cautious[None])
         fixed = float(weights @ near.fixed[0])
         if self._known[best] in measured:
             errors = dict(zip(self._known, (cautious * fixed).tolist(), strict=True))
@@ -493,43 +445,41 @@ class PairedExpectedRatio(Rule):
             # Far from all training, all ratios are 1.
             of_known = [(errors[trial], trial != BASELINE) for trial in self._known]
             best = min(range(len(of_known)), key=of_known.__getitem__)
-        familiarity = float(near.evidence.familiarity[0])
         trial = self._known[best]
         return Selection(
             trial,
             self.data_.sets[trial],
             predicted_error=float(expected[best]) * fixed,
             predicted_fixed=fixed,
-            familiarity=familiarity,
+            familiarity=float(near.evidence.familiarity[0]),
             n_sequences=float(1.0 / (weights @ weights)),
         )
 
-    def _ratios(self, near: Near, settings: PairedSettings) -> Ratios:
-        """Ratios of all in `near` to the fixed set's error."""
-        ratios = _expected_ratios(near, settings)
+    def _ratios(
+        self, near: Near, sharpness: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Ratios of the errors in `near` to the fixed set's.
+
+        Expected and cautious ones, of shape (n_scans, n_candidates), and the weights of the
+        training sequences, of shape (n_scans, n_sequences).
+        """
+        ratio = (near.errors + ERROR_FLOOR) / (near.fixed[..., None] + ERROR_FLOOR)
+        weights = near.evidence.weights(sharpness)
+        expected = np.einsum("qs,qsc->qc", weights, ratio)
+        variance = np.einsum("qs,qsc->qc", weights, (ratio - expected[:, None]) ** 2)
+        # One over the number of sequences that this rests on. The fewer they are, the less they
+        # show how much they differ: one alone is taken to differ as much as all sequences do.
+        share = (weights**2).sum(axis=1)[:, None]
+        error = np.sqrt(share * (variance + share * ratio.var(axis=1)))
+        trust = near.evidence.trust[:, None]
+        expected = 1.0 + trust * (expected - 1.0)
+        cautious = expected + trust * CAUTION * error
         # Neither mixing nor caution is for the set that all are compared with.
-        ratios.expected[:, self._fixed_at] = ratios.cautious[:, self._fixed_at] = 1.0
-        return ratios
+        expected[:, self._fixed_at] = cautious[:, self._fixed_at] = 1.0
+        return expected, cautious, weights
 
-
-def _expected_ratios(near: Near, settings: PairedSettings) -> Ratios:
-    """Ratio of every candidate's error to the fixed set's."""
-    ratio = (near.errors + ERROR_FLOOR) / (near.fixed[..., None] + ERROR_FLOOR)
-    weights = near.evidence.weights(settings.sharpness)
-    expected = np.einsum("qs,qsc->qc", weights, ratio)
-    variance = np.einsum("qs,qsc->qc", weights, (ratio - expected[:, None]) ** 2)
-    # One over the number of sequences that this rests on. The fewer they are, the less they show
-    # how much they differ: one alone is taken to differ as much as all sequences do.
-    share = (weights**2).sum(axis=1)[:, None]
-    error = np.sqrt(share * (variance + share * ratio.var(axis=1)))
-    trust = near.evidence.trust[:, None]
-    expected = 1.0 + trust * (expected - 1.0)
-    return Ratios(expected, expected + trust * settings.caution * error, weights)
-
-
-def _best(
-    cautious: NDArray[np.float64], fixed_at: int, settings: PairedSettings
-) -> NDArray[np.intp]:
-    """Position of the best candidate for each scan, of shape (n_scans,)."""
-    worth = np.log(cautious.min(axis=1)) < settings.threshold
-    return np.where(worth, cautious.argmin(axis=1), fixed_at)
+    def _best(self, cautious: NDArray[np.float64]) -> NDArray[np.intp]:
+        """Position of the best candidate for each scan, of shape (n_scans,)."""
+        cautious = cautious[:, : len(self.candidates_)]
+        worth = np.log(cautious.min(axis=1)) < THRESHOLD
+        return np.where(worth, cautious.argmin(axis=1), self._fixed_at)

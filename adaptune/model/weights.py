@@ -35,6 +35,9 @@ UNTRIED_MEAN_SQUARE = 4.0
 """Mean square of a member that nobody has tried, in that of the first one."""
 SMOOTHED_SELECTIONS = 5
 """Selections whose weights are averaged: errors cancel each other while weights stay the same."""
+EVEN_SHARE = 0.05
+"""Added to the members' mean squares, as a share of their harmonic mean, for weights that are more
+even."""
 MEMBER_POOL_SIZE = 64
 """A bank's members are searched for among this many of the best sets."""
 
@@ -42,7 +45,7 @@ MEMBER_POOL_SIZE = 64
 class BankSettings(BaseModel):
     """Settings of a bank's weights."""
 
-    # A file of a later version may hold more.
+    # A file of another version may hold more.
     model_config = ConfigDict(extra="ignore", frozen=True)
 
     adapt: bool = True  # if not, the fixed set keeps all the weight
@@ -51,9 +54,6 @@ class BankSettings(BaseModel):
     n_frames: PositiveInt = 300  # nearest frames of each sequence
     # Minimum share of the weight that the fixed set keeps where nothing was measured.
     min_fixed_share: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
-    # Added to the members' mean squares, as a share of their harmonic mean: the larger, the more
-    # even are the weights.
-    even: Annotated[NonNegativeFloat, Field(allow_inf_nan=False)] = 0.05
     # How many windows of live evidence the training counts as.
     prior_windows: Annotated[PositiveFloat, Field(allow_inf_nan=False)] = 3.0
     # Errors are clipped at this many times the fixed set's root mean square in the sequence: a
@@ -145,10 +145,7 @@ class BankRule(Rule):
         products, fixed = evidence.means(self.products_), evidence.means(self.fixed_squares_)
         return NearProducts(self.members_, evidence, products, fixed)
 
-    def select(
-        self,
-        feature: NDArray[np.float64],
-    ) -> Selection:
+    def select(self, feature: NDArray[np.float64]) -> Selection:
         """See `Rule.select`; by the training alone."""
         return self.weigh(self.near(feature[None]), None)
 
@@ -203,7 +200,7 @@ def bank_weights(
         UNFAMILIAR_PRIOR_SHARE + (1.0 - UNFAMILIAR_PRIOR_SHARE) * near.evidence.trust
     )
     squares = np.array([blend(*of_scan) for of_scan in zip(learned, windows, live, strict=True)])
-    weights = np.array([minimum_variance_weights(of_scan, settings.even) for of_scan in squares])
+    weights = np.array([minimum_variance_weights(of_scan) for of_scan in squares])
     measured = np.array([0.0 if one is None else one.windows for one in live])
     kept = settings.min_fixed_share * windows / (windows + measured)
     weights *= (1.0 - kept)[:, None]
@@ -283,18 +280,18 @@ def clip_errors(
     return kept.astype(np.float32), np.where(lost, most, 0.0).astype(np.float32)
 
 
-def minimum_variance_weights(
-    squares: NDArray[np.float64], even: float = BankSettings().even
-) -> NDArray[np.float64]:
+def minimum_variance_weights(squares: NDArray[np.float64]) -> NDArray[np.float64]:
     """Weights w, none negative and adding up to 1, for which w'Sw is least.
 
-    S is of shape (n, n); see `BankSettings` for `even`.
+    S is of shape (n, n), and made more even by `EVEN_SHARE`.
 
     Returns shape (n,).
     """
     n = len(squares)
     harmonic = 1.0 / (1.0 / np.maximum(squares.diagonal(), 1e-12)).mean()
-    squares = squares + np.eye(n) * (even * harmonic + 1e-9 * squares.diagonal().max() + 1e-12)
+    squares = squares + np.eye(n) * (
+        EVEN_SHARE * harmonic + 1e-9 * squares.diagonal().max() + 1e-12
+    )
     # Up to a factor they are those for which w'Sw - 2 sum w is least.
     weights = np.linalg.solve(squares, np.ones(n))
     if weights.min() < 0.0:

@@ -249,8 +249,3 @@ def check_writable(path: Path) -> None:
                 f"{there[0]}: is there, and is not of an estimate that is complete; move it away, "
                 f"or write elsewhere with --out"
             )
-
-
-def estimated_name(recording: Path) -> str:
-    """Name of the file of its reference, without suffix."""
-    return f"{recording.resolve().stem}_reference"

@@ -5,7 +5,6 @@ also registered directly to scans some metres before. A pose graph brings both t
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from itertools import count
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,22 +70,15 @@ def estimate_reference(
     EstimateError
         If the recording does not allow it: the robot hardly moves, or nothing can be registered.
     """
-    n, done = scans.n_messages, count(1)
+    n = scans.n_messages
     # What comes after the pass takes a while, too.
     after = max(1, n // (20 * N_GRAPHS))
-
-    def one_more() -> None:
-        i = next(done)
-        advance(i, max(n, i) + N_GRAPHS * after)
-
-    found = pass_over(scans, one_more)
+    found = pass_over(scans, lambda done: advance(done, max(n, done) + N_GRAPHS * after))
     last = max(n, len(found.stamps))
-    graphs = count(1)
-
-    def one_graph() -> None:
-        advance(last + next(graphs) * after, last + N_GRAPHS * after)
-
-    return estimated(scans.name, found, priors, scans, one_graph)
+    total = last + N_GRAPHS * after
+    return estimated(
+        scans.name, found, priors, scans, lambda graphs: advance(last + graphs * after, total)
+    )
 
 
 def estimated(
@@ -94,12 +86,12 @@ def estimated(
     found: Pass,
     priors: Trajectory | None = None,
     scans: Iterable[Scan] = (),
-    advance: Callable[[], None] = lambda: None,
+    advance: Callable[[int], None] = lambda _: None,
 ) -> EstimatedReference:
     """The reference that follows from a pass over a recording, see `estimate_reference`.
 
     The scans are read again if the path comes by again; by default it is not. `advance` is called
-    after each of `N_GRAPHS` pose graphs.
+    with how many of `N_GRAPHS` pose graphs are done.
     """
     _check(name, found)
     T_odom_sensor, edges = _revised(found)
@@ -107,10 +99,10 @@ def estimated(
     places = None if priors is None else positions(priors, found.stamps, T)
     again = loops(T, np.unique([edge.end for edge in edges]))
     by_loops = closed(scans, again, T) if again else []
-    advance()
+    advance(1)
     if places is not None or by_loops:
         T = optimised(T_odom_sensor, [*edges, *by_loops], places, T)
-    advance()
+    advance(2)
     registrations = _judged(found.guesses, edges, T)
     reference = EstimatedReference(
         found.stamps,
@@ -269,7 +261,7 @@ def _halves(
     edges: Sequence[Edge],
     places: Positions | None,
     T_world_sensor: Poses,
-    advance: Callable[[], None],
+    advance: Callable[[int], None],
 ) -> Poses:
     """The reference twice, each from half of the pool and half of the scans: (2, n, 4, 4)."""
     ends = {end: i % 2 for i, end in enumerate(sorted({edge.end for edge in edges}))}
@@ -278,7 +270,7 @@ def _halves(
         T = _chained(T_world_sensor[0], _steps_of(found, T_world_sensor, members))
         own = [edge for edge in edges if ends[edge.end] == half]
         halves.append(optimised(T, own, places, T_world_sensor))
-        advance()
+        advance(3 + half)
     return np.array(halves)
 
 

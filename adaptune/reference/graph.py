@@ -128,11 +128,11 @@ class _Anchor(NamedTuple):
     T_odom_sensor: Poses  # (1 + n_members, 4, 4): of the consensus, then of its members
 
 
-def pass_over(scans: Iterable[Scan], advance: Callable[[], None] = lambda: None) -> Pass:
+def pass_over(scans: Iterable[Scan], advance: Callable[[int], None] = lambda _: None) -> Pass:
     """Run the consensus along a recording, and register scans directly to those before them.
 
     Only the scans of the last metres and seconds are kept in memory. `advance` is called after
-    every scan.
+    every scan with how many are done.
     """
     consensus, registering = Consensus(), _Registering(Consensus.n_members)
     stamps: list[int] = []
@@ -146,7 +146,7 @@ def pass_over(scans: Iterable[Scan], advance: Callable[[], None] = lambda: None)
         poses.append(T_odom_sensor)
         motions.append(T_previous_current)
         registered.append(sound)
-        advance()
+        advance(len(stamps))
     registering.end()
     return Pass(
         np.array(stamps, np.int64),
@@ -421,11 +421,8 @@ _DEPARTURE = (0.3, 0.01)
 of the way between the two scans: it may be of another place that looks alike."""
 
 
-class Loop(NamedTuple):
-    """Two scans at the same place, by their numbers."""
-
-    start: int
-    end: int
+Loop = tuple[int, int]
+"""Two scans at the same place, by their numbers."""
 
 
 def loops(T_world_sensor: Poses, numbers: NDArray[np.intp]) -> list[Loop]:
@@ -444,7 +441,7 @@ def loops(T_world_sensor: Poses, numbers: NDArray[np.intp]) -> list[Loop]:
             i for i in tree.query_ball_point(places[j], NEAR) if metres[j] - metres[i] > LATER
         ]:
             away = np.linalg.norm(places[before] - places[j], axis=1)
-            found.append(Loop(int(numbers[before[int(away.argmin())]]), int(numbers[j])))
+            found.append((int(numbers[before[int(away.argmin())]]), int(numbers[j])))
             last = metres[j]
     return found[:: -(-len(found) // MOST)] if found else []
 

@@ -84,7 +84,7 @@ def test_they_are_made_once_and_again_for_another_model(own):
     assert run_replays(study, study.model_path) == 1
     assert [r["trial"] for r in selections(study, "adaptive")] == [r["trial"] for r in before]
     # Without being asked for, they are compared if they are there, and renewed by a command.
-    other = replace(ErrorModel.load(study.model_path), paired=PairedSettings(threshold=-0.2))
+    other = replace(ErrorModel.load(study.model_path), paired=PairedSettings(sharpness=7.0))
     other.save(study.model_path)
     plain = own()
     assert run_replays(plain, plain.model_path) == 2

@@ -64,7 +64,7 @@ def test_a_member_that_is_killed_costs_its_weight_and_nothing_else(order, caplog
     scans = [Scan(stamp, points) for stamp, points, _ in drives.scans(0, 110, STEP)]
     with caplog.at_level(logging.WARNING, "adaptune.bank.bank"):
         found = replay(killing(scans), bank, HealthCheck(), selector)
-    assert not bank.dead
+    assert not any(member.ended for member in bank._members)
     bank.close()
     T = found.trajectory.T_world_sensor[-1]
     assert np.linalg.norm(T[:3, 3] - [STEP * (len(scans) - 1), 0.0, 0.0]) < 0.1

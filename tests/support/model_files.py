@@ -10,7 +10,7 @@ from safetensors import safe_open
 from safetensors.numpy import save_file
 
 from adaptune.model import ErrorModel, ModelError
-from adaptune.model.error_model import checksum
+from adaptune.model.error_model import digest
 
 
 def assert_same(a, b):
@@ -39,7 +39,7 @@ def rewrite(path, arrays=None, text=None, **header):
         parts = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     parts |= arrays or {}
     said["header"] |= header
-    said["checksum"] = checksum(said["header"], parts)
+    said["digest"] = digest(said["header"], parts)
     parts = {name: np.ascontiguousarray(part) for name, part in parts.items()}
     save_file(parts, path, {"adaptune": json.dumps(said)})
 

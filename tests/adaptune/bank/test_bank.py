@@ -233,7 +233,7 @@ def test_a_member_that_a_fault_has_ended_is_told_once_and_starts_again(caplog):
         "trial 3 (mine) is back",
     ]
     assert len(bank.faults) >= bank.restarts == 1
-    assert not bank.dead
+    assert not any(member.ended for member in bank._members)
     bank.close()
 
 
@@ -241,7 +241,7 @@ def test_one_that_cannot_start_is_out_for_good(caplog):
     bank = with_faulty("never begins")
     with caplog.at_level(logging.WARNING, "adaptune.bank.bank"):
         np.testing.assert_allclose(steps_of(bank, 90), 0.1)
-    assert bank.dead == {3}
+    assert [member.ended for member in bank._members].count(True) == 1
     assert len(bank.faults) == MOST_FAULTS
     # Twice for every restart, with a past and without.
     assert bank.restarts < MOST_FAULTS

@@ -119,7 +119,12 @@ def test_a_process_that_is_killed_costs_its_members_weight(scans):
                         os.kill(process, signal.SIGKILL)
 
     dead = []
-    poses, _ = run(odometry, scans, lambda i: (kill(i), dead.append(len(odometry.dead))))
+
+    def before(i):
+        kill(i)
+        dead.append(sum(member.ended for member in odometry._members))
+
+    poses, _ = run(odometry, scans, before)
     assert max(dead) == 3
     assert dead[-1] == 0
     assert len(odometry.faults) == 3

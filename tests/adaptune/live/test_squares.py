@@ -18,6 +18,7 @@ from adaptune.live.hops import (
     live_squares,
     register,
 )
+from adaptune.model import weights
 from adaptune.model.weights import minimum_variance_weights
 from adaptune.recording.scan import Scan
 
@@ -40,9 +41,9 @@ def empty(n_members):
 def test_what_all_members_share_changes_no_weights(errors, constant):
     """Such as the registration's own error."""
     products = live_squares(hops(errors)).products + 0.1 * np.eye(4)
-    plain, shifted = (
-        minimum_variance_weights(s, even=0.0) for s in (products, products + constant)
-    )
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(weights, "EVEN_SHARE", 0.0)
+        plain, shifted = map(minimum_variance_weights, (products, products + constant))
     np.testing.assert_allclose(shifted, plain, atol=1e-5)
 
 

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tables import table
 
-from adaptune.model import PairedExpectedRatio, PairedSettings, TrainingData
+from adaptune.model import PairedExpectedRatio, PairedSettings, TrainingData, rules
 from adaptune.model.rules import complementary
 
 modest = settings(max_examples=30, deadline=None)
@@ -90,6 +90,16 @@ def plain_ratios(data, feature, m, h, tau, c):
     return expected, cautious, sum(w * f for w, f in zip(weights, fixed, strict=True))
 
 
+def among_all(data):
+    return replace(data, candidates=data.sets.trials)
+
+
+def ratios(rule, feature):
+    """Expected ratio of each candidate."""
+    (expected,), *_ = rule._ratios(rule.near(feature[None]), rule.settings.sharpness)
+    return expected[: len(rule.candidates_)]
+
+
 @modest
 @given(
     seeds,
@@ -101,12 +111,18 @@ def plain_ratios(data, feature, m, h, tau, c):
 def test_it_follows_its_definition(seed, n_frames, n_sets, n_sequences, constants):
     data = random_data(seed, n_frames, n_sets, n_sequences)
     m, h, tau, c = constants
-    settings = PairedSettings(n_sets=None, n_frames=m, width=h, sharpness=tau, caution=c)
-    rule = PairedExpectedRatio(settings).fit(data)
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in (("N_FRAMES", m), ("WIDTH", h), ("CAUTION", c)):
+            patch.setattr(rules, name, value)
+        check_definition(data, seed, constants, PairedSettings(sharpness=tau))
+
+
+def check_definition(data, seed, constants, settings):
+    rule = PairedExpectedRatio(settings).fit(among_all(data))
     for feature in np.random.default_rng(seed).normal(size=(3, 3)):
         expected, cautious, fixed = plain_ratios(data, feature, *constants)
-        np.testing.assert_allclose(rule.predict(feature), np.multiply(expected, fixed), rtol=1e-5)
         expected[data.fixed] = cautious[data.fixed] = 1.0
+        np.testing.assert_allclose(ratios(rule, feature), expected, rtol=1e-5)
         best = int(np.argmin(cautious))
         selection = rule.select(feature)
         assert selection.predicted_fixed == pytest.approx(fixed, rel=1e-6)
@@ -121,9 +137,7 @@ def test_it_chooses_among_complementary_sets(seed, n_frames, n_sets, n_sequences
     data = random_data(seed, n_frames, n_sets, n_sequences)
     few = complementary(data, 2)
     rule = PairedExpectedRatio(PairedSettings(n_sets=2)).fit(data)
-    predicted = rule.predict(np.zeros(3))
-    assert np.isfinite(predicted[few]).all()
-    assert np.isinf(np.delete(predicted, few)).all()
+    assert rule.candidates_ == tuple(few)
     assert rule.select(np.zeros(3)).trial in few
     fixed = PairedExpectedRatio(PairedSettings(adapt=False)).fit(data)
     assert fixed.select(np.zeros(3)).trial == data.fixed
@@ -134,12 +148,10 @@ def test_it_chooses_among_complementary_sets(seed, n_frames, n_sets, n_sequences
 def test_it_chooses_among_those_named_on_the_evidence_of_all(seed, n_frames, n_sets):
     data = random_data(seed, n_frames, n_sets)
     named = (data.fixed, (data.fixed + 2) % n_sets)
-    of_all = PairedExpectedRatio(PairedSettings(n_sets=None)).fit(data).predict(np.zeros(3))
-    few = PairedExpectedRatio(PairedSettings()).fit(replace(data, candidates=named))
-    predicted = few.predict(np.zeros(3))
+    of_all = ratios(PairedExpectedRatio().fit(among_all(data)), np.zeros(3))
+    few = PairedExpectedRatio().fit(replace(data, candidates=named))
     # Sets beside them are still heeded.
-    np.testing.assert_allclose(predicted[[*named]], of_all[[*named]], rtol=1e-5)
-    assert np.isinf(np.delete(predicted, [*named])).all()
+    np.testing.assert_allclose(ratios(few, np.zeros(3)), of_all[[*named]], rtol=1e-5)
     assert few.select(np.zeros(3)).trial in named
     fixed = PairedExpectedRatio(PairedSettings(adapt=False)).fit(replace(data, candidates=named))
     assert fixed.select(np.zeros(3)).trial == data.fixed
@@ -184,12 +196,11 @@ def test_a_sequence_says_nothing_of_sets_it_has_not_seen():
         table([[0.0, 0.0], [1.0, 1.0], [0.0, 1.0]]),
         0,
     )
-    rule = PairedExpectedRatio(PairedSettings(n_sets=None)).fit(data)
-    assert rule.candidates_ == (0, 2)
+    assert complementary(data, 3) == [0, 2]
     rule = PairedExpectedRatio().fit(replace(data, candidates=(0, 1, 2)))
     # Half of the evidence, of 0.52 / 1.02, and half of 1; against 0.62 / 1.02 on all of it.
     np.testing.assert_allclose(
-        rule.predict(np.zeros(2)), [1.0, 0.5 * (0.52 / 1.02 + 1.0), 0.62 / 1.02], rtol=1e-6
+        ratios(rule, np.zeros(2)), [1.0, 0.5 * (0.52 / 1.02 + 1.0), 0.62 / 1.02], rtol=1e-6
     )
     assert rule.select(np.zeros(2)).trial == 2
 

@@ -1,5 +1,4 @@
 import numpy as np
-import pytest
 from tables import table
 
 from adaptune.model.rules import Costs, SetCost, Spending, TrainingData, complementary
@@ -67,12 +66,6 @@ def test_members_share_prepared_scans():
     assert COSTS.adaptive([0, 4]) == 14.5
     assert COSTS.adaptive([0, 4, 7, 9]) == 55.5
     assert np.isnan(COSTS.adaptive([0, 5]))
-
-
-def test_they_are_read_as_they_were_written():
-    assert Costs.load(COSTS.dump()) == COSTS
-    with pytest.raises(KeyError):
-        Costs.load({"sets": []})
 
 
 def test_a_budget_holds_for_all_together():

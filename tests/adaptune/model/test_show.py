@@ -59,8 +59,8 @@ def test_a_model_is_explained(model, tmp_path):
         "street 2 3 2.000 2.000 0 0",
         "0, fixed 3.000 distance 4, kernel none",
         "1 3.000 distance 2, kernel [huber]",
-        "downsampling 0.5",
-        "seed 7",
+        "downsampling: 0.5",
+        "seed: 7",
         "Driven: one set at a time.",
         "Not validated yet",
     ):

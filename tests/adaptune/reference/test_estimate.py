@@ -308,7 +308,7 @@ def test_where_the_path_comes_by_again_scans_are_registered(monkeypatch):
     assert read is scans
     assert len(wanted) > 5
     ends = {g.end for g in made.guesses}
-    assert all({loop.start, loop.end} <= ends for loop in wanted)
+    assert all(set(loop) <= ends for loop in wanted)
     for start, end in wanted:
         back, was, true = (invert(P[start]) @ P[end] for P in (found.T_world_sensor, wrong, T))
         far = [np.linalg.norm((P - true)[:3, 3]) for P in (back, was)]
