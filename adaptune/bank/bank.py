@@ -26,8 +26,6 @@ from adaptune.odometry.registry import Factory
 from adaptune.recording.scan import Scan
 from adaptune.space import ODOMETRY, ParameterSet, Selection
 
-# The scans of the last seconds, on which a new instance builds its map before it takes over.
-
 Make = Callable[[ParameterSet], OdometryInstance]
 """Makes a new instance with these parameters."""
 
@@ -41,7 +39,7 @@ class PastScan(NamedTuple):
 
 
 class Successor:
-    """A new instance on its way through scans of the past, of which some are still waiting.
+    """A new instance that builds its map on the scans of the last seconds before it takes over.
 
     `T_own_sensor`, of shape (4, 4), is its own newest pose.
     """

@@ -88,13 +88,11 @@ class NearestFrames:
         for s, (members, own) in enumerate(zip(self.members_, self.features_, strict=True)):
             squared[:, s], nearest = _nearest(own, features, self.n_frames)
             frames.append(members[nearest])
-        return Evidence(tuple(frames), squared, self._familiarity(squared.min(axis=1)))
-
-    def _familiarity(self, squared: NDArray[np.float64]) -> NDArray[np.float64]:
-        if not len(self.distances_):
-            return np.full(len(squared), np.nan)
-        below = np.searchsorted(self.distances_, squared, side="left")
-        return np.asarray(1.0 - below / len(self.distances_))
+        familiarity = np.full(len(features), np.nan)
+        if len(self.distances_):
+            below = np.searchsorted(self.distances_, squared.min(axis=1), side="left")
+            familiarity = 1.0 - below / len(self.distances_)
+        return Evidence(tuple(frames), squared, familiarity)
 
     def _distances_between_sequences(self) -> NDArray[np.float64]:
         """Sorted distances of training frames from the other sequences, as many of each."""

@@ -252,9 +252,6 @@ def test_any_shape_follows_its_definition(seed, size, second, third):
     np.testing.assert_array_equal(ndt_histogram(points), plain_histogram(points))
 
 
-LINE, PLANE = (0.1, 0.02, 0.01), (0.1, 0.1, 0.01)
-
-
 @modest
 @given(seeds, st.sampled_from([1, 2, 3]))
 def test_quarter_turns_change_nothing(seed, quarters):
