@@ -39,22 +39,12 @@ class PastScan(NamedTuple):
 
 
 class Successor:
-    """A new instance that builds its map on the scans of the last seconds before it takes over.
-
-    `T_own_sensor`, of shape (4, 4), is its own newest pose.
-    """
+    """A new instance that builds its map on the scans of the last seconds before it takes over."""
 
     def __init__(self, odometry: OdometryInstance, past: Iterable[PastScan]):
         self.odometry = odometry
         self.waiting = deque(past)
         self._start(self.waiting.popleft())
-
-    def catch_up(self, n: int) -> None:
-        """See at most `n` more scans."""
-        for _ in range(n):
-            if self.waiting:
-                self.submit()
-                self.collect()
 
     def submit(self) -> None:
         """Begin to register the next of the scans that wait."""
@@ -63,8 +53,7 @@ class Successor:
 
     def collect(self) -> None:
         """Wait for its pose."""
-        self.T_own_sensor = self.odometry.collect().T_odom_sensor
-        if not np.isfinite(self.T_own_sensor).all():
+        if not np.isfinite(self.odometry.collect().T_odom_sensor).all():
             # It begins without a past.
             self._start(self.waiting.pop() if self.waiting else self._submitted)
             self.waiting.clear()
@@ -72,16 +61,6 @@ class Successor:
     def _start(self, past: PastScan) -> None:
         prepared = past.scan.by(self.odometry)
         self.odometry.start(prepared, past.T_odom_sensor, past.T_previous_current)
-        self.T_own_sensor = past.T_odom_sensor
-
-
-def catch_up_together(successors: Sequence[Successor]) -> None:
-    """See all scans that wait; those at the end register while those at the beginning do."""
-    while waiting := [one for one in successors if one.waiting]:
-        for one in waiting:
-            one.submit()
-        for one in reversed(waiting):
-            one.collect()
 
 
 # How well motions place the newest scan on the scans before it: what tells a lost member.
@@ -501,7 +480,12 @@ class Bank(OdometryInstance):
         successors = [Successor(member, self._past) for member in due]
         # Somebody has to go on meanwhile.
         if self._rate is None or (self.late.absent | members).all():
-            catch_up_together(successors)
+            # Those at the end register while those at the beginning do.
+            while waiting := [one for one in successors if one.waiting]:
+                for one in waiting:
+                    one.submit()
+                for one in reversed(waiting):
+                    one.collect()
             for i in np.flatnonzero(members).tolist():
                 self.late.back(i, self._past[-1].T_odom_sensor)
         else:
@@ -519,7 +503,10 @@ class Bank(OdometryInstance):
         if not self._returning or self._returning[0].odometry.busy:
             return
         first = self._returning[0]
-        first.catch_up(CATCH_UP)
+        for _ in range(CATCH_UP):
+            if first.waiting:
+                first.submit()
+                first.collect()
         if not first.waiting:
             i = self._members.index(first.odometry)
             self.late.back(i, self._past[-1].T_odom_sensor)

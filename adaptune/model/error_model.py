@@ -445,7 +445,7 @@ def _sequences(model: ErrorModel) -> list[dict[str, Any]]:
     fixed = model.sets.column(model.fixed)
     for s, name in enumerate(model.sequences):
         errors = model.errors[model.sequence == s]
-        run = ~np.isnan(errors).all(axis=0) if len(errors) else np.zeros(len(model.sets), bool)
+        run = ~np.isnan(errors).all(axis=0)
         row: dict[str, Any] = {"sequence": name, "frames": len(errors), "sets": int(run.sum())}
         row |= {"fixed [%]": None, "best [%]": None, "best set": None, "lost frames, fixed": None}
         if run.any():
