@@ -18,7 +18,7 @@ import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
@@ -615,8 +615,8 @@ def shared_cores() -> set[int]:
     return os.sched_getaffinity(0) if _before is None else _before
 
 
-def pin(core: int, alone: bool = False) -> Callable[[], None]:
-    """Keep this process on one core, and return a function that undoes it.
+def pin(core: int, alone: bool = False) -> ExitStack:
+    """Keep this process on one core until what it returns is closed.
 
     Open3D sums in an order that depends on its threads. Only on one core do its results repeat bit
     by bit. Running threads keep their cores: call this before the first use of Open3D. Numbers
@@ -624,6 +624,7 @@ def pin(core: int, alone: bool = False) -> Callable[[], None]:
     work: then `next_core` gives others the rest.
     """
     global _before  # noqa: PLW0603 - the cores are those of the process
+    pinned = ExitStack()
     cores = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {sorted(cores)[core % len(cores)]})
     _before = cores if alone else None
@@ -633,7 +634,8 @@ def pin(core: int, alone: bool = False) -> Callable[[], None]:
         os.sched_setaffinity(0, cores)
         _before = None
 
-    return unpin
+    pinned.callback(unpin)
+    return pinned
 
 
 def next_core() -> int:

@@ -147,13 +147,13 @@ def main() -> None:
     )
     parser.add_argument("--seconds", type=float, default=60.0, help="of the replay in real time")
     seconds = parser.parse_args().seconds
-    unpin = processes.pin(0, alone=True)
+    pinned = processes.pin(0, alone=True)
     lockstep(Path(os.environ["ADAPTUNE_TEST_DATA"]) / "street.bag")
     spread_bank(list(simulate(Course(scenes=("street",), length=40.0, seed=1))))
     in_real_time(
         list(simulate(Course(scenes=("street",), length=seconds, sensor="hdl64e", seed=1)))
     )
-    unpin()
+    pinned.close()
 
 
 if __name__ == "__main__":

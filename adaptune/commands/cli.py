@@ -6,7 +6,6 @@ from typing import Annotated, Any
 import typer
 
 from adaptune.commands import offline, online, tools
-from adaptune.commands import offline as reference
 from adaptune.commands.terminal import Commands, errors, say
 
 # Every command imports what it needs, so that `adaptune --help` answers at once.
@@ -36,8 +35,7 @@ app = typer.Typer(
 
 for _command in (
     *(tools.inspect, tools.cache, tools.serve),
-    *(offline.simulate, reference.reference),
-    *(offline.offline, offline.trials, offline.validate),
+    *(offline.simulate, offline.reference, offline.offline, offline.trials, offline.validate),
     *(online.online, online.compare, online.record),
     tools.import_rustle,
 ):

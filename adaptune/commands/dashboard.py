@@ -1,9 +1,7 @@
 """What a replay, or a drive, does now: a dashboard for the terminal."""
 
 import time
-from collections import deque
-from collections.abc import Iterable, Iterator, Mapping
-from typing import NamedTuple
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 from rich.table import Table
@@ -15,12 +13,6 @@ from online.replay import ReplayRecord
 
 NEWEST = 1000
 """Scans, and selections, whose milliseconds are shown."""
-
-
-class _Line(NamedTuple):
-    name: str
-    words: str
-    style: str = ""
 
 
 class Dashboard:
@@ -41,86 +33,69 @@ class Dashboard:
         record
             What became of the scans so far.
         """
-        now = time.perf_counter()
+        step = record.steps[-1]
         if what != self._what:
-            self._what, self._begun = what, now
-            self._first = record.steps[-1].stamp
-            self._scan_ms: deque[float] = deque(maxlen=NEWEST)
-            self._selection_ms: deque[float] = deque(maxlen=NEWEST)
-            self._restarts = self._n_choices = self._rejected = 0
-            self._choice = None
-        step, choice = record.steps[-1], record.newest
-        self._now, self._total, self._record = now, total, record
-        self._scan_ms.append(1e3 * (step.prepare_seconds + step.register_seconds))
+            self._what, self._begun, self._first = what, time.perf_counter(), step.stamp
+            self._restarts = 0
         self._restarts += step.unhealthy is not None
-        if choice is not None and choice is not self._choice:
-            self._n_choices += 1
-            self._rejected += bool(choice.why_not)
-            self._selection_ms.append(1e3 * choice.seconds)
-        self._choice = choice
+        self._total, self._record = total, record
 
     def __rich__(self) -> Table:
         table = Table.grid(padding=(0, 2))
         table.add_column(style="bold")
         table.add_column()
-        for name, words, style in self._lines() if self._what else ():
-            table.add_row(Text(name), Text(words, style))
+        for name, words, *style in self._lines() if self._what else ():
+            table.add_row(Text(name), Text(words, *style))
         return table
 
-    def _lines(self) -> Iterator[_Line]:
+    def _lines(self) -> Iterator[tuple[str, ...]]:
+        """Names, words and, of some, styles."""
         record = self._record
-        driven = (record.steps[-1].stamp - self._first) * 1e-9
-        speed = driven / max(self._now - self._begun, 1e-9)
-        yield _Line(self._what, f"{driven:.1f} s driven, {speed:.1f} times as fast as recorded")
+        # Copies: the replay goes on.
+        steps = list(record.steps)[-NEWEST:]
+        driven = (steps[-1].stamp - self._first) * 1e-9
+        speed = driven / max(time.perf_counter() - self._begun, 1e-9)
+        yield self._what, f"{driven:.1f} s driven, {speed:.1f} times as fast as recorded"
         of = f" of {self._total}" if self._total else ""
         restarts = f", restarted {self._restarts} times" if self._restarts else ""
-        yield _Line("scans", f"{record.done}{of}{restarts}; {_in_ms(self._scan_ms)} a scan")
+        took = _in_ms(step.prepare_seconds + step.register_seconds for step in steps)
+        yield "scans", f"{record.done}{of}{restarts}; {took} a scan"
         if record.rate is not None:
-            late = 1e3 * np.array(list(record.late)[-NEWEST:])
-            words = f"pose {_in_ms(late)} after the scan; scans dropped: {record.dropped}"
-            if record.missed:
-                words += f", selections missed: {record.missed}"
-            is_late = record.dropped + record.missed > 0
-            yield _Line("latency", words, "yellow" if is_late else "")
-        if self._choice is None:
+            words = f"pose {_in_ms(list(record.late)[-NEWEST:])} after the scan"
+            words += f"; scans dropped: {record.dropped}, selections missed: {record.missed}"
+            yield "latency", words, "yellow" if record.dropped + record.missed else ""
+        if (choice := record.newest) is None:
             return
-        rejected = f", {self._rejected} not applied" if self._rejected else ""
-        yield _Line("selections", f"{self._n_choices}{rejected}; {_in_ms(self._selection_ms)}")
-        yield from _chosen(self._choice.selection)
-        if why := self._choice.why_not or self._choice.fallen_back:
-            yield _Line("warning", why, "yellow")
+        applied, rejected = list(record.choices), list(record.rejected)
+        took = _in_ms(one.seconds for one in (applied + rejected)[-NEWEST:])
+        yield "selections", f"{took}; not applied: {len(rejected)}"
+        yield from _chosen(choice.selection)
+        if why := choice.why_not or choice.fallen_back:
+            yield "warning", why, "yellow"
 
 
-def _chosen(selection: Selection) -> Iterator[_Line]:
+def _chosen(selection: Selection) -> Iterator[tuple[str, ...]]:
     """Of a selection: the set or weights, what is predicted, and what was measured."""
     if selection.weights is None:
         values = ", ".join(
-            f"{name} {_short(value)}" for name, value in selection.parameters.items()
+            f"{name} {plain(value) if isinstance(value, int | float) else value}"
+            for name, value in selection.parameters.items()
         )
-        yield _Line("chosen", f"trial {selection.trial}: {values}")
+        yield "chosen", f"trial {selection.trial}: {values}"
     else:
-        yield _Line("weights", _weights(selection.weights))
+        heaviest = sorted(selection.weights.items(), key=lambda pair: -pair[1])
+        yield "weights", ", ".join(f"trial {trial} {100.0 * w:.0f} %" for trial, w in heaviest)
     if np.isfinite(selection.predicted_error):
         fixed = f"{selection.predicted_fixed:.3f} %"
-        yield _Line("predicted", f"{selection.predicted_error:.3f} %, of the fixed set {fixed}")
+        yield "predicted", f"{selection.predicted_error:.3f} %, of the fixed set {fixed}"
     if np.isfinite(selection.estimated_error):
         low, high = selection.estimated_low, selection.estimated_high
-        words = f"{selection.estimated_error:.3f} % ({low:.3f}-{high:.3f} %)"
-        yield _Line("measured", words)
+        yield "measured", f"{selection.estimated_error:.3f} % ({low:.3f}-{high:.3f} %)"
     if selection.lost:
-        yield _Line("lost", "do not rely on the pose", "bold red")
+        yield "lost", "do not rely on the pose", "bold red"
 
 
-def _weights(weights: Mapping[int, float]) -> str:
-    heaviest = sorted(weights.items(), key=lambda pair: -pair[1])
-    return ", ".join(f"trial {trial} {100.0 * weight:.0f} %" for trial, weight in heaviest)
-
-
-def _short(value: object) -> str:
-    return plain(value) if isinstance(value, int | float) else str(value)
-
-
-def _in_ms(values: Iterable[float]) -> str:
-    """Median and 99th percentile."""
-    half, most = np.percentile(list(values) or [0.0], (50, 99))
+def _in_ms(seconds: Iterable[float]) -> str:
+    """Median and 99th percentile, in milliseconds."""
+    half, most = 1e3 * np.percentile(list(seconds) or [0.0], (50, 99))
     return f"{half:.1f} ms (99 %: {most:.1f})"

@@ -3,8 +3,7 @@
 import math
 import os
 import sys
-from collections.abc import Callable
-from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -27,14 +26,9 @@ from adaptune.commands.terminal import (
     say_next_online,
 )
 from adaptune.errors import AdaptuneError
-from adaptune.progress import Progress
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from adaptune.recording.scan import Recording
     from adaptune.reference.stored import Gap, StoredEstimate
-    from adaptune.trajectory import Trajectory
     from offline.config import OfflineStudy
 
 
@@ -63,7 +57,7 @@ def simulate(
             path = loaded.sequences.recording(name)
             record(courses[name], path, overwrite=overwrite, progress=show)
     say(f"Recorded {len(due)} of {len(courses)} courses: {loaded.folder / 'recordings'}/")
-    say_next_of_study("run trials, fit the error model", "offline", study, override, folder)
+    say_next_of_study("run trials, fit the error model", "offline")
 
 
 def offline(
@@ -100,11 +94,10 @@ def offline(
         say(sentence)
     say(f"Fixed set: {loaded.folder / 'fixed.yaml'}")
     if len(loaded.config.offline.objective) > 1:
-        front = loaded.folder / "pareto"
-        say(f"The sets that no other set beats in every objective: {front}.*")
+        say(f"The sets that no other set beats in every objective: {loaded.folder / 'pareto'}.*")
     say(driven(model, loaded.config.online, loaded.odometry, loaded.mechanism))
     say(f"Error model: {loaded.model_path}")
-    say_next_of_trained(bool(model.expected), loaded.config.test, study, override, folder)
+    say_next_of_trained(loaded, bool(model.expected))
 
 
 def trials(
@@ -157,10 +150,9 @@ def trials(
         for sentence in estimates_in_words(estimates, loaded.config.sub_trajectory):
             say(sentence)
         if has_ended(loaded.folder):
-            say_next_of_trained(len(names) > 1, loaded.config.test, study, override, folder)
+            say_next_of_trained(loaded, len(names) > 1)
         else:
-            why = "run the trials that are left, fit"
-            say_next_of_study(why, "offline", study, override, folder)
+            say_next_of_study("run the trials that are left, fit", "offline")
     if export is not None:
         begin_work()
         n = table.export(archive, names, [row["trial"] for row in chosen], export)
@@ -196,21 +188,13 @@ def validate(
     )
     for verdict in verdicts:
         say(verdict)
-    names = ("validation", "stretches")
-    say(f"Tables and picture: {', '.join(f'{loaded.folder / name}.*' for name in names)}")
-    say_next_online(loaded.config.test, study, override, folder)
+    say(f"Tables and picture: {loaded.folder / 'validation'}.*, {loaded.folder / 'stretches'}.*")
+    say_next_online(loaded)
 
 
 # The command that estimates references.
 
 
-_STUDIES = (".yaml", ".yml")
-
-
-Target = Annotated[
-    Path,
-    typer.Argument(metavar="TARGET", help="A recording, or a study's YAML.", show_default=False),
-]
 Out = Annotated[
     Path | None,
     typer.Option(
@@ -221,18 +205,9 @@ Out = Annotated[
         file_okay=False,
     ),
 ]
-Points = Annotated[
-    str | None,
-    typer.Option(metavar="TOPIC", help="Topic of the scans.", show_default="as `inspect` proposes"),
-]
 Given = Annotated[
     str | None,
-    typer.Option(
-        "--reference",
-        metavar="TOPIC|FILE",
-        help="A given reference to compare with.",
-        show_default="as `inspect` proposes",
-    ),
+    typer.Option("--reference", metavar="TOPIC|FILE", help="A given reference to compare with."),
 ]
 Prior = Annotated[
     str | None,
@@ -240,7 +215,6 @@ Prior = Annotated[
         "--position-prior",
         metavar="TOPIC|FILE",
         help="Positions to join that are right over long distances, as those of a GPS.",
-        show_default="none",
     ),
 ]
 Length = Annotated[
@@ -255,10 +229,12 @@ Length = Annotated[
 
 
 def reference(
-    target: Target,
+    target: Annotated[
+        Path, typer.Argument(help="A recording, or a study's YAML.", show_default=False)
+    ],
     override: Override = [],  # noqa: B006
     folder: Out = None,
-    points: Points = None,
+    points: Annotated[str | None, typer.Option(metavar="TOPIC", help="Topic of the scans.")] = None,
     given: Given = None,
     prior: Prior = None,
     length: Length = None,
@@ -268,11 +244,10 @@ def reference(
     It writes the poses (TUM), what is known of their error (JSON), and a picture. Of a study, it
     estimates the references of all sequences that have none, or `reference: estimated`.
     """
-    if target.suffix not in _STUDIES:
+    if target.suffix not in (".yaml", ".yml"):
         if override:
             raise AdaptuneError(f"{target}: -o is for studies; give a study's YAML")
-        with _on_one_core():
-            _of_recording(target, folder or Path(), (points, given, prior), length)
+        _of_recording(target, folder or Path(), (points, given, prior), length)
         return
     options: dict[str, str | float | None] = {"--points": points, "--reference": given}
     options |= {"--position-prior": prior, "--length": length}
@@ -281,25 +256,8 @@ def reference(
             f"{wrong[0]} is for a single recording; of a study, the YAML says it, see "
             f"docs/reference-study.md"
         )
-    loaded = load(target, override, folder)
-    _of_study(loaded)
-    say_next_of_study("run trials, fit the error model", "offline", target, override, folder)
-
-
-@contextmanager
-def _on_one_core() -> "Iterator[None]":
-    """So that results repeat bit by bit, see `pin`."""
-    from adaptune.processes import pin
-
-    unpin = pin(os.getpid())
-    try:
-        yield
-    finally:
-        unpin()
-
-
-def _advance(show: Progress, what: str) -> Callable[[int, int], None]:
-    return lambda done, total: show(what, done, total)
+    _of_study(load(target, override, folder))
+    say_next_of_study("run trials, fit the error model", "offline")
 
 
 def _of_recording(
@@ -309,56 +267,49 @@ def _of_recording(
     length: float | None,
 ) -> None:
     """Estimate the reference of a recording, write it, and say what it is worth."""
+    from adaptune.processes import pin
     from adaptune.recording.inspect import inspect
     from adaptune.recording.recording import open_sequence
-    from adaptune.reference import check as of_recording
-    from adaptune.reference import estimate
-    from adaptune.reference.check import proposed_sub_trajectory
+    from adaptune.reference import check, estimate
     from adaptune.reference.graph import warn_of_unused
     from adaptune.reference.stored import write_estimate
 
     points, given, prior = topics
-    config = of_recording.recording_config(inspect(target), points, given)
+    config = check.recording_config(inspect(target), points, given)
     scans = open_sequence(config)
-    joined = None if prior is None else of_recording.read_prior(config, prior)
+    joined = None if prior is None else check.read_prior(config, prior)
     path = out / f"{target.resolve().stem}_reference.tum"
     # What can fail is found before the estimate, which takes minutes.
-    of_recording.check_writable(path)
-    there = _given_reference(scans, required=given is not None)
-    with progress() as show:
-        found = estimate.estimate_reference(scans, _advance(show, "estimating"), joined)
+    check.check_writable(path)
+    try:
+        there = scans.reference()
+    except AdaptuneError as error:
+        if given is not None:
+            raise
+        say(f"The given reference is not compared with: {error}")
+        there = None
+    # Only on one core do results repeat bit by bit.
+    with pin(os.getpid()), progress() as show:
+        found = estimate.estimate_reference(scans, partial(show, "estimating"), joined)
         warn_of_unused(scans.name, joined, found)
         about = {"recording": str(target.resolve()), "points": config.points}
         about["position_prior"] = prior
-        metres = length or proposed_sub_trajectory(found.trajectory())
+        metres = length or check.proposed_sub_trajectory(found.trajectory())
         stored = write_estimate(path, found, about, metres)
         if there is not None:
-            advance = _advance(show, "given reference")
-            measured = of_recording.measure_reference(scans, there, advance)
+            measured = check.measure_reference(scans, there, partial(show, "given reference"))
     _say_estimate(stored, found.gaps(), metres)
     if there is not None:
         of = "" if config.reference is None else f" ({config.reference})"
-        say(f"Given reference{of}: {of_recording.accuracy_words(measured, metres)}.")
-        difference = of_recording.mean_difference(there.at(found.stamps), found.known_poses, metres)
+        say(f"Given reference{of}: {check.accuracy_words(measured, metres)}.")
+        difference = check.mean_difference(there.at(found.stamps), found.known_poses, metres)
         if math.isnan(difference):
             say(f"The two share no stretch of {metres:g} m.")
         else:
             say(f"The two differ by {difference:.2g} % over {metres:g} m.")
     say(f"Files: {path}, {path.with_suffix('.json').name}, {path.with_suffix('.png').name}")
     first = f"write `reference: {path}` under this sequence in a study; then "
-    why = "train with it, as with a given one"
-    say_next(why, "offline", "STUDY.yaml", first=first)
-
-
-def _given_reference(scans: "Recording", required: bool) -> "Trajectory | None":
-    """The reference to compare with; one that was not asked for may be of no use."""
-    try:
-        return scans.reference()
-    except AdaptuneError as error:
-        if required:
-            raise
-        say(f"The given reference is not compared with: {error}")
-        return None
+    say_next("train with it, as with a given one", "offline", "STUDY.yaml", first=first)
 
 
 def _say_estimate(stored: "StoredEstimate", unknown: "list[Gap]", length: float) -> None:
@@ -369,12 +320,12 @@ def _say_estimate(stored: "StoredEstimate", unknown: "list[Gap]", length: float)
         say(f"Its error is not known: the path holds no {length:g} m without interruption.")
     else:
         say(f"It is wrong by about {error:.2g} % over {length:g} m, as its two halves tell.")
-    if not unknown:
+    if unknown:
+        where = ", ".join(f"{gap.begin:.1f}-{gap.end:.1f} s ({gap.reason})" for gap in unknown)
+        share = f"{100.0 * stored.unknown_share:.1f} % of the scans"
+        say(f"It is unknown for {share}, which have no pose: {where} after the first scan.")
+    else:
         say("It is known everywhere.")
-        return
-    where = ", ".join(f"{gap.begin:.1f}-{gap.end:.1f} s ({gap.reason})" for gap in unknown)
-    share = f"{100.0 * stored.unknown_share:.1f} % of the scans"
-    say(f"It is unknown for {share}, which have no pose: {where} after the first scan.")
 
 
 def _of_study(study: "OfflineStudy") -> None:

@@ -3,7 +3,7 @@
 import logging
 import os
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -46,17 +46,12 @@ Mode = Annotated[
         show_default="adaptive, or the first of online.modes",
     ),
 ]
-
-
 Model = Annotated[
     Path | None,
     typer.Option(help="An error model.", show_default="the study's own", dir_okay=False),
 ]
 Untrained = Annotated[
     bool, typer.Option("--untrained", help="Only the baseline, and a bank that needs no model.")
-]
-Thorough = Annotated[
-    bool, typer.Option("--thorough", help="All modes that there are to compare with, too.")
 ]
 Repeats = Annotated[
     int, typer.Option(help="How often to replay each mode on a sequence.", min=1, max=20)
@@ -73,7 +68,6 @@ def online(
     folder: Folder = None,
     model: Model = None,
     untrained: Untrained = False,
-    thorough: Thorough = False,
     repeats: Repeats = 1,
     ros: Annotated[bool, typer.Option("--ros", help="Drive on a robot with ROS 1.")] = False,
     ros2: Ros2 = False,
@@ -90,7 +84,7 @@ def online(
     With `--untrained`, it needs no trials, no model and no ground truth. It replays all sequences
     if the study names no test.
 
-    With `--thorough`, it replays all modes to compare with (`online.modes`): the bank with even
+    With `-o online.modes=all`, it replays all modes to compare with, too: the bank with even
     weights, and the untrained bank.
 
     With `-o online.real_time.rate=1`, scans come when the sensor gave them. A selection that is
@@ -102,30 +96,33 @@ def online(
     to know the best choice in hindsight: the fixed set, the members of the bank, and those that
     complement each other best in training. Nothing is learned from them.
     """
-    if oracle:
-        _oracle(load(study, override, folder), cluster)
-        say_next_of_study("table and pictures of the modes", "compare", study, override, folder)
-        return
-    if cluster is not None:
-        raise AdaptuneError("--cluster is for the trials of --oracle")
-    if untrained:
-        _check_untrained(model, mode)
-    if thorough and (untrained or ros or ros2):
-        raise AdaptuneError("--thorough is for replays with a model; leave out the other option")
-    if thorough:
-        override = [*override, "online.modes=all"]
+    robot = ros or ros2
+    for is_wrong, words in (
+        (cluster is not None and not oracle, "--cluster is for the trials of --oracle"),
+        (untrained and model is not None, f"--untrained uses no model; leave out --model {model}"),
+        (
+            untrained and mode is not None,
+            f"--untrained is a mode of its own; leave out --mode {mode}",
+        ),
+        (ros and ros2, "give only one of --ros and --ros2"),
+        (
+            mode is not None and not robot,
+            f"--mode {mode} is for a robot (--ros, --ros2); all modes are replayed",
+        ),
+    ):
+        if is_wrong:
+            raise AdaptuneError(words)
     loaded = load(study, override, folder)
-    if ros or ros2:
-        if ros and ros2:
-            raise AdaptuneError("give only one of --ros and --ros2")
+    if robot:
         _drive(loaded, mode, model, untrained=untrained, ros2=ros2)
         return
-    if mode is not None:
-        raise AdaptuneError(f"--mode {mode} is for a robot (--ros, --ros2); all modes are replayed")
-    made, n = _replay(loaded, model, repeats, untrained=untrained)
-    there = f"{made} of {n} replays made" if made else f"All {n} replays were there already"
-    say(f"{there}: {loaded.folder / 'replays'}/")
-    say_next_of_study("table and pictures of the modes", "compare", study, override, folder)
+    if oracle:
+        _oracle(loaded, cluster)
+    else:
+        made = _replay(loaded, model, repeats, untrained=untrained)
+        there = f"{made} replays made" if made else "All replays were there already"
+        say(f"{there}: {loaded.folder / 'replays'}/")
+    say_next_of_study("table and pictures of the modes", "compare")
 
 
 def _oracle(loaded: "OfflineStudy", cluster: str | None) -> None:
@@ -145,52 +142,25 @@ def _oracle(loaded: "OfflineStudy", cluster: str | None) -> None:
     say(f"Trials: {loaded.folder / 'oracle'}/")
 
 
-def _check_untrained(model: Path | None, mode: str | None) -> None:
-    """Refuse options that contradict --untrained."""
-    if model is not None:
-        raise AdaptuneError(f"--untrained uses no model; leave out --model {model}")
-    if mode is not None:
-        raise AdaptuneError(f"--untrained is a mode of its own; leave out --mode {mode}")
-
-
-@contextmanager
-def _on_one_core(study: "OfflineStudy") -> Iterator[None]:
+def _alone(study: "OfflineStudy") -> ExitStack:
     """Bind this process to one core, and leave the others to what it starts."""
-    from adaptune.processes import pin as bind
+    from adaptune.processes import pin
 
     # Ask for the number of cores before.
     _ = study.mechanism
-    unbind = bind(os.getpid(), alone=True)
-    try:
-        yield
-    finally:
-        unbind()
+    return pin(os.getpid(), alone=True)
 
 
-def _replay(
-    loaded: "OfflineStudy", model: Path | None, repeats: int, *, untrained: bool
-) -> tuple[int, int]:
-    """Make the replays that are missing; how many were made, and how many there are."""
+def _replay(loaded: "OfflineStudy", model: Path | None, repeats: int, *, untrained: bool) -> int:
+    """Make the replays that are missing; how many were made."""
     from adaptune.commands.dashboard import Dashboard
-    from adaptune.model import ErrorModel
-    from online.modes import (
-        WITHOUT_MODEL,
-        ReplaySetup,
-        run_replays,
-        run_untrained,
-        sequences_without_model,
-    )
+    from online.modes import run_replays, run_untrained
 
-    dashboard, path = Dashboard(), model or loaded.model_path
-    with _on_one_core(loaded), progress(dashboard) as show:
+    dashboard = Dashboard()
+    with _alone(loaded), progress(dashboard) as show:
         if untrained:
-            made = run_untrained(loaded, show, dashboard.look, repeats)
-        else:
-            made = run_replays(loaded, path, show, dashboard.look, repeats)
-    if untrained:
-        return made, len(sequences_without_model(loaded.config)) * len(WITHOUT_MODEL) * repeats
-    modes = ReplaySetup.of(loaded).modes(ErrorModel.load(path))
-    return made, len(loaded.config.test) * len(modes) * repeats
+            return run_untrained(loaded, show, dashboard.look, repeats)
+        return run_replays(loaded, model or loaded.model_path, show, dashboard.look, repeats)
 
 
 def _drive(
@@ -207,7 +177,7 @@ def _drive(
     path = None if mode in WITHOUT_MODEL else model or loaded.model_path
     drive = RobotDrive(loaded, mode, path)
     link, dashboard = Ros2(loaded.config.online.ros.router) if ros2 else local_ros1(), Dashboard()
-    with closing(link), _on_one_core(loaded), progress(dashboard):
+    with closing(link), _alone(loaded), progress(dashboard):
         log.info("drive, %s: Ctrl-C ends it", mode)
         driven = drive.run(link, dashboard.look)
     dropped = f", {driven.record.dropped} of them dropped" if driven.record.dropped else ""
@@ -254,18 +224,16 @@ def _compare_one(study: Path, override: list[str], folder: Path | None) -> None:
     found = _compared(loaded)
     say(f"Tables: {loaded.folder / 'comparison'}/")
     if found.rows[0].yardstick == "baseline":
-        say_next_of_study("look for better sets", "offline", study, override, folder)
+        say_next_of_study("look for better sets", "offline")
         return
     say(f"Fixed set: {loaded.folder / 'fixed.yaml'}")
     if found.unfinished:
-        say_next_of_study("replay what is missing", "online", study, override, folder)
-        return
-    if (n := len(loaded.config.training)) < MIN_RECORDINGS:
+        say_next_of_study("replay what is missing", "online")
+    elif (n := len(loaded.config.training)) < MIN_RECORDINGS:
         first = f"name {MIN_RECORDINGS} training recordings or more, the study has {n}; then "
-        why = "find out what adapting gains elsewhere"
-        say_next_of_study(why, "offline", study, override, folder, first)
+        say_next_of_study("find out what adapting gains elsewhere", "offline", first)
     else:
-        say_next_of_study("replays to look at in Foxglove", "record", study, override, folder)
+        say_next_of_study("replays to look at in Foxglove", "record")
 
 
 def _compared(loaded: "OfflineStudy") -> "ComparedReplays":

@@ -7,9 +7,8 @@ import shutil
 import signal
 import sys
 import time
-from collections import deque
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -21,7 +20,7 @@ from adaptune.errors import AdaptuneError
 from adaptune.progress import Progress
 
 if TYPE_CHECKING:
-    from rich.progress import TaskID
+    from rich.progress import Task, TaskID
 
     from offline.config import OfflineStudy
 
@@ -76,9 +75,6 @@ def progress(above: Any = None) -> Iterator[Progress]:
     In a terminal, `above` stands over the bars: something that rich can render, again and again.
     """
     begin_work()
-    if not errors.is_terminal:
-        yield _logger()
-        return
     from rich import progress as columns
     from rich.console import Group
     from rich.live import Live
@@ -90,87 +86,41 @@ def progress(above: Any = None) -> Iterator[Progress]:
         columns.TimeElapsedColumn(),
         columns.TextColumn("{task.fields[remark]}", markup=False),
         console=errors,
+        get_time=time.monotonic,
     )
     tasks: dict[str, TaskID] = {}
-    pace, full = _Pace(), _Full()
-    shown = bars if above is None else Live(Group(above, bars), console=errors)
-    with shown:
+    log, told = logging.getLogger("adaptune"), time.monotonic()
 
-        def show(what: str, done: float, total: int, remark: str = "", /) -> None:
-            if full.again(what, done, total):
-                return
-            if what not in tasks:
-                over = [task.id for task in bars.tasks if task.finished]
-                for finished in over[:-MOST_FINISHED]:
-                    bars.update(finished, visible=False)
-                tasks[what] = bars.add_task(what, total=total, remark="")
-            words = ", ".join(filter(None, (pace.left(what, done, total), remark)))
-            bars.update(tasks[what], completed=done, total=max(total, done), remark=words)
+    def show(what: str, done: float, total: int, remark: str = "", /) -> None:
+        nonlocal told
+        if what not in tasks:
+            over = [task.id for task in bars.tasks if task.finished]
+            for finished in over[:-MOST_FINISHED]:
+                bars.update(finished, visible=False)
+            tasks[what] = bars.add_task(what, total=total, remark="")
+        task = bars.tasks[tasks[what]]
+        # Several workers may read the same, one after the other.
+        if task.finished and task.total == total:
+            return
+        # What a resumed study has done already comes in the first moment, and says nothing.
+        bars.speed_estimate_period = 0.8 * (task.elapsed or 0.0)
+        bars.update(task.id, completed=done, total=max(total, done))
+        words = ", ".join(filter(None, (_time_left(task), remark)))
+        bars.update(task.id, remark=words)
+        if not errors.is_terminal and time.monotonic() - told > LOG_EVERY:
+            told = time.monotonic()
+            log.info("%s: %d of %d%s", what, done, total, words and f", {words}")
 
+    shown = bars if above is None else Group(above, bars)
+    with Live(shown, console=errors) if errors.is_terminal else nullcontext():
         yield show
 
 
-def _logger() -> Progress:
-    log = logging.getLogger("adaptune")
-    last = time.monotonic()
-    pace, full = _Pace(), _Full()
-
-    def show(what: str, done: float, total: int, remark: str = "", /) -> None:
-        nonlocal last
-        if full.again(what, done, total):
-            return
-        now = time.monotonic()
-        left = pace.left(what, done, total, now)
-        if now - last > LOG_EVERY:
-            last = now
-            words = (f"{what}: {int(done)} of {total}", left, remark)
-            log.info("%s", ", ".join(filter(None, words)))
-
-    return show
-
-
-class _Pace:
-    """How long each thing will take, by how long it took in the newer half of the time so far.
-
-    What a study that is resumed has done already comes in the first moment, and says nothing.
-    """
-
-    def __init__(self) -> None:
-        self._begun: dict[str, float] = {}
-        self._past: dict[str, deque[tuple[float, float]]] = {}  # when, and how much was done
-
-    def left(self, what: str, done: float, total: int, now: float | None = None) -> str:
-        """In words; empty before a first piece is done, and in the first seconds."""
-        now = time.monotonic() if now is None else now
-        past = self._past.setdefault(what, deque())
-        if not past or done < past[0][1] or done == past[-1][1] == past[0][1]:
-            self._begun[what] = now
-            past.clear()
-        elapsed = now - self._begun[what]
-        if not past or now - past[-1][0] > 0.01 * elapsed:
-            past.append((now, done))
-        while len(past) > 1 and past[1][0] <= now - 0.5 * elapsed:
-            past.popleft()
-        seconds, gained = now - past[0][0], done - past[0][1]
-        if gained < 1.0 or elapsed < LOG_EVERY or done >= total:
-            return ""
-        return _time_left((total - done) * seconds / gained)
-
-
-class _Full:
-    """What was done completely: several workers may read the same, one after the other."""
-
-    def __init__(self) -> None:
-        self._totals: dict[str, int] = {}
-
-    def again(self, what: str, done: float, total: int) -> bool:
-        """Whether it is done once more."""
-        if done >= total:
-            self._totals[what] = total
-        return done < total == self._totals.get(what)
-
-
-def _time_left(seconds: float) -> str:
+def _time_left(task: "Task") -> str:
+    """In words; empty before a first piece is done, and in the first seconds."""
+    seconds = task.time_remaining
+    if not seconds or (task.elapsed or 0.0) < LOG_EVERY:
+        return ""
     for unit, length in (("h", 3600.0), ("min", 60.0)):
         if seconds > 2.0 * length:
             return f"about {seconds / length:.0f} {unit} left"
@@ -182,51 +132,34 @@ def _time_left(seconds: float) -> str:
 
 def say_next(why: str, *words: object, first: str = "") -> None:
     """Print a command, ready to copy, what it is for, and what to do first."""
-    say(f"Next: {first}{shlex.join([_program(), *map(str, words)])}    # {why}")
-
-
-def say_next_of_study(
-    why: str,
-    command: str,
-    study: Path,
-    override: Sequence[str],
-    folder: Path | None,
-    first: str = "",
-) -> None:
-    """Name a command on the same study, with the same options."""
-    of_folder = [] if folder is None else ["--folder", folder]
-    options = [word for text in override for word in ("-o", text)]
-    say_next(why, command, study, *of_folder, *options, first=first)
-
-
-def say_next_online(
-    test: Sequence[str], study: Path, override: Sequence[str], folder: Path | None
-) -> None:
-    """Name the replay of the test sequences, if there are any."""
-    first = "" if test else f"name sequences for the `test` of {study}; then "
-    why = "replay the test sequences in every mode"
-    say_next_of_study(why, "online", study, override, folder, first)
-
-
-def say_next_of_trained(
-    enough: bool,
-    test: Sequence[str],
-    study: Path,
-    override: Sequence[str],
-    folder: Path | None,
-) -> None:
-    """Name what follows training: nothing can be left out of a single stretch."""
-    if enough:
-        say_next_of_study("what does adapting gain elsewhere?", "validate", study, override, folder)
-    else:
-        say_next_online(test, study, override, folder)
-
-
-def _program() -> str:
-    """The command line as the user can call it."""
     called = Path(sys.argv[0])
     typed = called.name == "adaptune" and shutil.which("adaptune") is None
-    return str(called) if typed else "adaptune"
+    program = str(called) if typed else "adaptune"
+    say(f"Next: {first}{shlex.join([program, *map(str, words)])}    # {why}")
+
+
+_study_words: list[object] = []
+"""Words for the study that was loaded last."""
+
+
+def say_next_of_study(why: str, command: str, first: str = "") -> None:
+    """Name a command on the study that was loaded, with the same options."""
+    say_next(why, command, *_study_words, first=first)
+
+
+def say_next_online(study: "OfflineStudy") -> None:
+    """Name the replay of the test sequences, if there are any."""
+    first = f"name sequences for the `test` of {_study_words[0]}; then "
+    why = "replay the test sequences in every mode"
+    say_next_of_study(why, "online", "" if study.config.test else first)
+
+
+def say_next_of_trained(study: "OfflineStudy", enough: bool) -> None:
+    """Name what follows training: nothing can be left out of a single stretch."""
+    if enough:
+        say_next_of_study("what does adapting gain elsewhere?", "validate")
+    else:
+        say_next_online(study)
 
 
 # Arguments that all commands on a study share.
@@ -274,12 +207,17 @@ Cluster = Annotated[
 
 
 def load(path: Path, overrides: list[str], folder: Path | None) -> "OfflineStudy":
-    """Load the study of a YAML file, or of the folder of a study that has begun."""
+    """Load the study of a YAML file, or of the folder of a study that has begun.
+
+    `say_next_of_study` names it then.
+    """
     from offline.config import load_study
 
     if not path.exists():
         what = "give the YAML of a study, or the folder of one that has begun"
         raise AdaptuneError(f"{path}: there is no such file or folder; {what}")
+    of_folder = [] if folder is None else ["--folder", folder]
+    _study_words[:] = [path, *of_folder, *(word for text in overrides for word in ("-o", text))]
     if path.is_dir():
         if not (path / "study.yaml").exists():
             raise AdaptuneError(f"{path}: is no study's folder: there is no study.yaml in it")

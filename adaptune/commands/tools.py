@@ -3,10 +3,9 @@
 import logging
 import os
 import sys
-from enum import StrEnum
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -17,7 +16,8 @@ from adaptune.progress import Progress
 
 if TYPE_CHECKING:
     from adaptune.recording.inspect import Inspection
-    from adaptune.reference.check import MeasuredReference
+
+_log = logging.getLogger(__name__)
 
 MODEL_SUFFIX = ".safetensors"
 """Of files of error models."""
@@ -44,16 +44,11 @@ def inspect(
     from adaptune.recording.inspect import inspect as inspect_file
     from adaptune.recording.inspect import render_inspection
 
-    begin_work()
-    measured, accuracy = None, "`--deep` also measures how wrong it is"
-    if deep:
-        with progress() as show:
-            found = inspect_file(file, deep, show)
-            measured, accuracy = _measured(found, show)
-    else:
-        found = inspect_file(file)
+    with progress() as show:
+        found = inspect_file(file, deep, show)
+        length, accuracy = _sub_trajectory(found, deep, show)
     console.print(render_inspection(found, accuracy), crop=False)
-    _begin_study(found, measured)
+    _begin_study(found, length)
 
 
 def _show_model(file: Path) -> None:
@@ -73,37 +68,36 @@ UNKNOWN_LENGTH = "5.0    # metres; 10.0 for a path of 200 m or more, 25.0 for on
 """The length of sub-trajectories to propose where the path is not known."""
 
 
-def _measured(found: "Inspection", show: Progress) -> "tuple[MeasuredReference | None, str]":
-    """Registrations along the reference, and what they tell; None where there is none to measure.
+def _sub_trajectory(found: "Inspection", deep: bool, show: Progress) -> tuple[str, str]:
+    """The length of sub-trajectories to propose, and how wrong the reference is, if it is measured.
 
     Only what can be used to train is measured.
     """
-    if found.reference is None or not found.name or found.missing.get("offline"):
-        return None, ""
+    if found.reference is None:
+        return UNKNOWN_LENGTH, ""
     from adaptune.recording.recording import open_sequence
-    from adaptune.reference.check import (
-        accuracy_words,
-        advice,
-        measure_reference,
-        proposed_sub_trajectory,
-    )
+    from adaptune.reference import check
 
+    usual = check.proposed_sub_trajectory(found.reference)
+    if not deep:
+        return str(usual), "`--deep` also measures how wrong it is"
+    if not found.name or found.missing.get("offline"):
+        return str(usual), ""
     try:
         scans = open_sequence(found.config())
         if (reference := scans.reference()) is None:
-            return None, ""
-        measured = measure_reference(scans, reference, partial(show, "registering"))
+            return str(usual), ""
+        measured = check.measure_reference(scans, reference, partial(show, "registering"))
     except AdaptuneError as error:
-        return None, f"its error cannot be measured: {error}"
-    length = proposed_sub_trajectory(reference, measured)
-    usual = proposed_sub_trajectory(reference)
-    words = accuracy_words(measured, usual, length), advice(measured, reference)
-    return measured, "; ".join(filter(None, words))
+        return str(usual), f"its error cannot be measured: {error}"
+    length = check.proposed_sub_trajectory(reference, measured)
+    words = check.accuracy_words(measured, usual, length), check.advice(measured, reference)
+    return str(length), "; ".join(filter(None, words))
 
 
-def _begin_study(found: "Inspection", measured: "MeasuredReference | None") -> None:
+def _begin_study(found: "Inspection", length: str) -> None:
     """Print the rest of a study of this recording alone, and the command that begins it."""
-    from adaptune.reference.check import TRAINING, proposed_sub_trajectory
+    from adaptune.reference.check import TRAINING
 
     if not (name := found.name):
         return
@@ -113,9 +107,7 @@ def _begin_study(found: "Inspection", measured: "MeasuredReference | None") -> N
             "serve, write `reference: estimated`"
         )
         return
-    share, length = f"{100 * TRAINING:.0f}", UNKNOWN_LENGTH
-    if found.reference is not None:
-        length = str(proposed_sub_trajectory(found.reference, measured))
+    share = f"{100 * TRAINING:.0f}"
     say(
         f"training: [{name}: 0-{share}%]\ntest: [{name}: {share}-100%]\n"
         f"sub_trajectory: {length}\n"
@@ -125,15 +117,8 @@ def _begin_study(found: "Inspection", measured: "MeasuredReference | None") -> N
     say_next("train on a part of it", "offline", f"{name}.yaml", first=first)
 
 
-class CacheAction(StrEnum):
-    """What to do with the cache."""
-
-    LIST = "list"
-    CLEAR = "clear"
-
-
 def cache(
-    action: Annotated[CacheAction, typer.Argument(help="List or clear it.")] = CacheAction.LIST,
+    action: Annotated[Literal["list", "clear"], typer.Argument(help="List or clear it.")] = "list",
 ) -> None:
     """List or clear the decoded recordings on disk.
 
@@ -143,7 +128,7 @@ def cache(
     from adaptune.recording.cache import clear_cache
     from adaptune.recording.inspect import render_cache
 
-    if action is CacheAction.CLEAR:
+    if action == "clear":
         say(f"Freed {clear_cache() / 1e9:.2f} GB. Bags are decoded again when they are read.")
     else:
         console.print(render_cache())
@@ -177,12 +162,6 @@ def serve(
         serving.serve(sys.stdin.buffer, writer, odometry)
 
 
-# Studies from the files of other programs.
-
-
-_log = logging.getLogger(__name__)
-
-
 def import_rustle(
     file: Annotated[
         Path,
@@ -207,11 +186,8 @@ def import_rustle(
     from adaptune.study.rustle import import_rustle as make_studies
 
     studies, skipped = make_studies(file, algorithms, datasets)
-    paths = [output]
-    if len(studies) > 1:
-        paths = [
-            output.with_name(f"{output.stem}_{study.name}{output.suffix}") for study in studies
-        ]
+    names = [f"{output.stem}_{study.name}" if studies[1:] else output.stem for study in studies]
+    paths = [output.with_name(name + output.suffix) for name in names]
     if len(set(paths)) < len(paths):
         raise AdaptuneError(f"{file}: two tests have the same name; give each its own")
     if there := [str(path) for path in paths if path.exists() and not overwrite]:

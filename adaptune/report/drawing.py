@@ -80,26 +80,19 @@ _MANY, _OUTLINED = 1000, 150
 
 def looks(chart: Chart) -> dict[str, Look]:
     """The look of each name in a chart, in the order in which they appear; modes have theirs."""
-    names = dict.fromkeys(name for panel in chart.panels for name in _names(panel) if name)
+    items = (item for panel in chart.panels for item in panel.drawn)
+    names = dict.fromkeys(name for item in items for name in _names(item))
     taken = {MODES[name].colour for name in names if name in MODES}
-    colours = [colour for colour in _COLOURS if colour not in taken]
-    others = zip(cycle(colours), cycle(_DASHES), cycle(_SHAPES), strict=False)
-    made = {}
-    for name in names:
-        if name in MODES:
-            made[name] = MODES[name]
-        else:
-            colour, dash, shape = next(others)
-            made[name] = Look(colour, dash=dash, shape=shape)
-    return made
+    colours = cycle([colour for colour in _COLOURS if colour not in taken])
+    others = zip(colours, cycle(_DASHES), cycle(_SHAPES), strict=False)
+    made = (Look(colour, dash=dash, shape=shape) for colour, dash, shape in others)
+    return {name: MODES[name] if name in MODES else next(made) for name in names}
 
 
-def _names(panel: Panel) -> Iterator[str]:
-    for item in panel.drawn:
-        if isinstance(item, Shares):
-            yield from item.names
-        elif not isinstance(item, Mark | Cloud):
-            yield item.name
+def _names(item: Drawn) -> tuple[str, ...]:
+    """The names of an item in the legend."""
+    named = (getattr(item, "name", ""),)
+    return tuple(filter(None, item.names if isinstance(item, Shares) else named))
 
 
 def _layer(item: Drawn) -> float:
@@ -153,21 +146,16 @@ def thinned(*columns: NDArray[np.float64], most: int = _MOST) -> NDArray[np.intp
     return np.array(sorted(kept))
 
 
+class _Wrapper(textwrap.TextWrapper):
+    """Breaks long names, too, where it is best."""
+
+    wordsep_simple_re = re.compile(r"(\s+|(?<=[_/.])(?=\D))")
+
+
 def wrapped(words: str, letters: float) -> list[str]:
     """Words on lines of at most so many letters, where they can be broken."""
-    width = max(int(letters), 8)
-
-    def cut(name: re.Match[str]) -> str:
-        """A long name with spaces where it is best broken."""
-        parts = [""]
-        for part in re.split(r"(?<=[_/.])", name[0]):
-            if parts[-1] and len(parts[-1] + part) > width:
-                parts.append("")
-            parts[-1] += part
-        return " ".join(parts)
-
-    lines = (re.sub(rf"\S{{{width + 1},}}", cut, line) for line in words.splitlines())
-    return [part for line in lines for part in textwrap.wrap(line, width)] or [""]
+    wrapper = _Wrapper(max(int(letters), 8), break_on_hyphens=False)
+    return [part for line in words.splitlines() for part in wrapper.wrap(line)] or [""]
 
 
 # The drawing, as a specification of Vega-Lite.
@@ -234,16 +222,11 @@ def spec(chart: Chart, titled: bool = True) -> Spec:
         if panel.equal:
             extents[i], high = _equal(extents[i], width, 1.6 * high)
         panels.append(_Drawing(panel, every, (width, high), extents[i]).spec(above, below))
+    row: Spec = {"concat": panels, "columns": columns}
+    row["resolve"] = {"scale": {"color": "independent"}}
     made: Spec = {
         "$schema": "https://vega.github.io/schema/vega-lite/v6.json",
-        "vconcat": [
-            {
-                "concat": panels,
-                "columns": columns,
-                "resolve": {"scale": {"color": "independent"}},
-            },
-            *_legend(chart, every),
-        ],
+        "vconcat": [row, *_legend(chart, every)],
         "config": _CONFIG,
         "background": "white",
         "padding": 8,
@@ -314,14 +297,10 @@ def _extent(panel: Panel, which: Literal["x", "y"]) -> tuple[float, float]:
         return axis.limits
     if axis.names is not None:
         return -0.6, len(axis.names) - 0.4
+    marks = (item for item in panel.drawn if isinstance(item, Mark) and item.axis == which)
     found = [pair[which == "y"] for pair in _coordinates(panel)]
-    found += [
-        numbers([item.at], axis)
-        for item in panel.drawn
-        if isinstance(item, Mark) and item.axis == which
-    ]
-    values = np.concatenate([np.empty(0), *found])
-    values = values[np.isfinite(values) & ((values > 0.0) | (not axis.log))]
+    values = np.concatenate([*found, numbers([mark.at for mark in marks], axis)])
+    values = values[np.isfinite(values)]
     if not len(values):
         return 1.0, 10.0
     low, high = float(values.min()), float(values.max())
@@ -432,34 +411,24 @@ class _Drawing:
         return self._looks.get(name, Look("#666666"))
 
     def _line(self, line: Line) -> Iterator[Spec]:
-        look = self._look(line.name)
         x, y = numbers(line.x, self._panel.x), numbers(line.y, self._panel.y)
         kept = thinned(x, y, most=_MOST_FAINT if line.faint else _MOST)
-        mark: Spec = {
-            "type": "line",
-            "color": look.colour,
-            "strokeWidth": min(look.width, 1.2) if line.faint else look.width,
-            "strokeDash": (5, 3) if line.dashed else look.dash,
-            "opacity": 0.4 if line.faint else 1.0,
-            "interpolate": "step-after" if line.steps else "linear",
-            "strokeJoin": "round",
-            "tooltip": line.name,
-        }
+        mark: Spec = {"type": "line", "strokeJoin": "round", "tooltip": line.name}
+        mark |= {"interpolate": "step-after" if line.steps else "linear"}
         # Drawn in the order of the points, and not from left to right.
-        yield self._drawn(mark, {"x": x[kept], "y": y[kept]}, order={"value": None})
+        data, order = {"x": x[kept], "y": y[kept]}, {"value": None}
+        yield self._drawn(mark | _stroke(line, self._look(line.name)), data, order=order)
 
     def _points(self, points: Points) -> Iterator[Spec]:
-        look = self._look(points.name)
-        panel, many = self._panel, len(points.x) > _MANY
-        x, y = numbers(points.x, panel.x), numbers(points.y, panel.y)
-        mark = _marker(points, look)
-        if many:
+        panel = self._panel
+        columns: dict[str, Any] = {"x": numbers(points.x, panel.x), "y": numbers(points.y, panel.y)}
+        mark = _marker(points, self._look(points.name))
+        if len(points.x) > _MANY:
             mark |= {"size": 12, "opacity": 0.7}
         if points.faint:
             mark |= {"opacity": 0.35}
-        if len(x) <= _OUTLINED and not points.faint:
+        elif len(points.x) <= _OUTLINED:
             mark |= _OUTLINE
-        columns: dict[str, Any] = {"x": x, "y": y}
         tips: list[Spec] = [
             {"field": "x", "title": panel.x.label or "x", "format": ".4~g"},
             {"field": "y", "title": panel.y.label or "y", "format": ".4~g"},
@@ -470,14 +439,13 @@ class _Drawing:
         if points.colour is None:
             yield self._drawn(mark, columns, tooltip=tips)
             return
-        colour = numbers(points.colour, Axis("", log=points.log_colour))
+        columns["c"] = colour = numbers(points.colour, Axis("", log=points.log_colour))
         known = np.isfinite(colour)
-        unknown = {name: np.array(column)[~known] for name, column in columns.items()}
-        if len(unknown["x"]):
-            yield self._drawn(mark | {"color": _UNKNOWN}, unknown, tooltip=tips)
+        unknown, columns = (
+            {name: np.array(of)[kept] for name, of in columns.items()} for kept in (~known, known)
+        )
+        yield self._drawn(mark | {"color": _UNKNOWN}, unknown, tooltip=tips)
         if known.any():
-            columns = {name: np.array(of)[known] for name, of in columns.items()}
-            columns["c"] = colour[known]
             limits = float(colour[known].min()), float(colour[known].max())
             bar = self._colour_bar(points.colour_label, limits, points.log_colour)
             yield self._drawn(mark, columns, tooltip=tips, color=bar)
@@ -529,8 +497,7 @@ class _Drawing:
         if panel.y.log:
             low = np.where(np.isfinite(high) & np.isnan(low), self._extent["y"][0], low)
         kept = thinned(x, low, high)
-        mark: Spec = {"type": "area", "color": look.colour, "fillOpacity": 0.25}
-        mark |= {"stroke": look.colour, "strokeOpacity": 0.6, "tooltip": band.name}
+        mark: Spec = {"type": "area", "strokeOpacity": 0.6, "tooltip": band.name} | _shade(look)
         yield self._drawn(mark, {"x": x[kept], "y": low[kept], "y2": high[kept]})
 
     def _bars(self, bars: Bars) -> Iterator[Spec]:
@@ -554,16 +521,13 @@ class _Drawing:
     def _spans(self, spans: Spans, named: bool) -> Iterator[Spec]:
         """Shade stretches, and write their names above them, or turned where they are short."""
         tinted = _span_tints(spans)
-        if not tinted:
-            return
-        begins, ends, _, tints = zip(*tinted, strict=True)
-        data = _table(x=begins, x2=ends, tint=tints)
+        columns = dict(zip(("x", "x2", "tint"), zip(*tinted, strict=True), strict=False))
         tint = {"field": "tint", "type": "nominal", "scale": None}
         encoding = {"x": self._x, "x2": {"field": "x2"}, "color": tint}
         mark: Spec = {"type": "rect", "stroke": "white", "tooltip": None, "clip": True}
-        yield {"data": data, "mark": mark, "encoding": encoding}
+        yield {"data": _table(**columns), "mark": mark, "encoding": encoding}
         low, high = self._extent["x"]
-        for begin, end, name, _ in tinted if named else ():
+        for begin, end, _, name in tinted if named else ():
             pixels, needed = (end - begin) / (high - low) * self._width, _LETTER * len(name)
             words: Spec = {"type": "text", "text": name, "color": _DARK, "fontSize": 11}
             if name == spans.name or (needed > pixels and (pixels < 13 or needed > self._height)):
@@ -611,11 +575,11 @@ def ticks(low: float, high: float) -> list[float]:
 
 
 def _span_tints(spans: Spans) -> list[tuple[float, float, str, str]]:
-    """Begin, end, name and colour of each span that is shaded."""
+    """Begin, end, colour and name of each span that is shaded."""
     edges = np.asarray(spans.edges, float).tolist()
-    different = list(dict.fromkeys(name for name in spans.names if name))
+    different = list(dict.fromkeys(filter(None, spans.names)))
     return [
-        (begin, end, name, _TINTS[4 if spans.name else different.index(name) % len(_TINTS)])
+        (begin, end, _TINTS[4 if spans.name else different.index(name) % len(_TINTS)], name)
         for begin, end, name in zip(edges[:-1], edges[1:], spans.names, strict=True)
         if name
     ]
@@ -637,10 +601,10 @@ def _png(pixels: NDArray[np.uint8]) -> bytes:
 
 def _legend(chart: Chart, every: dict[str, Look]) -> list[Spec]:
     """The legend below the panels: of each name what is drawn of it, and the name."""
-    kinds: dict[str, dict[type, Drawn]] = {}
+    kinds: dict[str, dict[type, Any]] = {}
     for item in (item for panel in chart.panels for item in panel.drawn):
-        for name in item.names if isinstance(item, Shares) else [getattr(item, "name", "")]:
-            if name and not (isinstance(item, Line | Points) and not len(item.x)):
+        for name in _names(item):
+            if not (isinstance(item, Line | Points) and not len(item.x)):
                 kinds.setdefault(name, {}).setdefault(type(item), item)
     layers: list[Spec] = []
     x, y = 0.0, 0.5 * _LINE
@@ -659,25 +623,34 @@ def _legend(chart: Chart, every: dict[str, Look]) -> list[Spec]:
     return [size | {"data": _table(i=[0]), "layer": [{"encoding": {}} | of for of in layers]}]
 
 
-def _glyphs(kinds: dict[type, Drawn], look: Look, x: float, y: float) -> Iterator[Spec]:
+def _glyphs(kinds: dict[type, Any], look: Look, x: float, y: float) -> Iterator[Spec]:
     """What is drawn of a name, small."""
     fill: Spec = {"type": "rect", "x": x, "x2": x + 32.0, "y": y - 6.0, "y2": y + 6.0}
     if Spans in kinds:
         yield {"mark": fill | {"color": _TINTS[4]}}
     if Band in kinds:
-        yield {"mark": fill | {"color": look.colour, "fillOpacity": 0.25, "stroke": look.colour}}
+        yield {"mark": fill | _shade(look)}
     if Bars in kinds or Shares in kinds:
-        yield {"mark": fill | {"color": look.colour, **_OUTLINE}}
-    if isinstance(line := kinds.get(Line), Line):
+        yield {"mark": fill | {"color": look.colour} | _OUTLINE}
+    if line := kinds.get(Line):
         ends = {"x": {"value": x}, "x2": {"value": x + 32.0}, "y": {"value": y}}
-        dash = (5, 3) if line.dashed else look.dash
-        width, opacity = (min(look.width, 1.2), 0.4) if line.faint else (look.width, 1.0)
-        mark: Spec = {"type": "rule", "color": look.colour, "strokeWidth": width}
-        mark |= {"strokeDash": dash, "opacity": opacity}
-        yield {"mark": mark, "encoding": ends}
-    if isinstance(points := kinds.get(Points), Points):
+        yield {"mark": {"type": "rule"} | _stroke(line, look), "encoding": ends}
+    if points := kinds.get(Points):
         colour = {"color": _MAP[3]} if points.colour is not None else {}
         yield {"mark": _marker(points, look) | {"x": x + 16.0, "y": y} | colour | _OUTLINE}
+
+
+# How a name is drawn, in a panel and in the legend.
+
+
+def _stroke(line: Line, look: Look) -> Spec:
+    width, opacity = (min(look.width, 1.2), 0.4) if line.faint else (look.width, 1.0)
+    dash = (5, 3) if line.dashed else look.dash
+    return {"color": look.colour, "strokeWidth": width, "strokeDash": dash, "opacity": opacity}
+
+
+def _shade(look: Look) -> Spec:
+    return {"color": look.colour, "fillOpacity": 0.25, "stroke": look.colour}
 
 
 def _marker(points: Points, look: Look) -> Spec:

@@ -139,13 +139,11 @@ def _estimate(
     given = sequences.unseen(name)
     scans, prior = RecordedSequence(given), position_prior(given)
     # GTSAM's sums may depend on its threads: only on one core do results repeat bit by bit.
-    unpin = pin(os.getpid())
     try:
-        found = estimate.estimate_reference(scans, advance, prior)
+        with pin(os.getpid()):
+            found = estimate.estimate_reference(scans, advance, prior)
     except EstimateError as error:
         return str(error) if scans.name in str(error) else f"{scans.name}: {error}"
-    finally:
-        unpin()
     warn_of_unused(name, prior, found)
     return found
 
