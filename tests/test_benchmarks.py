@@ -1,12 +1,8 @@
 """Benchmarks that run with nothing but their argument."""
 
 import importlib.util
-import json
-import os
-import shutil
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,7 +14,7 @@ from adaptune.recording.config import SequenceConfig
 from adaptune.recording.recording import open_sequence
 from adaptune.simulation.record import Drive
 from adaptune.strict import ConfigurationError
-from offline.config import OfflineStudy, load_study
+from offline.config import load_study
 
 pytestmark = pytest.mark.services
 
@@ -40,23 +36,6 @@ def test_each_can_be_imported(name, monkeypatch):
     benchmark(name)
 
 
-def test_stages_needs_its_argument_only(recorded, monkeypatch):
-    stages = benchmark("stages")
-    measured: list[OfflineStudy] = []
-    monkeypatch.setenv("ADAPTUNE_TEST_DATA", "to be restored")
-    os.environ.pop("ADAPTUNE_TEST_DATA")
-    monkeypatch.setattr(stages.processes, "pin", lambda _: None)
-    monkeypatch.setattr(stages, "trial", measured.append)
-    monkeypatch.setattr(stages, "train", lambda _: SimpleNamespace(model=None))
-    monkeypatch.setattr(stages, "adaptive_replay", lambda study, _: measured.append(study))
-    monkeypatch.chdir(recorded.parent)
-    stages.main(Path(recorded.name))
-    bags = {sequence.bag for study in measured for sequence in study.config.sequences.values()}
-    assert {Path(bag).resolve() for bag in bags} == {
-        (recorded / name).resolve() for name in ("hall.bag", "street.bag")
-    }
-
-
 def test_directions_of_recorded_data_are_studies(recorded, tmp_path, monkeypatch):
     module = benchmark("recorded")
     monkeypatch.setenv("ADAPTUNE_TEST_DATA", str(recorded))
@@ -75,33 +54,6 @@ def test_directions_of_recorded_data_are_studies(recorded, tmp_path, monkeypatch
     assert len(roles["test"]) == 10
     assert "compensate" in module.sequence("town", "ndt")[1]
     assert "compensate" not in module.sequence("town", "kiss_icp")[1]
-
-
-def test_recorded_prints_every_mode_and_resumes(
-    study_file, trained_folder, tmp_path, monkeypatch, capsys
-):
-    module = benchmark("recorded")
-    shutil.copytree(trained_folder, tmp_path / "gicp-small-10-3")
-    text = study_file.read_text().replace("bag: ", f"bag: {study_file.parent}/")
-    online = {"rules": ["adaptive"], "switching": {"mechanism": "bank"}}
-    given = {**files.Document(text).data, "online": online}
-    monkeypatch.setattr(module, "DIRECTIONS", {"small": None, "other": None})
-    monkeypatch.setattr(module, "definition", lambda *_, **__: given)
-    monkeypatch.setattr(module.processes, "pin", lambda _: None)
-    monkeypatch.setenv("ADAPTUNE_TEST_DATA", str(tmp_path))
-    words = ["--odometries", "gicp", "--directions", "small", "--sets", "10", "--seed", "3"]
-    monkeypatch.setattr(sys, "argv", ["recorded.py", str(tmp_path), *words])
-    module.main()
-    (row,) = [line for line in capsys.readouterr().out.splitlines() if line[2:].startswith("three")]
-    assert all(f"{mode} 0." in row or f"{mode} 1." in row for mode in module.MODES)
-    replays = tmp_path / "gicp-small-10-3/replays/three"
-    made = {path: path.stat().st_mtime_ns for path in replays.rglob("*.tum")}
-    assert len(made) == 5
-    rows = json.loads((tmp_path / "recorded.json").read_text())
-    assert [(row["tuned_on"], row["mode"]) for row in rows] == [("small", m) for m in module.MODES]
-    module.main()
-    assert row in capsys.readouterr().out
-    assert {path: path.stat().st_mtime_ns for path in made} == made
 
 
 def test_simulated_kitti_is_read_as_it_was_driven(tmp_path, monkeypatch):

@@ -303,10 +303,11 @@ def _comparison(found: "ComparedReplays | str", length: float) -> "PageSection":
     title = "What adapting gained"
     if isinstance(found, str):
         return PageSection(title, missing=(found,))
-    chart = comparison_chart(found.rows)
-    missing = () if chart else ("No ratios of errors: no sequence has a reference.",)
-    made = [*tables(found.rows, length), modes_in_words(found.rows)]
-    return PageSection(title, (), missing, (chart,) if chart else (), tuple(made))
+    made = *tables(found.rows, length), modes_in_words(found.rows)
+    if (chart := comparison_chart(found.rows)) is None:
+        missing = ("No ratios of errors: no sequence has a reference.",)
+        return PageSection(title, missing, tables=made)
+    return PageSection(title, charts=(chart,), tables=made)
 
 
 def _search(study: "OfflineStudy") -> "PageSection":

@@ -1,6 +1,6 @@
 """One HTML file that opens without a network: words, tables and charts."""
 
-import math
+import json
 import re
 from dataclasses import dataclass
 from importlib.resources import files
@@ -23,7 +23,6 @@ class PageSection:
     """A heading, and what is below it in this order."""
 
     title: str
-    words: tuple[str, ...] = ()  # paragraphs
     missing: tuple[str, ...] = ()  # what is not there, and why
     charts: tuple[Chart, ...] = ()
     tables: tuple[Listing, ...] = ()
@@ -111,14 +110,11 @@ def _columns(table: Listing) -> dict[str, str]:
     def number(value: Any) -> bool:
         return value is None or (isinstance(value, int | float) and not isinstance(value, bool))
 
-    keys = [key for key in (table.rows[0] if table.rows else {}) if not key.startswith("_")]
-    return {key: "number" if all(number(row[key]) for row in table.rows) else "" for key in keys}
+    return {k: "number" if all(number(row[k]) for row in table.rows) else "" for k in table.keys}
 
 
 def _sorted_by(value: Any) -> str:
     """By what a cell is sorted: the whole number, and nothing for one that is missing."""
-    if value is None or (isinstance(value, float) and math.isnan(value)):
+    if cell_text(value) == "-":
         return ""
-    if isinstance(value, float) and math.isinf(value):
-        return "Infinity" if value > 0 else "-Infinity"
-    return str(value)
+    return json.dumps(value) if isinstance(value, float) else str(value)

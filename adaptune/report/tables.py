@@ -38,18 +38,22 @@ class Listing(NamedTuple):
     # that are named. Rows with a true ``_in_hindsight`` do not count.
     least: Literal["row"] | tuple[str, ...] = ()
 
+    @property
+    def keys(self) -> list[str]:
+        """The keys that are shown."""
+        return [key for key in (self.rows[0] if self.rows else {}) if not key.startswith("_")]
+
 
 def table(title: str, rows: Sequence[Mapping[str, Any]], caption: str = "") -> Table:
-    """Rows of equal keys as a table that fits 80 columns where it can.
+    """A listing as a table that fits 80 columns where it can.
 
-    Numbers are aligned to the right. A gap separates groups of equal first columns. Keys that
-    start with an underscore are for files only.
+    Numbers are aligned to the right. A gap separates groups of equal first columns.
     """
+    keys = Listing(title, rows).keys
     space: Any = {"box": rich.box.SIMPLE_HEAD, "pad_edge": False, "padding": (0, 1, 0, 0)}
     # As texts, names are printed literally.
     made = Table(title=Text(title, "table.title"), caption=Text(caption, "table.caption"), **space)
     made.title_justify = made.caption_justify = "left"
-    keys = [key for key in (rows[0] if rows else {}) if not key.startswith("_")]
     for key in keys:
         numbers = all(isinstance(row[key], int | float | None) for row in rows)
         side: Any = "right" if numbers else "left"
@@ -72,11 +76,10 @@ def tables_within(listing: Listing, width: int) -> list[Table | Text]:
     whole = table(*listing[:3])
     if Console(width=_WIDEST).measure(whole).maximum <= width:
         return [whole]
-    rows = listing.rows
     headings, needed = {}, {}
-    for key in (key for key in rows[0] if not key.startswith("_")):
-        parts = re.split(r"(?<=_)|\s", key)
-        needed[key] = max(len(text) for text in (*parts, *(cell_text(row[key]) for row in rows)))
+    for key in listing.keys:
+        cells = [cell_text(row[key]) for row in listing.rows]
+        needed[key] = max(map(len, (*re.split(r"(?<=_)|\s", key), *cells)))
         headings[key] = textwrap.fill(key, needed[key], break_long_words=False)
     first, *others = headings
     tables = [[first]]
@@ -87,7 +90,7 @@ def tables_within(listing: Listing, width: int) -> list[Table | Text]:
         tables[-1].append(key)
     titles = [listing.title, *("" for _ in tables[1:])]
     made: list[Table | Text] = [
-        table(title, [{headings[key]: row[key] for key in keys} for row in rows])
+        table(title, [{headings[key]: row[key] for key in keys} for row in listing.rows])
         for title, keys in zip(titles, tables, strict=True)
     ]
     return [*made, Text(listing.caption, "table.caption")] if listing.caption else made
@@ -106,14 +109,11 @@ def cell_text(value: Any) -> str:
 def markdown(listing: Listing) -> str:
     """The table in Markdown, with its title and caption."""
     keys, cells = _printed(listing)
-    lines = [list(keys)]
-    lines.append([":--" if i == 0 else "--:" for i in range(len(keys))])
+    lines = [keys, [":--", *["--:"] * (len(keys) - 1)][: len(keys)]]
     lines += [[f"**{text}**" if bold else text for text, bold in row] for row in cells]
-    body = "\n".join(
-        f"| {' | '.join(t.replace('|', chr(92) + '|') for t in line)} |" for line in lines
-    )
-    parts = [f"**{listing.title}**", body, listing.caption]
-    return "\n\n".join(part for part in parts if part) + "\n"
+    escaped = ([text.replace("|", r"\|") for text in line] for line in lines)
+    body = "\n".join(f"| {' | '.join(line)} |" for line in escaped)
+    return "\n\n".join(filter(None, (f"**{listing.title}**", body, listing.caption))) + "\n"
 
 
 def latex(listing: Listing, label: str) -> str:
@@ -130,14 +130,12 @@ def latex(listing: Listing, label: str) -> str:
     groups, names = zip(*(key.rpartition(": ")[::2] for key in keys), strict=True)
     lines = []
     if any(groups):
-        spans = [(group, len(list(same))) for group, same in itertools.groupby(groups)]
-        ends = list(itertools.accumulate(n for _, n in spans))
-        heads = (f"\\multicolumn{{{n}}}{{c}}{{{_escaped(group)}}}" for group, n in spans)
-        rules = (
-            f"\\cmidrule(lr){{{end - n + 1}-{end}}}"
-            for (group, n), end in zip(spans, ends, strict=True)
-            if group
-        )
+        heads, rules, end = [], [], 0
+        for group, same in itertools.groupby(groups):
+            begin, end = end + 1, end + len(list(same))
+            heads.append(rf"\multicolumn{{{end - begin + 1}}}{{c}}{{{_escaped(group)}}}")
+            if group:
+                rules.append(rf"\cmidrule(lr){{{begin}-{end}}}")
         lines += [" & ".join(heads) + r" \\", " ".join(rules)]
     lines += [" & ".join(map(_escaped, names)) + r" \\", r"\midrule"]
     for row in cells:
@@ -160,18 +158,18 @@ def latex(listing: Listing, label: str) -> str:
 
 def _printed(listing: Listing) -> tuple[list[str], list[list[tuple[str, bool]]]]:
     """Keys that are printed, and for each row its texts and whether they are set in bold."""
-    rows = listing.rows
-    keys = [key for key in (rows[0] if rows else {}) if not key.startswith("_")]
-    numbers = np.array([[_number(row[key]) for key in keys] for row in rows], np.float64)
-    numbers[[bool(row.get("_in_hindsight")) for row in rows]] = np.nan
+    rows, keys = listing.rows, listing.keys
+    numbers = np.full((len(rows), len(keys)), np.nan)
+    for i, row in enumerate(rows):
+        if not row.get("_in_hindsight"):
+            numbers[i] = [row[key] if isinstance(row[key], float) else np.nan for key in keys]
     bold = np.zeros(numbers.shape, bool)
     if listing.least == "row":
-        groups = [key.rpartition(": ")[0] for key in keys]
-        for group in dict.fromkeys(groups):
-            columns = [i for i, of in enumerate(groups) if of == group]
-            bold[:, columns] = _least(numbers[:, columns], axis=1)
+        groups = np.array([key.rpartition(": ")[0] for key in keys])
+        for group in set(groups.tolist()):
+            bold[:, groups == group] = _least(numbers[:, groups == group], axis=1)
     else:
-        columns = [i for i, key in enumerate(keys) if key in listing.least]
+        columns = [key in listing.least for key in keys]
         bold[:, columns] = _least(numbers[:, columns], axis=0)
     texts = [[cell_text(row[key]) for key in keys] for row in rows]
     return keys, [list(zip(*pair, strict=True)) for pair in zip(texts, bold.tolist(), strict=True)]
@@ -182,10 +180,6 @@ def _least(numbers: NDArray[np.float64], axis: int) -> NDArray[np.bool_]:
     known = np.isfinite(numbers)
     least = np.where(known, numbers, np.inf).min(axis=axis, keepdims=True, initial=np.inf)
     return np.asarray(known & (numbers == least) & (known.sum(axis=axis, keepdims=True) > 1))
-
-
-def _number(value: Any) -> float:
-    return float(value) if isinstance(value, float) else np.nan
 
 
 _SPECIAL = str.maketrans(

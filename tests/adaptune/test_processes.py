@@ -295,28 +295,24 @@ def allowed(monkeypatch):
 
 
 def test_a_process_is_kept_on_one_core_until_that_is_undone(allowed):
-    unpin = processes.pin(6)
-    assert allowed == {5}
-    assert processes.available() == 1
-    unpin()
+    with processes.pin(6):
+        assert allowed == {5}
+        assert processes.available() == 1
     assert allowed == {2, 3, 5, 7}
 
 
 def test_others_get_the_rest_only_where_this_process_is_alone(allowed):
-    unpin = processes.pin(1, alone=True)
-    assert {processes.next_core() for _ in range(4)} == {2, 3, 5, 7}
-    unpin()
-    unpin = processes.pin(1)
-    assert {processes.next_core() for _ in range(4)} == allowed == {3}
-    unpin()
+    with processes.pin(1, alone=True):
+        assert {processes.next_core() for _ in range(4)} == {2, 3, 5, 7}
+    with processes.pin(1):
+        assert {processes.next_core() for _ in range(4)} == allowed == {3}
 
 
 def test_those_that_work_for_this_process_get_other_cores(allowed):
     assert [processes.other_core(i) for i in range(4)] == [3, 5, 7, 3]
-    unpin = processes.pin(1, alone=True)
-    assert processes.shared_cores() == {2, 3, 5, 7}
-    assert [processes.other_core(i) for i in range(4)] == [2, 5, 7, 2]
-    unpin()
+    with processes.pin(1, alone=True):
+        assert processes.shared_cores() == {2, 3, 5, 7}
+        assert [processes.other_core(i) for i in range(4)] == [2, 5, 7, 2]
     allowed.clear()
     allowed.add(7)
     assert [processes.other_core(i) for i in range(2)] == [7, 7]

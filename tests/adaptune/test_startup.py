@@ -1,3 +1,4 @@
+import os
 import subprocess
 import sys
 
@@ -34,3 +35,30 @@ def test_help_imports_neither_numpy_nor_a_stage():
 )
 def test_configuration_imports_nothing_heavy(code):
     assert not imported(code) & {"adaptune.simulation.record", "adaptune.simulation.world", *HEAVY}
+
+
+ZSH = {
+    "_ADAPTUNE_COMPLETE": "complete_zsh",
+    "_TYPER_COMPLETE_ARGS": "adaptune offline my.yaml -o offline.tr",
+}
+BASH = {
+    "_ADAPTUNE_COMPLETE": "complete_bash",
+    "COMP_WORDS": "adaptune offline my.yaml -o offline.tr",
+    "COMP_CWORD": "4",
+}
+
+
+@pytest.mark.parametrize("shell", [BASH, ZSH], ids=["bash", "zsh"])
+def test_the_shell_is_answered(shell, tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-X", "importtime", "-m", "adaptune"],
+        cwd=tmp_path,
+        env=os.environ | shell,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert "offline.trials=" in done.stdout
+    imported = {line.rpartition("|")[2].strip().split(".")[0] for line in done.stderr.splitlines()}
+    assert "pydantic" in imported
+    assert not imported & HEAVY

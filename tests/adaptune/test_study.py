@@ -77,13 +77,8 @@ def test_reads_a_study(gicp_study_file, tmp_path):
             "odometry.parameters.keyframe_interval={low: 3, high: 2}",
             ["odometry.parameters.keyframe_interval", "low (3) must be less than high (2)"],
         ),
-        ("offline.sampler=tpee", ["offline.sampler", "'tpe'"]),
         ("offline.sampler=math:sin", ["offline.sampler", "not a class derived from optuna"]),
         ("offline.sampler=no.such:Best", ["cannot import no.such", "PYTHONPATH"]),
-        (
-            "offline.sampler_settings.gama=1",
-            ["gama: tpe has no such setting; did you mean 'gamma'"],
-        ),
         ("offline.sampler_settings.seed=1", ["sampler_settings.seed", "offline.seed"]),
         (
             "offline={sampler: grid, sampler_settings: {grid: "
@@ -94,16 +89,13 @@ def test_reads_a_study(gicp_study_file, tmp_path):
             "offline={sampler: annealing, objective: [rte, rpe]}",
             ["annealing minimises one objective"],
         ),
-        ("offline.objective=rtee", ["offline.objective: there is no metric 'rtee'", "'rte'"]),
         ("offline.objective=[rte, {rte: 1.0}]", ["offline.objective: names an objective twice"]),
         ("offline.trial=3", ["offline.trial", "did you mean 'trials'?"]),
         ("online.switching.mechanism=hand_over", ["hand_over is gone", "give auto, live or bank"]),
-        ("online.switching.sizes=5", ["did you mean 'size'?"]),
         (
             "online.switching.sets=[0, {keyframe_intervall: 1.0}]",
             ["online.switching.sets.1", "did you mean 'keyframe_interval'?"],
         ),
-        ("training=[ones]", ["training.0", "did you mean 'one'?"]),
         ("test=[three, three]", ["test.1", "named twice"]),
         ("sequences.one.bag=four.bag", ["sequences.one", "four.bag", "no such bag"]),
         ("sequences.one.bag=${NO_SUCH_VARIABLE}/a.bag", ["NO_SUCH_VARIABLE"]),
@@ -135,8 +127,6 @@ MAX_DISTANCE = "max_correspondence_distance: "
         (ANNEALING + "steps:\n  {keyframe: {mu: 1}}}}", 15, "did you mean 'keyframe_interval'?"),
         (ANNEALING + "steps: {keyframe_interval: {\n delta_max: 3}}}}", 15, "of a log float are"),
         (ANNEALING + "steps: {\n keyframe_interval: {low: 9, high: 8}}}}", 15, "low below high"),
-        (ANNEALING + "start: {\n keyframe_interval: 20}}}", 15, "from 0.5 to 15, not 20"),
-        (ANNEALING + "\n alfa: 0.9}}", 15, "alfa: unknown key; did you mean 'alpha'?"),
         (
             GRID + "\n keyframe_interval: [1, 1, 3]}}}",
             14,

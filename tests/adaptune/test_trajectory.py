@@ -126,14 +126,3 @@ def test_any_text_gives_a_trajectory_or_an_error(tmp_path_factory, text):
             assert np.isfinite(read_trajectory(folder / name).T_world_sensor).all()
         except TrajectoryError:
             continue
-
-
-def test_poses_are_known_up_to_the_largest_gap():
-    stamps = np.array([0, 10**9, 4 * 10**9])
-    T = np.tile(np.eye(4), (3, 1, 1))
-    T[:, 0, 3] = [0, 1, 4]
-    at = np.array([-1, 0, 5 * 10**8, 2 * 10**9, 4 * 10**9, 4 * 10**9 + 1])
-    x = Trajectory(stamps, T).at(at)[:, 0, 3]
-    np.testing.assert_allclose(x, [np.nan, 0, 0.5, np.nan, 4, np.nan])
-    assert Trajectory(stamps, T, max_gap=3.0).at(at)[3, 0, 3] == pytest.approx(2)
-    assert Trajectory(stamps, T).at(at, max_gap=3.0)[3, 0, 3] == pytest.approx(2)

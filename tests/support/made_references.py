@@ -2,8 +2,6 @@
 
 import numpy as np
 
-from adaptune.recording.config import SequenceConfig
-from adaptune.recording.recording import open_sequence
 from adaptune.reference.stored import EstimatedReference, Registrations
 
 
@@ -24,16 +22,3 @@ def made_of(stamps, T, scale=0.02, lost=(), seed=0):
     none = np.zeros(0, np.intp)
     found = Registrations(none, none, none.astype(bool), none.astype(float))
     return EstimatedReference(stamps, smooth(T, scale, seed), trusted, halves, found)
-
-
-def of_truth(bag, truth="/truth", **given):
-    """Stands for `estimate_reference`; the truth is that of a bag."""
-
-    def estimate(scans, advance=lambda *_: None, priors=None):
-        assert priors is None or len(priors)
-        stamps = np.array([scan.stamp for scan in scans], np.int64)
-        advance(len(stamps), len(stamps))
-        reference = open_sequence(SequenceConfig(bag=str(bag), reference=truth)).reference()
-        return made_of(stamps, reference.at(stamps), **given)
-
-    return estimate

@@ -132,7 +132,6 @@ def sample_page() -> Page:
         (
             PageSection(
                 "Results",
-                ("Errors are means over the sub-trajectories of a drive.",),
                 charts=(comparison(), over_time()),
                 tables=(Listing("Errors by drive", rows, "Only drives with a reference."),),
             ),

@@ -32,19 +32,6 @@ def adaptune(tmp_path, monkeypatch):
     return commands.call
 
 
-def process(*arguments, cwd):
-    """Call the command line in a process of its own."""
-    return subprocess.run(
-        [sys.executable, "-m", "adaptune.commands.cli", *map(str, arguments)],
-        cwd=cwd,
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-        env=os.environ | {"COLUMNS": "80"},
-    )
-
-
 def next_words(done):
     """The words of the command that is named as the next one, which is said last."""
     *_, last = done.stdout.splitlines()
@@ -70,7 +57,14 @@ def test_one_bag_is_enough_and_every_command_names_the_next(adaptune, study_file
         lines = [line for line in done.stdout.splitlines() if line.strip()]
         assert len(set(lines)) == len(lines)
         assert (command == "online") != ("Fixed set: my study[v2]/fixed.yaml" in done.stdout)
-    assert "one_60-100" in done.stdout
+        assert (command == "online") == ("4 replays made: my study[v2]/replays/" in done.stdout)
+        fixed = r"^Fixed: \d.* % against the baseline's \d.* \(1 sequences\)"
+        assert (command == "offline") == bool(re.search(fixed, done.stdout, re.MULTILINE))
+    assert done.stdout.startswith("Whether adapting gains is not known, on one_60-100: ")
+    words = "baseline", "fixed", "adaptive", "paper", "APE [m]", "RPE [m]", "one_60-100"
+    assert all(word in done.stdout for word in words)
+    table = done.stdout[done.stdout.index("RTE over") : done.stdout.index("Page: ")]
+    assert max(map(len, table.splitlines())) <= 80
     assert "# find out what adapting gains elsewhere" in done.stdout
     assert (tmp_path / "my study[v2]/report/figures/one_60-100-paths.png").exists()
 
@@ -99,29 +93,6 @@ def test_inspect_proposes_a_study_without_a_reference_too(tmp_path):
     study = load_study(tmp_path / "one.yaml", [], tmp_path / "run")
     assert study.training == ["scans_0-60"]
     assert study.config.sub_trajectory == 5.0
-
-
-def test_the_whole_way(study_file, tmp_path):
-    done = process("offline", study_file, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert re.search(
-        r"^Fixed: \d.* % against the baseline's \d.* \(2 sequences\)", done.stdout, re.MULTILINE
-    )
-    assert "Parameters of the fixed set: max_correspondence_distance" in done.stdout
-    assert next_words(done)[:2] == ["validate", str(study_file)]
-    done = process("online", study_file, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert "4 of 4 replays made" in done.stdout
-    assert next_words(done)[:2] == ["compare", str(study_file)]
-    done = process("compare", study_file, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    for mode in ("baseline", "fixed", "adaptive", "paper"):
-        assert mode in done.stdout
-    assert all(name in done.stdout for name in ("APE [m]", "RPE [m]"))
-    assert done.stdout.startswith("Whether adapting gains is not known, on three: `adaptive` has ")
-    table = done.stdout[done.stdout.index("RTE over") : done.stdout.index("Page: ")]
-    assert max(map(len, table.splitlines())) <= 80
-    assert (tmp_path / "runs/small/report/figures/three-errors.svg").exists()
 
 
 @pytest.mark.parametrize(

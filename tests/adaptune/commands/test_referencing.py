@@ -2,7 +2,6 @@ import re
 
 import commands
 import estimates
-import made_references
 import pytest
 
 from adaptune.commands import terminal
@@ -20,11 +19,11 @@ def bag(study_file):
 
 
 @pytest.fixture
-def adaptune(tmp_path, monkeypatch, bag):
-    """Call the command line; estimates are made of the truth."""
+def adaptune(tmp_path, monkeypatch):
+    """Call the command line; estimates are made up."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(terminal.console, "width", 100)
-    monkeypatch.setattr(estimate, "estimate_reference", made_references.of_truth(bag))
+    monkeypatch.setattr(estimate, "estimate_reference", estimates.Estimator())
     return lambda *words: commands.call("reference", *words)
 
 
@@ -43,7 +42,7 @@ def test_a_recording_gets_files_and_sentences(adaptune, bag, tmp_path):
 
 
 def test_where_it_is_lost_is_said(adaptune, bag, tmp_path, monkeypatch):
-    monkeypatch.setattr(estimate, "estimate_reference", made_references.of_truth(bag, lost=[9]))
+    monkeypatch.setattr(estimate, "estimate_reference", estimates.Estimator(untrusted=[9]))
     done = adaptune(bag, "--out", "refs", "--length", "1.5")
     assert done.exit_code == 0, done.stderr
     assert re.search(
@@ -119,7 +118,7 @@ def test_a_reference_of_another_time_that_was_not_asked_for_hinders_nothing(
 def test_of_a_study_those_that_it_lacks_are_estimated(
     adaptune, bag, study_file, tmp_path, monkeypatch
 ):
-    made = made_references.of_truth(bag)
+    made = estimates.Estimator()
     asked = []
 
     def estimated(scans, *given):

@@ -82,7 +82,7 @@ def test_cells_are_sorted_by_whole_numbers_and_missing_ones_by_nothing():
 
 def test_names_between_backticks_are_code():
     table = Listing("C", [{"one_set": 1.0}], "Of `fixed`.")
-    sections = (PageSection("B", ("`a<b` is kept.",), ("run `adaptune online`",), (), (table,)),)
+    sections = (PageSection("B", ("`a<b` is kept: run `adaptune online`",), (), (table,)),)
     seen = Seen(page_text(Page("A", "", ("`adaptive` has less.",), sections)))
     assert seen.texts["code"] == ["adaptive", "a<b", "adaptune online", "fixed"]
 
