@@ -21,23 +21,15 @@ app = typer.Typer(
         "Tune the parameters of a LiDAR odometry, and keep tuning them while the robot drives.\n\n"
         "A study is a YAML file: an odometry, its parameters, and sequences for training and test. "
         "Its folder keeps all results. Run the same command again to resume it.\n\n"
-        "    adaptune inspect  my.bag               # what is in a recording\n\n"
-        "    adaptune simulate configs/demo.yaml    # record its simulated sequences\n\n"
-        "    adaptune reference my.bag              # a reference without ground truth\n\n"
-        "    adaptune offline  configs/demo.yaml    # run trials, fit the error model\n\n"
-        "    adaptune trials   configs/demo.yaml    # list, sort and export its trials\n\n"
-        "    adaptune validate configs/demo.yaml    # does adapting pay elsewhere?\n\n"
-        "    adaptune online   configs/demo.yaml    # replay the test sequences\n\n"
-        "    adaptune compare  configs/demo.yaml    # what adapting gained; a page\n\n"
-        "    adaptune record   configs/demo.yaml    # replays to look at in Foxglove or Rerun"
+        "Every command names the next one at its end; the first is `adaptune inspect my.bag`."
     ),
 )
 
 for _command in (
-    *(tools.inspect, tools.cache, tools.serve),
-    *(offline.simulate, offline.reference, offline.offline, offline.trials, offline.validate),
+    *(tools.inspect, offline.simulate, offline.reference),
+    *(offline.offline, offline.trials, offline.validate),
     *(online.online, online.compare, online.record),
-    tools.import_rustle,
+    *(tools.cache, tools.serve, tools.import_rustle),
 ):
     app.command()(_command)
 

@@ -15,7 +15,6 @@ from adaptune.commands.terminal import (
     Override,
     StudyFile,
     begin_work,
-    console,
     errors,
     load,
     progress,
@@ -24,6 +23,7 @@ from adaptune.commands.terminal import (
     say_next_of_study,
     say_next_of_trained,
     say_next_online,
+    show_table,
 )
 from adaptune.errors import AdaptuneError
 
@@ -74,21 +74,18 @@ def offline(
     all sequences), and each sequence's best. Stop it with Ctrl-C, and run it again to resume.
     """
     loaded = load(study, override, folder)
-    from adaptune.report import tables
     from adaptune.study.study import driven
     from offline.train import train
 
     with progress() as show:
         training = train(loaded, show, cluster)
     model = training.model
-    console.print(
-        tables.table(
-            f"RTE [%] over {model.length:g} m in training, "
-            f"{len(next(iter(training.means.values())))} parameter sets",
-            training.rows,
-            "A trial that loses track restarts at the reference, which counts as 30 %. A whole run "
-            "is driven as `adaptune online` does it; whole runs decide which set is the fixed one.",
-        )
+    n = len(next(iter(training.means.values())))
+    show_table(
+        f"RTE [%] over {model.length:g} m in training, {n} parameter sets",
+        training.rows,
+        "A trial that loses track restarts at the reference, which counts as 30 %. A whole run is "
+        "driven as `adaptune online` does it; whole runs decide which set is the fixed one.",
     )
     for sentence in training.words:
         say(sentence)
@@ -128,7 +125,7 @@ def trials(
     loaded = load(study, override, folder)
     from adaptune import archive as table
     from adaptune.archive import Archive
-    from adaptune.report import tables
+    from adaptune.report.tables import csv_text
     from adaptune.study.references import estimates_in_words, estimates_of
     from offline.search import has_ended
 
@@ -139,10 +136,10 @@ def trials(
     chosen = table.select(finished, where, sort, top)
     labels = loaded.odometry.space.labels
     if csv:
-        sys.stdout.write(tables.csv_text(chosen))
+        sys.stdout.write(csv_text(chosen))
     else:
         title = f"{len(chosen)} of {len(finished)} trials"
-        console.print(tables.table(title, table.with_units(chosen, names, labels)))
+        show_table(title, table.with_units(chosen, names, labels))
         if judged := [row for row in finished if row["mean"] is not None]:
             best = min(judged, key=lambda row: row["mean"])
             say(f"Best mean: {best['mean']:.3f} %, of trial {best['trial']}.")
@@ -172,19 +169,16 @@ def validate(
     are ratios to the error of the fixed set, which is chosen without what is left out, too.
     """
     loaded = load(study, override, folder)
-    from adaptune.report import tables
     from offline.validate import validate as validate_study
 
     with progress() as show:
         _, rows, verdicts = validate_study(loaded, show)
-    console.print(
-        tables.table(
-            "Error as a ratio to the fixed set's, each recording or stretch left out in turn",
-            rows,
-            "Oracles know the errors: the best set of the sequence, and of every period. "
-            "Intervals: for a recording, a block bootstrap over time, if it is long enough; for "
-            "the geometric mean over the stretches, what is expected elsewhere.",
-        )
+    show_table(
+        "Error as a ratio to the fixed set's, each recording or stretch left out in turn",
+        rows,
+        "Oracles know the errors: the best set of the sequence, and of every period. Intervals: "
+        "for a recording, a block bootstrap over time, if it is long enough; for the geometric "
+        "mean over the stretches, what is expected elsewhere.",
     )
     for verdict in verdicts:
         say(verdict)
@@ -330,7 +324,6 @@ def _say_estimate(stored: "StoredEstimate", unknown: "list[Gap]", length: float)
 
 def _of_study(study: "OfflineStudy") -> None:
     """Estimate the references that a study lacks, and say what each is worth."""
-    from adaptune.report import tables
     from adaptune.study.references import ensure_references, estimates_of, to_estimate
 
     names = to_estimate(study.sequences, (*study.config.training, *study.config.test))
@@ -355,7 +348,7 @@ def _of_study(study: "OfflineStudy") -> None:
     ]
     if rows:
         caption = f"Errors are estimates over {length:g} m. A picture of each shows where it fails."
-        console.print(tables.table("Estimated references", rows, caption))
+        show_table("Estimated references", rows, caption)
         say(f"Files: {study.folder / 'references'}/")
     if refused:
         raise AdaptuneError("\n".join(refused.values()))

@@ -22,6 +22,7 @@ from adaptune.commands.terminal import (
     progress,
     say,
     say_next_of_study,
+    show_table,
 )
 from adaptune.errors import AdaptuneError
 
@@ -97,19 +98,14 @@ def online(
     complement each other best in training. Nothing is learned from them.
     """
     robot = ros or ros2
-    for is_wrong, words in (
-        (cluster is not None and not oracle, "--cluster is for the trials of --oracle"),
-        (untrained and model is not None, f"--untrained uses no model; leave out --model {model}"),
-        (
-            untrained and mode is not None,
-            f"--untrained is a mode of its own; leave out --mode {mode}",
-        ),
-        (ros and ros2, "give only one of --ros and --ros2"),
-        (
-            mode is not None and not robot,
-            f"--mode {mode} is for a robot (--ros, --ros2); all modes are replayed",
-        ),
-    ):
+    wrong = {
+        "--cluster is for the trials of --oracle": cluster and not oracle,
+        f"--untrained uses no model; leave out --model {model}": untrained and model,
+        f"--untrained is a mode of its own; leave out --mode {mode}": untrained and mode,
+        "give only one of --ros and --ros2": ros and ros2,
+        f"--mode {mode} is for a robot (--ros, --ros2); all modes are replayed": mode and not robot,
+    }
+    for words, is_wrong in wrong.items():
         if is_wrong:
             raise AdaptuneError(words)
     loaded = load(study, override, folder)
@@ -127,17 +123,14 @@ def online(
 
 def _oracle(loaded: "OfflineStudy", cluster: str | None) -> None:
     """Run sets of the model on the test sequences as trials."""
-    from adaptune.report import tables
     from offline.train import run_oracle
 
     with progress() as show:
         rows = run_oracle(loaded, ORACLE_SETS, show, cluster)
-    console.print(
-        tables.table(
-            f"RTE [%] over {loaded.config.sub_trajectory:g} m on test sequences, as trials",
-            rows,
-            "The best set is known only in hindsight: no rule can rely on it.",
-        )
+    show_table(
+        f"RTE [%] over {loaded.config.sub_trajectory:g} m on test sequences, as trials",
+        rows,
+        "The best set is known only in hindsight: no rule can rely on it.",
     )
     say(f"Trials: {loaded.folder / 'oracle'}/")
 
@@ -238,7 +231,6 @@ def _compare_one(study: Path, override: list[str], folder: Path | None) -> None:
 
 def _compared(loaded: "OfflineStudy") -> "ComparedReplays":
     """Compare a study's replays, print words and tables, and write the page."""
-    from adaptune.report import tables as report
     from online.compare import compare as compare_replays
     from online.tables import tables
 
@@ -253,7 +245,7 @@ def _compared(loaded: "OfflineStudy") -> "ComparedReplays":
     for said in found.words:
         say(said)
     for made in tables(found.rows, loaded.config.sub_trajectory):
-        console.print(*report.tables_within(made, console.width), sep="\n")
+        show_table(*made[:3])
     _write_page(loaded, found)
     return found
 
@@ -357,7 +349,7 @@ def _of_charts(title: str, make: "Callable[[], Charts]") -> "PageSection":
 
 
 def _compare_several(studies: list[Path], override: list[str], to: Path | None) -> None:
-    from adaptune.report import tables as report
+    from adaptune.report.tables import write_tables
     from online.tables import side_by_side
 
     loaded = [load(study, override, None) for study in studies]
@@ -375,9 +367,9 @@ def _compare_several(studies: list[Path], override: list[str], to: Path | None) 
     console.rule("side by side")
     made = side_by_side(rows)
     for listing in made:
-        console.print(*report.tables_within(listing, console.width), sep="\n")
+        show_table(*listing[:3])
     folder = to or loaded[0].folder.with_name("+".join(rows))
-    report.write_tables(folder, " and ".join(rows), made)
+    write_tables(folder, " and ".join(rows), made)
     say(f"Tables: {folder}/")
 
 

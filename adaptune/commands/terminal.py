@@ -7,7 +7,7 @@ import shutil
 import signal
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -53,6 +53,13 @@ class Commands(TyperGroup):
 def say(text: str) -> None:
     """Print plain text, on one line however narrow the terminal is."""
     console.print(text, soft_wrap=True)
+
+
+def show_table(title: str, rows: Sequence[Mapping[str, Any]], caption: str = "") -> None:
+    """Print a table, or several below each other where the terminal is narrow."""
+    from adaptune.report.tables import Listing, tables_within
+
+    console.print(*tables_within(Listing(title, rows, caption), console.width), sep="\n")
 
 
 def begin_work() -> None:
