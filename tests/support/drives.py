@@ -1,13 +1,12 @@
 """Bags of a sensor driving through a world of points, small enough to register in no time."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import rec
 from numpy.typing import NDArray
-from rosbags.rosbag1 import Writer
-from rosbags.typesys import Stores, get_typestore
 
-STORE = get_typestore(Stores.ROS1_NOETIC)
 FIRST_STAMP = 1_700_000_000_123_456_789
 STUDY_FILE = "small.yaml"
 STUDY = """\
@@ -60,39 +59,10 @@ def scans(
     return made
 
 
-def cloud(stamp: int, points: NDArray[np.float32]) -> object:
-    """A sensor_msgs/PointCloud2 with x, y and z."""
-    types = STORE.types
-    field = types["sensor_msgs/msg/PointField"]
-    return types["sensor_msgs/msg/PointCloud2"](
-        header=header(stamp),
-        height=1,
-        width=len(points),
-        fields=[field(name, 4 * i, 7, 1) for i, name in enumerate("xyz")],
-        is_bigendian=False,
-        point_step=12,
-        row_step=12 * len(points),
-        data=np.ascontiguousarray(points, np.float32).view(np.uint8).reshape(-1),
-        is_dense=True,
-    )
-
-
-def header(stamp: int) -> object:
-    """A std_msgs/Header."""
-    time = STORE.types["builtin_interfaces/msg/Time"](stamp // 10**9, stamp % 10**9)
-    return STORE.types["std_msgs/msg/Header"](0, time, "sensor")
-
-
-def pose(stamp: int, T: NDArray[np.float64]) -> object:
-    """A geometry_msgs/PoseStamped of a pose without rotation."""
-    types = STORE.types
-    return types["geometry_msgs/msg/PoseStamped"](
-        header(stamp),
-        types["geometry_msgs/msg/Pose"](
-            types["geometry_msgs/msg/Point"](*T[:3, 3].tolist()),
-            types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0),
-        ),
-    )
+def cloud(stamp: int, points: NDArray[np.float32], names: str = "xyz") -> Any:
+    """A sensor_msgs/PointCloud2 of points of shape (n, 3)."""
+    kind = [(name, "<f4") for name in names]
+    return rec.cloud(np.ascontiguousarray(points, "<f4").view(kind)[:, 0], stamp, rec.ROS1)
 
 
 def write_bag(
@@ -100,16 +70,15 @@ def write_bag(
     drive: list[tuple[int, NDArray[np.float32], NDArray[np.float64]]],
     reference_delay: int = 0,
 ) -> Path:
-    """Write a drive to a ROS 1 bag with /points and /truth."""
+    """Write a drive without rotations to a ROS 1 bag with /points and /truth."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    with Writer(path) as bag:
-        points = bag.add_connection("/points", "sensor_msgs/msg/PointCloud2", typestore=STORE)
-        truth = bag.add_connection("/truth", "geometry_msgs/msg/PoseStamped", typestore=STORE)
-        for stamp, xyz, T in drive:
-            message = cloud(stamp, xyz)
-            bag.write(points, stamp, STORE.serialize_ros1(message, "sensor_msgs/msg/PointCloud2"))
-            message = pose(stamp + reference_delay, T)
-            bag.write(truth, stamp, STORE.serialize_ros1(message, "geometry_msgs/msg/PoseStamped"))
+    messages = []
+    for stamp, xyz, T in drive:
+        position, still = T[:3, 3].tolist(), (0.0, 0.0, 0.0, 1.0)
+        messages.append(("/points", stamp, cloud(stamp, xyz)))
+        truth = rec.pose(stamp + reference_delay, position, still, rec.ROS1)
+        messages.append(("/truth", stamp, truth))
+    rec.write_bag(path, messages)
     return path
 
 

@@ -3,18 +3,16 @@
 import threading
 from collections import defaultdict
 
-import drives
 import numpy as np
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+import rec
+from drives import cloud
 
 from adaptune.ros.link import LinkError
 from online.live import CLOUD, IMU
 
-STORE = get_typestore(Stores.ROS1_NOETIC)
-STORE.register(
-    get_types_from_msg("geometry_msgs/TransformStamped[] transforms\n", "tf2_msgs/msg/TFMessage")
-)
+STORE = rec.ROS1
 TYPES = STORE.types
+__all__ = ["STORE", "TYPES", "LocalLink", "cloud", "header", "imu", "odometry"]
 
 
 class LocalLink:
@@ -73,35 +71,20 @@ class LocalLink:
 
 
 def header(stamp, frame="lidar"):
-    time = TYPES["builtin_interfaces/msg/Time"](*divmod(stamp, 10**9))
-    return TYPES["std_msgs/msg/Header"](0, time, frame)
-
-
-def cloud(stamp, points, names="xyz"):
-    """sensor_msgs/PointCloud2 of points of shape (n, 3)."""
-    made = drives.cloud(stamp, points)
-    made.header = header(stamp)
-    for field, name in zip(made.fields, names, strict=True):
-        field.name = name
-    return made
+    return rec.header(stamp, frame, STORE)
 
 
 def imu(stamp, rate=0.0):
-    vector = TYPES["geometry_msgs/msg/Vector3"]
-    still = TYPES["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
-    unknown = np.zeros(9)
-    measured = vector(0.0, 0.0, rate), unknown, vector(0.0, 0.0, 9.81), unknown
-    return TYPES[IMU](header(stamp), still, unknown, *measured)
+    made = rec.imu(stamp, (0.0, 0.0, rate), (0.0, 0.0, 9.81), STORE)
+    made.header = header(stamp)
+    return made
 
 
 def odometry(stamp, T):
     """nav_msgs/Odometry of a pose without rotation."""
-    point = TYPES["geometry_msgs/msg/Point"](*map(float, T[:3, 3]))
-    still = TYPES["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
     zero = TYPES["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0)
-    pose = TYPES["geometry_msgs/msg/PoseWithCovariance"](
-        TYPES["geometry_msgs/msg/Pose"](point, still), np.zeros(36)
-    )
+    still = rec.bare_pose(map(float, T[:3, 3]), (0.0, 0.0, 0.0, 1.0), STORE)
+    pose = TYPES["geometry_msgs/msg/PoseWithCovariance"](still, np.zeros(36))
     twist = TYPES["geometry_msgs/msg/TwistWithCovariance"](
         TYPES["geometry_msgs/msg/Twist"](zero, zero), np.zeros(36)
     )
