@@ -323,7 +323,7 @@ def run_replays(
     progress
         Called about every scan.
     look
-        Sees every scan, see `adaptune.commands.dashboard.Dashboard.look`.
+        Sees every scan, see `adaptune.commands.terminal.Dashboard.look`.
     repeats
         How often each mode is replayed on a sequence.
 

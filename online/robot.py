@@ -304,7 +304,7 @@ class RobotDrive:
 
         Where the clock goes back, all begins anew.
 
-        `look` is called after every scan, see `adaptune.commands.dashboard.Dashboard.look`.
+        `look` is called after every scan, see `adaptune.commands.terminal.Dashboard.look`.
         """
         done = 0
         with ExitStack() as stack:

@@ -13,6 +13,7 @@ import typer
 
 from adaptune.commands.terminal import (
     Cluster,
+    Dashboard,
     Folder,
     Override,
     StudyFile,
@@ -146,7 +147,6 @@ def _alone(study: "OfflineStudy") -> ExitStack:
 
 def _replay(loaded: "OfflineStudy", model: Path | None, repeats: int, *, untrained: bool) -> int:
     """Make the replays that are missing; how many were made."""
-    from adaptune.commands.dashboard import Dashboard
     from online.modes import run_replays, run_untrained
 
     dashboard = Dashboard()
@@ -160,7 +160,6 @@ def _drive(
     loaded: "OfflineStudy", mode: str | None, model: Path | None, *, untrained: bool, ros2: bool
 ) -> None:
     """Drive on a robot until Ctrl-C."""
-    from adaptune.commands.dashboard import Dashboard
     from adaptune.ros.ros1 import local_ros1
     from adaptune.ros.ros2 import Ros2
     from online.modes import UNTRAINED, WITHOUT_MODEL

@@ -1,7 +1,7 @@
 import numpy as np
 from rich.console import Console
 
-from adaptune.commands.dashboard import Dashboard
+from adaptune.commands.terminal import Dashboard
 from adaptune.odometry.tracker import RegisteredScan
 from adaptune.space import Selection
 from online.replay import Choice, ReplayRecord
