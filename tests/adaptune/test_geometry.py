@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rooms import moved
 from scipy.spatial.transform import Rotation
 
 from adaptune.geometry import (
@@ -27,13 +28,6 @@ def random_poses(seed, *shape, size=50.0):
     count = int(np.prod(shape))
     T[..., :3, :3] = Rotation.random(count, rng=rng).as_matrix().reshape(*shape, 3, 3)
     T[..., :3, 3] = rng.uniform(-size, size, (*shape, 3))
-    return T
-
-
-def pose(angle_z=0.0, x=0.0, y=0.0, z=0.0):
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_euler("z", angle_z).as_matrix()
-    T[:3, 3] = x, y, z
     return T
 
 
@@ -68,10 +62,10 @@ def test_rectified_rotations_are_rotations(seed, noise):
 @given(seeds)
 def test_steps_lead_from_the_first_pose_to_the_last(seed):
     T = random_poses(seed, 6)
-    moved = T[0]
+    reached = T[0]
     for step in steps(T):
-        moved = moved @ step
-    np.testing.assert_allclose(moved, T[-1], atol=1e-10)
+        reached = reached @ step
+    np.testing.assert_allclose(reached, T[-1], atol=1e-10)
 
 
 @pytest.mark.parametrize(
@@ -81,7 +75,7 @@ def test_rotation_angle(angle):
     rng = np.random.default_rng(3)
     for _ in range(5):
         axis = rng.normal(size=3)
-        T = pose(x=3.0)
+        T = moved(x=3.0)
         T[:3, :3] = Rotation.from_rotvec(angle * axis / np.linalg.norm(axis)).as_matrix()
         assert rotation_angle(T) == pytest.approx(angle, rel=1e-7, abs=1e-14)
     assert rotation_angle(np.tile(T, (2, 3, 1, 1))).shape == (2, 3)
@@ -128,7 +122,7 @@ def test_interpolation_at_the_stamps_gives_the_very_poses(seed):
 
 def test_nothing_is_interpolated_outside_or_in_gaps():
     stamps = np.array([0, 10, 20, 50, 60])
-    T = np.array([pose(x=float(s)) for s in stamps])
+    T = np.array([moved(x=float(s)) for s in stamps])
     at = np.array([-1, 0, 5, 15, 20, 21, 35, 49, 50, 55, 60, 61])
     x = interpolate(stamps, T, at, max_gap=10)[:, 0, 3]
     nan = np.nan

@@ -4,6 +4,7 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
+import rooms
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -77,12 +78,6 @@ def test_scans_of_another_sensor_get_the_fixed_set(caplog):
     assert all(s.trial == 5 and s.parameters == {"speed": 8.0} for s in made)
 
 
-def moving(metres):
-    T = np.eye(4)
-    T[0, 3] = metres
-    return Motions(T, {})
-
-
 def with_motion():
     """Two places that differ by how fast they were passed, and by which set is better."""
     model = of_two_caves()
@@ -109,7 +104,7 @@ def test_its_motion_is_that_of_the_last_second_of_poses(by_motion, steps):
     selector, scan = by_motion, Scan(0, np.zeros((0, 3), np.float32))
     selector.reset()
     for i, stamp in enumerate(stamps.tolist()):
-        motions = STILL if i < 2 else moving(steps[i - 1][1])
+        motions = STILL if i < 2 else Motions(rooms.moved(steps[i - 1][1]), {})
         selector.observe(stamp, scan, motions)
         with patch("adaptune.selector.fill_in") as fill_in:
             selector.select()

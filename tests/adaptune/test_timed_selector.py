@@ -7,6 +7,7 @@ from pathlib import Path
 import drives
 import numpy as np
 import pytest
+import rooms
 from random_models import random_model
 
 from adaptune.odometry.base import InProcess, Motions
@@ -20,9 +21,7 @@ GUIDE = Path(__file__).parents[2] / "docs/adapting-live.md"
 
 
 def moved(metres):
-    T = np.eye(4)
-    T[0, 3] = metres
-    return Motions(T, {})
+    return Motions(rooms.moved(metres), {})
 
 
 class Counting:

@@ -159,7 +159,3 @@ def test_a_telephone_scrolls_tables_and_charts_and_not_the_page(opened):
     assert opened.evaluate("document.documentElement.scrollWidth") == 390
     assert opened.evaluate("document.querySelector('.box').scrollWidth") > 390
     opened.set_viewport_size({"width": 1280, "height": 900})
-
-
-def test_the_page_is_printed(opened):
-    assert opened.pdf(format="A4").count(b"/Type /Page\n") > 2
