@@ -7,7 +7,6 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from adaptune.metrics import (
-    KITTI_LENGTHS,
     absolute_error,
     bootstrap,
     kitti_error,
@@ -15,7 +14,6 @@ from adaptune.metrics import (
     sub_trajectory_rte,
     window_ends,
 )
-from adaptune.trajectory import read_kitti
 
 modest = settings(max_examples=40, deadline=None)
 seeds = st.integers(0, 2**32 - 1)
@@ -135,25 +133,6 @@ def test_the_end_is_the_first_frame_beyond_the_length():
     np.testing.assert_array_equal(window_ends(T, 6.5), [-1] * 8)
     np.testing.assert_array_equal(window_ends(T[:0], 1.0), [])
     np.testing.assert_array_equal(window_ends(T[:1], 1.0), [-1])
-
-
-def test_kitti_error_of_a_recorded_pair(recorded):
-    folder = recorded / "kitti_00"
-    T_ref = read_kitti(folder / "ground_truth_kitti.txt")
-    T_est = read_kitti(folder / "kiss_icp_kitti.txt")
-    error = kitti_error(T_ref, T_est)
-    assert error.translation == pytest.approx(0.5283, abs=5e-5)
-    # Found by the arc cosine of a trace, which the rounding of the files reaches.
-    assert error.rotation == pytest.approx(0.001887, abs=1e-6)
-    assert error.lengths == KITTI_LENGTHS
-
-
-def test_errors_of_a_recorded_pair_are_those_of_evo(recorded):
-    folder = recorded / "kitti_00"
-    T_ref = read_kitti(folder / "ground_truth_kitti.txt")
-    T_est = read_kitti(folder / "kiss_icp_kitti.txt")
-    assert absolute_error(T_ref, T_est) == pytest.approx(3.500719, abs=1e-6)
-    assert relative_error(T_ref, T_est) == pytest.approx(0.034188, abs=1e-6)
 
 
 def test_errors_worked_by_hand():
