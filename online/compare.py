@@ -143,7 +143,7 @@ def _missing(
 def replayed_by(asked: Sequence[str], mode: str) -> str:
     """The command that replays a mode, given those on demand that the study asks for."""
     on_demand = mode in ALSO and mode not in asked
-    option = "--untrained" if mode == UNTRAINED else "--thorough"
+    option = "--untrained" if mode == UNTRAINED else "-o online.modes=all"
     return f"`adaptune online{f' {option}' if on_demand else ''}`"
 
 
