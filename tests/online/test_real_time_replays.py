@@ -105,9 +105,9 @@ def test_the_command_takes_a_rate(study_file, trained_folder, tmp_path):
     folder = shutil.copytree(trained_folder, tmp_path / "run")
     given = [study_file, "--folder", folder, "-o", "online.modes=[adaptive]"]
     first, again = (call("online", *given, "-o", "online.real_time.rate=20") for _ in range(2))
-    assert "3 of 3 replays made" in first.output
+    assert "3 replays made" in first.output
     assert json.loads((folder / "replays/three/fixed/replay.json").read_text())["real_time"]
-    assert "All 3 replays were there" in again.output
+    assert "All replays were there" in again.output
     assert call("compare", *given).exit_code == 0
     refused = call("online", *given, "-o", "online.real_time.rate=-1")
     assert refused.exit_code == 2
