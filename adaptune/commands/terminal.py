@@ -9,7 +9,7 @@ import signal
 import sys
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -122,8 +122,10 @@ def progress(above: Any = None) -> Iterator[Progress]:
             told = time.monotonic()
             log.info("%s: %d of %d%s", what, done, total, words and f", {words}")
 
-    shown = bars if above is None else Group(above, bars)
-    with Live(shown, console=errors) if errors.is_terminal else nullcontext():
+    live: AbstractContextManager[object] = nullcontext()
+    if errors.is_terminal:
+        live = Live(bars if above is None else Group(above, bars), console=errors)
+    with live:
         yield show
 
 
