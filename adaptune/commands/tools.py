@@ -73,7 +73,7 @@ def _sub_trajectory(found: "Inspection", deep: bool, show: Progress) -> tuple[st
 
     Only what can be used to train is measured.
     """
-    if found.reference is None:
+    if found.reference is None or not found.name or found.missing.get("offline"):
         return UNKNOWN_LENGTH, ""
     from adaptune.recording.recording import open_sequence
     from adaptune.reference import check
@@ -81,8 +81,6 @@ def _sub_trajectory(found: "Inspection", deep: bool, show: Progress) -> tuple[st
     usual = check.proposed_sub_trajectory(found.reference)
     if not deep:
         return str(usual), "`--deep` also measures how wrong it is"
-    if not found.name or found.missing.get("offline"):
-        return str(usual), ""
     try:
         scans = open_sequence(found.config())
         if (reference := scans.reference()) is None:
