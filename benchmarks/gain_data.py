@@ -22,6 +22,7 @@ from adaptune.space import ParameterSets, ParameterSpace
 from offline.config import OfflineConfig
 from offline.labelled import (
     BankSimulation,
+    Extent,
     LabelledData,
     LabelledSequence,
     error_vectors,
@@ -98,7 +99,7 @@ def run(path: Path, course: Course, odometry: str, seed: int) -> None:
     course_scans: Any = SharedCourse(path.stem, scans, frames)
     trials = run_trials(settings, factory, course_scans, sets)
     length = settings.sub_trajectory
-    vectors = [error_vectors(frames, trial, length) for trial in trials]
+    vectors = [error_vectors(frames.T_ref_sensor, trial, length) for trial in trials]
     motions = recorded_motions(frames, trials)[..., :3, :]
     with replacing(path) as temporary, temporary.open("wb") as file:
         np.savez_compressed(
@@ -163,11 +164,18 @@ def labelled_sequence(name: str, found: Any) -> LabelledSequence:
         Hops(*(found[f"hops_{name}"] for name in Hops._fields)),
         partial(np.take, motions, axis=1),
     )
-    return LabelledSequence(
-        name,
-        period[known],
-        described[known],
-        errors[known],
-        vectors=dict(enumerate(np.moveaxis(found["vectors"][known], 1, 0))),
-        simulation=simulation,
-    )
+    return in_place(name, simulation, errors[known], found["vectors"][known], known)
+
+
+def in_place(
+    name: str,
+    simulation: BankSimulation,
+    errors: NDArray[np.float32],
+    vectors: NDArray[np.float32],
+    known: NDArray[np.bool_],
+) -> LabelledSequence:
+    """A recording of one stretch, with the errors of all sets on its known frames."""
+    extent = Extent.of(simulation.T_ref_sensor, known, simulation.length)
+    of = (name, name, simulation, extent, np.zeros(len(errors), np.intp), errors)
+    of_sets = dict(enumerate(np.moveaxis(vectors, 1, 0)))
+    return LabelledSequence(*of, errors[:, 0].astype(float), {"ndt": N_FEATURES}, of_sets)

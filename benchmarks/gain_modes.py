@@ -11,7 +11,7 @@ from adaptune.live.hops import Hop
 from adaptune.metrics import sub_trajectory_rte, travelled, window_ends
 from adaptune.model.weights import MemberWeights, clip_errors, minimum_variance_weights
 from offline.labelled import LabelledData, LabelledSequence, chained, periods
-from offline.tuning import bank_errors, cancelling_members
+from offline.tuning import cancelling_members
 from offline.validate import Validation, leave_one_out, leave_out
 
 Errors = dict[str, NDArray[np.float64]]
@@ -38,7 +38,7 @@ def by_kind(data: LabelledData, size: int) -> None:
     for kind in KINDS:
         others = data._replace(sequences=[s for s in data.sequences if kind not in scenes[s.name]])
         left_out = [
-            leave_out(s, others, None, size, by_recording=True)
+            leave_out(s, others, size, by_recording=True)
             for s in data.sequences
             if kind in scenes[s.name]
         ]
@@ -71,7 +71,6 @@ def own_errors(data: LabelledData) -> None:
 def own_errors_on(sequence: LabelledSequence) -> Iterator[tuple[float, float, float, float]]:
     """The estimate, its interval and the true error, after every hop of every set."""
     simulation = sequence.simulation
-    assert simulation is not None
     T_ref, hops, length = simulation.T_ref_sensor, simulation.hops, simulation.length
     metres, ends = travelled(T_ref), window_ends(T_ref, length)
     seconds = (simulation.stamps - simulation.stamps[0]) * 1e-9
@@ -94,7 +93,7 @@ def own_errors_on(sequence: LabelledSequence) -> Iterator[tuple[float, float, fl
 
 def constantly(sequence: LabelledSequence, members: Sequence[int]) -> Errors:
     """Errors of a bank whose weights stay the same."""
-    assert sequence.simulation is not None
+    simulation = sequence.simulation
     vectors, lost = clip_errors(np.stack([sequence.vectors[m] for m in members], axis=1), 0)
     squares = np.einsum("ijx,ikx->jk", vectors, vectors) + np.diag((lost**2).sum(axis=0))
     modes = {
@@ -102,9 +101,11 @@ def constantly(sequence: LabelledSequence, members: Sequence[int]) -> Errors:
         # Nobody who has not been there knows them.
         "bank, best weights": minimum_variance_weights(squares),
     }
-    n_periods = len(periods(sequence.simulation.period)[0])
+    n_periods = len(periods(simulation.period)[0])
     return {
-        mode: bank_errors(sequence, MemberWeights(tuple(members), np.tile(weights, (n_periods, 1))))
+        mode: simulation.errors(MemberWeights(tuple(members), np.tile(weights, (n_periods, 1))))[
+            sequence.extent.frames
+        ]
         for mode, weights in modes.items()
     }
 

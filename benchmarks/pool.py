@@ -21,7 +21,6 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +31,6 @@ from replays import ORDERS, mean_error
 
 from adaptune.bank.bank import Bank
 from adaptune.model import ErrorModel
-from adaptune.model.ndt import N_FEATURES
 from adaptune.odometry.remote import SERVICE
 from adaptune.odometry.tracker import HealthCheck
 from adaptune.processes import server
@@ -55,11 +53,11 @@ DRIVEN_LENGTH = 40.0
 def left_out(data: LabelledData) -> None:
     """Leave each course out in turn, and print ratios and costs."""
     fixed_set = None if data.budget is None else data._replace(budget=None)
-    validation = leave_one_out(data, {} if fixed_set is None else None)
+    validation = leave_one_out(data)
     print_left_out(validation)
     if fixed_set is not None:
         # The fixed set without a budget.
-        free = leave_one_out(fixed_set, {}, bank=0)
+        free = leave_one_out(fixed_set, bank=0)
         pairs = zip(validation.left_out, free.left_out, strict=True)
         ratio = np.array([a.errors[PAIRED].mean() / b.errors["fixed"].mean() for a, b in pairs])
         print(f"within the budget, adaptive / fixed without it: {_words(ratio)}")
@@ -96,8 +94,6 @@ def _words(ratio: NDArray[np.float64]) -> str:
 
 def model_of(data: LabelledData) -> ErrorModel:
     """The error model with what is driven and its rivals."""
-    sequences = [replace(s, blocks={"ndt": N_FEATURES}) for s in data.sequences]
-    data = data._replace(sequences=sequences)
     model = fit(data, data.fixed(), pool().identity, 25.0, WINDOW, {})
     return tuned(model, data, SwitchingConfig())
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from gain_data import PERIOD, WINDOW, SharedCourse, training_courses
+from gain_data import PERIOD, WINDOW, SharedCourse, in_place, training_courses
 from numpy.typing import NDArray
 
 from adaptune.archive import PREPARE_MS, REGISTER_MS, Frames
@@ -102,7 +102,8 @@ def _write(path: Path, odometry: str, sets: list[ParameterSet], course: SharedCo
     settings, frames = TrialSettings(), course.frames
     scans: Any = course
     trials = run_trials(settings, pool().factories[odometry], scans, sets)
-    vectors = [error_vectors(frames, trial, settings.sub_trajectory) for trial in trials]
+    T_ref_sensor, length = frames.T_ref_sensor, settings.sub_trajectory
+    vectors = [error_vectors(T_ref_sensor, trial, length) for trial in trials]
     motions = recorded_motions(frames, trials)[..., :3, :]
     with replacing(path) as temporary, temporary.open("wb") as file:
         np.savez_compressed(
@@ -167,11 +168,4 @@ def _labelled(name: str, found: list[dict[str, NDArray[Any]]]) -> LabelledSequen
         Hops(*(first[f"hops_{key}"] for key in Hops._fields)),
         partial(np.take, motions, axis=1),
     )
-    return LabelledSequence(
-        name,
-        period[known],
-        described[known],
-        errors[known],
-        vectors=dict(enumerate(np.moveaxis(vectors[known], 1, 0))),
-        simulation=simulation,
-    )
+    return in_place(name, simulation, errors[known], vectors[known], known)

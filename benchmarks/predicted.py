@@ -18,16 +18,16 @@ from replays import bank_of, mean_error, model_of, of_world, replays_of
 from adaptune.metrics import cap
 from adaptune.simulation.record import simulate
 from offline.labelled import LabelledData, LabelledSequence
-from offline.tuning import Policy, bank_data, bank_errors, bank_evidence, weights_along
+from offline.tuning import Policy, bank_errors
 
 BOUND = 1.1
 
 
 def predict(sequence: LabelledSequence, others: LabelledData, chosen: Policy) -> float:
     """Mean error of a bank on a sequence that is left out, by its members' recorded motions."""
-    data, pca = others.training_data()
-    near = bank_evidence(sequence, bank_data(others, data, chosen.members), pca, chosen.bank)
-    return float(bank_errors(sequence, weights_along(sequence, near, chosen.bank)).mean())
+    fitted = others.training_data()
+    errors, _ = next(bank_errors(sequence, others, fitted, chosen.members, [chosen.bank]))
+    return float(errors.mean())
 
 
 def main() -> None:

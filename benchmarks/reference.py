@@ -25,7 +25,6 @@ from scipy.stats import spearmanr
 
 from adaptune.files import replacing
 from adaptune.metrics import cap, sub_trajectory_rte, sub_trajectory_vectors
-from adaptune.model import PairedExpectedRatio
 from adaptune.reference.estimate import VERSION, estimated
 from adaptune.reference.graph import pass_over
 from adaptune.reference.stored import EstimateError
@@ -158,8 +157,7 @@ def trained(data: LabelledData, estimates: LabelledData, size: int) -> None:
             ("estimate", of_truth, without),
             ("circular", of_estimate, without),
         ):
-            rules: dict[str, Any] = {PAIRED: PairedExpectedRatio()}
-            found[name].append(validation.leave_out(left, others, rules, size, True))
+            found[name].append(validation.leave_out(left, others, size, True))
     for name, what in (
         ("truth", "trained with truth, judged by truth"),
         ("estimate", "trained without truth, judged by truth"),

@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 from adaptune.bank.bank import Bank
 from adaptune.metrics import cap, sub_trajectory_rte
 from adaptune.model import ErrorModel
-from adaptune.model.ndt import N_FEATURES
 from adaptune.model.rules import ERROR_FLOOR
 from adaptune.model.weights import weighted_selection
 from adaptune.odometry.base import Motions, OdometryInstance
@@ -81,9 +80,7 @@ def geometric(data: LabelledData) -> int:
 
 def model_of(odometry: str, data: LabelledData) -> ErrorModel:
     """The error model, with the settings of the paired rule chosen on the same sequences."""
-    sequences = [replace(s, blocks={"ndt": N_FEATURES}) for s in data.sequences]
-    identity = factory_of(odometry).identity
-    model = fit(data._replace(sequences=sequences), data.fixed(), identity, 25.0, WINDOW, {})
+    model = fit(data, data.fixed(), factory_of(odometry).identity, 25.0, WINDOW, {})
     return replace(model, paired=choose(data, 0).one_set)
 
 
@@ -98,7 +95,7 @@ def bank_of(
     data: LabelledData, model: ErrorModel, factory: OdometryFactory, size: int
 ) -> tuple[Policy, Way]:
     """A bank that is chosen on sequences, and what chose it."""
-    chosen = choose(data, size, one_set=False)
+    chosen = choose(data._replace(live=False), size)
     members = {trial: model.sets[trial] for trial in chosen.members}
     of_bank = replace(
         model,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune.archive import PREPARE_MS, REGISTER_MS, Archive, Frames, Summary, Trial
+from adaptune.archive import PREPARE_MS, REGISTER_MS, Archive, Frames, Trial
 from adaptune.bank.members import LEVER, Agreement, share
 from adaptune.geometry import Poses, invert, mean_motion, rectify, rotation_angle, steps
 from adaptune.live.evidence import SPACING
@@ -37,7 +37,7 @@ from adaptune.recording.scan import origin, places, stretch_numbers
 from adaptune.space import ParameterSets
 from adaptune.study.study import MIN_RECORDINGS, PER_STRETCH
 from offline.campaign import mean_values, read_whole_runs, whole_errors, whole_values
-from offline.config import Metric, OfflineStudyConfig
+from offline.config import OfflineStudyConfig
 from offline.objective import (
     affordable,
     best_candidates,
@@ -59,16 +59,15 @@ MISFIT_PER_METRE = 0.25
 """By how much farther a scan is from the one before, about, in a metre by which it is misplaced."""
 
 
-def error_vectors(frames: Frames, trial: Trial, length: float) -> NDArray[np.float32]:
+def error_vectors(T_ref_sensor: Poses, trial: Trial, length: float) -> NDArray[np.float32]:
     """Errors of a trial as vectors, see `sub_trajectory_vectors`.
 
     Their lengths are the trial's errors. Where a trial was run several times, their directions are
-    those of the first run.
+    those of the first run. The reference is of shape (n_frames, 4, 4), the length in metres.
 
     Returns shape (n_frames, 3).
     """
-    T_ref_sensor, T_odom_sensor = frames.T_ref_sensor, trial.T_odom_sensor
-    vectors = sub_trajectory_vectors(T_ref_sensor, T_odom_sensor, length, trial.restarted)
+    vectors = sub_trajectory_vectors(T_ref_sensor, trial.T_odom_sensor, length, trial.restarted)
     vectors[np.isinf(trial.errors)] = np.inf
     lengths = np.linalg.norm(vectors, axis=1)
     finite = np.isfinite(lengths) & (lengths > 0.0)
@@ -104,8 +103,6 @@ class BankSimulation:
     def _measured(self, members: tuple[int, ...]) -> list[LiveSquares | None]:
         first = np.unique(self.period, return_index=True)[1]
         start, end, T_start_end, projection = self.hops
-        if not len(start):
-            return [None] * len(first)
         T_previous_current = self.motions(members)
         known = np.asarray(np.isfinite(T_previous_current).all(axis=(-2, -1)))
         T_odom_sensor = chained(np.where(known[..., None, None], T_previous_current, np.eye(4)))
@@ -204,23 +201,6 @@ def recorded_motions(frames: Frames, trials: Sequence[Trial]) -> Poses:
     return motions
 
 
-def motions_from_archive(
-    archive: Archive, name: str, frames: Frames
-) -> Callable[[tuple[int, ...]], Poses]:
-    """Read the motions of trials on a sequence when they are asked for; see `BankSimulation`."""
-
-    @cache
-    def read(trial: int) -> Trial:
-        return archive.read(name, trial)
-
-    @lru_cache(maxsize=1)
-    def motions(trials: tuple[int, ...]) -> Poses:
-        # One bank after the other is asked for, each many times.
-        return recorded_motions(frames, [read(trial) for trial in trials])
-
-    return motions
-
-
 MARGIN_FRAMES = 2
 """Frames that a part of a simulation is longer than its stretch: a distance that is summed from
 another frame may differ in its last bits, and a sub-trajectory then ends one frame later."""
@@ -229,12 +209,10 @@ another frame may differ in its last bits, and a sub-trajectory then ends one fr
 class Extent(NamedTuple):
     """Where the labelled frames of a sequence are, and how far their sub-trajectories reach."""
 
-    frames: NDArray[np.intp]  # (n,): their numbers among all frames of the sequence
+    T_ref_sensor: Poses  # (n_frames, 4, 4): of all frames of the sequence
+    frames: NDArray[np.intp]  # (n,): numbers of the labelled ones
     ends: NDArray[np.intp]  # (n,): last frames of their sub-trajectories
-    # Metres: where these frames are, and where their sub-trajectories end, each of shape (n, 3).
-    positions: NDArray[np.float64]
-    end_positions: NDArray[np.float64]
-    length: float  # of a sub-trajectory
+    length: float  # metres of a sub-trajectory
 
     @classmethod
     def of(cls, T_ref_sensor: Poses, known: NDArray[np.bool_], length: float) -> Self:
@@ -243,18 +221,21 @@ class Extent(NamedTuple):
         `T_ref_sensor` is of shape (n_frames, 4, 4), `known` of (n_frames,), `length` in metres.
         """
         frames = np.flatnonzero(known)
-        ends = window_ends(T_ref_sensor, length)[frames]
-        at = T_ref_sensor[:, :3, 3]
-        return cls(frames, ends, at[frames], at[ends], length)
+        return cls(T_ref_sensor, frames, window_ends(T_ref_sensor, length)[frames], length)
+
+    @property
+    def positions(self) -> NDArray[np.float64]:
+        """Where these frames are in metres, of shape (n, 3)."""
+        return self.T_ref_sensor[self.frames, :3, 3]
+
+    @property
+    def end_positions(self) -> NDArray[np.float64]:
+        """Where their sub-trajectories end in metres, of shape (n, 3)."""
+        return self.T_ref_sensor[self.ends, :3, 3]
 
     def some(self, kept: NDArray[np.bool_]) -> Self:
         """The same of some of the frames."""
-        return self._replace(
-            frames=self.frames[kept],
-            ends=self.ends[kept],
-            positions=self.positions[kept],
-            end_positions=self.end_positions[kept],
-        )
+        return self._replace(frames=self.frames[kept], ends=self.ends[kept])
 
     def near(self, left_out: "Extent", is_view: bool) -> NDArray[np.bool_]:
         """Which frames must not be known where others of the same recording are left out.
@@ -275,52 +256,27 @@ class Extent(NamedTuple):
             found = near | ~(before | (self.frames > left_out.ends.max()))
         return np.asarray(found)
 
+    def stretches(self) -> NDArray[np.intp]:
+        """Number of each labelled frame's stretch along the reference, of shape (n,).
 
-def cut(T_ref_sensor: Poses, extent: Extent) -> NDArray[np.intp]:
-    """Number of each labelled frame's stretch along the reference, of shape (n,).
+        The last piece joins the stretch before if it is shorter than half a stretch.
+        """
+        if not len(self.frames):
+            return np.empty(0, np.intp)
+        size = PER_STRETCH * self.length
+        distance = travelled(self.T_ref_sensor)[self.frames]
+        distance -= distance[0]
+        n_stretches = max(1, int(distance[-1] / size + 0.5))
+        return np.minimum((distance / size).astype(np.intp), n_stretches - 1)
 
-    The last piece joins the stretch before if it is shorter than half a stretch.
-    """
-    if not len(extent.frames):
-        return np.empty(0, np.intp)
-    size = PER_STRETCH * extent.length
-    distance = travelled(T_ref_sensor)[extent.frames]
-    distance -= distance[0]
-    n_stretches = max(1, int(distance[-1] / size + 0.5))
-    return np.minimum((distance / size).astype(np.intp), n_stretches - 1)
+    def stretches_of(self, recording: "Extent", numbers: NDArray[np.intp]) -> NDArray[np.intp]:
+        """Number of the stretch of a recording that each frame of a view shows, of shape (n,).
 
+        It is that of the recording's nearest frame: a view shares the recording's reference.
+        """
+        from scipy.spatial import cKDTree
 
-def stretches_of_view(
-    view: Extent, recording: Extent, numbers: NDArray[np.intp]
-) -> NDArray[np.intp]:
-    """Number of the stretch that each frame of a view shows, of shape (n,).
-
-    It is that of the recording's nearest frame: a view shares the recording's reference.
-    """
-    from scipy.spatial import cKDTree
-
-    return np.asarray(numbers[cKDTree(recording.positions).query(view.positions)[1]])
-
-
-def part_of(simulation: BankSimulation, extent: Extent) -> tuple[BankSimulation, Extent]:
-    """The part of a simulation that a stretch takes, and the stretch's extent in it."""
-    first = int(extent.frames.min())
-    stop = min(int(extent.ends.max()) + 1 + MARGIN_FRAMES, len(simulation.stamps))
-    frames = slice(first, stop)
-
-    def motions(members: tuple[int, ...]) -> Poses:
-        return simulation.motions(members)[first : stop - 1]
-
-    part = replace(
-        simulation,
-        stamps=simulation.stamps[frames],
-        T_ref_sensor=simulation.T_ref_sensor[frames],
-        descriptors=simulation.descriptors[frames],
-        period=simulation.period[frames],
-        hops=simulation.hops.part(first, stop),
-        motions=motions,
-    )
-    return part, extent._replace(frames=extent.frames - first, ends=extent.ends - first)
+        return np.asarray(numbers[cKDTree(recording.positions).query(self.positions)[1]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -328,85 +284,77 @@ class LabelledSequence:
     """The frames of a sequence that have a sub-trajectory, and the errors of sets there."""
 
     name: str
-    # (n,): whole periods since the first scan: in each, one selection holds.
-    period: NDArray[np.int64]
-    descriptors: NDArray[np.float32]  # (n, n_features)
+    recording: str  # that it is, or is a part or a view of
+    simulation: BankSimulation  # of all frames
+    extent: Extent  # where the labelled frames are
+    stretch: NDArray[np.intp]  # (n,): number of each frame's stretch, the same in a view
     # (n, n_sets): percent, infinite where the track was lost, NaN where a set was not run.
     errors: NDArray[np.float32]
-    # By name, in order, the lengths of the descriptors; one descriptor when left out.
-    blocks: Mapping[str, int] | None = None
-    # (n,): errors of the baseline, which may exceed limits; those of the first set when left out.
-    baseline: NDArray[np.float64] | None = None
+    baseline: NDArray[np.float64]  # (n,): errors of the baseline, which may exceed limits
+    blocks: Mapping[str, int]  # by name, in order, the lengths of the descriptors
+    # By trial number (n, 3): errors of the best sets as vectors, see `adaptune.model.TrainingData`.
+    vectors: Mapping[int, NDArray[np.float32]] = field(default_factory=dict)
     # (n_sets,): the objective that chooses the fixed set; the mean capped error when left out.
     values: NDArray[np.float64] | None = None
     # (n_sets, n_repeats): where trials are repeated, the objective of every run.
     repeats: NDArray[np.float64] | None = None
-    # (n_sets,): sets that were searched for on this sequence or a view of it alone. Where the
-    # sequence is left out, they are unknown.
+    # (n_sets,): sets that were searched for on this sequence or a view of it alone, if any. Where
+    # the sequence is left out, they are unknown.
     own: NDArray[np.bool_] | None = None
     block: int = 1  # frames of a sub-trajectory
     elevation: float = np.nan  # degrees, see `adaptune.model.descriptor.lowest_elevation`
-    # By trial number (n, 3): errors of the best sets as vectors, see `adaptune.model.TrainingData`.
-    vectors: Mapping[int, NDArray[np.float32]] = field(default_factory=dict)
     # By trial number, the objective in whole runs of the candidates for the fixed set.
     whole: Mapping[int, float] = field(default_factory=dict)
-    # By trial number (n,): errors in these whole runs.
-    whole_errors: Mapping[int, NDArray[np.float64]] = field(default_factory=dict)
-    # Whether the objective is that of the errors alone, and so is known on some frames, too.
-    by_frames: bool = False
-    # What it is a part or a view of; it alone when left out.
-    recorded_in: str = ""
-    # With all frames; without it there is no bank.
-    simulation: BankSimulation | None = None
-    # Number of each frame's stretch, of shape (n,), the same in a view; one stretch when left out.
-    cuts: NDArray[np.intp] | None = None
-    extent: Extent | None = None  # where the frames are; without it there is one stretch
+    # By trial number (n,): errors in these whole runs, where the objective is that of the errors
+    # alone, and so is known on some frames, too; else None.
+    whole_errors: Mapping[int, NDArray[np.float64]] | None = None
 
     @cached_property
-    def stretch(self) -> NDArray[np.intp]:
-        """Number of each frame's stretch, of shape (n,)."""
-        return np.zeros(len(self.errors), np.intp) if self.cuts is None else self.cuts
+    def period(self) -> NDArray[np.int64]:
+        """Whole periods since the first scan, of shape (n,): in each, one selection holds."""
+        return self.simulation.period[self.extent.frames]
 
-    @property
-    def recording(self) -> str:
-        """The recording that it is, or is a part or a view of."""
-        return self.recorded_in or origin(self.name)
+    @cached_property
+    def descriptors(self) -> NDArray[np.float32]:
+        """Averaged descriptors, of shape (n, n_features)."""
+        return self.simulation.descriptors[self.extent.frames]
 
     def frames(self, kept: NDArray[np.bool_]) -> "LabelledSequence":
         """The same with some of the frames."""
         if kept.all():
             return self
-        few = {n: errors[kept] for n, errors in self.whole_errors.items() if kept.any()}
-        whole = {n: float(cap(errors).mean()) for n, errors in few.items()}
-        return replace(
+        some = replace(
             self,
-            period=self.period[kept],
-            descriptors=self.descriptors[kept],
+            extent=self.extent.some(kept),
+            stretch=self.stretch[kept],
             errors=self.errors[kept],
-            baseline=None if self.baseline is None else self.baseline[kept],
-            # Where errors alone are the objective, it is that of the frames that are left.
-            values=None if self.by_frames else self.values,
-            repeats=None if self.by_frames else self.repeats,
+            baseline=self.baseline[kept],
             vectors={trial: vectors[kept] for trial, vectors in self.vectors.items()},
-            whole=whole if self.by_frames else self.whole,
-            whole_errors=few,
-            cuts=self.stretch[kept],
-            extent=None if self.extent is None else self.extent.some(kept),
         )
+        if self.whole_errors is None or not kept.any():
+            return some
+        few = {n: errors[kept] for n, errors in self.whole_errors.items()}
+        whole = {n: float(cap(errors).mean()) for n, errors in few.items()}
+        # The objective is that of the frames that are left.
+        return replace(some, values=None, repeats=None, whole=whole, whole_errors=few)
 
-    def left_out(self, number: int) -> "LabelledSequence":
-        """A stretch, with the part of the simulation that it takes."""
-        one = self.frames(self.stretch == number)
-        if one.simulation is None or one.extent is None:
-            return one
-        simulation, extent = part_of(one.simulation, one.extent)
-        return replace(one, simulation=simulation, extent=extent)
-
-    def without(self, left_out: Extent | None, is_view: bool) -> "LabelledSequence":
-        """The same without what must not be known where a stretch is left out."""
-        if self.extent is None or left_out is None:
-            return self.frames(np.zeros(len(self.errors), bool))
-        return self.frames(~self.extent.near(left_out, is_view))
+    def part(self) -> "LabelledSequence":
+        """The same with the part of the simulation that its frames take."""
+        extent, simulation = self.extent, self.simulation
+        first = int(extent.frames.min())
+        stop = min(int(extent.ends.max()) + 1 + MARGIN_FRAMES, len(simulation.stamps))
+        frames = slice(first, stop)
+        part = replace(
+            simulation,
+            stamps=simulation.stamps[frames],
+            T_ref_sensor=simulation.T_ref_sensor[frames],
+            descriptors=simulation.descriptors[frames],
+            period=simulation.period[frames],
+            hops=simulation.hops.part(first, stop),
+            motions=lambda members: simulation.motions(members)[first : stop - 1],
+        )
+        its = Extent(part.T_ref_sensor, extent.frames - first, extent.ends - first, extent.length)
+        return replace(self, simulation=part, extent=its)
 
     def subset(self, columns: NDArray[np.intp]) -> "LabelledSequence":
         """The same with some of the sets."""
@@ -424,7 +372,7 @@ class LabelledData(NamedTuple):
 
     sequences: Sequence[LabelledSequence]
     sets: ParameterSets  # the columns of their errors
-    costs: Costs | None = None  # of the sets, as far as they are known
+    costs: Costs = Costs({}, np.nan)  # of the sets, as far as they are known
     # Milliseconds of CPU time a scan that may be spent, live evidence included.
     budget: float | None = None
     live: bool = True  # whether the odometry changes from one set to another between scans
@@ -438,8 +386,7 @@ class LabelledData(NamedTuple):
     def complete(self) -> "LabelledData":
         """The same with the sets that were run on all sequences, on every frame."""
         missing = np.array([np.isnan(s.errors).any(axis=0) for s in self.sequences])
-        everywhere = np.flatnonzero(~missing.any(axis=0))
-        return self.subset([self.sets.trials[column] for column in everywhere])
+        return self.subset([self.sets.trials[c] for c in np.flatnonzero(~missing.any(axis=0))])
 
     @property
     def recordings(self) -> list[str]:
@@ -462,24 +409,20 @@ class LabelledData(NamedTuple):
         for one in self.sequences:
             if origin(one.name) != one.name:
                 continue
+            elsewhere = [s for s in self.sequences if s.recording != one.recording]
             if by_recording:
-                others = [s for s in self.sequences if s.recording != one.recording]
-                folds.append((one, self._replace(sequences=others)))
-            else:
-                folds += [self._without(one, int(n)) for n in np.unique(one.stretch)]
-        return [(one, others) for one, others in folds if others.sequences]
-
-    def _without(
-        self, one: LabelledSequence, number: int
-    ) -> tuple[LabelledSequence, "LabelledData"]:
-        """A stretch of a recording, and all that may be known where it is left out."""
-        left = one.frames(one.stretch == number)
-        others = [
-            s if s.recording != one.recording else s.without(left.extent, s.name != one.name)
-            for s in self.sequences
-        ]
-        known = [s for s in others if len(s.errors)]
-        return one.left_out(number), self._replace(sequences=known)
+                folds.append((one, elsewhere))
+                continue
+            for number in np.unique(one.stretch):
+                left = one.frames(one.stretch == number)
+                known = [
+                    s
+                    if s.recording != one.recording
+                    else s.frames(~s.extent.near(left.extent, s.name != one.name))
+                    for s in self.sequences
+                ]
+                folds.append((left.part(), [s for s in known if len(s.errors)]))
+        return [(left, self._replace(sequences=others)) for left, others in folds if others]
 
     def stretches(self) -> NDArray[np.intp]:
         """Number of every frame's stretch, of shape (n_frames,); views share their numbers."""
@@ -519,9 +462,8 @@ class LabelledData(NamedTuple):
         AdaptuneError
             If there is none.
         """
-        if self.costs is None or not np.isfinite(budget):
-            return list(self.sets)
-        return affordable(self.costs, list(self.sets), budget)
+        trials = list(self.sets)
+        return affordable(self.costs, trials, budget) if np.isfinite(budget) else trials
 
     def best(self, trials: Collection[int]) -> int:
         """Trial number of the best of some sets, see `offline.objective.choose_fixed`.
@@ -550,8 +492,7 @@ class LabelledData(NamedTuple):
         from adaptune.model.pca import ScaledPCA  # takes long to import
 
         descriptors = np.concatenate([s.descriptors for s in self.sequences])
-        blocks = self.sequences[0].blocks
-        pca = ScaledPCA(blocks=None if blocks is None else tuple(blocks.values()))
+        pca = ScaledPCA(blocks=tuple(self.sequences[0].blocks.values()))
         data = TrainingData(
             pca.fit(descriptors).transform(descriptors),
             self.stretches(),
@@ -606,31 +547,23 @@ def measured_costs(
     """Mean costs of sets over the sequences on which they were run.
 
     `run` has for each sequence the trials that count there.
-
-    Returns
-    -------
-    Costs
-        Not a number where an older adaptune ran the trials, which did not measure them.
     """
     numbers: dict[Hashable, int] = {}
     found: dict[int, SetCost] = {}
-    counted = {name: set(trials) for name, trials in run.items()}
     for trial in sets:
-        where = [name for name, trials in counted.items() if trial in trials]
-        runs = [archive.finished(name)[trial] for name in where]
+        runs = [archive.finished(name)[trial] for name, trials in run.items() if trial in trials]
         register, prepare = (
-            float(np.mean([one.others.get(key, np.nan) for one in runs])) if runs else np.nan
+            float(np.mean([one.others.get(key, np.nan) for one in runs]))
             for key in (REGISTER_MS, PREPARE_MS)
         )
         key = odometry(sets[trial]).preparation
         found[trial] = SetCost(register, prepare, numbers.setdefault(key, len(numbers)))
-    evidence = [archive.read_frames(name).evidence_ms for name in counted]
-    return Costs(found, float(np.mean(evidence)))
+    return Costs(found, float(np.mean([archive.read_frames(name).evidence_ms for name in run])))
 
 
 def labelled_data(
     archive: Archive,
-    run: Mapping[str, Sequence[int]],
+    run: Mapping[str, Collection[int]],
     sets: ParameterSets,
     config: OfflineStudyConfig,
     window: int,
@@ -647,80 +580,51 @@ def labelled_data(
     ModelError
         If a trial is missing.
     """
+    read: dict[str, LabelledSequence] = {}
     for name, counted in run.items():
         if missing := set(counted) - set(archive.finished(name)):
             raise ModelError(
                 f"{archive.folder}: lacks trial {min(missing)} on {name}, which the model was "
                 f"fitted to; run `adaptune offline` again"
             )
-    read = [_labelled(archive, name, set(run[name]), sets, config, window) for name in run]
-    number = np.repeat(np.arange(len(read)), [len(s.errors) for s, _, _ in read])
-    means = mean_errors(np.concatenate([s.errors for s, _, _ in read]), number)
-    # With a sequence left out, others than now may be among the best. To read the poses of
-    # thousands of trials would take long.
-    order = np.argsort(means, kind="stable")[: 2 * MEMBER_POOL_SIZE]
-    best = [sets.trials[c] for c in order]
-    eligible = {t for t in (BASELINE, *best) if t in sets and np.isfinite(means[sets.column(t)])}
-    named = (n if isinstance(n, int) else sets.find(n) for n in config.online.switching.sets or ())
-    eligible |= {trial for trial in named if trial is not None}
-    slots = archive.slots()
-    owners = [owner(slots, trial) for trial in sets]
+        one = _labelled(archive, name, set(counted), sets, config, window, recorded_in(name))
+        if of := read.get(origin(name)):
+            one = replace(one, stretch=one.extent.stretches_of(of.extent, of.stretch))
+        read[name] = one
+    eligible = _eligible(list(read.values()), sets, config)
+    bounds = LabelledData(list(read.values()), sets).bounds()
+    rivals = [*best_candidates(bounds), *sets.defaults]
+    runs = read_whole_runs(archive, list(run), rivals, config.health)
     labelled = []
-    for sequence, frames, known in read:
-        name, length = sequence.name, config.sub_trajectory
+    for name, whole in whole_values(config.offline, runs).items():
+        s = read[name]
+        T_ref_sensor, frames, length = s.simulation.T_ref_sensor, s.extent.frames, s.extent.length
         vectors = {
-            trial: error_vectors(frames, archive.read(name, trial), length)[known]
-            for trial in eligible.intersection(sets).intersection(run[name])
+            trial: error_vectors(T_ref_sensor, archive.read(name, trial), length)[frames]
+            for trial in eligible.intersection(run[name])
         }
-        own = [one is not None and origin(one) == origin(name) for one in owners]
-        found = replace(sequence, own=np.array(own, bool), vectors=vectors)
-        labelled.append(replace(found, recorded_in=recorded_in(name)))
-    cut_up = _with_cuts(_with_whole_runs(archive, labelled, sets, config))
+        # Whether the objective on some frames follows from the errors there.
+        by_frames = set(config.offline.objective[0]) == {"rte"}
+        errors_of = whole_errors(archive, name, whole, frames) if by_frames else None
+        labelled.append(replace(s, vectors=vectors, whole=whole, whole_errors=errors_of))
     costs = measured_costs(archive, run, sets, odometry)
-    return LabelledData(cut_up, sets, costs, config.online.budget, odometry.description.live)
+    return LabelledData(labelled, sets, costs, config.online.budget, odometry.description.live)
 
 
-def _with_whole_runs(
-    archive: Archive,
-    labelled: Sequence[LabelledSequence],
-    sets: ParameterSets,
-    config: OfflineStudyConfig,
-) -> list[LabelledSequence]:
-    """Add what is known of the whole runs of the candidates for the fixed set."""
-    rivals = [*best_candidates(LabelledData(labelled, sets).bounds()), *sets.defaults]
-    runs = read_whole_runs(archive, [s.name for s in labelled], rivals, config.health)
-    whole = whole_values(config.offline, runs)
-    # Whether the objective on some frames follows from the errors there.
-    by_frames = set(config.offline.objective[0]) == {"rte"}
-    found = []
-    for s in labelled:
-        of = whole[s.name]
-        if by_frames and s.extent is not None:
-            errors = whole_errors(archive, s.name, of, s.extent.frames)
-            found.append(replace(s, whole=of, whole_errors=errors, by_frames=True))
-        else:
-            found.append(replace(s, whole=of))
-    return found
+def _eligible(
+    sequences: Sequence[LabelledSequence], sets: ParameterSets, config: OfflineStudyConfig
+) -> set[int]:
+    """Trials whose sets may be members of a bank, and so need error vectors.
 
-
-def _with_cuts(sequences: Sequence[LabelledSequence]) -> list[LabelledSequence]:
-    """Cut recordings into stretches, and views as their recordings are."""
-    cuts: dict[str, NDArray[np.intp]] = {}
-    extents: dict[str, Extent] = {}
-    for s in sequences:
-        if s.extent is not None and s.simulation is not None:
-            cuts[s.name] = cut(s.simulation.T_ref_sensor, s.extent)
-            extents[s.name] = s.extent
-    found = []
-    for s in sequences:
-        of = origin(s.name)
-        if of == s.name or of not in cuts:
-            # A view without its recording is cut by itself.
-            found.append(replace(s, cuts=cuts.get(s.name)))
-        else:
-            numbers = stretches_of_view(extents[s.name], extents[of], cuts[of])
-            found.append(replace(s, cuts=numbers))
-    return found
+    With a sequence left out, others than now may be among the best. To read the poses of thousands
+    of trials would take long.
+    """
+    number = np.repeat(np.arange(len(sequences)), [len(s.errors) for s in sequences])
+    means = mean_errors(np.concatenate([s.errors for s in sequences]), number)
+    best = [sets.trials[c] for c in np.argsort(means, kind="stable")[: 2 * MEMBER_POOL_SIZE]]
+    found = {t for t in (BASELINE, *best) if t in sets and np.isfinite(means[sets.column(t)])}
+    named = (n if isinstance(n, int) else sets.find(n) for n in config.online.switching.sets or ())
+    return found | {trial for trial in named if trial is not None and trial in sets}
 
 
 def _labelled(
@@ -730,53 +634,58 @@ def _labelled(
     sets: ParameterSets,
     config: OfflineStudyConfig,
     window: int,
-) -> tuple[LabelledSequence, Frames, NDArray[np.bool_]]:
-    """A labelled sequence without error vectors, its frames, and which of them are labelled."""
-    frames = archive.read_frames(name)
+    recording: str,
+) -> LabelledSequence:
+    """A labelled sequence without error vectors and whole runs."""
+    frames, length = archive.read_frames(name), config.sub_trajectory
     errors = archive.read_errors(name, list(sets))
     # Trials that were run for another budget do not count.
     errors[:, [trial not in run for trial in sets]] = np.nan
     # Whether there is a sub-trajectory depends on the reference alone.
     known = np.asarray(~np.isnan(errors).all(axis=1))
-    period, objective = config.online.period, config.offline.objective[0]
-    described = averaged(frames.descriptors, frames.stamps, window, period)
-    periods_since = ((frames.stamps - frames.stamps[0]) * 1e-9 // period).astype(np.int64)
+    period, objective, n_repeats = (
+        config.online.period,
+        config.offline.objective[0],
+        config.offline.repeats,
+    )
     summaries = [archive.finished(name)[trial] if trial in run else None for trial in sets]
     values = [np.inf if s is None else weighted(objective, s.metrics) for s in summaries]
+    # Of the baseline, there may be more runs.
+    repeats = [
+        [np.nan] * n_repeats if s is None else repeated(objective, s.repeats)[:n_repeats]
+        for s in summaries
+    ]
+    slots = archive.slots()
+    owners = [owner(slots, trial) for trial in sets]
+    read = cache(partial(archive.read, name))
+
+    @lru_cache(maxsize=1)  # one bank after the other is asked for, each many times
+    def motions(trials: tuple[int, ...]) -> Poses:
+        return recorded_motions(frames, [read(trial) for trial in trials])
+
     simulation = BankSimulation(
         frames.stamps,
         frames.T_ref_sensor,
-        described,
-        periods_since,
-        config.sub_trajectory,
+        averaged(frames.descriptors, frames.stamps, window, period),
+        ((frames.stamps - frames.stamps[0]) * 1e-9 // period).astype(np.int64),
+        length,
         config.lost_track,
         frames.hops,
-        motions_from_archive(archive, name, frames),
+        motions,
     )
-    labelled = LabelledSequence(
+    extent = Extent.of(frames.T_ref_sensor, known, length)
+    return LabelledSequence(
         name,
-        periods_since[known],
-        described[known],
+        recording,
+        simulation,
+        extent,
+        extent.stretches(),
         errors[known],
-        blocks=frames.blocks,
-        baseline=archive.read(name, 0).errors[known],
+        archive.read(name, 0).errors[known],
+        frames.blocks,
         values=np.array(values),
-        repeats=_repeats(summaries, objective, config.offline.repeats),
-        block=span(frames.T_ref_sensor, config.sub_trajectory),
+        repeats=np.array(repeats) if n_repeats > 1 else None,
+        own=np.array([one is not None and origin(one) == origin(name) for one in owners]),
+        block=span(frames.T_ref_sensor, length),
         elevation=float(np.nanmedian(frames.elevations)),
-        simulation=simulation,
-        extent=Extent.of(frames.T_ref_sensor, known, config.sub_trajectory),
     )
-    return labelled, frames, known
-
-
-def _repeats(
-    summaries: Sequence[Summary | None], objective: Mapping[Metric, float], n_repeats: int
-) -> NDArray[np.float64] | None:
-    """The objective in every run of repeated trials, of shape (n_sets, n_repeats), or None."""
-    if n_repeats == 1:
-        return None
-    missing = [np.nan] * n_repeats
-    # Of the baseline, there may be more runs.
-    rows = [missing if s is None else repeated(objective, s.repeats) for s in summaries]
-    return np.array([row[:n_repeats] for row in rows])

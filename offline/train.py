@@ -443,7 +443,7 @@ def fit(
         fixed=fixed,
         length=length,
         sequences=[s.name for s in sequences],
-        blocks=dict(sequences[0].blocks or {}),
+        blocks=dict(sequences[0].blocks),
         window=window,
         descriptors=np.concatenate([s.descriptors for s in sequences]),
         sequence=np.repeat(np.arange(len(sequences)), [len(s.errors) for s in sequences]),

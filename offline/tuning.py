@@ -3,7 +3,7 @@
 All are compared by their expected loss on evidence that is left out, see `offline.expected_loss`.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -188,7 +188,6 @@ def choose(
     bank: int | Sequence[int],
     by_recording: bool | None = None,
     most: int | None = None,
-    one_set: bool = True,
     fixed: int | None = None,
 ) -> Policy:
     """Choose what is driven, leaving one recording or stretch after the other out.
@@ -198,14 +197,11 @@ def choose(
     data
         What the rules will be fitted on, and nothing else.
     bank
-        Number of a bank's members, or their trial numbers; no bank is considered with 0, nor
-        without recorded motions.
+        Number of a bank's members, or their trial numbers; no bank is considered with 0.
     by_recording
         See `LabelledData.folds`.
     most
         Number of folds at most, evenly chosen.
-    one_set
-        Whether one set at a time is considered, where the odometry can change it.
     fixed
         Trial number of the fixed set, `LabelledData.fixed` by default.
     """
@@ -213,11 +209,9 @@ def choose(
     if most is not None and len(folds) > most:
         folds = [folds[i] for i in np.linspace(0, len(folds) - 1, most).round().astype(int)]
     fixed = data.fixed() if fixed is None else fixed
-    simulable = all(s.simulation is not None for s in data.sequences)
-    choosers = _choosers(bank, data) if simulable else {}
-    spending = data.spending
+    choosers, spending = _choosers(bank, data), data.spending
     # Whether the budget allows live evidence beside the fixed set.
-    one_set = one_set and data.live and (spending is None or spending.allows([fixed]))
+    one_set = data.live and (spending is None or spending.allows([fixed]))
     banks = {way: make(data, fixed) for way, make in choosers.items()}
     banks = {way: members for way, members in banks.items() if len(members) > 1}
     members = next(iter(banks.values()), [])
@@ -310,7 +304,7 @@ def _logs(
     `PAIRED_SETTINGS`, then those of each bank with each of `BANK_SETTINGS`.
     """
     left_out, others = comparable(left_out, others)
-    data, pca = others.training_data()
+    fitted = data, pca = others.training_data()
     fixed = cap(left_out.errors[:, data.sets.column(data.fixed)])
     columns = []
     if one_set:
@@ -323,29 +317,47 @@ def _logs(
         if members not in known and len(members) < 2:
             known[members] = [fixed] * len(BANK_SETTINGS)
         elif members not in known:
-            of_bank = bank_data(others, data, members)
-            known[members] = list(_bank_errors(left_out, of_bank, pca))
+            simulated = bank_errors(left_out, others, fitted, members, BANK_SETTINGS)
+            known[members] = [errors for errors, _ in simulated]
         columns += known[members]
     if not columns:
         return np.empty((len(np.unique(left_out.stretch)), 0))
     return np.stack([log_ratios(e, fixed, left_out.stretch) for e in columns], axis=1)
 
 
-def _bank_errors(
-    left_out: LabelledSequence, of_bank: TrainingData, pca: "ScaledPCA"
-) -> Iterator[NDArray[np.float64]]:
-    """Capped errors of a bank with each of `BANK_SETTINGS`."""
+def bank_errors(
+    left_out: LabelledSequence,
+    others: LabelledData,
+    fitted: tuple[TrainingData, "ScaledPCA"],
+    members: Sequence[int],
+    settings: Iterable[BankSettings],
+) -> Iterator[tuple[NDArray[np.float64], MemberWeights]]:
+    """Simulate a bank on what is left out, with one settings after the other.
+
+    Its weights are fitted to the others, whose `LabelledData.training_data` is given.
+
+    Yields
+    ------
+    tuple
+        Capped errors on the labelled frames, of shape (n,), and smoothed weights.
+    """
+    data, pca = fitted
+    simulation, members = left_out.simulation, tuple(members)
+    vectors = others.vectors(members)
+    of_bank = replace(data, fixed=members[0], candidates=members, vectors=vectors)
+    scans = pca.transform(simulation.descriptors[periods(simulation.period)[0]])
     near: dict[tuple[float, int], NearProducts] = {}
     votes: MemberWeights | None = None
-    for settings in BANK_SETTINGS:
-        key = settings.clip, settings.n_frames
+    for one in settings:
+        key = one.clip, one.n_frames
         if key not in near:
             # Settings that share what is near follow each other: one at a time is kept.
-            near = {key: bank_evidence(left_out, of_bank, pca, settings)}
-        weights = weights_along(left_out, near[key], settings)
+            near = {key: BankRule(one).fit(of_bank).near(scans)}
+        weights, _ = bank_weights(near[key], one, simulation.live(members))
+        smoothed = MemberWeights(members, smooth_weights(weights))
         # Who agrees takes long to find, and hangs on the settings but little.
-        votes = weights if votes is None else votes
-        yield bank_errors(left_out, weights, votes)
+        votes = smoothed if votes is None else votes
+        yield simulation.errors(smoothed, votes)[left_out.extent.frames], smoothed
 
 
 def _paired_errors(
@@ -427,47 +439,8 @@ WAYS: dict[str, Chooser] = {
 """Ways to choose a bank's members."""
 
 
-def bank_data(others: LabelledData, data: TrainingData, members: Sequence[int]) -> TrainingData:
-    """What a bank's weights are fitted to."""
-    vectors = others.vectors(members)
-    return replace(data, fixed=members[0], candidates=tuple(members), vectors=vectors)
-
-
-def bank_evidence(
-    sequence: LabelledSequence, data: TrainingData, pca: "ScaledPCA", settings: BankSettings
-) -> NearProducts:
-    """What a rule that is fitted to `data` finds near to the first scan of every period."""
-    assert sequence.simulation is not None
-    first, _ = periods(sequence.simulation.period)
-    rule = BankRule(settings).fit(data)
-    return rule.near(pca.transform(sequence.simulation.descriptors[first]))
-
-
-def weights_along(
-    sequence: LabelledSequence, near: NearProducts, settings: BankSettings
-) -> MemberWeights:
-    """Smoothed weights along a sequence, by the training and by what is measured on the way."""
-    assert sequence.simulation is not None
-    weights, _ = bank_weights(near, settings, sequence.simulation.live(near.members))
-    return MemberWeights(near.members, smooth_weights(weights))
-
-
-def bank_errors(
-    sequence: LabelledSequence, weights: MemberWeights, votes: MemberWeights | None = None
-) -> NDArray[np.float64]:
-    """Capped errors of a simulated bank on the labelled frames, of shape (n,).
-
-    Members vote about who agrees with `votes`; with `weights` when left out.
-    """
-    assert sequence.simulation is not None
-    errors = sequence.simulation.errors(weights, votes)
-    return errors[~np.isnan(errors) if sequence.extent is None else sequence.extent.frames]
-
-
 def driven_cost(data: LabelledData, policy: Policy, fixed: int) -> float:
     """Milliseconds of CPU time a scan that a policy costs; NaN if it is unknown."""
-    if data.costs is None:
-        return np.nan
     if policy.bank.adapt:
         return data.costs.adaptive(policy.members)
     if policy.one_set.adapt:

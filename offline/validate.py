@@ -6,9 +6,8 @@ looked up, period by period; no odometry runs.
 """
 
 import logging
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,9 +16,8 @@ from numpy.typing import NDArray
 from adaptune.archive import Archive
 from adaptune.errors import AdaptuneError
 from adaptune.metrics import bootstrap, cap
-from adaptune.model import RULES, ErrorModel, ModelError, PairedExpectedRatio, Rule, TrainingData
+from adaptune.model import RULES, ErrorModel, ModelError, PairedExpectedRatio, Rule
 from adaptune.model.knn import NearestNeighbours
-from adaptune.model.pca import ScaledPCA
 from adaptune.model.rules import ERROR_FLOOR
 from adaptune.progress import Progress, unseen
 from adaptune.report import tables
@@ -41,16 +39,12 @@ from offline.labelled import LabelledData, LabelledSequence, comparable, labelle
 from offline.tuning import (
     MOST_FOLDS,
     Figures,
-    Policy,
-    bank_data,
     bank_errors,
-    bank_evidence,
     choose,
     driven_cost,
     figures,
     log_ratios,
     rivals,
-    weights_along,
 )
 
 _log = logging.getLogger(__name__)
@@ -69,24 +63,16 @@ class LeftOut(NamedTuple):
     """What happened on one recording, or stretch of it, that was left out."""
 
     name: str
+    recording: str  # that it is a part of
+    stretch: NDArray[np.intp]  # (n,): of each frame
+    block: int  # frames of a sub-trajectory
     # For every mode the capped error in percent at each frame, of shape (n,).
     errors: dict[str, NDArray[np.float64]]
     # For every rule the share of periods in which it did not choose the fixed set; of a bank, the
     # share of the weight that the other members had.
     adapted: dict[str, float]
-    familiarity: NDArray[np.float64]  # (n,): see `Selection`; NaN where no rule computes it
-    block: int = 1  # frames of a sub-trajectory
-    stretch: NDArray[np.intp] | None = None  # (n,): of each frame; one stretch when left out
-    recording: str = ""  # that it is a part of; it alone when left out
-    # For every mode the milliseconds of CPU time a scan that it costs, as far as they are known.
-    costs: Mapping[str, float] = MappingProxyType({})
-
-    @property
-    def stretches(self) -> NDArray[np.intp]:
-        """Number of each frame's stretch, of shape (n,)."""
-        if self.stretch is None:
-            return np.zeros(len(self.errors["fixed"]), np.intp)
-        return self.stretch
+    # For every mode the milliseconds of CPU time a scan that it costs; NaN if it is unknown.
+    costs: Mapping[str, float]
 
     def interval(self, mode: str) -> tuple[float, float] | None:
         """95 % interval of the ratio to the fixed set's error, see `bootstrap`.
@@ -102,35 +88,31 @@ def joined(parts: Sequence[LeftOut]) -> LeftOut:
     first = parts[0]
     if len(parts) == 1:
         return first
-    n_frames = [len(part.familiarity) for part in parts]
-    return LeftOut(
-        first.name,
-        {
+    n_frames = [len(part.stretch) for part in parts]
+
+    def mean(values: Sequence[Mapping[str, float]]) -> dict[str, float]:
+        return {
+            mode: float(np.average([of[mode] for of in values], weights=n_frames))
+            for mode in _of_all(values)
+        }
+
+    return first._replace(
+        stretch=np.concatenate([part.stretch for part in parts]),
+        errors={
             mode: np.concatenate([part.errors[mode] for part in parts])
-            for mode in _of_all(part.errors for part in parts)
+            for mode in _of_all([part.errors for part in parts])
         },
-        {
-            mode: float(np.average([part.adapted[mode] for part in parts], weights=n_frames))
-            for mode in first.adapted
-        },
-        np.concatenate([part.familiarity for part in parts]),
-        first.block,
-        np.concatenate([part.stretches for part in parts]),
-        first.recording,
-        {
-            mode: float(np.average([part.costs[mode] for part in parts], weights=n_frames))
-            for mode in _of_all(part.costs for part in parts)
-        },
+        adapted=mean([part.adapted for part in parts]),
+        costs=mean([part.costs for part in parts]),
     )
 
 
-def _of_all(parts: Iterable[Mapping[str, object]]) -> list[str]:
+def _of_all(parts: Sequence[Mapping[str, object]]) -> list[str]:
     """The modes that are known of every part, in the order of the first.
 
     A rival may be unknown where something is left out, if its cost was measured elsewhere only.
     """
-    every = list(parts)
-    return [mode for mode in every[0] if all(mode in one for one in every)]
+    return [mode for mode in parts[0] if all(mode in one for one in parts)]
 
 
 @dataclass
@@ -138,7 +120,6 @@ class Validation:
     """All that was left out, and the conclusion."""
 
     left_out: list[LeftOut]  # one of each recording
-    bank: bool = False  # whether a bank was simulated
     # For every mode its mean error over the fixed set's, a number for each recording.
     ratios: dict[str, NDArray[np.float64]] = field(init=False)
     # For every mode the logarithm of its ratio to the fixed set's error on each stretch.
@@ -146,7 +127,7 @@ class Validation:
     recordings: list[str] = field(init=False)  # of each stretch
 
     def __post_init__(self) -> None:
-        modes = _of_all(one.errors for one in self.left_out)
+        modes = _of_all([one.errors for one in self.left_out])
         means = {
             mode: np.array([s.errors[mode].mean() for s in self.left_out]) + ERROR_FLOOR
             for mode in modes
@@ -154,13 +135,11 @@ class Validation:
         self.ratios = {mode: mean / means["fixed"] for mode, mean in means.items()}
         self.logs = {
             mode: np.concatenate(
-                [log_ratios(s.errors[mode], s.errors["fixed"], s.stretches) for s in self.left_out]
+                [log_ratios(s.errors[mode], s.errors["fixed"], s.stretch) for s in self.left_out]
             )
             for mode in modes
         }
-        self.recordings = [
-            s.recording or s.name for s in self.left_out for _ in np.unique(s.stretches)
-        ]
+        self.recordings = [s.recording for s in self.left_out for _ in np.unique(s.stretch)]
 
     @property
     def modes(self) -> list[str]:
@@ -186,8 +165,9 @@ class Validation:
 
     def verdict(self, rule: str) -> str:
         """What to expect of a rule, in a sentence."""
-        what = f"`{rule}`, with the bank where that is best" if self.bank else f"`{rule}`"
-        what = what if rule == PAIRED else f"`{rule}`"
+        # One set at a time is a mode of its own where a bank was simulated.
+        bank = rule == PAIRED and ONE_SET in self.ratios
+        what = f"`{rule}`, with the bank where that is best" if bank else f"`{rule}`"
         expected = expected_in_words(self.figures(rule)._asdict())
         share = 100 * np.mean([left_out.adapted.get(rule, 0.0) for left_out in self.left_out])
         if not share:
@@ -195,7 +175,7 @@ class Validation:
                 f"{what} kept the fixed set wherever something was left out: the rest did not show "
                 f"less expected loss; so there is no estimate of it."
             )
-        if rule == PAIRED and self.bank:
+        if bank:
             return f"{what}: {expected}, with {share:.0f} % of the weight on other sets than fixed."
         return f"{what}: {expected}, adapting {share:.0f} % of the time."
 
@@ -212,10 +192,7 @@ class Validation:
 
 
 def leave_one_out(
-    data: LabelledData,
-    rules: Mapping[str, Rule] | None = None,
-    progress: Progress = unseen,
-    bank: int | Sequence[int] = BANK_SIZE,
+    data: LabelledData, progress: Progress = unseen, bank: int | Sequence[int] = BANK_SIZE
 ) -> Validation:
     """Leave each recording or stretch out in turn, with all views of it.
 
@@ -226,14 +203,11 @@ def leave_one_out(
     ----------
     data
         The training sequences.
-    rules
-        By name. When left out, those of `adaptune.model.RULES`, of which `PAIRED` is what has the
-        least expected loss.
     progress
         Called about every fold.
     bank
         Number of a bank's members, or their trial numbers, the first of which counts as the fixed
-        one. No bank is simulated with 0, nor without recorded motions.
+        one. No bank is simulated with 0.
 
     Raises
     ------
@@ -242,45 +216,27 @@ def leave_one_out(
     """
     by_recording = len(data.recordings) >= MIN_RECORDINGS
     folds = data.folds(by_recording)
-    check_folds(data, folds)
+    if len(folds) < 2:
+        length = data.sequences[0].extent.length
+        raise ValidationError(
+            f"training: there is one stretch only, or every stretch passes within {length:g} m of "
+            f"all others, so nothing remains to train on when it is left out. Record "
+            f"{2 * PER_STRETCH * length:g} m or more that do not stay in one place, add "
+            f"recordings, or lower sub_trajectory (two stretches are {2 * PER_STRETCH} "
+            f"sub-trajectories)"
+        )
     parts: dict[str, list[LeftOut]] = {}
     for i, (left_out, others) in enumerate(folds):
         progress("parts left out", i, len(folds))
-        found = leave_out(left_out, others, rules, bank, by_recording)
+        found = leave_out(left_out, others, bank, by_recording)
         parts.setdefault(found.name, []).append(found)
     progress("parts left out", len(folds), len(folds))
-    has_bank = bool(bank) and data.sequences[0].simulation is not None
-    return Validation([joined(of) for of in parts.values()], has_bank)
-
-
-def check_folds(data: LabelledData, folds: Sequence[object]) -> None:
-    """Refuse to leave out what nothing remains of.
-
-    Raises
-    ------
-    ValidationError
-    """
-    if len(folds) > 1:
-        return
-    extent = data.sequences[0].extent
-    if extent is None:
-        raise ValidationError(
-            "training: one stretch cannot be validated, for nothing remains to train on when it is "
-            "left out; add recordings"
-        )
-    least = 2 * PER_STRETCH * extent.length
-    raise ValidationError(
-        f"training: there is one stretch only, or every stretch passes within "
-        f"{extent.length:g} m of all others, so nothing remains to train on when it is left out. "
-        f"Record {least:g} m or more that do not stay in one place, add recordings, or lower "
-        f"sub_trajectory (two stretches are {2 * PER_STRETCH} sub-trajectories)"
-    )
+    return Validation([joined(of) for of in parts.values()])
 
 
 def leave_out(
     sequence: LabelledSequence,
     others: LabelledData,
-    rules: Mapping[str, Rule] | None,
     bank: int | Sequence[int],
     by_recording: bool,
 ) -> LeftOut:
@@ -289,81 +245,42 @@ def leave_out(
     sequence, others = comparable(sequence, others)
     if not isinstance(bank, int) and len(others.sets) < n_sets:
         bank = len(bank)
-    bank = bank if sequence.simulation is not None else 0
-    data, pca = others.training_data()
+    fitted = data, pca = others.training_data()
     features = pca.transform(sequence.descriptors)
     capped = cap(sequence.errors)
     fixed = capped[:, data.sets.column(data.fixed)]
     first, period = periods(sequence.period)
     frames = np.arange(len(capped))
-    baseline = capped[:, 0] if sequence.baseline is None else cap(sequence.baseline)
-    errors, adapted = {"baseline": baseline, "fixed": fixed}, {}
-    familiarity = np.full(len(first), np.nan)
-    chosen = None
-    if rules is None or bank:
-        chosen = choose(others, bank, by_recording, MOST_FOLDS, rules is None or PAIRED in rules)
-    if rules is None:
-        one_set = PairedExpectedRatio(chosen.one_set if chosen else None)
-        rules = {PAIRED: one_set, "paper": NearestNeighbours()}
+    errors, adapted = {"baseline": cap(sequence.baseline), "fixed": fixed}, {}
+    chosen = choose(others, bank, by_recording, MOST_FOLDS)
+    one_set, paper = PairedExpectedRatio(chosen.one_set), NearestNeighbours()
+    rules: dict[str, Rule] = {PAIRED: one_set, "paper": paper}
+    if bank:
+        rules = {"paper": paper, ONE_SET: one_set}
     for name, rule in rules.items():
         rule.fit(data)
         selections = [rule.select(features[i]) for i in first]
         selected = data.sets.columns([selection.trial for selection in selections])
         errors[name] = capped[frames, selected[period]]
         adapted[name] = float(np.mean([selection.trial != data.fixed for selection in selections]))
-        if not np.isnan(selections[0].familiarity):
-            familiarity = np.array([selection.familiarity for selection in selections])
-    if bank and chosen is not None:
+    if bank:
         # Where a bank does not have the least loss, one set at a time is driven, or the fixed one.
-        instead = errors.pop(PAIRED, fixed), adapted.pop(PAIRED, 0.0)
-        if PAIRED in rules:
-            errors[ONE_SET], adapted[ONE_SET] = instead
-        driven = _simulate(sequence, others, data, pca, chosen) if chosen.bank.adapt else instead
-        errors[PAIRED], adapted[PAIRED] = driven
-    costs, of_rivals = _rivals(others, chosen, data.fixed, adapted)
+        errors[PAIRED], adapted[PAIRED] = errors[ONE_SET], adapted[ONE_SET]
+    if bank and chosen.bank.adapt:
+        simulated = bank_errors(sequence, others, fitted, chosen.members, [chosen.bank])
+        errors[PAIRED], weights = next(simulated)
+        adapted[PAIRED] = float(1.0 - weights.weights[:, 0].mean())
+    driven, alone = driven_cost(others, chosen, data.fixed), others.costs.alone
+    of_rivals = rivals(others, driven)
+    costs = {"baseline": alone(0), "fixed": alone(data.fixed), PAIRED: driven}
+    costs |= {name: alone(trial) for name, trial in of_rivals.items()}
     errors |= {name: capped[:, data.sets.column(trial)] for name, trial in of_rivals.items()}
     of_periods = np.array([capped[period == p].mean(axis=0) for p in range(len(first))])
     # The best set in hindsight, of the whole sequence and of each frame's period.
     errors["oracle, sequence"] = capped[:, int(np.argmin(capped.mean(axis=0)))]
     errors["oracle, period"] = capped[frames, of_periods[period].argmin(axis=1)]
-    return LeftOut(
-        sequence.name,
-        errors,
-        adapted,
-        familiarity[period],
-        sequence.block,
-        sequence.stretch,
-        sequence.recording,
-        costs,
-    )
-
-
-def _rivals(
-    others: LabelledData, chosen: Policy | None, fixed: int, adapted: Collection[str]
-) -> tuple[dict[str, float], dict[str, int]]:
-    """What the modes cost, as far as it is known, and the rivals' trials."""
-    if chosen is None or others.costs is None:
-        return {}, rivals(others, np.nan)
-    costs = others.costs
-    driven = driven_cost(others, chosen, fixed)
-    found = rivals(others, driven)
-    of = {"baseline": costs.alone(0), "fixed": costs.alone(fixed)}
-    of |= {PAIRED: driven} if PAIRED in adapted else {}
-    return of | {name: costs.alone(trial) for name, trial in found.items()}, found
-
-
-def _simulate(
-    sequence: LabelledSequence,
-    others: LabelledData,
-    data: TrainingData,
-    pca: ScaledPCA,
-    chosen: Policy,
-) -> tuple[NDArray[np.float64], float]:
-    """A bank's errors on what is left out, and the weight that the first member did not have."""
-    of_bank = bank_data(others, data, chosen.members)
-    near = bank_evidence(sequence, of_bank, pca, chosen.bank)
-    weights = weights_along(sequence, near, chosen.bank)
-    return bank_errors(sequence, weights), float(1.0 - weights.weights[:, 0].mean())
+    about = (sequence.name, sequence.recording, sequence.stretch, sequence.block)
+    return LeftOut(*about, errors, adapted, costs)
 
 
 class Validated(NamedTuple):
@@ -402,7 +319,7 @@ def validate(study: OfflineStudy, progress: Progress = unseen) -> Validated:
         switching = study.config.online.switching
         bank = switching.size if switching.sets is None else model.bank
     try:
-        validation = leave_one_out(data, None, progress, bank)
+        validation = leave_one_out(data, progress, bank)
     except ValidationError as error:
         raise ValidationError(f"{error}. {online}") from error
     rows = _rows(validation, _rate(data))
@@ -471,9 +388,9 @@ def _labelled(study: OfflineStudy, model: ErrorModel) -> LabelledData:
 
 def _rate(data: LabelledData) -> float:
     """Scans a second."""
-    stamps = [s.simulation.stamps for s in data.sequences if s.simulation is not None]
+    stamps = [s.simulation.stamps for s in data.sequences]
     seconds = sum(float(of[-1] - of[0]) * 1e-9 for of in stamps)
-    return sum(map(len, stamps)) / seconds if seconds else np.nan
+    return sum(map(len, stamps)) / seconds
 
 
 def _rows(validation: Validation, rate: float) -> list[dict[str, Any]]:
@@ -519,8 +436,8 @@ def _stretch_rows(validation: Validation) -> list[dict[str, Any]]:
     logs = {mode: of for mode, of in validation.logs.items() if mode != "fixed"}
     rows: list[dict[str, Any]] = []
     for one in validation.left_out:
-        for number in np.unique(one.stretches):
-            fixed = one.errors["fixed"][one.stretches == number]
+        for number in np.unique(one.stretch):
+            fixed = one.errors["fixed"][one.stretch == number]
             rows.append(
                 {"recording": one.name, "stretch": int(number), "fixed [%]": float(fixed.mean())}
                 | {mode: float(np.exp(of[len(rows)])) for mode, of in logs.items()}

@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from labelled_places import of_errors
 from tables import table
 
 from adaptune.archive import Summary
 from adaptune.model.rules import ERROR_FLOOR
 from offline.config import OfflineConfig
-from offline.labelled import LabelledData, LabelledSequence
+from offline.labelled import LabelledData
 from offline.objective import best_by_trials, judge
 from offline.tuning import (
     expected_loss,
@@ -23,10 +24,8 @@ from offline.tuning import (
 def labelled(runs):
     """Sequences on which each of three sets had these values in repeated runs."""
     sequences = [
-        LabelledSequence(
+        of_errors(
             f"s{i}",
-            np.arange(4),
-            np.zeros((4, 90), np.float32),
             np.tile(np.mean(of_sets, axis=1).astype(np.float32), (4, 1)),
             values=np.mean(of_sets, axis=1),
             repeats=np.array(of_sets),
@@ -88,9 +87,7 @@ def test_a_candidate_of_all_sequences_is_none_where_its_luck_is_left_out():
     luckiest = int(errors.mean(axis=0).argmin())
     whole = {0: 5.0, luckiest: 0.9}
     sequences = [
-        LabelledSequence(
-            f"s{i}", np.arange(4), np.zeros((4, 90), np.float32), np.tile(of, (4, 1)), whole=whole
-        )
+        of_errors(f"s{i}", np.tile(of, (4, 1)), whole=whole)
         for i, of in enumerate(errors.astype(np.float32))
     ]
     data = LabelledData(sequences, table(np.linspace(0, 1, 256)[:, None], tuple(range(256))))

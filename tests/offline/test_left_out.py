@@ -3,14 +3,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from labelled_places import (
-    SETS,
-    TRIALS,
-    in_stretches,
-    labelled,
-    two_kinds,
-    with_motions,
-)
+from labelled_places import SETS, TRIALS, labelled, two_kinds, with_motions
 
 from adaptune.errors import AdaptuneError
 from adaptune.model import ErrorModel, ModelError
@@ -22,7 +15,6 @@ from adaptune.study.study import driven
 from offline import tuning
 from offline import validate as validation
 from offline.config import load_study
-from offline.labelled import LabelledSequence
 from offline.train import fit, tuned
 from offline.tuning import DO_NOT_ADAPT, NO_BANK, PairedSettings
 from offline.validate import (
@@ -43,7 +35,7 @@ def _few_settings(monkeypatch):
 
 
 def test_rules_gain_where_places_tell_the_sets_apart():
-    validation = leave_one_out(labelled(two_kinds(np.random.default_rng(0))))
+    validation = leave_one_out(labelled(two_kinds(np.random.default_rng(0))), bank=0)
     for rule in ("adaptive", "paper"):
         np.testing.assert_allclose(validation.ratios[rule], [0.5] * 4 + [0.4] * 4, rtol=0.05)
         said = validation.verdict(rule)
@@ -68,56 +60,56 @@ class Cheat(Rule):
     def predict(self, feature):
         raise NotImplementedError
 
-    def select(self, _feature, _current=None):
+    def select(self, _feature):
         return Selection(0, {})
 
 
-def test_the_sequence_left_out_is_never_seen():
+def test_the_sequence_left_out_is_never_seen(monkeypatch):
     sequences = two_kinds(np.random.default_rng(1))
-    marked = [
-        LabelledSequence(s.name, s.period, s.descriptors, s.errors + np.float32(i))
-        for i, s in enumerate(sequences)
-    ]
+    marked = [replace(s, errors=s.errors + np.float32(i)) for i, s in enumerate(sequences)]
+    monkeypatch.setattr(validation, "NearestNeighbours", Cheat)
     Cheat.fitted = ()
-    leave_one_out(labelled(marked), {"cheat": Cheat()})
+    leave_one_out(labelled(marked), bank=0)
     for i, data in enumerate(Cheat.fitted):
         seen = {e.tobytes() for e in data.errors}
         assert not seen & {e.tobytes() for e in marked[i].errors}
         assert len(seen) == 7 * 80
 
 
-def test_a_selection_holds_for_its_second():
+def test_a_selection_holds_for_its_second(monkeypatch):
     asked = []
 
     class Remember(Cheat):
-        def select(self, feature, _current=None):
+        def select(self, feature):
             asked.append(feature)
             return Selection(TRIALS[len(asked) % 2], {})
 
     sequences = two_kinds(np.random.default_rng(2))[:2]
-    validation = leave_one_out(labelled(sequences), {"r": Remember()})
+    monkeypatch.setattr(validation, "NearestNeighbours", Remember)
+    found = leave_one_out(labelled(sequences), bank=0)
     assert len(asked) == 2 * 8
     expected = np.where(np.arange(80) // 10 % 2 == 0, 1, 0)
     np.testing.assert_allclose(
-        validation.left_out[0].errors["r"], sequences[0].errors[np.arange(80), expected], rtol=1e-6
+        found.left_out[0].errors["paper"], sequences[0].errors[np.arange(80), expected], rtol=1e-6
     )
 
 
-def test_a_sequence_is_left_out_with_its_views():
+def test_a_sequence_is_left_out_with_its_views(monkeypatch):
     sequences = two_kinds(np.random.default_rng(4))[:3]
     seen = [
         replace(s, name=f"{s.name}+noise", errors=s.errors + np.float32(100 + i))
         for i, s in enumerate(sequences)
     ]
+    monkeypatch.setattr(validation, "NearestNeighbours", Cheat)
     Cheat.fitted = ()
-    validation = leave_one_out(labelled([*sequences, *seen]), {"cheat": Cheat()})
-    assert [s.name for s in validation.left_out] == [s.name for s in sequences]
+    found = leave_one_out(labelled([*sequences, *seen]), bank=0)
+    assert [s.name for s in found.left_out] == [s.name for s in sequences]
     for i, data in enumerate(Cheat.fitted):
         fitted = {e.tobytes() for e in data.errors}
         assert not fitted & {e.tobytes() for e in (*sequences[i].errors, *seen[i].errors)}
         assert len(fitted) == 4 * 80
     with pytest.raises(ValidationError, match="one stretch"):
-        leave_one_out(labelled([sequences[0], seen[0]]))
+        leave_one_out(labelled([sequences[0], seen[0]]), bank=0)
 
 
 def test_the_fixed_set_is_chosen_by_what_the_study_judges_by():
@@ -134,7 +126,6 @@ def test_validates_a_study(study_file, trained_folder, tmp_path, caplog):
     assert verdicts[0] == driven(
         ErrorModel.load(study.model_path), study.config.online, study.odometry, study.mechanism
     )
-    assert all(np.isnan(one.familiarity).all() for one in validation.left_out)
     ends = ["ms a scan", "cores", "geometric", "arithmetic", "worst tenth", "worst"]
     assert [row["left out"] for row in rows] == ["one", "two", *ends]
     assert rows[0]["adaptive"] == pytest.approx(validation.ratios["adaptive"][0])
@@ -166,13 +157,12 @@ def test_validates_a_study(study_file, trained_folder, tmp_path, caplog):
 def test_a_bank_gains_where_no_set_is_better_than_another():
     rng = np.random.default_rng(6)
     sequences = [with_motions(f"s{i}", rng, 120) for i in range(7)]
-    validation = leave_one_out(labelled(sequences), {}, bank=3)
-    assert validation.modes == ["adaptive"]
+    validation = leave_one_out(labelled(sequences), bank=3)
+    assert validation.modes == ["adaptive", "one set", "paper"]
     assert validation.summary("adaptive")["geometric"] < 0.7
     assert "expected gain" in validation.verdict("adaptive")
     assert "of the weight on other sets than fixed" in validation.verdict("adaptive")
     assert all(0.2 < left_out.adapted["adaptive"] < 1.0 for left_out in validation.left_out)
-    assert not leave_one_out(labelled(sequences), {}, bank=0).modes
 
 
 def judged(data, study, monkeypatch, given=()):
@@ -201,7 +191,6 @@ def test_validate_judges_what_online_drives(study_file, tmp_path, monkeypatch):
     assert found.verdicts[0] == driven(model, study.config.online, study.odometry, study.mechanism)
     expected = "`adaptive`, with the bank where that is best: expected gain "
     assert found.verdicts[1].startswith(expected)
-    assert found.validation.bank
     assert found.validation.modes == ["adaptive", "one set", "paper"]
     assert {"adaptive", "one set"} <= set(found.rows[0])
     # The same model without a bank: one set at a time, or the fixed set alone.
@@ -222,16 +211,18 @@ def test_validate_judges_what_online_drives(study_file, tmp_path, monkeypatch):
     ):
         given = [f"online.switching.mechanism={mechanism}", "online.switching.size=3"]
         study = load_study(study_file, given, tmp_path)
-        match = f"one stretch cannot .* will drive {what} .* too little .* takes 80 m of rec"
+        match = (
+            f"there is one stretch only, .* will drive {what} .* too little .* takes 80 m of rec"
+        )
         with pytest.raises(ValidationError, match=match):
             judged(alone, study, monkeypatch)
 
 
 def test_stretches_of_one_recording_are_left_out():
     # 400 m, with sub-trajectories of 10 m.
-    one = in_stretches(with_motions("one", np.random.default_rng(6), 1334))
+    one = with_motions("one", np.random.default_rng(6), 1334)
     data = labelled([one])
-    validation = leave_one_out(data, {}, bank=2)
+    validation = leave_one_out(data, bank=2)
     assert [s.name for s in validation.left_out] == ["one"]
     assert len(validation.logs["adaptive"]) == len(validation.recordings) == 10
     assert validation.summary("adaptive")["geometric"] < 0.9
@@ -239,10 +230,10 @@ def test_stretches_of_one_recording_are_left_out():
         "adaptive"
     )
     (left_out,) = validation.left_out
-    np.testing.assert_array_equal(left_out.stretches, one.cuts)
+    np.testing.assert_array_equal(left_out.stretch, one.stretch)
     # The fixed set is another one in each stretch; the errors are those of the whole recording.
     for number, (left, others) in enumerate(data.folds()):
-        of = left_out.stretches == number
+        of = left_out.stretch == number
         fixed = one.errors[of, SETS.column(others.fixed())]
         np.testing.assert_allclose(left_out.errors["fixed"][of], fixed, rtol=1e-6)
         assert len(left.errors) == of.sum()
@@ -252,9 +243,10 @@ def test_stretches_of_one_recording_are_left_out():
     ("errors", "better"), [((0.5, 0.51), True), ((0.5, 1.0), False), ((1.5, 1.51), False)]
 )
 def test_the_baseline_is_better_only_where_the_interval_shows_it(errors, better):
+    one_stretch = np.zeros(9, int)
     left_out = [
-        LeftOut(f"s{i}", {"baseline": np.full(9, e), "fixed": np.ones(9)}, {}, np.empty(0))
-        for i, e in enumerate(errors)
+        LeftOut(*2 * [f"s{i}"], one_stretch, 1, {"baseline": of, "fixed": np.ones(9)}, {}, {})
+        for i, of in enumerate(np.outer(errors, np.ones(9)))
     ]
     said = baseline_in_words(Validation(left_out))
     assert " times the error of the sets that are chosen without what is left out, over 2 " in said

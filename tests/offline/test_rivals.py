@@ -77,7 +77,7 @@ def test_a_budget_bounds_the_fixed_set_and_what_is_selected(places):
 def validation():
     rng = np.random.default_rng(7)
     known = data([with_motions(f"s{i}", rng, 150) for i in range(7)])
-    return known, leave_one_out(known, {}, bank=2)
+    return known, leave_one_out(known, bank=2)
 
 
 def test_rivals_are_left_out_too(validation):
@@ -97,5 +97,5 @@ def test_a_bank_stays_within_the_budget():
     rich = data([with_motions(f"s{i}", rng, 100) for i in range(4)])
     fixed = rich.costs.alone(rich.fixed())
     for budget in (fixed, 40.0, 200.0):
-        found = leave_one_out(rich._replace(budget=budget), {}, bank=2)
+        found = leave_one_out(rich._replace(budget=budget), bank=2)
         assert found.cost(PAIRED) <= budget + 1e-6

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from labelled_places import in_stretches, labelled, with_motions
+from labelled_places import labelled, with_motions
 
 from adaptune.metrics import travelled, window_ends
-from offline.labelled import PER_STRETCH, Extent, cut, stretches_of_view
+from offline.labelled import PER_STRETCH, Extent
 
 LENGTH = 10.0
 
@@ -42,7 +42,7 @@ paths = st.integers(0, 2**32 - 1).map(any_path)
 @given(paths)
 def test_stretches_share_out_the_frames(T):
     extent = extent_of(T)
-    numbers = cut(T, extent)
+    numbers = extent.stretches()
     assert numbers.shape == extent.frames.shape
     if not len(numbers):
         return
@@ -66,7 +66,7 @@ def test_nothing_that_is_known_comes_near_to_what_is_left_out(T, which):
     extent = extent_of(T)
     if not len(extent.frames):
         return
-    numbers = cut(T, extent)
+    numbers = extent.stretches()
     left = extent.some(numbers == which % (numbers.max() + 1))
     kept = extent.some(~extent.near(left, is_view=False))
     # Sub-trajectories that begin where the other ends have a frame in common.
@@ -84,8 +84,8 @@ def test_nothing_that_is_known_comes_near_to_what_is_left_out(T, which):
 def test_a_view_that_is_played_backwards_is_cut_as_its_recording():
     T = poses(np.full(400, 0.5), np.zeros(400))
     recording, view = extent_of(T), extent_of(T[::-1])
-    numbers = cut(T, recording)
-    of_view = stretches_of_view(view, recording, numbers)
+    numbers = recording.stretches()
+    of_view = view.stretches_of(recording, numbers)
     at = np.linspace(11.0, 189.0, 30)
     for x in at:
         frame = np.abs(recording.positions[:, 0] - x).argmin()
@@ -101,7 +101,7 @@ def test_a_view_that_is_played_backwards_is_cut_as_its_recording():
 
 def test_with_six_recordings_whole_ones_are_left_out():
     rng = np.random.default_rng(3)
-    sequences = [in_stretches(with_motions(f"s{i}", rng, 500)) for i in range(6)]
+    sequences = [with_motions(f"s{i}", rng, 500) for i in range(6)]
     assert len(labelled(sequences).folds()) == 6
     for left, others in labelled(sequences).folds():
         assert [s.name for s in others.sequences] == [
@@ -118,8 +118,8 @@ def test_with_six_recordings_whole_ones_are_left_out():
 
 def test_parts_of_a_recording_are_one_recording():
     rng = np.random.default_rng(3)
-    one = in_stretches(with_motions("s0", rng, 500))
-    parts = [replace(one, name=f"s{i}", recorded_in="drive.bag") for i in range(6)]
+    one = with_motions("s0", rng, 500)
+    parts = [replace(one, name=f"s{i}", recording="drive.bag") for i in range(6)]
     data = labelled(parts)
     assert data.recordings == ["drive.bag"]
     # So stretches are left out; here all parts show the same place, so none of it is known.
@@ -129,13 +129,13 @@ def test_parts_of_a_recording_are_one_recording():
         numbers = {int(n) for s in others.sequences for n in np.unique(s.stretch)}
         assert int(left.stretch[0]) not in numbers
     assert data.folds(by_recording=True) == []
-    other = labelled([*parts[:2], replace(one, name="other")])
+    other = labelled([*parts[:2], replace(one, name="other", recording="other")])
     names = [[s.name for s in others.sequences] for _, others in other.folds(by_recording=True)]
     assert names == [["other"], ["other"], ["s0", "s1"]]
 
 
 def test_a_stretch_takes_its_part_of_everything():
-    one = in_stretches(with_motions("one", np.random.default_rng(3), 500))
+    one = with_motions("one", np.random.default_rng(3), 500)
     n = len(one.errors)
     whole_errors = {0: np.linspace(0.0, 1.0, n), 3: np.full(n, 50.0)}
     one = replace(
@@ -145,7 +145,6 @@ def test_a_stretch_takes_its_part_of_everything():
         repeats=np.ones((5, 3)),
         whole={0: 0.5, 3: 30.0},
         whole_errors=whole_errors,
-        by_frames=True,
     )
     kept = one.stretch == 1
     some = one.frames(kept)
@@ -155,7 +154,7 @@ def test_a_stretch_takes_its_part_of_everything():
     assert some.repeats is None
     assert len(some.baseline) == len(some.period) == len(some.errors) == kept.sum()
     assert {len(of) for of in some.vectors.values()} == {kept.sum()}
-    other = replace(one, by_frames=False).frames(kept)
+    other = replace(one, whole_errors=None).frames(kept)
     assert (other.whole, len(other.values)) == (one.whole, 5)
     assert one.frames(np.ones(n, bool)) is one
     cut_again = some.frames(np.arange(kept.sum()) < 5)

@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from labelled_places import TRIALS, in_stretches, labelled, sequence, two_kinds, with_motions
+from labelled_places import TRIALS, labelled, sequence, two_kinds, with_motions
 
 from adaptune.model import BankSettings, PairedSettings
 from adaptune.model.rules import Costs, SetCost
@@ -21,6 +21,11 @@ from offline.tuning import (
 
 def tune(sequences):
     return choose(labelled(sequences), 0)
+
+
+def bank_only(sequences):
+    """Labelled data of an odometry that cannot change its parameters between scans."""
+    return labelled(sequences)._replace(live=False)
 
 
 def test_settings_are_chosen_on_the_sequences_at_hand():
@@ -74,13 +79,13 @@ def test_a_bank_that_gains_nothing_does_not_adapt():
         )
         for s in sequences
     ]
-    found = choose(labelled(alike), [0, 3, 4], one_set=False)
+    found = choose(bank_only(alike), [0, 3, 4])
     assert found.bank == NO_BANK
     assert found.members == [0, 3, 4]
-    found = choose(labelled(sequences), [0, 8], one_set=False)
+    found = choose(bank_only(sequences), [0, 8])
     assert found.bank in BANK_SETTINGS
     # Two recordings are enough where the gain is large.
-    assert choose(labelled(sequences[:3]), [0, 8], one_set=False).bank.adapt
+    assert choose(bank_only(sequences[:3]), [0, 8]).bank.adapt
 
 
 def test_the_least_loss_wins():
@@ -123,7 +128,7 @@ def test_the_least_loss_wins():
 
 def test_the_baseline_is_the_reserve_of_a_bank():
     rng = np.random.default_rng(7)
-    data = labelled([in_stretches(with_motions("s", rng, 500))])
+    data = labelled([with_motions("s", rng, 500)])
     assert reserve([3, 8, 4], data) == [0]
     assert reserve([3, 0, 4], data) == []
     assert reserve([3], data) == []  # there is no bank
@@ -154,7 +159,7 @@ def test_a_bank_is_simulated_with_smoothed_weights(monkeypatch):
 
     monkeypatch.setattr(BankSimulation, "errors", errors)
     monkeypatch.setattr(tuning, "bank_weights", bank_weights)
-    choose(labelled(sequences), [0, 8], one_set=False)
+    choose(bank_only(sequences), [0, 8])
     assert len(seen) == 3 * len(BANK_SETTINGS)
     for weights in seen:
         np.testing.assert_allclose(weights[:2], [[1.0, 0.0], [0.5, 0.5]], atol=0.01)
