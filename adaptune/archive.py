@@ -35,79 +35,45 @@ class ArchiveError(AdaptuneError):
 
 @dataclass(frozen=True, eq=False)
 class Frames:
-    """Data that all trials on a sequence share.
+    """Data that all trials on a sequence share."""
 
-    Attributes
-    ----------
-    stamps : ndarray of shape (n,)
-        Nanoseconds.
-    T_ref_sensor : ndarray of shape (n, 4, 4)
-        The reference, NaN where there is none.
-    descriptors : ndarray of shape (n, n_features)
-        float32.
-    blocks : dict
-        By name, in order, how many of the features are each descriptor's.
-    elevations : ndarray of shape (n,)
-        float32 degrees, of each scan's lowest points, see `adaptune.descriptor.lowest_elevation`.
-    hops : Hops
-        Direct registrations, one a second at most, see `adaptune.live.hops`.
-    evidence_ms : float
-        Milliseconds of CPU time a scan that these took; NaN if not measured.
-    """
-
-    stamps: NDArray[np.int64]
-    T_ref_sensor: Poses
-    descriptors: NDArray[np.float32]
-    blocks: dict[str, int]
+    stamps: NDArray[np.int64]  # (n,): nanoseconds
+    T_ref_sensor: Poses  # (n, 4, 4): the reference, NaN where there is none
+    descriptors: NDArray[np.float32]  # (n, n_features)
+    blocks: dict[str, int]  # by name, in order, how many of the features are each descriptor's
+    # (n,): degrees, of each scan's lowest points, see `adaptune.model.descriptor.lowest_elevation`.
     elevations: NDArray[np.float32]
+    # Direct registrations, one a second at most, see `adaptune.live.hops`.
     hops: Hops = field(default_factory=lambda: Hops.of([]))
-    evidence_ms: float = np.nan
+    evidence_ms: float = np.nan  # CPU time a scan that these took; NaN if not measured
 
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """One parameter set on one sequence.
-
-    Attributes
-    ----------
-    parameters : dict
-    T_odom_sensor : ndarray of shape (n, 4, 4)
-    errors : ndarray of shape (n,)
-        Sub-trajectory RTE in percent; NaN without a sub-trajectory, infinite after a lost track.
-    restarted : ndarray of shape (n,)
-        Frames at which the odometry lost track and restarted at the reference.
-    registered : ndarray of shape (n,)
-        False where the scan had too few points.
-    seconds : ndarray of shape (n,)
-        Computing time of the odometry for each scan, without preparing it.
-    faults : tuple of str
-        Reasons why the odometry's process ended or gave no pose, each with its last output.
-    metrics : dict
-        Of the whole trajectory by name, see `offline.objective`.
-    usage : dict
-        CPU time and memory, which differ from run to run: percent of a core, megabytes, and
-        milliseconds of CPU time a scan to register (`REGISTER_MS`) and prepare it (`PREPARE_MS`).
-    repeats : tuple of dict
-        If the trial was run several times, RTE and metrics of every run. Poses are then those of
-        the first run, and errors the mean of the capped errors of all runs.
-    unhealthy : dict
-        Faults that the health check would have found in the first run, and how often, see
-        `adaptune.odometry.tracker.Guard.check`. In a whole run, those that it found.
-    health : dict
-        Of a whole run, the bounds of the health check that restarted it.
-    """
+    """One parameter set on one sequence."""
 
     parameters: ParameterSet
-    T_odom_sensor: Poses
+    T_odom_sensor: Poses  # (n, 4, 4): of the first run, if the trial was run several times
+    # (n,): sub-trajectory RTE in percent; NaN without a sub-trajectory, infinite after a lost
+    # track. Of several runs, the mean of the capped errors.
     errors: NDArray[np.float64]
-    restarted: NDArray[np.bool_]
-    registered: NDArray[np.bool_]
+    restarted: NDArray[np.bool_]  # (n,): where it lost track and restarted at the reference
+    registered: NDArray[np.bool_]  # (n,): False where the scan had too few points
+    # (n,): computing time of the odometry for each scan, without preparing it.
     seconds: NDArray[np.float64]
+    # Reasons why the odometry's process ended or gave no pose, each with its last output.
     faults: tuple[str, ...] = ()
+    # Of the whole trajectory by name, see `offline.objective`.
     metrics: dict[str, float] = field(default_factory=dict)
+    # CPU time and memory, which differ from run to run: percent of a core, megabytes, and
+    # milliseconds of CPU time a scan to register (`REGISTER_MS`) and prepare it (`PREPARE_MS`).
     usage: dict[str, float] = field(default_factory=dict)
+    # RTE and metrics of every run, if the trial was run several times.
     repeats: tuple[dict[str, float], ...] = ()
+    # Faults that the health check would have found in the first run, and how often, see
+    # `adaptune.odometry.tracker.Guard.check`. In a whole run, those that it found.
     unhealthy: dict[str, int] = field(default_factory=dict)
+    # Of a whole run, the bounds of the health check that restarted it.
     health: dict[str, float] = field(default_factory=dict)
 
     @property
@@ -448,11 +414,9 @@ class Archive:
                 dict(_unpacked(data["blocks"])),
                 data["elevations"],
                 Hops(*(data[f"hops_{name}"] for name in Hops._fields)),
-                float(data.get("evidence_ms", np.nan)),
+                float(data["evidence_ms"]),
             )
-        except KeyError as error:
-            raise ArchiveError(f"{path}: lacks {error}; run `adaptune offline`") from error
-        except (ValueError, TypeError) as error:
+        except (KeyError, ValueError, TypeError) as error:
             raise _damaged(path, error) from error
 
     def write(self, sequence: str, number: int, trial: Trial, whole: bool = False) -> None:
@@ -485,8 +449,6 @@ class Archive:
         """Read a trial."""
         path = self.trial_path(sequence, number, whole)
         data = _read(path)
-        # Older files have none.
-        data = {"unhealthy": _packed({}), "health": _packed({})} | data
         _check_place(path, data, [sequence, number, whole])
         try:
             plain = {name: _unpacked(data[name]) for name in _PLAIN}
@@ -513,13 +475,10 @@ class Archive:
             if number not in self.finished(sequence):
                 continue
             path = self.trial_path(sequence, number)
-            try:
-                # Arrays are loaded one by one. Poses, most of the file, are not needed.
-                data = _read(path, ["errors", "place"])
-                _check_place(path, data, [sequence, number, False])
-                errors = data["errors"]
-            except KeyError as error:
-                raise ArchiveError(f"{path}: lacks {error}; remove it and run again") from error
+            # Arrays are loaded one by one. Poses, most of the file, are not needed.
+            data = _read(path, ["errors", "place"])
+            _check_place(path, data, [sequence, number, False])
+            errors = data["errors"]
             if read is None:
                 read = np.full((len(errors), len(numbers)), np.nan, np.float32)
             if len(errors) != len(read):
@@ -570,7 +529,7 @@ def _read(path: Path, names: Sequence[str] | None = None) -> dict[str, NDArray[A
             return {name: file[name] for name in names or file}
     except FileNotFoundError as error:
         raise ArchiveError(f"{path}: there is no such file; run `adaptune offline`") from error
-    except DAMAGED_NPZ as error:
+    except (KeyError, *DAMAGED_NPZ) as error:
         raise _damaged(path, error) from error
 
 
@@ -614,44 +573,34 @@ def rows(archive: Archive, names: Sequence[str]) -> list[Row]:
     sequences), mean error on each sequence, then over all sequences how often it lost track, how
     often its process ended and how often the health check would have found a fault, its other
     metrics (None if a sequence is too short for one), and its cost in milliseconds of CPU time a
-    scan (None if it was not measured; without the column if none was).
+    scan (None if it was not measured).
     """
     finished = {name: archive.finished(name) for name in names}
-    # A dictionary keeps their order.
-    known = {m: None for of in finished.values() for trial in of.values() for m in trial.metrics}
-    metrics = [metric for metric in known if metric not in ("rte", REGISTER_MS, PREPARE_MS)]
-    sets = (trial.parameters for of in finished.values() for trial in of.values())
-    # Sets of several odometries have other parameters.
-    names_of_parameters = list(dict.fromkeys(name for parameters in sets for name in parameters))
-    found = [
-        _row(number, {n: finished[n].get(number) for n in names}, names_of_parameters, metrics)
-        for number in sorted(set().union(*finished.values()))
-    ]
-    if all(row["cost"] is None for row in found):
-        for row in found:
-            del row["cost"]
+    every = [trial for trials in finished.values() for trial in trials.values()]
+    # Dictionaries keep the order of metrics, and of parameters: several odometries have others.
+    metrics = dict.fromkeys(metric for trial in every for metric in trial.metrics)
+    parameters = dict.fromkeys(name for trial in every for name in trial.parameters)
+    found = []
+    for number in sorted(set().union(*finished.values())):
+        trials = {name: finished[name].get(number) for name in names}
+        there = [trial for trial in trials.values() if trial is not None]
+        row: Row = {"trial": number} | {name: there[0].parameters.get(name) for name in parameters}
+        row["mean"] = _mean([trial and trial.mean_error for trial in trials.values()])
+        row |= {name: trial and trial.mean_error for name, trial in trials.items()}
+        row |= {"lost": sum(t.lost for t in there), "faults": sum(t.faults for t in there)}
+        row["unhealthy"] = sum(sum(t.unhealthy.values()) for t in there)
+        for metric in metrics:
+            if metric not in ("rte", REGISTER_MS, PREPARE_MS):
+                row[metric] = _mean([t.metrics.get(metric) for t in there])
+        cost = float(np.mean([t.cost for t in there]))
+        found.append(row | {"cost": None if np.isnan(cost) else cost})
     return found
 
 
-def _row(
-    number: int,
-    trials: Mapping[str, Summary | None],
-    parameters: Sequence[str],
-    metrics: Sequence[str],
-) -> Row:
-    there = [trial for trial in trials.values() if trial is not None]
-    whole = len(there) == len(trials)
-    row: Row = {"trial": number} | {name: there[0].parameters.get(name) for name in parameters}
-    row["mean"] = float(np.mean([trial.mean_error for trial in there])) if whole else None
-    row |= {name: trial and trial.mean_error for name, trial in trials.items()}
-    row |= {"lost": sum(t.lost for t in there), "faults": sum(t.faults for t in there)}
-    row["unhealthy"] = sum(sum(t.unhealthy.values()) for t in there)
-    for metric in metrics:
-        values = [t.metrics[metric] for t in there if metric in t.metrics]
-        row[metric] = float(np.mean(values)) if len(values) == len(there) else None
-    cost = float(np.mean([t.cost for t in there]))
-    row["cost"] = None if np.isnan(cost) else cost
-    return row
+def _mean(values: Sequence[float | None]) -> float | None:
+    """Mean of values; None if one is unknown."""
+    known = [value for value in values if value is not None]
+    return float(np.mean(known)) if len(known) == len(values) else None
 
 
 def select(

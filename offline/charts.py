@@ -1,10 +1,11 @@
 """Charts of the offline stage: of trials, of Pareto fronts, and of what was left out."""
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,39 +34,52 @@ from offline.storage import distribution
 from offline.tuning import figures
 
 
+class TriedSet(NamedTuple):
+    """A parameter set, and how it did in its trials."""
+
+    number: int
+    parameters: ParameterSet
+    by_sequence: Mapping[str, float]  # the first objective on the sequences on which it was run
+    value: float  # its mean over all training sequences, NaN if not run on all
+    feasible: bool  # whether it keeps all limits
+    cost: float  # milliseconds of CPU time a scan, NaN if unknown
+
+
 @dataclass(frozen=True, eq=False)
 class TrialTable:
     """Trials, in the order of their numbers."""
 
     space: ParameterSpace
-    numbers: NDArray[np.int64]  # (n,)
-    sets: Sequence[ParameterSet]
-    # By training sequence (n,): the first objective, NaN where a trial was not run.
-    by_sequence: Mapping[str, NDArray[np.float64]]
-    values: NDArray[np.float64]  # (n,): its mean over all sequences, NaN if not run on all
-    feasible: NDArray[np.bool_]  # (n,): whether the trial keeps all limits
-    costs: NDArray[np.float64]  # (n,): milliseconds of CPU time a scan, NaN if unknown
+    names: Sequence[str]  # of the training sequences
+    trials: Sequence[TriedSet]
     objective: str = "RTE [%]"  # name of the first objective, with its unit
     fixed: int | None = None  # trial number of the fixed set, once it is chosen
 
     def __len__(self) -> int:
-        return len(self.numbers)
+        return len(self.trials)
+
+    @cached_property
+    def numbers(self) -> NDArray[np.int64]:
+        """Their numbers, of shape (n,)."""
+        return np.array([trial.number for trial in self.trials], int)
+
+    @cached_property
+    def values(self) -> NDArray[np.float64]:
+        """See `TriedSet`, of shape (n,)."""
+        return np.array([trial.value for trial in self.trials])
+
+    def on(self, name: str) -> NDArray[np.float64]:
+        """The first objective on a sequence, of shape (n,); NaN where a trial was not run."""
+        return np.array([trial.by_sequence.get(name, np.nan) for trial in self.trials])
 
     def column(self, name: str) -> list[Any]:
         """Values of one of `space.parameters`; None where a set has none."""
-        return [self.space.flat(of_set).get(name) for of_set in self.sets]
+        return [self.space.flat(trial.parameters).get(name) for trial in self.trials]
 
-    def some(self, kept: NDArray[np.bool_]) -> "TrialTable":
+    def some(self, kept: Iterable[bool | np.bool_]) -> "TrialTable":
         """The same of some of the trials."""
-        return replace(
-            self,
-            numbers=self.numbers[kept],
-            sets=[own for own, its in zip(self.sets, kept, strict=True) if its],
-            by_sequence={name: of[kept] for name, of in self.by_sequence.items()},
-            values=self.values[kept],
-            feasible=self.feasible[kept],
-            costs=self.costs[kept],
-        )
+        few = [trial for trial, its in zip(self.trials, kept, strict=True) if its]
+        return replace(self, trials=few)
 
     def shared(self) -> "TrialTable":
         """The same of the trials whose sets all sequences share."""
@@ -73,8 +87,8 @@ class TrialTable:
 
     def odometries(self) -> dict[str, "TrialTable"]:
         """By the name of an odometry its trials; of the only one by no name."""
-        names = [str(of_set.get(ODOMETRY, "")) for of_set in self.sets]
-        return {name: self.some(np.array(names) == name) for name in dict.fromkeys(names)}
+        names = [str(trial.parameters.get(ODOMETRY, "")) for trial in self.trials]
+        return {name: self.some(own == name for own in names) for name in dict.fromkeys(names)}
 
 
 def read_trials(study: OfflineStudy) -> TrialTable:
@@ -96,26 +110,18 @@ def trial_table(
 
     Of `config`, the first objective and the limits count; `fixed` is the fixed set, once chosen.
     """
-    numbers = sorted({number for trials in finished.values() for number in trials})
-    n, objective = len(numbers), config.objective[0]
-    values, costs, feasible = np.full(n, np.nan), np.full(n, np.nan), np.zeros(n, bool)
-    by_sequence = {name: np.full(n, np.nan) for name in finished}
-    sets: list[ParameterSet] = []
-    for i, number in enumerate(numbers):
-        runs = {name: trials[number] for name, trials in finished.items() if number in trials}
+    objective, trials = config.objective[0], []
+    for number in sorted({number for of_sequence in finished.values() for number in of_sequence}):
+        runs = {name: of[number] for name, of in finished.items() if number in of}
         verdict = judge(config, list(runs.values()))
-        sets.append(verdict.parameters)
-        costs[i] = np.mean([run.cost for run in runs.values()])
-        feasible[i] = verdict.feasible
-        for name, run in runs.items():
-            by_sequence[name][i] = weighted(objective, run.metrics)
-        if len(runs) == len(finished):
-            values[i] = verdict.values[0]
+        by_sequence = {name: weighted(objective, run.metrics) for name, run in runs.items()}
+        value = verdict.values[0] if len(runs) == len(finished) else np.nan
+        cost = float(np.mean([run.cost for run in runs.values()]))
+        about = (number, verdict.parameters, by_sequence, value, verdict.feasible, cost)
+        trials.append(TriedSet(*about))
     named = "RTE [%]" if objective == {"rte": 1.0} else label(objective, units=True)
-    chosen = next((k for k, own in zip(numbers, sets, strict=True) if own == fixed), None)
-    return TrialTable(
-        space, np.array(numbers, int), sets, by_sequence, values, feasible, costs, named, chosen
-    )
+    chosen = next((trial.number for trial in trials if trial.parameters == fixed), None)
+    return TrialTable(space, list(finished), trials, named, chosen)
 
 
 _SPREAD = 20.0
@@ -123,7 +129,7 @@ _SPREAD = 20.0
 FEW = 8
 """With fewer trials, importances mean nothing."""
 MOST_PANELS = 12
-"""Panels of a chart; further parameters and sequences are not shown."""
+"""Panels of a chart; further sequences are not shown."""
 _COLOURED = 4.0
 """Colours say errors of up to so many times the least."""
 
@@ -137,7 +143,7 @@ def scatter_chart(
     x_axis, y_axis = (parameter_axis(name, table.space.parameters[name]) for name in parameters)
     xy = [on_axis(table.column(name), table.space.parameters[name]) for name in parameters]
     shown = list(sequences)[: MOST_PANELS - 1]
-    values = {name: table.by_sequence[name] for name in shown}
+    values = {name: table.on(name) for name in shown}
     if len(sequences) > 1:
         values["mean over all sequences"] = table.values
     panels = []
@@ -185,14 +191,14 @@ def iteration_chart(table: TrialTable) -> Chart | None:
         values, title = table.values, ""
         if slot:
             # A search of its own is on one sequence.
-            n_known = {n: np.isfinite(v[slots == slot]).sum() for n, v in table.by_sequence.items()}
-            of = max(n_known, key=n_known.__getitem__)
-            values, title = table.by_sequence[of], f"{of} alone"
+            own = table.some(slots == slot)
+            of = max(table.names, key=lambda name: np.isfinite(own.on(name)).sum())
+            values, title = table.on(of), f"{of} alone"
         kept = (slots == slot) & np.isfinite(values)
         number, errors = table.numbers[kept] - OF_SLOT * slot, values[kept]
         if len(number) < 2:
             continue
-        allowed = np.where(table.feasible[kept], errors, np.inf)
+        allowed = np.where([trial.feasible for trial in table.some(kept).trials], errors, np.inf)
         least = np.minimum.accumulate(allowed)
         drawn: list[Drawn] = [
             Points(number, errors, "trial", texts=[f"trial {n}" for n in table.numbers[kept]]),
@@ -214,43 +220,17 @@ def iteration_chart(table: TrialTable) -> Chart | None:
     )
 
 
-def sensitivity_chart(table: TrialTable) -> Chart | None:
-    """Error of all trials over each parameter."""
-    table = table.shared()
-    table = table.some(np.isfinite(table.values))
-    panels = []
-    if len(table) < 2:
-        return None
-    for name, parameter in list(table.space.parameters.items())[:MOST_PANELS]:
-        x = on_axis(table.column(name), parameter)
-        at = int(table.values.argmin())
-        drawn = [
-            Points(x, table.values, "trial", texts=[f"trial {n}" for n in table.numbers]),
-            *_marked(table, x, table.values),
-            Points(x[[at]], table.values[[at]], "best trial", shape="diamond"),
-        ]
-        y = Axis(table.objective, bool((table.values > 0.0).all()))
-        panels.append(Panel(parameter_axis(name, parameter), y, tuple(drawn)))
-    return Chart(
-        "sensitivity",
-        "Error over each parameter",
-        tuple(panels),
-        "Each point is a trial, its error is the mean over all training sequences. A clear valley "
-        "means that the parameter matters alone; a cloud means that others decide.",
-        columns=min(2, len(panels)),
-    )
-
-
 def cost_chart(table: TrialTable) -> Chart | None:
     """Error over CPU time of all trials, with their Pareto front."""
-    table = table.some(np.isfinite(table.values) & np.isfinite(table.costs))
+    table = table.some(np.isfinite(trial.value + trial.cost) for trial in table.trials)
     if len(table) < 2:
         return None
-    front = pareto_front(np.column_stack([table.costs, table.values]))
+    costs = np.array([trial.cost for trial in table.trials])
+    front = pareto_front(np.column_stack([costs, table.values]))
     drawn = (
-        Points(table.costs, table.values, "trial", texts=[f"trial {n}" for n in table.numbers]),
-        Line(table.costs[front], table.values[front], "Pareto front", steps=True),
-        *_marked(table, table.costs, table.values),
+        Points(costs, table.values, "trial", texts=[f"trial {n}" for n in table.numbers]),
+        Line(costs[front], table.values[front], "Pareto front", steps=True),
+        *_marked(table, costs, table.values),
     )
     log = bool((table.values > 0.0).all())
     x, y = Axis("CPU time a scan [ms]", log=True), Axis(table.objective, log)
@@ -432,15 +412,12 @@ def charts_of_trials(study: OfflineStudy) -> Charts:
 
 
 def _of_trials(table: TrialTable) -> Iterator[Chart | str | None]:
-    names = [name for name in table.by_sequence if OF_VIEW not in name]
-    if (n := len(table.space.parameters)) > MOST_PANELS:
-        yield f"Of {n} parameters, the charts show the first {MOST_PANELS}."
+    names = [name for name in table.names if OF_VIEW not in name]
     found = {name: importances(of) for name, of in table.shared().odometries().items()}
     yield iteration_chart(table)
     yield importance_chart(found) or (
         f"No importance of parameters: it takes {FEW} finished trials and two parameters."
     )
-    yield sensitivity_chart(table)
     for odometry, of in table.odometries().items():
         pair = most_important(of, found.get(odometry, {}))
         chart = scatter_chart(of, pair, names)
@@ -448,10 +425,7 @@ def _of_trials(table: TrialTable) -> Iterator[Chart | str | None]:
             key, title = f"{chart.key}-{odometry}", f"{odometry}: {chart.title}"
             chart = replace(chart, key=key, title=title)
         yield chart
-    yield cost_chart(table) or (
-        "No costs of trials: they are of an older adaptune, or of an odometry that does not "
-        "measure them."
-    )
+    yield cost_chart(table)
 
 
 def most_important(table: TrialTable, shares: Mapping[str, float]) -> list[str]:

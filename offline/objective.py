@@ -244,14 +244,9 @@ def affordable(costs: Costs, trials: Sequence[int], budget: float) -> list[int]:
     AdaptuneError
         If there is none.
     """
-    if all(np.isnan(costs.alone(n)) for n in trials):
-        raise AdaptuneError(
-            "online.budget: the trials are of an older adaptune, which did not measure what they "
-            "cost; remove the folder of trials and run `adaptune offline`"
-        )
     few = [n for n in trials if costs.alone(n) <= budget + ROUNDING]
     if not few:
-        cheapest = min(trials, key=lambda n: np.nan_to_num(costs.alone(n), nan=np.inf))
+        cheapest = min(trials, key=costs.alone)
         raise AdaptuneError(
             f"online.budget: {budget:g} ms of CPU time a scan is less than the cheapest of "
             f"{len(trials)} parameter sets takes, {costs.alone(cheapest):.1f} ms (trial "

@@ -64,9 +64,6 @@ from offline.trial import TrialSettings, TrialSetup
 from offline.tuning import DO_NOT_ADAPT, NO_BANK, choose, driven_cost, reserve, rivals
 from offline.workers import Cluster, Workers
 
-COARSE_REFERENCE = 0.6
-"""A reference whose error is more than this share of the best set's hardly tells sets apart."""
-
 COST = "cost [ms]"
 """Column of CPU time a scan, preparation included."""
 
@@ -77,10 +74,7 @@ class Training(NamedTuple):
     """Result of the offline stage."""
 
     model: ErrorModel
-    # For every training sequence the mean capped error in percent of each trial, by rising number,
-    # of shape (n_trials,); NaN where it was not run.
-    means: dict[str, list[float]]
-    fixed: int  # number of the trial of the fixed set
+    trials: list[dict[str, Any]]  # a row each, as in trials.csv
     # For every training sequence what the baseline, the fixed set and its own best set do there.
     rows: list[dict[str, Any]]
     remark: str | None  # see `baseline_warning`
@@ -89,46 +83,25 @@ class Training(NamedTuple):
     @property
     def words(self) -> list[str]:
         """What the fixed set is, and what it gains in training."""
-        own, fixed = (
+        own, of_fixed = (
             sum(row[f"{mode}, whole run"] for row in self.rows) / len(self.rows)
             for mode in ("baseline", "fixed")
         )
-        sets, n = self.model.sets, len(self.rows)
+        sets, fixed, costs, n = self.model.sets, self.model.fixed, self.model.costs, len(self.rows)
         baseline = f"Parameters of the baseline: {in_words(sets.space.baseline)}"
         where = f"in whole runs in training ({n} sequence{'s' if n > 1 else ''})"
-        if self.fixed == 0:
+        if fixed == 0:
             beaten = f"No set clearly beat the baseline's {own:.3f} % {where}"
             return [*self.said, f"{beaten}; the fixed set is the baseline.", baseline]
+        ms = np.nan if costs is None else costs.alone(fixed)
+        cost = f"; it costs {ms:.1f} ms of CPU time a scan" if np.isfinite(ms) else ""
         return [
             *self.said,
-            f"Fixed: {fixed:.3f} % against the baseline's {own:.3f} % {where}.",
-            f"Parameters of the fixed set: {in_words(sets[self.fixed])}{self._cost}",
+            f"Fixed: {of_fixed:.3f} % against the baseline's {own:.3f} % {where}.",
+            f"Parameters of the fixed set: {in_words(sets[fixed])}{cost}",
             baseline,
             *([self.remark] if self.remark else []),
         ]
-
-    @property
-    def _cost(self) -> str:
-        """What the fixed set costs, if it is known."""
-        costs = self.model.costs
-        ms = np.nan if costs is None else costs.alone(self.fixed)
-        return f"; it costs {ms:.1f} ms of CPU time a scan" if np.isfinite(ms) else ""
-
-
-def doubts(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """A sentence about references that are hardly more accurate than the best sets, if any are."""
-    coarse = [
-        f"{row['sequence']} ({row['_reference_error']:.2g} against {row['own best']:.2g} %)"
-        for row in rows
-        if (row["_reference_error"] or 0.0) > COARSE_REFERENCE * row["own best"]
-    ]
-    if not coarse:
-        return []
-    return [
-        f"The estimated reference is hardly more accurate than the best set on "
-        f"{', '.join(coarse)}: it pulls ratios towards 1, and sets that differ by less cannot "
-        f"be told apart. A longer sub_trajectory may help."
-    ]
 
 
 def train(study: OfflineStudy, progress: Progress = unseen, cluster: str | None = None) -> Training:
@@ -172,7 +145,8 @@ def train(study: OfflineStudy, progress: Progress = unseen, cluster: str | None 
     model = _fitted(study, archive, verdicts, fixed, before)
     write_text(study.folder / "fixed.yaml", files.dump(verdicts[fixed].parameters))
     table = _trial_rows(config, space, verdicts, finished)
-    tables.write_rows(study.folder, "trials", list(table.values()))
+    trials = list(table.values())
+    tables.write_rows(study.folder, "trials", trials)
     if len(config.objective) > 1:
         _write_pareto(study.folder, config.objective, verdicts, fixed, table)
     estimates = estimates_of(study.sequences, names)
@@ -181,13 +155,8 @@ def train(study: OfflineStudy, progress: Progress = unseen, cluster: str | None 
     tables.write_rows(study.folder, "training", rows)
     said = [] if before is None else changes(before, model)
     said += [*estimates_in_words(estimates, model.length, intervals=True)]
-    said += doubts(rows)
-    said += baseline_words(config, [trials[0] for trials in finished.values()])
-    means = {
-        name: [trials[n].mean_error if n in trials else np.nan for n in verdicts]
-        for name, trials in finished.items()
-    }
-    return Training(model, means, fixed, rows, remark, said)
+    said += baseline_words(config, [runs[0] for runs in finished.values()])
+    return Training(model, trials, rows, remark, said)
 
 
 def _ready_archive(study: OfflineStudy, progress: Progress) -> Archive:
@@ -284,9 +253,8 @@ def _fitted(
     estimates = estimates_of(study.sequences, study.training)
     if judged := estimates_as_data(estimates, config.sub_trajectory):
         provenance |= {"estimated_references": judged}
-    provenance["evidence"] = _evidence(
-        config, study.window, archive, study.training, verdicts, fixed, provenance
-    )
+    about = (config, archive, study.training, verdicts, fixed)
+    provenance["evidence"] = _evidence(*about, provenance)
     if before is not None and before.provenance == provenance:
         manifest.record(study.model_inputs_path, inputs)
         return before
@@ -312,7 +280,6 @@ def _fitted(
 
 def _evidence(
     config: OfflineStudyConfig,
-    window: int,
     archive: Archive,
     names: Sequence[str],
     verdicts: Mapping[int, Verdict],
@@ -328,11 +295,9 @@ def _evidence(
         ]
         for name in names
     }
-    settings = (config.sub_trajectory, config.lost_track, window, config.online.period)
     switching = config.online.switching.model_dump(mode="json", include={"size", "sets"})
-    feasible = [n for n, verdict in verdicts.items() if verdict.feasible]
-    budget = config.online.budget
-    about = [provenance, trials, settings, switching, budget, feasible, fixed, list(names)]
+    online = (config.online.period, config.online.budget, switching)
+    about = [provenance, trials, online, fixed]
     found = hashlib.blake2b(json.dumps(about).encode(), digest_size=16)
     for name in names:
         frames = archive.read_frames(name)

@@ -3,8 +3,9 @@
 All are compared by their expected loss on evidence that is left out, see `offline.expected_loss`.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -168,8 +169,8 @@ ROUNDING = 1e-6
 DO_NOT_ADAPT = PairedSettings(adapt=False)
 NO_BANK = BankSettings(adapt=False)
 
-Chooser = Callable[[LabelledData, int, int, Spending | None], list[int]]
-"""Chooses a bank's members on sequences, for a fixed set, so many, for what they may cost."""
+Chooser = Callable[[LabelledData, int], list[int]]
+"""Chooses a bank's members on sequences, for a fixed set: trial numbers, the fixed set's first."""
 
 
 class Policy(NamedTuple):
@@ -209,38 +210,36 @@ def choose(
     if most is not None and len(folds) > most:
         folds = [folds[i] for i in np.linspace(0, len(folds) - 1, most).round().astype(int)]
     fixed = data.fixed() if fixed is None else fixed
-    choosers, spending = _choosers(bank, data), data.spending
+    spending = data.spending
     # Whether the budget allows live evidence beside the fixed set.
     one_set = data.live and (spending is None or spending.allows([fixed]))
-    banks = {way: make(data, fixed) for way, make in choosers.items()}
-    banks = {way: members for way, members in banks.items() if len(members) > 1}
-    members = next(iter(banks.values()), [])
+    made = [(make, make(data, fixed)) for make in _choosers(bank, spending)]
+    choosers = [make for make, members in made if len(members) > 1]
+    banks = [members for _, members in made if len(members) > 1]
     recordings: list[str] = []
     logs: list[NDArray[np.float64]] = []
     # The matrices are small: more threads would mostly wait for each other.
     with threadpool_limits(1, "blas"):
         for left_out, others in folds:
-            of_fold = _logs(left_out, others, {way: choosers[way] for way in banks}, one_set)
-            logs.append(of_fold)
-            recordings += [left_out.recording] * len(of_fold)
+            logs.append(_logs(left_out, others, choosers, one_set))
+            recordings += [left_out.recording] * len(logs[-1])
     if len(recordings) < 2 or not logs[0].shape[1]:
         # A bank measures the errors of its members while it drives.
-        return Policy(DO_NOT_ADAPT, BankSettings(adapt=len(members) > 1), members, {})
-    return least_loss(
-        np.concatenate(logs), recordings, banks, len(PAIRED_SETTINGS) if one_set else 0
-    )
+        return Policy(DO_NOT_ADAPT, BankSettings(adapt=bool(banks)), banks[0] if banks else [], {})
+    n_single = len(PAIRED_SETTINGS) if one_set else 0
+    return least_loss(np.concatenate(logs), recordings, banks, n_single)
 
 
 def least_loss(
     logs: NDArray[np.float64],
     recordings: Sequence[str],
-    banks: Mapping[str, list[int]],
+    banks: Sequence[list[int]],
     n_single: int,
 ) -> Policy:
     """The settings with the least loss, of one set at a time and of a bank.
 
     `logs` is of shape (n_stretches, n_single + len(banks) * len(BANK_SETTINGS)); its first
-    `n_single` columns are about one set at a time. `banks` has the members by way to choose them.
+    `n_single` columns are about one set at a time. `banks` has the members of each.
     """
     losses = np.array([expected_loss(column, recordings) for column in logs.T])
     losses[~(np.abs(losses) > ROUNDING)] = 0.0
@@ -249,7 +248,7 @@ def least_loss(
     drawn = np.where(losses == 0.0, 0.0, drawn / (len(logs) + STRETCHES_ELSEWHERE))
     losses[n_single:] = drawn[n_single:]
     expected: dict[str, Figures] = {}
-    one_set, bank, members = DO_NOT_ADAPT, NO_BANK, next(iter(banks.values()), [])
+    one_set, bank, members = DO_NOT_ADAPT, NO_BANK, banks[0] if banks else []
     if n_single:
         best = int(np.argmin(losses[:n_single]))
         expected[ONE_SET] = figures(logs[:, best], recordings)
@@ -259,43 +258,35 @@ def least_loss(
         best = n_single + int(np.argmin(losses[n_single:]))
         expected[BANK] = figures(logs[:, best], recordings)
         way, which = divmod(best - n_single, len(BANK_SETTINGS))
-        members = list(banks.values())[way]
+        members = banks[way]
         if losses[best] < min(0.0, losses[:n_single].min(initial=0.0)):
             bank = BANK_SETTINGS[which]
     return Policy(one_set, bank, members, expected)
 
 
-def _choosers(
-    bank: int | Sequence[int], data: LabelledData
-) -> dict[str, Callable[[LabelledData, int], list[int]]]:
-    """By name, the ways to choose a bank's members."""
+def _choosers(bank: int | Sequence[int], spending: Spending | None) -> list[Chooser]:
+    """The ways to choose a bank's members."""
     if not isinstance(bank, int):
         named = list(bank)
-        return {"named": lambda *_: named}
+        return [lambda *_: named]
     if bank < 2:
-        return {}
-
-    def of_size(
-        way: Chooser, size: int = bank, spending: Spending | None = None
-    ) -> Callable[[LabelledData, int], list[int]]:
-        return lambda data, fixed: way(data, fixed, size, spending)
-
-    if (spending := data.spending) is None:
-        return {name: of_size(way) for name, way in WAYS.items()}
+        return []
+    ways = (cancelling_members, complementary_members)
+    if spending is None:
+        return [partial(way, size=bank) for way in ways]
     # A budget may be spent on more members, on dearer ones, or on those that gain most for it.
+    sizes = dict.fromkeys((bank, MOST_MEMBERS))
     thrifty = spending._replace(thrifty=True)
-    ways = {
-        f"{name}, {n}": of_size(way, n, spending)
-        for name, way in WAYS.items()
-        for n in dict.fromkeys((bank, MOST_MEMBERS))
-    }
-    return ways | {"thrifty": of_size(cancelling_members, MOST_MEMBERS, thrifty)}
+    return [
+        *(partial(way, size=size, spending=spending) for way in ways for size in sizes),
+        partial(cancelling_members, size=MOST_MEMBERS, spending=thrifty),
+    ]
 
 
 def _logs(
     left_out: LabelledSequence,
     others: LabelledData,
-    choosers: Mapping[str, Callable[[LabelledData, int], list[int]]],
+    choosers: Sequence[Chooser],
     one_set: bool,
 ) -> NDArray[np.float64]:
     """Logarithms of ratios to the fixed set's error, on a fold.
@@ -310,7 +301,7 @@ def _logs(
     if one_set:
         columns += list(_paired_errors(left_out, data, pca))
     known: dict[tuple[int, ...], list[NDArray[np.float64]]] = {}
-    for make in choosers.values():
+    for make in choosers:
         found = [trial for trial in make(others, data.fixed) if trial in data.sets]
         # Whatever the order of the others is, they are the same bank.
         members = (*found[:1], *sorted(found[1:]))
@@ -430,13 +421,6 @@ def reserve(members: Sequence[int], data: LabelledData) -> list[int]:
         return []
     spending = data.spending
     return [BASELINE] if spending is None or spending.allows([*members, BASELINE]) else []
-
-
-WAYS: dict[str, Chooser] = {
-    "cancelling": cancelling_members,
-    "complementary": complementary_members,
-}
-"""Ways to choose a bank's members."""
 
 
 def driven_cost(data: LabelledData, policy: Policy, fixed: int) -> float:

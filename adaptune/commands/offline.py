@@ -80,7 +80,7 @@ def offline(
     with progress() as show:
         training = train(loaded, show, cluster)
     model = training.model
-    n = len(next(iter(training.means.values())))
+    n = len(training.trials)
     show_table(
         f"RTE [%] over {model.length:g} m in training, {n} parameter sets",
         training.rows,

@@ -30,7 +30,7 @@ def trained(study_file, trained_folder, tmp_path_factory):
 
 def test_the_fixed_set_is_the_best_of_the_candidates_in_whole_runs(trained):
     study, training = trained
-    means = np.mean([training.means["one"], training.means["two"]], axis=0)
+    means = np.array([row["mean"] for row in training.trials])
     assert means.min() < means.max() / 1.5
     archive = Archive(study.folder / "trials")
     candidates = {0, *np.argsort(means)[:4].tolist()}
@@ -43,7 +43,7 @@ def test_the_fixed_set_is_the_best_of_the_candidates_in_whole_runs(trained):
     near = [n for n in candidates if whole[n] <= 1.02 * min(whole.values())]
     assert training.model.fixed == min(near, key=lambda n: means[n])
     shown = [row["fixed, whole run"] for row in training.rows]
-    assert np.mean(shown) == pytest.approx(whole[training.fixed])
+    assert np.mean(shown) == pytest.approx(whole[training.model.fixed])
 
 
 def test_whole_runs_are_made_again_with_another_health_check(trained, study_file, tmp_path):
@@ -142,7 +142,7 @@ def test_views_are_trained_on_beside_their_origin(gicp_study_file, tmp_path):
     frames = [archive.read_frames(name).T_ref_sensor for name in names]
     np.testing.assert_array_equal(frames[0], frames[1])
     np.testing.assert_allclose(frames[0], frames[2][::-1], atol=1e-9)
-    errors = [training.means[name][0] for name in names]
+    errors = [training.trials[0][name] for name in names]
     assert len(set(errors)) == 4
 
 
@@ -212,9 +212,9 @@ def test_a_reference_that_contradicts_the_motion_is_told(
 def test_the_baseline_wins_where_trials_flatter(study_file, tmp_path):
     study = study_of(study_file, tmp_path / "study", "offline.trials=6")
     training = train(study)
-    best = int(np.nanargmin(np.mean(list(training.means.values()), axis=0)))
+    best = int(np.argmin([row["mean"] for row in training.trials]))
     assert best != 0
-    assert training.fixed == training.model.fixed == 0
+    assert training.model.fixed == 0
     assert "the baseline is better than the trials suggested: its rte is" in training.remark
     assert f"trial {best}, the best by its trials" in training.remark
     assert "the fixed set is the baseline" in training.remark

@@ -103,7 +103,7 @@ def test_with_nothing_to_do_nothing_is_done(trained):
     # Other evidence drops it.
     more = load_study(trained.folder.parent / "small.yaml", ["offline.trials=5"], trained.folder)
     assert not train(more).model.validation
-    assert len(first.means["one"]) == 4
+    assert len(first.trials) == 4
 
 
 @pytest.mark.parametrize("place", [("two", 2), ("one", 3)])

@@ -68,9 +68,6 @@ def test_a_budget_bounds_the_fixed_set_and_what_is_selected(places):
     frugal = data(places, budget=12.0)
     assert allowed_sets(frugal.spending, frugal.sets, TRIALS[1]) == TRIALS[:2]
     assert data(places).spending is None
-    unknown = Costs({t: SetCost(np.nan, np.nan, 0) for t in TRIALS}, np.nan)
-    with pytest.raises(AdaptuneError, match="older adaptune"):
-        data(places, budget=12.0)._replace(costs=unknown).fixed()
 
 
 @pytest.fixture(scope="module")

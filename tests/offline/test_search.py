@@ -2,7 +2,6 @@ import csv
 import dataclasses
 import itertools
 import json
-import math
 import os
 import re
 from functools import partial
@@ -344,12 +343,12 @@ def test_what_a_pruned_trial_has_seen_feeds_the_model(pruning_study, tmp_path):
     assert (n_seen[:3] == 4).all()
     assert 2 <= n_seen.min() < 4
     model = ErrorModel.load(study.folder / "model.safetensors")
-    for s, (row, means) in enumerate(zip(np.transpose(seen), training.means.values(), strict=True)):
+    for s, (name, row) in enumerate(zip(study.training, np.transpose(seen), strict=True)):
         errors = model.errors[model.sequence == s]
         assert (np.isnan(errors).all(axis=0) == ~row).all()
         assert (np.isnan(errors).any(axis=0) == ~row).all()
-        assert [math.isnan(mean) for mean in means] == (~row).tolist()
-    assert n_seen[training.fixed] == 4
+        assert [trial[name] is None for trial in training.trials] == (~row).tolist()
+    assert n_seen[training.model.fixed] == 4
     rows = list(csv.DictReader((study.folder / "trials.csv").open()))
     assert [row["mean"] == "" for row in rows] == (n_seen < 4).tolist()
     validation = validate(study).validation

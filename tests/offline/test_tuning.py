@@ -91,7 +91,7 @@ def test_a_bank_that_gains_nothing_does_not_adapt():
 def test_the_least_loss_wins():
     logs = np.zeros((8, len(PAIRED_SETTINGS) + 2 * len(BANK_SETTINGS)))
     names = [str(i) for i in range(8)]
-    banks = {"first": [0, 1], "second": [0, 2]}
+    banks = [[0, 1], [0, 2]]
 
     def best():
         return tuning.least_loss(logs, names, banks, len(PAIRED_SETTINGS))

@@ -163,7 +163,7 @@ def test_what_it_takes_is_measured_and_can_be_limited(make):
     assert 12.5 <= 1e3 * np.median(trial.seconds) < 200.0
     assert 100 * 0.5 / 3.9 <= trial.usage["cpu"] < 200.0
     assert 200.0 <= trial.usage["memory"] < 1000.0
-    assert len(train(study).means) > 0
+    assert len(train(study).trials) > 0
     late = make("hang", "isolation.seconds=0.02")
     trial, _ = run(late)
     assert trial.faults
