@@ -122,27 +122,22 @@ def summarise(trial: Trial) -> Summary:
     )
 
 
-class _Entry(NamedTuple):
-    """A line of the index: a summary, and the size and time that reveal a change of its file."""
+_Key = tuple[str, int, int, int]
+"""A trial in the index: sequence and number, size and time, which reveal a change of its file."""
 
-    sequence: str
-    trial: int
-    size: int
-    mtime_ns: int
-    summary: Summary
 
-    def dump(self) -> str:
-        """The line."""
-        return json.dumps(self._asdict() | {"summary": asdict(self.summary)}) + "\n"
+def _line(key: _Key, summary: Summary) -> str:
+    """A line of the index."""
+    return json.dumps([key, asdict(summary)]) + "\n"
 
-    @classmethod
-    def load(cls, line: str) -> "_Entry | None":
-        """Parse a line; None for one that is damaged."""
-        try:
-            data = json.loads(line)
-            return cls(**data | {"summary": Summary(**data["summary"])})
-        except (ValueError, TypeError, KeyError):
-            return None
+
+def _indexed(line: str) -> tuple[_Key, Summary] | None:
+    """Parse a line of the index; None for one that is damaged."""
+    try:
+        (sequence, number, size, mtime_ns), summary = json.loads(line)
+        return (str(sequence), int(number), int(size), int(mtime_ns)), Summary(**summary)
+    except (ValueError, TypeError):
+        return None
 
 
 class Sources(NamedTuple):
@@ -304,7 +299,7 @@ class Archive:
         """Remove unfinished files and repair the index. No process may be writing."""
         for unfinished in (*self.folder.glob("*/.*.npz"), *self.folder.glob(".index.*")):
             unfinished.unlink()
-        index = "".join(entry.dump() for entry in self._entries())
+        index = "".join(_line(*entry) for entry in self._entries())
         if index != self._index():
             write_text(self.folder / INDEX, index)
 
@@ -318,8 +313,8 @@ class Archive:
     def _all(self) -> dict[str, dict[int, Summary]]:
         if self._finished is None:
             self._finished = {}
-            for entry in self._entries():
-                self._finished.setdefault(entry.sequence, {})[entry.trial] = entry.summary
+            for (sequence, number, *_), summary in self._entries():
+                self._finished.setdefault(sequence, {})[number] = summary
         return self._finished
 
     def sets(self) -> dict[int, ParameterSet]:
@@ -360,18 +355,16 @@ class Archive:
             write_text(path, json.dumps(slots) + "\n")
         return slots
 
-    def _entries(self) -> Iterator[_Entry]:
+    def _entries(self) -> Iterator[tuple[_Key, Summary]]:
         """Entries that the index should have."""
-        indexed = {
-            entry[:4]: entry for line in self._index().splitlines() if (entry := _Entry.load(line))
-        }
+        indexed = dict(filter(None, map(_indexed, self._index().splitlines())))
         for path in sorted(self.folder.glob("*/")):
             with os.scandir(path) as files:
                 found = [file for file in files if _TRIAL.fullmatch(file.name)]
             trials = sorted((int(file.name[:-4]), file.stat()) for file in found)
             for number, status in trials:
                 key = (path.name, number, status.st_size, status.st_mtime_ns)
-                yield indexed.get(key) or _Entry(*key, summarise(self.read(path.name, number)))
+                yield key, indexed.get(key) or summarise(self.read(path.name, number))
 
     def _index(self) -> str:
         try:
@@ -439,9 +432,9 @@ class Archive:
         if whole:
             return
         status, summary = path.stat(), summarise(trial)
-        entry = _Entry(sequence, number, status.st_size, status.st_mtime_ns, summary)
+        line = _line((sequence, number, status.st_size, status.st_mtime_ns), summary)
         with needing_room(i := self.folder / INDEX), i.open("a", encoding="utf-8") as file:
-            file.write(entry.dump())
+            file.write(line)
         if self._finished is not None:
             self._finished.setdefault(sequence, {})[number] = summary
 

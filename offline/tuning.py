@@ -104,14 +104,14 @@ def standard_error(logs: Logs, recordings: Sequence[str]) -> float:
     return max(independent, float(scale * _resampled_means(logs, number).std()))
 
 
-def _resampled_means(logs: Logs, number: NDArray[np.intp], seed: int = 0) -> NDArray[np.float64]:
+def _resampled_means(logs: Logs, number: NDArray[np.intp]) -> NDArray[np.float64]:
     """Means of a circular block bootstrap, whose blocks are of one recording."""
     following = np.arange(1, len(logs) + 1)
     for recording in np.unique(number):
         of = np.flatnonzero(number == recording)
         following[of] = np.roll(of, -1)
     n_blocks = -(-len(logs) // BLOCK_STRETCHES)
-    drawn = np.random.default_rng(seed).integers(0, len(logs), (RESAMPLES, n_blocks))
+    drawn = np.random.default_rng(0).integers(0, len(logs), (RESAMPLES, n_blocks))
     return np.asarray((logs[drawn] + logs[following[drawn]]).mean(axis=1) / BLOCK_STRETCHES)
 
 

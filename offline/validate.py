@@ -74,14 +74,6 @@ class LeftOut(NamedTuple):
     # For every mode the milliseconds of CPU time a scan that it costs; NaN if it is unknown.
     costs: Mapping[str, float]
 
-    def interval(self, mode: str) -> tuple[float, float] | None:
-        """95 % interval of the ratio to the fixed set's error, see `bootstrap`.
-
-        It is about this sequence, and says nothing about other places.
-        """
-        intervals = bootstrap(self.errors[mode], self.errors["fixed"], self.block)
-        return intervals and intervals[1]
-
 
 def joined(parts: Sequence[LeftOut]) -> LeftOut:
     """Stretches of a recording that were left out, as one."""
@@ -417,7 +409,10 @@ def _rows(validation: Validation, rate: float) -> list[dict[str, Any]]:
 
     for i, sequence in enumerate(validation.left_out):
         of = {mode: float(validation.ratios[mode][i]) for mode in modes}
-        add(sequence.name, sequence.errors["fixed"].mean(), of, sequence.interval(default))
+        errors, fixed = sequence.errors[default], sequence.errors["fixed"]
+        # It is about this sequence, and says nothing about other places.
+        intervals = bootstrap(errors, fixed, sequence.block)
+        add(sequence.name, fixed.mean(), of, intervals and intervals[1])
     costs = {mode: validation.cost(mode) for mode in ["fixed", *modes]}
     if np.isfinite(list(costs.values())).any():
         add("ms a scan", costs["fixed"], costs)

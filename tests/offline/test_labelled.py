@@ -2,8 +2,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from labelled_places import of_errors
 from tables import table
 
@@ -102,9 +100,6 @@ def test_a_candidate_of_all_sequences_is_none_where_its_luck_is_left_out():
     assert others._replace(sequences=some).fixed() != others.fixed()
 
 
-logs = st.lists(st.floats(-3.0, 3.0), min_size=2, max_size=30).map(np.array)
-
-
 def alone(values):
     """Each stretch is a recording."""
     return [str(i) for i in range(len(values))]
@@ -112,15 +107,6 @@ def alone(values):
 
 def test_one_stretch_shows_nothing():
     assert expected_loss(np.array([-1.0]), ["one"]) == np.inf
-
-
-@given(logs)
-def test_loss_is_the_mean_and_what_may_go_wrong(values):
-    loss = expected_loss(values, alone(values))
-    if values.any():
-        assert loss >= values.mean()
-        risk = 0.5 * max(0.0, worst_tenth(values))
-        assert loss == pytest.approx(values.mean() + risk + standard_error(values, alone(values)))
 
 
 def test_one_disaster_outweighs_small_gains():
