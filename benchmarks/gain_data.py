@@ -22,7 +22,6 @@ from adaptune.space import ParameterSets, ParameterSpace
 from offline.config import OfflineConfig
 from offline.labelled import (
     BankSimulation,
-    Extent,
     LabelledData,
     LabelledSequence,
     error_vectors,
@@ -175,7 +174,7 @@ def in_place(
     known: NDArray[np.bool_],
 ) -> LabelledSequence:
     """A recording of one stretch, with the errors of all sets on its known frames."""
-    extent = Extent.of(simulation.T_ref_sensor, known, simulation.length)
-    of = (name, name, simulation, extent, np.zeros(len(errors), np.intp), errors)
+    frames = np.flatnonzero(known)
+    of = (name, name, simulation, frames, np.zeros(len(frames), np.intp), errors)
     of_sets = dict(enumerate(np.moveaxis(vectors, 1, 0)))
     return LabelledSequence(*of, errors[:, 0].astype(float), {"ndt": N_FEATURES}, of_sets)

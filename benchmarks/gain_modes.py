@@ -102,12 +102,11 @@ def constantly(sequence: LabelledSequence, members: Sequence[int]) -> Errors:
         "bank, best weights": minimum_variance_weights(squares),
     }
     n_periods = len(periods(simulation.period)[0])
-    return {
-        mode: simulation.errors(MemberWeights(tuple(members), np.tile(weights, (n_periods, 1))))[
-            sequence.extent.frames
-        ]
+    constant = {
+        mode: MemberWeights(tuple(members), np.tile(weights, (n_periods, 1)))
         for mode, weights in modes.items()
     }
+    return {mode: simulation.errors(of)[sequence.known] for mode, of in constant.items()}
 
 
 def print_summary(validation: Validation, modes: Iterable[str]) -> None:

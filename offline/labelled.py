@@ -3,7 +3,7 @@
 from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, lru_cache, partial
-from typing import TYPE_CHECKING, NamedTuple, Self
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,6 +94,11 @@ class BankSimulation:
     )
     _live: dict[tuple[int, ...], list[LiveSquares | None]] = field(default_factory=dict, init=False)
 
+    @cached_property
+    def ends(self) -> NDArray[np.intp]:
+        """Last frame of the sub-trajectory from each frame on, of shape (n_frames,)."""
+        return window_ends(self.T_ref_sensor, self.length)
+
     def live(self, members: tuple[int, ...]) -> list[LiveSquares | None]:
         """What is measured of members before the first frame of each period."""
         if members not in self._live:
@@ -101,7 +106,6 @@ class BankSimulation:
         return self._live[members]
 
     def _measured(self, members: tuple[int, ...]) -> list[LiveSquares | None]:
-        first = np.unique(self.period, return_index=True)[1]
         start, end, T_start_end, projection = self.hops
         T_previous_current = self.motions(members)
         known = np.asarray(np.isfinite(T_previous_current).all(axis=(-2, -1)))
@@ -114,11 +118,14 @@ class BankSimulation:
         unknown = np.concatenate([np.zeros((1, len(members)), np.intp), np.cumsum(~known, axis=0)])
         errors[unknown[end] > unknown[start]] = np.nan
         hops = HopErrors(errors, metres[start], metres[end], seconds[end])
-        found = []
-        for frame in first:
-            before = HopErrors(*(array[end < frame] for array in hops))
-            found.append(live_squares(before.recent(float(metres[frame]), float(seconds[frame]))))
-        return found
+        return [
+            live_squares(
+                HopErrors(*(array[end < frame] for array in hops)).recent(
+                    float(metres[frame]), float(seconds[frame])
+                )
+            )
+            for frame in np.unique(self.period, return_index=True)[1]
+        ]
 
     def agreeing(self, votes: MemberWeights) -> NDArray[np.bool_]:
         """Over which scans each member agrees with the others, of shape (n_frames - 1, n_members).
@@ -206,77 +213,19 @@ MARGIN_FRAMES = 2
 another frame may differ in its last bits, and a sub-trajectory then ends one frame later."""
 
 
-class Extent(NamedTuple):
-    """Where the labelled frames of a sequence are, and how far their sub-trajectories reach."""
+def stretches(simulation: BankSimulation, known: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Number of each labelled frame's stretch along the reference, of shape (n,).
 
-    T_ref_sensor: Poses  # (n_frames, 4, 4): of all frames of the sequence
-    frames: NDArray[np.intp]  # (n,): numbers of the labelled ones
-    ends: NDArray[np.intp]  # (n,): last frames of their sub-trajectories
-    length: float  # metres of a sub-trajectory
-
-    @classmethod
-    def of(cls, T_ref_sensor: Poses, known: NDArray[np.bool_], length: float) -> Self:
-        """The extent of the frames that are known to have errors.
-
-        `T_ref_sensor` is of shape (n_frames, 4, 4), `known` of (n_frames,), `length` in metres.
-        """
-        frames = np.flatnonzero(known)
-        return cls(T_ref_sensor, frames, window_ends(T_ref_sensor, length)[frames], length)
-
-    @property
-    def positions(self) -> NDArray[np.float64]:
-        """Where these frames are in metres, of shape (n, 3)."""
-        return self.T_ref_sensor[self.frames, :3, 3]
-
-    @property
-    def end_positions(self) -> NDArray[np.float64]:
-        """Where their sub-trajectories end in metres, of shape (n, 3)."""
-        return self.T_ref_sensor[self.ends, :3, 3]
-
-    def some(self, kept: NDArray[np.bool_]) -> Self:
-        """The same of some of the frames."""
-        return self._replace(frames=self.frames[kept], ends=self.ends[kept])
-
-    def near(self, left_out: "Extent", is_view: bool) -> NDArray[np.bool_]:
-        """Which frames must not be known where others of the same recording are left out.
-
-        That is each frame within the length of a sub-trajectory of where these are, and each whose
-        sub-trajectory overlaps one of theirs.
-
-        A view counts frames in another way, and may be played backwards.
-        """
-        from scipy.spatial import cKDTree  # slow to import
-
-        path = cKDTree(left_out.positions)
-        near = path.query(self.positions)[0] <= self.length
-        if is_view:
-            found = near | (path.query(self.end_positions)[0] <= self.length)
-        else:
-            before = self.ends < left_out.frames.min()
-            found = near | ~(before | (self.frames > left_out.ends.max()))
-        return np.asarray(found)
-
-    def stretches(self) -> NDArray[np.intp]:
-        """Number of each labelled frame's stretch along the reference, of shape (n,).
-
-        The last piece joins the stretch before if it is shorter than half a stretch.
-        """
-        if not len(self.frames):
-            return np.empty(0, np.intp)
-        size = PER_STRETCH * self.length
-        distance = travelled(self.T_ref_sensor)[self.frames]
-        distance -= distance[0]
-        n_stretches = max(1, int(distance[-1] / size + 0.5))
-        return np.minimum((distance / size).astype(np.intp), n_stretches - 1)
-
-    def stretches_of(self, recording: "Extent", numbers: NDArray[np.intp]) -> NDArray[np.intp]:
-        """Number of the stretch of a recording that each frame of a view shows, of shape (n,).
-
-        It is that of the recording's nearest frame: a view shares the recording's reference.
-        """
-        from scipy.spatial import cKDTree
-
-        return np.asarray(numbers[cKDTree(recording.positions).query(self.positions)[1]])
+    `known` has the numbers of these frames. The last piece joins the stretch before if it is
+    shorter than half a stretch.
+    """
+    if not len(known):
+        return np.empty(0, np.intp)
+    size = PER_STRETCH * simulation.length
+    distance = travelled(simulation.T_ref_sensor)[known]
+    distance -= distance[0]
+    n_stretches = max(1, int(distance[-1] / size + 0.5))
+    return np.minimum((distance / size).astype(np.intp), n_stretches - 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -286,7 +235,7 @@ class LabelledSequence:
     name: str
     recording: str  # that it is, or is a part or a view of
     simulation: BankSimulation  # of all frames
-    extent: Extent  # where the labelled frames are
+    known: NDArray[np.intp]  # (n,): numbers of the labelled ones
     stretch: NDArray[np.intp]  # (n,): number of each frame's stretch, the same in a view
     # (n, n_sets): percent, infinite where the track was lost, NaN where a set was not run.
     errors: NDArray[np.float32]
@@ -312,12 +261,51 @@ class LabelledSequence:
     @cached_property
     def period(self) -> NDArray[np.int64]:
         """Whole periods since the first scan, of shape (n,): in each, one selection holds."""
-        return self.simulation.period[self.extent.frames]
+        return self.simulation.period[self.known]
 
     @cached_property
     def descriptors(self) -> NDArray[np.float32]:
         """Averaged descriptors, of shape (n, n_features)."""
-        return self.simulation.descriptors[self.extent.frames]
+        return self.simulation.descriptors[self.known]
+
+    @property
+    def ends(self) -> NDArray[np.intp]:
+        """Last frames of the sub-trajectories, of shape (n,)."""
+        return self.simulation.ends[self.known]
+
+    @property
+    def positions(self) -> NDArray[np.float64]:
+        """Where the frames are in metres, of shape (n, 3)."""
+        return self.simulation.T_ref_sensor[self.known, :3, 3]
+
+    def near(self, left_out: "LabelledSequence") -> NDArray[np.bool_]:
+        """Which frames must not be known where others of the same recording are left out.
+
+        That is each frame within the length of a sub-trajectory of where these are, and each whose
+        sub-trajectory overlaps one of theirs.
+        """
+        from scipy.spatial import cKDTree  # slow to import
+
+        path, length = cKDTree(left_out.positions), self.simulation.length
+        near = path.query(self.positions)[0] <= length
+        if self.name == left_out.name:
+            before = self.ends < left_out.known.min()
+            found = near | ~(before | (self.known > left_out.ends.max()))
+        else:
+            # A view counts frames in another way, and may be played backwards.
+            at_ends = self.simulation.T_ref_sensor[self.ends, :3, 3]
+            found = near | (path.query(at_ends)[0] <= length)
+        return np.asarray(found)
+
+    def cut_as(self, recording: "LabelledSequence") -> "LabelledSequence":
+        """A view, cut into the stretches of the recording's nearest frames.
+
+        It shares the recording's reference.
+        """
+        from scipy.spatial import cKDTree
+
+        nearest = cKDTree(recording.positions).query(self.positions)[1]
+        return replace(self, stretch=recording.stretch[nearest])
 
     def frames(self, kept: NDArray[np.bool_]) -> "LabelledSequence":
         """The same with some of the frames."""
@@ -325,7 +313,7 @@ class LabelledSequence:
             return self
         some = replace(
             self,
-            extent=self.extent.some(kept),
+            known=self.known[kept],
             stretch=self.stretch[kept],
             errors=self.errors[kept],
             baseline=self.baseline[kept],
@@ -340,9 +328,8 @@ class LabelledSequence:
 
     def part(self) -> "LabelledSequence":
         """The same with the part of the simulation that its frames take."""
-        extent, simulation = self.extent, self.simulation
-        first = int(extent.frames.min())
-        stop = min(int(extent.ends.max()) + 1 + MARGIN_FRAMES, len(simulation.stamps))
+        simulation, first = self.simulation, int(self.known.min())
+        stop = min(int(self.ends.max()) + 1 + MARGIN_FRAMES, len(simulation.stamps))
         frames = slice(first, stop)
         part = replace(
             simulation,
@@ -353,8 +340,7 @@ class LabelledSequence:
             hops=simulation.hops.part(first, stop),
             motions=lambda members: simulation.motions(members)[first : stop - 1],
         )
-        its = Extent(part.T_ref_sensor, extent.frames - first, extent.ends - first, extent.length)
-        return replace(self, simulation=part, extent=its)
+        return replace(self, simulation=part, known=self.known - first)
 
     def subset(self, columns: NDArray[np.intp]) -> "LabelledSequence":
         """The same with some of the sets."""
@@ -416,9 +402,7 @@ class LabelledData(NamedTuple):
             for number in np.unique(one.stretch):
                 left = one.frames(one.stretch == number)
                 known = [
-                    s
-                    if s.recording != one.recording
-                    else s.frames(~s.extent.near(left.extent, s.name != one.name))
+                    s if s.recording != one.recording else s.frames(~s.near(left))
                     for s in self.sequences
                 ]
                 folds.append((left.part(), [s for s in known if len(s.errors)]))
@@ -588,9 +572,7 @@ def labelled_data(
                 f"fitted to; run `adaptune offline` again"
             )
         one = _labelled(archive, name, set(counted), sets, config, window, recorded_in(name))
-        if of := read.get(origin(name)):
-            one = replace(one, stretch=one.extent.stretches_of(of.extent, of.stretch))
-        read[name] = one
+        read[name] = one.cut_as(read[origin(name)]) if origin(name) in read else one
     eligible = _eligible(list(read.values()), sets, config)
     bounds = LabelledData(list(read.values()), sets).bounds()
     rivals = [*best_candidates(bounds), *sets.defaults]
@@ -598,14 +580,14 @@ def labelled_data(
     labelled = []
     for name, whole in whole_values(config.offline, runs).items():
         s = read[name]
-        T_ref_sensor, frames, length = s.simulation.T_ref_sensor, s.extent.frames, s.extent.length
+        T_ref_sensor, length = s.simulation.T_ref_sensor, config.sub_trajectory
         vectors = {
-            trial: error_vectors(T_ref_sensor, archive.read(name, trial), length)[frames]
+            trial: error_vectors(T_ref_sensor, archive.read(name, trial), length)[s.known]
             for trial in eligible.intersection(run[name])
         }
         # Whether the objective on some frames follows from the errors there.
         by_frames = set(config.offline.objective[0]) == {"rte"}
-        errors_of = whole_errors(archive, name, whole, frames) if by_frames else None
+        errors_of = whole_errors(archive, name, whole, s.known) if by_frames else None
         labelled.append(replace(s, vectors=vectors, whole=whole, whole_errors=errors_of))
     costs = measured_costs(archive, run, sets, odometry)
     return LabelledData(labelled, sets, costs, config.online.budget, odometry.description.live)
@@ -673,13 +655,13 @@ def _labelled(
         frames.hops,
         motions,
     )
-    extent = Extent.of(frames.T_ref_sensor, known, length)
+    labelled = np.flatnonzero(known)
     return LabelledSequence(
         name,
         recording,
         simulation,
-        extent,
-        extent.stretches(),
+        labelled,
+        stretches(simulation, labelled),
         errors[known],
         archive.read(name, 0).errors[known],
         frames.blocks,

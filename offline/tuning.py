@@ -348,7 +348,7 @@ def bank_errors(
         smoothed = MemberWeights(members, smooth_weights(weights))
         # Who agrees takes long to find, and hangs on the settings but little.
         votes = smoothed if votes is None else votes
-        yield simulation.errors(smoothed, votes)[left_out.extent.frames], smoothed
+        yield simulation.errors(smoothed, votes)[left_out.known], smoothed
 
 
 def _paired_errors(

@@ -209,7 +209,7 @@ def leave_one_out(
     by_recording = len(data.recordings) >= MIN_RECORDINGS
     folds = data.folds(by_recording)
     if len(folds) < 2:
-        length = data.sequences[0].extent.length
+        length = data.sequences[0].simulation.length
         raise ValidationError(
             f"training: there is one stretch only, or every stretch passes within {length:g} m of "
             f"all others, so nothing remains to train on when it is left out. Record "

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from labelled_places import labelled, with_motions
+from labelled_places import in_place, labelled, simulated, with_motions
 
 from adaptune.metrics import travelled, window_ends
-from offline.labelled import PER_STRETCH, Extent
+from adaptune.study.study import PER_STRETCH
 
 LENGTH = 10.0
 
@@ -21,8 +21,10 @@ def poses(steps, turns):
     return T
 
 
-def extent_of(T):
-    return Extent.of(T, window_ends(T, LENGTH) >= 0, LENGTH)
+def along(T, name="one"):
+    known = window_ends(T, LENGTH) >= 0
+    errors = np.zeros((known.sum(), 1), np.float32)
+    return in_place(name, simulated(np.zeros((len(T), 1)), None, T), known, errors)
 
 
 def any_path(seed):
@@ -41,14 +43,14 @@ paths = st.integers(0, 2**32 - 1).map(any_path)
 @settings(max_examples=60, deadline=None)
 @given(paths)
 def test_stretches_share_out_the_frames(T):
-    extent = extent_of(T)
-    numbers = extent.stretches()
-    assert numbers.shape == extent.frames.shape
+    one = along(T)
+    numbers = one.stretch
+    assert numbers.shape == one.known.shape
     if not len(numbers):
         return
     assert numbers[0] == 0
     assert set(np.diff(numbers)) <= {0, 1}
-    distance = travelled(T)[extent.frames]
+    distance = travelled(T)[one.known]
     size = PER_STRETCH * LENGTH
     of_stretches = [np.ptp(distance[numbers == n]) for n in np.unique(numbers)]
     # All but the last are as long as they should be, within a step; that is half as long at least,
@@ -63,40 +65,39 @@ def test_stretches_share_out_the_frames(T):
 @settings(max_examples=60, deadline=None)
 @given(paths, st.integers(0, 9))
 def test_nothing_that_is_known_comes_near_to_what_is_left_out(T, which):
-    extent = extent_of(T)
-    if not len(extent.frames):
+    one = along(T)
+    if not len(one.known):
         return
-    numbers = extent.stretches()
-    left = extent.some(numbers == which % (numbers.max() + 1))
-    kept = extent.some(~extent.near(left, is_view=False))
+    left = one.frames(one.stretch == which % (one.stretch.max() + 1))
+    kept = one.frames(~one.near(left))
     # Sub-trajectories that begin where the other ends have a frame in common.
-    first, last = left.frames.min(), left.ends.max()
-    assert not ((kept.frames <= last) & (kept.ends >= first)).any()
+    first, last = left.known.min(), left.ends.max()
+    assert not ((kept.known <= last) & (kept.ends >= first)).any()
     apart = np.linalg.norm(kept.positions[:, None] - left.positions[None], axis=-1)
     assert (apart > LENGTH).all()
     # Nothing else is dropped.
-    dropped = extent.some(extent.near(left, is_view=False))
+    dropped = one.frames(one.near(left))
     apart = np.linalg.norm(dropped.positions[:, None] - left.positions[None], axis=-1).min(axis=1)
-    overlaps = (dropped.frames <= last) & (dropped.ends >= first)
+    overlaps = (dropped.known <= last) & (dropped.ends >= first)
     assert (overlaps | (apart <= LENGTH)).all()
 
 
 def test_a_view_that_is_played_backwards_is_cut_as_its_recording():
     T = poses(np.full(400, 0.5), np.zeros(400))
-    recording, view = extent_of(T), extent_of(T[::-1])
-    numbers = recording.stretches()
-    of_view = view.stretches_of(recording, numbers)
+    recording = along(T)
+    view = along(T[::-1], "one+reverse").cut_as(recording)
     at = np.linspace(11.0, 189.0, 30)
     for x in at:
         frame = np.abs(recording.positions[:, 0] - x).argmin()
         same = np.abs(view.positions[:, 0] - x).argmin()
-        assert of_view[same] == numbers[frame]
-    left = recording.some(numbers == 2)
-    kept = view.some(~view.near(left, is_view=True))
-    first, last = left.positions[:, 0].min(), left.end_positions[:, 0].max()
+        assert view.stretch[same] == recording.stretch[frame]
+    left = recording.frames(recording.stretch == 2)
+    kept = view.frames(~view.near(left))
+    first, last = left.positions[:, 0].min(), T[left.ends, 0, 3].max()
     # It goes from its start back to its end.
-    assert ((kept.positions[:, 0] < first) | (kept.end_positions[:, 0] > last - LENGTH)).all()
-    assert len(kept.frames)
+    end_positions = T[::-1][kept.ends, 0, 3]
+    assert ((kept.positions[:, 0] < first) | (end_positions > last - LENGTH)).all()
+    assert len(kept.known)
 
 
 def test_with_six_recordings_whole_ones_are_left_out():
@@ -158,4 +159,4 @@ def test_a_stretch_takes_its_part_of_everything():
     assert (other.whole, len(other.values)) == (one.whole, 5)
     assert one.frames(np.ones(n, bool)) is one
     cut_again = some.frames(np.arange(kept.sum()) < 5)
-    np.testing.assert_array_equal(cut_again.extent.frames, np.flatnonzero(kept)[:5])
+    np.testing.assert_array_equal(cut_again.known, np.flatnonzero(kept)[:5])

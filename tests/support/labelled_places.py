@@ -8,7 +8,7 @@ from tables import table
 from adaptune.live.hops import Hops
 from adaptune.metrics import sub_trajectory_vectors
 from adaptune.recording.scan import origin
-from offline.labelled import BankSimulation, Extent, LabelledData, LabelledSequence
+from offline.labelled import BankSimulation, LabelledData, LabelledSequence, stretches
 
 TRIALS = (0, 3, 4, 7, 8)
 SETS = table(np.linspace(0.0, 1.0, 5)[:, None], TRIALS)
@@ -35,11 +35,12 @@ def of_errors(name, errors, histograms=None, **more):
     return in_place(name, simulation, np.arange(n + 34) < n, errors, **more)
 
 
-def simulated(described, motions):
-    """A drive along x, ten scans a second, 0.3 m from each to the next."""
+def simulated(described, motions, T_ref_sensor=None):
+    """A drive, ten scans a second, by default along x, 0.3 m from each to the next."""
     n = len(described)
-    T_ref_sensor = np.tile(np.eye(4), (n, 1, 1))
-    T_ref_sensor[1:, 0, 3] = 0.3 * np.arange(1, n)
+    if T_ref_sensor is None:
+        T_ref_sensor = np.tile(np.eye(4), (n, 1, 1))
+        T_ref_sensor[1:, 0, 3] = 0.3 * np.arange(1, n)
     stamps = np.arange(n, dtype=np.int64) * 10**8
     hops = Hops.of([])
     return BankSimulation(
@@ -49,8 +50,8 @@ def simulated(described, motions):
 
 def in_place(name, simulation, known, errors, **more):
     """A sequence with errors on its known frames."""
-    extent = Extent.of(simulation.T_ref_sensor, known, simulation.length)
-    place = (name, origin(name), simulation, extent, extent.stretches())
+    frames = np.flatnonzero(known)
+    place = (name, origin(name), simulation, frames, stretches(simulation, frames))
     return LabelledSequence(*place, errors, errors[:, 0], {"ndt": 90}, **more)
 
 
