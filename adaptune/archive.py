@@ -291,10 +291,6 @@ class Archive:
         """File of a trial, or of its whole run, which is driven as a replay is."""
         return self.folder / sequence / f"{number:05d}{'-whole' if whole else ''}.npz"
 
-    def frames_path(self, sequence: str) -> Path:
-        """File of the data that all trials on a sequence share."""
-        return self.folder / sequence / "frames.npz"
-
     def tidy(self) -> None:
         """Remove unfinished files and repair the index. No process may be writing."""
         for unfinished in (*self.folder.glob("*/.*.npz"), *self.folder.glob(".index.*")):
@@ -382,7 +378,7 @@ class Archive:
     def write_frames(self, sequence: str, frames: Frames) -> None:
         """Write the data that all trials on a sequence share."""
         self._note(sequence)
-        path = self.frames_path(sequence)
+        path = self.folder / sequence / "frames.npz"
         with replacing(path) as temporary, temporary.open("wb") as file:
             np.savez_compressed(
                 file,
@@ -397,7 +393,7 @@ class Archive:
 
     def read_frames(self, sequence: str) -> Frames:
         """Read the data that all trials on a sequence share."""
-        path = self.frames_path(sequence)
+        path = self.folder / sequence / "frames.npz"
         data = _read(path)
         try:
             return Frames(

@@ -18,7 +18,7 @@ from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
 from adaptune.metrics import cap
 from adaptune.model import ErrorModel, ModelError
-from adaptune.model.rules import TrainingData, complementary, mean_errors
+from adaptune.model.rules import complementary, mean_errors
 from adaptune.processes import available
 from adaptune.progress import Progress, unseen
 from adaptune.recording.config import NO_REFERENCE
@@ -512,14 +512,7 @@ def oracle_sets(model: ErrorModel, n: int) -> list[int]:
     The fixed set, the members of the bank, sets that complement each other (see `complementary`),
     and, where these are too few, those with the least training error.
     """
-    data = TrainingData(
-        np.empty((len(model.sequence), 0)),
-        model.stretches(),
-        model.errors,
-        model.sets,
-        model.fixed,
-        allowed=model.allowed(),
-    )
+    data = model.training_data(model.pca())
     means = np.where(data.allows(), mean_errors(data.errors, data.sequence), np.inf)
     best = [model.sets.trials[c] for c in np.argsort(means, kind="stable") if means[c] < np.inf]
     chosen = dict.fromkeys([model.fixed, *model.bank, *complementary(data, n), *best])
