@@ -49,7 +49,6 @@ def test_there_is_a_row_for_every_trial(archive):
 
 def test_the_cost_is_a_column_and_its_parts_are_none(archive):
     trial = archive.read("cave", 3)
-    assert "cost" not in rows(archive, ["cave"])[0]
     for name, register in (("cave", 2.0), ("street", 4.0)):
         usage = {"register_ms": register, "prepare_ms": 5.0, "memory": 9.0}
         archive.write(name, 4, replace(trial, usage=usage))

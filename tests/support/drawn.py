@@ -25,9 +25,11 @@ class Drawn:
 
     def wait(self):
         task, self._task = self._task, None
+        T_ref_sensor = np.tile(np.eye(4), (N_FRAMES, 1, 1))
+        T_ref_sensor[:, 0, 3] = 0.3 * np.arange(N_FRAMES)
         frames = Frames(
             np.arange(N_FRAMES) * 10**8,
-            np.tile(np.eye(4), (N_FRAMES, 1, 1)),
+            T_ref_sensor,
             np.random.default_rng(len(task.sequence)).random((N_FRAMES, 90)).astype(np.float32),
             {"ndt": 90},
             np.zeros(N_FRAMES, np.float32),
