@@ -624,12 +624,8 @@ def _labelled(
     # Trials that were run for another budget do not count.
     errors[:, [trial not in run for trial in sets]] = np.nan
     # Whether there is a sub-trajectory depends on the reference alone.
-    known = np.asarray(~np.isnan(errors).all(axis=1))
-    period, objective, n_repeats = (
-        config.online.period,
-        config.offline.objective[0],
-        config.offline.repeats,
-    )
+    known = np.flatnonzero(~np.isnan(errors).all(axis=1))
+    objective, n_repeats = config.offline.objective[0], config.offline.repeats
     summaries = [archive.finished(name)[trial] if trial in run else None for trial in sets]
     values = [np.inf if s is None else weighted(objective, s.metrics) for s in summaries]
     # Of the baseline, there may be more runs.
@@ -637,8 +633,8 @@ def _labelled(
         [np.nan] * n_repeats if s is None else repeated(objective, s.repeats)[:n_repeats]
         for s in summaries
     ]
-    slots = archive.slots()
-    owners = [owner(slots, trial) for trial in sets]
+    slots, place = archive.slots(), origin(name)
+    own = [(by := owner(slots, trial)) is not None and origin(by) == place for trial in sets]
     read = cache(partial(archive.read, name))
 
     @lru_cache(maxsize=1)  # one bank after the other is asked for, each many times
@@ -648,26 +644,25 @@ def _labelled(
     simulation = BankSimulation(
         frames.stamps,
         frames.T_ref_sensor,
-        averaged(frames.descriptors, frames.stamps, window, period),
-        ((frames.stamps - frames.stamps[0]) * 1e-9 // period).astype(np.int64),
+        averaged(frames.descriptors, frames.stamps, window, config.online.period),
+        ((frames.stamps - frames.stamps[0]) * 1e-9 // config.online.period).astype(np.int64),
         length,
         config.lost_track,
         frames.hops,
         motions,
     )
-    labelled = np.flatnonzero(known)
     return LabelledSequence(
         name,
         recording,
         simulation,
-        labelled,
-        stretches(simulation, labelled),
+        known,
+        stretches(simulation, known),
         errors[known],
         archive.read(name, 0).errors[known],
         frames.blocks,
         values=np.array(values),
         repeats=np.array(repeats) if n_repeats > 1 else None,
-        own=np.array([one is not None and origin(one) == origin(name) for one in owners]),
+        own=np.array(own),
         block=span(frames.T_ref_sensor, length),
         elevation=float(np.nanmedian(frames.elevations)),
     )
