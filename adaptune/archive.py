@@ -574,8 +574,8 @@ def rows(archive: Archive, names: Sequence[str]) -> list[Row]:
         trials = {name: finished[name].get(number) for name in names}
         there = [trial for trial in trials.values() if trial is not None]
         row: Row = {"trial": number} | {name: there[0].parameters.get(name) for name in parameters}
-        row["mean"] = _mean([trial and trial.mean_error for trial in trials.values()])
-        row |= {name: trial and trial.mean_error for name, trial in trials.items()}
+        errors = {name: t.mean_error if t is not None else None for name, t in trials.items()}
+        row |= {"mean": _mean(list(errors.values()))} | errors
         row |= {"lost": sum(t.lost for t in there), "faults": sum(t.faults for t in there)}
         row["unhealthy"] = sum(sum(t.unhealthy.values()) for t in there)
         for metric in metrics:
