@@ -6,10 +6,10 @@ Science, 1983. It differs from RUSTLE: steps beyond a bound are reflected instea
 are divided by `energy_scale`, and there are log scales, categories and several chains.
 """
 
-import contextlib
 import copy
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -24,7 +24,6 @@ from optuna.search_space import IntersectionSearchSpace
 from optuna.study import Study, StudyDirection
 from optuna.trial import FrozenTrial, TrialState
 
-from adaptune.errors import nearest
 from offline.config import AnnealingSettings, Step
 
 SIGMA = 0.05
@@ -36,7 +35,7 @@ CHANGE = 0.3
 
 
 _Trial = tuple[int, dict[str, Any], float]
-"""Number, parameters and value of a finished trial."""
+"""Number, parameters and energy of a finished trial."""
 
 
 class Chain:
@@ -47,10 +46,9 @@ class Chain:
         self.params: dict[str, Any] | None = None  # it steps from; None before its first trial
         self.energy = self.best = math.inf  # error of that set, and the least error so far
         self.temperature = settings.initial_temperature
-        # Steps since the last acceptance, and since the best trial.
-        self.unaccepted = self.no_best = 0
-        # Steps since the chain was last heated, for each of the three triggers.
-        self._fixed = self._unaccepted = self._no_best = 0
+        self._n_steps = 0
+        # Numbers of the steps with the last acceptance, the last new best, and the last heating.
+        self._accepted = self._new_best = self._heated = 0
 
     def start(self, params: Mapping[str, Any], energy: float) -> None:
         """Begin with a trial."""
@@ -64,39 +62,32 @@ class Chain:
         if self.params is None:
             self.start(params, energy)
             return
-        accepted = energy <= self.energy or u < math.exp(
-            -(energy - self.energy) / scale / self.temperature
-        )
-        new_best = energy < self.best
-        if accepted:
-            self.params, self.energy = dict(params), energy
-        self.best = min(self.best, energy)
-        self.unaccepted = 0 if accepted else self.unaccepted + 1
-        self.no_best = 0 if new_best else self.no_best + 1
-        self._fixed += 1
-        self._unaccepted = 0 if accepted else self._unaccepted + 1
-        self._no_best = 0 if new_best else self._no_best + 1
-        s = self.settings
+        self._n_steps += 1
+        if energy < self.best:
+            self.best, self._new_best = energy, self._n_steps
+        worse = energy - self.energy
+        if energy <= self.energy or u < math.exp(-worse / scale / self.temperature):
+            self.params, self.energy, self._accepted = dict(params), energy, self._n_steps
+        s, heated = self.settings, self._heated
         if (
-            _reached(self._fixed, s.reanneal_fixed)
-            or _reached(self._unaccepted, s.reanneal_accepted)
-            or _reached(self._no_best, s.reanneal_best)
+            self._since(heated, s.reanneal_fixed)
+            or self._since(max(heated, self._accepted), s.reanneal_accepted)
+            or self._since(max(heated, self._new_best), s.reanneal_best)
         ):
-            self.temperature = s.initial_temperature
-            self._fixed = self._unaccepted = self._no_best = 0
+            self.temperature, self._heated = s.initial_temperature, self._n_steps
         else:
             self.temperature *= s.alpha
+
+    def _since(self, step: int, limit: int | None) -> bool:
+        return limit is not None and self._n_steps - step >= limit
 
     @property
     def stalled(self) -> bool:
         """Whether it has made enough steps without an acceptance or a new best."""
-        return _reached(self.unaccepted, self.settings.stall_accepted) or _reached(
-            self.no_best, self.settings.stall_best
+        s = self.settings
+        return self._since(self._accepted, s.stall_accepted) or self._since(
+            self._new_best, s.stall_best
         )
-
-
-def _reached(count: int, limit: int | None) -> bool:
-    return limit is not None and count >= limit
 
 
 class AnnealingSampler(BaseSampler):
@@ -137,8 +128,8 @@ class AnnealingSampler(BaseSampler):
         self.n_startup_trials = n_startup_trials
         self.seed = seed
         self._space = IntersectionSearchSpace()
-        # Name of the study, its finished trials, and the chains after them.
-        self._walked: tuple[str, list[int], list[Chain]] | None = None
+        # Name of the study, numbers of its finished trials, and the chains after them.
+        self._walked: tuple[str, list[int], list[Chain]] = "", [], []
 
     def infer_relative_search_space(
         self,
@@ -156,11 +147,6 @@ class AnnealingSampler(BaseSampler):
         self._raise_error_if_multi_objective(study)
         if not search_space or trial.number < self.n_startup_trials:
             return {}
-        for name in self.settings.steps:
-            if name not in search_space:
-                raise ValueError(
-                    f"steps of {name!r}: there is no such parameter; {nearest(name, search_space)}"
-                )
         chain = self.chains(study)[trial.number % self.settings.chains]
         if chain.params is None:
             return {}
@@ -190,81 +176,50 @@ class AnnealingSampler(BaseSampler):
         sampler = RandomSampler(seed=int(word.generate_state(1)[0]))
         return sampler.sample_independent(study, trial, param_name, param_distribution)
 
-    def after_trial(
-        self,
-        study: Study,
-        trial: FrozenTrial,
-        state: TrialState,
-        values: Sequence[float] | None,
-    ) -> None:
-        """Stop the study if all chains have stalled."""
-        stalls = (self.settings.stall_accepted, self.settings.stall_best)
-        if stalls == (None, None) or state != TrialState.COMPLETE or values is None:
-            return
-        # For the study, the trial is not finished yet.
-        finished = [*self._finished(study), (trial.number, trial.params, values[0])]
-        if all(chain.stalled for chain in self._walk(study, finished)):
-            with contextlib.suppress(RuntimeError):  # with ask and tell, there is no loop to leave
-                study.stop()
-
-    def chains(self, study: Study) -> list[Chain]:
-        """The chains after the study's finished trials."""
-        return self._walk(study, self._finished(study))
-
     def stalled(self, study: Study) -> bool:
         """Whether all chains have stalled."""
         return all(chain.stalled for chain in self.chains(study))
 
-    @staticmethod
-    def _finished(study: Study) -> list[_Trial]:
-        trials = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
-        return [(t.number, t.params, t.value or 0.0) for t in trials]
-
-    def _walk(self, study: Study, trials: list[_Trial]) -> list[Chain]:
-        trials.sort(key=lambda t: t[0])
-        walked, numbers = self._walked, [number for number, *_ in trials]
+    def chains(self, study: Study) -> list[Chain]:
+        """The chains after the study's finished trials."""
+        sign = -1.0 if study.direction == StudyDirection.MAXIMIZE else 1.0
+        finished = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
+        trials = [
+            (t.number, t.params, sign * (t.value or 0.0))
+            for t in sorted(finished, key=lambda t: t.number)
+        ]
+        numbers = [number for number, *_ in trials]
+        name, walked, chains = self._walked
         if (
-            walked is None
-            or walked[0] != study.study_name
-            or not _extends(numbers, walked[1])
-            or len(walked[1]) < self.n_startup_trials  # the chains begin with the best of them
+            name != study.study_name
+            or numbers[: len(walked)] != walked  # one finished after those that follow it
+            or len(walked) < self.n_startup_trials  # the chains begin with the best of them
         ):
-            walked = study.study_name, [n for n in numbers if n < self.n_startup_trials], []
-            walked[2].extend(self._started(study, trials[: len(walked[1])]))
-        chains = [copy.copy(chain) for chain in walked[2]]
-        sign = _sign(study)
+            walked = [number for number in numbers if number < self.n_startup_trials]
+            chains = self._started(trials[: len(walked)])
+        chains = [copy.copy(chain) for chain in chains]
         scale = self.settings.energy_scale or next(
-            (abs(value) for *_, value in trials if value and math.isfinite(value)), 1.0
+            (abs(energy) for *_, energy in trials if energy and math.isfinite(energy)), 1.0
         )
-        for number, params, value in trials[len(walked[1]) :]:
-            chain = chains[number % len(chains)]
-            chain.step(params, sign * value, scale, self._rng(number).random())
+        for number, params, energy in trials[len(walked) :]:
+            u = self._rng(number).random()
+            chains[number % len(chains)].step(params, energy, scale, u)
         self._walked = study.study_name, numbers, chains
         return chains
 
-    def _started(self, study: Study, startup: list[_Trial]) -> list[Chain]:
+    def _started(self, startup: list[_Trial]) -> list[Chain]:
         chains = [Chain(self.settings) for _ in range(self.settings.chains)]
-        sign = _sign(study)
-        best = sorted(startup, key=lambda t: sign * t[2])[: len(chains)]
+        best = sorted(startup, key=itemgetter(2))[: len(chains)]
         given = self.settings.start
         for k, chain in enumerate(chains):
             if best:
-                _, params, value = best[k % len(best)]
+                _, params, energy = best[k % len(best)]
                 # The error at a given start is unknown: the first step from it is accepted.
-                chain.start(params | (given or {}), sign * value if given is None else math.inf)
+                chain.start(params | (given or {}), energy if given is None else math.inf)
         return chains
 
     def _rng(self, number: int) -> np.random.Generator:
         return np.random.default_rng((self.seed, number))
-
-
-def _sign(study: Study) -> float:
-    return -1.0 if study.direction == StudyDirection.MAXIMIZE else 1.0
-
-
-def _extends(numbers: list[int], before: list[int]) -> bool:
-    """Whether all new trials come after those before."""
-    return numbers[: len(before)] == before
 
 
 def step_from(
@@ -294,11 +249,9 @@ def step_from(
         i = round((value - low) / distribution.step) + int(rng.integers(-longest, longest + 1))
         made = low + reflected(i, n) * distribution.step
         return int(made) if isinstance(distribution, IntDistribution) else min(made, high)
-    first, last = low, high
+    first, last, x = low, high, value
     if distribution.log:
-        low, high, x = math.log(low), math.log(high), math.log(value)
-    else:
-        x = value
+        low, high, x = map(math.log, (low, high, value))
     sigma = SIGMA * (high - low) if step.sigma is None else step.sigma
     x += rng.normal(step.mu or 0.0, sigma)
     x = low + reflected(x - low, high - low)

@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, get_args
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, BeforeValidator, Field, model_validator
 
@@ -296,15 +296,20 @@ def _steps(parameter: Float | Integer, given: Sequence[Value]) -> list[float]:
     return [first + i * step for i in range(int(count))]
 
 
+def _untuned(key: str, names: Iterable[str], space: ParameterSpace) -> Iterable[Mistake]:
+    for name in names:
+        if name not in space.names:
+            help_ = nearest(name, space.names)
+            yield Mistake((key, name), f"no parameter {name!r} is tuned: {help_}")
+
+
 def check_grid(
     axes: Mapping[str, Span | Sequence[Value]], space: ParameterSpace, bounded: bool
 ) -> Iterable[Mistake]:
     """Find mistakes in a grid; their keys begin below the sampler's settings."""
-    for name in axes:
-        if name not in space.names:
-            help_ = nearest(name, space.names)
-            yield Mistake(("grid", name), f"no parameter {name!r} is tuned: {help_}")
-            return
+    if untuned := list(_untuned("grid", axes, space)):
+        yield from untuned
+        return
     made = {}
     for name, parameter in space.parameters.items():
         try:
@@ -357,10 +362,14 @@ def check_sampler(
         return
     elif name == "annealing":
         given = AnnealingSettings.model_validate(settings)
-        for parameter, value in (given.start or {}).items():
-            yield from _check_start(parameter, value, given.steps.get(parameter, Step()), space)
-        for parameter, step in given.steps.items():
-            yield from _check_step(parameter, step, space)
+        steps, start = given.steps, given.start or {}
+        yield from _untuned("start", start, space)
+        yield from _untuned("steps", steps, space)
+        for parameter, of in space.parameters.items():
+            if parameter in start:
+                yield from _check_start(parameter, of, start[parameter], steps.get(parameter))
+            if parameter in steps:
+                yield from _check_step(parameter, of, steps[parameter])
     elif name in ("grid", "random"):
         axes = RandomSettings.model_validate(settings).grid
         if axes is not None:
@@ -388,18 +397,18 @@ def _check_optuna(
         yield Mistake((), "cmaes searches among numbers, and all parameters are categories")
 
 
-def _check_step(name: str, step: Step, space: ParameterSpace) -> Iterable[Mistake]:
-    key = ("steps", name)
-    parameter = space.parameters.get(name)
-    if parameter is None:
-        yield Mistake(key, f"no parameter {name!r} is tuned: {nearest(name, space.names)}")
-        return
-    allowed = _allowed(parameter)
-    given = step.model_dump(exclude_none=True)
+def _check_step(
+    name: str, parameter: Float | Integer | Categorical, step: Step
+) -> Iterable[Mistake]:
+    key, given = ("steps", name), step.model_dump(exclude_none=True)
+    allowed: tuple[str, ...] = ("change",)
+    if not isinstance(parameter, Categorical):
+        linear = isinstance(parameter, Integer) and not parameter.log
+        allowed = (*(("delta_max",) if linear else ("mu", "sigma")), *_BOX)
     for setting in given:
         if setting not in allowed:
             kind = "log " * getattr(parameter, "log", False) + parameter.type
-            message = f"steps of a {kind} are set by {_listed(allowed)}"
+            message = f"steps of a {kind} are set by {', '.join(allowed)} only"
             yield Mistake((*key, setting), message)
     if not isinstance(parameter, Categorical):
         low, high = box = _box(parameter, step)
@@ -412,31 +421,23 @@ def _check_step(name: str, step: Step, space: ParameterSpace) -> Iterable[Mistak
         yield Mistake(key, f"never moves with {named}")
 
 
-def _check_start(name: str, value: float, step: Step, space: ParameterSpace) -> Iterable[Mistake]:
-    key = ("start", name)
-    parameter = space.parameters.get(name)
-    if parameter is None:
-        yield Mistake(key, f"no parameter {name!r} is tuned: {nearest(name, space.names)}")
-    elif isinstance(parameter, Categorical):
-        yield Mistake(key, "is a category, which starts at the baseline; leave it out")
-    else:
-        low, high = _box(parameter, step)
-        if not (parameter.contains(value) and low <= value <= high):
-            what = "a whole number" if isinstance(parameter, Integer) else "a number"
-            yield Mistake(key, f"give {what} from {low:g} to {high:g}, not {value!r}")
+def _check_start(
+    name: str, parameter: Float | Integer | Categorical, value: float, step: Step | None
+) -> Iterable[Mistake]:
+    if isinstance(parameter, Categorical):
+        what = "is a category, which starts at the baseline; leave it out"
+        yield Mistake(("start", name), what)
+        return
+    low, high = _box(parameter, step or Step())
+    if not (parameter.contains(value) and low <= value <= high):
+        what = "a whole number" if isinstance(parameter, Integer) else "a number"
+        yield Mistake(("start", name), f"give {what} from {low:g} to {high:g}, not {value!r}")
 
 
 def _box(parameter: Float | Integer, step: Step) -> tuple[float, float]:
     """Bounds of the walk."""
     low, high = step.low, step.high
     return parameter.low if low is None else low, parameter.high if high is None else high
-
-
-def _allowed(parameter: Float | Integer | Categorical) -> tuple[str, ...]:
-    if isinstance(parameter, Categorical):
-        return ("change",)
-    linear = isinstance(parameter, Integer) and not parameter.log
-    return (*(("delta_max",) if linear else ("mu", "sigma")), *_BOX)
 
 
 def _make_elsewhere(name: str, settings: Mapping[str, Any], seed: int) -> None:
@@ -452,11 +453,6 @@ def _make_elsewhere(name: str, settings: Mapping[str, Any], seed: int) -> None:
         process.close()
 
 
-def _listed(words: tuple[str, ...]) -> str:
-    *first, last = words
-    return f"{', '.join(first)} and {last}" if first else last
-
-
 Metric = Literal["rte", "kitti", "rpe", "ape", "ms_per_scan", "cpu", "memory"]
 """What a trial can be judged by; `offline.objective` explains each."""
 TIMED = ("ms_per_scan", "cpu", "memory")
@@ -468,11 +464,6 @@ def _weighted(given: Any) -> Any:
     """Write every objective, a metric or a weighted sum of metrics, as a weighted sum."""
     objectives = given if isinstance(given, list | tuple) else [given]
     weighted = tuple({one: 1.0} if isinstance(one, str) else one for one in objectives)
-    metrics = get_args(Metric)
-    for weights in weighted:
-        for metric in weights if isinstance(weights, dict) else ():
-            if metric not in metrics:
-                raise ValueError(f"there is no metric {metric!r}: {nearest(str(metric), metrics)}")
     if any(weights in weighted[:i] for i, weights in enumerate(weighted)):
         raise ValueError("names an objective twice")
     return weighted
@@ -536,8 +527,15 @@ class OfflineConfig(StrictModel):
 
     def mistakes(self, space: ParameterSpace | None) -> Iterable[Mistake]:
         """Find mistakes in the sampler and its settings."""
-        yield from self._search_mistakes(space)
-        key = ("sampler_settings",)
+        key, n = ("sampler_settings",), 1 if space is None else len(space.baselines)
+        if n > 1 and (
+            self.sampler not in (*STATELESS, "random") or "grid" in self.sampler_settings
+        ):
+            message = "with several odometries, choose tpe, gp or random, without a grid"
+            yield Mistake(("sampler",), message)
+        if self.trials is not None and self.trials < n:
+            message = f"{n} odometries need {n} trials at least, to try the parameters of each"
+            yield Mistake(("trials",), message)
         if len(self.objective) > 1 and self.sampler in SINGLE_OBJECTIVE:
             others = ", ".join(sorted(set(NAMES) - set(SINGLE_OBJECTIVE)))
             message = f"{self.sampler} minimises one objective only; choose one of {others}"
@@ -556,17 +554,6 @@ class OfflineConfig(StrictModel):
                 return
         below = check_sampler(self.sampler, self.sampler_settings, space, self.budgeted)
         yield from (mistake.below(key) for mistake in below)
-
-    def _search_mistakes(self, space: ParameterSpace | None) -> Iterable[Mistake]:
-        """Find samplers that cannot search among several odometries."""
-        n = 1 if space is None else len(space.baselines)
-        grid = "grid" in self.sampler_settings
-        if n > 1 and (self.sampler not in (*STATELESS, "random") or grid):
-            message = "with several odometries, choose tpe, gp or random, without a grid"
-            yield Mistake(("sampler",), message)
-        if self.trials is not None and self.trials < n:
-            message = f"{n} odometries need {n} trials at least, to try the parameters of each"
-            yield Mistake(("trials",), message)
 
 
 _SEARCH = (

@@ -3,8 +3,8 @@
 import json
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Iterator, Sequence
-from itertools import islice
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from itertools import islice, zip_longest
 from operator import itemgetter
 from typing import Any
 
@@ -18,7 +18,6 @@ from adaptune.space import (
     ODOMETRY,
     Categorical,
     Float,
-    Integer,
     ParameterSet,
     ParameterSpace,
     PooledSpace,
@@ -29,7 +28,6 @@ from offline.config import (
     STATELESS,
     AnnealingSettings,
     Grid,
-    GridSettings,
     OfflineConfig,
     RandomSettings,
     SamplerError,
@@ -112,25 +110,20 @@ _SHUFFLED = 1 << 20
 
 
 class RandomSampler(Sampler):
-    """Uniform in the unit cube, or points of a grid in random order.
+    """Uniform in the unit cube.
 
     Each set follows from the number of its trial. One that was tried before is drawn again.
     """
 
-    def __init__(self, space: ParameterSpace, config: OfflineConfig):
-        super().__init__(space, config)
-        axes = RandomSettings.model_validate(config.sampler_settings).grid
-        self._grid = None if axes is None else make_grid(space, axes)
-
     def _propose(self, numbers: range, history: Sequence[SamplerResult]) -> list[ParameterSet]:
-        if self._grid is not None:
-            order = _shuffled(self._grid.size, self.config.seed, numbers.stop)
-            return _walk(self._grid, order, self.space.baseline, numbers)
         tried = {key(result.parameters) for result in history}
         sets: list[ParameterSet] = []
         for number in numbers:
-            point: ParameterSet | None = self._point(number)
-            if point is not None and key(point) in tried:
+            point: ParameterSet | None = self.space.baseline
+            if number:
+                rng = np.random.default_rng((self.config.seed, number))
+                (point,) = self.space.from_unit(rng.random((1, len(self.space))))
+            if key(point) in tried:
                 rng = np.random.default_rng((self.config.seed, number, 1))
                 point = untried(self.space, tried, rng)
             if point is None:
@@ -139,34 +132,20 @@ class RandomSampler(Sampler):
             sets.append(point)
         return sets
 
-    def _point(self, number: int) -> ParameterSet:
-        if number == 0:
-            return self.space.baseline
-        drawn = np.random.default_rng((self.config.seed, number)).random((1, len(self.space)))
-        (point,) = self.space.from_unit(drawn)
-        return point
-
 
 class GridSampler(Sampler):
-    """Points of a grid in row-major order: the last parameter changes fastest."""
-
-    def __init__(self, space: ParameterSpace, config: OfflineConfig):
-        super().__init__(space, config)
-        axes = GridSettings.model_validate(config.sampler_settings).grid
-        self._grid = make_grid(space, axes)
+    """The baseline, then the other points of a grid, in row-major or in random order."""
 
     def _propose(self, numbers: range, history: Sequence[SamplerResult]) -> list[ParameterSet]:  # noqa: ARG002
-        order = iter(range(min(numbers.stop, self._grid.size)))
-        return _walk(self._grid, order, self.space.baseline, numbers)
-
-
-def _walk(
-    grid: Grid, order: Iterator[int], baseline: ParameterSet, numbers: range
-) -> list[ParameterSet]:
-    """Sets `numbers` of a list: the baseline, then the other points of a grid in their order."""
-    known = grid.index(baseline)
-    rest = islice((i for i in order if i != known), max(numbers.start - 1, 0), numbers.stop - 1)
-    return [baseline] * (numbers.start == 0) + [grid[i] for i in rest]
+        settings = RandomSettings.model_validate(self.config.sampler_settings)
+        grid = make_grid(self.space, settings.grid or {})
+        order: Iterable[int] = range(grid.size)
+        if self.config.sampler == "random":
+            order = _shuffled(grid.size, self.config.seed, numbers.stop)
+        baseline = self.space.baseline
+        known = grid.index(baseline)
+        rest = islice((i for i in order if i != known), max(numbers.start - 1, 0), numbers.stop - 1)
+        return [baseline] * (numbers.start == 0) + [grid[i] for i in rest]
 
 
 def _shuffled(size: int, seed: int, n: int) -> Iterator[int]:
@@ -199,21 +178,18 @@ def sobol_points(space: ParameterSpace, seed: int, numbers: range) -> list[Param
     if not numbers:
         return []
     sobol = qmc.Sobol(len(space), rng=np.random.default_rng((seed, 0)))
-    if numbers.start:
-        sobol.fast_forward(numbers.start)
     # One by one: scipy warns if the number of points is not a power of two.
-    return space.from_unit(np.concatenate([sobol.random(1) for _ in numbers]))
+    points = [sobol.random(1) for _ in range(numbers.stop)]
+    return space.from_unit(np.concatenate(points[numbers.start :]))
 
 
 class AskedSampler(Sampler):
     """Begins with points of a Sobol sequence, and then asks an Optuna sampler.
 
-    Many Optuna samplers keep notes on the trials that they proposed: a generation, a population,
-    the state of their random numbers. A resumed search therefore asks again for the earlier
-    proposals, and answers from the history. Samplers without notes receive the history instead,
-    and begin every batch with a seed of its own; so do those that no longer propose what they did,
-    because sequences were added or removed, or another version is installed. Nothing is kept on
-    disk.
+    Many Optuna samplers keep notes on the trials that they proposed. A resumed search therefore
+    asks again for the earlier proposals, and answers from the history. Samplers without notes
+    receive the history instead, and begin every batch with a seed of its own; so do those that no
+    longer propose what they did, because sequences were added, or another version is installed.
 
     If the sampler proposes a set that was tried before, it receives the known value at once and is
     asked again. After many attempts, a random set is taken.
@@ -221,7 +197,12 @@ class AskedSampler(Sampler):
 
     def __init__(self, space: ParameterSpace, config: OfflineConfig):
         super().__init__(space, config)
-        self._distributions = {name: _distribution(p) for name, p in space.parameters.items()}
+        self._distributions = {
+            name: optuna.distributions.CategoricalDistribution(range(len(p.choices)))
+            if isinstance(p, Categorical)
+            else distribution(p)
+            for name, p in space.parameters.items()
+        }
         self._forgetful = config.sampler in STATELESS
         self._begin(0, ())
         self.constrained = isinstance(self._study.sampler, CONSTRAINED)
@@ -235,7 +216,7 @@ class AskedSampler(Sampler):
                 params=self._encode(result.parameters),
                 distributions=self._distributions,
                 values=np.atleast_1d(result.value).tolist(),
-                constraints=_named(result.constraints),
+                constraints={str(i): by for i, by in enumerate(result.constraints)},
             )
             for result in history
         )
@@ -274,29 +255,19 @@ class AskedSampler(Sampler):
 
     def _ask(self, numbers: range) -> list[ParameterSet]:
         """Sets of the next batch; the same sets until they are answered."""
-        if not self._waiting and not self._stalled():
-            tried = {key(result.parameters) for result in self._history}
-            n_initial = self._n_initial(numbers)
-            given = [self.space.baseline] if numbers.start == 0 else []
-            given += sobol_points(
-                self.space, self.config.seed, range(numbers.start + len(given), n_initial)
-            )
-            for number in numbers:
-                first = given[number - numbers.start] if number < n_initial else None
-                if not self._ask_once(number, first, tried):
-                    break
-        return [parameters for parameters, _ in self._waiting.values()]
-
-    def _stalled(self) -> bool:
         sampler = self._study.sampler
         if isinstance(sampler, AnnealingSampler) and sampler.stalled(self._study):
             self.end = "all chains have stalled"
-            return True
-        return False
-
-    def _n_initial(self, numbers: range) -> int:
-        n = 1 if self.config.sampler == "qmc" else self.config.initial
-        return max(numbers.start, min(numbers.stop, n))
+        elif not self._waiting:
+            tried = {key(result.parameters) for result in self._history}
+            n_initial = 1 if self.config.sampler == "qmc" else self.config.initial
+            given = [self.space.baseline][numbers.start :]
+            rest = range(numbers.start + len(given), min(numbers.stop, n_initial))
+            given += sobol_points(self.space, self.config.seed, rest)
+            for number, first in zip_longest(numbers, given):
+                if not self._ask_once(number, first, tried):
+                    break
+        return [parameters for parameters, _ in self._waiting.values()]
 
     def _ask_once(self, number: int, given: ParameterSet | None, tried: set[str]) -> bool:
         for attempt in range(_ATTEMPTS):
@@ -333,8 +304,8 @@ class AskedSampler(Sampler):
         self._waiting = {}
 
     def _tell(self, trial: optuna.Trial, result: SamplerResult) -> None:
-        for name, by in _named(result.constraints).items():
-            trial.set_constraint(name, by)
+        for i, by in enumerate(result.constraints):
+            trial.set_constraint(str(i), by)
         self._study.tell(trial, result.value)
 
     # For Optuna, as for Python, the choices 1 and True are equal: it receives their index.
@@ -358,16 +329,6 @@ class AskedSampler(Sampler):
                 raise SamplerError(f"{what}, which is not between {p.low:g} and {p.high:g}")
             decoded[name] = float(inside) if isinstance(p, Float) else int(inside)
         return decoded
-
-
-def _named(constraints: Sequence[float]) -> dict[str, float]:
-    return {str(i): by for i, by in enumerate(constraints)}
-
-
-def _distribution(parameter: Float | Integer | Categorical) -> Any:
-    if isinstance(parameter, Categorical):
-        return optuna.distributions.CategoricalDistribution(range(len(parameter.choices)))
-    return distribution(parameter)
 
 
 class PooledSampler(Sampler):
@@ -400,18 +361,13 @@ class PooledSampler(Sampler):
         able = list(of)
         while (n := sum(map(len, sets.values()))) < len(numbers) and able:
             for label, more in self._split(range(numbers.start + n, numbers.stop), of, able):
-                wanted = len(sets[label]) + more
+                wanted, first = len(sets[label]) + more, len(of[label])
                 # Asked for more, a sampler proposes the same sets first.
-                sets[label] = self._asked(label, wanted, of[label])
-                if len(sets[label]) < wanted:
+                own = self._samplers[label]._propose(range(first, first + wanted), of[label])
+                sets[label] = [{ODOMETRY: label, **parameters} for parameters in own]
+                if len(own) < wanted:
                     able.remove(label)
         return _spread(sets, numbers.start)
-
-    def _asked(self, label: str, n: int, history: Sequence[SamplerResult]) -> list[ParameterSet]:
-        """The next `n` sets of one odometry; fewer where nothing else is left."""
-        first = len(history)
-        proposed = self._samplers[label]._propose(range(first, first + n), history)
-        return [{ODOMETRY: label, **own} for own in proposed]
 
     def _own(self, label: str, history: Sequence[SamplerResult]) -> list[SamplerResult]:
         """The results of the sets of one odometry, as its sampler takes them."""
@@ -431,8 +387,7 @@ class PooledSampler(Sampler):
         for number in initial:
             counts[labels[number % len(labels)]] += 1
         rest = len(numbers) - len(initial)
-        best = {label: _best(of[label]) for label in labels}
-        ranked = sorted(labels, key=lambda label: best[label])
+        ranked = sorted(labels, key=lambda label: _best(of[label]))
         shares = 1.0 / np.arange(1, len(ranked) + 1)
         ideal = rest * shares / shares.sum()
         whole = np.floor(ideal).astype(int)
@@ -484,7 +439,7 @@ def make_sampler(space: ParameterSpace, config: OfflineConfig) -> Sampler:
     """Make the sampler that a configuration names."""
     if isinstance(space, PooledSpace):
         return PooledSampler(space, config)
-    if config.sampler == "grid":
+    if config.sampler_settings.get("grid") is not None and config.sampler in ("grid", "random"):
         return GridSampler(space, config)
     if config.sampler == "random":
         return RandomSampler(space, config)
