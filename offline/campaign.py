@@ -2,7 +2,7 @@
 
 import logging
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,9 +17,9 @@ from adaptune.progress import Progress, unseen
 from adaptune.space import ParameterSet, PooledSpace
 from offline.config import OfflineConfig, OfflineStudy
 from offline.objective import Verdict, best_by_trials, judge, label, mean_value, weighted
-from offline.search import Clock, Finished, Search, assess, make_searches, rungs
+from offline.search import Clock, Finished, assess, make_searches, rungs
 from offline.storage import Mirror, MirrorRow
-from offline.workers import Pool, Task, TaskProgress, TaskResult, run
+from offline.workers import Pool, Task, TaskResult, run
 
 _log = logging.getLogger(__name__)
 
@@ -45,7 +45,7 @@ class Campaign:
         self._without_frames = [
             name for name in self._names if not archive.has_frames(name, described)
         ]
-        self._tally = _Tally(progress, self._finished, self._searches)
+        self._best = ""  # in words
         # For each trial number, the sequences that count.
         self._counted: dict[int, Sequence[str]] = {}
 
@@ -54,13 +54,12 @@ class Campaign:
         clock = Clock(self._study.folder / "elapsed.json")
         batch = 0
         while at_work := [s for s in self._searches if s.begin(clock.hours(batch))]:
-            self._tally.begin(at_work)
             begun = False
             for m in rungs(self._config.pruning == "wilcoxon", batch, len(at_work[0].sequences)):
                 if tasks := self._tasks([of for search in at_work for of in search.missing(m)]):
                     begun = True
                     with clock.running(batch):
-                        self._tally.watch(self._archive, self._workers, tasks)
+                        self._run_tasks(tasks)
                 for search in at_work:
                     search.prune(m)
             numbers = sorted({n for search in at_work for n in search.numbers})
@@ -68,22 +67,51 @@ class Campaign:
                 self._counted |= dict.fromkeys(search.numbers, search.sequences)
                 search.close()
             self._counted[0] = self._names
-            self._tally.best = self._best()
+            self._best = self._best_in_words()
             if begun:
                 self._mirror_trials()
-                self._tally.catch_up()
-                _log.debug("trials %d to %d done; %s", numbers[0], numbers[-1], self._tally.best)
+                self._show(self._n_done())
+                _log.debug("trials %d to %d done; %s", numbers[0], numbers[-1], self._best)
             batch += 1
         for search in self._searches:
             where = f" on {search.sequences[0]}" if self._config.sets == "own" else ""
             _log.info("the search%s ends: %s", where, search.end)
         self._mirror_trials()
-        self._tally.catch_up()
+        self._show(self._n_done())
         if self._config.sets == "own":
             self._run_everywhere()
         return {n: self._verdict(n) for n in sorted(self._counted)}
 
-    def _best(self) -> str:
+    def _run_tasks(self, tasks: list[Task]) -> None:
+        before = self._n_done()
+
+        def show(what: str, done: float, of: int, remark: str = "", /) -> None:
+            if what == "runs":
+                self._show(before + done, remark)
+            else:
+                self._progress(what, done, of, remark)
+
+        for task, result in run(self._workers, tasks, "runs", show):
+            _store(self._archive, task, result)
+
+    def _n_done(self) -> int:
+        """Runs that are done, with those that will not be run."""
+        closed = sum(len(search.verdicts) * len(search.sequences) for search in self._searches)
+        return closed + sum(
+            number in self._finished[name]
+            for search in self._searches
+            for name in search.sequences
+            for number in search.numbers
+        )
+
+    def _show(self, done: float, at_work: str = "") -> None:
+        runs = [run for of in self._finished.values() for run in of.values()]
+        failed = sum(run.lost > 0 or run.faults > 0 for run in runs)
+        remarks = [at_work, self._best, f"{failed} lost track or failed" if failed else ""]
+        total = sum(search.total() for search in self._searches)
+        self._progress("runs", done, total, ", ".join(filter(None, remarks)))
+
+    def _best_in_words(self) -> str:
         """The best value so far, or its mean where each search has a sequence of its own."""
         best = [search.verdicts[search.best] for search in self._searches]
         value = float(np.mean([verdict.values[0] for verdict in best]))
@@ -165,91 +193,12 @@ def _mirrored(config: OfflineConfig, verdict: Verdict, finished: Finished, n: in
     return MirrorRow(verdict.parameters, verdict.values, attributes, constraints)
 
 
-class _Tally:
-    """The progress of trials."""
-
-    def __init__(self, progress: Progress, finished: Finished, searches: Sequence[Search]):
-        self.best = ""
-        self._progress, self._finished = progress, finished
-        self._searches = searches
-        self._done = self._failed = self._running = 0
-
-    def begin(self, at_work: Iterable[Search]) -> None:
-        """Begin a batch; some of its trials may be finished already."""
-        for search in at_work:
-            for name in search.sequences:
-                self._add(name, [n for n in search.numbers if n in self._finished[name]])
-        self._show(self._done)
-
-    def watch(self, archive: Archive, workers: Pool[Any], tasks: list[Task]) -> None:
-        """Run tasks, store their results, and count trials scan by scan."""
-        before = self._done
-
-        def show(what: str, done: float, of: int, remark: str = "", /) -> None:
-            if what == "runs":
-                self._show(before + done)
-            else:
-                self._progress(what, done, of, remark)
-
-        for task, result, self._running in watched(workers, tasks, "runs", show):
-            _store(archive, task, result)
-            self._add(task.sequence, task.numbers)
-            self._show(self._done)
-
-    def catch_up(self) -> None:
-        """Count trials that will not run as done, too."""
-        self._done = sum(len(s.verdicts) * len(s.sequences) for s in self._searches)
-        self._show(self._done)
-
-    def _add(self, name: str, numbers: Iterable[int]) -> None:
-        runs = [self._finished[name][n] for n in numbers]
-        self._done += len(runs)
-        self._failed += sum(run.lost > 0 or run.faults > 0 for run in runs)
-
-    def _show(self, done: float) -> None:
-        n = self._running
-        remarks = [f"{n} worker{'s' if n > 1 else ''} at work"] if n else []
-        remarks += [self.best] if self.best else []
-        remarks += [f"{self._failed} lost track or failed"] if self._failed else []
-        total = sum(search.total() for search in self._searches)
-        self._progress("runs", done, total, ", ".join(remarks))
-
-
 def watch_tasks(
     archive: Archive, workers: Pool[Any], tasks: list[Task], what: str, progress: Progress
 ) -> None:
-    """Run tasks and store their results, see `watched`."""
-    for task, result, _ in watched(workers, tasks, what, progress):
+    """Run tasks and store their results, see `offline.workers.run`."""
+    for task, result in run(workers, tasks, what, progress):
         _store(archive, task, result)
-
-
-def watched(
-    workers: Pool[Any], tasks: list[Task], what: str, progress: Progress
-) -> Iterator[tuple[Task, TaskResult, int]]:
-    """Run tasks, and yield each with its result and the number of workers that are at work.
-
-    `progress` is called with `what` and the number of runs that are done, and about scans that are
-    read: several workers may read the same sequence.
-    """
-    total, done = sum(len(task.numbers) for task in tasks), 0
-    read: dict[str, float] = {}  # scans, by what for
-    under_way: dict[tuple[str, tuple[int, ...]], float] = {}  # runs of unfinished tasks
-
-    def report(task: Task, of_task: TaskProgress) -> None:
-        stage, scans, of = of_task
-        if stage == "running":
-            under_way[task.key] = len(task.numbers) * scans / max(of, 1)
-        else:
-            reading = f"{stage} {task.sequence}"
-            read[reading] = max(scans, read.get(reading, 0))
-            progress(reading, read[reading], of, "")
-        progress(what, done + sum(under_way.values()), total, "")
-
-    for task, result, running in run(workers, tasks, report):
-        under_way.pop(task.key, None)
-        done += len(task.numbers)
-        progress(what, done + sum(under_way.values()), total, "")
-        yield task, result, running
 
 
 def _store(archive: Archive, task: Task, result: TaskResult) -> None:
@@ -385,17 +334,15 @@ def run_baseline(
                 tasks.append(Task(name, (number,), (parameters,), True, frames))
                 frames = False
     done = []
-    for task, result, _ in watched(workers, tasks, "baseline", progress):
+    for task, result in run(workers, tasks, "baseline", progress):
         check_baseline(labels[task.numbers[0]], task.sequence, result.trials[0])
         done.append((task, result))
     for task, result in done:
-        if result.frames is not None:
-            archive.write_frames(task.sequence, result.frames)
-    for task, result in done:
-        (number,), (run,) = task.numbers, result.trials
-        archive.write(task.sequence, number, run, whole=True)
+        _store(archive, task, result)
+        if task.numbers != (0,):
+            continue
         T_ref_sensor = archive.read_frames(task.sequence).T_ref_sensor
-        if number == 0 and (what := contradiction(run.T_odom_sensor, T_ref_sensor)):
+        if what := contradiction(result.trials[0].T_odom_sensor, T_ref_sensor):
             _log.warning(
                 "sequences.%s: the reference contradicts the odometry's motion nearly everywhere: "
                 "%s; check the file or topic (reference), the LiDAR's pose in its frame "

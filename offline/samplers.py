@@ -122,7 +122,7 @@ class RandomSampler(Sampler):
             point: ParameterSet | None = self.space.baseline
             if number:
                 rng = np.random.default_rng((self.config.seed, number))
-                (point,) = self.space.from_unit(rng.random((1, len(self.space))))
+                point = self.space.from_unit(rng.random((1, len(self.space))))[0]
             if key(point) in tried:
                 rng = np.random.default_rng((self.config.seed, number, 1))
                 point = untried(self.space, tried, rng)

@@ -245,10 +245,6 @@ class Search:
             for name in self.order[:m]
         ]
 
-    def parameters(self, number: int) -> ParameterSet:
-        """The set of a trial of the batch."""
-        return self._sets[number]
-
     def prune(self, m: int) -> None:
         """Stop trials that promise little after `m` sequences."""
         if m < len(self.order):

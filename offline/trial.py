@@ -3,7 +3,7 @@
 import time
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import count, islice
@@ -57,12 +57,9 @@ SharedScan = Callable[[OdometryInstance], Any]
 class SharedScans:
     """The scans of a sequence, each prepared once for all instances with the same preparation.
 
-    Iterating yields a function for every scan, which gives it as an instance takes it. It does not
-    end.
-
-    Prepared scans that exceed `memory` bytes are read and prepared again on every pass. Of several
-    preparations, those that a pass does not use make room.
-
+    Iterating yields a `SharedScan` for every scan, and does not end. Prepared scans that exceed
+    `memory` bytes are read and prepared again on every pass. Of several preparations, those that a
+    pass does not use make room.
     """
 
     def __init__(self, scans: Iterable[Scan], memory: float):
@@ -77,9 +74,17 @@ class SharedScans:
 
     def __iter__(self) -> Iterator[SharedScan]:
         self._used = set()
-        reader = _Reader(self._scans)
+        numbered = enumerate(self._scans)
+        last: tuple[int, Any] = -1, None
+
+        def read(i: int) -> Any:  # only what is asked for, in order
+            nonlocal last
+            while last[0] < i:
+                last = next(numbered)
+            return last[1]
+
         for i in count():
-            yield partial(self.prepared, i, partial(reader.read, i))
+            yield partial(self.prepared, i, partial(read, i))
 
     def prepared(self, i: int, read: Callable[[], Scan], instance: OdometryInstance) -> Any:
         """Scan `i`, which `read` returns, as an instance takes it."""
@@ -120,24 +125,6 @@ class SharedScans:
         return self.nbytes + size <= self._memory
 
 
-class _Reader:
-    """Reads scans in order, and only if it is asked for one."""
-
-    def __init__(self, scans: Iterable[Scan]):
-        self._scans = scans
-        self._iterator: Iterator[Scan] | None = None
-        self._at = -1
-
-    def read(self, i: int) -> Scan:
-        """Scan `i`, which is no earlier than the one before."""
-        if self._iterator is None:
-            self._iterator = iter(self._scans)
-        while self._at < i:
-            self._scan = next(self._iterator)
-            self._at += 1
-        return self._scan
-
-
 class TrialRun:
     """A run of an odometry on a sequence, restarted at the reference where it loses track.
 
@@ -168,14 +155,10 @@ class TrialRun:
         """See `Trial`."""
         return (*(() if self._odometry is None else self._odometry.faults), *self._failure)
 
-    @property
-    def usage(self) -> Usage:
-        """What the odometry used."""
-        return Usage(0.0, None) if self._odometry is None else self._odometry.usage
-
-    def prepare_ms(self, scans: SharedScans) -> float:
-        """Mean CPU time that it took to prepare a scan."""
-        return 0.0 if self._odometry is None else scans.milliseconds(self._odometry)
+    def usage(self, scans: SharedScans) -> tuple[Usage, float]:
+        """What the odometry used, and the mean CPU time in ms that it took to prepare a scan."""
+        of = self._odometry
+        return (Usage(0.0, None), 0.0) if of is None else (of.usage, scans.milliseconds(of))
 
     def step(self, i: int, scan: SharedScan) -> None:
         """Register the scan of frame `i`."""
@@ -349,17 +332,17 @@ class PreparedSequence:
         self._baseline = partial(odometry, isolated=settings.isolated)
         self._odometry: OdometryInstance | None = None
         reference = _reference(key, scans, settings)
-        with _of_sequence(name):
-            describe = Describer(settings.descriptors)
         stamps, descriptors, elevations, full, enough = [], [], [], False, False
-        for scan in _watched(scans, scans.n_messages, "reading", progress):
-            enough = enough or len(scan) >= MIN_POINTS
-            stamps.append(scan.stamp)
-            with _of_sequence(name):
+        try:
+            describe = Describer(settings.descriptors)
+            for scan in _watched(scans, scans.n_messages, "reading", progress):
+                enough = enough or len(scan) >= MIN_POINTS
+                stamps.append(scan.stamp)
                 descriptors.append(describe(scan))
-            elevations.append(lowest_elevation(scan))
-            if not full:
-                full = self._prepare(len(stamps) - 1, scan)
+                elevations.append(lowest_elevation(scan))
+                full = full or self._prepare(len(stamps) - 1, scan)
+        except DescriptorError as error:
+            raise AdaptuneError(f"sequences.{name}: {error}") from error
         if not enough:
             raise AdaptuneError(
                 f"sequences.{name}: none of its {len(stamps)} scans has {MIN_POINTS} points; check "
@@ -398,15 +381,6 @@ def _watched(scans: Iterable[Any], n: int, what: str, progress: Progress) -> Ite
         yield scan
         progress(what, min(done, n), n)
     progress(what, done, done)
-
-
-@contextmanager
-def _of_sequence(name: str) -> Iterator[None]:
-    """Name the sequence in errors of descriptors."""
-    try:
-        yield
-    except DescriptorError as error:
-        raise AdaptuneError(f"sequences.{name}: {error}") from error
 
 
 def _reference(key: str, scans: recording.Recording, settings: TrialSettings) -> Trajectory:
@@ -517,39 +491,35 @@ def _trial(
 ) -> Trial:
     """Make a trial of a run."""
     frames, T_odom_sensor = scans.frames, run.T_odom_sensor
-    length, T_ref_sensor = settings.sub_trajectory, frames.T_ref_sensor
     T_steps = steps(T_odom_sensor)
     for i, T_step in run.lost_steps.items():
         T_steps[i - 1] = T_step
-    if (apart := run.usage.seconds) is not None:
-        run.seconds[:] = apart
+    usage, prepare_ms = run.usage(scans.shared)
+    if usage.seconds is not None:
+        run.seconds[:] = usage.seconds
+    used = {
+        "cpu": 100.0 * usage.cpu / ((frames.stamps[-1] - frames.stamps[0]) * 1e-9),
+        REGISTER_MS: 1e3 * usage.cpu / len(frames.stamps),
+        PREPARE_MS: prepare_ms,
+    } | ({} if usage.memory is None else {"memory": usage.memory})
     driven = run if isinstance(run, DrivenRun) else None
     return Trial(
         parameters,
         T_odom_sensor,
-        sub_trajectory_rte(T_ref_sensor, T_odom_sensor, length, run.restarted),
+        sub_trajectory_rte(
+            frames.T_ref_sensor, T_odom_sensor, settings.sub_trajectory, run.restarted
+        ),
         run.restarted,
         run.registered,
         run.seconds,
         run.faults,
         trajectory_metrics(frames, T_odom_sensor, run.lost_steps),
-        _usage(scans, run),
+        used,
         unhealthy=dict(driven.unhealthy)
         if driven
         else unhealthy(settings.health, T_steps, frames.stamps, run.registered),
         health=settings.health.model_dump() if driven else {},
     )
-
-
-def _usage(scans: PreparedSequence, run: TrialRun) -> dict[str, float]:
-    """What a trial used, see `Trial`."""
-    stamps, usage = scans.frames.stamps, run.usage
-    used = {
-        "cpu": 100.0 * usage.cpu / ((stamps[-1] - stamps[0]) * 1e-9),
-        REGISTER_MS: 1e3 * usage.cpu / len(stamps),
-        PREPARE_MS: run.prepare_ms(scans.shared),
-    }
-    return used if usage.memory is None else used | {"memory": usage.memory}
 
 
 def _mean(parameters: ParameterSet, repeats: Sequence[Trial]) -> Trial:

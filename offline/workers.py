@@ -116,14 +116,14 @@ class Pool(Protocol[W]):
 
 
 def run(
-    pool: Pool[W],
-    tasks: Sequence[Task],
-    report: Callable[[Task, TaskProgress], None] = lambda *_: None,
-) -> Iterator[tuple[Task, TaskResult, int]]:
-    """Run tasks, and yield each as it is done, with its result and the number of workers at work.
+    pool: Pool[W], tasks: Sequence[Task], what: str = "runs", progress: Progress = unseen
+) -> Iterator[tuple[Task, TaskResult]]:
+    """Run tasks, and yield each as it is done, with its result.
 
     A task goes to a worker that has prepared its sequence, if there is one. If a worker dies,
-    another one runs its task again. `report` is called about tasks that go on.
+    another one runs its task again. `progress` is called with `what`, the number of runs that are
+    done, and the workers that are at work. It is also called about scans that are read: several
+    workers may read the same sequence.
 
     Raises
     ------
@@ -132,14 +132,11 @@ def run(
     WorkerError
         If several workers died at the same task.
     """
-    queue = _Queue(pool, tasks, report)
+    queue = _Queue(pool, tasks, what, progress)
     while queue.open:
         queue.start()
         finished, queue.finished = queue.finished, []
-        # The workers work while their results are written.
-        n_running = len(queue.running)
-        for task, result in finished:
-            yield task, result, n_running
+        yield from finished  # the workers work while their results are written
         if queue.failure is not None:
             raise queue.failure
         queue.wait()
@@ -148,16 +145,18 @@ def run(
 class _Queue(Generic[W]):
     """Tasks that wait, run, and are finished."""
 
-    def __init__(
-        self, pool: Pool[W], tasks: Sequence[Task], report: Callable[[Task, TaskProgress], None]
-    ):
+    def __init__(self, pool: Pool[W], tasks: Sequence[Task], what: str, progress: Progress):
         self.waiting = list(tasks)
         self.running: dict[W, Task] = {}
         self.finished: list[tuple[Task, TaskResult]] = []
         self.failure: AdaptuneError | None = None
-        self._pool, self._report = pool, report
+        self._pool, self._what, self._progress = pool, what, progress
         self._deaths = Counter[tuple[str, tuple[int, ...]]]()
         self._near: dict[W, set[str]] = {}
+        self._total = sum(len(task.numbers) for task in tasks)
+        # Runs by task, also in part, and scans that were read by what for.
+        self._done: dict[tuple[str, tuple[int, ...]], float] = {}
+        self._read: dict[str, float] = {}
 
     @property
     def open(self) -> bool:
@@ -183,11 +182,24 @@ class _Queue(Generic[W]):
             task = self.running.pop(worker)
             if isinstance(outcome, TaskResult):
                 self.finished.append((task, outcome))
+                self._report(task, TaskProgress("running", 1, 1))
             elif isinstance(outcome, AdaptuneError):
                 self.failure = outcome
             else:
                 self._near.pop(worker, None)
                 self._again(task, outcome)
+
+    def _report(self, task: Task, of_task: TaskProgress) -> None:
+        stage, scans, of = of_task
+        if stage == "running":
+            self._done[task.key] = len(task.numbers) * scans / max(of, 1)
+        else:
+            reading = f"{stage} {task.sequence}"
+            self._read[reading] = max(scans, self._read.get(reading, 0))
+            self._progress(reading, self._read[reading], of, "")
+        n = len(self.running)
+        at_work = f"{n} worker{'s' if n > 1 else ''} at work" if n else ""
+        self._progress(self._what, sum(self._done.values()), self._total, at_work)
 
     def _again(self, task: Task, death: Death) -> None:
         # A class that is not as clean as it says then costs its own trial only.
@@ -554,8 +566,7 @@ class Cluster:
 
 def _away(setup: TrialSetup, digests: Mapping[str, str]) -> TrialSetup:
     """The setup for workers, which may not have the recordings."""
-    given = {f.name: getattr(setup.sequences, f.name) for f in dataclasses.fields(StudySequences)}
-    given["folder"] = setup.sequences.folder.absolute()
+    given = vars(setup.sequences) | {"folder": setup.sequences.folder.absolute()}
     sequences = AwaySequences(**given, digests=digests)
     odometry = setup.odometry.changed(program_input=sequences.program_input)
     return TrialSetup(setup.settings, odometry, sequences)

@@ -3,7 +3,6 @@ from importlib import import_module
 import pytest
 
 from offline import workers
-from offline.campaign import watched
 from offline.config import load_study
 from offline.train import train
 from offline.workers import Death, Task, TaskProgress, TaskResult, Workers, now_and_then, run
@@ -29,7 +28,7 @@ def test_what_a_dead_worker_had_done_does_not_count():
     pool, calls = TwoWords(), []
     half = TaskProgress("running", 8, 10)
     pool.said = [half, Death("it was killed"), half]
-    list(watched(pool, [Task("one", (0, 1), ({}, {}))], "runs", lambda *call: calls.append(call)))
+    list(run(pool, [Task("one", (0, 1), ({}, {}))], "runs", lambda *call: calls.append(call)))
     assert [done for _, done, *_ in calls] == [1.6, 1.6, 2]
 
 

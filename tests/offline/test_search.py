@@ -210,7 +210,7 @@ def test_verdicts_belong_to_their_trials_where_numbers_are_left_out():
     search = Search(sampler, config, ["one"], finished, known, 1)
     while search.begin(0.0):
         for n in search.numbers:
-            finished["one"][n] = Summary(search.parameters(n), 1.0, 0, 0, 1.0)
+            finished["one"][n] = Summary(search._sets[n], 1.0, 0, 0, 1.0)
         search.close()
     assert {n: v.parameters for n, v in search.done.items()} == {
         n: run.parameters for n, run in finished["one"].items()
