@@ -93,11 +93,10 @@ class Chain:
 class AnnealingSampler(BaseSampler):
     """Sampler using simulated annealing.
 
-    A trial is a step from its chain's set. The chain accepts it if its error is no larger, or else
-    with probability exp(-dE / energy_scale / T). The first `n_startup_trials` are random unless
-    enqueued; the chains begin with the best of them. The state follows from the finished trials,
-    and every trial has random numbers of its own: a loaded study continues exactly as if it had
-    never stopped. Trials that run at the same time step from their chain's set at their beginning.
+    The first `n_startup_trials` are random unless enqueued; the chains begin with the best of them.
+    The state follows from the finished trials, and every trial has random numbers of its own: a
+    loaded study continues exactly as if it had never stopped. Trials that run at the same time step
+    from their chain's set at their beginning.
 
     Parameters
     ----------

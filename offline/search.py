@@ -188,7 +188,7 @@ class Search:
         self.numbers: list[int] = []  # trial numbers of the present batch
         self.order = self.sequences  # in which they are run
         self.end: str | None = None  # why the search has ended
-        self.make_sampler, self._config = sampler, config
+        self._make_sampler, self._config = sampler, config
         self._limit = max_trials(config)
         self._finished = finished
         self._known, self._slot = known, slot
@@ -198,7 +198,7 @@ class Search:
     @cached_property
     def _sampler(self) -> "Sampler":
         # Where nothing is to be proposed, it is not needed, and takes long to import.
-        return self.make_sampler()
+        return self._make_sampler()
 
     def number(self, i: int) -> int:
         """Trial number in the study of trial `i` of this search."""

@@ -137,7 +137,7 @@ def export(scans: Iterable[Scan], imu: Imu | None, path: Path, layout: Layout) -
     streams = [_clouds(messages, scans)]
     if imu is not None:
         types[IMU] = "sensor_msgs/msg/Imu"
-        streams.append(_measurements(messages, imu))
+        streams.append(measurements(messages, imu, IMU))
     messages.write(path, types, heapq.merge(*streams, key=lambda message: message[1]))
 
 
@@ -160,10 +160,11 @@ def structured(scan: Scan) -> NDArray[Any]:
     return cloud
 
 
-def _measurements(messages: Messages, imu: Imu) -> Iterator[Message]:
+def measurements(messages: Messages, imu: Imu, topic: str) -> Iterator[Message]:
+    """Every measurement of an IMU on a topic."""
     measured = zip(imu.stamps.tolist(), imu.angular_velocity, imu.acceleration, strict=True)
     for stamp, gyro, accel in measured:
-        yield IMU, stamp, messages.imu(messages.header(IMU, stamp, "imu"), gyro, accel)
+        yield topic, stamp, messages.imu(messages.header(topic, stamp, "imu"), gyro, accel)
 
 
 def write_kitti_sequence(

@@ -4,7 +4,6 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from types import MappingProxyType
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
@@ -54,19 +53,17 @@ def _sensor(
 # Two blocks of 32 lasers: a third of a degree apart above, half a degree below.
 _HDL64E = np.concatenate([2.0 - np.arange(32) / 3.0, -8.83 - 0.5 * np.arange(32)])[::-1]
 
-SENSORS: Mapping[str, Sensor] = MappingProxyType(
-    {
-        "vlp16": _sensor(np.arange(-15.0, 16.0, 2.0), 1800, (0.5, 100.0)),
-        # 900 columns, half of what it can do, keep a scan at 28,800 rays.
-        "hdl32e": _sensor(10.67 - (4.0 / 3.0) * np.arange(31, -1, -1), 900, (1.0, 100.0)),
-        "hdl64e": _sensor(_HDL64E, 2083, (0.9, 120.0)),
-        "os0-64": _sensor(np.linspace(45.0, -45.0, 64), 1024, (0.3, 50.0)),
-        "os1-128": _sensor(np.linspace(22.5, -22.5, 128), 1024, (0.5, 120.0)),
-        "avia": replace(
-            _sensor((np.arange(6) - 2.5) * 0.6, 4000, (1.0, 190.0), 0.02), pattern="rosette"
-        ),
-    }
-)
+SENSORS: Mapping[str, Sensor] = {
+    "vlp16": _sensor(np.arange(-15.0, 16.0, 2.0), 1800, (0.5, 100.0)),
+    # 900 columns, half of what it can do, keep a scan at 28,800 rays.
+    "hdl32e": _sensor(10.67 - (4.0 / 3.0) * np.arange(31, -1, -1), 900, (1.0, 100.0)),
+    "hdl64e": _sensor(_HDL64E, 2083, (0.9, 120.0)),
+    "os0-64": _sensor(np.linspace(45.0, -45.0, 64), 1024, (0.3, 50.0)),
+    "os1-128": _sensor(np.linspace(22.5, -22.5, 128), 1024, (0.5, 120.0)),
+    "avia": replace(
+        _sensor((np.arange(6) - 2.5) * 0.6, 4000, (1.0, 190.0), 0.02), pattern="rosette"
+    ),
+}
 """LiDARs by name."""
 
 _PRISMS = (7294.0 / 60.0, -4664.0 / 60.0)
@@ -138,23 +135,21 @@ class Motion:
         return max(2.0 * self.band[1], self.speed / 2.0)
 
 
-MOTIONS: Mapping[str, Motion] = MappingProxyType(
-    {
-        # Speed, acceleration, turning, height, base and weave; shift, turn and band of the shake.
-        "robot": Motion(
-            *(3.0, 0.8, 1.0, 0.9, (0.8, 0.6), 0.15),
-            *((0.002, 0.003, 0.004), (0.0015, 0.0015, 0.001), (0.5, 3.5)),
-        ),
-        "car": Motion(
-            *(10.0, 2.0, 2.5, 1.75, (2.7, 1.6), 0.15),
-            *((0.003, 0.006, 0.010), (0.0015, 0.0020, 0.0007), (0.6, 2.5)),
-        ),
-        "handheld": Motion(
-            *(1.3, 0.6, 0.8, 1.5, (0.4, 0.4), 0.3),
-            *((0.012, 0.020, 0.022), (0.012, 0.012, 0.015), (0.4, 2.5)),
-        ),
-    }
-)
+MOTIONS: Mapping[str, Motion] = {
+    # Speed, acceleration, turning, height, base and weave; shift, turn and band of the shake.
+    "robot": Motion(
+        *(3.0, 0.8, 1.0, 0.9, (0.8, 0.6), 0.15),
+        *((0.002, 0.003, 0.004), (0.0015, 0.0015, 0.001), (0.5, 3.5)),
+    ),
+    "car": Motion(
+        *(10.0, 2.0, 2.5, 1.75, (2.7, 1.6), 0.15),
+        *((0.003, 0.006, 0.010), (0.0015, 0.0020, 0.0007), (0.6, 2.5)),
+    ),
+    "handheld": Motion(
+        *(1.3, 0.6, 0.8, 1.5, (0.4, 0.4), 0.3),
+        *((0.012, 0.020, 0.022), (0.012, 0.012, 0.015), (0.4, 2.5)),
+    ),
+}
 """Ways of carrying a sensor, by name."""
 
 
@@ -171,14 +166,12 @@ class Weather:
     reach: float  # metres within which such an echo is strong enough to be seen
 
 
-WEATHERS: Mapping[str, Weather] = MappingProxyType(
-    {
-        "clear": Weather(0.0, 0.0, 0.0),
-        # 10 mm/h, and fog through which one sees some 150 m (3.9 / extinction).
-        "rain": Weather(0.003, 0.0015, 20.0),
-        "fog": Weather(0.026, 0.012, 12.0),
-    }
-)
+WEATHERS: Mapping[str, Weather] = {
+    "clear": Weather(0.0, 0.0, 0.0),
+    # 10 mm/h, and fog through which one sees some 150 m (3.9 / extinction).
+    "rain": Weather(0.003, 0.0015, 20.0),
+    "fog": Weather(0.026, 0.012, 12.0),
+}
 """Weathers by name."""
 
 

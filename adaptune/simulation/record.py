@@ -1,11 +1,13 @@
 """Recordings of simulated courses: ROS bags and KITTI odometry folders."""
 
+import heapq
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,11 +20,12 @@ from adaptune.recording.export import (
     T_CAMERA_LIDAR,
     Message,
     Messages,
+    measurements,
     structured,
     write_kitti_poses,
     write_kitti_sequence,
 )
-from adaptune.recording.scan import Scan
+from adaptune.recording.scan import Imu, Scan
 from adaptune.report.charts import Axis, Chart, Cloud, Line, Panel
 from adaptune.report.drawing import draw_chart
 from adaptune.simulation import kernels
@@ -197,14 +200,11 @@ GRAVITY = 9.80665
 """m/s^2, downwards along the world's z axis."""
 
 
-class Inertial(NamedTuple):
-    """Angular velocities (rad/s) and specific forces (m/s^2) in the IMU's frame, of shape (n, 3).
+Inertial = tuple[NDArray[np.float64], NDArray[np.float64]]
+"""Angular velocities (rad/s) and specific forces (m/s^2) in the IMU's frame, of shape (n, 3).
 
-    The specific force points up at rest.
-    """
-
-    gyro: NDArray[np.float64]
-    accel: NDArray[np.float64]
+The specific force points up at rest.
+"""
 
 
 def ideal(ride: Ride, times: NDArray[np.float64]) -> Inertial:
@@ -218,7 +218,7 @@ def ideal(ride: Ride, times: NDArray[np.float64]) -> Inertial:
     round_ = np.cross(turn_rate, lever) + np.cross(turn, np.cross(turn, lever))
     force = acceleration + np.array([0.0, 0.0, GRAVITY])
     force = np.einsum("nji,nj->ni", R_world_lidar, force) + round_
-    return Inertial(turn @ R_lidar_imu, force @ R_lidar_imu)
+    return turn @ R_lidar_imu, force @ R_lidar_imu
 
 
 def measure(ride: Ride, times: NDArray[np.float64], rate: float, seed: int) -> Inertial:
@@ -227,7 +227,7 @@ def measure(ride: Ride, times: NDArray[np.float64], rate: float, seed: int) -> I
     `seed` is that of the errors; see `ideal`.
     """
     rng = np.random.default_rng([seed, 5])
-    truth = ideal(ride, times)
+    gyro, accel = ideal(ride, times)
 
     def error(start: float, walk: float, noise: float) -> NDArray[np.float64]:
         shape = (len(times), 3)
@@ -235,13 +235,15 @@ def measure(ride: Ride, times: NDArray[np.float64], rate: float, seed: int) -> I
         bias = bias + np.cumsum(rng.normal(0.0, walk / np.sqrt(rate), shape), axis=0)
         return np.asarray(bias + rng.normal(0.0, noise * np.sqrt(rate), shape))
 
-    gyro = truth.gyro + error(2e-3, NOISE.gyroscope_walk, NOISE.gyroscope)
-    return Inertial(gyro, truth.accel + error(2e-2, NOISE.accelerometer_walk, NOISE.accelerometer))
+    gyro = gyro + error(2e-3, NOISE.gyroscope_walk, NOISE.gyroscope)
+    return gyro, accel + error(2e-2, NOISE.accelerometer_walk, NOISE.accelerometer)
 
 
 Layout = Literal["ros1", "ros2", "mcap", "kitti"]
 """ROS 1 bag, ROS 2 folder with sqlite3, one MCAP file, KITTI odometry folder."""
 
+_GEOMETRY = ("Point", "Quaternion", "Pose", "PoseStamped")
+_BY_SUFFIX: Mapping[str, Layout] = {".bag": "ros1", ".mcap": "mcap"}
 _MARKS = {"ros2": "metadata.yaml", "kitti": "sequences"}
 """Marks of a recording's folder, which may be overwritten."""
 
@@ -274,7 +276,7 @@ def record(
         Notes every scan, under the recording's name.
     """
     path = Path(path)
-    layout = _layout(path) if layout is None else layout
+    layout = layout or _BY_SUFFIX.get(path.suffix, "ros2")
     stem = path.name if layout in _MARKS else path.stem
     truth = path.with_name(f"{stem}.tum")
     previews = [path.with_name(f"{stem}{suffix}") for suffix in (".png", ".svg")]
@@ -285,12 +287,16 @@ def record(
         raise SimulationError("the course is over before its first scan is: make it longer")
     with ExitStack() as stack:
         temporary_truth = stack.enter_context(replacing(truth))
-        scans = _watched(drive, picture := Preview(drive), progress, path.stem)
+        picture = Preview(drive)
+        scans = picture.watched(progress, path.stem)
         new = stack.enter_context((replacing_folder if layout in _MARKS else replacing)(path))
         if layout == "kitti":
             _write_kitti(drive, scans, new)
         elif layout == "mcap":
-            _write_mcap(drive, scans, new)
+            with tempfile.TemporaryDirectory(prefix=f".{path.stem}.", dir=path.parent) as name:
+                _write_bag(drive, scans, Path(name) / "bag", 2, mcap=True)
+                (file,) = Path(name).glob("bag/*.mcap")
+                file.replace(new)
         else:
             # The writer makes the file itself.
             new.unlink(missing_ok=True)
@@ -298,10 +304,6 @@ def record(
         stamps = drive.stamps()
         write_tum(temporary_truth, Trajectory(stamps, drive.ride.poses(drive.seconds(stamps))))
         draw_chart(picture.chart(), *previews)
-
-
-def _layout(path: Path) -> Layout:
-    return {".bag": "ros1", ".mcap": "mcap"}.get(path.suffix, "ros2")  # type: ignore[return-value]
 
 
 def _check(path: Path, overwrite: bool, mark: str | None) -> None:
@@ -316,74 +318,6 @@ def _check(path: Path, overwrite: bool, mark: str | None) -> None:
         raise SimulationError(f"{path} is a file, the recording would be a folder: not replaced")
 
 
-def _watched(
-    drive: Drive, preview: "Preview", progress: Progress, name: str
-) -> Iterator[SimulatedScan]:
-    for number, scan in enumerate(drive.scans(), start=1):
-        preview.add(scan)
-        yield scan
-        progress(name, number, len(drive))
-
-
-class _Composer(Messages):
-    """Makes the ROS messages of a drive."""
-
-    def __init__(self, drive: Drive, version: Literal[1, 2]) -> None:
-        super().__init__(version)
-        self._drive = drive
-
-    @property
-    def topics(self) -> dict[str, str]:
-        """Type of each topic."""
-        topics = {POINTS: "sensor_msgs/msg/PointCloud2", POSES: "geometry_msgs/msg/PoseStamped"}
-        if self._drive.course.imu is not None:
-            topics[IMU] = "sensor_msgs/msg/Imu"
-        return topics
-
-    def messages(self, scans: Iterator[SimulatedScan]) -> Iterator[Message]:
-        """All messages in the order in which they are sent: a cloud when its scan is over."""
-        drive = self._drive
-        stamps = drive.stamps()
-        T_world_sensor = drive.ride.poses(drive.seconds(stamps))
-        quaternions = geometry.to_quaternions(T_world_sensor)
-        inertial, inertial_stamps = self._inertial(int(stamps[-1]))
-        sent = 0
-        yield POSES, int(stamps[0]), self._pose(int(stamps[0]), T_world_sensor[0], quaternions[0])
-        for i, scan in enumerate(scans):
-            end = int(stamps[i + 1])
-            while sent < len(inertial_stamps) and inertial_stamps[sent] <= end:
-                stamp = int(inertial_stamps[sent])
-                header = self.header(IMU, stamp, "imu")
-                yield IMU, stamp, self.imu(header, inertial.gyro[sent], inertial.accel[sent])
-                sent += 1
-            yield POSES, end, self._pose(end, T_world_sensor[i + 1], quaternions[i + 1])
-            yield POINTS, end, self._cloud(scan, end)
-
-    def _inertial(self, end: int) -> tuple[Inertial, NDArray[np.int64]]:
-        drive, rate = self._drive, self._drive.course.imu
-        if rate is None:
-            return Inertial(np.empty((0, 3)), np.empty((0, 3))), np.empty(0, np.int64)
-        start = int(drive.stamps()[0])
-        stamps = np.arange(start, end + 1, 10**9 // rate, dtype=np.int64)
-        return measure(drive.ride, drive.seconds(stamps), rate, drive.course.seed), stamps
-
-    def _pose(self, stamp: int, T: geometry.Poses, quaternion: NDArray[np.float64]) -> Any:
-        t = self.types
-        pose = t["geometry_msgs/msg/Pose"](
-            position=t["geometry_msgs/msg/Point"](*T[:3, 3].tolist()),
-            orientation=t["geometry_msgs/msg/Quaternion"](*quaternion.tolist()),
-        )
-        header = self.header(POSES, stamp, "map")
-        return t["geometry_msgs/msg/PoseStamped"](header=header, pose=pose)
-
-    def _cloud(self, scan: SimulatedScan, end: int) -> Any:
-        at_end, cloud = self._drive.course.stamp == "end", structured(scan)
-        if at_end:
-            cloud["time"] -= np.float32((end - scan.stamp) * 1e-9)
-        header = self.header(POINTS, end if at_end else scan.stamp, "velodyne")
-        return self.cloud(header, cloud)
-
-
 def _write_bag(
     drive: Drive,
     scans: Iterator[SimulatedScan],
@@ -391,16 +325,44 @@ def _write_bag(
     version: Literal[1, 2],
     mcap: bool = False,
 ) -> None:
-    composer = _Composer(drive, version)
-    composer.write(path, composer.topics, composer.messages(scans), mcap)
+    ros = Messages(version)
+    topics = {POINTS: "sensor_msgs/msg/PointCloud2", POSES: "geometry_msgs/msg/PoseStamped"}
+    if drive.course.imu is not None:
+        topics[IMU] = "sensor_msgs/msg/Imu"
+    ros.write(path, topics, _messages(ros, drive, scans), mcap)
 
 
-def _write_mcap(drive: Drive, scans: Iterator[SimulatedScan], path: Path) -> None:
-    with tempfile.TemporaryDirectory(prefix=f".{path.stem}.", dir=path.parent) as name:
-        folder = Path(name) / "bag"
-        _write_bag(drive, scans, folder, 2, mcap=True)
-        (file,) = folder.glob("*.mcap")
-        file.replace(path)
+def _messages(ros: Messages, drive: Drive, scans: Iterator[SimulatedScan]) -> Iterator[Message]:
+    """All messages in the order in which they are sent: a cloud when its scan is over."""
+    stamps, course = drive.stamps(), drive.course
+    T_world_sensor = drive.ride.poses(drive.seconds(stamps))
+    quaternions = geometry.to_quaternions(T_world_sensor)
+    types = {name: ros.types[f"geometry_msgs/msg/{name}"] for name in _GEOMETRY}
+
+    def pose(i: int) -> Message:
+        stamp = int(stamps[i])
+        position = types["Point"](*T_world_sensor[i, :3, 3].tolist())
+        orientation = types["Quaternion"](*quaternions[i].tolist())
+        pose = types["Pose"](position=position, orientation=orientation)
+        header = ros.header(POSES, stamp, "map")
+        return POSES, stamp, types["PoseStamped"](header=header, pose=pose)
+
+    def seen() -> Iterator[Message]:
+        for i, scan in enumerate(scans):
+            yield pose(i + 1)
+            end, cloud = int(stamps[i + 1]), structured(scan)
+            if at_end := course.stamp == "end":
+                cloud["time"] -= np.float32((end - scan.stamp) * 1e-9)
+            header = ros.header(POINTS, end if at_end else scan.stamp, "velodyne")
+            yield POINTS, end, ros.cloud(header, cloud)
+
+    inertial: Iterator[Message] = iter(())
+    if course.imu is not None:
+        at = np.arange(stamps[0], stamps[-1] + 1, 10**9 // course.imu, dtype=np.int64)
+        measured = measure(drive.ride, drive.seconds(at), course.imu, course.seed)
+        inertial = measurements(ros, Imu(at, *measured), IMU)
+    yield pose(0)
+    yield from heapq.merge(inertial, seen(), key=itemgetter(1))
 
 
 def _write_kitti(drive: Drive, scans: Iterator[SimulatedScan], folder: Path) -> None:
@@ -440,27 +402,27 @@ _MAP_SCANS, _MAP_POINTS = 150, 4000
 
 
 class Preview:
-    """Collects the content of the picture of a drive scan by scan."""
+    """The picture of a drive, whose content is collected scan by scan."""
 
     def __init__(self, drive: Drive) -> None:
         self._drive = drive
-        self._every = max(len(drive) // _MAP_SCANS, 1)
-        self._shown = len(drive) // 2
-        self._count = 0
         self._map: list[NDArray[np.float64]] = []
         self._scan: SimulatedScan | None = None
 
-    def add(self, scan: SimulatedScan) -> None:
-        """Add the next scan."""
-        if self._count % self._every == 0 and len(scan):
-            T = scan.T_world_sensor
-            points = scan.points[:: max(len(scan) // _MAP_POINTS, 1)]
-            near = points[np.linalg.norm(points[:, :2], axis=1) < 45.0]
-            # Height above the sensor, in its own upright frame.
-            self._map.append(np.column_stack([near @ T[:2, :3].T + T[:2, 3], near @ T[2, :3]]))
-        if self._count == self._shown:
-            self._scan = scan
-        self._count += 1
+    def watched(self, progress: Progress, name: str) -> Iterator[SimulatedScan]:
+        """The scans of the drive; `progress` is told of each."""
+        n = len(self._drive)
+        for i, scan in enumerate(self._drive.scans()):
+            if i % max(n // _MAP_SCANS, 1) == 0 and len(scan):
+                T = scan.T_world_sensor
+                points = scan.points[:: max(len(scan) // _MAP_POINTS, 1)]
+                near = points[np.linalg.norm(points[:, :2], axis=1) < 45.0]
+                # Height above the sensor, in its own upright frame.
+                self._map.append(np.column_stack([near @ T[:2, :3].T + T[:2, 3], near @ T[2, :3]]))
+            if i == n // 2:
+                self._scan = scan
+            yield scan
+            progress(name, i + 1, n)
 
     def chart(self) -> Chart:
         """The map with the path, and the middle scan from above and as a panorama."""

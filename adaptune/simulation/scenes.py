@@ -2,8 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from types import MappingProxyType
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -29,6 +28,9 @@ from adaptune.simulation.mesh import (
     tube,
 )
 
+if TYPE_CHECKING:
+    from adaptune.simulation.world import Road
+
 # Scenes, and the tiles in which they are built.
 
 
@@ -50,24 +52,11 @@ class Spots:
     d: Floats
 
 
-class RoadLine(Protocol):
-    """The line along which a scene is built: the part of `Road` that scenes use."""
-
-    def heading(self, s: Floats) -> Floats:
-        """Radians from the x axis at each station."""
-
-    def plane(self, s: Floats, d: Floats) -> tuple[Floats, Floats]:
-        """Coordinates x and y of a station and an offset."""
-
-    def ground(self, x: Floats, y: Floats) -> Floats:
-        """Height of the ground."""
-
-
 @dataclass(frozen=True)
 class Tile:
     """A piece of a scene: up to twenty metres of road and its surroundings."""
 
-    line: RoadLine  # the road
+    road: "Road"
     index: int  # its number along the road: it begins at station ``index * TILE``
     # Stations of its ends, in metres; a leg may begin or end within it.
     start: float
@@ -86,12 +75,12 @@ class Tile:
     def at(self, s: ArrayLike, d: ArrayLike, lift: ArrayLike = 0.0) -> Floats:
         """Points of shape (..., 3) `lift` metres above the ground at stations and offsets."""
         s, d = np.broadcast_arrays(np.asarray(s, np.float64), np.asarray(d, np.float64))
-        x, y = self.line.plane(s, d)
-        return np.stack([x, y, self.line.ground(x, y) + np.asarray(lift)], axis=-1)
+        x, y = self.road.plane(s, d)
+        return np.stack([x, y, self.road.ground(x, y) + np.asarray(lift)], axis=-1)
 
     def heading(self, s: ArrayLike) -> Floats:
         """Heading of the road in radians."""
-        return self.line.heading(np.asarray(s, np.float64))
+        return self.road.heading(np.asarray(s, np.float64))
 
     def scatter(
         self, density: float, near: float, far: float, margin: float = 0.0
@@ -142,20 +131,31 @@ def paved(*bands: tuple[float, Material]) -> Callable[[Floats], NDArray[np.uint8
 
 def beyond(d: Floats, start: float, width: float) -> Floats:
     """Rise smoothly from 0 to 1 over `width` metres from a distance `start` off the road."""
-    u = np.clip((np.abs(d) - start) / width, 0.0, 1.0)
+    return smooth((np.abs(d) - start) / width)
+
+
+def smooth(u: Floats) -> Floats:
+    """Rise from 0 to 1 while `u` does, level at both ends."""
+    u = np.clip(u, 0.0, 1.0)
     return u * u * (3.0 - 2.0 * u)
 
 
 def strew(
-    tile: Tile, models: list[Mesh], s: Floats, d: Floats, scale: ArrayLike, *, sink: float = 0.1
+    tile: Tile,
+    model: Callable[[int], Mesh],
+    s: Floats,
+    d: Floats,
+    scale: ArrayLike,
+    *,
+    sink: float = 0.1,
+    variants: int = VARIANTS,
 ) -> Mesh:
-    """Put models, in turn and turned at random, at stations and offsets, sunk into the ground."""
+    """Put a model's variants, turned at random, at stations and offsets, sunk into the ground."""
     scale = np.broadcast_to(np.asarray(scale, np.float64), len(s))
     yaw = tile.rng.uniform(0.0, 2.0 * np.pi, len(s))
-    at = tile.at(s, d, -sink * scale)
-    n, used = len(models), models[: len(s)]
-    placed = [place(m, at[i::n], yaw[i::n], scale[i::n]) for i, m in enumerate(used)]
-    return merge(placed)
+    at, n = tile.at(s, d, -sink * scale), variants
+    used = range(min(n, len(s)))
+    return merge([place(model(i), at[i::n], yaw[i::n], scale[i::n]) for i in used])
 
 
 def wall(tile: Tile, s: ArrayLike, d: ArrayLike, height: ArrayLike, material: Material) -> Mesh:
@@ -229,9 +229,8 @@ def _cave_build(tile: Tile) -> list[Mesh]:
     meshes.extend(_face(tile, end, angle) for end in tile.ends)
     meshes.extend(_dripstones(tile))
     s_rocks, d_rocks = tile.scatter(0.05, 1.8, 4.5)
-    boulders = [boulder(v) for v in range(VARIANTS)]
     sizes = tile.rng.uniform(0.2, 0.55, len(s_rocks))
-    return [*meshes, strew(tile, boulders, s_rocks, d_rocks, sizes)]
+    return [*meshes, strew(tile, boulder, s_rocks, d_rocks, sizes)]
 
 
 def _face(tile: Tile, end: float, angle: Floats) -> Mesh:
@@ -299,10 +298,6 @@ _HALF, _HEIGHT = 1.5, 2.8
 _DOOR, _RECESS = 1.0, 0.35
 
 
-def _corridor_relief(spots: Spots, seed: int) -> Floats:  # noqa: ARG001 - a floor is flat, whatever the seed
-    return np.zeros_like(spots.x)
-
-
 def _corridor_build(tile: Tile) -> list[Mesh]:
     rng = tile.rng
     ceiling_s = np.linspace(tile.start, tile.stop, 11)
@@ -366,7 +361,7 @@ def _front(tile: Tile, end: float) -> list[Mesh]:
 CORRIDOR = Scene(
     summary="smooth parallel walls with doors, degenerate along its axis",
     build=_corridor_build,
-    relief=_corridor_relief,
+    relief=lambda spots, _seed: np.zeros_like(spots.x),
     surface=paved((np.inf, Material.PAVING)),
     winding=0.0,
     bend=30.0,
@@ -388,15 +383,18 @@ def _field_relief(spots: Spots, seed: int) -> Floats:
 
 def _field_build(tile: Tile) -> list[Mesh]:
     rng = tile.rng
-    boulders = [boulder(v) for v in range(VARIANTS)]
     s, d = tile.scatter(0.002, 4.0, 50.0, margin=3.0)
-    meshes = [strew(tile, boulders, s, d, rng.uniform(0.25, 0.6, len(s)))]
+    meshes = [strew(tile, boulder, s, d, rng.uniform(0.25, 0.6, len(s)))]
     tip = box((0.05, 0.05, 0.3), Material.METAL, (0, 0, 1.3))
     post = merge([box((0.12, 0.12, 1.5), Material.WOOD), tip])
     # An old fence on one side, some of its posts missing.
     stations = np.arange(np.ceil(tile.start / 4.0), tile.stop / 4.0) * 4.0
     stations = stations[rng.random(len(stations)) < 0.75]
-    meshes.append(strew(tile, [post], stations, np.full(len(stations), 17.0), 1.0, sink=0.3))
+    meshes.append(
+        strew(
+            tile, lambda _: post, stations, np.full(len(stations), 17.0), 1.0, sink=0.3, variants=1
+        )
+    )
     return meshes
 
 
@@ -448,8 +446,7 @@ def _garden_relief(spots: Spots, seed: int) -> Floats:
 
 
 def _trees(tile: Tile, s: Floats, d: Floats, sizes: tuple[float, float]) -> Mesh:
-    models = [tree(v) for v in range(VARIANTS)]
-    return strew(tile, models, s, d, tile.rng.uniform(*sizes, len(s)), sink=0.02)
+    return strew(tile, tree, s, d, tile.rng.uniform(*sizes, len(s)), sink=0.02)
 
 
 def _on_land(s: Floats, d: Floats) -> tuple[Floats, Floats]:
@@ -459,12 +456,11 @@ def _on_land(s: Floats, d: Floats) -> tuple[Floats, Floats]:
 
 def _garden_build(tile: Tile) -> list[Mesh]:
     rng, kind = tile.rng, _kind(tile.index, tile.seed)
-    bushes = [bush(v) for v in range(VARIANTS)]
     near = 9.0 if kind == "clearing" else 3.2
     s, d = _on_land(*tile.scatter(_KINDS[kind], near, 32.0, margin=4.0))
     meshes = [_trees(tile, s, d, (0.7, 1.3))]
     s, d = _on_land(*tile.scatter(0.02, 2.4, 14.0, margin=4.0))
-    meshes.append(strew(tile, bushes, s, d, rng.uniform(0.4, 1.2, len(s))))
+    meshes.append(strew(tile, bush, s, d, rng.uniform(0.4, 1.2, len(s))))
     water_s = np.linspace(tile.start, tile.stop, 6)[:, None]
     water = tile.at(water_s, np.array([[_BANK, _RIVER - 12.0]]))
     water[..., 2] = tile.at(water_s, 0.0)[..., 2] - 1.2
@@ -545,24 +541,21 @@ def _open_ground_relief(spots: Spots, seed: int) -> Floats:
 
 def _open_ground_build(tile: Tile) -> list[Mesh]:
     rng = tile.rng
-    boulders = [boulder(v) for v in range(VARIANTS)]
-    bushes = [bush(v) for v in range(VARIANTS)]
-    trees = [tree(v) for v in range(VARIANTS)]
     meshes = []
-    for models, density, near, far, sizes in (
-        (boulders, 0.010, 4.0, 60.0, (0.3, 1.3)),
-        (bushes, 0.010, 4.0, 60.0, (0.6, 1.6)),
-        (trees, 0.0020, 12.0, 50.0, (0.7, 1.2)),
-        (trees, 0.004, 50.0, 75.0, (0.8, 1.4)),
+    for model, density, near, far, sizes in (
+        (boulder, 0.010, 4.0, 60.0, (0.3, 1.3)),
+        (bush, 0.010, 4.0, 60.0, (0.6, 1.6)),
+        (tree, 0.0020, 12.0, 50.0, (0.7, 1.2)),
+        (tree, 0.004, 50.0, 75.0, (0.8, 1.4)),
     ):
         s, d = tile.scatter(density, near, far, margin=4.0)
-        meshes.append(strew(tile, models, s, d, rng.uniform(*sizes, len(s))))
+        meshes.append(strew(tile, model, s, d, rng.uniform(*sizes, len(s))))
     if rng.random() < 0.45:
         s = rng.uniform(tile.start, tile.stop, 1)
         d = rng.choice([-1.0, 1.0], 1) * rng.uniform(22.0, 40.0)
         roof = box((12.8, 3.0, 1.2), Material.WOOD, (0.0, 0.0, 3.5))
         shed = merge([box((12.0, 7.0, 3.6), Material.WOOD), roof])
-        meshes.append(strew(tile, [shed], s, d, 1.0, sink=0.3))
+        meshes.append(strew(tile, lambda _: shed, s, d, 1.0, sink=0.3, variants=1))
     return meshes
 
 
@@ -708,14 +701,12 @@ STREET = Scene(
 )
 
 
-SCENES: Mapping[str, Scene] = MappingProxyType(
-    {
-        "cave": CAVE,
-        "open": OPEN,
-        "street": STREET,
-        "garden": GARDEN,
-        "corridor": CORRIDOR,
-        "field": FIELD,
-    }
-)
+SCENES: Mapping[str, Scene] = {
+    "cave": CAVE,
+    "open": OPEN,
+    "street": STREET,
+    "garden": GARDEN,
+    "corridor": CORRIDOR,
+    "field": FIELD,
+}
 """Scenes by name."""

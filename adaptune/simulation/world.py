@@ -11,7 +11,7 @@ from scipy.ndimage import gaussian_filter1d
 from adaptune.geometry import Poses
 from adaptune.simulation.course import Motion
 from adaptune.simulation.mesh import Mesh, car, grid, merge, walker
-from adaptune.simulation.scenes import TILE, Scene, Spots, Tile
+from adaptune.simulation.scenes import TILE, Scene, Spots, Tile, smooth
 
 # The line that a course follows over the ground.
 
@@ -94,8 +94,8 @@ class Road:
         shares = []
         for leg in self.legs:
             first, last = leg is self.legs[0], leg is self.legs[-1]
-            rise = np.ones_like(s) if first else _smooth((s - leg.start) / (2 * BLEND) + 0.5)
-            fall = np.ones_like(s) if last else _smooth((leg.stop - s) / (2 * BLEND) + 0.5)
+            rise = np.ones_like(s) if first else smooth((s - leg.start) / (2 * BLEND) + 0.5)
+            fall = np.ones_like(s) if last else smooth((leg.stop - s) / (2 * BLEND) + 0.5)
             shares.append((leg, rise * fall))
         return shares
 
@@ -109,11 +109,6 @@ class Road:
             if share.any():
                 z = z + share * leg.scene.relief(spots, self.seed)
         return z
-
-
-def _smooth(u: Floats) -> Floats:
-    u = np.clip(u, 0.0, 1.0)
-    return u * u * (3.0 - 2.0 * u)
 
 
 def _legs(scenes: Sequence[tuple[Scene, float]]) -> list[Leg]:
@@ -195,7 +190,7 @@ class World:
             if last - first < 1e-6:
                 continue
             tile = Tile(
-                line=road,
+                road=road,
                 index=index,
                 start=first,
                 stop=last,
