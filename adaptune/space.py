@@ -25,7 +25,7 @@ class SpaceError(AdaptuneError):
 class _Range(StrictModel):
     """Bounds, scale and unit of a real or whole number."""
 
-    _types: ClassVar[tuple[type[int | float], ...]] = (int,)
+    _types: ClassVar[tuple[type, ...]] = (int,)
 
     low: float
     high: float
@@ -46,9 +46,9 @@ class _Range(StrictModel):
 
     def contains(self, value: object) -> bool:
         """Whether `value` is a number of the type and in the range."""
-        if isinstance(value, bool) or not isinstance(value, self._types):
+        if not isinstance(value, int | float) or isinstance(value, bool):
             return False
-        return self.low <= value <= self.high
+        return isinstance(value, self._types) and self.low <= value <= self.high
 
     def to_unit(self, value: Any) -> float:
         """Map a value to [0, 1], a whole number to the middle of its share."""
@@ -64,15 +64,14 @@ class _Range(StrictModel):
         return math.log(value) if self.log else value
 
     def _bounds(self) -> tuple[float, float]:
-        # Half a step on either side gives the first and the last whole number a whole share.
-        half = 0.5 * (float not in self._types)
-        return self._scale(self.low - half), self._scale(self.high + half)
+        """Ends of the unit interval, scaled."""
+        return self._scale(self.low), self._scale(self.high)
 
 
 class Float(_Range):
     """A real number from `low` to `high`, both included; `log` spaces it evenly in ratio."""
 
-    _types: ClassVar[tuple[type[int | float], ...]] = (int, float)
+    _types: ClassVar[tuple[type, ...]] = (int, float)
 
     type: Literal["float"] = "float"
 
@@ -92,10 +91,15 @@ class Integer(_Range):
     low: _Whole
     high: _Whole
     baseline: _Whole
+    log: bool = False
 
     def from_unit(self, unit: float) -> int:
         """Map from [0, 1] to the value whose share it falls in."""
         return min(max(round(self._unscaled(unit)), self.low), self.high)
+
+    def _bounds(self) -> tuple[float, float]:
+        # Half a step on either side gives the first and the last value a whole share.
+        return self._scale(self.low - 0.5), self._scale(self.high + 0.5)
 
 
 class Categorical(StrictModel):
@@ -444,28 +448,27 @@ class PooledSpace(ParameterSpace):
             For each odometry 1 or 0, for whether the set is its; then its parameters, 0.5 where the
             set is another's. So sets of two odometries are farther apart than most of one.
         """
-        unit = np.full((len(sets), len(self)), 0.5)
-        unit[:, : len(self.spaces)] = 0.0
+        sizes = [len(space) for space in self.spaces.values()]
+        begins = len(sizes) + np.concatenate([[0], np.cumsum(sizes)])
+        unit = np.full((len(sets), int(begins[-1])), 0.5)
+        unit[:, : len(sizes)] = 0.0
+        labels = list(self.spaces)
         for row, given in zip(unit, sets, strict=True):
             label, own = self.split(given)
-            row[list(self.spaces).index(label)] = 1.0
-            row[self._columns[label]] = self.spaces[label].to_unit([own])[0]
+            at = labels.index(label)
+            row[at] = 1.0
+            row[begins[at] : begins[at + 1]] = self.spaces[label].to_unit([own])[0]
         return unit
-
-    @cached_property
-    def _columns(self) -> dict[str, slice]:
-        """Columns of the parameters of each odometry in the unit cube."""
-        ends = len(self.spaces) + np.cumsum([len(space) for space in self.spaces.values()])
-        of_each = zip(self.spaces.items(), ends.tolist(), strict=True)
-        return {label: slice(end - len(space), end) for (label, space), end in of_each}
 
     def from_unit(self, unit: NDArray[np.float64]) -> list[ParameterSet]:
         """Map what `to_unit` returns to parameter sets; the highest of the first columns counts."""
-        sets = []
+        sizes = [len(space) for space in self.spaces.values()]
+        begins = len(sizes) + np.concatenate([[0], np.cumsum(sizes)])
+        labels, sets = list(self.spaces), []
         for row in unit:
-            label = list(self.spaces)[int(np.argmax(row[: len(self.spaces)]))]
-            (own,) = self.spaces[label].from_unit(row[None, self._columns[label]])
-            sets.append({ODOMETRY: label, **own})
+            at = int(np.argmax(row[: len(sizes)]))
+            own = self.spaces[labels[at]].from_unit(row[None, begins[at] : begins[at + 1]])
+            sets.append({ODOMETRY: labels[at], **own[0]})
         return sets
 
     def dump(self) -> dict[str, dict[str, Any]]:

@@ -56,25 +56,21 @@ class Mirror:
         if self._study is None and _reported(self._path).issuperset(numbers):
             return
         with needing_room(self._path):
-            if self._study is None:
+            try:
+                self._study = self._study or self._opened()
+            except (ValueError, KeyError, TypeError, AssertionError) as error:
+                _log.warning("%s: is damaged; it is written again (%s)", self._path, error)
+                self._path.unlink(missing_ok=True)
                 self._study = self._opened()
             self._add(self._study, numbers, row)
 
     def _opened(self) -> "optuna.Study":
-        if self._path.exists() and not self._path.read_bytes().endswith(b"\n"):
-            self._path.unlink()
-        try:
-            return self._create()
-        except (ValueError, KeyError, TypeError, AssertionError) as error:
-            _log.warning("%s: is damaged; it is written again (%s)", self._path, error)
-            self._path.unlink(missing_ok=True)
-            return self._create()
-
-    def _create(self) -> "optuna.Study":
         import optuna
         from optuna.storages import JournalStorage
         from optuna.storages.journal import JournalFileBackend
 
+        if self._path.exists() and not self._path.read_bytes().endswith(b"\n"):
+            self._path.unlink()
         return optuna.create_study(
             storage=JournalStorage(JournalFileBackend(str(self._path))),
             study_name=self._path.parent.name,

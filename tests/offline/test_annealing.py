@@ -111,17 +111,17 @@ def walk(energies, **given):
     return chain, temperatures
 
 
-def test_is_heated_after_a_number_of_steps():
-    assert walk([2.0] * 7, reanneal_fixed=3)[1] == [0.5, 0.25, 1.0, 0.5, 0.25, 1.0, 0.5]
-
-
-def test_is_heated_after_a_stretch_without_acceptance():
-    assert walk([9.0, 0.9, 9.0, 9.0, 9.0], reanneal_accepted=2)[1] == [0.5, 0.25, 0.125, 1.0, 0.5]
-
-
-def test_is_heated_after_a_stretch_without_a_new_best():
-    # The same energy is accepted, but it is no new best one.
-    assert walk([1.0, 0.9, 0.9, 0.9, 0.8], reanneal_best=2)[1] == [0.5, 0.25, 0.125, 1.0, 0.5]
+@pytest.mark.parametrize(
+    ("energies", "trigger", "temperatures"),
+    [
+        ([2.0] * 7, {"reanneal_fixed": 3}, [0.5, 0.25, 1.0, 0.5, 0.25, 1.0, 0.5]),
+        ([9.0, 0.9, 9.0, 9.0, 9.0], {"reanneal_accepted": 2}, [0.5, 0.25, 0.125, 1.0, 0.5]),
+        # The same energy is accepted, but it is no new best one.
+        ([1.0, 0.9, 0.9, 0.9, 0.8], {"reanneal_best": 2}, [0.5, 0.25, 0.125, 1.0, 0.5]),
+    ],
+)
+def test_is_heated_again(energies, trigger, temperatures):
+    assert walk(energies, **trigger)[1] == temperatures
 
 
 def test_stalls():
