@@ -22,14 +22,9 @@ from offline.objective import Verdict, judge, sampler_results, weighted
 if TYPE_CHECKING:
     from offline.samplers import Sampler
 
-# Pruning: which trials of a batch continue on more sequences, and which stop.
-#
-# The first batch runs in full. It shows which sequences are hard, and these come first from then
-# on: sets fail on them, if anywhere. Trials of later batches run on one sequence after the other.
-# One stops if it cannot win any more, or if a signed-rank test finds it worse than the best trial
-# on the same sequences (Optuna's `WilcoxonPruner`). The model also uses what a trial saw before it
-# stopped. Values are never negative, so a trial whose sum over some sequences exceeds the best
-# trial's sum over all sequences cannot win.
+# Pruning: the first batch runs in full, and shows which sequences are hard. Later trials run on
+# these first, and stop where they cannot win any more, or where a signed-rank test finds them worse
+# than the best trial on the same sequences (Optuna's `WilcoxonPruner`).
 
 
 SIGNIFICANCE = 0.1
@@ -54,6 +49,7 @@ def survivors(batch: Mapping[int, Values], before: Mapping[int, Values]) -> list
         return list(batch)
     n_sequences = max(map(len, before.values()))
     best = min((v for v in before.values() if len(v) == n_sequences), key=sum)
+    # Values are never negative: a sum over some sequences is no more than that over all.
     return [n for n, own in batch.items() if sum(own) <= sum(best) and not _worse(own, best)]
 
 

@@ -308,28 +308,18 @@ class PreparedSequence:
     shared : SharedScans
         The prepared scans, which take `memory` bytes at most.
 
-    Errors of its reference name it by `key`.
-
     Raises
     ------
     AdaptuneError
         If the sequence cannot be read, or no error can be measured on it.
     """
 
-    def __init__(
-        self,
-        name: str,
-        scans: recording.Recording,
-        odometry: Factory,
-        settings: TrialSettings,
-        memory: float,
-        progress: Progress,
-        key: str,
-    ):
+    def __init__(self, setup: "TrialSetup", name: str, memory: float, progress: Progress):
+        settings, key = setup.settings, setup.sequences.key(name)
         self.name = name
-        self.scans = scans
+        self.scans = scans = setup.sequences.open(name)
         self.shared = SharedScans(scans, memory)
-        self._baseline = partial(odometry, isolated=settings.isolated)
+        self._baseline = partial(setup.odometry, isolated=settings.isolated)
         self._odometry: OdometryInstance | None = None
         reference = _reference(key, scans, settings)
         stamps, descriptors, elevations, full, enough = [], [], [], False, False
@@ -552,8 +542,7 @@ class TrialSetup:
 
     def prepare(self, name: str, memory: float, progress: Progress = unseen) -> PreparedSequence:
         """Read and prepare a sequence, see `PreparedSequence`."""
-        scans, key = self.sequences.open(name), self.sequences.key(name)
-        return PreparedSequence(name, scans, self.odometry, self.settings, memory, progress, key)
+        return PreparedSequence(self, name, memory, progress)
 
     def run(
         self,

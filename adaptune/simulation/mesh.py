@@ -1,6 +1,6 @@
 """Triangle meshes with materials, and the solids that scenes consist of."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cache
@@ -194,6 +194,11 @@ def foliage(centres: NDArray[np.float64], radii: ArrayLike, leaf: float, seed: i
 
 VARIANTS = 4
 """How many different trees, bushes and boulders there are."""
+
+
+def variants(model: Callable[[int], Mesh]) -> list[Mesh]:
+    """All variants of a tree, a bush or a boulder."""
+    return [model(variant) for variant in range(VARIANTS)]
 
 
 @cache

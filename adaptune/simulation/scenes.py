@@ -26,6 +26,7 @@ from adaptune.simulation.mesh import (
     sign,
     tree,
     tube,
+    variants,
 )
 
 if TYPE_CHECKING:
@@ -81,6 +82,16 @@ class Tile:
     def heading(self, s: ArrayLike) -> Floats:
         """Heading of the road in radians."""
         return self.road.heading(np.asarray(s, np.float64))
+
+    def put(
+        self, model: Mesh, s: ArrayLike, d: ArrayLike, turn: float = 0.0, scale: ArrayLike = 1.0
+    ) -> Mesh:
+        """Put a model at stations and offsets, turned from the road's heading by some radians."""
+        return place(model, self.at(s, d), self.heading(s) + turn, scale)
+
+    def every(self, spacing: float) -> Floats:
+        """Stations at the multiples of so many metres."""
+        return np.arange(np.ceil(self.start / spacing), self.stop / spacing) * spacing
 
     def scatter(
         self, density: float, near: float, far: float, margin: float = 0.0
@@ -141,21 +152,14 @@ def smooth(u: Floats) -> Floats:
 
 
 def strew(
-    tile: Tile,
-    model: Callable[[int], Mesh],
-    s: Floats,
-    d: Floats,
-    scale: ArrayLike,
-    *,
-    sink: float = 0.1,
-    variants: int = VARIANTS,
+    tile: Tile, models: list[Mesh], s: Floats, d: Floats, scale: ArrayLike, *, sink: float = 0.1
 ) -> Mesh:
-    """Put a model's variants, turned at random, at stations and offsets, sunk into the ground."""
+    """Put models, in turn and turned at random, at stations and offsets, sunk into the ground."""
     scale = np.broadcast_to(np.asarray(scale, np.float64), len(s))
     yaw = tile.rng.uniform(0.0, 2.0 * np.pi, len(s))
-    at, n = tile.at(s, d, -sink * scale), variants
-    used = range(min(n, len(s)))
-    return merge([place(model(i), at[i::n], yaw[i::n], scale[i::n]) for i in used])
+    at = tile.at(s, d, -sink * scale)
+    n, used = len(models), models[: len(s)]
+    return merge([place(m, at[i::n], yaw[i::n], scale[i::n]) for i, m in enumerate(used)])
 
 
 def wall(tile: Tile, s: ArrayLike, d: ArrayLike, height: ArrayLike, material: Material) -> Mesh:
@@ -230,7 +234,7 @@ def _cave_build(tile: Tile) -> list[Mesh]:
     meshes.extend(_dripstones(tile))
     s_rocks, d_rocks = tile.scatter(0.05, 1.8, 4.5)
     sizes = tile.rng.uniform(0.2, 0.55, len(s_rocks))
-    return [*meshes, strew(tile, boulder, s_rocks, d_rocks, sizes)]
+    return [*meshes, strew(tile, variants(boulder), s_rocks, d_rocks, sizes)]
 
 
 def _face(tile: Tile, end: float, angle: Floats) -> Mesh:
@@ -317,23 +321,21 @@ def _corridor_build(tile: Tile) -> list[Mesh]:
             spot = (0.38, side * (_RECESS / 2 - 0.04), 1.05)
             handle = box((0.12, 0.08, 0.04), Material.METAL, spot)
             middle = door + _DOOR / 2
-            at = tile.at(middle, side * (_HALF + _RECESS / 2))
-            meshes.append(place(merge([lintel, handle]), at, tile.heading(middle)))
+            door_case = merge([lintel, handle])
+            meshes.append(tile.put(door_case, middle, side * (_HALF + _RECESS / 2)))
         # Pilasters between the doors, not quite evenly.
-        for station in np.arange(np.ceil(tile.start / 4.5), tile.stop / 4.5) * 4.5:
+        for station in tile.every(4.5):
             pilaster = box((rng.uniform(0.3, 0.6), 0.25, _HEIGHT), Material.PLASTER)
             s_pilaster = station + rng.uniform(-0.8, 0.8)
-            at = tile.at(s_pilaster, side * (_HALF - 0.12))
-            meshes.append(place(pilaster, at, tile.heading(s_pilaster)))
+            meshes.append(tile.put(pilaster, s_pilaster, side * (_HALF - 0.12)))
     # Beams under the ceiling, extinguishers, and a cupboard now and then.
-    for station in np.arange(np.ceil(tile.start / 5.0), tile.stop / 5.0) * 5.0:
-        beam = box((0.25, 2 * _HALF, 0.22), Material.PLASTER, (0.0, 0.0, _HEIGHT - 0.22))
-        meshes.append(place(beam, tile.at(station, 0.0), tile.heading(station)))
+    beam = box((0.25, 2 * _HALF, 0.22), Material.PLASTER, (0.0, 0.0, _HEIGHT - 0.22))
+    meshes.extend(tile.put(beam, station, 0.0) for station in tile.every(5.0))
     for size, chance in (((0.18, 0.18, 0.6), 0.6), ((0.9, 0.4, 1.9), 0.8), ((0.4, 0.35, 0.7), 0.8)):
         if rng.random() < chance:
             station, side = rng.uniform(tile.start, tile.stop), rng.choice([-1.0, 1.0])
-            at = tile.at(station, side * (_HALF - size[1] / 2))
-            meshes.append(place(box(size, Material.METAL), at, tile.heading(station)))
+            cupboard = box(size, Material.METAL)
+            meshes.append(tile.put(cupboard, station, side * (_HALF - size[1] / 2)))
     for end in tile.ends:
         meshes.extend(_front(tile, end))
     return meshes
@@ -384,17 +386,13 @@ def _field_relief(spots: Spots, seed: int) -> Floats:
 def _field_build(tile: Tile) -> list[Mesh]:
     rng = tile.rng
     s, d = tile.scatter(0.002, 4.0, 50.0, margin=3.0)
-    meshes = [strew(tile, boulder, s, d, rng.uniform(0.25, 0.6, len(s)))]
+    meshes = [strew(tile, variants(boulder), s, d, rng.uniform(0.25, 0.6, len(s)))]
     tip = box((0.05, 0.05, 0.3), Material.METAL, (0, 0, 1.3))
     post = merge([box((0.12, 0.12, 1.5), Material.WOOD), tip])
     # An old fence on one side, some of its posts missing.
-    stations = np.arange(np.ceil(tile.start / 4.0), tile.stop / 4.0) * 4.0
+    stations = tile.every(4.0)
     stations = stations[rng.random(len(stations)) < 0.75]
-    meshes.append(
-        strew(
-            tile, lambda _: post, stations, np.full(len(stations), 17.0), 1.0, sink=0.3, variants=1
-        )
-    )
+    meshes.append(strew(tile, [post], stations, np.full(len(stations), 17.0), 1.0, sink=0.3))
     return meshes
 
 
@@ -446,7 +444,7 @@ def _garden_relief(spots: Spots, seed: int) -> Floats:
 
 
 def _trees(tile: Tile, s: Floats, d: Floats, sizes: tuple[float, float]) -> Mesh:
-    return strew(tile, tree, s, d, tile.rng.uniform(*sizes, len(s)), sink=0.02)
+    return strew(tile, variants(tree), s, d, tile.rng.uniform(*sizes, len(s)), sink=0.02)
 
 
 def _on_land(s: Floats, d: Floats) -> tuple[Floats, Floats]:
@@ -460,14 +458,14 @@ def _garden_build(tile: Tile) -> list[Mesh]:
     s, d = _on_land(*tile.scatter(_KINDS[kind], near, 32.0, margin=4.0))
     meshes = [_trees(tile, s, d, (0.7, 1.3))]
     s, d = _on_land(*tile.scatter(0.02, 2.4, 14.0, margin=4.0))
-    meshes.append(strew(tile, bush, s, d, rng.uniform(0.4, 1.2, len(s))))
+    meshes.append(strew(tile, variants(bush), s, d, rng.uniform(0.4, 1.2, len(s))))
     water_s = np.linspace(tile.start, tile.stop, 6)[:, None]
     water = tile.at(water_s, np.array([[_BANK, _RIVER - 12.0]]))
     water[..., 2] = tile.at(water_s, 0.0)[..., 2] - 1.2
     meshes.append(grid(water, Material.WATER))
     middle = (tile.start + tile.stop) / 2.0
     if kind == "avenue":
-        stations = np.arange(np.ceil(tile.start / 5.0), tile.stop / 5.0) * 5.0
+        stations = tile.every(5.0)
         for side in (-1.0, 1.0):
             d = side * (2.9 + rng.uniform(-0.2, 0.2, len(stations)))
             meshes.append(_trees(tile, stations + rng.uniform(-0.4, 0.4), d, (0.9, 1.1)))
@@ -496,8 +494,7 @@ def _hedges(tile: Tile) -> list[Mesh]:
             spread = rng.uniform(-0.5, 0.5, (n, 3)) * [length, 0.9, height + 0.2]
             spread += np.array([0.0, 0.0, height / 2.0])
             leaves = foliage(spread, 0.15, 0.16, int(rng.integers(2**31)))
-            at = tile.at(middle, side * 2.3)
-            meshes.append(place(merge([heart, leaves]), at, tile.heading(middle)))
+            meshes.append(tile.put(merge([heart, leaves]), middle, side * 2.3))
             s += length + rng.uniform(1.2, 3.0)
     return meshes
 
@@ -507,8 +504,7 @@ def _railings(tile: Tile, middle: float) -> list[Mesh]:
     meshes = []
     for side in (-1.0, 1.0):
         posts = np.arange(middle - 5.0, middle + 5.1, 1.25)
-        post = box((0.12, 0.12, 1.15), Material.WOOD)
-        meshes.append(place(post, tile.at(posts, side * 1.55), tile.heading(posts)))
+        meshes.append(tile.put(box((0.12, 0.12, 1.15), Material.WOOD), posts, side * 1.55))
         for lift in (0.55, 1.05):
             rail = [tile.at(posts, side * 1.55, height) for height in (lift, lift + 0.1)]
             meshes.append(grid(np.stack(rail), Material.WOOD))
@@ -549,13 +545,13 @@ def _open_ground_build(tile: Tile) -> list[Mesh]:
         (tree, 0.004, 50.0, 75.0, (0.8, 1.4)),
     ):
         s, d = tile.scatter(density, near, far, margin=4.0)
-        meshes.append(strew(tile, model, s, d, rng.uniform(*sizes, len(s))))
+        meshes.append(strew(tile, variants(model), s, d, rng.uniform(*sizes, len(s))))
     if rng.random() < 0.45:
         s = rng.uniform(tile.start, tile.stop, 1)
         d = rng.choice([-1.0, 1.0], 1) * rng.uniform(22.0, 40.0)
         roof = box((12.8, 3.0, 1.2), Material.WOOD, (0.0, 0.0, 3.5))
         shed = merge([box((12.0, 7.0, 3.6), Material.WOOD), roof])
-        meshes.append(strew(tile, lambda _: shed, s, d, 1.0, sink=0.3, variants=1))
+        meshes.append(strew(tile, [shed], s, d, 1.0, sink=0.3))
     return meshes
 
 
@@ -629,12 +625,11 @@ def _street_build(tile: Tile) -> list[Mesh]:
             away = abs(middle - (tile.index + 0.5) * 20.0)
             if width >= 4.0 and not (crossing and away < width / 2.0 + 6.0):
                 house = _house(width, rng.uniform(8.0, 12.0), int(rng.integers(2, 6)), rng)
-                at = tile.at(middle, side * (_KERB + rng.uniform(4.0, 10.0)))
-                meshes.append(place(house, at, tile.heading(middle) + turn))
+                d = side * (_KERB + rng.uniform(4.0, 10.0))
+                meshes.append(tile.put(house, middle, d, turn))
             elif width >= 4.0 and rng.random() < 0.5 and not crossing:
                 hedge = box((width, 0.8, 1.6), Material.LEAVES)
-                at = tile.at(middle, side * (_KERB + 4.0))
-                meshes.append(place(hedge, at, tile.heading(middle)))
+                meshes.append(tile.put(hedge, middle, side * (_KERB + 4.0)))
             s += width + gap
         if crossing:
             meshes.extend(_side_street(tile, side))
@@ -667,24 +662,22 @@ def _kerbside(tile: Tile, side: float, turn: float, crossing: bool) -> list[Mesh
         slots = slots[np.abs(slots - (tile.index + 0.5) * 20.0) > 9.0]
     slots = slots[rng.random(len(slots)) < 0.35] + rng.uniform(-0.3, 0.3)
     if len(slots):
-        at = tile.at(slots, side * (_KERB - 1.05 + rng.uniform(-0.1, 0.1, len(slots))))
+        d = side * (_KERB - 1.05 + rng.uniform(-0.1, 0.1, len(slots)))
         scale = rng.uniform(0.9, 1.12, (len(slots), 3)) * [1.0, 1.0, rng.choice([1.0, 1.25])]
-        meshes.append(place(car(), at, tile.heading(slots) + turn, scale))
-    stations = np.arange(np.ceil(tile.start / 10.0), tile.stop / 10.0) * 10.0
+        meshes.append(tile.put(car(), slots, d, turn, scale))
+    stations = tile.every(10.0)
     if crossing:
         stations = stations[np.abs(stations - (tile.index + 0.5) * 20.0) > 6.0]
     for s in stations:
         if round(s / 10.0) % 3 == (0 if side > 0 else 1):
-            at = tile.at(s, side * (_KERB + 0.5))
-            meshes.append(place(lamp(), at, tile.heading(s) + turn + np.pi))
+            meshes.append(tile.put(lamp(), s, side * (_KERB + 0.5), turn + np.pi))
         elif rng.random() < 0.45:
             model = tree(int(rng.integers(VARIANTS)))
             at = tile.at(s + rng.uniform(-1.5, 1.5), side * (_KERB + 1.2))
             meshes.append(place(model, at, rng.uniform(0.0, 6.28), rng.uniform(0.6, 0.9)))
     if rng.random() < 0.5:
         s = rng.uniform(tile.start, tile.stop)
-        bin_ = box((0.6, 0.6, 1.1), Material.METAL)
-        meshes.append(place(bin_, tile.at(s, side * (_KERB + 2.6)), tile.heading(s)))
+        meshes.append(tile.put(box((0.6, 0.6, 1.1), Material.METAL), s, side * (_KERB + 2.6)))
     return meshes
 
 
