@@ -119,13 +119,12 @@ class RandomSampler(Sampler):
         tried = {key(result.parameters) for result in history}
         sets: list[ParameterSet] = []
         for number in numbers:
-            point: ParameterSet | None = self.space.baseline
+            drawn = self.space.baseline
             if number:
                 rng = np.random.default_rng((self.config.seed, number))
-                point = self.space.from_unit(rng.random((1, len(self.space))))[0]
-            if key(point) in tried:
-                rng = np.random.default_rng((self.config.seed, number, 1))
-                point = untried(self.space, tried, rng)
+                (drawn,) = self.space.from_unit(rng.random((1, len(self.space))))
+            again = np.random.default_rng((self.config.seed, number, 1))
+            point = untried(self.space, tried, again) if key(drawn) in tried else drawn
             if point is None:
                 break
             tried.add(key(point))

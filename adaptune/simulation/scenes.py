@@ -670,7 +670,8 @@ def _kerbside(tile: Tile, side: float, turn: float, crossing: bool) -> list[Mesh
         stations = stations[np.abs(stations - (tile.index + 0.5) * 20.0) > 6.0]
     for s in stations:
         if round(s / 10.0) % 3 == (0 if side > 0 else 1):
-            meshes.append(tile.put(lamp(), s, side * (_KERB + 0.5), turn + np.pi))
+            at = tile.at(s, side * (_KERB + 0.5))
+            meshes.append(place(lamp(), at, tile.heading(s) + turn + np.pi))
         elif rng.random() < 0.45:
             model = tree(int(rng.integers(VARIANTS)))
             at = tile.at(s + rng.uniform(-1.5, 1.5), side * (_KERB + 1.2))
