@@ -161,7 +161,7 @@ def test_a_trial_keeps_its_faults_and_goes_on_at_the_reference(study_file, tmp_p
     # And the campaign goes on.
     tasks = [Task("one", (n,), ({"x": 0.5},)) for n in range(2)]
     with Workers(setup, 1, 1e9) as workers:
-        results = [result for _, result, _ in run(workers, tasks)]
+        results = [result for _, result in run(workers, tasks)]
     assert ["SIGABRT" in result.trials[0].faults[0] for result in results] == [True, True]
 
 
@@ -173,7 +173,7 @@ def test_a_class_that_ends_the_worker_then_runs_apart(study_file, tmp_path, faul
     overrides = ["odometry.name=faulty:Clean", "odometry.parameters=", "odometry.settings="]
     study = load_study(study_file, overrides, tmp_path / "study")
     with Workers(setup_of(study, factory(fault, here=True)), 1, 1e9) as workers:
-        ((_, result, _),) = run(workers, [Task("one", (0,), ({"x": 0.5},), frames=True)])
+        ((_, result),) = run(workers, [Task("one", (0,), ({"x": 0.5},), frames=True)])
         ((process, _),) = workers._workers.values()
         # It may end its process group.
         assert os.getpgid(process.pid) == process.pid
