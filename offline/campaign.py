@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from adaptune.archive import Archive, ArchiveError, Summary, Trial, summarise
 from adaptune.errors import AdaptuneError
 from adaptune.odometry.base import MOST_FAULTS
-from adaptune.odometry.program import contradiction
 from adaptune.odometry.tracker import HealthCheck
 from adaptune.progress import Progress, unseen
+from adaptune.reference.diagnosis import contradictions
 from adaptune.space import ParameterSet, PooledSpace
+from adaptune.study.study import StudySequences
 from offline.config import OfflineConfig, OfflineStudy
 from offline.objective import Verdict, best_by_trials, judge, label, mean_value, weighted
 from offline.search import Clock, Finished, assess, make_searches, rungs
@@ -314,8 +315,7 @@ def run_baseline(
     """Run the baseline from end to end on every training sequence, unless that was done before.
 
     Of several odometries, the baseline of each. Nothing is stored before all have done well on all
-    sequences. Where the reference contradicts the motion of the first, a warning says what the
-    reference looks like.
+    sequences. Where the reference contradicts the motion of one, scans say which of them is wrong.
 
     Raises
     ------
@@ -339,17 +339,17 @@ def run_baseline(
         done.append((task, result))
     for task, result in done:
         _store(archive, task, result)
-        if task.numbers != (0,):
-            continue
-        T_ref_sensor = archive.read_frames(task.sequence).T_ref_sensor
-        if what := contradiction(result.trials[0].T_odom_sensor, T_ref_sensor):
-            _log.warning(
-                "sequences.%s: the reference contradicts the odometry's motion nearly everywhere: "
-                "%s; check the file or topic (reference), the LiDAR's pose in its frame "
-                "(extrinsic) and its clock (clock_offset)",
-                task.sequence,
-                what,
-            )
+        warn_of_contradictions(
+            study.sequences, task.sequence, labels[task.numbers[0]], result.trials[0]
+        )
+
+
+def warn_of_contradictions(sequences: StudySequences, name: str, odometry: str, run: Trial) -> None:
+    """Tell what the scans of a sequence say where a whole run disagrees with the reference."""
+    place, given = sequences.config(name).extrinsic, sequences.estimate(name) is None
+    scans = sequences.open(name)
+    for what in contradictions(scans, run.T_odom_sensor, run.mean_error, place, given):
+        _log.warning("sequences.%s, %s: %s", name, odometry, what)
 
 
 def check_baseline(odometry: str, sequence: str, run: Trial) -> None:

@@ -448,12 +448,15 @@ def compare(study: Study) -> ComparedReplays:
         check_reference(study.folder / "replays" / name, study.sequences.reference(name))
     judged: list[JudgedModes] = []
     oracles: list[ComparisonRow] = []
+    wrong: list[str] = []
     for name in names:
         folder = study.folder / "replays" / name
         replays = {mode: read_repeats(folder / mode) for mode in modes}
         stored = study.sequences.estimate(name)
         reference = Reference.read(folder, study.config.sub_trajectory, stored)
         every = _with_fixed_rivals(replays, model)
+        summaries = (replay.summary for repeats in replays.values() for replay in repeats)
+        wrong += [f"On {name}, {what}." for each in summaries for what in each.contradictions]
         of_modes = compare_modes(name, every, reference)
         judged.append(of_modes._replace(recording=study.sequences.recorded_in(name)))
         oracle = None if model is None else oracle_errors(study.archive("oracle"), name, model)
@@ -462,6 +465,7 @@ def compare(study: Study) -> ComparedReplays:
             oracles += oracle_rows(judged[-1], oracle, model.fixed, period)
     rows = _rows(judged, oracles)
     words = [
+        *dict.fromkeys(wrong),
         *remarks(rows),
         *_equal_cost(model, modes),
         *compared.words,

@@ -20,6 +20,8 @@ from adaptune.odometry.registry import Factory
 from adaptune.processes import release_memory, shared_cores
 from adaptune.progress import Progress, unseen
 from adaptune.recording.scan import Recording, Scan, part_name
+from adaptune.reference.check import mean_difference
+from adaptune.reference.diagnosis import contradictions
 from adaptune.selector import AnySelector, Selector, UntrainedSelector, untrained_sets
 from adaptune.space import ParameterSet, ParameterSets, Selection
 from adaptune.study.config import RealTimeConfig, StudyConfig, SwitchingConfig
@@ -33,6 +35,7 @@ from adaptune.study.study import (
     cannot_adapt,
     mechanism_of,
 )
+from adaptune.trajectory import Trajectory
 from online.real_time import SelectorProcess, replay_in_real_time
 from online.record import (
     StoredReplay,
@@ -421,15 +424,32 @@ def _replay_all(
                     record = _replayed(study, recording, odometry, mode, run.what, progress, look)
             except DescriptorError as error:
                 raise ReplayError(f"sequences.{name}: {error}") from error
+            wrong: list[str] = []
             if i == 0:
                 write_reference(folder, recording.reference(), record.trajectory, poses)
-            write_replay(run.folder, record, run.inputs, model_path)
+                wrong = _contradictions(study, name, recording, record.trajectory)
+            write_replay(run.folder, record, run.inputs, model_path, wrong)
         if not due:
             trajectory = StoredReplay.read(folder / modes[0]).trajectory
             write_reference(folder, recording.reference(), trajectory, poses)
             _log.info("%s: the reference has changed; no replay depends on it", name)
         made += len(due)
     return made
+
+
+def _contradictions(
+    study: Study, name: str, recording: Recording, replayed: Trajectory
+) -> list[str]:
+    """What the scans say where a replay and the reference disagree."""
+    if (reference := recording.reference()) is None:
+        return []
+    T_ref_sensor, T_odom_sensor = reference.at(replayed.stamps), replayed.T_world_sensor
+    error = mean_difference(T_odom_sensor, T_ref_sensor, study.config.sub_trajectory)
+    place, given = study.sequences.config(name).extrinsic, study.sequences.estimate(name) is None
+    found = list(contradictions(recording, T_odom_sensor, error, place, given))
+    for what in found:
+        _log.warning("sequences.%s: %s", name, what)
+    return found
 
 
 def _due(study: Study, name: str, inputs: manifest.Inputs) -> _Run | None:

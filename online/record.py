@@ -42,6 +42,8 @@ class ReplaySummary(BaseModel):
     cpu_ms: float | None = None  # milliseconds of CPU time a scan, without reading it
     memory_mb: float | None = None  # most megabytes of all processes
     real_time: dict[str, float] | None = None  # how it kept up, see `kept_up`
+    # What scans say where the poses disagree with the reference, see `contradictions`.
+    contradictions: tuple[str, ...] = ()
     model_file: str | None  # of the model that it was made with; None if it needed none
     inputs: dict[str, Any] = Field({}, exclude=True)  # see `adaptune.manifest`
 
@@ -187,7 +189,11 @@ def switched(choices: Mapping[str, Sequence[Any]]) -> NDArray[np.bool_]:
 
 
 def write_replay(
-    folder: Path, replay: ReplayRecord, inputs: manifest.Inputs, model_file: Path | None
+    folder: Path,
+    replay: ReplayRecord,
+    inputs: manifest.Inputs,
+    model_file: Path | None,
+    contradictions: Sequence[str] = (),
 ) -> None:
     """Write ``trajectory.tum``, ``selections.csv``, ``frames.csv`` and, last, ``replay.json``.
 
@@ -212,6 +218,7 @@ def write_replay(
         cpu_ms=round(replay.cpu_ms, 3),
         memory_mb=round(replay.memory, 1),
         real_time=kept_up(replay),
+        contradictions=tuple(contradictions),
         model_file=None if model_file is None else str(model_file.resolve()),
     )
     manifest.record(folder / manifest.FILE, inputs)

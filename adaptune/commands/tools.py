@@ -71,12 +71,14 @@ UNKNOWN_LENGTH = "5.0    # metres; 10.0 for a path of 200 m or more, 25.0 for on
 def _sub_trajectory(found: "Inspection", deep: bool, show: Progress) -> tuple[str, str]:
     """The length of sub-trajectories to propose, and how wrong the reference is, if it is measured.
 
-    Only what can be used to train is measured.
+    Only what can be used to train is measured. What the scans say against it joins the faults.
     """
     if found.reference is None or not found.name or found.missing.get("offline"):
         return UNKNOWN_LENGTH, ""
+    from adaptune.recording.inspect import Fault
     from adaptune.recording.recording import open_sequence
     from adaptune.reference import check
+    from adaptune.reference.diagnosis import diagnose_reference, measured_motions
 
     usual = check.proposed_sub_trajectory(found.reference)
     if not deep:
@@ -86,6 +88,10 @@ def _sub_trajectory(found: "Inspection", deep: bool, show: Progress) -> tuple[st
         if (reference := scans.reference()) is None:
             return str(usual), ""
         measured = check.measure_reference(scans, reference, partial(show, "registering"))
+        motions = measured_motions(scans, len(measured.stamps))
+        if (cause := diagnose_reference(reference, measured.stamps, motions)) is not None:
+            what = f"the reference contradicts the scans: {cause}"
+            found.faults.append(Fault(what, "reference"))
     except AdaptuneError as error:
         return str(usual), f"its error cannot be measured: {error}"
     length = check.proposed_sub_trajectory(reference, measured)

@@ -24,7 +24,7 @@ from adaptune import files, processes
 from adaptune.errors import OdometryError, UnavailableError, nearest
 from adaptune.files import replacing_folder, temporary_folder
 from adaptune.geometry import Poses, invert, rotation_angle, steps, to_pose
-from adaptune.metrics import travelled, window_ends
+from adaptune.metrics import window_ends
 from adaptune.odometry.base import (
     BaseSettings,
     Description,
@@ -333,89 +333,12 @@ def _aligning(own: Poses, true: Poses) -> Poses:
     return R_true_own
 
 
-def contradiction(T_odom_sensor: Poses, T_ref_sensor: Poses) -> str | None:
-    """What a reference looks like whose motions contradict an odometry's nearly everywhere.
-
-    Directions over a metre, not their lengths, are compared, and turns: a rotation (Kabsch) must
-    explain most of what they differ by. Noise and lost tracks are not explained by any. Poses are
-    of shape (n, 4, 4); the odometry's owe nothing to the reference, whose are NaN where unknown.
-
-    Returns
-    -------
-    str or None
-        What has become of the reference, as in "it looks turned by about 90 degrees"; None if it
-        does not contradict the odometry, or too little is known.
-    """
-    T_own, T_true = _motions(T_odom_sensor, T_ref_sensor, 1.0)
-    # An odometry that stands still says nothing.
-    moved = np.linalg.norm(T_own[:, :3, 3], axis=1) > _MIN_MOTION
-    if (
-        moved.sum() < max(_MIN_FRAMES, 0.5 * len(moved))
-        or travelled(T_ref_sensor)[-1] < _MIN_LENGTH
-    ):
-        return None
-    apart, left = _apart(T_own[moved, :3, 3], T_true[moved, :3, 3])
-    if apart > _MIN_DEGREES and left < _MAX_LEFT * apart:
-        return _turned(apart, T_odom_sensor, T_ref_sensor)
-    same = _same_turns(*_motions(T_odom_sensor, T_ref_sensor, _MIN_LENGTH))
-    if same > 1.0 - _MAX_OTHER_TURNS and apart > _MIN_SWAPPED_DEGREES:
-        return "its orientations fit, but its positions do not: it looks as if axes were swapped"
-    if same < _MAX_OTHER_TURNS and apart < _MIN_DEGREES:
-        return "its turns go the other way: it looks mirrored, or its z axis points down"
-    return None
-
-
 def _motions(T_odom_sensor: Poses, T_ref_sensor: Poses, length: float) -> tuple[Poses, Poses]:
     """Motions of both while the reference moves so many metres."""
     ends = window_ends(T_ref_sensor, length)
     starts = np.flatnonzero(ends >= 0)
     own, true = (invert(T[starts]) @ T[ends[starts]] for T in (T_odom_sensor, T_ref_sensor))
     return own, true
-
-
-def _same_turns(T_own: Poses, T_true: Poses) -> float:
-    """Share of the turns that go the same way; NaN if there are few."""
-    from scipy.spatial.transform import Rotation
-
-    if len(T_own) < _MIN_FRAMES:
-        return np.nan
-    own, true = (Rotation.from_matrix(T[:, :3, :3]).as_rotvec() for T in (T_own, T_true))
-    turning = np.minimum(np.linalg.norm(own, axis=1), np.linalg.norm(true, axis=1)) > _MIN_TURN
-    same = (own * true).sum(axis=1)[turning] > 0.0
-    return float(same.mean()) if len(same) >= _MIN_FRAMES else np.nan
-
-
-def _apart(own: Poses, true: Poses) -> tuple[float, float]:
-    """Median angle between displacements in degrees, and what a rotation leaves of it."""
-    own, true = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (own, true))
-    R_true_own = _aligning(own, true)
-    both = ((v * true).sum(axis=1).clip(-1.0, 1.0) for v in (own, own @ R_true_own.T))
-    before, after = (float(np.degrees(np.median(np.arccos(cosine)))) for cosine in both)
-    return before, after
-
-
-def _turned(degrees: float, T_odom_sensor: Poses, T_ref_sensor: Poses) -> str:
-    """Tell a turned reference from one that runs backwards, by speeds and turn rates."""
-    turned = f"it looks turned by about {5 * round(degrees / 5)} degrees"
-    if degrees < _MIN_REVERSED_DEGREES:
-        return turned
-    smooth = np.ones(min(10, len(T_ref_sensor) - 1)) / 10.0
-    own, true = (
-        [np.convolve(v, smooth, "same") for v in np.nan_to_num(speeds)]
-        for speeds in (
-            (np.linalg.norm(T[:, :3, 3], axis=1), rotation_angle(T))
-            for T in (steps(T_odom_sensor), steps(T_ref_sensor))
-        )
-    )
-    with np.errstate(invalid="ignore", divide="ignore"):
-        forwards, backwards = (
-            np.nan_to_num([np.corrcoef(o, t[::way])[0, 1] for o, t in zip(own, true, strict=True)])
-            for way in (1, -1)
-        )
-    if backwards.sum() > forwards.sum() + 0.1:
-        return "it looks reversed in time"
-    more = "" if forwards.sum() > backwards.sum() + 0.1 else ", or reversed in time"
-    return turned + more
 
 
 # Odometries that run once on a whole recording.

@@ -1,0 +1,197 @@
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from adaptune.geometry import from_quaternions, invert, to_quaternions
+from adaptune.live.hops import Hops
+from adaptune.reference.diagnosis import diagnose_odometry, diagnose_reference
+from adaptune.trajectory import Trajectory
+
+SCANS = np.arange(0, 60_000_000_000, 100_000_000)
+POSES = np.arange(-1_000_000_000, 61_000_000_000, 50_000_000)
+
+
+def poses(stamps):
+    """A winding way on a bumpy ground, whose turns do not repeat."""
+    t = stamps * 1e-9
+    yaw = 0.9 * np.sin(0.45 * t) + 0.4 * np.sin(1.1 * t + 0.004 * t**2) + 0.3 * np.sin(0.2 * t)
+    tilt = 0.06 * np.sin(0.9 * t), 0.05 * np.cos(0.7 * t)
+    R = Rotation.from_euler("ZYX", np.column_stack([yaw, *tilt])).as_matrix()
+    fine = np.arange(-2.0, 62.0, 0.01)
+    turn = 0.9 * np.sin(0.45 * fine) + 0.4 * np.sin(1.1 * fine + 0.004 * fine**2)
+    turn += 0.3 * np.sin(0.2 * fine)
+    xy = 0.01 * np.cumsum(1.5 * np.array([np.cos(turn), np.sin(turn)]), axis=1)
+    T = np.tile(np.eye(4), (len(t), 1, 1))
+    T[:, :3, :3] = R
+    T[:, :3, 3] = np.column_stack([*(np.interp(t, fine, row) for row in xy), 0.1 * np.sin(0.3 * t)])
+    return T
+
+
+def hops(noise=0.01, projection=None):
+    """Registrations over four metres, once a second."""
+    rng, T = np.random.default_rng(0), poses(SCANS)
+    start = np.arange(0, len(SCANS) - 30, 10)
+    end = start + 27
+    apart = np.tile(np.eye(4), (len(start), 1, 1))
+    apart[:, :3, :3] = Rotation.from_rotvec(rng.normal(0, 1e-3, (len(start), 3))).as_matrix()
+    apart[:, :3, 3] = rng.normal(0, noise, (len(start), 3))
+    known = np.tile(np.eye(3) if projection is None else projection, (len(start), 1, 1))
+    return Hops(start, end, invert(T[start]) @ T[end] @ apart, known)
+
+
+def quaternions(order):
+    return lambda T: from_quaternions(T[:, :3, 3], to_quaternions(T)[:, order])
+
+
+def quaternions_of(same):
+    return lambda T: from_quaternions(T[:, :3, 3], np.tile(same, (len(T), 1)))
+
+
+def with_positions(change: Callable) -> Callable:
+    def spoil(T):
+        T = T.copy()
+        T[:, :3, 3] = change(T[:, :3, 3])
+        return T
+
+    return spoil
+
+
+def left_handed(T):
+    mirror = np.diag([1.0, -1.0, 1.0, 1.0])
+    return mirror @ T @ mirror
+
+
+def turned(T):
+    place = np.eye(4)
+    place[:3, :3] = Rotation.from_euler("z", 90, degrees=True).as_matrix()
+    return T @ place
+
+
+def carried(T):
+    place = np.eye(4)
+    place[:3, 3] = 0.8, 0.3, 0.2
+    return T @ place
+
+
+@pytest.mark.parametrize(
+    ("spoil", "what", "mend"),
+    [
+        (quaternions([3, 0, 1, 2]), "began with w", "qx qy qz qw"),
+        (quaternions([1, 2, 3, 0]), "ended with w", "qw qx qy qz"),
+        (with_positions(lambda p: p * (1, -1, 1)), "mirrored along y", "sign of y"),
+        (left_handed, "left-handed", "right-handed"),
+        (with_positions(lambda p: p[:, [1, 0, 2]]), "swapped", "x y z"),
+        (with_positions(lambda p: 1000.0 * p), "times as long", "metres"),
+        (with_positions(lambda p: 1.1 * p), "1.1 times as long", "metres"),
+        (invert, "inverted", "LiDAR in the world"),
+        (turned, "other axes", "extrinsic: [0, 0, 0, 0, 0, -0.707"),
+        (carried, "lever arm", "extrinsic: [-0.79"),
+        (lambda T: turned(carried(T)), "other axes", "extrinsic: [-0.29"),
+        (quaternions_of([0.0, 0.0, 0.0, 1.0]), "without orientation", "position_prior"),
+    ],
+)
+def test_a_broken_convention_is_named_with_what_mends_it(spoil, what, mend):
+    reference = Trajectory(POSES, spoil(poses(POSES)))
+    found = diagnose_reference(reference, SCANS, hops())
+    assert what in found.what
+    assert mend in found.mend
+    assert found.before > 4.0
+    assert np.isnan(found.after) or found.after < 0.2 * found.before
+
+
+@pytest.mark.parametrize("seconds", [0.1, 0.5, -3.0, 18.0])
+def test_another_clock_is_found_to_the_hundredth(seconds):
+    reference = Trajectory(POSES + round(seconds * 1e9), poses(POSES))
+    found = diagnose_reference(reference, SCANS, hops())
+    assert "clock" in found.what
+    assert "ambiguous" not in found.mend
+    assert float(found.mend.split()[1]) == pytest.approx(-seconds, abs=0.01)
+
+
+def test_a_clock_is_ambiguous_where_turns_repeat():
+    def circling(stamps):
+        t = stamps * 1e-9
+        yaw = 0.5 * np.sin(2 * np.pi * t / 6.0)
+        T = np.tile(np.eye(4), (len(t), 1, 1))
+        T[:, :3, :3] = Rotation.from_euler("z", yaw[:, None]).as_matrix()
+        T[:, 0, 3] = 1.5 * t
+        return T
+
+    T, start = circling(SCANS), np.arange(0, len(SCANS) - 30, 10)
+    measured = invert(T[start]) @ T[start + 27]
+    known = np.tile(np.eye(3), (len(start), 1, 1))
+    reference = Trajectory(POSES + 1_500_000_000, circling(POSES))
+    found = diagnose_reference(reference, SCANS, Hops(start, start + 27, measured, known))
+    assert "clock" in found.what
+    assert "ambiguous" in found.mend
+
+
+def test_rare_poses_are_named_where_interpolation_fails():
+    def shaking(stamps):
+        T = poses(stamps)
+        T[:, 1, 3] += 0.3 * np.sin(1.5e-9 * stamps)
+        return T
+
+    rare = POSES[::24]
+    T, given = shaking(SCANS), hops()
+    measured = given._replace(T_start_end=invert(T[given.start]) @ T[given.end])
+    assert diagnose_reference(Trajectory(POSES, shaking(POSES)), SCANS, measured) is None
+    found = diagnose_reference(Trajectory(rare, shaking(rare), 2.0), SCANS, measured)
+    assert "too rare" in found.what
+    assert "one every 1.2 s with a scan every 0.1 s" in found.what
+
+
+def noisy(T):
+    apart = np.random.default_rng(1).normal(0.0, 0.15, (len(T), 3))
+    return with_positions(lambda p: p + apart)(T)
+
+
+def drifting(T):
+    return with_positions(lambda p: p * (1, 1, 1) + 0.02 * np.cumsum(np.abs(p), axis=0) / len(p))(T)
+
+
+@pytest.mark.parametrize("spoil", [lambda T: T, noisy, drifting])
+def test_noise_and_drift_break_no_convention(spoil):
+    assert diagnose_reference(Trajectory(POSES, spoil(poses(POSES))), SCANS, hops()) is None
+    assert diagnose_odometry(spoil(poses(SCANS)), hops()) is None
+
+
+def test_what_the_place_does_not_show_contradicts_nothing():
+    long = Trajectory(POSES, with_positions(lambda p: p * 1.1)(poses(POSES)))
+    assert diagnose_reference(long, SCANS, hops()) is not None
+    assert diagnose_reference(long, SCANS, Hops(*(array[:4] for array in hops()))) is None
+    given = hops()
+    way = given.T_start_end[:, :3, 3] / np.linalg.norm(given.T_start_end[:, :3, 3], axis=1)[:, None]
+    across = np.eye(3) - np.einsum("ni,nj->nij", way, way)
+    assert diagnose_reference(long, SCANS, given._replace(projection=across)) is None
+
+
+@pytest.mark.parametrize(
+    ("spoil", "what"),
+    [
+        (lambda T: np.concatenate([T[:1], invert(T[:-1]) @ T[1:]]), "increments"),
+        (invert, "inverted"),
+        (quaternions([3, 0, 1, 2]), "began with w"),
+        (
+            lambda T: from_quaternions(T[:, :3, 3], to_quaternions(T) * (-1, -1, -1, 1)),
+            "transposed",
+        ),
+        (turned, "other axes"),
+        (carried, "lever arm"),
+    ],
+)
+def test_what_an_odometry_returns_instead_of_poses_is_named(spoil, what):
+    found = diagnose_odometry(spoil(poses(SCANS)), hops())
+    assert what in found.what
+    assert found.after < 0.2 * found.before
+
+
+def test_an_odometry_that_is_lost_breaks_no_convention():
+    still = np.tile(np.eye(4), (len(SCANS), 1, 1))
+    assert diagnose_odometry(still, hops()) is None
+    lost = poses(SCANS)
+    lost[200:, :3, 3] += np.arange(len(lost) - 200)[:, None] * 0.2
+    assert diagnose_odometry(lost, hops()) is None
+    assert diagnose_odometry(np.full_like(lost, np.nan), hops()) is None
