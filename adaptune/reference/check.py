@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import TYPE_CHECKING
@@ -9,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune.geometry import Poses
+from adaptune.geometry import Poses, invert
 from adaptune.live.evidence import MIN_REACH, Link, OwnError, OwnErrors, hops_along
 from adaptune.live.hops import LENGTHS as HOPS
 from adaptune.live.hops import Hops
@@ -25,6 +26,10 @@ if TYPE_CHECKING:
     from adaptune.reference.estimate import Advance
 
 
+UNSEEN = 0.7
+"""Share of a way that a registration does not show, from which it does not count."""
+
+
 @dataclass(frozen=True, eq=False)
 class MeasuredReference:
     """A reference at the scans' stamps, and registrations of the scans."""
@@ -38,8 +43,11 @@ class MeasuredReference:
 
         What the registrations themselves are wrong by is part of it. A registration is `HOPS`
         metres long at most; over less, the reference counts as wrong by as many metres. None if
-        the registrations that follow each other reach nowhere over the length.
+        the registrations that follow each other reach nowhere over the length, or most of them do
+        not show motion along the way.
         """
+        if self.unseen:
+            return None
         longer = max(length, HOPS[0])
         metres, reach = self._metres(), 0.0
         part = np.cumsum(np.isnan(self.T_ref_sensor[:, 0, 0]))
@@ -63,6 +71,20 @@ class MeasuredReference:
         found = errors.estimate() if reach >= MIN_REACH * longer else None
         scale = longer / length
         return None if found is None else OwnError(*(scale * value for value in found))
+
+    @cached_property
+    def unseen(self) -> str:
+        """Axis of the sensor along which the place does not show motion, though it moves so.
+
+        Empty where most registrations show it. All scans of a tunnel look alike along it.
+        """
+        T = invert(self.T_ref_sensor[self.hops.start]) @ self.T_ref_sensor[self.hops.end]
+        way = T[:, :3, 3] / np.linalg.norm(T[:, :3, 3], axis=1, keepdims=True)
+        lost = way - np.einsum("nij,nj->ni", self.hops.projection, way)
+        far = np.linalg.norm(lost, axis=1) > UNSEEN
+        if not len(way) or far.mean() < 0.5:
+            return ""
+        return "xyz"[int(np.abs(lost[far]).mean(axis=0).argmax())]
 
     def _metres(self) -> NDArray[np.float64]:
         """Metres driven until each end of a registration, of shape (n,); NaN elsewhere.
@@ -176,6 +198,9 @@ def accuracy_words(measured: MeasuredReference, *lengths: float) -> str:
             most = "at most " if length < HOPS[0] else ""
             interval = f"({error.low:.2g}-{error.high:.2g})"
             words.append(f"{most}{error.mean:.2g} % {interval} over {length:g} m")
+    if measured.unseen:
+        axis = measured.unseen
+        return f"its error cannot be measured: the place does not show motion along {axis}"
     if not words:
         return f"its error over {lengths[0]:g} m cannot be measured: too few scans agree"
     return f"wrong by {', '.join(words)}, as registrations of scans tell"
