@@ -13,7 +13,7 @@ from adaptune.errors import AdaptuneError
 from adaptune.odometry.base import MOST_FAULTS
 from adaptune.odometry.tracker import HealthCheck
 from adaptune.progress import Progress, unseen
-from adaptune.reference.diagnosis import contradictions
+from adaptune.reference.check import contradictions
 from adaptune.space import ParameterSet, PooledSpace
 from adaptune.study.study import StudySequences
 from offline.config import OfflineConfig, OfflineStudy

@@ -20,8 +20,7 @@ from adaptune.odometry.registry import Factory
 from adaptune.processes import release_memory, shared_cores
 from adaptune.progress import Progress, unseen
 from adaptune.recording.scan import Recording, Scan, part_name
-from adaptune.reference.check import mean_difference
-from adaptune.reference.diagnosis import contradictions
+from adaptune.reference.check import contradictions, mean_difference
 from adaptune.selector import AnySelector, Selector, UntrainedSelector, untrained_sets
 from adaptune.space import ParameterSet, ParameterSets, Selection
 from adaptune.study.config import RealTimeConfig, StudyConfig, SwitchingConfig
@@ -31,6 +30,7 @@ from adaptune.study.study import (
     Mechanism,
     ModeError,
     Study,
+    StudySequences,
     bank_members,
     cannot_adapt,
     mechanism_of,
@@ -427,7 +427,8 @@ def _replay_all(
             wrong: list[str] = []
             if i == 0:
                 write_reference(folder, recording.reference(), record.trajectory, poses)
-                wrong = _contradictions(study, name, recording, record.trajectory)
+                replayed = record.trajectory
+                wrong = _contradictions(study.sequences, name, recording, replayed, length)
             write_replay(run.folder, record, run.inputs, model_path, wrong)
         if not due:
             trajectory = StoredReplay.read(folder / modes[0]).trajectory
@@ -438,14 +439,14 @@ def _replay_all(
 
 
 def _contradictions(
-    study: Study, name: str, recording: Recording, replayed: Trajectory
+    sequences: StudySequences, name: str, recording: Recording, replayed: Trajectory, length: float
 ) -> list[str]:
     """What the scans say where a replay and the reference disagree."""
     if (reference := recording.reference()) is None:
         return []
     T_ref_sensor, T_odom_sensor = reference.at(replayed.stamps), replayed.T_world_sensor
-    error = mean_difference(T_odom_sensor, T_ref_sensor, study.config.sub_trajectory)
-    place, given = study.sequences.config(name).extrinsic, study.sequences.estimate(name) is None
+    error = mean_difference(T_odom_sensor, T_ref_sensor, length)
+    place, given = sequences.config(name).extrinsic, sequences.estimate(name) is None
     found = list(contradictions(recording, T_odom_sensor, error, place, given))
     for what in found:
         _log.warning("sequences.%s: %s", name, what)

@@ -78,7 +78,7 @@ def _sub_trajectory(found: "Inspection", deep: bool, show: Progress) -> tuple[st
     from adaptune.recording.inspect import Fault
     from adaptune.recording.recording import open_sequence
     from adaptune.reference import check
-    from adaptune.reference.diagnosis import diagnose_reference, measured_motions
+    from adaptune.reference.check import diagnose_reference, measured_motions
 
     usual = check.proposed_sub_trajectory(found.reference)
     if not deep:

@@ -1,4 +1,4 @@
-"""How accurate a reference is that came with a recording, by direct registrations of its scans."""
+"""Who is wrong, and by how much: a reference, or an odometry, by direct registrations of scans."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -24,7 +24,21 @@ from adaptune.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from adaptune.reference.estimate import Advance
+from collections.abc import Callable, Iterable, Sequence
+from itertools import islice
+from typing import Any, NamedTuple
 
+from scipy.optimize import minimize_scalar
+from scipy.spatial.transform import Rotation
+
+from adaptune.geometry import (
+    from_quaternions,
+    rotation_angle,
+    to_pose,
+    to_quaternions,
+)
+from adaptune.live.hops import Hop, HopCloud, register
+from adaptune.recording.compensation import neighbour_motions
 
 UNSEEN = 0.7
 """Share of a way that a registration does not show, from which it does not count."""
@@ -138,6 +152,434 @@ def mean_difference(T_one: Poses, T_other: Poses, length: float) -> float:
     errors = sub_trajectory_rte(T_one, T_other, length)
     errors = cap(errors[~np.isnan(errors)])
     return float(errors.mean()) if len(errors) else float("nan")
+
+
+# The likeliest cause where poses contradict the scans, and what mends it.
+#
+# Motions that registrations of scans have measured owe nothing to a reference nor to an odometry.
+# Poses that do not show them break a convention: another order of numbers, another frame, another
+# clock. Each convention predicts the poses as they would be without it; the one that fits the
+# measured motions is the likeliest.
+
+SUSPICIOUS = 1.5
+"""Percent. Poses that differ less from what scans show break no convention."""
+UNEXPLAINED = 5.0
+"""Percent from which a reference is surely wrong, whatever the reason."""
+EXPLAINED = 0.5
+"""A cause explains the difference if it leaves less than this share of it."""
+FEWEST_HOPS = 5
+"""Measured motions that a verdict needs."""
+TRUSTED = 0.8
+"""Share of the measured motions that are right at least, those that fit best."""
+CLOCK = 30.0
+"""Seconds by which clocks may differ to be found."""
+SAME_CLOCK = 0.01
+"""Seconds by which two clocks may differ and count as the same."""
+AMBIGUOUS = 1.5
+"""Another offset of the clock that fits by less than this times as badly could be the right one."""
+
+
+class Cause(NamedTuple):
+    """The likeliest reason why poses contradict the scans."""
+
+    what: str  # completes "the poses look ..."
+    mend: str  # what to do about it
+    before: float  # percent by which the poses differ from what scans show
+    after: float  # and without the cause; NaN if it is not known
+
+    def __str__(self) -> str:
+        """Figures, cause and cure, as they follow a colon."""
+        left = "" if np.isnan(self.after) else f" ({self.after:.3g} % is left without that)"
+        return (
+            f"over some metres they differ by {self.before:.3g} %, by registrations of scans; they "
+            f"look {self.what}{left}; {self.mend}"
+        )
+
+
+class _Candidate(NamedTuple):
+    what: str
+    mend: str
+    T_world_sensor: Poses  # (n, 4, 4): at the scans
+
+
+def mismatch(T_world_sensor: Poses, hops: Hops) -> NDArray[np.float64]:
+    """How far motions differ from measured ones, in percent of each, at most 100, of shape (n,).
+
+    The poses are of shape (n_scans, 4, 4). Both translation and rotation (in radians) count, along
+    the directions that the place shows; NaN where a pose is unknown.
+    """
+    T = invert(T_world_sensor[hops.start]) @ T_world_sensor[hops.end]
+    apart = invert(hops.T_start_end) @ T
+    metres = np.linalg.norm(hops.T_start_end[:, :3, 3], axis=1)
+    shift = np.einsum("nij,nj->ni", hops.projection, T[:, :3, 3] - hops.T_start_end[:, :3, 3])
+    share = np.linalg.norm(shift, axis=1) / np.maximum(metres, 1e-9)
+    return np.asarray(100.0 * np.minimum(np.hypot(share, rotation_angle(apart)), 1.0))
+
+
+def _mean(errors: NDArray[np.float64]) -> float:
+    """Mean of most of the errors: registrations fail, too, now and then; NaN if there are few."""
+    known = np.sort(errors[np.isfinite(errors)])
+    most = known[: round(TRUSTED * len(known))]
+    return float(most.mean()) if len(known) >= FEWEST_HOPS else np.nan
+
+
+def diagnose_reference(
+    reference: Trajectory, stamps: NDArray[np.int64], hops: Hops, place: Poses | None = None
+) -> Cause | None:
+    """Why a reference contradicts measured motions; None if it does not, or nobody can tell.
+
+    Parameters
+    ----------
+    reference
+        Poses of the LiDAR.
+    stamps
+        Of the scans, in nanoseconds, of shape (n_scans,).
+    hops
+        Measured motions between scans.
+    place
+        The LiDAR's pose in the frame of the poses that were given, of shape (4, 4), as the study
+        states it; by default they are the LiDAR's own.
+    """
+    before = _mean(mismatch(reference.at(stamps), hops))
+    if np.isnan(before) or before < SUSPICIOUS:
+        return None
+    T_given_sensor = np.eye(4) if place is None else place
+    given = reference.T_world_sensor @ invert(T_given_sensor)
+    turned = rotation_angle(invert(given[:1]) @ given).max()
+    if turned < 1e-6 and rotation_angle(hops.T_start_end).max() > np.radians(2.0):
+        mend = "use its positions only: `reference: estimated`, with this one as `position_prior`"
+        return Cause("without orientation (all are alike)", mend, before, np.nan)
+
+    def at_scans(T_world_given: Poses) -> Poses:
+        T = T_world_given @ T_given_sensor
+        return Trajectory(reference.stamps, T, reference.max_gap).at(stamps)
+
+    backwards = "give the poses in the order of their stamps"
+    candidates = [
+        *_conventions(given, at_scans),
+        _Candidate("reversed in time", backwards, at_scans(given[::-1])),
+        *_clock(reference, stamps, hops),
+        *_places(at_scans(given) @ invert(T_given_sensor), hops),
+    ]
+    return _likeliest(candidates, hops, before) or _sparse(reference, stamps, hops, before)
+
+
+def diagnose_odometry(T_odom_sensor: Poses, hops: Hops) -> Cause | None:
+    """Why an odometry's poses, of shape (n_scans, 4, 4), contradict measured motions; else None."""
+    before = _mean(mismatch(T_odom_sensor, hops))
+    if np.isnan(before) or before < SUSPICIOUS:
+        return None
+    known = np.isfinite(T_odom_sensor).all(axis=(1, 2), keepdims=True)
+    steps = np.where(known, T_odom_sensor, np.eye(4))
+    candidates = [
+        _Candidate(
+            "like increments from scan to scan",
+            "let the odometry return the pose of each scan in the frame of the first one",
+            _accumulated(steps),
+        ),
+        *_conventions(T_odom_sensor, lambda T: T),
+        *_places(T_odom_sensor, hops, of_odometry=True),
+    ]
+    return _likeliest(candidates, hops, before)
+
+
+def _accumulated(steps: Poses) -> Poses:
+    T = np.empty_like(steps)
+    last = np.eye(4)
+    for i, step in enumerate(steps):  # scans, not points
+        last = T[i] = last @ step
+    return T
+
+
+def _likeliest(candidates: Iterable[_Candidate], hops: Hops, before: float) -> Cause | None:
+    """The first candidate that leaves nearly as little as the best one, if that explains it."""
+    left = [(c, _mean(mismatch(c.T_world_sensor, hops))) for c in candidates]
+    left = [(c, after) for c, after in left if np.isfinite(after)]
+    least = min((after for _, after in left), default=np.inf)
+    if least > EXPLAINED * before:
+        return None
+    # Causes stand in the order of their freedom: what has more of it fits noise, too.
+    for candidate, after in left:
+        if after <= max(1.25 * least, 0.1 * before):
+            return Cause(candidate.what, candidate.mend, before, after)
+    return None
+
+
+def _conventions(T: Poses, at_scans: Callable[[Poses], Poses]) -> Iterator[_Candidate]:
+    """Poses as they would be if the file, or the odometry, wrote them by another convention."""
+    known = np.isfinite(T[:, 0, 0])
+    safe = np.where(np.isfinite(T), T, np.eye(4))
+    translations, q = safe[:, :3, 3], to_quaternions(safe)
+
+    def placed(translations: NDArray[np.float64], quaternions: NDArray[np.float64]) -> Poses:
+        T = from_quaternions(translations, quaternions)
+        T[~known] = np.nan
+        return at_scans(T)
+
+    write = "write the quaternions as"
+    yield _Candidate(
+        "as if their quaternions began with w",
+        f"{write} qx qy qz qw",
+        placed(translations, q[:, [1, 2, 3, 0]]),
+    )
+    yield _Candidate(
+        "as if their quaternions ended with w",
+        f"{write} qw qx qy qz",
+        placed(translations, q[:, [3, 0, 1, 2]]),
+    )
+    inverse = invert(safe)
+    inverse[~known] = np.nan
+    yield _Candidate("inverted", "write the poses of the LiDAR in the world", at_scans(inverse))
+    yield _Candidate(
+        "as if their rotations were transposed",
+        "write the rotations from the LiDAR to the world",
+        placed(translations, q * (-1.0, -1.0, -1.0, 1.0)),
+    )
+    for axis, name in enumerate("xyz"):
+        sign = np.ones(3)
+        sign[axis] = -1.0
+        yield _Candidate(
+            f"mirrored along {name}",
+            f"change the sign of {name}",
+            placed(translations * sign, q),
+        )
+        # A rotation in a mirrored world: its axis is mirrored, and it turns the other way.
+        yield _Candidate(
+            f"left-handed ({name} points the other way)",
+            f"convert them to right-handed axes: change the signs of {name} and of the quaternion's"
+            f" other two",
+            placed(translations * sign, q * np.append(-sign, 1.0)),
+        )
+    for a, b in ((0, 1), (1, 2), (0, 2)):
+        order = np.arange(3)
+        order[[a, b]] = b, a
+        yield _Candidate(
+            f"as if {'xyz'[a]} and {'xyz'[b]} of their positions were swapped",
+            "write the positions as x y z",
+            placed(translations[:, order], q),
+        )
+
+
+def _clock(reference: Trajectory, stamps: NDArray[np.int64], hops: Hops) -> Iterator[_Candidate]:
+    """The reference by another clock, found by how fast both turn and move."""
+    turned, moved = _turned_moved(hops.T_start_end)
+    seconds = 1e-9 * (stamps[hops.end] - stamps[hops.start])
+    ends = np.concatenate([stamps[hops.start], stamps[hops.end]])
+
+    def shifted(offset: float, at: NDArray[np.int64]) -> Poses:
+        return reference.at(at - round(offset * 1e9))
+
+    def unlike(offset: float) -> float:
+        start, end = np.split(shifted(offset, ends), 2)
+        other_turned, other_moved = _turned_moved(invert(start) @ end)
+        apart = np.hypot(other_turned - turned, (other_moved - moved) / np.maximum(moved, 1e-9))
+        known = np.isfinite(apart)
+        # Where half of it is unknown, an offset explains nothing.
+        return float(np.minimum(apart[known], 1.0).mean()) if known.mean() > 0.5 else np.inf
+
+    step = float(np.clip(0.2 * np.median(seconds), 0.05, 0.5))
+    offsets = np.arange(-CLOCK, CLOCK + step / 2, step)
+    costs = np.array([unlike(offset) for offset in offsets])
+    if not np.isfinite(costs).any():
+        return
+
+    def left(offset: float) -> float:
+        error = _mean(mismatch(shifted(offset, stamps), hops))
+        return 100.0 if np.isnan(error) else error
+
+    rough = float(offsets[costs.argmin()])
+    bounds = (rough - step, rough + step)
+    best = float(minimize_scalar(left, bounds=bounds, method="bounded", options={"xatol": 1e-3}).x)
+    if abs(best) < SAME_CLOCK:
+        return
+    away = np.abs(offsets - rough) > max(1.0, 2.0 * float(np.median(seconds)))
+    others = away & (costs < AMBIGUOUS * max(float(costs.min()), 0.01))
+    mend = f"add {best:.3f} to `clock_offset`"
+    if others.any():
+        also = offsets[others][costs[others].argmin()]
+        mend += f" (ambiguous, turns repeat: {also:.1f} fits nearly as well)"
+    yield _Candidate("like those of another clock", mend, shifted(best, stamps))
+
+
+def _turned_moved(T: Poses) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Radians and metres of motions, which no frame changes much."""
+    return rotation_angle(T), np.linalg.norm(T[:, :3, 3], axis=1)
+
+
+def _places(T_world_body: Poses, hops: Hops, of_odometry: bool = False) -> Iterator[_Candidate]:
+    """The poses of another body of the same platform, or in other units."""
+    T = invert(T_world_body[hops.start]) @ T_world_body[hops.end]
+    known = np.isfinite(T).all(axis=(1, 2))
+    T, measured = T[known], hops.T_start_end[known]
+    if len(T) < FEWEST_HOPS:
+        return
+    scale = float(np.median(_turned_moved(T)[1] / np.maximum(_turned_moved(measured)[1], 1e-9)))
+    if scale > 0.0:
+        scaled = T_world_body.copy()
+        scaled[:, :3, 3] /= scale
+        what = f"{scale:.4g} times as long as the way of the scans"
+        yield _Candidate(what, "write the positions in metres", scaled)
+    turned, lever = _rotation(T, measured), _lever(T, measured, np.eye(3))
+    both = _lever(T, measured, turned)
+    for R, t, what in (
+        (np.eye(3), lever, "like those of another body, a lever arm away"),
+        (turned, np.zeros(3), "like those of other axes"),
+        (turned, both, "like those of another body, with other axes"),
+    ):
+        place = np.eye(4)
+        place[:3, :3], place[:3, 3] = R, t
+        numbers = " ".join(
+            f"{value + 0.0:.4g}"
+            for value in (*t.round(3), *to_quaternions(place[None])[0].round(4))
+        )
+        mend = f"set `extrinsic: [{numbers.replace(' ', ', ')}]`, the LiDAR's pose in their frame"
+        if of_odometry:
+            mend = f"return the LiDAR's poses: multiply by its place in the body, {numbers}"
+        yield _Candidate(what, mend, T_world_body @ place)
+
+
+def _rotation(T: Poses, measured: Poses) -> NDArray[np.float64]:
+    """Rotation of shape (3, 3) from the measured frame to that of the poses, by all motions."""
+    vectors = []
+    for motions in (T, measured):
+        turns = Rotation.from_matrix(motions[:, :3, :3]).as_rotvec()
+        vectors.append(np.concatenate([motions[:, :3, 3], 10.0 * turns]))
+    R, _ = Rotation.align_vectors(*vectors)
+    return np.asarray(R.as_matrix())
+
+
+def _lever(T: Poses, measured: Poses, R_body_sensor: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Position of shape (3,) of the sensor in the body, as far as turns show it."""
+    # (R - 1) t = R_body_sensor t_measured - t_body
+    A = T[:, :3, :3] - np.eye(3)
+    b = np.einsum("ij,nj->ni", R_body_sensor, measured[:, :3, 3]) - T[:, :3, 3]
+    weights = np.ones(len(T))
+    t = np.zeros(3)
+    for _ in range(10):
+        t = np.linalg.lstsq(
+            (weights[:, None, None] * A).reshape(-1, 3), (weights[:, None] * b).ravel(), rcond=0.05
+        )[0]
+        residuals = np.linalg.norm(A @ t - b, axis=1)
+        weights = 1.0 / np.sqrt(np.maximum(residuals, 1e-2 + np.median(residuals)))
+    return np.asarray(t)
+
+
+def _sparse(
+    reference: Trajectory, stamps: NDArray[np.int64], hops: Hops, before: float
+) -> Cause | None:
+    """Whether there are too few poses to interpolate, by what half of them would lose."""
+    between = float(np.median(np.diff(reference.stamps))) * 1e-9
+    scans = float(np.median(np.diff(stamps))) * 1e-9
+    if between < 2.0 * scans or len(reference) < 5:
+        return None
+    thin = Trajectory(reference.stamps[::2], reference.T_world_sensor[::2], 2.0 * reference.max_gap)
+    whole, half = (t.at(stamps) for t in (reference, thin))
+    # Interpolation errs by the square of the time between poses: half of them, by four times; and
+    # by as much where the motion is faster than both.
+    shown = hops._replace(T_start_end=invert(whole[hops.start]) @ whole[hops.end])
+    if not _mean(mismatch(half, shown)) / 2.0 > 0.3 * before:
+        return None
+    what = f"too rare to interpolate, one every {between:.2g} s with a scan every {scans:.2g} s"
+    return Cause(what, "give a denser one, or `reference: estimated`", before, np.nan)
+
+
+def contradictions(
+    scans: Recording, T_odom_sensor: Poses, error: float, place: Sequence[Any] | None, given: bool
+) -> Iterator[str]:
+    """What a recording's scans say where its reference and an odometry disagree.
+
+    Parameters
+    ----------
+    scans
+        They are read once more, as far as needed.
+    T_odom_sensor
+        The odometry's poses, of shape (n_scans, 4, 4), which owe nothing to the reference.
+    error
+        Percent by which the odometry differs from the reference. Where it is small, nothing is
+        wrong, and nothing is read.
+    place
+        The LiDAR's pose in the reference's frame as a study states it (`extrinsic`).
+    given
+        Whether the reference came with the recording.
+    """
+    if not error > SUSPICIOUS:
+        return
+    stamps: list[int] = []
+
+    def read() -> Iterator[Scan]:
+        for scan in scans:
+            stamps.append(scan.stamp)
+            yield scan
+
+    hops = measured_motions(read(), len(T_odom_sensor))
+    reference = scans.reference() if given else None
+    if reference is not None:
+        at = np.array(stamps, np.int64)
+        T = None if place is None else to_pose(list(place))
+        cause = diagnose_reference(reference, at, hops, T)
+        apart = _mean(mismatch(reference.at(at), hops)), _mean(mismatch(T_odom_sensor, hops))
+        if cause is not None:
+            yield f"the reference contradicts the scans: {cause}"
+        elif apart[0] > max(UNEXPLAINED, 4.0 * apart[1]):
+            yield (
+                f"the reference contradicts the scans: over some metres they differ by "
+                f"{apart[0]:.3g} %, by registrations of scans, and the odometry by {apart[1]:.3g} "
+                f"%; check its file or topic (`reference`), the LiDAR's pose in its frame "
+                f"(`extrinsic`) and its clock (`clock_offset`), or use `reference: estimated`"
+            )
+    if (cause := diagnose_odometry(T_odom_sensor, hops)) is not None:
+        yield f"the odometry's poses contradict the scans: {cause}"
+
+
+# Motions that scans alone show.
+
+STRETCHES, SCANS = 8, 40
+"""Stretches of a recording that are looked at, evenly spread, and the scans of each."""
+METRES, EACH = 4.0, 4
+"""A motion is measured over so many metres, or over the rest of half a stretch, and one begins at
+every so manieth scan."""
+_AGREE = 0.3
+"""Metres by which two ways of registering the same scans may differ."""
+
+
+def measured_motions(scans: Iterable[Scan], n_scans: int) -> Hops:
+    """Register scans over some metres from standing still, here and there along a recording.
+
+    Neighbours are registered one after the other, then scans some metres apart directly. What is
+    returned owes nothing to any poses. There is nothing where both ways end apart, as where the
+    view is narrow.
+    """
+    n_stretches = min(STRETCHES, max(n_scans // SCANS, 1))
+    begins = np.linspace(0, max(n_scans - SCANS, 0), n_stretches).astype(int)
+    scans, position = iter(scans), 0
+    found: list[tuple[int, int, Hop]] = []
+    for begin in begins.tolist():
+        stretch = list(islice(scans, begin - position, begin - position + SCANS))
+        position = begin + SCANS
+        found += [(begin + i, begin + k, hop) for i, k, hop in _motions_over(stretch)]
+    return Hops.of(found)
+
+
+def _motions_over(stretch: list[Scan]) -> Iterator[tuple[int, int, Hop]]:
+    """Numbers of two scans of a stretch, and the registration of one to the other."""
+    T = np.full((len(stretch), 4, 4), np.nan)
+    clouds = []
+    for i, (scan, step, seconds) in enumerate(neighbour_motions(stretch)):
+        if i and step is None:
+            break
+        T[i] = np.eye(4) if step is None else T[i - 1] @ step
+        clouds.append(HopCloud(scan, np.eye(4) if step is None else step, seconds if i else 0.0))
+        if i == 1 and step is not None:
+            clouds[0].moved(step, seconds)
+    for start in range(0, len(clouds) - SCANS // 2, EACH):
+        guesses = invert(T[start]) @ T[start : start + SCANS // 2 + 1]
+        metres = np.linalg.norm(guesses[:, :3, 3], axis=1)
+        away = int(np.argmax(metres >= METRES)) or len(metres) - 1
+        hop = register(clouds[start], clouds[start + away], [guesses[away]])
+        if hop is not None:
+            apart = hop.projection @ (hop.T_start_end - guesses[away])[:3, 3]
+            if np.linalg.norm(apart) < _AGREE:
+                yield start, start + away, hop
 
 
 # Which length of sub-trajectories to propose for a study, given how accurate its reference is.

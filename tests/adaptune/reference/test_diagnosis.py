@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from adaptune.geometry import from_quaternions, invert, to_quaternions
 from adaptune.live.hops import Hops
-from adaptune.reference.diagnosis import diagnose_odometry, diagnose_reference
+from adaptune.reference.check import diagnose_odometry, diagnose_reference
 from adaptune.trajectory import Trajectory
 
 SCANS = np.arange(0, 60_000_000_000, 100_000_000)
