@@ -1,12 +1,14 @@
 """Trajectories, and their files in the TUM, KITTI, EuRoC and OXTS formats.
 
 All readers raise a TrajectoryError that names the file and the line that is not a pose, or whose
-stamp does not come after the one before.
+stamp lies before the one before it.
 """
 
-from collections.abc import Callable, Iterator
+import logging
+import re
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +18,8 @@ from adaptune import geometry
 from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
 from adaptune.geometry import Poses
+
+_log = logging.getLogger(__name__)
 
 
 class TrajectoryError(AdaptuneError):
@@ -63,30 +67,34 @@ Row = tuple[int, list[str]]
 """Number of a line, and its fields."""
 
 
-def _lines(path: Path) -> Iterator[Row]:
-    """Lines that are neither empty nor a comment."""
+_NUMBER = re.compile(r"[-+.]*\d")
+
+
+def _lines(path: Path) -> Iterator[tuple[int, str, list[str]]]:
+    """Number, text and fields of lines that are not empty; a comment has no fields."""
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")
     except FileNotFoundError as error:
         raise TrajectoryError(f"{path}: there is no such file") from error
     except (OSError, UnicodeDecodeError) as error:
         raise TrajectoryError(f"{path}: cannot be read as text ({error})") from error
     for number, line in enumerate(text.splitlines(), start=1):
-        fields = line.replace(",", " ").split()
-        if fields and not fields[0].startswith("#"):
-            yield number, fields
+        if line := line.strip().rstrip(",; "):
+            yield number, line, [] if line[0] == "#" else re.split(r"\s*[,;]\s*|\s+", line)
 
 
 def _rows(path: Path, columns: int, kind: str, or_more: bool = False) -> list[Row]:
-    rows = []
-    for number, fields in _lines(path):
+    rows = [(number, fields) for number, _, fields in _lines(path) if fields]
+    for number, fields in rows:
         if len(fields) != columns and not (or_more and len(fields) > columns):
             what = f"a {kind} line has {columns} numbers, this has {len(fields)}"
             raise TrajectoryError(f"{path}, line {number}: {what}")
-        rows.append((number, fields[:columns]))
     if not rows:
-        raise TrajectoryError(f"{path}: holds no pose; give a file of TUM, KITTI or EuRoC")
-    return rows
+        raise TrajectoryError(f"{path}: {_EMPTY}")
+    return [(number, fields[:columns]) for number, fields in rows]
+
+
+_EMPTY = "holds no pose; give a file of TUM, KITTI or EuRoC"
 
 
 def _numbers(path: Path, rows: list[Row]) -> NDArray[np.float64]:
@@ -101,45 +109,141 @@ def _numbers(path: Path, rows: list[Row]) -> NDArray[np.float64]:
     return values
 
 
-def _stamps(
-    path: Path, rows: list[Row], parse: Callable[[str], int], unit: str
-) -> NDArray[np.int64]:
-    """Strictly increasing nanoseconds of the rows' first fields."""
-    stamps = np.empty(len(rows), np.int64)
-    for i, (number, fields) in enumerate(rows):
+_COLUMNS = ("timestamp", "x", "y", "z", "qx", "qy", "qz", "qw")
+# What a header may call them, in lower case and without units; an axis follows the last two.
+_NAMES = {
+    "nanoseconds": r"(.*[._ ])?n(ano)?sec\w*",
+    "seconds": r"(.*[._ ])?sec\w*",
+    "timestamp": r"t|.*(time|stamp).*",
+    "q": r"(.*[._ ])?(q|quat|orient|rot)(.*[._ ])?[xyzw]",
+    "": r"(t_?|(.*[._ ])?(p|pos|trans|loc)(.*[._ ])?)?[xyz]",
+}
+
+
+def _named(header: str) -> dict[str, int]:
+    """Where a header has each of `_COLUMNS`, as far as it names them."""
+    header = re.sub(r"\[.*?\]|\(.*?\)|[#%\"]", "", header).lower().strip()
+    found: dict[str, int] = {}
+    for i, name in enumerate(re.split(r"\s*[,;]\s*" if "," in header else r"\s+", header)):
+        of = next((of for of, known in _NAMES.items() if re.fullmatch(known, name)), None)
+        if of is not None:
+            found.setdefault(of if len(of) > 1 else of + name[-1], i)
+    both = found.keys() >= {"seconds", "nanoseconds"}
+    if "seconds" in found and (both or "timestamp" not in found):
+        found["timestamp"] = found["seconds"]
+    if not both:
+        found.pop("nanoseconds", None)
+    return found
+
+
+def _table(path: Path) -> tuple[dict[str, int], list[Row]]:
+    """Columns that a header, or a comment before the poses, names completely; and the rows."""
+    named: dict[str, int] = {}
+    rows: list[Row] = []
+    for number, line, fields in _lines(path):
+        if fields and (rows or any(map(_NUMBER.match, fields))):
+            rows.append((number, fields))
+        elif not rows:
+            found = _named(line)
+            missing = [name for name in _COLUMNS if name not in found]
+            if fields and missing:
+                what = f"names no column {', '.join(missing)}"
+                help_ = f"name the columns {' '.join(_COLUMNS)}, in their order"
+                raise TrajectoryError(f"{path}, line {number}: {what}; {help_}")
+            named = named if missing else found
+    if not rows:
+        raise TrajectoryError(f"{path}: {_EMPTY}")
+    return named, rows
+
+
+def _stamps(path: Path, rows: list[Row], columns: Sequence[int]) -> tuple[NDArray[np.int64], bool]:
+    """Nanoseconds of rows, and whether the file counts in them: the size of the numbers shows.
+
+    A second column has the nanoseconds beyond the seconds of the first.
+    """
+    times: list[Decimal] = []
+    for number, fields in rows:
         try:
-            stamps[i] = parse(fields[0])
-        except (InvalidOperation, ValueError, OverflowError) as error:
-            what = f"{fields[0]!r} is not a time in {unit}"
+            # A double holds seconds since 1970 to 0.2 microseconds only.
+            parts = [Decimal(fields[column]).scaleb(-9 * i) for i, column in enumerate(columns)]
+            times.append(sum(parts, Decimal(0)))
+            if abs(times[-1]) >= 9e18:
+                raise OverflowError
+        except (ArithmeticError, ValueError) as error:
+            what = f"{fields[columns[0]]!r} is not a time"
             raise TrajectoryError(f"{path}, line {number}: {what}") from error
-        if i and stamps[i] <= stamps[i - 1]:
-            what = "its stamp does not come after the line before"
-            raise TrajectoryError(f"{path}, line {number}: {what}")
-    return stamps
+    numbers = np.array(times, float)
+    size = np.abs(numbers).max()
+    # Since 1970 there are 1 to 9 times so many seconds, milliseconds or microseconds.
+    since = ((0, 0.0, 9e9), (3, 1e12, 9e12), (6, 1e15, 9e15))
+    unit = next((unit for unit, least, most in since if least <= size < most), 9)
+    # No poses are 100 s apart: a clock that counts whole nanoseconds began with zero.
+    whole = len(rows) > 1 and all(fields[columns[0]].isdigit() for _, fields in rows)
+    if whole and unit < 6 and np.median(np.diff(numbers)) > 1e5:
+        unit = 9
+    scaled = [int(time.scaleb(9 - unit).to_integral_value()) for time in times]
+    return np.array(scaled, np.int64), unit == 9
 
 
-def _with_stamps(
-    path: Path, rows: list[Row], parse: Callable[[str], int], unit: str, order: list[int]
-) -> Trajectory:
-    """Trajectory of rows of a stamp, a translation and a quaternion whose x y z w `order` finds."""
-    values = _numbers(path, [(number, fields[1:]) for number, fields in rows])
-    stamps, quaternions = _stamps(path, rows, parse, unit), values[:, order]
-    norms = np.linalg.norm(quaternions, axis=1)
+def _once(path: Path, rows: list[Row], stamps: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Which rows count: of poses with the same stamp the first one."""
+    steps = np.diff(stamps, prepend=stamps[0] - 1)
+    if len(back := np.flatnonzero(steps < 0)):
+        what = "its stamp does not come after the line before; sort the lines by time"
+        raise TrajectoryError(f"{path}, line {rows[back[0]][0]}: {what}")
+    if len(again := np.flatnonzero(steps == 0)):
+        what = f"{len(again)} of {len(rows)} poses repeat the stamp of the line before"
+        where = f"the first on line {rows[again[0]][0]}"
+        if len(again) > 0.1 * len(rows):
+            raise TrajectoryError(f"{path}: {what}, {where}; write stamps with all their digits")
+        _log.warning("%s: left out poses, %s, %s", path, what, where)
+    return steps > 0
+
+
+def _read(path: Path, csv: bool) -> Trajectory:
+    named, rows = _table(path)
+    for number, fields in rows:
+        n, need = len(fields), max([7, *named.values()]) + 1
+        if n < need or not (named or csv or n in (8, 11)):
+            kind = "line below this header" if named else "EuRoC line" if csv else "TUM line"
+            what = f"a {kind} has {need} numbers{' or more' * csv}, this has {n}"
+            help_ = f"for other columns, begin with a line of names ({' '.join(_COLUMNS)})"
+            raise TrajectoryError(f"{path}, line {number}: {what}; {help_}")
+    stamped = [named[name] for name in ("timestamp", "nanoseconds") if name in named]
+    stamps, nanoseconds = _stamps(path, rows, stamped or [0])
+    keep = _once(path, rows, stamps)
+
+    def read(order: Sequence[int]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        values = _numbers(path, [(n, [fields[column] for column in order]) for n, fields in rows])
+        return values, np.linalg.norm(values[:, 3:], axis=1)
+
+    quaternion = (5, 6, 7, 4) if csv and nanoseconds else (4, 5, 6, 7)
+    order = [named[name] for name in _COLUMNS[1:]] if named else [1, 2, 3, *quaternion]
+    values, norms = read(order)
+    if np.abs(norms - 1.0).max() > 1e-2 and not named and min(len(f) for _, f in rows) > 10:
+        # Roll, pitch and yaw may come before the quaternion.
+        others = read([1, 2, 3, 7, 8, 9, 10])
+        values, norms = others if np.abs(others[1] - 1.0).max() <= 1e-2 else (values, norms)
     worst = int(np.argmax(np.abs(norms - 1.0)))
     if abs(norms[worst] - 1.0) > 1e-2:
         what = f"its quaternion has length {norms[worst]:.3g}, not 1"
         raise TrajectoryError(f"{path}, line {rows[worst][0]}: {what}")
-    return Trajectory(stamps, geometry.from_quaternions(values[:, :3], quaternions))
+    return Trajectory(stamps[keep], geometry.from_quaternions(values[keep, :3], values[keep, 3:]))
 
 
 def read_tum(path: Path) -> Trajectory:
     """Read ``timestamp tx ty tz qx qy qz qw`` lines, exact to the nanosecond."""
+    return _read(path, csv=False)
 
-    def nanoseconds(text: str) -> int:
-        # A double holds seconds since 1970 to 0.2 microseconds only.
-        return int(Decimal(text).scaleb(9).to_integral_value())
 
-    return _with_stamps(path, _rows(path, 8, "TUM"), nanoseconds, "seconds", [3, 4, 5, 6])
+def read_trajectory(path: Path) -> Trajectory:
+    """Read poses with stamps, of a TUM file, or of a ``.csv`` as EuRoC or others write them.
+
+    A header that names the columns gives their order. Without one, a ``.csv`` with nanoseconds has
+    EuRoC's (``timestamp, p_x, p_y, p_z, q_w, q_x, q_y, q_z, ...``), all else TUM's. Roll, pitch and
+    yaw may come before the quaternion. The size of the stamps shows their unit.
+    """
+    return _read(path, csv=path.suffix == ".csv")
 
 
 def write_tum(path: Path, trajectory: Trajectory) -> None:
@@ -175,21 +279,8 @@ def write_kitti(path: Path, T_world_sensor: Poses) -> None:
 
 def is_kitti(path: Path) -> bool:
     """Whether a file's first pose has 12 numbers, and no stamp."""
-    return path.suffix != ".csv" and len(next(_lines(path), (0, []))[1]) == 12
-
-
-def read_trajectory(path: Path) -> Trajectory:
-    """Read poses with stamps: ``.csv`` as EuRoC writes them, all else as TUM."""
-    return read_euroc(path) if path.suffix == ".csv" else read_tum(path)
-
-
-def read_euroc(path: Path) -> Trajectory:
-    """Read ``timestamp, p_x, p_y, p_z, q_w, q_x, q_y, q_z, ...`` lines, nanoseconds and metres.
-
-    Numbers after the pose (velocities, biases) are ignored.
-    """
-    rows = _rows(path, 8, "EuRoC", or_more=True)
-    return _with_stamps(path, rows, int, "nanoseconds", [4, 5, 6, 3])
+    first: list[str] = next((fields for *_, fields in _lines(path) if fields), [])
+    return path.suffix != ".csv" and len(first) == 12 and bool(_NUMBER.match(first[0]))
 
 
 _EARTH_RADIUS = 6378137.0

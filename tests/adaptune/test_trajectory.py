@@ -9,7 +9,6 @@ from adaptune.trajectory import (
     Trajectory,
     TrajectoryError,
     is_kitti,
-    read_euroc,
     read_kitti,
     read_oxts,
     read_trajectory,
@@ -107,7 +106,7 @@ def test_the_line_that_is_wrong_is_named(tmp_path, name, text, message):
     assert name in str(caught.value)
 
 
-@pytest.mark.parametrize("read", [read_tum, read_euroc, read_kitti, is_kitti, read_trajectory])
+@pytest.mark.parametrize("read", [read_tum, read_kitti, is_kitti, read_trajectory])
 def test_files_that_are_no_text_are_refused(tmp_path, read):
     assert callable(read)
     with pytest.raises(TrajectoryError, match="there is no such file"):
