@@ -54,6 +54,18 @@ class Trajectory:
     def __len__(self) -> int:
         return len(self.stamps)
 
+    @property
+    def sparse(self) -> str:
+        """Where many poses are further apart than `max_gap`: how many, and what to set."""
+        seconds = np.diff(self.stamps) * 1e-9
+        long = seconds[seconds > self.max_gap]
+        if len(long) <= 0.1 * len(seconds):
+            return ""
+        what = f"{len(long)} of {len(seconds)} gaps of the reference are longer than max_gap"
+        enough = np.ceil(2.0 * np.median(long)) / 2.0
+        help_ = f"scans in them get no label, set `max_gap: {enough:g}` or more"
+        return f"{what} = {self.max_gap:g} s: {help_}"
+
     def at(self, stamps: NDArray[np.int64], max_gap: float | None = None) -> Poses:
         """Interpolated poses of shape (m, 4, 4) at m stamps; NaN where there is no pose.
 
@@ -77,7 +89,7 @@ def _lines(path: Path) -> Iterator[tuple[int, str, list[str]]]:
     except FileNotFoundError as error:
         raise TrajectoryError(f"{path}: there is no such file") from error
     except (OSError, UnicodeDecodeError) as error:
-        raise TrajectoryError(f"{path}: cannot be read as text ({error})") from error
+        raise TrajectoryError(f"{path}: cannot be read as text in UTF-8 ({error})") from error
     for number, line in enumerate(text.splitlines(), start=1):
         if line := line.strip().rstrip(",; "):
             yield number, line, [] if line[0] == "#" else re.split(r"\s*[,;]\s*|\s+", line)
@@ -211,7 +223,6 @@ def _read(path: Path, csv: bool) -> Trajectory:
             raise TrajectoryError(f"{path}, line {number}: {what}; {help_}")
     stamped = [named[name] for name in ("timestamp", "nanoseconds") if name in named]
     stamps, nanoseconds = _stamps(path, rows, stamped or [0])
-    keep = _once(path, rows, stamps)
 
     def read(order: Sequence[int]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         values = _numbers(path, [(n, [fields[column] for column in order]) for n, fields in rows])
@@ -224,10 +235,11 @@ def _read(path: Path, csv: bool) -> Trajectory:
         # Roll, pitch and yaw may come before the quaternion.
         others = read([1, 2, 3, 7, 8, 9, 10])
         values, norms = others if np.abs(others[1] - 1.0).max() <= 1e-2 else (values, norms)
-    worst = int(np.argmax(np.abs(norms - 1.0)))
-    if abs(norms[worst] - 1.0) > 1e-2:
-        what = f"its quaternion has length {norms[worst]:.3g}, not 1"
-        raise TrajectoryError(f"{path}, line {rows[worst][0]}: {what}")
+    if len(bad := np.flatnonzero(np.abs(norms - 1.0) > 1e-2)):
+        columns = ", ".join(str(column + 1) for column in order[3:])
+        what = f"its quaternion has length {norms[bad[0]]:.3g}, not 1 (columns {columns})"
+        raise TrajectoryError(f"{path}, line {rows[bad[0]][0]}: {what}")
+    keep = _once(path, rows, stamps)
     return Trajectory(stamps[keep], geometry.from_quaternions(values[keep, :3], values[keep, 3:]))
 
 

@@ -415,13 +415,20 @@ def reference_poses(
     AdaptuneError
         If no error can be measured on the sequence.
     """
-    T_ref_sensor = reference.at(stamps)
+    T_ref_sensor, length = reference.at(stamps), settings.sub_trajectory
+    whole = (window_ends(T_ref_sensor, length) >= 0).any()
+    if (
+        not whole
+        and reference.sparse
+        and (window_ends(reference.at(stamps, 1e9), length) >= 0).any()
+    ):
+        raise AdaptuneError(f"{key}: {reference.sparse}")
     if np.isnan(T_ref_sensor).all():
         raise AdaptuneError(
             f"{key}: the reference does not overlap the scans in time; check that both "
             f"are of the same recording and clock"
         )
-    if not (window_ends(T_ref_sensor, settings.sub_trajectory) >= 0).any():
+    if not whole:
         raise _too_short(key, T_ref_sensor[~np.isnan(T_ref_sensor[:, 0, 0])], settings)
     shortest = min(KITTI_LENGTHS)
     if "kitti" in settings.metrics and not (window_ends(T_ref_sensor, shortest) >= 0).any():

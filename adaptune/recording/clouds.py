@@ -91,7 +91,8 @@ def header_stamp(data: bytes | memoryview, cdr: bool) -> int | None:
 DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 _LARGEST_POINT = 1 << 20
 RING_FIELDS = ("ring", "line", "channel", "laser_id")
-INTENSITY_FIELDS = ("intensity", "reflectivity")
+# CloudCompare puts a prefix before the names of what it stores in a PLY file.
+INTENSITY_FIELDS = ("intensity", "reflectivity", "scalar_intensity", "scalar_Intensity")
 
 
 class PointCloudError(AdaptuneError):

@@ -622,7 +622,8 @@ def _reference_faults(reference: Trajectory, complete: bool, timed: bool = True)
         yield Fault(f"{what}: {help_}", of)
     if complete and timed and (gaps := np.count_nonzero(seconds > reference.max_gap)):
         what = f"the reference has {gaps} gaps beyond {reference.max_gap:g} s"
-        yield Fault(f"{what}, the longest of {seconds.max():.2f} s: their scans get no label", of)
+        what += f", the longest of {seconds.max():.2f} s: their scans get no label"
+        yield Fault(reference.sparse or what, of)
 
 
 def _overlap_faults(reference: Trajectory, scans: tuple[int, int], slack: float) -> Iterator[Fault]:

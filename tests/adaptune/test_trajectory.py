@@ -112,7 +112,7 @@ def test_files_that_are_no_text_are_refused(tmp_path, read):
     with pytest.raises(TrajectoryError, match="there is no such file"):
         read(tmp_path / "none.tum")
     (tmp_path / "a.tum").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(TrajectoryError, match="cannot be read as text"):
+    with pytest.raises(TrajectoryError, match="cannot be read as text in UTF-8"):
         read(tmp_path / "a.tum")
 
 
