@@ -1,17 +1,19 @@
 """Principal components by which descriptors are compared."""
 
 from collections.abc import Sequence
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from sklearn.base import BaseEstimator, TransformerMixin
 from sklearn.decomposition import PCA
+from sklearn.utils.validation import check_is_fitted, validate_data
 
 N_COMPONENTS = 10
 """Of each descriptor."""
 
 
-class ScaledPCA:
+class ScaledPCA(TransformerMixin, BaseEstimator):  # type: ignore[misc]
     """Principal components, divided by the mean of their standard deviations.
 
     One divisor for all keeps the components' shares in a distance, and gives distances a size that
@@ -29,9 +31,9 @@ class ScaledPCA:
     def __init__(self, blocks: Sequence[int] | None = None):
         self.blocks = blocks
 
-    def fit(self, X: NDArray[np.floating]) -> Self:
+    def fit(self, X: NDArray[np.floating], y: Any = None) -> Self:  # noqa: ARG002
         """Learn from descriptors of shape (n_scans, n_features)."""
-        X = np.asarray(X, np.float64)
+        X = validate_data(self, X, dtype=np.float64)
         ends = np.cumsum(X.shape[1:] if self.blocks is None else self.blocks)
         self.mean_ = np.empty(X.shape[1])
         components, scales = [], []
@@ -52,4 +54,6 @@ class ScaledPCA:
 
     def transform(self, X: NDArray[np.floating]) -> NDArray[np.float64]:
         """Map descriptors to shape (n_scans, n_components)."""
-        return np.asarray((X.astype(np.float64) - self.mean_) @ self.components_.T / self.scale_)
+        check_is_fitted(self)
+        X = validate_data(self, X, dtype=np.float64, reset=False)
+        return np.asarray((X - self.mean_) @ self.components_.T / self.scale_)

@@ -3,10 +3,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sklearn.neighbors import KNeighborsRegressor
+from sklearn.utils.estimator_checks import parametrize_with_checks
 from tables import table
 
 from adaptune.model import TrainingData
-from adaptune.model.knn import NearestNeighbours
+from adaptune.model.knn import NearestNeighbours, ProductKNeighborsRegressor
 
 modest = settings(max_examples=30, deadline=None)
 shapes = st.tuples(
@@ -84,3 +85,24 @@ def test_the_least_prediction_is_chosen(shape):
     assert selection.predicted_error == predicted.min()
     assert selection.predicted_fixed == predicted[data.fixed]
     assert isinstance(selection.trial, int)
+
+
+@parametrize_with_checks([ProductKNeighborsRegressor()])
+def test_it_is_a_regressor_of_scikit_learn(estimator, check):
+    check(estimator)
+
+
+@pytest.mark.parametrize(
+    ("sets", "y", "k", "message"),
+    [
+        (np.zeros((2, 1)), np.zeros((3, 4)), 5, r"2 sets, 12 targets of shape \(3, 4\)"),
+        (np.zeros((4, 1)), np.zeros((2, 4)), 5, r"3 frames, 4 sets, 8 targets of shape \(2, 4\)"),
+        (np.zeros((4, 1)), np.full((3, 4), np.nan), 5, " 0 targets"),
+        (np.zeros((4, 1)), np.full((3, 4), np.inf), 5, "infinity"),
+        (np.full((4, 1), np.nan), np.zeros((3, 4)), 5, "NaN"),
+        (np.zeros((4, 1)), np.zeros((3, 4)), 0, "0 neighbours"),
+    ],
+)
+def test_what_does_not_go_together_is_refused(sets, y, k, message):
+    with pytest.raises(ValueError, match=message):
+        ProductKNeighborsRegressor(sets, k).fit(np.zeros((3, 2)), y)

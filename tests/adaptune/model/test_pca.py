@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 from sklearn.decomposition import PCA
+from sklearn.utils.estimator_checks import parametrize_with_checks
 
 from adaptune.model.pca import ScaledPCA
 
@@ -52,3 +53,8 @@ def test_each_block_has_components_of_its_own():
         np.hstack([want[0].transform(fresh[:, :20]), want[1].transform(fresh[:, 20:])]),
         atol=1e-9,
     )
+
+
+@parametrize_with_checks([ScaledPCA()])
+def test_it_is_a_transformer_of_scikit_learn(estimator, check):
+    check(estimator)
