@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,8 +78,6 @@ class Trajectory:
 
 Row = tuple[int, list[str]]
 """Number of a line, and its fields."""
-
-
 _NUMBER = re.compile(r"[-+.]*\d")
 
 
@@ -96,17 +95,12 @@ def _lines(path: Path) -> Iterator[tuple[int, str, list[str]]]:
 
 
 def _rows(path: Path, columns: int, kind: str, or_more: bool = False) -> list[Row]:
-    rows = [(number, fields) for number, _, fields in _lines(path) if fields]
+    rows = _table(path)[1]
     for number, fields in rows:
         if len(fields) != columns and not (or_more and len(fields) > columns):
             what = f"a {kind} line has {columns} numbers, this has {len(fields)}"
             raise TrajectoryError(f"{path}, line {number}: {what}")
-    if not rows:
-        raise TrajectoryError(f"{path}: {_EMPTY}")
     return [(number, fields[:columns]) for number, fields in rows]
-
-
-_EMPTY = "holds no pose; give a file of TUM, KITTI or EuRoC"
 
 
 def _numbers(path: Path, rows: list[Row]) -> NDArray[np.float64]:
@@ -125,8 +119,7 @@ _COLUMNS = ("timestamp", "x", "y", "z", "qx", "qy", "qz", "qw")
 # What a header may call them, in lower case and without units; an axis follows the last two.
 _NAMES = {
     "nanoseconds": r"(.*[._ ])?n(ano)?sec\w*",
-    "seconds": r"(.*[._ ])?sec\w*",
-    "timestamp": r"t|.*(time|stamp).*",
+    "timestamp": r"t|.*(time|stamp).*|(.*[._ ])?sec\w*",
     "q": r"(.*[._ ])?(q|quat|orient|rot)(.*[._ ])?[xyzw]",
     "": r"(t_?|(.*[._ ])?(p|pos|trans|loc)(.*[._ ])?)?[xyz]",
 }
@@ -140,11 +133,6 @@ def _named(header: str) -> dict[str, int]:
         of = next((of for of, known in _NAMES.items() if re.fullmatch(known, name)), None)
         if of is not None:
             found.setdefault(of if len(of) > 1 else of + name[-1], i)
-    both = found.keys() >= {"seconds", "nanoseconds"}
-    if "seconds" in found and (both or "timestamp" not in found):
-        found["timestamp"] = found["seconds"]
-    if not both:
-        found.pop("nanoseconds", None)
     return found
 
 
@@ -157,89 +145,77 @@ def _table(path: Path) -> tuple[dict[str, int], list[Row]]:
             rows.append((number, fields))
         elif not rows:
             found = _named(line)
-            missing = [name for name in _COLUMNS if name not in found]
+            missing = ", ".join(name for name in _COLUMNS if name not in found)
             if fields and missing:
-                what = f"names no column {', '.join(missing)}"
-                help_ = f"name the columns {' '.join(_COLUMNS)}, in their order"
-                raise TrajectoryError(f"{path}, line {number}: {what}; {help_}")
+                what = f"line {number}: names no column {missing}"
+                raise TrajectoryError(f"{path}, {what}; name all of {' '.join(_COLUMNS)}")
             named = named if missing else found
     if not rows:
-        raise TrajectoryError(f"{path}: {_EMPTY}")
+        raise TrajectoryError(f"{path}: holds no pose; give a file of TUM, KITTI or EuRoC")
     return named, rows
 
 
 def _stamps(path: Path, rows: list[Row], columns: Sequence[int]) -> tuple[NDArray[np.int64], bool]:
-    """Nanoseconds of rows, and whether the file counts in them: the size of the numbers shows.
-
-    A second column has the nanoseconds beyond the seconds of the first.
-    """
-    times: list[Decimal] = []
+    """Nanoseconds of rows, and whether the file counts in them; a second column adds to seconds."""
+    times: list[Any] = []
     for number, fields in rows:
         try:
             # A double holds seconds since 1970 to 0.2 microseconds only.
-            parts = [Decimal(fields[column]).scaleb(-9 * i) for i, column in enumerate(columns)]
-            times.append(sum(parts, Decimal(0)))
+            times.append(sum(Decimal(fields[c]).scaleb(-9 * i) for i, c in enumerate(columns)))
             if abs(times[-1]) >= 9e18:
                 raise OverflowError
         except (ArithmeticError, ValueError) as error:
             what = f"{fields[columns[0]]!r} is not a time"
             raise TrajectoryError(f"{path}, line {number}: {what}") from error
     numbers = np.array(times, float)
-    size = np.abs(numbers).max()
     # Since 1970 there are 1 to 9 times so many seconds, milliseconds or microseconds.
     since = ((0, 0.0, 9e9), (3, 1e12, 9e12), (6, 1e15, 9e15))
+    size = np.abs(numbers).max()
     unit = next((unit for unit, least, most in since if least <= size < most), 9)
-    # No poses are 100 s apart: a clock that counts whole nanoseconds began with zero.
-    whole = len(rows) > 1 and all(fields[columns[0]].isdigit() for _, fields in rows)
-    if whole and unit < 6 and np.median(np.diff(numbers)) > 1e5:
-        unit = 9
+    if unit < 6 and all(fields[columns[0]].isdigit() for _, fields in rows):
+        # No poses are 100 s apart: a clock that counts nanoseconds began with zero.
+        unit = 9 if np.median(np.diff(numbers, append=numbers[-1])) > 1e5 else unit
     scaled = [int(time.scaleb(9 - unit).to_integral_value()) for time in times]
     return np.array(scaled, np.int64), unit == 9
 
 
-def _once(path: Path, rows: list[Row], stamps: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Which rows count: of poses with the same stamp the first one."""
-    steps = np.diff(stamps, prepend=stamps[0] - 1)
-    if len(back := np.flatnonzero(steps < 0)):
-        what = "its stamp does not come after the line before; sort the lines by time"
-        raise TrajectoryError(f"{path}, line {rows[back[0]][0]}: {what}")
-    if len(again := np.flatnonzero(steps == 0)):
-        what = f"{len(again)} of {len(rows)} poses repeat the stamp of the line before"
-        where = f"the first on line {rows[again[0]][0]}"
-        if len(again) > 0.1 * len(rows):
-            raise TrajectoryError(f"{path}: {what}, {where}; write stamps with all their digits")
-        _log.warning("%s: left out poses, %s, %s", path, what, where)
-    return steps > 0
-
-
 def _read(path: Path, csv: bool) -> Trajectory:
     named, rows = _table(path)
+    need = max([7, *named.values()]) + 1
     for number, fields in rows:
-        n, need = len(fields), max([7, *named.values()]) + 1
-        if n < need or not (named or csv or n in (8, 11)):
-            kind = "line below this header" if named else "EuRoC line" if csv else "TUM line"
-            what = f"a {kind} has {need} numbers{' or more' * csv}, this has {n}"
-            help_ = f"for other columns, begin with a line of names ({' '.join(_COLUMNS)})"
+        if len(fields) < need or not (named or csv or len(fields) in (8, 11)):
+            what = f"a {'CSV' if csv else 'TUM'} line has {need} numbers, this has {len(fields)}"
+            help_ = f"name other columns in the first line ({' '.join(_COLUMNS)})"
             raise TrajectoryError(f"{path}, line {number}: {what}; {help_}")
-    stamped = [named[name] for name in ("timestamp", "nanoseconds") if name in named]
-    stamps, nanoseconds = _stamps(path, rows, stamped or [0])
+    at = named.get("timestamp", 0)
+    pair = named.get("nanoseconds") == at + 1
+    stamps, nanoseconds = _stamps(path, rows, [at, at + 1] if pair else [at])
 
-    def read(order: Sequence[int]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def read(order: Sequence[int]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         values = _numbers(path, [(n, [fields[column] for column in order]) for n, fields in rows])
-        return values, np.linalg.norm(values[:, 3:], axis=1)
+        return values, np.abs(np.linalg.norm(values[:, 3:], axis=1) - 1.0) > 1e-2
 
     quaternion = (5, 6, 7, 4) if csv and nanoseconds else (4, 5, 6, 7)
     order = [named[name] for name in _COLUMNS[1:]] if named else [1, 2, 3, *quaternion]
-    values, norms = read(order)
-    if np.abs(norms - 1.0).max() > 1e-2 and not named and min(len(f) for _, f in rows) > 10:
+    values, wrong = read(order)
+    if wrong.any() and not named and min(len(fields) for _, fields in rows) > 10:
         # Roll, pitch and yaw may come before the quaternion.
         others = read([1, 2, 3, 7, 8, 9, 10])
-        values, norms = others if np.abs(others[1] - 1.0).max() <= 1e-2 else (values, norms)
-    if len(bad := np.flatnonzero(np.abs(norms - 1.0) > 1e-2)):
-        columns = ", ".join(str(column + 1) for column in order[3:])
-        what = f"its quaternion has length {norms[bad[0]]:.3g}, not 1 (columns {columns})"
-        raise TrajectoryError(f"{path}, line {rows[bad[0]][0]}: {what}")
-    keep = _once(path, rows, stamps)
+        values, wrong = (values, wrong) if others[1].any() else others
+    if wrong.any():
+        i, columns = int(np.argmax(wrong)), ", ".join(str(column + 1) for column in order[3:])
+        what = f"its quaternion has length {np.linalg.norm(values[i, 3:]):.3g}, not 1"
+        raise TrajectoryError(f"{path}, line {rows[i][0]}: {what} (columns {columns})")
+    ahead = np.diff(stamps, prepend=stamps[0] - 1)
+    if (back := int(np.argmin(ahead))) and ahead[back] < 0:
+        what = "its stamp does not come after the line before; sort the lines by time"
+        raise TrajectoryError(f"{path}, line {rows[back][0]}: {what}")
+    keep = ahead > 0
+    if n := np.count_nonzero(~keep):
+        what = f"{n} of {len(rows)} poses repeat the stamp before, first on line {rows[back][0]}"
+        if n > 0.1 * len(rows):
+            raise TrajectoryError(f"{path}: {what}; write stamps with all their digits")
+        _log.warning("%s: %s; they are left out", path, what)
     return Trajectory(stamps[keep], geometry.from_quaternions(values[keep, :3], values[keep, 3:]))
 
 

@@ -415,13 +415,9 @@ def reference_poses(
     AdaptuneError
         If no error can be measured on the sequence.
     """
-    T_ref_sensor, length = reference.at(stamps), settings.sub_trajectory
-    whole = (window_ends(T_ref_sensor, length) >= 0).any()
-    if (
-        not whole
-        and reference.sparse
-        and (window_ends(reference.at(stamps, 1e9), length) >= 0).any()
-    ):
+    T_ref_sensor = reference.at(stamps)
+    whole = (window_ends(T_ref_sensor, settings.sub_trajectory) >= 0).any()
+    if not whole and reference.sparse:
         raise AdaptuneError(f"{key}: {reference.sparse}")
     if np.isnan(T_ref_sensor).all():
         raise AdaptuneError(

@@ -75,9 +75,10 @@ class ProductKNeighborsRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator
         """
         check_is_fitted(self)
         X = validate_data(self, X, dtype=np.float64, order="C", reset=False)
-        return np.array([self._predict(x) for x in X]).reshape(len(X), *self._shape)
+        return np.array([self.predict_one(x) for x in X]).reshape(len(X), *self._shape)
 
-    def _predict(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+    def predict_one(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Targets of all sets for one frame of shape (n_features,), unchecked: it is quicker."""
         near = _nearest_of_groups(self._X, self._bounds, x, self.n_neighbors)
         squared, frames, group = near[0], self._frames[near[1]], near[2]
         # Of equally near frames the earlier one first, whatever group it is of.
@@ -119,7 +120,7 @@ class NearestNeighbours(Rule):
 
     def predict(self, feature: NDArray[np.float64]) -> NDArray[np.float64]:
         """Predicted error of every set in percent; infinite for those that may not be chosen."""
-        return np.where(self._allowed, self.regressor_.predict(feature[None])[0], np.inf)
+        return np.where(self._allowed, self.regressor_.predict_one(feature), np.inf)
 
     def select(self, feature: NDArray[np.float64]) -> Selection:
         """See `Rule.select`."""

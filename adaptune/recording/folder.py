@@ -131,7 +131,12 @@ def _fields(path: Path) -> NDArray[Any] | dict[str, NDArray[Any]]:
 
 def _open3d_fields(path: Path) -> dict[str, NDArray[Any]]:
     if path.suffix == ".pcd":
-        _check_viewpoint(path)
+        with path.open("rb") as file:
+            header = takewhile(lambda line: line[:4] != b"DATA", file)
+            pose = next((line.split()[1:8] for line in header if line[:9] == b"VIEWPOINT"), [])
+        if any(abs(float(number)) > 1e-6 for number in pose[:3] + pose[4:]):
+            what = "VIEWPOINT is a pose, and its points may be in the sensor's frame or the world's"
+            raise ValueError(f"{what}: give the sensor's, with VIEWPOINT 0 0 0 1 0 0 0")
     cloud = open3d.load().t.io.read_point_cloud(str(path))
     # Open3D returns an empty cloud for files that it cannot read.
     if "positions" not in cloud.point or not len(cloud.point.positions):
@@ -139,19 +144,6 @@ def _open3d_fields(path: Path) -> dict[str, NDArray[Any]]:
     fields = {name: tensor.numpy() for name, tensor in cloud.point.items()}
     columns = {name: v[:, 0] for name, v in fields.items() if v.ndim == 2 and v.shape[1] == 1}
     return columns | {axis: fields["positions"][:, i] for i, axis in enumerate("xyz")}
-
-
-def _check_viewpoint(path: Path) -> None:
-    """Refuse a sensor's pose in the header: it does not say which frame the points are in."""
-    with path.open("rb") as file:
-        header = [line.split() for line in takewhile(lambda line: line[:4] != b"DATA", file)]
-    pose = next((words[1:8] for words in header if words[:1] == [b"VIEWPOINT"]), [])
-    if any(abs(float(number)) > 1e-6 for number in pose[:3] + pose[4:]):
-        raise ValueError(
-            f"VIEWPOINT {b' '.join(pose).decode()} is a pose of the sensor, and some programs then "
-            f"write points in its frame, others in the world's: give points in the sensor's frame, "
-            f"with VIEWPOINT 0 0 0 1 0 0 0"
-        )
 
 
 def scan_folder(folder: Path, timing: Timing = AUTO) -> FileSource:

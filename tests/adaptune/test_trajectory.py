@@ -1,6 +1,8 @@
+import re
+
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
@@ -28,6 +30,7 @@ def some_poses(n):
     return geometry.from_quaternions(rng.normal(0, 10, (n, 3)), rng.normal(0, 1, (n, 4)))
 
 
+@settings(deadline=None)  # the first example imports scipy
 @given(STAMPS)
 def test_tum_files_keep_every_nanosecond(tmp_path_factory, stamps):
     path = tmp_path_factory.mktemp("tum") / "a.tum"
@@ -64,6 +67,52 @@ def test_euroc_files_begin_their_quaternions_with_w(tmp_path):
     np.testing.assert_allclose(trajectory.T_world_sensor[1][:3, :3], np.eye(3))
 
 
+AT, TURN = "1,2,3", "0,0,0.70710678,0.70710678"
+EUROC = "#timestamp [ns], p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], "
+ROS = "%time,field.header.frame_id,field.pose.pose.position.x,field.pose.pose.position.y," + (
+    "field.pose.pose.position.z,field.pose.pose.orientation.x,field.pose.pose.orientation.y,"
+    "field.pose.pose.orientation.z,field.pose.pose.orientation.w,field.pose.covariance0\n"
+)
+S, MS, NS = (("1700000000" + zeros, "1700000001" + zeros) for zeros in ("", "000", "0" * 9))
+
+
+@pytest.mark.parametrize(
+    ("header", "row", "stamps"),
+    [
+        ("", f"{{}},{AT},{TURN}\n", S),
+        ("", f"{{}},{AT},{TURN}\n".replace(",", " "), S),
+        ("", f"{{}}; {AT}; {TURN};\r\n", MS),
+        ("\ufefftimestamp,x,y,z,qx,qy,qz,qw\n", f"{{}},{AT},{TURN}\n", NS),
+        ("qw qx qy qz t tx ty tz\n", "0.70710678 0 0 0.70710678 {} 1 2 3\n", S),
+        ("# Poses\n#sec,nsec,x,y,z,qx,qy,qz,qw\n", f"{{}},{AT},{TURN}\n", [f"{s},0" for s in S]),
+        (ROS, f"{{}},lidar,{AT},{TURN},9\n", NS),
+        (f"{EUROC}q_RS_y [], q_RS_z [], v_x\n", f"{{}},{AT},.70710678,0,0,.70710678,5\n", NS),
+        ("", f"{{}},{AT},0,0,1.5707963,{TURN}\n", NS),
+    ],
+)
+def test_poses_are_found_in_columns_of_any_order(tmp_path, header, row, stamps):
+    (tmp_path / "a.csv").write_text(header + "".join(map(row.format, stamps)))
+    trajectory = read_trajectory(tmp_path / "a.csv")
+    assert trajectory.stamps.tolist() == [17 * 10**17, 1700000001 * 10**9]
+    want = [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
+    np.testing.assert_allclose(trajectory.T_world_sensor, [want, want], atol=1e-7)
+
+
+def test_a_clock_of_nanoseconds_may_begin_with_zero(tmp_path):
+    (tmp_path / "a.csv").write_text("".join(f"{i}00000000,{i},0,0,1,0,0,0\n" for i in range(4)))
+    trajectory = read_trajectory(tmp_path / "a.csv")
+    assert trajectory.stamps.tolist() == [0, 10**8, 2 * 10**8, 3 * 10**8]
+    np.testing.assert_allclose(trajectory.T_world_sensor[:, :3, :3], np.tile(np.eye(3), (4, 1, 1)))
+
+
+def test_of_poses_with_one_stamp_the_first_counts(tmp_path, caplog):
+    lines = [f"{i} {i} 0 0 0 0 0 1\n" for i in range(12)]
+    (tmp_path / "a.tum").write_text("".join([*lines[:6], "5 9 0 0 0 0 0 1\n", *lines[6:]]))
+    trajectory = read_trajectory(tmp_path / "a.tum")
+    assert trajectory.T_world_sensor[:, 0, 3].tolist() == list(range(12))
+    assert "1 of 13 poses repeat the stamp before, first on line 7" in caplog.text
+
+
 def test_oxts_files_are_metres_east_and_north(tmp_path):
     files = []
     for i, (latitude, longitude) in enumerate([(49.0, 8.4), (49.0, 8.401), (49.001, 8.4)]):
@@ -96,7 +145,12 @@ TUM_LINE = "1.5 0 0 0 0 0 0 1\n"
         ("a.tum", "now 0 0 0 0 0 0 1\n", "line 1: 'now' is not a time"),
         ("a.tum", "2 0 0 0 0 0 0 1\n" + TUM_LINE, "line 2: its stamp does not come after"),
         ("a.tum", TUM_LINE + "# c\n2 0 0 0 0 0 0 0\n", "line 3: its quaternion has length 0"),
-        ("a.csv", "1.5,0,0,0,1,0,0,0\n", "'1.5' is not a time in nanoseconds"),
+        ("a.tum", TUM_LINE + "2 0 0 0 0 0 0 2\n", r"line 2: .* length 2, .*columns 5, 6, 7, 8"),
+        ("a.tum", TUM_LINE * 3, "2 of 3 poses repeat .* first on line 2; write .* digits"),
+        ("a.csv", "1.5,0,0,0,1,0,0\n", "line 1: a CSV line has 8 numbers, this has 7; name other"),
+        ("a.csv", "1e19,0,0,0,1,0,0,0\n", "line 1: '1e19' is not a time"),
+        ("a.csv", "t,x,y,z,yaw\n1.5,0,0,0,1\n", "line 1: names no column qx, qy, qz, qw; name"),
+        ("a.csv", "w,t,x,y,z,qx,qy,qz,qw\n1,2,3,4,5,6,7,8\n", "line 2: a CSV line has 9 numbers"),
     ],
 )
 def test_the_line_that_is_wrong_is_named(tmp_path, name, text, message):
@@ -125,3 +179,16 @@ def test_any_text_gives_a_trajectory_or_an_error(tmp_path_factory, text):
             assert np.isfinite(read_trajectory(folder / name).T_world_sensor).all()
         except TrajectoryError:
             continue
+
+
+@pytest.mark.parametrize(
+    ("seconds", "help_"),
+    [
+        (1.4, "11 of 11 gaps of the reference are longer than max_gap = 1 s: .* `max_gap: 1.5` or"),
+        (2.0, "`max_gap: 2` or more"),
+        (1.0, "^$"),
+    ],
+)
+def test_a_sparse_trajectory_says_what_to_set(seconds, help_):
+    stamps = np.round(np.arange(12) * seconds * 1e9).astype(np.int64)
+    assert re.search(help_, Trajectory(stamps, np.tile(np.eye(4), (12, 1, 1))).sparse)

@@ -14,8 +14,9 @@ from adaptune.odometry.base import OdometryInstance
 from adaptune.odometry.keyframe import KeyframeGicp
 from adaptune.recording import SequenceConfig
 from adaptune.recording.scan import Scan
+from adaptune.trajectory import Trajectory
 from offline.config import load_study
-from offline.trial import SharedScans, TrialSettings
+from offline.trial import SharedScans, TrialSettings, reference_poses
 from online.replay import replay
 
 GOOD = {"max_correspondence_distance": 2.0, "keyframe_interval": 1.0}
@@ -225,6 +226,16 @@ def test_a_path_that_is_too_short_is_found_before_scans_are_read(study, tmp_path
     with pytest.raises(AdaptuneError, match=rf"^{key}: its path of .* holds no sub-trajectory"):
         setup.prepare(name, 1e9, lambda *progress: read.append(progress))
     assert read == []
+
+
+def test_a_reference_with_too_few_poses_names_max_gap():
+    stamps = np.round(np.arange(20) * 1.4e9).astype(np.int64)
+    T = np.tile(np.eye(4), (20, 1, 1))
+    T[:, 0, 3] = np.arange(20)
+    scans, settings = np.arange(0, 26 * 10**9, 10**8) + 1, TrialSettings(sub_trajectory=5.0)
+    with pytest.raises(AdaptuneError, match=r"^sequences\.one: 19 of 19 gaps .*`max_gap: 1\.5`"):
+        reference_poses("sequences.one", Trajectory(stamps, T), scans, settings)
+    assert reference_poses("", Trajectory(stamps, T, 1.5), scans, settings).shape == (260, 4, 4)
 
 
 def prepare(study, bag, reference="/truth"):
