@@ -225,11 +225,9 @@ def read_tum(path: Path) -> Trajectory:
 
 
 def read_trajectory(path: Path) -> Trajectory:
-    """Read poses with stamps, of a TUM file, or of a ``.csv`` as EuRoC or others write them.
+    """Read poses with stamps: of a ``.csv`` in nanoseconds as EuRoC writes them, else as TUM does.
 
-    A header that names the columns gives their order. Without one, a ``.csv`` with nanoseconds has
-    EuRoC's (``timestamp, p_x, p_y, p_z, q_w, q_x, q_y, q_z, ...``), all else TUM's. Roll, pitch and
-    yaw may come before the quaternion. The size of the stamps shows their unit.
+    A header of names gives any other order. Roll, pitch and yaw may come before the quaternion.
     """
     return _read(path, csv=path.suffix == ".csv")
 
