@@ -536,8 +536,10 @@ def contradictions(
 STRETCHES, SCANS = 8, 40
 """Stretches of a recording that are looked at, evenly spread, and the scans of each."""
 METRES, EACH = 4.0, 4
-"""A motion is measured over so many metres, or over the rest of half a stretch, and one begins at
-every so manieth scan."""
+"""A motion is measured over so many metres, or over half a stretch if that is less, and begins at
+every fourth scan of it."""
+ENOUGH = 10.0
+"""Metres after which the rest of a stretch is not looked at."""
 _AGREE = 0.3
 """Metres by which two ways of registering the same scans may differ."""
 
@@ -571,10 +573,14 @@ def _motions_over(stretch: list[Scan]) -> Iterator[tuple[int, int, Hop]]:
         clouds.append(HopCloud(scan, np.eye(4) if step is None else step, seconds if i else 0.0))
         if i == 1 and step is not None:
             clouds[0].moved(step, seconds)
-    for start in range(0, len(clouds) - SCANS // 2, EACH):
-        guesses = invert(T[start]) @ T[start : start + SCANS // 2 + 1]
+        if np.linalg.norm(T[i, :3, 3]) > ENOUGH:
+            break
+    for start in range(0, len(clouds) - 1, EACH):
+        guesses = invert(T[start]) @ T[start : min(start + SCANS // 2 + 1, len(clouds))]
         metres = np.linalg.norm(guesses[:, :3, 3], axis=1)
         away = int(np.argmax(metres >= METRES)) or len(metres) - 1
+        if metres[away] < METRES and away < SCANS // 2:
+            return  # the rest is too short
         hop = register(clouds[start], clouds[start + away], [guesses[away]])
         if hop is not None:
             apart = hop.projection @ (hop.T_start_end - guesses[away])[:3, 3]
