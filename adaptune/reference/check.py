@@ -292,17 +292,22 @@ def _accumulated(steps: Poses) -> Poses:
 
 
 def _likeliest(candidates: Iterable[_Candidate], hops: Hops, before: float) -> Cause | None:
-    """The first candidate that leaves nearly as little as the best one, if that explains it."""
+    """What leaves nearly as little as the best candidate, if that explains the difference.
+
+    On a straight way, two may fit alike.
+    """
     left = [(c, _mean(mismatch(c.T_world_sensor, hops))) for c in candidates]
     left = [(c, after) for c, after in left if np.isfinite(after)]
     least = min((after for _, after in left), default=np.inf)
     if least > EXPLAINED * before:
         return None
-    # Causes stand in the order of their freedom: what has more of it fits noise, too.
-    for candidate, after in left:
-        if after <= max(1.25 * least, 0.1 * before):
-            return Cause(candidate.what, candidate.mend, before, after)
-    return None
+    # The last one, with the most freedom, fits whatever others fit, and noise, too.
+    most = max(1.25 * least, 0.1 * before)
+    fit = [(c, after) for c, after in left if after <= most]
+    fit = fit[:-1] or fit
+    what = ", or ".join(candidate.what for candidate, _ in fit[:2])
+    mend = ", or ".join(candidate.mend for candidate, _ in fit[:2])
+    return Cause(what, mend, before, fit[0][1])
 
 
 def _conventions(T: Poses, at_scans: Callable[[Poses], Poses]) -> Iterator[_Candidate]:
