@@ -19,12 +19,15 @@ from adaptune.files import DAMAGED_NPZ, needing_room, replacing, write_text
 from adaptune.geometry import Poses
 from adaptune.live.hops import Hops
 from adaptune.metrics import cap
+from adaptune.odometry.base import MOST_FAULTS
 from adaptune.recording.cache import status_key
 from adaptune.space import ODOMETRY, ParameterSet, in_words
 from adaptune.strict import ConfigurationError
 from adaptune.trajectory import Trajectory, write_tum
 
 REGISTER_MS, PREPARE_MS = "register_ms", "prepare_ms"  # in `Trial.usage`
+MAX_SHARE_WITHOUT_POSE = 0.1
+"""Share of the scans from which an odometry that gives no pose for them has failed."""
 
 _log = logging.getLogger(__name__)
 
@@ -70,8 +73,9 @@ class Trial:
     usage: dict[str, float] = field(default_factory=dict)
     # RTE and metrics of every run, if the trial was run several times.
     repeats: tuple[dict[str, float], ...] = ()
-    # Faults that the health check would have found in the first run, and how often, see
-    # `adaptune.odometry.tracker.Guard.check`. In a whole run, those that it found.
+    # Faults that the health check would have found in one run, and how often, see
+    # `adaptune.odometry.tracker.Guard.check`. In a whole run, those that it found. Of several
+    # runs, the first one with the most scans without a pose.
     unhealthy: dict[str, int] = field(default_factory=dict)
     # Of a whole run, the bounds of the health check that restarted it.
     health: dict[str, float] = field(default_factory=dict)
@@ -94,6 +98,16 @@ class Summary:
     others: dict[str, float] = field(default_factory=dict)  # other metrics by name
     repeats: Sequence[dict[str, float]] = ()  # see `Trial`
     unhealthy: dict[str, int] = field(default_factory=dict)  # see `Trial`
+    without_pose: float = 0.0  # share of the scans; unknown in older trials, which gave up instead
+
+    @property
+    def usable(self) -> bool:
+        """Whether the set gave poses, but for a scan now and then. Others are never chosen.
+
+        Where an odometry ends or gives no pose, it takes no time, and may seem to do well.
+        """
+        gave_up = self.faults >= MOST_FAULTS * max(1, len(self.repeats))
+        return not gave_up and self.without_pose < MAX_SHARE_WITHOUT_POSE
 
     @property
     def cost(self) -> float:
@@ -119,6 +133,7 @@ def summarise(trial: Trial) -> Summary:
         trial.metrics | trial.usage,
         list(trial.repeats),
         trial.unhealthy,
+        trial.unhealthy.get("no_pose", 0) / len(errors),
     )
 
 

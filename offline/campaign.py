@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from adaptune.archive import Archive, ArchiveError, Summary, Trial, summarise
 from adaptune.errors import AdaptuneError
-from adaptune.odometry.base import MOST_FAULTS
 from adaptune.odometry.tracker import HealthCheck
 from adaptune.progress import Progress, unseen
 from adaptune.reference.check import contradictions
@@ -120,7 +119,7 @@ class Campaign:
         if self._config.sets == "own":
             return f"{what} in the mean of {len(best)} sequences"
         (search,) = self._searches
-        feasible = "" if best[0].feasible else ", which does not keep the limits"
+        feasible = "" if best[0].excess == 0.0 else ", which does not keep the limits"
         return f"{what} (trial {search.number(search.best)}){feasible}"
 
     def _run_everywhere(self) -> None:
@@ -191,7 +190,8 @@ def _mirrored(config: OfflineConfig, verdict: Verdict, finished: Finished, n: in
         f"{name} <= {limit.max:g}": by
         for (name, limit), by in zip(config.limits.items(), verdict.constraints, strict=True)
     }
-    return MirrorRow(verdict.parameters, verdict.values, attributes, constraints)
+    values = verdict.values if verdict.usable else (np.inf,) * len(verdict.values)
+    return MirrorRow(verdict.parameters, values, attributes, constraints)
 
 
 def watch_tasks(
@@ -256,13 +256,20 @@ def run_whole(
 def whole_values(config: OfflineConfig, runs: WholeRuns) -> dict[str, dict[int, float]]:
     """By sequence, the first objective in whole runs of every candidate for the fixed set.
 
-    Candidates have whole runs on all sequences, and keep the limits there if one does.
+    Candidates have whole runs on all sequences, and keep the limits there if one does. The
+    objective of those that are not usable there is infinite.
     """
     numbers = set.intersection(*(set(of_sequence) for of_sequence in runs.values()))
     verdicts = {n: judge(config, [runs[name][n] for name in runs]) for n in sorted(numbers)}
-    feasible = [n for n, verdict in verdicts.items() if verdict.feasible] or list(verdicts)
+    within = any(verdict.feasible for verdict in verdicts.values())
+    kept = [n for n, v in verdicts.items() if v.feasible or not (v.usable and within)]
     return {
-        name: {n: weighted(config.objective[0], of_sequence[n].metrics) for n in feasible}
+        name: {
+            n: weighted(config.objective[0], of_sequence[n].metrics)
+            if verdicts[n].usable
+            else np.inf
+            for n in kept
+        }
         for name, of_sequence in runs.items()
     }
 
@@ -299,10 +306,6 @@ def baseline_warning(
     if fixed == 0:
         return f"{beaten}. So the fixed set is the baseline."
     return f"{beaten}. So the fixed set is trial {fixed}, with {whole[fixed]:.3g}."
-
-
-MAX_SHARE_WITHOUT_POSE = 0.1
-"""Share of the scans from which an odometry that gives no pose for them has failed."""
 
 
 class BaselineError(AdaptuneError):
@@ -360,12 +363,11 @@ def check_baseline(odometry: str, sequence: str, run: Trial) -> None:
     BaselineError
     """
     n, missing = len(run.errors), run.unhealthy.get("no_pose", 0)
-    if not run.faults and missing < MAX_SHARE_WITHOUT_POSE * n:
+    usable = summarise(run).usable
+    if usable and not run.faults:
         return
-    failed = missing >= MAX_SHARE_WITHOUT_POSE * n
-    gave_up = len(run.faults) >= MOST_FAULTS * max(1, len(run.repeats))
     last = run.faults[-1] if run.faults else "it gave no pose, and no reason"
-    if failed or gave_up:
+    if not usable:
         raise BaselineError(
             f"sequences.{sequence}: {odometry} fails with its own parameters, the baseline: no "
             f"pose for {missing} of {n} scans; {last}; nothing of it is stored: mend the odometry "

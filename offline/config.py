@@ -31,9 +31,12 @@ OPTUNA = {
     "gp": "optuna.samplers:GPSampler",
     "nsga2": "optuna.samplers:NSGAIISampler",
     "qmc": "optuna.samplers:QMCSampler",
+    "sobol": "optuna.samplers:QMCSampler",
     "tpe": "optuna.samplers:TPESampler",
 }
 """Optuna's samplers; their settings are the keywords of the class."""
+QUASI = ("qmc", "sobol")
+"""Names of the same sampler; the second one is that of older studies."""
 NAMES = ("annealing", "grid", "random", *OPTUNA)
 SINGLE_OBJECTIVE = ("annealing", "cmaes")
 """Samplers that minimise one objective only."""

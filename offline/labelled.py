@@ -370,9 +370,10 @@ class LabelledData(NamedTuple):
         return self._replace(sequences=few, sets=self.sets.subset(trials))
 
     def complete(self) -> "LabelledData":
-        """The same with the sets that were run on all sequences, on every frame."""
+        """The same with the usable sets that were run on all sequences, on every frame."""
         missing = np.array([np.isnan(s.errors).any(axis=0) for s in self.sequences])
-        return self.subset([self.sets.trials[c] for c in np.flatnonzero(~missing.any(axis=0))])
+        everywhere = [self.sets.trials[c] for c in np.flatnonzero(~missing.any(axis=0))]
+        return self.subset([n for n in everywhere if self.costs is None or self.costs.usable(n)])
 
     @property
     def recordings(self) -> list[str]:
@@ -483,7 +484,7 @@ class LabelledData(NamedTuple):
             np.concatenate([s.errors for s in self.sequences]),
             self.sets,
             fixed := self.fixed(),
-            allowed=allowed_sets(self.spending, self.sets, fixed),
+            allowed=allowed_sets(self.costs, self.budget, self.sets, fixed),
         )
         return data, pca
 
@@ -540,6 +541,8 @@ def measured_costs(
             float(np.mean([one.others.get(key, np.nan) for one in runs]))
             for key in (REGISTER_MS, PREPARE_MS)
         )
+        if not all(one.usable for one in runs):
+            register = np.inf
         key = odometry(sets[trial]).preparation
         found[trial] = SetCost(register, prepare, numbers.setdefault(key, len(numbers)))
     return Costs(found, float(np.mean([archive.read_frames(name).evidence_ms for name in run])))
@@ -627,7 +630,7 @@ def _labelled(
     known = np.flatnonzero(~np.isnan(errors).all(axis=1))
     objective, n_repeats = config.offline.objective[0], config.offline.repeats
     summaries = [archive.finished(name)[trial] if trial in run else None for trial in sets]
-    values = [np.inf if s is None else weighted(objective, s.metrics) for s in summaries]
+    values = [weighted(objective, s.metrics) if s and s.usable else np.inf for s in summaries]
     # Of the baseline, there may be more runs.
     repeats = [
         [np.nan] * n_repeats if s is None else repeated(objective, s.repeats)[:n_repeats]

@@ -46,7 +46,15 @@ CANDIDATES = 4
 EQUAL_WITHIN = 1.02
 """Whole runs whose values differ by no larger factor count as equal."""
 PENALTY = 10.0
-"""A set that breaks a limit is worse by so many times the baseline's value."""
+"""A set that breaks a limit is worse by so many times the baseline's value.
+
+One that is not usable has so many times the baseline's value at least, and exceeds every limit so
+many times: nobody knows what it would cost."""
+UNUSABLE = (
+    "odometry: none of {n} parameter sets gives poses for nearly all scans of every training "
+    "sequence, so none can be chosen (`adaptune trials` lists their faults): mend the odometry, or "
+    "narrow the ranges of the parameters (odometry.parameters)"
+)
 
 Value = float | tuple[float, ...]
 """What samplers minimise: a tuple if there are several objectives."""
@@ -65,6 +73,7 @@ class Verdict(NamedTuple):
     # Whether the set was run on all sequences; if not, its values are estimates.
     complete: bool = True
     sequences: tuple[str, ...] = ()  # the sequences on which it was run
+    usable: bool = True  # see `Summary.usable`; on all sequences
 
     @property
     def excess(self) -> float:
@@ -78,8 +87,8 @@ class Verdict(NamedTuple):
 
     @property
     def feasible(self) -> bool:
-        """Whether the set keeps all limits."""
-        return self.excess == 0.0
+        """Whether the set may be chosen: it is usable, and keeps all limits."""
+        return self.usable and self.excess == 0.0
 
 
 class SamplerResult(NamedTuple):
@@ -131,15 +140,16 @@ def judge(config: OfflineConfig, runs: Sequence[Summary]) -> Verdict:
         float(mean_value(np.array([weighted(weights, of_run) for of_run in metrics])))
         for weights in config.objective
     )
+    usable = all(run.usable for run in runs)
     constraints = tuple(
-        max(of_run[name] for of_run in metrics) / limit.max - 1.0
+        max(max(of_run[name] for of_run in metrics) / limit.max - 1.0, -1.0 if usable else PENALTY)
         for name, limit in config.limits.items()
     )
     above = 0.0
     # Without repeats, nothing is known of the other sets' intervals.
     if config.repeats > 1 and all(run.repeats for run in runs):
         above = float(margin(np.array([repeated(config.objective[0], r.repeats) for r in runs])))
-    return Verdict(runs[0].parameters, values, constraints, above)
+    return Verdict(runs[0].parameters, values, constraints, above, usable=usable)
 
 
 def weighted(weights: Mapping[Metric, float], metrics: Mapping[str, float]) -> float:
@@ -173,11 +183,14 @@ def margin(repeats: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def sampler_results(verdicts: Sequence[Verdict]) -> list[SamplerResult]:
-    """The results of trials as samplers receive them."""
-    return [
-        SamplerResult(v.parameters, v.values if len(v.values) > 1 else v.values[0], v.constraints)
-        for v in verdicts
-    ]
+    """The results of trials as samplers receive them; the first one is the baseline's."""
+    found = []
+    for v in verdicts:
+        least = [0.0 if v.usable else PENALTY * (of or 1.0) for of in verdicts[0].values]
+        values = tuple(map(max, v.values, least))
+        value = values if len(values) > 1 else values[0]
+        found.append(SamplerResult(v.parameters, value, v.constraints))
+    return found
 
 
 def penalised(history: Sequence[SamplerResult]) -> list[SamplerResult]:
@@ -213,16 +226,18 @@ def candidates(config: OfflineConfig, verdicts: Mapping[int, Verdict]) -> list[i
     Raises
     ------
     AdaptuneError
-        If no set keeps all limits.
+        If no set is usable and keeps all limits.
     """
-    complete = [n for n, verdict in verdicts.items() if verdict.complete]
+    complete = [n for n, verdict in verdicts.items() if verdict.complete and verdict.usable]
+    if not complete:
+        raise AdaptuneError(UNUSABLE.format(n=len(verdicts)))
     feasible = [n for n in complete if verdicts[n].feasible]
     if not feasible:
         nearest = min(complete, key=lambda n: verdicts[n].excess)
         limits = ", ".join(f"{name} <= {limit.max:g}" for name, limit in config.limits.items())
         raise AdaptuneError(
-            f"offline.limits: none of {len(complete)} parameter sets keeps {limits} on every "
-            f"sequence; trial {nearest} comes nearest, {verdicts[nearest].excess:.0%} beyond "
+            f"offline.limits: none of {len(complete)} usable parameter sets keeps {limits} on "
+            f"every sequence; trial {nearest} comes nearest, {verdicts[nearest].excess:.0%} beyond "
             f"(`adaptune trials` lists all): loosen the limits, widen the ranges of the "
             f"parameters, or run more trials"
         )
@@ -275,6 +290,16 @@ def label(weights: Mapping[Metric, float], units: bool = False) -> str:
         ("" if weight == 1.0 else f"{weight:g} ") + name + (f" [{UNITS[name]}]" if units else "")
         for name, weight in weights.items()
     )
+
+
+def failed_in_words(verdicts: Mapping[int, Verdict]) -> list[str]:
+    """A sentence about the sets that are not usable, if there are any."""
+    if not (failed := sum(not verdict.usable for verdict in verdicts.values())):
+        return []
+    return [
+        f"{failed} of {len(verdicts)} parameter sets are never chosen: the odometry gave no pose "
+        f"for a tenth of a sequence's scans, or gave up (see faults in `adaptune trials`)."
+    ]
 
 
 def baseline_words(config: OfflineConfig, runs: Sequence[Summary]) -> list[str]:

@@ -24,6 +24,7 @@ from adaptune.space import (
 )
 from offline.annealing import AnnealingSampler
 from offline.config import (
+    QUASI,
     SERVICE,
     STATELESS,
     AnnealingSettings,
@@ -232,7 +233,7 @@ class AskedSampler(Sampler):
             "cmaes": {"n_startup_trials": config.initial, "warn_independent_sampling": False},
             "gp": {"n_startup_trials": 1, "warn_independent_sampling": False},
             "nsga2": {"population_size": max(config.batch, 2)},
-            "qmc": {"scramble": True, "warn_independent_sampling": False},
+            **{n: {"scramble": True, "warn_independent_sampling": False} for n in QUASI},
             # The initial points are the start-up; TPE needs no random points of its own.
             "tpe": {"n_startup_trials": 1},
         }
@@ -259,7 +260,7 @@ class AskedSampler(Sampler):
             self.end = "all chains have stalled"
         elif not self._waiting:
             tried = {key(result.parameters) for result in self._history}
-            n_initial = 1 if self.config.sampler == "qmc" else self.config.initial
+            n_initial = 1 if self.config.sampler in QUASI else self.config.initial
             given = [self.space.baseline][numbers.start :]
             rest = range(numbers.start + len(given), min(numbers.stop, n_initial))
             given += sobol_points(self.space, self.config.seed, rest)

@@ -254,7 +254,7 @@ class Search:
         of = (self._config, self.sequences, self._finished)
         self.verdicts += [assess(n, self.sequences, *of) for n in self.numbers]
         self._closed += self.numbers
-        ranks = [(not v.complete, v.excess, v.values[0]) for v in self.verdicts]
+        ranks = [(not v.complete, not v.usable, v.excess, v.values[0]) for v in self.verdicts]
         self.best = min((self.best, *range(first, len(ranks))), key=ranks.__getitem__)
         if len(self.numbers) < self._config.batch and len(self.verdicts) != self._limit:
             self.end = self._sampler.end

@@ -49,12 +49,14 @@ from offline.charts import pareto_chart
 from offline.config import TIMED, Metric, OfflineConfig, OfflineStudy, OfflineStudyConfig
 from offline.labelled import LabelledData, labelled_data, measured_costs
 from offline.objective import (
+    UNUSABLE,
     Verdict,
     affordable,
     baseline_words,
     best_by_trials,
     candidates,
     choose_fixed,
+    failed_in_words,
     judge,
     label,
     pareto_front,
@@ -155,6 +157,7 @@ def train(study: OfflineStudy, progress: Progress = unseen, cluster: str | None 
     tables.write_rows(study.folder, "training", rows)
     said = [] if before is None else changes(before, model)
     said += [*estimates_in_words(estimates, model.length, intervals=True)]
+    said += failed_in_words(verdicts)
     said += baseline_words(config, [runs[0] for runs in finished.values()])
     return Training(model, trials, rows, remark, said)
 
@@ -219,6 +222,8 @@ def _fixed(
     """Trial number of the fixed set, one of the best, and what `baseline_warning` says of it."""
     rivals = {name: {n: runs[n] for n in best} for name, runs in whole.items()}
     values = mean_values(list(whole_values(config, rivals).values()))
+    if np.isinf(min(values.values())):
+        raise AdaptuneError(UNUSABLE.format(n=f"the {len(best)} best"))
     fixed = choose_fixed(values, {n: verdicts[n].bound for n in best})
     return fixed, baseline_warning(config, values, best[0], fixed)
 
@@ -258,11 +263,12 @@ def _fitted(
     if before is not None and before.provenance == provenance:
         manifest.record(study.model_inputs_path, inputs)
         return before
-    feasible = {n: verdict for n, verdict in verdicts.items() if verdict.feasible}
+    # Sets that are not usable show where not to go.
+    known = {n: verdict for n, verdict in verdicts.items() if verdict.excess == 0.0}
     data = labelled_data(
         archive,
-        {name: [n for n, v in feasible.items() if name in v.sequences] for name in study.training},
-        _sets_of(study.odometry.space, feasible),
+        {name: [n for n, v in known.items() if name in v.sequences] for name in study.training},
+        _sets_of(study.odometry.space, known),
         config,
         study.window,
         study.sequences.recorded_in,
@@ -456,8 +462,9 @@ def named_members(
     if len(set(members)) == len(named):
         return members
     _log.warning(
-        "online.switching.sets: one of them was not run on every training sequence, or is named "
-        "twice; the bank is chosen without them (trials.csv lists the sets)"
+        "online.switching.sets: one of them was not run on every training sequence, gave no pose "
+        "for many scans, or is named twice; the bank is chosen without them (trials.csv lists the "
+        "sets)"
     )
     return []
 

@@ -143,6 +143,7 @@ class TrialRun:
         self.registered = np.ones(n, bool)
         self.seconds = np.zeros(n)
         self.lost_steps: dict[int, Poses] = {}
+        self.unhealthy = Counter[str]()  # scans without a pose
         self._make = make
         self._odometry: OdometryInstance | None = None
         self._failure: tuple[str, ...] = ()
@@ -192,6 +193,7 @@ class TrialRun:
         T, self.registered[i] = odometry.register(prepared)
         self.seconds[i] = time.perf_counter() - begin
         finite = np.isfinite(T).all()
+        self.unhealthy.update([] if finite else ["no_pose"])
         # An odometry without a pose counts as not moved.
         T_step = invert(self.T_odom_sensor[i - 1]) @ T if finite else np.eye(4)
         if self._lost(i, T_step if finite else None):
@@ -206,6 +208,7 @@ class TrialRun:
         self.T_odom_sensor[i] = T
 
     def _step_without_pose(self, i: int) -> None:
+        self.unhealthy["no_pose"] += 1
         self.registered[i] = False
         if self._lost(i, None):
             self.T_odom_sensor[i], self.restarted[i] = self._T_ref_sensor[i], True
@@ -227,7 +230,6 @@ class DrivenRun(TrialRun):
 
     def __init__(self, make: Callable[[], OdometryInstance], frames: Frames, health: HealthCheck):
         super().__init__(make, frames, None)
-        self.unhealthy = Counter[str]()
         self._stamps, self._health = frames.stamps.tolist(), health
 
     def _step(self, i: int, scan: SharedScan) -> None:
@@ -239,10 +241,6 @@ class DrivenRun(TrialRun):
         self.T_odom_sensor[i], self.registered[i] = found.T_odom_sensor, found.registered
         self.seconds[i] = found.register_seconds if i else 0.0
         self.unhealthy.update([found.unhealthy] if found.unhealthy else [])
-
-    def _step_without_pose(self, i: int) -> None:
-        super()._step_without_pose(i)
-        self.unhealthy["no_pose"] += 1
 
 
 def with_measured_hops(
@@ -508,9 +506,10 @@ def _trial(
         run.faults,
         trajectory_metrics(frames, T_odom_sensor, run.lost_steps),
         used,
-        unhealthy=dict(driven.unhealthy)
+        unhealthy=dict(run.unhealthy)
         if driven
-        else unhealthy(settings.health, T_steps, frames.stamps, run.registered),
+        else unhealthy(settings.health, T_steps, frames.stamps, run.registered)
+        | dict(run.unhealthy),
         health=settings.health.model_dump() if driven else {},
     )
 
@@ -530,7 +529,7 @@ def _mean(parameters: ParameterSet, repeats: Sequence[Trial]) -> Trial:
         {m: float(np.mean([t.metrics[m] for t in repeats])) for m in repeats[0].metrics},
         {m: float(np.mean([t.usage[m] for t in repeats])) for m in repeats[0].usage},
         tuple({"rte": trial.mean_error} | trial.metrics for trial in repeats),
-        repeats[0].unhealthy,
+        max(repeats, key=lambda trial: trial.unhealthy.get("no_pose", 0)).unhealthy,
         repeats[0].health,
     )
 

@@ -416,7 +416,7 @@ def reserve(members: Sequence[int], data: LabelledData) -> list[int]:
     right. There is none if it is a member already, was not run on every sequence, or costs too
     much.
     """
-    known = all(BASELINE in s.vectors for s in data.sequences)
+    known = BASELINE in data.sets and all(BASELINE in s.vectors for s in data.sequences)
     if len(members) < 2 or BASELINE in members or not known:
         return []
     spending = data.spending

@@ -369,7 +369,7 @@ def _labelled(study: OfflineStudy, model: ErrorModel) -> LabelledData:
         study.window,
         study.sequences.recorded_in,
         study.odometry,
-    )
+    ).complete()
     if not set(data.whole()) - {0} and model.fixed != 0:
         _log.warning(
             "the candidates for the fixed set have no whole runs with this health check: with a "

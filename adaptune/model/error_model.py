@@ -25,7 +25,6 @@ from adaptune.model.descriptor import DESCRIPTORS
 from adaptune.model.rules import (
     Costs,
     PairedSettings,
-    Spending,
     TrainingData,
     allowed_sets,
     mean_errors,
@@ -220,8 +219,8 @@ class ErrorModel:
         return replace(data, fixed=members[0], candidates=tuple(members), vectors=vectors)
 
     def allowed(self) -> tuple[int, ...] | None:
-        """The sets that the budget allows one at a time, the fixed one included; None for all."""
-        return allowed_sets(Spending.of(self.costs, self.budget), self.sets, self.fixed)
+        """See `allowed_sets`."""
+        return allowed_sets(self.costs, self.budget, self.sets, self.fixed)
 
     def trial(self, named: int | ParameterSet) -> int | None:
         """Trial number of a set that is named by it, or by its values that are not the baseline's.

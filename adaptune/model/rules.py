@@ -147,7 +147,8 @@ class SetCost(NamedTuple):
 class Costs:
     """What sets cost, as it was measured in the trials."""
 
-    sets: Mapping[int, SetCost]  # by trial number
+    # By trial number; infinite where a set is not usable.
+    sets: Mapping[int, SetCost]
     evidence: float  # milliseconds of CPU time a scan that live evidence takes
 
     def __contains__(self, trial: object) -> bool:
@@ -156,6 +157,10 @@ class Costs:
     def alone(self, trial: int) -> float:
         """Milliseconds of CPU time a scan of one instance, no live evidence; NaN if unknown."""
         return self.sets[trial].alone if trial in self.sets else np.nan
+
+    def usable(self, trial: int) -> bool:
+        """Whether the odometry works with a set, see `adaptune.archive.Summary.usable`."""
+        return not np.isinf(self.alone(trial))
 
     def adaptive(self, trials: Iterable[int]) -> float:
         """Milliseconds of CPU time a scan of several instances together, with live evidence.
@@ -192,12 +197,14 @@ class Spending(NamedTuple):
 
 
 def allowed_sets(
-    spending: Spending | None, sets: Iterable[int], fixed: int
+    costs: Costs | None, budget: float | None, sets: Iterable[int], fixed: int
 ) -> tuple[int, ...] | None:
-    """The sets that a budget allows one at a time, the fixed one included; None for all."""
-    if spending is None:
+    """The usable sets that a budget allows one at a time, the fixed one included; None for all."""
+    if costs is None:
         return None
-    return tuple(trial for trial in sets if trial == fixed or spending.allows([trial]))
+    spending = Spending.of(costs, budget)
+    allows = costs.usable if spending is None else lambda trial: spending.allows([trial])
+    return tuple(trial for trial in sets if trial == fixed or allows(trial))
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,7 +227,7 @@ class TrainingData:
     # (n_frames, n_candidates, 3): errors of the candidates as vectors in the frame of the
     # sub-trajectory's start, not finite where the track was lost; see `sub_trajectory_vectors`.
     vectors: NDArray[np.float32] | None = None
-    # Trial numbers of the sets that a budget allows, the fixed one included; all sets if None.
+    # Trial numbers of the usable sets that a budget allows, the fixed one included; all if None.
     allowed: tuple[int, ...] | None = None
 
     def allows(self) -> NDArray[np.bool_]:

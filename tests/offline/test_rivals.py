@@ -66,7 +66,7 @@ def test_a_budget_bounds_the_fixed_set_and_what_is_selected(places):
     assert cheap.fixed() in TRIALS[:2]
     # Live evidence does not fit beside the second one.
     frugal = data(places, budget=12.0)
-    assert allowed_sets(frugal.spending, frugal.sets, TRIALS[1]) == TRIALS[:2]
+    assert allowed_sets(frugal.costs, frugal.budget, frugal.sets, TRIALS[1]) == TRIALS[:2]
     assert data(places).spending is None
 
 

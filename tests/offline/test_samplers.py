@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from adaptune.space import Categorical, Float, Integer, ParameterSpace
-from offline.config import OfflineConfig
+from offline.config import OfflineConfig, load_study
 from offline.samplers import make_sampler, sobol_points
 
 SPACE = ParameterSpace(
@@ -208,3 +208,11 @@ def test_ends_when_all_chains_have_stalled():
     assert sampler.end == "all chains have stalled"
     assert make_sampler(SPACE, config).propose(history) == []
     assert len(make_sampler(SPACE, config).propose(history[:-4])) == 4
+
+
+def test_older_studies_call_qmc_sobol(study_file):
+    assert load_study(study_file, ["offline.sampler=sobol"]).config.offline.sampler == "sobol"
+    of = [OfflineConfig(sampler=name, batch=8, seed=5) for name in ("qmc", "sobol")]
+    one, other = (make_sampler(SPACE, config).propose([]) for config in of)
+    assert len(one) == 8
+    assert one == other
