@@ -295,7 +295,7 @@ def _evidence(
     """Digest of everything that a model of the study depends on."""
     trials = {
         name: [
-            (n, run.parameters, run.mean_error, run.lost, judge(config.offline, [run]).values)
+            (n, run.mean_error, run.lost, judge(config.offline, [run]))
             for n, run in sorted(archive.finished(name).items())
             if n in verdicts and name in verdicts[n].sequences
         ]
