@@ -187,7 +187,7 @@ def test_a_single_fault_is_told(caplog):
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        ({"step": 0.3}, None),
+        ({"step": 0.375}, None),
         ({}, "0.79"),
         ({"axis": 1}, "were swapped, or like those of other axes"),
         ({"step": -0.3}, "or inverted"),
