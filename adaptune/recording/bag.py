@@ -32,7 +32,7 @@ from adaptune.recording.clouds import (
     POSES,
     TRANSFORMS,
     PointCloudError,
-    header_stamp,
+    header_of,
     message_stamp,
     of_frame,
     usable,
@@ -157,8 +157,8 @@ class BagSource:
         ROS 1 ``.bag`` files, or ROS 2 folders and files, as `bag_paths` gives them.
     points
         Topic of the point clouds; may be left out where there is only one.
-    timing
-        Meaning of the stamps.
+    timing, frame
+        Meaning of the stamps, and frame of the point clouds where the topic has several.
     about
         Result of `about` when they were opened before; the bags are then not opened now.
     """
@@ -171,9 +171,10 @@ class BagSource:
         paths: Sequence[Path],
         points: str | None = None,
         timing: Timing = AUTO,
+        frame: str | None = None,
         about: dict[str, Any] | None = None,
     ):
-        self.paths, self.timing = tuple(paths), timing
+        self.paths, self.timing, self.frame = tuple(paths), timing, frame
         if about is not None:
             self.topics: dict[str, str] = dict(about["topics"])
             self.points: str = about["points"]
@@ -215,21 +216,28 @@ class BagSource:
     def frames(self) -> Iterator[Frame]:
         """All scans in the order of their recording."""
         with self.open() as reader:
-            load = self.loader(reader)
+            load, frames, wanted = self.loader(reader), set[str](), (self.frame or "").lstrip("/")
             messages = enumerate(self.read(reader, self.points), start=1)
             for number, (_, recorded, data) in messages:
                 what = f"{self.name}: message {number} on {self.points}"
-                stamp = header_stamp(data, reader.is2)
+                stamp, frame = header_of(data, reader.is2)
                 if stamp is None:
                     raise SequenceError(f"{what} is cut short")
-                yield Frame(stamp, recorded, partial(load, data, what))
+                frames.add(frame)
+                if not wanted and len(frames) > 1:
+                    break
+                if wanted in ("", frame):
+                    yield Frame(stamp, recorded, partial(load, data, what))
+        if len(frames - {wanted}) == len(frames) > (not wanted):
+            what = f"{self.points} holds clouds of {', '.join(sorted(map(repr, frames)))}"
+            raise SequenceError(f"{self.name}: {what}; name one of these frames as `frame`")
 
     def _begin(self, reader: AnyReader, topic: str) -> int | None:
         """Stamp of the first message, if it has one. Reading the bag reports why it has none."""
         try:
             connection, _, data = next(self.read(reader, topic))
             if topic == self.points:
-                return header_stamp(data, reader.is2)
+                return header_of(data, reader.is2)[0]
             message = reader.deserialize(data, connection.msgtype)
             return POSES[connection.msgtype](message)[0][0]
         except Exception:

@@ -2,6 +2,7 @@
 
 import struct
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from functools import cache, lru_cache
 from typing import Any, NamedTuple
 
@@ -32,6 +33,7 @@ class Serialized:
         self.order = "<" if not cdr or data[1] else ">"  # of bytes, as numpy and struct write it
         self.data = memoryview(data)[4 if cdr else 0 :]
         self.at = 0  # where to read on
+        self.frame = ""  # of the header
         self._cdr = cdr
         self._unpack = _WORD[self.order]
 
@@ -69,7 +71,7 @@ class Serialized:
         if not self._cdr:
             self.uint32()  # its sequence number
         stamp = self.uint32() * 10**9 + self.uint32()
-        self.text()
+        self.frame = self.text().lstrip("/")  # ROS 1 may write it with a slash
         return stamp
 
     def end(self) -> None:
@@ -79,12 +81,13 @@ class Serialized:
             raise ValueError(f"{left} bytes are left over")
 
 
-def header_stamp(data: bytes | memoryview, cdr: bool) -> int | None:
-    """Stamp of a message that begins with a header; none if it is damaged there."""
+def header_of(data: bytes | memoryview, cdr: bool) -> tuple[int | None, str]:
+    """Stamp and frame of a message that begins with a header; no stamp if it is damaged there."""
     try:
-        return Serialized(data, cdr).header()
+        message = Serialized(data, cdr)
+        return message.header(), message.frame
     except (ValueError, IndexError, struct.error):
-        return None
+        return None, ""
 
 
 # The numbers of sensor_msgs/PointField's datatypes.
@@ -93,6 +96,9 @@ _LARGEST_POINT = 1 << 20
 RING_FIELDS = ("ring", "line", "channel", "laser_id")
 # CloudCompare puts a prefix before the names of what it stores in a PLY file.
 INTENSITY_FIELDS = ("intensity", "reflectivity", "scalar_intensity", "scalar_Intensity")
+FARTHEST = 1000.0
+"""Metres beyond which a point is doubted."""
+_NEVER = 1e4  # metres beyond which no LiDAR sees
 
 
 class PointCloudError(AdaptuneError):
@@ -191,8 +197,8 @@ def read_points(cloud: PointCloud2) -> NDArray[Any]:
 def decode_cloud(data: bytes | memoryview, cdr: bool, timing: Timing = AUTO) -> Scan:
     """Decode a serialised sensor_msgs/PointCloud2.
 
-    Points that are not finite are dropped, and so are those at the very origin, by which drivers
-    mark rays that did not come back. See `parse` and `from_fields`.
+    Points that are not finite are dropped, and so are those at the very origin and farther than any
+    LiDAR sees, by which drivers mark rays that did not come back. See `parse` and `from_fields`.
     """
     cloud = parse(data, cdr)
     return from_fields(read_points(cloud), cloud.stamp, timing)
@@ -213,7 +219,7 @@ def from_fields(raw: NDArray[Any] | Mapping[str, NDArray[Any]], stamp: int, timi
     Raises
     ------
     PointCloudError
-        If x, y or z are not single numbers, or the times cannot be.
+        If x, y or z are not single numbers, or if they or the times cannot be.
     """
     names = raw.dtype.names or () if isinstance(raw, np.ndarray) else tuple(raw)
     time = next((name for name in TIME_FIELDS if name in names), None)
@@ -232,19 +238,58 @@ def from_fields(raw: NDArray[Any] | Mapping[str, NDArray[Any]], stamp: int, timi
             _NO_RINGS if ring is None else np.asarray(columns[ring], np.uint16),
             _NO_INTENSITIES if intensity is None else np.asarray(columns[intensity], np.float32),
         )
-    n = len(x)
+    n, marks = len(x), 0
     made = (np.empty((n, 3), np.float32), *(np.empty(len(v), v.dtype) for v in given))
-    valid, low, high = _kernel(given[0].dtype.str)(x, y, z, given, made)
+    gather = _kernel(given[0].dtype.str)
+    valid, far, low, high = gather(x, y, z, given, made)
+    if far or not valid:
+        marked = _marks([columns[axis] for axis in "xyz"])
+        marks = int(np.count_nonzero(marked))
+        x = np.where(marked, np.float32(np.nan), x)
+        valid, _, low, high = gather(x, y, z, given, made)
     if valid < n:
         # A copy, so that the other points are not kept in memory with them.
         made = tuple(values[:valid].copy() for values in made)
-    points, times, rings, intensities = made
+    points, times, rings, lights = made
     try:
-        start, seconds = timing.resolve(stamp, None if time is None else times, (low, high))
+        timed = None if time is None else times
+        start, seconds, reading = timing.resolve(stamp, timed, (low, high))
     except TimingError as error:
         raise PointCloudError(str(error)) from error
-    given_rings, lights = rings if ring else None, intensities if intensity else None
-    return Scan(start, points, seconds, given_rings, intensities=lights)
+    given_rings, given_lights = rings if ring else None, lights if intensity else None
+    reading = reading._replace(marks=marks)
+    return Scan(start, points, seconds, given_rings, None, given_lights, reading)
+
+
+@np.errstate(over="ignore", invalid="ignore")
+def _marks(columns: Sequence[NDArray[Any]]) -> NDArray[np.bool_]:
+    """Which points are marks of lost rays; a PointCloudError if the coordinates are misread."""
+    away = _norms(columns)
+    seen = np.isfinite(away) & (away > 0)
+    # Marks are all at one distance. Nothing that is measured is.
+    far = seen & (away > FARTHEST)
+    same = far & (np.abs(away / np.median(away[far]) - 1.0) < 1e-6) if far.any() else far
+    marks = (far & (away > _NEVER)) | (same & (np.count_nonzero(same) > 2))
+    rest = seen & ~same
+    middle = np.median(away[rest]) if rest.any() else 0.0
+    if middle <= FARTHEST and np.count_nonzero(marks & rest) <= 0.1 * np.count_nonzero(rest):
+        return marks
+    swapped = _norms([column.byteswap() for column in columns])[seen]
+    spread = [np.std(column[rest].astype(np.float64)) for column in columns]
+    if np.mean(swapped < FARTHEST) > 0.9 and np.median(swapped) > 0.1:
+        help_ = "the bytes are in the other order than `is_bigendian` says, correct it in the bag"
+    elif np.linalg.norm(spread) < 0.1 * (middle := np.median(away[rest])):
+        help_ = f"they lie {middle:.3g} m away as on a map, give them in the sensor's frame"
+    else:
+        help_ = "are they in millimetres, or at other offsets than the fields say? Convert the bag"
+    share = np.mean(far[seen])
+    raise PointCloudError(f"{share:.0%} of the points are farther than {FARTHEST:g} m; {help_}")
+
+
+def _norms(columns: Sequence[NDArray[Any]]) -> NDArray[np.float64]:
+    """Distances of points given axis by axis."""
+    x, y, z = (np.asarray(column, np.float64) for column in columns)
+    return np.asarray(np.hypot(np.hypot(x, y), z))
 
 
 _NO_TIMES, _NO_RINGS = np.empty(0, np.float32), np.empty(0, np.uint16)
@@ -258,6 +303,7 @@ def _native(values: NDArray[Any]) -> NDArray[Any]:
 
 # Single precision keeps the loop fast.
 _ZERO, _INFINITE = np.float32(0.0), np.float32(np.inf)
+_DOUBTED = np.float32(FARTHEST**2)
 
 
 def _gather(
@@ -266,18 +312,19 @@ def _gather(
     z: NDArray[np.float32],
     given: tuple[NDArray[Any], NDArray[np.uint16], NDArray[np.float32]],
     made: tuple[NDArray[np.float32], NDArray[Any], NDArray[np.uint16], NDArray[np.float32]],
-) -> tuple[int, Any, Any]:
-    """Put the valid points side by side; count them, and find the extent of their times."""
+) -> tuple[int, int, Any, Any]:
+    """Put the valid points side by side; count them and far ones, and find their times' extent."""
     given_times, given_rings, given_intensities = given
     points, times, rings, intensities = made
     timed, ringed, lit = len(given_times) > 0, len(given_rings) > 0, len(given_intensities) > 0
     low = high = times.dtype.type(0)
-    valid = 0
+    valid = far = 0
     for i in range(len(x)):
         a, b, c = x[i], y[i], z[i]
         # Not a number or infinite if any coordinate is, zero if all of them are.
         square = a * a + b * b + c * c
         good = (square > _ZERO) & (square < _INFINITE)
+        far += good & (square > _DOUBTED)
         # What is not valid is overwritten by the next point.
         points[valid, 0] = a
         points[valid, 1] = b
@@ -294,7 +341,7 @@ def _gather(
             light = given_intensities[i]
             intensities[valid] = light if light - light == _ZERO else _ZERO
         valid += good
-    return valid, low, high
+    return valid, far, low, high
 
 
 @cache
@@ -312,7 +359,9 @@ def _kernel(kind: str) -> Callable[..., Any]:
     kinds = ((real, 2), (time, 1), (whole, 1), (real, 1))
     scan = types.Tuple([types.Array(scalar, axes, "C") for scalar, axes in kinds])
     given = types.Tuple((column(time), column(whole), column(real)))
-    signature = types.Tuple((numba.int64, time, time))(*3 * (column(real),), given, scan)
+    signature = types.Tuple((numba.int64, numba.int64, time, time))(
+        *3 * (column(real),), given, scan
+    )
     compiled: Callable[..., Any] = numba.njit(signature, nogil=True, cache=True)(_gather)
     return compiled
 
@@ -344,13 +393,15 @@ def decode_livox(data: bytes | memoryview, cdr: bool, timing: Timing = AUTO) -> 
     """Decode a serialised message without an object for each of its points.
 
     The points' offsets count from the time base. The stamp marks the same moment, unless `timing`
-    sets it to mark the scan's end. A PointCloudError reports a message that is cut short.
+    sets it to mark the scan's end, or takes the time base in its place. A PointCloudError reports a
+    message that is cut short.
     """
     try:
         body = Serialized(data, cdr)
         stamp = body.header()
         body.align(8)
-        body.block(8 + 4 + 1 + 3)  # what comes before the points
+        base = int(np.frombuffer(body.block(8), body.order + "u8")[0])
+        body.block(4 + 1 + 3)  # what else comes before the points
         count = body.uint32()
         dtype = np.dtype([(name, body.order + kind) for name, kind in _LIVOX_POINT], align=cdr)
         # Behind the last point there is no padding.
@@ -360,7 +411,10 @@ def decode_livox(data: bytes | memoryview, cdr: bool, timing: Timing = AUTO) -> 
         raw.view(np.uint8)[: len(points)] = np.frombuffer(points, np.uint8)
     except (struct.error, ValueError, IndexError) as error:
         raise PointCloudError(f"not a whole Livox message ({error})") from error
-    return from_fields(raw, stamp, timing)
+    if timing.stamp == "sensor_clock":
+        stamp, timing = base, replace(timing, stamp="start")
+    scan = from_fields(raw, stamp, timing)
+    return replace(scan, reading=scan.reading._replace(clock=base))
 
 
 # velodyne_msgs/VelodyneScan, the raw packets of a turn, to scans.

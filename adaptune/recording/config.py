@@ -18,7 +18,7 @@ from pydantic import (
 from adaptune import geometry
 from adaptune.errors import AdaptuneError
 from adaptune.files import expand_user
-from adaptune.recording.scan import USUAL, Imu, ImuNoise, Part, SequenceError, Unit
+from adaptune.recording.scan import USUAL, Imu, ImuNoise, Mark, Part, SequenceError, Unit
 from adaptune.strict import StrictModel
 
 MOST_VIEWS = 16
@@ -226,9 +226,10 @@ class SequenceConfig(_Part):
     folder: Annotated[str, AfterValidator(resolve)] | None = None
     evalio: str | None = None  # one of evalio's sequences, as ``newer_college_2020/short``
     points: str | None = None  # topic of the point clouds
-    stamp: Literal["auto", "start", "end"] = "auto"  # what a stamp marks of its scan
+    frame: str | None = None  # `frame_id` of the point clouds, where the topic has several
+    stamp: Mark = "auto"  # what a stamp marks of its scan
     time_unit: Unit | None = None  # of the points' times
-    # Seconds a scan takes; used if neither points nor files have times.
+    # Seconds a scan takes; used if neither points nor files have times, or these are of a `turn`.
     period: float = Field(0.1, gt=0, le=60)
     stride: int = Field(1, ge=1, le=10_000)  # use every stride-th scan
     part: Part | None = None  # of the time from `start` to `stop`
@@ -259,8 +260,9 @@ class SequenceConfig(_Part):
         if len(given) != 1:
             found = " and ".join(given) or "none"
             raise ValueError(f"give one of {', '.join(_SOURCES)}, not {found}")
-        if self.points is not None and given[0] != "bag":
-            raise ValueError(f"`points` names a topic of a bag; {given[0]} has none")
+        for key in ("points", "frame"):
+            if getattr(self, key) is not None and given[0] != "bag":
+                raise ValueError(f"`{key}` is for a bag; {given[0]} has none")
         if self.elevation is not None and given[0] != "kitti":
             raise ValueError(f"`elevation` is for kitti; {given[0]} has none")
         if self.compensate == "gyro" and self.imu is None:

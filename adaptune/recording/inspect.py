@@ -1,6 +1,7 @@
 """Inspect a recording: what it holds, what is odd about it, and how to name it in a study."""
 
 import datetime
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,22 +19,24 @@ from adaptune.errors import AdaptuneError
 from adaptune.progress import Progress, unseen
 from adaptune.recording import Scan, SequenceConfig, SequenceError, cache
 from adaptune.recording.bag import IMU_TYPES, POINTS_TYPES, BagSource, IndexReader
+from adaptune.recording.checks import SOONEST, doubts
 from adaptune.recording.clouds import (
     DATATYPES,
+    FARTHEST,
     PATH,
     POSES,
     RING_FIELDS,
     Pose,
-    header_stamp,
+    header_of,
     usable,
 )
 from adaptune.recording.config import BAG_SUFFIXES, REFERENCE_FILES, bag_paths
-from adaptune.recording.recording import RecordedSequence
-from adaptune.recording.scan import TIME_FIELDS
+from adaptune.recording.recording import RecordedSequence, repeats
+from adaptune.recording.scan import TIME_FIELDS, Reading
 from adaptune.trajectory import Trajectory, is_kitti, read_kitti, read_trajectory
 
-LEAST_POINTS, FARTHEST = 20, 1000.0
-"""Valid points that an odometry needs, and metres beyond which a point is not valid."""
+LEAST_POINTS = 20
+"""Valid points that an odometry needs."""
 
 _KITTI_FOLDERS = ("velodyne", "velodyne_points")
 # What each stage uses.
@@ -67,6 +70,7 @@ class Topic:
     stamps: list[list[int]] = field(default_factory=list)
     recorded: list[list[int]] = field(default_factory=list)  # on the recorder's clock
     undecoded: list[tuple[float, str]] = field(default_factory=list)  # seconds, and why
+    frames: Counter[str] = field(default_factory=Counter)  # messages of each frame of reference
 
     @property
     def times(self) -> NDArray[np.int64]:
@@ -115,6 +119,9 @@ class Inspection:
     recorded: int = 0
     layout: tuple[tuple[str, str, int], ...] = ()
     valid: list[int] = field(default_factory=list)  # valid points of each cloud that was read
+    readings: list[Reading] = field(default_factory=list)  # of each of them
+    repeated: int = 0  # how many of them hold the same points as the one before
+    last: Scan | None = None  # the newest of them
     reference: Trajectory | None = None  # as far as it was read
     faults: list[Fault] = field(default_factory=list)
 
@@ -242,8 +249,9 @@ def _inspect_scans(path: Path, kind: str, deep: bool, show: Progress) -> Inspect
 def _keep_scan(found: Inspection, scan: Scan) -> None:
     with np.errstate(over="ignore"):
         found.valid.append(geometry.count_within(scan.points, 0.0, FARTHEST))
-    if found.scan is None:
-        found.scan = scan
+    found.readings.append(scan.reading)
+    found.repeated += found.last is not None and repeats(scan, found.last)
+    found.scan, found.last = found.scan or scan, scan
 
 
 # Reading bags: a sample of their messages, or all of them.
@@ -414,9 +422,10 @@ class _Survey:
         """Keep when a message was made and recorded, and decode it where it is used."""
         topic.n_read += 1
         topic.recorded[-1].append(when)
-        stamp = header_stamp(data, self._reader.is2) if topic.stamped else None
+        stamp, frame = header_of(data, self._reader.is2) if topic.stamped else (None, "")
         if stamp is not None:
             topic.stamps[-1].append(stamp)
+            topic.frames[frame] += 1
         if topic.type == PATH and topic.name in self._of:
             self._path = data  # each path repeats the one before: the last one will do
         else:
@@ -507,7 +516,7 @@ def _find_faults(found: Inspection, apart: bool, slack: float) -> None:
         found.faults += _topic_faults(topic, of.get(topic.name, ""), found.complete, apart)
     scans = found.topics.get(found.used.get("points", ""))
     if scans is not None:
-        found.faults += _cloud_faults(scans, found.valid)
+        found.faults += [*_cloud_faults(scans, found.valid), *_content_faults(found, scans)]
     if (reference := found.reference) is None:
         return
     poses = found.topics.get(found.used.get("reference", ""))
@@ -521,6 +530,7 @@ def _topic_faults(topic: Topic, of: str, complete: bool, apart: bool) -> Iterato
     if topic.undecoded:
         (seconds, why), n = topic.undecoded[0], len(topic.undecoded)
         help_, lacks = _UNDECODED[of]
+        help_ = "the stages refuse them" if of == "points" and "`" in why else help_
         many = f"all {n}" if n == topic.n_read else f"{n} of {topic.n_read}"
         what = f"{many} messages do not decode, the first at {seconds:.1f} s ({why})"
         yield Fault(f"{topic.name}: {what}; {help_}", of, lacks)
@@ -549,6 +559,9 @@ def _stamp_faults(topic: Topic, of: str) -> Iterator[Fault]:
         # Recordings that count from zero begin with it.
         "are zero": np.count_nonzero(times[1:] == 0),
     }
+    if of == "points":
+        soon = np.count_nonzero((steps > 0) & (steps < SOONEST))
+        counts["come less than 1 ms after the one before"] = soon
     for what, count in counts.items():
         if count:
             yield Fault(f"{name}: {count} of {n} stamps {what}{_LEFT_OUT.get(of, '')}", of)
@@ -591,6 +604,29 @@ def _cloud_faults(topic: Topic, valid: list[int]) -> Iterator[Fault]:
         yield Fault(f"{name}: all {n} clouds hold {rule}; {help_}", "points", "clouds with points")
     elif few:
         yield Fault(f"{name}: {few} of {n} clouds hold {rule}{_GAPS['points']}", "points")
+
+
+def _content_faults(found: Inspection, topic: Topic) -> Iterator[Fault]:
+    """Faults of what clouds hold: their frames, their points and the times of these."""
+    name, n, marks = topic.name, len(found.valid), sum(r.marks for r in found.readings)
+    if len(topic.frames) > 1:
+        ((frame, _), *_) = frames = topic.frames.most_common()
+        found.given["frame"] = frame
+        many = " and ".join(f"{count} clouds of frame {named!r}" for named, count in frames)
+        yield Fault(f"{name}: holds {many}: choose one, as in `frame: {frame}`", "points")
+    if found.repeated:
+        what = f"{found.repeated} of {n} clouds hold the same points as the one before"
+        yield Fault(f"{name}: {what}{_LEFT_OUT['points']}", "points")
+    if marks:
+        what = f"{100.0 * marks / (marks + sum(found.valid)):.2g} % of the points are marks"
+        help_ = f"of rays that did not come back, beyond {FARTHEST:g} m: adaptune drops them"
+        yield Fault(f"{name}: {what} {help_}", "points")
+    absolute = [(r.stamp, r.clock) for r in found.readings if r.clock]
+    if any(clock < 1e15 and abs(stamp - clock) < 1e9 for stamp, clock in absolute):
+        yield Fault(f"{name}: adaptune reads times of points as absolute, as the stamps are")
+    steps = topic.steps[topic.steps * 1e9 >= SOONEST]
+    for doubt in doubts(found.readings, float(np.median(steps)) if len(steps) else 0.0):
+        yield Fault(f"{name}: {doubt.text}", doubt.of, doubt.lacks)
 
 
 def _reference_faults(reference: Trajectory, complete: bool, timed: bool = True) -> Iterator[Fault]:

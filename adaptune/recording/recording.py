@@ -4,8 +4,9 @@ import logging
 import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
+from functools import cache as once
 from functools import cached_property
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,6 +17,7 @@ from adaptune import geometry
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import to_pose
 from adaptune.recording import cache, compensation, views
+from adaptune.recording.checks import FIRST_SCANS, SOONEST, doubts
 from adaptune.recording.config import ESTIMATED, NO_REFERENCE, SequenceConfig, files_of
 from adaptune.recording.scan import (
     Frame,
@@ -35,6 +37,8 @@ _log = logging.getLogger(__name__)
 
 BACKWARD = "scans whose stamps do not come after the one before"
 LEAP = "scans whose stamps leap ahead of the recording"
+REPEATED = "scans with the same points as the one before"
+SOON = "scans less than 1 ms after the one before"
 
 
 def in_order(frames: Iterable[Frame], left_out: Counter[str]) -> Iterator[Frame]:
@@ -72,6 +76,11 @@ def in_order(frames: Iterable[Frame], left_out: Counter[str]) -> Iterator[Frame]
 
 # Nanoseconds; a recorder is seldom later than this.
 _DOUBT = 50_000_000
+
+
+def repeats(scan: Scan, last: Scan) -> bool:
+    """Whether it holds the same points as the scan before. No sensor measures twice the same."""
+    return len(scan) > 0 and np.array_equal(scan.points, last.points)
 
 
 def _leap(last: Frame | None, frame: Frame) -> int:
@@ -197,15 +206,15 @@ def _source(config: SequenceConfig) -> tuple[Source, str | None]:
         return evalio_source(config.evalio), None
     paths = config.bags()
     if not config.cache or not cache.cap():
-        return BagSource(paths, config.points, timing), None
+        return BagSource(paths, config.points, timing, config.frame), None
     try:
         part = (config.start, config.stop, config.stride, config.part)
-        key = cache.key(files_of(paths), (config.points, timing, *part))
+        key = cache.key(files_of(paths), (config.points, config.frame, timing, *part))
     except OSError as error:
         raise SequenceError(f"{paths[0]}: cannot be read ({error})") from error
     entry = cache.find(key)
     about = None if entry is None else entry.about
-    return BagSource(paths, config.points, timing, about), key
+    return BagSource(paths, config.points, timing, config.frame, about), key
 
 
 def _check_topics(source: Source, config: SequenceConfig) -> None:
@@ -287,8 +296,8 @@ class RecordedSequence:
     def __iter__(self) -> Iterator[Scan]:
         """Read the scans one after the other.
 
-        Scans whose stamps do not come after the one before are left out, counted, and reported in
-        the log.
+        Scans whose stamps do not come after the one before, or that repeat it, are left out,
+        counted, and reported in the log. Times that cannot be are a SequenceError.
         """
         left_out: Counter[str] = Counter()
         kept = None if self.key is None else cache.find(self.key)
@@ -297,21 +306,37 @@ class RecordedSequence:
             left_out.update(kept.about["left_out"])
         else:
             about = self.source.about() | {"left_out": left_out}
-            decoded = self._decode(left_out)
+            decoded = self._checked(self._decode(left_out))
             yield from decoded if self.key is None else cache.tee(decoded, self.key, about)
         if left_out:
             what = ", ".join(f"{n} {reason}" for reason, n in left_out.items())
             _log.warning("%s: left out %s", self.name, what)
 
+    def _checked(self, scans: Iterator[Scan]) -> Iterator[Scan]:
+        """The scans, unless the first ones have times that cannot be."""
+        first = list(islice(scans, FIRST_SCANS))
+        steps = np.diff([scan.stamp for scan in first]) * 1e-9 / self.stride
+        period = float(np.median(steps)) if len(steps) else 0.0
+        timing = Timing(self._config.stamp, self._config.time_unit)
+        for doubt in doubts([scan.reading for scan in first], period, timing):
+            if doubt.of == "points" and doubt.lacks:
+                raise SequenceError(f"{self.name}: {doubt.text}")
+            _warn(self.name, doubt.text)
+        yield from chain(first, scans)
+
     def _decode(self, left_out: Counter[str]) -> Iterator[Scan]:
-        last = None
+        last: Scan | None = None
         for frame in self._frames(left_out):
             scan = frame.load()
-            if last is not None and scan.stamp <= last:
+            if last is not None and scan.stamp <= last.stamp:
                 left_out[BACKWARD] += 1
-                continue
-            last = scan.stamp
-            yield scan
+            elif last is not None and repeats(scan, last):
+                left_out[REPEATED] += 1
+            elif last is not None and scan.stamp - last.stamp < SOONEST:
+                left_out[SOON] += 1
+            else:
+                last = scan
+                yield scan
         if last is None:
             stop = "the end" if self.stop is None else f"{self.stop:g} s"
             raise SequenceError(
@@ -459,6 +484,11 @@ class RecordedSequence:
         # The stamps already include the offset that is set.
         offset = self._config.clock_offset + found
         return f" (the {what} the same motion with clock_offset: {offset:.3f})"
+
+
+@once
+def _warn(name: str, text: str) -> None:
+    _log.warning("%s: %s", name, text)
 
 
 def _warn_of_jumps(name: str, trajectory: Trajectory) -> None:

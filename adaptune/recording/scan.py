@@ -75,6 +75,20 @@ def joined(parts: Sequence[Imu]) -> Imu:
     return replace(parts[0], **whole)
 
 
+class Reading(NamedTuple):
+    """How a scan was read from its message; times in seconds since its stamp, NaN without times."""
+
+    stamp: int = 0  # of the scan
+    first: float = np.nan
+    last: float = np.nan
+    unit: float = 0.0  # seconds per unit of the points' times
+    clock: int | None = None  # nanoseconds of the first point, if the sensor gives its own clock
+    marks: int = 0  # points that were dropped because they are farther than any LiDAR sees
+
+
+UNREAD = Reading()
+
+
 @dataclass(frozen=True, eq=False)
 class Scan:
     """A point cloud in the sensor's frame; its arrays cannot be written to.
@@ -95,6 +109,8 @@ class Scan:
     intensities : ndarray of shape (n,), optional
         float32 share of the light that came back from each point, on the sensor's own scale;
         finite.
+    reading : Reading
+        Of a scan as it was read, neither changed nor from the cache.
     """
 
     stamp: int
@@ -103,6 +119,7 @@ class Scan:
     rings: NDArray[np.uint16] | None = None
     imu: Imu | None = None
     intensities: NDArray[np.float32] | None = None
+    reading: Reading = UNREAD
 
     def __post_init__(self) -> None:
         # Decoded scans may be shared by all who use them, as those from the cache are.
@@ -171,17 +188,26 @@ class Recording(Protocol):
 TIME_FIELDS = ("time", "t", "timestamp", "timestamps", "time_stamp", "offset_time", "time_offset")
 """Names under which drivers write the time of a point."""
 
-Unit = Literal["s", "ms", "us", "ns"]
+Mark = Literal["auto", "start", "end", "first_point", "sensor_clock"]
+Unit = Literal["s", "ms", "us", "ns", "turn", "none"]
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+LEAVE_OUT = "no `time_unit` mends them: write `time_unit: none` to leave the times out"
 
 # A turn of a spinning LiDAR takes 0.05 to 0.2 s, a frame of the slowest accumulating ones 1 s.
 _LONGEST = 10.0
 # A header and its points are on the same clock if they are no further apart than this.
 _SAME_CLOCK = 10.0
+# Times below a day or so are absolute, too, if they agree with the header to this.
+_AGREE = 0.1
 
 
 class TimingError(AdaptuneError):
     """Times of points that are not plausible."""
+
+
+def unit_of(span: float, least: float, most: float) -> str | None:
+    """Unit in which a span as the driver wrote it takes from `least` to `most` seconds, if any."""
+    return next((u for u, scale in _SECONDS.items() if least < span * scale < most), None)
 
 
 @dataclass(frozen=True)
@@ -189,17 +215,19 @@ class Timing:
     """Meaning of the time stamps of a recording."""
 
     # Moment of the scan that the header's stamp marks. `auto` follows the points: they come before
-    # the stamp or after it. Scans whose points have no time are stamped at their start.
-    stamp: Literal["auto", "start", "end"] = "auto"
+    # the stamp or after it. Scans whose points have no time are stamped at their start. The stamp
+    # of `first_point` is that point's, on whatever clock the points are; `sensor_clock` takes the
+    # points' absolute times in place of the header's.
+    stamp: Mark = "auto"
     # Unit of the points' times. If left out, floating-point numbers are seconds and whole ones
-    # nanoseconds; the size of absolute times reveals their unit.
+    # nanoseconds; the size of absolute times reveals their unit. A `turn` takes `period` seconds.
     unit: Unit | None = None
-    # Seconds a scan takes; only for scans stamped at their end whose points have no time.
+    # Seconds a scan takes; for `turn`, and scans stamped at their end whose points have no time.
     period: float = 0.1
 
     def resolve(
         self, stamp: int, values: NDArray[Any] | None, extent: tuple[float, float]
-    ) -> tuple[int, NDArray[np.float32] | None]:
+    ) -> tuple[int, NDArray[np.float32] | None, Reading]:
         """Find the start of a scan, and the time of each point since then.
 
         Parameters
@@ -218,21 +246,15 @@ class Timing:
             Nanoseconds.
         times : ndarray of shape (n,)
             float32 seconds since `start`, none below zero.
+        reading : Reading
         """
-        if values is None or not len(values):
+        if values is None or not len(values) or self.unit == "none":
             start = stamp - round(self.period * 1e9) if self.stamp == "end" else stamp
-            return start, None if values is None else np.empty(0, np.float32)
-        low, high = extent
-        scale, absolute = self._scale(values.dtype, high)
-        span = (high - low) * scale
-        what = ""
-        if not span <= _LONGEST:
-            what = f"span {span:g} s"
-        elif not absolute and max(abs(low), abs(high)) * scale > _LONGEST:
-            what = f"reach {high * scale:g} s from the scan's stamp"
-        if what:
-            help_ = "if they are in another unit, name it with `time_unit: s|ms|us|ns`"
-            raise TimingError(f"the times of the points {what}; {help_}")
+            none = values is None or self.unit == "none"
+            return start, None if none else np.empty(0, np.float32), UNREAD
+        values, extent = _unwrapped(values, extent)
+        scale, absolute = self._scale(stamp, values.dtype, extent)
+        self._check(values.dtype, extent, scale, absolute)
         zero, begin = self._start(stamp, extent, scale, absolute)
         if scale == 1.0 and zero == 0 and values.dtype == np.float32:
             times = np.ascontiguousarray(values)
@@ -241,7 +263,34 @@ class Timing:
             small = values.dtype.kind in "iu" and values.dtype.itemsize < 8
             wide = values.astype(np.int64) if small else values
             times = ((wide - wide.dtype.type(zero)) * scale).astype(np.float32)
-        return stamp + round(begin * 1e9), times
+        start, clock = stamp + round(begin * 1e9), _nanoseconds(extent[0], scale)
+        first, last = ((end - zero) * scale for end in extent)
+        return start, times, Reading(start, first, last, scale, clock if absolute else None)
+
+    def _check(
+        self, dtype: np.dtype[Any], extent: tuple[float, float], scale: float, absolute: bool
+    ) -> None:
+        """Refuse times that no scan has."""
+        low, high = extent
+        span = (high - low) * scale
+        # Seconds from the stamp to the first point, or from the last one to the stamp.
+        away = max(low, -high, 0) * scale
+        reach = max(abs(low), abs(high)) * scale
+        if not span <= _LONGEST:
+            what, unit = f"span {span:g} s", unit_of(high - low, 2e-3, 2.0)
+            help_ = LEAVE_OUT if absolute or unit is None else f"write `time_unit: {unit}`"
+        elif absolute or self.stamp == "first_point":
+            return
+        elif self.stamp == "sensor_clock":
+            what, help_ = "are not absolute", "leave `stamp: sensor_clock` out"
+        elif reach > _LONGEST or away > max(1.0, 2.0 * span):
+            what = f"begin {low * scale:g} s after their scan's stamp: they are on another clock"
+            help_ = "write `stamp: first_point` to count them from the first point of each scan"
+        else:
+            return
+        if dtype == np.float32 and low > high - low and np.spacing(np.float32(high)) * scale > 1e-3:
+            what, help_ = f"reach {reach:g} s, too much for float32", LEAVE_OUT
+        raise TimingError(f"the times of the points {what}; {help_}")
 
     def _start(
         self, stamp: int, extent: tuple[float, float], scale: float, absolute: bool
@@ -249,10 +298,11 @@ class Timing:
         """The points' time at the scan's start, and seconds from the header's stamp to it."""
         low, high = extent
         span = (high - low) * scale
+        if self.stamp == "first_point":
+            return low, 0.0
         if absolute:
-            nanoseconds = low if scale == 1e-9 else low * scale * 1e9
-            before = (int(nanoseconds) - stamp) * 1e-9
-            same_clock = abs(before) <= _SAME_CLOCK
+            before = (_nanoseconds(low, scale) - stamp) * 1e-9
+            same_clock = abs(before) <= _SAME_CLOCK or self.stamp == "sensor_clock"
             known = {"start": 0.0, "end": -span}
             return low, known.get(self.stamp, before if same_clock else 0.0)
         if low < 0:
@@ -261,11 +311,19 @@ class Timing:
         # Counted from the scan's start, which is before the first ray that came back.
         return 0, -high * scale if self.stamp == "end" else 0.0
 
-    def _scale(self, dtype: np.dtype[Any], high: float) -> tuple[float, bool]:
+    def _scale(
+        self, stamp: int, dtype: np.dtype[Any], extent: tuple[float, float]
+    ) -> tuple[float, bool]:
         """Seconds per unit, and whether the times are absolute."""
-        if self.unit is not None:
-            scale = _SECONDS[self.unit]
-            return scale, high * scale > 1e6 and dtype.itemsize == 8
+        high = extent[1]
+        if self.unit == "turn":
+            return self.period, False
+        given = None if self.unit is None else _SECONDS[self.unit]
+        for scale in _SECONDS.values() if given is None else (given,):
+            if _agree(stamp * 1e-9, extent, scale):
+                return scale, True
+        if given is not None:
+            return given, high * given > 1e6 and dtype.itemsize == 8
         whole = dtype.kind in "iu"
         if dtype.itemsize < 8 or high < (1e12 if whole else 1e6):
             return (1e-9 if whole else 1.0), False
@@ -274,6 +332,31 @@ class Timing:
             if high < limit:
                 return scale, True
         return 1e-9, True
+
+
+def _nanoseconds(value: float, scale: float) -> int:
+    return int(value if scale == 1e-9 else value * scale * 1e9)
+
+
+def _agree(stamp: float, extent: tuple[float, float], scale: float) -> bool:
+    """Whether the first or the last time is the stamp, in seconds, and not a short one."""
+    low, high = (end * scale for end in extent)
+    if 2.0 * low <= high - low or low < 0.5 * stamp or high - low > _LONGEST:
+        return False
+    return min(abs(low - stamp), abs(high - stamp)) <= _AGREE
+
+
+def _unwrapped(
+    values: NDArray[Any], extent: tuple[float, float]
+) -> tuple[NDArray[Any], tuple[float, float]]:
+    """The times and their extent; those below zero, which unsigned numbers wrap, as such."""
+    size, spread = values.dtype.itemsize, extent[1] - extent[0]
+    if values.dtype.kind == "u" and size >= 4 and spread > 2 ** (8 * size - 1):
+        signed = values.view(f"i{size}")
+        low, high = int(signed.min()), int(signed.max())
+        if high - low < spread // 2:
+            return signed, (low, high)
+    return values, extent
 
 
 AUTO = Timing()

@@ -14,7 +14,7 @@ def header(stamp):
 
 def cloud(stamp, n=200):
     raw = np.zeros(n, [(name, "<f4") for name in ("x", "y", "z", "time")])
-    raw["x"], raw["y"], raw["z"] = np.random.default_rng(0).normal(0, 10, (n, 3)).T
+    raw["x"], raw["y"], raw["z"] = np.random.default_rng(stamp).normal(0, 10, (n, 3)).T
     raw["time"][5:] = np.linspace(0, 0.1, n - 5)
     raw[:5] = np.nan
     return rec.cloud(raw, stamp, STORE)

@@ -114,6 +114,56 @@ def test_topics_are_found_or_asked_for(tmp_path):
     assert len(list(opened(two, points="/b"))) == 1
 
 
+def clouds_at(path, stamps, clouds, frames=("lidar",)):
+    messages = []
+    for i, (stamp, points) in enumerate(zip(stamps, clouds, strict=True)):
+        header = rec.header(stamp, frames[i % len(frames)], rec.ROS1)
+        raw = rec.velodyne(points)
+        messages.append(("/points", stamp, rec.cloud(raw, stamp, rec.ROS1, header=header)))
+    return rec.write_bag(path, messages)
+
+
+@pytest.mark.parametrize(
+    ("later", "same", "what"),
+    [
+        (5 * 10**7, True, "3 scans with the same points as the one before"),
+        (1000, True, "3 scans with the same points as the one before"),
+        (1000, False, "3 scans less than 1 ms after the one before"),
+    ],
+)
+def test_scans_that_repeat_the_one_before_are_left_out(tmp_path, caplog, later, same, what):
+    first, others = rec.scans(3), rec.scans(3, seed=1)
+    stamps = [rec.START + i * 10**8 + after for i in range(3) for after in (0, later)]
+    clouds = [points for i in range(3) for points in (first[i], (first if same else others)[i])]
+    scans = list(opened(clouds_at(tmp_path / "a.bag", stamps, clouds)))
+    assert [scan.stamp for scan in scans] == stamps[::2]
+    assert what in caplog.text
+
+
+def test_clouds_of_two_frames_are_one_sensor_s_only_when_it_is_named(tmp_path):
+    stamps = [rec.START + i * 10**8 for i in range(6)]
+    bag = clouds_at(tmp_path / "a.bag", stamps, rec.scans(6), ("front", "/rear"))
+    for options in ({}, {"frame": "raer"}):
+        with pytest.raises(SequenceError, match="/points holds clouds of 'front', 'rear'; name"):
+            list(opened(bag, **options))
+    assert [scan.stamp for scan in opened(bag, frame="rear")] == stamps[1::2]
+    slashed = clouds_at(tmp_path / "b.bag", stamps, rec.scans(6), ("front", "/front"))
+    assert len(list(opened(slashed))) == 6
+
+
+@pytest.mark.parametrize("cache", [False, True])
+def test_times_that_cannot_be_stop_a_sequence_before_its_first_scan(tmp_path, cache):
+    messages = [
+        ("/points", stamp, rec.cloud(rec.velodyne(points, span=1.0), stamp, rec.ROS1))
+        for stamp, points in zip(range(rec.START, 2 * rec.START, 10**8), rec.scans(8), strict=False)
+    ]
+    bag = rec.write_bag(tmp_path / "a.bag", messages)
+    with pytest.raises(SequenceError, match=r"a.bag: .*write `time_unit: turn`"):
+        next(iter(opened(bag, cache=cache)))
+    assert len(list(opened(bag, cache=cache, time_unit="turn"))) == 8
+    assert len(list(opened(bag, cache=cache, time_unit="s"))) == 8  # by its user's own word
+
+
 def poses_of(store):
     """Two poses in a message of each type, at (0, 0, 0) and (1, 2, 3) turned half about z."""
     t = store.types

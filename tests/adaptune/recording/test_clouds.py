@@ -1,3 +1,5 @@
+import re
+
 import numpy as np
 import pytest
 import rec
@@ -150,6 +152,16 @@ DIALECTS = {
     "hesai, clock years off": ("timestamp", "<f8", [1e9, 1e9 + 0.1, 1e9 + 0.2], NS, None, 0),
     "livox": ("timestamp", "<f8", [NS, NS + 5e7, NS + 1e8], NS, [0, 0.05, 0.1], 0),
     "ends of small integers": ("t", "<i1", [-128, 0, 127], NS, [0, 128e-9, 255e-9], 0),
+    "a simulator's clock": ("timestamp", "<f8", [2.0, 2.05, 2.1], 2 * 10**9, [0, 0.05, 0.1], 0),
+    "a simulator's clock, nanoseconds": (
+        "t",
+        "<u4",
+        [2 * 10**9, 21 * 10**8],
+        21 * 10**8,
+        None,
+        -100,
+    ),
+    "wrapped below zero": ("t", "<u4", [2**32 - 1000, 0, 10**8], NS, [0, 1e-6, 0.100001], -0.001),
     "microseconds, absolute": ("timestamp", "<f8", [S * 1e6, S * 1e6 + 1e5], NS, [0, 0.1], 0),
 }
 
@@ -161,7 +173,8 @@ def test_times_count_from_the_start_of_the_scan_in_every_dialect(
     *, field, kind, values, stamp, times, shift
 ):
     scan = decode(rec.cloud(raw_of(len(values), **{field: (kind, values)}), stamp))
-    expected = np.array(values) - values[0] if times is None else times
+    unit = 1e-9 if kind == "<u4" else 1.0
+    expected = (np.array(values) - values[0]) * unit if times is None else times
     assert scan.times is not None
     np.testing.assert_allclose(scan.times, expected, atol=1e-6)
     assert abs(scan.stamp - (stamp + shift * 10**6)) < 1000
@@ -188,7 +201,12 @@ def test_a_scan_stamped_at_its_end_without_times_starts_a_period_before():
 
 @pytest.mark.parametrize(
     ("unit", "kind", "values"),
-    [("us", "<u4", [0, 100_000]), ("ms", "<f4", [0, 100]), ("ns", "<f4", [0, 1e8])],
+    [
+        ("us", "<u4", [0, 100_000]),
+        ("ms", "<f4", [0, 100]),
+        ("ns", "<f4", [0, 1e8]),
+        ("turn", "<f4", [0, 1]),
+    ],
 )
 def test_a_unit_can_be_set(unit, kind, values):
     raw = raw_of(2, time=(kind, values))
@@ -197,11 +215,69 @@ def test_a_unit_can_be_set(unit, kind, values):
 
 
 @pytest.mark.parametrize(
-    ("values", "kind"), [([0, 100.0], "<f4"), ([1e30, 2e30], "<f4"), ([500.0, 500.1], "<f4")]
+    ("values", "kind", "help_"),
+    [
+        ([0, 100.0], "<f4", "write `time_unit: ms`"),
+        ([0, 1e5], "<f4", "write `time_unit: us`"),
+        ([1e30, 2e30], "<f4", "write `time_unit: none`"),
+        ([S, S + 128], "<f4", "too much for float32; no `time_unit` mends them"),
+        ([500.0, 500.1], "<f4", "another clock; write `stamp: first_point`"),
+        ([3.0, 3.1], "<f8", "begin 3 s after their scan's stamp"),
+        ([-3.0, -2.9], "<f8", "another clock"),
+    ],
 )
-def test_times_no_scan_takes_are_refused(values, kind):
-    with pytest.raises(PointCloudError, match="time_unit"):
-        decode(rec.cloud(raw_of(2, time=(kind, values))))
+def test_times_no_scan_takes_are_refused_with_what_mends_them(values, kind, help_):
+    cloud = rec.cloud(raw_of(2, time=(kind, values)), NS)
+    with pytest.raises(PointCloudError) as caught:
+        decode(cloud)
+    assert help_ in str(caught.value)
+    if mark := re.search("`stamp: (.*?)`", str(caught.value)):
+        scan = decode(cloud, Timing(mark[1]))
+        assert scan.stamp == NS
+        np.testing.assert_allclose(scan.times, [0, 0.1], atol=1e-4)
+    elif unit := re.search("write `time_unit: (.*?)`", str(caught.value)):
+        times = decode(cloud, Timing(unit=unit[1])).times
+        assert times is None if unit[1] == "none" else times[1] == pytest.approx(0.1)
+
+
+def test_the_sensor_s_own_clock_can_be_the_stamp():
+    raw = raw_of(2, timestamp=("<f8", [1e9, 1e9 + 0.1]))
+    assert decode(rec.cloud(raw, NS), Timing("sensor_clock")).stamp == 10**18
+    with pytest.raises(PointCloudError, match="leave `stamp: sensor_clock` out"):
+        decode(rec.cloud(raw_of(2, time=("<f4", [0, 0.1])), NS), Timing("sensor_clock"))
+
+
+def seen(n=200):
+    return np.random.default_rng(0).normal(0, 10, (n, 3))
+
+
+@pytest.mark.parametrize(
+    "mark", [[65535.0] * 3, [1e19] * 3, [5000.0, 0, 0]], ids=["16 bits", "huge", "along x"]
+)
+def test_marks_of_rays_that_did_not_come_back_are_dropped(mark):
+    points = seen()
+    points[::3] = mark
+    scan = decode(rec.cloud(rec.velodyne(points)))
+    assert np.array_equal(scan.points, np.delete(points, np.s_[::3], axis=0).astype(np.float32))
+    assert len(scan.times) == len(scan)
+    assert scan.reading.marks == 67
+
+
+def test_a_point_that_a_long_range_lidar_may_see_stays():
+    assert len(decode(rec.cloud(rec.velodyne(np.vstack([seen(), [[1500, 20, 3]]]))))) == 201
+
+
+@pytest.mark.parametrize(
+    ("points", "changes", "message"),
+    [
+        (seen(), {"is_bigendian": True}, "other order than `is_bigendian` says"),
+        (seen() * 1e3, {}, "in millimetres"),
+        (seen() + np.array([5e5, 5e6, 0]), {}, "as on a map"),
+    ],
+)
+def test_coordinates_that_are_misread_are_refused(points, changes, message):
+    with pytest.raises(PointCloudError, match=message):
+        decode(rec.cloud(rec.velodyne(points), **changes))
 
 
 def damaged(**changes):

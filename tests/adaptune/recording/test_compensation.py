@@ -174,8 +174,8 @@ def imu_bag(path, offset):
     """Scans and an IMU on one clock, poses on another."""
     imu, trajectory = imu_and_trajectory(offset)
     messages = [
-        ("/points", s, rec.cloud(rec.velodyne(rec.scans(1)[0]), s, rec.ROS1))
-        for s in range(10**18, 10**18 + 60 * 10**9, 10**10)
+        ("/points", s, rec.cloud(rec.velodyne(points), s, rec.ROS1))
+        for s, points in zip(range(10**18, 10**18 + 60 * 10**9, 10**10), rec.scans(6), strict=True)
     ]
     for stamp, rate in zip(imu.stamps[::4].tolist(), imu.angular_velocity[::4], strict=True):
         messages.append(("/imu", stamp, rec.imu(stamp, rate, (0, 0, 1), rec.ROS1)))

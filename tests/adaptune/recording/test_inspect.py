@@ -109,6 +109,58 @@ def test_messages_that_do_not_decode_are_reported(tmp_path):
     assert len(list(open_sequence(config.model_copy(update={"stop": 0.3})))) == 3
 
 
+def drive_of(path, span=0.1, begin=0.0, kind="<f4", mark=None, later=(), names=("lidar",)):
+    """Ten scans whose times begin at `begin`; a fifth of their points is `mark`."""
+    messages = []
+    for i, first in enumerate(np.broadcast_to(begin, 10)):
+        raw = np.zeros(200, [*((name, "<f4") for name in "xyz"), ("time", kind)])
+        raw["x"], raw["y"], raw["z"] = np.random.default_rng(i).normal(0, 10, (3, 200))
+        raw["time"] = first + np.linspace(0, span, 200)
+        if mark is not None:
+            raw["x"][::5] = raw["y"][::5] = raw["z"][::5] = mark
+        for after in (0, *later):
+            stamp = START + i * 10**8 + after
+            header = rec.header(stamp, names[i % len(names)], STORE)
+            messages.append(("/points", stamp, rec.cloud(raw, stamp, STORE, header=header)))
+    return write(path, messages)
+
+
+@pytest.mark.parametrize(
+    ("given", "expected", "stage", "runs"),
+    [
+        ({"span": 1.0}, "they look like shares of a turn: write `time_unit: turn`", "online", 0),
+        (
+            {"span": 1e5, "kind": "<u4"},
+            "scans come every 0.1 s; write `time_unit: us`",
+            "online",
+            0,
+        ),
+        ({"span": 100.0}, "write `time_unit: ms`", "online", 0),
+        ({"span": 0.0}, "the same time", "motion compensation", 0),
+        ({"span": 0.0}, "the same time", "online", 10),
+        ({"begin": 0.3}, "write `stamp: first_point`", "online", 0),
+        ({"mark": 65535.0}, "20 % of the points are marks of rays", "online", 10),
+        ({"later": [1000]}, "10 of 20 clouds hold the same points", "online", 10),
+        ({"later": [1000]}, "10 of 20 stamps come less than 1 ms after", "online", 10),
+        ({"names": ("a", "b")}, "5 clouds of frame 'a' and 5 clouds of frame 'b'", "online", 5),
+    ],
+)
+def test_what_breaks_a_convention_is_named(tmp_path, given, expected, stage, runs):
+    inspection = inspect(drive_of(tmp_path / "a.bag", **given))
+    assert expected in " ".join(texts(inspection))
+    assert (not inspection.missing[stage]) == bool(runs)
+    if runs:
+        ((_, config),) = entry(inspection).items()
+        assert len(list(open_sequence(config))) == runs
+
+
+def test_stamps_that_shake_against_the_sensor_s_clock_are_named(tmp_path):
+    own, shake = 7e8 + 0.1 * np.arange(10), np.random.default_rng(0).uniform(0, 0.04, 10)
+    assert texts(inspect(drive_of(tmp_path / "a.bag", begin=own, kind="<f8"))) == []
+    (text,) = texts(inspect(drive_of(tmp_path / "b.bag", begin=own + shake, kind="<f8")))
+    assert "ms against the sensor's clock; write `stamp: sensor_clock`" in text
+
+
 def test_a_bag_that_is_damaged_in_the_middle_says_so(tmp_path):
     bag = drive(tmp_path / "a.bag", [0.1 * i for i in range(5)], [])
     data = bag.read_bytes()
