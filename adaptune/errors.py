@@ -11,9 +11,11 @@ from typing import Any
 class AdaptuneError(Exception):
     """A mistake in the input, with a sentence that says what to do.
 
-    The command line prints the sentence and exits with code 2. Modules derive their own class
+    The command line prints the sentence and exits with `exit_code`. Modules derive their own class
     from it, and chain the cause.
     """
+
+    exit_code = 2
 
 
 class OdometryError(AdaptuneError):

@@ -50,6 +50,14 @@ PENALTY = 10.0
 
 One that is not usable has so many times the baseline's value at least, and exceeds every limit so
 many times: nobody knows what it would cost."""
+
+
+class NothingUsableError(AdaptuneError):
+    """No parameter set gives poses."""
+
+    exit_code = 1
+
+
 UNUSABLE = (
     "odometry: none of {n} parameter sets gives poses for nearly all scans of every training "
     "sequence, so none can be chosen (`adaptune trials` lists their faults): mend the odometry, or "
@@ -230,18 +238,34 @@ def candidates(config: OfflineConfig, verdicts: Mapping[int, Verdict]) -> list[i
     """
     complete = [n for n, verdict in verdicts.items() if verdict.complete and verdict.usable]
     if not complete:
-        raise AdaptuneError(UNUSABLE.format(n=len(verdicts)))
+        raise NothingUsableError(UNUSABLE.format(n=len(verdicts)))
     feasible = [n for n in complete if verdicts[n].feasible]
     if not feasible:
-        nearest = min(complete, key=lambda n: verdicts[n].excess)
-        limits = ", ".join(f"{name} <= {limit.max:g}" for name, limit in config.limits.items())
-        raise AdaptuneError(
-            f"offline.limits: none of {len(complete)} usable parameter sets keeps {limits} on "
-            f"every sequence; trial {nearest} comes nearest, {verdicts[nearest].excess:.0%} beyond "
-            f"(`adaptune trials` lists all): loosen the limits, widen the ranges of the "
-            f"parameters, or run more trials"
-        )
+        raise AdaptuneError(_beyond(config, verdicts, complete))
     return best_candidates({n: verdicts[n].bound for n in feasible})
+
+
+def _beyond(config: OfflineConfig, verdicts: Mapping[int, Verdict], usable: list[int]) -> str:
+    """That no usable set keeps all limits, and what to do."""
+    nearest = min(usable, key=lambda n: verdicts[n].excess)
+    limits = ", ".join(f"{name} <= {limit.max:g}" for name, limit in config.limits.items())
+    return (
+        f"offline.limits: none of {len(usable)} usable parameter sets keeps {limits} on every "
+        f"sequence; trial {nearest} comes nearest, {verdicts[nearest].excess:.0%} beyond "
+        f"(`adaptune trials` lists all): loosen the limits, widen the ranges of the parameters, "
+        f"or run more trials"
+    )
+
+
+def or_baseline(
+    config: OfflineConfig, verdicts: Mapping[int, Verdict]
+) -> tuple[dict[int, Verdict], list[str]]:
+    """The verdicts, and a sentence if no set keeps all limits: then the baseline may break them."""
+    usable = [n for n, verdict in verdicts.items() if verdict.complete and verdict.usable]
+    if 0 not in usable or any(verdicts[n].feasible for n in usable):
+        return dict(verdicts), []
+    said = f"{_beyond(config, verdicts, usable)}. Until then the fixed set is the baseline."
+    return {**verdicts, 0: verdicts[0]._replace(constraints=())}, [said]
 
 
 def best_candidates(bounds: Mapping[int, float]) -> list[int]:

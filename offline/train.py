@@ -50,6 +50,7 @@ from offline.config import TIMED, Metric, OfflineConfig, OfflineStudy, OfflineSt
 from offline.labelled import LabelledData, labelled_data, measured_costs
 from offline.objective import (
     UNUSABLE,
+    NothingUsableError,
     Verdict,
     affordable,
     baseline_words,
@@ -59,6 +60,7 @@ from offline.objective import (
     failed_in_words,
     judge,
     label,
+    or_baseline,
     pareto_front,
 )
 from offline.search import BUDGETS, Finished
@@ -117,7 +119,7 @@ def train(study: OfflineStudy, progress: Progress = unseen, cluster: str | None 
     Raises
     ------
     AdaptuneError
-        If a sequence, its reference or the odometry cannot be used, or no set keeps the limits.
+        If a sequence, its reference or the odometry cannot be used, or no set gives poses.
     """
     archive = _ready_archive(study, progress)
     config = study.config.offline
@@ -127,6 +129,7 @@ def train(study: OfflineStudy, progress: Progress = unseen, cluster: str | None 
     with trial_workers(study, names, cluster) as workers:
         run_baseline(study, archive, workers, progress)
         verdicts = Campaign(study, archive, workers, progress).run()
+        verdicts, beyond = or_baseline(config, verdicts)
         finished = {
             name: {n: archive.finished(name)[n] for n, v in verdicts.items() if name in v.sequences}
             for name in names
@@ -155,7 +158,7 @@ def train(study: OfflineStudy, progress: Progress = unseen, cluster: str | None 
     errors = {name: stored.error(model.length) for name, stored in estimates.items()}
     rows = _training_rows(config, verdicts, finished, fixed, whole, errors, space)
     tables.write_rows(study.folder, "training", rows)
-    said = [] if before is None else changes(before, model)
+    said = beyond if before is None else [*beyond, *changes(before, model)]
     said += [*estimates_in_words(estimates, model.length, intervals=True)]
     said += failed_in_words(verdicts)
     said += baseline_words(config, [runs[0] for runs in finished.values()])
@@ -223,7 +226,7 @@ def _fixed(
     rivals = {name: {n: runs[n] for n in best} for name, runs in whole.items()}
     values = mean_values(list(whole_values(config, rivals).values()))
     if np.isinf(min(values.values())):
-        raise AdaptuneError(UNUSABLE.format(n=f"the {len(best)} best"))
+        raise NothingUsableError(UNUSABLE.format(n=f"the {len(best)} best"))
     fixed = choose_fixed(values, {n: verdicts[n].bound for n in best})
     return fixed, baseline_warning(config, values, best[0], fixed)
 
@@ -354,7 +357,8 @@ def _training_rows(
     """A row for every training sequence; its own best set is found as the fixed one is."""
     rows = []
     for name, runs in finished.items():
-        best = best_by_trials(config, {n: judge(config, [run]) for n, run in runs.items()})
+        judged, _ = or_baseline(config, {n: judge(config, [run]) for n, run in runs.items()})
+        best = best_by_trials(config, judged)
         error = reference_errors.get(origin(name))
         row = {
             "sequence": name,

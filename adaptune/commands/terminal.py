@@ -48,7 +48,7 @@ class Commands(TyperGroup):
             if isinstance(error, BrokenPipeError):
                 raise  # nobody reads the output any more
             errors.print(f"error: {error}", style="red", soft_wrap=True)
-            raise typer.Exit(2) from error
+            raise typer.Exit(getattr(error, "exit_code", 2)) from error
         except KeyboardInterrupt as error:
             errors.print("interrupted; run the same command again to resume", style="yellow")
             raise typer.Exit(130) from error

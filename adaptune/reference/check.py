@@ -449,8 +449,9 @@ def _rotation(T: Poses, measured: Poses) -> NDArray[np.float64]:
     for motions in (T, measured):
         turns = Rotation.from_matrix(motions[:, :3, :3]).as_rotvec()
         vectors.append(np.concatenate([motions[:, :3, 3], 10.0 * turns]))
-    R, _ = Rotation.align_vectors(*vectors)
-    return np.asarray(R.as_matrix())
+    # Kabsch, Acta Cryst. 1976. On a straight way, the turn about it is arbitrary.
+    U, _, Vt = np.linalg.svd(vectors[0].T @ vectors[1])
+    return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
 
 
 def _lever(T: Poses, measured: Poses, R_body_sensor: NDArray[np.float64]) -> NDArray[np.float64]:
