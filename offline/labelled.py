@@ -50,7 +50,7 @@ from offline.objective import (
 from offline.search import owner
 
 if TYPE_CHECKING:
-    from adaptune.model.pca import ScaledPCA
+    from adaptune.model.knn import ScaledPCA
 
 
 SECONDS_UNTIL_NOTICED = 1.0
@@ -474,7 +474,7 @@ class LabelledData(NamedTuple):
 
     def training_data(self) -> tuple[TrainingData, "ScaledPCA"]:
         """What selection rules are fitted to, and the transformation of descriptors for them."""
-        from adaptune.model.pca import ScaledPCA  # takes long to import
+        from adaptune.model.knn import ScaledPCA  # takes long to import
 
         descriptors = np.concatenate([s.descriptors for s in self.sequences])
         pca = ScaledPCA(blocks=tuple(self.sequences[0].blocks.values()))

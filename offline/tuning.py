@@ -34,7 +34,7 @@ from adaptune.study.study import (
 from offline.labelled import LabelledData, LabelledSequence, comparable, periods
 
 if TYPE_CHECKING:
-    from adaptune.model.pca import ScaledPCA
+    from adaptune.model.knn import ScaledPCA
 
 
 WORST_TENTH_WEIGHT = 0.5

@@ -36,7 +36,7 @@ from adaptune.space import ParameterSet, ParameterSets, SpaceError, in_words, lo
 from adaptune.strict import in_one_line
 
 if TYPE_CHECKING:
-    from adaptune.model.pca import ScaledPCA
+    from adaptune.model.knn import ScaledPCA
 
 FORMAT = 7
 """Raised whenever an older adaptune could not read the file, or would read it wrongly."""
@@ -181,7 +181,7 @@ class ErrorModel:
 
     def pca(self) -> "ScaledPCA":
         """Principal components of the training frames' descriptors."""
-        from adaptune.model.pca import ScaledPCA  # not needed to load a model
+        from adaptune.model.knn import ScaledPCA  # not needed to load a model
 
         return ScaledPCA(blocks=tuple(self.blocks.values())).fit(self.descriptors)
 

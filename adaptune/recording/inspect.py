@@ -19,7 +19,6 @@ from adaptune.errors import AdaptuneError
 from adaptune.progress import Progress, unseen
 from adaptune.recording import Scan, SequenceConfig, SequenceError, cache
 from adaptune.recording.bag import IMU_TYPES, POINTS_TYPES, BagSource, IndexReader
-from adaptune.recording.checks import SOONEST, doubts
 from adaptune.recording.clouds import (
     DATATYPES,
     FARTHEST,
@@ -32,7 +31,7 @@ from adaptune.recording.clouds import (
 )
 from adaptune.recording.config import BAG_SUFFIXES, REFERENCE_FILES, bag_paths
 from adaptune.recording.recording import RecordedSequence, repeats
-from adaptune.recording.scan import TIME_FIELDS, Reading
+from adaptune.recording.scan import SOONEST, TIME_FIELDS, Reading, doubts
 from adaptune.trajectory import Trajectory, is_kitti, read_kitti, read_trajectory
 
 LEAST_POINTS = 20

@@ -17,9 +17,10 @@ from adaptune import geometry
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import to_pose
 from adaptune.recording import cache, compensation, views
-from adaptune.recording.checks import FIRST_SCANS, SOONEST, doubts
 from adaptune.recording.config import ESTIMATED, NO_REFERENCE, SequenceConfig, files_of
 from adaptune.recording.scan import (
+    FIRST_SCANS,
+    SOONEST,
     Frame,
     Imu,
     Recording,
@@ -27,6 +28,7 @@ from adaptune.recording.scan import (
     SequenceError,
     Source,
     Timing,
+    doubts,
 )
 from adaptune.trajectory import Trajectory, TrajectoryError, is_kitti, read_kitti, read_trajectory
 
