@@ -155,6 +155,7 @@ def test_an_estimate_that_is_not_finite_is_a_failure(bad):
     assert np.isnan(errors).tolist() == [False] * 7 + [True] * 2
 
 
+@pytest.mark.services
 def test_bootstrap_covers_the_mean_of_correlated_errors():
     rng = np.random.default_rng(0)
     covered = {1: 0, 40: 0}

@@ -98,6 +98,7 @@ class Random(optuna.samplers.RandomSampler):
 """
 
 
+@pytest.mark.services
 @pytest.mark.usefixtures("processes")
 def test_the_driver_imports_no_code_of_the_user_s(mine, study_file, tmp_path, capsys):
     mine("users_own", MINE)

@@ -87,6 +87,7 @@ def test_more_trials_go_on_where_fewer_stopped(trained, study_file, tmp_path):
     assert {k: ours[k] for k in theirs} == theirs
 
 
+@pytest.mark.services
 @pytest.mark.usefixtures("processes")
 def test_a_killed_worker_is_replaced(trained, study_file, tmp_path, monkeypatch):
     study, _ = trained
@@ -237,6 +238,7 @@ def run_baselines(study):
     return archive
 
 
+@pytest.mark.services
 def test_the_baseline_of_every_odometry_is_run_once(study_file, tmp_path, monkeypatch):
     second = "{name: 'stumbling:Apart', label: apart, settings: {step: 0.31}}"
     study = study_of_two(study_file, tmp_path / "study", second)

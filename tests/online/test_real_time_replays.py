@@ -101,6 +101,7 @@ def test_replays_in_real_time_are_compared_as_they_are(study, study_file):
     assert late in remarks(rows)
 
 
+@pytest.mark.services
 def test_the_command_takes_a_rate(study_file, trained_folder, tmp_path):
     folder = shutil.copytree(trained_folder, tmp_path / "run")
     given = [study_file, "--folder", folder, "-o", "online.modes=[adaptive]"]

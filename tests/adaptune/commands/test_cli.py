@@ -40,6 +40,7 @@ def next_words(done):
     return shlex.split(match[1])
 
 
+@pytest.mark.services
 def test_one_bag_is_enough_and_every_command_names_the_next(adaptune, study_file, tmp_path):
     (tmp_path / "one.bag").symlink_to(study_file.parent / "one.bag")
     done = adaptune("inspect", "one.bag")
@@ -134,6 +135,7 @@ def test_help_and_version(adaptune):
     assert adaptune("--version").stdout.startswith("adaptune 0.")
 
 
+@pytest.mark.services
 def test_ctrl_c_leaves_a_study_that_resumes(adaptune, gicp_study_file, tmp_path):
     command = [sys.executable, "-m", "adaptune.commands.cli", "offline", str(gicp_study_file)]
     many = ["-o", "offline.trials=400", "-o", "offline.batch=4"]
@@ -203,6 +205,7 @@ def test_a_finished_study_has_a_page_of_everything(finished):
         assert f">{mode}</td>" in page
 
 
+@pytest.mark.services
 def test_studies_are_compared_side_by_side_by_their_folders(finished, tmp_path):
     other = shutil.copytree(finished, tmp_path / "other")
     ended = call("compare", finished, other, "--to", tmp_path / "both")

@@ -7,6 +7,7 @@ from adaptune.recording.config import SequenceConfig
 from adaptune.recording.recording import open_sequence
 
 
+@pytest.mark.services
 def test_parameters_matter_as_much_as_is_known(recorded):
     """A loop through a hall at two scans a second; the figures come with the recording."""
     topics = {"points": "/velodyne_points", "reference": "/gt_poses"}

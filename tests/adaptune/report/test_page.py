@@ -87,6 +87,7 @@ def test_names_between_backticks_are_code():
     assert seen.texts["code"] == ["adaptive", "a<b", "adaptune online", "fixed"]
 
 
+@pytest.mark.services
 def test_any_key_names_files_of_its_own_beside_the_page(tmp_path):
     keys = ("a/b", "a b", "A_B", "../x", ".a", "会議室 <1>")
     charts = tuple(replace(empty(), key=key) for key in keys)
