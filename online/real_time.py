@@ -15,6 +15,9 @@ from multiprocessing.connection import Connection
 from queue import Queue
 from typing import Any, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from adaptune.bank.bank import CLOCK, Bank, Clock
 from adaptune.errors import AdaptuneError
 from adaptune.odometry.base import Motions, OdometryInstance
@@ -249,26 +252,38 @@ class Arrival(NamedTuple):
     dropped: int  # scans before it that waited too long
 
 
+PlayedAt = Callable[[NDArray[np.int64]], NDArray[np.int64]]
+
+
 def arrivals(
-    scans: Iterable[Scan], rate: float, queue: int, clock: Clock = CLOCK
+    scans: Iterable[Scan],
+    rate: float,
+    queue: int,
+    clock: Clock = CLOCK,
+    played_at: PlayedAt | None = None,
 ) -> Iterator[Arrival]:
     """Scans, each when it is due or as soon as it is asked for after that.
 
     What an IMU measured before a scan that is dropped goes to the scan after it.
 
-    For `rate` and `queue` see `RealTimeConfig`; the sensor goes by `clock`.
+    For `rate` and `queue` see `RealTimeConfig`; the sensor goes by `clock`, and a recording whose
+    speed was changed by `played_at`, see `Recording`.
     """
+
+    def played(scan: Scan) -> int:
+        return scan.stamp if played_at is None else int(played_at(np.array([scan.stamp]))[0])
+
     source = iter(scans)
     ahead = next(source, None)
     if ahead is None:
         return
-    first, begin = ahead.stamp, clock.now()
+    first, begin = played(ahead), clock.now()
     waiting: deque[tuple[Scan, float]] = deque()
     imus: list[Imu] = []
     dropped = 0
     while ahead is not None or waiting:
         while ahead is not None:
-            due = begin + (ahead.stamp - first) * 1e-9 / rate
+            due = begin + (played(ahead) - first) * 1e-9 / rate
             if due > (now := clock.now()):
                 if waiting:
                     break
@@ -322,7 +337,9 @@ def replay_in_real_time(
     drive = RealTimeDrive(odometry, health, settings, selector, record, what, clock)
     source = _read_ahead(scans)
     first = list(islice(source, _AHEAD // 2))  # read before the first one is due
-    for arrival in arrivals(chain(first, source), settings.rate, settings.queue, clock):
+    played_at: PlayedAt | None = getattr(scans, "played_at", None)
+    every = chain(first, source)
+    for arrival in arrivals(every, settings.rate, settings.queue, clock, played_at):
         drive.step(arrival)
         watch(record)
     drive.finish()
