@@ -129,7 +129,9 @@ def _named(header: str) -> dict[str, int]:
     """Where a header has each of `_COLUMNS`, as far as it names them."""
     header = re.sub(r"\[.*?\]|\(.*?\)|[#%\"]", "", header).lower().strip()
     found: dict[str, int] = {}
-    for i, name in enumerate(re.split(r"\s*[,;]\s*" if "," in header else r"\s+", header)):
+    for i, name in enumerate(
+        re.split(r"\s*[,;]\s*" if re.search("[,;]", header) else r"\s+", header)
+    ):
         of = next((of for of, known in _NAMES.items() if re.fullmatch(known, name)), None)
         if of is not None:
             found.setdefault(of if len(of) > 1 else of + name[-1], i)

@@ -12,6 +12,7 @@ from adaptune.archive import Archive, ArchiveError, Summary, Trial, summarise
 from adaptune.errors import AdaptuneError
 from adaptune.odometry.tracker import HealthCheck
 from adaptune.progress import Progress, unseen
+from adaptune.recording.scan import origin
 from adaptune.reference.check import contradictions
 from adaptune.space import ParameterSet, PooledSpace
 from adaptune.study.study import StudySequences
@@ -298,10 +299,10 @@ def baseline_warning(
     if 0 not in whole or best == 0 or whole[0] >= whole.get(best, np.inf):
         return None
     what = label(config.objective[0])
+    other = f"{whole[best]:.3g}" if best in whole else "beyond the limits, or not known"
     beaten = (
         f"In whole runs with the health check, the baseline is better than the trials suggested: "
-        f"its {what} is {whole[0]:.3g}, that of trial {best}, the best by its trials, "
-        f"{whole[best]:.3g}"
+        f"its {what} is {whole[0]:.3g}, that of trial {best}, the best by its trials, {other}"
     )
     if fixed == 0:
         return f"{beaten}. So the fixed set is the baseline."
@@ -348,7 +349,12 @@ def run_baseline(
 
 
 def warn_of_contradictions(sequences: StudySequences, name: str, odometry: str, run: Trial) -> None:
-    """Tell what the scans of a sequence say where a whole run disagrees with the reference."""
+    """Tell what the scans of a sequence say where a whole run disagrees with the reference.
+
+    A view has its origin's reference, seen otherwise: nothing is said of it.
+    """
+    if origin(name) != name or sequences.config(name).views:
+        return
     place, given = sequences.config(name).extrinsic, sequences.estimate(name) is None
     scans = sequences.open(name)
     for what in contradictions(scans, run.T_odom_sensor, run.mean_error, place, given):

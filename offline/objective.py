@@ -250,7 +250,7 @@ def _beyond(config: OfflineConfig, verdicts: Mapping[int, Verdict], usable: list
     nearest = min(usable, key=lambda n: verdicts[n].excess)
     limits = ", ".join(f"{name} <= {limit.max:g}" for name, limit in config.limits.items())
     return (
-        f"offline.limits: none of {len(usable)} usable parameter sets keeps {limits} on every "
+        f"offline.limits: no usable parameter set that ran everywhere keeps {limits} on every "
         f"sequence; trial {nearest} comes nearest, {verdicts[nearest].excess:.0%} beyond "
         f"(`adaptune trials` lists all): loosen the limits, widen the ranges of the parameters, "
         f"or run more trials"

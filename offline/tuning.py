@@ -1,6 +1,6 @@
 """Choice of what is driven: the fixed set, one set at a time, or a bank, and with what settings.
 
-All are compared by their expected loss on evidence that is left out, see `offline.expected_loss`.
+All are compared by their expected loss on evidence that is left out, see `expected_loss`.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence

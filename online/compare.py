@@ -37,6 +37,7 @@ from online.record import (
     StoredReplay,
     StoredReplayError,
     check_reference,
+    read_contradictions,
     read_repeats,
 )
 from online.statistics import (
@@ -455,8 +456,7 @@ def compare(study: Study) -> ComparedReplays:
         stored = study.sequences.estimate(name)
         reference = Reference.read(folder, study.config.sub_trajectory, stored)
         every = _with_fixed_rivals(replays, model)
-        summaries = (replay.summary for repeats in replays.values() for replay in repeats)
-        wrong += [f"On {name}, {what}." for each in summaries for what in each.contradictions]
+        wrong += [f"On {name}, {what}." for what in read_contradictions(folder)]
         of_modes = compare_modes(name, every, reference)
         judged.append(of_modes._replace(recording=study.sequences.recorded_in(name)))
         oracle = None if model is None else oracle_errors(study.archive("oracle"), name, model)
@@ -465,7 +465,7 @@ def compare(study: Study) -> ComparedReplays:
             oracles += oracle_rows(judged[-1], oracle, model.fixed, period)
     rows = _rows(judged, oracles)
     words = [
-        *dict.fromkeys(wrong),
+        *wrong,
         *remarks(rows),
         *_equal_cost(model, modes),
         *compared.words,

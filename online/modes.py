@@ -416,6 +416,7 @@ def _replay_all(
         if not due and is_reference_of(folder, poses):
             continue
         recording = study.sequences.open(name)
+        judge = partial(_judge, study.sequences, name, recording, folder, poses, length)
         for i, run in enumerate(due):
             mode = setup.mode(run.mode, model)
             release_memory()
@@ -424,33 +425,38 @@ def _replay_all(
                     record = _replayed(study, recording, odometry, mode, run.what, progress, look)
             except DescriptorError as error:
                 raise ReplayError(f"sequences.{name}: {error}") from error
-            wrong: list[str] = []
             if i == 0:
-                write_reference(folder, recording.reference(), record.trajectory, poses)
-                replayed = record.trajectory
-                wrong = _contradictions(study.sequences, name, recording, replayed, length)
-            write_replay(run.folder, record, run.inputs, model_path, wrong)
+                judge(record.trajectory)
+            write_replay(run.folder, record, run.inputs, model_path)
         if not due:
             trajectory = StoredReplay.read(folder / modes[0]).trajectory
-            write_reference(folder, recording.reference(), trajectory, poses)
+            judge(trajectory)
             _log.info("%s: the reference has changed; no replay depends on it", name)
         made += len(due)
     return made
 
 
-def _contradictions(
-    sequences: StudySequences, name: str, recording: Recording, replayed: Trajectory, length: float
-) -> list[str]:
-    """What the scans say where a replay and the reference disagree."""
-    if (reference := recording.reference()) is None:
-        return []
-    T_ref_sensor, T_odom_sensor = reference.at(replayed.stamps), replayed.T_world_sensor
-    error = mean_difference(T_odom_sensor, T_ref_sensor, length)
-    place, given = sequences.config(name).extrinsic, sequences.estimate(name) is None
-    found = list(contradictions(recording, T_odom_sensor, error, place, given))
-    for what in found:
+def _judge(
+    sequences: StudySequences,
+    name: str,
+    recording: Recording,
+    folder: Path,
+    about: manifest.Inputs,
+    length: float,
+    replayed: Trajectory,
+) -> None:
+    """Write the reference of a sequence, and what scans say where a replay disagrees with it."""
+    reference, config, wrong = recording.reference(), sequences.config(name), list[str]()
+    if reference is not None and not config.views:
+        T_ref_sensor, T_odom_sensor = reference.at(replayed.stamps), replayed.T_world_sensor
+        error = mean_difference(T_ref_sensor, T_odom_sensor, length)
+        given = sequences.estimate(name) is None
+        seen = set(replayed.stamps.tolist())
+        scans = contradictions(recording, T_odom_sensor, error, config.extrinsic, given, seen)
+        wrong = list(scans)
+    for what in wrong:
         _log.warning("sequences.%s: %s", name, what)
-    return found
+    write_reference(folder, reference, replayed, about, wrong)
 
 
 def _due(study: Study, name: str, inputs: manifest.Inputs) -> _Run | None:

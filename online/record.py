@@ -42,8 +42,6 @@ class ReplaySummary(BaseModel):
     cpu_ms: float | None = None  # milliseconds of CPU time a scan, without reading it
     memory_mb: float | None = None  # most megabytes of all processes
     real_time: dict[str, float] | None = None  # how it kept up, see `kept_up`
-    # What scans say where the poses disagree with the reference, see `contradictions`.
-    contradictions: tuple[str, ...] = ()
     model_file: str | None  # of the model that it was made with; None if it needed none
     inputs: dict[str, Any] = Field({}, exclude=True)  # see `adaptune.manifest`
 
@@ -193,7 +191,6 @@ def write_replay(
     replay: ReplayRecord,
     inputs: manifest.Inputs,
     model_file: Path | None,
-    contradictions: Sequence[str] = (),
 ) -> None:
     """Write ``trajectory.tum``, ``selections.csv``, ``frames.csv`` and, last, ``replay.json``.
 
@@ -218,7 +215,6 @@ def write_replay(
         cpu_ms=round(replay.cpu_ms, 3),
         memory_mb=round(replay.memory, 1),
         real_time=kept_up(replay),
-        contradictions=tuple(contradictions),
         model_file=None if model_file is None else str(model_file.resolve()),
     )
     manifest.record(folder / manifest.FILE, inputs)
@@ -361,6 +357,7 @@ def _made_again(folder: Path) -> str:
 # The reference beside the replays of a sequence, and what it was made from.
 
 
+_CONTRADICTIONS = "contradictions.txt"
 _REFERENCE_INPUTS = f"reference.{manifest.FILE}"
 
 
@@ -390,11 +387,16 @@ def check_reference(folder: Path, about: manifest.Inputs) -> None:
 
 
 def write_reference(
-    folder: Path, reference: Trajectory | None, odometry: Trajectory, about: manifest.Inputs
+    folder: Path,
+    reference: Trajectory | None,
+    odometry: Trajectory,
+    about: manifest.Inputs,
+    contradictions: Sequence[str] = (),
 ) -> None:
     """Write ``reference.tum``, at the stamps of a replay; remove it if there is none.
 
-    `about` is what the reference is made from, see `adaptune.manifest`.
+    `about` is what the reference is made from, see `adaptune.manifest`; `contradictions` is what
+    scans say against it.
     """
     path = folder / "reference.tum"
     if reference is None:
@@ -408,4 +410,11 @@ def write_reference(
                 f"are of the same recording and clock"
             )
         write_tum(path, Trajectory(odometry.stamps[known], T[known]))
+    write_text(folder / _CONTRADICTIONS, "".join(f"{what}\n" for what in contradictions))
     manifest.record(folder / _REFERENCE_INPUTS, {**about, "known": reference is not None})
+
+
+def read_contradictions(folder: Path) -> list[str]:
+    """What scans say against the reference of a sequence's replays."""
+    path = folder / _CONTRADICTIONS
+    return path.read_text(encoding="utf-8").splitlines() if path.exists() else []

@@ -284,21 +284,11 @@ def _about(folder: Path) -> Any:
         return None
 
 
-# Notice poses that belong to another frame than the LiDAR's, and references that do.
+# Notice poses that belong to another frame than the LiDAR's.
 
 
-_MIN_FRAMES, _MIN_LENGTH = 10, 5.0
-"""Frames, and metres, below which nothing is said of a reference."""
-_MIN_MOTION = 0.2
-"""Metres that an odometry moves while the reference moves one."""
-_MIN_DEGREES, _MAX_LEFT = 20.0, 0.3
-"""Degrees between an odometry's motions and the reference's, and the share that may be left."""
-_MIN_SWAPPED_DEGREES = 45.0
-"""Degrees between them that no rotation explains."""
-_MIN_TURN, _MAX_OTHER_TURNS = np.radians(3.0), 0.1
-"""Radians of a turn, and the share of turns that may be otherwise than the others."""
-_MIN_REVERSED_DEGREES = 120.0
-"""Degrees from which a reference may be reversed in time."""
+_MIN_FRAMES = 10
+"""Frames below which nothing is said of a frame."""
 
 
 def check_frame(T_own_sensor: Poses, T_ref_sensor: Poses | None) -> None:

@@ -228,7 +228,8 @@ class BagSource:
                     break
                 if wanted in ("", frame):
                     yield Frame(stamp, recorded, partial(load, data, what))
-        if len(frames - {wanted}) == len(frames) > (not wanted):
+        wrong = wanted not in frames if wanted else len(frames) > 1
+        if frames and wrong:
             what = f"{self.points} holds clouds of {', '.join(sorted(map(repr, frames)))}"
             raise SequenceError(f"{self.name}: {what}; name one of these frames as `frame`")
 

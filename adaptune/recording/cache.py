@@ -91,7 +91,8 @@ class CachedScans:
         # All at once: mapped arrays stay even if another process removes the entry.
         self._arrays = [self._map(name, end) for name, end in zip(_ARRAYS, ends, strict=True)]
         # Records when the entry was last used.
-        os.utime(path / _ABOUT)
+        with suppress(OSError):  # a folder that only others may write to
+            os.utime(path / _ABOUT)
 
     def __len__(self) -> int:
         return len(self._index)
@@ -126,6 +127,8 @@ def find(key: str) -> CachedScans | None:
     try:
         return CachedScans(path)
     except FileNotFoundError:
+        # A process that was killed may have left a part of it.
+        shutil.rmtree(path, ignore_errors=True)
         return None
     except (OSError, ValueError, IndexError) as error:
         _log.warning("%s: is damaged and removed (%s)", path, error)
@@ -196,7 +199,8 @@ def tee(scans: Iterable[Scan], key: str, about: dict[str, Any]) -> Iterator[Scan
         except OSError as error:
             _log.warning(_NOT_KEPT, about.get("name"), error)
         for scan in scans:
-            total += scan.points.nbytes
+            arrays = (getattr(scan, name, None) for name in ("points", "times", "rings"))
+            total += sum(array.nbytes for array in arrays if array is not None)
             if writer is not None and total > cap():
                 _log.warning(_NOT_KEPT, about.get("name"), "larger than the cache may grow")
                 writer = None

@@ -401,9 +401,12 @@ def doubts(readings: Sequence[Reading], period: float, timing: Timing = AUTO) ->
             what = f"the times of the points begin {late:.3g} s after their scan's stamp"
             help_ = "write `stamp: first_point` to count them from the first point of each scan"
             yield Doubt(f"{what}; {help_}", lacks=_POSSIBLE if timing.stamp == "auto" else "")
-    late_by = [reading.stamp - reading.clock for reading in timed if reading.clock is not None]
-    if len(late_by) >= 5:
-        steps = np.diff(late_by)
+    both = [(reading.stamp, reading.stamp - reading.clock) for reading in timed if reading.clock]
+    if len(both) >= 5:
+        stamps, late_by = np.array(both).T
+        # One clock may go faster than the other.
+        drift = (late_by[-1] - late_by[0]) / max(stamps[-1] - stamps[0], 1)
+        steps = np.diff(late_by) - drift * np.diff(stamps)
         if (shake := float(np.quantile(np.abs(steps), 0.8)) * 1e-6) > 5.0:
             what = f"the stamps shake by {shake:.0f} ms against the sensor's clock"
             yield Doubt(f"{what}; write `stamp: sensor_clock`, and `clock_offset` if needed")

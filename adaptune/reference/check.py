@@ -1,20 +1,31 @@
 """Who is wrong, and by how much: a reference, or an odometry, by direct registrations of scans."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import islice
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
+from scipy.spatial.transform import Rotation
 
-from adaptune.geometry import Poses, invert
+from adaptune.geometry import (
+    Poses,
+    from_quaternions,
+    invert,
+    rotation_angle,
+    to_pose,
+    to_quaternions,
+)
 from adaptune.live.evidence import MIN_REACH, Link, OwnError, OwnErrors, hops_along
 from adaptune.live.hops import LENGTHS as HOPS
-from adaptune.live.hops import Hops
+from adaptune.live.hops import Hop, HopCloud, Hops, register
 from adaptune.metrics import cap, sub_trajectory_rte, travelled
+from adaptune.recording.compensation import neighbour_motions
 from adaptune.recording.config import ESTIMATED, SequenceConfig
 from adaptune.recording.inspect import Inspection
 from adaptune.recording.recording import position_prior
@@ -24,21 +35,6 @@ from adaptune.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from adaptune.reference.estimate import Advance
-from collections.abc import Callable, Iterable, Sequence
-from itertools import islice
-from typing import Any, NamedTuple
-
-from scipy.optimize import minimize_scalar
-from scipy.spatial.transform import Rotation
-
-from adaptune.geometry import (
-    from_quaternions,
-    rotation_angle,
-    to_pose,
-    to_quaternions,
-)
-from adaptune.live.hops import Hop, HopCloud, register
-from adaptune.recording.compensation import neighbour_motions
 
 UNSEEN = 0.7
 """Share of a way that a registration does not show, from which it does not count."""
@@ -259,7 +255,7 @@ def diagnose_reference(
         *_conventions(given, at_scans),
         _Candidate("reversed in time", backwards, at_scans(given[::-1])),
         *_clock(reference, stamps, hops),
-        *_places(at_scans(given) @ invert(T_given_sensor), hops),
+        *_places(at_scans(given) @ invert(T_given_sensor), hops, T_given_sensor),
     ]
     return _likeliest(candidates, hops, before) or _sparse(reference, stamps, hops, before)
 
@@ -278,7 +274,7 @@ def diagnose_odometry(T_odom_sensor: Poses, hops: Hops) -> Cause | None:
             _accumulated(steps),
         ),
         *_conventions(T_odom_sensor, lambda T: T),
-        *_places(T_odom_sensor, hops, of_odometry=True),
+        *_places(T_odom_sensor, hops, np.eye(4), of_odometry=True),
     ]
     return _likeliest(candidates, hops, before)
 
@@ -411,7 +407,9 @@ def _turned_moved(T: Poses) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return rotation_angle(T), np.linalg.norm(T[:, :3, 3], axis=1)
 
 
-def _places(T_world_body: Poses, hops: Hops, of_odometry: bool = False) -> Iterator[_Candidate]:
+def _places(
+    T_world_body: Poses, hops: Hops, T_body_sensor: Poses, of_odometry: bool = False
+) -> Iterator[_Candidate]:
     """The poses of another body of the same platform, or in other units."""
     T = invert(T_world_body[hops.start]) @ T_world_body[hops.end]
     known = np.isfinite(T).all(axis=(1, 2))
@@ -423,7 +421,7 @@ def _places(T_world_body: Poses, hops: Hops, of_odometry: bool = False) -> Itera
         scaled = T_world_body.copy()
         scaled[:, :3, 3] /= scale
         what = f"{scale:.4g} times as long as the way of the scans"
-        yield _Candidate(what, "write the positions in metres", scaled)
+        yield _Candidate(what, "write the positions in metres", scaled @ T_body_sensor)
     turned, lever = _rotation(T, measured), _lever(T, measured, np.eye(3))
     both = _lever(T, measured, turned)
     for R, t, what in (
@@ -490,7 +488,12 @@ def _sparse(
 
 
 def contradictions(
-    scans: Recording, T_odom_sensor: Poses, error: float, place: Sequence[Any] | None, given: bool
+    scans: Recording,
+    T_odom_sensor: Poses,
+    error: float,
+    place: Sequence[Any] | None,
+    given: bool,
+    seen: Collection[int] | None = None,
 ) -> Iterator[str]:
     """What a recording's scans say where its reference and an odometry disagree.
 
@@ -507,6 +510,8 @@ def contradictions(
         The LiDAR's pose in the reference's frame as a study states it (`extrinsic`).
     given
         Whether the reference came with the recording.
+    seen
+        Stamps of the scans that the odometry was given, if they are not all.
     """
     if not error > SUSPICIOUS:
         return
@@ -514,8 +519,9 @@ def contradictions(
 
     def read() -> Iterator[Scan]:
         for scan in scans:
-            stamps.append(scan.stamp)
-            yield scan
+            if seen is None or scan.stamp in seen:
+                stamps.append(scan.stamp)
+                yield scan
 
     hops = measured_motions(read(), len(T_odom_sensor))
     reference = scans.reference() if given else None
@@ -544,6 +550,8 @@ STRETCHES, SCANS = 8, 40
 METRES, EACH = 4.0, 4
 """A motion is measured over so many metres, or over half a stretch if that is less, and begins at
 every fourth scan of it."""
+STANDING = 0.5
+"""Metres below which a motion is noise."""
 ENOUGH = 10.0
 """Metres after which the rest of a stretch is not looked at."""
 _AGREE = 0.3
@@ -587,6 +595,8 @@ def _motions_over(stretch: list[Scan]) -> Iterator[tuple[int, int, Hop]]:
         away = int(np.argmax(metres >= METRES)) or len(metres) - 1
         if metres[away] < METRES and away < SCANS // 2:
             return  # the rest is too short
+        if metres[away] < STANDING:
+            continue
         hop = register(clouds[start], clouds[start + away], [guesses[away]])
         if hop is not None:
             apart = hop.projection @ (hop.T_start_end - guesses[away])[:3, 3]

@@ -571,7 +571,7 @@ def expected_in_words(expected: Mapping[str, float]) -> str:
     Parameters
     ----------
     expected
-        See `offline.expected_loss.Figures`.
+        See `offline.tuning.Figures`.
     """
     gain, low, high = (100.0 * (1.0 - expected[key]) for key in ("geometric", "high", "low"))
     stretches, recordings = int(expected["n_stretches"]), int(expected["n_recordings"])

@@ -6,6 +6,8 @@ from scipy.spatial.transform import Rotation
 
 from adaptune.geometry import from_quaternions, invert, to_quaternions
 from adaptune.live.hops import Hops
+from adaptune.recording.scan import Scan
+from adaptune.reference import check
 from adaptune.reference.check import diagnose_odometry, diagnose_reference
 from adaptune.trajectory import Trajectory
 
@@ -143,6 +145,15 @@ def test_rare_poses_are_named_where_interpolation_fails():
     assert "one every 1.2 s with a scan every 0.1 s" in found.what
 
 
+def test_units_are_found_where_the_study_says_where_the_sensor_is():
+    place = carried(turned(np.eye(4)[None]))[0]
+    T_world_body = poses(POSES) @ invert(place)
+    millimetres = with_positions(lambda p: 1000.0 * p)(T_world_body)
+    found = diagnose_reference(Trajectory(POSES, millimetres @ place), SCANS, hops(), place)
+    assert "times as long" in found.what
+    assert "metres" in found.mend
+
+
 def noisy(T):
     apart = np.random.default_rng(1).normal(0.0, 0.15, (len(T), 3))
     return with_positions(lambda p: p + apart)(T)
@@ -195,3 +206,29 @@ def test_an_odometry_that_is_lost_breaks_no_convention():
     lost[200:, :3, 3] += np.arange(len(lost) - 200)[:, None] * 0.2
     assert diagnose_odometry(lost, hops()) is None
     assert diagnose_odometry(np.full_like(lost, np.nan), hops()) is None
+
+
+class Recorded:
+    """Scans without points, and a reference."""
+
+    def __init__(self, T):
+        self.reference = lambda: Trajectory(SCANS, T)
+
+    def __iter__(self):
+        return (Scan(int(stamp), np.zeros((0, 3), np.float32)) for stamp in SCANS)
+
+
+def test_scans_that_were_dropped_do_not_count(monkeypatch):
+    """An odometry that was given half of the scans is as right as one that was given all."""
+    half = SCANS[::2]
+
+    T = poses(half)
+    start, end = hops().start // 2, (hops().end + 1) // 2
+    measured = hops()._replace(start=start, end=end, T_start_end=invert(T[start]) @ T[end])
+    monkeypatch.setattr(check, "measured_motions", lambda scans, n: [*scans] and measured)
+    found = check.contradictions(Recorded(poses(SCANS)), T, 10.0, None, True, set(half.tolist()))
+    assert not list(found)
+    assert not list(check.contradictions(Recorded(poses(SCANS)), T, 1.0, None, True))
+    wrong = check.contradictions(Recorded(turned(poses(SCANS))), T, 99.0, None, True, set(half))
+    (words,) = wrong
+    assert words.startswith("the reference contradicts the scans: over some metres they differ by")
