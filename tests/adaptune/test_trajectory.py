@@ -83,6 +83,7 @@ S, MS, NS = (("1700000000" + zeros, "1700000001" + zeros) for zeros in ("", "000
         ("", f"{{}},{AT},{TURN}\n".replace(",", " "), S),
         ("", f"{{}}; {AT}; {TURN};\r\n", MS),
         ("\ufefftimestamp,x,y,z,qx,qy,qz,qw\n", f"{{}},{AT},{TURN}\n", NS),
+        ("timestamp;x;y;z;qx;qy;qz;qw\n", f"{{}};{AT};{TURN}\n".replace(",", ";"), S),
         ("qw qx qy qz t tx ty tz\n", "0.70710678 0 0 0.70710678 {} 1 2 3\n", S),
         ("# Poses\n#sec,nsec,x,y,z,qx,qy,qz,qw\n", f"{{}},{AT},{TURN}\n", [f"{s},0" for s in S]),
         (ROS, f"{{}},lidar,{AT},{TURN},9\n", NS),

@@ -147,6 +147,9 @@ def test_clouds_of_two_frames_are_one_sensor_s_only_when_it_is_named(tmp_path):
         with pytest.raises(SequenceError, match="/points holds clouds of 'front', 'rear'; name"):
             list(opened(bag, **options))
     assert [scan.stamp for scan in opened(bag, frame="rear")] == stamps[1::2]
+    nameless = clouds_at(tmp_path / "c.bag", stamps, rec.scans(6), ("", "front"))
+    with pytest.raises(SequenceError, match="/points holds clouds of '', 'front'; name"):
+        list(opened(nameless))
     slashed = clouds_at(tmp_path / "b.bag", stamps, rec.scans(6), ("front", "/front"))
     assert len(list(opened(slashed))) == 6
 

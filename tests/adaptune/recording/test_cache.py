@@ -140,6 +140,9 @@ def test_a_damaged_entry_is_made_anew(tmp_path, cache_folder, caplog):
         again = list(open_sequence(config))
         assert [s.stamp for s in again] == [s.stamp for s in whole]
         assert "damaged" in caplog.text
+    (entry / "index.npy").unlink()  # as a killed process leaves an entry that it removes
+    list(open_sequence(config))
+    assert (entry / "index.npy").exists()
 
 
 def _write_slowly(ready):

@@ -225,7 +225,7 @@ def test_scans_that_were_dropped_do_not_count(monkeypatch):
     T = poses(half)
     start, end = hops().start // 2, (hops().end + 1) // 2
     measured = hops()._replace(start=start, end=end, T_start_end=invert(T[start]) @ T[end])
-    monkeypatch.setattr(check, "measured_motions", lambda scans, n: [*scans] and measured)
+    monkeypatch.setattr(check, "measured_motions", lambda scans, _: [*scans] and measured)
     found = check.contradictions(Recorded(poses(SCANS)), T, 10.0, None, True, set(half.tolist()))
     assert not list(found)
     assert not list(check.contradictions(Recorded(poses(SCANS)), T, 1.0, None, True))
