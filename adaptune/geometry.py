@@ -94,6 +94,17 @@ def rotation_angle(T_target_source: Poses) -> Any:
     return np.arctan2(sine, cosine)
 
 
+def nearest_rotation(
+    source: NDArray[np.float64], target: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """The rotation of shape (3, 3) that takes vectors of shape (n, 3) nearest to others.
+
+    By Kabsch (Acta Cryst. 1976). Where the vectors lie on a line, the turn about it is arbitrary.
+    """
+    U, _, Vt = np.linalg.svd(target.T @ source)
+    return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
+
+
 def from_quaternions(translations: ArrayLike, quaternions: ArrayLike) -> Poses:
     """Poses of shape (n, 4, 4) from translations (n, 3) and quaternions x, y, z, w (n, 4).
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune.geometry import Poses, invert, rotation_angle, steps
+from adaptune.geometry import Poses, invert, nearest_rotation, rotation_angle, steps
 
 RESAMPLES = 2000
 """Resamples of a bootstrap."""
@@ -188,9 +188,8 @@ def absolute_error(T_ref_sensor: Poses, T_odom_sensor: Poses) -> float:
     known = ~np.isnan(T_ref_sensor[:, 0, 0])
     ref, odom = T_ref_sensor[known, :3, 3], T_odom_sensor[known, :3, 3]
     ref, odom = ref - ref.mean(axis=0), odom - odom.mean(axis=0)
-    U, _, Vt = np.linalg.svd(ref.T @ odom)
-    U[:, 2] *= np.linalg.det(U @ Vt)  # a rotation, not a mirror
-    return float(np.sqrt(np.mean(np.sum((ref - odom @ (U @ Vt).T) ** 2, axis=1))))
+    R_ref_odom = nearest_rotation(odom, ref)
+    return float(np.sqrt(np.mean(np.sum((ref - odom @ R_ref_odom.T) ** 2, axis=1))))
 
 
 def relative_error(T_ref_sensor: Poses, T_odom_sensor: Poses) -> float:

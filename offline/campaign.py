@@ -12,10 +12,8 @@ from adaptune.archive import Archive, ArchiveError, Summary, Trial, summarise
 from adaptune.errors import AdaptuneError
 from adaptune.odometry.tracker import HealthCheck
 from adaptune.progress import Progress, unseen
-from adaptune.recording.scan import origin
-from adaptune.reference.check import contradictions
 from adaptune.space import ParameterSet, PooledSpace
-from adaptune.study.study import StudySequences
+from adaptune.study.references import contradictions_of
 from offline.config import OfflineConfig, OfflineStudy
 from offline.objective import Verdict, best_by_trials, judge, label, mean_value, weighted
 from offline.search import Clock, Finished, assess, make_searches, rungs
@@ -343,22 +341,10 @@ def run_baseline(
         done.append((task, result))
     for task, result in done:
         _store(archive, task, result)
-        warn_of_contradictions(
-            study.sequences, task.sequence, labels[task.numbers[0]], result.trials[0]
-        )
-
-
-def warn_of_contradictions(sequences: StudySequences, name: str, odometry: str, run: Trial) -> None:
-    """Tell what the scans of a sequence say where a whole run disagrees with the reference.
-
-    A view has its origin's reference, seen otherwise: nothing is said of it.
-    """
-    if origin(name) != name or sequences.config(name).views:
-        return
-    place, given = sequences.config(name).extrinsic, sequences.estimate(name) is None
-    scans = sequences.open(name)
-    for what in contradictions(scans, run.T_odom_sensor, run.mean_error, place, given):
-        _log.warning("sequences.%s, %s: %s", name, odometry, what)
+        name, whole = task.sequence, result.trials[0]
+        told = contradictions_of(study.sequences, name, whole.T_odom_sensor, whole.mean_error)
+        for what in told:
+            _log.warning("sequences.%s, %s: %s", name, labels[task.numbers[0]], what)
 
 
 def check_baseline(odometry: str, sequence: str, run: Trial) -> None:

@@ -20,11 +20,11 @@ from adaptune.odometry.registry import Factory
 from adaptune.processes import release_memory, shared_cores
 from adaptune.progress import Progress, unseen
 from adaptune.recording.scan import Recording, Scan, part_name
-from adaptune.reference.check import contradictions, mean_difference
+from adaptune.reference.check import mean_difference
 from adaptune.selector import AnySelector, Selector, UntrainedSelector, untrained_sets
 from adaptune.space import ParameterSet, ParameterSets, Selection
 from adaptune.study.config import RealTimeConfig, StudyConfig, SwitchingConfig
-from adaptune.study.references import ensure_references
+from adaptune.study.references import contradictions_of, ensure_references
 from adaptune.study.study import (
     RIVALS,
     Mechanism,
@@ -446,14 +446,12 @@ def _judge(
     replayed: Trajectory,
 ) -> None:
     """Write the reference of a sequence, and what scans say where a replay disagrees with it."""
-    reference, config, wrong = recording.reference(), sequences.config(name), list[str]()
-    if reference is not None and not config.views:
+    reference, wrong = recording.reference(), list[str]()
+    if reference is not None:
         T_ref_sensor, T_odom_sensor = reference.at(replayed.stamps), replayed.T_world_sensor
         error = mean_difference(T_ref_sensor, T_odom_sensor, length)
-        given = sequences.estimate(name) is None
         seen = set(replayed.stamps.tolist())
-        scans = contradictions(recording, T_odom_sensor, error, config.extrinsic, given, seen)
-        wrong = list(scans)
+        wrong = contradictions_of(sequences, name, T_odom_sensor, error, seen)
     for what in wrong:
         _log.warning("sequences.%s: %s", name, what)
     write_reference(folder, reference, replayed, about, wrong)

@@ -23,7 +23,7 @@ from pydantic import AfterValidator
 from adaptune import files, processes
 from adaptune.errors import OdometryError, UnavailableError, nearest
 from adaptune.files import replacing_folder, temporary_folder
-from adaptune.geometry import Poses, invert, rotation_angle, steps, to_pose
+from adaptune.geometry import Poses, invert, nearest_rotation, rotation_angle, steps, to_pose
 from adaptune.metrics import window_ends
 from adaptune.odometry.base import (
     BaseSettings,
@@ -305,7 +305,7 @@ def check_frame(T_own_sensor: Poses, T_ref_sensor: Poses | None) -> None:
     if len(own) < _MIN_FRAMES:
         return
     T_true_own = np.eye(4)
-    T_true_own[:3, :3] = R_true_own = _aligning(own, true)
+    T_true_own[:3, :3] = R_true_own = nearest_rotation(own, true)
     before = np.linalg.norm(own - true, axis=1).mean()
     after = np.linalg.norm(own @ R_true_own.T - true, axis=1).mean()
     if before > 0.3 and after < 0.2 * before:
@@ -314,13 +314,6 @@ def check_frame(T_own_sensor: Poses, T_ref_sensor: Poses | None) -> None:
             f"the program's poses are those of another frame: turned by {angle:.0f} degrees, they "
             f"are the reference's; give the LiDAR's pose in it (odometry.settings.extrinsic)"
         )
-
-
-def _aligning(own: Poses, true: Poses) -> Poses:
-    """The rotation that takes directions of shape (n, 3) nearest to others, of shape (3, 3)."""
-    U, _, Vt = np.linalg.svd(true.T @ own)
-    R_true_own: Poses = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
-    return R_true_own
 
 
 def _motions(T_odom_sensor: Poses, T_ref_sensor: Poses, length: float) -> tuple[Poses, Poses]:

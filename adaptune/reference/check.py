@@ -17,6 +17,7 @@ from adaptune.geometry import (
     Poses,
     from_quaternions,
     invert,
+    nearest_rotation,
     rotation_angle,
     to_pose,
     to_quaternions,
@@ -447,9 +448,7 @@ def _rotation(T: Poses, measured: Poses) -> NDArray[np.float64]:
     for motions in (T, measured):
         turns = Rotation.from_matrix(motions[:, :3, :3]).as_rotvec()
         vectors.append(np.concatenate([motions[:, :3, 3], 10.0 * turns]))
-    # Kabsch, Acta Cryst. 1976. On a straight way, the turn about it is arbitrary.
-    U, _, Vt = np.linalg.svd(vectors[0].T @ vectors[1])
-    return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
+    return nearest_rotation(vectors[1], vectors[0])
 
 
 def _lever(T: Poses, measured: Poses, R_body_sensor: NDArray[np.float64]) -> NDArray[np.float64]:

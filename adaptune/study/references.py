@@ -3,11 +3,12 @@
 import logging
 import math
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from functools import partial
 from typing import Any
 
 from adaptune import manifest
+from adaptune.geometry import Poses
 from adaptune.processes import pin
 from adaptune.recording.cache import fingerprints
 from adaptune.recording.recording import (
@@ -19,6 +20,7 @@ from adaptune.recording.recording import (
 )
 from adaptune.recording.scan import origin
 from adaptune.reference import estimate
+from adaptune.reference.check import SUSPICIOUS, contradictions
 from adaptune.reference.graph import warn_of_unused
 from adaptune.reference.stored import (
     EstimatedReference,
@@ -182,3 +184,22 @@ def estimates_as_data(estimates: Mapping[str, StoredEstimate], length: float) ->
         percent = None if math.isnan(error) else round(error, 4)
         found[name] = {"error_percent": percent, "unknown_share": stored.unknown_share}
     return found
+
+
+def contradictions_of(
+    sequences: StudySequences,
+    name: str,
+    T_odom_sensor: Poses,
+    error: float,
+    seen: Collection[int] | None = None,
+) -> list[str]:
+    """What the scans of a sequence say where its reference and an odometry disagree.
+
+    For the parameters see `adaptune.reference.check.contradictions`. A view has its origin's
+    reference, seen otherwise: nothing is said of it.
+    """
+    config = sequences.config(name)
+    if config.views or not error > SUSPICIOUS:
+        return []
+    scans, given = sequences.open(name), sequences.estimate(name) is None
+    return list(contradictions(scans, T_odom_sensor, error, config.extrinsic, given, seen))
