@@ -87,8 +87,9 @@ def trial(study: OfflineStudy) -> None:
     """One trial over prepared scans."""
     setup = TrialSetup(TrialSettings.of(study.config), study.odometry, study.sequences)
     sequence = setup.prepare("hall_begin", 8e9)
-    prepared = [(scan.cloud, scan.tree) for scan in sequence]
     parameters: ParameterSet = {"max_correspondence_distance": 2.0, "keyframe_interval": 1.0}
+    instance = study.odometry(parameters)
+    prepared = [(scan.cloud, scan.tree) for scan in (load(instance) for load in sequence)]
     iterations = study.odometry.settings.iterations
     compare(
         f"trial, {len(prepared)} scans",
