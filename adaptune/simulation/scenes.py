@@ -232,24 +232,30 @@ def _section(s: Floats, angle: Floats, seed: int) -> tuple[Floats, Floats]:
     return lean + d + bumps * np.cos(angle), z + bumps * np.sin(angle)
 
 
-def _cave_build(tile: Tile) -> list[Mesh]:
+_Section = Callable[[Floats, Floats, int], tuple[Floats, Floats]]
+
+
+def _tunnel(tile: Tile, section: _Section) -> list[Mesh]:
+    """Raise rock of a section over the road, and a rock face at each mouth."""
     s = np.linspace(tile.start, tile.stop, max(int((tile.stop - tile.start) / 0.3), 1) + 1)[:, None]
     angle = np.linspace(-0.35, np.pi + 0.35, 56)[None]
-    d, z = _section(s, angle, tile.seed)
+    d, z = section(s, angle, tile.seed)
     rock = tile.at(s, d)
     # Above one line, so that the roof does not follow the rubble below it.
     rock[..., 2] = tile.at(s, 0.0)[..., 2] + z
-    meshes = [grid(rock, Material.ROCK)]
-    meshes.extend(_face(tile, end, angle) for end in tile.ends)
-    meshes.extend(_dripstones(tile))
+    return [grid(rock, Material.ROCK), *(_face(tile, end, angle, section) for end in tile.ends)]
+
+
+def _cave_build(tile: Tile) -> list[Mesh]:
+    meshes = [*_tunnel(tile, _section), *_dripstones(tile)]
     s_rocks, d_rocks = tile.scatter(0.05, 1.8, 4.5)
     sizes = tile.rng.uniform(0.2, 0.55, len(s_rocks))
     return [*meshes, strew(tile, variants(boulder), s_rocks, d_rocks, sizes)]
 
 
-def _face(tile: Tile, end: float, angle: Floats) -> Mesh:
-    """Build the rock face around the cave's mouth."""
-    d, z = _section(np.full((1, 1), end), angle, tile.seed)
+def _face(tile: Tile, end: float, angle: Floats, section: _Section) -> Mesh:
+    """Build the rock face around the mouth of a tunnel."""
+    d, z = section(np.full((1, 1), end), angle, tile.seed)
     foot = tile.at(np.full(1, end), np.zeros(1))[0, 2]
     growth = np.linspace(0.0, 1.0, 14)[:, None]
     far_d = 26.0 * np.cos(angle)
@@ -302,6 +308,38 @@ CAVE = Scene(
     slope=0.03,
     shake=1.2,
     pace=0.35,
+)
+
+
+# A narrow gallery of a mine, driven fast: it winds every few metres, and its walls are uneven.
+
+
+def _gallery(s: Floats, angle: Floats, seed: int) -> tuple[Floats, Floats]:
+    """Offset and height of the rock at stations and angles from the left, over the top."""
+    along = np.stack([s.ravel(), np.zeros(s.size), np.zeros(s.size)], axis=1)
+    half = 2.5 + 0.5 * fractal(along, 11.0, seed + 41).reshape(s.shape)
+    roof = 2.3 + 0.4 * fractal(along, 9.0, seed + 42).reshape(s.shape)
+    d, z = half * np.cos(angle), roof * np.sin(angle)
+    places = np.stack(np.broadcast_arrays(s, d, z), axis=-1).reshape(-1, 3)
+    bumps = 0.35 * fractal(places, 1.8, seed + 43, 2).reshape(d.shape)
+    return d + bumps * np.cos(angle), z + bumps * np.sin(angle)
+
+
+def _mine_build(tile: Tile) -> list[Mesh]:
+    s_rocks, d_rocks = tile.scatter(0.04, 1.5, 2.4)
+    sizes = tile.rng.uniform(0.15, 0.35, len(s_rocks))
+    return [*_tunnel(tile, _gallery), strew(tile, variants(boulder), s_rocks, d_rocks, sizes)]
+
+
+MINE = Scene(
+    summary="narrow gallery that bends every few metres, with uneven walls",
+    build=_mine_build,
+    relief=_cave_relief,
+    surface=paved((np.inf, Material.ROCK)),
+    winding=1.2,
+    bend=7.0,
+    slope=0.02,
+    shake=1.0,
 )
 
 
@@ -712,5 +750,6 @@ SCENES: Mapping[str, Scene] = {
     "garden": GARDEN,
     "corridor": CORRIDOR,
     "field": FIELD,
+    "mine": MINE,
 }
 """Scenes by name."""
