@@ -205,6 +205,8 @@ def relative_error(T_ref_sensor: Poses, T_odom_sensor: Poses) -> float:
 
 FAILURE = 30.0
 """Percent. A lost track and every larger error count as this."""
+LOST_ABOVE = 5.0
+"""Percent. An odometry with a larger mean error does not track."""
 
 
 def cap(errors: NDArray[np.floating]) -> NDArray[np.float64]:

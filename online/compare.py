@@ -23,6 +23,7 @@ from adaptune.study.study import (
     oracle_errors,
 )
 from online.modes import (
+    ADAPTIVE,
     BASELINE,
     EVEN,
     MODES,
@@ -56,7 +57,7 @@ from online.statistics import (
     mean_of,
     oracle_rows,
 )
-from online.tables import remarks, tables
+from online.tables import remarks, tables, verdict
 
 # Which replays are compared: the modes that were replayed on every sequence.
 
@@ -417,7 +418,8 @@ class ComparedReplays(NamedTuple):
 
     # A row for every sequence and mode; over several sequences, a row for every mode follows.
     rows: list[ComparisonRow]
-    words: list[str]  # sentences: what was gained, and what must be known to trust it
+    verdict: list[str]  # sentences: what to do, and why
+    details: list[str]  # sentences: what was gained, and what must be known to trust it
     unfinished: Sequence[str] = ()  # sequences that are not compared, for want of replays
 
 
@@ -464,18 +466,21 @@ def compare(study: Study) -> ComparedReplays:
             period = study.config.online.period
             oracles += oracle_rows(judged[-1], oracle, model.fixed, period)
     rows = _rows(judged, oracles)
-    words = [
+    obstacle = "" if ADAPTIVE in modes else ReplaySetup.of(study).obstacle(ADAPTIVE, model)
+    said = [*wrong[:1], *verdict(rows, study.config.sub_trajectory, obstacle)]
+    details = [
         *wrong,
         *remarks(rows),
         *_equal_cost(model, modes),
         *compared.words,
         *_missing_repeats(judged),
     ]
-    words += _without_oracle(judged, oracles) if model is not None else []
+    details += _without_oracle(judged, oracles) if model is not None else []
     folder = study.folder / "comparison"
     report.write_rows(folder, "comparison", [row.columns() for row in rows])
-    report.write_tables(folder, study.name, tables(rows, study.config.sub_trajectory), words)
-    return ComparedReplays(rows, words, compared.unfinished)
+    made = tables(rows, study.config.sub_trajectory)
+    report.write_tables(folder, study.name, made, [*said, *details])
+    return ComparedReplays(rows, said, details, compared.unfinished)
 
 
 def _equal_cost(model: ErrorModel | None, modes: Sequence[str]) -> list[str]:
@@ -534,7 +539,7 @@ def _against(
     """Compare a mode that adapts with controls and rivals, too, on the same frames."""
     if row.mode not in ("adaptive", UNTRAINED):
         return row
-    others = [other.mode for other in rows if other.mode in (EVEN, *RIVALS)]
+    others = [other.mode for other in rows if other.mode in (BASELINE, EVEN, *RIVALS)]
     return replace(row, against={other: ratio_to(judged, row.mode, other) for other in others})
 
 

@@ -3,9 +3,8 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from adaptune.metrics import MIN_BLOCKS
 from adaptune.report.tables import Listing
-from adaptune.study.study import MIN_RECORDINGS, RIVAL_WORDS, RIVALS
+from adaptune.study.study import EQUAL_COST, MIN_RECORDINGS, RIVAL_WORDS, RIVALS
 from online.modes import EVEN
 from online.statistics import (
     ALL,
@@ -33,6 +32,17 @@ def tables(rows: Sequence[ComparisonRow], length: float) -> list[Listing]:
         made.append(_of_sequences(rows, length))
     standard = _standard(rows)
     return made if standard is None else [*made, standard]
+
+
+_DECIDES = ("mode", "RTE [%]", "95 %", "worst tenth", "restarts", "ms a scan")
+
+
+def decision_table(rows: Sequence[ComparisonRow], length: float) -> Listing:
+    """What a decision needs: a row a mode with its error, its ratio with interval, and its cost."""
+    whole = _of_modes(rows, length)
+    kept = (*_DECIDES, f"vs {rows[0].yardstick}")
+    cells = [{k: v for k, v in row.items() if k in kept} for row in whole.rows]
+    return Listing(whole.title, cells)
 
 
 _DRIVEN = {
@@ -191,9 +201,12 @@ def _change(row: ComparisonRow, rows: Sequence[ComparisonRow]) -> dict[str, Any]
     return cells
 
 
-# The first sentences of a comparison: what was gained, how surely, at what cost, what to do.
+# The decision: what to drive, what that gives, and at what cost.
 
 
+WORTH = 0.1
+"""Adapting is worth its CPU time where it has so much less error than one set, as a share, and
+surely less."""
 NEARLY = 0.05
 """Where a whole interval lies within this share of 1, there is no difference."""
 ROUNDING = 1e-6
@@ -201,24 +214,117 @@ ROUNDING = 1e-6
 _UNSURE = "nothing can be said of how sure that is"
 _YARDSTICKS = {"fixed": "fixed set", "baseline": "baseline"}
 _NOT_ADAPTIVE = ("baseline", "fixed", *RIVALS, *ORACLES, EVEN)
+_CALLED = {
+    "baseline": "the odometry's own parameters",
+    "fixed": "the fixed set",
+    "adaptive": "adaptive",
+    "untrained": "the untrained bank",
+    **RIVAL_WORDS,
+}
+_ONE_SET = ("baseline", "fixed", "best_default")
+"""Modes that drive one set; those that cost less first."""
 
 
-def verdict(rows: Sequence[ComparisonRow]) -> list[str]:
+def decided(rows: Sequence[ComparisonRow]) -> ComparisonRow:
+    """What to drive: the one set with the least error, or what is worth its cost.
+
+    The rows over all sequences come last.
+    """
+    last = {row.mode: row for row in _last(rows) if row.ratio is not None}
+    one = min((last[m] for m in _ONE_SET if m in last), key=lambda row: _ratio(row).value)
+    worth = [one]
+    for mode in ("adaptive", "untrained", EQUAL_COST):
+        if (row := last.get(mode)) is not None:
+            ratio = _to(row, one)
+            surely = ratio.interval is not None and ratio.interval[1] < 1.0
+            worth += [row] * (ratio.value <= 1.0 - WORTH and surely)
+    return min(worth, key=lambda row: _ratio(row).value)
+
+
+def _to(row: ComparisonRow, one: ComparisonRow) -> Ratio:
+    """Ratio of two modes' errors, with its interval where that is known."""
+    if one.mode == row.yardstick:
+        return _ratio(row)
+    return row.against.get(one.mode, Ratio(_ratio(row).value / max(_ratio(one).value, 1e-12)))
+
+
+def adapting(rows: Sequence[ComparisonRow]) -> ComparisonRow | None:
+    """The mode that adapts: `adaptive`, or without a model the untrained bank; None if none is."""
+    last = {row.mode: row for row in _last(rows) if row.ratio is not None}
+    return next((last[mode] for mode in ("adaptive", "untrained") if mode in last), None)
+
+
+def verdict(rows: Sequence[ComparisonRow], length: float, obstacle: str = "") -> list[str]:
+    """What to do, and why, in at most three sentences.
+
+    Parameters
+    ----------
+    rows
+        Those over all sequences come last.
+    length
+        Metres of a sub-trajectory.
+    obstacle
+        Why nothing adapts, if nothing does.
+    """
+    last = {row.mode: row for row in _last(rows)}
+    if all(row.ratio is None for row in last.values()):
+        return ["No test sequence has a reference: nobody can say what was gained."]
+    best = decided(rows)
+    errors = {m: f"{row.rte:.3g} %" for m, row in last.items() if row.rte is not None}
+    others = [m for m in ("fixed", "baseline") if m in errors and m != best.mode]
+    instead = " and ".join(f"{errors[m]} with {_CALLED[m]}" for m in others)
+    do = "Keep" if best.mode == "baseline" else "Drive"
+    said = f"{do} {_CALLED[best.mode]}: {errors[best.mode]} RTE over {length:g} m"
+    said += f" instead of {instead}" if instead else ""
+    said += f", {_where(rows)}"
+    main = adapting(rows)
+    if best.mode not in _ONE_SET:
+        return [f"{said}.", f"It has {_times(best)}{_for_cost(best, last[best.yardstick])}."]
+    return [f"{said}.", *_why_not(main, best, rows, obstacle)]
+
+
+def _for_cost(main: ComparisonRow, one: ComparisonRow) -> str:
+    if main.cpu_ms is None or not one.cpu_ms:
+        return ""
+    return f", for {main.cpu_ms / one.cpu_ms:.1f} times its CPU time ({main.cpu_ms:.3g} ms a scan)"
+
+
+def _why_not(
+    main: ComparisonRow | None, best: ComparisonRow, rows: Sequence[ComparisonRow], obstacle: str
+) -> list[str]:
+    """Why not to adapt."""
+    if main is None:
+        return [f"Adapting was not tried: {obstacle}."] if obstacle else []
+    if _is_yardstick(main):
+        return ["Adapting was not driven: the training promised no gain."]
+    ratio = _to(main, best)
+    cost = _for_cost(main, best)
+    has = f"{ratio.value:.2f} times its error ({_interval(ratio)}){cost}"
+    if ratio.value <= 1.0 - WORTH:
+        more = "drive more test recordings, or longer ones, to know"
+        return [f"Adapting had {has}, which may be chance: {more}."]
+    return [f"Adapting is not worth its cost {_where(rows)}: {has}."]
+
+
+# A comparison in words: what was gained, how surely, at what cost.
+
+
+def explained(rows: Sequence[ComparisonRow]) -> list[str]:
     """What the comparison says, in the order in which a user asks.
 
     The rows over all sequences come last.
     """
     last = {row.mode: row for row in rows if row.sequence == rows[-1].sequence}
     if all(row.ratio is None for row in last.values()):
-        return ["No test sequence has a reference: nobody can say what was gained."]
+        return []
     adaptive = [row for mode, row in last.items() if mode not in _NOT_ADAPTIVE]
     tuned = []
     if {"fixed", "baseline"} <= last.keys():
         tuned = [_of_baseline(last["baseline"], rows)]
     if not adaptive:
-        return [*tuned, _advice(last)]
+        return tuned
     # `adaptive` comes first; without a model there is the untrained bank.
-    main = next((row for row in adaptive if row.mode == "adaptive"), adaptive[-1])
+    main = adapting(rows) or adaptive[-1]
     if _is_yardstick(main):
         what = f"`{main.mode}` kept the {_YARDSTICKS[main.yardstick]} {_where(rows)}."
         said = [f"Nothing was adapted, nothing gained: {what}"]
@@ -231,7 +337,7 @@ def verdict(rows: Sequence[ComparisonRow]) -> list[str]:
     ]
     said += _even(main, last)
     said += [_other(row) for row in adaptive if row is not main and not _is_yardstick(row)]
-    return [*said, *tuned, _advice(last)]
+    return [*said, *tuned]
 
 
 def _is_yardstick(row: ComparisonRow) -> bool:
@@ -375,41 +481,9 @@ def _of_baseline(row: ComparisonRow, rows: Sequence[ComparisonRow]) -> str:
     }[_surely(ratio)]
 
 
-def _preferred(row: ComparisonRow) -> float:
-    return _ratio(row).value * (1.0 - NEARLY * (row.mode == "adaptive"))
-
-
-def _advice(last: Mapping[str, ComparisonRow]) -> str:
-    """What to do: drive what is surely better than the yardstick, the best of it.
-
-    The best of several is so by chance, too: `adaptive` is kept if it is nearly as good.
-    """
-    drivable = {m: r for m, r in last.items() if m not in (*ORACLES, EVEN) and r.ratio}
-    better = [row for row in drivable.values() if _surely(_ratio(row)) == "less"]
-    yardstick = _YARDSTICKS[next(iter(last.values())).yardstick]
-    if better:
-        best = min(better, key=_preferred)
-        called = RIVAL_WORDS.get(best.mode, f"`{best.mode}`")
-        return f"What to do: drive {called}."
-    others = [r for r in drivable.values() if r.mode != r.yardstick and not _is_yardstick(r)]
-    if any(_surely(_ratio(row)) == "unknown" for row in others):
-        return (
-            f"What to do: replay {MIN_RECORDINGS} test recordings or more, or longer ones (at "
-            f"least {MIN_BLOCKS} sub-trajectories each); without, nothing can be said of how sure "
-            f"this is. Until then, drive the {yardstick}."
-        )
-    promising = [r for r in others if _ratio(r).value < 1.0 - NO_DIFFERENCE]
-    if any(_surely(_ratio(row)) == "open" for row in promising):
-        return f"What to do: replay more test sequences; until they decide, drive the {yardstick}."
-    return f"What to do: drive the {yardstick}; nothing is surely better."
-
-
-# A comparison in words.
-
-
 def remarks(rows: Sequence[ComparisonRow]) -> list[str]:
     """In words: what was gained, and what must be known to trust it."""
-    return verdict(rows) + _judges(rows) + _estimates(rows) + _kept_up(rows) + _restarts(rows)
+    return explained(rows) + _judges(rows) + _estimates(rows) + _kept_up(rows) + _restarts(rows)
 
 
 def _judges(rows: Sequence[ComparisonRow]) -> list[str]:

@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
-from adaptune.commands import offline, online, tools
+from adaptune.commands import offline, online, tools, tune
 from adaptune.commands.terminal import Commands, errors, say
 
 # Every command imports what it needs, so that `adaptune --help` answers at once.
@@ -21,12 +21,12 @@ app = typer.Typer(
         "Tune the parameters of a LiDAR odometry, and keep tuning them while the robot drives.\n\n"
         "A study is a YAML file: an odometry, its parameters, and sequences for training and test. "
         "Its folder keeps all results. Run the same command again to resume it.\n\n"
-        "Every command names the next one at its end; the first is `adaptune inspect my.bag`."
+        "Every command names the next one at its end; the first is `adaptune tune my.bag`."
     ),
 )
 
 for _command in (
-    *(tools.inspect, offline.simulate, offline.reference),
+    *(tune.tune, tune.inspect, offline.simulate, offline.reference),
     *(offline.offline, offline.trials, offline.validate),
     *(online.online, online.compare, online.record),
     *(tools.cache, tools.serve, tools.import_rustle),

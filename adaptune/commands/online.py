@@ -59,6 +59,7 @@ Repeats = Annotated[
     int, typer.Option(help="How often to replay each mode on a sequence.", min=1, max=20)
 ]
 Ros2 = Annotated[bool, typer.Option("--ros2", help="Drive on a robot with ROS 2 over Zenoh.")]
+Details = Annotated[bool, typer.Option("--details", help="Print all sentences and tables.")]
 Oracle = Annotated[
     bool, typer.Option("--oracle", help="Run sets as trials: what was there to gain?")
 ]
@@ -116,7 +117,7 @@ def online(
     if oracle:
         _oracle(loaded, cluster)
     else:
-        made = _replay(loaded, model, repeats, untrained=untrained)
+        made = replay_missing(loaded, model, repeats, untrained=untrained)
         there = f"{made} replays made" if made else "All replays were there already"
         say(f"{there}: {loaded.folder / 'replays'}/")
     say_next_of_study("table and pictures of the modes", "compare")
@@ -145,7 +146,9 @@ def _alone(study: "OfflineStudy") -> ExitStack:
     return pin(os.getpid(), alone=True)
 
 
-def _replay(loaded: "OfflineStudy", model: Path | None, repeats: int, *, untrained: bool) -> int:
+def replay_missing(
+    loaded: "OfflineStudy", model: Path | None = None, repeats: int = 1, *, untrained: bool = False
+) -> int:
     """Make the replays that are missing; how many were made."""
     from online.modes import run_replays, run_untrained
 
@@ -187,39 +190,38 @@ def compare(
         Path | None,
         typer.Option(help="Of several studies, where their tables go.", file_okay=False),
     ] = None,
+    details: Details = False,
 ) -> None:
-    """Compare the replays: what adapting gained, in words, tables and a page of charts.
+    """Compare the replays: what to drive, what adapting gained, and at what cost.
 
     *RTE* is the mean sub-trajectory error. *vs fixed* is its ratio to the fixed set's error: below
     1, adapting is better. Intervals come from a paired block bootstrap. With six test sequences or
     more, they speak of other sequences like these, else of these alone. Where an estimated
     reference judged, they include its own error.
 
-    The study's folder receives CSV, JSON, Markdown, LaTeX, and a page (HTML) of all that is known
-    of the study, also of one that is not finished. It opens without a network, and its charts lie
-    beside it as PNG and SVG. With several studies, their errors also stand side by side.
+    The study's folder receives a page (HTML) of all that is known of the study, also of one that
+    is not finished. It opens without a network, and its charts lie beside it as PNG and SVG. All
+    tables are there as CSV, JSON, Markdown and LaTeX, too; `--details` prints them. With several
+    studies, their errors also stand side by side.
     """
     if len(studies) == 1:
         if to is not None:
             raise AdaptuneError("--to is for several studies; one has its tables in its folder")
-        _compare_one(studies[0], override, folder)
+        _compare_one(studies[0], override, folder, details=details)
         return
     if folder is not None:
         raise AdaptuneError("--folder is for one study; several have their own under runs/")
-    _compare_several(studies, override, to)
+    _compare_several(studies, override, to, details=details)
 
 
-def _compare_one(study: Path, override: list[str], folder: Path | None) -> None:
+def _compare_one(study: Path, override: list[str], folder: Path | None, *, details: bool) -> None:
     from adaptune.study.study import MIN_RECORDINGS
 
     loaded = load(study, override, folder)
-    found = _compared(loaded)
-    say(f"Tables: {loaded.folder / 'comparison'}/")
+    found = compared(loaded, details=details)
     if found.rows[0].yardstick == "baseline":
         say_next_of_study("look for better sets", "offline")
-        return
-    say(f"Fixed set: {loaded.folder / 'fixed.yaml'}")
-    if found.unfinished:
+    elif found.unfinished:
         say_next_of_study("replay what is missing", "online")
     elif (n := len(loaded.config.training)) < MIN_RECORDINGS:
         first = f"name {MIN_RECORDINGS} training recordings or more, the study has {n}; then "
@@ -228,10 +230,13 @@ def _compare_one(study: Path, override: list[str], folder: Path | None) -> None:
         say_next_of_study("replays to look at in Foxglove", "record")
 
 
-def _compared(loaded: "OfflineStudy") -> "ComparedReplays":
-    """Compare a study's replays, print words and tables, and write the page."""
+def compared(loaded: "OfflineStudy", *, details: bool = False) -> "ComparedReplays":
+    """Compare a study's replays, write the page, and print what to do and a table.
+
+    With `details`, print all sentences and tables of the page, too.
+    """
     from online.compare import compare as compare_replays
-    from online.tables import tables
+    from online.tables import decision_table, tables
 
     begin_work()
     try:
@@ -239,13 +244,18 @@ def _compared(loaded: "OfflineStudy") -> "ComparedReplays":
     except AdaptuneError as error:
         # A study that still runs has a page, too.
         if (loaded.folder / "study.yaml").exists():
-            _write_page(loaded, f"No comparison: {error}.")
+            say(f"Page: {_write_page(loaded, f'No comparison: {error}.')}")
         raise
-    for said in found.words:
-        say(said)
-    for made in tables(found.rows, loaded.config.sub_trajectory):
+    page, length = _write_page(loaded, found), loaded.config.sub_trajectory
+    say(" ".join(found.verdict))
+    if found.rows[0].yardstick == "fixed":
+        say(f"The parameters: {loaded.folder / 'fixed.yaml'}.")
+    say(f"More: {page}")
+    shown = tables(found.rows, length) if details else [decision_table(found.rows, length)]
+    for sentence in found.details if details else ():
+        say(sentence)
+    for made in shown:
         show_table(*made[:3])
-    _write_page(loaded, found)
     return found
 
 
@@ -256,7 +266,7 @@ _BEST = 50
 """Trials of the page's table: the best ones."""
 
 
-def _write_page(study: "OfflineStudy", found: "ComparedReplays | str") -> None:
+def _write_page(study: "OfflineStudy", found: "ComparedReplays | str") -> Path:
     """Write all that is known of a study as one page; `found` may be why nothing is compared."""
     from adaptune.report.page import Page, write_page
     from offline.charts import charts_of_validation
@@ -280,10 +290,10 @@ def _write_page(study: "OfflineStudy", found: "ComparedReplays | str") -> None:
         f"{', '.join(config.odometries)}: trained on {len(config.training)} sequences, tested on "
         f"{len(config.test)}, errors over {config.sub_trajectory:g} m, seed {config.offline.seed}"
     )
-    words = () if isinstance(found, str) else tuple(found.words)
+    words = () if isinstance(found, str) else tuple(found.verdict)
     path = study.folder / "report" / "report.html"
     write_page(path, Page(study.name, subtitle, words, tuple(sections)))
-    say(f"Page: {path}; its charts as PNG and SVG: {path.parent}/figures/")
+    return path
 
 
 def _comparison(found: "ComparedReplays | str", length: float) -> "PageSection":
@@ -295,10 +305,8 @@ def _comparison(found: "ComparedReplays | str", length: float) -> "PageSection":
     if isinstance(found, str):
         return PageSection(title, missing=(found,))
     made = *tables(found.rows, length), modes_in_words(found.rows)
-    if (chart := comparison_chart(found.rows)) is None:
-        missing = ("No ratios of errors: no sequence has a reference.",)
-        return PageSection(title, missing, tables=made)
-    return PageSection(title, charts=(chart,), tables=made)
+    chart = comparison_chart(found.rows)
+    return PageSection(title, tuple(found.details), () if chart is None else (chart,), made)
 
 
 def _search(study: "OfflineStudy") -> "PageSection":
@@ -347,7 +355,9 @@ def _of_charts(title: str, make: "Callable[[], Charts]") -> "PageSection":
     return PageSection(title, missing=tuple(notes), charts=tuple(charts))
 
 
-def _compare_several(studies: list[Path], override: list[str], to: Path | None) -> None:
+def _compare_several(
+    studies: list[Path], override: list[str], to: Path | None, *, details: bool
+) -> None:
     from adaptune.report.tables import write_tables
     from online.tables import side_by_side
 
@@ -362,7 +372,7 @@ def _compare_several(studies: list[Path], override: list[str], to: Path | None) 
     rows: dict[str, list[ComparisonRow]] = {}
     for one in loaded:
         console.rule(one.name)
-        rows[one.name] = _compared(one).rows
+        rows[one.name] = compared(one, details=details).rows
     console.rule("side by side")
     made = side_by_side(rows)
     for listing in made:

@@ -622,9 +622,11 @@ TRAINING = 0.6
 
 
 def proposed_sub_trajectory(
-    reference: Trajectory, measured: MeasuredReference | None = None
+    reference: Trajectory, measured: MeasuredReference | None = None, training: float = TRAINING
 ) -> float:
-    """Metres of the sub-trajectories that a study of a recording alone should judge by.
+    """Metres of the sub-trajectories that a study should judge by.
+
+    The test begins after the share `training` of the reference's duration.
 
     The first of `LENGTHS` for which the test's part of the path is long enough, 1 m if none is,
     or a longer one if that does not last `SECONDS`. Where registrations say that the reference is
@@ -632,7 +634,7 @@ def proposed_sub_trajectory(
     the longest that fits, up to the greatest of `LENGTHS`.
     """
     first, last = reference.stamps[[0, -1]]
-    tested = reference.stamps >= first + TRAINING * (last - first)
+    tested = reference.stamps >= first + training * (last - first)
     seconds = float(last - reference.stamps[tested][0]) * 1e-9
     path = float(travelled(reference.T_world_sensor[tested])[-1])
     usual = next((length for length, n in LENGTHS.items() if n * length <= path), 1.0)

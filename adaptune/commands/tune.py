@@ -1,0 +1,411 @@
+"""Commands that begin with recordings: look at one, or tune an odometry on them."""
+
+import shlex
+from collections.abc import Sequence
+from functools import partial
+from importlib.util import find_spec
+from itertools import count
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from adaptune.commands.online import Details, compared, replay_missing
+from adaptune.commands.terminal import (
+    console,
+    load,
+    progress,
+    say,
+    say_next,
+    say_next_of_study,
+    show_table,
+)
+from adaptune.errors import AdaptuneError
+from adaptune.files import write_text
+from adaptune.progress import Progress
+
+if TYPE_CHECKING:
+    from adaptune.recording.inspect import Inspection
+    from offline.config import OfflineStudy
+    from offline.train import Training
+
+MODEL_SUFFIX = ".safetensors"
+"""Of files of error models."""
+UNKNOWN_LENGTH = "5.0    # metres; 10.0 for a path of 200 m or more, 25.0 for one of 500 m or more"
+"""The length of sub-trajectories to propose where the path is not known."""
+
+
+def inspect(
+    file: Annotated[
+        Path,
+        typer.Argument(
+            metavar="FILE",
+            help="A bag, a folder, a file of poses, an error model, or a study's folder.",
+            show_default=False,
+        ),
+    ],
+    deep: Annotated[bool, typer.Option("--deep", help="Read all messages, not a sample.")] = False,
+    study: Annotated[
+        Path | None,
+        typer.Option(metavar="YAML", help="Write the study to this file.", dir_okay=False),
+    ] = None,
+) -> None:
+    """Show what is in a recording, what each stage lacks, and how to name it in a study.
+
+    Of an error model, or of a study's folder, show its sets, sequences, provenance and validation.
+    """
+    if file.suffix == MODEL_SUFFIX or (file / f"model{MODEL_SUFFIX}").exists():
+        _show_model(file)
+        return
+    if study is not None and study.exists():
+        raise AdaptuneError(f"{study}: exists; name another file with --study, or move it away")
+    from adaptune.recording.inspect import inspect as inspect_file
+    from adaptune.recording.inspect import render_inspection
+
+    with progress() as show:
+        found = inspect_file(file, deep, show)
+        length, accuracy = _sub_trajectory(found, deep, show)
+    console.print(render_inspection(found, accuracy), crop=False)
+    if not found.name:
+        return
+    if found.missing.get("offline"):
+        say(
+            "Next: mend what is lacking, see docs/your-bag.md; where only the reference does not "
+            "serve, write `reference: estimated`"
+        )
+        return
+    rest = roles([found.name], length, ["gicp"])
+    say(rest)
+    path = study or Path(f"{found.name}.yaml")
+    first = "" if study else f"put the lines from `sequences:` on in {path}; then "
+    if study is not None:
+        write_text(study, f"{found.entry}\n{rest}")
+    say_next("train on a part of it", "offline", path, first=first)
+
+
+def _show_model(file: Path) -> None:
+    from adaptune.model import ErrorModel
+    from adaptune.model.error_model import render
+    from adaptune.study.study import CONFIGURATION, MODEL
+
+    file = file / MODEL if file.is_dir() else file
+    console.print(render(ErrorModel.load(file), file))
+    if (study := file.parent / CONFIGURATION).exists():
+        other = [] if file.name == MODEL else ["--model", file]
+        why = "replay the test sequences with it"
+        say_next(why, "online", study, "--folder", file.parent, *other)
+
+
+def _sub_trajectory(found: "Inspection", deep: bool, show: Progress) -> tuple[str, str]:
+    """The length of sub-trajectories to propose, and how wrong the reference is, if it is measured.
+
+    Only what can be used to train is measured. What the scans say against it joins the faults.
+    """
+    if found.reference is None or not found.name or found.missing.get("offline"):
+        return UNKNOWN_LENGTH, ""
+    from adaptune.recording.inspect import Fault
+    from adaptune.recording.recording import open_sequence
+    from adaptune.reference import check
+    from adaptune.reference.check import diagnose_reference, measured_motions
+
+    usual = check.proposed_sub_trajectory(found.reference)
+    if not deep:
+        return str(usual), "`--deep` also measures how wrong it is"
+    try:
+        scans = open_sequence(found.config())
+        if (reference := scans.reference()) is None:
+            return str(usual), ""
+        measured = check.measure_reference(scans, reference, partial(show, "registering"))
+        motions = measured_motions(scans, len(measured.stamps))
+        if (cause := diagnose_reference(reference, measured.stamps, motions)) is not None:
+            what = f"the reference contradicts the scans: {cause}"
+            found.faults.append(Fault(what, "reference"))
+    except AdaptuneError as error:
+        return str(usual), f"its error cannot be measured: {error}"
+    length = check.proposed_sub_trajectory(reference, measured)
+    words = check.accuracy_words(measured, usual, length), check.advice(measured, reference)
+    return str(length), "; ".join(filter(None, words))
+
+
+# A study of recordings, and nothing else: what it says beside their names.
+
+
+def roles(names: Sequence[str], length: str, odometries: Sequence[str]) -> str:
+    """YAML of a study: what it trains and tests on, over which metres, and the odometry.
+
+    The last part of a single recording is kept for the test, the last one of several.
+    """
+    from adaptune.reference.check import TRAINING
+
+    share = f"{100 * TRAINING:.0f}"
+    if len(names) == 1:
+        training, test = f"{names[0]}: 0-{share}%", f"{names[0]}: {share}-100%"
+    else:
+        training, test = ", ".join(names[:-1]), names[-1]
+    if len(odometries) == 1:
+        odometry = f"{{name: {odometries[0]}}}    # or another one, see docs/your-odometry.md"
+    else:
+        odometry = "".join(f"\n  - {{name: {name}}}" for name in odometries)
+    return (
+        f"training: [{training}]\ntest: [{test}]\nsub_trajectory: {length}\nodometry: {odometry}\n"
+    )
+
+
+# Tune an odometry on recordings.
+
+
+TRIALS, EACH = 32, 16
+"""Parameter sets to try, and at least for each of several odometries."""
+LEAST_PATH = 2.0
+"""Metres that the part for the test has to hold."""
+Points = Annotated[
+    str | None, typer.Option(metavar="TOPIC", help="Topic of the scans, where there are several.")
+]
+Given = Annotated[
+    str | None,
+    typer.Option(
+        metavar="TOPIC|FILE",
+        help="The reference, or `estimated` to compute one from the scans.",
+        show_default="the recording's own, or estimated",
+    ),
+]
+
+
+def tune(
+    recordings: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="BAG...", help="Bags of one robot, or folders (KITTI).", show_default=False
+        ),
+    ],
+    odometry: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME",
+            help="gicp, kiss_icp, my_module:MyClass, ...; several with commas, or `all`.",
+        ),
+    ] = "gicp",
+    points: Points = None,
+    reference: Given = None,
+    trials: Annotated[
+        int | None,
+        typer.Option(help="Parameter sets to try.", min=2, show_default=f"{TRIALS}"),
+    ] = None,
+    minutes: Annotated[
+        float | None, typer.Option(help="Time for trying them; without, all are tried.", min=0.01)
+    ] = None,
+    folder: Annotated[
+        Path | None,
+        typer.Option(help="The study's folder.", show_default="the first bag's name, under runs/"),
+    ] = None,
+    details: Details = False,
+) -> None:
+    """Tune an odometry on recordings, and say what to drive.
+
+    It keeps the last 40 % of one recording, or the last one of several, for the test. It tries
+    parameter sets on the rest, replays the test with the odometry's own parameters, the best set,
+    and adapting, and compares.
+
+    What it decides is written to a study file in its folder, with which all other commands work.
+    Run the same command again to resume.
+    """
+    several = len(recordings) > 1
+    name = "+".join(dict.fromkeys(odometry.replace(":", "_").split(",")))
+    stem = _name_of(recordings[0]) + ("_and_more" if several else "")
+    folder = folder or Path("runs") / (stem if odometry == "gicp" else f"{stem}_{name}")
+    path = folder / f"{folder.resolve().name}.yaml"
+    words = [*(str(bag.resolve()) for bag in recordings), "--odometry", odometry]
+    words += ["--points", points] if points else []
+    words += ["--reference", reference] if reference else []
+    made_by = f"# adaptune tune {shlex.join(words)}\n"
+    overrides = []
+    if not path.exists():
+        text = _decided(recordings, odometry, (points, reference), (trials, minutes), folder)
+        write_text(path, made_by + text)
+    elif not path.read_text("utf-8").startswith(made_by):
+        raise AdaptuneError(
+            f"{path}: was made by another command, see its first line; give that one to resume it, "
+            f"or another --folder"
+        )
+    else:
+        overrides = [f"offline.{limit}".replace(": ", "=") for limit in _limits(trials, minutes)]
+    loaded = load(path, overrides, folder)
+    say(f"Study: {path}")
+    from offline.train import train
+
+    with progress() as show:
+        training = train(loaded, show)
+    replay_missing(loaded)
+    compared(loaded, details=details)
+    _say_odometries(loaded, training)
+    say_next_of_study("replays to look at in Foxglove", "record")
+
+
+def _limits(trials: int | None, minutes: float | None) -> list[str]:
+    """The budget of the search, as keys and values of a study."""
+    of_time = [] if minutes is None else [f"hours: {minutes / 60.0:.4g}"]
+    return of_time if trials is None else [f"trials: {trials}", *of_time]
+
+
+def _name_of(recording: Path) -> str:
+    stem = "".join(c if c.isalnum() or c in "_.-" else "_" for c in recording.resolve().stem)
+    return stem.lstrip(".-") or "recording"
+
+
+def _decided(
+    recordings: Sequence[Path],
+    odometry: str,
+    topics: tuple[str | None, str | None],
+    budget: tuple[int | None, float | None],
+    folder: Path,
+) -> str:
+    """The study of some recordings as YAML, with comments; nothing is written but references."""
+    points, reference = topics
+    if len(recordings) > 1 and reference is not None and Path(reference).is_file():
+        raise AdaptuneError(
+            f"--reference {reference}: is a file, and of {len(recordings)} recordings each needs "
+            f"its own; write a study file, see docs/your-bag.md"
+        )
+    with progress() as show:
+        found = [_usable(path, points, reference, show) for path in recordings]
+    named: dict[str, Inspection] = {}
+    for one in found:
+        numbered = (f"{one.name}_{i}" for i in count(2))
+        named[next(name for name in (one.name, *numbered) if name not in named)] = one
+    odometries = _odometries(odometry, all("imu" in one.given for one in found))
+    trials, minutes = budget
+    if trials is None and minutes is None:
+        trials = max(TRIALS, EACH * len(odometries))
+    limits = _limits(trials, minutes)
+
+    def study(length: str) -> str:
+        from adaptune import files
+
+        recorded = files.dump({"sequences": {name: one.given for name, one in named.items()}})
+        return (
+            f"# Every command works with this file; change what you like.\n\n{recorded}\n"
+            f"# The part for the test is not trained on.\n"
+            f"{roles(list(named), length, odometries)}"
+            f"offline: {{{', '.join(limits)}}}    # parameter sets to try, or the time for it\n"
+            f"online: {{modes: [adaptive]}}\n"
+        )
+
+    return study(_length(study("5.0"), list(named), folder))
+
+
+def _usable(path: Path, points: str | None, reference: str | None, show: Progress) -> "Inspection":
+    """Look at a recording; it has scans of one topic, and a reference or is to get one."""
+    from adaptune.recording.bag import POINTS_TYPES
+    from adaptune.recording.inspect import inspect as inspect_file
+
+    found = inspect_file(path, False, show)
+    if not found.name:
+        raise AdaptuneError(f"{path}: is a file of poses; give a recording of scans")
+    clouds = [topic for topic in found.topics.values() if topic.type in POINTS_TYPES]
+    if len(clouds) > 1 and points is None:
+        each = ", ".join(f"{one.name} ({one.count:,} of {one.type})" for one in clouds)
+        raise AdaptuneError(
+            f"{path}: has {len(clouds)} topics of point clouds: {each}; name one with --points"
+        )
+    if points is None and (lacking := found.missing["online"]):
+        raise AdaptuneError(f"{path}: lacks {' and '.join(lacking)}; see `adaptune inspect {path}`")
+    if points is not None:
+        found.given["points"] = points
+    if reference is not None:
+        is_file = Path(reference).is_file()
+        found.given["reference"] = str(Path(reference).resolve()) if is_file else reference
+    elif found.missing["offline"]:
+        why = "; ".join(fault.text for fault in found.faults if fault.of == "reference")
+        say(f"{path}: its reference does not serve ({why}): one is estimated")
+        found.given["reference"] = "estimated"
+    return found
+
+
+def _odometries(given: str, imu: bool) -> list[str]:
+    """The odometries that a name, several, or `all` stand for."""
+    from adaptune.odometry import registry
+
+    if given != "all":
+        names = list(dict.fromkeys(filter(None, map(str.strip, given.split(",")))))
+        for name in names:
+            if name in registry.PROGRAMS:
+                raise AdaptuneError(
+                    f"--odometry {name}: a program needs settings; write a study file, see "
+                    f"docs/your-odometry.md"
+                )
+            if registry.is_user_class(name):
+                registry.where(name)
+            else:
+                registry.odometry_class(name)
+        return names
+    there = []
+    for name, where in registry.ODOMETRIES.items():
+        package = registry.PACKAGES.get(name, where.partition(":")[0].rpartition(".")[2])
+        if find_spec(package.replace("-", "_")) is None or name == "evalio_kiss_icp":
+            continue  # the other one is the same KISS-ICP
+        if imu or not registry.declare(name, {}).sound(name)[1].needs_imu:
+            there.append(name)
+    return there
+
+
+def _length(text: str, whole: Sequence[str], folder: Path) -> str:
+    """Metres of the sub-trajectories by which a study, whose YAML is given, should judge.
+
+    References that are lacking are estimated: they tell how far the robot has moved. `whole` has
+    the names of the recordings.
+    """
+    from adaptune.metrics import travelled
+    from adaptune.reference.check import TRAINING, proposed_sub_trajectory
+    from adaptune.study.references import ensure_references, to_estimate
+    from adaptune.trajectory import read_trajectory
+    from offline.config import load_study
+
+    with TemporaryDirectory() as temporary:
+        path = Path(temporary) / "study.yaml"
+        write_text(path, text)
+        study = load_study(path, folder=folder)
+    sequences, names = study.sequences, (*study.config.training, *study.config.test)
+    if to_estimate(sequences, names):
+        study.open()
+        with progress() as show:
+            ensure_references(sequences, names, 5.0, show)
+    (test,) = study.config.test
+    reference, before = sequences.open(whole[-1]).reference(), TRAINING if len(whole) == 1 else 0.0
+    if reference is None:
+        reference, before = read_trajectory(sequences.estimate_path(test)), 0.0
+    begin, end = reference.stamps[[0, -1]]
+    tested = reference.T_world_sensor[reference.stamps >= begin + before * (end - begin)]
+    if (metres := float(travelled(tested)[-1])) < LEAST_PATH:
+        raise AdaptuneError(
+            f"{test}: moves {metres:.1f} m, too little for a test, which takes {LEAST_PATH:g} m at "
+            f"least; record a longer drive, or name another recording for the test as the last one"
+        )
+    length = proposed_sub_trajectory(reference, training=before)
+    return f"{length}    # metres over which errors are measured; the test moves {metres:.0f} m"
+
+
+def _say_odometries(study: "OfflineStudy", training: "Training") -> None:
+    """Of several odometries, what each gives with its own parameters and tuned, in training."""
+    from adaptune.space import ODOMETRY
+    from offline.train import COST
+
+    labels = list(study.config.odometries)
+    if len(labels) < 2:
+        return
+    rows = []
+    for label in labels:
+        mine = [row for row in training.trials if row[ODOMETRY] == label]
+        known = [row for row in mine if row["mean"] is not None]
+        best = min(known, key=lambda row: row["mean"], default=None)
+        rows.append(
+            {
+                "odometry": label,
+                "its own parameters [%]": mine[0]["mean"] if mine else None,
+                "tuned [%]": None if best is None else best["mean"],
+                "ms a scan": None if best is None else best[COST],
+            }
+        )
+    rows.sort(key=lambda row: row["tuned [%]"] if row["tuned [%]"] is not None else float("inf"))
+    say(f"Best odometry in training: {rows[0]['odometry']}.")
+    show_table("RTE of each odometry in training", rows)
