@@ -27,6 +27,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any, Self
 
@@ -77,18 +78,9 @@ def bare(study: OfflineStudy, sets: Sequence[dict[str, Any]]) -> None:
 
 def in_children(function: Callable[..., Any], *calls: tuple[Any, ...]) -> list[tuple[float, Any]]:
     """Time calls, each in a fresh process, all at once; return their seconds and results."""
-    context = mp.get_context("spawn")
-    queues = [context.SimpleQueue() for _ in calls]
-    children = [
-        context.Process(target=_answer, args=(queue, function, arguments))
-        for queue, arguments in zip(queues, calls, strict=True)
-    ]
-    for child in children:
-        child.start()
-    answers = [queue.get() for queue in queues]
-    for child in children:
-        child.join()
-    return answers
+    with ProcessPoolExecutor(len(calls), mp.get_context("spawn")) as pool:
+        timed = [pool.submit(_timed, function, arguments) for arguments in calls]
+        return [one.result() for one in timed]
 
 
 def in_child(function: Callable[..., Any], *arguments: Any) -> tuple[float, Any]:
@@ -96,10 +88,10 @@ def in_child(function: Callable[..., Any], *arguments: Any) -> tuple[float, Any]
     return in_children(function, arguments)[0]
 
 
-def _answer(queue: Any, function: Callable[..., Any], arguments: tuple[Any, ...]) -> None:
+def _timed(function: Callable[..., Any], arguments: tuple[Any, ...]) -> tuple[float, Any]:
     begin = time.monotonic()
     returned = function(*arguments)
-    queue.put((time.monotonic() - begin, returned))
+    return time.monotonic() - begin, returned
 
 
 def train(study: OfflineStudy) -> list[dict[str, Any]]:
