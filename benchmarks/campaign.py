@@ -50,7 +50,7 @@ from offline.trial import TrialSettings, TrialSetup
 from offline.workers import Task, TaskResult
 
 STUDY = """\
-odometry: {{name: gicp, settings: {{downsampling: 0.5}}}}
+odometry: {{name: gicp, settings: {{downsampling: 0.5, iterations: 20}}}}
 courses: {{cave: {{scenes: [cave], length: {length:.0f}, sensor: hdl32e, seed: 1}}}}
 training: [cave]
 offline: {{initial: {trials}, trials: {trials}}}
