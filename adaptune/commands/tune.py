@@ -1,10 +1,11 @@
 """Commands that begin with recordings: look at one, or tune an odometry on them."""
 
+import re
 import shlex
 from collections.abc import Sequence
 from functools import partial
 from importlib.util import find_spec
-from itertools import count
+from itertools import chain, count
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated
@@ -18,7 +19,6 @@ from adaptune.commands.terminal import (
     progress,
     say,
     say_next,
-    say_next_of_study,
     show_table,
 )
 from adaptune.errors import AdaptuneError
@@ -239,7 +239,7 @@ def tune(
     replay_missing(loaded)
     compared(loaded, details=details)
     _say_odometries(loaded, training)
-    say_next_of_study("replays to look at in Foxglove", "record")
+    say_next("replays to look at in Foxglove", "record", folder)
 
 
 def _limits(trials: int | None, minutes: float | None) -> list[str]:
@@ -271,8 +271,8 @@ def _decided(
         found = [_usable(path, points, reference, show) for path in recordings]
     named: dict[str, Inspection] = {}
     for one in found:
-        numbered = (f"{one.name}_{i}" for i in count(2))
-        named[next(name for name in (one.name, *numbered) if name not in named)] = one
+        names = chain([one.name], (f"{one.name}_{i}" for i in count(2)))
+        named[next(name for name in names if name not in named)] = one
     odometries = _odometries(odometry, all("imu" in one.given for one in found))
     trials, minutes = budget
     if trials is None and minutes is None:
@@ -288,7 +288,7 @@ def _decided(
             f"# The part for the test is not trained on.\n"
             f"{roles(list(named), length, odometries)}"
             f"offline: {{{', '.join(limits)}}}    # parameter sets to try, or the time for it\n"
-            f"online: {{modes: [adaptive]}}\n"
+            "online: {modes: [adaptive]}\n"
         )
 
     return study(_length(study("5.0"), list(named), folder))
@@ -364,7 +364,11 @@ def _length(text: str, whole: Sequence[str], folder: Path) -> str:
     with TemporaryDirectory() as temporary:
         path = Path(temporary) / "study.yaml"
         write_text(path, text)
-        study = load_study(path, folder=folder)
+        try:
+            study = load_study(path, folder=folder)
+        except AdaptuneError as error:
+            # The file is nowhere for the user to look.
+            raise AdaptuneError(re.sub(rf"{path}(, line \d+)?: ", "", str(error))) from error
     sequences, names = study.sequences, (*study.config.training, *study.config.test)
     if to_estimate(sequences, names):
         study.open()

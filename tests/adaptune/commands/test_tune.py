@@ -1,0 +1,156 @@
+"""Tuning from recordings alone, with no study file."""
+
+import commands
+import drives
+import pytest
+import rec
+from typer.testing import CliRunner
+
+from adaptune.commands import tune
+from adaptune.commands.cli import app
+from offline.config import load_study
+
+FAKE = ("--odometry", "fake_odometry:Fake")
+
+
+def failed(*arguments):
+    """What a command line says before it exits with 2."""
+    done = CliRunner().invoke(app, ["tune", *map(str, arguments)])
+    assert done.exit_code == 2, done.output
+    assert "Traceback" not in done.output
+    return " ".join(done.stderr.split())
+
+
+@pytest.fixture
+def bag(study_file, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "one.bag").symlink_to(study_file.parent / "one.bag")
+    return tmp_path / "one.bag"
+
+
+@pytest.fixture
+def decided(monkeypatch):
+    """Only decide; nothing is run."""
+
+    def stop(path, overrides, _):
+        raise tune.AdaptuneError(f"{path} {' '.join(overrides)}".strip())
+
+    monkeypatch.setattr(tune, "load", stop)
+
+
+@pytest.mark.services
+def test_one_command_tunes_compares_and_resumes(bag, tmp_path):
+    done = commands.call("tune", bag, *FAKE, "--trials", 4)
+    assert done.exit_code == 0, done.stderr
+    folder = tmp_path / "runs/one_fake_odometry_Fake"
+    lines = done.stdout.splitlines()
+    begin = next(i for i, line in enumerate(lines) if line.startswith(("Drive", "Keep")))
+    assert (folder / "report/report.html").exists()
+    assert f"The parameters: runs/{folder.name}/fixed.yaml." in lines[begin + 1]
+    assert lines[begin + 2].startswith("More: runs/")
+    # The same command does nothing again; a greater budget continues.
+    model = (folder / "model.safetensors").stat().st_mtime_ns
+    commands.call("tune", bag, *FAKE, "--trials", 4)
+    assert (folder / "model.safetensors").stat().st_mtime_ns == model
+    done = commands.call("tune", bag, *FAKE, "--trials", 6)
+    assert len(commands.call("trials", folder, "--csv").stdout.splitlines()) == 7, done.output
+    # Other commands take the file that it wrote.
+    assert commands.call("compare", folder / f"{folder.name}.yaml").exit_code == 0
+
+
+@pytest.mark.usefixtures("decided")
+def test_what_it_decides_stands_in_a_study_file(bag, tmp_path):
+    assert failed(bag) == "error: runs/one/one.yaml"
+    text = (tmp_path / "runs/one/one.yaml").read_text()
+    assert text.startswith(f"# adaptune tune {bag.resolve()} --odometry gicp\n")
+    study = load_study(tmp_path / "runs/one/one.yaml", [], tmp_path / "elsewhere")
+    assert study.training == ["one_0-60"]
+    assert study.config.test == ("one_60-100",)
+    assert study.config.sub_trajectory == 2.0
+    assert study.config.offline.trials == tune.TRIALS
+    assert study.config.sequences["one"].points == "/points"
+    assert study.config.sequences["one"].reference == "/truth"
+
+
+@pytest.mark.usefixtures("decided")
+def test_what_the_user_changed_stays(bag, tmp_path):
+    failed(bag)
+    path = tmp_path / "runs/one/one.yaml"
+    path.write_text(path.read_text() + "lost_track: 2.0\n")
+    assert failed(bag, "--trials", 9, "--minutes", 3).endswith(
+        "one.yaml offline.trials=9 offline.hours=0.05"
+    )
+    assert "lost_track: 2.0" in path.read_text()
+    said = failed(bag, "--reference", "estimated")
+    assert "runs/one/one.yaml: was made by another command, see its first line" in said
+
+
+@pytest.mark.usefixtures("decided")
+def test_the_last_of_several_bags_is_the_test(bag, study_file, tmp_path):
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other/one.bag").symlink_to(study_file.parent / "three.bag")
+    failed(bag, study_file.parent / "two.bag", "other/one.bag", "--minutes", 6)
+    study = load_study(tmp_path / "runs/one_and_more/one_and_more.yaml", [], tmp_path / "new")
+    assert study.training == ["one", "two"]
+    assert study.config.test == ("one_2",)
+    assert (study.config.offline.trials, study.config.offline.hours) == (None, 0.1)
+    assert failed(bag, bag).startswith("error: test.0: 'one_2' is the recording of the training")
+
+
+@pytest.mark.usefixtures("decided")
+def test_several_odometries_share_a_study(bag, tmp_path):
+    failed(bag, "--odometry", "gicp,kiss_icp")
+    study = load_study(
+        tmp_path / "runs/one_gicp+kiss_icp/one_gicp+kiss_icp.yaml", [], tmp_path / "other"
+    )
+    assert list(study.config.odometries) == ["gicp", "kiss_icp"]
+    assert study.config.offline.trials == 2 * tune.EACH
+    every = tune._odometries("all", imu=False)
+    assert {"gicp", "vgicp", "ndt", "kiss_icp"} <= set(every)
+    assert "evalio_kiss_icp" not in every
+
+
+@pytest.mark.usefixtures("decided")
+def test_a_drive_too_short_to_split_is_refused(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    short = drives.write_bag(tmp_path / "short.bag", drives.scans(n_scans=12))
+    said = failed(short)
+    assert "short_60-100: moves 1.2 m, too little for a test, which takes 2 m at least" in said
+    assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.usefixtures("decided")
+def test_of_two_topics_one_is_to_be_named(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    clouds = [(topic, s, drives.cloud(s, xyz)) for s, xyz, _ in drives.scans() for topic in "ab"]
+    truth = [
+        ("/truth", s, rec.pose(s, T[:3, 3].tolist(), (0.0, 0.0, 0.0, 1.0), rec.ROS1))
+        for s, _, T in drives.scans()
+    ]
+    messages = [(f"/{topic}", s, m) for topic, s, m in clouds] + truth
+    rec.write_bag(tmp_path / "both.bag", sorted(messages, key=lambda m: m[1]))
+    said = failed("both.bag")
+    assert "both.bag: has 2 topics of point clouds: /a (60 of sensor_msgs" in said
+    assert said.endswith("name one with --points")
+    failed("both.bag", "--points", "/b")
+    study = load_study(tmp_path / "runs/both/both.yaml", [], tmp_path / "other")
+    assert study.config.sequences["both"].points == "/b"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["none.bag"], "none.bag: there is no such file"),
+        (["poses.tum"], "poses.tum: is a file of poses; give a recording of scans"),
+        (["one.bag", "--odometry", "gicb"], "gicb"),
+        (["one.bag", "--odometry", "command"], "command: a program needs settings; write a study"),
+        (["one.bag", "--points", "/nothing"], "/nothing"),
+        (["one.bag", "one.bag", "--reference", "poses.tum"], "of 2 recordings each needs its own"),
+        (["one.bag", "--reference", "/nothing"], "/nothing"),
+    ],
+)
+@pytest.mark.usefixtures("bag")
+def test_mistakes_are_told_in_a_sentence_and_nothing_is_made(tmp_path, arguments, words):
+    (tmp_path / "poses.tum").write_text("1 0 0 0 0 0 0 1\n2 1 0 0 0 0 0 1\n")
+    assert words in failed(*arguments)
+    assert not (tmp_path / "runs").exists()
