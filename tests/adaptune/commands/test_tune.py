@@ -94,7 +94,8 @@ def test_the_last_of_several_bags_is_the_test(bag, study_file, tmp_path):
     assert study.training == ["one", "two"]
     assert study.config.test == ("one_2",)
     assert (study.config.offline.trials, study.config.offline.hours) == (None, 0.1)
-    assert failed(bag, bag).startswith("error: test.0: 'one_2' is the recording of the training")
+    said = failed(bag, bag, "--folder", "twice")
+    assert said.startswith("error: test.0: 'one_2' is the recording of the training sequence 'one'")
 
 
 @pytest.mark.usefixtures("decided")
