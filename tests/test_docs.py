@@ -2,6 +2,7 @@
 
 import ast
 import re
+import sys
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,9 +11,11 @@ from typing import Any
 import drives
 import numpy as np
 import pytest
+from setups import setup_of
 from typer.main import get_command
 
 from adaptune.commands.cli import app
+from offline.config import load_study
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
@@ -95,3 +98,20 @@ def test_the_example_of_an_odometry_follows_a_drive():
             pose, registered = odometry.register(odometry.prepare(SimpleNamespace(points=points)))
         assert registered
         assert abs(pose[0, 3] - 5 * 0.3) < 0.15
+
+
+def test_the_example_of_a_program_follows_a_drive(study_file, tmp_path, monkeypatch):
+    monkeypatch.setenv("PATH", str(Path(sys.executable).parent), prepend=":")
+    ((template, example),) = re.findall(
+        r"`([^`]*)` in `kiss_icp\.yaml`:\n\n```yaml\n(.*?)^```",
+        (ROOT / "docs/your-odometry.md").read_text(encoding="utf-8"),
+        re.MULTILINE | re.DOTALL,
+    )
+    (tmp_path / "kiss_icp.yaml").write_text(template)
+    _, rest = study_file.read_text().split("sequences:")
+    rest = rest.replace("bag: ", f"bag: {study_file.parent}/")
+    (tmp_path / "study.yaml").write_text(f"{example}sequences:{rest}")
+    setup = setup_of(load_study(tmp_path / "study.yaml", runs=tmp_path / "runs"))
+    (trial,) = setup.run(setup.prepare("one", 1e9), [{"mapping.voxel_size": 0.5}])
+    assert not trial.faults
+    assert np.nanmean(trial.errors) < 5.0

@@ -1,6 +1,7 @@
 """Odometries in programs that read a recording and a parameter file and write a trajectory."""
 
 import fcntl
+import glob
 import json
 import os
 import re
@@ -485,11 +486,17 @@ def poses_at(trajectory: Trajectory, stamps: NDArray[np.int64]) -> Poses:
 _PLACEHOLDERS = ("input", "output", "parameters", "points", "imu")
 
 
+def _inside(output: str) -> str:
+    if Path(output).is_absolute() or ".." in Path(output).parts:
+        raise ValueError("give a path in the program's working folder, without `..`")
+    return output
+
+
 class FileSettings(WholeSettings):
     """The files of a program that reads a recording; ``docs/your-odometry.md`` describes them."""
 
     template: Annotated[str, AfterValidator(resolve)] | None = None
-    output: str = "trajectory.tum"
+    output: Annotated[str, AfterValidator(_inside)] = "trajectory.tum"  # or a pattern
     format: Literal["tum", "kitti", "evalio"] = "tum"
     input: Layout = "bag"
 
@@ -518,6 +525,11 @@ class FileRun(WholeRun):
         values = {"points": given.points, "imu": given.imu, **self.parameters, **paths}
         return [replace(argument, values) for argument in self.settings.command]
 
+    @property
+    def told_output(self) -> bool:
+        """Whether the command says where to write; if so, the folder is there for it."""
+        return any("output" in placeholders(argument) for argument in self.settings.command)
+
 
 class Command(FileRun):
     """A program that runs once on a whole recording, and its trajectory; see `WholeRun`."""
@@ -536,13 +548,15 @@ class Command(FileRun):
         here = folder / "run"
         output = here / self.settings.output
         here.mkdir()
-        output.parent.mkdir(parents=True, exist_ok=True)
+        if self.told_output:
+            output.parent.mkdir(parents=True, exist_ok=True)
         paths = {"input": given.path.resolve(), "output": output}
         if (file := self.filled_template(folder)) is not None:
             paths["parameters"] = file
         command = self.arguments(given, **paths)
         self._execute(command, here, folder / "output", len(given.stamps))
-        return read_output(here, self.settings, given.stamps)
+        found = find_output(here, self.settings.output)
+        return read_output(found, self.settings, given.stamps)
 
     def _execute(self, command: list[str], folder: Path, log: Path, n: int) -> None:
         """Run the program; an `OdometryError` says how it ended if not well."""
@@ -570,28 +584,48 @@ class Command(FileRun):
             raise OdometryError(processes.how_it_ended(in_time.code))
 
 
-def read_output(folder: Path, settings: FileSettings, stamps: NDArray[np.int64]) -> Trajectory:
-    """Read the trajectory that a program left in a folder; `stamps` of shape (n,) are the scans'.
+def find_output(folder: Path, output: str) -> Path:
+    """The one file in a folder that an output, a path or a pattern, fits; links are followed.
 
-    There is an `OdometryError` or a `TrajectoryError` if there is none, or it holds something else.
+    There is an `OdometryError` if no file fits, or several.
     """
-    path = folder / settings.output
-    if not path.exists():
-        raise OdometryError(f"it left no {settings.output}")
+    root = folder.resolve()
+    fitting = (output, *glob.glob(output, root_dir=root))  # noqa: PTH207
+    found = _files_in(root, [root / name for name in fitting])
+    if len(found) == 1:
+        return found[0]
+    what = f"{len(found)} files fit {output}:" if found else f"it left no {output}"
+    if left := found or _files_in(root, root.rglob("*")):
+        names = [str(path.relative_to(root)) for path in left[:5]] + ["..."]
+        what += ("" if found else ", but") + f" {', '.join(names[: len(left)])}"
+        what += "; let odometry.settings.output fit just one file"
+    raise OdometryError(what)
+
+
+def _files_in(root: Path, paths: Iterable[Path]) -> list[Path]:
+    real = {path.resolve() for path in paths if os.path.isfile(path)}  # noqa: PTH113
+    return sorted(path for path in real if path.is_relative_to(root))
+
+
+def read_output(path: Path, settings: FileSettings, stamps: NDArray[np.int64]) -> Trajectory:
+    """Read the trajectory that a program left; `stamps` of shape (n,) are the scans'.
+
+    There is an `OdometryError` or a `TrajectoryError` if the file holds something else.
+    """
     try:
         if settings.format == "kitti":
             poses = read_kitti(path)
             if len(poses) > len(stamps):
                 counted = f"{len(poses)} poses without stamps for {len(stamps)} scans"
-                raise OdometryError(f"{settings.output} has {counted}")
+                raise OdometryError(f"{path.name} has {counted}")
             trajectory = Trajectory(stamps[: len(poses)], poses)
         else:
             trajectory = read_tum(path)
     except TrajectoryError as error:
-        raise TrajectoryError(str(error).replace(f"{folder}{os.sep}", "")) from error
+        raise TrajectoryError(str(error).replace(str(path), path.name)) from error
     for number, T in enumerate(trajectory.T_world_sensor):
         if what := pose_fault(T):
-            raise OdometryError(f"{settings.output}, pose {number + 1}: {what}")
+            raise OdometryError(f"{path.name}, pose {number + 1}: {what}")
     return trajectory
 
 

@@ -30,6 +30,7 @@ from adaptune.odometry.program import (
     FileSettings,
     ProgramInput,
     check_arguments,
+    find_output,
     read_output,
     replace,
 )
@@ -67,7 +68,7 @@ class DockerCommand(FileRun):
         shared = make_shared(folder / "shared")
         output = make_shared(shared / "output")
         nested = output
-        for part in Path(self.settings.output).parts[:-1]:
+        for part in Path(self.settings.output).parts[:-1] if self.told_output else ():
             nested = make_shared(nested / part)
         source = given.path.resolve()
         inside = "/data" if source.is_dir() else f"/data/{source.name}"
@@ -91,11 +92,14 @@ class DockerCommand(FileRun):
             with kept_log(self, given.logs, failure, {}) as kept:
                 if kept is not None:
                     (kept / "output.log").write_bytes(container.log())
-        checked = folder / "checked"
-        copy_regular(output / self.settings.output, output, checked / self.settings.output)
-        remove_shared(shared, self.name, user)
-        if failure is not None:
-            raise OdometryError(failure)
+        try:
+            if failure is not None:
+                raise OdometryError(failure)
+            found = find_output(output, self.settings.output)
+            checked = folder / "checked" / found.name
+            copy_regular(found, output.resolve(), checked)
+        finally:
+            remove_shared(shared, self.name, user)
         return read_output(checked, self.settings, given.stamps)
 
     def _watch(self, container: Container, n: int) -> str | None:

@@ -11,7 +11,8 @@ import pytest
 import yaml
 from setups import setup_of
 
-from adaptune.odometry.program import Template
+from adaptune.errors import OdometryError
+from adaptune.odometry.program import Template, find_output
 from adaptune.odometry.tracker import HealthCheck
 from adaptune.strict import ConfigurationError
 from offline.campaign import BaselineError
@@ -208,6 +209,60 @@ def test_faults_are_told_with_the_last_lines(make, fault):
     assert np.isinf(trial.errors[~np.isnan(trial.errors)][-1])
 
 
+# As KISS-ICP's program leaves it: a folder with other files, and a link to the latest.
+LEAVES = (
+    "mkdir -p results/now; ln -s $PWD/results/now results/latest; ln -s /etc etc; "
+    "touch results/now/config.yml; "
+    "{python} {{study}}/program.py {{input}} {{points}} results/now/one_poses.tum x pretend"
+)
+
+
+@pytest.mark.parametrize(
+    "output",
+    ["results/latest/one_poses.tum", "results/latest/*_poses.tum", "results/*/o?e_poses.t[tu]m"],
+)
+def test_a_pattern_and_links_within_the_folder_lead_to_the_trajectory(make, output):
+    trial, sequence = run(make_leaving(make, output))
+    assert not trial.faults
+    np.testing.assert_allclose(trial.T_odom_sensor, sequence.frames.T_ref_sensor, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("output", "told"),
+    [
+        ("results/*/*", "2 files fit results/*/*: {}"),
+        ("*.tum", "it left no *.tum, but {}"),
+        ("etc/*", "it left no etc/*, but {}"),
+        ("etc/passwd", "it left no etc/passwd, but {}"),
+    ],
+)
+def test_no_file_or_several_that_fit(make, output, told):
+    (fault,) = run(make_leaving(make, output))[0].faults
+    names = "results/now/config.yml, results/now/one_poses.tum"
+    assert fault.startswith(told.format(names) + "; let odometry.settings.output fit just one file")
+
+
+def make_leaving(make, output):
+    script = LEAVES.format(python=sys.executable)
+    return make(
+        "pretend",
+        f"odometry.settings.command=[sh, -c, '{script}', '{{registration.voxel}}{{distance}}']",
+        f"odometry.settings.output='{output}'",
+        "odometry.settings.template=",
+    )
+
+
+def test_of_many_files_some_are_listed(tmp_path):
+    for i in range(7):
+        (tmp_path / f"{i}.txt").touch()
+    with pytest.raises(OdometryError) as caught:
+        find_output(tmp_path, "[0-5].txt")
+    assert "6 files fit [0-5].txt: 0.txt, 1.txt, 2.txt, 3.txt, 4.txt, ...;" in str(caught.value)
+    # A file of just that name is meant first of all.
+    (tmp_path / "[a].txt").touch()
+    assert find_output(tmp_path, "[a].txt").name == "[a].txt"
+
+
 def test_with_the_baseline_s_parameters_something_else_than_these_is_wrong(make):
     study = make("exit")
     with pytest.raises(BaselineError, match=r"one: command fails .*code 1: .*no planes here"):
@@ -269,6 +324,8 @@ def test_the_whole_way(make, caplog):
         ("odometry.settings.template=", "voxel}, and there is no template"),
         ("odometry.settings.command=[slam3000, x]", "there is no program 'slam3000'"),
         ("odometry.settings.command=[sh, '{ouput}']", "{ouput} is nothing; did you mean 'output'?"),
+        ("odometry.settings.output=/x.tum", "output: give a path in the program's working folder"),
+        ("odometry.settings.output=a/../../x.tum", "output: give a path in the program's working"),
         ("odometry.settings.inpt=bag", "did you mean 'input'?"),
         ("online.switching.mechanism=bank", "command runs whole recordings and cannot change"),
         ("odometry.settings.command=sh", "settings.command: give a list, not 'sh'"),

@@ -180,6 +180,22 @@ def test_a_file_of_another_user_is_read(tmp_path, given):
 
 
 @pytest.mark.usefixtures("nothing_left")
+@pytest.mark.parametrize("output", ["runs/latest/*.tum", "runs/*/t*.tum", "etc/passwd"])
+def test_a_pattern_and_links_within_the_output_lead_to_the_trajectory(output, tmp_path, given):
+    script = (
+        "odometry-plain {points} && cd /output && mkdir -p runs/now && "
+        "mv trajectory.tum runs/now && ln -s now runs/latest && ln -s /etc etc"
+    )
+    odometry = made(shell(tmp_path, script, output=output), given)
+    poses = drive(odometry)
+    if output == "etc/passwd":
+        assert "it left no etc/passwd, but runs/now/trajectory.tum; let" in odometry.faults[0]
+        return
+    assert not odometry.faults
+    np.testing.assert_allclose(poses[:, :3, 3], truth()[:, :3, 3], atol=0.1)
+
+
+@pytest.mark.usefixtures("nothing_left")
 @pytest.mark.parametrize(
     "script",
     ["mkfifo /output/trajectory.tum", "ln -s /etc/hostname /output/trajectory.tum", "exit 255"],
