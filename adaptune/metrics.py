@@ -1,6 +1,6 @@
 """Errors of an odometry: over sub-trajectories, as KITTI's benchmark and as evo define them."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -215,6 +215,23 @@ def cap(errors: NDArray[np.floating]) -> NDArray[np.float64]:
     NaN stays NaN.
     """
     return np.minimum(errors.astype(np.float64), FAILURE)
+
+
+def lost_in_words(best: str, errors: Mapping[str, float], odometry: str) -> list[str]:
+    """A sentence where even the best does not track: the likeliest cause, and what to try.
+
+    `errors` has by sequence the mean error of the best, in percent.
+    """
+    if not (mean := sum(errors.values()) / len(errors)) > LOST_ABOVE:
+        return []
+    where = ", ".join(name for name, error in errors.items() if error > LOST_ABOVE)
+    return [
+        f"Even {best} does not track on {where}: {mean:.1f} % is more than {LOST_ABOVE:g} %. The "
+        f"likeliest cause is none of the tuned parameters: the odometry does not suit the "
+        f"recording (compare with `{'kiss_icp' if odometry == 'gicp' else 'gicp'}`), or points' "
+        f"times, motion compensation, the range settings or the reference are wrong (`adaptune "
+        f"inspect --deep` checks the recording). If neither helps, widen the parameters' ranges."
+    ]
 
 
 def bootstrap(

@@ -16,7 +16,7 @@ from adaptune import __version__, files, manifest
 from adaptune.archive import Archive
 from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
-from adaptune.metrics import cap
+from adaptune.metrics import cap, lost_in_words
 from adaptune.model import ErrorModel, ModelError
 from adaptune.model.rules import complementary, mean_errors
 from adaptune.processes import available
@@ -92,15 +92,18 @@ class Training(NamedTuple):
             for mode in ("baseline", "fixed")
         )
         sets, fixed, costs, n = self.model.sets, self.model.fixed, self.model.costs, len(self.rows)
+        errors = {row["sequence"]: row["fixed, whole run"] for row in self.rows}
+        best = f"the fixed set, the best of {len(self.trials)} parameter sets,"
+        said = [*lost_in_words(best, errors, self.model.odometry["name"]), *self.said]
         baseline = f"Parameters of the baseline: {in_words(sets.space.baseline)}"
         where = f"in whole runs in training ({n} sequence{'s' if n > 1 else ''})"
         if fixed == 0:
             beaten = f"No set clearly beat the baseline's {own:.3f} % {where}"
-            return [*self.said, f"{beaten}; the fixed set is the baseline.", baseline]
+            return [*said, f"{beaten}; the fixed set is the baseline.", baseline]
         ms = np.nan if costs is None else costs.alone(fixed)
         cost = f"; it costs {ms:.1f} ms of CPU time a scan" if np.isfinite(ms) else ""
         return [
-            *self.said,
+            *said,
             f"Fixed: {of_fixed:.3f} % against the baseline's {own:.3f} % {where}.",
             f"Parameters of the fixed set: {in_words(sets[fixed])}{cost}",
             baseline,

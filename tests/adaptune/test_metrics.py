@@ -10,6 +10,7 @@ from adaptune.metrics import (
     absolute_error,
     bootstrap,
     kitti_error,
+    lost_in_words,
     relative_error,
     sub_trajectory_rte,
     window_ends,
@@ -178,3 +179,13 @@ def test_bootstrap_of_a_ratio_is_paired():
     assert low < 0.5 * fixed.mean() < high
     # Nine blocks tell nothing.
     assert bootstrap(fixed[:199], fixed[:199], 20) is None
+
+
+def test_a_large_error_has_words():
+    assert lost_in_words("the best", {"one": 5.0}, "ndt") == []
+    assert lost_in_words("the best", {"one": math.nan}, "ndt") == []
+    (said,) = lost_in_words("the best", {"one": 1.0, "two": 10.0}, "ndt")
+    assert said.startswith("Even the best does not track on two: 5.5 % is more than 5 %. ")
+    assert "compare with `gicp`" in said
+    (said,) = lost_in_words("the best", {"one": 9.0}, "gicp")
+    assert "compare with `kiss_icp`" in said

@@ -263,6 +263,14 @@ def test_of_many_files_some_are_listed(tmp_path):
     assert find_output(tmp_path, "[a].txt").name == "[a].txt"
 
 
+def test_where_every_set_is_lost_it_is_said_first(make):
+    said = train(make("jump", "offline.trials=2")).words
+    assert said[0].startswith(
+        "Even the fixed set, the best of 2 parameter sets, does not track on one: "
+    )
+    assert "compare with `gicp`" in said[0]
+
+
 def test_with_the_baseline_s_parameters_something_else_than_these_is_wrong(make):
     study = make("exit")
     with pytest.raises(BaselineError, match=r"one: command fails .*code 1: .*no planes here"):
