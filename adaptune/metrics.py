@@ -217,20 +217,27 @@ def cap(errors: NDArray[np.floating]) -> NDArray[np.float64]:
     return np.minimum(errors.astype(np.float64), FAILURE)
 
 
-def lost_in_words(best: str, errors: Mapping[str, float], odometry: str) -> list[str]:
+def lost_in_words(
+    best: str, errors: Mapping[str, float], odometry: str, cause: str = ""
+) -> list[str]:
     """A sentence where even the best does not track: the likeliest cause, and what to try.
 
-    `errors` has by sequence the mean error of the best, in percent.
+    `errors` has by sequence the mean error of the best, in percent; `cause` is what is known.
     """
     if not (mean := sum(errors.values()) / len(errors)) > LOST_ABOVE:
         return []
     where = ", ".join(name for name, error in errors.items() if error > LOST_ABOVE)
+    lost = f"Even {best} does not track on {where}: {mean:.1f} % is more than {LOST_ABOVE:g} %. "
+    if cause:
+        return [
+            f"{lost}The likeliest cause: {cause}. Drive slower or record more scans a second, or "
+            f"try an odometry that uses an IMU (`rko_lio`)."
+        ]
     return [
-        f"Even {best} does not track on {where}: {mean:.1f} % is more than {LOST_ABOVE:g} %. The "
-        f"likeliest cause is none of the tuned parameters: the odometry does not suit the "
-        f"recording (compare with `{'kiss_icp' if odometry == 'gicp' else 'gicp'}`), or points' "
-        f"times, motion compensation, the range settings or the reference are wrong (`adaptune "
-        f"inspect --deep` checks the recording). If neither helps, widen the parameters' ranges."
+        f"{lost}The likeliest cause is none of the tuned parameters: the odometry does not suit "
+        f"the recording (compare with `{'kiss_icp' if odometry == 'gicp' else 'gicp'}`), or "
+        f"points' times, motion compensation, the range settings or the reference are wrong "
+        f"(`adaptune inspect --deep` checks the recording)."
     ]
 
 

@@ -9,8 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptune import manifest
-from adaptune.metrics import MIN_BLOCKS, RESAMPLES, resampled_means, worst_tenth
+from adaptune.metrics import (
+    LOST_ABOVE,
+    MIN_BLOCKS,
+    RESAMPLES,
+    lost_in_words,
+    resampled_means,
+    worst_tenth,
+)
 from adaptune.model import ErrorModel
+from adaptune.reference.check import hard_to_track
 from adaptune.report import tables as report
 from adaptune.study.config import ALSO
 from adaptune.study.study import (
@@ -57,7 +65,7 @@ from online.statistics import (
     mean_of,
     oracle_rows,
 )
-from online.tables import remarks, tables, verdict
+from online.tables import CALLED, decided, remarks, tables, verdict
 
 # Which replays are compared: the modes that were replayed on every sequence.
 
@@ -468,6 +476,7 @@ def compare(study: Study) -> ComparedReplays:
     rows = _rows(judged, oracles)
     obstacle = "" if ADAPTIVE in modes else ReplaySetup.of(study).obstacle(ADAPTIVE, model)
     said = [*wrong[:1], *verdict(rows, study.config.sub_trajectory, obstacle)]
+    said[:0] = [] if wrong else _lost(study, judged, rows)
     details = [
         *wrong,
         *remarks(rows),
@@ -481,6 +490,20 @@ def compare(study: Study) -> ComparedReplays:
     made = tables(rows, study.config.sub_trajectory)
     report.write_tables(folder, study.name, made, [*said, *details])
     return ComparedReplays(rows, said, details, compared.unfinished)
+
+
+def _lost(study: Study, judged: Sequence[JudgedModes], rows: Sequence[ComparisonRow]) -> list[str]:
+    """A sentence where even what does best has lost its way."""
+    known = [row for one in judged for row in one.rows if row.rte is not None]
+    if not known:
+        return []
+    best = decided(rows)
+    errors = {row.sequence: row.rte or 0.0 for row in known if row.mode == best.mode}
+    worst = max(errors, key=lambda name: errors[name])
+    if errors[worst] <= LOST_ABOVE:
+        return []
+    cause = hard_to_track(study.sequences.open(worst))
+    return lost_in_words(CALLED[best.mode], errors, study.odometry.name, cause)
 
 
 def _equal_cost(model: ErrorModel | None, modes: Sequence[str]) -> list[str]:

@@ -214,7 +214,7 @@ ROUNDING = 1e-6
 _UNSURE = "nothing can be said of how sure that is"
 _YARDSTICKS = {"fixed": "fixed set", "baseline": "baseline"}
 _NOT_ADAPTIVE = ("baseline", "fixed", *RIVALS, *ORACLES, EVEN)
-_CALLED = {
+CALLED = {
     "baseline": "the odometry's own parameters",
     "fixed": "the fixed set",
     "adaptive": "adaptive",
@@ -272,9 +272,9 @@ def verdict(rows: Sequence[ComparisonRow], length: float, obstacle: str = "") ->
     best = decided(rows)
     errors = {m: f"{row.rte:.3g} %" for m, row in last.items() if row.rte is not None}
     others = [m for m in ("fixed", "baseline") if m in errors and m != best.mode]
-    instead = " and ".join(f"{errors[m]} with {_CALLED[m]}" for m in others)
+    instead = " and ".join(f"{errors[m]} with {CALLED[m]}" for m in others)
     do = "Keep" if best.mode == "baseline" else "Drive"
-    said = f"{do} {_CALLED[best.mode]}: {errors[best.mode]} RTE over {length:g} m"
+    said = f"{do} {CALLED[best.mode]}: {errors[best.mode]} RTE over {length:g} m"
     said += f" instead of {instead}" if instead else ""
     said += f", {_where(rows)}"
     main = adapting(rows)

@@ -542,6 +542,21 @@ def contradictions(
         yield f"the odometry's poses contradict the scans: {cause}"
 
 
+NARROW, RARE = 180.0, 5.0
+"""Degrees of view, and scans a second, below which an odometry loses track easily."""
+
+
+def hard_to_track(scans: Iterable[Scan]) -> str:
+    """What makes a recording hard to track; empty where nothing is known of it."""
+    some = list(islice(scans, 20))
+    x, y, _ = np.concatenate([scan.points for scan in some]).T
+    view = 5.0 * len(np.unique(np.degrees(np.arctan2(y, x)) // 5.0))
+    rate = 1e9 / float(np.median(np.diff([scan.stamp for scan in some]))) if some[1:] else np.inf
+    found = [f"the sensor sees {view:.0f} degrees only"] * (view < NARROW)
+    found += [f"it gives {rate:.2g} scans a second"] * (rate < RARE)
+    return ", and ".join(found)
+
+
 # Motions that scans alone show.
 
 STRETCHES, SCANS = 8, 40

@@ -337,7 +337,7 @@ MINE = Scene(
     relief=_cave_relief,
     surface=paved((np.inf, Material.ROCK)),
     winding=1.2,
-    bend=7.0,
+    bend=6.0,
     slope=0.02,
     shake=1.0,
 )
