@@ -83,6 +83,14 @@ class Description(NamedTuple):
     module: str = ""  # in which a class is written
 
 
+class OwnFile(NamedTuple):
+    """A parameter set as the odometry's own tool reads it."""
+
+    suffix: str  # of the file's name
+    text: str
+    use: str  # what to do with it: a command, where FILE stands for its path, or words
+
+
 class LastMotion:
     """The motion over the last scan, from one pose to the next."""
 
@@ -272,6 +280,11 @@ class Odometry(ABC):
         """What a study must know of the odometry with these settings."""
         known = cls.space, cls.live, cls.needs_imu, cls.warm_up
         return Description(*known, clean=cls.clean, module=cls.__module__)
+
+    @classmethod
+    def own_file(cls, parameters: ParameterSet, settings: Any) -> OwnFile | None:  # noqa: ARG003
+        """A set as the odometry's own tool reads it; None if it has no such tool."""
+        return None
 
     @property
     def preparation(self) -> Hashable:

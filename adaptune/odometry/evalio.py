@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 from scipy.spatial.transform import Rotation
 
+from adaptune import files
 from adaptune.errors import OdometryError, import_extra, nearest
 from adaptune.geometry import Poses, invert, squared_ranges
 from adaptune.odometry.base import (
@@ -19,6 +20,7 @@ from adaptune.odometry.base import (
     NO_IMU,
     BaseSettings,
     Description,
+    OwnFile,
     OwnFrameOdometry,
     RangeSettings,
     duration_of,
@@ -184,6 +186,21 @@ class Pipeline(OwnFrameOdometry):
             cls(settings=settings)  # raises if a parameter is unknown, or a value of another type
         return super().describe(settings)
 
+    @classmethod
+    def own_file(cls, parameters: ParameterSet, settings: Any) -> OwnFile:
+        made = cls(parameters, settings)
+        entry = {"name": "fixed", "pipeline": cls.pipeline, **made._values(settings.deskew)}
+        # evalio refuses a file without data sets, and they are the user's to name.
+        text = files.dump({"datasets": [], "pipelines": [entry]})
+        return OwnFile(".yaml", text, "name data sets in a copy; then evalio run --config COPY")
+
+    def _values(self, deskew: bool) -> ParameterSet:
+        """All parameters of the pipeline; `deskew` counts unless the settings name it, too."""
+        values: ParameterSet = self._defaults | self.untuned | self._given
+        if "deskew" in self._defaults and "deskew" not in self.settings.parameters:
+            values["deskew"] = deskew
+        return values
+
     def _typed(self, name: str, value: Value) -> Value:
         """A value in the type that the pipeline needs: it takes no 1 for a float."""
         where = f"parameters.{name}: {self.pipeline}"
@@ -212,9 +229,7 @@ class Pipeline(OwnFrameOdometry):
     def _begin(self, prepared: EvalioScan) -> None:
         pipelines, types, _ = evalio_modules()
         self._shape = prepared.shape
-        parameters = self._defaults | self.untuned | self._given
-        if "deskew" in self._defaults and "deskew" not in self.settings.parameters:
-            parameters["deskew"] = self.settings.deskew and prepared.duration > 0
+        parameters = self._values(self.settings.deskew and prepared.duration > 0)
         # Pipelines divide by the length of the scan, and some end the process where it is 0.
         self._needs_times = bool(parameters.get("deskew"))
         if "deskew" in parameters:

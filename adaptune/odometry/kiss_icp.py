@@ -11,6 +11,7 @@ from kiss_icp.registration import get_registration
 from kiss_icp.threshold import get_threshold_estimator
 from numpy.typing import NDArray
 
+from adaptune import files
 from adaptune.geometry import Poses, count_within
 from adaptune.odometry.base import (
     END,
@@ -18,6 +19,7 @@ from adaptune.odometry.base import (
     MIN_POINTS,
     AtStamp,
     Odometry,
+    OwnFile,
     RangeSettings,
     Registration,
     duration_of,
@@ -70,6 +72,12 @@ class Kiss(Odometry):
         config.adaptive_threshold.initial_threshold = self.parameters["initial_threshold"]
         config.adaptive_threshold.min_motion_th = self.parameters["min_motion_th"]
         return config
+
+    @classmethod
+    def own_file(cls, parameters: ParameterSet, settings: Any) -> OwnFile:
+        # Where results go stays open: KISS-ICP has an environment variable for it.
+        data = cls(parameters, settings)._config().model_dump(exclude={"out_dir"})
+        return OwnFile(".yaml", files.dump(data), "kiss_icp_pipeline --config FILE DATA")
 
     def configure(self, parameters: ParameterSet) -> None:
         # The adaptive threshold restarts at a new `initial_threshold`; with a new `min_motion_th`

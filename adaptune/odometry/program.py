@@ -30,6 +30,7 @@ from adaptune.odometry.base import (
     BaseSettings,
     Description,
     Faulting,
+    OwnFile,
     Registration,
     Usage,
     pose_fault,
@@ -511,13 +512,24 @@ class CommandSettings(FileSettings):
 class FileRun(WholeRun):
     """A program that is told by arguments, and by a file, where it reads and writes."""
 
+    @staticmethod
+    def own_file(parameters: ParameterSet, settings: Any) -> OwnFile | None:
+        """The template with the parameters, if there is a template."""
+        if settings.template is None:
+            return None
+        template = Template(Path(settings.template))
+        # Arguments may hold parameters, too.
+        values = {**parameters, "parameters": "FILE"}
+        command = " ".join(replace(argument, values) for argument in settings.command)
+        use = command or f"in the place of {template.path.name}"
+        return OwnFile(template.path.suffix, template.fill(parameters), use)
+
     def filled_template(self, folder: Path) -> Path | None:
         """A copy of the template with the parameters, if there is a template."""
-        if self.settings.template is None:
+        if (own := self.own_file(self.parameters, self.settings)) is None:
             return None
-        template = Template(Path(self.settings.template))
-        file = folder / template.path.name
-        file.write_text(template.fill(self.parameters), encoding="utf-8")
+        file = folder / Path(self.settings.template).name
+        file.write_text(own.text, encoding="utf-8")
         return file
 
     def arguments(self, given: ProgramInput, **paths: str | Path) -> list[str]:

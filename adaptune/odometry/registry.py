@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, RootModel
 
 from adaptune import processes, strict
 from adaptune.errors import OdometryError
-from adaptune.odometry.base import Description, InProcess, Odometry, OdometryInstance
+from adaptune.odometry.base import Description, InProcess, Odometry, OdometryInstance, OwnFile
 from adaptune.odometry.remote import SERVICE, Guarded, Isolated, Limits
 from adaptune.space import ParameterSet, ParameterSpace, PooledSpace
 from adaptune.strict import Mistake, validated
@@ -312,6 +312,13 @@ class OdometryFactory:
     def alone(self, parameters: ParameterSet) -> tuple["OdometryFactory", ParameterSet]:
         """What makes the odometry that a set is for, and all parameters that it takes."""
         return self, self.space.complete(parameters)
+
+    def own_file(self, parameters: ParameterSet) -> OwnFile | None:
+        """All parameters as the odometry's own tool reads them; None if it has no such tool."""
+        if is_user_class(self.name):
+            return None  # which is not imported here
+        found: OwnFile | None = odometry_class(self.name).own_file(parameters, self.settings)
+        return found
 
     def __call__(
         self,

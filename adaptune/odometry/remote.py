@@ -322,6 +322,10 @@ class UserProgram(Isolated):
         """Make an instance, as all programs of the user are made; it reads no recording."""
         return cls(parameters, settings, limits)
 
+    @staticmethod
+    def own_file(parameters: ParameterSet, settings: Any) -> None:
+        """It has none: parameters reach it in messages."""
+
     @classmethod
     def describe(cls, settings: Any) -> Description:
         """What the program reports about itself; an error if it cannot be reached."""

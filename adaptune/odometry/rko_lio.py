@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from adaptune import files
 from adaptune.errors import OdometryError, import_extra
 from adaptune.geometry import Poses, count_within
 from adaptune.odometry.base import (
@@ -20,11 +21,12 @@ from adaptune.odometry.base import (
     MIN_POINTS,
     NO_IMU,
     Description,
+    OwnFile,
     OwnFrameOdometry,
     RangeSettings,
 )
 from adaptune.recording.scan import Imu, Scan
-from adaptune.space import Float, ParameterSpace
+from adaptune.space import Float, ParameterSet, ParameterSpace
 
 _LATER = 10**9
 """Nanoseconds added to all stamps: at time 0 it assumes that nothing has come yet."""
@@ -94,6 +96,22 @@ class RkoLio(OwnFrameOdometry):
         _bindings()  # raises if there are none
         return super().describe(settings)
 
+    @classmethod
+    def own_file(cls, parameters: ParameterSet, settings: Any) -> OwnFile:
+        text = files.dump({"lio": cls(parameters, settings)._values(settings.deskew)})
+        return OwnFile(".yaml", text, "rko_lio --config FILE DATA")
+
+    def _values(self, deskew: bool) -> ParameterSet:
+        """Values that may differ from RKO-LIO's defaults."""
+        return {
+            **{name: float(value) for name, value in self.parameters.items()},
+            "min_range": self.settings.min_range,
+            "max_range": self.settings.max_range,
+            "double_downsample": self.settings.double_downsample,
+            "deskew": deskew,
+            "max_num_threads": 1,
+        }
+
     def prepare(self, scan: Scan) -> RkoLioScan:
         if scan.imu is None:
             raise OdometryError(NO_IMU.format("rko_lio"))
@@ -110,13 +128,9 @@ class RkoLio(OwnFrameOdometry):
     def _begin(self, prepared: RkoLioScan) -> None:
         bindings = _bindings()
         config = bindings._LIOConfig()
-        for name, value in self.parameters.items():
-            setattr(config, name, float(value))
-        config.min_range, config.max_range = self.settings.min_range, self.settings.max_range
-        config.double_downsample = self.settings.double_downsample
-        config.deskew = self.settings.deskew and prepared.duration > 0
+        for name, value in self._values(self.settings.deskew and prepared.duration > 0).items():
+            setattr(config, name, value)
         self._share = END if config.deskew else MIDDLE
-        config.max_num_threads = 1
         self._lio = bindings._LIO(config)
         T_sensor_imu = prepared.imu.T_sensor_imu
         self._T_base_sensor = np.eye(4)

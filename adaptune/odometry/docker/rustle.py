@@ -34,6 +34,7 @@ from adaptune.odometry.base import (
     Description,
     Faulting,
     OdometryInstance,
+    OwnFile,
     Registration,
     Usage,
     pose_fault,
@@ -122,6 +123,12 @@ class Rustle:
             raise OdometryError(f"template: {template.path} is not YAML, as ROS 1 reads it")
         check_names(parameters, template, ())
         image_digest(settings.image)
+
+    @staticmethod
+    def own_file(parameters: ParameterSet, settings: RustleSettings) -> OwnFile:
+        """The parameter file that the system reads."""
+        template, text = filled(settings, parameters)
+        return OwnFile(template.path.suffix, text, f"in the place of {template.path.name}")
 
     @staticmethod
     def instance(

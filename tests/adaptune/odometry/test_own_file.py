@@ -1,0 +1,133 @@
+"""Parameter sets as the odometries' own tools read them, against what the adapters use."""
+
+import importlib.util
+from dataclasses import fields
+from types import SimpleNamespace
+
+import pytest
+import turns
+import yaml
+from needs import lacking, needs_evalio
+
+from adaptune.odometry import evalio
+from adaptune.odometry.kiss_icp import Kiss
+from adaptune.odometry.registry import OdometryFactory, is_user_class, odometry_class
+from adaptune.odometry.remote import Limits, Process
+from adaptune.space import ParameterSpace
+
+PIPELINES = ("ct_icp", "dlio", "evalio_kiss_icp", "form", "genz_icp", "lio_sam", "loam", "mad_icp")
+
+
+def own_file(name, settings=None, space=None, **parameters):
+    """What the factory of an odometry gives."""
+    space = odometry_class(name).space if space is None else space
+    factory, whole = OdometryFactory(name, settings or {}, space, Limits()).alone(parameters)
+    return factory.own_file(whole)
+
+
+def least(name):
+    """The smallest value of every parameter, which is not the baseline."""
+    parameters = odometry_class(name).space.parameters
+    return {key: parameter.low for key, parameter in parameters.items()}
+
+
+@pytest.mark.parametrize(
+    "settings", [{}, {"deskew": False, "min_range": 2, "max_range": 60}], ids=["own", "given"]
+)
+def test_kiss_icp_loads_it(tmp_path, monkeypatch, settings):
+    from kiss_icp.config import load_config
+
+    tuned = least("kiss_icp") | {"min_motion_th": 1e-5}
+    own = own_file("kiss_icp", settings, **tuned)
+    path = tmp_path / f"fixed{own.suffix}"
+    path.write_text(own.text)
+    used = Kiss(tuned, Kiss.settings_type(**settings))._kiss.config
+    assert load_config(path) == used
+    assert used.adaptive_threshold.min_motion_th == 1e-5
+    assert used.registration.max_num_threads == 1
+    # It does not say where results go.
+    monkeypatch.setenv("kiss_icp_out_dir", "elsewhere")
+    assert load_config(path).out_dir == "elsewhere"
+
+
+class Listener:
+    """Stands for a pipeline that begins."""
+
+    def set_params(self, parameters):
+        self.given = dict(parameters)
+
+    def __getattr__(self, _):
+        return lambda *_: None
+
+
+@pytest.mark.parametrize("name", PIPELINES)
+@pytest.mark.parametrize("deskew", [True, False])
+def test_evalio_parses_it(name, deskew, monkeypatch):
+    needs_evalio()
+    from evalio import datasets, pipelines
+
+    own = own_file(name, {"deskew": deskew}, **least(name))
+    cls = odometry_class(name)
+    odometry = cls(least(name), cls.settings_type(deskew=deskew))
+    modules, listener = evalio.evalio_modules(), Listener()
+    silent = SimpleNamespace(all_pipelines=lambda: {cls.pipeline: lambda: listener})
+    monkeypatch.setattr(evalio, "evalio_modules", lambda: (silent, *modules[1:]))
+    odometry._begin(odometry.prepare(turns.measured(0, turns.ROWS, turns.COLUMNS)))
+    # Its command line reads the file so.
+    read = yaml.load(own.text, Loader=yaml.CSafeLoader)
+    pipeline = pipelines.get_pipeline(cls.pipeline)
+    assert pipelines.parse_config(read["pipelines"]) == [("fixed", pipeline, listener.given)]
+    assert datasets.parse_config(read["datasets"]) == []
+
+
+@pytest.mark.parametrize("deskew", [True, False])
+def test_rko_lio_parses_it(deskew, monkeypatch):
+    if importlib.util.find_spec("rko_lio") is None:
+        lacking("rko_lio", "RKO-LIO is not installed: pip install 'adaptune[rko_lio]'")
+    from rko_lio import rko_lio_pybind
+    from rko_lio.config import LIOConfig, PipelineConfig
+
+    settings = {"deskew": deskew, "double_downsample": False, "max_range": 60}
+    own = own_file("rko_lio", settings, **least("rko_lio"))
+    cls, used = odometry_class("rko_lio"), []
+    monkeypatch.setattr(rko_lio_pybind, "_LIO", used.append)
+    odometry = cls(least("rko_lio"), cls.settings_type(**settings))
+    odometry._begin(odometry.prepare(turns.measured(0)))
+    read = PipelineConfig.from_dict(yaml.safe_load(own.text)).lio.to_pybind()
+    for field in fields(LIOConfig):
+        assert getattr(read, field.name) == getattr(used[0], field.name)
+
+
+FLOAT = {"type": "float", "low": 0.0, "high": 1.0, "baseline": 0.5}
+TEMPLATE = "# of the robot\nmap: {voxel: 1.0, size: 1e3}\nuse_sim_time: on\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "use"),
+    [
+        ("command", {"command": ["slam", "{input}", "{parameters}", "-d={d}"]}, "-d=0.25"),
+        ("docker_command", {"image": "slam"}, "in the place of slam.yaml"),
+        ("rustle", {"image": "slam", "odometry": "/odom"}, "in the place of slam.yaml"),
+    ],
+)
+def test_a_template_keeps_all_else(tmp_path, name, settings, use):
+    space = ParameterSpace.load({"map.voxel": FLOAT} | ({"d": FLOAT} if name == "command" else {}))
+    (tmp_path / "slam.yaml").write_text(TEMPLATE)
+    given = settings | {"template": str(tmp_path / "slam.yaml")}
+    own = own_file(name, given, space, **dict.fromkeys(space.names, 0.25))
+    # ROS takes 1e3 for a text.
+    assert own.text == TEMPLATE.replace("1.0", "0.25").replace("1e3", "1000.0")
+    assert own.suffix == ".yaml"
+    assert own.use == (f"slam {{input}} FILE {use}" if name == "command" else use)
+
+
+def test_odometries_without_a_tool_of_their_own():
+    for name in ("gicp", "vgicp", "ndt"):
+        assert own_file(name) is None
+    assert own_file("command", {"command": ["slam"]}, ParameterSpace({})) is None
+    assert Process.own_file({}, None) is None
+    # A class of the user is not imported, whatever it is derived from.
+    factory = OdometryFactory("kiss_icp", {}, Kiss.space, Limits())
+    object.__setattr__(factory, "name", "theirs.odometry:Mine")
+    assert is_user_class(factory.name)
+    assert factory.own_file({}) is None
