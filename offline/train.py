@@ -19,13 +19,14 @@ from adaptune.files import write_text
 from adaptune.metrics import cap, lost_in_words
 from adaptune.model import ErrorModel, ModelError
 from adaptune.model.rules import complementary, mean_errors
+from adaptune.odometry.registry import ODOMETRIES, PROGRAMS
 from adaptune.processes import available
 from adaptune.progress import Progress, unseen
 from adaptune.recording.config import NO_REFERENCE
 from adaptune.recording.scan import origin
 from adaptune.report import tables
 from adaptune.report.drawing import draw_chart
-from adaptune.space import ParameterSets, ParameterSpace, in_words
+from adaptune.space import ParameterSet, ParameterSets, ParameterSpace, in_words
 from adaptune.study.config import SwitchingConfig
 from adaptune.study.references import (
     ensure_references,
@@ -114,7 +115,7 @@ class Training(NamedTuple):
 def train(study: OfflineStudy, progress: Progress = unseen, cluster: str | None = None) -> Training:
     """Estimate the references that are lacking, run the trials that are, and fit the model.
 
-    The study's folder receives the archive, the error model, the fixed set (``fixed.yaml``),
+    The study's folder receives the archive, the error model, the fixed set (see `write_fixed`),
     tables of the trials (``trials``) and of the training sequences (``training``), and with
     several objectives their Pareto front (``pareto``). `cluster` is the address of a Dask
     scheduler whose workers run the trials. Trials of other inputs than now are run again.
@@ -151,7 +152,7 @@ def train(study: OfflineStudy, progress: Progress = unseen, cluster: str | None 
     with contextlib.suppress(ModelError):
         before = ErrorModel.load(study.model_path)
     model = _fitted(study, archive, verdicts, fixed, before)
-    write_text(study.folder / "fixed.yaml", files.dump(verdicts[fixed].parameters))
+    write_fixed(study, verdicts[fixed].parameters)
     table = _trial_rows(config, space, verdicts, finished)
     trials = list(table.values())
     tables.write_rows(study.folder, "trials", trials)
@@ -188,6 +189,21 @@ def _ready_archive(study: OfflineStudy, progress: Progress) -> Archive:
             path.unlink()
     archive.tidy()
     return archive
+
+
+def write_fixed(study: OfflineStudy, fixed: ParameterSet) -> None:
+    """Write the fixed set (``fixed.yaml``), and again as its odometry's own tool reads it, if any.
+
+    The latter is ``fixed_<odometry>``, with a suffix. That of another odometry is removed.
+    """
+    own = study.own_file(fixed)
+    ours = {f"fixed_{name}" for name in (*ODOMETRIES, *PROGRAMS)}
+    for path in study.folder.glob("fixed_*"):
+        if path.stem in ours and (own is None or path != own[0]):
+            path.unlink()
+    write_text(study.folder / "fixed.yaml", files.dump(fixed))
+    if own is not None:
+        write_text(own[0], own[1].text)
 
 
 def changes(before: ErrorModel, after: ErrorModel) -> list[str]:

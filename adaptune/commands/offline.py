@@ -19,6 +19,7 @@ from adaptune.commands.terminal import (
     load,
     progress,
     say,
+    say_fixed,
     say_next,
     say_next_of_study,
     say_next_of_trained,
@@ -89,7 +90,7 @@ def offline(
     )
     for sentence in training.words:
         say(sentence)
-    say(f"Fixed set: {loaded.folder / 'fixed.yaml'}")
+    say_fixed(loaded)
     if len(loaded.config.offline.objective) > 1:
         say(f"The sets that no other set beats in every objective: {loaded.folder / 'pareto'}.*")
     say(driven(model, loaded.config.online, loaded.odometry, loaded.mechanism))

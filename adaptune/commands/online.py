@@ -22,6 +22,7 @@ from adaptune.commands.terminal import (
     load,
     progress,
     say,
+    say_fixed,
     say_next_of_study,
     show_table,
 )
@@ -249,7 +250,7 @@ def compared(loaded: "OfflineStudy", *, details: bool = False) -> "ComparedRepla
     page, length = _write_page(loaded, found), loaded.config.sub_trajectory
     say(" ".join(found.verdict))
     if found.rows[0].yardstick == "fixed":
-        say(f"The parameters: {loaded.folder / 'fixed.yaml'}.")
+        say_fixed(loaded)
     say(f"More: {page}")
     shown = tables(found.rows, length) if details else [decision_table(found.rows, length)]
     for sentence in found.details if details else ():

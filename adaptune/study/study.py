@@ -22,7 +22,7 @@ from adaptune.files import write_text
 from adaptune.manifest import merged
 from adaptune.model import ErrorModel
 from adaptune.model.descriptor import descriptor_content
-from adaptune.odometry.base import Description
+from adaptune.odometry.base import Description, OwnFile
 from adaptune.odometry.program import ProgramInput, program_input
 from adaptune.odometry.registry import Factory, OdometryFactory, OdometryPool, declare
 from adaptune.processes import available
@@ -281,6 +281,13 @@ class Study(Generic[C_co]):
             self.config.isolation,
             self.sequences.program_input if described.whole else None,
         )
+
+    def own_file(self, fixed: ParameterSet) -> tuple[Path, OwnFile] | None:
+        """The fixed set as its odometry's own tool reads it, and where; None if it has none."""
+        factory, parameters = self.odometry.alone(fixed)
+        if (own := factory.own_file(parameters)) is None:
+            return None
+        return self.folder / f"fixed_{factory.name}{own.suffix}", own
 
     @property
     def training(self) -> list[str]:

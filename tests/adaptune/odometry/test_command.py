@@ -311,6 +311,9 @@ def test_the_whole_way(make, caplog):
     assert training.model.sets.space.names == ("registration.voxel", "distance")
     assert run_replays(study, study.folder / "model.safetensors") == 2
     assert {row.mode for row in compare(study).rows} == {"baseline", "fixed"}
+    fixed = training.model.sets[training.model.fixed]
+    filled = json.loads((study.folder / "fixed_command.json").read_text())
+    assert filled["registration"] == {key.split(".")[-1]: value for key, value in fixed.items()}
     file = study.folder.parent / "file.json"
     file.write_text(file.read_text() + " ")
     train(study)

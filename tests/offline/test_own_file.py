@@ -1,0 +1,46 @@
+import pytest
+from drives import STUDY
+
+from adaptune import files
+from adaptune.commands import terminal
+from adaptune.space import ODOMETRY
+from offline.config import load_study
+from offline.train import write_fixed
+
+ODOMETRIES = "odometry: [{name: gicp}, {name: kiss_icp}]\n"
+
+
+@pytest.fixture
+def study(study_file, tmp_path):
+    """A study of two odometries, one of which has a tool of its own."""
+    rest = STUDY[STUDY.index("sequences:") :].replace("bag: ", f"bag: {study_file.parent}/")
+    (tmp_path / "two.yaml").write_text(ODOMETRIES + rest)
+    return load_study(tmp_path / "two.yaml", [], tmp_path / "study")
+
+
+def write(study, label, **parameters):
+    fixed = study.odometry.space.complete({ODOMETRY: label, **parameters})
+    write_fixed(study, fixed)
+    assert files.Document.of_file(study.folder / "fixed.yaml").data == fixed
+
+
+def said(study, capsys):
+    terminal.say_fixed(study)
+    return capsys.readouterr().out.splitlines()
+
+
+def test_the_fixed_set_s_odometry_decides(study, capsys):
+    own, users = study.folder / "fixed_kiss_icp.yaml", study.folder / "fixed_mine.yaml"
+    write(study, "kiss_icp", voxel_size=0.7)
+    users.touch()
+    assert files.Document.of_file(own).data["mapping"]["voxel_size"] == 0.7
+    first, second = said(study, capsys)
+    assert first == f"Fixed set: {study.folder}/fixed.yaml"
+    assert f"{own} (kiss_icp_pipeline --config FILE DATA)" in second
+    # Of a study that was trained before there was such a file.
+    own.unlink()
+    assert said(study, capsys) == [first]
+    write(study, "kiss_icp")
+    write(study, "gicp")
+    assert sorted(study.folder.glob("fixed*")) == [study.folder / "fixed.yaml", users]
+    assert said(study, capsys) == [first]
