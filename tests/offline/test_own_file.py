@@ -26,7 +26,8 @@ def write(study, label, **parameters):
 
 def said(study, capsys):
     terminal.say_fixed(study)
-    return capsys.readouterr().out.splitlines()
+    (line,) = capsys.readouterr().out.splitlines()
+    return line
 
 
 def test_the_fixed_set_s_odometry_decides(study, capsys):
@@ -34,13 +35,13 @@ def test_the_fixed_set_s_odometry_decides(study, capsys):
     write(study, "kiss_icp", voxel_size=0.7)
     users.touch()
     assert files.Document.of_file(own).data["mapping"]["voxel_size"] == 0.7
-    first, second = said(study, capsys)
-    assert first == f"Fixed set: {study.folder}/fixed.yaml"
-    assert f"{own} (kiss_icp_pipeline --config FILE DATA)" in second
+    alone = f"The parameters: {study.folder}/fixed.yaml"
+    for_tool = f"for the odometry's own tool: {own} (kiss_icp_pipeline --config FILE DATA)"
+    assert said(study, capsys) == f"{alone}; {for_tool}."
     # Of a study that was trained before there was such a file.
     own.unlink()
-    assert said(study, capsys) == [first]
+    assert said(study, capsys) == f"{alone}."
     write(study, "kiss_icp")
     write(study, "gicp")
     assert sorted(study.folder.glob("fixed*")) == [study.folder / "fixed.yaml", users]
-    assert said(study, capsys) == [first]
+    assert said(study, capsys) == f"{alone}."

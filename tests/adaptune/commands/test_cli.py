@@ -47,6 +47,10 @@ def test_one_bag_is_enough_and_every_command_names_the_next(adaptune, study_file
     assert done.exit_code == 0, done.stderr
     begin, end = (done.stdout.index(word) for word in ("sequences:", "Next:"))
     (tmp_path / "one.yaml").write_text(done.stdout[begin:end])
+    assert adaptune("inspect", "one.bag", "--study", "same.yaml").exit_code == 0
+    same = load_study(tmp_path / "same.yaml").config, load_study(tmp_path / "one.yaml").config
+    assert same[0] == same[1]
+    assert adaptune("inspect", "one.bag", "--study", "same.yaml").exit_code == 2
     words = [*next_words(done), "-o", "offline.trials=4", "--folder", "my study[v2]"]
     for command in ("offline", "online", "compare"):
         assert words[0] == command
@@ -57,14 +61,15 @@ def test_one_bag_is_enough_and_every_command_names_the_next(adaptune, study_file
         assert words[1:] == ["one.yaml", "--folder", "my study[v2]", *overrides]
         lines = [line for line in done.stdout.splitlines() if line.strip()]
         assert len(set(lines)) == len(lines)
-        assert (command == "online") != ("Fixed set: my study[v2]/fixed.yaml" in done.stdout)
+        there = "The parameters: my study[v2]/fixed.yaml." in done.stdout
+        assert (command == "online") != there
         assert (command == "online") == ("4 replays made: my study[v2]/replays/" in done.stdout)
         trained = "% in whole runs in training (1 sequence)"
         assert (command == "offline") == (trained in done.stdout)
-    assert done.stdout.startswith("Whether adapting gains is not known, ")
-    words = "baseline", "fixed", "adaptive", "paper", "APE [m]", "RPE [m]", "one_60-100"
+    assert done.stdout.startswith(("Drive ", "Keep "))
+    words = "baseline", "fixed", "adaptive", "paper", "one_60-100"
     assert all(word in done.stdout for word in words)
-    table = done.stdout[done.stdout.index("RTE over") : done.stdout.index("Page: ")]
+    table = done.stdout[done.stdout.index("RTE over") : done.stdout.index("Next: ")]
     assert max(map(len, table.splitlines())) <= 80
     assert "# find out what adapting gains elsewhere" in done.stdout
     assert (tmp_path / "my study[v2]/report/figures/one_60-100-paths.png").exists()
