@@ -27,10 +27,11 @@ class Line:
 
     x: Values
     y: Values  # NaN interrupts it
-    name: str  # in the legend; of a mode, the mode's, whose colour and width it then has
+    name: str  # in the legend; of a mode or a place, its own, whose colour it then has
     steps: bool = False
     dashed: bool = False
     faint: bool = False  # lies in the background
+    width: float = 1.8  # pixels
 
 
 @dataclass(frozen=True)
@@ -106,7 +107,16 @@ class Mark:
     axis: Literal["x", "y"] = "y"
 
 
-Drawn = Line | Points | Cloud | Band | Bars | Shares | Spans | Mark
+@dataclass(frozen=True)
+class Words:
+    """Names at points; one that would lie on another is left out."""
+
+    x: Values
+    y: Values
+    words: Sequence[str]
+
+
+Drawn = Line | Points | Cloud | Band | Bars | Shares | Spans | Mark | Words
 
 
 @dataclass(frozen=True)
@@ -130,7 +140,8 @@ class Chart:
     panels: tuple[Panel, ...]  # row by row
     caption: str = ""  # what it shows, in a sentence or two
     columns: int = 1
-    shared_x: bool = False  # panels below each other have the same x axis
+    aside: bool = False  # the first panel stands left of the others, which are one column
+    shared_x: bool = False  # panels below each other have the same x axis, unless they are `equal`
 
 
 class Charts(NamedTuple):

@@ -8,8 +8,7 @@ import textwrap
 import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import partial
-from itertools import cycle
+from itertools import chain, cycle
 from pathlib import Path
 from typing import Any, Literal
 
@@ -31,6 +30,7 @@ from adaptune.report.charts import (
     Shares,
     Spans,
     Values,
+    Words,
 )
 
 # How a chart looks.
@@ -41,25 +41,22 @@ class Look:
     """How whatever has one name is drawn."""
 
     colour: str
-    width: float = 1.6  # of a line, pixels
     dash: tuple[float, ...] = ()  # strokes and gaps in pixels; none if it is solid
     shape: str = "circle"  # of a marker, as Vega names it, or an SVG path
 
 
 _STAR = "M0,-1.2 L.3,-.4 L1.1,-.4 L.5,.1 L.7,.95 L0,.5 L-.7,.95 L-.5,.1 L-1.1,-.4 L-.3,-.4 Z"
 _TIMES = "M-1,-.7 L-.7,-1 L0,-.3 L.7,-1 L1,-.7 L.3,0 L1,.7 L.7,1 L0,.3 L-.7,1 L-1,.7 L-.3,0 Z"
-# Colours that the colour-blind tell apart, most of them Okabe and Ito's. Lines that coincide
-# lie on each other from wide to narrow and are dark and light in turn, so that each is seen, in
-# grey, too.
+# Colours that the colour-blind tell apart, most of them Okabe and Ito's.
 MODES = {
-    "baseline": Look("#b0b0b0", 9.0, shape="square"),
-    "best_default": Look("#882255", 7.5, shape="triangle-down"),
-    "equal_cost": Look("#56c8a0", 6.0, shape="cross"),
-    "fixed": Look("#0072b2", 4.5, shape=_STAR),
-    "adaptive": Look("#e69f00", 2.6),
-    "untrained": Look("#7b3294", 1.2, shape="triangle-left"),
-    "even": Look("#117733", 1.7, (3, 3), "triangle-right"),
-    "paper": Look("#000000", 1.0, (4, 4), "triangle-up"),
+    "baseline": Look("#999999", shape="square"),
+    "best_default": Look("#882255", shape="triangle-down"),
+    "equal_cost": Look("#56c8a0", shape="cross"),
+    "fixed": Look("#0072b2", shape=_STAR),
+    "adaptive": Look("#e69f00"),
+    "untrained": Look("#7b3294", shape="triangle-left"),
+    "even": Look("#117733", (3, 3), "triangle-right"),
+    "paper": Look("#000000", (4, 4), "triangle-up"),
     "oracle, sequence": Look("#009e73", shape="diamond"),
     "oracle, period": Look("#009e73", shape=_TIMES),
 }
@@ -67,9 +64,14 @@ MODES = {
 _COLOURS = ("#d55e00", "#56b4e9", "#009e73", "#cc79a7", "#888888", "#b8a800")
 _DASHES: tuple[tuple[float, ...], ...] = ((), (8, 3), (2, 3), (8, 3, 2, 3))
 _SHAPES = ("circle", "square", "triangle-up", "diamond", "triangle-down", _TIMES, "cross")
-_TINTS = ("#dbe9f6", "#fbe3d0", "#dcefdc", "#efdff0", "#e8e8e8", "#fbf3c4")
+_PLACES = ("#8c510a", "#35a79c", "#c51b7d", "#7fbc41", "#555555", "#b8a800")
+"""Colours of places; no mode has them."""
 _MAP = ("#440154", "#472d7b", "#3b528b", "#2c728e", "#21918c", "#28ae80", "#5ec962", "#9bd93c")
 """A colour map whose lightness rises, without colours too light for a white ground."""
+_SHADE, _TINT = "#555555", 0.15
+"""Colour of stretches that are no places, and opacity of what is shaded."""
+_SHARES = ("#c97f00", "#f0b84d", "#8f5a00", "#f8dba5", "#b0885a")
+"""Colours of shares that have no look of their own."""
 _UNKNOWN = "#bbbbbb"
 """Colour of points without a number where colours say numbers."""
 _MOST, _MOST_FAINT = 1500, 500
@@ -80,13 +82,17 @@ _MANY, _OUTLINED = 1000, 150
 
 def looks(chart: Chart) -> dict[str, Look]:
     """The look of each name in a chart, in the order in which they appear; modes have theirs."""
-    items = (item for panel in chart.panels for item in panel.drawn)
-    names = dict.fromkeys(name for item in items for name in _names(item))
-    taken = {MODES[name].colour for name in names if name in MODES}
+    items = [item for panel in chart.panels for item in panel.drawn]
+    spans = (item for item in items if isinstance(item, Spans) and not item.name)
+    places = dict.fromkeys(name for item in spans for name in item.names if name)
+    shares = dict.fromkeys(n for item in items if isinstance(item, Shares) for n in item.names)
+    known = dict(zip(shares, map(Look, cycle(_SHARES)), strict=False)) | MODES
+    known |= dict(zip(places, map(Look, cycle(_PLACES)), strict=False))
+    names = dict.fromkeys(name for item in items for name in _names(item)) | places
+    taken = {known[name].colour for name in names if name in known}
     colours = cycle([colour for colour in _COLOURS if colour not in taken])
-    others = zip(colours, cycle(_DASHES), cycle(_SHAPES), strict=False)
-    made = (Look(colour, dash=dash, shape=shape) for colour, dash, shape in others)
-    return {name: MODES[name] if name in MODES else next(made) for name in names}
+    made = map(Look, colours, cycle(_DASHES), cycle(_SHAPES))
+    return {name: known[name] if name in known else next(made) for name in names}
 
 
 def _names(item: Drawn) -> tuple[str, ...]:
@@ -102,9 +108,10 @@ def _layer(item: Drawn) -> float:
     if isinstance(item, Points) and len(item.x) > _MANY:
         return 4.5
     if isinstance(item, Line):
-        # Equal lines of modes lie on each other from wide to narrow.
-        return 5.0 + (list(MODES).index(item.name) if item.name in MODES else len(MODES)) / 100.0
-    if isinstance(item, Mark):
+        # Of lines that coincide, one is seen between the dashes of the other.
+        place = list(MODES).index(item.name) if item.name in MODES else len(MODES)
+        return 5.0 + 0.5 * item.dashed + place / 100.0
+    if isinstance(item, Mark | Words):
         return 7.0
     order = (Spans, Cloud, Shares, Bars, Band)
     return float(order.index(type(item))) if isinstance(item, order) else 6.0
@@ -164,6 +171,8 @@ def wrapped(words: str, letters: float) -> list[str]:
 Spec = dict[str, Any]
 _WIDTH, _LETTER, _LINE = 900, 6.5, 14
 """Pixels: width of a chart, width of a letter, about, and height of a line of words."""
+_ASIDE = 0.4
+"""Share of the width of a panel that stands left of the others."""
 _DARK = "#333333"
 _Extent = tuple[tuple[float, float], tuple[float, float]]
 _OUTLINE: dict[str, Any] = {"stroke": "black", "strokeWidth": 0.5}
@@ -207,26 +216,34 @@ def spec(chart: Chart, titled: bool = True) -> Spec:
     columns = max(1, min(chart.columns, len(chart.panels)))
     rows = [chart.panels[i : i + columns] for i in range(0, len(chart.panels), columns)]
     beside = sum(max(map(_beside, chart.panels[c::columns])) for c in range(columns))
-    width = round((_WIDTH - beside) / columns)
+    widths = [round((_WIDTH - beside) / columns)] * len(chart.panels)
+    if chart.aside:
+        first, *others = chart.panels
+        right = round((1.0 - _ASIDE) * _WIDTH - max(map(_beside, others)))
+        widths = [round(_ASIDE * _WIDTH - _beside(first)), *([right] * len(others))]
     usual = 300.0 if len(rows) == 1 else 150.0 if chart.shared_x else 240.0
     extents = [(_extent(panel, "x"), _extent(panel, "y")) for panel in chart.panels]
-    if chart.shared_x:
-        across = min(x[0] for x, _ in extents), max(x[1] for x, _ in extents)
-        extents = [(across, y) for _, y in extents]
+    sharing = [chart.shared_x and not panel.equal for panel in chart.panels]
+    if any(sharing):
+        own = [x for (x, _), shares in zip(extents, sharing, strict=True) if shares]
+        across = min(x[0] for x in own), max(x[1] for x in own)
+        extents = [(across if s else x, y) for (x, y), s in zip(extents, sharing, strict=True)]
     every = looks(chart)
     panels = []
     for i, panel in enumerate(chart.panels):
         high = round(usual * max(map(_height, rows[i // columns])))
-        above = chart.shared_x and i >= columns
-        below = chart.shared_x and i + columns < len(chart.panels)
+        below = sharing[i] and i + columns < len(chart.panels)
         if panel.equal:
-            extents[i], high = _equal(extents[i], width, 1.6 * high)
-        panels.append(_Drawing(panel, every, (width, high), extents[i]).spec(above, below))
+            most = usual * sum(map(_height, chart.panels[1:])) if chart.aside else 1.6 * high
+            extents[i], high = _equal(extents[i], widths[i], most)
+        panels.append(_Drawing(panel, every, (widths[i], high), extents[i]).spec(below))
     row: Spec = {"concat": panels, "columns": columns}
+    if chart.aside:
+        row = {"hconcat": [panels[0], {"vconcat": panels[1:]}]}
     row["resolve"] = {"scale": {"color": "independent"}}
     made: Spec = {
         "$schema": "https://vega.github.io/schema/vega-lite/v6.json",
-        "vconcat": [row, *_legend(chart, every)],
+        "vconcat": [*_legend(chart, every), row],
         "config": _CONFIG,
         "background": "white",
         "padding": 8,
@@ -262,7 +279,7 @@ def _height(panel: Panel) -> float:
 def _beside(panel: Panel) -> float:
     """Pixels for what stands left and right of a panel."""
     names = [part for name in panel.y.names or () for part in wrapped(name, 32)]
-    bar = any(
+    bar = not panel.equal and any(
         isinstance(item, Cloud) or (isinstance(item, Points) and item.colour is not None)
         for item in panel.drawn
     )
@@ -305,13 +322,14 @@ def _extent(panel: Panel, which: Literal["x", "y"]) -> tuple[float, float]:
         return 1.0, 10.0
     low, high = float(values.min()), float(values.max())
     # A line may begin at the edge; points are not cut.
+    named = any(isinstance(item, Words) for item in panel.drawn)
     marked = any(isinstance(item, Points) and not item.faint for item in panel.drawn)
-    share = 0.06 if which == "y" else 0.03 if marked else 0.01
+    share = 0.06 if which == "y" or named else 0.03 if marked else 0.01
     if axis.log:
         beyond = max((high / low) ** share, 1.0 + share)
         return low / beyond, high * beyond
     beyond = share * (high - low) or 0.1 * abs(high) or 1.0
-    begins = low == 0.0 < high and not (which == "x" and marked)
+    begins = low == 0.0 < high and not (which == "x" and (marked or named))
     return (low if begins else low - beyond), high + beyond
 
 
@@ -348,8 +366,8 @@ class _Drawing:
         self._width, self._height = size
         self._extent = {"x": extent[0], "y": extent[1]}
 
-    def spec(self, above: bool, below: bool) -> Spec:
-        """The panel; `above` and `below` are whether ones that share its x axis lie there."""
+    def spec(self, below: bool) -> Spec:
+        """The panel; `below` is whether one that shares its x axis lies there."""
         panel = self._panel
         self._x, self._y = self._channel("x", panel.x, hidden=below), self._channel("y", panel.y)
         made: Spec = {"width": self._width, "height": self._height}
@@ -371,11 +389,14 @@ class _Drawing:
             Band: self._band,
             Bars: self._bars,
             Shares: self._shares,
-            Spans: partial(self._spans, named=not above),
+            Spans: self._spans,
             Mark: self._mark,
+            Words: self._words,
         }
         items = sorted(panel.drawn, key=_layer)
-        return made | {"layer": [layer for item in items for layer in draw[type(item)](item)]}
+        layers = [layer for item in items for layer in draw[type(item)](item)]
+        names = [self._span_names(item) for item in panel.drawn if isinstance(item, Spans)]
+        return made | {"layer": [*layers, *chain(*names)]}
 
     def _channel(self, which: Literal["x", "y"], axis: Axis, hidden: bool = False) -> Spec:
         low, high = self._extent[which]
@@ -453,6 +474,9 @@ class _Drawing:
     def _colour_bar(self, words: str, limits: tuple[float, float], log: bool) -> Spec:
         legend: Spec = {"title": wrapped(words, 16), "gradientOpacity": 1.0}
         legend["gradientLength"] = min(self._height - 40, 220)
+        if self._panel.equal:
+            legend |= {"title": words, "orient": "bottom", "titleOrient": "left"}
+            legend |= {"gradientLength": 0.5 * self._width, "gradientThickness": 10}
         legend |= {"values": ticks(*limits), "format": "~r"} if log else {"tickCount": 5}
         scale = {"type": "log" if log else "linear", "domain": limits, "range": _MAP}
         return {"field": "c", "type": "quantitative", "scale": scale, "legend": legend}
@@ -518,45 +542,52 @@ class _Drawing:
             mark |= {"interpolate": "step-after", "stroke": "white", "strokeWidth": 0.5}
             yield self._drawn(mark, {"x": x, "y": low, "y2": high})
 
-    def _spans(self, spans: Spans, named: bool) -> Iterator[Spec]:
-        """Shade stretches, and write their names above them, or turned where they are short."""
-        tinted = _span_tints(spans)
-        columns = dict(zip(("x", "x2", "tint"), zip(*tinted, strict=True), strict=False))
-        tint = {"field": "tint", "type": "nominal", "scale": None}
-        encoding = {"x": self._x, "x2": {"field": "x2"}, "color": tint}
-        mark: Spec = {"type": "rect", "stroke": "white", "tooltip": None, "clip": True}
-        yield {"data": _table(**columns), "mark": mark, "encoding": encoding}
+    def _spans(self, spans: Spans) -> Iterator[Spec]:
+        for begin, end, name in _shaded(spans):
+            mark: Spec = {"type": "rect", "stroke": "white", "tooltip": None, "clip": True}
+            colour = _SHADE if spans.name else self._look(name).colour
+            mark |= {"color": colour, "fillOpacity": _TINT}
+            encoding = {"x": self._x, "x2": {"field": "x2"}}
+            yield {"data": _table(x=[begin], x2=[end]), "mark": mark, "encoding": encoding}
+
+    def _span_names(self, spans: Spans) -> Iterator[Spec]:
+        """The names of stretches above them, or turned where they are short."""
         low, high = self._extent["x"]
-        for begin, end, _, name in tinted if named else ():
+        for begin, end, name in _shaded(spans):
             pixels, needed = (end - begin) / (high - low) * self._width, _LETTER * len(name)
-            words: Spec = {"type": "text", "text": name, "color": _DARK, "fontSize": 11}
             if name == spans.name or (needed > pixels and (pixels < 13 or needed > self._height)):
                 continue
-            if needed <= pixels:
-                words |= {"y": -4, "baseline": "bottom"}
-            else:
-                words |= {"y": 4, "angle": -90, "align": "right"}
-            middle = _table(x=[0.5 * (begin + end)])
-            yield {"data": middle, "mark": words, "encoding": {"x": self._x}}
+            words: Spec = {"text": name, "fontSize": 11, "y": -4}
+            if needed > pixels:
+                words |= {"y": 4, "angle": -90, "align": "right", "baseline": "middle"}
+            yield from _read_anywhere(words, _table(x=[0.5 * (begin + end)]), {"x": self._x})
 
     def _mark(self, mark: Mark) -> Iterator[Spec]:
         """A line across the panel, and its words."""
         low, high = sorted(self._extent[mark.axis])
         if not low <= mark.at <= high:
             return
-        encoding = {mark.axis: self._x if mark.axis == "x" else self._y}
+        encoding: Spec = {mark.axis: self._x if mark.axis == "x" else self._y}
         data = _table(**{mark.axis: [mark.at]})
         rule: Spec = {"type": "rule", "color": _DARK, "strokeDash": (5, 3)}
         yield {"data": data, "mark": rule, "encoding": encoding}
-        words: Spec = {"type": "text", "text": mark.words, "color": _DARK, "baseline": "bottom"}
-        if mark.axis == "y":
-            words |= {"align": "right", "x": self._width - 3, "dy": -2}
-        else:
-            words |= {"align": "right", "y": 3, "angle": -90, "dy": -2}
-        # White behind the words, so that they are read on whatever lies there.
-        halo = words | {"stroke": "white", "strokeWidth": 4, "strokeOpacity": 0.8}
-        for text in (halo, words) if mark.words else ():
-            yield {"data": data, "mark": text, "encoding": encoding}
+        words: Spec = {"text": mark.words, "align": "right", "dy": -2}
+        words |= {"x": self._width - 3} if mark.axis == "y" else {"y": 3, "angle": -90}
+        if mark.words:
+            yield from _read_anywhere(words, data, encoding)
+
+    def _words(self, words: Words) -> Iterator[Spec]:
+        x, y = numbers(words.x, self._panel.x), numbers(words.y, self._panel.y)
+        right, up = x * self._width, y * self._height
+        right, up = right / np.ptp(self._extent["x"]), up / np.ptp(self._extent["y"])
+        shown: list[int] = []
+        for i, text in enumerate(words.words):
+            wide = [_LETTER * (0.5 * len(text + words.words[k]) + 1.0) for k in shown]
+            near = np.abs(right[shown] - right[i]) < wide
+            if not (near & (np.abs(up[shown] - up[i]) < 1.3 * _LINE)).any():
+                shown.append(i)
+                at, encoding = _table(x=x[[i]], y=y[[i]]), {"x": self._x, "y": self._y}
+                yield from _read_anywhere({"text": text, "dy": -8}, at, encoding)
 
 
 def ticks(low: float, high: float) -> list[float]:
@@ -574,15 +605,19 @@ def ticks(low: float, high: float) -> list[float]:
     return [value for value in values if low <= value <= high]
 
 
-def _span_tints(spans: Spans) -> list[tuple[float, float, str, str]]:
-    """Begin, end, colour and name of each span that is shaded."""
+def _shaded(spans: Spans) -> list[tuple[float, float, str]]:
+    """Begin, end and name of each stretch that is shaded."""
     edges = np.asarray(spans.edges, float).tolist()
-    different = list(dict.fromkeys(filter(None, spans.names)))
-    return [
-        (begin, end, _TINTS[4 if spans.name else different.index(name) % len(_TINTS)], name)
-        for begin, end, name in zip(edges[:-1], edges[1:], spans.names, strict=True)
-        if name
-    ]
+    every = zip(edges[:-1], edges[1:], spans.names, strict=True)
+    return [span for span in every if span[2]]
+
+
+def _read_anywhere(words: Spec, data: Spec, encoding: Spec) -> Iterator[Spec]:
+    """A text, with white behind it, so that it is read on whatever lies there."""
+    text = {"type": "text", "color": _DARK, "baseline": "bottom"} | words
+    halo = {"stroke": "white", "strokeWidth": 4, "strokeOpacity": 0.8}
+    for mark in (text | halo, text):
+        yield {"data": data, "mark": mark, "encoding": encoding}
 
 
 def _png(pixels: NDArray[np.uint8]) -> bytes:
@@ -600,10 +635,12 @@ def _png(pixels: NDArray[np.uint8]) -> bytes:
 
 
 def _legend(chart: Chart, every: dict[str, Look]) -> list[Spec]:
-    """The legend below the panels: of each name what is drawn of it, and the name."""
+    """The legend above the panels: of each name what is drawn of it, and the name."""
     kinds: dict[str, dict[type, Any]] = {}
-    for item in (item for panel in chart.panels for item in panel.drawn):
-        for name in _names(item):
+    items = [item for panel in chart.panels for item in panel.drawn]
+    written = {word for item in items if isinstance(item, Words) for word in item.words}
+    for item in items:
+        for name in {*_names(item)} - written:
             if not (isinstance(item, Line | Points) and not len(item.x)):
                 kinds.setdefault(name, {}).setdefault(type(item), item)
     layers: list[Spec] = []
@@ -627,7 +664,7 @@ def _glyphs(kinds: dict[type, Any], look: Look, x: float, y: float) -> Iterator[
     """What is drawn of a name, small."""
     fill: Spec = {"type": "rect", "x": x, "x2": x + 32.0, "y": y - 6.0, "y2": y + 6.0}
     if Spans in kinds:
-        yield {"mark": fill | {"color": _TINTS[4]}}
+        yield {"mark": fill | {"color": _SHADE, "fillOpacity": _TINT}}
     if Band in kinds:
         yield {"mark": fill | _shade(look)}
     if Bars in kinds or Shares in kinds:
@@ -644,7 +681,7 @@ def _glyphs(kinds: dict[type, Any], look: Look, x: float, y: float) -> Iterator[
 
 
 def _stroke(line: Line, look: Look) -> Spec:
-    width, opacity = (min(look.width, 1.2), 0.4) if line.faint else (look.width, 1.0)
+    width, opacity = (1.2, 0.4) if line.faint else (line.width, 1.0)
     dash = (5, 3) if line.dashed else look.dash
     return {"color": look.colour, "strokeWidth": width, "strokeDash": dash, "opacity": opacity}
 

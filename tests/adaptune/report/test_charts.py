@@ -18,6 +18,7 @@ from adaptune.report.charts import (
     Points,
     Shares,
     Spans,
+    Words,
 )
 from adaptune.report.drawing import MODES, draw_chart, looks, spec, thinned, ticks
 
@@ -116,7 +117,7 @@ def test_an_empty_panel_says_so_and_has_no_legend(tmp_path):
 
 
 def test_metres_are_as_long_along_both_axes():
-    made = spec(from_above())["vconcat"][0]["concat"][0]
+    made = spec(from_above())["vconcat"][-1]["concat"][0]
     domains = [made["layer"][0]["encoding"][which]["scale"]["domain"] for which in "xy"]
     pixels = [
         made[size] / np.ptp(of) for size, of in zip(("width", "height"), domains, strict=True)
@@ -125,7 +126,7 @@ def test_metres_are_as_long_along_both_axes():
 
 
 def test_panels_that_share_an_axis_begin_and_end_alike():
-    panels = spec(over_time())["vconcat"][0]["concat"]
+    panels = spec(over_time())["vconcat"][-1]["concat"]
     axes = [panel["layer"][0]["encoding"]["x"] for panel in panels]
     assert len({tuple(x["scale"]["domain"]) for x in axes}) == 1
     assert [x["title"] is not None for x in axes] == [False, False, True]
@@ -138,6 +139,31 @@ def test_modes_keep_their_colours_and_others_differ():
     assert len({(look.colour, look.shape) for look in found.values()}) == len(names)
 
 
+def test_a_place_has_one_colour_and_its_name_no_second_time_in_the_legend(tmp_path):
+    spans = Spans([0, 50, 100], ("cave", "street"))
+    path = Panel(
+        Axis("[m]"),
+        Axis("[m]"),
+        (Line([0, 9], [0, 1], "cave"), Words([0, 0.1, 9], [0, 0, 1], ["cave", "nook", "street"])),
+        equal=True,
+    )
+    errors = Panel(Axis("time [s]"), Axis("y"), (spans, Line([0, 100], [1, 2], "fixed")))
+    for aside in (False, True):
+        chart = Chart("one", "A chart", (path, errors), aside=aside, shared_x=True)
+        texts, svg = drawn(chart, tmp_path)
+        # Each word has a white shadow: on the path, and above the stretch.
+        assert {name: texts.count(name) for name in ("cave", "street", "nook", "fixed")} == {
+            "cave": 4,
+            "street": 4,
+            "nook": 0,
+            "fixed": 1,
+        }
+        found = looks(chart)
+        assert svg.count(found["cave"].colour) == 2
+        assert found["cave"].colour != found["street"].colour
+        assert 800 < float(ElementTree.fromstring(svg).get("width")) < 990
+
+
 def test_long_lines_are_thinned_and_keep_peaks_and_gaps():
     y = np.sin(np.arange(20_000.0))
     y[777], y[12_000:12_100] = 9.0, np.nan
@@ -147,7 +173,7 @@ def test_long_lines_are_thinned_and_keep_peaks_and_gaps():
     assert np.isnan(y[kept]).any()
     assert kept[0] == 0
     assert kept[-1] == len(y) - 1
-    data = spec(trials())["vconcat"][0]["concat"][0]["layer"]
+    data = spec(trials())["vconcat"][-1]["concat"][0]["layer"]
     assert max(len(layer["data"]["values"]) for layer in data) <= 2000
 
 
