@@ -232,24 +232,41 @@ class Reference(NamedTuple):
         T_ref_sensor = self.trajectory.at(odometry.stamps)
         return sub_trajectory_rte(T_ref_sensor, odometry.T_world_sensor, self.length)
 
+    def errors_around(self, odometry: Trajectory) -> NDArray[np.float64]:
+        """Mean RTE in percent of the sub-trajectories through each pose; NaN without any."""
+        starts, ends, of = self._known(odometry)
+        n = len(odometry) + 1
+        sums, counts = (
+            np.cumsum(np.bincount(starts, w, n) - np.bincount(ends + 1, w, n))[:-1]
+            for w in (of, None)
+        )
+        return np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
+
     def errors_behind(self, odometry: Trajectory) -> NDArray[np.float64]:
         """Mean RTE in percent of the sub-trajectories that ended in the last `SECONDS`.
 
         It is what an odometry estimates while it drives. NaN where none ended.
         """
-        if self.trajectory is None:
-            return np.full(len(odometry), np.nan)
-        of = self.errors(odometry)
-        ends = window_ends(self.trajectory.at(odometry.stamps), self.length)
-        known = (ends >= 0) & np.isfinite(of)
+        _, ends, of = self._known(odometry)
         sums, counts = (
-            np.concatenate([[0.0], np.cumsum(np.bincount(ends[known], w, len(odometry)))])
-            for w in (of[known], None)
+            np.concatenate([[0.0], np.cumsum(np.bincount(ends, w, len(odometry)))])
+            for w in (of, None)
         )
         stop = np.arange(1, len(odometry) + 1)
         first = np.searchsorted(odometry.stamps, odometry.stamps - int(SECONDS * 1e9))
         with np.errstate(invalid="ignore"):
             return np.asarray((sums[stop] - sums[first]) / (counts[stop] - counts[first]))
+
+    def _known(
+        self, odometry: Trajectory
+    ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.float64]]:
+        """First and last frame and RTE in percent of the sub-trajectories that are known."""
+        of = self.errors(odometry)
+        starts = np.flatnonzero(np.isfinite(of))
+        if self.trajectory is None:
+            return starts, starts, of[starts]
+        ends = window_ends(self.trajectory.at(odometry.stamps), self.length)
+        return starts, ends[starts], of[starts]
 
     def standard(self, odometry: Trajectory) -> "StandardErrors | None":
         """The errors that other tools give, where there are reference poses to compare with."""

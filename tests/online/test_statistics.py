@@ -61,6 +61,18 @@ def test_errors_of_the_last_seconds_stand_where_their_sub_trajectories_end():
     assert np.isnan(Reference(None, 4.5).errors_behind(trajectory(T))).all()
 
 
+def test_errors_around_a_pose_are_those_of_the_sub_trajectories_through_it():
+    T = straight(40)
+    T[10:, 0, 3] += 0.5
+    reference, odometry = Reference(trajectory(straight(40)), 4.5), trajectory(T)
+    errors, around = reference.errors(odometry), reference.errors_around(odometry)
+    # Each starts at a pose and ends at the fifth after it.
+    expected = [errors[max(0, i - 5) : min(i + 1, 35)].mean() for i in range(40)]
+    np.testing.assert_allclose(around, expected, atol=1e-9)
+    assert around[[4, 15]].tolist() == pytest.approx([0.0, 0.0], abs=1e-9)
+    assert np.isnan(Reference(None, 4.5).errors_around(odometry)).all()
+
+
 @pytest.mark.parametrize(("metres", "lengths"), [(99, None), (150, "100"), (250, "100-200")])
 def test_kittis_error_is_there_from_100_m_on(metres, lengths):
     truth = straight(metres + 2)
