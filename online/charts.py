@@ -1,7 +1,7 @@
 """Charts of the online stage: of a comparison, and of the replays of a sequence."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,6 +22,7 @@ from adaptune.report.charts import (
     Points,
     Shares,
     Spans,
+    Words,
     charts_of,
 )
 from adaptune.report.drawing import plain
@@ -29,7 +30,7 @@ from adaptune.space import ParameterSpace
 from adaptune.study.study import Study, StudySequences, named
 from adaptune.trajectory import Trajectory, read_tum
 from online.compare import current_replays
-from online.modes import UNTRAINED
+from online.modes import ADAPTIVE, BASELINE, FIXED, UNTRAINED, WITHOUT_MODEL
 from online.record import StoredReplay, check_reference, switched
 from online.statistics import ALL, ComparisonRow, Reference
 
@@ -125,8 +126,8 @@ class ModeReplay(NamedTuple):
     """Errors, selections and times of one mode along a sequence: n scans, m selections."""
 
     seconds: NDArray[np.float64]  # since the first scan, of shape (n,)
-    xy: NDArray[np.float64]  # metres, seen from the reference's first pose, of shape (n, 2)
     errors: NDArray[np.float64]  # sub-trajectory RTE in percent, of shape (n,)
+    errors_around: NDArray[np.float64]  # the mean of those through each place
     errors_behind: NDArray[np.float64]  # the mean of those that ended in the last 30 s
     restarted: NDArray[np.bool_]  # of shape (n,)
     choice_seconds: NDArray[np.float64]  # of shape (m,)
@@ -147,11 +148,6 @@ class ModeReplay(NamedTuple):
         """When each choice was made, and the end, until which the last one holds."""
         return np.append(self.choice_seconds, self.seconds[-1])
 
-    def selection_at(self) -> NDArray[np.intp]:
-        """Number of the selection that holds at each frame, of shape (n,)."""
-        after = np.searchsorted(self.choice_seconds, self.seconds, side="right")
-        return np.maximum(after - 1, 0)
-
     @property
     def adapts(self) -> bool:
         """Whether anything was selected along the way."""
@@ -167,7 +163,6 @@ class ReplayedSequence:
     modes: Mapping[str, ModeReplay]  # in the order in which lines lie on each other
     space: ParameterSpace
     scenes: Spans | None = None  # of a simulated course
-    reference: NDArray[np.float64] | None = None  # (k, 2): places, metres; None if there is none
     estimated: bool = False  # whether the reference was computed from the recording
     refused: Sequence[str] = ()  # sentences about replays that are not among them
 
@@ -183,16 +178,12 @@ def read_replays(study: Study, name: str) -> ReplayedSequence:
         If a file is damaged, or if `compare` refuses all of them.
     """
     folder, length = study.folder / "replays" / name, study.config.sub_trajectory
-    space = study.odometry.space
     reference = Reference.read(folder, length, study.sequences.estimate(name))
-    # Of a single odometry, numbers name the members of a bank.
-    several = len(space.baselines) > 1 and study.model_path.exists()
-    model = ErrorModel.load(study.model_path) if several else None
     current = current_replays(study, [name])
     if current.modes:
         check_reference(folder, study.sequences.reference(name))
     replays = {mode: StoredReplay.read(folder / mode) for mode in current.modes}
-    modes = {mode: _read_mode(replay, reference, model) for mode, replay in replays.items()}
+    modes = {mode: _read_mode(replay, reference, current.model) for mode, replay in replays.items()}
     scenes = None
     if replays:
         stamps = next(iter(replays.values())).trajectory.stamps
@@ -201,9 +192,8 @@ def read_replays(study: Study, name: str) -> ReplayedSequence:
         name,
         length,
         modes,
-        space,
+        study.odometry.space,
         scenes,
-        None if reference.trajectory is None else _seen_from(reference.trajectory),
         reference.estimated,
         current.refused,
     )
@@ -221,17 +211,14 @@ def scenes_along(sequences: StudySequences, name: str, stamps: NDArray[np.int64]
 def _read_mode(replay: StoredReplay, reference: Reference, model: ErrorModel | None) -> ModeReplay:
     """Read a replay; `model` names the members of a bank."""
     stamps, truth = replay.trajectory.stamps, reference.trajectory
-    # The odometry's own frame begins elsewhere: both are drawn from the first common pose.
-    start = 0 if truth is None else int(np.argmax(np.isin(stamps, truth.stamps)))
-    xy = _seen_from(replay.trajectory, start)
-    places = xy
+    places = _seen_from(replay.trajectory)
     if truth is not None and len(known := np.flatnonzero(np.isin(stamps, truth.stamps))):
         places = np.full((len(stamps), 2), np.nan)
         places[known] = _seen_from(truth)[np.searchsorted(truth.stamps, stamps[known])]
     return ModeReplay(
         (stamps - stamps[0]) * 1e-9,
-        xy,
         reference.errors(replay.trajectory),
+        reference.errors_around(replay.trajectory),
         reference.errors_behind(replay.trajectory),
         replay.restarted,
         np.asarray((replay.choice_stamps - stamps[0]) * 1e-9),
@@ -250,16 +237,18 @@ def _read_mode(replay: StoredReplay, reference: Reference, model: ErrorModel | N
 def _member(replay: StoredReplay, model: ErrorModel | None, number: int) -> str:
     """What a member of a bank is called. Those of a bank without a model are no trials."""
     if replay.summary.inputs["mode"] == UNTRAINED:
-        return f"untrained set {number}" if number else "baseline's set"
+        return f"untrained set {number}" if number else BASELINE
     if model is None or number not in model.sets:
         return f"trial {number}"
-    return f"trial {named(model, number)}"
+    if number == model.fixed:
+        return FIXED
+    return BASELINE if (name := named(model, number)) == "0" else f"trial {name}"
 
 
-def _seen_from(trajectory: Trajectory, start: int = 0) -> NDArray[np.float64]:
-    """Positions in the plane of the sensor at a pose: x forward, y to the left."""
+def _seen_from(trajectory: Trajectory) -> NDArray[np.float64]:
+    """Positions in the plane of the sensor at the first pose: x forward, y to the left."""
     T = trajectory.T_world_sensor
-    return np.asarray((invert(T[start]) @ T)[:, :2, 3])
+    return np.asarray((invert(T[0]) @ T)[:, :2, 3])
 
 
 # Charts of selections: how familiar the surroundings were, and how long all took.
@@ -341,12 +330,11 @@ def histograms(times: Mapping[str, NDArray[np.float64]]) -> list[Line]:
 
 TIME = Axis("time [s]")
 _MOST_PLACES = 200
-"""Points of a map; more would hide each other."""
-_MOST_MAPS = 12
-_SLENDER, _LOW = 0.2, 0.35
-"""A course whose height from above is a smaller share of its width has low panels."""
-_BESIDE = 0.5
-"""By how much of its extent a picture may reach beyond the reference."""
+"""Points of a path; more would hide each other."""
+_COMPACT = 0.5
+"""A path of a larger height, as a share of its width, stands upright beside the errors."""
+_WIDE = 8.0
+"""Errors are drawn on a logarithmic axis if the largest is so many times their median."""
 _RESTARTED = "restarted by the health check"
 
 
@@ -356,57 +344,16 @@ def charts_of_replays(replayed: ReplayedSequence) -> Charts:
     if not replayed.modes:
         none = [f"No replays of {sequence}: run `adaptune online`."]
         return Charts([], [*replayed.refused] or none)
-    whose = "mode whose replay can be read" if replayed.refused else "mode"
     return charts_of(
         (
             *replayed.refused,
-            path_chart(replayed),
             error_chart(replayed)
             or f"No errors of the replays of {sequence}: it has no reference.",
             choice_chart(replayed),
-            map_chart(replayed)
-            or f"No map of what was selected on {sequence}: no {whose} has changed anything.",
             familiarity_chart(replayed),
             latency_chart(replayed),
         )
     )
-
-
-def path_chart(replayed: ReplayedSequence) -> Chart:
-    """The trajectory of every mode from above, beside the reference."""
-    drawn: list[Drawn] = [
-        Line(of.xy[:, 0], of.xy[:, 1], mode) for mode, of in replayed.modes.items()
-    ]
-    if (reference := replayed.reference) is not None:
-        some = reference[np.linspace(0, len(reference) - 1, 40).astype(int)]
-        name = "estimated reference" if replayed.estimated else "reference"
-        drawn.append(Points(some[:, 0], some[:, 1], name, shape="circle"))
-    for mode, of in replayed.modes.items():
-        if of.restarted.any():
-            texts = [f"{mode}, {seconds:.1f} s" for seconds in of.seconds[of.restarted]]
-            x, y = of.xy[of.restarted].T
-            drawn.append(Points(x, y, _RESTARTED, texts=texts, shape="triangle-down"))
-    drawn.append(Points([0.0], [0.0], "start", shape="cross"))
-    x_limits, y_limits = _path_limits(replayed).tolist()
-    x, y = Axis("x [m]", limits=tuple(x_limits)), Axis("y [m]", limits=tuple(y_limits))
-    return Chart(
-        f"{replayed.name}-paths",
-        f"{replayed.name}: trajectories from above",
-        (Panel(x, y, tuple(drawn), equal=True),),
-        "Every trajectory begins at the first pose of the reference, and is not aligned any "
-        "further. What leaves the picture has lost its way.",
-    )
-
-
-def _path_limits(replayed: ReplayedSequence) -> NDArray[np.float64]:
-    """Limits of x and y, of shape (2, 2): not far from the reference, where there is one."""
-    places = np.concatenate([of.xy for of in replayed.modes.values()])
-    if (reference := replayed.reference) is not None:
-        side = _BESIDE * max(float(np.ptp(reference, axis=0).max()), 1.0)
-        places = places.clip(reference.min(axis=0) - side, reference.max(axis=0) + side)
-        places = np.concatenate([places, reference])
-    beyond = 0.05 * float(np.ptp(places, axis=0).max()) + 0.1
-    return np.column_stack([places.min(axis=0) - beyond, places.max(axis=0) + beyond])
 
 
 def error_chart(replayed: ReplayedSequence) -> Chart | None:
@@ -488,8 +435,8 @@ def choice_chart(replayed: ReplayedSequence) -> Chart | None:
         f"{replayed.name}: what was applied along the course",
         tuple(panels),
         "Parameters of each mode over time; of a bank, the shares of its members in the weighted "
-        "mean, the fixed set's first (without a model, the baseline's). Names above are the scenes "
-        "of the course, if it is a simulated one: what is applied should change with them.",
+        "mean. Names above are the scenes of the course, if it is a simulated one: what is applied "
+        "should change with them.",
         shared_x=True,
     )
 
@@ -504,7 +451,8 @@ def _parameters(replayed: ReplayedSequence) -> Iterator[Panel]:
         drawn = _scenes(replayed)
         for mode, values in chosen.items():
             y = [_place(value, names) for value in values]
-            drawn.append(Line(single[mode].span, [*y, y[-1]], mode, steps=True))
+            of = single[mode]
+            drawn.append(Line(of.span, [*y, y[-1]], mode, steps=True, dashed=not of.adapts))
         log = name in replayed.space.logarithmic and names is None
         axis = Axis(replayed.space.labels[name], log=log, names=names)
         yield Panel(TIME, axis, tuple(drawn), name)
@@ -527,7 +475,10 @@ def _weights(replayed: ReplayedSequence) -> Iterator[Panel]:
         if not _changes(shares):
             continue
         shares = np.column_stack([shares, shares[:, -1]])
-        drawn = (*_scenes(replayed), Shares(track.span, shares, tuple(track.weights)))
+        # Shares hide what is shaded.
+        ends = [] if replayed.scenes is None else replayed.scenes.edges[1:-1]
+        edges = (Mark(float(edge), axis="x") for edge in ends)
+        drawn = (*_scenes(replayed), Shares(track.span, shares, tuple(track.weights)), *edges)
         y = Axis("weight [%]", limits=(0.0, 100.0))
         yield Panel(TIME, y, drawn, f"{mode} applies a bank: weights of its members")
 
@@ -541,56 +492,105 @@ def _scenes(replayed: ReplayedSequence) -> list[Drawn]:
     return [] if replayed.scenes is None else [replayed.scenes]
 
 
-def map_chart(replayed: ReplayedSequence) -> Chart | None:
-    """The course from above, coloured by what each mode applied there."""
-    panels = [
-        panel
-        for mode, of in replayed.modes.items()
-        if of.adapts and np.isfinite(of.places).all(axis=1).any()
-        for panel in _maps(mode, of, replayed)
-    ]
-    if not panels:
+# The picture of a comparison: a sequence at a glance.
+
+
+def charts_of_comparison(
+    rows: Sequence[ComparisonRow], read: Callable[[str], ReplayedSequence]
+) -> Charts:
+    """The picture of a comparison, and the ratios of all modes; `read` is `read_replays`."""
+    none = "No ratios of errors: no sequence has a reference."
+    return charts_of((overview_chart(rows, read), comparison_chart(rows) or none))
+
+
+def overview_chart(
+    rows: Sequence[ComparisonRow], read: Callable[[str], ReplayedSequence]
+) -> Chart | None:
+    """The sequence on which the main modes differ most: where, how far off, and what was chosen."""
+    main = WITHOUT_MODEL if rows[0].yardstick == BASELINE else (BASELINE, FIXED, ADAPTIVE)
+    errors: dict[str, dict[str, float]] = {}
+    for row in rows:
+        if row.sequence != ALL and row.mode in main and row.rte is not None:
+            errors.setdefault(row.sequence, {})[row.mode] = max(row.rte, 1e-12)
+    ratios = {of: max(e.values()) / min(e.values()) for of, e in errors.items() if len(e) > 1}
+    if not ratios:
         return None
+    name = max(ratios, key=lambda name: ratios[name])
+    replayed = read(name)
+    replayed = replace(replayed, modes={mode: replayed.modes[mode] for mode in errors[name]})
+    places = _turned([*replayed.modes.values()][-1].places)
+    wide, high = np.nanmax(places, axis=0) - np.nanmin(places, axis=0)
+    if aside := bool(high > _COMPACT * wide):
+        places = places[:, ::-1] * (-1.0, 1.0)
+    panels = _path(replayed, places), _errors_around(replayed), *_chosen(replayed)
+    *means, least = (f"{mode} ({rte:.2g} %)" for mode, rte in errors[name].items())
+    last = [*replayed.modes][-1]
+    chose = f"The last panel shows what {last} chose" if len(panels) > 2 else f"{last} kept its set"
     return Chart(
-        f"{replayed.name}-map",
-        f"{replayed.name}: what was applied where, from above",
-        tuple(panels[:_MOST_MAPS]),
-        "Each point is a scan where the sensor was, seen from its first pose; its colour is what "
-        "was applied there. Of a bank, it is the share of the heaviest member other than its first "
-        "one, which is the fixed set, or without a model the baseline. Places that look alike "
-        "should have the same colour.",
-        # A course that leads straight ahead needs the whole width, and no height.
-        columns=1 if panels[0].height < 1.0 else min(2, len(panels)),
+        "overview",
+        f"{name}: error of {', '.join(means)} and {least}",
+        panels,
+        f"The error at each moment is the mean of the sub-trajectories of {replayed.length:g} m "
+        f"through it. {chose}.",
+        aside=aside,
+        shared_x=True,
     )
 
 
-def _maps(mode: str, of: ModeReplay, replayed: ReplayedSequence) -> Iterator[Panel]:
+def _path(replayed: ReplayedSequence, places: NDArray[np.float64]) -> Panel:
+    """The path, coloured by kind of place, or where none is known by the error of the last mode."""
+    mode, of = list(replayed.modes.items())[-1]
+    x, y = places.T
+    drawn: list[Drawn] = []
+    named = [(int(np.isfinite(x).argmax()), "start")]
+    if (scenes := replayed.scenes) is None:
+        some = np.linspace(0, len(x) - 1, _MOST_PLACES).astype(int)
+        some = some[np.isfinite(of.errors_around[some])]
+        drawn.append(Line(x, y, "", faint=True))
+        drawn.append(Points(x[some], y[some], "", of.errors_around[some], "error [%]"))
+    else:
+        ends = np.searchsorted(of.seconds, scenes.edges)
+        for begin, end, name in zip(ends[:-1], ends[1:], scenes.names, strict=True):
+            drawn.append(Line(x[begin : end + 1], y[begin : end + 1], name, width=7.0))
+        named += [*zip((ends[:-1] + ends[1:]) // 2, scenes.names, strict=True)]
+    at = [i for i, _ in named]
+    drawn.append(Words(x[at], y[at], [name for _, name in named]))
+    title = f"the path from above, by {'kind of place' if scenes else f'error of {mode}'}"
+    return Panel(Axis("[m]"), Axis("[m]"), tuple(drawn), title, equal=True)
+
+
+def _turned(places: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Places, of shape (n, 2), turned so that they lie along x, and lead to the right."""
+    known = places[np.isfinite(places).all(axis=1)]
+    angles = np.radians(np.arange(0.0, 180.0, 2.0))
+    heights = np.ptp(known @ (-np.sin(angles), np.cos(angles)), axis=0)
+    angle = angles[heights.argmin()]
+    along = np.array([np.cos(angle), np.sin(angle)])
+    along *= np.sign((known[-1] - known[0]) @ along) or 1.0
+    return np.asarray((places - known[0]) @ np.column_stack([along, (-along[1], along[0])]))
+
+
+def _errors_around(replayed: ReplayedSequence) -> Panel:
+    fixed, lines = replayed.modes.get(FIXED), []
+    for mode, of in replayed.modes.items():
+        same = fixed is not None and np.array_equal(of.errors, fixed.errors, equal_nan=True)
+        # It would hide the line of the fixed set, which it has kept.
+        lines.append(Line(of.seconds, of.errors_around, mode, dashed=mode != FIXED and same))
+    known = np.concatenate([line.y for line in lines])
+    most, log = np.nanmax(known), bool(np.nanmax(known) > _WIDE * np.nanmedian(known))
+    y = Axis("error [%]", log, limits=None if log else (0.0, 1.05 * most or 1.0))
+    title = f"error (RTE over {replayed.length:g} m) around each moment"
+    return Panel(TIME, y, (*_scenes(replayed), *lines), title, height=1.6)
+
+
+def _chosen(replayed: ReplayedSequence) -> Iterator[Panel]:
+    """What the last mode chose: weights, or the parameter that it changed most often."""
+    mode, of = list(replayed.modes.items())[-1]
     if of.weights:
-        weights = 100.0 * np.array(list(of.weights.values()))
-        if _changes(weights):
-            title = f"{mode}: heaviest other member"
-            yield _map(of, weights[1:].max(axis=0), "weight [%]", title)
-        return
-    for name, values in of.choices.items():
-        if any(isinstance(v, str) for v in values) or len(set(map(repr, values))) < 2:
-            continue
-        chosen = np.array(values, float)
-        label, log = replayed.space.labels[name], name in replayed.space.logarithmic
-        yield _map(of, chosen, label, f"{mode}: {name}", log)
-
-
-def _map(
-    of: ModeReplay, chosen: NDArray[np.float64], label: str, title: str, log: bool = False
-) -> Panel:
-    """A panel with what was chosen at each selection, of shape (m,), at some of the scans."""
-    known = np.flatnonzero(np.isfinite(of.places).all(axis=1))
-    some = known[np.unique(np.linspace(0, len(known) - 1, _MOST_PLACES).astype(int))]
-    x, y = of.places[some].T
-    texts = [f"{seconds:.1f} s" for seconds in of.seconds[some]]
-    drawn = (
-        Points(x, y, "", chosen[of.selection_at()][some], label, log, texts),
-        Points(x[:1], y[:1], "start", shape="cross"),
-    )
-    wide, high = (float(np.ptp(of.places[known][:, axis])) + 1.0 for axis in (0, 1))
-    height = _LOW if high < _SLENDER * wide else 1.0
-    return Panel(Axis("x [m]"), Axis("y [m]"), drawn, title, equal=True, height=height)
+        yield from _weights(replace(replayed, modes={mode: of}))
+    elif of.adapts:
+        changes = {name: switched({name: values}).sum() for name, values in of.choices.items()}
+        most = max(changes, key=lambda name: changes[name])
+        if changes[most]:
+            (panel,) = (panel for panel in _parameters(replayed) if panel.title == most)
+            yield replace(panel, title=f"what {mode} chose: {most}")

@@ -5,7 +5,7 @@ import os
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from adaptune.report.charts import Charts
     from adaptune.report.page import PageSection
     from offline.config import OfflineStudy, OfflineStudyConfig
+    from online.charts import ReplayedSequence
     from online.compare import ComparedReplays
     from online.statistics import ComparisonRow
 
@@ -274,14 +275,16 @@ def _write_page(study: "OfflineStudy", found: "ComparedReplays | str") -> Path:
     from online.charts import charts_of_replays, read_replays
     from online.modes import sequences_without_model
 
+    read = cache(partial(read_replays, study))
+
     def along(name: str) -> "Charts":
-        return charts_of_replays(read_replays(study, name))
+        return charts_of_replays(read(name))
 
     config = study.config
     # Without a test, some may have been replayed without a model.
     others = sequences_without_model(config)
     replayed = [name for name in others if (study.folder / "replays" / name).exists()]
-    sections = [_comparison(found, config.sub_trajectory)]
+    sections = [_comparison(found, config.sub_trajectory, read)]
     names = config.test or replayed
     sections += [_of_charts(f"Along {name}", partial(along, name)) for name in names]
     sections.append(_search(study))
@@ -297,17 +300,20 @@ def _write_page(study: "OfflineStudy", found: "ComparedReplays | str") -> Path:
     return path
 
 
-def _comparison(found: "ComparedReplays | str", length: float) -> "PageSection":
+def _comparison(
+    found: "ComparedReplays | str", length: float, read: "Callable[[str], ReplayedSequence]"
+) -> "PageSection":
     from adaptune.report.page import PageSection
-    from online.charts import comparison_chart
+    from online.charts import charts_of_comparison
     from online.tables import modes_in_words, tables
 
     title = "What adapting gained"
     if isinstance(found, str):
         return PageSection(title, missing=(found,))
     made = *tables(found.rows, length), modes_in_words(found.rows)
-    chart = comparison_chart(found.rows)
-    return PageSection(title, tuple(found.details), () if chart is None else (chart,), made)
+    charts = partial(charts_of_comparison, found.rows, read)
+    section = _of_charts(title, charts)
+    return replace(section, missing=(*section.missing, *found.details), tables=made)
 
 
 def _search(study: "OfflineStudy") -> "PageSection":

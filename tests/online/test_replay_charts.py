@@ -1,17 +1,12 @@
-from dataclasses import replace
-
 import numpy as np
-import pytest
-from made_replays import SCENES, SECONDS, XY, bank, kept, replay, sequence
+from made_replays import SCENES, SECONDS, bank, kept, replay, sequence
 
-from adaptune.report.charts import Band, Line, Points, Shares, Spans
+from adaptune.report.charts import Band, Line, Mark, Points, Shares, Spans
 from offline.config import load_study
 from online.charts import (
     charts_of_replays,
     choice_chart,
     error_chart,
-    map_chart,
-    path_chart,
     read_replays,
     switches,
 )
@@ -19,17 +14,6 @@ from online.charts import (
 
 def of_kind(panel, kind):
     return [d for d in panel.drawn if isinstance(d, kind)]
-
-
-def test_trajectories_stay_near_the_reference():
-    lost = replay(xy=1e6 * XY, restarted=np.arange(len(SECONDS)) == 50)
-    replayed = replace(sequence(fixed=kept(), paper=lost), reference=XY)
-    (panel,) = path_chart(replayed).panels
-    assert [line.name for line in of_kind(panel, Line)] == ["fixed", "paper"]
-    named = [points.name for points in of_kind(panel, Points)]
-    assert named == ["reference", "restarted by the health check", "start"]
-    assert panel.equal
-    assert panel.x.limits[1] - panel.x.limits[0] < 5.0 * np.ptp(XY[:, 0])
 
 
 def test_errors_of_all_modes_are_drawn_with_their_switches():
@@ -81,8 +65,9 @@ def test_what_a_mode_measured_of_itself_has_a_panel():
 def test_choices_last_until_the_next_one():
     chart = choice_chart(sequence(fixed=kept(), paper=replay(), adaptive=bank()))
     distance, kernel, weights = chart.panels
-    _, steps = of_kind(distance, Line)
+    constant, steps = of_kind(distance, Line)
     assert steps.steps
+    assert (constant.dashed, steps.dashed) == (True, False)
     np.testing.assert_allclose(steps.x, [0.0, 8.0, 9.0, SECONDS[-1]])
     assert list(steps.y) == [0.7, 0.9, 0.9, 0.9]
     assert distance.y.log
@@ -92,12 +77,13 @@ def test_choices_last_until_the_next_one():
     np.testing.assert_allclose(shares.shares.sum(axis=0), 100.0)
     np.testing.assert_allclose(shares.shares[:, -1], [60.0, 10.0, 30.0])
     assert shares.names == ("trial 4", "trial 17", "trial 2")
+    # Shares hide what is shaded: a line shows where a scene ends.
+    assert [mark.at for mark in of_kind(weights, Mark)] == [8.0]
 
 
 def test_weights_that_never_change_are_not_drawn():
     even = replay(weights={"trial 4": [0.5] * 3, "trial 17": [0.5] * 3})
     assert choice_chart(sequence(adaptive=even)) is None
-    assert map_chart(sequence(adaptive=even)) is None
 
 
 def test_sets_of_several_odometries_leave_gaps():
@@ -107,18 +93,6 @@ def test_sets_of_several_odometries_leave_gaps():
     by_name = {panel.title: of_kind(panel, Line)[0] for panel in panels}
     np.testing.assert_array_equal(by_name["kernel"].y, [0.0, np.nan, np.nan, np.nan])
     np.testing.assert_array_equal(by_name["resolution"].y, [np.nan, 2.0, 2.0, 2.0])
-
-
-def test_the_map_shows_what_was_applied_where():
-    chart = map_chart(sequence(fixed=kept(), paper=replay(), adaptive=bank()))
-    parameter, weight = chart.panels
-    assert parameter.title == "paper: distance"
-    places = of_kind(parameter, Points)[0]
-    assert places.log_colour
-    np.testing.assert_array_equal(places.colour, np.where(np.asarray(places.x) < 8.0, 0.7, 0.9))
-    # The heaviest of all members but the first.
-    assert sorted(set(of_kind(weight, Points)[0].colour)) == pytest.approx([30.0, 70.0])
-    assert map_chart(sequence(fixed=kept())) is None
 
 
 def test_a_sequence_without_replays_says_so(study_file, tmp_path):

@@ -41,9 +41,7 @@ def test_replays_are_read_with_what_was_measured(study):
         assert of.adapts == (mode in ("adaptive", "paper"))
         # The reference goes straight on; the odometry nearly so.
         assert abs(of.places[:, 1]).max() < 1e-6
-        np.testing.assert_allclose(of.places, of.xy, atol=0.5)
-        assert (np.diff(of.selection_at()) >= 0).all()
-        assert of.selection_at()[-1] == m - 1
+        assert (np.isfinite(of.errors_around) >= np.isfinite(of.errors)).all()
     with (study.folder / "replays/three/paper/selections.csv").open() as file:
         told = [float(row["ms"]) for row in csv.DictReader(file)]
     np.testing.assert_array_equal(replayed.modes["paper"].selection_ms, told)
@@ -55,7 +53,7 @@ def test_all_charts_are_made(study):
     keys = {chart.key for chart in charts}
     assert {"three-errors", "three-choices", "three-latency", "three-familiarity"} <= keys
     assert all(chart.caption and chart.title.startswith("three: ") for chart in charts)
-    assert all("map" in note for note in notes)
+    assert notes == []
 
 
 def test_a_damaged_table_is_refused(study, study_file, tmp_path):

@@ -76,7 +76,7 @@ def test_nothing_but_a_recording_is_needed(load, caplog):
     assert weights[-1] != weights[0]
     # They are no trials: a trial of the same number has other parameters.
     (bank,) = (of for m, of in read_replays(study, "three").modes.items() if m == MODES[1])
-    assert list(bank.weights) == ["baseline's set", *(f"untrained set {i}" for i in (1, 2, 3))]
+    assert list(bank.weights) == ["baseline", *(f"untrained set {i}" for i in (1, 2, 3))]
     rows = compare(study).rows
     assert [(row.sequence, row.mode, row.rte) for row in rows] == [
         ("three", m, None) for m in MODES

@@ -16,8 +16,8 @@ def replay(**changed):
     n = len(SECONDS)
     made = ModeReplay(
         seconds=SECONDS,
-        xy=XY,
         errors=np.where(SECONDS < 15.0, 0.7 + 0.1 * np.sin(SECONDS), np.nan),
+        errors_around=np.where(SECONDS < 16.0, 0.7, np.nan),
         errors_behind=np.full(len(SECONDS), np.nan),
         restarted=np.zeros(len(SECONDS), bool),
         choice_seconds=np.array([0.0, 8.0, 9.0]),

@@ -72,7 +72,7 @@ def test_one_bag_is_enough_and_every_command_names_the_next(adaptune, study_file
     table = done.stdout[done.stdout.index("RTE over") : done.stdout.index("Next: ")]
     assert max(map(len, table.splitlines())) <= 80
     assert "# find out what adapting gains elsewhere" in done.stdout
-    assert (tmp_path / "my study[v2]/report/figures/one_60-100-paths.png").exists()
+    assert (tmp_path / "my study[v2]/report/figures/overview.png").exists()
 
 
 @pytest.mark.parametrize(
@@ -204,7 +204,8 @@ def test_a_finished_study_has_a_page_of_everything(finished):
         assert f"{title}</h2>" in page
     assert "No validation: run <code>adaptune validate</code>." in page
     figures = {path.stem for path in (finished / "report/figures").glob("*.svg")}
-    assert {"comparison", "three-errors", "three-paths"} <= figures
+    assert {"overview", "comparison", "three-errors", "three-choices"} <= figures
+    assert page.index('id="overview"') < page.index('id="comparison"')
     assert figures == {path.stem for path in (finished / "report/figures").glob("*.png")}
     for mode in ("baseline", "fixed", "adaptive", "paper"):
         assert f">{mode}</td>" in page
