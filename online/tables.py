@@ -268,7 +268,8 @@ def verdict(rows: Sequence[ComparisonRow], length: float, obstacle: str = "") ->
     """
     last = {row.mode: row for row in _last(rows)}
     if all(row.ratio is None for row in last.values()):
-        return ["No test sequence has a reference: nobody can say what was gained."]
+        nobody = "No test sequence has a reference: nobody can say what was gained."
+        return [nobody, *_estimates(rows)[:2]]
     best = decided(rows)
     errors = {m: f"{row.rte:.3g} %" for m, row in last.items() if row.rte is not None}
     others = [m for m in ("fixed", "baseline") if m in errors and m != best.mode]

@@ -135,6 +135,8 @@ class Scene:
     slope: float  # greatest rise of the road, as a ratio
     shake: float  # how rough the ride is; 1 is a paved road
     pace: float = 1.0  # share of its usual speed at which a vehicle goes
+    # Whether it winds from its mouth on, however long the bends before it are.
+    winds_at_once: bool = False
     # What moves about in it: kinds of mover with the offset they keep.
     movers: tuple[tuple[str, float], ...] = ()
 
@@ -340,6 +342,7 @@ MINE = Scene(
     bend=6.0,
     slope=0.02,
     shake=1.0,
+    winds_at_once=True,
 )
 
 

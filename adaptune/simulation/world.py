@@ -134,6 +134,7 @@ def _bends(
     sign = 1.0
     s = stations[0]
     for leg, amplitude, spacing in amplitudes:
+        s = min(s, leg.start + spacing) if leg.scene.winds_at_once else s
         while s < leg.stop:
             nodes.append(s)
             values.append(sign * amplitude * rng.uniform(0.4, 1.0))

@@ -115,14 +115,14 @@ def test_what_is_missing_somewhere_is_told_and_left_out(own, tmp_path):
     assert (
         "Not compared, because replays are missing: four (`fixed`, `paper`); `adaptune online` "
         "makes them."
-    ) in compare(both).words
-    assert any("`equal_cost` is the fixed set" in said for said in compare(both).words)
+    ) in compare(both).details
+    assert any("`equal_cost` is the fixed set" in said for said in compare(both).details)
     shutil.rmtree(both.folder / "replays/three/fixed")
     assert {(row.mode, row.yardstick) for row in compare(both).rows} == {
         ("baseline", "baseline"),
         ("untrained", "baseline"),
     }
-    assert not any("`equal_cost` is the fixed set" in said for said in compare(both).words)
+    assert not any("`equal_cost` is the fixed set" in said for said in compare(both).details)
     (said,) = compared_modes(both).words
     assert said.startswith("`fixed` is not compared: there is no replay on any sequence; `adaptune")
     shutil.rmtree(both.folder / "replays/four/untrained")
@@ -143,7 +143,7 @@ def test_where_only_some_were_replayed_without_a_model_those_are_compared(own, t
     assert (
         "Not compared, because replays are missing: three (`baseline`); `adaptune online "
         "--untrained` makes them."
-    ) in compare(both).words
+    ) in compare(both).details
 
 
 def test_every_mode_is_repeated(own):
@@ -163,7 +163,7 @@ def test_every_mode_is_repeated(own):
     assert len(read_repeats(kept / "paper")) == 1
     assert run_replays(study, study.model_path, repeats=3) == 1
     shutil.rmtree(kept / "fixed/repeat_3")
-    (said,) = (said for said in compare(study).words if said.startswith("Replayed less often"))
+    (said,) = (said for said in compare(study).details if said.startswith("Replayed less often"))
     assert "less often than 3 times (`adaptune online --repeats 3` goes on): " in said
     assert "fixed on three 2" in said
     assert "paper" not in said
@@ -186,6 +186,8 @@ def test_the_command_line(own, study_file):
     shutil.rmtree(folder / "replays/three/paper")
     done = CliRunner().invoke(app, ["compare", *words])
     assert done.exit_code == 0, done.output
+    assert "paper" not in done.stdout
+    done = CliRunner().invoke(app, ["compare", *words, "--details"])
     assert "`paper` is not compared: there is no replay on any sequence" in done.stdout
     for value, words_ in (("[even, even]", "one of them is named twice"), ("[odd]", "not 'odd'")):
         done = CliRunner().invoke(app, ["online", *words, "-o", f"online.modes={value}"])

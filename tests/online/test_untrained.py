@@ -84,12 +84,13 @@ def test_nothing_but_a_recording_is_needed(load, caplog):
     # An estimate is told as one.
     assert rows[0].estimated is None
     assert (rows[1].estimated, rows[1].estimated_interval) == (6.0, (5.0, 9.0))
-    said = remarks(rows)
-    assert said == [
-        "No test sequence has a reference: nobody can say what was gained.",
+    nobody = "No test sequence has a reference: nobody can say what was gained."
+    estimate = (
         "three has no reference. `untrained` estimates its own mean RTE there: 6.000 % (95 % "
-        "interval 5.000-9.000 %).",
-    ]
+        "interval 5.000-9.000 %)."
+    )
+    assert remarks(rows) == [estimate]
+    assert compare(study).verdict == [nobody, estimate]
     assert caplog.messages == [
         "three, untrained: the bank is lost at 1.0 s",
         "three, untrained: the bank goes on at 2.0 s",
