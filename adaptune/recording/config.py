@@ -21,6 +21,8 @@ from adaptune.files import expand_user
 from adaptune.recording.scan import USUAL, Imu, ImuNoise, Mark, Part, SequenceError, Unit
 from adaptune.strict import StrictModel
 
+Compensation = Literal["constant_velocity", "gyro"] | None
+"""How motion within a scan is undone; none if it is left as it is."""
 MOST_VIEWS = 16
 """Views of one sequence, and views to train on; each costs time with every scan."""
 REFERENCE_FILES = (".tum", ".txt", ".csv")
@@ -250,7 +252,7 @@ class SequenceConfig(_Part):
     # benchmark and the raw drives when left out.
     elevation: float | None = Field(None, ge=-5, le=5)
     # Undo the motion since the scan before, or the rotation that the IMU measured.
-    compensate: Literal["constant_velocity", "gyro"] | None = None
+    compensate: Compensation = None
     views: Annotated[tuple[ViewConfig, ...], Field(max_length=MOST_VIEWS)] = ()
     cache: bool = True  # whether to keep decoded bags in the cache
 

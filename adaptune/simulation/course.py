@@ -13,7 +13,7 @@ from pydantic import AfterValidator, Field, model_validator
 from adaptune import geometry
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses
-from adaptune.recording.config import SequenceConfig
+from adaptune.recording.config import Compensation, SequenceConfig
 from adaptune.recording.scan import ImuNoise, Part
 from adaptune.simulation.scenes import SCENES
 from adaptune.strict import StrictModel
@@ -224,6 +224,8 @@ class Course(StrictModel):
     imu: Literal[200, 400] | None = None
     moving_objects: bool = False  # whether cars and walkers move about
     weather: Annotated[str, _known("weather", WEATHERS)] = "clear"
+    # How motion within a scan is undone, as for a recorded sequence.
+    compensate: Compensation = None
     # Whether a recording's headers mark the start or the end of each scan.
     stamp: Literal["start", "end"] = "start"
     # The course whose recording it is a part of; a study's `training` and `test` name such parts.
@@ -238,6 +240,8 @@ class Course(StrictModel):
             raise ValueError(f"{what}: it needs at least {least:g}")
         if sum(length for _, length in self.legs) > LONGEST:
             raise ValueError(f"a course is at most {LONGEST:g} m long")
+        if self.compensate == "gyro" and self.imu is None:
+            raise ValueError("`compensate: gyro` needs `imu`, as in `imu: 200`")
         return self
 
     @property
@@ -277,4 +281,5 @@ def as_sequence(course: Course, path: Path) -> SequenceConfig:
     extrinsic = geometry.invert(T_IMU_LIDAR).tolist()
     imu: Any = {"topic": IMU, "extrinsic": extrinsic, "noise": NOISE._asdict()}
     imu = None if course.imu is None else imu
-    return SequenceConfig(bag=str(path), points=POINTS, reference=POSES, imu=imu, part=course.part)
+    given: Any = {"imu": imu, "part": course.part, "compensate": course.compensate}
+    return SequenceConfig(bag=str(path), points=POINTS, reference=POSES, **given)
