@@ -210,15 +210,9 @@ def tune(
     What it decides is written to a study file in its folder, with which all other commands work.
     Run the same command again to resume.
     """
-    several = len(recordings) > 1
-    name = "+".join(dict.fromkeys(odometry.replace(":", "_").split(",")))
-    stem = _name_of(recordings[0]) + ("_and_more" if several else "")
-    folder = folder or Path("runs") / (stem if odometry == "gicp" else f"{stem}_{name}")
+    folder = folder or Path("runs") / _study_name(recordings, odometry)
     path = folder / f"{folder.resolve().name}.yaml"
-    words = [*(str(bag.resolve()) for bag in recordings), "--odometry", odometry]
-    words += ["--points", points] if points else []
-    words += ["--reference", reference] if reference else []
-    made_by = f"# adaptune tune {shlex.join(words)}\n"
+    made_by = _made_by(recordings, odometry, points, reference)
     overrides = []
     if not path.exists():
         text = _decided(recordings, odometry, (points, reference), (trials, minutes), folder)
@@ -238,8 +232,24 @@ def tune(
         training = train(loaded, show)
     replay_missing(loaded)
     compared(loaded, details=details)
-    _say_odometries(loaded, training)
+    _sayodometries_of(loaded, training)
     say_next("replays to look at in Foxglove", "record", folder)
+
+
+def _study_name(recordings: Sequence[Path], odometry: str) -> str:
+    stem = _name_of(recordings[0]) + "_and_more" * (len(recordings) > 1)
+    others = "+".join(dict.fromkeys(odometry.replace(":", "_").split(",")))
+    return stem if odometry == "gicp" else f"{stem}_{others}"
+
+
+def _made_by(
+    recordings: Sequence[Path], odometry: str, points: str | None, reference: str | None
+) -> str:
+    """The first line of a study: what it was decided for."""
+    words = [*(str(bag.resolve()) for bag in recordings), "--odometry", odometry]
+    words += ["--points", points] if points else []
+    words += ["--reference", reference] if reference else []
+    return f"# adaptune tune {shlex.join(words)}\n"
 
 
 def _limits(trials: int | None, minutes: float | None) -> list[str]:
@@ -273,7 +283,7 @@ def _decided(
     for one in found:
         names = chain([one.name], (f"{one.name}_{i}" for i in count(2)))
         named[next(name for name in names if name not in named)] = one
-    odometries = _odometries(odometry, all("imu" in one.given for one in found))
+    odometries = odometries_of(odometry, all("imu" in one.given for one in found))
     trials, minutes = budget
     if trials is None and minutes is None:
         trials = max(TRIALS, EACH * len(odometries))
@@ -322,7 +332,7 @@ def _usable(path: Path, points: str | None, reference: str | None, show: Progres
     return found
 
 
-def _odometries(given: str, imu: bool) -> list[str]:
+def odometries_of(given: str, imu: bool) -> list[str]:
     """The odometries that a name, several, or `all` stand for."""
     from adaptune.odometry import registry
 
@@ -389,7 +399,7 @@ def _length(text: str, whole: Sequence[str], folder: Path) -> str:
     return f"{length}    # metres over which errors are measured; the test moves {metres:.0f} m"
 
 
-def _say_odometries(study: "OfflineStudy", training: "Training") -> None:
+def _sayodometries_of(study: "OfflineStudy", training: "Training") -> None:
     """Of several odometries, what each gives with its own parameters and tuned, in training."""
     from adaptune.space import ODOMETRY
     from offline.train import COST

@@ -9,7 +9,7 @@ import pytest
 from wicked import IMPORTS, gone
 
 from adaptune import processes
-from adaptune.commands.tools import inspect
+from adaptune.commands.tune import inspect
 from adaptune.errors import AdaptuneError
 from adaptune.model import ModelError
 from adaptune.model.error_model import ErrorModel

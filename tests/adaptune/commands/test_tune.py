@@ -108,7 +108,7 @@ def test_several_odometries_share_a_study(bag, tmp_path):
     )
     assert list(study.config.odometries) == ["gicp", "kiss_icp"]
     assert study.config.offline.trials == 2 * tune.EACH
-    every = tune._odometries("all", imu=False)
+    every = tune.odometries_of("all", imu=False)
     assert {"gicp", "vgicp", "ndt", "kiss_icp"} <= set(every)
     assert "evalio_kiss_icp" not in every
 
