@@ -162,6 +162,12 @@ LEAST_PATH = 2.0
 Points = Annotated[
     str | None, typer.Option(metavar="TOPIC", help="Topic of the scans, where there are several.")
 ]
+Trials = Annotated[
+    int | None, typer.Option(help="Parameter sets to try.", min=2, show_default=f"{TRIALS}")
+]
+Minutes = Annotated[
+    float | None, typer.Option(help="Time for trying them; without, all are tried.", min=0.01)
+]
 Given = Annotated[
     str | None,
     typer.Option(
@@ -188,13 +194,8 @@ def tune(
     ] = "gicp",
     points: Points = None,
     reference: Given = None,
-    trials: Annotated[
-        int | None,
-        typer.Option(help="Parameter sets to try.", min=2, show_default=f"{TRIALS}"),
-    ] = None,
-    minutes: Annotated[
-        float | None, typer.Option(help="Time for trying them; without, all are tried.", min=0.01)
-    ] = None,
+    trials: Trials = None,
+    minutes: Minutes = None,
     folder: Annotated[
         Path | None,
         typer.Option(help="The study's folder.", show_default="the first bag's name, under runs/"),
@@ -213,7 +214,7 @@ def tune(
     folder = folder or Path("runs") / _study_name(recordings, odometry)
     path = folder / f"{folder.resolve().name}.yaml"
     made_by = _made_by(recordings, odometry, points, reference)
-    overrides = []
+    overrides: list[str] = []
     if not path.exists():
         text = _decided(recordings, odometry, (points, reference), (trials, minutes), folder)
         write_text(path, made_by + text)
@@ -224,10 +225,10 @@ def tune(
         )
     else:
         overrides = [f"offline.{limit}".replace(": ", "=") for limit in _limits(trials, minutes)]
-    loaded = load(path, overrides, folder)
-    say(f"Study: {path}")
     from offline.train import train
 
+    loaded = load(path, overrides, folder)
+    say(f"Study: {path}")
     with progress() as show:
         training = train(loaded, show)
     replay_missing(loaded)
