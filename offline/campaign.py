@@ -16,8 +16,7 @@ from adaptune.space import ParameterSet, PooledSpace
 from adaptune.study.references import contradictions_of
 from offline.config import OfflineConfig, OfflineStudy
 from offline.objective import Verdict, best_by_trials, judge, label, mean_value, weighted
-from offline.search import Clock, Finished, assess, make_searches, rungs
-from offline.storage import Mirror, MirrorRow
+from offline.search import Clock, Finished, Mirror, MirrorRow, assess, make_searches, rungs
 from offline.workers import Pool, Task, TaskResult, run
 
 _log = logging.getLogger(__name__)

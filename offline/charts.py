@@ -28,9 +28,8 @@ from adaptune.report.charts import (
 )
 from adaptune.space import ODOMETRY, Categorical, Float, Integer, ParameterSet, ParameterSpace
 from adaptune.space import label as parameter_label
-from offline.config import OfflineConfig, OfflineStudy
+from offline.config import OfflineConfig, OfflineStudy, distribution
 from offline.objective import judge, label, pareto_front, weighted
-from offline.storage import distribution
 from offline.tuning import figures
 
 

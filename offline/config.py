@@ -332,6 +332,21 @@ def check_grid(
         yield Mistake(("grid",), "has more points than can be numbered; give a coarser grid")
 
 
+def distribution(parameter: Float | Integer | Categorical) -> Any:
+    """A parameter as Optuna describes it."""
+    from optuna.distributions import (
+        CategoricalDistribution,
+        FloatDistribution,
+        IntDistribution,
+    )
+
+    if isinstance(parameter, Categorical):
+        return CategoricalDistribution(parameter.choices)
+    if isinstance(parameter, Integer):
+        return IntDistribution(parameter.low, parameter.high, log=parameter.log)
+    return FloatDistribution(parameter.low, parameter.high, log=parameter.log)
+
+
 _SET_BY_KEY = {"seed": "seed", "n_startup_trials": "initial", "constraints_func": "limits"}
 """Settings of Optuna's samplers that adaptune sets, and from which key."""
 _BOX = ("low", "high")

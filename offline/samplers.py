@@ -32,13 +32,13 @@ from offline.config import (
     OfflineConfig,
     RandomSettings,
     SamplerError,
+    distribution,
     is_user_sampler,
     make_grid,
     optuna_class,
     optuna_sampler,
 )
 from offline.objective import SamplerResult, exceeded, penalised
-from offline.storage import distribution
 
 _ENUMERABLE = 4096
 _DRAWS = 1000

@@ -6,7 +6,7 @@ import pytest
 from optuna.storages.journal import JournalFileBackend
 
 from adaptune.space import Float, Integer, ParameterSpace, PooledSpace
-from offline.storage import JOURNAL, Mirror, MirrorRow
+from offline.search import JOURNAL, Mirror, MirrorRow
 
 SPACE = ParameterSpace.of(
     max_correspondence_distance=Float(low=0.1, high=5.0, baseline=1.0),
