@@ -30,6 +30,7 @@ from adaptune.study.study import (
     EQUAL_COST,
     MIN_RECORDINGS,
     ONE_SET,
+    WORTH,
 )
 from offline.labelled import LabelledData, LabelledSequence, comparable, periods
 
@@ -177,7 +178,7 @@ class Policy(NamedTuple):
     """What is driven."""
 
     one_set: PairedSettings  # adapts if that has less expected loss than the fixed set
-    bank: BankSettings  # adapts if that has the least expected loss of all
+    bank: BankSettings  # adapts if that has the least expected loss of all, and is worth its cost
     members: list[int]  # of the bank; trial numbers, the fixed set's first
     # By `BANK` and `ONE_SET`, what is expected with the best settings; empty where there is too
     # little to compare.
@@ -224,8 +225,8 @@ def choose(
             logs.append(_logs(left_out, others, choosers, one_set))
             recordings += [left_out.recording] * len(logs[-1])
     if len(recordings) < 2 or not logs[0].shape[1]:
-        # A bank measures the errors of its members while it drives.
-        return Policy(DO_NOT_ADAPT, BankSettings(adapt=bool(banks)), banks[0] if banks else [], {})
+        # The bank rests, and joins in where it measures that the fixed set fails.
+        return Policy(DO_NOT_ADAPT, NO_BANK, banks[0] if banks else [], {})
     n_single = len(PAIRED_SETTINGS) if one_set else 0
     return least_loss(np.concatenate(logs), recordings, banks, n_single)
 
@@ -259,7 +260,8 @@ def least_loss(
         expected[BANK] = figures(logs[:, best], recordings)
         way, which = divmod(best - n_single, len(BANK_SETTINGS))
         members = banks[way]
-        if losses[best] < min(0.0, losses[:n_single].min(initial=0.0)):
+        worth = expected[BANK].geometric <= 1.0 - WORTH and expected[BANK].high < 1.0
+        if worth and losses[best] < min(0.0, losses[:n_single].min(initial=0.0)):
             bank = BANK_SETTINGS[which]
     return Policy(one_set, bank, members, expected)
 

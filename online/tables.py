@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from adaptune.report.tables import Listing
-from adaptune.study.study import EQUAL_COST, MIN_RECORDINGS, RIVAL_WORDS, RIVALS
+from adaptune.study.study import EQUAL_COST, MIN_RECORDINGS, RIVAL_WORDS, RIVALS, WORTH
 from online.modes import EVEN
 from online.statistics import (
     ALL,
@@ -204,9 +204,6 @@ def _change(row: ComparisonRow, rows: Sequence[ComparisonRow]) -> dict[str, Any]
 # The decision: what to drive, what that gives, and at what cost.
 
 
-WORTH = 0.1
-"""Adapting is worth its CPU time where it has so much less error than one set, as a share, and
-surely less."""
 NEARLY = 0.05
 """Where a whole interval lies within this share of 1, there is no difference."""
 ROUNDING = 1e-6

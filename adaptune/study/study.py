@@ -473,6 +473,8 @@ PER_STRETCH = 4
 """Sub-trajectories of a stretch, the unit of evidence."""
 MIN_RECORDINGS = 6
 """With as many, whole recordings are left out; with fewer, stretches of them."""
+WORTH = 0.1
+"""Share of the error that a bank has to spare, surely, to be worth its CPU time."""
 BANK, ONE_SET = "bank", "one set"
 """Names of the ways to adapt."""
 BEST_DEFAULT, EQUAL_COST = "best_default", "equal_cost"
@@ -523,11 +525,8 @@ def driven(
         words = f"`online` will drive the bank of trials {members} as `adaptive`"
         if model.costs is not None and math.isfinite(cost := model.costs.adaptive(trials)):
             words += f", at {cost:.1f} ms of CPU time a scan"
-        if BANK in expected:
-            words += f", because it has the least expected loss: {expected[BANK]}"
-        else:
-            words += f". It relies on what it measures while it drives, for {why}"
-        return f"{words}.{joining}"
+        why = f", because it is worth that: {expected[BANK]}" if BANK in expected else ""
+        return f"{words}{why}.{joining}"
     if how == "live" and model.paired.adapt:
         words = "`online` will drive one set at a time as `adaptive`, changed live"
         if ONE_SET in expected:
@@ -537,7 +536,7 @@ def driven(
     if compared := [way for way in compared if way in expected]:
         way = min(compared, key=lambda way: model.expected[way]["loss"])
         best = f"{'a bank' if way == BANK else 'one set at a time'}: {expected[way]}"
-        why = f"it has the least expected loss; the best alternative is {best}"
+        why = f"nothing else is worth its cost; the best alternative is {best}"
     return f"{fixed} as `adaptive`, because {why}.{joining}"
 
 
@@ -611,7 +610,9 @@ def mechanism_of(
     live
         Whether the odometry changes its parameters between scans.
     """
-    if mechanism == "bank" and (mode != "adaptive" or model.bank_adapts or model.bank_rests):
+    # What was published, `paper`, has one instance, and all sets to choose from.
+    bank = model.bank_adapts or model.bank_rests if mode == "adaptive" else not live
+    if mechanism == "bank" and bank:
         return "bank"
     return "live" if live else None
 
