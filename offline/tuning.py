@@ -163,8 +163,6 @@ BANK_SETTINGS = [
 """A bank is driven with one of these; of equally good ones the first."""
 MOST_FOLDS = 12
 """So many folds at most compare ways to adapt where evidence is left out already."""
-LOSS_ELSEWHERE, STRETCHES_ELSEWHERE = float(np.log(0.8)), 2
-"""The loss of banks elsewhere, and as how many stretches it counts: few stretches show little."""
 ROUNDING = 1e-6
 """A smaller loss, or gain, is one of rounding."""
 DO_NOT_ADAPT = PairedSettings(adapt=False)
@@ -244,10 +242,6 @@ def least_loss(
     """
     losses = np.array([expected_loss(column, recordings) for column in logs.T])
     losses[~(np.abs(losses) > ROUNDING)] = 0.0
-    # Banks are drawn to what they are elsewhere; one that never adapts has 0.
-    drawn = len(logs) * losses + STRETCHES_ELSEWHERE * LOSS_ELSEWHERE
-    drawn = np.where(losses == 0.0, 0.0, drawn / (len(logs) + STRETCHES_ELSEWHERE))
-    losses[n_single:] = drawn[n_single:]
     expected: dict[str, Figures] = {}
     one_set, bank, members = DO_NOT_ADAPT, NO_BANK, banks[0] if banks else []
     if n_single:
