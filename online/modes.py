@@ -2,6 +2,7 @@
 
 import itertools
 import logging
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
@@ -55,6 +56,11 @@ WITHOUT_MODEL: tuple[str, ...] = (BASELINE, UNTRAINED)
 """The modes that need neither trials nor a model."""
 
 
+ONE_CORE = 50.0
+"""Milliseconds of CPU time a scan up to which a bank runs on one core: of several, each prepares
+every scan again. Most sensors give a scan every 100 ms."""
+
+
 class EvenSelector:
     """Gives all members of a bank the same weight, always: a control, which looks at nothing.
 
@@ -97,6 +103,7 @@ class Mode(NamedTuple):
     sets: Mapping[int, ParameterSet]  # by trial: a bank's members, or the one set to begin with
     bank: bool = False
     selector: Callable[[], AnySelector] | None = None  # makes it; pickles
+    cost: float = math.nan  # of a bank, milliseconds of CPU time a scan in training, if known
 
     @property
     def fixed(self) -> int:
@@ -158,14 +165,15 @@ class ReplaySetup:
             return Mode(name, {trial: model.sets[trial]})
         if name == EVEN:
             members = self._always(model)
-            return Mode(name, members, True, partial(EvenSelector, model.sets, list(members)))
+            even = partial(EvenSelector, model.sets, list(members))
+            return Mode(name, members, True, even, _cost(model, members))
         if self._mechanism(name, model) == "live":
             one = {model.fixed: model.sets[model.fixed]}
             return Mode(name, one, False, partial(Selector, model, name, (), self.descriptors))
         # The bank's reserve joins in by what is measured: only this mode has one.
         members = bank_members(self.switching, model) if name == ADAPTIVE else self._always(model)
         make = partial(Selector, model, name, list(members), self.descriptors)
-        return Mode(name, members, True, make)
+        return Mode(name, members, True, make, _cost(model, members))
 
     def obstacle(self, name: str, model: ErrorModel | None = None) -> str:
         """Why a mode is not possible; empty if it is, as far as is known without a model."""
@@ -211,7 +219,8 @@ class ReplaySetup:
         waits = self.real_time is None or not self.real_time.queue
         rate = None if self.real_time is None or waits else self.real_time.rate
         warm_up = self.odometry.description.warm_up
-        cores = len(shared_cores())
+        pace = 1.0 if self.real_time is None else self.real_time.rate
+        cores = 1 if mode.cost * pace <= ONE_CORE else len(shared_cores())
         return Bank(self.odometry, mode.sets, warm_up, self.lost_track, cores, rate)
 
     def identity(
@@ -256,6 +265,10 @@ class ReplaySetup:
     def _untrained_sets(self) -> ParameterSets:
         """The members of the bank that needs no model."""
         return untrained_sets(self.odometry.space, self.switching.size)
+
+
+def _cost(model: ErrorModel, members: Iterable[int]) -> float:
+    return math.nan if model.costs is None else model.costs.adaptive(members)
 
 
 def needed(name: str, model: ErrorModel | None) -> ErrorModel:

@@ -7,10 +7,11 @@ import pytest
 from random_models import random_model
 
 from adaptune.model import BankSettings, PairedSettings
+from adaptune.model.rules import Costs, SetCost
 from adaptune.odometry.registry import OdometryFactory, OdometryPool, odometry_class
 from adaptune.odometry.remote import Limits
 from adaptune.space import ParameterSpace
-from adaptune.study.config import ALSO, SwitchingConfig
+from adaptune.study.config import ALSO, RealTimeConfig, SwitchingConfig
 from adaptune.study.study import ModeError
 from online.modes import ReplaySetup
 
@@ -41,7 +42,7 @@ def test_rivals_are_driven_where_the_model_has_some():
     same = replace(model, rivals={"equal_cost": model.fixed, "best_default": 2})
     assert setup().modes(same)[:3] == ("baseline", "best_default", "fixed")
     for mode, trial in {"equal_cost": 6, "best_default": 2, "fixed": 4}.items():
-        assert setup().mode(mode, both)[1:] == ({trial: both.sets[trial]}, False, None)
+        assert setup().mode(mode, both)[1:4] == ({trial: both.sets[trial]}, False, None)
     identity = setup().identity("equal_cost", both, "digest")
     assert identity["parameters"] == both.sets[6]
     # Another model with the same rival replays the same.
@@ -117,3 +118,20 @@ def test_a_program_that_runs_whole_recordings_has_none():
     assert "whole recordings" in asked.obstacle("even", random_model())
     with pytest.raises(ModeError, match="untrained is not possible: a program that runs whole"):
         asked.mode("untrained")
+
+
+def test_a_cheap_bank_runs_on_one_core(monkeypatch):
+    monkeypatch.setattr("online.modes.shared_cores", lambda: {0, 1, 2})
+    made = []
+    monkeypatch.setattr("online.modes.Bank", lambda *given: made.append(given[4]))
+    model, two = random_model(), SwitchingConfig(size=2)
+    bank = replace(setup(), mechanism="bank", switching=two)
+    # Two members, which share what they prepare, and live evidence.
+    for register, pace, cores in ((5.0, None, 1), (5.0, 3.0, 1), (5.0, 4.0, 3), (25.0, None, 3)):
+        costs = Costs({trial: SetCost(register, 4.0, 0) for trial in model.sets}, 1.0)
+        in_real_time = None if pace is None else RealTimeConfig(rate=pace)
+        given = replace(bank, real_time=in_real_time)
+        given.instance(given.mode("adaptive", replace(model, costs=costs)))
+        assert made.pop() == cores, (register, pace)
+    bank.instance(bank.mode("adaptive", replace(model, costs=None)))
+    assert made == [3]
