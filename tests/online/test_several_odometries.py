@@ -105,7 +105,8 @@ def test_it_is_replayed_and_compared(trained):
         assert [replace(row, mode="fixed") for row in one] == other
     assert all(row.cpu_ms > 0.0 and row.cores > 0.0 and row.memory_mb > 0.0 for row in rows)
     assert tables(rows, 3.0)
-    assert len([said for said in remarks(rows) if "CPU time" in said]) == 1 + len(rivals)
+    # On so little evidence the bank rests: nothing is said of what adapting costs.
+    assert len([said for said in remarks(rows) if "CPU time" in said]) == len(rivals)
     assert run_replays(study, study.model_path) == 0
 
 
