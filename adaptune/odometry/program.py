@@ -589,7 +589,8 @@ class Command(FileRun):
         with log.open("rb") as written:
             self._words = processes.last_lines(written)
         if ended is not None:
-            self._usage = Usage(ended.cpu, ended.memory, (time.perf_counter() - begin) / n)
+            seconds = (time.perf_counter() - begin) / n
+            self._usage = Usage(ended.cpu, ended.memory, seconds, other_cpu=ended.cpu)
         if in_time is None:
             raise self.too_long
         if in_time.code:

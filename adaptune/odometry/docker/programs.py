@@ -109,7 +109,7 @@ class DockerCommand(FileRun):
             used = container.used()
             cpu, memory = max(cpu, used.cpu), max(memory, used.memory)
             seconds = time.perf_counter() - begin
-            self._usage = Usage(cpu, memory, seconds / n)
+            self._usage = Usage(cpu, memory, seconds / n, other_cpu=cpu)
             if seconds > self._limits.seconds * n:
                 return str(self.too_long)
             time.sleep(_BETWEEN_LOOKS)

@@ -541,7 +541,8 @@ class PlayedBag(WholeRun):
         The bag sets the pace, so CPU time counts as the system's time.
         """
         system.state()
-        self._usage = system.usage._replace(seconds=system.usage.cpu / n)
+        cpu = system.usage.cpu
+        self._usage = system.usage._replace(seconds=cpu / n, other_cpu=cpu)
 
     def _check_time(self) -> None:
         if time.monotonic() > self._end:

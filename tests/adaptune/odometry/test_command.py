@@ -164,6 +164,9 @@ def test_what_it_takes_is_measured_and_can_be_limited(make):
     assert 100 * 0.5 / 3.9 <= trial.usage["cpu"] < 200.0
     assert 200.0 <= trial.usage["memory"] < 1000.0
     assert len(train(study).trials) > 0
+    # A replay counts the program's CPU time, too.
+    run_replays(study, study.model_path)
+    assert all(row.cpu_ms > 12.5 for row in compare(study).rows)
     late = make("hang", "isolation.seconds=0.02")
     trial, _ = run(late)
     assert trial.faults
