@@ -82,19 +82,18 @@ def offline(
         training = train(loaded, show, cluster)
     model = training.model
     n = len(training.trials)
+    for sentence in training.words:
+        say(sentence)
+    say(driven(model, loaded.config.online, loaded.odometry, loaded.mechanism))
+    say_fixed(loaded)
+    if len(loaded.config.offline.objective) > 1:
+        say(f"The sets that no other set beats in every objective: {loaded.folder / 'pareto'}.*")
     show_table(
         f"RTE [%] over {model.length:g} m in training, {n} parameter sets",
         training.rows,
         "A trial that loses track restarts at the reference, which counts as 30 %. A whole run is "
         "driven as `adaptune online` does it; whole runs decide which set is the fixed one.",
     )
-    for sentence in training.words:
-        say(sentence)
-    say_fixed(loaded)
-    if len(loaded.config.offline.objective) > 1:
-        say(f"The sets that no other set beats in every objective: {loaded.folder / 'pareto'}.*")
-    say(driven(model, loaded.config.online, loaded.odometry, loaded.mechanism))
-    say(f"Error model: {loaded.model_path}")
     say_next_of_trained(loaded, bool(model.expected))
 
 
@@ -174,6 +173,8 @@ def validate(
 
     with progress() as show:
         _, rows, verdicts = validate_study(loaded, show)
+    for verdict in verdicts:
+        say(verdict)
     show_table(
         "Error as a ratio to the fixed set's, each recording or stretch left out in turn",
         rows,
@@ -181,8 +182,6 @@ def validate(
         "for a recording, a block bootstrap over time, if it is long enough; for the geometric "
         "mean over the stretches, what is expected elsewhere.",
     )
-    for verdict in verdicts:
-        say(verdict)
     say(f"Tables and picture: {loaded.folder / 'validation'}.*, {loaded.folder / 'stretches'}.*")
     say_next_online(loaded)
 
