@@ -559,7 +559,7 @@ def hard_to_track(scans: Iterable[Scan]) -> str:
 
 # Motions that scans alone show.
 
-STRETCHES, SCANS = 8, 40
+STRETCHES, SCANS = 4, 40
 """Stretches of a recording that are looked at, evenly spread, and the scans of each."""
 METRES, EACH = 4.0, 4
 """A motion is measured over so many metres, or over half a stretch if that is less, and begins at
