@@ -10,7 +10,6 @@ from online.statistics import (
     ALL,
     ERROR_FACTOR,
     GAP,
-    NO_DIFFERENCE,
     ORACLES,
     ComparisonRow,
     Ratio,
@@ -135,7 +134,8 @@ def _of_modes(rows: Sequence[ComparisonRow], length: float) -> Listing:
 def _caption(rows: Sequence[ComparisonRow], shown: Mapping[str, Any]) -> str:
     of, to = rows[0].yardstick, _YARDSTICKS[rows[0].yardstick]
     said = [
-        "Intervals of 95 %: paired block bootstrap, seed 0, where there is enough to draw from.",
+        "Intervals of 95 %: paired block bootstrap, seed 0, where there is enough to draw from; "
+        f"with fewer than {MIN_RECORDINGS} test recordings, they speak of these alone.",
         f"vs {of}: geometric mean of the ratios to the {to}'s RTE." * (rows[-1].sequence == ALL),
         "Worst tenth: that mean over the worst tenth of the stretches." * ("worst tenth" in shown),
         "Better / worse: sequences on which the error is less or more by 1 %."
@@ -204,13 +204,9 @@ def _change(row: ComparisonRow, rows: Sequence[ComparisonRow]) -> dict[str, Any]
 # The decision: what to drive, what that gives, and at what cost.
 
 
-NEARLY = 0.05
-"""Where a whole interval lies within this share of 1, there is no difference."""
 ROUNDING = 1e-6
 """A ratio that differs less from 1 is 1."""
-_UNSURE = "nothing can be said of how sure that is"
 _YARDSTICKS = {"fixed": "fixed set", "baseline": "baseline"}
-_NOT_ADAPTIVE = ("baseline", "fixed", *RIVALS, *ORACLES, EVEN)
 CALLED = {
     "baseline": "the odometry's own parameters",
     "fixed": "the fixed set",
@@ -304,40 +300,6 @@ def _why_not(
     return [f"Adapting is not worth its cost {_where(rows)}: {has}."]
 
 
-# A comparison in words: what was gained, how surely, at what cost.
-
-
-def explained(rows: Sequence[ComparisonRow]) -> list[str]:
-    """What the comparison says, in the order in which a user asks.
-
-    The rows over all sequences come last.
-    """
-    last = {row.mode: row for row in rows if row.sequence == rows[-1].sequence}
-    if all(row.ratio is None for row in last.values()):
-        return []
-    adaptive = [row for mode, row in last.items() if mode not in _NOT_ADAPTIVE]
-    tuned = []
-    if {"fixed", "baseline"} <= last.keys():
-        tuned = [_of_baseline(last["baseline"], rows)]
-    if not adaptive:
-        return tuned
-    # `adaptive` comes first; without a model there is the untrained bank.
-    main = adapting(rows) or adaptive[-1]
-    if _is_yardstick(main):
-        what = f"`{main.mode}` kept the {_YARDSTICKS[main.yardstick]} {_where(rows)}."
-        said = [f"Nothing was adapted, nothing gained: {what}"]
-    else:
-        said = [_gain(main, rows), *_how_surely(main, rows), *_cost(main, last[main.yardstick])]
-    said += [
-        _against(main, mode, main.against[mode], last.get(mode))
-        for mode in RIVALS
-        if mode in main.against
-    ]
-    said += _even(main, last)
-    said += [_other(row) for row in adaptive if row is not main and not _is_yardstick(row)]
-    return [*said, *tuned]
-
-
 def _is_yardstick(row: ComparisonRow) -> bool:
     """Whether a mode did what the yardstick did."""
     # A bank whose other members rest moves as the fixed set does, but for rounding.
@@ -375,113 +337,27 @@ def _times(row: ComparisonRow) -> str:
     )
 
 
-def _surely(ratio: Ratio) -> str:
-    """Whether a ratio is surely `less`, `more`, or `equal`; `open` or `unknown` otherwise."""
-    if ratio.interval is None:
-        return "unknown"
-    low, high = ratio.interval
-    if (high < 1.0 or low > 1.0) and abs(ratio.value - 1.0) >= NO_DIFFERENCE:
-        return "less" if high < 1.0 else "more"
-    return "equal" if low > 1.0 - NEARLY and high < 1.0 + NEARLY else "open"
-
-
-def _gain(row: ComparisonRow, rows: Sequence[ComparisonRow]) -> str:
-    ratio, where = _ratio(row), _where(rows)
-    # The parts of one recording are one.
-    n = row.recordings or len(_judged(rows))
-    few = rows[-1].sequence != ALL or n < MIN_RECORDINGS
-    has = f"`{row.mode}` has {_times(row)}"
-    alone = ". The interval speaks of these recordings alone." if few else "."
-    percent = 100.0 * abs(ratio.value - 1.0)
-    return {
-        "unknown": f"Whether adapting gains is not known, {where}: {has}; {_UNSURE}.",
-        "open": f"Whether adapting gains is open, {where}: {has}{alone}",
-        "equal": f"Adapting changed nothing that counts {where}: {has}{alone}",
-        "less": f"Adapting gained {percent:.0f} % {where}: {has}{alone}",
-        "more": f"Adapting lost {percent:.0f} % {where}: {has}{alone}",
-    }[_surely(ratio)]
-
-
-def _how_surely(row: ComparisonRow, rows: Sequence[ComparisonRow]) -> list[str]:
-    """On how many sequences it is better, and on which it is worse."""
-    if row.better is None:
-        return []
-    of = [r for r in rows if r.mode == row.mode and r.ratio is not None and r.sequence != ALL]
-    worse = [r.sequence for r in of if _ratio(r).value > 1.0 + NO_DIFFERENCE]
-    said = f"By more than 1 %, it has less error on {row.better} of {len(of)} sequences, and more "
-    said += f"on {row.worse} ({', '.join(worse)})" if worse else "on none"
-    if row.surely_better is not None:
-        known = sum(r.ratio_interval is not None for r in of)
-        said += f"; surely better on {row.surely_better}, surely worse on {row.surely_worse}"
-        said += "" if known == len(of) else f", of {known} long enough to tell"
-    return [f"{said}."]
-
-
-def _cost(row: ComparisonRow, yardstick: ComparisonRow) -> list[str]:
-    if row.cpu_ms is None or not yardstick.cpu_ms:
-        return []
-    cores = "" if row.cores is None else f", {row.cores:.2f} cores at the sensor's rate"
-    return [
-        f"It takes {row.cpu_ms:.1f} ms of CPU time a scan{cores}: "
-        f"{row.cpu_ms / yardstick.cpu_ms:.1f} times what the {_YARDSTICKS[row.yardstick]} takes."
-    ]
-
-
-def _against(
-    main: ComparisonRow, mode: str, ratio: Ratio, other: ComparisonRow | None = None
-) -> str:
-    """How the mode compares with another one, on the same frames, and in cost with a rival."""
-    what, cost = RIVAL_WORDS.get(mode, f"`{mode}`"), ""
-    if other is not None and other.cpu_ms is not None and main.cpu_ms is not None:
-        cost = f", at {main.cpu_ms:.1f} ms of CPU time a scan against {other.cpu_ms:.1f}"
-    has = f"`{main.mode}` has {ratio.value:.2f} times the error of {what}"
-    return f"{has} ({_interval(ratio)}){cost}."
-
-
-def _even(main: ComparisonRow, last: Mapping[str, ComparisonRow]) -> list[str]:
-    """What the bank with even weights gives, which chooses nothing, and what choosing adds."""
-    row, ratio = last.get(EVEN), main.against.get(EVEN)
-    if row is None or row.ratio is None:
-        return []
-    said = [f"The study's bank with even weights has {_times(row)}."]
-    if ratio is not None and not _is_yardstick(main):
-        how = {
-            "less": "Choosing added to that",
-            "more": "Choosing took from that",
-            "equal": "Choosing added nothing to that",
-            "open": "Whether choosing adds to that is open",
-            "unknown": "Whether choosing adds to that is not known",
-        }[_surely(ratio)]
-        said.append(f"{how}: {_against(main, EVEN, ratio)}")
-    return said
-
-
-def _other(row: ComparisonRow) -> str:
-    times = _times(row)
-    return {
-        "less": f"`{row.mode}` is better: {times}.",
-        "more": f"`{row.mode}` is worse: {times}.",
-        "equal": f"`{row.mode}` changed nothing that counts: {times}.",
-        "open": f"`{row.mode}` does not surely differ: {times}.",
-        "unknown": f"`{row.mode}` has {times}; {_UNSURE}.",
-    }[_surely(_ratio(row))]
-
-
-def _of_baseline(row: ComparisonRow, rows: Sequence[ComparisonRow]) -> str:
-    ratio, where, has = _ratio(row), _where(rows), f"the baseline has {_times(row)}"
-    gained = 100.0 * (1.0 - 1.0 / max(ratio.value, 1e-12))
-    return {
-        "unknown": f"Whether tuning gains is not known, {where}: {has}.",
-        "open": f"Whether tuning gains is open, {where}: {has}.",
-        "equal": f"No difference that counts between baseline and fixed set: {has}.",
-        "less": f"The baseline is better than the fixed set: {has}.",
-        "more": f"Tuning alone gained {gained:.0f} % of the baseline's error: {has}.",
-    }[_surely(ratio)]
+# What must be known to trust a comparison, in words.
 
 
 def remarks(rows: Sequence[ComparisonRow]) -> list[str]:
-    """In words: what was gained, and what must be known to trust it."""
-    return explained(rows) + _judges(rows) + _estimates(rows) + _kept_up(rows) + _restarts(rows)
+    """How what adapts compares with rivals and controls, and what must be known to trust it."""
+    return _rivals(rows) + _judges(rows) + _estimates(rows) + _kept_up(rows) + _restarts(rows)
+
+
+def _rivals(rows: Sequence[ComparisonRow]) -> list[str]:
+    """How what adapts compares on the same frames with what costs as much, or chooses nothing."""
+    main, last = adapting(rows), {row.mode: row for row in _last(rows)}
+    said = []
+    for mode, ratio in ({} if main is None else main.against).items():
+        if mode in (*RIVALS, EVEN) and main is not None:
+            what, cost = RIVAL_WORDS.get(mode, "the same bank with even weights"), ""
+            other = last.get(mode)
+            if other is not None and other.cpu_ms is not None and main.cpu_ms is not None:
+                cost = f", at {main.cpu_ms:.1f} ms of CPU time a scan against {other.cpu_ms:.1f}"
+            has = f"`{main.mode}` has {ratio.value:.2f} times the error of {what}"
+            said.append(f"{has} ({_interval(ratio)}){cost}.")
+    return said
 
 
 def _judges(rows: Sequence[ComparisonRow]) -> list[str]:

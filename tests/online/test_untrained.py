@@ -127,7 +127,7 @@ def test_what_a_bank_measures_of_itself_is_kept_and_compared(load):
     assert (written[1]["estimated [%]"], written[1]["estimated_high"]) == (6.0, 9.0)
     assert {"estimated [%]", "lost [s]"} <= tables(compared, 3.0)[0].rows[0].keys()
     said = remarks(compared)
-    assert said[0].startswith("Whether adapting gains is not known, on three: `untrained` has ")
+    assert said[0].startswith("`untrained` estimates its own mean RTE at 6.000 %")
     assert not any("fixed" in one or "no reference" in one for one in said)
 
 
