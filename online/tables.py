@@ -263,24 +263,39 @@ def verdict(rows: Sequence[ComparisonRow], length: float, obstacle: str = "") ->
     if all(row.ratio is None for row in last.values()):
         nobody = "No test sequence has a reference: nobody can say what was gained."
         return [nobody, *_estimates(rows)[:2]]
-    best = decided(rows)
-    errors = {m: f"{row.rte:.3g} %" for m, row in last.items() if row.rte is not None}
+    best, main = decided(rows), adapting(rows)
+    errors = {m: f"{row.rte:.3f} %" for m, row in last.items() if row.rte is not None}
     others = [m for m in ("fixed", "baseline") if m in errors and m != best.mode]
-    instead = " and ".join(f"{errors[m]} with {CALLED[m]}" for m in others)
-    do = "Keep" if best.mode == "baseline" else "Drive"
-    said = f"{do} {CALLED[best.mode]}: {errors[best.mode]} RTE over {length:g} m"
-    said += f" instead of {instead}" if instead else ""
-    said += f", {_where(rows)}"
-    main = adapting(rows)
+    judge = " by an estimated reference" * any(row.reference == "estimated" for row in rows)
+    where = f"RTE over {length:g} m, {_where(rows)}{judge}"
+    if best.mode == "baseline" and "fixed" in last and _is_yardstick(best):
+        said = f"Keep {CALLED[best.mode]}: {errors[best.mode]} {where}. No set that was tried did "
+        said += "surely better in training"
+    else:
+        instead = " and ".join(f"{errors[m]} with {CALLED[m]}" for m in others)
+        said = f"{'Keep' if best.mode == 'baseline' else 'Drive'} {CALLED[best.mode]}: "
+        said += (
+            f"{errors[best.mode]} instead of {instead}, {where}" if instead else errors[best.mode]
+        )
     if best.mode not in _ONE_SET:
         return [f"{said}.", f"It has {_times(best)}{_for_cost(best, last[best.yardstick])}."]
-    return [f"{said}.", *_why_not(main, best, rows, obstacle)]
+    return [f"{said}{_doubt(best, last)}.", *_why_not(main, best, rows, obstacle)]
+
+
+def _doubt(best: ComparisonRow, last: Mapping[str, ComparisonRow]) -> str:
+    """Whether one set may be better than another by chance only, and what it costs."""
+    row = last.get("baseline")
+    if best.mode == "best_default" or row is None or "fixed" not in last or _is_yardstick(row):
+        return ""
+    ends = row.ratio_interval
+    chance = ends is None or ends[0] <= 1.0 <= ends[1]
+    return f"; the two may differ by chance ({_interval(_ratio(row))})" if chance else ""
 
 
 def _for_cost(main: ComparisonRow, one: ComparisonRow) -> str:
     if main.cpu_ms is None or not one.cpu_ms:
         return ""
-    return f", for {main.cpu_ms / one.cpu_ms:.1f} times its CPU time ({main.cpu_ms:.3g} ms a scan)"
+    return f", for {main.cpu_ms / one.cpu_ms:.1f} times its CPU time ({main.cpu_ms:.1f} ms a scan)"
 
 
 def _why_not(
@@ -290,14 +305,15 @@ def _why_not(
     if main is None:
         return [f"Adapting was not tried: {obstacle}."] if obstacle else []
     if _is_yardstick(main):
-        return ["Adapting was not driven: the training promised no gain."]
+        return ["Adapting kept the fixed set."]
     ratio = _to(main, best)
     cost = _for_cost(main, best)
     has = f"{ratio.value:.2f} times its error ({_interval(ratio)}){cost}"
     if ratio.value <= 1.0 - WORTH:
         more = "drive more test recordings, or longer ones, to know"
         return [f"Adapting had {has}, which may be chance: {more}."]
-    return [f"Adapting is not worth its cost {_where(rows)}: {has}."]
+    what = "is not worth its cost" if ratio.value <= 1.0 else "did worse"
+    return [f"Adapting {what} {_where(rows)}: {has}."]
 
 
 def _is_yardstick(row: ComparisonRow) -> bool:

@@ -237,7 +237,7 @@ def _in_ms(seconds: Iterable[float]) -> str:
     return f"{half:.1f} ms (99 %: {most:.1f})"
 
 
-def say_fixed(study: "OfflineStudy") -> None:
+def say_fixed(study: "OfflineStudy", advised: bool = True) -> None:
     """Say where the fixed set is, and where it is as the odometry's own tool reads it."""
     from adaptune.files import Document
 
@@ -246,7 +246,8 @@ def say_fixed(study: "OfflineStudy") -> None:
     own = None if fixed is None else study.own_file(fixed)
     there = own is not None and own[0].exists()
     more = f"; for the odometry's own tool: {own[0]} ({own[1].use})" if own and there else ""
-    say(f"The parameters: {path}{more}.")
+    what = "The parameters" if advised else "The fixed set, which is not advised here"
+    say(f"{what}: {path}{more}.")
 
 
 # The command to run next, which every command names at its end.

@@ -58,6 +58,7 @@ def inspect(
     if file.suffix == MODEL_SUFFIX or (file / f"model{MODEL_SUFFIX}").exists():
         _show_model(file)
         return
+    check_no_study(file)
     if study is not None and study.exists():
         raise AdaptuneError(f"{study}: exists; name another file with --study, or move it away")
     from adaptune.recording.inspect import inspect as inspect_file
@@ -82,6 +83,15 @@ def inspect(
     if study is not None:
         write_text(study, f"{found.entry}\n{rest}")
     say_next("train on a part of it", "offline", path, first=first)
+
+
+def check_no_study(path: Path) -> None:
+    """Refuse a study where a recording is expected."""
+    if path.suffix in (".yaml", ".yml") or (path / "study.yaml").is_file():
+        raise AdaptuneError(
+            f"{path}: is a study, not a recording; `adaptune offline`, `online` and `compare` take "
+            f"it, and `adaptune inspect` takes its folder once it has a model"
+        )
 
 
 def _show_model(file: Path) -> None:
@@ -157,6 +167,8 @@ def roles(names: Sequence[str], length: str, odometries: Sequence[str]) -> str:
 
 TRIALS, EACH = 32, 16
 """Parameter sets to try, and at least for each of several odometries."""
+DISTORTED = {"gicp", "vgicp", "ndt"}
+"""Odometries that do not undo the motion within scans themselves: it is undone for them."""
 LEAST_PATH = 2.0
 """Metres that the part for the test has to hold."""
 Points = Annotated[
@@ -217,7 +229,7 @@ def tune(
     overrides: list[str] = []
     if not path.exists():
         text = _decided(recordings, odometry, (points, reference), (trials, minutes), folder)
-        write_text(path, made_by + text)
+        _write(path, made_by + text)
     elif not path.read_text("utf-8").startswith(made_by):
         raise AdaptuneError(
             f"{path}: was made by another command, see its first line; give that one to resume it, "
@@ -233,13 +245,24 @@ def tune(
         training = train(loaded, show)
     replay_missing(loaded)
     compared(loaded, details=details)
-    _sayodometries_of(loaded, training)
+    _say_odometries(loaded, training)
     say_next("replays to look at in Foxglove", "record", folder)
+
+
+def _write(path: Path, text: str) -> None:
+    try:
+        write_text(path, text)
+    except OSError as error:
+        raise AdaptuneError(
+            f"{path.parent}: cannot be written to ({error.strerror}); name another folder with "
+            f"--folder"
+        ) from error
 
 
 def _study_name(recordings: Sequence[Path], odometry: str) -> str:
     stem = _name_of(recordings[0]) + "_and_more" * (len(recordings) > 1)
-    others = "+".join(dict.fromkeys(odometry.replace(":", "_").split(",")))
+    names = (name.strip().replace(":", "_") for name in odometry.split(","))
+    others = "+".join(dict.fromkeys(names))
     return stem if odometry == "gicp" else f"{stem}_{others}"
 
 
@@ -249,13 +272,15 @@ def _made_by(
     """The first line of a study: what it was decided for."""
     words = [*(str(bag.resolve()) for bag in recordings), "--odometry", odometry]
     words += ["--points", points] if points else []
-    words += ["--reference", reference] if reference else []
+    if reference is not None:
+        file = Path(reference)
+        words += ["--reference", str(file.resolve()) if file.is_file() else reference]
     return f"# adaptune tune {shlex.join(words)}\n"
 
 
 def _limits(trials: int | None, minutes: float | None) -> list[str]:
     """The budget of the search, as keys and values of a study."""
-    of_time = [] if minutes is None else [f"hours: {minutes / 60.0:.4g}"]
+    of_time = [] if minutes is None else [f"hours: {minutes / 60.0:.6g}"]
     return of_time if trials is None else [f"trials: {trials}", *of_time]
 
 
@@ -273,6 +298,9 @@ def _decided(
 ) -> str:
     """The study of some recordings as YAML, with comments; nothing is written but references."""
     points, reference = topics
+    for path in recordings:
+        if [one.resolve() for one in recordings].count(path.resolve()) > 1:
+            raise AdaptuneError(f"{path}: is named twice; the test needs a recording of its own")
     if len(recordings) > 1 and reference is not None and Path(reference).is_file():
         raise AdaptuneError(
             f"--reference {reference}: is a file, and of {len(recordings)} recordings each needs "
@@ -285,6 +313,10 @@ def _decided(
         names = chain([one.name], (f"{one.name}_{i}" for i in count(2)))
         named[next(name for name in names if name not in named)] = one
     odometries = odometries_of(odometry, all("imu" in one.given for one in found))
+    if set(odometries) <= DISTORTED:
+        for one in found:
+            if one.scan is not None and one.scan.times is not None and one.scan.times.any():
+                one.given["compensate"] = "constant_velocity"
     trials, minutes = budget
     if trials is None and minutes is None:
         trials = max(TRIALS, EACH * len(odometries))
@@ -310,6 +342,7 @@ def _usable(path: Path, points: str | None, reference: str | None, show: Progres
     from adaptune.recording.bag import POINTS_TYPES
     from adaptune.recording.inspect import inspect as inspect_file
 
+    check_no_study(path)
     found = inspect_file(path, False, show)
     if not found.name:
         raise AdaptuneError(f"{path}: is a file of poses; give a recording of scans")
@@ -379,7 +412,8 @@ def _length(text: str, whole: Sequence[str], folder: Path) -> str:
             study = load_study(path, folder=folder)
         except AdaptuneError as error:
             # The file is nowhere for the user to look.
-            raise AdaptuneError(re.sub(rf"{path}(, line \d+)?: ", "", str(error))) from error
+            told = re.sub(rf"{re.escape(str(path))}(, line \d+)?: ", "", str(error))
+            raise AdaptuneError(told.replace(f"{temporary}/", "")) from error
     sequences, names = study.sequences, (*study.config.training, *study.config.test)
     if to_estimate(sequences, names):
         study.open()
@@ -400,7 +434,7 @@ def _length(text: str, whole: Sequence[str], folder: Path) -> str:
     return f"{length}    # metres over which errors are measured; the test moves {metres:.0f} m"
 
 
-def _sayodometries_of(study: "OfflineStudy", training: "Training") -> None:
+def _say_odometries(study: "OfflineStudy", training: "Training") -> None:
     """Of several odometries, what each gives with its own parameters and tuned, in training."""
     from adaptune.space import ODOMETRY
     from offline.train import COST

@@ -28,20 +28,21 @@ def cheap(**ratios):
 
 def test_adapting_is_advised_where_it_is_worth_its_cost():
     assert verdict(cheap(adaptive=0.7), 10.0) == [
-        "Drive adaptive: 0.7 % RTE over 10 m instead of 1 % with the fixed set and 1.5 % with the "
-        "odometry's own parameters, on 12 test sequences.",
+        "Drive adaptive: 0.700 % instead of 1.000 % with the fixed set and 1.500 % with the "
+        "odometry's own parameters, RTE over 10 m, on 12 test sequences.",
         "It has 0.70 times the fixed set's error (95 % interval 0.68 to 0.72), for 4.0 times its "
-        "CPU time (20 ms a scan).",
+        "CPU time (20.0 ms a scan).",
     ]
 
 
 @pytest.mark.parametrize(("ratio", "interval"), [(0.93, "0.90 to 0.96"), (1.3, "1.26 to 1.34")])
 def test_one_set_is_advised_where_adapting_is_not(ratio, interval):
     assert verdict(cheap(adaptive=ratio), 10.0) == [
-        "Drive the fixed set: 1 % RTE over 10 m instead of 1.5 % with the odometry's own "
-        "parameters, on 12 test sequences.",
-        f"Adapting is not worth its cost on 12 test sequences: {ratio:.2f} times its error (95 % "
-        f"interval {interval}), for 4.0 times its CPU time (20 ms a scan).",
+        "Drive the fixed set: 1.000 % instead of 1.500 % with the odometry's own parameters, RTE "
+        "over 10 m, on 12 test sequences.",
+        f"Adapting {'did worse' if ratio > 1.0 else 'is not worth its cost'} on 12 test sequences: "
+        f"{ratio:.2f} times its error (95 % interval {interval}), for 4.0 times its CPU time (20.0 "
+        f"ms a scan).",
     ]
 
 
@@ -59,24 +60,22 @@ def test_own_parameters_are_kept_where_they_do_best():
     against = {"baseline": Ratio(1.2, (1.1, 1.3))}
     rows = [replace(row, against=against) for row in cheap(baseline=0.8, adaptive=0.96)]
     first, second = verdict(rows, 10.0)
-    assert first.startswith(
-        "Keep the odometry's own parameters: 0.8 % RTE over 10 m instead of 1 %"
-    )
+    assert first.startswith("Keep the odometry's own parameters: 0.800 % instead of 1.000 % with")
     assert "1.20 times its error (95 % interval 1.10 to 1.30)" in second
     better = {"baseline": Ratio(0.75, (0.7, 0.8))}
     rows = [replace(row, against=better) for row in cheap(baseline=0.8, adaptive=0.6)]
-    assert verdict(rows, 10.0)[0].startswith("Drive adaptive: 0.6 %")
+    assert verdict(rows, 10.0)[0].startswith("Drive adaptive: 0.600 %")
 
 
 @pytest.mark.parametrize(
     ("ratios", "start"),
     [
-        ({"equal_cost": 0.6, "adaptive": 0.8}, "Drive the best set that costs no more: 0.6 %"),
-        ({"equal_cost": 0.95}, "Drive the fixed set: 1 %"),
+        ({"equal_cost": 0.6, "adaptive": 0.8}, "Drive the best set that costs no more: 0.600 %"),
+        ({"equal_cost": 0.95}, "Drive the fixed set: 1.000 %"),
         ({"best_default": 0.9, "baseline": 1.1}, "Drive the best odometry with its own param"),
-        ({"even": 0.5, "adaptive": 0.8}, "Drive adaptive: 0.8 %"),
-        ({"paper": 0.5, "adaptive": 0.8}, "Drive adaptive: 0.8 %"),
-        ({"baseline": 1.0}, "Keep the odometry's own parameters: 1 %"),
+        ({"even": 0.5, "adaptive": 0.8}, "Drive adaptive: 0.800 %"),
+        ({"paper": 0.5, "adaptive": 0.8}, "Drive adaptive: 0.800 %"),
+        ({"baseline": 1.0}, "Keep the odometry's own parameters: 1.000 %"),
     ],
 )
 def test_only_what_can_be_driven_is_advised(ratios, start):
@@ -87,7 +86,27 @@ def test_why_nothing_was_adapted_is_told():
     why = "a program that runs whole recordings cannot change its parameters"
     assert verdict(every(), 5.0, why)[1:] == [f"Adapting was not tried: {why}."]
     kept = [replace(row, switches=0) for row in every(adaptive=1.0)]
-    assert verdict(kept, 5.0)[1:] == ["Adapting was not driven: the training promised no gain."]
+    assert verdict(kept, 5.0)[1:] == ["Adapting kept the fixed set."]
+
+
+def test_one_set_may_be_better_by_chance():
+    for ratio, interval, sure in (
+        (1.5, (1.2, 1.8), True),
+        (1.5, (0.9, 1.8), False),
+        (1.5, None, False),
+        (0.8, (0.7, 0.9), True),
+        (0.8, None, False),
+    ):
+        rows = [replace(row, ratio_interval=interval) for row in every(baseline=ratio)]
+        (said,) = verdict(rows, 5.0)
+        assert ("; the two may differ by chance (" in said) != sure, (ratio, interval)
+    same = [replace(row, ratio=1.0, rte=1.0, switches=0) for row in every()]
+    assert verdict(same, 5.0) == [
+        "Keep the odometry's own parameters: 1.000 % RTE over 5 m, on 12 test sequences. No set "
+        "that was tried did surely better in training."
+    ]
+    estimated = [replace(row, reference="estimated") for row in every()]
+    assert ", on 12 test sequences by an estimated reference" in verdict(estimated, 5.0)[0]
 
 
 def test_a_rival_is_compared_once_in_error_and_cost_also_where_the_fixed_set_is_kept():
@@ -113,7 +132,7 @@ def test_the_verdict_of_a_study_without_a_model_goes_by_the_baseline():
         if row.mode != "fixed"
     ]
     first, second = verdict(rows, 10.0)
-    assert first.startswith("Drive the untrained bank: 0.8 % RTE over 10 m instead of 1 % with the")
+    assert first.startswith("Drive the untrained bank: 0.800 % instead of 1.000 % with the")
     assert second == "It has 0.80 times the baseline's error (95 % interval 0.78 to 0.82)."
     near = [replace(row, ratio_interval=(1.004, 1.12)) for row in every(adaptive=1.04)]
     assert "(95 % interval 1.004 to 1.12)" in verdict(near, 10.0)[1]

@@ -10,6 +10,8 @@ from typer.testing import CliRunner
 
 from adaptune.commands import tune
 from adaptune.commands.cli import app
+from adaptune.simulation import Course
+from adaptune.simulation.record import record
 from offline.config import load_study
 
 FAKE = ("--odometry", "fake_odometry:Fake")
@@ -96,8 +98,10 @@ def test_the_last_of_several_bags_is_the_test(bag, study_file, tmp_path):
     assert study.training == ["one", "two"]
     assert study.config.test == ("one_2",)
     assert (study.config.offline.trials, study.config.offline.hours) == (None, 0.1)
-    said = failed(bag, bag, "--folder", "twice")
-    assert said.startswith("error: test.0: 'one_2' is the recording of the training sequence 'one'")
+    assert "one.bag: is named twice; the test" in failed(bag, bag, "--folder", "twice")
+    shutil.copy(bag, tmp_path / "other/copy.bag")
+    said = failed(bag, "other/copy.bag", "--folder", "twice")
+    assert said.startswith("error: test.0: 'copy' is the recording of the training sequence 'one'")
 
 
 @pytest.mark.usefixtures("decided")
@@ -120,6 +124,17 @@ def test_a_drive_too_short_to_split_is_refused(tmp_path, monkeypatch):
     said = failed(short)
     assert "short_60-100: moves 1.2 m, too little for a test, which takes 2 m at least" in said
     assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.usefixtures("decided")
+def test_motion_within_scans_is_undone_where_the_odometry_does_not(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    course = Course(scenes=("street",), length=15.0, columns=100)
+    record(course, tmp_path / "street.bag")
+    for odometry, how in (("gicp", "constant_velocity"), ("kiss_icp", None)):
+        failed("street.bag", "--odometry", odometry, "--folder", odometry)
+        study = load_study(tmp_path / odometry / f"{odometry}.yaml", [], tmp_path / "other")
+        assert study.config.sequences["street"].compensate == how
 
 
 @pytest.mark.usefixtures("decided")
@@ -148,7 +163,10 @@ def test_of_two_topics_one_is_to_be_named(tmp_path, monkeypatch):
         (["one.bag", "--odometry", "gicb"], "gicb"),
         (["one.bag", "--odometry", "command"], "command: a program needs settings; write a study"),
         (["one.bag", "--points", "/nothing"], "/nothing"),
-        (["one.bag", "one.bag", "--reference", "poses.tum"], "of 2 recordings each needs its own"),
+        (["one.bag", "two.bag", "--reference", "poses.tum"], "of 2 recordings each needs its own"),
+        (["poses.yaml"], "poses.yaml: is a study, not a recording"),
+        (["one.bag", "--reference", "gt.tum"], "gt.tum"),
+        (["one.bag", "--folder", "poses.tum"], "poses.tum: cannot be written to"),
         (["one.bag", "--reference", "/nothing"], "/nothing"),
     ],
 )
