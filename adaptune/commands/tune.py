@@ -2,6 +2,7 @@
 
 import re
 import shlex
+import shutil
 from collections.abc import Sequence
 from functools import partial
 from importlib.util import find_spec
@@ -416,9 +417,18 @@ def _length(text: str, whole: Sequence[str], folder: Path) -> str:
             raise AdaptuneError(told.replace(f"{temporary}/", "")) from error
     sequences, names = study.sequences, (*study.config.training, *study.config.test)
     if to_estimate(sequences, names):
+        there = folder.exists()
         study.open()
-        with progress() as show:
-            ensure_references(sequences, names, 5.0, show)
+        try:
+            with progress() as show:
+                ensure_references(sequences, names, 5.0, show)
+        except AdaptuneError as error:
+            if not there and not [*folder.glob("references/*.tum")]:
+                shutil.rmtree(folder)
+            raise AdaptuneError(
+                f"{error}; or give a --reference, or name other parts in a study of your own: "
+                f"`adaptune inspect --study FILE` begins one"
+            ) from error
     (test,) = study.config.test
     reference, before = sequences.open(whole[-1]).reference(), TRAINING if len(whole) == 1 else 0.0
     if reference is None:
