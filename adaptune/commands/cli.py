@@ -1,6 +1,8 @@
 """The command line."""
 
 import logging
+import sys
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -64,7 +66,8 @@ def _main(
 
 
 def main() -> None:
-    """Run the command line."""
+    """Run the command line; a user's classes are also found in the working folder."""
+    sys.path.append(str(Path.cwd()))
     app(prog_name="adaptune")
 
 

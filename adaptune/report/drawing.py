@@ -592,6 +592,8 @@ class _Drawing:
 
 def ticks(low: float, high: float) -> list[float]:
     """Values to name on a logarithmic axis between two numbers above zero."""
+    if not high > low:
+        return [low]
     decades = np.log10(high) - np.log10(low)  # the ratio may be too large for a number
     if decades < 0.5:
         rough = (high - low) / 4.0

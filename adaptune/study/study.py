@@ -629,9 +629,13 @@ def bank_members(switching: SwitchingConfig, model: ErrorModel) -> dict[int, Par
     if switching.sets is None and model.budget is not None:
         return {trial: model.sets[trial] for trial in model.bank}
     if switching.sets is None:
-        complete = int((~np.isnan(model.errors).any(axis=0)).sum())
+        # Sets that are never chosen, because they fail, are in no bank.
+        complete = ~np.isnan(model.errors).any(axis=0)
+        usable = [
+            c for c, t in enumerate(model.sets) if model.costs is None or model.costs.usable(t)
+        ]
         n = len(model.bank) - model.bank_settings.reserve
-        if n < min(switching.size, complete):
+        if n < min(switching.size, int(complete[usable].sum())):
             raise _another_bank("size")
         if model.bank[0] != model.fixed:
             raise _another_bank("sets")

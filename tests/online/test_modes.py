@@ -135,3 +135,13 @@ def test_a_cheap_bank_runs_on_one_core(monkeypatch):
         assert made.pop() == cores, (register, pace)
     bank.instance(bank.mode("adaptive", replace(model, costs=None)))
     assert made == [3]
+
+
+def test_sets_that_fail_are_missing_in_no_bank():
+    model, bank = random_model(), replace(setup(), mechanism="bank")  # of four, fitted for two
+    given = {trial: SetCost(5.0 if trial in model.bank else np.inf, 4.0, 0) for trial in model.sets}
+    failing = replace(model, costs=Costs(given, 1.0))
+    four = replace(bank, switching=SwitchingConfig(size=4))
+    assert list(four.mode("adaptive", failing).sets) == model.bank
+    with pytest.raises(ModeError, match="another bank"):
+        four.mode("adaptive", model)

@@ -188,3 +188,4 @@ def test_long_lines_are_thinned_and_keep_peaks_and_gaps():
 )
 def test_logarithmic_axes_name_round_numbers(ends, named):
     assert ticks(*ends) == named
+    assert ticks(30.0, 30.0) == [30.0]
