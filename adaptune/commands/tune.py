@@ -11,6 +11,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated
 
+import numpy as np
 import typer
 
 from adaptune.commands.online import Details, compared, replay_missing
@@ -28,6 +29,7 @@ from adaptune.progress import Progress
 
 if TYPE_CHECKING:
     from adaptune.recording.inspect import Inspection
+    from adaptune.trajectory import Trajectory
     from offline.config import OfflineStudy
     from offline.train import Training
 
@@ -142,16 +144,19 @@ def _sub_trajectory(found: "Inspection", deep: bool, show: Progress) -> tuple[st
 # A study of recordings, and nothing else: what it says beside their names.
 
 
-def roles(names: Sequence[str], length: str, odometries: Sequence[str]) -> str:
+def roles(
+    names: Sequence[str], length: str, odometries: Sequence[str], share: float | None = None
+) -> str:
     """YAML of a study: what it trains and tests on, over which metres, and the odometry.
 
-    The last part of a single recording is kept for the test, the last one of several.
+    Of a single recording, what follows after a `share` of its duration is kept for the test; of
+    several, the last one.
     """
     from adaptune.reference.check import TRAINING
 
-    share = f"{100 * TRAINING:.0f}"
     if len(names) == 1:
-        training, test = f"{names[0]}: 0-{share}%", f"{names[0]}: {share}-100%"
+        end = f"{100 * (share or TRAINING):.0f}"
+        training, test = f"{names[0]}: 0-{end}%", f"{names[0]}: {end}-100%"
     else:
         training, test = ", ".join(names[:-1]), names[-1]
     if len(odometries) == 1:
@@ -170,6 +175,9 @@ TRIALS, EACH = 32, 16
 """Parameter sets to try, and at least for each of several odometries."""
 DISTORTED = {"gicp", "vgicp", "ndt"}
 """Odometries that do not undo the motion within scans themselves: it is undone for them."""
+UNEVEN = 0.2
+"""By how much the share of the path may differ from that of the duration, before the split goes by
+the path."""
 LEAST_PATH = 2.0
 """Metres that the part for the test has to hold."""
 Points = Annotated[
@@ -323,19 +331,19 @@ def _decided(
         trials = max(TRIALS, EACH * len(odometries))
     limits = _limits(trials, minutes)
 
-    def study(length: str) -> str:
+    def study(length: str, share: float | None = None) -> str:
         from adaptune import files
 
         recorded = files.dump({"sequences": {name: one.given for name, one in named.items()}})
         return (
             f"# Every command works with this file; change what you like.\n\n{recorded}\n"
             f"# The part for the test is not trained on.\n"
-            f"{roles(list(named), length, odometries)}"
+            f"{roles(list(named), length, odometries, share)}"
             f"offline: {{{', '.join(limits)}}}    # parameter sets to try, or the time for it\n"
             "online: {modes: [adaptive]}\n"
         )
 
-    return study(_length(study("5.0"), list(named), folder))
+    return study(*_split(study("5.0"), list(named), folder))
 
 
 def _usable(path: Path, points: str | None, reference: str | None, show: Progress) -> "Inspection":
@@ -394,15 +402,14 @@ def odometries_of(given: str, imu: bool) -> list[str]:
     return there
 
 
-def _length(text: str, whole: Sequence[str], folder: Path) -> str:
+def _split(text: str, whole: Sequence[str], folder: Path) -> tuple[str, float]:
     """Metres of the sub-trajectories by which a study, whose YAML is given, should judge.
 
-    References that are lacking are estimated: they tell how far the robot has moved. `whole` has
-    the names of the recordings.
+    And the share of a single recording to train on. A reference that is lacking is estimated: it
+    tells how far the robot has moved. `whole` has the names of the recordings.
     """
     from adaptune.metrics import travelled
-    from adaptune.reference.check import TRAINING, proposed_sub_trajectory
-    from adaptune.study.references import ensure_references, to_estimate
+    from adaptune.reference.check import proposed_sub_trajectory
     from adaptune.trajectory import read_trajectory
     from offline.config import load_study
 
@@ -415,33 +422,51 @@ def _length(text: str, whole: Sequence[str], folder: Path) -> str:
             # The file is nowhere for the user to look.
             told = re.sub(rf"{re.escape(str(path))}(, line \d+)?: ", "", str(error))
             raise AdaptuneError(told.replace(f"{temporary}/", "")) from error
-    sequences, names = study.sequences, (*study.config.training, *study.config.test)
-    if to_estimate(sequences, names):
-        there = folder.exists()
-        study.open()
-        try:
-            with progress() as show:
-                ensure_references(sequences, names, 5.0, show)
-        except AdaptuneError as error:
-            if not there and not [*folder.glob("references/*.tum")]:
-                shutil.rmtree(folder)
-            raise AdaptuneError(
-                f"{error}; or give a --reference, or name other parts in a study of your own: "
-                f"`adaptune inspect --study FILE` begins one"
-            ) from error
-    (test,) = study.config.test
-    reference, before = sequences.open(whole[-1]).reference(), TRAINING if len(whole) == 1 else 0.0
+    sequences = study.sequences
+    reference = sequences.open(whole[-1]).reference()
     if reference is None:
-        reference, before = read_trajectory(sequences.estimate_path(test)), 0.0
+        _estimate(study, whole[-1:])
+        reference = read_trajectory(sequences.estimate_path(whole[-1]))
+    share = _share(reference) if len(whole) == 1 else 0.0
     begin, end = reference.stamps[[0, -1]]
-    tested = reference.T_world_sensor[reference.stamps >= begin + before * (end - begin)]
+    tested = reference.T_world_sensor[reference.stamps >= begin + share * (end - begin)]
     if (metres := float(travelled(tested)[-1])) < LEAST_PATH:
         raise AdaptuneError(
-            f"{test}: moves {metres:.1f} m, too little for a test, which takes {LEAST_PATH:g} m at "
-            f"least; record a longer drive, or name another recording for the test as the last one"
+            f"{whole[-1]}: moves {metres:.1f} m in the part for the test, which takes "
+            f"{LEAST_PATH:g} m at least; record a longer drive, or name another recording for the "
+            f"test as the last one"
         )
-    length = proposed_sub_trajectory(reference, training=before)
-    return f"{length}    # metres over which errors are measured; the test moves {metres:.0f} m"
+    length = proposed_sub_trajectory(reference, training=share)
+    words = f"{length}    # metres over which errors are measured; the test moves {metres:.0f} m"
+    return words, share
+
+
+def _share(reference: "Trajectory") -> float:
+    """Share of a recording's duration to train on: of its path, where it stands for long."""
+    from adaptune.metrics import travelled
+    from adaptune.reference.check import TRAINING
+
+    metres = travelled(reference.T_world_sensor)
+    time = (reference.stamps - reference.stamps[0]) / np.ptp(reference.stamps)
+    of_path = float(np.interp(TRAINING, time, metres / max(float(metres[-1]), 1e-9)))
+    if abs(of_path - TRAINING) <= UNEVEN:
+        return TRAINING
+    return round(float(np.interp(TRAINING * metres[-1], metres, time)), 2)
+
+
+def _estimate(study: "OfflineStudy", names: Sequence[str]) -> None:
+    """Estimate references; where one is refused, nothing is left behind."""
+    from adaptune.study.references import ensure_references
+
+    there = study.folder.exists()
+    study.open()
+    try:
+        with progress() as show:
+            ensure_references(study.sequences, names, 5.0, show)
+    except AdaptuneError as error:
+        if not there:
+            shutil.rmtree(study.folder)
+        raise AdaptuneError(f"{error}; or give a --reference") from error
 
 
 def _say_odometries(study: "OfflineStudy", training: "Training") -> None:

@@ -630,7 +630,7 @@ def bank_members(switching: SwitchingConfig, model: ErrorModel) -> dict[int, Par
         return {trial: model.sets[trial] for trial in model.bank}
     if switching.sets is None:
         # Sets that are never chosen, because they fail, are in no bank.
-        complete = ~np.isnan(model.errors).any(axis=0)
+        complete = np.asarray(~np.isnan(model.errors).any(axis=0))
         usable = [
             c for c, t in enumerate(model.sets) if model.costs is None or model.costs.usable(t)
         ]

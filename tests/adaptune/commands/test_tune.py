@@ -122,8 +122,21 @@ def test_a_drive_too_short_to_split_is_refused(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     short = drives.write_bag(tmp_path / "short.bag", drives.scans(n_scans=12))
     said = failed(short)
-    assert "short_60-100: moves 1.2 m, too little for a test, which takes 2 m at least" in said
+    assert "short: moves 1.2 m in the part for the test, which takes 2 m at least" in said
     assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.usefixtures("decided")
+def test_a_recording_that_stands_for_long_is_split_by_its_path(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    moving = drives.scans(n_scans=60)
+    first, points, T = moving[0]
+    standing = [(first - i * 100_000_000, points, T) for i in range(90, 0, -1)]
+    late = drives.write_bag(tmp_path / "late.bag", standing + moving)
+    failed(late)
+    study = load_study(tmp_path / "runs/late/late.yaml", [], tmp_path / "other")
+    # It stands for 9 s of 15; 60 % of the way are over after 12.5 s.
+    assert study.config.test == ("late_84-100",)
 
 
 @pytest.mark.usefixtures("decided")
