@@ -75,7 +75,8 @@ class Template:
             raise OdometryError(f"{path}: a template is a file of {', '.join(_FORMATS)}")
         read, self._write = _FORMATS[path.suffix]
         try:
-            self._text = path.read_text(encoding="utf-8")
+            # Ends of lines stay as they are.
+            self._text = path.read_bytes().decode()
             self._data = read(self._text)
         except FileNotFoundError as error:
             raise OdometryError(f"{path}: there is no such file") from error
