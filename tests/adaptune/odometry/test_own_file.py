@@ -11,6 +11,7 @@ from needs import lacking, needs_evalio
 
 from adaptune.odometry import evalio
 from adaptune.odometry.kiss_icp import Kiss
+from adaptune.odometry.program import Template
 from adaptune.odometry.registry import OdometryFactory, is_user_class, odometry_class
 from adaptune.odometry.remote import Limits, Process
 from adaptune.space import ParameterSpace
@@ -131,3 +132,9 @@ def test_odometries_without_a_tool_of_their_own():
     object.__setattr__(factory, "name", "theirs.odometry:Mine")
     assert is_user_class(factory.name)
     assert factory.own_file({}) is None
+
+
+def test_ends_of_lines_stay(tmp_path):
+    path = tmp_path / "windows.yaml"
+    path.write_bytes(b"a:\r\n  b: 1.0  # x\r\nd: 3\r\n")
+    assert Template(path).fill({"a.b": 2.5, "d": 4}) == "a:\r\n  b: 2.5  # x\r\nd: 4\r\n"

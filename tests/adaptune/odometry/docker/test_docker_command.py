@@ -218,9 +218,3 @@ def test_an_engine_that_goes_away_is_no_trial(tmp_path, study_file, monkeypatch)
     monkeypatch.setattr(Container, "ended", gone)
     with pytest.raises(EngineError, match="does not answer"):
         setup.run(sequence, [{"max_correspondence_distance": 2.0}])
-
-
-def test_ends_of_lines_stay(tmp_path):
-    path = tmp_path / "windows.yaml"
-    path.write_bytes(b"a:\r\n  b: 1.0  # x\r\nd: 3\r\n")
-    assert Template(path).fill({"a.b": 2.5, "d": 4}) == "a:\r\n  b: 2.5  # x\r\nd: 4\r\n"
