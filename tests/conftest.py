@@ -8,6 +8,7 @@ from pathlib import Path
 
 import drives
 import fake_odometry
+import hypothesis
 import pytest
 from in_process import InProcess
 from needs import lacking
@@ -17,6 +18,9 @@ from offline import train as training
 from offline.config import load_study
 from offline.train import train
 from offline.workers import Workers
+
+hypothesis.settings.register_profile("untimed", deadline=None)
+hypothesis.settings.load_profile("untimed")
 
 Factory = pytest.TempPathFactory
 SUPPORT = Path(__file__).parent / "support"
