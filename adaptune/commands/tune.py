@@ -11,7 +11,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 import typer
 
 from adaptune.commands.online import Details, compared, replay_missing
@@ -443,6 +442,8 @@ def _split(text: str, whole: Sequence[str], folder: Path) -> tuple[str, float]:
 
 def _share(reference: "Trajectory") -> float:
     """Share of a recording's duration to train on: of its path, where it stands for long."""
+    import numpy as np
+
     from adaptune.metrics import travelled
     from adaptune.reference.check import TRAINING
 
