@@ -112,6 +112,12 @@ def write_text(path: Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
+def plain_name(path: Path) -> str:
+    """Name of a sequence for a recording: letters, digits, _ . and - of the file's."""
+    name = "".join(c if c.isalnum() or c in "_.-" else "_" for c in path.stem)
+    return name.lstrip(".-") or "recording"
+
+
 # YAML with the numbers and booleans of YAML 1.2, unique keys, and line numbers.
 
 

@@ -1,6 +1,6 @@
 """Errors of an odometry: over sub-trajectories, as KITTI's benchmark and as evo define them."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -218,17 +218,21 @@ def cap(errors: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 def lost_in_words(
-    best: str, errors: Mapping[str, float], odometry: str, cause: str = ""
+    best: str,
+    errors: Mapping[str, float],
+    odometry: str,
+    find_cause: Callable[[], str] = lambda: "",
 ) -> list[str]:
     """A sentence where even the best does not track: the likeliest cause, and what to try.
 
-    `errors` has by sequence the mean error of the best, in percent; `cause` is what is known.
+    `errors` has by sequence the mean error of the best, in percent. Where it does not track,
+    `find_cause` says what is known of the cause.
     """
     if not (mean := sum(errors.values()) / len(errors)) > LOST_ABOVE:
         return []
     where = ", ".join(name for name, error in errors.items() if error > LOST_ABOVE)
     lost = f"Even {best} does not track on {where}: {mean:.1f} % is more than {LOST_ABOVE:g} %. "
-    if cause:
+    if cause := find_cause():
         return [
             f"{lost}The likeliest cause: {cause}. Drive slower or record more scans a second, or "
             f"try an odometry that uses an IMU (`rko_lio`)."

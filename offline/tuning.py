@@ -30,7 +30,7 @@ from adaptune.study.study import (
     EQUAL_COST,
     MIN_RECORDINGS,
     ONE_SET,
-    WORTH,
+    is_worth,
 )
 from offline.labelled import LabelledData, LabelledSequence, comparable, periods
 
@@ -254,7 +254,7 @@ def least_loss(
         expected[BANK] = figures(logs[:, best], recordings)
         way, which = divmod(best - n_single, len(BANK_SETTINGS))
         members = banks[way]
-        worth = expected[BANK].geometric <= 1.0 - WORTH and expected[BANK].high < 1.0
+        worth = is_worth(expected[BANK].geometric, expected[BANK].high)
         if worth and losses[best] < min(0.0, losses[:n_single].min(initial=0.0)):
             bank = BANK_SETTINGS[which]
     return Policy(one_set, bank, members, expected)

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from adaptune import manifest
 from adaptune.metrics import (
-    LOST_ABOVE,
     MIN_BLOCKS,
     RESAMPLES,
     lost_in_words,
@@ -427,8 +426,14 @@ class ComparedReplays(NamedTuple):
     # A row for every sequence and mode; over several sequences, a row for every mode follows.
     rows: list[ComparisonRow]
     verdict: list[str]  # sentences: what to do, and why
-    details: list[str]  # sentences: what was gained, and what must be known to trust it
+    details: list[str]  # sentences: what must be known to trust it
     unfinished: Sequence[str] = ()  # sequences that are not compared, for want of replays
+
+    @property
+    def advised(self) -> str:
+        """The mode to drive; empty where nobody can say."""
+        best = decided(self.rows)
+        return "" if best is None else best.mode
 
 
 def compare(study: Study) -> ComparedReplays:
@@ -475,8 +480,8 @@ def compare(study: Study) -> ComparedReplays:
             oracles += oracle_rows(judged[-1], oracle, model.fixed, period)
     rows = _rows(judged, oracles)
     obstacle = "" if ADAPTIVE in modes else ReplaySetup.of(study).obstacle(ADAPTIVE, model)
-    said = [*wrong[:1], *verdict(rows, study.config.sub_trajectory, obstacle)]
-    said[:0] = [] if wrong else _lost(study, judged, rows)
+    said = wrong[:1] or _lost(study, judged, rows)
+    said += verdict(rows, study.config.sub_trajectory, obstacle)
     details = [
         *wrong,
         *remarks(rows),
@@ -493,17 +498,18 @@ def compare(study: Study) -> ComparedReplays:
 
 
 def _lost(study: Study, judged: Sequence[JudgedModes], rows: Sequence[ComparisonRow]) -> list[str]:
-    """A sentence where even what does best has lost its way."""
-    known = [row for one in judged for row in one.rows if row.rte is not None]
-    if not known:
+    """A sentence where even the best mode has lost its way."""
+    if (best := decided(rows)) is None:
         return []
-    best = decided(rows)
-    errors = {row.sequence: row.rte or 0.0 for row in known if row.mode == best.mode}
+    every = [row for one in judged for row in one.rows if row.mode == best.mode]
+    errors = {row.sequence: row.rte for row in every if row.rte is not None}
     worst = max(errors, key=lambda name: errors[name])
-    if errors[worst] <= LOST_ABOVE:
-        return []
-    cause = hard_to_track(study.sequences.open(worst))
-    return lost_in_words(CALLED[best.mode], errors, study.odometry.name, cause)
+    return lost_in_words(
+        CALLED[best.mode],
+        errors,
+        study.odometry.name,
+        lambda: hard_to_track(study.sequences.open(worst)),
+    )
 
 
 def _equal_cost(model: ErrorModel | None, modes: Sequence[str]) -> list[str]:

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from adaptune.report.tables import Listing
-from adaptune.study.study import EQUAL_COST, MIN_RECORDINGS, RIVAL_WORDS, RIVALS, WORTH
+from adaptune.study.study import EQUAL_COST, MIN_RECORDINGS, RIVAL_WORDS, RIVALS, WORTH, is_worth
 from online.modes import EVEN
 from online.statistics import (
     ALL,
@@ -218,19 +218,21 @@ _ONE_SET = ("baseline", "fixed", "best_default")
 """Modes that drive one set; those that cost less first."""
 
 
-def decided(rows: Sequence[ComparisonRow]) -> ComparisonRow:
+def decided(rows: Sequence[ComparisonRow]) -> ComparisonRow | None:
     """What to drive: the one set with the least error, or what is worth its cost.
 
-    The rows over all sequences come last.
+    The rows over all sequences come last. None if no test sequence has a reference.
     """
     last = {row.mode: row for row in _last(rows) if row.ratio is not None}
+    if not last:
+        return None
     one = min((last[m] for m in _ONE_SET if m in last), key=lambda row: _ratio(row).value)
     worth = [one]
     for mode in ("adaptive", "untrained", EQUAL_COST):
         if (row := last.get(mode)) is not None:
             ratio = _to(row, one)
-            surely = ratio.interval is not None and ratio.interval[1] < 1.0
-            worth += [row] * (ratio.value <= 1.0 - WORTH and surely)
+            if ratio.interval is not None and is_worth(ratio.value, ratio.interval[1]):
+                worth.append(row)
     return min(worth, key=lambda row: _ratio(row).value)
 
 
@@ -260,10 +262,10 @@ def verdict(rows: Sequence[ComparisonRow], length: float, obstacle: str = "") ->
         Why nothing adapts, if nothing does.
     """
     last = {row.mode: row for row in _last(rows)}
-    if all(row.ratio is None for row in last.values()):
+    if (best := decided(rows)) is None:
         nobody = "No test sequence has a reference: nobody can say what was gained."
         return [nobody, *_estimates(rows)[:2]]
-    best, main = decided(rows), adapting(rows)
+    main = adapting(rows)
     errors = {m: f"{row.rte:.3f} %" for m, row in last.items() if row.rte is not None}
     others = [m for m in ("fixed", "baseline") if m in errors and m != best.mode]
     judge = " by an estimated reference" * any(row.reference == "estimated" for row in rows)
@@ -274,16 +276,14 @@ def verdict(rows: Sequence[ComparisonRow], length: float, obstacle: str = "") ->
     else:
         instead = " and ".join(f"{errors[m]} with {CALLED[m]}" for m in others)
         said = f"{'Keep' if best.mode == 'baseline' else 'Drive'} {CALLED[best.mode]}: "
-        said += (
-            f"{errors[best.mode]} instead of {instead}, {where}" if instead else errors[best.mode]
-        )
+        said += f"{errors[best.mode]}{f' instead of {instead},' if instead else ''} {where}"
     if best.mode not in _ONE_SET:
         return [f"{said}.", f"It has {_times(best)}{_for_cost(best, last[best.yardstick])}."]
     return [f"{said}{_doubt(best, last)}.", *_why_not(main, best, rows, obstacle)]
 
 
 def _doubt(best: ComparisonRow, last: Mapping[str, ComparisonRow]) -> str:
-    """Whether one set may be better than another by chance only, and what it costs."""
+    """That the fixed set and the baseline may differ by chance only, where that is so."""
     row = last.get("baseline")
     if best.mode == "best_default" or row is None or "fixed" not in last or _is_yardstick(row):
         return ""

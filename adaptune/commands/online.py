@@ -238,8 +238,8 @@ def compared(loaded: "OfflineStudy", *, details: bool = False) -> "ComparedRepla
     With `details`, print all sentences and tables of the page, too.
     """
     from online.compare import compare as compare_replays
-    from online.modes import BASELINE
-    from online.tables import decided, decision_table, tables
+    from online.modes import ADAPTIVE, FIXED
+    from online.tables import decision_table, tables
 
     begin_work()
     try:
@@ -252,7 +252,7 @@ def compared(loaded: "OfflineStudy", *, details: bool = False) -> "ComparedRepla
     page, length = _write_page(loaded, found), loaded.config.sub_trajectory
     say(" ".join(found.verdict))
     if found.rows[0].yardstick == "fixed":
-        say_fixed(loaded, advised=decided(found.rows).mode != BASELINE)
+        say_fixed(loaded, advised=found.advised in ("", FIXED, ADAPTIVE))
     say(f"More: {page}")
     shown = tables(found.rows, length) if details else [decision_table(found.rows, length)]
     for sentence in found.details if details else ():

@@ -23,7 +23,7 @@ from adaptune.commands.terminal import (
     show_table,
 )
 from adaptune.errors import AdaptuneError
-from adaptune.files import write_text
+from adaptune.files import plain_name, write_text
 from adaptune.progress import Progress
 
 if TYPE_CHECKING:
@@ -231,6 +231,8 @@ def tune(
     What it decides is written to a study file in its folder, with which all other commands work.
     Run the same command again to resume.
     """
+    if reference is not None and Path(reference).is_file():
+        reference = str(Path(reference).resolve())
     folder = folder or Path("runs") / _study_name(recordings, odometry)
     path = folder / f"{folder.resolve().name}.yaml"
     made_by = _made_by(recordings, odometry, points, reference)
@@ -244,7 +246,8 @@ def tune(
             f"or another --folder"
         )
     else:
-        overrides = [f"offline.{limit}".replace(": ", "=") for limit in _limits(trials, minutes)]
+        limits = _limits(trials, minutes)
+        overrides = [f"offline.{key}={value}" for key, value in limits.items()]
     from offline.train import train
 
     loaded = load(path, overrides, folder)
@@ -268,7 +271,7 @@ def _write(path: Path, text: str) -> None:
 
 
 def _study_name(recordings: Sequence[Path], odometry: str) -> str:
-    stem = _name_of(recordings[0]) + "_and_more" * (len(recordings) > 1)
+    stem = plain_name(recordings[0].resolve()) + "_and_more" * (len(recordings) > 1)
     names = (name.strip().replace(":", "_") for name in odometry.split(","))
     others = "+".join(dict.fromkeys(names))
     return stem if odometry == "gicp" else f"{stem}_{others}"
@@ -280,21 +283,14 @@ def _made_by(
     """The first line of a study: what it was decided for."""
     words = [*(str(bag.resolve()) for bag in recordings), "--odometry", odometry]
     words += ["--points", points] if points else []
-    if reference is not None:
-        file = Path(reference)
-        words += ["--reference", str(file.resolve()) if file.is_file() else reference]
+    words += ["--reference", reference] if reference else []
     return f"# adaptune tune {shlex.join(words)}\n"
 
 
-def _limits(trials: int | None, minutes: float | None) -> list[str]:
-    """The budget of the search, as keys and values of a study."""
-    of_time = [] if minutes is None else [f"hours: {minutes / 60.0:.6g}"]
-    return of_time if trials is None else [f"trials: {trials}", *of_time]
-
-
-def _name_of(recording: Path) -> str:
-    stem = "".join(c if c.isalnum() or c in "_.-" else "_" for c in recording.resolve().stem)
-    return stem.lstrip(".-") or "recording"
+def _limits(trials: int | None, minutes: float | None) -> dict[str, str]:
+    """The budget of the search by its keys in a study."""
+    given = {"trials": trials, "hours": None if minutes is None else minutes / 60.0}
+    return {key: f"{value:.10g}" for key, value in given.items() if value is not None}
 
 
 def _decided(
@@ -328,7 +324,7 @@ def _decided(
     trials, minutes = budget
     if trials is None and minutes is None:
         trials = max(TRIALS, EACH * len(odometries))
-    limits = _limits(trials, minutes)
+    limits = ", ".join(f"{key}: {value}" for key, value in _limits(trials, minutes).items())
 
     def study(length: str, share: float | None = None) -> str:
         from adaptune import files
@@ -338,7 +334,7 @@ def _decided(
             f"# Every command works with this file; change what you like.\n\n{recorded}\n"
             f"# The part for the test is not trained on.\n"
             f"{roles(list(named), length, odometries, share)}"
-            f"offline: {{{', '.join(limits)}}}    # parameter sets to try, or the time for it\n"
+            f"offline: {{{limits}}}    # parameter sets to try, or the time for it\n"
             "online: {modes: [adaptive]}\n"
         )
 
@@ -365,8 +361,7 @@ def _usable(path: Path, points: str | None, reference: str | None, show: Progres
     if points is not None:
         found.given["points"] = points
     if reference is not None:
-        is_file = Path(reference).is_file()
-        found.given["reference"] = str(Path(reference).resolve()) if is_file else reference
+        found.given["reference"] = reference
     elif found.missing["offline"]:
         why = "; ".join(fault.text for fault in found.faults if fault.of == "reference")
         say(f"{path}: its reference does not serve ({why}): one is estimated")
@@ -407,8 +402,7 @@ def _split(text: str, whole: Sequence[str], folder: Path) -> tuple[str, float]:
     And the share of a single recording to train on. A reference that is lacking is estimated: it
     tells how far the robot has moved. `whole` has the names of the recordings.
     """
-    from adaptune.metrics import travelled
-    from adaptune.reference.check import proposed_sub_trajectory
+    from adaptune.reference.check import path_after, proposed_sub_trajectory
     from adaptune.trajectory import read_trajectory
     from offline.config import load_study
 
@@ -427,9 +421,8 @@ def _split(text: str, whole: Sequence[str], folder: Path) -> tuple[str, float]:
         _estimate(study, whole[-1:])
         reference = read_trajectory(sequences.estimate_path(whole[-1]))
     share = _share(reference) if len(whole) == 1 else 0.0
-    begin, end = reference.stamps[[0, -1]]
-    tested = reference.T_world_sensor[reference.stamps >= begin + share * (end - begin)]
-    if (metres := float(travelled(tested)[-1])) < LEAST_PATH:
+    metres, _ = path_after(reference, share)
+    if metres < LEAST_PATH:
         raise AdaptuneError(
             f"{whole[-1]}: moves {metres:.1f} m in the part for the test, which takes "
             f"{LEAST_PATH:g} m at least; record a longer drive, or name another recording for the "

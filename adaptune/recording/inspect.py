@@ -139,8 +139,7 @@ class Inspection:
         """Name of the sequence that is proposed; empty for a file of poses."""
         if "reference" in self.given and len(self.given) == 1:
             return ""
-        name = "".join(c if c.isalnum() or c in "_.-" else "_" for c in self.path.stem)
-        return name.lstrip(".-") or "recording"
+        return files.plain_name(self.path)
 
     def config(self) -> SequenceConfig:
         """The sequence that is proposed."""

@@ -636,6 +636,14 @@ TRAINING = 0.6
 """Share of a recording's duration that is proposed for training, before the test."""
 
 
+def path_after(reference: Trajectory, training: float) -> tuple[float, float]:
+    """Metres and seconds of a reference after the share `training` of its duration."""
+    first, last = reference.stamps[[0, -1]]
+    after = reference.stamps >= first + training * (last - first)
+    seconds = float(last - reference.stamps[after][0]) * 1e-9
+    return float(travelled(reference.T_world_sensor[after])[-1]), seconds
+
+
 def proposed_sub_trajectory(
     reference: Trajectory, measured: MeasuredReference | None = None, training: float = TRAINING
 ) -> float:
@@ -648,10 +656,7 @@ def proposed_sub_trajectory(
     too noisy for it, the first longer one that fits and for which it is not; where it is for all,
     the longest that fits, up to the greatest of `LENGTHS`.
     """
-    first, last = reference.stamps[[0, -1]]
-    tested = reference.stamps >= first + training * (last - first)
-    seconds = float(last - reference.stamps[tested][0]) * 1e-9
-    path = float(travelled(reference.T_world_sensor[tested])[-1])
+    path, seconds = path_after(reference, training)
     usual = next((length for length, n in LENGTHS.items() if n * length <= path), 1.0)
     least = min(SECONDS * path / seconds, max(LENGTHS)) if seconds else 0.0
     fit = [usual, *(length for length in LONGER if length > usual and FEWEST * length <= path)]

@@ -475,6 +475,13 @@ MIN_RECORDINGS = 6
 """With as many, whole recordings are left out; with fewer, stretches of them."""
 WORTH = 0.1
 """Share of the error that a bank has to spare, surely, to be worth its CPU time."""
+
+
+def is_worth(ratio: float, high: float) -> bool:
+    """Whether a ratio of errors, whose 95 % interval ends at `high`, is worth the CPU time."""
+    return ratio <= 1.0 - WORTH and high < 1.0
+
+
 BANK, ONE_SET = "bank", "one set"
 """Names of the ways to adapt."""
 BEST_DEFAULT, EQUAL_COST = "best_default", "equal_cost"
@@ -610,7 +617,7 @@ def mechanism_of(
     live
         Whether the odometry changes its parameters between scans.
     """
-    # What was published, `paper`, has one instance, and all sets to choose from.
+    # `paper` was published with one instance, and all sets to choose from.
     bank = model.bank_adapts or model.bank_rests if mode == "adaptive" else not live
     if mechanism == "bank" and bank:
         return "bank"

@@ -3,7 +3,7 @@ from dataclasses import replace
 import pytest
 
 from online.statistics import ALL, ORACLES, ComparisonRow, Ratio
-from online.tables import remarks, verdict
+from online.tables import decided, remarks, verdict
 
 
 def rows_of(sequence=ALL, **ratios):
@@ -134,6 +134,10 @@ def test_the_verdict_of_a_study_without_a_model_goes_by_the_baseline():
     first, second = verdict(rows, 10.0)
     assert first.startswith("Drive the untrained bank: 0.800 % instead of 1.000 % with the")
     assert second == "It has 0.80 times the baseline's error (95 % interval 0.78 to 0.82)."
+    alone = [row for row in rows if row.mode == "baseline"]
+    assert verdict(alone, 10.0) == [
+        "Keep the odometry's own parameters: 1.000 % RTE over 10 m, on 12 test sequences."
+    ]
     near = [replace(row, ratio_interval=(1.004, 1.12)) for row in every(adaptive=1.04)]
     assert "(95 % interval 1.004 to 1.12)" in verdict(near, 10.0)[1]
 
@@ -143,6 +147,7 @@ def test_nothing_is_said_where_nothing_is_known():
     nobody = "No test sequence has a reference: nobody can say what was gained."
     assert verdict(rows, 10.0) == [nobody]
     assert remarks(rows) == []
+    assert decided(rows) is None
     oracle = ComparisonRow(ALL, ORACLES[0], 0.5, 0.5, 0, 0, 0)
     assert not any(ORACLES[0] in said for said in verdict([*every(adaptive=0.7), oracle], 10.0))
 
