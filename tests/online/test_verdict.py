@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import pytest
 
+from online.compare import ComparedReplays
 from online.statistics import ALL, ORACLES, ComparisonRow, Ratio
 from online.tables import decided, remarks, verdict
 
@@ -134,6 +135,7 @@ def test_the_verdict_of_a_study_without_a_model_goes_by_the_baseline():
     first, second = verdict(rows, 10.0)
     assert first.startswith("Drive the untrained bank: 0.800 % instead of 1.000 % with the")
     assert second == "It has 0.80 times the baseline's error (95 % interval 0.78 to 0.82)."
+    assert ComparedReplays(rows, [], []).advised == "untrained"
     alone = [row for row in rows if row.mode == "baseline"]
     assert verdict(alone, 10.0) == [
         "Keep the odometry's own parameters: 1.000 % RTE over 10 m, on 12 test sequences."
@@ -148,6 +150,7 @@ def test_nothing_is_said_where_nothing_is_known():
     assert verdict(rows, 10.0) == [nobody]
     assert remarks(rows) == []
     assert decided(rows) is None
+    assert ComparedReplays(rows, [], []).advised == ""
     oracle = ComparisonRow(ALL, ORACLES[0], 0.5, 0.5, 0, 0, 0)
     assert not any(ORACLES[0] in said for said in verdict([*every(adaptive=0.7), oracle], 10.0))
 
