@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from adaptune.geometry import (
     Poses,
     from_quaternions,
+    interpolate,
     invert,
     nearest_rotation,
     rotation_angle,
@@ -170,6 +171,8 @@ TRUSTED = 0.8
 """Share of the measured motions that are right at least, those that fit best."""
 CLOCK = 30.0
 """Seconds by which clocks may differ to be found."""
+LAG = 3.0
+"""Scans by which an odometry's poses may be late to be found."""
 SAME_CLOCK = 0.01
 """Seconds by which two clocks may differ and count as the same."""
 AMBIGUOUS = 1.5
@@ -237,7 +240,8 @@ def diagnose_reference(
         The LiDAR's pose in the frame of the poses that were given, of shape (4, 4), as the study
         states it; by default they are the LiDAR's own.
     """
-    before = _mean(mismatch(reference.at(stamps), hops))
+    errors = mismatch(reference.at(stamps), hops)
+    before = _mean(errors)
     if np.isnan(before) or before < SUSPICIOUS:
         return None
     T_given_sensor = np.eye(4) if place is None else place
@@ -258,12 +262,13 @@ def diagnose_reference(
         *_clock(reference, stamps, hops),
         *_places(at_scans(given) @ invert(T_given_sensor), hops, T_given_sensor),
     ]
-    return _likeliest(candidates, hops, before) or _sparse(reference, stamps, hops, before)
+    return _likeliest(candidates, hops, errors) or _sparse(reference, stamps, hops, before)
 
 
 def diagnose_odometry(T_odom_sensor: Poses, hops: Hops) -> Cause | None:
     """Why an odometry's poses, of shape (n_scans, 4, 4), contradict measured motions; else None."""
-    before = _mean(mismatch(T_odom_sensor, hops))
+    errors = mismatch(T_odom_sensor, hops)
+    before = _mean(errors)
     if np.isnan(before) or before < SUSPICIOUS:
         return None
     known = np.isfinite(T_odom_sensor).all(axis=(1, 2), keepdims=True)
@@ -275,9 +280,10 @@ def diagnose_odometry(T_odom_sensor: Poses, hops: Hops) -> Cause | None:
             _accumulated(steps),
         ),
         *_conventions(T_odom_sensor, lambda T: T),
+        _moment(T_odom_sensor, hops),
         *_places(T_odom_sensor, hops, np.eye(4), of_odometry=True),
     ]
-    return _likeliest(candidates, hops, before)
+    return _likeliest(candidates, hops, errors)
 
 
 def _accumulated(steps: Poses) -> Poses:
@@ -288,19 +294,28 @@ def _accumulated(steps: Poses) -> Poses:
     return T
 
 
-def _likeliest(candidates: Iterable[_Candidate], hops: Hops, before: float) -> Cause | None:
+def _likeliest(
+    candidates: Iterable[_Candidate], hops: Hops, contradicting: NDArray[np.float64]
+) -> Cause | None:
     """What leaves nearly as little as the best candidate, if that explains the difference.
 
-    On a straight way, two may fit alike.
+    On a straight way, two may fit alike. `contradicting` is how far each motion differs.
     """
-    left = [(c, _mean(mismatch(c.T_world_sensor, hops))) for c in candidates]
-    left = [(c, after) for c, after in left if np.isfinite(after)]
-    least = min((after for _, after in left), default=np.inf)
+    before = _mean(contradicting)
+
+    def after(errors: NDArray[np.float64]) -> float:
+        # Where a candidate knows no pose, it explains nothing: the same motions are compared.
+        same = _mean(np.where(np.isnan(errors), np.nan, contradicting))
+        return _mean(errors) * before / max(same, 1e-9)
+
+    left = [(c, after(mismatch(c.T_world_sensor, hops))) for c in candidates]
+    left = [(c, rest) for c, rest in left if np.isfinite(rest)]
+    least = min((rest for _, rest in left), default=np.inf)
     if least > EXPLAINED * before:
         return None
     # The last one, with the most freedom, fits whatever others fit, and noise, too.
     most = max(1.25 * least, 0.1 * before)
-    fit = [(c, after) for c, after in left if after <= most]
+    fit = [(c, rest) for c, rest in left if rest <= most]
     fit = fit[:-1] or fit
     what = ", or ".join(candidate.what for candidate, _ in fit[:2])
     mend = ", or ".join(candidate.mend for candidate, _ in fit[:2])
@@ -318,19 +333,14 @@ def _conventions(T: Poses, at_scans: Callable[[Poses], Poses]) -> Iterator[_Cand
         T[~known] = np.nan
         return at_scans(T)
 
-    write = "write the quaternions as"
-    yield _Candidate(
-        "as if their quaternions began with w",
-        f"{write} qx qy qz qw",
-        placed(translations, q[:, [1, 2, 3, 0]]),
-    )
-    yield _Candidate(
-        "as if their quaternions ended with w",
-        f"{write} qw qx qy qz",
-        placed(translations, q[:, [3, 0, 1, 2]]),
-    )
-    inverse = invert(safe)
-    inverse[~known] = np.nan
+    for where, right, columns in (
+        ("began", "qx qy qz qw", (1, 2, 3, 0)),
+        ("ended", "qw qx qy qz", (3, 0, 1, 2)),
+    ):
+        what = f"as if their quaternions {where} with w"
+        T_right = placed(translations, q[:, columns])
+        yield _Candidate(what, f"write the quaternions as {right}", T_right)
+    inverse = np.where(known[:, None, None], invert(safe), np.nan)
     yield _Candidate("inverted", "write the poses of the LiDAR in the world", at_scans(inverse))
     yield _Candidate(
         "as if their rotations were transposed",
@@ -385,13 +395,8 @@ def _clock(reference: Trajectory, stamps: NDArray[np.int64], hops: Hops) -> Iter
     if not np.isfinite(costs).any():
         return
 
-    def left(offset: float) -> float:
-        error = _mean(mismatch(shifted(offset, stamps), hops))
-        return 100.0 if np.isnan(error) else error
-
     rough = float(offsets[costs.argmin()])
-    bounds = (rough - step, rough + step)
-    best = float(minimize_scalar(left, bounds=bounds, method="bounded", options={"xatol": 1e-3}).x)
+    best = _shift(lambda offset: shifted(offset, stamps), hops, rough - step, rough + step)
     if abs(best) < SAME_CLOCK:
         return
     away = np.abs(offsets - rough) > max(1.0, 2.0 * float(np.median(seconds)))
@@ -401,6 +406,34 @@ def _clock(reference: Trajectory, stamps: NDArray[np.int64], hops: Hops) -> Iter
         also = offsets[others][costs[others].argmin()]
         mend += f" (ambiguous, turns repeat: {also:.1f} fits nearly as well)"
     yield _Candidate("like those of another clock", mend, shifted(best, stamps))
+
+
+def _shift(shifted: Callable[[float], Poses], hops: Hops, low: float, high: float) -> float:
+    """By how much the poses must be shifted in time to fit the measured motions best."""
+
+    def left(offset: float) -> float:
+        error = _mean(mismatch(shifted(offset), hops))
+        return 100.0 if np.isnan(error) else error
+
+    options = {"xatol": 1e-3}
+    return float(minimize_scalar(left, bounds=(low, high), method="bounded", options=options).x)
+
+
+def _moment(T_odom_sensor: Poses, hops: Hops) -> _Candidate:
+    """The poses as they are if they are not those at the stamps, but some scans later.
+
+    What moves during a scan that is not compensated looks as from the middle of the scan.
+    """
+    at = np.arange(len(T_odom_sensor), dtype=np.int64) * 10**9  # stamps that count scans
+    known = np.isfinite(T_odom_sensor).all(axis=(1, 2))
+
+    def shifted(scans: float) -> Poses:
+        return interpolate(at[known], T_odom_sensor[known], at - round(scans * 1e9), 10**9)
+
+    best = _shift(shifted, hops, -LAG, LAG)
+    what = f"like those of {abs(best):.2g} scans {'after' if best > 0 else 'before'} their stamps"
+    mend = "undo the motion within scans (`compensate`), or return each pose at its scan's stamp"
+    return _Candidate(what, mend, shifted(best))
 
 
 def _turned_moved(T: Poses) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -568,6 +601,8 @@ STANDING = 0.5
 """Metres below which a motion is noise."""
 ENOUGH = 10.0
 """Metres after which the rest of a stretch is not looked at."""
+MOTIONS = 12
+"""Motions after which no more are measured, an equal share of them in each stretch."""
 _AGREE = 0.3
 """Metres by which two ways of registering the same scans may differ."""
 
@@ -586,36 +621,36 @@ def measured_motions(scans: Iterable[Scan], n_scans: int) -> Hops:
     for begin in begins.tolist():
         stretch = list(islice(scans, begin - position, begin - position + SCANS))
         position = begin + SCANS
-        found += [(begin + i, begin + k, hop) for i, k, hop in _motions_over(stretch)]
+        some = islice(_motions_over(stretch), -(-MOTIONS // n_stretches))
+        found += [(begin + i, begin + k, hop) for i, k, hop in some]
     return Hops.of(found)
 
 
 def _motions_over(stretch: list[Scan]) -> Iterator[tuple[int, int, Hop]]:
     """Numbers of two scans of a stretch, and the registration of one to the other."""
-    T = np.full((len(stretch), 4, 4), np.nan)
-    clouds = []
+    T: list[Poses] = []
+    clouds: list[HopCloud] = []
+    start = 0
     for i, (scan, step, seconds) in enumerate(neighbour_motions(stretch)):
         if i and step is None:
             break
-        T[i] = np.eye(4) if step is None else T[i - 1] @ step
+        T.append(np.eye(4) if step is None else T[-1] @ step)
         clouds.append(HopCloud(scan, np.eye(4) if step is None else step, seconds if i else 0.0))
         if i == 1 and step is not None:
             clouds[0].moved(step, seconds)
-        if np.linalg.norm(T[i, :3, 3]) > ENOUGH:
+        while start < i:
+            guess = invert(T[start]) @ T[i]
+            metres = np.linalg.norm(guess[:3, 3])
+            if metres < METRES and i - start < SCANS // 2:
+                break
+            hop = register(clouds[start], clouds[i], [guess]) if metres >= STANDING else None
+            if hop is not None:
+                apart = hop.projection @ (hop.T_start_end - guess)[:3, 3]
+                if np.linalg.norm(apart) < _AGREE:
+                    yield start, i, hop
+            start += EACH
+        if np.linalg.norm(T[i][:3, 3]) > ENOUGH:
             break
-    for start in range(0, len(clouds) - 1, EACH):
-        guesses = invert(T[start]) @ T[start : min(start + SCANS // 2 + 1, len(clouds))]
-        metres = np.linalg.norm(guesses[:, :3, 3], axis=1)
-        away = int(np.argmax(metres >= METRES)) or len(metres) - 1
-        if metres[away] < METRES and away < SCANS // 2:
-            return  # the rest is too short
-        if metres[away] < STANDING:
-            continue
-        hop = register(clouds[start], clouds[start + away], [guesses[away]])
-        if hop is not None:
-            apart = hop.projection @ (hop.T_start_end - guesses[away])[:3, 3]
-            if np.linalg.norm(apart) < _AGREE:
-                yield start, start + away, hop
 
 
 # Which length of sub-trajectories to propose for a study, given how accurate its reference is.

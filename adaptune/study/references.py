@@ -201,5 +201,6 @@ def contradictions_of(
     config = sequences.config(name)
     if config.views or not error > SUSPICIOUS:
         return []
-    scans, given = sequences.open(name), sequences.estimate(name) is None
+    # Registrations undo the motion within the scans that they need.
+    scans, given = RecordedSequence(config), sequences.estimate(name) is None
     return list(contradictions(scans, T_odom_sensor, error, config.extrinsic, given, seen))

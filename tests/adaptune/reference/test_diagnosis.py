@@ -191,6 +191,8 @@ def test_what_the_place_does_not_show_contradicts_nothing():
         ),
         (turned, "other axes"),
         (carried, "lever arm"),
+        (lambda T: T[np.maximum(np.arange(len(T)) - 2, 0)], "2 scans before their stamps"),
+        (lambda _: poses(SCANS + 50_000_000), "0.5 scans after their stamps"),
     ],
 )
 def test_what_an_odometry_returns_instead_of_poses_is_named(spoil, what):
@@ -206,6 +208,14 @@ def test_an_odometry_that_is_lost_breaks_no_convention():
     lost[200:, :3, 3] += np.arange(len(lost) - 200)[:, None] * 0.2
     assert diagnose_odometry(lost, hops()) is None
     assert diagnose_odometry(np.full_like(lost, np.nan), hops()) is None
+
+
+def test_motions_that_a_cause_cannot_show_speak_neither_for_nor_against_it():
+    begins_late = poses(SCANS)
+    begins_late[:15] = begins_late[15]
+    some = Hops(*(array[:6] for array in hops()))
+    # Poses that are shifted to later scans do not reach the first motion, which is the worst.
+    assert diagnose_odometry(begins_late, some) is None
 
 
 class Recorded:
