@@ -150,6 +150,8 @@ def _rotate(scan: Scan, moments: NDArray[np.float64], rotations: Any) -> NDArray
 
 _LEAST_CORRELATION = 0.8
 """Of two rates of turning that show the same motion."""
+_NEARLY = 0.95
+"""Share of the best correlation with which another offset could be the right one."""
 
 
 def clock_offset(
@@ -157,7 +159,7 @@ def clock_offset(
     stamps: NDArray[np.int64],
     turning: NDArray[np.float64],
     rate: float = 50.0,
-) -> float | None:
+) -> list[float]:
     """Seconds to add to a trajectory's stamps so that it turns when a gyroscope or a LiDAR does.
 
     The rates of turning, which no choice of frames changes, are correlated at every offset at
@@ -174,11 +176,12 @@ def clock_offset(
 
     Returns
     -------
-    float or None
-        None if the two do not show the same motion.
+    list of float
+        The best one, and another if others fit nearly as well because turns repeat. Empty if the
+        two do not show the same motion.
     """
     if len(trajectory) < 3 or len(stamps) < 3:
-        return None
+        return []
     turned = geometry.rotation_angle(geometry.steps(trajectory.T_world_sensor))
     seconds = np.diff(trajectory.stamps) * 1e-9
     middles = (trajectory.stamps[:-1] - trajectory.stamps[0]) * 1e-9 + seconds / 2
@@ -187,13 +190,16 @@ def clock_offset(
     a = _sampled(middles, turned / seconds, rate, float(np.median(np.diff(other))))
     b = _sampled(other, turning, rate, float(np.median(seconds)))
     if min(len(a), len(b)) < 2 * rate:
-        return None
+        return []
     coefficients, lags = _correlation(a, b)
     best = int(np.argmax(coefficients))
-    if coefficients[best] < _LEAST_CORRELATION:
-        return None
+    others = np.where(np.abs(lags - lags[best]) > rate, coefficients, -1.0)
+    other = int(np.argmax(others))
     start = (stamps[0] - trajectory.stamps[0]) * 1e-9 - middles[0]
-    return float(start + lags[best] / rate)
+    least = max(_LEAST_CORRELATION, _NEARLY * float(coefficients[best]))
+    fit = [best] if coefficients[best] >= _LEAST_CORRELATION else []
+    fit += [other] if fit and others[other] >= least else []
+    return [float(start + lags[at] / rate) for at in fit]
 
 
 def _sampled(

@@ -481,11 +481,11 @@ class RecordedSequence:
                 return ""
             what = "scans show"
         found = compensation.clock_offset(trajectory, stamps, turning)
-        if found is None:
-            return ""
         # The stamps already include the offset that is set.
-        offset = self._config.clock_offset + found
-        return f" (the {what} the same motion with clock_offset: {offset:.3f})"
+        offsets = [f"{self._config.clock_offset + offset:.3f}" for offset in found]
+        also = f"; turns repeat: others, as {offsets[1]}, fit nearly as well" if offsets[1:] else ""
+        same = f" (the {what} the same motion with clock_offset: "
+        return f"{same}{offsets[0]}{also})" if offsets else ""
 
 
 @once
