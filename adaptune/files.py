@@ -211,19 +211,54 @@ def _count(node: Any, counted: dict[int, int]) -> int:
     return counted[id(node)]
 
 
+class _Foreign(yaml.SafeLoader):
+    """What ROS 1 reads: YAML 1.1, where 1e3 is a text; of a key that comes twice, the last counts.
+
+    Keys stay as they are written. `remarks` names what its author may not expect.
+    """
+
+    def __init__(self, text: str):
+        super().__init__(text)
+        self.remarks: list[str] = []
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
+        """Construct a mapping."""
+        seen: dict[str, int] = {}
+        for key, _ in node.value:
+            line = key.start_mark.line + 1
+            if (before := seen.get(str(key.value))) and key.value != "<<":
+                what = f"line {line}: {key.value} was given before, in line {before}"
+                self.remarks.append(f"{what}; the last one counts, as for ROS")
+            seen[str(key.value)] = line
+        self.flatten_mapping(node)
+        return {str(key.value): self.construct_object(value, deep) for key, value in node.value}
+
+    def text(self, node: Any) -> str:
+        """Construct a text."""
+        text: str = self.construct_scalar(node)
+        if not node.style and _FLOAT.match(text):
+            line, number = node.start_mark.line + 1, dump([float(text)]).removeprefix("- ").strip()
+            self.remarks.append(f"line {line}: {text} is a text for ROS 1; for a number, {number}")
+        return text
+
+
+_Foreign.add_constructor(_PREFIX + "str", _Foreign.text)
+
+
 class Document:
     """A YAML text as plain data (`data`), and where in the text each part of it stands.
 
     A YamlError names the line that is wrong.
     """
 
-    def __init__(self, text: str):
+    def __init__(self, text: str, foreign: bool = False):
         try:
-            loader = _Loader(text)
+            loader = _Foreign(text) if foreign else _Loader(text)
             self._node = loader.get_single_node()
             if self._node is not None and _count(self._node, {}) > _MOST:
                 raise YamlError(f"holds more than {_MOST:,} values, or an alias of itself")
             self.data = None if self._node is None else loader.construct_document(self._node)
+            self.remarks = loader.remarks if isinstance(loader, _Foreign) else []
         except yaml.MarkedYAMLError as error:
             mark = error.problem_mark or error.context_mark
             where = f"line {mark.line + 1}: " if mark else ""
@@ -273,8 +308,8 @@ class Document:
                 entries = [(value, value) for value in node.value[part : part + 1]]
             if not entries:
                 break
-            found.append(entries[0])
-            node = entries[0][1]
+            found.append(entries[-1])
+            node = entries[-1][1]
         return found
 
     def where(self, file: Path, path: Sequence[str | int]) -> str:

@@ -3,6 +3,7 @@
 import fcntl
 import glob
 import json
+import logging
 import os
 import re
 import shutil
@@ -11,13 +12,13 @@ import time
 import tomllib
 from abc import abstractmethod
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, Self
 
 import numpy as np
 import tomli_w
-import yaml as pyyaml
 from numpy.typing import NDArray
 from pydantic import AfterValidator
 
@@ -43,9 +44,11 @@ from adaptune.ros.link import LinkError
 from adaptune.space import ParameterSet, Selection
 from adaptune.trajectory import Trajectory, TrajectoryError, read_kitti, read_tum
 
+_log = logging.getLogger(__name__)
+
 # Parameter files made from a template: YAML, JSON, TOML, and the layouts of ROS 1 and ROS 2.
 
-_YAML = (lambda text: files.Document(text).data, files.dump)
+_YAML = (lambda text: files.Document(text, foreign=True).data, files.dump)
 _FORMATS: dict[str, tuple[Callable[[str], Any], Callable[[Any], str]]] = {
     ".yaml": _YAML,
     ".yml": _YAML,
@@ -82,6 +85,8 @@ class Template:
             raise OdometryError(f"{path}: there is no such file") from error
         except (OSError, ValueError, files.YamlError) as error:
             raise OdometryError(f"{path}: {error}") from error
+        yaml = self._write is files.dump
+        self.remarks = files.Document(self._text, foreign=True).remarks if yaml else []
         held = isinstance(self._data, dict | list)
         self._places = list(_places(self._data)) if held else []
 
@@ -106,21 +111,22 @@ class Template:
         """The file's text with new values; parameters that are not in it are ignored.
 
         A real number stays one where the new value is whole. All else in a YAML file stays as it
-        is, because its readers differ in what they take for a number or a truth value. Only
-        numbers such as ``1e3``, which ROS 1 takes for a text, are written as 1000.0.
+        is, byte for byte. An `OdometryError` names a value that cannot be replaced alone.
         """
         changed = []
         for name, value in parameters.items():
             if (place := self._find(name)) is not None:
                 _, held_in, key, _ = place
                 # ROS 1 and other readers tell 20 from 20.0.
-                real = isinstance(held_in[key], float) and type(value) is int
-                held_in[key] = float(value) if real else value
+                real = isinstance(held_in[key], float) or _EXPONENT.fullmatch(str(held_in[key]))
+                held_in[key] = float(value) if real and type(value) is int else value
                 changed.append(place)
-        written = self._write(self._data)
-        if self.path.suffix in (".yaml", ".yml"):
-            return _replaced(self._text, self._places, changed, self._data) or written
-        return written
+        if self._write is not files.dump:
+            return self._write(self._data)
+        try:
+            return _replaced(self._text, changed, self._data)
+        except files.YamlError as error:
+            raise OdometryError(f"{self.path}: {error}") from error
 
     def _find(self, name: str) -> _Place | None:
         wanted = _parts(name)
@@ -148,33 +154,33 @@ def _places(data: Any, path: tuple[str, ...] = (), keys: tuple[Any, ...] = ()) -
             yield below, data, key, (*keys, key)
 
 
-def _replaced(
-    text: str, places: Iterable[_Place], changed: Iterable[_Place], data: Any
-) -> str | None:
-    """A YAML text with the new values in their places; None where that is not possible."""
-    document = files.Document(text)
-    names = {keys for *_, keys in changed}
-    spans = []
-    for _, held_in, key, keys in places:
-        span, value = document.span(keys), held_in[key]
-        if span is None:
-            continue
-        if keys in names or (isinstance(value, float) and not _is_number(text[slice(*span)])):
-            spans.append((*span, files.dump([value]).removeprefix("- ").strip()))
+_EXPONENT = re.compile(r"[-+]?[.\d]+[eE][-+]?\d+")
+
+
+def _replaced(text: str, changed: Iterable[_Place], data: Any) -> str:
+    """A YAML text with the new values in their places; a YamlError where that is not possible."""
+    document, spans, lines = files.Document(text, foreign=True), [], []
+    for _, held_in, key, keys in changed:
+        new = files.dump([held_in[key]]).removeprefix("- ").strip()
+        lines.append(document.line(keys))
+        begin, end = document.span(keys) or (0, 0)
+        spans.append((begin, end, new if begin < end else f" {new}"))
     for begin, end, new in sorted(spans, reverse=True):
         text = text[:begin] + new + text[end:]
-    try:
-        return text if files.Document(text).data == data else None
-    except files.YamlError:
-        return None
+    with suppress(files.YamlError):
+        # Where nan is nan.
+        if repr(files.Document(text, foreign=True).data) == repr(data):
+            return text
+    where = ", ".join(str(line) for line in lines)
+    raise files.YamlError(
+        f"a parameter cannot be replaced alone (line {where}); write its value without anchors, "
+        f"aliases and tags"
+    )
 
 
-def _is_number(text: str) -> bool:
-    """Whether readers of YAML 1.1, as ROS 1, take a text for a number."""
-    try:
-        return isinstance(pyyaml.safe_load(text), int | float)
-    except pyyaml.YAMLError:
-        return False
+@cache
+def _remark(path: Path, remark: str) -> None:
+    _log.warning("%s, %s", path, remark)
 
 
 _PLACEHOLDER = re.compile(r"\{([\w./-]+)\}")
@@ -199,6 +205,9 @@ def check_names(
     parameters: ParameterSet, template: Template | None, command: Collection[str]
 ) -> None:
     """Raise an `OdometryError` if a parameter is neither in the template nor in the arguments."""
+    if template is not None:
+        for remark in template.remarks:
+            _remark(template.path, remark)
     inside = {name for argument in command for name in placeholders(argument)}
     for name in parameters:
         if name in inside or (template is not None and template.path_of(name)):

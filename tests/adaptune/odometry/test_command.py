@@ -358,5 +358,5 @@ def test_what_is_not_tuned_stays_as_it_is(tmp_path):
     )
     text = Template(path).fill({"b/c": 1e-05, "b/d/1": 3, "g": 4})
     assert text == (
-        "# for the robot\na: yes\nb: {c: 1.0e-05, d: [1, 3.0]}  # near\ne: 010\nf: 1000.0\ng: 4.0\n"
+        "# for the robot\na: yes\nb: {c: 1.0e-05, d: [1, 3.0]}  # near\ne: 010\nf: 1e3\ng: 4.0\n"
     )

@@ -9,9 +9,10 @@ import turns
 import yaml
 from needs import lacking, needs_evalio
 
+from adaptune.errors import OdometryError
 from adaptune.odometry import evalio
 from adaptune.odometry.kiss_icp import Kiss
-from adaptune.odometry.program import Template
+from adaptune.odometry.program import Template, check_names
 from adaptune.odometry.registry import OdometryFactory, is_user_class, odometry_class
 from adaptune.odometry.remote import Limits, Process
 from adaptune.space import ParameterSpace
@@ -116,8 +117,7 @@ def test_a_template_keeps_all_else(tmp_path, name, settings, use):
     (tmp_path / "slam.yaml").write_text(TEMPLATE)
     given = settings | {"template": str(tmp_path / "slam.yaml")}
     own = own_file(name, given, space, **dict.fromkeys(space.names, 0.25))
-    # ROS takes 1e3 for a text.
-    assert own.text == TEMPLATE.replace("1.0", "0.25").replace("1e3", "1000.0")
+    assert own.text == TEMPLATE.replace("1.0", "0.25")
     assert own.suffix == ".yaml"
     assert own.use == (f"slam {{input}} FILE {use}" if name == "command" else use)
 
@@ -132,6 +132,55 @@ def test_odometries_without_a_tool_of_their_own():
     object.__setattr__(factory, "name", "theirs.odometry:Mine")
     assert is_user_class(factory.name)
     assert factory.own_file({}) is None
+
+
+PUBLISHED = b"""# Faster-LIO, Velodyne 32 \xc2\xb0\r
+common:\r
+    lid_topic:  "/points_raw"   # two spaces\r
+    time_sync_en: off\r
+preprocess: {lidar_type: 2, time_scale: 1e3, scan_rate: 010}\r
+mapping:\r
+    acc_cov: 0.1\r
+    gyr_cov: 1e-2\r
+    det_range:    100.0\r
+    extrinsic_T: [ 0, 0, 0.28 ]\r
+    filter_size_surf: 0.5\r
+    stamp: 12:30\r
+    empty:\r
+    filter_size_surf: 0.4 # last\r
+point_filter_num: 4\r
+"""
+
+
+def test_a_published_parameter_file_is_read_as_ros_reads_it(tmp_path, caplog):
+    path = tmp_path / "params.yaml"
+    path.write_bytes(PUBLISHED)
+    template, held = Template(path), yaml.safe_load(PUBLISHED)
+    for name in template.names:
+        value = held
+        for key in template.path_of(name):
+            value = value[int(key) if isinstance(value, list) else key]
+        assert template.value(name) == value
+    space = ParameterSpace.load({"filter_size_surf": FLOAT, "gyr_cov": FLOAT, "empty": FLOAT})
+    for _ in range(2):  # a remark is made once
+        check_names(space.baseline, template, ())
+    assert caplog.messages == [
+        f"{path}, line 5: 1e3 is a text for ROS 1; for a number, 1000.0",
+        f"{path}, line 14: filter_size_surf was given before, in line 11; the last one counts, as "
+        f"for ROS",
+        f"{path}, line 8: 1e-2 is a text for ROS 1; for a number, 0.01",
+    ]
+    text = template.fill({"filter_size_surf": 0.25, "gyr_cov": 1, "empty": 7.0})
+    expected = PUBLISHED.replace(b"0.4 #", b"0.25 #").replace(b"1e-2", b"1.0")
+    assert text.encode() == expected.replace(b"empty:", b"empty: 7.0")
+
+
+@pytest.mark.parametrize("text", ["c: 2\na: &x 1.0\nb: *x\n", "c: &x 2.0\na: *x\n"])
+def test_a_value_that_others_share_is_not_replaced(tmp_path, text):
+    path = tmp_path / "shared.yaml"
+    path.write_text(text)
+    with pytest.raises(OdometryError, match=r"shared.yaml: .* \(line 2\); write its value without"):
+        Template(path).fill({"a": 3.0})
 
 
 def test_ends_of_lines_stay(tmp_path):
