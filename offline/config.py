@@ -624,8 +624,9 @@ def load_study(
     overrides: Sequence[str] = (),
     folder: Path | None = None,
     runs: Path = Path("runs"),
+    needed: bool = True,
 ) -> OfflineStudy:
     """Read and check the whole YAML of a study, see `adaptune.study.loading.read_study`."""
     from adaptune.study.loading import read_study  # which opens recordings
 
-    return read_study(Path(path), OfflineStudyConfig, overrides, folder, runs)
+    return read_study(Path(path), OfflineStudyConfig, overrides, folder, runs, needed)

@@ -46,17 +46,19 @@ def simulate(
     """
     loaded = load(study, override, folder)
     from adaptune.simulation.record import record
+    from adaptune.study.study import StudySequences
 
     if not loaded.config.courses:
         help_ = "add one, as in courses: {demo: {scenes: [cave]}}"
         raise AdaptuneError(f"{study}: courses: there is none to simulate; {help_}")
     loaded.open()
+    # Without what the odometry says of them: it may not be installed.
+    sequences = StudySequences({}, loaded.config.courses, {}, loaded.folder)
     with progress() as show:
         courses = {name: c for name, c in loaded.config.courses.items() if c.of is None}
-        due = [n for n in courses if overwrite or not loaded.sequences.recording(n).exists()]
+        due = [n for n in courses if overwrite or not sequences.recording(n).exists()]
         for name in due:
-            path = loaded.sequences.recording(name)
-            record(courses[name], path, overwrite=overwrite, progress=show)
+            record(courses[name], sequences.recording(name), overwrite=overwrite, progress=show)
     say(f"Recorded {len(due)} of {len(courses)} courses: {loaded.folder / 'recordings'}/")
     say_next_of_study("run trials, fit the error model", "offline")
 
@@ -74,7 +76,7 @@ def offline(
     The table shows the *baseline* (the odometry's own parameters), the *fixed* set (the best over
     all sequences), and each sequence's best. Stop it with Ctrl-C, and run it again to resume.
     """
-    loaded = load(study, override, folder)
+    loaded = load(study, override, folder, runs=True)
     from adaptune.study.study import driven
     from offline.train import train
 

@@ -112,7 +112,7 @@ def online(
     for words, is_wrong in wrong.items():
         if is_wrong:
             raise AdaptuneError(words)
-    loaded = load(study, override, folder)
+    loaded = load(study, override, folder, runs=True)
     if robot:
         _drive(loaded, mode, model, untrained=untrained, ros2=ros2)
         return

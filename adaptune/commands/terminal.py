@@ -329,10 +329,12 @@ Cluster = Annotated[
 ]
 
 
-def load(path: Path, overrides: list[str], folder: Path | None) -> "OfflineStudy":
+def load(
+    path: Path, overrides: list[str], folder: Path | None, *, runs: bool = False
+) -> "OfflineStudy":
     """Load the study of a YAML file, or of the folder of a study that has begun.
 
-    `say_next_of_study` names it then.
+    `say_next_of_study` names it then. Only a command that `runs` the odometry needs it installed.
     """
     from offline.config import load_study
 
@@ -345,4 +347,4 @@ def load(path: Path, overrides: list[str], folder: Path | None) -> "OfflineStudy
         if not (path / "study.yaml").exists():
             raise AdaptuneError(f"{path}: is no study's folder: there is no study.yaml in it")
         path, folder = path / "study.yaml", folder or path
-    return load_study(path, overrides, folder)
+    return load_study(path, overrides, folder, needed=runs)

@@ -250,7 +250,7 @@ def tune(
         overrides = [f"offline.{key}={value}" for key, value in limits.items()]
     from offline.train import train
 
-    loaded = load(path, overrides, folder)
+    loaded = load(path, overrides, folder, runs=True)
     say(f"Study: {path}")
     with progress() as show:
         training = train(loaded, show)

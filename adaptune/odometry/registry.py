@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from pydantic import BaseModel, ConfigDict, RootModel
 
 from adaptune import processes, strict
-from adaptune.errors import OdometryError
+from adaptune.errors import NotInstalledError, OdometryError
 from adaptune.odometry.base import Description, InProcess, Odometry, OdometryInstance, OwnFile
 from adaptune.odometry.remote import SERVICE, Guarded, Isolated, Limits
 from adaptune.space import ParameterSet, ParameterSpace, PooledSpace
@@ -86,6 +86,10 @@ def odometry_class(name: str) -> type[Any]:
     try:
         found = strict.load(name, where(name), "class")
     except strict.PluginError as error:
+        if name in ODOMETRIES and isinstance(error.__cause__, ImportError):
+            what = f"{name} cannot be imported ({error.__cause__})"
+            help_ = f"run `pip install {PACKAGES.get(name, name)}`"
+            raise NotInstalledError(f"{what}; {help_}") from error
         raise OdometryError(str(error)) from error
     if name in PROGRAMS:
         return found  # type: ignore[no-any-return]

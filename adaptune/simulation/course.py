@@ -222,6 +222,8 @@ class Course(StrictModel):
     columns: int | None = Field(default=None, ge=16, le=8192)
     # Hz of the inertial measurements; none are made if not given.
     imu: Literal[200, 400] | None = None
+    # Seconds at rest before it drives off, as a LiDAR-inertial odometry needs them to begin.
+    stand: float = Field(default=0.0, ge=0.0, le=600.0)
     moving_objects: bool = False  # whether cars and walkers move about
     weather: Annotated[str, _known("weather", WEATHERS)] = "clear"
     # How motion within a scan is undone, as for a recorded sequence.

@@ -72,7 +72,7 @@ class Drive:
     def __init__(self, course: Course) -> None:
         self.course = course
         self.road = Road([(SCENES[name], length) for name, length in course.legs], course.seed)
-        self.ride = Ride(self.road, MOTIONS[course.motion], course.seed)
+        self.ride = Ride(self.road, MOTIONS[course.motion], course.seed, course.stand)
 
     def __len__(self) -> int:
         """Whole scans in the drive."""

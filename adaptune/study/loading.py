@@ -37,7 +37,7 @@ _KINDS: dict[str, type[Float | Integer | Categorical]] = {
 }
 
 
-def check_odometries(data: Any, mistakes: list[Mistake], folder: Path) -> None:
+def check_odometries(data: Any, mistakes: list[Mistake], folder: Path, needed: bool = True) -> None:
     """Check each odometry by itself; make paths in its settings absolute.
 
     Parameters
@@ -48,11 +48,13 @@ def check_odometries(data: Any, mistakes: list[Mistake], folder: Path) -> None:
         Receives what is wrong.
     folder
         Where relative paths begin.
+    needed
+        Whether they must be there: installed, and their images on this machine.
     """
     for key, one in _entries(data).items():
         given = {"name": one} if isinstance(one, str) else one
         if isinstance(given, dict):
-            _check_odometry(given, key, mistakes, folder)
+            _check_odometry(given, key, mistakes, folder, needed)
 
 
 def _entries(given: Any) -> dict[Key, Any]:
@@ -129,7 +131,9 @@ def _meet(one: Any, other: Any) -> bool:
     return bool(one.low <= other.high and other.low <= one.high)
 
 
-def _check_odometry(data: dict[str, Any], at: Key, mistakes: list[Mistake], folder: Path) -> None:
+def _check_odometry(
+    data: dict[str, Any], at: Key, mistakes: list[Mistake], folder: Path, needed: bool
+) -> None:
     """Check all that depends on the odometry; make paths in its settings absolute."""
     name, settings = data.get("name"), data.get("settings") or {}
     if not isinstance(name, str) or not isinstance(settings, dict):
@@ -149,12 +153,11 @@ def _check_odometry(data: dict[str, Any], at: Key, mistakes: list[Mistake], fold
         found = _check_parameters(name, described.space, tuned)
         mistakes += (mistake.below((*at, "parameters")) for mistake in found)
         check = getattr(odometry_class(name), "check", None) if name in PROGRAMS else None
-        if check is not None and isinstance(tuned, dict):
+        if check is not None and isinstance(tuned, dict) and needed:
             check(declared.settings, dict.fromkeys(tuned, 0))
-    except NotInstalledError as error:
-        mistakes.append(Mistake((*at, "name"), str(error)))
     except OdometryError as error:
-        mistakes.append(Mistake((*at, at_fault), str(error)))
+        key = "name" if isinstance(error, NotInstalledError) else at_fault
+        mistakes += [Mistake((*at, key), str(error))] * needed
 
 
 def _check_parameters(name: str, space: ParameterSpace | None, tuned: Any) -> list[Mistake]:
@@ -313,6 +316,7 @@ def read_study(
     overrides: Sequence[str] = (),
     folder: Path | None = None,
     runs: Path = Path("runs"),
+    needed: bool = True,
 ) -> Study[C]:
     """Read and check the YAML of a study.
 
@@ -328,6 +332,8 @@ def read_study(
         The study's folder; by default the YAML's name under `runs`.
     runs
         Folder of all studies.
+    needed
+        Whether the odometry must be there to run.
 
     Raises
     ------
@@ -340,7 +346,7 @@ def read_study(
     document = _read(path)
     data: Any = document.data
     overridden = [_override(data, text) for text in overrides]
-    config, mistakes = _check(config_type, data, path.parent.resolve())
+    config, mistakes = _check(config_type, data, path.parent.resolve(), needed)
     if mistakes or config is None:
         mistakes.sort(key=lambda mistake: document.line(mistake.key) or 0)
         said = dict.fromkeys(_say(_deleted(m, data), path, document, overridden) for m in mistakes)
@@ -400,7 +406,7 @@ def _say(mistake: Mistake, path: Path, document: files.Document, overridden: Seq
 
 
 def _check(
-    config_type: type[C], data: dict[str, Any], folder: Path
+    config_type: type[C], data: dict[str, Any], folder: Path, needed: bool
 ) -> tuple[C | None, list[Mistake]]:
     """Validate a study's data, and find the mistakes that the models cannot find.
 
@@ -411,15 +417,15 @@ def _check(
     mistakes : list of Mistake
     """
     mistakes: list[Mistake] = []
-    check_odometries(data.get("odometry"), mistakes, folder)
+    check_odometries(data.get("odometry"), mistakes, folder, needed)
     origins, in_roles = settle_roles(data)
     mistakes += in_roles
     context = {"folder": folder}
     config = validated(config_type, data, (), mistakes, context)
     sound = all(mistake.key[:1] != ("odometry",) for mistake in mistakes)
     if config is None:
-        needed = {"odometry": {"name": ""}, "training": [""]}
-        config = validated_rest(config_type, data, needed, mistakes, context)
+        least = {"odometry": {"name": ""}, "training": [""]}
+        config = validated_rest(config_type, data, least, mistakes, context)
     if config is not None:
         space = None
         if sound:

@@ -17,7 +17,7 @@ from typing_extensions import TypeVar
 
 from adaptune import files, manifest
 from adaptune.archive import Archive, Sources
-from adaptune.errors import AdaptuneError
+from adaptune.errors import AdaptuneError, OdometryError
 from adaptune.files import write_text
 from adaptune.manifest import merged
 from adaptune.model import ErrorModel
@@ -177,7 +177,10 @@ class StudySequences:
         course = self.courses.get(origin(name))
         others = {*_PATHS, *_AS_ESTIMATED, "cache"}
         config = self.config(name).model_dump(mode="json", exclude=others)
-        config |= {} if course is None else course.model_dump(mode="json")
+        # A course that never stands is what it was before courses could.
+        standing = course is not None and course.stand
+        of_course = {} if course is None else course.model_dump(mode="json")
+        config |= {key: value for key, value in of_course.items() if key != "stand" or standing}
         recording = fingerprints(self.files(name).recording)
         return {self._kind(name): {name: config}, "recording": {name: recording}}
 
@@ -429,7 +432,8 @@ class Study(Generic[C_co]):
                     f"another folder (--folder)"
                 ) from error
             _locks[str(folder)] = lock
-        write_text(folder / CONFIGURATION, files.dump(self._resolved()))
+        with contextlib.suppress(OdometryError):  # one that is not here, and not needed now
+            write_text(folder / CONFIGURATION, files.dump(self._resolved()))
 
     def _resolved(self) -> dict[str, Any]:
         """The configuration with nothing left to defaults."""

@@ -20,7 +20,7 @@ from typing import Any, BinaryIO, Literal, NamedTuple
 from pydantic import Field
 
 from adaptune import files, processes
-from adaptune.errors import OdometryError, UnavailableError
+from adaptune.errors import NotInstalledError, OdometryError, UnavailableError
 from adaptune.files import replacing_folder, temporary_prefix
 from adaptune.keeper import Ended
 from adaptune.odometry.base import BaseSettings
@@ -148,8 +148,11 @@ def image_digest(name: str) -> str:
 
 
 def _image(name: str) -> Any:
-    from docker.errors import APIError, ImageNotFound
-
+    try:
+        from docker.errors import APIError, ImageNotFound
+    except ImportError as error:
+        what = f"docker cannot be imported ({error}); run `pip install docker`"
+        raise NotInstalledError(what) from error
     with _telling(name):
         try:
             return engine().api.inspect_image(name)

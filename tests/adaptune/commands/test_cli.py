@@ -226,3 +226,42 @@ def test_studies_are_compared_side_by_side_by_their_folders(finished, tmp_path):
     assert ended.exit_code == 2
     ended = call("compare", tmp_path)
     assert "is no study's folder" in ended.output
+
+
+COURSE = """
+courses: {c: {scenes: [corridor], length: 10, sensor: vlp16, columns: 16}}
+training: [c]
+sub_trajectory: 5
+"""
+IMAGE = """
+odometry:
+  name: NAME
+  settings: {image: nowhere/slam, SETTINGS}
+  parameters: {a: {type: float, low: 0.1, high: 1.0, baseline: 0.5}}
+"""
+
+
+@pytest.mark.parametrize(
+    ("odometry", "lacking"),
+    [
+        (IMAGE.replace("NAME", "rustle"), "docker"),
+        (IMAGE.replace("NAME", "docker_process"), "docker"),
+        ("odometry: kiss_icp\n", "kiss_icp"),
+    ],
+)
+def test_only_what_runs_an_odometry_needs_it(adaptune, tmp_path, monkeypatch, odometry, lacking):
+    for name in [name for name in sys.modules if name.partition(".")[0] == lacking]:
+        monkeypatch.setitem(sys.modules, name, None)
+    monkeypatch.setitem(sys.modules, lacking, None)
+    monkeypatch.setitem(sys.modules, f"{lacking}.errors", None)
+    monkeypatch.delitem(sys.modules, "adaptune.odometry.kiss_icp", raising=False)
+    (tmp_path / "p.yaml").write_text("a: 0.5\n")
+    study = tmp_path / "lean.yaml"
+    settings = "template: p.yaml, odometry: /odom" if "rustle" in odometry else "command: [slam]"
+    study.write_text(odometry.replace("SETTINGS", settings) + COURSE)
+    assert "Recorded 1 of 1 courses" in adaptune("simulate", study).stdout
+    unfinished = adaptune("trials", study)
+    assert "no trial is finished yet" in unfinished.stderr
+    told = " ".join(adaptune("offline", study).stderr.split())
+    assert f"{lacking} cannot be imported" in told
+    assert "run `pip install" in told
