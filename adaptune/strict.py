@@ -344,5 +344,8 @@ def load(name: str, path: str, sort: str) -> Any:
     except ImportError as error:
         help_ = "install it, or name its folder in PYTHONPATH"
         raise PluginError(f"{name}: cannot import {module} ({error}); {help_}") from error
+    except ValidationError as error:
+        what = f"{error.title}: {in_one_line(error)}"
+        raise PluginError(f"{name}: cannot import {module} ({what})") from error
     except AttributeError as error:
         raise PluginError(f"{name}: {module} has no {attribute or sort}") from error

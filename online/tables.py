@@ -333,7 +333,9 @@ def _where(rows: Sequence[ComparisonRow]) -> str:
 
 def _interval(ratio: Ratio) -> str:
     ends = ratio.interval
-    return "no interval" if ends is None else f"95 % interval {_end(ends[0])} to {_end(ends[1])}"
+    if ends is None:
+        return "no interval: the test is too short"
+    return f"95 % interval {_end(ends[0])} to {_end(ends[1])}"
 
 
 def _end(ratio: float) -> str:

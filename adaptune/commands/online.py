@@ -225,7 +225,7 @@ def _compare_one(study: Path, override: list[str], folder: Path | None, *, detai
         say_next_of_study("look for better sets", "offline")
     elif found.unfinished:
         say_next_of_study("replay what is missing", "online")
-    elif (n := len(loaded.config.training)) < MIN_RECORDINGS:
+    elif loaded.rules and (n := len(loaded.config.training)) < MIN_RECORDINGS:
         first = f"name {MIN_RECORDINGS} training recordings or more, the study has {n}; then "
         say_next_of_study("find out what adapting gains elsewhere", "offline", first)
     else:

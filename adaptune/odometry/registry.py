@@ -1,10 +1,11 @@
 """The odometries by name, imported when they are asked for."""
 
+import inspect
 import json
 import os
 import shutil
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, partial
 from importlib import metadata
@@ -97,7 +98,29 @@ def odometry_class(name: str) -> type[Any]:
         raise OdometryError(f"{name}: is not a class derived from adaptune.odometry.Odometry")
     if lacking := [key for key in ("space", "live") if not hasattr(found, key)]:
         raise OdometryError(f"{name}: the class has no attribute {' and no '.join(lacking)}")
+    for fault in _faults(found):
+        raise OdometryError(f"{name}: {fault}")
     return found
+
+
+def _faults(found: type[Odometry]) -> Iterator[str]:
+    """What keeps a class from being made, in the words of its author."""
+    space: Any = found.space
+    if not isinstance(space, ParameterSpace):
+        like = 'ParameterSpace({"x": Float(low=0.1, high=2.0, baseline=0.5)})'
+        yield f"its `space` is a {type(space).__name__}; write it as space = {like}"
+    settings: Any = found.settings_type
+    if not (isinstance(settings, type) and issubclass(settings, BaseModel)):
+        yield f"its `settings_type` is {settings!r}, and not derived from BaseSettings"
+    if lacking := sorted(found.__abstractmethods__):
+        yield f"the class lacks the method{'s' * (len(lacking) > 1)} {' and '.join(lacking)}"
+    try:
+        inspect.signature(found).bind(None, None)
+    except TypeError:
+        yield (
+            f"its __init__ takes {inspect.signature(found)}; write __init__(self, parameters=None, "
+            f"settings=None), and pass both on to super().__init__"
+        )
 
 
 def make_here(name: str, parameters: ParameterSet, settings: Any) -> tuple[Any, Description]:

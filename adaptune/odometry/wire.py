@@ -133,7 +133,9 @@ def unpacked(found: Any) -> Registration:
     try:
         return Registration(*found)
     except TypeError as error:
-        raise TypeError(f"register returned {found!r:.100}, not a Registration") from error
+        is_array = isinstance(found, np.ndarray)
+        what = f"an array of shape {found.shape}" if is_array else f"{found!r:.60}"
+        raise TypeError(f"register returned {what}, not a Registration(pose)") from error
 
 
 def answered(odometry: Any, message: Message, prepared: Any = None) -> dict[str, Any]:

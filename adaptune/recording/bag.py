@@ -1,6 +1,7 @@
 """Recordings in ROS 1 and ROS 2 bags."""
 
 import logging
+import re
 import struct
 from collections import Counter, defaultdict, deque
 from collections.abc import (
@@ -345,6 +346,9 @@ class BagSource:
             reader.open()
         except Exception as error:
             # The readers raise what their formats and decompressors raise.
+            if re.search("File magic is|not a database", str(error)):
+                what = "is no bag, whatever its name says; give the recording itself"
+                raise SequenceError(f"{self.name}: {what}") from error
             raise SequenceError(
                 f"{self.name}: cannot be opened as a bag ({_say(error)}); if the recording was cut "
                 f"short, repair it first (`rosbag reindex`, `ros2 bag reindex` or `mcap recover`)"

@@ -158,7 +158,7 @@ def scan_folder(folder: Path, timing: Timing = AUTO) -> FileSource:
         if files := sorted(folder.glob(f"*{suffix}"), key=_natural):
             break
     else:
-        raise SequenceError(f"{folder}: holds no scan ({', '.join(SUFFIXES)})")
+        raise SequenceError(f"{folder}: holds no scan ({', '.join(SUFFIXES)}) and no bag")
     times = folder / "times.txt"
     if not times.exists():
         return FileSource(str(folder), files, _named_stamps(files, timing.period), timing)

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 
 import commands
 import drives
@@ -15,7 +16,7 @@ from commands import call
 from typer.testing import CliRunner
 
 from adaptune.archive import Archive
-from adaptune.commands import terminal
+from adaptune.commands import online, terminal
 from adaptune.commands.cli import app
 from adaptune.reference.check import proposed_sub_trajectory
 from adaptune.trajectory import Trajectory
@@ -226,6 +227,20 @@ def test_studies_are_compared_side_by_side_by_their_folders(finished, tmp_path):
     assert ended.exit_code == 2
     ended = call("compare", tmp_path)
     assert "is no study's folder" in ended.output
+
+
+@pytest.mark.parametrize(("rules", "next_one"), [(("paired",), "offline"), ((), "record")])
+def test_recordings_are_asked_for_only_where_something_adapts(
+    adaptune, monkeypatch, rules, next_one
+):
+    study = SimpleNamespace(rules=rules, config=SimpleNamespace(training=("one",)))
+    found = SimpleNamespace(rows=[SimpleNamespace(yardstick="fixed")], unfinished=False)
+    named = []
+    monkeypatch.setattr(online, "load", lambda *_: study)
+    monkeypatch.setattr(online, "compared", lambda *_, **__: found)
+    monkeypatch.setattr(online, "say_next_of_study", lambda _, command, *__: named.append(command))
+    adaptune("compare", "study.yaml")
+    assert named == [next_one]
 
 
 COURSE = """

@@ -1,6 +1,7 @@
 """Tuning from recordings alone, with no study file."""
 
 import shutil
+from types import SimpleNamespace
 
 import commands
 import drives
@@ -13,6 +14,7 @@ from adaptune.commands.cli import app
 from adaptune.simulation import Course
 from adaptune.simulation.record import record
 from offline.config import load_study
+from offline.train import COST
 
 FAKE = ("--odometry", "fake_odometry:Fake")
 
@@ -36,7 +38,7 @@ def bag(study_file, tmp_path, monkeypatch):
 def decided(monkeypatch):
     """Only decide; nothing is run."""
 
-    def stop(path, overrides, _):
+    def stop(path, overrides, _, *, runs):  # noqa: ARG001
         raise tune.AdaptuneError(f"{path} {' '.join(overrides)}".strip())
 
     monkeypatch.setattr(tune, "load", stop)
@@ -85,6 +87,11 @@ def test_what_the_user_changed_stays(bag, tmp_path):
         "one.yaml offline.trials=9 offline.hours=0.05"
     )
     assert "lost_track: 2.0" in path.read_text()
+    # What other commands read agrees with it.
+    assert "\noffline: {trials: 9, hours: 0.05}    # parameter sets" in path.read_text()
+    path.write_text(path.read_text().replace("{trials: 9, hours: 0.05}", "\n  trials: 5"))
+    assert failed(bag, "--trials", 7).endswith("one.yaml offline.trials=7")
+    assert "\n  trials: 5" in path.read_text()
     said = failed(bag, "--reference", "estimated")
     assert "runs/one/one.yaml: was made by another command, see its first line" in said
 
@@ -102,6 +109,22 @@ def test_the_last_of_several_bags_is_the_test(bag, study_file, tmp_path):
     shutil.copy(bag, tmp_path / "other/copy.bag")
     said = failed(bag, "other/copy.bag", "--folder", "twice")
     assert said.startswith("error: test.0: 'copy' is the recording of the training sequence 'one'")
+
+
+def test_of_several_odometries_the_replayed_one_is_named(monkeypatch):
+    said = []
+    monkeypatch.setattr(tune, "say", said.append)
+    monkeypatch.setattr(tune, "show_table", lambda *_: None)
+    study = SimpleNamespace(config=SimpleNamespace(odometries={"gicp": 0, "ndt": 0}))
+    trials = [
+        {"odometry": name, "mean": mean, COST: 1.0} for name, mean in (("gicp", 2), ("ndt", 1))
+    ]
+    model = SimpleNamespace(fixed=7, sets={7: {"odometry": "gicp"}})
+    tune.say_odometries(study, SimpleNamespace(trials=trials, model=model))
+    assert said == [
+        "Best odometry in training: ndt. On the test, the fixed set is gicp's, the baseline "
+        "gicp's; to see another there, name it alone (--odometry)."
+    ]
 
 
 @pytest.mark.usefixtures("decided")

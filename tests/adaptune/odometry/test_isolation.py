@@ -40,7 +40,7 @@ HERE = {
     "exit": "SystemExit|ended with code 0: about to go wrong|ended",
     "hang": r"a scan took longer than isolation\.seconds = 0\.3",
     "hangs in init": r"a scan took longer than isolation\.seconds = 0\.3",
-    "nothing": "TypeError: register returned None, not a Registration",
+    "nothing": "TypeError: register returned None, not a Registration.pose",
     "NaN": "it gave a pose that is not finite",
     "not rigid": "it gave a pose that is not rigid",
     "shape": r"it gave a pose of shape \(3, 4\)",

@@ -22,6 +22,22 @@ class Mine(Odometry):
 class Lacking(Odometry):
     pass
 
+class OfDict(Mine):
+    space = {"x": 1}
+
+class OfType(Mine):
+    settings_type = dict
+
+class Half(Odometry):
+    space, live = Mine.space, True
+    def prepare(self, scan): ...
+
+class Other(Mine):
+    def __init__(self, voxel): ...
+
+class More(Mine):
+    def __init__(self, parameters=None, settings=None, voxel=1.0): ...
+
 other = 3
 """
 
@@ -44,11 +60,28 @@ def mine(tmp_path, monkeypatch):
         ("my_odometry:", "my_odometry has no class"),
         ("my_odometry:other", "not a class derived from adaptune.odometry.Odometry"),
         ("my_odometry:Lacking", "has no attribute space and no live"),
+        ("my_odometry:OfDict", r"its `space` is a dict; write it as space = ParameterSpace\(\{"),
+        ("my_odometry:OfType", "its `settings_type` is <class 'dict'>, and not derived from Base"),
+        ("my_odometry:Half", "the class lacks the methods register and start"),
+        ("my_odometry:Other", r"its __init__ takes \(voxel\); write __init__\(self, parameters="),
     ],
 )
 def test_names_that_do_not_do(name, message):
     with pytest.raises(OdometryError, match=message):
         odometry_class(name)
+
+
+def test_a_parameter_without_its_baseline_is_named(tmp_path, monkeypatch):
+    (tmp_path / "my_lacking.py").write_text(MINE.replace(", baseline=0.5", ""))
+    monkeypatch.syspath_prepend(str(tmp_path))
+    told = r"my_lacking:Mine: cannot import my_lacking \(Float: baseline: this key is missing\)"
+    with pytest.raises(OdometryError, match=told):
+        odometry_class("my_lacking:Mine")
+
+
+@pytest.mark.usefixtures("mine")
+def test_a_class_may_take_more():
+    assert odometry_class("my_odometry:More").__name__ == "More"
 
 
 def test_an_odometry_that_a_package_announces(monkeypatch):

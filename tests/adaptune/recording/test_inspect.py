@@ -230,12 +230,19 @@ def test_the_poses_of_a_kitti_folder_are_inspected(tmp_path):
     assert inspect(tmp_path).missing["offline"] == ("a reference trajectory",)
 
 
+def _text(path):
+    path.write_text("<html>Sign in to download</html>\n" * 100)
+    return path
+
+
 def test_files_that_are_no_recording_are_refused(tmp_path):
     (tmp_path / "a.yaml").write_text("text")
+    (tmp_path / "empty").mkdir()
     for path, message in [
         (tmp_path / "none.bag", "there is no such file or folder"),
         (tmp_path / "a.yaml", "not a bag"),
-        (tmp_path, "holds no scan"),
+        (tmp_path / "empty", r"holds no scan \(.*\) and no bag"),
+        *((_text(tmp_path / f"a{kind}"), "is no bag, whatever") for kind in (".bag", ".mcap")),
     ]:
         with pytest.raises(SequenceError, match=message):
             inspect(path)
