@@ -1,5 +1,6 @@
 """Odometries in programs that read a recording and a parameter file and write a trajectory."""
 
+import copy
 import fcntl
 import glob
 import json
@@ -13,7 +14,8 @@ import tomllib
 from abc import abstractmethod
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
-from functools import cache
+from functools import cache, reduce
+from operator import getitem
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, Self
 
@@ -113,20 +115,17 @@ class Template:
         A real number stays one where the new value is whole. All else in a YAML file stays as it
         is, byte for byte. An `OdometryError` names a value that cannot be replaced alone.
         """
-        changed = []
+        changed, data = {}, copy.deepcopy(self._data)
         for name, value in parameters.items():
             if (place := self._find(name)) is not None:
-                _, held_in, key, _ = place
-                # ROS 1 and other readers tell 20 from 20.0.
+                *_, key = keys = place[-1]
+                held_in = reduce(getitem, keys[:-1], data)
                 real = isinstance(held_in[key], float) or _EXPONENT.fullmatch(str(held_in[key]))
                 held_in[key] = float(value) if real and type(value) is int else value
-                changed.append(place)
+                changed[keys] = held_in[key]
         if self._write is not files.dump:
-            return self._write(self._data)
-        try:
-            return _replaced(self._text, changed, self._data)
-        except files.YamlError as error:
-            raise OdometryError(f"{self.path}: {error}") from error
+            return self._write(data)
+        return _replaced(self._text, changed, data, self.path)
 
     def _find(self, name: str) -> _Place | None:
         wanted = _parts(name)
@@ -157,13 +156,12 @@ def _places(data: Any, path: tuple[str, ...] = (), keys: tuple[Any, ...] = ()) -
 _EXPONENT = re.compile(r"[-+]?[.\d]+[eE][-+]?\d+")
 
 
-def _replaced(text: str, changed: Iterable[_Place], data: Any) -> str:
-    """A YAML text with the new values in their places; a YamlError where that is not possible."""
-    document, spans, lines = files.Document(text, foreign=True), [], []
-    for _, held_in, key, keys in changed:
-        new = files.dump([held_in[key]]).removeprefix("- ").strip()
-        lines.append(document.line(keys))
+def _replaced(text: str, changed: Mapping[tuple[Any, ...], Any], data: Any, path: Path) -> str:
+    """A YAML text with new values in their places, by their keys."""
+    document, spans = files.Document(text, foreign=True), []
+    for keys, value in changed.items():
         begin, end = document.span(keys) or (0, 0)
+        new = files.dump([value]).removeprefix("- ").strip()
         spans.append((begin, end, new if begin < end else f" {new}"))
     for begin, end, new in sorted(spans, reverse=True):
         text = text[:begin] + new + text[end:]
@@ -171,10 +169,10 @@ def _replaced(text: str, changed: Iterable[_Place], data: Any) -> str:
         # Where nan is nan.
         if repr(files.Document(text, foreign=True).data) == repr(data):
             return text
-    where = ", ".join(str(line) for line in lines)
-    raise files.YamlError(
-        f"a parameter cannot be replaced alone (line {where}); write its value without anchors, "
-        f"aliases and tags"
+    where = ", ".join(str(document.line(keys)) for keys in changed)
+    raise OdometryError(
+        f"{path}: a parameter cannot be replaced alone (line {where}); write its value without "
+        f"anchors, aliases and tags"
     )
 
 

@@ -171,8 +171,6 @@ TRUSTED = 0.8
 """Share of the measured motions that are right at least, those that fit best."""
 CLOCK = 30.0
 """Seconds by which clocks may differ to be found."""
-LAG = 3.0
-"""Scans by which an odometry's poses may be late to be found."""
 SAME_CLOCK = 0.01
 """Seconds by which two clocks may differ and count as the same."""
 AMBIGUOUS = 1.5
@@ -420,7 +418,7 @@ def _shift(shifted: Callable[[float], Poses], hops: Hops, low: float, high: floa
 
 
 def _moment(T_odom_sensor: Poses, hops: Hops) -> _Candidate:
-    """The poses as they are if they are not those at the stamps, but some scans later.
+    """The poses as they are if they are not those at the stamps, but of a later moment of the scan.
 
     What moves during a scan that is not compensated looks as from the middle of the scan.
     """
@@ -430,8 +428,8 @@ def _moment(T_odom_sensor: Poses, hops: Hops) -> _Candidate:
     def shifted(scans: float) -> Poses:
         return interpolate(at[known], T_odom_sensor[known], at - round(scans * 1e9), 10**9)
 
-    best = _shift(shifted, hops, -LAG, LAG)
-    what = f"like those of {abs(best):.2g} scans {'after' if best > 0 else 'before'} their stamps"
+    best = _shift(shifted, hops, 0.0, 1.0)
+    what = f"like those of {best:.2g} scans after their stamps"
     mend = "undo the motion within scans (`compensate`), or return each pose at its scan's stamp"
     return _Candidate(what, mend, shifted(best))
 

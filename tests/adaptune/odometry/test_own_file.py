@@ -173,6 +173,7 @@ def test_a_published_parameter_file_is_read_as_ros_reads_it(tmp_path, caplog):
     text = template.fill({"filter_size_surf": 0.25, "gyr_cov": 1, "empty": 7.0})
     expected = PUBLISHED.replace(b"0.4 #", b"0.25 #").replace(b"1e-2", b"1.0")
     assert text.encode() == expected.replace(b"empty:", b"empty: 7.0")
+    assert template.fill({}).encode() == PUBLISHED
 
 
 @pytest.mark.parametrize("text", ["c: 2\na: &x 1.0\nb: *x\n", "c: &x 2.0\na: *x\n"])
