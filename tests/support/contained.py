@@ -25,11 +25,11 @@ LIMITS = Limits(seconds=60.0, memory=2.0)
 VALUES = {"max_correspondence_distance": 2.0, "keyframe_interval": 1.5}
 """Of the parameters in the template that are tuned here."""
 FIXED = {"downsampling": 0.7, "iterations": 20}
-"""The others; ROS reads `7e-1` as a text, and the node would take its default for it."""
+"""The others, as they stand in the template."""
 TEMPLATE = """\
 use_sim_time: {sim}
 common: {{points_topic: {points}}}
-gicp: {{max_correspondence_distance: 9.0, keyframe_interval: 9, downsampling: 7e-1, iterations: 20}}
+gicp: {{max_correspondence_distance: 9.0, keyframe_interval: 9, downsampling: 0.7, iterations: 20}}
 other: {{voxel: 1}}
 imitate: {imitate}
 """
