@@ -3,7 +3,7 @@
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import islice
+from itertools import accumulate, islice
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -275,21 +275,13 @@ def diagnose_odometry(T_odom_sensor: Poses, hops: Hops) -> Cause | None:
         _Candidate(
             "like increments from scan to scan",
             "let the odometry return the pose of each scan in the frame of the first one",
-            _accumulated(steps),
+            np.array([*accumulate(steps, np.matmul)]),
         ),
         *_conventions(T_odom_sensor, lambda T: T),
         _moment(T_odom_sensor, hops),
         *_places(T_odom_sensor, hops, np.eye(4), of_odometry=True),
     ]
     return _likeliest(candidates, hops, errors)
-
-
-def _accumulated(steps: Poses) -> Poses:
-    T = np.empty_like(steps)
-    last = np.eye(4)
-    for i, step in enumerate(steps):  # scans, not points
-        last = T[i] = last @ step
-    return T
 
 
 def _likeliest(
@@ -595,6 +587,8 @@ STRETCHES, SCANS = 4, 40
 METRES, EACH = 4.0, 4
 """A motion is measured over so many metres, or over half a stretch if that is less, and begins at
 every fourth scan of it."""
+NEAR = 0.6, 0.1, 0.5
+"""Metres, radians and seconds between neighbours, below which scans in between are left out."""
 STANDING = 0.5
 """Metres below which a motion is noise."""
 ENOUGH = 10.0
@@ -624,8 +618,20 @@ def measured_motions(scans: Iterable[Scan], n_scans: int) -> Hops:
     return Hops.of(found)
 
 
+def _stride(stretch: list[Scan]) -> int:
+    """Which scans are enough where the sensor moves slowly: every one, second or fourth."""
+    *_, (_, T, seconds) = neighbour_motions(stretch[:2])
+    T = np.full((4, 4), np.nan) if T is None else T
+    apart = np.array([np.linalg.norm(T[:3, 3]), rotation_angle(T), seconds])
+    return max(n for n in (1, 2, EACH) if n == 1 or (n * apart < NEAR).all())
+
+
 def _motions_over(stretch: list[Scan]) -> Iterator[tuple[int, int, Hop]]:
     """Numbers of two scans of a stretch, and the registration of one to the other."""
+    if len(stretch) < 2:
+        return
+    stride = _stride(stretch)
+    stretch = stretch[::stride]
     T: list[Poses] = []
     clouds: list[HopCloud] = []
     start = 0
@@ -639,14 +645,14 @@ def _motions_over(stretch: list[Scan]) -> Iterator[tuple[int, int, Hop]]:
         while start < i:
             guess = invert(T[start]) @ T[i]
             metres = np.linalg.norm(guess[:3, 3])
-            if metres < METRES and i - start < SCANS // 2:
+            if metres < METRES and i - start < SCANS // 2 // stride:
                 break
             hop = register(clouds[start], clouds[i], [guess]) if metres >= STANDING else None
             if hop is not None:
                 apart = hop.projection @ (hop.T_start_end - guess)[:3, 3]
                 if np.linalg.norm(apart) < _AGREE:
-                    yield start, i, hop
-            start += EACH
+                    yield start * stride, i * stride, hop
+            start += EACH // stride
         if np.linalg.norm(T[i][:3, 3]) > ENOUGH:
             break
 
