@@ -88,6 +88,7 @@ class _Measuring:
     ):
         self.fixed, self.members = fixed, tuple(members)
         self._sets, self._weighs = sets, weighs
+        self._always: Sequence[int] = self.members  # those that never rest
         self._live = LiveEvidence(self.members, length)
 
     def reset(self) -> None:
@@ -107,9 +108,15 @@ class _Measuring:
         self._live.measure()
 
     def fall_back(self) -> Selection:
-        """What to apply where nothing can be chosen: the fixed set, of a bank with all weight."""
-        weights = {member: float(member == self.fixed) for member in self.members}
-        return Selection(self.fixed, self._sets[self.fixed], weights if self._weighs else None)
+        """What to apply where nothing can be chosen: the fixed set, or what most of a bank do.
+
+        No member of a bank is a better guess than those that agree, see `Agreement`.
+        """
+        if not self._weighs:
+            return Selection(self.fixed, self._sets[self.fixed])
+        share = 1.0 / len(self._always)
+        weights = {member: share * (member in self._always) for member in self.members}
+        return Selection(self.fixed, self._sets[self.fixed], weights)
 
     def _weighted(self, weights: NDArray[np.float64]) -> Selection:
         """A selection of the members' weights, shared by those that are present."""
@@ -263,6 +270,8 @@ class Selector(_Measuring):
         mean = np.stack(self._descriptors).mean(axis=0, dtype=np.float64, keepdims=True)
         feature = self._pca.transform(mean.astype(np.float32))[0]
         is_foreign = self._rule.gated and self._is_foreign(self._scan)
+        if self._failed and self.members:
+            self._live.forget()  # hops over a restart say nothing of any member
         selection = self._choose(feature, is_foreign)
         self._failed = False
         # Where the fixed set does worse than predicted, training's guess is better than none.
@@ -619,6 +628,7 @@ class UntrainedSelector(_Measuring):
 
     def __init__(self, sets: ParameterSets, length: float):
         super().__init__(sets, sets.trials[0], sets.trials, length, True)
+        self._always = sets.trials[:1]  # nobody knows the others
 
     def select(self) -> Selection:
         """Choose the weights to apply before the newest scan is registered."""

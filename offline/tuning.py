@@ -149,15 +149,7 @@ PAIRED_SETTINGS = [
 BANK_FRAMES = 1000
 """Nearest frames of each stretch in a bank: products of errors need more frames than means do."""
 BANK_SETTINGS = [
-    BankSettings(
-        sharpness=sharpness,
-        min_fixed_share=share,
-        prior_windows=windows,
-        clip=clip,
-        n_frames=BANK_FRAMES,
-    )
-    for clip in (6.0, 18.0)
-    for sharpness in (12.0, 48.0)
+    BankSettings(sharpness=48.0, min_fixed_share=share, prior_windows=windows, n_frames=BANK_FRAMES)
     for share, windows in ((0.0, 3.0), (0.0, 10.0), (0.25, 3.0), (0.75, 10.0))
 ]
 """A bank is driven with one of these; of equally good ones the first."""

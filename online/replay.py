@@ -102,7 +102,7 @@ class Driver:
         return self._tracker.register_prepared(scan.stamp, prepared, seconds, scan)
 
     def _unhealthy(self, stamp: int, what: str) -> bool:
-        """Return to the fixed set, unless it is in use; whether it was not.
+        """Return to what is safe, unless it is in use; whether it was not.
 
         All members of a bank join in.
         """
@@ -131,7 +131,8 @@ class Driver:
             what = "%s: %s at %.1f s; nor can the fixed set: %s"
             _log.warning(what, self._what, why, seconds, error)
             return False
-        _log.warning("%s: %s at %.1f s; the fixed set is used", self._what, why, seconds)
+        used = "the fixed set is" if fixed.weights is None else "members that agree are"
+        _log.warning("%s: %s at %.1f s; %s used", self._what, why, seconds, used)
         self._note(Choice(stamp, fixed, 0.0, fallen_back=why))
         return True
 

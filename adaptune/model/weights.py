@@ -35,7 +35,7 @@ UNTRIED_MEAN_SQUARE = 4.0
 """Mean square of a member that nobody has tried, in that of the first one."""
 SMOOTHED_SELECTIONS = 5
 """Selections whose weights are averaged: errors cancel each other while weights stay the same."""
-EVEN_SHARE = 0.05
+EVEN_SHARE = 0.5
 """Added to the members' mean squares, as a share of their harmonic mean, for weights that are more
 even."""
 MEMBER_POOL_SIZE = 64

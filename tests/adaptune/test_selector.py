@@ -377,3 +377,17 @@ def test_a_member_without_a_pose_is_not_chosen():
     chosen = selections(selector, scans[:1], IN_A_BANK) + selections(selector, scans[1:3], dying)
     assert [one.trial for one in chosen] == [5, 3, 3]
     assert chosen[-1].parameters == SETS[3]
+
+
+def test_hops_over_a_restart_of_a_bank_are_no_evidence(monkeypatch):
+    forgotten = []
+    monkeypatch.setattr(LiveEvidence, "forget", lambda _: forgotten.append(True))
+    selector = Selector(of_two_caves(), members=[3, 5])
+    scan, resting = drive_cave("hdl32e", 1)[0], np.eye(4)
+    counts = []
+    for second, starts in enumerate((0, 1, 1, 2, 2)):
+        selector.observe(second * 10**9, scan, Motions(resting, {3: resting, 5: resting}, starts))
+        selector.select()
+        counts.append(len(forgotten))
+    # The start after the first scan is no failure.
+    assert counts == [0, 0, 0, 1, 1]

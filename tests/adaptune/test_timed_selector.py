@@ -10,6 +10,7 @@ import pytest
 import rooms
 from random_models import random_model
 
+from adaptune.model import BankSettings
 from adaptune.odometry.base import InProcess, Motions
 from adaptune.odometry.keyframe import KeyframeGicp
 from adaptune.recording.scan import Scan
@@ -132,13 +133,15 @@ def test_an_error_of_the_measurement_shows_at_the_next_scan(caplog):
     assert trials(timed, [1, 2, 10**9]) == {1: 0, 2: None, 10**9: 7}
 
 
-@pytest.mark.parametrize("bank", [True, False])
-def test_falls_back_to_the_fixed_set(bank):
-    model = random_model()
-    members = model.bank if bank else ()
+@pytest.mark.parametrize(
+    ("members", "reserve", "weights"),
+    [((), 0, None), ((4, 10), 0, {4: 0.5, 10: 0.5}), ((4, 10), 1, {4: 1.0, 10: 0.0})],
+)
+def test_falls_back_to_the_fixed_set_or_to_members_that_never_rest(members, reserve, weights):
+    model = replace(random_model(), bank_settings=BankSettings(reserve=reserve))
     found = Selector(model, members=members).fall_back()
     assert (found.trial, found.parameters) == (model.fixed, model.sets[model.fixed])
-    assert found.weights == ({t: float(t == model.fixed) for t in members} if bank else None)
+    assert found.weights == weights
     untrained = UntrainedSelector(model.sets, 10.0).fall_back()
     assert untrained.weights.pop(model.sets.trials[0]) == 1.0
     assert not any(untrained.weights.values())

@@ -116,7 +116,9 @@ def test_it_is_lost_after_two_rejections_in_a_row_and_sound_again(exactly):
         drive(live, 10, bank(1.0, 1.0), first=i)
         states.append(live.lost)
     assert states == [False, True, True]
-    assert live.estimated(Selection(0, {})).lost
+    selection = live.estimated(Selection(0, {}))
+    assert selection.lost
+    assert np.isnan(selection.estimated_error)
     exactly(exact)
     drive(live, 10, bank(1.0, 1.0), first=80)
     assert not live.lost
