@@ -16,7 +16,7 @@ from typing import Any, Self
 
 import yaml
 
-from adaptune.errors import AdaptuneError
+from adaptune.errors import AdaptuneError, import_extra
 
 DAMAGED_NPZ = (
     *(OSError, ValueError, TypeError, EOFError, RuntimeError),
@@ -348,12 +348,11 @@ def dump(data: Any) -> str:
 def load() -> Any:
     """Import ``open3d``, which takes about a second, and let it report errors only.
 
-    Its compiled part needs ``libusb-1.0.so.0``, which a fresh machine does not have.
+    Its compiled part needs ``libusb-1.0.so.0``, which a fresh machine does not have. A
+    NotInstalledError says how to install it.
     """
-    import libusb_package
-
-    ctypes.CDLL(str(libusb_package.get_library_path()), mode=ctypes.RTLD_GLOBAL)
-    import open3d
-
+    (libusb,) = import_extra("open3d", "libusb_package")
+    ctypes.CDLL(str(libusb.get_library_path()), mode=ctypes.RTLD_GLOBAL)
+    (open3d,) = import_extra("open3d", "open3d")
     open3d.utility.set_verbosity_level(open3d.utility.VerbosityLevel.Error)
     return open3d

@@ -2,12 +2,15 @@
 
 from abc import abstractmethod
 from collections.abc import Hashable
+from importlib.util import find_spec
 from typing import Any, NamedTuple
 
 import numpy as np
 import small_gicp
 from pydantic import Field
 
+from adaptune.errors import import_extra
+from adaptune.files import load
 from adaptune.geometry import Poses, invert, rectify, scale, squared_ranges
 from adaptune.odometry.base import MIN_POINTS, BaseSettings, Description, Odometry, Registration
 from adaptune.recording.scan import Scan
@@ -221,9 +224,13 @@ class KeyframeNdt(KeyframeOdometry):
         iterations=ITERATIONS.model_copy(update={"baseline": 30}),
     )
 
-    def prepare(self, scan: Scan) -> PreparedCloud:
-        from adaptune.files import load
+    @classmethod
+    def describe(cls, settings: Any) -> Description:
+        if find_spec("open3d") is None:  # it takes a second to import
+            import_extra("open3d", "open3d")
+        return super().describe(settings)
 
+    def prepare(self, scan: Scan) -> PreparedCloud:
         o3d = load()
         points = o3d.utility.Vector3dVector(crop(scan, self.settings.min_range))
         cloud = o3d.geometry.PointCloud(points).voxel_down_sample(self.parameters["downsampling"])
@@ -233,8 +240,6 @@ class KeyframeNdt(KeyframeOdometry):
     def align(
         self, target: PreparedCloud, source: PreparedCloud, T_target_guess: Poses
     ) -> tuple[Poses, bool]:
-        from adaptune.files import load
-
         registration = load().pipelines.registration
         option = registration.NormalDistributionsTransformOption(
             voxel_size=self.parameters["resolution"], max_iteration=self.parameters["iterations"]

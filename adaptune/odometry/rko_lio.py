@@ -66,7 +66,7 @@ class RkoLioScan(NamedTuple):
 
 
 def _bindings() -> Any:
-    return import_extra("rko_lio", "rko_lio.rko_lio_pybind")[0]
+    return import_extra("rko-lio", "rko_lio.rko_lio_pybind")[0]
 
 
 with contextlib.suppress(OdometryError):

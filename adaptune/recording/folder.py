@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from adaptune import files as open3d
 from adaptune import geometry
+from adaptune.errors import NotInstalledError
 from adaptune.geometry import Poses
 from adaptune.recording.clouds import PointCloudError, from_fields
 from adaptune.recording.scan import AUTO, Frame, Imu, Scan, SequenceError, Timing
@@ -87,6 +88,8 @@ def read_scan(path: Path, stamp: int, timing: Timing = AUTO) -> Scan:
         return from_fields(_fields(path), stamp, timing)
     except FileNotFoundError as error:
         raise SequenceError(f"{path}: there is no such file") from error
+    except NotInstalledError as error:
+        raise SequenceError(f"{path}: {error}") from error
     except (OSError, ValueError, KeyError, EOFError, RuntimeError, PointCloudError) as error:
         raise SequenceError(f"{path}: cannot be read as a scan ({error})") from error
 

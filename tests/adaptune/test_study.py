@@ -197,16 +197,17 @@ def test_a_parameter_that_a_setting_fixes_is_not_tuned(gicp_study_file):
     )
 
 
-@pytest.mark.parametrize("name", ["genz_icp", "rko_lio"])
-def test_an_odometry_that_is_not_installed_is_named(study_file, monkeypatch, name):
-    extra = "evalio" if name == "genz_icp" else name
-    for module in ("evalio", "evalio.pipelines", "rko_lio", "rko_lio.rko_lio_pybind"):
+@pytest.mark.parametrize(
+    ("name", "extra"), [("genz_icp", "evalio"), ("ndt", "open3d"), ("rko_lio", "rko-lio")]
+)
+def test_an_odometry_that_is_not_installed_is_named(study_file, monkeypatch, name, extra):
+    for module in ("evalio", "evalio.pipelines", "open3d", "rko_lio", "rko_lio.rko_lio_pybind"):
         monkeypatch.setitem(sys.modules, module, None)
     import_extra.cache_clear()
     file = study_file.with_name("lacking.yaml")
     text = study_file.read_text()
     one = text[: text.index("sequences:")]
-    lines = f"odometry:\n  - name: gicp\n  - settings: {{deskew: false}}\n    name: {name}\n"
+    lines = f"odometry:\n  - name: gicp\n  - settings: {{min_range: 0.5}}\n    name: {name}\n"
     file.write_text(text.replace(one, lines))
     told = failure(file)
     import_extra.cache_clear()

@@ -85,7 +85,7 @@ def test_evalio_parses_it(name, deskew, monkeypatch):
 @pytest.mark.parametrize("deskew", [True, False])
 def test_rko_lio_parses_it(deskew, monkeypatch):
     if importlib.util.find_spec("rko_lio") is None:
-        lacking("rko_lio", "RKO-LIO is not installed: pip install 'adaptune[rko_lio]'")
+        lacking("rko_lio", "RKO-LIO is not installed: pip install 'adaptune[rko-lio]'")
     from rko_lio import rko_lio_pybind
     from rko_lio.config import LIOConfig, PipelineConfig
 

@@ -14,7 +14,7 @@ from adaptune.odometry.rko_lio import RkoLio
 @pytest.fixture(autouse=True)
 def _rko_lio():
     if importlib.util.find_spec("rko_lio") is None:
-        lacking("rko_lio", "RKO-LIO is not installed: pip install 'adaptune[rko_lio]'")
+        lacking("rko_lio", "RKO-LIO is not installed: pip install 'adaptune[rko-lio]'")
 
 
 def poses(odometry, scans):

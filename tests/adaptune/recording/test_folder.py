@@ -1,11 +1,14 @@
+import sys
+
 import numpy as np
 import pytest
 import rec
 from scipy.spatial.transform import Rotation
 
 from adaptune import files, geometry
+from adaptune.errors import import_extra
 from adaptune.recording import SequenceConfig, SequenceError
-from adaptune.recording.folder import turn_up
+from adaptune.recording.folder import read_scan, turn_up
 from adaptune.recording.recording import open_sequence
 from adaptune.trajectory import write_kitti
 
@@ -137,6 +140,16 @@ def test_a_kitti_raw_drive(tmp_path):
     expected = np.tile(np.eye(4), (4, 1, 1))
     expected[:, 0, 3] = np.arange(4) * 0.1
     np.testing.assert_allclose(reference.T_world_sensor, expected, atol=1e-6)
+
+
+def test_clouds_that_only_open3d_reads_say_how_to_install_it(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "libusb_package", None)
+    for cached in (import_extra, files.load):
+        cached.cache_clear()
+    (tmp_path / "1.ply").write_text("ply\n")
+    what = r"1\.ply: open3d cannot be imported .*pip install 'adaptune\[open3d\]'"
+    with pytest.raises(SequenceError, match=what):
+        read_scan(tmp_path / "1.ply", 0)
 
 
 @pytest.mark.parametrize("suffix", [".npy", ".pcd", ".ply", ".bin", "structured"])

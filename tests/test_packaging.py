@@ -1,0 +1,102 @@
+"""The wheel serves without the repository, and packages of others add to it."""
+
+import os
+import re
+import subprocess
+import sys
+import tomllib
+import zipfile
+from importlib.util import find_spec
+from pathlib import Path
+
+import drives
+import numpy as np
+import pytest
+import yaml
+from setups import setup_of
+
+from adaptune.model.descriptor import Describer
+from offline.config import load_study
+
+ROOT = Path(__file__).parent.parent
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+
+
+def test_the_version_is_everywhere_the_same():
+    changes = re.findall(r"^## ([\d.]+)", (ROOT / "CHANGELOG.md").read_text("utf-8"), re.MULTILINE)
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text("utf-8"))
+    assert [changes[0], citation["version"]] == [PROJECT["version"]] * 2
+
+
+def test_the_tests_run_on_a_python_that_the_package_names():
+    named = [c.rpartition(" ")[2] for c in PROJECT["classifiers"] if ":: 3." in c]
+    assert PROJECT["requires-python"] == f">={named[0]}"
+    assert f"{sys.version_info[0]}.{sys.version_info[1]}" in named
+
+
+def test_extras_are_named_as_every_pip_reads_them():
+    # An older pip finds no extra under a name that was normalised when the package was built.
+    extras = PROJECT["optional-dependencies"]
+    assert [e for e in extras if e != re.sub(r"[-_.]+", "-", e).lower()] == []
+    for file in [*(ROOT / "docs").glob("*.md"), *(ROOT / "adaptune").rglob("*.py")]:
+        text = file.read_text("utf-8")
+        for names in re.findall(r"adaptune\[([\w,-]+)\]|import_extra\(\"([^\"]+)\"", text):
+            assert set("".join(names).split(",")) <= set(extras), file
+
+
+def built(project: Path, folder: Path) -> Path:
+    """The wheel of a project, built without a network."""
+    if find_spec("hatchling") is None:
+        pytest.skip("hatchling is not installed: pip install 'adaptune[dev]'")
+    command = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", folder]
+    subprocess.run(command, cwd=project, check=True, capture_output=True)
+    (wheel,) = folder.glob("*.whl")
+    return wheel
+
+
+def run(folder: Path, path: list[Path], *arguments: str) -> str:
+    """Run adaptune in a folder with these packages only, and return what it prints."""
+    done = subprocess.run(
+        [sys.executable, "-P", "-m", "adaptune", *arguments],
+        cwd=folder,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(map(str, path))},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@pytest.mark.services
+def test_the_wheel_tunes_a_bag_without_the_repository(tmp_path):
+    wheel = built(ROOT, tmp_path / "dist")
+    with zipfile.ZipFile(wheel) as archive:
+        names = archive.namelist()
+        archive.extractall(tmp_path / "installed")
+    assert {name.split("/")[0] for name in names if ".dist-info/" not in name} == {
+        *("adaptune", "offline", "online")
+    }
+    drives.write_bag(tmp_path / "drive.bag", drives.scans(n_scans=60))
+    said = run(tmp_path, [tmp_path / "installed"], "tune", "drive.bag", "--trials", "2")
+    assert "runs/drive/report/report.html" in said
+    assert (tmp_path / "runs/drive/report/report.html").stat().st_size > 100_000
+
+
+def test_a_package_of_others_adds_an_odometry_and_a_descriptor(tmp_path, monkeypatch):
+    wheel = built(ROOT / "tests/support/plugin", tmp_path / "dist")
+    target = tmp_path / "installed"
+    command = [sys.executable, "-m", "pip", "install", "--no-deps", "--no-index", "--target"]
+    subprocess.run([*command, target, wheel], check=True, capture_output=True)
+    monkeypatch.setenv("PYTHONPATH", str(target), prepend=os.pathsep)
+    monkeypatch.syspath_prepend(target)
+    study = drives.write_study(tmp_path)
+    _, rest = study.read_text().split("sequences:")
+    text = "odometry: {name: scan_to_scan}\ndescriptor: [range_deciles]\nsequences:"
+    study.write_text(text + rest)
+    setup = setup_of(load_study(study))
+    scans = setup.prepare("one", 1e9)
+    (trial,) = setup.run(scans, [{"voxel": 0.4}])
+    assert np.nanmean(trial.errors) < 5.0
+    assert Describer(["range_deciles"]).blocks == {"range_deciles": 9}
+    assert setup.odometry.content["version of adaptune-example"] == "1.2.3"
