@@ -6,11 +6,12 @@ BIN := $(VENV)/bin
 STUDY := configs/demo.yaml
 SUDO := $(if $(filter 0,$(shell id -u)),,sudo)
 
-.PHONY: help demo test test-services lint types pytest services reference-image format clean
+.PHONY: help demo test test-services lint types docs pytest services reference-image format clean
 
 help:
 	@echo "make demo    simulate, train, replay and compare, in a few minutes"
 	@echo "make test    run linters, type checker, import contract and all tests that need no service"
+	@echo "make docs    build the documentation as a site, build/site"
 	@echo "make test-services  test with Docker, ROS, a browser, a cluster, kills and benchmarks"
 	@echo "make services  install what pip cannot bring: ROS 1, Docker, Chromium (Debian 12)"
 	@echo "make reference-image  build the image of a ROS 1 odometry that tests run"
@@ -24,7 +25,7 @@ demo: $(VENV)/.installed
 	$(BIN)/adaptune compare $(STUDY)
 
 test: PYTEST_OPTIONS = -m "not services"
-test: lint types pytest
+test: lint types docs pytest
 
 test-services: PYTEST_OPTIONS = -m services
 test-services: pytest
@@ -36,6 +37,9 @@ lint: $(VENV)/.installed
 
 types: $(VENV)/.installed
 	$(BIN)/mypy
+
+docs: $(VENV)/docs/.installed
+	$(VENV)/docs/bin/python -m sphinx -q -W --keep-going -d build/doctrees docs build/site
 
 pytest: $(VENV)/.installed
 	$(BIN)/pytest -n auto --dist worksteal $(PYTEST_OPTIONS)
@@ -61,6 +65,14 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "adaptune needs Python 3.11 or newer; set PYTHON, as in: make demo PYTHON=python3.12")'
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	touch $@
+
+PURELIB := -c 'import sysconfig; print(sysconfig.get_path("purelib"))'
+# On top of the other environment, so that Sphinx can import adaptune.
+$(VENV)/docs/.installed: $(VENV)/.installed docs/requirements.txt
+	$(BIN)/python -m venv $(VENV)/docs
+	$(VENV)/docs/bin/python -m pip install --quiet --disable-pip-version-check -r docs/requirements.txt
+	$(BIN)/python $(PURELIB) > "$$($(VENV)/docs/bin/python $(PURELIB))/adaptune.pth"
 	touch $@
 
 clean:

@@ -80,6 +80,11 @@ class Trial:
     # Of a whole run, the bounds of the health check that restarted it.
     health: dict[str, float] = field(default_factory=dict)
 
+    def __repr__(self) -> str:
+        lost = int(self.restarted.sum())
+        told = f"{self.mean_error:.3f} %, {lost} lost tracks, {len(self.faults)} faults"
+        return f"<Trial of {in_words(self.parameters)}: {told}>"
+
     @property
     def mean_error(self) -> float:
         """Mean capped error in percent over the frames with a sub-trajectory."""
@@ -204,6 +209,9 @@ class Archive:
         self._sources = sources
         self._statuses: dict[str, dict[Path, str]] = {}
         self._finished: dict[str, dict[int, Summary]] | None = None
+
+    def __repr__(self) -> str:
+        return f"<Archive in {self.folder}>"
 
     def _note(self, sequence: str) -> None:
         """Record what the trials on a sequence depend on, before the first of them is written."""

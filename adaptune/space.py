@@ -164,6 +164,10 @@ class ParameterSpace:
     def __len__(self) -> int:
         return len(self.parameters)
 
+    def __repr__(self) -> str:
+        ranges = (f"{name} {describe(parameter)}" for name, parameter in self.parameters.items())
+        return f"<ParameterSpace: {', '.join(ranges)}>"
+
     @property
     def names(self) -> tuple[str, ...]:
         """Names in order."""

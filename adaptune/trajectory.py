@@ -55,6 +55,10 @@ class Trajectory:
     def __len__(self) -> int:
         return len(self.stamps)
 
+    def __repr__(self) -> str:
+        seconds = np.ptp(self.stamps) * 1e-9 if len(self) else 0.0
+        return f"<Trajectory: {len(self)} poses in {seconds:.1f} s>"
+
     @property
     def sparse(self) -> str:
         """Where many poses are further apart than `max_gap`: how many, and what to set."""

@@ -1,6 +1,7 @@
 """The documentation leads where it says, and names commands that exist."""
 
 import ast
+import importlib.util
 import re
 import sys
 from functools import cache
@@ -15,7 +16,7 @@ from setups import setup_of
 from typer.main import get_command
 
 from adaptune.commands.cli import app
-from offline.config import load_study
+from offline.config import OfflineStudyConfig, load_study
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
@@ -74,6 +75,49 @@ def test_commands_exist(page):
     assert named <= set(get_command(app).commands)
 
 
+def test_the_guide_is_short():
+    words = sum(len(page.read_text("utf-8").split()) for page in (ROOT / "docs").glob("*.md"))
+    assert words <= 20_000
+
+
+@cache
+def site() -> Any:
+    """The module docs/conf.py, which makes references from the code."""
+    spec = importlib.util.spec_from_file_location("docs_conf", ROOT / "docs/conf.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_site_lists_all_keys_commands_and_objects():
+    made = {mark: text() for mark, text in site().MADE.items()}
+    pages = "".join(page.read_text("utf-8") for page in GUIDE)
+    assert all(pages.count(mark) == 1 for mark in made)
+    keys = made["<!-- settings -->"]
+    assert "| `sequences.<name>.imu.noise.gyroscope` | number, above 0, at most 1000000 |" in keys
+    assert "| `online.switching.mechanism` | `auto`, `live`, `bank` | `auto` |" in keys
+    for name in get_command(app).commands:
+        assert f"### {name}\n" in made["<!-- commands -->"]
+    assert "autoclass:: adaptune.selector.Selector\n" in made["<!-- python -->"]
+
+
+def test_the_tables_of_settings_are_those_of_the_code():
+    schema = OfflineStudyConfig.model_json_schema()
+    defaults = {key: told for key, _, told in site().keys(schema, schema["$defs"], "")}
+    text = (ROOT / "docs/reference-study.md").read_text("utf-8")
+    table = text[text.index("## The odometry") : text.index("## Objectives")]
+    rows = re.findall(r"^\| (`.+?`) \| .* \| ?(.*?) \|$", table, re.MULTILINE)
+    told = {key: default for keys, default in rows for key in re.findall(r"`(\S+)`", keys)}
+    unknown = [key for key in told if not any(name.startswith(key) for name in defaults)]
+    assert unknown == []
+    given = {key: default for key, default in told.items() if re.fullmatch(r"[\d.]+", default)}
+    assert len(given) > 10
+    coded = {key: float(defaults[key].strip("`") or "nan") for key in given}
+    assert coded == {key: float(default) for key, default in given.items()}
+    missing = [key for key in defaults if not key.startswith(tuple(told))]
+    assert missing == []
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_imports_in_examples_exist(page):
     for block in re.findall(r"^```python\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL):
@@ -104,7 +148,7 @@ def test_the_example_of_a_program_follows_a_drive(study_file, tmp_path, monkeypa
     monkeypatch.setenv("PATH", str(Path(sys.executable).parent), prepend=":")
     ((template, example),) = re.findall(
         r"`([^`]*)` in `kiss_icp\.yaml`:\n\n```yaml\n(.*?)^```",
-        (ROOT / "docs/your-odometry.md").read_text(encoding="utf-8"),
+        (ROOT / "docs/programs.md").read_text(encoding="utf-8"),
         re.MULTILINE | re.DOTALL,
     )
     (tmp_path / "kiss_icp.yaml").write_text(template)

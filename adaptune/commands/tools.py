@@ -46,7 +46,7 @@ def serve(
     """Serve an odometry to another program, over standard input and output.
 
     The odometry's own output goes to standard error; an odometry in a process of its own reports it
-    with its faults. `docs/your-odometry.md` describes the messages.
+    with its faults. `docs/programs.md` describes the messages.
     """
     from adaptune.odometry import serving
 

@@ -159,7 +159,7 @@ def roles(
     else:
         training, test = ", ".join(names[:-1]), names[-1]
     if len(odometries) == 1:
-        odometry = f"{{name: {odometries[0]}}}    # or another one, see docs/your-odometry.md"
+        odometry = f"{{name: {odometries[0]}}}    # or another one, see docs/odometries.md"
     else:
         odometry = "".join(f"\n  - {{name: {name}}}" for name in odometries)
     return (
@@ -388,7 +388,7 @@ def odometries_of(given: str, imu: bool) -> list[str]:
             if name in registry.PROGRAMS:
                 raise AdaptuneError(
                     f"--odometry {name}: a program needs settings; write a study file, see "
-                    f"docs/your-odometry.md"
+                    f"docs/programs.md"
                 )
             if registry.is_user_class(name):
                 registry.where(name)

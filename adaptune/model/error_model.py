@@ -163,6 +163,10 @@ class ErrorModel:
         if not len(self.stretch):
             object.__setattr__(self, "stretch", np.zeros(len(self.sequence), np.intp))
 
+    def __repr__(self) -> str:
+        what = f"{len(self.sets)} sets on {len(self.errors)} frames of {', '.join(self.sequences)}"
+        return f"<ErrorModel of {self.odometry['name']}: {what}; fixed: {self.fixed}>"
+
     @property
     def bank_adapts(self) -> bool:
         """Whether there is a bank, and it is what is driven."""

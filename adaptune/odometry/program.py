@@ -502,7 +502,7 @@ def _inside(output: str) -> str:
 
 
 class FileSettings(WholeSettings):
-    """The files of a program that reads a recording; ``docs/your-odometry.md`` describes them."""
+    """The files of a program that reads a recording; ``docs/programs.md`` describes them."""
 
     template: Annotated[str, AfterValidator(resolve)] | None = None
     output: Annotated[str, AfterValidator(_inside)] = "trajectory.tum"  # or a pattern

@@ -228,7 +228,7 @@ def parse_address(address: str) -> tuple[socket.AddressFamily, Any]:
 
 
 class ProcessSettings(BaseSettings):
-    """How to reach a program that speaks `adaptune.odometry.wire`, see ``docs/your-odometry.md``.
+    """How to reach a program that speaks `adaptune.odometry.wire`, see ``docs/programs.md``.
 
     A command uses its standard input and output. Results of another `version` do not count.
     """

@@ -1,6 +1,6 @@
 """Messages between a program and an odometry in another process, version 2.
 
-Each is a JSON header and the raw bytes of arrays, see ``docs/your-odometry.md``. The odometry
+Each is a JSON header and the raw bytes of arrays, see ``docs/programs.md``. The odometry
 answers each with one of its own, with ``refused`` and a ``message`` if it cannot do what is asked,
 or with ``fault`` and a ``message`` if it has ended. The other side ends by closing the stream.
 """

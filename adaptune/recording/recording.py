@@ -273,6 +273,9 @@ class RecordedSequence:
             self.stop = self.stop if end == 1.0 else self.start + end * whole
             self.start += begin * whole
 
+    def __repr__(self) -> str:
+        return f"<RecordedSequence {self.name}: about {self.n_messages} scans>"
+
     @property
     def name(self) -> str:
         """The recording's file."""
