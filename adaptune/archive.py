@@ -156,7 +156,7 @@ def _indexed(line: str) -> tuple[_Key, Summary] | None:
     try:
         (sequence, number, size, mtime_ns), summary = json.loads(line)
         return (str(sequence), int(number), int(size), int(mtime_ns)), Summary(**summary)
-    except (ValueError, TypeError):
+    except (ValueError, TypeError, OverflowError):
         return None
 
 
@@ -365,7 +365,7 @@ class Archive:
         try:
             text = path.read_text("utf-8") if path.exists() else "{}"
             slots = {str(name): int(slot) for name, slot in json.loads(text).items()}
-        except (OSError, ValueError, TypeError, AttributeError) as error:
+        except (OSError, ValueError, TypeError, AttributeError, OverflowError) as error:
             why = f"{path}: is damaged ({error}); give the study another folder"
             raise ArchiveError(why) from error
         for name in (new := [name for name in names if name not in slots]):

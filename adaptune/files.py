@@ -6,6 +6,7 @@ import os
 import re
 import shutil
 import tempfile
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Iterator, Sequence
@@ -19,10 +20,10 @@ import yaml
 from adaptune.errors import AdaptuneError, import_extra
 
 DAMAGED_NPZ = (
-    *(OSError, ValueError, TypeError, EOFError, RuntimeError),
-    *(zipfile.BadZipFile, zlib.error),
+    *(OSError, ValueError, TypeError, EOFError, RuntimeError, OverflowError),
+    *(SyntaxError, tokenize.TokenError, zipfile.BadZipFile, zlib.error),
 )
-"""What numpy and zipfile raise on damaged ``.npz`` files."""
+"""What numpy and zipfile raise on damaged ``.npy`` and ``.npz`` files."""
 
 
 def expand_user(path: str) -> Path:

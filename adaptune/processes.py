@@ -121,7 +121,7 @@ def receive(stream: Readable) -> Message | None:
         for name, kind, shape in header.pop("arrays"):
             data = _exactly(stream, int(np.prod(shape)) * np.dtype(kind).itemsize)
             arrays[name] = np.frombuffer(data, kind).reshape(shape)
-    except (struct.error, ValueError, KeyError, TypeError) as error:
+    except (struct.error, ValueError, KeyError, TypeError, SyntaxError) as error:
         raise WireError(f"the stream holds no message of adaptune's ({error})") from error
     return Message(header, arrays)
 

@@ -66,7 +66,7 @@ BENCHMARKS = {
     ),
     "campaign": Benchmark(
         ["campaign.py", "speed"],
-        ["campaign.py", "speed", "4", "120"],
+        ["campaign.py", "speed", "4", "350"],
         [
             Figure("campaign, one worker", BARE, rf"1 worker .*: {N} times the bare", "", 1.1),
             Figure(

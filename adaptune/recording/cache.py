@@ -24,7 +24,7 @@ import platformdirs
 from numpy.typing import NDArray
 
 from adaptune.errors import AdaptuneError
-from adaptune.files import expand_user
+from adaptune.files import DAMAGED_NPZ, expand_user
 from adaptune.recording.scan import Scan
 
 _log = logging.getLogger(__name__)
@@ -87,6 +87,8 @@ class CachedScans:
         self.about: dict[str, Any] = json.loads((path / _ABOUT).read_text("utf-8"))
         # Of each scan its stamp, and in each array where it begins and ends; -1 if it has none.
         self._index = np.load(path / _INDEX)
+        if (self._index[:, 1] < 0).any():
+            raise ValueError("a scan has no points")
         ends = self._index[:, 2::2].max(axis=0, initial=0).tolist()
         # All at once: mapped arrays stay even if another process removes the entry.
         self._arrays = [self._map(name, end) for name, end in zip(_ARRAYS, ends, strict=True)]
@@ -130,7 +132,7 @@ def find(key: str) -> CachedScans | None:
         # A process that was killed may have left a part of it.
         shutil.rmtree(path, ignore_errors=True)
         return None
-    except (OSError, ValueError, IndexError) as error:
+    except (IndexError, *DAMAGED_NPZ) as error:
         _log.warning("%s: is damaged and removed (%s)", path, error)
         shutil.rmtree(path, ignore_errors=True)
         return None

@@ -90,7 +90,7 @@ def read_scan(path: Path, stamp: int, timing: Timing = AUTO) -> Scan:
         raise SequenceError(f"{path}: there is no such file") from error
     except NotInstalledError as error:
         raise SequenceError(f"{path}: {error}") from error
-    except (OSError, ValueError, KeyError, EOFError, RuntimeError, PointCloudError) as error:
+    except (KeyError, PointCloudError, *open3d.DAMAGED_NPZ) as error:
         raise SequenceError(f"{path}: cannot be read as a scan ({error})") from error
 
 

@@ -192,3 +192,11 @@ def test_a_missing_file_is_named(tmp_path):
         Archive(tmp_path).read("cave", 7)
     with pytest.raises(ArchiveError, match=r"cave/frames\.npz: there is no such file"):
         Archive(tmp_path).read_frames("cave")
+
+
+def test_a_damaged_line_of_the_index_does_not_count(tmp_path):
+    Archive(tmp_path).write("cave", 0, random_trial())
+    known = list(Archive(tmp_path).finished("cave"))  # which writes the index
+    index = tmp_path / INDEX
+    index.write_text('[["cave", Infinity, 1, 1], {}]\n' + index.read_text())
+    assert list(Archive(tmp_path).finished("cave")) == known == [0]

@@ -8,6 +8,7 @@ import contextlib
 import logging
 import re
 import shutil
+import struct
 import tempfile
 import threading
 import time
@@ -23,6 +24,7 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, model_validator
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag1 import Writer
+from rosbags.serde import SerdeError
 from rosbags.typesys.store import Typestore
 
 from adaptune import processes
@@ -145,7 +147,10 @@ class Rustle:
 
 def read_poses(store: Typestore, kind: str, data: bytes) -> list[Pose]:
     """The poses in a message; none if it is of another type."""
-    return POSES[kind](store.deserialize_ros1(data, kind)) if kind in POSES else []
+    try:
+        return POSES[kind](store.deserialize_ros1(data, kind)) if kind in POSES else []
+    except (SerdeError, struct.error, ValueError, IndexError) as error:
+        raise OdometryError(f"it publishes a {kind} that cannot be read ({error})") from error
 
 
 # A ROS 1 system in a container that receives scan after scan, and can change its parameters.

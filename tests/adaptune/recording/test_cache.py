@@ -140,6 +140,10 @@ def test_a_damaged_entry_is_made_anew(tmp_path, cache_folder, caplog):
         again = list(open_sequence(config))
         assert [s.stamp for s in again] == [s.stamp for s in whole]
         assert "damaged" in caplog.text
+    index = np.load(entry / "index.npy")
+    index[1, 1] = -1  # a scan without points
+    np.save(entry / "index.npy", index)
+    assert len(list(open_sequence(config))) == len(whole)
     (entry / "index.npy").unlink()  # as a killed process leaves an entry that it removes
     list(open_sequence(config))
     assert (entry / "index.npy").exists()

@@ -239,6 +239,11 @@ def test_a_kitti_pose_file_goes_with_any_recording(tmp_path):
         open_sequence(SequenceConfig(bag=bag, reference=str(tmp_path / "gt.txt"))).reference()
 
 
+def headed(header):
+    """A file of numpy's with this header."""
+    return b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header
+
+
 def broken(path, name, content):
     (path / name).write_bytes(content)
     return path
@@ -251,6 +256,7 @@ def broken(path, name, content):
         ("folder", lambda p: p, "holds no scan"),
         ("folder", lambda p: broken(p, "1.bin", bytes(17)), "17 bytes are not a whole number"),
         ("folder", lambda p: broken(p, "1.npy", b"\x93NUMPY\x01\x00"), "cannot be read as a scan"),
+        ("folder", lambda p: broken(p, "1.npy", headed(b"{'descr': (")), "cannot be read as a"),
         ("folder", lambda p: broken(p, "1.pcd", b"VERSION .7\nFIELDS x y\n"), "damaged or holds"),
         ("kitti", lambda p: p / "none", "there is no such folder"),
         ("kitti", lambda p: p, "not a KITTI sequence"),

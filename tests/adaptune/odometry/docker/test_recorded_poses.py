@@ -121,6 +121,15 @@ def test_poses_are_kept_as_they_come(link, tmp_path):
         assert sorted(stamp for _, stamp, _ in bag.messages()) == SCANS[:4].tolist()
 
 
+def test_a_message_that_is_none_is_named(link):
+    recorder = PoseRecorder(link, "/found")
+    link.publish(odometry(0))
+    kind, data = recorder.received[0]
+    recorder.received.append((kind, data[:-9]))
+    with pytest.raises(OdometryError, match=f"publishes a {kind} that cannot be read"):
+        recorder.newest()
+
+
 @pytest.mark.parametrize(
     ("drain", "interval", "pause"),
     [(2.0, 0.1, 2.0), (2.0, 1.5, 4.5), (2.0, 9, 10)],
