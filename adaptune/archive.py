@@ -25,7 +25,8 @@ from adaptune.space import ODOMETRY, ParameterSet, in_words
 from adaptune.strict import ConfigurationError
 from adaptune.trajectory import Trajectory, write_tum
 
-REGISTER_MS, PREPARE_MS = "register_ms", "prepare_ms"  # in `Trial.usage`
+# In `Trial.usage`; the last one in seconds, where the first scan has no pose.
+REGISTER_MS, PREPARE_MS, FIRST_POSE = "register_ms", "prepare_ms", "first_pose"
 MAX_SHARE_WITHOUT_POSE = 0.1
 """Share of the scans from which an odometry that gives no pose for them has failed."""
 
@@ -61,7 +62,8 @@ class Trial:
     # track. Of several runs, the mean of the capped errors.
     errors: NDArray[np.float64]
     restarted: NDArray[np.bool_]  # (n,): where it lost track and restarted at the reference
-    registered: NDArray[np.bool_]  # (n,): False where the scan had too few points
+    # (n,): False where the scan had too few points, and before the odometry's first pose.
+    registered: NDArray[np.bool_]
     # (n,): computing time of the odometry for each scan, without preparing it.
     seconds: NDArray[np.float64]
     # Reasons why the odometry's process ended or gave no pose, each with its last output.
@@ -569,6 +571,7 @@ _HEADINGS = {
     "cpu": "cpu [%]",
     "memory": "memory [MB]",
     "cost": "cost [ms]",
+    FIRST_POSE: "first pose after [s]",
 }
 """Columns as a table for reading names them."""
 _CONDITION = re.compile(r"\s*([\w.-]+)\s*(<=|>=|==|!=|<|>)\s*(.*?)\s*")
@@ -603,7 +606,8 @@ def rows(archive: Archive, names: Sequence[str]) -> list[Row]:
         row["unhealthy"] = sum(sum(t.unhealthy.values()) for t in there)
         for metric in metrics:
             if metric not in ("rte", REGISTER_MS, PREPARE_MS):
-                row[metric] = _mean([t.metrics.get(metric) for t in there])
+                without = 0.0 if metric == FIRST_POSE else None
+                row[metric] = _mean([t.metrics.get(metric, without) for t in there])
         cost = float(np.mean([t.cost for t in there]))
         found.append(row | {"cost": None if np.isnan(cost) else cost})
     return found

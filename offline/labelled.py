@@ -322,7 +322,7 @@ class LabelledSequence:
         if self.whole_errors is None or not kept.any():
             return some
         few = {n: errors[kept] for n, errors in self.whole_errors.items()}
-        whole = {n: float(cap(errors).mean()) for n, errors in few.items()}
+        whole = {n: float(np.nanmean(cap(errors))) for n, errors in few.items()}
         # The objective is that of the frames that are left.
         return replace(some, values=None, repeats=None, whole=whole, whole_errors=few)
 
@@ -626,8 +626,10 @@ def _labelled(
     errors = archive.read_errors(name, list(sets))
     # Trials that were run for another budget do not count.
     errors[:, [trial not in run for trial in sets]] = np.nan
-    # Whether there is a sub-trajectory depends on the reference alone.
-    known = np.flatnonzero(~np.isnan(errors).all(axis=1))
+    baseline = archive.read(name, 0).errors
+    # All trials know the same frames, but for those before an odometry's first pose.
+    ran = np.column_stack([errors[:, ~np.isnan(errors).all(axis=0)], baseline])
+    known = np.flatnonzero(~np.isnan(ran).any(axis=1))
     objective, n_repeats = config.offline.objective[0], config.offline.repeats
     summaries = [archive.finished(name)[trial] if trial in run else None for trial in sets]
     values = [weighted(objective, s.metrics) if s and s.usable else np.inf for s in summaries]
@@ -661,7 +663,7 @@ def _labelled(
         known,
         stretches(simulation, known),
         errors[known],
-        archive.read(name, 0).errors[known],
+        baseline[known],
         frames.blocks,
         values=np.array(values),
         repeats=np.array(repeats) if n_repeats > 1 else None,

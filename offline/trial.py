@@ -13,7 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptune import recording
-from adaptune.archive import PREPARE_MS, REGISTER_MS, Frames, Trial
+from adaptune.archive import (
+    FIRST_POSE,
+    MAX_SHARE_WITHOUT_POSE,
+    PREPARE_MS,
+    REGISTER_MS,
+    Frames,
+    Trial,
+)
 from adaptune.errors import AdaptuneError, UnavailableError, in_a_line
 from adaptune.geometry import Poses, invert, steps
 from adaptune.live.evidence import hops_along
@@ -184,15 +191,20 @@ class TrialRun:
             T = np.eye(4) if np.isnan(T[0, 0]) else T
             self._odometry = self._make()
             self._odometry.start(scan(self._odometry), T)
-            self.T_odom_sensor[i] = T
+            self.T_odom_sensor[i], self.registered[i] = T, self._odometry.begun
             return
         assert self._odometry is not None
         odometry = self._odometry
-        prepared = scan(odometry)
+        prepared, waiting = scan(odometry), not odometry.begun
         begin = time.perf_counter()
         T, self.registered[i] = odometry.register(prepared)
         self.seconds[i] = time.perf_counter() - begin
         finite = np.isfinite(T).all()
+        if waiting and not odometry.faults:
+            # Nobody knows how it moved until its first pose.
+            self.registered[i] &= odometry.begun and finite
+            self.T_odom_sensor[i] = T if self.registered[i] else self.T_odom_sensor[i - 1]
+            return
         self.unhealthy.update([] if finite else ["no_pose"])
         # An odometry without a pose counts as not moved.
         T_step = invert(self.T_odom_sensor[i - 1]) @ T if finite else np.eye(4)
@@ -485,6 +497,15 @@ def _trial(
     T_steps = steps(T_odom_sensor)
     for i, T_step in run.lost_steps.items():
         T_steps[i - 1] = T_step
+    n, first = len(frames.stamps), int(np.argmax([*run.registered, True]))
+    # Scans before the first pose are unknown, unless they are so many that the run has failed.
+    begin = 0
+    if (missing := first + run.unhealthy["no_pose"]) >= MAX_SHARE_WITHOUT_POSE * n:
+        run.unhealthy["no_pose"] = min(missing, n)
+    elif begin := first:
+        T_ref_sensor = frames.T_ref_sensor.copy()
+        T_ref_sensor[:first] = np.nan
+        frames = replace(frames, T_ref_sensor=T_ref_sensor)
     usage, prepare_ms = run.usage(scans.shared)
     if usage.seconds is not None:
         run.seconds[:] = usage.seconds
@@ -493,6 +514,8 @@ def _trial(
         REGISTER_MS: 1e3 * usage.cpu / len(frames.stamps),
         PREPARE_MS: prepare_ms,
     } | ({} if usage.memory is None else {"memory": usage.memory})
+    if 0 < first < n:
+        used[FIRST_POSE] = (frames.stamps[first] - frames.stamps[0]) * 1e-9
     driven = run if isinstance(run, DrivenRun) else None
     return Trial(
         parameters,
@@ -508,7 +531,9 @@ def _trial(
         used,
         unhealthy=dict(run.unhealthy)
         if driven
-        else unhealthy(settings.health, T_steps, frames.stamps, run.registered)
+        else unhealthy(
+            settings.health, T_steps[begin:], frames.stamps[begin:], run.registered[begin:]
+        )
         | dict(run.unhealthy),
         health=settings.health.model_dump() if driven else {},
     )
@@ -527,7 +552,10 @@ def _mean(parameters: ParameterSet, repeats: Sequence[Trial]) -> Trial:
         np.mean([trial.seconds for trial in repeats], axis=0),
         tuple(fault for trial in repeats for fault in trial.faults),
         {m: float(np.mean([t.metrics[m] for t in repeats])) for m in repeats[0].metrics},
-        {m: float(np.mean([t.usage[m] for t in repeats])) for m in repeats[0].usage},
+        {
+            m: float(np.mean([t.usage.get(m, 0.0) for t in repeats]))
+            for m in {m: None for t in repeats for m in t.usage}
+        },
         tuple({"rte": trial.mean_error} | trial.metrics for trial in repeats),
         max(repeats, key=lambda trial: trial.unhealthy.get("no_pose", 0)).unhealthy,
         repeats[0].health,

@@ -6,11 +6,13 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable, MutableSequence
 from dataclasses import dataclass, field
+from itertools import takewhile
 from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from adaptune.archive import MAX_SHARE_WITHOUT_POSE
 from adaptune.errors import AdaptuneError
 from adaptune.model.rules import BASELINE
 from adaptune.odometry.base import OdometryInstance, Usage
@@ -170,6 +172,7 @@ class ReplayRecord:
     seconds: float = 0.0  # the whole replay, reading included
     cpu_ms: float = math.nan  # milliseconds of CPU time a scan, in all processes, without reading
     memory: float = 0.0  # most megabytes of all processes
+    first_pose: float = 0.0  # seconds until then; the steps begin there
     # In real time:
     dropped: int = 0  # scans that the odometry did not get
     missed: int = 0  # selections that were not there at their deadline
@@ -242,6 +245,11 @@ class ReplayRecord:
         """
         if not self._n:
             raise AdaptuneError("there is no scan to replay; check start, stop and views")
+        # Scans before the first pose are unknown, unless they are so many that it has failed.
+        waiting = sum(1 for _ in takewhile(lambda step: not step.begun, self.steps))
+        if 0 < waiting < MAX_SHARE_WITHOUT_POSE * self._n:
+            self.first_pose = (self.steps[waiting].stamp - self.steps[0].stamp) * 1e-9
+            del self.steps[:waiting], self.late[:waiting]
         self.seconds = time.perf_counter() - self._started
         self.cpu_ms = 1e3 * (self._cpu + usage.other_cpu + other_cpu) / self._n
         self.memory += usage.memory or 0.0

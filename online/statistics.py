@@ -93,6 +93,7 @@ class ComparisonRow:
     restarts: int = 0  # by the health check, in all repeats
     switches: int = 0  # changes of the parameters, in all repeats
     poor_scans: int = 0  # too poor to register
+    first_pose: float = 0.0  # seconds until then, at most; scans before it do not count
     rte_interval: Interval = None
     ratio_interval: Interval = None
     median: float | None = None  # of the sub-trajectory RTE, percent
@@ -336,6 +337,7 @@ def _measured(
         restarts=sum(summary.restarts for summary in summaries),
         switches=int(sum(switched(repeat.choices).sum() for repeat in repeats)),
         poor_scans=sum(summary.poor_scans for summary in summaries),
+        first_pose=max(summary.first_pose_s for summary in summaries),
         standard=StandardErrors.pooled(known),
         first_restart=min((float(at[0]) * 1e-9 for at in restarts if len(at)), default=None),
         unhealthy=tuple(dict.fromkeys(found for s in summaries for found in s.unhealthy)),

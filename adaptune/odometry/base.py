@@ -166,6 +166,11 @@ class OdometryInstance(ABC):
         return False
 
     @property
+    def begun(self) -> bool:
+        """Whether it has given a pose; the poses of scans before its first one are unknown."""
+        return True
+
+    @property
     def given_up(self) -> bool:
         """Whether it had so many faults that it does not start again."""
         return False

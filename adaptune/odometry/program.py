@@ -366,7 +366,8 @@ class WholeRun(Faulting):
         super().__init__(getattr(settings, "image", None) or settings.command[0], parameters)
         self.settings, self._limits, self._read_input = settings, limits, read
         self._T_own_sensor: dict[int, Poses] | None = None
-        self._T_odom_own = np.eye(4)
+        self._T_begin = self._T_odom_own = np.eye(4)
+        self._begun = False
         self._usage = Usage(0.0, None)
 
     @staticmethod
@@ -378,6 +379,10 @@ class WholeRun(Faulting):
     def instance(cls, *given: Any) -> Self:
         """Make an instance, as all programs of the user are made."""
         return cls(*given)
+
+    @property
+    def begun(self) -> bool:
+        return self._begun or bool(self.faults)
 
     @property
     def usage(self) -> Usage:
@@ -409,10 +414,18 @@ class WholeRun(Faulting):
             given = self._read_input()
             poses = self._run(given)
             self._T_own_sensor = dict(zip(given.stamps.tolist(), poses, strict=True))
-        self._T_odom_own = T_odom_sensor @ invert(self._own(prepared))
+        self._T_begin = T_odom_sensor
+        self._place(self._own(prepared))
         self._last_motion.start(T_odom_sensor, T_previous_current)
 
+    def _place(self, T_own_sensor: Poses) -> None:
+        """Begin with a pose of its own."""
+        self._T_odom_own = self._T_begin @ invert(T_own_sensor)
+        self._begun = self._begun or bool(np.isfinite(T_own_sensor).all())
+
     def collect(self) -> Registration:
+        if not self.begun:
+            self._place(self._own(self._submitted))
         T_odom_sensor = self._T_odom_own @ self._own(self._submitted)
         self._last_motion.move(T_odom_sensor)
         return Registration(T_odom_sensor, bool(np.isfinite(T_odom_sensor).all()))
@@ -454,17 +467,31 @@ class WholeRun(Faulting):
 def _lacking(T_own_sensor: Poses, given: ProgramInput) -> str | None:
     """What is said where too few scans have poses, or too little of the way."""
     known = np.isfinite(T_own_sensor[:, 0, 0])
-    seconds = 1e-9 * (given.stamps - given.stamps[0])
-    until = f"the last at {seconds[known][-1]:.1f} s of {seconds[-1]:.1f} s" if known.any() else ""
     if known.mean() < _COVERAGE:
-        return f"it gave poses for {known.sum()} of {len(known)} scans, {until}"
+        return (
+            f"it gave poses for {known.sum()} of {len(known)} scans; {missing(known, given.stamps)}"
+        )
     if given.T_ref_sensor is not None:
         metres = np.nan_to_num(np.linalg.norm(steps(given.T_ref_sensor)[:, :3, 3], axis=1))
         covered = metres[known[:-1] & known[1:]].sum()
         if covered < _COVERAGE * metres.sum():
             way = f"{covered:.0f} m of {metres.sum():.0f} m"
-            return f"it gave poses for {way} of the way, {until}"
+            return f"it gave poses for {way} of the way; {missing(known, given.stamps)}"
     return None
+
+
+def missing(known: NDArray[np.bool_], stamps: NDArray[np.int64]) -> str:
+    """Where scans have no pose, and the cause that this suggests; both of shape (n,)."""
+    if not known.any():
+        return "none at all"
+    seconds, (first, last) = 1e-9 * (stamps - stamps[0]), np.flatnonzero(known)[[0, -1]]
+    causes = {
+        f"at the start (it begins late: first pose after {seconds[first]:.1f} s)": first,
+        "on the way (it drops scans)": int((~known[first : last + 1]).sum()),
+        f"at the end (it stops early: the last pose at {seconds[last]:.1f} s of "
+        f"{seconds[-1]:.1f} s)": len(known) - 1 - last,
+    }
+    return "without one: " + ", ".join(f"{n} {where}" for where, n in causes.items() if n)
 
 
 def poses_at(trajectory: Trajectory, stamps: NDArray[np.int64]) -> Poses:

@@ -233,6 +233,7 @@ class RegisteredScan(NamedTuple):
     unhealthy: str | None
     prepare_seconds: float
     register_seconds: float
+    begun: bool = True  # False before the odometry's first pose: the scan's is unknown
 
 
 class _Seen(NamedTuple):
@@ -278,6 +279,11 @@ class Tracker:
         if self._last is None:
             T_odom_sensor, T_previous_current = np.eye(4), None
             self.odometry.start(prepared, T_odom_sensor)
+        elif not self._last.begun:
+            T_odom_sensor, T_previous_current = self._last.T_odom_sensor, None
+            T, registered = self.odometry.register(prepared)
+            if self.odometry.begun and np.isfinite(T).all():
+                T_odom_sensor = T
         else:
             T_odom_previous = self._last.T_odom_sensor
             T_odom_sensor, registered = self.odometry.register(prepared)
@@ -300,10 +306,9 @@ class Tracker:
                     T_odom_sensor = T_warm
         if self.fall_back is not None and scan is not None and self.odometry.rewinds:
             self._remember(scan, prepared, T_odom_sensor, T_previous_current)
-        seconds = time.perf_counter() - begin
-        self._last = RegisteredScan(
-            stamp, T_odom_sensor, registered, unhealthy, prepare_seconds, seconds
-        )
+        seconds, begun = time.perf_counter() - begin, self.odometry.begun
+        found = (registered and begun, unhealthy, prepare_seconds, seconds, begun)
+        self._last = RegisteredScan(stamp, T_odom_sensor, *found)
         return self._last
 
     def _remember(

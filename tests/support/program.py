@@ -103,6 +103,9 @@ def spoil(poses, fault):
         rows = [[[1, 0, 0, -T[1][3]], [0, 1, 0, -T[2][3]], [0, 0, 1, T[0][3]]] for T in rows]
     if fault == "half":
         stamps, rows = stamps[: len(stamps) // 2], rows[: len(rows) // 2]
+    if fault.startswith("begins after "):
+        n = int(fault.split()[-1])
+        stamps, rows = stamps[n:], rows[n:]
     if fault == "backwards":
         stamps = stamps[::-1]
     if fault == "late":

@@ -190,6 +190,10 @@ class Lockstep(Faulting):
         return self._system is None
 
     @property
+    def begun(self) -> bool:
+        return self._has_run or bool(self.faults)
+
+    @property
     def usage(self) -> Usage:
         if self._system is not None and time.monotonic() - self._looked > _BETWEEN_LOOKS:
             self._look(self._system)

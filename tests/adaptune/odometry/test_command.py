@@ -11,6 +11,7 @@ import pytest
 import yaml
 from setups import setup_of
 
+from adaptune.archive import Archive, rows, summarise
 from adaptune.errors import OdometryError
 from adaptune.odometry.program import Template, find_output
 from adaptune.odometry.tracker import HealthCheck
@@ -20,6 +21,7 @@ from offline.config import load_study
 from offline.train import train
 from online.compare import compare
 from online.modes import run_replays
+from online.tables import remarks
 
 STUDY = """\
 odometry:
@@ -154,6 +156,39 @@ def test_a_program_that_stamps_the_end_of_a_scan(make):
     assert np.nanmax(trial.errors) < 5.0
 
 
+def test_scans_before_the_first_pose_are_unknown_and_do_not_count(make):
+    polite, _ = run(make("polite"))
+    study = make("begins after 3")
+    for whole in (False, True):
+        trial, _ = run(study, whole)
+        assert not trial.faults
+        assert not trial.restarted.any()
+        assert trial.registered.tolist() == [False] * 3 + [True] * 37
+        assert np.isnan(trial.errors[:3]).all()
+        np.testing.assert_allclose(trial.errors[3:], polite.errors[3:], atol=1e-4)
+        assert trial.metrics["ape"] < 1e-4
+        assert trial.metrics["rpe"] < 1e-4
+        assert trial.usage["first_pose"] == pytest.approx(0.3)
+        assert trial.unhealthy == {}
+    train(study)
+    table = rows(Archive(study.folder / "trials"), ["one"])
+    assert [row["first_pose"] for row in table] == pytest.approx([0.3] * 3)
+    run_replays(study, study.model_path)
+    compared = compare(study)
+    for row in compared.rows:
+        assert (row.restarts, row.first_pose) == (0, 0.3)
+        assert row.rte < 1e-3
+        assert row.standard.ape < 1e-4
+    (words,) = [words for words in remarks(compared.rows) if "first pose" in words]
+    assert words.startswith("On two the first pose came after 0.3 s (`baseline`), 0.3 s (`fixed`)")
+
+
+def test_too_many_scans_before_the_first_pose_are_a_failure(make):
+    trial, _ = run(make("begins after 5"))
+    assert not summarise(trial).usable
+    assert trial.mean_error > 1.0
+
+
 def test_what_it_takes_is_measured_and_can_be_limited(make):
     kept = "{cpu: {max: 100000}, ms_per_scan: {max: 1000}}"
     once = "offline.trials=1"
@@ -193,7 +228,8 @@ FAULTS = {
     "hang": r"longer than isolation.seconds = 0\.1 for each scan: reading one\.bag",
     "memory": "code 1: .*MemoryError",
     "nothing": r"it left no trajectory\.tum: reading one\.bag",
-    "half": r"it gave poses for 2[01] of 40 scans, the last at .* of 3\.9 s",
+    "half": r"poses for 2[01] of 40 scans; without one: .* at the end .*last pose at .* of 3\.9 s",
+    "begins after 5": r"35 of 40 scans; without one: 5 at the start .*: first pose after 0\.5 s\)",
     "cut": r"trajectory\.tum, line 42: a TUM line has 8 numbers",
     "backwards": "line 4: its stamp does not come after the line before",
     "clock": "its poses are of 0.000 s to 3.900 s, the scans of 1700000000",
@@ -209,7 +245,8 @@ def test_faults_are_told_with_the_last_lines(make, fault):
     assert re.search(FAULTS[fault], told, re.DOTALL), told
     if fault == "half":
         assert np.isfinite(trial.errors[:9]).all()
-    assert np.isinf(trial.errors[~np.isnan(trial.errors)][-1])
+    if not fault.startswith("begins"):
+        assert np.isinf(trial.errors[~np.isnan(trial.errors)][-1])
 
 
 # As KISS-ICP's program leaves it: a folder with other files, and a link to the latest.
