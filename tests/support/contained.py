@@ -61,7 +61,7 @@ def template(path, sim="true", points="/points", **imitate):
 
 
 def rustle(file, **settings):
-    given = {"image": reference_image(), "odometry": "/Odometry", "rate": 4.0, "drain": 60.0}
+    given = {"image": reference_image(), "odometry": "/Odometry", "rate": 4.0}
     return RustleSettings(template=str(file), **(given | settings))
 
 

@@ -49,7 +49,14 @@ from adaptune.odometry.docker.ros_container import (
     warn_of_unread,
     whole_name,
 )
-from adaptune.odometry.program import ProgramInput, Template, WholeRun, WholeSettings, check_names
+from adaptune.odometry.program import (
+    ProgramInput,
+    Template,
+    WholeRun,
+    WholeSettings,
+    check_names,
+    missing,
+)
 from adaptune.odometry.remote import Limits
 from adaptune.recording.clouds import PATH, POSES, Pose, usable
 from adaptune.recording.config import resolve
@@ -83,10 +90,9 @@ class RustleSettings(ContainerSettings, WholeSettings):
     package: str | None = Field(None, pattern=r"^[\w-]+$")
     arguments: tuple[Annotated[str, Field(pattern=r"^[\w:=./-]+$")], ...] = ()
     play: Literal["bag", "lockstep"] = "bag"
-    rate: float = Field(1.0, gt=0, le=100)
+    rate: float = Field(1.0, ge=0, le=100)
     use_sim_time: bool | None = None
     ready: float = Field(60.0, gt=0, le=3600)
-    drain: float = Field(2.0, ge=0, le=3600)
     patience: float = Field(2.0, gt=0, le=3600)
     node: Topic | None = None
     set_parameter: SetCommand | None = None
@@ -98,6 +104,8 @@ class RustleSettings(ContainerSettings, WholeSettings):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
+        if self.play == "bag" and not self.rate:
+            raise ValueError("rate: 0 is for play: lockstep; a bag plays at 1, or at another rate")
         if self.set_parameter is not None and self.node is None:
             raise ValueError("set_parameter: name the node, too (node)")
         if self.node is not None and self.play == "bag":
@@ -168,7 +176,8 @@ _EARLY = 1_000_000
 class Lockstep(Faulting):
     """A ROS 1 system that hears a scan, and then waits for the next one until its pose is there.
 
-    It begins in a new container. Where a scan gets no pose, the last motion goes on.
+    It begins in a new container. Where a scan gets no pose, the last motion goes on. With a `rate`,
+    a scan waits until as much time has passed since the one before as in the recording.
     """
 
     apart = True
@@ -183,6 +192,7 @@ class Lockstep(Faulting):
         self._news = threading.Condition()
         self._poses: list[tuple[int, Poses]] = []
         self._waiting = self._has_run = False
+        self._shown = (0, -np.inf)  # stamp of the last scan, and when it was published
         self._looked = -np.inf
 
     @property
@@ -212,6 +222,7 @@ class Lockstep(Faulting):
         self._T_step = np.eye(4) if T_previous_current is None else np.array(T_previous_current)
         self._T_odom_own: Poses | None = None
         self._silent, self._stamp, self._poses = 0, prepared.stamp, []
+        self._shown = (prepared.stamp, -np.inf)
         self._late: int | None = None
         self._before: tuple[int, Poses] | None = None
         try:
@@ -308,7 +319,7 @@ class Lockstep(Faulting):
         self._messages = Messages(1)
         take = weakref.WeakMethod(self._take)  # the link must not keep this alive
         link.record(self._settings.odometry, lambda *given: (do := take()) and do(*given))
-        self._clock = system.run_clock(scan.stamp)
+        self._clock = system.run_clock(scan.stamp, self._settings.rate or 1.0)
         self._send_cloud = link.advertise(topics[0], _CLOUD)
         self._send_imu = link.advertise(topics[1], _IMU) if self._settings.imu else None
         self._topics = topics
@@ -322,6 +333,10 @@ class Lockstep(Faulting):
 
     def _show(self, scan: Scan) -> None:
         """Publish what the system hears until the end of a scan."""
+        stamp, at = self._shown
+        if rate := self._settings.rate:
+            time.sleep(max(0.0, at + 1e-9 * (scan.stamp - stamp) / rate - time.monotonic()))
+        self._shown = scan.stamp, time.monotonic()
         with self._news:
             self._poses = []
         messages, (points, imu_topic) = self._messages, self._topics
@@ -411,10 +426,18 @@ class Lockstep(Faulting):
 
 _BETWEEN_TOPIC_LOOKS = 0.1
 _BETWEEN_STATES = 1.0
-_LONGEST_PAUSE = 10.0
-"""Seconds; a pause between poses may have been longer, and is then not waited for."""
+_QUIET = 2.0
+"""Seconds without a pose, and without work, that are the end."""
+_FIRST = 10.0
+"""The same where no pose has come yet."""
+_BUSY_QUIET = 60.0
+"""Seconds without a pose that are the end of a system that never rests."""
+_IDLE = 0.1
+"""Cores that a system may use while it rests: nodes wake up with the clock."""
 _STEADY = 0.9
 """Least share of poses whose stamps are as far from the scans' as those of the others."""
+_SAME = 5_000_000
+"""Nanoseconds by which these may differ: a clock differs by more."""
 
 _log = logging.getLogger(__name__)
 
@@ -447,10 +470,10 @@ class PoseRecorder:
             )
         return [pose for kind, data in messages for pose in self._poses(kind, data)]
 
-    def newest(self) -> int:
-        """Stamp of the pose that came last; 0 if there is none."""
+    def newest(self) -> tuple[int, int]:
+        """How many poses there are, and the stamp of the one that came last."""
         poses = self._poses(*self.received[-1]) if self.received else []
-        return poses[-1][0] if poses else 0
+        return len(self.received) + max(len(poses) - 1, 0), poses[-1][0] if poses else 0
 
     def _poses(self, kind: str, data: bytes) -> list[Pose]:
         return read_poses(self.store, kind, data)
@@ -464,17 +487,34 @@ class PoseRecorder:
                 bag.write(connection, max(stamps, default=0), data)
 
 
-def drained(recorder: PoseRecorder, over: float, last: int, drain: float) -> bool:
-    """Whether the pose of the last scan is there, or nothing came for `drain` seconds.
+class Drain:
+    """Tells when nothing comes any more of a system whose bag of n scans is over.
 
-    They are more where poses came in longer intervals. `over` is the time at which the bag was
-    over, `last` the stamp of the last scan.
+    Every scan has its pose, or none comes while the system rests, at any load of the machine.
+    `last` is the last scan's stamp, `cpu` gives the seconds of CPU time that the system has used.
     """
-    # Stamps of a clock of its own say nothing.
-    if last <= recorder.newest() < last + 10**9:
-        return True
-    pause = max(drain, min(3.0 * recorder.longest_pause, _LONGEST_PAUSE))
-    return time.monotonic() - max(recorder.last, over) > pause
+
+    def __init__(self, recorder: PoseRecorder, n: int, last: int, cpu: Callable[[], float]):
+        self._recorder, self._n, self._last, self._cpu = recorder, n, last, cpu
+        self._over = self._since = time.monotonic()
+        self._used = cpu()
+
+    def over(self) -> bool:
+        """Whether nothing comes any more."""
+        recorder, now = self._recorder, time.monotonic()
+        count, newest = recorder.newest()
+        # Stamps of a clock of its own, or poses between scans, say nothing.
+        if count == self._n and self._last <= newest < self._last + 10**9:
+            return True
+        heard = max(recorder.last, self._over)
+        wait = max(_QUIET, 3.0 * recorder.longest_pause) if count else _FIRST
+        if self._since < heard or now - self._since > wait:
+            used, before, since = self._cpu(), self._used, self._since
+            self._used, self._since = used, now
+            if since >= heard:
+                rests = used - before < _IDLE * (now - since)
+                return rests or now - heard > max(_BUSY_QUIET, wait)
+        return False
 
 
 class PlayedBag(WholeRun):
@@ -536,22 +576,23 @@ class PlayedBag(WholeRun):
                     self._see(system, n)
                 self._check_time()
         with self._timed("drained"):
-            over = time.monotonic()
             # Nodes that sleep by the clock must wake up to finish.
             system.run_clock(_end_of(given.path), self.settings.rate)
-            while not drained(recorder, over, int(given.stamps[-1]), self.settings.drain):
+            drain = Drain(recorder, n, int(given.stamps[-1]), lambda: self._see(system, n))
+            while not drain.over():
                 time.sleep(_BETWEEN_TOPIC_LOOKS)
                 self._check_time()
             self._see(system, n)
 
-    def _see(self, system: RosSystem, n: int) -> None:
-        """See whether the system runs, and what it has used.
+    def _see(self, system: RosSystem, n: int) -> float:
+        """See whether the system runs, and how many seconds of CPU time it has used.
 
         The bag sets the pace, so CPU time counts as the system's time.
         """
         system.state()
         cpu = system.usage.cpu
         self._usage = system.usage._replace(seconds=cpu / n, other_cpu=cpu)
+        return cpu
 
     def _check_time(self) -> None:
         if time.monotonic() > self._end:
@@ -565,9 +606,9 @@ class PlayedBag(WholeRun):
         others = ", ".join(sorted(topics - {topic})) or "nothing"
         if topic in topics:
             raise OdometryError(
-                f"nothing was published on {topic} until {self.settings.drain:g} s after the bag, "
-                f"though a node announces it (others publish {others}); a system that is slow to "
-                f"begin needs a longer odometry.settings.drain"
+                f"nothing was published on {topic} until the system had rested for {_FIRST:g} s "
+                f"after the bag, though a node announces it (others publish {others}); does the "
+                f"system need another sensor, or some seconds at rest at the start?"
             )
         raise OdometryError(
             f"nothing was published on {topic}, but on {others}; name its topic as "
@@ -591,15 +632,19 @@ class PlayedBag(WholeRun):
                 recorder.write(kept / "odometry.bag")
 
     def _checked(self, recorder: PoseRecorder, given: ProgramInput) -> Trajectory:
-        """The trajectory, if its stamps are those of the data."""
+        """The trajectory, if its stamps are those of the data, or each scan has one pose."""
         poses = recorder.poses()
         stamps = np.array([stamp for stamp, *_ in poses], np.int64)
-        if scatter := check_stamps(stamps, given.stamps):
-            _log.warning(
-                "%s: stamps of poses scatter by up to %.3f s around those of the scans: %s, and "
-                "errors contain it",
-                *(self.name, scatter, _OWN_CLOCK),
-            )
+        try:
+            check_stamps(stamps, given.stamps)
+        except OdometryError as error:
+            if len(stamps) != len(given.stamps):
+                n = f"{len(stamps)} poses for {len(given.stamps)} scans"
+                help_ = f"{n} cannot be matched by number; set odometry.settings.play: lockstep"
+                raise OdometryError(f"{error}, and {help_}") from error
+            _log.warning("%s: %s; poses are matched to scans by number", self.name, error)
+            stamps = given.stamps
+            poses = [(s, *of) for s, (_, *of) in zip(stamps.tolist(), poses, strict=True)]
         trajectory, unusable = usable(poses)
         if trajectory is None or unusable:
             raise OdometryError(
@@ -609,13 +654,10 @@ class PlayedBag(WholeRun):
         near = np.searchsorted(stamps, given.stamps - half) < np.searchsorted(
             stamps, given.stamps + 2.0 * half
         )
-        # Systems need a few scans to begin.
-        missing = int((~near[np.argmax(near) :]).sum())
-        if missing > 0.01 * n:
+        if (~near).sum() > 0.01 * n:
             _log.warning(
-                "%s: %d of %d scans have no pose at rate %g: it drops scans, so a lower "
-                "odometry.settings.rate gives other results",
-                *(self.name, missing, n, self.settings.rate),
+                "%s: %d of %d scans have no pose at rate %g; %s",
+                *(self.name, (~near).sum(), n, self.settings.rate, missing(near, given.stamps)),
             )
         return trajectory
 
@@ -623,20 +665,19 @@ class PlayedBag(WholeRun):
 _OWN_CLOCK = "the system stamps poses by its own clock, not by the scans"
 
 
-def check_stamps(stamps: NDArray[np.int64], scans: NDArray[np.int64]) -> float:
+def check_stamps(stamps: NDArray[np.int64], scans: NDArray[np.int64]) -> None:
     """Refuse stamps of poses that are not those of the scans, in nanoseconds, shapes (m,) and (n,).
 
     A system that publishes one pose for a scan stamps it with the scan's start, its end, or
-    anything fixed between. One that publishes more is judged by begin and end only. Returns the
-    seconds by which stamps scatter around those of the scans; 0 if they do not.
+    anything fixed between. One that publishes more is judged by begin and end only.
 
     Raises
     ------
     OdometryError
-        If they go back, or are further off than two scans. It says how far.
+        If they go back, are further off than a scan and a quarter, or scatter. It says how far.
     """
     if len(stamps) < 2:
-        return 0.0
+        return
     if backwards := int((np.diff(stamps) < 0).sum()):
         what = f"{backwards} of {len(stamps)} poses have stamps that go back"
         raise OdometryError(f"{what}: {_OWN_CLOCK}")
@@ -648,19 +689,21 @@ def check_stamps(stamps: NDArray[np.int64], scans: NDArray[np.int64]) -> float:
             f"{1e-9 * scans[0]:.3f} s to {1e-9 * scans[-1]:.3f} s: {_OWN_CLOCK}"
         )
     if len(stamps) > 1.5 * len(scans):
-        return 0.0
+        return
     # Pose j is of scan j, or of a later one if poses are missing before it.
     missing = max(0, len(scans) - len(stamps))
     n = min(len(stamps), len(scans))
     late = 1e-9 * float(np.percentile(stamps[:n] - scans[missing : missing + n], 95))
     early = 1e-9 * float(np.percentile(scans[:n] - stamps[:n], 95))
-    if max(late, early) > 2e-9 * period:
+    if max(late, early) > 1.25e-9 * period:
         how = f"{late:.3f} s late" if late > early else f"{early:.3f} s early"
         raise OdometryError(f"its stamps are up to {how}: {_OWN_CLOCK}")
     i = np.searchsorted(scans, stamps).clip(1, len(scans) - 1)
     off = np.minimum(np.abs(stamps - scans[i]), np.abs(stamps - scans[i - 1])).astype(float)
-    steady = np.abs(off - np.median(off)) < max(5e6, 0.1 * period)
-    return 0.0 if steady.mean() > _STEADY else 1e-9 * float(np.percentile(off, 95))
+    scatter = np.abs(off - np.median(off))
+    if np.mean(scatter < _SAME) < _STEADY:
+        by = 1e-9 * float(np.percentile(scatter, 95))
+        raise OdometryError(f"its stamps scatter by up to {by:.3f} s: {_OWN_CLOCK}")
 
 
 def _end_of(bag: Path) -> int:

@@ -19,7 +19,8 @@ def settings(**given):
         ({"package": "a; rm"}, "package"),
         ({"arguments": ("a:=$(b)",)}, "arguments"),
         ({"play": "both"}, "play"),
-        ({"rate": 0}, "rate"),
+        ({"rate": 0}, "rate: 0 is for play: lockstep"),
+        ({"rate": -1}, "rate"),
         ({"image": ""}, "image"),
         ({"node": "/gicp"}, "node: parameters change only with play: lockstep"),
         (
