@@ -639,8 +639,10 @@ class PlayedBag(WholeRun):
             check_stamps(stamps, given.stamps)
         except OdometryError as error:
             if len(stamps) != len(given.stamps):
-                n = f"{len(stamps)} poses for {len(given.stamps)} scans"
-                help_ = f"{n} cannot be matched by number; set odometry.settings.play: lockstep"
+                counts = f"{len(stamps)} poses for {len(given.stamps)} scans"
+                help_ = (
+                    f"{counts} cannot be matched by number; set odometry.settings.play: lockstep"
+                )
                 raise OdometryError(f"{error}, and {help_}") from error
             _log.warning("%s: %s; poses are matched to scans by number", self.name, error)
             stamps = given.stamps
