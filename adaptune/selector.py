@@ -80,6 +80,13 @@ class AnySelector(Protocol):
         """What to apply where nothing can be chosen."""
 
 
+def used_instead(fallen_back: Selection) -> str:
+    """What is used where nothing can be chosen, in words."""
+    if fallen_back.weights is None:
+        return "the fixed set is used"
+    return "members that agree are used"
+
+
 class _Measuring:
     """What selectors of a bank, or of a single odometry, have in common: they measure it."""
 
@@ -435,7 +442,7 @@ class TimedSelector:
     """Selects once a period, and never raises nor reads a file or a clock.
 
     Call `update` with every scan, from any thread. What goes wrong costs a selection and not the
-    drive: the odometry then gets the fixed set, once, and the next period begins anew.
+    drive: the odometry then gets what `fall_back` says, once, and the next period begins anew.
 
     Parameters
     ----------
@@ -553,8 +560,9 @@ class TimedSelector:
         if self._failing:
             return None
         self._failing = True
-        _log.exception("no parameters can be selected; the fixed set is used")
-        return self._selector.fall_back()
+        fallen_back = self._selector.fall_back()
+        _log.exception("no parameters can be selected; %s", used_instead(fallen_back))
+        return fallen_back
 
 
 # A bank without a model: parameter sets that nobody has tried, and weights for them.

@@ -233,36 +233,32 @@ def containers(_: Path) -> Case:
     return one
 
 
-def counted(target: Callable[..., Counter[str]], *arguments: Any) -> Case:
-    """A case of `tests/support/fuzz.py`, whose functions count many."""
-    return lambda rng: target(20, int(rng.integers(2**31)), *arguments)
+def counted(target: Callable[..., Counter[str]], number: int, folder: Path | None = None) -> Case:
+    """So many cases of a function of `tests/support/fuzz.py`, each time in an empty folder."""
+
+    def one(rng: np.random.Generator) -> object:
+        if folder is None:
+            return target(number, int(rng.integers(2**31)))
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir()
+        return target(number, int(rng.integers(2**31)), folder)
+
+    return one
 
 
 def messages(_: Path) -> Case:
     """Point clouds in messages."""
-    return counted(fuzz.fuzz_messages)
+    return counted(fuzz.fuzz_messages, 20)
 
 
 def bags(folder: Path) -> Case:
     """Bags of ROS 1 and ROS 2."""
-
-    def one(rng: np.random.Generator) -> object:
-        shutil.rmtree(folder, ignore_errors=True)
-        folder.mkdir()
-        return fuzz.fuzz_bags(60, int(rng.integers(2**31)), folder)
-
-    return one
+    return counted(fuzz.fuzz_bags, 60, folder)
 
 
 def studies(folder: Path) -> Case:
     """Study files."""
-
-    def one(rng: np.random.Generator) -> object:
-        shutil.rmtree(folder, ignore_errors=True)
-        folder.mkdir()
-        return fuzz.fuzz_studies(20, int(rng.integers(2**31)), folder)
-
-    return one
+    return counted(fuzz.fuzz_studies, 20, folder)
 
 
 TARGETS: dict[str, Callable[[Path], Case]] = {

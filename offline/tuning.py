@@ -3,7 +3,7 @@
 All are compared by their expected loss on evidence that is left out, see `expected_loss`.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
@@ -18,7 +18,6 @@ from adaptune.model.rules import BASELINE, ERROR_FLOOR, Spending, complementary,
 from adaptune.model.weights import (
     MEMBER_POOL_SIZE,
     MemberWeights,
-    NearProducts,
     bank_weights,
     choose_members,
     smooth_weights,
@@ -309,9 +308,11 @@ def bank_errors(
     others: LabelledData,
     fitted: tuple[TrainingData, "ScaledPCA"],
     members: Sequence[int],
-    settings: Iterable[BankSettings],
+    settings: Sequence[BankSettings],
 ) -> Iterator[tuple[NDArray[np.float64], MemberWeights]]:
     """Simulate a bank on what is left out, with one settings after the other.
+
+    They have the same `clip` and `n_frames`.
 
     Its weights are fitted to the others, whose `LabelledData.training_data` is given.
 
@@ -325,14 +326,10 @@ def bank_errors(
     vectors = others.vectors(members)
     of_bank = replace(data, fixed=members[0], candidates=members, vectors=vectors)
     scans = pca.transform(simulation.descriptors[periods(simulation.period)[0]])
-    near: dict[tuple[float, int], NearProducts] = {}
+    near, live = BankRule(settings[0]).fit(of_bank).near(scans), simulation.live(members)
     votes: MemberWeights | None = None
     for one in settings:
-        key = one.clip, one.n_frames
-        if key not in near:
-            # Settings that share what is near follow each other: one at a time is kept.
-            near = {key: BankRule(one).fit(of_bank).near(scans)}
-        weights, _ = bank_weights(near[key], one, simulation.live(members))
+        weights, _ = bank_weights(near, one, live)
         smoothed = MemberWeights(members, smooth_weights(weights))
         # Who agrees takes long to find, and hangs on the settings but little.
         votes = smoothed if votes is None else votes

@@ -19,7 +19,7 @@ from adaptune.odometry.base import OdometryInstance, Usage
 from adaptune.odometry.tracker import HealthCheck, RegisteredScan, Tracker
 from adaptune.processes import resident_megabytes
 from adaptune.recording.scan import Scan
-from adaptune.selector import REMEMBERED, SETTLING, AnySelector, Schedule
+from adaptune.selector import REMEMBERED, SETTLING, AnySelector, Schedule, used_instead
 from adaptune.space import Selection
 from adaptune.trajectory import Trajectory
 
@@ -133,8 +133,7 @@ class Driver:
             what = "%s: %s at %.1f s; nor can the fixed set: %s"
             _log.warning(what, self._what, why, seconds, error)
             return False
-        used = "the fixed set is" if fixed.weights is None else "members that agree are"
-        _log.warning("%s: %s at %.1f s; %s used", self._what, why, seconds, used)
+        _log.warning("%s: %s at %.1f s; %s", self._what, why, seconds, used_instead(fixed))
         self._note(Choice(stamp, fixed, 0.0, fallen_back=why))
         return True
 

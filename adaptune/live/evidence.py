@@ -429,16 +429,13 @@ class LiveEvidence:
 
     def estimated(self, selection: Selection) -> Selection:
         """A selection with what is measured."""
+        selection = selection._replace(lost=self.lost, restart=self._told_to_restart())
         # Where registrations are rejected, the last chains are of before.
         error = None if self._rejected >= HOPS_TO_BE_LOST else self.own_error()
         if error is None:
-            return selection._replace(lost=self.lost, restart=self._told_to_restart())
+            return selection
         return selection._replace(
-            estimated_error=error.mean,
-            estimated_low=error.low,
-            estimated_high=error.high,
-            lost=self.lost,
-            restart=self._told_to_restart(),
+            estimated_error=error.mean, estimated_low=error.low, estimated_high=error.high
         )
 
 

@@ -50,14 +50,12 @@ _log = logging.getLogger(__name__)
 
 # Parameter files made from a template: YAML, JSON, TOML, and the layouts of ROS 1 and ROS 2.
 
-_YAML = (lambda text: files.Document(text, foreign=True).data, files.dump)
+_YAML = (".yaml", ".yml")
 _FORMATS: dict[str, tuple[Callable[[str], Any], Callable[[Any], str]]] = {
-    ".yaml": _YAML,
-    ".yml": _YAML,
     ".json": (json.loads, lambda data: json.dumps(data, indent=2) + "\n"),
     ".toml": (tomllib.loads, tomli_w.dumps),
 }
-"""Functions that read and write a format, by a file's suffix."""
+"""Functions that read and write a format, by a file's suffix; in YAML only values are replaced."""
 
 _ROS2 = "ros__parameters"
 
@@ -76,19 +74,22 @@ class Template:
 
     def __init__(self, path: Path):
         self.path = path
-        if path.suffix not in _FORMATS:
-            raise OdometryError(f"{path}: a template is a file of {', '.join(_FORMATS)}")
-        read, self._write = _FORMATS[path.suffix]
+        if path.suffix not in (*_YAML, *_FORMATS):
+            raise OdometryError(f"{path}: a template is a file of {', '.join((*_YAML, *_FORMATS))}")
+        self._data: Any
+        self.remarks: list[str] = []
         try:
             # Ends of lines stay as they are.
             self._text = path.read_bytes().decode()
-            self._data = read(self._text)
+            if path.suffix in _YAML:
+                self._document = files.Document(self._text, foreign=True)
+                self._data, self.remarks = self._document.data, self._document.remarks
+            else:
+                self._data = _FORMATS[path.suffix][0](self._text)
         except FileNotFoundError as error:
             raise OdometryError(f"{path}: there is no such file") from error
         except (OSError, ValueError, files.YamlError) as error:
             raise OdometryError(f"{path}: {error}") from error
-        yaml = self._write is files.dump
-        self.remarks = files.Document(self._text, foreign=True).remarks if yaml else []
         held = isinstance(self._data, dict | list)
         self._places = list(_places(self._data)) if held else []
 
@@ -123,9 +124,28 @@ class Template:
                 real = isinstance(held_in[key], float) or _EXPONENT.fullmatch(str(held_in[key]))
                 held_in[key] = float(value) if real and type(value) is int else value
                 changed[keys] = held_in[key]
-        if self._write is not files.dump:
-            return self._write(data)
-        return _replaced(self._text, changed, data, self.path)
+        if self.path.suffix in _YAML:
+            return self._replaced(changed, data)
+        return _FORMATS[self.path.suffix][1](data)
+
+    def _replaced(self, changed: Mapping[tuple[Any, ...], Any], data: Any) -> str:
+        """A YAML text with new values in their places, by their keys."""
+        text, spans = self._text, []
+        for keys, value in changed.items():
+            begin, end = self._document.span(keys) or (0, 0)
+            new = files.dump([value]).removeprefix("- ").strip()
+            spans.append((begin, end, new if begin < end else f" {new}"))
+        for begin, end, new in sorted(spans, reverse=True):
+            text = text[:begin] + new + text[end:]
+        with suppress(files.YamlError):
+            # Where nan is nan.
+            if repr(files.Document(text, foreign=True).data) == repr(data):
+                return text
+        where = ", ".join(str(self._document.line(keys)) for keys in changed)
+        raise OdometryError(
+            f"{self.path}: a parameter cannot be replaced alone (line {where}); write its value "
+            f"without anchors, aliases and tags"
+        )
 
     def _find(self, name: str) -> _Place | None:
         wanted = _parts(name)
@@ -154,26 +174,6 @@ def _places(data: Any, path: tuple[str, ...] = (), keys: tuple[Any, ...] = ()) -
 
 
 _EXPONENT = re.compile(r"[-+]?[.\d]+[eE][-+]?\d+")
-
-
-def _replaced(text: str, changed: Mapping[tuple[Any, ...], Any], data: Any, path: Path) -> str:
-    """A YAML text with new values in their places, by their keys."""
-    document, spans = files.Document(text, foreign=True), []
-    for keys, value in changed.items():
-        begin, end = document.span(keys) or (0, 0)
-        new = files.dump([value]).removeprefix("- ").strip()
-        spans.append((begin, end, new if begin < end else f" {new}"))
-    for begin, end, new in sorted(spans, reverse=True):
-        text = text[:begin] + new + text[end:]
-    with suppress(files.YamlError):
-        # Where nan is nan.
-        if repr(files.Document(text, foreign=True).data) == repr(data):
-            return text
-    where = ", ".join(str(document.line(keys)) for keys in changed)
-    raise OdometryError(
-        f"{path}: a parameter cannot be replaced alone (line {where}); write its value without "
-        f"anchors, aliases and tags"
-    )
 
 
 @cache

@@ -150,7 +150,7 @@ def _rotate(scan: Scan, moments: NDArray[np.float64], rotations: Any) -> NDArray
 
 _LEAST_CORRELATION = 0.8
 """Of two rates of turning that show the same motion."""
-_NEARLY = 0.95
+_AMBIGUOUS = 0.95
 """Share of the best correlation with which another offset could be the right one."""
 
 
@@ -196,7 +196,7 @@ def clock_offset(
     others = np.where(np.abs(lags - lags[best]) > rate, coefficients, -1.0)
     other = int(np.argmax(others))
     start = (stamps[0] - trajectory.stamps[0]) * 1e-9 - middles[0]
-    least = max(_LEAST_CORRELATION, _NEARLY * float(coefficients[best]))
+    least = max(_LEAST_CORRELATION, _AMBIGUOUS * float(coefficients[best]))
     fit = [best] if coefficients[best] >= _LEAST_CORRELATION else []
     fit += [other] if fit and others[other] >= least else []
     return [float(start + lags[at] / rate) for at in fit]

@@ -436,7 +436,7 @@ _IDLE = 0.1
 """Cores that a system may use while it rests: nodes wake up with the clock."""
 _STEADY = 0.9
 """Least share of poses whose stamps are as far from the scans' as those of the others."""
-_SAME = 5_000_000
+_MAX_SCATTER = 5_000_000
 """Nanoseconds by which these may differ: a clock differs by more."""
 
 _log = logging.getLogger(__name__)
@@ -703,7 +703,7 @@ def check_stamps(stamps: NDArray[np.int64], scans: NDArray[np.int64]) -> None:
     i = np.searchsorted(scans, stamps).clip(1, len(scans) - 1)
     off = np.minimum(np.abs(stamps - scans[i]), np.abs(stamps - scans[i - 1])).astype(float)
     scatter = np.abs(off - np.median(off))
-    if np.mean(scatter < _SAME) < _STEADY:
+    if np.mean(scatter < _MAX_SCATTER) < _STEADY:
         by = 1e-9 * float(np.percentile(scatter, 95))
         raise OdometryError(f"its stamps scatter by up to {by:.3f} s: {_OWN_CLOCK}")
 
