@@ -143,7 +143,7 @@ def test_a_damaged_entry_is_made_anew(tmp_path, cache_folder, caplog):
     index = np.load(entry / "index.npy")
     index[1, 1] = -1  # a scan without points
     np.save(entry / "index.npy", index)
-    assert len(list(open_sequence(config))) == len(whole)
+    assert [len(s.points) for s in open_sequence(config)] == [len(s.points) for s in whole]
     (entry / "index.npy").unlink()  # as a killed process leaves an entry that it removes
     list(open_sequence(config))
     assert (entry / "index.npy").exists()
