@@ -553,7 +553,7 @@ class TimedSelector:
         return selection
 
     def _after_failure(self) -> Selection | None:
-        """The fixed set, unless the odometry has it since the last failure."""
+        """What to fall back to, unless the odometry has it since the last failure."""
         self.failed += 1
         self._unmeasured = False
         self._selector.reset()
