@@ -27,11 +27,7 @@ def test_a_copy_of_a_training_sequence_is_refused(load):
 
 @pytest.mark.parametrize(
     ("one", "three", "overlapping"),
-    [
-        ("stop=2", "start=2", False),
-        ("stop=2", "start=1.9", True),
-        ("start=1", "stride=2", True),
-    ],
+    [("stop=2", "start=2", False), ("stop=2", "start=1.9", True), ("start=1", "stride=2", True)],
 )
 def test_sections_may_not_overlap(load, one, three, overlapping):
     overrides = [f"sequences.one.{one}", f"sequences.three.{three}"]

@@ -20,8 +20,7 @@ GICP = ParameterSpace.of(
     kernel=Categorical(choices=("huber", "none"), baseline="none"),
 )
 NDT = ParameterSpace.of(
-    distance=Float(low=1.0, high=4.0, baseline=2.0),
-    passes=Integer(low=1, high=9, baseline=3),
+    distance=Float(low=1.0, high=4.0, baseline=2.0), passes=Integer(low=1, high=9, baseline=3)
 )
 SPACE = PooledSpace({"gicp": GICP, "ndt": NDT})
 
@@ -29,10 +28,7 @@ SPACE = PooledSpace({"gicp": GICP, "ndt": NDT})
 def sets():
     unit = st.lists(st.floats(0.0, 1.0), min_size=2, max_size=2)
     return st.builds(
-        lambda label, u: {
-            ODOMETRY: label,
-            **SPACE.spaces[label].from_unit(np.array([u]))[0],
-        },
+        lambda label, u: {ODOMETRY: label, **SPACE.spaces[label].from_unit(np.array([u]))[0]},
         st.sampled_from(["gicp", "ndt"]),
         unit,
     )

@@ -10,13 +10,7 @@ from pydantic import ValidationError
 from tables import table
 
 from adaptune import files
-from adaptune.space import (
-    Categorical,
-    Float,
-    Integer,
-    ParameterSpace,
-    SpaceError,
-)
+from adaptune.space import Categorical, Float, Integer, ParameterSpace, SpaceError
 
 modest = settings(max_examples=60, deadline=None)
 unit = st.floats(0.0, 1.0)
@@ -101,11 +95,7 @@ def test_sets_of_the_unit_cube_are_of_the_space(points):
             [1.0, 1.5, 2.0, 1, np.float64(1.2)],
             [0.999, 2.001, math.nan, math.inf, True, "1.5", None],
         ),
-        (
-            Integer(low=1, high=3, baseline=1),
-            [1, 2, 3],
-            [0, 4, 2.0, True, "2", None],
-        ),
+        (Integer(low=1, high=3, baseline=1), [1, 2, 3], [0, 4, 2.0, True, "2", None]),
         (
             Categorical(choices=("a", 1, False), baseline="a"),
             ["a", 1, False],

@@ -159,16 +159,14 @@ def test_names_what_to_install(study_file, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("old", "words"),
-    [(old, words) for old, words in DELETED.items() if "=" not in old],
+    ("old", "words"), [(old, words) for old, words in DELETED.items() if "=" not in old]
 )
 def test_an_old_key_is_told_what_became_of_it(study_file, old, words):
     assert failure(study_file, f"{old}=3") == f"-o: {old}: {words}"
 
 
 @pytest.mark.parametrize(
-    ("old", "words"),
-    [(old, words) for old, words in DELETED.items() if "=" in old],
+    ("old", "words"), [(old, words) for old, words in DELETED.items() if "=" in old]
 )
 def test_an_old_value_is_told_what_became_of_it(study_file, old, words):
     key, _, value = old.partition("=")

@@ -118,11 +118,7 @@ def test_trials_have_their_charts(study):
     assert charts_of_trials(study) == ([], ["No trials: run `adaptune offline`."])
     write_trials(study, lambda _, p: p["keyframe_interval"], 20)
     charts, notes = charts_of_trials(study)
-    assert [chart.key for chart in charts] == [
-        "iterations",
-        "importance",
-        "parameter-scatter",
-    ]
+    assert [chart.key for chart in charts] == ["iterations", "importance", "parameter-scatter"]
     assert notes == []
     # The most important one comes first.
     assert charts[-1].panels[0].x.label == "keyframe_interval [m]"
@@ -151,13 +147,7 @@ def test_validation_is_read_or_missed(study):
     assert notes == []
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "[{",
-        '[{"a": 1}]',
-    ],
-)
+@pytest.mark.parametrize("text", ["[{", '[{"a": 1}]'])
 def test_a_damaged_validation_is_named(study, text):
     (study.folder).mkdir(exist_ok=True)
     (study.folder / "stretches.json").write_text(text, "utf-8")

@@ -53,8 +53,7 @@ def scheduler(tmp_path_factory):
             "asyncio.run(main())"
         )
         made = subprocess.Popen(
-            [sys.executable, "-c", code, address, *([version] if version else [])],
-            **silent,
+            [sys.executable, "-c", code, address, *([version] if version else [])], **silent
         )
         processes.append(made)
         return made

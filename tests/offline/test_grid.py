@@ -61,11 +61,7 @@ def test_a_huge_grid_is_drawn_from_without_making_it():
 
 
 @given(
-    st.integers(1, 6),
-    st.integers(1, 6),
-    st.floats(0.0, 4.0),
-    st.floats(0.01, 1.0),
-    st.booleans(),
+    st.integers(1, 6), st.integers(1, 6), st.floats(0.0, 4.0), st.floats(0.01, 1.0), st.booleans()
 )
 def test_index_is_the_inverse(n, m, first, step, log):
     low, high = first + 0.01, first + 0.01 + step * n

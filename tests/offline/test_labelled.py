@@ -10,13 +10,7 @@ from adaptune.model.rules import ERROR_FLOOR
 from offline.config import OfflineConfig
 from offline.labelled import LabelledData
 from offline.objective import best_by_trials, judge
-from offline.tuning import (
-    expected_loss,
-    interval_of,
-    log_ratios,
-    standard_error,
-    worst_tenth,
-)
+from offline.tuning import expected_loss, interval_of, log_ratios, standard_error, worst_tenth
 
 
 def labelled(runs):

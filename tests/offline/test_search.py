@@ -173,13 +173,7 @@ def test_what_a_place_has_found_is_not_known_where_it_is_left_out(study_of):
     )
     seen = {name: [n for n, v in verdicts.items() if name in v.sequences] for name in NAMES}
     data = labelled_data(
-        archive,
-        seen,
-        sets,
-        study.config,
-        study.window,
-        study.sequences.recorded_in,
-        study.odometry,
+        archive, seen, sets, study.config, study.window, study.sequences.recorded_in, study.odometry
     )
     assert np.isnan(data.sequences[0].errors).any()
     complete = data.complete()

@@ -73,8 +73,7 @@ def test_a_bank_that_gains_nothing_does_not_adapt():
             errors=np.repeat(s.errors[:, :1], 5, axis=1),
             vectors=dict.fromkeys(TRIALS, s.vectors[0]),
             simulation=replace(
-                s.simulation,
-                motions=lambda m, of=s.simulation.motions: of((0,) * len(m)),
+                s.simulation, motions=lambda m, of=s.simulation.motions: of((0,) * len(m))
             ),
         )
         for s in sequences

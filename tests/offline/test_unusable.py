@@ -16,10 +16,7 @@ from offline.train import train
 from offline.validate import validate
 
 GOOD = Summary({"x": 1}, 2.0, 0, 0, 10.0)
-FAILS = [
-    Summary({"x": 2}, 1.0, 0, 10, 0.01),
-    Summary({"x": 2}, 1.0, 0, 1, 0.01, without_pose=0.1),
-]
+FAILS = [Summary({"x": 2}, 1.0, 0, 10, 0.01), Summary({"x": 2}, 1.0, 0, 1, 0.01, without_pose=0.1)]
 FAST = "offline.objective={rte: 0.001, ms_per_scan: 1.0}"
 TWO_FOLD = "offline.objective=[ms_per_scan, rte]"
 LIMIT = "offline.limits={ms_per_scan: {max: 1000}}"

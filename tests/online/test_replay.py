@@ -308,10 +308,7 @@ def spend(seconds):
 
 
 def test_selections_of_several_odometries_are_stored_with_gaps(tmp_path):
-    sets = [
-        {"odometry": "a", "speed": 1.0, "kernel": "huber"},
-        {"odometry": "b", "points": 3},
-    ]
+    sets = [{"odometry": "a", "speed": 1.0, "kernel": "huber"}, {"odometry": "b", "points": 3}]
 
     class Any(InProcess):
         def apply(self, selection):

@@ -3,13 +3,7 @@ from made_replays import SCENES, SECONDS, bank, kept, replay, sequence
 
 from adaptune.report.charts import Band, Line, Mark, Points, Shares, Spans
 from offline.config import load_study
-from online.charts import (
-    charts_of_replays,
-    choice_chart,
-    error_chart,
-    read_replays,
-    switches,
-)
+from online.charts import charts_of_replays, choice_chart, error_chart, read_replays, switches
 
 
 def of_kind(panel, kind):

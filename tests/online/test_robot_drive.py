@@ -22,10 +22,7 @@ from online.modes import ReplaySetup
 from online.replay import replay
 from online.robot import RobotDrive
 
-PATIENT = (
-    "online.real_time={deadline: 60, queue: 0}",
-    "online.ros={points: /points, tf: true}",
-)
+PATIENT = ("online.real_time={deadline: 60, queue: 0}", "online.ros={points: /points, tf: true}")
 SCANS = drives.scans(2, 25)
 
 

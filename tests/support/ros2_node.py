@@ -17,10 +17,7 @@ ODOMETRY = "nav_msgs/msg/Odometry"
 SET, GET = "rcl_interfaces/srv/SetParameters", "rcl_interfaces/srv/GetParameters"
 REASON = "parameter 'rings' cannot be set because it is read-only"
 SERVICES = {
-    SET: (
-        "rcl_interfaces/Parameter[] parameters",
-        "rcl_interfaces/SetParametersResult[] results",
-    ),
+    SET: ("rcl_interfaces/Parameter[] parameters", "rcl_interfaces/SetParametersResult[] results"),
     GET: ("string[] names", "rcl_interfaces/ParameterValue[] values"),
 }
 

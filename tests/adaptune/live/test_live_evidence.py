@@ -255,10 +255,7 @@ def test_a_registration_that_another_does_not_confirm_counts_as_rejected(exactly
 
         return register
 
-    for pairs, found, lost in (
-        ([(39, 49)], 9, False),
-        ([(39, 49), (49, 59)], 8, True),
-    ):
+    for pairs, found, lost in (([(39, 49)], 9, False), ([(39, 49), (49, 59)], 8, True)):
         exactly(wrong(*pairs))
         live = LiveEvidence((0, 1))
         taken, states = [], []

@@ -93,18 +93,10 @@ def test_one_that_goes_wrong_is_named(monkeypatch, name):
         describe(turns.turn(5))
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "crashes",
-    ],
-)
+@pytest.mark.parametrize("name", ["crashes"])
 def test_a_campaign_names_the_descriptor_and_the_sequence(study_file, tmp_path, name):
     overrides = [f"descriptor=descriptors_elsewhere:{name}"]
     study = load_study(study_file, overrides, tmp_path / "study")
     words = rf"sequences\.one: descriptors_elsewhere:{name}: its process was ended by SIGSEGV"
-    with (
-        Workers(setup_of(study), 1, 1e9) as workers,
-        pytest.raises(AdaptuneError, match=words),
-    ):
+    with Workers(setup_of(study), 1, 1e9) as workers, pytest.raises(AdaptuneError, match=words):
         list(run(workers, [Task("one", (), (), frames=True)]))

@@ -265,10 +265,7 @@ def test_of_slow_scans_some_are_enough(monkeypatch, metres, seconds, used):
     T[:, :3, :3] = Rotation.from_euler("z", yaw[:, None]).as_matrix()
     T[:, 0, 3] = -15.0 + metres * np.arange(80)
     scans = [
-        Scan(
-            int(i * seconds * 1e9),
-            (world @ at[:3, :3] + invert(at)[:3, 3]).astype(np.float32),
-        )
+        Scan(int(i * seconds * 1e9), (world @ at[:3, :3] + invert(at)[:3, 3]).astype(np.float32))
         for i, at in enumerate(T)
     ]
     read = []

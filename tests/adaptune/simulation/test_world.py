@@ -55,12 +55,7 @@ def test_each_column_is_cast_from_its_own_pose():
     T = from_quaternions([[10.0, 0.0, 1.0], [11.0, 2.0, 1.0]], [[0, 0, 0, 1], [0, 0, 1, 1]])
     looks = np.array([[[1.0, 0, 0], [0, 0, 1]], [[1.0, 0, 0], [0, 1, 0]]], np.float32)
     rays = kernels.aim(looks, T, np.array([10.0, 0.0, 0.0]))
-    expected = [
-        [0, 0, 1, 1, 0, 0],
-        [0, 0, 1, 0, 0, 1],
-        [1, 2, 1, 0, 1, 0],
-        [1, 2, 1, -1, 0, 0],
-    ]
+    expected = [[0, 0, 1, 1, 0, 0], [0, 0, 1, 0, 0, 1], [1, 2, 1, 0, 1, 0], [1, 2, 1, -1, 0, 0]]
     np.testing.assert_allclose(rays, expected, atol=1e-6)
 
 

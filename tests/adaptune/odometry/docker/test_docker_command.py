@@ -144,10 +144,7 @@ FAULTS = {
     "exit": ("echo no planes here >&2; exit 3", r"its process ended with code 3: no planes here"),
     "nothing": ("echo done", r"it left no trajectory\.tum: done"),
     "no such program": ("no-such-program", r"its process ended with code 127: .*not found"),
-    "memory": (
-        "python3 -c 'bytearray(10**9)'",
-        r"out of isolation\.memory = 0\.3 GB: Killed",
-    ),
+    "memory": ("python3 -c 'bytearray(10**9)'", r"out of isolation\.memory = 0\.3 GB: Killed"),
     "hang": ("echo waiting; exec sleep 300", "it took longer than isolation.seconds.*: waiting"),
 }
 
