@@ -1,8 +1,5 @@
-import io
-import json
 import os
 import signal
-import struct
 import subprocess
 import sys
 import time
@@ -369,10 +366,3 @@ def test_large_arrays_among_small_ones_leave_no_holes():
 
     assert kept("as ever") > 50.0
     assert kept("apart") < 10.0
-
-
-def test_a_kind_of_numbers_that_is_none_is_a_message_of_others():
-    header = json.dumps({"arrays": [["pose", ",", [4, 4]]]}).encode()
-    stream = io.BytesIO(struct.pack("<I", len(header)) + header)
-    with pytest.raises(processes.WireError, match="holds no message of adaptune's"):
-        processes.receive(stream)

@@ -240,12 +240,3 @@ def test_an_interruption_leaves_those_that_are_done(estimator, load, monkeypatch
     assert os.sched_getaffinity(0) == before
     assert study.sequences.estimate("one") is not None
     assert study.sequences.estimate("two") is None
-
-
-@pytest.mark.usefixtures("estimator")
-def test_a_damaged_note_is_told(load):
-    study = load(LEFT_OUT)
-    ensure(study, ["one"])
-    (study.folder / "references/one.json").write_text("{")
-    with pytest.raises(EstimateError, match=r"one\.json: is damaged .* remove it and one\.tum"):
-        ensure(study, ["one"])

@@ -207,12 +207,6 @@ def test_repeats_are_averaged_and_kept(study):
     np.testing.assert_array_equal(trial.T_odom_sensor, alone.T_odom_sensor)
 
 
-def test_a_reference_of_another_time_is_refused(study, tmp_path):
-    drives.write_bag(tmp_path / "late.bag", drives.scans(0, 12), reference_delay=10**12)
-    with pytest.raises(AdaptuneError, match=r"late\.bag: the reference covers .*clock_offset"):
-        prepare(study, tmp_path / "late.bag")
-
-
 @pytest.mark.parametrize("part", [None, (0.0, 0.3)])
 def test_a_path_that_is_too_short_is_found_before_scans_are_read(study, tmp_path, part):
     bag, name = tmp_path / "hall.bag", "hall" if part is None else "hall_0-30"
@@ -236,12 +230,6 @@ def test_a_reference_with_too_few_poses_names_max_gap():
     with pytest.raises(AdaptuneError, match=r"^sequences\.one: 19 of 19 gaps .*`max_gap: 1\.5`"):
         reference_poses("sequences.one", Trajectory(stamps, T), scans, settings)
     assert reference_poses("", Trajectory(stamps, T, 1.5), scans, settings).shape == (260, 4, 4)
-
-
-def prepare(study, bag, reference="/truth"):
-    config = SequenceConfig(bag=str(bag), points="/points", reference=reference)
-    sequences = dataclasses.replace(study.sequences, recordings={"one": config})
-    dataclasses.replace(setup_of(study), sequences=sequences).prepare("one", 1e9)
 
 
 N, SIZE = 5, 1000

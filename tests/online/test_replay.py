@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from adaptune.bank.bank import Bank
-from adaptune.errors import AdaptuneError, OdometryError
+from adaptune.errors import AdaptuneError
 from adaptune.odometry.base import InProcess, Odometry, Registration, Usage
 from adaptune.odometry.keyframe import KeyframeGicp
 from adaptune.odometry.tracker import HealthCheck
@@ -240,14 +240,6 @@ def test_a_bank_without_a_model_takes_odometries_that_are_not_live():
 def test_no_scans():
     with pytest.raises(AdaptuneError, match="no scan to replay; check start, stop and views"):
         replay([], InProcess(Scripted()), HEALTH)
-
-
-def test_an_odometry_that_is_not_live_is_refused():
-    class Stiff(Scripted):
-        live = False
-
-    with pytest.raises(OdometryError, match="cannot change its parameters"):
-        replay(scans([0.0]), InProcess(Stiff()), HEALTH, Chooser([{"speed": 1.0}] * 2))
 
 
 def test_a_real_replay_is_the_same_every_time(tmp_path):

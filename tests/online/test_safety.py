@@ -1,6 +1,5 @@
 """What happens where an odometry, a switch or a selection goes wrong."""
 
-import logging
 import math
 
 import numpy as np
@@ -213,16 +212,3 @@ def test_where_a_bank_that_rests_fails_all_join_in():
     np.testing.assert_allclose(
         result.trajectory.T_world_sensor[:, 0, 3], STEP * np.arange(40), atol=1e-9
     )
-
-
-def test_the_log_says_when_it_is_lost(caplog):
-    class Lost(InTurns):
-        def select(self):
-            return super().select()._replace(lost=self.n in (2, 3))
-
-    with caplog.at_level(logging.WARNING):
-        drive(Fragile(), Lost(1.0))
-    assert caplog.messages == [
-        "home: the odometry is lost at 1.0 s",
-        "home: the odometry goes on at 3.0 s",
-    ]

@@ -66,9 +66,7 @@ def cloud(stamp: int, points: NDArray[np.float32], names: str = "xyz") -> Any:
 
 
 def write_bag(
-    path: Path,
-    drive: list[tuple[int, NDArray[np.float32], NDArray[np.float64]]],
-    reference_delay: int = 0,
+    path: Path, drive: list[tuple[int, NDArray[np.float32], NDArray[np.float64]]]
 ) -> Path:
     """Write a drive without rotations to a ROS 1 bag with /points and /truth."""
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -76,8 +74,7 @@ def write_bag(
     for stamp, xyz, T in drive:
         position, still = T[:3, 3].tolist(), (0.0, 0.0, 0.0, 1.0)
         messages.append(("/points", stamp, cloud(stamp, xyz)))
-        truth = rec.pose(stamp + reference_delay, position, still, rec.ROS1)
-        messages.append(("/truth", stamp, truth))
+        messages.append(("/truth", stamp, rec.pose(stamp, position, still, rec.ROS1)))
     rec.write_bag(path, messages)
     return path
 

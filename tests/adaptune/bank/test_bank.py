@@ -10,7 +10,7 @@ from walker import at, kept, makes, selected, x_of, x_on
 from adaptune.bank.bank import Bank
 from adaptune.odometry import OdometryError
 from adaptune.odometry.base import MOST_FAULTS, InProcess
-from adaptune.odometry.keyframe import KeyframeGicp, KeyframeSettings
+from adaptune.odometry.keyframe import KeyframeGicp
 from adaptune.odometry.remote import Isolated, Limits
 from adaptune.space import Selection
 
@@ -135,17 +135,6 @@ def test_members_that_rest_see_no_scans_until_they_are_woken():
     assert [one.starts[1:] for one in made[1:]] == [[(12, 0.0)], []]
 
 
-def test_no_pose_at_all_is_told():
-    make, _ = makes({s: {3: np.nan} for s in (1.0, 3.0)})
-    odometry = Bank(make, {7: {"speed": 1.0}, 3: {"speed": 3.0}}, 2.0, 0.1)
-    x = x_of(odometry, range(4))
-    assert np.isnan(x[3])
-    # The caller starts it anew.
-    T = moved(7.0)
-    odometry.start(odometry.prepare(at(3)), T)
-    assert odometry.register(odometry.prepare(at(4))).T_odom_sensor[0, 3] == 8.0
-
-
 def test_a_bank_has_no_other_sets():
     make, _ = makes()
     bank = Bank(make, {7: {"speed": 1.0}, 3: {"speed": 2.0}}, 1.0)
@@ -190,14 +179,6 @@ def test_a_bank_of_equal_instances_is_the_single_run():
     bank = Bank(lambda _: gicp(NEAR), {0: NEAR, 1: FAR}, warm_up=1.0)
     switched = drive(bank, [0, 1], n=15)
     np.testing.assert_allclose(switched, drive(gicp(NEAR), n=15), atol=1e-12)
-
-
-def test_a_bank_in_other_processes_is_the_same():
-    def elsewhere(parameters):
-        return Isolated("gicp", parameters, KeyframeSettings(), Limits())
-
-    a, b = (drive(Bank(make, {0: NEAR, 1: FAR}, 0.5), [0, 1], 15) for make in (gicp, elsewhere))
-    np.testing.assert_array_equal(a, b)
 
 
 def with_faulty(fault):

@@ -2,6 +2,7 @@ import io
 import os
 import pickle
 import re
+import struct
 
 import drives
 import faulty
@@ -250,8 +251,15 @@ def test_what_a_server_refuses(first, message):
     assert "https://" not in answer.header["message"]
 
 
+NO_NUMBERS = b'{"arrays": [["pose", ",", [4, 4]]]}'
+
+
 @pytest.mark.parametrize(
-    "data", [b"Hello, world!", b"\x02\0\0\0{}", b"\x05\0\0\0{}", b"\x01", b"\x03\0\0\0[1]"]
+    "data",
+    [
+        *(b"Hello, world!", b"\x02\0\0\0{}", b"\x05\0\0\0{}", b"\x01", b"\x03\0\0\0[1]"),
+        struct.pack("<I", len(NO_NUMBERS)) + NO_NUMBERS,
+    ],
 )
 def test_what_is_no_message(data):
     with pytest.raises(processes.WireError, match="the stream"):

@@ -182,9 +182,3 @@ def test_a_value_that_others_share_is_not_replaced(tmp_path, text):
     path.write_text(text)
     with pytest.raises(OdometryError, match=r"shared.yaml: .* \(line 2\); write its value without"):
         Template(path).fill({"a": 3.0})
-
-
-def test_ends_of_lines_stay(tmp_path):
-    path = tmp_path / "windows.yaml"
-    path.write_bytes(b"a:\r\n  b: 1.0  # x\r\nd: 3\r\n")
-    assert Template(path).fill({"a.b": 2.5, "d": 4}) == "a:\r\n  b: 2.5  # x\r\nd: 4\r\n"

@@ -11,12 +11,6 @@ def shown(rows, title="t", caption=""):
     return capture.get()
 
 
-@pytest.mark.parametrize("name", ["my[v2]", "[/b]", ":x:", "[red]a[/red]"])
-def test_texts_are_printed_literally(name):
-    text = shown([{name: name}], title=f"of {name}", caption=f"by {name}")
-    assert text.count(name) == 4
-
-
 @pytest.mark.parametrize(
     ("value", "cell"),
     [

@@ -142,7 +142,10 @@ def test_every_placeholder_and_the_file_get_there(tmp_path, given):
 
 FAULTS = {
     "exit": ("echo no planes here >&2; exit 3", r"its process ended with code 3: no planes here"),
+    "another code": ("exit 255", r"its process ended with code 255.*"),
     "nothing": ("echo done", r"it left no trajectory\.tum: done"),
+    "pipe": ("mkfifo /output/trajectory.tum", r"it left no trajectory\.tum.*"),
+    "link": ("ln -s /etc/hostname /output/trajectory.tum", r"it left no trajectory\.tum.*"),
     "no such program": ("no-such-program", r"its process ended with code 127: .*not found"),
     "memory": ("python3 -c 'bytearray(10**9)'", r"out of isolation\.memory = 0\.3 GB: Killed"),
     "hang": ("echo waiting; exec sleep 300", "it took longer than isolation.seconds.*: waiting"),
@@ -174,36 +177,6 @@ def test_a_file_of_another_user_is_read(tmp_path, given):
         return
     assert not odometry.faults
     np.testing.assert_allclose(poses[:, :3, 3], truth()[:, :3, 3], atol=0.1)
-
-
-@pytest.mark.usefixtures("nothing_left")
-@pytest.mark.parametrize("output", ["runs/latest/*.tum", "runs/*/t*.tum", "etc/passwd"])
-def test_a_pattern_and_links_within_the_output_lead_to_the_trajectory(output, tmp_path, given):
-    script = (
-        "odometry-plain {points} && cd /output && mkdir -p runs/now && "
-        "mv trajectory.tum runs/now && ln -s now runs/latest && ln -s /etc etc"
-    )
-    odometry = made(shell(tmp_path, script, output=output), given)
-    poses = drive(odometry)
-    if output == "etc/passwd":
-        assert "it left no etc/passwd, but runs/now/trajectory.tum; let" in odometry.faults[0]
-        return
-    assert not odometry.faults
-    np.testing.assert_allclose(poses[:, :3, 3], truth()[:, :3, 3], atol=0.1)
-
-
-@pytest.mark.usefixtures("nothing_left")
-@pytest.mark.parametrize(
-    "script",
-    ["mkfifo /output/trajectory.tum", "ln -s /etc/hostname /output/trajectory.tum", "exit 255"],
-    ids=["pipe", "link", "255"],
-)
-def test_what_a_container_leaves_is_not_trusted(script, tmp_path, given):
-    odometry = made(shell(tmp_path, script), given)
-    drive(odometry)
-    (fault,) = odometry.faults
-    told = "its process ended with code 255" if "255" in script else "it left no trajectory.tum"
-    assert fault.startswith(told)
 
 
 def test_an_engine_that_goes_away_is_no_trial(tmp_path, study_file, monkeypatch):
