@@ -1,8 +1,11 @@
 """Drives on a robot that lives in this process; `test_ros1` has a real one."""
 
+import csv
 import json
 import shutil
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import drives
 import local_link
@@ -10,17 +13,21 @@ import numpy as np
 import pytest
 from commands import call
 
-from adaptune.errors import AdaptuneError
+from adaptune.errors import AdaptuneError, OdometryError
 from adaptune.model import BankSettings, ErrorModel
+from adaptune.odometry.tracker import RegisteredScan
 from adaptune.recording.scan import Scan
 from adaptune.ros.link import LinkError
+from adaptune.space import Selection
+from adaptune.study.config import SteerConfig
 from adaptune.study.study import ModeError
 from adaptune.trajectory import read_tum
 from offline.config import load_study
+from online import robot
 from online import robot as robot_drive
 from online.modes import ReplaySetup
-from online.replay import replay
-from online.robot import RobotDrive
+from online.replay import Choice, replay
+from online.robot import DriveLog, RobotDrive, SteeredNode
 
 PATIENT = ("online.real_time={deadline: 60, queue: 0}", "online.ros={points: /points, tf: true}")
 SCANS = drives.scans(2, 25)
@@ -197,3 +204,203 @@ def test_options_that_exclude_each_other(study_file, folder, options, said):
     result = call("online", study_file, "--folder", folder, *options)
     assert result.exit_code == 2
     assert said in result.output
+
+
+TENTH = 10**8
+
+
+def pose(x, y=0.0):
+    T = np.eye(4)
+    T[:2, 3] = x, y
+    return T
+
+
+def scan(stamp):
+    return Scan(stamp, np.zeros((0, 3), np.float32))
+
+
+@pytest.fixture
+def link():
+    return local_link.LocalLink()
+
+
+@pytest.fixture
+def node(link, monkeypatch):
+    monkeypatch.setattr(robot, "PATIENCE", 0.01)
+
+    def make(**settings):
+        return SteeredNode(link, SteerConfig(node="/node", odometry="/odom", **settings))
+
+    return make
+
+
+def play(link, *stamps):
+    """A metre a second."""
+    for stamp in stamps:
+        link.play("/odom", local_link.odometry(stamp, pose(100.0 + stamp * 1e-9)))
+
+
+def test_its_motions_are_those_of_the_node(link, node):
+    odometry = node()
+    play(link, 0)
+    odometry.start(odometry.prepare(scan(0)), pose(0.0, 5.0))
+    # Its stamps may be others than the scans'.
+    play(link, TENTH // 2, 3 * TENTH // 2, 2 * TENTH)
+    for i in (1, 2):
+        found = odometry.register(scan(i * TENTH))
+        assert found.registered
+        np.testing.assert_allclose(found.T_odom_sensor, pose(0.1 * i, 5.0), atol=1e-9)
+        np.testing.assert_allclose(odometry.motions.T_previous_current, pose(0.1), atol=1e-9)
+
+
+def test_a_node_that_is_silent_gives_no_pose_and_goes_on(link, node):
+    odometry = node()
+    odometry.start(odometry.prepare(scan(0)), np.eye(4))
+    found = odometry.register(scan(TENTH))
+    assert np.isnan(found.T_odom_sensor).all()
+    assert not found.registered
+    # The health check lets it start again where it would be.
+    odometry.start(odometry.prepare(scan(TENTH)), pose(0.1))
+    play(link, TENTH, 2 * TENTH)
+    found = odometry.register(scan(2 * TENTH))
+    np.testing.assert_allclose(found.T_odom_sensor, pose(0.2), atol=1e-9)
+
+
+def test_where_the_clock_goes_back_old_poses_do_not_count(link, node):
+    odometry = node()
+    play(link, *range(0, 50 * TENTH, TENTH))
+    # The same stamps again, at three times the speed.
+    for stamp in range(0, 3 * TENTH, TENTH):
+        link.play("/odom", local_link.odometry(stamp, pose(3e-9 * stamp)))
+    odometry.start(odometry.prepare(scan(0)), np.eye(4))
+    np.testing.assert_allclose(odometry.register(scan(TENTH)).T_odom_sensor, pose(0.3), atol=1e-9)
+
+
+def test_a_topic_without_poses_is_named_once(node, caplog):
+    odometry = node()
+    odometry.start(odometry.prepare(scan(0)), np.eye(4))
+    for i in range(1, 30):
+        odometry.register(scan(i * TENTH))
+    assert caplog.messages == [
+        "/odom: no pose of /node for 10 scans; is it the topic, and does the node run?"
+    ]
+
+
+def test_poses_of_another_frame_become_those_of_the_sensor(link, node):
+    turned = (0.0, 0.0, 1.0, 0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5))
+    odometry = node(extrinsic=turned)
+    play(link, 0, TENTH)
+    odometry.start(odometry.prepare(scan(0)), np.eye(4))
+    T = odometry.register(scan(TENTH)).T_odom_sensor
+    # The sensor is turned to the left: ahead is to its right.
+    np.testing.assert_allclose(T[:3, 3], [0.0, -0.1, 0.0], atol=1e-9)
+
+
+def test_what_the_node_holds_is_compared(link, node):
+    odometry = node()
+    odometry.apply(Selection(1, {"voxel": 0.5}))
+    assert link.holds == {"voxel": 0.5}
+    link.refuses = ("voxel",)
+    with pytest.raises(LinkError, match="refuses voxel"):
+        odometry.apply(Selection(2, {"voxel": 0.7}))
+    link.set_parameters = lambda *_: {"voxel": "fine"}
+    with pytest.raises(OdometryError, match="/node holds voxel = fine"):
+        odometry.apply(Selection(2, {"voxel": 0.7}))
+    link.set_parameters = lambda *_: {"voxel": 0.5}
+    with pytest.raises(OdometryError, match=r"/node holds voxel = 0\.5"):
+        odometry.apply(Selection(2, {"voxel": 0.7}))
+
+
+def test_it_says_once_that_nobody_knows_whether_a_parameter_counts(link, node, caplog):
+    odometry = node()
+    link.set_parameters = lambda *_: {}
+    for value in (0.5, 0.6):
+        odometry.apply(Selection(1, {"voxel": value}))
+    assert caplog.messages == [
+        "/node: nobody says whether voxel takes effect before the node starts again"
+    ]
+
+
+def test_a_command_sets_parameters(tmp_path, node):
+    write = "import sys; open(sys.argv[1], 'a').write(' '.join(sys.argv[2:]) + '\\n')"
+    command = [sys.executable, "-c", write, str(tmp_path / "set"), "{node}", "{name}={value}"]
+    odometry = node(command=command)
+    odometry.apply(Selection(1, {"voxel": 1e-5, "n": 3, "on": True, "name": "a b"}))
+    assert (tmp_path / "set").read_text().splitlines() == [
+        "/node voxel=0.00001",
+        "/node n=3",
+        "/node on=true",
+        "/node name=a b",
+    ]
+
+
+def test_a_command_that_fails_is_named(node):
+    odometry = node(command=[sys.executable, "-c", "exit('no {name} {value}')"])
+    with pytest.raises(OdometryError, match=r"exit code 1: no voxel 0\.5$"):
+        odometry.apply(Selection(1, {"voxel": 0.5}))
+    with pytest.raises(OdometryError, match="nowhere"):
+        node(command=["nowhere", "{name}", "{value}"]).apply(Selection(1, {"voxel": 0.5}))
+
+
+def test_a_command_names_the_parameter_and_its_value():
+    with pytest.raises(ValueError, match=r"names no \{value\} in its arguments"):
+        SteerConfig(node="/node", odometry="/odom", command=["set", "{name}"])
+
+
+STAMP = 1_700_000_000_123_456_789
+
+
+def step(i):
+    T = np.eye(4)
+    T[0, 3] = 0.5 * i
+    return RegisteredScan(STAMP + i * 10**8, T, True, "max_speed" if i == 1 else None, 0.001, 0.002)
+
+
+def rows(path):
+    with path.open() as file:
+        return list(csv.DictReader(file))
+
+
+def test_everything_is_on_disk_before_the_end(tmp_path):
+    log = DriveLog(tmp_path / "drive", ["voxel", "range"])
+    for i in range(3):
+        log.scan(step(i), 0.0123)
+    log.choice(Choice(STAMP, Selection(4, {"voxel": 0.5}), 0.004))
+    log.choice(Choice(STAMP, Selection(7, {"range": 9}, {4: 0.25, 7: 0.75}), 0.03, "too late"))
+    found = read_tum(tmp_path / "drive/trajectory.tum")
+    assert found.stamps.tolist() == [STAMP, STAMP + 10**8, STAMP + 2 * 10**8]
+    assert found.T_world_sensor[:, 0, 3].tolist() == [0.0, 0.5, 1.0]
+    frames = rows(tmp_path / "drive/frames.csv")
+    assert [(row["restarted"], row["late_ms"]) for row in frames] == [
+        ("0", "12.3"),
+        ("1", "12.3"),
+        ("0", "12.3"),
+    ]
+    first, second = rows(tmp_path / "drive/selections.csv")
+    assert (first["trial"], first["voxel"], first["range"], first["why_not"]) == (
+        "4",
+        "0.5",
+        "",
+        "",
+    )
+    assert (second["weights"], second["range"]) == ("4:0.250 7:0.750", "9")
+    assert (second["why_not"], second["ms"]) == ("too late", "30.000")
+    log.close()
+
+
+def test_a_full_disk_ends_the_log_and_not_the_drive(tmp_path, caplog):
+    if not Path("/dev/full").exists():
+        pytest.skip("there is no /dev/full")
+    log = DriveLog(tmp_path / "drive", [])
+    log.scan(step(0), 0.01)
+    log._files["frames.csv"] = open("/dev/full", "w", buffering=1)  # noqa: SIM115, PTH123
+    for i in range(1, 4):
+        log.scan(step(i), 0.01)
+    log.close()
+    assert "No space left on device" in log.lost
+    assert len(caplog.messages) == 1
+    assert "nothing more is recorded" in caplog.text
+    assert "the drive goes on" in caplog.text
+    # What was there stays whole.
+    assert len(read_tum(tmp_path / "drive/trajectory.tum")) == 2
+    assert len(rows(tmp_path / "drive/frames.csv")) == 1
