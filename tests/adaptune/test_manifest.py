@@ -1,4 +1,3 @@
-import os
 import re
 import shutil
 import sys
@@ -6,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from small_bag import replace_bag
 
 from adaptune import manifest
 from adaptune.archive import Frames, Trial
@@ -94,15 +94,6 @@ def renewed(study, caplog):
     study.archive().renew(study.training)
     said = [m for m in caplog.messages if " again: " in m]
     return " ".join(said), [name for name in files(study) if "frames" not in name]
-
-
-def replace_bag(path, offset=0):
-    """Put another bag of the same size and time in its place."""
-    times = path.stat().st_atime_ns, path.stat().st_mtime_ns
-    data = bytearray(path.read_bytes())
-    data[len(data) // 2] ^= 1
-    path.write_bytes(data + bytes(offset))
-    os.utime(path, ns=times)
 
 
 ONE, TWO = ["one/00000", "one/00001"], ["two/00000", "two/00001"]

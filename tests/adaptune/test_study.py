@@ -6,7 +6,6 @@ import drives
 import fuzz
 import pytest
 import yaml
-from drives import STUDY
 from needs import needs_evalio
 
 from adaptune.errors import import_extra
@@ -477,11 +476,10 @@ TWO = """
 @pytest.fixture
 def study_of(study_file, tmp_path):
     """Load the study with other odometries, which are given as YAML."""
-    rest = STUDY[STUDY.index("sequences:") :].replace("bag: ", f"bag: {study_file.parent}/")
 
     def load(odometry, *overrides):
         path = tmp_path / "several.yaml"
-        path.write_text(f"odometry:{odometry}\n{rest}")
+        path.write_text(drives.study_with(f"odometry:{odometry}\n", study_file.parent))
         return load_study(path, list(overrides), runs=tmp_path)
 
     return load

@@ -2,7 +2,6 @@ import logging
 import os
 import shutil
 import signal
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -105,7 +104,7 @@ def test_a_killed_worker_is_replaced(trained, study_file, tmp_path, monkeypatch)
     def kill(_what, done, *_):
         if done and len(spawned) == 2 and spawned[0].is_alive():
             os.kill(spawned[0].pid, signal.SIGKILL)
-            time.sleep(0.05)
+            spawned[0].join()
 
     train(again, kill)
     assert len(spawned) > 2

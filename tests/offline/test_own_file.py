@@ -1,5 +1,5 @@
 import pytest
-from drives import STUDY
+from drives import study_with
 
 from adaptune import files
 from adaptune.commands import terminal
@@ -13,8 +13,7 @@ ODOMETRIES = "odometry: [{name: gicp}, {name: kiss_icp}]\n"
 @pytest.fixture
 def study(study_file, tmp_path):
     """A study of two odometries, one of which has a tool of its own."""
-    rest = STUDY[STUDY.index("sequences:") :].replace("bag: ", f"bag: {study_file.parent}/")
-    (tmp_path / "two.yaml").write_text(ODOMETRIES + rest)
+    (tmp_path / "two.yaml").write_text(study_with(ODOMETRIES, study_file.parent))
     return load_study(tmp_path / "two.yaml", [], tmp_path / "study")
 
 

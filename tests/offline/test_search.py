@@ -33,7 +33,9 @@ def study_of(study_file, tmp_path):
 
     def make(folder=None, training=NAMES, **given):
         given = {"trials": 11, "initial": 4, "batch": 4} | given
-        overrides = [f"offline.{key}={value}" for key, value in given.items()]
+        pool = given.pop("pool", None)
+        overrides = [f"odometry={pool}"] if pool else []
+        overrides += [f"offline.{key}={value}" for key, value in given.items()]
         folder = folder or tmp_path / str(next(numbers)) / "study"
         overrides += [f"training=[{', '.join(training)}]", "test=[]"]
         study = load_study(study_file, overrides, folder)
@@ -46,7 +48,7 @@ def study_of(study_file, tmp_path):
 def error(sequence, parameters):
     """Every sequence has another best distance; the third is the hardest."""
     best = {"one": 0.2, "two": 0.4, "three": 0.8}[sequence]
-    off = abs(np.log(parameters["max_correspondence_distance"] / best))
+    off = abs(np.log(parameters.get("max_correspondence_distance", 1.0) / best))
     return (1.0 + off + 0.01 * parameters["keyframe_interval"]) * (
         2.0 if sequence == "three" else 1.0
     )
@@ -112,11 +114,19 @@ SAMPLERS = {
 }
 
 
+POOL = "[{name: gicp}, {name: vgicp}]"
+
+
 @pytest.mark.parametrize(
-    ("sampler", "kind"), [("tpe", "shared"), *((sampler, "own") for sampler in SAMPLERS)]
+    ("sampler", "kind", "pool"),
+    [
+        *(("tpe", "shared", None), ("tpe", "shared", POOL), ("random", "shared", POOL)),
+        *((sampler, "own", None) for sampler in SAMPLERS),
+    ],
 )
-def test_stopped_and_resumed_it_is_the_same(study_of, sampler, kind):
+def test_stopped_and_resumed_it_is_the_same(study_of, sampler, kind, pool):
     given = {"sets": kind, "sampler": sampler, "sampler_settings": SAMPLERS[sampler]}
+    given["pool"] = pool
     expected, _, archive = run(study_of(**given))
     # With a smaller budget first, which has other sets run everywhere...
     fewer = study_of(trials=6, **given)

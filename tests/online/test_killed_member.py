@@ -1,20 +1,17 @@
 """A bank of three odometries, of which one is killed on the way."""
 
 import logging
-import os
-import signal
-from pathlib import Path
 
 import drives
 import numpy as np
 import pytest
 from needs import needs_evalio
+from wicked import tell
 
 from adaptune.bank.bank import Bank
 from adaptune.odometry.registry import OdometryFactory, OdometryPool, odometry_class
 from adaptune.odometry.remote import SERVICE, Limits
 from adaptune.odometry.tracker import HealthCheck
-from adaptune.processes import server
 from adaptune.recording import Scan
 from adaptune.selector import UntrainedSelector
 from adaptune.space import ParameterSets
@@ -31,18 +28,11 @@ KILLED = range(40, 60)
 """Scans before which the process of trial 12 is killed, if it has one."""
 
 
-def children(process):
-    """The children of a process, by their numbers."""
-    return map(int, Path(f"/proc/{process}/task/{process}/children").read_text().split())
-
-
 def killing(scans):
     """Scans, and a murder before some of them."""
     for i, scan in enumerate(scans):
-        # The server has a watcher for each process.
-        for watcher in children(server(SERVICE, "genz_icp").process.pid) if i in KILLED else ():
-            for process in children(watcher):
-                os.kill(process, signal.SIGKILL)
+        if i in KILLED:
+            tell(SERVICE, "genz_icp")
         yield scan
 
 

@@ -4,7 +4,7 @@ import csv
 from dataclasses import replace
 
 import pytest
-from drives import STUDY
+from drives import study_with
 
 from adaptune import files
 from adaptune.archive import Archive
@@ -28,11 +28,9 @@ odometry:
 @pytest.fixture(scope="module")
 def load(study_file, tmp_path_factory):
     folder = tmp_path_factory.mktemp("several")
-    rest = STUDY[STUDY.index("sequences:") :].replace("bag: ", f"bag: {study_file.parent}/")
     path = folder / "several.yaml"
-    path.write_text(
-        ODOMETRIES + rest + "online: {modes: [adaptive], switching: {mechanism: bank}}\n"
-    )
+    online = "online: {modes: [adaptive], switching: {mechanism: bank}}\n"
+    path.write_text(study_with(ODOMETRIES, study_file.parent) + online)
     return lambda *overrides: load_study(path, list(overrides), folder / "study")
 
 

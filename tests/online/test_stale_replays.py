@@ -6,6 +6,7 @@ import shutil
 from pathlib import Path
 
 import pytest
+from small_bag import replace_bag
 
 from adaptune import manifest
 from adaptune.errors import AdaptuneError
@@ -54,16 +55,6 @@ def load(replayed, tmp_path, caplog):
     return lambda *overrides: load_at(folder, *overrides)
 
 
-def change(path):
-    """Put another bag of the same size and time in its place."""
-    times = path.stat().st_atime_ns, path.stat().st_mtime_ns
-    data = bytearray(path.read_bytes())
-    at = len(data) // 2
-    data[at] ^= 1
-    path.write_bytes(data)
-    os.utime(path, ns=times)
-
-
 def rewrite(folder, **inputs):
     """Change what a replay was made from."""
     path = folder / manifest.FILE
@@ -74,7 +65,7 @@ def test_a_test_recording_that_was_replaced(load, caplog):
     study = load()
     assert run(study) == 0
     compare(study)
-    change(study.folder.parent / "three.bag")
+    replace_bag(study.folder.parent / "three.bag")
     with pytest.raises(StoredReplayError, match=r"three\.bag has other content; run `adaptune on"):
         compare(study)
     assert run(study) == 3
@@ -104,7 +95,7 @@ def test_another_reference_replays_nothing(load, caplog):
 
 def test_a_training_recording_that_was_replaced(load):
     study = load()
-    change(study.folder.parent / "one.bag")
+    replace_bag(study.folder.parent / "one.bag")
     for use in (run, validate):
         with pytest.raises(AdaptuneError, match=r"one\.bag has other content; run `adaptune off"):
             use(study)
@@ -179,7 +170,7 @@ def test_what_is_refused_is_told_and_not_drawn(load):
 
 def test_all_that_is_refused_for_one_reason_is_told_at_once(load):
     study = load()
-    change(study.folder.parent / "three.bag")
+    replace_bag(study.folder.parent / "three.bag")
     charts, (said,) = charts_of_replays(read_replays(study, "three"))
     assert not charts
     assert said == (

@@ -79,6 +79,11 @@ def write_bag(
     return path
 
 
+def study_with(odometry: str, bags: Path) -> str:
+    """The same study of another odometry, given as YAML, for a file elsewhere than its bags."""
+    return odometry + STUDY[STUDY.index("sequences:") :].replace("bag: ", f"bag: {bags}/")
+
+
 def write_study(folder: Path) -> Path:
     """Write a study of three short drives, with its bags, and return its file."""
     for seed, name in enumerate(("one", "two", "three")):

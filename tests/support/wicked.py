@@ -1,6 +1,11 @@
-"""Modules of users that go wrong when they are imported, and what is said then."""
+"""Modules of users that go wrong when they are imported, and processes that are made to."""
 
+import contextlib
+import os
+import signal
 from pathlib import Path
+
+from adaptune.processes import server
 
 IMPORTS = {
     "exit": ("import sys\nprint('no licence')\nsys.exit(0)", "ended with code 0: no licence"),
@@ -19,3 +24,17 @@ def gone(process):
         return stat.rpartition(")")[2].split()[0] == "Z"
     except OSError:
         return True
+
+
+def children(process):
+    """Numbers of the processes that a process has started."""
+    path = Path(f"/proc/{process}/task/{process}/children")
+    return map(int, path.read_text().split())
+
+
+def tell(service, name, what=signal.SIGKILL):
+    """Send a signal to all processes of an odometry; its server has a watcher for each."""
+    for watcher in children(server(service, name).process.pid):
+        for process in children(watcher):
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(process, what)

@@ -1,15 +1,13 @@
 """A bank in real time, of which members are late, rest, or restart on the way."""
 
-import contextlib
 import logging
-import os
 import signal
-from pathlib import Path
 
 import drives
 import numpy as np
 import pytest
 from clocks import SteppedClock
+from wicked import tell
 
 from adaptune.bank.bank import MAX_LATE_SECONDS, Bank, Lateness
 from adaptune.bank.members import SERVICE
@@ -17,7 +15,6 @@ from adaptune.odometry.base import LastMotion, OdometryInstance, Registration
 from adaptune.odometry.registry import OdometryFactory, OdometryPool, odometry_class
 from adaptune.odometry.remote import Limits
 from adaptune.odometry.tracker import HealthCheck, Tracker
-from adaptune.processes import server
 from adaptune.recording.scan import Scan
 from adaptune.space import Selection
 
@@ -261,17 +258,6 @@ def test_where_all_restart_it_waits_for_them(clock):
     assert T[0, 3] == pytest.approx(STEP * 15)
 
 
-def tell(what):
-    def children(process):
-        path = Path(f"/proc/{process}/task/{process}/children")
-        return map(int, path.read_text().split())
-
-    for watcher in children(server(SERVICE, "gicp").process.pid):
-        for process in children(watcher):
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(process, what)
-
-
 def test_a_process_that_is_stopped_is_late_and_comes_back():
     gicp = OdometryFactory("gicp", {}, odometry_class("gicp").space, Limits())
     pool = OdometryPool({"gicp": gicp})
@@ -281,7 +267,7 @@ def test_a_process_that_is_stopped_is_late_and_comes_back():
     bank.apply(EVEN)
     try:
         for i, (stamp, points, _) in enumerate(drives.scans(0, 16, STEP)):
-            tell(signal.SIGSTOP if i == 10 else signal.SIGCONT)
+            tell(SERVICE, "gicp", signal.SIGSTOP if i == 10 else signal.SIGCONT)
             prepared = bank.prepare(Scan(stamp, points))
             if i == 0:
                 bank.start(prepared, np.eye(4))
@@ -291,9 +277,9 @@ def test_a_process_that_is_stopped_is_late_and_comes_back():
             if i == 10:
                 assert np.isnan(bank.motions.members[5][0, 3])
                 assert bank.late.scans[1] >= 1
-                tell(signal.SIGCONT)
+                tell(SERVICE, "gicp", signal.SIGCONT)
                 bank.late.settle()
         assert bank.motions.members[5][0, 3] == pytest.approx(STEP, abs=0.05)
     finally:
-        tell(signal.SIGCONT)
+        tell(SERVICE, "gicp", signal.SIGCONT)
         bank.close()

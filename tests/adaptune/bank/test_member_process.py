@@ -1,17 +1,13 @@
-import os
-import signal
-from pathlib import Path
-
 import drives
 import numpy as np
 import pytest
+from wicked import tell
 
 from adaptune.bank.bank import Bank
 from adaptune.bank.members import KEPT, SERVICE, Member, spread
 from adaptune.odometry.base import InProcess
 from adaptune.odometry.registry import OdometryFactory, OdometryPool, odometry_class
 from adaptune.odometry.remote import Limits
-from adaptune.processes import server
 from adaptune.recording.scan import Scan
 from adaptune.space import Selection
 
@@ -104,24 +100,14 @@ def test_members_that_restart_see_the_same_scans(scans):
     assert KEPT > 12 * 10
 
 
-def children(process):
-    return map(int, Path(f"/proc/{process}/task/{process}/children").read_text().split())
-
-
 def test_a_process_that_is_killed_costs_its_members_weight(scans):
     odometry = bank(2)
-
-    def kill(i):
-        if i == 15:
-            for name in ("gicp", "vgicp"):
-                for watcher in children(server(SERVICE, name).process.pid):
-                    for process in children(watcher):
-                        os.kill(process, signal.SIGKILL)
 
     dead = []
 
     def before(i):
-        kill(i)
+        for name in ("gicp", "vgicp") if i == 15 else ():
+            tell(SERVICE, name)
         dead.append(sum(member.ended for member in odometry._members))
 
     poses, _ = run(odometry, scans, before)

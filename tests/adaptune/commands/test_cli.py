@@ -18,8 +18,6 @@ from typer.testing import CliRunner
 from adaptune.archive import Archive
 from adaptune.commands import online, terminal
 from adaptune.commands.cli import app
-from adaptune.reference.check import proposed_sub_trajectory
-from adaptune.trajectory import Trajectory
 from offline.config import load_study
 from offline.train import train
 from online.modes import run_replays
@@ -74,17 +72,6 @@ def test_one_bag_is_enough_and_every_command_names_the_next(adaptune, study_file
     assert max(map(len, table.splitlines())) <= 80
     assert "# find out what adapting gains elsewhere" in done.stdout
     assert (tmp_path / "my study[v2]/report/figures/overview.png").exists()
-
-
-@pytest.mark.parametrize(
-    ("tested", "length"),
-    [(0.4, 1.0), (6.0, 2.0), (8.0, 5.0), (20.0, 5.0), (99.0, 10.0), (1e3, 25.0)],
-)
-def test_the_proposed_sub_trajectory_fits_the_test(tested, length):
-    stamps = np.arange(101) * 10**9
-    T = np.tile(np.eye(4), (101, 1, 1))
-    T[:, 0, 3] = np.concatenate([np.linspace(0, 5e3, 61), 5e3 + np.linspace(0, tested, 41)[1:]])
-    assert proposed_sub_trajectory(Trajectory(stamps, T)) == length
 
 
 def test_inspect_proposes_a_study_without_a_reference_too(tmp_path):

@@ -51,9 +51,13 @@ def test_a_noisy_reference_needs_longer_sub_trajectories(metres, wrong, length, 
 
 @pytest.mark.parametrize(
     ("metres", "seconds", "length"),
-    [(215.0, 215, 10.0), (215.0, 38, 25.0), (107.0, 11, 25.0), (60.0, 6, 10.0), (900.0, 30, 25.0)],
+    [
+        *((1.0, 1000, 1.0), (15.0, 1000, 2.0), (20.0, 1000, 5.0), (50.0, 1000, 5.0)),
+        *((248.0, 1000, 10.0), (2500.0, 1000, 25.0), (215.0, 215, 10.0), (215.0, 38, 25.0)),
+        *((107.0, 11, 25.0), (60.0, 6, 10.0), (900.0, 30, 25.0)),
+    ],
 )
-def test_who_is_fast_gets_longer_ones(metres, seconds, length):
+def test_longer_drives_and_faster_ones_get_longer_ones(metres, seconds, length):
     assert proposed_sub_trajectory(path(metres, seconds)) == length
 
 
