@@ -1,4 +1,3 @@
-import threading
 import time
 
 import local_link
@@ -97,17 +96,23 @@ def test_what_is_no_point_cloud_is_left_out(link, caplog):
 
 
 def test_a_topic_that_falls_silent_and_comes_back(link, caplog, monkeypatch):
-    monkeypatch.setattr(live, "SILENCE", 0.05)
-    scans = LiveScans(link, "/other", Timing())
-    later = threading.Timer(0.5, lambda: link.play("/other", local_link.cloud(START, points(0))))
-    later.start()
+    monkeypatch.setattr(live, "SILENCE", 0.01)
+    scans, topics, asked = LiveScans(link, "/other", Timing()), link.topics(), []
+
+    def look():
+        asked.append(0)
+        if len(asked) == 4:
+            link.play("/other", local_link.cloud(START, points(0)))
+        return topics
+
+    link.topics = look
     next(scans.arrivals())
-    said = caplog.messages
+    *silent, again = caplog.records
     hint = "; nobody publishes it (point clouds come on /points)"
-    assert said[0] == f"/other: no scan for 0 s{hint}"
-    # After 0.05, 0.1, 0.2 and 0.4 s.
-    assert 3 <= len(said) - 1 <= 5
-    assert said[-1].startswith("/other: scans come again, after ")
+    assert silent[0].getMessage() == f"/other: no scan for 0 s{hint}"
+    # Again after twice as long.
+    assert [one.args[1] for one in silent] == pytest.approx([0.01, 0.02, 0.04, 0.08])
+    assert again.getMessage().startswith("/other: scans come again, after ")
 
 
 def test_scans_bring_along_what_the_imu_measured(link, monkeypatch):
