@@ -1,12 +1,23 @@
+import pickle
 import subprocess
 import sys
 from importlib import metadata
 
 import pytest
 
+from adaptune.model.descriptor import descriptor_content
 from adaptune.odometry import OdometryError
-from adaptune.odometry.keyframe import KeyframeGicp
-from adaptune.odometry.registry import odometry_class
+from adaptune.odometry.base import InProcess
+from adaptune.odometry.keyframe import KeyframeGicp, KeyframeNdt, KeyframeSettings
+from adaptune.odometry.program import CommandSettings
+from adaptune.odometry.registry import (
+    OdometryFactory,
+    OdometryPool,
+    odometry_class,
+    odometry_content,
+)
+from adaptune.odometry.remote import Limits, ProcessSettings
+from adaptune.space import ODOMETRY, Float, ParameterSpace, SpaceError
 
 MINE = """
 from adaptune.odometry import Odometry
@@ -109,3 +120,128 @@ def test_what_serves_an_odometry_imports_little():
         *("annotated_types", "numpy", "pydantic", "pydantic_core", "scipy", "small_gicp"),
         *("typing_extensions", "typing_inspection", "yaml"),  # what the reference image has
     }
+
+
+def factory(name, **settings):
+    cls = odometry_class(name)
+    made = cls.settings_type(**settings)
+    return OdometryFactory(name, made, cls.describe(made).space, Limits())
+
+
+def pool():
+    return OdometryPool({"gicp": factory("gicp", downsampling=0.4), "coarse": factory("ndt")})
+
+
+def test_it_makes_the_odometry_that_the_set_names():
+    both = pool()
+    gicp = both({ODOMETRY: "gicp", **both.factories["gicp"].space.baseline})
+    assert type(gicp.odometry) is KeyframeGicp
+    assert gicp.odometry.settings.downsampling == 0.4
+    ndt = both({ODOMETRY: "coarse"} | both.factories["coarse"].space.baseline | {"resolution": 2.5})
+    assert type(ndt.odometry) is KeyframeNdt
+    assert ndt.odometry.parameters["resolution"] == 2.5
+    # Without a set, the baseline of the first.
+    assert type(both().odometry) is KeyframeGicp
+    with pytest.raises(SpaceError, match="there is no odometry 'ndt'"):
+        both({ODOMETRY: "ndt"})
+    with pytest.raises(OdometryError):
+        OdometryPool({"a": factory("gicp").__class__("gipc", {}, both.space, Limits())})
+
+
+def test_it_pickles():
+    both = pool()
+    copy = pickle.loads(pickle.dumps(both))
+    assert copy.identity == both.identity
+    assert copy.space == both.space
+    assert copy.space.baselines == both.space.baselines
+    assert type(copy(both.space.baselines[1]).odometry) is KeyframeNdt
+
+
+SPACE = ParameterSpace({"keyframe_interval": Float(low=1.0, high=9.0, baseline=2.0)})
+
+
+def test_it_makes_what_the_name_says():
+    gicp = OdometryFactory("gicp", {"downsampling": 0.3}, SPACE, Limits())
+    instance = gicp({"keyframe_interval": 4.0})
+    assert isinstance(instance, InProcess)
+    odometry = instance.odometry
+    assert type(odometry) is KeyframeGicp
+    assert odometry.settings == gicp.settings == KeyframeSettings(downsampling=0.3)
+    given = {"keyframe_interval": 4.0, "downsampling": 0.3}
+    assert odometry.parameters == KeyframeGicp.space.baseline | given
+    # The baseline of the study's space, not the odometry's own.
+    assert gicp().odometry.parameters["keyframe_interval"] == 2.0
+    assert gicp.description == KeyframeGicp.describe(gicp.settings)
+    assert gicp.identity == {"name": "gicp", "settings": gicp.settings.model_dump(mode="json")}
+    assert "version of small_gicp" in gicp.content
+    assert gicp(isolated=True).usage.memory == 0.0
+    with pytest.raises(OdometryError, match="did you mean 'gicp'"):
+        _ = OdometryFactory("gipc", {}, SPACE, Limits()).description
+
+
+@pytest.fixture
+def package(tmp_path, monkeypatch):
+    """A package of the user whose modules must not be imported."""
+    folder = tmp_path / "theirs"
+    folder.mkdir()
+    (folder / "__init__.py").write_text("raise SystemExit\n")
+    (folder / "odometry.py").write_text("raise SystemExit\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    return folder
+
+
+def test_a_class_is_its_module(package):
+    before = odometry_content("theirs.odometry:Mine", None)
+    assert list(before) == ["module theirs.odometry"]
+    (package / "odometry.py").write_text("# another\n")
+    assert odometry_content("theirs.odometry:Mine", None) != before
+    assert not any(name.startswith("theirs") for name in sys.modules)
+
+
+@pytest.mark.parametrize(
+    ("name", "package"),
+    [("gicp", "small_gicp"), ("vgicp", "small_gicp"), ("ndt", "open3d"), ("mad_icp", "evalio")],
+)
+def test_a_built_in_one_is_the_version_of_its_package(name, package):
+    version = metadata.version(package)
+    assert odometry_content(name, None) == {f"version of {package}": version}
+
+
+def test_a_program_is_its_files(tmp_path):
+    script, template = tmp_path / "run.py", tmp_path / "template.yaml"
+    script.write_text("1")
+    template.write_text("a: 1")
+    arguments = (sys.executable, str(script), "{input}", "x" * 5000, "\0")
+    settings = CommandSettings(command=arguments, template=str(template))
+    before = odometry_content("command", settings)
+    assert set(before) == {sys.executable, str(script), str(template)}
+    for file in (script, template):
+        file.write_text("b: 2")
+        assert odometry_content("command", settings)[str(file)] != before[str(file)]
+    served = ProcessSettings(command=(sys.executable, str(script)))
+    assert set(odometry_content("process", served)) == {sys.executable, str(script)}
+    away = ProcessSettings(address="tcp://there:1")
+    assert odometry_content("process", away) == {}
+
+
+def test_descriptors_of_the_user_are_their_modules(package):
+    assert descriptor_content(["ndt", "motion"]) == {}
+    before = descriptor_content(["ndt", "theirs.odometry:describe"])
+    (package / "odometry.py").write_text("# another\n")
+    after = descriptor_content(["ndt", "theirs.odometry:describe"])
+    assert before.keys() == after.keys() == {"module theirs.odometry"}
+    assert before != after
+
+
+def test_a_class_is_also_the_module_in_which_it_is_written(package):
+    (package / "inner.py").write_text("1")
+    before = odometry_content("theirs.odometry:Mine", None, "theirs.inner")
+    assert set(before) == {"module theirs.odometry", "module theirs.inner"}
+    (package / "inner.py").write_text("2")
+    assert odometry_content("theirs.odometry:Mine", None, "theirs.inner") != before
+
+
+def test_a_file_behind_an_option_is_part_of_a_program(tmp_path):
+    (tmp_path / "c.txt").write_text("1")
+    settings = CommandSettings(command=(sys.executable, f"--config={tmp_path}/c.txt"))
+    assert set(odometry_content("command", settings)) == {sys.executable, f"{tmp_path}/c.txt"}

@@ -1,18 +1,259 @@
+"""Stamps and poses that a system publishes, without a container."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import contained
+import local_link
+import numpy as np
 import pytest
 from contained import template
+from hypothesis import given
+from hypothesis import strategies as st
 from pydantic import ValidationError
+from rooms import moved
+from rosbags.highlevel import AnyReader
 
 from adaptune.odometry import OdometryError
 from adaptune.odometry.docker.engine import EngineError
-from adaptune.odometry.docker.rustle import Rustle, RustleSettings
+from adaptune.odometry.docker.rustle import (
+    Drain,
+    PlayedBag,
+    PoseRecorder,
+    Rustle,
+    RustleSettings,
+    check_stamps,
+)
+from adaptune.odometry.program import ProgramInput
+from adaptune.recording.clouds import usable
+
+PERIOD = 10**8
+SCANS = 1_700_000_000_123_456_789 + PERIOD * np.arange(40)
+ODOMETRY = "nav_msgs/msg/Odometry"
 
 
-def settings(**given):
-    return RustleSettings(**({"image": "x", "template": "p.yaml", "odometry": "/o"} | given))
+@given(
+    late=st.integers(0, PERIOD),
+    drop=st.sets(st.integers(0, 39), max_size=30),
+    jitter=st.integers(0, 4_000_000),
+    seed=st.integers(0, 100),
+)
+def test_stamps_of_the_scans_pass_wherever_in_the_scan_they_are(late, drop, jitter, seed):
+    wobble = np.random.default_rng(seed).integers(0, jitter + 1, 40)
+    kept = [i for i in range(40) if i not in drop]
+    check_stamps((SCANS + late + wobble)[kept], SCANS)
+
+
+@given(often=st.integers(2, 20), late=st.integers(0, PERIOD))
+def test_poses_that_come_more_often_are_judged_by_begin_and_end(often, late):
+    stamps = SCANS[0] + late + PERIOD // often * np.arange(40 * often)
+    check_stamps(stamps, SCANS)
+    with pytest.raises(OdometryError, match=r"its poses are of .* s, the scans of .*its own clock"):
+        check_stamps(stamps + 2 * 10**9, SCANS)
+    with pytest.raises(OdometryError, match="its poses are of"):
+        check_stamps(stamps - 2 * 10**9, SCANS)
+
+
+@given(seed=st.integers(0, 1000))
+def test_stamps_that_scatter_are_refused(seed):
+    rng = np.random.default_rng(seed)
+    # As of a system that stamps when it has finished, and takes its time.
+    stamps = np.sort(SCANS + rng.integers(0, PERIOD // 2, 40))
+    with pytest.raises(OdometryError, match=r"its stamps scatter by up to 0\.0\d\d s: the system"):
+        check_stamps(stamps, SCANS)
+
+
+@given(seed=st.integers(0, 1000), missing=st.integers(0, 4))
+def test_stamps_that_are_late_are_refused(seed, missing):
+    rng = np.random.default_rng(seed)
+    stamps = np.delete(SCANS + PERIOD + PERIOD // 2, rng.choice(40, missing, replace=False))
+    if missing == 0:
+        with pytest.raises(OdometryError, match=r"its stamps are up to 0\.150 s late: the system"):
+            check_stamps(stamps, SCANS)
+    with pytest.raises(OdometryError, match="late: the system stamps poses by its own clock"):
+        check_stamps(stamps + missing * PERIOD, SCANS)
+
+
+@given(rate=st.floats(1.1, 4.0))
+def test_a_clock_of_another_speed_is_refused(rate):
+    stamps = SCANS[0] + ((SCANS - SCANS[0]) / rate).astype(np.int64)
+    with pytest.raises(OdometryError, match="the system stamps poses by its own clock"):
+        check_stamps(stamps, SCANS)
+
+
+def test_nothing_is_said_of_no_poses_and_of_one():
+    check_stamps(SCANS[:0], SCANS)
+    check_stamps(SCANS[:1], SCANS)
+
+
+class Recorded:
+    """Stands for a link whose node publishes messages of one type."""
+
+    store = local_link.STORE
+
+    def record(self, topic, take):
+        self.topic, self.take = topic, take
+
+    def publish(self, message):
+        kind = message.__msgtype__
+        self.take(kind, bytes(self.store.serialize_ros1(message, kind)))
+
+
+def odometry(i, x=0.0):
+    return local_link.odometry(int(SCANS[i]), moved(x))
+
+
+@pytest.fixture
+def link():
+    return Recorded()
+
+
+def test_poses_are_kept_as_they_come(link, tmp_path):
+    recorder = PoseRecorder(link, "/found")
+    assert link.topic == "/found"
+    assert recorder.poses() == []
+    for i in (0, 1, 3, 2):
+        link.publish(odometry(i, 0.3 * i))
+    assert [stamp for stamp, *_ in recorder.poses()] == SCANS[[0, 1, 3, 2]].tolist()
+    trajectory, unusable = usable(recorder.poses())
+    assert unusable == 0
+    np.testing.assert_allclose(trajectory.T_world_sensor[:, 0, 3], [0.0, 0.3, 0.6, 0.9])
+    recorder.write(tmp_path / "found.bag")
+    with AnyReader([tmp_path / "found.bag"]) as bag:
+        (connection,) = bag.connections
+        assert (connection.topic, connection.msgtype) == ("/found", ODOMETRY)
+        assert sorted(stamp for _, stamp, _ in bag.messages()) == SCANS[:4].tolist()
+
+
+def test_a_message_that_is_none_is_named(link):
+    recorder = PoseRecorder(link, "/found")
+    link.publish(odometry(0))
+    kind, data = recorder.received[0]
+    recorder.received.append((kind, data[:-9]))
+    with pytest.raises(OdometryError, match=f"publishes a {kind} that cannot be read"):
+        recorder.newest()
 
 
 @pytest.mark.parametrize(
-    ("given", "words"),
+    ("interval", "cores", "seconds"),
+    # Nodes that rest wake up with the clock; one that works is waited for, but not forever.
+    [(0.1, 0.03, 2.0), (1.5, 0.03, 4.5), (30, 0.03, 90.0), (0.1, 0.4, 60.0), (None, 0.0, 10.0)],
+)
+def test_a_system_is_waited_for_until_it_rests(link, monkeypatch, interval, cores, seconds):
+    now = [100.0]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    recorder = PoseRecorder(link, "/found")
+    for i in range(3 if interval else 0):
+        now[0] += interval
+        link.publish(odometry(i))
+    drain = Drain(recorder, len(SCANS), int(SCANS[-1]), lambda: cores * now[0])
+    over = now[0]
+    while not drain.over():
+        now[0] += 0.1
+    assert seconds <= now[0] - over < 1.1 * seconds + 2.5
+
+
+def test_a_pose_that_comes_late_is_waited_for(link, monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    recorder = PoseRecorder(link, "/found")
+    drain = Drain(recorder, len(SCANS), int(SCANS[-1]), lambda: 0.4 * now[0])
+    for i in range(39):
+        # Stamps of a clock that goes on tell nothing of the end.
+        link.publish(odometry(39) if i % 2 else odometry(i))
+        now[0] += 1.9
+        assert not drain.over()
+    link.publish(odometry(39))
+    assert drain.over()
+
+
+def test_messages_that_hold_no_poses_are_refused(link):
+    recorder = PoseRecorder(link, "/found")
+    link.publish(local_link.imu(0))
+    with pytest.raises(OdometryError, match=r"/found is sensor_msgs/msg/Imu; odometry\.settings"):
+        recorder.poses()
+
+
+@pytest.fixture
+def played(tmp_path):
+    """A system that hears a bag of the scans, as it is before a trial."""
+    file = contained.template(tmp_path / "template.yaml")
+    settings = RustleSettings(image="an image", template=str(file), odometry="/Odometry", rate=4.0)
+    return PlayedBag(contained.VALUES, settings, contained.LIMITS, None)
+
+
+GIVEN = ProgramInput(Path("drive.bag"), "/points", "", SCANS, None)
+
+
+@pytest.mark.parametrize(
+    ("topics", "words"),
+    [
+        (["/odom", "/clock"], "on /Odometry, but on /odom; name its topic as"),
+        (
+            ["/Odometry"],
+            "on /Odometry until the system had rested for 10 s after the bag, though a",
+        ),
+    ],
+)
+def test_a_topic_without_poses_is_told_with_the_others(link, played, topics, words):
+    system = SimpleNamespace(link=SimpleNamespace(topics=lambda: dict.fromkeys(topics)))
+    with pytest.raises(OdometryError, match=words):
+        played._check_published(system, PoseRecorder(link, "/Odometry"))
+
+
+def test_poses_that_are_none_are_refused(link, played):
+    recorder = PoseRecorder(link, "/Odometry")
+    for i in range(40):
+        link.publish(odometry(i, np.nan if i == 20 else 0.3 * i))
+    with pytest.raises(OdometryError, match=r"1 of 40 poses are no poses \(NaN, or no rotation\)"):
+        played._checked(recorder, GIVEN)
+
+
+def test_scans_without_a_pose_are_counted(link, played, caplog):
+    recorder = PoseRecorder(link, "/Odometry")
+    for i in range(0, 40, 2):
+        link.publish(odometry(i, 0.3 * i))
+    assert len(played._checked(recorder, GIVEN)) == 20
+    words = (
+        "20 of 40 scans have no pose at rate 4; without one: 19 on the way (it drops scans), 1 at"
+    )
+    assert words in caplog.text
+
+
+def test_stamps_of_a_clock_are_matched_by_number_or_refused(link, played, caplog):
+    recorder, late = PoseRecorder(link, "/Odometry"), np.linspace(0, 4 * PERIOD, 40, dtype=int)
+    for i in range(40):
+        link.publish(local_link.odometry(int(SCANS[i] + late[i]), moved(0.3 * i)))
+    found = played._checked(recorder, GIVEN)
+    np.testing.assert_array_equal(found.stamps, SCANS)
+    np.testing.assert_allclose(found.T_world_sensor[:, 0, 3], 0.3 * np.arange(40))
+    assert "own clock, not by the scans; poses are matched to scans by number" in caplog.text
+    recorder.received.pop()
+    with pytest.raises(OdometryError, match=r"39 poses for 40 .*play: lockstep"):
+        played._checked(recorder, GIVEN)
+
+
+def test_of_paths_the_last_holds_all(link, tmp_path):
+    recorder, types = PoseRecorder(link, "/path"), local_link.TYPES
+    poses = []
+    for i in range(3):
+        said = odometry(i, 0.1 * i)
+        poses.append(types["geometry_msgs/msg/PoseStamped"](said.header, said.pose.pose))
+        link.publish(types["nav_msgs/msg/Path"](said.header, list(poses)))
+    assert [stamp for stamp, *_ in recorder.poses()] == SCANS[:3].tolist()
+    recorder.write(tmp_path / "path.bag")
+    with AnyReader([tmp_path / "path.bag"]) as bag:
+        assert [stamp for _, stamp, _ in bag.messages()] == [SCANS[2]]
+    link.publish(types["nav_msgs/msg/Path"](said.header, []))
+    assert recorder.poses() == []
+
+
+def settings(**told):
+    return RustleSettings(**({"image": "x", "template": "p.yaml", "odometry": "/o"} | told))
+
+
+@pytest.mark.parametrize(
+    ("told", "words"),
     [
         ({"odometry": "Odometry"}, "odometry"),
         ({"points": "points"}, "points"),
@@ -33,20 +274,20 @@ def settings(**given):
         ),
     ],
 )
-def test_settings_that_are_refused(given, words):
+def test_settings_that_are_refused(told, words):
     with pytest.raises(ValidationError, match=words):
-        settings(**given)
+        settings(**told)
 
 
 def test_what_it_says_of_itself():
-    for given, live, needs_imu, whole in (
+    for told, live, needs_imu, whole in (
         ({}, False, False, True),
         ({"imu": "/imu"}, False, False, True),
         ({"play": "lockstep"}, False, False, False),
         ({"play": "lockstep", "imu": "/imu"}, False, True, False),
         ({"play": "lockstep", "node": "/n"}, True, False, False),
     ):
-        described = Rustle.describe(settings(**given))
+        described = Rustle.describe(settings(**told))
         assert described.space is None
         assert (described.live, described.needs_imu, described.whole) == (live, needs_imu, whole)
     assert settings().packages == ("rustle-ros", "rustle")
@@ -61,9 +302,9 @@ def test_what_is_checked_before_a_campaign(tmp_path, monkeypatch):
     json.write_text("{}")
     with pytest.raises(OdometryError, match=r"template: .*params\.json is not YAML, as ROS 1"):
         Rustle.check(settings(template=str(json)), {})
-    given = settings(template=str(file))
+    told = settings(template=str(file))
     with pytest.raises(OdometryError, match=r"voxl: .*params\.yaml has no such value; .*voxel"):
-        Rustle.check(given, {"voxl": 1.0})
+        Rustle.check(told, {"voxl": 1.0})
     asked = []
 
     def image_digest(name):
@@ -72,5 +313,5 @@ def test_what_is_checked_before_a_campaign(tmp_path, monkeypatch):
 
     monkeypatch.setattr("adaptune.odometry.docker.rustle.image_digest", image_digest)
     with pytest.raises(OdometryError, match="there is no image"):
-        Rustle.check(given, {"other.voxel": 1.0, "keyframe_interval": 1.0})
+        Rustle.check(told, {"other.voxel": 1.0, "keyframe_interval": 1.0})
     assert asked == ["x"]
