@@ -14,7 +14,6 @@ from adaptune.model.descriptor import (
     Describer,
     DescriptorError,
     averaged,
-    descriptor,
     lowest_elevation,
     speed_and_turn_rate,
 )
@@ -93,22 +92,12 @@ def test_descriptors_of_other_packages(monkeypatch):
         ("fpfh", "fpfh is gone, .* choose ndt or motion"),
         ("no_such_module:f", "cannot import no_such_module .*PYTHONPATH"),
         ("my_descriptors:other", "not a function"),
-    ],
-)
-def test_names_that_do_not_do(name, message):
-    with pytest.raises(DescriptorError, match=message):
-        descriptor(name)
-
-
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
         ("my_descriptors:grows", r"scan 0 by an array of shape \(2,\), instead of \(1,\)"),
         ("my_descriptors:flat", r"of shape \(2, 2\), instead of one axis"),
         ("my_descriptors:unknown", "NaN or infinity"),
     ],
 )
-def test_arrays_that_do_not_do(name, message):
+def test_names_and_arrays_that_do_not_do(name, message):
     with pytest.raises(DescriptorError, match=message):
         Describer([name])(turns.turn(0))
 
