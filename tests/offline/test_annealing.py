@@ -65,15 +65,6 @@ class TestSingleOnly(_Cases, pytest_samplers.SingleOnlySamplerTestCase):
     pass
 
 
-def test_a_loaded_study_goes_on_as_if_it_had_never_stopped():
-    once = optimize(40, AnnealingSampler(seed=3))
-    storage = optuna.storages.InMemoryStorage()
-    optimize(17, AnnealingSampler(seed=3), storage=storage, study_name="s")
-    study = optuna.load_study(study_name="s", storage=storage, sampler=AnnealingSampler(seed=3))
-    study.optimize(objective, n_trials=23)
-    assert history(study) == history(once)
-
-
 def test_tells_when_all_chains_have_stalled():
     sampler = AnnealingSampler(settings(chains=3, stall_best=5), seed=1)
     study = optuna.create_study(sampler=sampler)

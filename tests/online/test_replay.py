@@ -170,14 +170,6 @@ def test_a_frozen_pose_restarts():
     np.testing.assert_allclose(result.trajectory.T_world_sensor[7, 0, 3], 0.3)
 
 
-def test_a_robot_that_comes_to_a_stand_has_not_frozen():
-    odometry = Scripted([0.1, 0.08, 0.06, 0.04, 0.02] + [0.0] * 40)
-    result = replay(scans(0.1 * np.arange(40)), InProcess(odometry), HEALTH)
-    assert not result.restarted.any()
-    odometry = Scripted([0.0] * 40)
-    assert not replay(scans(0.1 * np.arange(40)), InProcess(odometry), HEALTH).restarted.any()
-
-
 def test_poor_scans_are_counted(tmp_path):
     odometry = Scripted([0.1, None, 0.1])
     result = replay(scans(np.arange(5) / 10), InProcess(odometry), HEALTH)

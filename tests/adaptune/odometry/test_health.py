@@ -49,10 +49,16 @@ def test_turning(degrees, healthy, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("speed", "seconds", "faults"), [(2.5, 0.9, {}), (2.5, 1.3, {"max_freeze": 1}), (0.4, 9.0, {})]
+    ("steps", "faults"),
+    [
+        ([0.25] * 20 + [0.0] * 9, {}),
+        ([0.25] * 20 + [0.0] * 13, {"max_freeze": 1}),
+        *(([0.04] * 20 + [0.0] * 90, {}), ([0.1, 0.08, 0.06, 0.04, 0.02] + [0.0] * 40, {})),
+        ([0.0] * 40, {}),
+    ],
 )
-def test_who_stops_dead_has_frozen(speed, seconds, faults):
-    motions = [moved(0.1 * speed)] * 20 + [np.eye(4)] * round(10 * seconds)
+def test_who_stops_dead_has_frozen(steps, faults):
+    motions = [moved(step) for step in steps]
     stamps = np.arange(len(motions) + 1) * 10**8
     assert unhealthy(HealthCheck(), np.array(motions), stamps, np.ones(len(stamps), bool)) == faults
 
