@@ -8,9 +8,8 @@ from dataclasses import replace
 import drives
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from commands import refused, succeeded
 
-from adaptune.commands.cli import app
 from adaptune.model import BankSettings, ErrorModel, PairedSettings
 from adaptune.study.config import ALSO
 from offline.config import load_study
@@ -94,10 +93,16 @@ def test_they_are_made_once_and_again_for_another_model(own):
     assert {row.mode for row in compare(plain).rows} == set(EVERY)
 
 
-def test_what_is_missing_somewhere_is_told_and_left_out(own, tmp_path):
+@pytest.fixture
+def on_two(own, tmp_path):
+    """Loads the copy with a second test sequence."""
     bag = drives.write_bag(tmp_path / "four.bag", drives.scans(4, 40))
     four = f"sequences.four={{bag: {bag}, points: /points, reference: /truth}}"
-    both = own("test=[three, four]", four, "online.modes=[adaptive, paper, even]")
+    return lambda *overrides: own("test=[three, four]", four, *overrides)
+
+
+def test_what_is_missing_somewhere_is_told_and_left_out(on_two):
+    both = on_two("online.modes=[adaptive, paper, even]")
     run_replays(both, both.model_path)
     shutil.rmtree(both.folder / "replays/four/paper")
     shutil.rmtree(both.folder / "replays/three/baseline")
@@ -132,10 +137,8 @@ def test_what_is_missing_somewhere_is_told_and_left_out(own, tmp_path):
         compare(both)
 
 
-def test_where_only_some_were_replayed_without_a_model_those_are_compared(own, tmp_path):
-    bag = drives.write_bag(tmp_path / "four.bag", drives.scans(4, 40))
-    four = f"sequences.four={{bag: {bag}, points: /points, reference: /truth}}"
-    both = own("test=[three, four]", four)
+def test_where_only_some_were_replayed_without_a_model_those_are_compared(on_two):
+    both = on_two()
     shutil.rmtree(both.folder / "replays", ignore_errors=True)
     run_untrained(both)
     shutil.rmtree(both.folder / "replays/three/baseline")
@@ -178,19 +181,14 @@ def test_every_mode_is_repeated(own):
 
 def test_the_command_line(own, study_file):
     folder = own().folder
-    words = [str(study_file), "--folder", str(folder)]
-    done = CliRunner().invoke(app, ["online", *words, "-o", "online.modes=all"])
-    assert done.exit_code == 0, done.output
+    words = [study_file, "--folder", folder]
+    done = succeeded("online", *words, "-o", "online.modes=all")
     assert "All replays were there already" in done.stdout
     assert "-o online.modes=all" in done.stdout.splitlines()[-1]
     shutil.rmtree(folder / "replays/three/paper")
-    done = CliRunner().invoke(app, ["compare", *words])
-    assert done.exit_code == 0, done.output
-    assert "paper" not in done.stdout
-    done = CliRunner().invoke(app, ["compare", *words, "--details"])
+    assert "paper" not in succeeded("compare", *words).stdout
+    done = succeeded("compare", *words, "--details")
     assert "`paper` is not compared: there is no replay on any sequence" in done.stdout
-    for value, words_ in (("[even, even]", "one of them is named twice"), ("[odd]", "not 'odd'")):
-        done = CliRunner().invoke(app, ["online", *words, "-o", f"online.modes={value}"])
-        assert done.exit_code == 2
-        assert words_ in done.stderr
+    for value, said in (("[even, even]", "one of them is named twice"), ("[odd]", "not 'odd'")):
+        assert said in refused("online", *words, "-o", f"online.modes={value}")
     assert set(ALSO) < set(EVERY)

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 import drives
 import numpy as np
 import pytest
-from commands import call
+from commands import call, refused, succeeded
 from rosbags.highlevel import AnyReader
 
 from adaptune.geometry import invert
@@ -81,10 +81,6 @@ def study(study_file, tmp_path):
     poses = study.sequences.reference("three")
     write_reference(folder, reference, along_x(), poses)
     return study
-
-
-def command(study, study_file, *words):
-    return call("record", study_file, *words, "--folder", study.folder)
 
 
 def left(study):
@@ -182,10 +178,9 @@ def test_recordings_are_the_same_again_and_replays_stay(study):
 
 
 def test_the_command_says_what_it_wrote(study, study_file):
-    done = command(study, study_file)
-    assert done.exit_code == 0, done.stderr
+    done = succeeded("record", study_file, "--folder", study.folder)
     assert f"{study.folder / 'recordings/three/three.mcap'} (" in done.stdout
-    assert command(study, study_file, "three").exit_code == 0
+    succeeded("record", study_file, "three", "--folder", study.folder)
 
 
 @contextmanager
@@ -203,10 +198,10 @@ def test_a_full_disk_leaves_nothing_half_written(study, study_file, size):
     list(study.sequences.open("three"))  # which is in the cache then
     for earlier in (False, True):
         if earlier:
-            assert command(study, study_file).exit_code == 0
+            succeeded("record", study_file, "--folder", study.folder)
         before = left(study)
         with files_of_at_most(size):
-            done = command(study, study_file)
+            done = call("record", study_file, "--folder", study.folder)
         assert done.exit_code == 2
         (line,) = done.stderr.strip().splitlines()
         assert line.startswith(f"error: {study.folder / 'recordings/three'}: cannot be written (")
@@ -228,16 +223,12 @@ def test_ctrl_c_leaves_nothing_half_written(study):
 
 
 def test_sequences_that_were_not_replayed_are_refused(study, study_file, tmp_path):
-    for words, said in (
-        (["one"], "one: there is no replay of it; .* `adaptune online`"),
-        (["thre"], "thre: there is no such sequence in the study: .*three"),
+    for names, folder, said in (
+        (["one"], study.folder, "one: there is no replay of it; .* `adaptune online`"),
+        (["thre"], study.folder, "thre: there is no such sequence in the study: .*three"),
+        ([], tmp_path / "other", "there is no replay; run `adaptune online`"),
     ):
-        done = command(study, study_file, *words)
-        assert done.exit_code == 2
-        assert re.search(said, done.stderr), done.stderr
-    done = call("record", study_file, "--folder", tmp_path / "other")
-    assert done.exit_code == 2
-    assert "there is no replay; run `adaptune online`" in done.stderr
+        assert re.search(said, refused("record", study_file, *names, "--folder", folder))
 
 
 def test_replays_of_something_else_are_refused(study, study_file):

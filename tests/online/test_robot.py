@@ -11,7 +11,7 @@ import drives
 import local_link
 import numpy as np
 import pytest
-from commands import call
+from commands import refused
 
 from adaptune.errors import AdaptuneError, OdometryError
 from adaptune.model import BankSettings, ErrorModel
@@ -201,9 +201,7 @@ def test_what_does_not_go_together_is_refused(make, monkeypatch):
     ],
 )
 def test_options_that_exclude_each_other(study_file, folder, options, said):
-    result = call("online", study_file, "--folder", folder, *options)
-    assert result.exit_code == 2
-    assert said in result.output
+    assert said in refused("online", study_file, "--folder", folder, *options)
 
 
 TENTH = 10**8

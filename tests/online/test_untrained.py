@@ -7,10 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from commands import refused, succeeded
 
 from adaptune import manifest
-from adaptune.commands.cli import app
 from adaptune.model import BankSettings, ErrorModel, PairedSettings
 from adaptune.selector import UntrainedSelector, untrained_sets
 from adaptune.study.study import ModeError
@@ -167,13 +166,11 @@ def test_without_a_test_all_recordings_are_replayed_whole(load, study_file):
 
 
 def test_a_bank_of_what_cannot_be_in_one_is_refused(study_file, tmp_path, load):
-    words = [str(study_file), "--untrained", "--folder", str(tmp_path / "run")]
-    done = CliRunner().invoke(app, ["online", *words, "-o", WHOLE])
-    assert done.exit_code == 2
-    assert "untrained is not possible: a program that runs whole recordings" in done.stderr
-    done = CliRunner().invoke(app, ["online", *words, "--model", "some.safetensors"])
-    assert done.exit_code == 2
-    assert "--untrained uses no model; leave out --model some.safetensors" in done.stderr
+    words = [study_file, "--untrained", "--folder", tmp_path / "run"]
+    said = refused("online", *words, "-o", WHOLE)
+    assert "untrained is not possible: a program that runs whole recordings" in said
+    said = refused("online", *words, "--model", "some.safetensors")
+    assert "--untrained uses no model; leave out --model some.safetensors" in said
     setup = ReplaySetup.of(load())
     for mode in ("fixed", "adaptive"):
         with pytest.raises(ModeError, match=f"{mode}: needs an error model"):
@@ -182,19 +179,13 @@ def test_a_bank_of_what_cannot_be_in_one_is_refused(study_file, tmp_path, load):
 
 
 def test_the_command_line_names_what_follows(study_file, tmp_path):
-    words = [str(study_file), "--folder", str(tmp_path / "run")]
-    done = CliRunner().invoke(app, ["online", *words, "--untrained"])
-    assert done.exit_code == 0, done.output
-    assert "2 replays made" in done.stdout
-    done = CliRunner().invoke(app, ["compare", *words])
-    assert done.exit_code == 0, done.output
+    words = [study_file, "--folder", tmp_path / "run"]
+    assert "2 replays made" in succeeded("online", *words, "--untrained").stdout
+    done = succeeded("compare", *words)
     made = list((tmp_path / "run").rglob("comparison.csv"))
     # A narrow terminal breaks the names of columns.
     assert ["vs baseline" in path.read_text("utf-8") for path in made] == [True]
     assert "fixed.yaml" not in done.stdout
     assert "adaptune offline" in done.stdout.splitlines()[-1]
-    blind = ["compare", *words, "-o", BLIND]
-    assert (
-        "run `adaptune online --untrained` with this study, which"
-        in CliRunner().invoke(app, blind).stderr
-    )
+    said = refused("compare", *words, "-o", BLIND)
+    assert "run `adaptune online --untrained` with this study, which" in said

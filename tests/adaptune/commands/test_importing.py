@@ -1,5 +1,5 @@
 import pytest
-from commands import call
+from commands import refused, succeeded
 
 from adaptune import files as yaml
 from adaptune.odometry.docker import rustle as docker_rustle
@@ -106,10 +106,6 @@ def rustle(tmp_path, monkeypatch):
     return tmp_path
 
 
-def run(name, *arguments):
-    return call("import-rustle", name, *arguments)
-
-
 def read(path):
     return yaml.Document(path.read_text(encoding="utf-8")).data
 
@@ -128,8 +124,7 @@ def check(path):
 
 def test_every_test_algorithm_and_speed_is_a_study(rustle, caplog):
     (rustle / "made").mkdir()
-    done = run("tests.yaml", "-o", "made/s.yaml")
-    assert done.exit_code == 0, done.stderr
+    done = succeeded("import-rustle", "tests.yaml", "-o", "made/s.yaml")
     names = sorted(path.name for path in (rustle / "made").iterdir())
     assert names == [
         *(f"s_fast_faster-lio_x{speed}.yaml" for speed in (1, 2, 3)),
@@ -179,7 +174,7 @@ def test_every_test_algorithm_and_speed_is_a_study(rustle, caplog):
 
 
 def test_a_grid_keeps_its_points_and_its_weights(rustle, caplog):
-    assert run("tuning.yaml").exit_code == 0
+    succeeded("import-rustle", "tuning.yaml")
     study = read(rustle / "study.yaml")
     assert study["odometry"]["parameters"] == {
         "filter_size_surf": {
@@ -206,7 +201,7 @@ def test_a_random_search_ends_with_the_grid(rustle):
         "tolerance: 4, ", "tolerance: 9, "
     )
     (rustle / "tuning.yaml").write_text(text + "  weighting: [cauchy, huber]\n  deskew: true\n")
-    assert run("tuning.yaml").exit_code == 0
+    succeeded("import-rustle", "tuning.yaml")
     config = check(rustle / "study.yaml")
     assert (config.sampler, config.trials) == ("random", 3 * 3 * 2 + 1)
     study = read(rustle / "study.yaml")
@@ -219,7 +214,7 @@ def test_a_random_search_ends_with_the_grid(rustle):
 
 
 def test_annealing_keeps_starts_bounds_and_steps(rustle, caplog):
-    assert run("annealing.yaml").exit_code == 0
+    succeeded("import-rustle", "annealing.yaml")
     config = check(rustle / "study.yaml")
     assert config.sampler_settings == {
         "chains": 1,
@@ -248,11 +243,10 @@ def test_annealing_keeps_starts_bounds_and_steps(rustle, caplog):
 
 def test_nothing_is_overwritten_unasked(rustle):
     (rustle / "study.yaml").write_text("mine")
-    done = run("tuning.yaml")
-    assert done.exit_code == 2
-    assert "study.yaml: exists; name another -o, or add --overwrite" in done.stderr
+    said = refused("import-rustle", "tuning.yaml")
+    assert "study.yaml: exists; name another -o, or add --overwrite" in said
     assert (rustle / "study.yaml").read_text() == "mine"
-    assert run("tuning.yaml", "--overwrite").exit_code == 0
+    succeeded("import-rustle", "tuning.yaml", "--overwrite")
 
 
 @pytest.mark.parametrize(
@@ -279,7 +273,6 @@ def test_mistakes_are_named_with_file_line_and_key(rustle, name, old, new, told)
     path = rustle / f"{name}.yaml"
     assert old in path.read_text()
     path.write_text(path.read_text().replace(old, new, 1))
-    done = run("tests.yaml" if name in ("algorithms", "datasets") else path.name)
-    assert done.exit_code == 2
-    assert told in done.stderr
+    imported = "tests.yaml" if name in ("algorithms", "datasets") else path.name
+    assert told in refused("import-rustle", imported)
     assert not list(rustle.glob("study*"))
