@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rooms import along_x
 from scipy.spatial.transform import Rotation
 
 from adaptune.metrics import (
@@ -40,12 +41,6 @@ def drift(rng, T, size=0.02):
         wrong[:3, 3] = rng.normal(0, size, 3)
         est[i] = est[i - 1] @ np.linalg.inv(T[i - 1]) @ T[i] @ wrong
     return est
-
-
-def line(*x):
-    T = np.tile(np.eye(4), (len(x), 1, 1))
-    T[:, 0, 3] = x
-    return T
 
 
 def plain_end(T_ref, start, length):
@@ -129,7 +124,7 @@ def test_kitti_error_follows_its_definition(seed):
 
 def test_the_end_is_the_first_frame_beyond_the_length():
     # At the length itself is not beyond it.
-    T = line(0, 1, 2, 3, 3, 4, 6, 6.5)
+    T = along_x([0, 1, 2, 3, 3, 4, 6, 6.5])
     np.testing.assert_array_equal(window_ends(T, 2.0), [3, 5, 6, 6, 6, 7, -1, -1])
     np.testing.assert_array_equal(window_ends(T, 6.5), [-1] * 8)
     np.testing.assert_array_equal(window_ends(T[:0], 1.0), [])
@@ -137,7 +132,7 @@ def test_the_end_is_the_first_frame_beyond_the_length():
 
 
 def test_errors_worked_by_hand():
-    T_ref, T_est = line(0.0, 1.0, 2.0, 3.0), line(0.0, 1.1, 2.1, 3.3)
+    T_ref, T_est = along_x([0.0, 1.0, 2.0, 3.0]), along_x([0.0, 1.1, 2.1, 3.3])
     assert relative_error(T_ref, T_est) == pytest.approx(np.sqrt((0.01 + 0.0 + 0.04) / 3))
     # Aligned on a line, what is left are the departures 0, 0.1, 0.1, 0.3 from their mean.
     assert absolute_error(T_ref, T_est) == pytest.approx(np.std([0.0, 0.1, 0.1, 0.3]))
@@ -148,7 +143,7 @@ def test_errors_worked_by_hand():
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_an_estimate_that_is_not_finite_is_a_failure(bad):
-    T_ref = line(*range(9))
+    T_ref = along_x(range(9))
     T_est = T_ref.copy()
     T_est[4, :3] = bad
     errors = sub_trajectory_rte(T_ref, T_est, 1.5)

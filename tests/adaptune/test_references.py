@@ -4,6 +4,7 @@ import drives
 import estimates
 import numpy as np
 import pytest
+from rooms import along_x
 
 from adaptune.recording.config import SequenceConfig
 from adaptune.recording.recording import open_sequence, wants_estimate
@@ -132,8 +133,8 @@ def test_it_is_estimated_again_when_something_has_changed(
 
 def truth(aside=0.0):
     stamps = drives.FIRST_STAMP + np.arange(40) * 10**8
-    T = np.tile(np.eye(4), (40, 1, 1))
-    T[:, 0, 3], T[:, 1, 3] = 0.3 * np.arange(40), aside
+    T = along_x(0.3 * np.arange(40))
+    T[:, 1, 3] = aside
     return Trajectory(stamps, T)
 
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from made_replays import SCENES, SECONDS, bank, kept, replay, sequence
+from rooms import along_x
 
 from adaptune.report.charts import Band, Line, Mark, Points, Shares, Spans, Words
 from adaptune.trajectory import Trajectory
@@ -154,9 +155,8 @@ def drive(stretched=1.0):
     """Two metres a second in the cave, then three; the path may be longer than the road."""
     seconds = np.linspace(0.0, 10.0 + 40.0 / 3.0, 2000)
     x = np.where(seconds < 10.0, 2.0 * seconds, 20.0 + 3.0 * (seconds - 10.0))
-    T = np.tile(np.eye(4), (len(x), 1, 1))
-    T[:, 0, 3] = stretched * x
-    return Trajectory(START + np.rint(seconds * 1e9).astype(np.int64), T)
+    stamps = START + np.rint(seconds * 1e9).astype(np.int64)
+    return Trajectory(stamps, along_x(stretched * x))
 
 
 @pytest.mark.parametrize("stretched", [1.0, 1.1])

@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from rooms import along_x
 
 from adaptune.metrics import KittiError, kitti_error
 from adaptune.trajectory import Trajectory, read_kitti
@@ -21,9 +22,7 @@ def trajectory(T, first=0):
 
 
 def straight(n, step=1.0):
-    T = np.tile(np.eye(4), (n, 1, 1))
-    T[:, 0, 3] = step * np.arange(n)
-    return T
+    return along_x(step * np.arange(n))
 
 
 def over_all(rows):

@@ -1,6 +1,7 @@
 """Workers that make up what trials give, in no time."""
 
 import numpy as np
+from rooms import along_x
 
 from adaptune.archive import Frames, Trial
 from offline.workers import TaskResult
@@ -25,11 +26,9 @@ class Drawn:
 
     def wait(self):
         task, self._task = self._task, None
-        T_ref_sensor = np.tile(np.eye(4), (N_FRAMES, 1, 1))
-        T_ref_sensor[:, 0, 3] = 0.3 * np.arange(N_FRAMES)
         frames = Frames(
             np.arange(N_FRAMES) * 10**8,
-            T_ref_sensor,
+            along_x(0.3 * np.arange(N_FRAMES)),
             np.random.default_rng(len(task.sequence)).random((N_FRAMES, 90)).astype(np.float32),
             {"ndt": 90},
             np.zeros(N_FRAMES, np.float32),

@@ -1,7 +1,7 @@
 """A reference of the drives in `drives`, as if it were estimated, and what it was asked for."""
 
-import drives
 import numpy as np
+from rooms import along_x
 
 from adaptune.reference.stored import EstimatedReference, Registrations
 
@@ -38,10 +38,7 @@ class Estimator:
 
     @staticmethod
     def _poses(stamps, factor):
-        T = np.tile(np.eye(4), (len(stamps), 1, 1))
-        T[:, 0, 3] = factor * STEP * (stamps - drives.FIRST_STAMP) * 1e-8
-        T[:, 0, 3] -= T[0, 0, 3]
-        return T
+        return along_x(factor * STEP * (stamps - stamps[0]) * 1e-8)
 
 
 def install(monkeypatch, *given, **settings):

@@ -3,6 +3,7 @@
 import itertools
 
 import numpy as np
+from rooms import along_x
 from tables import table
 
 from adaptune.live.hops import Hops
@@ -39,8 +40,7 @@ def simulated(described, motions, T_ref_sensor=None):
     """A drive, ten scans a second, by default along x, 0.3 m from each to the next."""
     n = len(described)
     if T_ref_sensor is None:
-        T_ref_sensor = np.tile(np.eye(4), (n, 1, 1))
-        T_ref_sensor[1:, 0, 3] = 0.3 * np.arange(1, n)
+        T_ref_sensor = along_x(0.3 * np.arange(n))
     stamps = np.arange(n, dtype=np.int64) * 10**8
     hops = Hops.of([])
     return BankSimulation(

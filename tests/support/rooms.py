@@ -43,3 +43,10 @@ def moved(x=0.0, y=0.0, z=0.0, yaw=0.0):
     T[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
     T[:3, 3] = x, y, z
     return T
+
+
+def along_x(x):
+    """Poses at these metres along x."""
+    T = np.tile(np.eye(4), (len(x), 1, 1))
+    T[:, 0, 3] = x
+    return T

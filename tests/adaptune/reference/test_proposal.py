@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from rooms import along_x
 
 from adaptune.live.evidence import OwnError
 from adaptune.recording.inspect import inspect
@@ -11,9 +12,7 @@ from adaptune.trajectory import Trajectory
 def path(metres, seconds=1000):
     """A reference along a straight line; the last 40 % of the time are for the test."""
     stamps = np.linspace(0, seconds * 10**9, 101).astype(np.int64)
-    T = np.tile(np.eye(4), (101, 1, 1))
-    T[:, 0, 3] = np.linspace(0.0, metres, 101)
-    return Trajectory(stamps, T)
+    return Trajectory(stamps, along_x(np.linspace(0.0, metres, 101)))
 
 
 class Measured:
