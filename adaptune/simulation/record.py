@@ -37,14 +37,13 @@ from adaptune.simulation.course import (
     POSES,
     SENSORS,
     T_IMU_LIDAR,
-    WEATHERS,
     Course,
     SimulationError,
     directions,
 )
 from adaptune.simulation.mesh import REFLECTIVITY, Mesh
 from adaptune.simulation.scenes import SCENES, TILE
-from adaptune.simulation.world import RADIUS, Ride, Road, World, model, populate
+from adaptune.simulation.world import Ride, Road, World
 from adaptune.trajectory import Trajectory, write_tum
 
 # Drive through a world and scan it.
@@ -90,25 +89,25 @@ class Drive:
     def scans(self) -> Iterator[SimulatedScan]:
         """Scan the world from one end of the drive to the other."""
         course, sensor = self.course, SENSORS[self.course.sensor]
-        air = WEATHERS[course.weather]
         columns = course.columns or sensor.columns
         rings = np.tile(np.arange(sensor.rings, dtype=np.uint16), columns)
         offsets = np.arange(columns) / (columns * course.turns)
         times = np.repeat(offsets, sensor.rings).astype(np.float32)
+        looks = directions(course.sensor, columns)
         receiver = kernels.Receiver(*sensor.range, sensor.noise, sensor.dropout)
         caster = _Caster(self, sensor.range[1])
         for number, stamp in enumerate(self.stamps()[:-1].tolist()):
             start = (stamp - EPOCH) * 1e-9
             T_world_sensor = self.ride.poses(start + offsets)
-            looks = directions(course.sensor, columns, start, course.turns)
-            cast = caster.cast(looks, T_world_sensor, start + offsets)
+            cast = caster.cast(looks, T_world_sensor)
             rng = np.random.default_rng([course.seed, 6, number])
+            # Two numbers for each ray, so that a seed gives the recording that it always gave.
+            chance, _ = rng.random((2, len(cast.rays)), np.float32)
             points, intensities, kept = kernels.receive(
                 looks.reshape(-1, 3),
                 cast,
                 receiver,
-                (air.extinction, air.backscatter, air.reach),
-                rng.random((2, len(cast.rays)), np.float32),
+                chance,
                 rng.standard_normal(len(cast.rays), np.float32),
             )
             yield SimulatedScan(
@@ -128,13 +127,8 @@ class _Caster:
         self._road, self._sight = drive.road, sight
         self._world = World(drive.road)
         self._here: int | None = None
-        self._movers = populate(drive.road) if drive.course.moving_objects else []
-        kinds = {mover.kind for mover in self._movers}
-        self._models = {kind: _Target(model(kind), np.zeros(3)) for kind in kinds}
 
-    def cast(
-        self, looks: NDArray[np.float32], T_world_sensor: Poses, times: NDArray[np.float64]
-    ) -> kernels.Cast:
+    def cast(self, looks: NDArray[np.float32], T_world_sensor: Poses) -> kernels.Cast:
         """Cast rays from each column's pose."""
         station = float(self._road.station(T_world_sensor[0, 0, 3]))
         tile = int(station // TILE)
@@ -144,25 +138,7 @@ class _Caster:
             self._target = _Target(mesh, self._origin)
             self._here = tile
         rays = kernels.aim(looks, T_world_sensor, self._origin)
-        hits, normals, reflectivity = self._target.cast(rays)
-        for mover in self._movers:
-            if abs(mover.middle - station) > mover.swing + self._sight:
-                continue
-            centres, yaw = mover.at(self._road, times)
-            picked, local = kernels.towards(
-                rays, looks.shape[1], centres - self._origin, yaw, RADIUS[mover.kind]
-            )
-            if not len(picked):
-                continue
-            nearer, turned, shine = self._models[mover.kind].cast(local)
-            hit = nearer < hits[picked]
-            picked, turned, heading = picked[hit], turned[hit], yaw[picked[hit] // looks.shape[1]]
-            hits[picked], reflectivity[picked] = nearer[hit], shine[hit]
-            cos, sin = np.cos(heading), np.sin(heading)
-            normals[picked, 0] = cos * turned[:, 0] - sin * turned[:, 1]
-            normals[picked, 1] = sin * turned[:, 0] + cos * turned[:, 1]
-            normals[picked, 2] = turned[:, 2]
-        return kernels.Cast(rays, hits, normals, reflectivity)
+        return kernels.Cast(rays, *self._target.cast(rays))
 
 
 class _Target:

@@ -303,8 +303,12 @@ DELETED = {
     "offline.target": "is gone; give trials, hours or stagnation",
     "offline.storage": "is gone: the trials are in a journal of Optuna's in the study's folder",
     "offline.max_frames": "is gone: the error model keeps all frames; leave it out",
+    "courses.*.moving_objects": "is gone: nothing moves in simulated places; leave it out",
+    "courses.*.weather": "is gone: the air is always clear; leave it out",
+    "courses.*.sensor=avia": "is gone; choose a sensor that turns",
 }
-"""Keys, and values of keys, of earlier versions that are gone, and what became of them."""
+"""Keys, and values of keys, of earlier versions that are gone, and what became of them; a star
+stands for any name."""
 
 _MOST_BYTES = 10**6
 
@@ -361,7 +365,9 @@ def _deleted(mistake: Mistake, data: Any) -> Mistake:
         value = reduce(getitem, mistake.key, data)
     except (LookupError, TypeError):
         return mistake
-    key = ".".join(part for part in mistake.key if isinstance(part, str))
+    parts = [part for part in mistake.key if isinstance(part, str)]
+    parts[1:2] = ["*"] if parts[:1] == ["courses"] else parts[1:2]
+    key = ".".join(parts)
     if key in DELETED:
         return mistake._replace(message=DELETED[key])
     gone = DELETED.get(f"{key}={value}")

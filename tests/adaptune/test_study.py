@@ -160,7 +160,7 @@ def test_names_what_to_install(study_file, monkeypatch):
 
 @pytest.mark.parametrize(
     ("old", "words"),
-    [(old, words) for old, words in DELETED.items() if "=" not in old],
+    [(old, words) for old, words in DELETED.items() if "=" not in old and "*" not in old],
 )
 def test_an_old_key_is_told_what_became_of_it(study_file, old, words):
     assert failure(study_file, f"{old}=3") == f"-o: {old}: {words}"
@@ -168,12 +168,24 @@ def test_an_old_key_is_told_what_became_of_it(study_file, old, words):
 
 @pytest.mark.parametrize(
     ("old", "words"),
-    [(old, words) for old, words in DELETED.items() if "=" in old],
+    [(old, words) for old, words in DELETED.items() if "=" in old and "*" not in old],
 )
 def test_an_old_value_is_told_what_became_of_it(study_file, old, words):
     key, _, value = old.partition("=")
     given = f"{key}=[{value}]" if key == "online.modes" else old
     assert f": {value} {words}" in failure(study_file, given)
+
+
+@pytest.mark.parametrize(
+    ("old", "words"), [(old, words) for old, words in DELETED.items() if "*" in old]
+)
+def test_an_old_key_of_a_course_is_told_what_became_of_it(study_file, old, words):
+    key, _, value = old.replace("courses.*.", "").partition("=")
+    given = {"scenes": "[cave]", key: value or "1"}
+    course = ", ".join(f"{name}: {text}" for name, text in given.items())
+    told = f"{value} {words}" if value else words
+    text = failure(study_file, f"courses.sim={{{course}}}")
+    assert text == f"-o: courses.sim.{key}: {told}"
 
 
 def test_a_folder_that_cannot_be_made(study_file, tmp_path):

@@ -29,10 +29,9 @@ def test_scenes_share_the_ground_without_a_step(road):
 
 
 AHEAD = np.array([[1.0, 0.0, 0.0]], np.float32)
-CLEAR = (0.0, 0.0, 0.0)
 
 
-def receive(distance, *, cosine=1.0, reflectivity=0.5, air=CLEAR, dropout=0.0, n=2000, noise=0.0):
+def receive(distance, *, cosine=1.0, reflectivity=0.5, dropout=0.0, n=2000, noise=0.0):
     rng = np.random.default_rng(0)
     looks = np.repeat(AHEAD, n, axis=0)
     normals = np.repeat([[-cosine, (1.0 - cosine**2) ** 0.5, 0.0]], n, axis=0).astype(np.float32)
@@ -45,8 +44,7 @@ def receive(distance, *, cosine=1.0, reflectivity=0.5, air=CLEAR, dropout=0.0, n
             np.full(n, reflectivity, np.float32),
         ),
         kernels.Receiver(1.0, 100.0, noise, dropout),
-        air,
-        rng.random((2, n), np.float32),
+        rng.random(n, np.float32),
         rng.standard_normal(n, np.float32),
     )
 
@@ -89,21 +87,3 @@ def test_range_limits_and_weak_echoes():
 
 def test_dropouts():
     assert 0.08 < 1.0 - len(receive(5.0, dropout=0.1)[2]) / 2000 < 0.12
-
-
-def test_fog_sends_echoes_of_its_own_and_hides_what_is_far():
-    fog = (0.03, 0.02, 10.0)
-    points, intensities, _ = receive(40.0, air=fog)
-    early = points[:, 0] < 39.0
-    # Chance of an echo between the sensor and ten metres, less those too near to be seen.
-    np.testing.assert_allclose(early.sum() / 2000, np.exp(-0.02) - np.exp(-0.2), atol=0.03)
-    assert intensities[early].max() < 5.0
-    assert len(receive(80.0, air=(0.03, 0.0, 0.0))[2]) == 0
-
-
-def test_rays_towards_a_moving_thing_are_seen_from_it():
-    rays = np.array([[0, 0, 0, 1, 0, 0], [0, 0, 0, 0, 1, 0], [0, 0, 0, -1, 0, 0]], np.float32)
-    centres = np.repeat([[5.0, 0.5, 0.0]], 3, axis=0)
-    picked, local = kernels.towards(rays, 1, centres, np.full(3, np.pi / 2), 1.0)
-    assert picked.tolist() == [0]
-    np.testing.assert_allclose(local[0], [-0.5, 5.0, 0.0, 0.0, -1.0, 0.0], atol=1e-6)
