@@ -50,19 +50,6 @@ class Points:
 
 
 @dataclass(frozen=True)
-class Cloud:
-    """Thousands of points, drawn as pixels; the last one lies on top."""
-
-    x: Values
-    y: Values
-    colour: Values  # a number for every point, shown on a colour bar
-    colour_label: str
-    colour_limits: tuple[float, float]
-    log_colour: bool = False
-    size: int = 1  # of a point, pixels
-
-
-@dataclass(frozen=True)
 class Band:
     """The space between two lines, as of an interval."""
 
@@ -116,7 +103,7 @@ class Words:
     words: Sequence[str]
 
 
-Drawn = Line | Points | Cloud | Band | Bars | Shares | Spans | Mark | Words
+Drawn = Line | Points | Band | Bars | Shares | Spans | Mark | Words
 
 
 @dataclass(frozen=True)

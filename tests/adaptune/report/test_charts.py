@@ -11,7 +11,6 @@ from adaptune.report.charts import (
     Band,
     Bars,
     Chart,
-    Cloud,
     Line,
     Mark,
     Panel,
@@ -59,16 +58,6 @@ def test_colours_of_points_are_on_a_bar_and_unknown_ones_are_grey(tmp_path):
     texts, svg = drawn(chart_of(points), tmp_path)
     assert {"size [m]", "0.2", "0.5", "trial"} <= set(texts)
     assert svg.count("#bbbbbb") == 1
-
-
-def test_a_cloud_is_a_picture_with_a_colour_bar(tmp_path):
-    rng = np.random.default_rng(0)
-    cloud = Cloud(*rng.normal(size=(2, 50_000)), rng.random(50_000), "height z [m]", (0.0, 1.0))
-    texts, svg = drawn(chart_of(cloud, Points([0.0], [0.0], "LiDAR"), equal=True), tmp_path)
-    assert {"LiDAR", "0.5"} <= set(texts)
-    assert "height z" in " ".join(texts)
-    assert svg.count("data:image/png;base64,") == 1
-    assert len(svg) < 2_000_000
 
 
 def test_spans_are_named_above_and_marks_carry_their_words(tmp_path):
