@@ -294,14 +294,6 @@ StudyFile = Annotated[
 ]
 
 
-def _complete_override(incomplete: str) -> list[str]:
-    """Keys and values for `-o`, when the shell asks."""
-    from adaptune.study.config import complete
-    from offline.config import NAMES, OfflineStudyConfig
-
-    return complete(OfflineStudyConfig, incomplete, {"offline.sampler": NAMES})
-
-
 Override = Annotated[
     list[str],
     typer.Option(
@@ -310,7 +302,6 @@ Override = Annotated[
         metavar="KEY=VALUE",
         help="Replace a value of the YAML, as in `-o offline.trials=128`. May be repeated.",
         show_default=False,
-        autocompletion=_complete_override,
     ),
 ]
 Folder = Annotated[

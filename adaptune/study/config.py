@@ -1,15 +1,13 @@
 """The configuration of a study: the settings that both stages share."""
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Annotated, Any, Literal, NamedTuple, get_args, get_origin
+from collections.abc import Iterable, Mapping
+from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import (
     AfterValidator,
-    BaseModel,
     BeforeValidator,
     Field,
-    field_validator,
     model_validator,
 )
 
@@ -21,7 +19,7 @@ from adaptune.recording.scan import Fractions, part_name, read_part
 from adaptune.ros.link import SetCommand
 from adaptune.simulation.course import Course
 from adaptune.space import ParameterSpace, Value
-from adaptune.strict import Mistake, StrictModel, alternatives
+from adaptune.strict import Mistake, StrictModel
 
 
 def _file_name(name: str) -> str:
@@ -177,11 +175,6 @@ class OnlineConfig(StrictModel):
     real_time: RealTimeConfig | None = None
     ros: RosConfig = RosConfig()
 
-    @field_validator("modes", mode="before")
-    @classmethod
-    def _all(cls, modes: Any) -> Any:
-        return (*RULES, *ALSO) if modes == "all" else modes
-
     @property
     def rules(self) -> tuple[str, ...]:
         """The modes that select parameters with the error model."""
@@ -231,33 +224,6 @@ class StudyConfig(StrictModel):
     def resolved(self) -> dict[str, Any]:
         """The configuration as plain data, with nothing left to defaults."""
         return self.model_dump(mode="json")
-
-
-# The keys of a study's YAML, for the completion of `-o`.
-
-
-def complete(
-    model: type[BaseModel], incomplete: str, more: Mapping[str, Sequence[str]] | None = None
-) -> list[str]:
-    """What ``KEY=VALUE`` can become; `more` has values of keys whose type names none."""
-    key, equals, _ = incomplete.partition("=")
-    keys = {name: (more or {}).get(name, values) for name, values in _keys(model, "")}
-    if equals:
-        return [t for v in keys.get(key, ()) if (t := f"{key}={v}").startswith(incomplete)]
-    return [f"{name}=" for name in keys if name.startswith(incomplete)]
-
-
-def _keys(model: type[BaseModel], prefix: str) -> Iterator[tuple[str, Sequence[str]]]:
-    """Every key below a section that has none below it, and its values if they are listed."""
-    for name, field in model.model_fields.items():
-        types = list(alternatives(field.annotation))
-        sections = [type_ for type_ in types if isinstance(type_, type(BaseModel))]
-        for section in sections:
-            yield from _keys(section, f"{prefix}{name}.")
-        if not sections:
-            listed = [get_args(type_) for type_ in types if get_origin(type_) is Literal]
-            listed += [("true", "false")] * (bool in types)
-            yield prefix + name, [str(value) for values in listed for value in values]
 
 
 # The sequences that a study names for training and test, and parts of them.
