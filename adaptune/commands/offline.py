@@ -103,10 +103,6 @@ def trials(
     study: StudyFile,
     override: Override = [],  # noqa: B006
     folder: Folder = None,
-    where: Annotated[
-        list[str],
-        typer.Option(metavar="CONDITION", help="As in `--where 'mean < 1'`. May be repeated."),
-    ] = [],  # noqa: B006
     sort: Annotated[
         str | None,
         typer.Option(metavar="COLUMN", help="With `-` before it, the largest first."),
@@ -135,7 +131,7 @@ def trials(
     finished = table.rows(archive, names)
     if not finished:
         raise AdaptuneError(f"{archive.folder}: no trial is finished yet; run `adaptune offline`")
-    chosen = table.select(finished, where, sort, top)
+    chosen = table.select(finished, sort, top)
     labels = loaded.odometry.space.labels
     if csv:
         sys.stdout.write(csv_text(chosen))

@@ -330,7 +330,7 @@ def _search(study: "OfflineStudy") -> "PageSection":
         return replace(section, missing=(*section.missing, f"{error}."))
     if not finished:
         return section
-    best = archive.select([row for row in finished if row["mean"] is not None], [], "mean", _BEST)
+    best = archive.select([row for row in finished if row["mean"] is not None], "mean", _BEST)
     title = f"The best {len(best)} of {len(finished)} trials, in training"
     listed = archive.with_units(best, study.training, study.odometry.space.labels)
     return replace(section, tables=(Listing(title, listed),))
