@@ -28,7 +28,7 @@ MOST_VIEWS = 16
 REFERENCE_FILES = (".tum", ".txt", ".csv")
 ESTIMATED, NO_REFERENCE = "estimated", "none"
 """In place of a `reference`: it is estimated from the scans, or there is none."""
-_SOURCES = ("bag", "kitti", "folder", "evalio")
+_SOURCES = ("bag", "kitti", "folder")
 _STANDARD_GRAVITY = 9.80665
 
 
@@ -218,7 +218,7 @@ class ImuConfig(StrictModel):
 
 
 class SequenceConfig(_Part):
-    """A recording, from one of `bag`, `kitti`, `folder` and `evalio`, and what of it to use."""
+    """A recording, from one of `bag`, `kitti` and `folder`, and what of it to use."""
 
     # Bags that follow each other: files, ROS 2 folders, folders of bags, patterns.
     bag: Annotated[str | tuple[str, ...] | None, BeforeValidator(_resolve_bags)] = None
@@ -226,7 +226,6 @@ class SequenceConfig(_Part):
     kitti: Annotated[str, AfterValidator(resolve)] | None = None
     # Folder of ``.pcd``, ``.ply``, ``.npy`` or ``.bin`` files.
     folder: Annotated[str, AfterValidator(resolve)] | None = None
-    evalio: str | None = None  # one of evalio's sequences, as ``newer_college_2020/short``
     points: str | None = None  # topic of the point clouds
     frame: str | None = None  # `frame_id` of the point clouds, where the topic has several
     stamp: Mark = "auto"  # what a stamp marks of its scan

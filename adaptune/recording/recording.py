@@ -135,10 +135,7 @@ def wants_estimate(config: SequenceConfig) -> bool:
     """Whether the reference of a sequence is to be estimated; a SequenceError if it cannot tell."""
     if config.reference is not None or config.bag is not None:
         return config.reference in (None, ESTIMATED)
-    source, _ = _source(config)
-    if config.evalio is not None:
-        return source.poses(None, None) is None
-    return not source.pose_files
+    return not _source(config)[0].pose_files
 
 
 def position_prior(config: SequenceConfig) -> Trajectory | None:
@@ -201,11 +198,6 @@ def _source(config: SequenceConfig) -> tuple[Source, str | None]:
         return kitti(Path(config.kitti), config.elevation), None
     if config.folder is not None:
         return scan_folder(Path(config.folder), timing), None
-    if config.evalio is not None:
-        # evalio is an optional package.
-        from adaptune.recording.evalio import evalio_source
-
-        return evalio_source(config.evalio), None
     paths = config.bags()
     if not config.cache or not cache.cap():
         return BagSource(paths, config.points, timing, config.frame), None

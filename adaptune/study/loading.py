@@ -303,6 +303,7 @@ DELETED = {
     "offline.target": "is gone; give trials, hours or stagnation",
     "offline.storage": "is gone: the trials are in a journal of Optuna's in the study's folder",
     "offline.max_frames": "is gone: the error model keeps all frames; leave it out",
+    "sequences.*.evalio": "is gone: give the data set's files, as `bag`, `kitti` or `folder`",
     "courses.*.moving_objects": "is gone: nothing moves in simulated places; leave it out",
     "courses.*.weather": "is gone: the air is always clear; leave it out",
     "courses.*.sensor=avia": "is gone; choose a sensor that turns",
@@ -366,7 +367,8 @@ def _deleted(mistake: Mistake, data: Any) -> Mistake:
     except (LookupError, TypeError):
         return mistake
     parts = [part for part in mistake.key if isinstance(part, str)]
-    parts[1:2] = ["*"] if parts[:1] == ["courses"] else parts[1:2]
+    if parts[:1] in (["sequences"], ["courses"]):
+        parts[1:2] = ["*"]
     key = ".".join(parts)
     if key in DELETED:
         return mistake._replace(message=DELETED[key])

@@ -52,7 +52,7 @@ from adaptune.study.config import (
 # The sequences of a study by name: recordings, simulated courses, and views of them.
 
 
-_PATHS = ("bag", "kitti", "folder", "evalio")
+_PATHS = ("bag", "kitti", "folder")
 _OF_POSES = ("reference", "child_frame", "extrinsic", "clock_offset", "max_gap")
 """Keys of a sequence that change its reference only."""
 _AS_ESTIMATED = {
