@@ -1,6 +1,5 @@
 """Inspect a recording: what it holds, what is odd about it, and how to name it in a study."""
 
-import datetime
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -17,7 +16,7 @@ from rosbags.highlevel import AnyReader
 from adaptune import files, geometry
 from adaptune.errors import AdaptuneError
 from adaptune.progress import Progress, unseen
-from adaptune.recording import Scan, SequenceConfig, SequenceError, cache
+from adaptune.recording import Scan, SequenceConfig, SequenceError
 from adaptune.recording.bag import IMU_TYPES, POINTS_TYPES, BagSource, IndexReader
 from adaptune.recording.clouds import (
     DATATYPES,
@@ -688,7 +687,7 @@ def _scan_span(topic: Topic) -> tuple[int, int]:
     return int(stamps.min()), int(stamps.max())
 
 
-# Show an inspected recording, and the cache, on a terminal.
+# Show an inspected recording on a terminal.
 
 
 def render_inspection(inspection: Inspection, accuracy: str = "") -> RenderableType:
@@ -784,16 +783,3 @@ def _reference_text(reference: Trajectory, complete: bool) -> str:
     # Poses without stamps are numbered by nanoseconds.
     lasted = f" in {seconds:.1f} s" if seconds > 1e-3 else ""
     return f"{len(reference):,} {words}{length:.1f} m{lasted}"
-
-
-def render_cache() -> RenderableType:
-    """The decoded sequences on disk, for a terminal."""
-    entries = cache.list_cache()
-    table = Table(box=None, pad_edge=False)
-    for column in ("sequence", "scans", "size", "last used"):
-        table.add_column(column, justify="left" if column == "sequence" else "right")
-    for entry in entries:
-        used = datetime.datetime.fromtimestamp(entry.used).strftime("%Y-%m-%d %H:%M")
-        table.add_row(entry.name, str(entry.n_scans), f"{entry.size / 1e6:,.1f} MB", used)
-    total, most = sum(entry.size for entry in entries) / 1e9, cache.cap() / 1e9
-    return Group(table, Text(f"{cache.folder()}: {total:.2f} GB of at most {most:g} GB"))

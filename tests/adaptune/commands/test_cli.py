@@ -122,18 +122,13 @@ def test_mistakes_are_told_in_a_sentence(study_file, tmp_path, arguments, words,
     assert "Traceback" not in done.stderr
 
 
-def test_the_cache_is_listed_and_cleared(adaptune):
-    assert adaptune("cache").exit_code == 0
-    assert adaptune("cache", "clear").stdout.startswith("Freed")
-
-
-MOST_COMMANDS = 13
+MOST_COMMANDS = 12
 
 
 def test_help_and_version(adaptune):
     done = adaptune("--help")
     assert done.exit_code == 0
-    for command in ("inspect", "simulate", "offline", "validate", "online", "compare", "cache"):
+    for command in ("inspect", "simulate", "offline", "validate", "online", "compare", "serve"):
         assert command in done.stdout
     commands = {command.name or command.callback.__name__ for command in app.registered_commands}
     assert len(commands) <= MOST_COMMANDS
