@@ -222,7 +222,7 @@ class SequenceConfig(_Part):
 
     # Bags that follow each other: files, ROS 2 folders, folders of bags, patterns.
     bag: Annotated[str | tuple[str, ...] | None, BeforeValidator(_resolve_bags)] = None
-    # Folder of a KITTI odometry sequence, or of a drive of KITTI raw or KITTI-360.
+    # Folder of a KITTI odometry sequence.
     kitti: Annotated[str, AfterValidator(resolve)] | None = None
     # Folder of ``.pcd``, ``.ply``, ``.npy`` or ``.bin`` files.
     folder: Annotated[str, AfterValidator(resolve)] | None = None
@@ -247,8 +247,7 @@ class SequenceConfig(_Part):
     # Seconds. The reference is unknown between poses further apart.
     max_gap: float = Field(1.0, gt=0, le=1e9)
     imu: ImuConfig | None = None
-    # Degrees by which to turn up every ray of a `kitti` recording; 0.205 for the odometry
-    # benchmark and the raw drives when left out.
+    # Degrees by which to turn up every ray of a `kitti` recording; 0.205 when left out.
     elevation: float | None = Field(None, ge=-5, le=5)
     # Undo the motion since the scan before, or the rotation that the IMU measured.
     compensate: Compensation = None

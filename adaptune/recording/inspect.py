@@ -36,7 +36,6 @@ from adaptune.trajectory import Trajectory, is_kitti, read_kitti, read_trajector
 LEAST_POINTS = 20
 """Valid points that an odometry needs."""
 
-_KITTI_FOLDERS = ("velodyne", "velodyne_points")
 # What each stage uses.
 _INPUTS = {
     "offline": ("points", "reference"),
@@ -182,7 +181,7 @@ class Inspection:
 def inspect(path: Path, deep: bool = False, show: Progress = unseen) -> Inspection:
     """Read a recording and report what it holds: a sample of it if it is long and not `deep`.
 
-    It is a bag, a folder with bags, a KITTI sequence or drive, a folder of scans, or a file of
+    It is a bag, a folder with bags, a KITTI sequence, a folder of scans, or a file of
     poses. An AdaptuneError says that it cannot be opened at all. What fails later is among the
     faults.
     """
@@ -194,7 +193,7 @@ def inspect(path: Path, deep: bool = False, show: Progress = unseen) -> Inspecti
         return _inspect_poses(path)
     if not path.is_dir():
         return _inspect_bags(path, deep, show)
-    if any((path / name).is_dir() for name in _KITTI_FOLDERS):
+    if (path / "velodyne").is_dir():
         return _inspect_scans(path, "kitti", deep, show)
     # Files of a ROS 2 folder may be compressed, and then have other suffixes.
     if {p.suffix for p in path.iterdir()} & {*BAG_SUFFIXES} or (path / "metadata.yaml").exists():
