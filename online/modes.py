@@ -46,7 +46,7 @@ from online.record import (
     write_reference,
     write_replay,
 )
-from online.replay import Look, ReplayRecord, replay
+from online.replay import ReplayRecord, replay
 
 BASELINE, FIXED, ADAPTIVE, PAPER = "baseline", "fixed", "adaptive", "paper"
 EVEN, UNTRAINED = "even", "untrained"
@@ -324,7 +324,6 @@ def run_replays(
     study: Study,
     model_path: Path,
     progress: Progress = unseen,
-    look: Look = lambda *_: None,
     repeats: int = 1,
 ) -> int:
     """Replay every test sequence in every mode, as often as asked, unless that was done before.
@@ -338,8 +337,6 @@ def run_replays(
         The error model.
     progress
         Called about every scan.
-    look
-        Sees every scan, see `adaptune.commands.terminal.Dashboard.look`.
     repeats
         How often each mode is replayed on a sequence.
 
@@ -365,13 +362,12 @@ def run_replays(
         names = " and ".join(name for name in asked if obstacles[name] == why)
         _log.warning("not replayed: %s, because %s", names, why)
     modes = setup.modes(model)
-    return _replay_all(study, study.config.test, modes, progress, look, repeats, model_path)
+    return _replay_all(study, study.config.test, modes, progress, repeats, model_path)
 
 
 def run_untrained(
     study: Study,
     progress: Progress = unseen,
-    look: Look = lambda *_: None,
     repeats: int = 1,
 ) -> int:
     """Replay sequences with the baseline, and with a bank that needs no model.
@@ -386,7 +382,7 @@ def run_untrained(
     """
     ReplaySetup.of(study).mode(UNTRAINED)  # or an error
     names = sequences_without_model(study.config)
-    return _replay_all(study, names, WITHOUT_MODEL, progress, look, repeats)
+    return _replay_all(study, names, WITHOUT_MODEL, progress, repeats)
 
 
 class _Run(NamedTuple):
@@ -403,7 +399,6 @@ def _replay_all(
     sequences: Sequence[str],
     modes: Sequence[str],
     progress: Progress,
-    look: Look,
     repeats: int,
     model_path: Path | None = None,
 ) -> int:
@@ -435,7 +430,7 @@ def _replay_all(
             release_memory()
             try:
                 with closing(setup.instance(mode, name)) as odometry:
-                    record = _replayed(study, recording, odometry, mode, run.what, progress, look)
+                    record = _replayed(study, recording, odometry, mode, run.what, progress)
             except DescriptorError as error:
                 raise ReplayError(f"sequences.{name}: {error}") from error
             if i == 0:
@@ -493,14 +488,12 @@ def _replayed(
     mode: Mode,
     what: str,
     progress: Progress,
-    look: Look,
 ) -> ReplayRecord:
     """Make a replay."""
     online, make, n = study.config.online, mode.selector, recording.n_messages
 
     def watch(record: ReplayRecord) -> None:
         progress(what, record.done, n)
-        look(what, n, record)
 
     given = recording, odometry, study.config.health
     if online.real_time is None:
