@@ -201,14 +201,6 @@ Given = Annotated[
     str | None,
     typer.Option("--reference", metavar="TOPIC|FILE", help="A given reference to compare with."),
 ]
-Prior = Annotated[
-    str | None,
-    typer.Option(
-        "--position-prior",
-        metavar="TOPIC|FILE",
-        help="Positions to join that are right over long distances, as those of a GPS.",
-    ),
-]
 Length = Annotated[
     float | None,
     typer.Option(
@@ -228,7 +220,6 @@ def reference(
     folder: Out = None,
     points: Annotated[str | None, typer.Option(metavar="TOPIC", help="Topic of the scans.")] = None,
     given: Given = None,
-    prior: Prior = None,
     length: Length = None,
 ) -> None:
     """Estimate the reference of a recording from its scans, without ground truth.
@@ -239,10 +230,10 @@ def reference(
     if target.suffix not in (".yaml", ".yml"):
         if override:
             raise AdaptuneError(f"{target}: -o is for studies; give a study's YAML")
-        _of_recording(target, folder or Path(), (points, given, prior), length)
+        _of_recording(target, folder or Path(), points, given, length)
         return
     options: dict[str, str | float | None] = {"--points": points, "--reference": given}
-    options |= {"--position-prior": prior, "--length": length}
+    options["--length"] = length
     if wrong := [name for name, value in options.items() if value is not None]:
         raise AdaptuneError(
             f"{wrong[0]} is for a single recording; of a study, the YAML says it, see "
@@ -255,7 +246,8 @@ def reference(
 def _of_recording(
     target: Path,
     out: Path,
-    topics: tuple[str | None, str | None, str | None],
+    points: str | None,
+    given: str | None,
     length: float | None,
 ) -> None:
     """Estimate the reference of a recording, write it, and say what it is worth."""
@@ -263,13 +255,10 @@ def _of_recording(
     from adaptune.recording.inspect import inspect
     from adaptune.recording.recording import open_sequence
     from adaptune.reference import check, estimate
-    from adaptune.reference.graph import warn_of_unused
     from adaptune.reference.stored import write_estimate
 
-    points, given, prior = topics
     config = check.recording_config(inspect(target), points, given)
     scans = open_sequence(config)
-    joined = None if prior is None else check.read_prior(config, prior)
     path = out / f"{target.resolve().stem}_reference.tum"
     # What can fail is found before the estimate, which takes minutes.
     check.check_writable(path)
@@ -282,10 +271,8 @@ def _of_recording(
         there = None
     # Only on one core do results repeat bit by bit.
     with pin(os.getpid()), progress() as show:
-        found = estimate.estimate_reference(scans, partial(show, "estimating"), joined)
-        warn_of_unused(scans.name, joined, found)
+        found = estimate.estimate_reference(scans, partial(show, "estimating"))
         about = {"recording": str(target.resolve()), "points": config.points}
-        about["position_prior"] = prior
         metres = length or check.proposed_sub_trajectory(found.trajectory())
         stored = write_estimate(path, found, about, metres)
         if there is not None:

@@ -238,8 +238,6 @@ class SequenceConfig(_Part):
     # `estimated` from the scans, also where there are poses; `none`. Left out, the recording's own
     # poses, and where it has none, estimated.
     reference: Annotated[str, AfterValidator(_resolve_file)] | None = None
-    # Poses like those of a `reference`, right over long distances only, that an estimate joins.
-    position_prior: Annotated[str, AfterValidator(_resolve_file)] | None = None
     child_frame: str | None = None  # of the transforms, where `reference` is a topic of them
     extrinsic: Transform | None = None  # the LiDAR's pose in the frame of the reference poses
     # Seconds to add to the reference's stamps, as far as those of other clocks lie.
@@ -267,13 +265,6 @@ class SequenceConfig(_Part):
             raise ValueError(f"`elevation` is for kitti; {given[0]} has none")
         if self.compensate == "gyro" and self.imu is None:
             raise ValueError("`compensate: gyro` needs `imu`")
-        if self.position_prior in (ESTIMATED, NO_REFERENCE):
-            raise ValueError("`position_prior` names a topic or a file of poses")
-        if self.position_prior is not None and self.reference not in (None, ESTIMATED):
-            raise ValueError(
-                f"`position_prior` joins an estimated reference: write `reference: {ESTIMATED}`, "
-                f"or leave `position_prior` out"
-            )
         return self
 
     @property
@@ -295,6 +286,4 @@ class SequenceConfig(_Part):
     def paths(self) -> list[Path]:
         """Files and folders that it is read from; a SequenceError if there is no such bag."""
         paths = [*self.bags(), *(Path(given) for given in (self.kitti, self.folder) if given)]
-        of_poses = (self.reference, self.position_prior)
-        paths += [Path(file) for file in of_poses if file and file.endswith(REFERENCE_FILES)]
-        return paths
+        return [*paths, self.poses_file] if self.poses_file else paths

@@ -94,11 +94,6 @@ def _leap(last: Frame | None, frame: Frame) -> int:
 # Opening recordings, and what they are read from, without reading their scans.
 
 
-PRIOR_GAP = 3.0
-"""Seconds. The default of `max_gap` for a prior: a GPS may give a position a second, and miss
-one."""
-
-
 def open_sequence(config: SequenceConfig) -> Recording:
     """Open what a study describes; scans are not read before they are asked for.
 
@@ -121,14 +116,6 @@ def check_sequence(config: SequenceConfig) -> None:
     reference is of another time.
     """
     RecordedSequence(config).check()
-    if config.position_prior is None:
-        return
-    if not wants_estimate(config):
-        raise SequenceError(
-            f"position_prior: joins an estimated reference, and the recording has poses of its "
-            f"own; write `reference: {ESTIMATED}`, or leave `position_prior` out"
-        )
-    RecordedSequence(of_prior(config)).check()
 
 
 def wants_estimate(config: SequenceConfig) -> bool:
@@ -136,23 +123,6 @@ def wants_estimate(config: SequenceConfig) -> bool:
     if config.reference is not None or config.bag is not None:
         return config.reference in (None, ESTIMATED)
     return not _source(config)[0].pose_files
-
-
-def position_prior(config: SequenceConfig) -> Trajectory | None:
-    """Poses of the LiDAR that are right over long distances only, if the sequence names any."""
-    return None if config.position_prior is None else RecordedSequence(of_prior(config)).reference()
-
-
-def prior_files(config: SequenceConfig) -> Sequence[Path]:
-    """The files of these poses, where they are not in the recording."""
-    return () if config.position_prior is None else sequence_files(of_prior(config)).reference
-
-
-def of_prior(config: SequenceConfig) -> SequenceConfig:
-    """The sequence with the poses of its prior as its reference."""
-    gap = config.max_gap if "max_gap" in config.model_fields_set else PRIOR_GAP
-    of = {"reference": config.position_prior, "position_prior": None, "max_gap": gap}
-    return config.model_copy(update=of)
 
 
 class SequenceFiles(NamedTuple):

@@ -28,9 +28,8 @@ from adaptune.live.hops import LENGTHS as HOPS
 from adaptune.live.hops import Hop, HopCloud, Hops, register
 from adaptune.metrics import cap, sub_trajectory_rte, travelled
 from adaptune.recording.compensation import neighbour_motions
-from adaptune.recording.config import ESTIMATED, SequenceConfig
+from adaptune.recording.config import SequenceConfig
 from adaptune.recording.inspect import Inspection
-from adaptune.recording.recording import position_prior
 from adaptune.recording.scan import Recording, Scan
 from adaptune.reference.stored import EstimateError, StoredEstimate
 from adaptune.trajectory import Trajectory
@@ -246,7 +245,7 @@ def diagnose_reference(
     given = reference.T_world_sensor @ invert(T_given_sensor)
     turned = rotation_angle(invert(given[:1]) @ given).max()
     if turned < 1e-6 and rotation_angle(hops.T_start_end).max() > np.radians(2.0):
-        mend = "use its positions only: `reference: estimated`, with this one as `position_prior`"
+        mend = "use `reference: estimated`"
         return Cause("without orientation (all are alike)", mend, before, np.nan)
 
     def at_scans(T_world_given: Poses) -> Poses:
@@ -760,21 +759,6 @@ def recording_config(
     chosen = {"points": points, "reference": reference}
     given |= {key: value for key, value in chosen.items() if value is not None}
     return SequenceConfig(**given)
-
-
-def read_prior(config: SequenceConfig, source: str) -> Trajectory:
-    """Positions that are right over long distances, from a topic of the recording or a file.
-
-    There is an `AdaptuneError` if there are none, or they are of another time.
-    """
-    given = config.model_dump(exclude_unset=True, exclude={"max_gap"})
-    joined = {"reference": ESTIMATED, "position_prior": source}
-    prior = position_prior(SequenceConfig(**given | joined))
-    if prior is None:
-        raise EstimateError(
-            f"--position-prior {source}: holds no pose; name a topic or a file of poses"
-        )
-    return prior
 
 
 def check_writable(path: Path) -> None:

@@ -303,6 +303,7 @@ DELETED = {
     "offline.target": "is gone; give trials, hours or stagnation",
     "offline.storage": "is gone: the trials are in a journal of Optuna's in the study's folder",
     "offline.max_frames": "is gone: the error model keeps all frames; leave it out",
+    "sequences.*.position_prior": "is gone: it changed nothing over 50 m; leave it out",
     "sequences.*.evalio": "is gone: give the data set's files, as `bag`, `kitti` or `folder`",
     "courses.*.moving_objects": "is gone: nothing moves in simulated places; leave it out",
     "courses.*.weather": "is gone: the air is always clear; leave it out",

@@ -57,7 +57,6 @@ _OF_POSES = ("reference", "child_frame", "extrinsic", "clock_offset", "max_gap")
 """Keys of a sequence that change its reference only."""
 _AS_ESTIMATED = {
     **{key: SequenceConfig.model_fields[key].default for key in _OF_POSES},
-    "position_prior": None,
     # A gap as long says where the estimate is not to be trusted.
     "max_gap": BREAK,
 }

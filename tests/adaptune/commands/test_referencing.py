@@ -38,7 +38,7 @@ def test_a_recording_gets_files_and_sentences(adaptune, bag, tmp_path):
     assert "write `reference: one_reference.tum` under" in done.stdout.splitlines()[-1]
     assert len(read_tum(tmp_path / "one_reference.tum")) == 40
     stored = StoredEstimate.read(tmp_path / "one_reference.tum")
-    assert stored.about == {"recording": str(bag), "points": "/points", "position_prior": None}
+    assert stored.about == {"recording": str(bag), "points": "/points"}
 
 
 def test_where_it_is_lost_is_said(adaptune, bag, tmp_path, monkeypatch):
@@ -58,10 +58,8 @@ def test_where_it_is_lost_is_said(adaptune, bag, tmp_path, monkeypatch):
         (["none.bag"], "there is no such file"),
         (["BAG", "--points", "/none"], "/none"),
         (["BAG", "--reference", "/none"], "/none"),
-        (["BAG", "--position-prior", "/none"], "/none"),
         (["BAG", "-o", "training=[one]"], "-o is for studies"),
         (["STUDY", "--length", "3"], "--length is for a single recording"),
-        (["STUDY", "--position-prior", "/gps"], "--position-prior is for a single recording"),
         (["STUDY"], "every sequence has a reference"),
         (["poses.tum"], "is a file of poses"),
     ],
@@ -80,13 +78,11 @@ def test_mistakes_are_told_in_a_sentence(adaptune, bag, study_file, tmp_path, wo
         (["--out", "a_file/refs"], "a_file/refs: cannot be written to"),
         (["--out", "mine"], "mine/one_reference.tum: is there, and is not of an estimate"),
         (["--reference", "early.tum"], "covers 1.000 s to 2.000 s"),
-        (["--position-prior", "bad.tum"], "bad.tum"),
     ],
 )
 def test_what_is_wrong_is_told_before_the_estimate(adaptune, bag, tmp_path, words, expected):
     (tmp_path / "a_file").touch()
     (tmp_path / "early.tum").write_text("1 0 0 0 0 0 0 1\n2 1 0 0 0 0 0 1\n")
-    (tmp_path / "bad.tum").write_text("x y z\n")
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine/one_reference.tum").write_text("mine")
 

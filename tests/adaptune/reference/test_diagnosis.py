@@ -91,7 +91,7 @@ def carried(T):
         (turned, "other axes", "extrinsic: [0, 0, 0, 0, 0, -0.707"),
         (carried, "lever arm", "extrinsic: [-0.79"),
         (lambda T: turned(carried(T)), "other axes", "extrinsic: [-0.29"),
-        (quaternions_of([0.0, 0.0, 0.0, 1.0]), "without orientation", "position_prior"),
+        (quaternions_of([0.0, 0.0, 0.0, 1.0]), "without orientation", "`reference: estimated`"),
     ],
 )
 def test_a_broken_convention_is_named_with_what_mends_it(spoil, what, mend):

@@ -17,9 +17,7 @@ from adaptune.reference.graph import (
     closed,
     loops,
     optimised,
-    positions,
 )
-from adaptune.trajectory import Trajectory
 
 N = 120
 TRUTH = winding(N)
@@ -87,44 +85,6 @@ def test_what_they_tell_across_a_tunnel_still_counts():
     T = straight(60)
     found = optimised(drifting(T, 0.0), edges(T, unknown=[0]))
     assert np.abs(found[:, 1, 3]).max() < 0.1 < np.abs(drifting(T, 0.0)[:, 1, 3]).max()
-
-
-class TestPositions:
-    T = winding(500, 1.0)
-    bent = drifting(T, 0.0, 0.001)
-    stamps = np.arange(500, dtype=np.int64) * 200_000_000
-    elsewhere = moved(1e3, -2e3, 50.0, 2.0)
-
-    def gps(self, noise=0.2):
-        T = self.elsewhere @ self.T
-        T[:, :3, 3] += np.random.default_rng(0).normal(0.0, noise, (500, 3))
-        return Trajectory(self.stamps, T)
-
-    def test_pull_a_bent_path_straight_and_hardly_change_short_ways(self):
-        places = positions(self.gps(), self.stamps, self.bent)
-        joined = optimised(self.bent, [], places)
-        before, after = (
-            [float(np.nanmean(sub_trajectory_rte(self.T, T, m))) for m in (2.0, 300.0)]
-            for T in (self.bent, joined)
-        )
-        assert after[1] < 0.1 * before[1]
-        assert after[0] < before[0] + 0.5
-        # Positions themselves are far worse over short ways.
-        assert np.nanmean(sub_trajectory_rte(self.T, self.gps().T_world_sensor, 2.0)) > 10.0
-        np.testing.assert_allclose(joined[0], np.eye(4), atol=1e-12)
-
-    def test_one_that_is_wrong_by_far_hardly_counts(self):
-        # As where a GPS is reflected by a building.
-        places = positions(self.gps(), self.stamps, self.bent)
-        metres = places.metres.copy()
-        metres[40] += 50.0
-        found = [optimised(self.bent, [], p) for p in (places, places._replace(metres=metres))]
-        assert farthest(*found) < 0.3
-
-    def test_count_once_a_second_near_the_poses(self):
-        places = positions(self.gps(0.0), self.stamps, self.T)
-        np.testing.assert_array_equal(places.numbers, np.arange(0, 500, 5))
-        np.testing.assert_allclose(places.metres, self.T[::5, :3, 3], atol=1e-6)
 
 
 def circle(metres, laps, step=0.5):
