@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from adaptune import geometry
 from adaptune.geometry import Poses
-from adaptune.recording.scan import Imu, Scan
+from adaptune.recording.scan import Scan
 from adaptune.trajectory import Trajectory
 
 # Rotation changes slowly: between these many moments of a scan it is taken as constant.
@@ -36,7 +36,15 @@ def compensate(scan: Scan, T_start_end: Poses, duration: float) -> Scan:
     twist = Rotation.from_matrix(T_start_end[:3, :3]).as_rotvec() / duration
     velocity = T_start_end[:3, 3] / duration
     moments = np.linspace(0.0, max(float(scan.times.max()), 1e-9), _MOMENTS)
-    points = _rotate(scan, moments, Rotation.from_rotvec(moments[:, None] * twist))
+    matrices = Rotation.from_rotvec(moments[:, None] * twist).as_matrix().astype(np.float32)
+    # The rotation of a point is looked up on a grid fine enough that the step between neighbours,
+    # a 64th of the scan's rotation, is met by interpolating the rotated points linearly.
+    place = np.clip(scan.times / np.float32(moments[1]), 0, _MOMENTS - 1)
+    low = np.minimum(place.astype(np.intp), _MOMENTS - 2)
+    share = (place - low)[:, None]
+    before = np.einsum("nij,nj->ni", matrices[low], scan.points)
+    after = np.einsum("nij,nj->ni", matrices[low + 1], scan.points)
+    points = before + share * (after - before)
     points += scan.times[:, None] * velocity.astype(np.float32)
     return replace(scan, points=points, times=np.zeros_like(scan.times))
 
@@ -103,49 +111,6 @@ def turning_of(scans: Iterable[Scan]) -> tuple[NDArray[np.int64], NDArray[np.flo
             stamps.append(scan.stamp - round(seconds * 0.5e9))
             rates.append(float(geometry.rotation_angle(T_before_scan)) / seconds)
     return np.array(stamps, np.int64), np.array(rates, np.float64)
-
-
-def compensate_rotation(scan: Scan, imu: Imu) -> Scan:
-    """Undo the rotation that a gyroscope measured during the scan.
-
-    Translation stays. A scan without times, or without measurements around it, is returned as it
-    is. Both are on the same clock.
-    """
-    if scan.times is None or not len(scan):
-        return scan
-    span = float(scan.times.max())
-    first, last = np.searchsorted(imu.stamps, [scan.stamp, scan.stamp + round(span * 1e9)])
-    # One measurement before the scan and one after it.
-    if first == 0 or last >= len(imu):
-        return scan
-    part = slice(first - 1, last + 1)
-    seconds = (imu.stamps[part] - scan.stamp) * 1e-9
-    rates = imu.angular_velocity[part] @ imu.T_sensor_imu[:3, :3].T
-    from scipy.spatial.transform import Rotation
-
-    moments = np.linspace(0.0, max(span, 1e-9), _MOMENTS)
-    at = np.stack([np.interp(moments, seconds, rates[:, i]) for i in range(3)], axis=1)
-    steps = Rotation.from_rotvec((at[1:] + at[:-1]) * 0.5 * np.diff(moments)[:, None])
-    rotations = [Rotation.identity()]
-    for step in steps:
-        rotations.append(rotations[-1] * step)
-    return replace(scan, points=_rotate(scan, moments, Rotation.concatenate(rotations)))
-
-
-def _rotate(scan: Scan, moments: NDArray[np.float64], rotations: Any) -> NDArray[np.float32]:
-    """Rotate each point by the rotation at its time.
-
-    The rotation of a point is looked up on a grid fine enough that the step between neighbours,
-    a 64th of the scan's rotation, is met by interpolating the rotated points linearly.
-    """
-    assert scan.times is not None
-    matrices = rotations.as_matrix().astype(np.float32)
-    place = np.clip(scan.times / np.float32(moments[1]), 0, _MOMENTS - 1)
-    low = np.minimum(place.astype(np.intp), _MOMENTS - 2)
-    share = (place - low)[:, None]
-    before = np.einsum("nij,nj->ni", matrices[low], scan.points)
-    after = np.einsum("nij,nj->ni", matrices[low + 1], scan.points)
-    return np.asarray(before + share * (after - before))
 
 
 _LEAST_CORRELATION = 0.8

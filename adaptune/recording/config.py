@@ -21,7 +21,7 @@ from adaptune.files import expand_user
 from adaptune.recording.scan import USUAL, Imu, ImuNoise, Mark, Part, SequenceError, Unit
 from adaptune.strict import StrictModel
 
-Compensation = Literal["constant_velocity", "gyro"] | None
+Compensation = Literal["constant_velocity"] | None
 """How motion within a scan is undone; none if it is left as it is."""
 MOST_VIEWS = 16
 """Views of one sequence, and views to train on; each costs time with every scan."""
@@ -247,7 +247,7 @@ class SequenceConfig(_Part):
     imu: ImuConfig | None = None
     # Degrees by which to turn up every ray of a `kitti` recording; 0.205 when left out.
     elevation: float | None = Field(None, ge=-5, le=5)
-    # Undo the motion since the scan before, or the rotation that the IMU measured.
+    # Undo the motion within scans, as fast as it was since the scan before.
     compensate: Compensation = None
     views: Annotated[tuple[ViewConfig, ...], Field(max_length=MOST_VIEWS)] = ()
     cache: bool = True  # whether to keep decoded bags in the cache
@@ -263,8 +263,6 @@ class SequenceConfig(_Part):
                 raise ValueError(f"`{key}` is for a bag; {given[0]} has none")
         if self.elevation is not None and given[0] != "kitti":
             raise ValueError(f"`elevation` is for kitti; {given[0]} has none")
-        if self.compensate == "gyro" and self.imu is None:
-            raise ValueError("`compensate: gyro` needs `imu`")
         return self
 
     @property

@@ -100,10 +100,8 @@ def open_sequence(config: SequenceConfig) -> Recording:
     A SequenceError says why it cannot be opened as described.
     """
     sequence: Recording = RecordedSequence(config)
-    if config.compensate == "constant_velocity":
+    if config.compensate is not None:
         sequence = views.without_motion(sequence)
-    elif config.compensate == "gyro":
-        sequence = views.without_rotation(sequence)
     for view in config.views:
         sequence = views.VIEWS[view.name](sequence, getattr(view, view.name))
     return sequence

@@ -185,8 +185,6 @@ class Course(StrictModel):
             raise ValueError(f"{what}: it needs at least {least:g}")
         if sum(length for _, length in self.legs) > LONGEST:
             raise ValueError(f"a course is at most {LONGEST:g} m long")
-        if self.compensate == "gyro" and self.imu is None:
-            raise ValueError("`compensate: gyro` needs `imu`, as in `imu: 200`")
         return self
 
     @property

@@ -305,6 +305,8 @@ DELETED = {
     "offline.max_frames": "is gone: the error model keeps all frames; leave it out",
     "sequences.*.position_prior": "is gone: it changed nothing over 50 m; leave it out",
     "sequences.*.evalio": "is gone: give the data set's files, as `bag`, `kitti` or `folder`",
+    "sequences.*.compensate=gyro": "is gone; give constant_velocity, which needs no IMU",
+    "courses.*.compensate=gyro": "is gone; give constant_velocity, which needs no IMU",
     "courses.*.moving_objects": "is gone: nothing moves in simulated places; leave it out",
     "courses.*.weather": "is gone: the air is always clear; leave it out",
     "courses.*.sensor=avia": "is gone; choose a sensor that turns",
