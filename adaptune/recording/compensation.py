@@ -115,6 +115,8 @@ def turning_of(scans: Iterable[Scan]) -> tuple[NDArray[np.int64], NDArray[np.flo
 
 _LEAST_CORRELATION = 0.8
 """Of two rates of turning that show the same motion."""
+_RATE = 50.0
+"""Samples per second to compare."""
 _AMBIGUOUS = 0.95
 """Share of the best correlation with which another offset could be the right one."""
 
@@ -123,7 +125,6 @@ def clock_offset(
     trajectory: Trajectory,
     stamps: NDArray[np.int64],
     turning: NDArray[np.float64],
-    rate: float = 50.0,
 ) -> list[float]:
     """Seconds to add to a trajectory's stamps so that it turns when a gyroscope or a LiDAR does.
 
@@ -136,8 +137,6 @@ def clock_offset(
         On its own clock.
     stamps, turning
         Nanoseconds on the other clock and radians per second, of shape (n,).
-    rate
-        Samples per second to compare.
 
     Returns
     -------
@@ -152,27 +151,27 @@ def clock_offset(
     middles = (trajectory.stamps[:-1] - trajectory.stamps[0]) * 1e-9 + seconds / 2
     other = (stamps - stamps[0]) * 1e-9
     # Each is a mean over the time between its samples: it is averaged over the other's too.
-    a = _sampled(middles, turned / seconds, rate, float(np.median(np.diff(other))))
-    b = _sampled(other, turning, rate, float(np.median(seconds)))
-    if min(len(a), len(b)) < 2 * rate:
+    a = _sampled(middles, turned / seconds, float(np.median(np.diff(other))))
+    b = _sampled(other, turning, float(np.median(seconds)))
+    if min(len(a), len(b)) < 2 * _RATE:
         return []
     coefficients, lags = _correlation(a, b)
     best = int(np.argmax(coefficients))
-    others = np.where(np.abs(lags - lags[best]) > rate, coefficients, -1.0)
+    others = np.where(np.abs(lags - lags[best]) > _RATE, coefficients, -1.0)
     other = int(np.argmax(others))
     start = (stamps[0] - trajectory.stamps[0]) * 1e-9 - middles[0]
     least = max(_LEAST_CORRELATION, _AMBIGUOUS * float(coefficients[best]))
     fit = [best] if coefficients[best] >= _LEAST_CORRELATION else []
     fit += [other] if fit and others[other] >= least else []
-    return [float(start + lags[at] / rate) for at in fit]
+    return [float(start + lags[at] / _RATE) for at in fit]
 
 
 def _sampled(
-    seconds: NDArray[np.float64], values: NDArray[np.float64], rate: float, over: float
+    seconds: NDArray[np.float64], values: NDArray[np.float64], over: float
 ) -> NDArray[np.float64]:
     # Ten hours at 50 Hz; anything longer is a stamp gone wrong.
-    grid = np.arange(seconds[0], min(seconds[-1], seconds[0] + 36000.0), 1.0 / rate)
-    window = min(max(round(over * rate), 1), max(len(grid), 1))
+    grid = np.arange(seconds[0], min(seconds[-1], seconds[0] + 36000.0), 1.0 / _RATE)
+    window = min(max(round(over * _RATE), 1), max(len(grid), 1))
     return np.convolve(np.interp(grid, seconds, values), np.ones(window) / window, mode="same")
 
 

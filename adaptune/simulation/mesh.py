@@ -141,12 +141,10 @@ _BOX_TRIANGLES = np.array(
 )
 
 
-def box(
-    size: ArrayLike, material: Material, at: ArrayLike = (0.0, 0.0, 0.0), yaw: float = 0.0
-) -> Mesh:
+def box(size: ArrayLike, material: Material, at: ArrayLike = (0.0, 0.0, 0.0)) -> Mesh:
     """Make a box of length, width and height `size` whose base is centred on `at`."""
     model = mesh(_BOX * np.asarray(size, np.float64), _BOX_TRIANGLES, material)
-    return place(model, at, yaw)
+    return place(model, at)
 
 
 def tube(rings: ArrayLike, material: Material, sides: int = 8) -> Mesh:
