@@ -342,7 +342,6 @@ class _Survey:
         self._of = {name: of for of, name in found.used.items()}
         if points is not None:
             try:
-                source.check(None, None)
                 self._load = source.loader(reader)
             except SequenceError as error:
                 del self._of[source.points]

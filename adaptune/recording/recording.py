@@ -182,11 +182,13 @@ def _source(config: SequenceConfig) -> tuple[Source, str | None]:
 def _check_topics(source: Source, config: SequenceConfig) -> None:
     """Find topics that are named and not there."""
     from adaptune.recording.bag import IMU_TYPES, BagSource
+    from adaptune.recording.clouds import POSES
 
     topic = None if config.imu is None else config.imu.topic
     if isinstance(source, BagSource):
-        source.check(config.poses_topic, topic)
-        if config.imu is not None and config.bag is not None:
+        if config.poses_topic is not None:
+            source.topic(config.poses_topic, POSES, "poses")
+        if config.imu is not None:
             source.topic(topic, IMU_TYPES, "an IMU's measurements")
     elif config.poses_topic or config.child_frame or topic:
         raise SequenceError(
