@@ -280,8 +280,3 @@ class SequenceConfig(_Part):
     def bags(self) -> list[Path]:
         """Bags to open; a SequenceError if there is no such bag."""
         return bag_paths((self.bag,) if isinstance(self.bag, str) else self.bag or ())
-
-    def paths(self) -> list[Path]:
-        """Files and folders that it is read from; a SequenceError if there is no such bag."""
-        paths = [*self.bags(), *(Path(given) for given in (self.kitti, self.folder) if given)]
-        return [*paths, self.poses_file] if self.poses_file else paths
