@@ -259,7 +259,7 @@ def diagnose_reference(
         *_clock(reference, stamps, hops),
         *_places(at_scans(given) @ invert(T_given_sensor), hops, T_given_sensor),
     ]
-    return _likeliest(candidates, hops, errors) or _sparse(reference, stamps, hops, before)
+    return _likeliest(candidates, hops, errors)
 
 
 def diagnose_odometry(T_odom_sensor: Poses, hops: Hops) -> Cause | None:
@@ -487,25 +487,6 @@ def _lever(T: Poses, measured: Poses, R_body_sensor: NDArray[np.float64]) -> NDA
         residuals = np.linalg.norm(A @ t - b, axis=1)
         weights = 1.0 / np.sqrt(np.maximum(residuals, 1e-2 + np.median(residuals)))
     return np.asarray(t)
-
-
-def _sparse(
-    reference: Trajectory, stamps: NDArray[np.int64], hops: Hops, before: float
-) -> Cause | None:
-    """Whether there are too few poses to interpolate, by what half of them would lose."""
-    between = float(np.median(np.diff(reference.stamps))) * 1e-9
-    scans = float(np.median(np.diff(stamps))) * 1e-9
-    if between < 2.0 * scans or len(reference) < 5:
-        return None
-    thin = Trajectory(reference.stamps[::2], reference.T_world_sensor[::2], 2.0 * reference.max_gap)
-    whole, half = (t.at(stamps) for t in (reference, thin))
-    # Interpolation errs by the square of the time between poses: half of them, by four times; and
-    # by as much where the motion is faster than both.
-    shown = hops._replace(T_start_end=invert(whole[hops.start]) @ whole[hops.end])
-    if not _mean(mismatch(half, shown)) / 2.0 > 0.3 * before:
-        return None
-    what = f"too rare to interpolate, one every {between:.2g} s with a scan every {scans:.2g} s"
-    return Cause(what, "give a denser one, or `reference: estimated`", before, np.nan)
 
 
 def contradictions(
