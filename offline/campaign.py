@@ -16,7 +16,7 @@ from adaptune.space import ParameterSet, PooledSpace
 from adaptune.study.references import contradictions_of
 from offline.config import OfflineConfig, OfflineStudy
 from offline.objective import Verdict, best_by_trials, judge, label, mean_value, weighted
-from offline.search import Clock, Finished, Mirror, MirrorRow, assess, make_searches, rungs
+from offline.search import Clock, assess, make_searches, rungs
 from offline.workers import Pool, Task, TaskResult, run
 
 _log = logging.getLogger(__name__)
@@ -37,8 +37,6 @@ class Campaign:
         self._config, self._names = study.config.offline, study.training
         self._finished = {name: archive.finished(name) for name in self._names}
         self._searches = make_searches(self._config, study.odometry.space, self._names, archive)
-        n_objectives = len(self._config.objective)
-        self._mirror = Mirror(study.folder, n_objectives, study.odometry.space)
         described = study.config.descriptor
         self._without_frames = [
             name for name in self._names if not archive.has_frames(name, described)
@@ -67,14 +65,12 @@ class Campaign:
             self._counted[0] = self._names
             self._best = self._best_in_words()
             if begun:
-                self._mirror_trials()
                 self._show(self._n_done())
                 _log.debug("trials %d to %d done; %s", numbers[0], numbers[-1], self._best)
             batch += 1
         for search in self._searches:
             where = f" on {search.sequences[0]}" if self._config.sets == "own" else ""
             _log.info("the search%s ends: %s", where, search.end)
-        self._mirror_trials()
         self._show(self._n_done())
         if self._config.sets == "own":
             self._run_everywhere()
@@ -143,11 +139,6 @@ class Campaign:
     def _verdict(self, n: int) -> Verdict:
         return assess(n, self._counted[n], self._config, self._names, self._finished)
 
-    def _mirror_trials(self) -> None:
-        self._mirror.report(
-            self._counted, lambda n: _mirrored(self._config, self._verdict(n), self._finished, n)
-        )
-
 
 def trial_tasks(
     missing: Sequence[tuple[str, Mapping[int, ParameterSet]]],
@@ -177,19 +168,6 @@ def trial_tasks(
                     tasks.append(Task(name, numbers, sets, frames=some[0] is first))
             left = left[n_workers * size :]
     return tasks
-
-
-def _mirrored(config: OfflineConfig, verdict: Verdict, finished: Finished, n: int) -> MirrorRow:
-    trials = {name: finished[name][n] for name in verdict.sequences}
-    attributes = {name: trial.mean_error for name, trial in trials.items()}
-    attributes["lost"] = sum(trial.lost for trial in trials.values())
-    attributes["ms"] = float(np.mean([trial.ms for trial in trials.values()]))
-    constraints = {
-        f"{name} <= {limit.max:g}": by
-        for (name, limit), by in zip(config.limits.items(), verdict.constraints, strict=True)
-    }
-    values = verdict.values if verdict.usable else (np.inf,) * len(verdict.values)
-    return MirrorRow(verdict.parameters, values, attributes, constraints)
 
 
 def watch_tasks(

@@ -183,9 +183,8 @@ def _ready_archive(study: OfflineStudy, progress: Progress) -> Archive:
     ensure_references(study.sequences, study.training, length, progress)
     archive = study.archive(more={"offline": study.config.search_inputs})
     if archive.renew(study.training):
-        # The search is told again what has been run; where nothing has, its time begins anew.
-        elapsed = () if archive.sets() else study.folder.glob("elapsed*.json")
-        for path in (*study.folder.glob("optuna.log*"), *elapsed):
+        # Where nothing has been run, the search's time begins anew.
+        for path in () if archive.sets() else study.folder.glob("elapsed*.json"):
             path.unlink()
     archive.tidy()
     return archive

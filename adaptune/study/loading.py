@@ -301,7 +301,7 @@ DELETED = {
     "offline.memory": "is gone: workers keep scans in a quarter of the machine's memory",
     "offline.preset": "is gone; for the paper's, give trials: 256, sets: own, runs: whole",
     "offline.target": "is gone; give trials, hours or stagnation",
-    "offline.storage": "is gone: the trials are in a journal of Optuna's in the study's folder",
+    "offline.storage": "is gone: the trials are files in the study's folder, and in trials.csv",
     "offline.max_frames": "is gone: the error model keeps all frames; leave it out",
 }
 """Keys, and values of keys, of earlier versions that are gone, and what became of them."""
