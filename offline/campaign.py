@@ -108,8 +108,8 @@ class Campaign:
     def _best_in_words(self) -> str:
         """The best value so far, or its mean where each search has a sequence of its own."""
         best = [search.verdicts[search.best] for search in self._searches]
-        value = float(np.mean([verdict.values[0] for verdict in best]))
-        what = f"best {label(self._config.objective[0])} {value:.3f}"
+        value = float(np.mean([verdict.value for verdict in best]))
+        what = f"best {label(self._config.objective)} {value:.3f}"
         if self._config.sets == "own":
             return f"{what} in the mean of {len(best)} sequences"
         (search,) = self._searches
@@ -230,7 +230,7 @@ def run_whole(
 
 
 def whole_values(config: OfflineConfig, runs: WholeRuns) -> dict[str, dict[int, float]]:
-    """By sequence, the first objective in whole runs of every candidate for the fixed set.
+    """By sequence, the objective in whole runs of every candidate for the fixed set.
 
     Candidates have whole runs on all sequences, and keep the limits there if one does. The
     objective of those that are not usable there is infinite.
@@ -241,9 +241,7 @@ def whole_values(config: OfflineConfig, runs: WholeRuns) -> dict[str, dict[int, 
     kept = [n for n, v in verdicts.items() if v.feasible or not (v.usable and within)]
     return {
         name: {
-            n: weighted(config.objective[0], of_sequence[n].metrics)
-            if verdicts[n].usable
-            else np.inf
+            n: weighted(config.objective, of_sequence[n].metrics) if verdicts[n].usable else np.inf
             for n in kept
         }
         for name, of_sequence in runs.items()
@@ -268,12 +266,12 @@ def baseline_warning(
 ) -> str | None:
     """In words where the baseline is better than the trials suggested.
 
-    `whole` has by trial number the first objective in whole runs, its mean over the sequences;
+    `whole` has by trial number the objective in whole runs, its mean over the sequences;
     `best` is the set with the best trials.
     """
     if 0 not in whole or best == 0 or whole[0] >= whole.get(best, np.inf):
         return None
-    what = label(config.objective[0])
+    what = label(config.objective)
     other = f"{whole[best]:.3g}" if best in whole else "beyond the limits, or not known"
     beaten = (
         f"In whole runs with the health check, the baseline is better than the trials suggested: "

@@ -38,8 +38,6 @@ OPTUNA = {
 QUASI = ("qmc", "sobol")
 """Names of the same sampler; the second one is that of older studies."""
 NAMES = ("annealing", "grid", "random", *OPTUNA)
-SINGLE_OBJECTIVE = ("annealing", "cmaes")
-"""Samplers that minimise one objective only."""
 STATELESS = ("tpe", "gp")
 """Samplers that keep no notes: they continue from any list of trials."""
 NEEDS = {"cmaes": "cmaes", "gp": "torch"}
@@ -449,12 +447,13 @@ _Weighted = Annotated[dict[Metric, Annotated[float, Field(gt=0, le=1e9)]], Field
 
 
 def _weighted(given: Any) -> Any:
-    """Write every objective, a metric or a weighted sum of metrics, as a weighted sum."""
-    objectives = given if isinstance(given, list | tuple) else [given]
-    weighted = tuple({one: 1.0} if isinstance(one, str) else one for one in objectives)
-    if any(weights in weighted[:i] for i, weights in enumerate(weighted)):
-        raise ValueError("names an objective twice")
-    return weighted
+    """Write a metric as a weighted sum."""
+    if isinstance(given, list | tuple):
+        raise ValueError(  # noqa: TRY004
+            "several objectives are gone, because the first one decided: give it alone, or a "
+            "weighted sum; `adaptune compare` draws error over CPU time of all trials"
+        )
+    return {given: 1.0} if isinstance(given, str) else given
 
 
 class Limit(StrictModel):
@@ -476,9 +475,7 @@ class OfflineConfig(StrictModel):
     batch: int = Field(16, ge=1, le=1000)
     seed: int = Field(0, ge=0, lt=2**32)
     workers: int | None = Field(None, ge=1, le=256)
-    objective: Annotated[tuple[_Weighted, ...], BeforeValidator(_weighted), Field(min_length=1)] = (
-        {"rte": 1.0},
-    )
+    objective: Annotated[_Weighted, BeforeValidator(_weighted)] = Field({"rte": 1.0})
     limits: dict[Metric, Limit] = Field(default_factory=dict)
     runs: Literal["restart", "whole"] = "restart"
     repeats: int = Field(1, ge=1, le=100)
@@ -488,8 +485,6 @@ class OfflineConfig(StrictModel):
 
     @model_validator(mode="after")
     def _check_pruning(self) -> Self:
-        if self.pruning != "none" and len(self.objective) > 1:
-            raise ValueError("pruning goes by one objective; give one, or set pruning: none")
         if self.pruning != "none" and self.sets == "own":
             raise ValueError(
                 "pruning spares trials further sequences, and with sets: own each runs on one; "
@@ -506,7 +501,7 @@ class OfflineConfig(StrictModel):
     @property
     def metrics(self) -> set[str]:
         """All metrics that a trial is judged by."""
-        return {*self.limits, *(metric for weights in self.objective for metric in weights)}
+        return {*self.limits, *self.objective}
 
     @property
     def budgeted(self) -> bool:
@@ -524,10 +519,6 @@ class OfflineConfig(StrictModel):
         if self.trials is not None and self.trials < n:
             message = f"{n} odometries need {n} trials at least, to try the parameters of each"
             yield Mistake(("trials",), message)
-        if len(self.objective) > 1 and self.sampler in SINGLE_OBJECTIVE:
-            others = ", ".join(sorted(set(NAMES) - set(SINGLE_OBJECTIVE)))
-            message = f"{self.sampler} minimises one objective only; choose one of {others}"
-            yield Mistake(("sampler",), message)
         if self.sampler in SETTINGS:
             found: list[Mistake] = []
             validated(SETTINGS[self.sampler], self.sampler_settings, key, found)

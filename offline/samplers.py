@@ -204,14 +204,12 @@ class AskedSampler(Sampler):
         self.constrained = isinstance(self._study.sampler, CONSTRAINED)
 
     def _begin(self, seed: int, history: Sequence[SamplerResult]) -> None:
-        self._study = optuna.create_study(
-            sampler=self._sampler(seed), directions=["minimize"] * len(self.config.objective)
-        )
+        self._study = optuna.create_study(sampler=self._sampler(seed))
         self._study.add_trials(
             optuna.trial.create_trial(
                 params=self._encode(result.parameters),
                 distributions=self._distributions,
-                values=np.atleast_1d(result.value).tolist(),
+                value=result.value,
                 constraints={str(i): by for i, by in enumerate(result.constraints)},
             )
             for result in history
@@ -405,9 +403,9 @@ class PooledSampler(Sampler):
 
 
 def _best(history: Sequence[SamplerResult]) -> float:
-    """The least first value of a set that keeps the limits."""
+    """The least value of a set that keeps the limits."""
     kept = (result.value for result in history if not exceeded(result.constraints))
-    return min((float(np.atleast_1d(value)[0]) for value in kept), default=np.inf)
+    return min(kept, default=np.inf)
 
 
 def _spread(sets: dict[str, list[ParameterSet]], first: int) -> list[ParameterSet]:

@@ -254,7 +254,7 @@ class Search:
         of = (self._config, self.sequences, self._finished)
         self.verdicts += [assess(n, self.sequences, *of) for n in self.numbers]
         self._closed += self.numbers
-        ranks = [(not v.complete, not v.usable, v.excess, v.values[0]) for v in self.verdicts]
+        ranks = [(not v.complete, not v.usable, v.excess, v.value) for v in self.verdicts]
         self.best = min((self.best, *range(first, len(ranks))), key=ranks.__getitem__)
         if len(self.numbers) < self._config.batch and len(self.verdicts) != self._limit:
             self.end = self._sampler.end
@@ -267,7 +267,7 @@ class Search:
         return n_trials * len(self.sequences)
 
     def _hardest_first(self) -> list[str]:
-        """The sequences by falling mean of the first objective over the first batch."""
+        """The sequences by falling mean of the objective over the first batch."""
         first = [self.number(i) for i in range(min(self._config.batch, len(self.verdicts)))]
         means = {
             name: np.mean([self._value(self._finished[name][n]) for n in first])
@@ -287,7 +287,7 @@ class Search:
         }
 
     def _value(self, run: Summary) -> float:
-        return weighted(self._config.objective[0], run.metrics)
+        return weighted(self._config.objective, run.metrics)
 
 
 def assess(
@@ -297,20 +297,17 @@ def assess(
     sequences: Sequence[str],
     finished: Finished,
 ) -> Verdict:
-    """Judge a trial; estimate its values if it was not run on all sequences."""
+    """Judge a trial; estimate its value if it was not run on all sequences."""
     seen = tuple(name for name in sequences if name in counted and number in finished[name])
     found = judge(config, [finished[name][number] for name in seen])
     if len(seen) == len(sequences):
         return found._replace(sequences=seen)
     order = (*seen, *(name for name in sequences if name not in seen))
-    values = tuple(
-        estimate(
-            [weighted(weights, finished[name][number].metrics) for name in seen],
-            [weighted(weights, finished[name][0].metrics) for name in order],
-        )
-        for weights in config.objective
+    value = estimate(
+        [weighted(config.objective, finished[name][number].metrics) for name in seen],
+        [weighted(config.objective, finished[name][0].metrics) for name in order],
     )
-    return found._replace(values=values, complete=False, sequences=seen)
+    return found._replace(value=value, complete=False, sequences=seen)
 
 
 def make_searches(

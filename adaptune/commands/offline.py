@@ -88,8 +88,6 @@ def offline(
         say(sentence)
     say(driven(model, loaded.config.online, loaded.odometry, loaded.mechanism))
     say_fixed(loaded)
-    if len(loaded.config.offline.objective) > 1:
-        say(f"The sets that no other set beats in every objective: {loaded.folder / 'pareto'}.*")
     show_table(
         f"RTE [%] over {model.length:g} m in training, {n} parameter sets",
         training.rows,

@@ -85,11 +85,7 @@ def test_reads_a_study(gicp_study_file, tmp_path):
             "{max_correspondence_distance: [1, 5, 0], keyframe_interval: [1, 0, 3]}}}",
             ["grid.max_correspondence_distance", "grid.keyframe_interval"],
         ),
-        (
-            "offline={sampler: annealing, objective: [rte, rpe]}",
-            ["annealing minimises one objective"],
-        ),
-        ("offline.objective=[rte, {rte: 1.0}]", ["offline.objective: names an objective twice"]),
+        ("offline.objective=[rte, rpe]", ["offline.objective: several objectives are gone"]),
         ("offline.trial=3", ["offline.trial", "did you mean 'trials'?"]),
         ("online.switching.mechanism=hand_over", ["hand_over is gone", "give auto, live or bank"]),
         (

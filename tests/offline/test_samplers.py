@@ -149,17 +149,6 @@ def test_begins_with_points_that_spread_evenly_in_ratio(name):
     assert counts.min() >= 14
 
 
-@pytest.mark.parametrize("name", ["tpe", "nsga2", "random"])
-def test_searches_for_several_objectives(name):
-    config = OfflineConfig(sampler=name, objective=["rte", "rpe"], batch=8, initial=16, seed=5)
-    history = run(config, 8, error=lambda s: (bowl(s), s["gain"] + 1.0))
-    assert len({repr(s) for s, _ in history}) == 64
-    assert make_sampler(SPACE, config).propose(history[:40]) == [s for s, _ in history[40:48]]
-    if name in LEARNING:
-        sums = [sum(values) for _, values in history]
-        assert np.mean(sums[40:]) < np.mean(sums[1:16])
-
-
 CONSTRAINED = ["tpe", "nsga2", "gp"]
 
 
