@@ -4,7 +4,6 @@ import inspect
 import math
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -26,22 +25,9 @@ from adaptune.strict import Mistake, StrictModel, validated
 from adaptune.study.config import StudyConfig
 from adaptune.study.study import Study
 
-OPTUNA = {
-    "cmaes": "optuna.samplers:CmaEsSampler",
-    "gp": "optuna.samplers:GPSampler",
-    "nsga2": "optuna.samplers:NSGAIISampler",
-    "qmc": "optuna.samplers:QMCSampler",
-    "sobol": "optuna.samplers:QMCSampler",
-    "tpe": "optuna.samplers:TPESampler",
-}
-"""Optuna's samplers; their settings are the keywords of the class."""
-QUASI = ("qmc", "sobol")
-"""Names of the same sampler; the second one is that of older studies."""
+OPTUNA = {"tpe": "optuna.samplers:TPESampler"}
+"""Optuna's samplers that have a name; their settings are the keywords of the class."""
 NAMES = ("annealing", "grid", "random", *OPTUNA)
-STATELESS = ("tpe", "gp")
-"""Samplers that keep no notes: they continue from any list of trials."""
-NEEDS = {"cmaes": "cmaes", "gp": "torch"}
-"""Packages that a sampler needs; adaptune's extra has the sampler's name."""
 
 
 class SamplerError(AdaptuneError):
@@ -115,12 +101,8 @@ def optuna_class(name: str) -> type[Any]:
     Raises
     ------
     SamplerError
-        It names the nearest sampler, or what to install.
+        It names the nearest sampler, or says why there is none.
     """
-    if name in NEEDS and find_spec(NEEDS[name]) is None:
-        raise SamplerError(
-            f"{name} needs the package {NEEDS[name]}: pip install 'adaptune[{name}]'"
-        )
     if name not in OPTUNA and ":" not in name:
         raise SamplerError(
             f"there is no sampler {name!r}: {nearest(name, NAMES)} (another Optuna sampler is "
@@ -357,7 +339,7 @@ def check_sampler(
     if name == "tpe" and not settings:
         return  # a look at Optuna would take long
     if name not in SETTINGS:
-        yield from _check_optuna(name, settings, space)
+        yield from _check_optuna(name, settings)
     elif space is None:
         return
     elif name == "annealing":
@@ -376,9 +358,7 @@ def check_sampler(
             yield from check_grid(axes, space, bounded=budgeted or name == "random")
 
 
-def _check_optuna(
-    name: str, settings: Mapping[str, Any], space: ParameterSpace | None
-) -> Iterable[Mistake]:
+def _check_optuna(name: str, settings: Mapping[str, Any]) -> Iterable[Mistake]:
     if taken := next((key for key in _SET_BY_KEY if key in settings), None):
         yield Mistake((taken,), f"is set by offline.{_SET_BY_KEY[taken]}")
         return
@@ -391,9 +371,6 @@ def _check_optuna(
     except SamplerError as error:
         key, _, rest = str(error).partition(": ")
         yield Mistake((key,), rest) if key in settings else Mistake((), str(error))
-    parameters = () if space is None else space.parameters.values()
-    if name == "cmaes" and parameters and all(isinstance(p, Categorical) for p in parameters):
-        yield Mistake((), "cmaes searches among numbers, and all parameters are categories")
 
 
 def _check_step(
@@ -511,10 +488,8 @@ class OfflineConfig(StrictModel):
     def mistakes(self, space: ParameterSpace | None) -> Iterable[Mistake]:
         """Find mistakes in the sampler and its settings."""
         key, n = ("sampler_settings",), 1 if space is None else len(space.baselines)
-        if n > 1 and (
-            self.sampler not in (*STATELESS, "random") or "grid" in self.sampler_settings
-        ):
-            message = "with several odometries, choose tpe, gp or random, without a grid"
+        if n > 1 and (self.sampler not in ("tpe", "random") or "grid" in self.sampler_settings):
+            message = "with several odometries, choose tpe or random, without a grid"
             yield Mistake(("sampler",), message)
         if self.trials is not None and self.trials < n:
             message = f"{n} odometries need {n} trials at least, to try the parameters of each"

@@ -23,8 +23,6 @@ from adaptune.space import (
 )
 from offline.annealing import AnnealingSampler
 from offline.config import (
-    QUASI,
-    STATELESS,
     AnnealingSettings,
     Grid,
     OfflineConfig,
@@ -155,7 +153,8 @@ def _shuffled(size: int, seed: int, n: int) -> Iterator[int]:
     yield from drawn[np.sort(at)].tolist()
 
 
-optuna.logging.set_verbosity(optuna.logging.WARNING)
+# Without warnings that a sampler draws some parameters independently.
+optuna.logging.set_verbosity(optuna.logging.ERROR)
 
 CONSTRAINED = (
     optuna.samplers.TPESampler,
@@ -199,7 +198,7 @@ class AskedSampler(Sampler):
             else distribution(p)
             for name, p in space.parameters.items()
         }
-        self._forgetful = config.sampler in STATELESS
+        self._forgetful = config.sampler == "tpe"
         self._begin(0, ())
         self.constrained = isinstance(self._study.sampler, CONSTRAINED)
 
@@ -223,15 +222,8 @@ class AskedSampler(Sampler):
         if config.sampler == "annealing":
             settings = AnnealingSettings.model_validate(config.sampler_settings)
             return AnnealingSampler(settings, n_startup_trials=config.initial, seed=config.seed)
-        all_usual: dict[str, dict[str, Any]] = {
-            "cmaes": {"n_startup_trials": config.initial, "warn_independent_sampling": False},
-            "gp": {"n_startup_trials": 1, "warn_independent_sampling": False},
-            "nsga2": {"population_size": max(config.batch, 2)},
-            **{n: {"scramble": True, "warn_independent_sampling": False} for n in QUASI},
-            # The initial points are the start-up; TPE needs no random points of its own.
-            "tpe": {"n_startup_trials": 1},
-        }
-        usual = all_usual.get(config.sampler, {})
+        # The initial points are the start-up; TPE needs no random points of its own.
+        usual = {"n_startup_trials": 1} if config.sampler == "tpe" else {}
         seed = int(np.random.SeedSequence((config.seed, batch)).generate_state(1)[0])
         return optuna_sampler(config.sampler, usual | config.sampler_settings, seed)
 
@@ -261,9 +253,8 @@ class AskedSampler(Sampler):
             self.end = "all chains have stalled"
         elif not self._waiting:
             tried = {key(result.parameters) for result in self._history}
-            n_initial = 1 if self.config.sampler in QUASI else self.config.initial
             given = [self.space.baseline][numbers.start :]
-            rest = range(numbers.start + len(given), min(numbers.stop, n_initial))
+            rest = range(numbers.start + len(given), min(numbers.stop, self.config.initial))
             given += sobol_points(self.space, self.config.seed, rest)
             for number, first in zip_longest(numbers, given):
                 if not self._ask_once(number, first, tried):

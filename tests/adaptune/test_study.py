@@ -147,13 +147,6 @@ def test_names_mistakes_in_sampler_settings_with_their_lines(study_file, offline
     assert len(message.splitlines()) == 1
 
 
-def test_names_what_to_install(study_file, monkeypatch):
-    monkeypatch.setattr("offline.config.find_spec", lambda _: None)
-    for name, package in (("gp", "torch"), ("cmaes", "cmaes")):
-        text = failure(study_file, f"offline.sampler={name}")
-        assert f"{name} needs the package {package}: pip install 'adaptune[{name}]'" in text
-
-
 @pytest.mark.parametrize(
     ("old", "words"),
     [(old, words) for old, words in DELETED.items() if "=" not in old],

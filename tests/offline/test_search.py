@@ -104,9 +104,8 @@ def test_each_sequence_searches_for_itself(study_of):
 SAMPLERS = {
     "tpe": "{}",
     "annealing": "{chains: 1}",
-    "nsga2": "{}",
-    "cmaes": "{}",
-    "qmc": "{}",
+    "optuna.samplers:NSGAIISampler": "{population_size: 4}",
+    "optuna.samplers:CmaEsSampler": "{}",
     "random": "{}",
     "grid": "{grid: {max_correspondence_distance: [1, 1, 4], keyframe_interval: [1, 2, 5]}}",
 }
