@@ -345,7 +345,7 @@ def stretch_chart(rows: Sequence[Mapping[str, Any]]) -> Chart | None:
         tuple(panels),
         "Each point is a stretch that nothing was trained on, sorted by its ratio; below 1 the "
         "mode beats the fixed set. The band is the 95 % interval of the geometric mean over all "
-        "stretches. Oracles know the errors in advance: they bound what choosing one set can gain.",
+        "stretches. The oracle knows the errors in advance: the best set of each sequence.",
         columns=min(2, len(panels)),
     )
 

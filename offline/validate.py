@@ -267,10 +267,8 @@ def leave_out(
     costs = {"baseline": alone(0), "fixed": alone(data.fixed), PAIRED: driven}
     costs |= {name: alone(trial) for name, trial in of_rivals.items()}
     errors |= {name: capped[:, data.sets.column(trial)] for name, trial in of_rivals.items()}
-    of_periods = np.array([capped[period == p].mean(axis=0) for p in range(len(first))])
-    # The best set in hindsight, of the whole sequence and of each frame's period.
+    # The best set in hindsight.
     errors["oracle, sequence"] = capped[:, int(np.argmin(capped.mean(axis=0)))]
-    errors["oracle, period"] = capped[frames, of_periods[period].argmin(axis=1)]
     about = (sequence.name, sequence.recording, sequence.stretch, sequence.block)
     return LeftOut(*about, errors, adapted, costs)
 

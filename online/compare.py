@@ -52,7 +52,7 @@ from online.statistics import (
     ALL,
     ERROR_FACTOR,
     NO_DIFFERENCE,
-    ORACLES,
+    ORACLE,
     ComparisonRow,
     JudgedModes,
     Ratio,
@@ -62,7 +62,7 @@ from online.statistics import (
     allowing_for,
     compare_modes,
     mean_of,
-    oracle_rows,
+    oracle_row,
 )
 from online.tables import CALLED, decided, remarks, tables, verdict
 
@@ -175,32 +175,23 @@ def pooled(
     known = [one for one in judged if one.rows[0].rte is not None]
     modes = [row.mode for row in known[0].rows]
     made = [_pooled(mode, known) for mode in modes]
-    in_hindsight = [
-        _mean_row(mode, rows)
-        for mode in ORACLES
-        if len(rows := [row for row in oracles if row.mode == mode]) == len(known)
-    ]
+    in_hindsight = [_mean_row(ORACLE, oracles)] if len(oracles) == len(known) else []
     return [*with_gaps(made, in_hindsight), *in_hindsight]
 
 
 def _pooled(mode: str, judged: Sequence[JudgedModes]) -> ComparisonRow:
     rows = [row for one in judged for row in one.rows if row.mode == mode]
-    recordings = len({one.recording or one.name for one in judged})
-    row = replace(_mean_row(mode, rows), recordings=recordings)
+    row = _mean_row(mode, rows)
     if mode == row.yardstick:
         return row
-    ends = [row.ratio_interval for row in rows if row.ratio_interval is not None]
     logs = _of_stretches(judged, mode)
     enough = len(logs) >= LEAST_STRETCHES
     return replace(
         row,
         ratio_interval=ratio_to(judged, mode).interval,
         worst_tenth=float(np.exp(worst_tenth(logs))) if enough else None,
-        stretches=len(logs),
         better=sum(row.ratio < 1.0 - NO_DIFFERENCE for row in rows if row.ratio is not None),
         worse=sum(row.ratio > 1.0 + NO_DIFFERENCE for row in rows if row.ratio is not None),
-        surely_better=sum(high < 1.0 for _, high in ends) if ends else None,
-        surely_worse=sum(low > 1.0 for low, _ in ends) if ends else None,
     )
 
 
@@ -300,7 +291,7 @@ def with_gaps(
     rows: Sequence[ComparisonRow], oracles: Sequence[ComparisonRow]
 ) -> list[ComparisonRow]:
     """Fill in the share of what the best set of each sequence gains over the fixed set."""
-    best = {row.mode: row.rte for row in oracles}.get(ORACLES[0])
+    best = oracles[0].rte if oracles else None
     others: Mapping[str, float | None] = {row.mode: row.rte for row in rows}
     fixed = others.get("fixed")
     if best is None or fixed is None or best >= fixed:
@@ -474,10 +465,10 @@ def compare(study: Study) -> ComparedReplays:
         wrong += [f"On {name}, {what}." for what in read_contradictions(folder)]
         of_modes = compare_modes(name, every, reference)
         judged.append(of_modes._replace(recording=study.sequences.recorded_in(name)))
-        oracle = None if model is None else oracle_errors(study.archive("oracle"), name, model)
-        if oracle is not None and model is not None:
-            period = study.config.online.period
-            oracles += oracle_rows(judged[-1], oracle, model.fixed, period)
+        errors = None if model is None else oracle_errors(study.archive("oracle"), name, model)
+        if errors is not None and model is not None:
+            oracle = oracle_row(judged[-1], errors, model.fixed)
+            oracles += [] if oracle is None else [oracle]
     rows = _rows(judged, oracles)
     obstacle = "" if ADAPTIVE in modes else ReplaySetup.of(study).obstacle(ADAPTIVE, model)
     said = wrong[:1] or _lost(study, judged, rows)

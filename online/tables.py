@@ -10,7 +10,7 @@ from online.statistics import (
     ALL,
     ERROR_FACTOR,
     GAP,
-    ORACLES,
+    ORACLE,
     ComparisonRow,
     Ratio,
     mean_of,
@@ -53,8 +53,7 @@ _DRIVEN = {
     "untrained": "a bank without a model: sets around the baseline, weighed while driving",
     "even": "the bank with even weights: a control, which chooses nothing",
     "paper": "the set with the least expected error, as Koide et al. (IROS 2021) choose it",
-    ORACLES[0]: "the best set of each sequence, known in hindsight only",
-    ORACLES[1]: "the best set of every period between selections, known in hindsight only",
+    ORACLE: "the best set of each sequence, known in hindsight only",
 }
 """What each mode drives."""
 
@@ -75,7 +74,7 @@ def side_by_side(studies: Mapping[str, Sequence[ComparisonRow]]) -> list[Listing
         (name, row.sequence, row.mode): row.rte for name, rows in studies.items() for row in rows
     }
     modes = {
-        name: [m for m in dict.fromkeys(row.mode for row in rows) if m not in ORACLES]
+        name: [m for m in dict.fromkeys(row.mode for row in rows) if m != ORACLE]
         for name, rows in studies.items()
     }
     of_study = [{row.sequence for row in rows} - {ALL} for rows in studies.values()]
@@ -122,7 +121,7 @@ def _of_modes(rows: Sequence[ComparisonRow], length: float) -> Listing:
     empty |= {k for k in _COUNTS if not any(row[k] for row in cells)}
     cells = [{k: v for k, v in row.items() if k not in empty} for row in cells]
     for row, of in zip(cells, last, strict=True):
-        row["_in_hindsight"] = of.mode in ORACLES
+        row["_in_hindsight"] = of.mode == ORACLE
     n = len({row.sequence for row in rows if row.rte is not None} - {ALL})
     where = f"on {n} sequences" if last[0].sequence == ALL else f"on {last[0].sequence}"
     repeats = f", {last[0].repeats} replays each" if last[0].repeats > 1 else ""
@@ -140,8 +139,8 @@ def _caption(rows: Sequence[ComparisonRow], shown: Mapping[str, Any]) -> str:
         "Worst tenth: that mean over the worst tenth of the stretches." * ("worst tenth" in shown),
         "Better / worse: sequences on which the error is less or more by 1 %."
         * ("better / worse" in shown),
-        "Oracles know the errors: the best set of each sequence, and of every period. Much of the "
-        "latter is chance, out of reach of any choice." * any(r.mode in ORACLES for r in rows),
+        "The oracle knows the errors: the best set of each sequence."
+        * any(row.mode == ORACLE for row in rows),
         "Gap closed: share of what the best set of each sequence, in hindsight, gains."
         * (GAP in shown),
         "Estimated: by the odometry itself while driving, without the reference."
@@ -155,7 +154,7 @@ def _caption(rows: Sequence[ComparisonRow], shown: Mapping[str, Any]) -> str:
 
 def _of_sequences(rows: Sequence[ComparisonRow], length: float) -> Listing:
     """One row a sequence: the error of each mode."""
-    modes = [mode for mode in dict.fromkeys(row.mode for row in rows) if mode not in ORACLES]
+    modes = [mode for mode in dict.fromkeys(row.mode for row in rows) if mode != ORACLE]
     judged = len({row.reference for row in rows if row.sequence != ALL}) > 1
     cells = []
     for name in dict.fromkeys(row.sequence for row in rows):

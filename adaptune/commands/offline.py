@@ -178,7 +178,7 @@ def validate(
     show_table(
         "Error as a ratio to the fixed set's, each recording or stretch left out in turn",
         rows,
-        "Oracles know the errors: the best set of the sequence, and of every period. Intervals: "
+        "The oracle knows the errors: the best set of the sequence. Intervals: "
         "for a recording, a block bootstrap over time, if it is long enough; for the geometric "
         "mean over the stretches, what is expected elsewhere.",
     )
