@@ -102,51 +102,27 @@ def compared_modes(study: Study) -> ComparedModes:
         raise StoredReplayError("test: name at least one sequence to compare on")
     if not finished:
         ReplaySummary.read(replays / names[0] / "fixed")
-    lacking = {mode: tuple(n for n in finished if mode not in made[n]) for mode in modes}
+    lacking = {mode: [n for n in finished if mode not in made[n]] for mode in modes}
     compared = tuple(mode for mode in modes if not lacking[mode])
     unasked = {*RIVALS, *ALSO} - every.intersection(ALSO) - {*setup.also}
     missing = {mode: on for mode, on in lacking.items() if on and mode not in unasked}
     if modes == WITHOUT_MODEL and not every.issubset(WITHOUT_MODEL):
-        missing = {"fixed": tuple(finished)}
-    unfinished = {n: there for n, there in made.items() if n not in finished}
-    words = _unfinished(unfinished, compared, setup.also)
-    words += _missing(missing, tuple(finished), setup.also)
-    return ComparedModes(tuple(finished), compared, tuple(unfinished), words)
-
-
-def _unfinished(
-    unfinished: Mapping[str, Sequence[str]], modes: Sequence[str], asked: Sequence[str]
-) -> list[str]:
-    """A sentence about sequences that lack replays, given the modes that each has."""
-    if not unfinished:
-        return []
-    due = [m for m in modes if m not in ALSO or modes == WITHOUT_MODEL]
-    lacking = (
-        f"{name} ({', '.join(f'`{mode}`' for mode in due if mode not in there)})"
-        for name, there in unfinished.items()
-    )
-    command = replayed_by(asked, UNTRAINED if modes == WITHOUT_MODEL else "fixed")
-    return [
-        f"Not compared, because replays are missing: {', '.join(lacking)}; {command} makes them."
+        missing = {"fixed": finished}
+    unfinished = tuple(name for name in made if name not in finished)
+    for mode in compared:
+        on = [name for name in unfinished if mode not in made[name]]
+        if on and (mode not in ALSO or modes == WITHOUT_MODEL):
+            missing[mode] = on
+    without = WITHOUT_MODEL if modes == WITHOUT_MODEL else ()
+    told: dict[str, list[str]] = {}
+    for mode, on in missing.items():
+        command = replayed_by(setup.also, UNTRAINED if mode in without else mode)
+        told.setdefault(command, []).append(f"`{mode}` on {' and '.join(on)}")
+    words = [
+        f"Not compared, because replays are missing: {', '.join(those)}; {command} makes them."
+        for command, those in told.items()
     ]
-
-
-def _missing(
-    missing: Mapping[str, tuple[str, ...]], sequences: tuple[str, ...], asked: Sequence[str]
-) -> list[str]:
-    """Sentences about modes that were not replayed, given on which sequences."""
-    said = []
-    for names in dict.fromkeys(missing.values()):
-        modes = [mode for mode, on in missing.items() if on == names]
-        are = "are" if len(modes) > 1 else "is"
-        each = " and ".join(f"`{mode}`" for mode in modes)
-        on = "any sequence" if names == sequences else " and ".join(names)
-        command = " or ".join(dict.fromkeys(replayed_by(asked, mode) for mode in modes))
-        said.append(
-            f"{each} {are} not compared: there is no replay on {on}; {command} makes what is "
-            f"missing."
-        )
-    return said
+    return ComparedModes(tuple(finished), compared, unfinished, words)
 
 
 def replayed_by(asked: Sequence[str], mode: str) -> str:
