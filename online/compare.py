@@ -1,6 +1,6 @@
 """The comparison of baseline, fixed and adaptive on the replayed sequences."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -152,7 +152,7 @@ def pooled(
     modes = [row.mode for row in known[0].rows]
     made = [_pooled(mode, known) for mode in modes]
     in_hindsight = [_mean_row(ORACLE, oracles)] if len(oracles) == len(known) else []
-    return [*with_gaps(made, in_hindsight), *in_hindsight]
+    return [*made, *in_hindsight]
 
 
 def _pooled(mode: str, judged: Sequence[JudgedModes]) -> ComparisonRow:
@@ -261,23 +261,6 @@ def _of_stretches(judged: Sequence[JudgedModes], mode: str) -> NDArray[np.float6
         n = max(1, errors.shape[1] // (PER_STRETCH * one.block))
         found += [_log(part) for part in np.array_split(errors, n, axis=1)]
     return np.array(found)
-
-
-def with_gaps(
-    rows: Sequence[ComparisonRow], oracles: Sequence[ComparisonRow]
-) -> list[ComparisonRow]:
-    """Fill in the share of what the best set of each sequence gains over the fixed set."""
-    best = oracles[0].rte if oracles else None
-    others: Mapping[str, float | None] = {row.mode: row.rte for row in rows}
-    fixed = others.get("fixed")
-    if best is None or fixed is None or best >= fixed:
-        return list(rows)
-    return [
-        replace(row, gap_closed=(fixed - row.rte) / (fixed - best))
-        if row.rte is not None and row.mode != "fixed"
-        else row
-        for row in rows
-    ]
 
 
 # Replays that are not of what the study is now: neither compared nor drawn.
@@ -525,7 +508,7 @@ def _rows(judged: Sequence[JudgedModes], oracles: Sequence[ComparisonRow]) -> li
     if len(judged) > 1:
         last = pooled(judged, oracles)
     else:
-        last, rows = [*with_gaps(rows, oracles), *oracles], []
+        last, rows = [*rows, *oracles], []
     return [*rows, *(_against(row, known, last) for row in last)]
 
 

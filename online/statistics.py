@@ -37,8 +37,6 @@ ESTIMATED, LOST = "estimated [%]", "lost [s]"
 """Columns of what a bank has measured of itself."""
 REFERENCE = "reference"
 """Column of the kind of reference."""
-GAP = "gap closed [%]"
-"""Column of the share of what the best set of each sequence would gain."""
 NO_DIFFERENCE = 0.01
 """Share of the yardstick's error by which others may differ without it being told."""
 ORACLE = "oracle, sequence"
@@ -49,7 +47,7 @@ Interval = tuple[float, float] | None
 
 _FOR_FILES = (
     *("reference_error", "poor_scans", "rte_interval", "ratio_interval", "estimated_interval"),
-    *("repeats", "worst_tenth", "better", "worse", "gap_closed"),
+    *("repeats", "worst_tenth", "better", "worse"),
 )
 """What only files have of a row; intervals are columns of their ends."""
 
@@ -110,13 +108,11 @@ class ComparisonRow:
     memory_mb: float | None = None  # most megabytes of all processes
     real_time: Mapping[str, float] | None = None  # see `ReplaySummary`
     repeats: int = 1  # replays of which errors are means
-    # Over all sequences: geometric mean of the ratios over the worst tenth of the stretches, on how
-    # many sequences the mode has less and more error by what counts, and the share of what the
-    # best set of each sequence would gain.
+    # Over all sequences: geometric mean of the ratios over the worst tenth of the stretches, and on
+    # how many sequences the mode has less and more error by what counts.
     worst_tenth: float | None = None
     better: int | None = None
     worse: int | None = None
-    gap_closed: float | None = None
     # By mode, that of this mode's error to the other one's; of controls and rivals.
     against: Mapping[str, Ratio] = field(default_factory=dict)
 
@@ -180,7 +176,6 @@ class ComparisonRow:
         over_all = {
             "worst tenth": self.worst_tenth,
             "better / worse": None if self.better is None else f"{self.better} / {self.worse}",
-            GAP: None if self.gap_closed is None else f"{100.0 * self.gap_closed:.0f}",
         }
         changed = {
             LOST: self.lost_seconds or None,

@@ -9,7 +9,6 @@ from online.modes import EVEN
 from online.statistics import (
     ALL,
     ERROR_FACTOR,
-    GAP,
     ORACLE,
     ComparisonRow,
     Ratio,
@@ -141,8 +140,6 @@ def _caption(rows: Sequence[ComparisonRow], shown: Mapping[str, Any]) -> str:
         * ("better / worse" in shown),
         "The oracle knows the errors: the best set of each sequence."
         * any(row.mode == ORACLE for row in rows),
-        "Gap closed: share of what the best set of each sequence, in hindsight, gains."
-        * (GAP in shown),
         "Estimated: by the odometry itself while driving, without the reference."
         * any(row.estimated is not None for row in rows),
         f"The error of an estimated reference pulls ratios towards 1, or hides what a mode has in "
