@@ -59,7 +59,7 @@ def comparison_chart(rows: Sequence[ComparisonRow]) -> Chart | None:
         texts = [f"{row.mode}, {row.sequence}" for row in some]
         return Points(ratios, places, name, texts=texts, **look)
 
-    drawn: list[Drawn] = [Mark(1.0, axis="x")]
+    drawn: list[Drawn] = [Mark(1.0)]
     ends = [(*row.ratio_interval, i) for i, row in enumerate(last) if row.ratio_interval]
     if ends:
         x = [value for low, high, _ in ends for value in (low, high, np.nan)]
@@ -413,7 +413,7 @@ def _weights(replayed: ReplayedSequence) -> Iterator[Panel]:
         shares = np.column_stack([shares, shares[:, -1]])
         # Shares hide what is shaded.
         ends = [] if replayed.scenes is None else replayed.scenes.edges[1:-1]
-        edges = (Mark(float(edge), axis="x") for edge in ends)
+        edges = (Mark(float(edge)) for edge in ends)
         drawn = (*_scenes(replayed), Shares(track.span, shares, tuple(track.weights)), *edges)
         y = Axis("weight [%]", limits=(0.0, 100.0))
         yield Panel(TIME, y, drawn, f"{mode} applies a bank: weights of its members")
