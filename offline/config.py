@@ -82,16 +82,10 @@ class Span(StrictModel):
 
 
 class GridSettings(StrictModel):
-    """Settings of `grid`."""
+    """Settings of `grid`, and of `random`, which draws the grid's points without repetition."""
 
     # For every number ``[first, step, count]`` or a `Span`; for categories the choices to try, by
     # default all.
-    grid: dict[str, Span | tuple[Value, ...]]
-
-
-class RandomSettings(StrictModel):
-    """Settings of `random`: with a grid, it draws the grid's points without repetition."""
-
     grid: dict[str, Span | tuple[Value, ...]] | None = None
 
 
@@ -148,7 +142,7 @@ def optuna_sampler(name: str, settings: Mapping[str, Any], seed: int) -> Any:
 SETTINGS: dict[str, type[BaseModel]] = {
     "annealing": AnnealingSettings,
     "grid": GridSettings,
-    "random": RandomSettings,
+    "random": GridSettings,
 }
 """Settings of adaptune's own samplers."""
 
@@ -353,9 +347,9 @@ def check_sampler(
             if parameter in steps:
                 yield from _check_step(parameter, of, steps[parameter])
     elif name in ("grid", "random"):
-        axes = RandomSettings.model_validate(settings).grid
-        if axes is not None:
-            yield from check_grid(axes, space, bounded=budgeted or name == "random")
+        axes = GridSettings.model_validate(settings).grid
+        if axes is not None or name == "grid":
+            yield from check_grid(axes or {}, space, bounded=budgeted or name == "random")
 
 
 def _check_optuna(name: str, settings: Mapping[str, Any]) -> Iterable[Mistake]:

@@ -25,8 +25,8 @@ from offline.annealing import AnnealingSampler
 from offline.config import (
     AnnealingSettings,
     Grid,
+    GridSettings,
     OfflineConfig,
-    RandomSettings,
     SamplerError,
     distribution,
     make_grid,
@@ -131,7 +131,7 @@ class GridSampler(Sampler):
     """The baseline, then the other points of a grid, in row-major or in random order."""
 
     def _propose(self, numbers: range, history: Sequence[SamplerResult]) -> list[ParameterSet]:  # noqa: ARG002
-        settings = RandomSettings.model_validate(self.config.sampler_settings)
+        settings = GridSettings.model_validate(self.config.sampler_settings)
         grid = make_grid(self.space, settings.grid or {})
         order: Iterable[int] = range(grid.size)
         if self.config.sampler == "random":
@@ -411,8 +411,8 @@ def make_sampler(space: ParameterSpace, config: OfflineConfig) -> Sampler:
     """Make the sampler that a configuration names."""
     if isinstance(space, PooledSpace):
         return PooledSampler(space, config)
-    if config.sampler_settings.get("grid") is not None and config.sampler in ("grid", "random"):
-        return GridSampler(space, config)
-    if config.sampler == "random":
+    if config.sampler == "random" and config.sampler_settings.get("grid") is None:
         return RandomSampler(space, config)
+    if config.sampler in ("grid", "random"):
+        return GridSampler(space, config)
     return AskedSampler(space, config)
