@@ -109,7 +109,7 @@ def optuna_class(name: str) -> type[Any]:
         found = strict.load(name, path, "class")
     except strict.PluginError as error:
         raise SamplerError(str(error)) from error
-    except Exception as error:  # of the user's module
+    except (Exception, SystemExit) as error:  # of the user's module
         raise SamplerError(f"{name}: cannot be imported: {in_a_line(error)}") from error
     if not (isinstance(found, type) and issubclass(found, BaseSampler)):
         raise SamplerError(f"{name}: is not a class derived from optuna.samplers.BaseSampler")

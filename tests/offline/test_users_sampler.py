@@ -85,7 +85,10 @@ def test_settings_that_do_not_do(study_file, settings, words):
         load_study(study_file, given)
 
 
-def test_one_that_cannot_be_imported(tmp_path, study_file):
-    (tmp_path / "broken_samplers.py").write_text("1 / 0")
-    with pytest.raises(ConfigurationError, match="broken_samplers:X: cannot be imported: ZeroDiv"):
-        load_study(study_file, ["offline.sampler=broken_samplers:X"])
+@pytest.mark.parametrize(
+    ("name", "code"), [("ZeroDivisionError", "1 / 0"), ("SystemExit", "exit()")]
+)
+def test_one_that_cannot_be_imported(tmp_path, study_file, name, code):
+    (tmp_path / f"broken_{name}.py").write_text(code)
+    with pytest.raises(ConfigurationError, match=f"broken_{name}:X: cannot be imported: {name}"):
+        load_study(study_file, [f"offline.sampler=broken_{name}:X"])
