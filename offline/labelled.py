@@ -589,7 +589,7 @@ def labelled_data(
             for trial in eligible.intersection(run[name])
         }
         # Whether the objective on some frames follows from the errors there.
-        by_frames = set(config.offline.objective[0]) == {"rte"}
+        by_frames = set(config.offline.objective) == {"rte"}
         errors_of = whole_errors(archive, name, whole, s.known) if by_frames else None
         labelled.append(replace(s, vectors=vectors, whole=whole, whole_errors=errors_of))
     costs = measured_costs(archive, run, sets, odometry)
@@ -630,7 +630,7 @@ def _labelled(
     # All trials know the same frames, but for those before an odometry's first pose.
     ran = np.column_stack([errors[:, ~np.isnan(errors).all(axis=0)], baseline])
     known = np.flatnonzero(~np.isnan(ran).any(axis=1))
-    objective, n_repeats = config.offline.objective[0], config.offline.repeats
+    objective, n_repeats = config.offline.objective, config.offline.repeats
     summaries = [archive.finished(name)[trial] if trial in run else None for trial in sets]
     values = [weighted(objective, s.metrics) if s and s.usable else np.inf for s in summaries]
     # Of the baseline, there may be more runs.

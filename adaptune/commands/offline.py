@@ -88,8 +88,6 @@ def offline(
         say(sentence)
     say(driven(model, loaded.config.online, loaded.odometry, loaded.mechanism))
     say_fixed(loaded)
-    if len(loaded.config.offline.objective) > 1:
-        say(f"The sets that no other set beats in every objective: {loaded.folder / 'pareto'}.*")
     show_table(
         f"RTE [%] over {model.length:g} m in training, {n} parameter sets",
         training.rows,
@@ -176,7 +174,7 @@ def validate(
     show_table(
         "Error as a ratio to the fixed set's, each recording or stretch left out in turn",
         rows,
-        "Oracles know the errors: the best set of the sequence, and of every period. Intervals: "
+        "The oracle knows the errors: the best set of the sequence. Intervals: "
         "for a recording, a block bootstrap over time, if it is long enough; for the geometric "
         "mean over the stretches, what is expected elsewhere.",
     )

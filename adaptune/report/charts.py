@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,11 +87,9 @@ class Spans:
 
 @dataclass(frozen=True)
 class Mark:
-    """A line at a value of x or y, with a few words on it."""
+    """A dashed line across the panel, at a value of x."""
 
     at: float
-    words: str = ""
-    axis: Literal["x", "y"] = "y"
 
 
 @dataclass(frozen=True)

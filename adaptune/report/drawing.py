@@ -54,7 +54,6 @@ MODES = {
     "even": Look("#117733", (3, 3), "triangle-right"),
     "paper": Look("#000000", (4, 4), "triangle-up"),
     "oracle, sequence": Look("#009e73", shape="diamond"),
-    "oracle, period": Look("#009e73", shape=_TIMES),
 }
 """Looks of the modes; the lines of the first lie lowest."""
 _COLOURS = ("#d55e00", "#56b4e9", "#009e73", "#cc79a7", "#888888", "#b8a800")
@@ -306,9 +305,9 @@ def _extent(panel: Panel, which: Literal["x", "y"]) -> tuple[float, float]:
         return axis.limits
     if axis.names is not None:
         return -0.6, len(axis.names) - 0.4
-    marks = (item for item in panel.drawn if isinstance(item, Mark) and item.axis == which)
+    marks = [item.at for item in panel.drawn if isinstance(item, Mark) and which == "x"]
     found = [pair[which == "y"] for pair in _coordinates(panel)]
-    values = np.concatenate([*found, numbers([mark.at for mark in marks], axis)])
+    values = np.concatenate([*found, marks])
     values = values[np.isfinite(values)]
     if not len(values):
         return 1.0, 10.0
@@ -521,18 +520,10 @@ class _Drawing:
             yield from _read_anywhere(words, _table(x=[0.5 * (begin + end)]), {"x": self._x})
 
     def _mark(self, mark: Mark) -> Iterator[Spec]:
-        """A line across the panel, and its words."""
-        low, high = sorted(self._extent[mark.axis])
-        if not low <= mark.at <= high:
-            return
-        encoding: Spec = {mark.axis: self._x if mark.axis == "x" else self._y}
-        data = _table(**{mark.axis: [mark.at]})
-        rule: Spec = {"type": "rule", "color": _DARK, "strokeDash": (5, 3)}
-        yield {"data": data, "mark": rule, "encoding": encoding}
-        words: Spec = {"text": mark.words, "align": "right", "dy": -2}
-        words |= {"x": self._width - 3} if mark.axis == "y" else {"y": 3, "angle": -90}
-        if mark.words:
-            yield from _read_anywhere(words, data, encoding)
+        low, high = sorted(self._extent["x"])
+        if low <= mark.at <= high:
+            rule: Spec = {"type": "rule", "color": _DARK, "strokeDash": (5, 3)}
+            yield {"data": _table(x=[mark.at]), "mark": rule, "encoding": {"x": self._x}}
 
     def _words(self, words: Words) -> Iterator[Spec]:
         x, y = numbers(words.x, self._panel.x), numbers(words.y, self._panel.y)

@@ -299,9 +299,19 @@ DELETED = {
     "offline.pruning=halving": _NO_PRUNING,
     "offline.pruning=hyperband": _NO_PRUNING,
     "offline.memory": "is gone: workers keep scans in a quarter of the machine's memory",
+    **{
+        f"offline.sampler={old}": f"is gone; give optuna.samplers:{name}, with its own settings"
+        for old, name in (
+            ("cmaes", "CmaEsSampler"),
+            ("gp", "GPSampler"),
+            ("nsga2", "NSGAIISampler"),
+            ("qmc", "QMCSampler"),
+            ("sobol", "QMCSampler"),
+        )
+    },
     "offline.preset": "is gone; for the paper's, give trials: 256, sets: own, runs: whole",
     "offline.target": "is gone; give trials, hours or stagnation",
-    "offline.storage": "is gone: the trials are in a journal of Optuna's in the study's folder",
+    "offline.storage": "is gone: the trials are files in the study's folder, and in trials.csv",
     "offline.max_frames": "is gone: the error model keeps all frames; leave it out",
     "sequences.*.position_prior": "is gone: it changed nothing over 50 m; leave it out",
     "sequences.*.evalio": "is gone: give the data set's files, as `bag`, `kitti` or `folder`",

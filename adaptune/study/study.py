@@ -703,7 +703,6 @@ class OracleErrors(NamedTuple):
     A trial restarts at the reference after a lost track. A replay does not.
     """
 
-    stamps: NDArray[np.int64]  # (n_frames,): nanoseconds
     trials: tuple[int, ...]  # numbers of the sets, the fixed one's first if it is among them
     # (n_frames, n_sets): sub-trajectory RTE in percent, NaN without a sub-trajectory, infinite
     # where the track was lost.
@@ -729,5 +728,4 @@ def oracle_errors(archive: Archive, name: str, model: ErrorModel) -> OracleError
         _log.warning(words, name, "; ".join(changes))
         return None
     trials = tuple(sorted(known, key=lambda trial: (trial != model.fixed, trial)))
-    stamps = archive.read_frames(name).stamps
-    return OracleErrors(stamps, trials, archive.read_errors(name, trials))
+    return OracleErrors(trials, archive.read_errors(name, trials))

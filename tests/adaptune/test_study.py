@@ -86,11 +86,7 @@ def test_reads_a_study(gicp_study_file, tmp_path):
             "{max_correspondence_distance: [1, 5, 0], keyframe_interval: [1, 0, 3]}}}",
             ["grid.max_correspondence_distance", "grid.keyframe_interval"],
         ),
-        (
-            "offline={sampler: annealing, objective: [rte, rpe]}",
-            ["annealing minimises one objective"],
-        ),
-        ("offline.objective=[rte, {rte: 1.0}]", ["offline.objective: names an objective twice"]),
+        ("offline.objective=[rte, rpe]", ["offline.objective: several objectives are gone"]),
         ("offline.trial=3", ["offline.trial", "did you mean 'trials'?"]),
         ("online.switching.mechanism=hand_over", ["hand_over is gone", "give auto, live or bank"]),
         (
@@ -150,13 +146,6 @@ def test_names_mistakes_in_sampler_settings_with_their_lines(study_file, offline
     assert f"line {line}: offline.sampler_settings" in message
     assert words in message
     assert len(message.splitlines()) == 1
-
-
-def test_names_what_to_install(study_file, monkeypatch):
-    monkeypatch.setattr("offline.config.find_spec", lambda _: None)
-    for name, package in (("gp", "torch"), ("cmaes", "cmaes")):
-        text = failure(study_file, f"offline.sampler={name}")
-        assert f"{name} needs the package {package}: pip install 'adaptune[{name}]'" in text
 
 
 @pytest.mark.parametrize(

@@ -103,18 +103,18 @@ def test_what_is_missing_somewhere_is_told_and_left_out(own, tmp_path):
     shutil.rmtree(both.folder / "replays/three/baseline")
     assert {row.mode for row in compare(both).rows} == {"fixed", "adaptive", "even"}
     assert compared_modes(both).words == [
-        "`baseline` is not compared: there is no replay on three; `adaptune online` makes what is "
-        "missing.",
-        "`untrained` and `paper` are not compared: there is no replay on four; `adaptune online "
-        "--untrained` or `adaptune online` makes what is missing.",
+        "Not compared, because replays are missing: `baseline` on three, `paper` on four; "
+        "`adaptune online` makes them.",
+        "Not compared, because replays are missing: `untrained` on four; `adaptune online "
+        "--untrained` makes them.",
     ]
     shutil.rmtree(both.folder / "replays/four/fixed")
     run_untrained(both)
     compared = compared_modes(both)
     assert (compared.sequences, compared.unfinished) == (("three",), ("four",))
     assert (
-        "Not compared, because replays are missing: four (`fixed`, `paper`); `adaptune online` "
-        "makes them."
+        "Not compared, because replays are missing: `fixed` on four, `paper` on four; `adaptune "
+        "online` makes them."
     ) in compare(both).details
     assert any("`equal_cost` is the fixed set" in said for said in compare(both).details)
     shutil.rmtree(both.folder / "replays/three/fixed")
@@ -124,7 +124,7 @@ def test_what_is_missing_somewhere_is_told_and_left_out(own, tmp_path):
     }
     assert not any("`equal_cost` is the fixed set" in said for said in compare(both).details)
     (said,) = compared_modes(both).words
-    assert said.startswith("`fixed` is not compared: there is no replay on any sequence; `adaptune")
+    assert said.endswith("missing: `fixed` on three and four; `adaptune online` makes them.")
     shutil.rmtree(both.folder / "replays/four/untrained")
     assert compared_modes(both).sequences == ("three",)
     shutil.rmtree(both.folder / "replays/three/untrained")
@@ -141,7 +141,7 @@ def test_where_only_some_were_replayed_without_a_model_those_are_compared(own, t
     shutil.rmtree(both.folder / "replays/three/baseline")
     assert {row.sequence for row in compare(both).rows} == {"four"}
     assert (
-        "Not compared, because replays are missing: three (`baseline`); `adaptune online "
+        "Not compared, because replays are missing: `baseline` on three; `adaptune online "
         "--untrained` makes them."
     ) in compare(both).details
 
@@ -188,7 +188,7 @@ def test_the_command_line(own, study_file):
     assert done.exit_code == 0, done.output
     assert "paper" not in done.stdout
     done = CliRunner().invoke(app, ["compare", *words, "--details"])
-    assert "`paper` is not compared: there is no replay on any sequence" in done.stdout
+    assert "replays are missing: `paper` on three" in done.stdout
     for value, words_ in (("[even, even]", "one of them is named twice"), ("[odd]", "not 'odd'")):
         done = CliRunner().invoke(app, ["online", *words, "-o", f"online.modes={value}"])
         assert done.exit_code == 2

@@ -5,7 +5,7 @@ import pytest
 
 from adaptune.metrics import KittiError
 from online.modes import MODES
-from online.statistics import ALL, ORACLES, ComparisonRow, StandardErrors
+from online.statistics import ALL, ORACLE, ComparisonRow, StandardErrors
 from online.tables import modes_in_words, side_by_side, tables
 
 SHORT = KittiError(np.nan, np.nan, ())
@@ -64,21 +64,21 @@ def test_references_are_told_where_they_differ():
 
 
 def test_every_mode_that_may_be_shown_is_put_in_words():
-    shown = [ComparisonRow("a", mode, 1.0, 1.0, 0, 0, 0) for mode in (*MODES, *ORACLES)]
+    shown = [ComparisonRow("a", mode, 1.0, 1.0, 0, 0, 0) for mode in (*MODES, ORACLE)]
     made = modes_in_words(shown)
-    assert [row["mode"] for row in made.rows] == [*MODES, *ORACLES]
+    assert [row["mode"] for row in made.rows] == [*MODES, ORACLE]
 
 
 def test_oracles_are_among_the_modes_only():
-    oracle = ComparisonRow(ALL, ORACLES[0], 0.4, 0.2, 0, 0, 0)
+    oracle = ComparisonRow(ALL, ORACLE, 0.4, 0.2, 0, 0, 0)
     switching = [replace(row, switches=3, restarts=1) for row in ROWS]
     modes, sequences, standard = tables([*switching, oracle], 25.0)
     # It was not driven.
     assert (modes.rows[-1]["switches"], modes.rows[-1]["restarts"]) == (None, None)
-    assert "Oracles know the errors" in modes.caption
+    assert "The oracle knows the errors" in modes.caption
     assert "Oracles" not in tables(ROWS, 25.0)[0].caption
-    assert modes.rows[-1]["mode"] == ORACLES[0]
-    assert ORACLES[0] not in sequences.rows[0]
+    assert modes.rows[-1]["mode"] == ORACLE
+    assert ORACLE not in sequences.rows[0]
     assert len(standard.rows) == 3
 
 

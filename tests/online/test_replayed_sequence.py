@@ -34,24 +34,21 @@ def test_replays_are_read_with_what_was_measured(study):
     for mode, of in replayed.modes.items():
         n, m = len(of.seconds), len(of.choice_seconds)
         assert of.places.shape == (n, 2)
-        assert of.scan_ms.shape == (n,)
         assert of.familiarity.shape == (m,)
-        assert len(of.selection_ms) == m
-        assert np.isfinite(of.selection_ms).all() == of.adapts
         assert of.adapts == (mode in ("adaptive", "paper"))
         # The reference goes straight on; the odometry nearly so.
         assert abs(of.places[:, 1]).max() < 1e-6
         assert (np.isfinite(of.errors_around) >= np.isfinite(of.errors)).all()
     with (study.folder / "replays/three/paper/selections.csv").open() as file:
-        told = [float(row["ms"]) for row in csv.DictReader(file)]
-    np.testing.assert_array_equal(replayed.modes["paper"].selection_ms, told)
+        told = [float(row["familiarity"]) for row in csv.DictReader(file)]
+    np.testing.assert_array_equal(replayed.modes["paper"].familiarity, told)
     assert read_replays(study, "one").modes == {}
 
 
 def test_all_charts_are_made(study):
     charts, notes = charts_of_replays(read_replays(study, "three"))
     keys = {chart.key for chart in charts}
-    assert {"three-errors", "three-choices", "three-latency", "three-familiarity"} <= keys
+    assert {"three-errors", "three-choices", "three-familiarity"} <= keys
     assert all(chart.caption and chart.title.startswith("three: ") for chart in charts)
     assert notes == []
 

@@ -3,7 +3,7 @@ from dataclasses import replace
 import pytest
 
 from online.compare import ComparedReplays
-from online.statistics import ALL, ORACLES, ComparisonRow, Ratio
+from online.statistics import ALL, ORACLE, ComparisonRow, Ratio
 from online.tables import decided, remarks, verdict
 
 
@@ -151,8 +151,8 @@ def test_nothing_is_said_where_nothing_is_known():
     assert remarks(rows) == []
     assert decided(rows) is None
     assert ComparedReplays(rows, [], []).advised == ""
-    oracle = ComparisonRow(ALL, ORACLES[0], 0.5, 0.5, 0, 0, 0)
-    assert not any(ORACLES[0] in said for said in verdict([*every(adaptive=0.7), oracle], 10.0))
+    oracle = ComparisonRow(ALL, ORACLE, 0.5, 0.5, 0, 0, 0)
+    assert not any(ORACLE in said for said in verdict([*every(adaptive=0.7), oracle], 10.0))
 
 
 def test_all_estimates_that_the_reference_contradicts_are_one_sentence():

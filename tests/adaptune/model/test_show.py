@@ -74,7 +74,7 @@ def test_no_model_shows_raw_data(model, tmp_path):
     summary = dict.fromkeys(("geometric", "low", "high", "worst", "arithmetic"), 0.9)
     augment = [{"name": "noise", "sigma": 0.1}, {"name": "cut", "start": None}]
     limits = {"rte": Limit(max=3.0)}
-    config = OfflineConfig(objective=({"rte": 1.0, "ape": 0.5}, "memory"), limits=limits)
+    config = OfflineConfig(objective={"rte": 1.0, "ape": 0.5}, limits=limits)
     extrinsic = {"translation": [0, 0.5, 1]}
     settings = {"command": ["slam", "--fast"], "extrinsic": extrinsic, "gpu": True}
     for changes in (
