@@ -35,6 +35,7 @@ from adaptune.model.weights import MEMBER_POOL_SIZE, MemberWeights
 from adaptune.odometry.registry import Factory
 from adaptune.recording.scan import origin, places, stretch_numbers
 from adaptune.space import ParameterSets
+from adaptune.study.config import WORTH
 from adaptune.study.study import MIN_RECORDINGS, PER_STRETCH
 from offline.campaign import mean_values, read_whole_runs, whole_errors, whole_values
 from offline.config import OfflineStudyConfig
@@ -361,6 +362,7 @@ class LabelledData(NamedTuple):
     costs: Costs = Costs({}, np.nan)  # of the sets, as far as they are known
     # Milliseconds of CPU time a scan that may be spent, live evidence included.
     budget: float | None = None
+    worth: float = WORTH  # share of the error that a bank has to spare
     live: bool = True  # whether the odometry changes from one set to another between scans
 
     def subset(self, trials: Sequence[int]) -> "LabelledData":
@@ -593,7 +595,8 @@ def labelled_data(
         errors_of = whole_errors(archive, name, whole, s.known) if by_frames else None
         labelled.append(replace(s, vectors=vectors, whole=whole, whole_errors=errors_of))
     costs = measured_costs(archive, run, sets, odometry)
-    return LabelledData(labelled, sets, costs, config.online.budget, odometry.description.live)
+    online, live = config.online, odometry.description.live
+    return LabelledData(labelled, sets, costs, online.budget, online.worth, live)
 
 
 def _eligible(

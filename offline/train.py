@@ -316,7 +316,7 @@ def _evidence(
         for name in names
     }
     switching = config.online.switching.model_dump(mode="json", include={"size", "sets"})
-    online = (config.online.period, config.online.budget, switching)
+    online = (config.online.period, config.online.budget, config.online.worth, switching)
     about = [provenance, trials, online, fixed]
     found = hashlib.blake2b(json.dumps(about).encode(), digest_size=16)
     for name in names:
@@ -419,6 +419,7 @@ def fit(
         paired=DO_NOT_ADAPT,
         bank_settings=NO_BANK,
         budget=data.budget,
+        worth=data.worth,
         costs=data.costs,
     )
 

@@ -377,13 +377,8 @@ class ComparedReplays(NamedTuple):
     rows: list[ComparisonRow]
     verdict: list[str]  # sentences: what to do, and why
     details: list[str]  # sentences: what must be known to trust it
+    advised: str = ""  # the mode to drive; empty where nobody can say
     unfinished: Sequence[str] = ()  # sequences that are not compared, for want of replays
-
-    @property
-    def advised(self) -> str:
-        """The mode to drive; empty where nobody can say."""
-        best = decided(self.rows)
-        return "" if best is None else best.mode
 
 
 def compare(study: Study) -> ComparedReplays:
@@ -431,7 +426,8 @@ def compare(study: Study) -> ComparedReplays:
     rows = _rows(judged, oracles)
     obstacle = "" if ADAPTIVE in modes else ReplaySetup.of(study).obstacle(ADAPTIVE, model)
     said = wrong[:1] or _lost(study, judged, rows)
-    said += verdict(rows, study.config.sub_trajectory, obstacle)
+    worth = study.config.online.worth
+    said += verdict(rows, study.config.sub_trajectory, obstacle, worth)
     details = [
         *wrong,
         *remarks(rows),
@@ -444,7 +440,9 @@ def compare(study: Study) -> ComparedReplays:
     report.write_rows(folder, "comparison", [row.columns() for row in rows])
     made = tables(rows, study.config.sub_trajectory)
     report.write_tables(folder, study.name, made, [*said, *details])
-    return ComparedReplays(rows, said, details, compared.unfinished)
+    best = decided(rows, worth)
+    advised = "" if best is None else best.mode
+    return ComparedReplays(rows, said, details, advised, compared.unfinished)
 
 
 def _lost(study: Study, judged: Sequence[JudgedModes], rows: Sequence[ComparisonRow]) -> list[str]:

@@ -24,7 +24,7 @@ from adaptune.recording.scan import Recording, Scan, part_name
 from adaptune.reference.check import mean_difference
 from adaptune.selector import AnySelector, Selector, UntrainedSelector, untrained_sets
 from adaptune.space import ParameterSet, ParameterSets, Selection
-from adaptune.study.config import RealTimeConfig, StudyConfig, SwitchingConfig
+from adaptune.study.config import WORTH, RealTimeConfig, StudyConfig, SwitchingConfig
 from adaptune.study.references import contradictions_of, ensure_references
 from adaptune.study.study import (
     RIVALS,
@@ -123,6 +123,7 @@ class ReplaySetup:
     lost_track: float  # metres a second by which the members of a bank may differ and agree
     descriptors: tuple[str, ...]  # those that the study names
     budget: float | None = None  # milliseconds of CPU time a scan
+    worth: float = WORTH  # share of the error that a bank has to spare
     real_time: RealTimeConfig | None = None
     also: tuple[str, ...] = ()  # modes on demand, see `OnlineConfig`
 
@@ -139,6 +140,7 @@ class ReplaySetup:
             config.lost_track,
             config.descriptor,
             config.online.budget,
+            config.online.worth,
             config.online.real_time,
             config.online.also,
         )
@@ -244,9 +246,12 @@ class ReplaySetup:
     def check(self, model: ErrorModel, path: Path) -> None:
         """Refuse a model for another bank, or with a descriptor of somebody else's, from `path`."""
         model.check_descriptors(self.descriptors, path)
-        if model.budget != self.budget:
+        other = "budget" if model.budget != self.budget else ""
+        if model.worth not in (None, self.worth):
+            other = "worth"
+        if other:
             raise ModeError(
-                f"online.budget: {path} was fitted for another budget; run `adaptune offline` "
+                f"online.{other}: {path} was fitted for another one; run `adaptune offline` "
                 f"again, which fits it to the finished trials"
             )
         is_even = EVEN in self.also and not self.obstacle(EVEN, model)

@@ -4,7 +4,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from adaptune.report.tables import Listing
-from adaptune.study.study import EQUAL_COST, MIN_RECORDINGS, RIVAL_WORDS, RIVALS, WORTH, is_worth
+from adaptune.study.config import WORTH
+from adaptune.study.study import EQUAL_COST, MIN_RECORDINGS, RIVAL_WORDS, RIVALS, is_worth
 from online.modes import EVEN
 from online.statistics import (
     ALL,
@@ -214,22 +215,23 @@ _ONE_SET = ("baseline", "fixed", "best_default")
 """Modes that drive one set; those that cost less first."""
 
 
-def decided(rows: Sequence[ComparisonRow]) -> ComparisonRow | None:
+def decided(rows: Sequence[ComparisonRow], worth: float = WORTH) -> ComparisonRow | None:
     """What to drive: the one set with the least error, or what is worth its cost.
 
-    The rows over all sequences come last. None if no test sequence has a reference.
+    The rows over all sequences come last. None if no test sequence has a reference. `worth` is the
+    share of the error that adapting has to spare.
     """
     last = {row.mode: row for row in _last(rows) if row.ratio is not None}
     if not last:
         return None
     one = min((last[m] for m in _ONE_SET if m in last), key=lambda row: _ratio(row).value)
-    worth = [one]
+    candidates = [one]
     for mode in ("adaptive", "untrained", EQUAL_COST):
         if (row := last.get(mode)) is not None:
             ratio = _to(row, one)
-            if ratio.interval is not None and is_worth(ratio.value, ratio.interval[1]):
-                worth.append(row)
-    return min(worth, key=lambda row: _ratio(row).value)
+            if ratio.interval is not None and is_worth(ratio.value, ratio.interval[1], worth):
+                candidates.append(row)
+    return min(candidates, key=lambda row: _ratio(row).value)
 
 
 def _to(row: ComparisonRow, one: ComparisonRow) -> Ratio:
@@ -245,7 +247,9 @@ def adapting(rows: Sequence[ComparisonRow]) -> ComparisonRow | None:
     return next((last[mode] for mode in ("adaptive", "untrained") if mode in last), None)
 
 
-def verdict(rows: Sequence[ComparisonRow], length: float, obstacle: str = "") -> list[str]:
+def verdict(
+    rows: Sequence[ComparisonRow], length: float, obstacle: str = "", worth: float = WORTH
+) -> list[str]:
     """What to do, and why, in at most three sentences.
 
     Parameters
@@ -256,9 +260,11 @@ def verdict(rows: Sequence[ComparisonRow], length: float, obstacle: str = "") ->
         Metres of a sub-trajectory.
     obstacle
         Why nothing adapts, if nothing does.
+    worth
+        Share of the error that adapting has to spare.
     """
     last = {row.mode: row for row in _last(rows)}
-    if (best := decided(rows)) is None:
+    if (best := decided(rows, worth)) is None:
         nobody = "No test sequence has a reference: nobody can say what was gained."
         return [nobody, *_estimates(rows)[:2]]
     main = adapting(rows)
@@ -275,7 +281,7 @@ def verdict(rows: Sequence[ComparisonRow], length: float, obstacle: str = "") ->
         said += f"{errors[best.mode]}{f' instead of {instead},' if instead else ''} {where}"
     if best.mode not in _ONE_SET:
         return [f"{said}.", f"It has {_times(best)}{_for_cost(best, last[best.yardstick])}."]
-    return [f"{said}{_doubt(best, last)}.", *_why_not(main, best, rows, obstacle)]
+    return [f"{said}{_doubt(best, last)}.", *_why_not(main, best, rows, obstacle, worth)]
 
 
 def _doubt(best: ComparisonRow, last: Mapping[str, ComparisonRow]) -> str:
@@ -295,7 +301,11 @@ def _for_cost(main: ComparisonRow, one: ComparisonRow) -> str:
 
 
 def _why_not(
-    main: ComparisonRow | None, best: ComparisonRow, rows: Sequence[ComparisonRow], obstacle: str
+    main: ComparisonRow | None,
+    best: ComparisonRow,
+    rows: Sequence[ComparisonRow],
+    obstacle: str,
+    worth: float,
 ) -> list[str]:
     """Why not to adapt."""
     if main is None:
@@ -305,7 +315,7 @@ def _why_not(
     ratio = _to(main, best)
     cost = _for_cost(main, best)
     has = f"{ratio.value:.2f} times its error ({_interval(ratio)}){cost}"
-    if ratio.value <= 1.0 - WORTH:
+    if ratio.value <= 1.0 - worth:
         more = "drive more test recordings, or longer ones, to know"
         return [f"Adapting had {has}, which may be chance: {more}."]
     what = "is not worth its cost" if ratio.value <= 1.0 else "did worse"

@@ -32,6 +32,8 @@ def _file_name(name: str) -> str:
 
 Name = Annotated[str, AfterValidator(_file_name)]
 """Becomes the name of a file."""
+WORTH = 0.1
+"""Share of the error that a bank has to spare, surely, to be worth its CPU time."""
 
 
 class OdometryConfig(StrictModel):
@@ -161,7 +163,8 @@ class OnlineConfig(StrictModel):
     """How to replay: seconds between selections, modes, switching, and what it may cost.
 
     `modes` are replayed besides baseline, fixed set and rivals; `all` of them is a choice, too.
-    The budget is in milliseconds of CPU time a scan, all members and live evidence together.
+    The budget is in milliseconds of CPU time a scan, all members and live evidence together; a
+    bank has to spare the share `worth` of the error to be driven.
     Without `real_time`, a replay is as fast as it goes and always the same.
     """
 
@@ -172,6 +175,7 @@ class OnlineConfig(StrictModel):
     )
     switching: SwitchingConfig = SwitchingConfig()
     budget: float | None = Field(None, gt=0, le=1e6)
+    worth: float = Field(WORTH, ge=0, le=1)
     real_time: RealTimeConfig | None = None
     ros: RosConfig = RosConfig()
 

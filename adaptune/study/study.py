@@ -483,13 +483,14 @@ PER_STRETCH = 4
 """Sub-trajectories of a stretch, the unit of evidence."""
 MIN_RECORDINGS = 6
 """With as many, whole recordings are left out; with fewer, stretches of them."""
-WORTH = 0.1
-"""Share of the error that a bank has to spare, surely, to be worth its CPU time."""
 
 
-def is_worth(ratio: float, high: float) -> bool:
-    """Whether a ratio of errors, whose 95 % interval ends at `high`, is worth the CPU time."""
-    return ratio <= 1.0 - WORTH and high < 1.0
+def is_worth(ratio: float, high: float, worth: float) -> bool:
+    """Whether a ratio of errors, whose 95 % interval ends at `high`, is worth the CPU time.
+
+    It is if it surely spares some of the error, and about the share `worth`.
+    """
+    return ratio <= 1.0 - worth and high < 1.0
 
 
 BANK, ONE_SET = "bank", "one set"

@@ -2,7 +2,6 @@ from dataclasses import replace
 
 import pytest
 
-from online.compare import ComparedReplays
 from online.statistics import ALL, ORACLE, ComparisonRow, Ratio
 from online.tables import decided, remarks, verdict
 
@@ -38,6 +37,9 @@ def test_adapting_is_advised_where_it_is_worth_its_cost():
 
 @pytest.mark.parametrize(("ratio", "interval"), [(0.93, "0.90 to 0.96"), (1.3, "1.26 to 1.34")])
 def test_one_set_is_advised_where_adapting_is_not(ratio, interval):
+    assert verdict(cheap(adaptive=ratio), 10.0, worth=0.05)[0].startswith(
+        "Drive adaptive" if ratio < 0.95 else "Drive the fixed set"
+    )
     assert verdict(cheap(adaptive=ratio), 10.0) == [
         "Drive the fixed set: 1.000 % instead of 1.500 % with the odometry's own parameters, RTE "
         "over 10 m, on 12 test sequences.",
@@ -135,7 +137,9 @@ def test_the_verdict_of_a_study_without_a_model_goes_by_the_baseline():
     first, second = verdict(rows, 10.0)
     assert first.startswith("Drive the untrained bank: 0.800 % instead of 1.000 % with the")
     assert second == "It has 0.80 times the baseline's error (95 % interval 0.78 to 0.82)."
-    assert ComparedReplays(rows, [], []).advised == "untrained"
+    best = decided(rows)
+    assert best is not None
+    assert best.mode == "untrained"
     alone = [row for row in rows if row.mode == "baseline"]
     assert verdict(alone, 10.0) == [
         "Keep the odometry's own parameters: 1.000 % RTE over 10 m, on 12 test sequences."
@@ -150,7 +154,6 @@ def test_nothing_is_said_where_nothing_is_known():
     assert verdict(rows, 10.0) == [nobody]
     assert remarks(rows) == []
     assert decided(rows) is None
-    assert ComparedReplays(rows, [], []).advised == ""
     oracle = ComparisonRow(ALL, ORACLE, 0.5, 0.5, 0, 0, 0)
     assert not any(ORACLE in said for said in verdict([*every(adaptive=0.7), oracle], 10.0))
 
