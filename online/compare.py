@@ -426,8 +426,8 @@ def compare(study: Study) -> ComparedReplays:
     rows = _rows(judged, oracles)
     obstacle = "" if ADAPTIVE in modes else ReplaySetup.of(study).obstacle(ADAPTIVE, model)
     said = wrong[:1] or _lost(study, judged, rows)
-    worth = study.config.online.worth
-    said += verdict(rows, study.config.sub_trajectory, obstacle, worth)
+    length, worth = study.config.sub_trajectory, study.config.online.worth
+    said += verdict(rows, length, obstacle, worth)
     details = [
         *wrong,
         *remarks(rows),
@@ -438,10 +438,8 @@ def compare(study: Study) -> ComparedReplays:
     details += _without_oracle(judged, oracles) if model is not None else []
     folder = study.folder / "comparison"
     report.write_rows(folder, "comparison", [row.columns() for row in rows])
-    made = tables(rows, study.config.sub_trajectory)
-    report.write_tables(folder, study.name, made, [*said, *details])
-    best = decided(rows, worth)
-    advised = "" if best is None else best.mode
+    report.write_tables(folder, study.name, tables(rows, length), [*said, *details])
+    advised = "" if (best := decided(rows, worth)) is None else best.mode
     return ComparedReplays(rows, said, details, advised, compared.unfinished)
 
 

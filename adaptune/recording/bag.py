@@ -338,6 +338,11 @@ class BagSource:
                 f"short, repair it first (`rosbag reindex`, `ros2 bag reindex` or `mcap recover`)"
             ) from error
         try:
+            if not all(isinstance(c.msgcount, int) for c in reader.connections):
+                what = (
+                    "metadata.yaml counts messages in what are no numbers; run `ros2 bag reindex`"
+                )
+                raise SequenceError(f"{self.name}: {what}")
             yield reader
         finally:
             reader.close()
