@@ -234,6 +234,7 @@ class Lockstep(Faulting):
         self._n_shown = self._n_answered = 0  # since its first pose
         self._shown = (prepared.stamp, -np.inf)
         self._late: int | None = None
+        self._steady = True  # whether all poses are as late as the first one
         self._before: tuple[int, Poses] | None = None
         begin = time.monotonic()
         try:
@@ -410,7 +411,9 @@ class Lockstep(Faulting):
     def _at_scan(self, stamp: int, T_own_sensor: Poses) -> Poses:
         """The pose at the scan's stamp, if the system gives that at the scan's end."""
         before, self._before = self._before, (stamp, T_own_sensor)
-        if before is None or not before[0] <= self._stamp < stamp:
+        # Stamps of a clock say nothing.
+        self._steady &= abs(stamp - self._stamp - (self._late or 0)) < _MAX_SCATTER
+        if before is None or not before[0] <= self._stamp < stamp or not self._steady:
             return T_own_sensor
         both = Trajectory(np.array([before[0], stamp]), np.stack([before[1], T_own_sensor]))
         T: Poses = both.at(np.array([self._stamp], np.int64), 1e9)[0]
