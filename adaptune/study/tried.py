@@ -6,7 +6,6 @@ from contextlib import closing
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
-from textwrap import indent
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -41,10 +40,9 @@ class Tried(NamedTuple):
     cpu: float  # cores
 
     @property
-    def late(self) -> NDArray[np.float64]:
+    def late(self) -> NDArray[Any]:
         """Seconds by which poses have later stamps than their scans, of shape (m,)."""
-        late: NDArray[np.float64] = 1e-9 * (self.stamps - self.of_scans)
-        return late
+        return 1e-9 * (self.stamps - self.of_scans)
 
     @property
     def by_clock(self) -> bool:
@@ -62,7 +60,7 @@ class Tried(NamedTuple):
             "first pose after [s]": 1e-9 * (self.of_scans[0] - begin) if len(self.late) else None,
             "poses per scan": len(self.stamps) / self.n_scans,
             "stamps": ("a clock's" if self.by_clock else of_scan) if len(self.late) else None,
-            "lag [s]": late if self.by_clock else self.lag,
+            "lag [s]": late if self.by_clock and self.lag is None else self.lag,
             "CPU of a second [s]": self.cpu,
             "fits": "no" if self.fault else "yes",
         }
@@ -90,19 +88,19 @@ def try_system(study: Study, progress: Progress) -> tuple[list[str], list[dict[s
         imu = settings.imu or given.imu or None
         own = {"points": settings.points or given.points, "imu": imu}
         bag = {"play": "bag", "node": None, "set_parameter": None, "rate": settings.rate or 1.0}
-        progress("with play: bag,", 0, 2)
+        progress("played bag", 0, 2)
         played = factory.changed(
             settings=settings.model_copy(update=bag), program_input=lambda _: given
         )
         by_bag = _tried("bag", played(None, name), given)
-        progress("with play: lockstep,", 1, 2)
+        progress("lockstep", 1, 2)
         one_by_one = factory.changed(
             settings=settings.model_copy(update={"play": "lockstep"} | own), program_input=None
         )
         sequences = replace(study.sequences, with_imu=imu is not None)
         scans = list(islice(sequences.open(name), len(given.stamps)))
         stepped = _tried("lockstep", one_by_one(None, name), given, scans)
-        progress("with play: lockstep,", 2, 2)
+        progress("lockstep", 2, 2)
     rows = [tried.row(int(given.stamps[0])) for tried in (by_bag, stepped)]
     return _advice(by_bag, stepped, own, settings), rows
 
@@ -128,14 +126,16 @@ def first_seconds(given: ProgramInput, path: Path) -> ProgramInput:
 
 def _tried(play: str, odometry: Any, given: ProgramInput, scans: Sequence[Scan] = ()) -> Tried:
     """Run on a bag, or on scans, one after the other."""
-    at, stamps, of_scans, lags, fault = given.stamps, [], [], [], None
+    at, lags, fault = given.stamps, [], None
+    stamps: list[int] = []
+    of_scans: list[int] = []
     with closing(odometry):
         try:
             if not scans:
                 odometry.start(at[0], np.eye(4))
                 stamps = odometry.pose_stamps.tolist()
                 before = np.searchsorted(at, stamps, "right").clip(1) - 1
-                of_scans = at if len(stamps) == len(at) else at[before]
+                of_scans = (at if len(stamps) == len(at) else at[before]).tolist()
             for i, scan in enumerate(scans):
                 if i == 0:
                     odometry.start(scan, np.eye(4))
@@ -175,12 +175,8 @@ def _advice(bag: Tried, stepped: Tried, own: dict[str, Any], settings: Any) -> l
         words["patience"] = round(5.0 * (stepped.lag or 0.0), 1)
     if chosen.by_clock and settings.use_sim_time is None:
         words["use_sim_time"] = True
-    written = ", ".join(
-        f"{key}: {str(value).lower() if value is True else value}"
-        for key, value in words.items()
-        if value
-    )
+    lines = "".join(f"\n    {files.dump({k: v}).strip()}" for k, v in words.items() if v)
     why = "nothing is lost, and it can adapt" if chosen is stepped else "lockstep does not fit"
-    said = [f"Write under odometry.settings, as {why}:\n{indent(written.rstrip(), '    ')}"]
+    said = [f"Write under odometry.settings, as {why}:{lines}"]
     other = stepped if chosen is bag else bag
     return said + ([f"With play: {other.play}: {other.fault}"] if other.fault else [])

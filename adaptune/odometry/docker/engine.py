@@ -33,7 +33,7 @@ _SIGNALS = {int(one) for one in signal.Signals}
 _PERIOD = 100_000
 """Microseconds over which the use of cores is counted."""
 _WEIGHT = 10 * 1024
-"""Of a core's use against that of other processes: at any load, a system has the cores it may use."""
+"""Of a core against other processes: at any load, a system has the cores that it may use."""
 _MOST_WRITTEN = 4 * 1024**3
 """Bytes of a file; a process that writes more gets SIGXFSZ."""
 _TAIL = 50
