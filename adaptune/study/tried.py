@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag1 import Writer
 
+from adaptune import files
 from adaptune.errors import OdometryError, UnavailableError
 from adaptune.files import temporary_folder
 from adaptune.odometry.program import ProgramInput
