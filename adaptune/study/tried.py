@@ -103,7 +103,7 @@ def try_system(study: Study, progress: Progress) -> tuple[list[str], list[dict[s
         stepped = _tried("lockstep", one_by_one(None, name), given, scans)
         progress("lockstep", 2, 2)
     rows = [tried.row(int(given.stamps[0])) for tried in (by_bag, stepped)]
-    return _advice(by_bag, stepped, own, settings), rows
+    return advice(by_bag, stepped, own, settings), rows
 
 
 def first_seconds(given: ProgramInput, path: Path) -> ProgramInput:
@@ -162,7 +162,7 @@ def _tried(play: str, odometry: Any, given: ProgramInput, scans: Sequence[Scan] 
     return Tried(play, fault, odometry.start_seconds, len(at), *of, lag, cpu)
 
 
-def _advice(bag: Tried, stepped: Tried, own: dict[str, Any], settings: Any) -> list[str]:
+def advice(bag: Tried, stepped: Tried, own: dict[str, Any], settings: Any) -> list[str]:
     """The decision, the settings that follow, and what goes wrong in the other way."""
     if bag.fault and stepped.fault:
         raise OdometryError(

@@ -36,14 +36,14 @@ def settings(**given):
 )
 def test_the_decision_and_the_settings_that_follow(bag, lockstep, written):
     given = found("bag", **bag), found("lockstep", **lockstep)
-    said = tried._advice(*given, OWN, settings())
+    said = tried.advice(*given, OWN, settings())
     assert said[0].endswith(written)
     assert said[1:] == [f"With play: {one.play}: no" for one in given if one.fault]
 
 
 def test_neither_way_is_one_sentence():
     with pytest.raises(OdometryError, match="in no way of playing; bag: none; lockstep: dead"):
-        tried._advice(found("bag", "none"), found("lockstep", "dead"), OWN, settings())
+        tried.advice(found("bag", "none"), found("lockstep", "dead"), OWN, settings())
 
 
 @pytest.mark.parametrize(
