@@ -17,7 +17,7 @@ from offline.config import load_study
 
 MANNERS = {
     "late": {"late": 2},
-    "own clock": {"own_clock": 0.3},
+    "own clock": {"own_clock": 0.1},
     "background": {"background": 0.005},
     "own layout": {"layout": ["x", "y", "z"]},
     "slow start": {"ready_delay": 2.0},
