@@ -448,7 +448,7 @@ class OfflineConfig(StrictModel):
     workers: int | None = Field(None, ge=1, le=256)
     objective: Annotated[_Weighted, BeforeValidator(_weighted)] = Field({"rte": 1.0})
     limits: dict[Metric, Limit] = Field(default_factory=dict)
-    runs: Literal["restart", "whole"] = "restart"
+    runs: Literal["restart", "whole"] | None = None  # see `OfflineStudyConfig.runs`
     repeats: int = Field(1, ge=1, le=100)
     baseline_runs: int | None = Field(None, ge=1, le=1000)
     augment: Annotated[tuple[ViewConfig, ...], Field(max_length=MOST_VIEWS)] = ()
@@ -525,6 +525,15 @@ class OfflineStudyConfig(StudyConfig):
             views[f"{view.name}{same + 1}" if same else view.name] = view
         return views
 
+    @property
+    def runs(self) -> Literal["restart", "whole"]:
+        """What a trial does where it loses track: a start in a new container costs too much."""
+        costly = any(
+            one.name == "rustle" and one.settings.get("play") == "lockstep"
+            for one in self.odometries.values()
+        )
+        return self.offline.runs or ("whole" if costly else "restart")
+
     def mistakes(self, space: ParameterSpace | None) -> Iterable[Mistake]:
         """See `StudyConfig.mistakes`."""
         return (mistake.below(("offline",)) for mistake in self.offline.mistakes(space))
@@ -532,6 +541,7 @@ class OfflineStudyConfig(StudyConfig):
     def resolved(self) -> dict[str, Any]:
         """See `StudyConfig.resolved`."""
         resolved, offline = super().resolved(), self.offline
+        resolved["offline"]["runs"] = self.runs
         if settings := SETTINGS.get(offline.sampler):
             given = settings.model_validate(offline.sampler_settings)
             whole = given.model_dump(mode="json", exclude_none=True)

@@ -250,6 +250,11 @@ def trial_workers(
     n = config.workers or available()
     where = cluster or f"{n} worker{'s' if n > 1 else ''}"
     _log.info("trials run on %s; each sequence is prepared before its first one", where)
+    if config.runs is None and study.config.runs == "whole":
+        _log.info(
+            "a start takes a new container, so trials run on where they lose track "
+            "(offline.runs: whole)"
+        )
     odometry = study.odometry.changed(user_code=True)
     setup = TrialSetup(TrialSettings.of(study.config), odometry, study.sequences)
     memory = 0.25 * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
