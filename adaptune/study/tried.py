@@ -37,7 +37,7 @@ class Tried(NamedTuple):
     n_scans: int
     stamps: NDArray[np.int64]  # of the poses, and of the scans that they are of: both of shape (m,)
     of_scans: NDArray[np.int64]
-    lag: float | None  # seconds from a scan to its pose
+    lag: float | None  # seconds from a scan to its pose; None for a bag
     cpu: float  # cores
 
     @property
@@ -61,7 +61,7 @@ class Tried(NamedTuple):
             "first pose after [s]": 1e-9 * (self.of_scans[0] - begin) if len(self.late) else None,
             "poses per scan": len(self.stamps) / self.n_scans,
             "stamps": ("a clock's" if self.by_clock else of_scan) if len(self.late) else None,
-            "lag [s]": late if self.by_clock and self.lag is None else self.lag,
+            "lag [s]": self.lag,
             "CPU of a second [s]": self.cpu,
             "fits": "no" if self.fault else "yes",
         }
