@@ -2,7 +2,6 @@
 
 import json
 import logging
-import operator
 import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -13,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune import files, manifest
+from adaptune import manifest
 from adaptune.errors import AdaptuneError, nearest
 from adaptune.files import DAMAGED_NPZ, needing_room, replacing, write_text
 from adaptune.geometry import Poses
@@ -547,19 +546,11 @@ def _read(path: Path, names: Sequence[str] | None = None) -> dict[str, NDArray[A
         raise _damaged(path, error) from error
 
 
-# The table of the trials in a study's archive: sort, filter and export it.
+# The table of the trials in a study's archive: sort and export it.
 
 
 Row = dict[str, Any]
 
-_OPERATORS: dict[str, Callable[[Any, Any], bool]] = {
-    "<=": operator.le,
-    ">=": operator.ge,
-    "==": operator.eq,
-    "!=": operator.ne,
-    "<": operator.lt,
-    ">": operator.gt,
-}
 _COLUMN = {"rte": "mean"}
 """Columns that have another name in a study's objectives."""
 _HEADINGS = {
@@ -574,11 +565,10 @@ _HEADINGS = {
     FIRST_POSE: "first pose after [s]",
 }
 """Columns as a table for reading names them."""
-_CONDITION = re.compile(r"\s*([\w.-]+)\s*(<=|>=|==|!=|<|>)\s*(.*?)\s*")
 
 
 class TrialsError(AdaptuneError):
-    """A condition or a column that is not valid."""
+    """A column that there is not."""
 
 
 def rows(archive: Archive, names: Sequence[str]) -> list[Row]:
@@ -619,38 +609,21 @@ def _mean(values: Sequence[float | None]) -> float | None:
     return float(np.mean(known)) if len(known) == len(values) else None
 
 
-def select(
-    table: Sequence[Row],
-    where: Sequence[str] = (),
-    sort: str | None = None,
-    top: int | None = None,
-) -> list[Row]:
-    """The first `top` rows that meet all conditions, in order.
+def select(table: Sequence[Row], sort: str | None = None, top: int | None = None) -> list[Row]:
+    """The first `top` rows, in the order of a column.
 
-    A condition, as ``mean < 1``, is a column, one of ``< <= > >= == !=``, and a value in YAML. With
-    ``-`` before the column to sort by, the largest value comes first; unknown values come last.
+    With ``-`` before the column, the largest value comes first; unknown values come last.
     """
-    chosen = list(table)
-    for condition in where:
-        option = f"--where {condition!r}"
-        match = _CONDITION.fullmatch(condition)
-        if match is None:
-            help_ = "give a column, one of < <= > >= == !=, and a value, as in 'mean < 1'"
-            raise TrialsError(f"{option}: {help_}")
-        name, sign, text = match.groups()
-        try:
-            value = files.scalar(text)
-        except files.YamlError as error:
-            raise TrialsError(f"{option}: {error}") from error
-        column = _column(chosen, name, option)
-        chosen = [row for row in chosen if _meets(row[column], sign, value, option)]
-    if sort is not None:
-        column = _column(chosen, sort.removeprefix("-"), f"--sort {sort}")
-        known = [row for row in chosen if row[column] is not None]
-        unknown = [row for row in chosen if row[column] is None]
-        known.sort(key=lambda row: row[column], reverse=sort.startswith("-"))
-        chosen = known + unknown
-    return chosen[:top]
+    if sort is None:
+        return list(table[:top])
+    name = sort.removeprefix("-")
+    column = _COLUMN.get(name, name)
+    if table and column not in table[0]:
+        known = nearest(column, table[0])
+        raise TrialsError(f"--sort {sort}: there is no column {column!r}: {known}")
+    chosen = [row for row in table if row[column] is not None]
+    chosen.sort(key=lambda row: row[column], reverse=sort.startswith("-"))
+    return [*chosen, *(row for row in table if row[column] is None)][:top]
 
 
 def with_units(table: Sequence[Row], names: Sequence[str], labels: Mapping[str, str]) -> list[Row]:
@@ -672,20 +645,6 @@ def _short(row: Row) -> Row:
     short = {"trial": row["trial"], ODOMETRY: parameters.pop(ODOMETRY)}
     short["parameters"] = in_words(parameters)
     return short | {key: row[key] for key in keys[last:]}
-
-
-def _column(table: Sequence[Row], name: str, option: str) -> str:
-    column = _COLUMN.get(name, name)
-    if table and column not in table[0]:
-        raise TrialsError(f"{option}: there is no column {column!r}: {nearest(column, table[0])}")
-    return column
-
-
-def _meets(given: Any, sign: str, value: Any, option: str) -> bool:
-    try:
-        return given is not None and _OPERATORS[sign](given, value)
-    except TypeError as error:
-        raise TrialsError(f"{option}: {given!r} and {value!r} cannot be compared") from error
 
 
 def export(archive: Archive, names: Sequence[str], numbers: Sequence[int], folder: Path) -> int:

@@ -70,9 +70,12 @@ def replacing(path: Path) -> Iterator[Path]:
     """Write a temporary file and rename it into place when the block ends well.
 
     The block receives an unused name in the same folder, which is made if needed, with the same
-    suffix. The file there replaces `path` in one step. It is removed if the block raises. See
-    `needing_room`.
+    suffix. The file there replaces `path` in one step. It is removed if the block raises. A device
+    or a pipe, such as ``/dev/null``, is written to instead. See `needing_room`.
     """
+    if path.exists() and not path.is_file() and not path.is_dir():
+        yield path
+        return
     with needing_room(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         handle, name = tempfile.mkstemp(path.suffix, f".{path.stem}.", path.parent)

@@ -246,7 +246,7 @@ def lost_in_words(
 
 
 def bootstrap(
-    errors: NDArray[np.float64], fixed: NDArray[np.float64], block: int, seed: int = 0
+    errors: NDArray[np.float64], fixed: NDArray[np.float64], block: int
 ) -> tuple[tuple[float, float], tuple[float, float]] | None:
     """95 % intervals of the mean error, and of its ratio to the fixed set's.
 
@@ -260,8 +260,6 @@ def bootstrap(
         Percent, of the same frames, of shape (n,).
     block
         Frames drawn together.
-    seed
-        Of the resampling.
 
     Returns
     -------
@@ -270,7 +268,7 @@ def bootstrap(
     """
     if len(errors) < MIN_BLOCKS * block:
         return None
-    means = resampled_means(np.stack([errors, fixed]), block, np.random.default_rng(seed))
+    means = resampled_means(np.stack([errors, fixed]), block, np.random.default_rng(0))
     ratios = means[0] / np.maximum(means[1], 1e-12)
     (low, high), (ratio_low, ratio_high) = np.percentile([means[0], ratios], [2.5, 97.5], axis=1).T
     return (float(low), float(high)), (float(ratio_low), float(ratio_high))

@@ -165,7 +165,8 @@ def how_it_ended(code: int) -> str:
         return f"its process ended with code {code}"
     known = -code in set(signal.Signals)
     by = signal.Signals(-code).name if known else f"signal {-code}"
-    return f"its process was ended by {by}"
+    why = " (it wrote too large a file)" if -code == signal.SIGXFSZ else ""
+    return f"its process was ended by {by}{why}"
 
 
 def last_lines(output: BinaryIO) -> str:

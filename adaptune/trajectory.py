@@ -1,4 +1,4 @@
-"""Trajectories, and their files in the TUM, KITTI, EuRoC and OXTS formats.
+"""Trajectories, and their files in the TUM, KITTI and EuRoC formats.
 
 All readers raise a TrajectoryError that names the file and the line that is not a pose, or whose
 stamp lies before the one before it.
@@ -96,15 +96,6 @@ def _lines(path: Path) -> Iterator[tuple[int, str, list[str]]]:
     for number, line in enumerate(text.splitlines(), start=1):
         if line := line.strip().rstrip(",; "):
             yield number, line, [] if line[0] == "#" else re.split(r"\s*[,;]\s*|\s+", line)
-
-
-def _rows(path: Path, columns: int, kind: str, or_more: bool = False) -> list[Row]:
-    rows = _table(path)[1]
-    for number, fields in rows:
-        if len(fields) != columns and not (or_more and len(fields) > columns):
-            what = f"a {kind} line has {columns} numbers, this has {len(fields)}"
-            raise TrajectoryError(f"{path}, line {number}: {what}")
-    return [(number, fields[:columns]) for number, fields in rows]
 
 
 def _numbers(path: Path, rows: list[Row]) -> NDArray[np.float64]:
@@ -257,7 +248,12 @@ def tum_lines(stamps: NDArray[np.int64], T_world_sensor: Poses) -> list[str]:
 
 def read_kitti(path: Path) -> Poses:
     """Read poses, of shape (n, 4, 4), from lines of 12 numbers, the rows of a 3x4 matrix."""
-    values = _numbers(path, _rows(path, 12, "KITTI"))
+    rows = _table(path)[1]
+    for number, fields in rows:
+        if len(fields) != 12:
+            what = f"a KITTI line has 12 numbers, this has {len(fields)}"
+            raise TrajectoryError(f"{path}, line {number}: {what}")
+    values = _numbers(path, rows)
     T = np.tile(np.eye(4), (len(values), 1, 1))
     T[:, :3] = values.reshape(-1, 3, 4)
     return T
@@ -273,30 +269,3 @@ def is_kitti(path: Path) -> bool:
     """Whether a file's first pose has 12 numbers, and no stamp."""
     first: list[str] = next((fields for *_, fields in _lines(path) if fields), [])
     return path.suffix != ".csv" and len(first) == 12 and bool(_NUMBER.match(first[0]))
-
-
-_EARTH_RADIUS = 6378137.0
-
-
-def read_oxts(files: list[Path]) -> Poses:
-    """Poses of a GPS/IMU from KITTI's OXTS files, one a file.
-
-    Latitude, longitude, altitude (degrees, metres), roll, pitch and yaw (radians) are mapped by a
-    Mercator projection true at the first file's latitude; the first position is the origin. Poses
-    are of shape (n, 4, 4); x points east, y north and z up.
-    """
-    from scipy.spatial.transform import Rotation
-
-    values = np.empty((len(files), 6))
-    for i, path in enumerate(files):
-        values[i] = _numbers(path, _rows(path, 6, "OXTS", or_more=True))[0]
-    latitude, longitude, altitude = values[:, :3].T
-    if np.any(np.abs(latitude) >= 90.0):
-        raise TrajectoryError(f"{files[int(np.argmax(np.abs(latitude)))]}: no such latitude")
-    scale = np.cos(np.deg2rad(latitude[0])) * _EARTH_RADIUS
-    north = scale * np.log(np.tan(np.deg2rad(90.0 + latitude) / 2.0))
-    position = np.column_stack([scale * np.deg2rad(longitude), north, altitude])
-    T = np.tile(np.eye(4), (len(files), 1, 1))
-    T[:, :3, :3] = Rotation.from_euler("ZYX", values[:, [5, 4, 3]]).as_matrix()
-    T[:, :3, 3] = position - position[0]
-    return T

@@ -6,7 +6,7 @@ The script sends SIGKILL to a driver or to one of its two workers, with equal ch
 a random number of trials has finished since the last kill. Then it starts the driver again.
 Whenever a driver has ended, no finished trial may be missing or written again. At the end archive,
 model and fixed set must equal those of the undisturbed campaign byte for byte, except for times,
-with every trial once in the index and in Optuna's journal. Fifty kills take several campaigns.
+with every trial once in the index. Fifty kills take several campaigns.
 """
 
 import sys

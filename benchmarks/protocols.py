@@ -29,12 +29,13 @@ import numpy as np
 from adaptune.geometry import Poses, invert
 from adaptune.recording.compensation import compensate
 from adaptune.recording.config import SequenceConfig
-from adaptune.recording.export import T_CAMERA_LIDAR, write_kitti_poses, write_kitti_sequence
+from adaptune.recording.export import write_kitti_sequence
 from adaptune.recording.folder import ELEVATION, turn_up
 from adaptune.recording.recording import open_sequence
 from adaptune.recording.scan import Scan, read_part
 from adaptune.simulation import Course
-from adaptune.simulation.record import Drive, record, standing
+from adaptune.simulation.record import Drive, SimulatedScan, record
+from adaptune.trajectory import write_kitti
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 
@@ -93,6 +94,17 @@ def simulate_kitti(root: Path, metres: float = 150.0) -> None:
         write_sequence(root, name, lowered)
 
 
+def standing(drive: Drive, scan: SimulatedScan) -> Scan:
+    """A scan as KITTI has it: undistorted to the scan's start, intensities from 0 to 1."""
+    assert scan.times is not None
+    times, column = np.unique(scan.times, return_inverse=True)
+    T_world_column = drive.ride.poses((scan.stamp - drive.stamps()[0]) * 1e-9 + times.astype(float))
+    T = (invert(scan.T_world_sensor) @ T_world_column)[column]
+    points = np.einsum("nij,nj->ni", T[:, :3, :3], scan.points) + T[:, :3, 3]
+    light = scan.intensities / np.float32(255.0)
+    return Scan(scan.stamp, points.astype(np.float32), intensities=light)
+
+
 def convert_drives(root: Path) -> None:
     """Parts of the recorded drives, undistorted by the car's own poses, as KITTI's clouds are."""
     for name, (drive, part) in PARTS.items():
@@ -129,8 +141,10 @@ def write_sequence(root: Path, name: str, scans: Iterable[tuple[Scan, Poses]]) -
         (root / kind).mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=".making.", dir=root) as made:
         new = Path(made)
-        write_kitti_sequence(seen(), new, name, T_CAMERA_LIDAR)
-        write_kitti_poses(np.array(T_world_lidar), new, name, T_CAMERA_LIDAR)
+        write_kitti_sequence(seen(), new, name)
+        write_kitti(
+            new / "poses" / f"{name}.txt", invert(T_world_lidar[0]) @ np.array(T_world_lidar)
+        )
         # The scans last: a sequence that is there has its poses.
         for file in (f"poses/{name}.txt", f"sequences/{name}"):
             (new / file).rename(root / file)

@@ -135,7 +135,7 @@ def main(folder: Path, hours: float) -> None:
     megabytes: list[float] = []
     begin = time.perf_counter()
 
-    def look(_: str, __: int, at: ReplayRecord) -> None:
+    def watch(at: ReplayRecord) -> None:
         robot.free.release()
         if at.done % round(EVERY * RATE) == 0:
             seconds.append(at.done / RATE)
@@ -148,7 +148,7 @@ def main(folder: Path, hours: float) -> None:
         if at.done == n:
             drive.stop()
 
-    driven = drive.run(robot, look)
+    driven = drive.run(robot, watch)
     late = len(seconds) // 4
     slope = 3600.0 * np.polyfit(seconds[late:], megabytes[late:], 1)[0]
     print(f"{driven.scans} scans; {slope:+.1f} MB an hour over the last three quarters (limit 5)")

@@ -6,7 +6,6 @@ Science, 1983. It differs from RUSTLE: steps beyond a bound are reflected instea
 are divided by `energy_scale`, and there are log scales, categories and several chains.
 """
 
-import copy
 import math
 from collections.abc import Mapping
 from operator import itemgetter
@@ -127,8 +126,6 @@ class AnnealingSampler(BaseSampler):
         self.n_startup_trials = n_startup_trials
         self.seed = seed
         self._space = IntersectionSearchSpace()
-        # Name of the study, numbers of its finished trials, and the chains after them.
-        self._walked: tuple[str, list[int], list[Chain]] = "", [], []
 
     def infer_relative_search_space(
         self,
@@ -187,23 +184,14 @@ class AnnealingSampler(BaseSampler):
             (t.number, t.params, sign * (t.value or 0.0))
             for t in sorted(finished, key=lambda t: t.number)
         ]
-        numbers = [number for number, *_ in trials]
-        name, walked, chains = self._walked
-        if (
-            name != study.study_name
-            or numbers[: len(walked)] != walked  # one finished after those that follow it
-            or len(walked) < self.n_startup_trials  # the chains begin with the best of them
-        ):
-            walked = [number for number in numbers if number < self.n_startup_trials]
-            chains = self._started(trials[: len(walked)])
-        chains = [copy.copy(chain) for chain in chains]
+        startup = [trial for trial in trials if trial[0] < self.n_startup_trials]
+        chains = self._started(startup)
         scale = self.settings.energy_scale or next(
             (abs(energy) for *_, energy in trials if energy and math.isfinite(energy)), 1.0
         )
-        for number, params, energy in trials[len(walked) :]:
+        for number, params, energy in trials[len(startup) :]:
             u = self._rng(number).random()
             chains[number % len(chains)].step(params, energy, scale, u)
-        self._walked = study.study_name, numbers, chains
         return chains
 
     def _started(self, startup: list[_Trial]) -> list[Chain]:

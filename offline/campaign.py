@@ -16,7 +16,7 @@ from adaptune.space import ParameterSet, PooledSpace
 from adaptune.study.references import contradictions_of
 from offline.config import OfflineConfig, OfflineStudy
 from offline.objective import Verdict, best_by_trials, judge, label, mean_value, weighted
-from offline.search import Clock, Finished, Mirror, MirrorRow, assess, make_searches, rungs
+from offline.search import Clock, assess, make_searches, rungs
 from offline.workers import Pool, Task, TaskResult, run
 
 _log = logging.getLogger(__name__)
@@ -37,8 +37,6 @@ class Campaign:
         self._config, self._names = study.config.offline, study.training
         self._finished = {name: archive.finished(name) for name in self._names}
         self._searches = make_searches(self._config, study.odometry.space, self._names, archive)
-        n_objectives = len(self._config.objective)
-        self._mirror = Mirror(study.folder, n_objectives, study.odometry.space)
         described = study.config.descriptor
         self._without_frames = [
             name for name in self._names if not archive.has_frames(name, described)
@@ -67,14 +65,12 @@ class Campaign:
             self._counted[0] = self._names
             self._best = self._best_in_words()
             if begun:
-                self._mirror_trials()
                 self._show(self._n_done())
                 _log.debug("trials %d to %d done; %s", numbers[0], numbers[-1], self._best)
             batch += 1
         for search in self._searches:
             where = f" on {search.sequences[0]}" if self._config.sets == "own" else ""
             _log.info("the search%s ends: %s", where, search.end)
-        self._mirror_trials()
         self._show(self._n_done())
         if self._config.sets == "own":
             self._run_everywhere()
@@ -112,8 +108,8 @@ class Campaign:
     def _best_in_words(self) -> str:
         """The best value so far, or its mean where each search has a sequence of its own."""
         best = [search.verdicts[search.best] for search in self._searches]
-        value = float(np.mean([verdict.values[0] for verdict in best]))
-        what = f"best {label(self._config.objective[0])} {value:.3f}"
+        value = float(np.mean([verdict.value for verdict in best]))
+        what = f"best {label(self._config.objective)} {value:.3f}"
         if self._config.sets == "own":
             return f"{what} in the mean of {len(best)} sequences"
         (search,) = self._searches
@@ -142,11 +138,6 @@ class Campaign:
 
     def _verdict(self, n: int) -> Verdict:
         return assess(n, self._counted[n], self._config, self._names, self._finished)
-
-    def _mirror_trials(self) -> None:
-        self._mirror.report(
-            self._counted, lambda n: _mirrored(self._config, self._verdict(n), self._finished, n)
-        )
 
 
 def trial_tasks(
@@ -177,19 +168,6 @@ def trial_tasks(
                     tasks.append(Task(name, numbers, sets, frames=some[0] is first))
             left = left[n_workers * size :]
     return tasks
-
-
-def _mirrored(config: OfflineConfig, verdict: Verdict, finished: Finished, n: int) -> MirrorRow:
-    trials = {name: finished[name][n] for name in verdict.sequences}
-    attributes = {name: trial.mean_error for name, trial in trials.items()}
-    attributes["lost"] = sum(trial.lost for trial in trials.values())
-    attributes["ms"] = float(np.mean([trial.ms for trial in trials.values()]))
-    constraints = {
-        f"{name} <= {limit.max:g}": by
-        for (name, limit), by in zip(config.limits.items(), verdict.constraints, strict=True)
-    }
-    values = verdict.values if verdict.usable else (np.inf,) * len(verdict.values)
-    return MirrorRow(verdict.parameters, values, attributes, constraints)
 
 
 def watch_tasks(
@@ -252,7 +230,7 @@ def run_whole(
 
 
 def whole_values(config: OfflineConfig, runs: WholeRuns) -> dict[str, dict[int, float]]:
-    """By sequence, the first objective in whole runs of every candidate for the fixed set.
+    """By sequence, the objective in whole runs of every candidate for the fixed set.
 
     Candidates have whole runs on all sequences, and keep the limits there if one does. The
     objective of those that are not usable there is infinite.
@@ -263,9 +241,7 @@ def whole_values(config: OfflineConfig, runs: WholeRuns) -> dict[str, dict[int, 
     kept = [n for n, v in verdicts.items() if v.feasible or not (v.usable and within)]
     return {
         name: {
-            n: weighted(config.objective[0], of_sequence[n].metrics)
-            if verdicts[n].usable
-            else np.inf
+            n: weighted(config.objective, of_sequence[n].metrics) if verdicts[n].usable else np.inf
             for n in kept
         }
         for name, of_sequence in runs.items()
@@ -290,12 +266,12 @@ def baseline_warning(
 ) -> str | None:
     """In words where the baseline is better than the trials suggested.
 
-    `whole` has by trial number the first objective in whole runs, its mean over the sequences;
+    `whole` has by trial number the objective in whole runs, its mean over the sequences;
     `best` is the set with the best trials.
     """
     if 0 not in whole or best == 0 or whole[0] >= whole.get(best, np.inf):
         return None
-    what = label(config.objective[0])
+    what = label(config.objective)
     other = f"{whole[best]:.3g}" if best in whole else "beyond the limits, or not known"
     beaten = (
         f"In whole runs with the health check, the baseline is better than the trials suggested: "

@@ -1,4 +1,4 @@
-"""Charts of the offline stage: of trials, of Pareto fronts, and of what was left out."""
+"""Charts of the offline stage: of trials, and of what was left out."""
 
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -29,7 +29,7 @@ from adaptune.report.charts import (
 from adaptune.space import ODOMETRY, Categorical, Float, Integer, ParameterSet, ParameterSpace
 from adaptune.space import label as parameter_label
 from offline.config import OfflineConfig, OfflineStudy, distribution
-from offline.objective import judge, label, pareto_front, weighted
+from offline.objective import judge, label, weighted
 from offline.tuning import figures
 
 
@@ -38,7 +38,7 @@ class TriedSet(NamedTuple):
 
     number: int
     parameters: ParameterSet
-    by_sequence: Mapping[str, float]  # the first objective on the sequences on which it was run
+    by_sequence: Mapping[str, float]  # the objective on the sequences on which it was run
     value: float  # its mean over all training sequences, NaN if not run on all
     feasible: bool  # whether it keeps all limits
     cost: float  # milliseconds of CPU time a scan, NaN if unknown
@@ -51,7 +51,7 @@ class TrialTable:
     space: ParameterSpace
     names: Sequence[str]  # of the training sequences
     trials: Sequence[TriedSet]
-    objective: str = "RTE [%]"  # name of the first objective, with its unit
+    objective: str = "RTE [%]"  # name of the objective, with its unit
     fixed: int | None = None  # trial number of the fixed set, once it is chosen
 
     def __len__(self) -> int:
@@ -68,7 +68,7 @@ class TrialTable:
         return np.array([trial.value for trial in self.trials])
 
     def on(self, name: str) -> NDArray[np.float64]:
-        """The first objective on a sequence, of shape (n,); NaN where a trial was not run."""
+        """The objective on a sequence, of shape (n,); NaN where a trial was not run."""
         return np.array([trial.by_sequence.get(name, np.nan) for trial in self.trials])
 
     def column(self, name: str) -> list[Any]:
@@ -107,14 +107,14 @@ def trial_table(
 ) -> TrialTable:
     """Finished trials as columns: by training sequence, `finished` has them by their numbers.
 
-    Of `config`, the first objective and the limits count; `fixed` is the fixed set, once chosen.
+    Of `config`, the objective and the limits count; `fixed` is the fixed set, once chosen.
     """
-    objective, trials = config.objective[0], []
+    objective, trials = config.objective, []
     for number in sorted({number for of_sequence in finished.values() for number in of_sequence}):
         runs = {name: of[number] for name, of in finished.items() if number in of}
         verdict = judge(config, list(runs.values()))
         by_sequence = {name: weighted(objective, run.metrics) for name, run in runs.items()}
-        value = verdict.values[0] if len(runs) == len(finished) else np.nan
+        value = verdict.value if len(runs) == len(finished) else np.nan
         cost = float(np.mean([run.cost for run in runs.values()]))
         about = (number, verdict.parameters, by_sequence, value, verdict.feasible, cost)
         trials.append(TriedSet(*about))
@@ -123,8 +123,6 @@ def trial_table(
     return TrialTable(space, list(finished), trials, named, chosen)
 
 
-_SPREAD = 20.0
-"""Largest over least value from which on an axis of a Pareto front is logarithmic."""
 FEW = 8
 """With fewer trials, importances mean nothing."""
 MOST_PANELS = 12
@@ -225,7 +223,9 @@ def cost_chart(table: TrialTable) -> Chart | None:
     if len(table) < 2:
         return None
     costs = np.array([trial.cost for trial in table.trials])
-    front = pareto_front(np.column_stack([costs, table.values]))
+    order = np.lexsort((table.values, costs))
+    least = np.minimum.accumulate(table.values[order])
+    front = order[np.diff(least, prepend=np.inf) < 0.0]
     drawn = (
         Points(costs, table.values, "trial", texts=[f"trial {n}" for n in table.numbers]),
         Line(costs[front], table.values[front], "Pareto front", steps=True),
@@ -240,34 +240,6 @@ def cost_chart(table: TrialTable) -> Chart | None:
         "Each point is a trial, in the mean over the training sequences. No trial has less of both "
         "than those on the Pareto front.",
     )
-
-
-def pareto_chart(
-    names: Sequence[str],
-    values: NDArray[np.float64],
-    front: NDArray[np.float64],
-    marked: Mapping[str, Sequence[float]],
-) -> Chart:
-    """The Pareto front and all sets, one panel for each two consecutive objectives.
-
-    `names` has the objectives with their units, `values` those of all sets that keep the limits, of
-    shape (n, n_objectives), `front` the same by a rising first objective, `marked` by name those of
-    the sets to mark.
-    """
-    panels = []
-    for i in range(len(names) - 1):
-        drawn: list[Drawn] = [Points(values[:, i], values[:, i + 1], "tried", faint=True)]
-        if len(names) == 2:  # with more objectives than are drawn, the front is no line
-            drawn.append(Line(front[:, 0], front[:, 1], "Pareto front", steps=True))
-        drawn.append(Points(front[:, i], front[:, i + 1], "Pareto front", shape="circle"))
-        drawn += [Points([of[i]], [of[i + 1]], name) for name, of in marked.items()]
-        shown = np.array([*values, *marked.values()])[:, i : i + 2]
-        low, high = shown.min(axis=0), shown.max(axis=0)
-        logs = ((low > 0.0) & (high > _SPREAD * low)).tolist()
-        axes = [Axis(name, log) for name, log in zip(names[i : i + 2], logs, strict=True)]
-        panels.append(Panel(axes[0], axes[1], tuple(drawn)))
-    title = "The sets that no other set beats in every objective"
-    return Chart("pareto", title, tuple(panels), columns=2)
 
 
 Parameter = Float | Integer | Categorical
@@ -373,7 +345,7 @@ def stretch_chart(rows: Sequence[Mapping[str, Any]]) -> Chart | None:
         tuple(panels),
         "Each point is a stretch that nothing was trained on, sorted by its ratio; below 1 the "
         "mode beats the fixed set. The band is the 95 % interval of the geometric mean over all "
-        "stretches. Oracles know the errors in advance: they bound what choosing one set can gain.",
+        "stretches. The oracle knows the errors in advance: the best set of each sequence.",
         columns=min(2, len(panels)),
     )
 

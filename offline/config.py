@@ -4,14 +4,13 @@ import inspect
 import math
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, BeforeValidator, Field, model_validator
 
-from adaptune import processes, strict
-from adaptune.errors import AdaptuneError, nearest
+from adaptune import strict
+from adaptune.errors import AdaptuneError, in_a_line, nearest
 from adaptune.recording.config import MOST_VIEWS, ViewConfig
 from adaptune.space import (
     Categorical,
@@ -26,31 +25,9 @@ from adaptune.strict import Mistake, StrictModel, validated
 from adaptune.study.config import StudyConfig
 from adaptune.study.study import Study
 
-OPTUNA = {
-    "cmaes": "optuna.samplers:CmaEsSampler",
-    "gp": "optuna.samplers:GPSampler",
-    "nsga2": "optuna.samplers:NSGAIISampler",
-    "qmc": "optuna.samplers:QMCSampler",
-    "sobol": "optuna.samplers:QMCSampler",
-    "tpe": "optuna.samplers:TPESampler",
-}
-"""Optuna's samplers; their settings are the keywords of the class."""
-QUASI = ("qmc", "sobol")
-"""Names of the same sampler; the second one is that of older studies."""
+OPTUNA = {"tpe": "optuna.samplers:TPESampler"}
+"""Optuna's samplers that have a name; their settings are the keywords of the class."""
 NAMES = ("annealing", "grid", "random", *OPTUNA)
-SINGLE_OBJECTIVE = ("annealing", "cmaes")
-"""Samplers that minimise one objective only."""
-STATELESS = ("tpe", "gp")
-"""Samplers that keep no notes: they continue from any list of trials."""
-NEEDS = {"cmaes": "cmaes", "gp": "torch"}
-"""Packages that a sampler needs; adaptune's extra has the sampler's name."""
-SERVICE = "offline.samplers"
-"""What a server does with a sampler of the user."""
-
-
-def is_user_sampler(name: str) -> bool:
-    """Whether a sampler is a class that is neither adaptune's nor Optuna's."""
-    return ":" in name and name.partition(":")[0].partition(".")[0] != "optuna"
 
 
 class SamplerError(AdaptuneError):
@@ -105,16 +82,10 @@ class Span(StrictModel):
 
 
 class GridSettings(StrictModel):
-    """Settings of `grid`."""
+    """Settings of `grid`, and of `random`, which draws the grid's points without repetition."""
 
     # For every number ``[first, step, count]`` or a `Span`; for categories the choices to try, by
     # default all.
-    grid: dict[str, Span | tuple[Value, ...]]
-
-
-class RandomSettings(StrictModel):
-    """Settings of `random`: with a grid, it draws the grid's points without repetition."""
-
     grid: dict[str, Span | tuple[Value, ...]] | None = None
 
 
@@ -124,12 +95,8 @@ def optuna_class(name: str) -> type[Any]:
     Raises
     ------
     SamplerError
-        It names the nearest sampler, or what to install.
+        It names the nearest sampler, or says why there is none.
     """
-    if name in NEEDS and find_spec(NEEDS[name]) is None:
-        raise SamplerError(
-            f"{name} needs the package {NEEDS[name]}: pip install 'adaptune[{name}]'"
-        )
     if name not in OPTUNA and ":" not in name:
         raise SamplerError(
             f"there is no sampler {name!r}: {nearest(name, NAMES)} (another Optuna sampler is "
@@ -142,6 +109,8 @@ def optuna_class(name: str) -> type[Any]:
         found = strict.load(name, path, "class")
     except strict.PluginError as error:
         raise SamplerError(str(error)) from error
+    except (Exception, SystemExit) as error:  # of the user's module
+        raise SamplerError(f"{name}: cannot be imported: {in_a_line(error)}") from error
     if not (isinstance(found, type) and issubclass(found, BaseSampler)):
         raise SamplerError(f"{name}: is not a class derived from optuna.samplers.BaseSampler")
     return found
@@ -173,7 +142,7 @@ def optuna_sampler(name: str, settings: Mapping[str, Any], seed: int) -> Any:
 SETTINGS: dict[str, type[BaseModel]] = {
     "annealing": AnnealingSettings,
     "grid": GridSettings,
-    "random": RandomSettings,
+    "random": GridSettings,
 }
 """Settings of adaptune's own samplers."""
 
@@ -354,17 +323,6 @@ _MAX_SETTING = 100_000
 """Candidates, or members of a population: more of them take hours, or all memory."""
 
 
-def check_class(name: str) -> None:
-    """Refuse a name that leads to no Optuna sampler; the user's are imported elsewhere."""
-    if not is_user_sampler(name):
-        optuna_class(name)
-        return
-    try:
-        processes.server(SERVICE, name)
-    except processes.HostError as error:
-        raise SamplerError(str(error)) from error
-
-
 def check_sampler(
     name: str, settings: Mapping[str, Any], space: ParameterSpace | None, budgeted: bool
 ) -> Iterable[Mistake]:
@@ -375,7 +333,7 @@ def check_sampler(
     if name == "tpe" and not settings:
         return  # a look at Optuna would take long
     if name not in SETTINGS:
-        yield from _check_optuna(name, settings, space)
+        yield from _check_optuna(name, settings)
     elif space is None:
         return
     elif name == "annealing":
@@ -389,14 +347,12 @@ def check_sampler(
             if parameter in steps:
                 yield from _check_step(parameter, of, steps[parameter])
     elif name in ("grid", "random"):
-        axes = RandomSettings.model_validate(settings).grid
-        if axes is not None:
-            yield from check_grid(axes, space, bounded=budgeted or name == "random")
+        axes = GridSettings.model_validate(settings).grid
+        if axes is not None or name == "grid":
+            yield from check_grid(axes or {}, space, bounded=budgeted or name == "random")
 
 
-def _check_optuna(
-    name: str, settings: Mapping[str, Any], space: ParameterSpace | None
-) -> Iterable[Mistake]:
+def _check_optuna(name: str, settings: Mapping[str, Any]) -> Iterable[Mistake]:
     if taken := next((key for key in _SET_BY_KEY if key in settings), None):
         yield Mistake((taken,), f"is set by offline.{_SET_BY_KEY[taken]}")
         return
@@ -405,14 +361,10 @@ def _check_optuna(
             yield Mistake((key,), f"give a number of at most {_MAX_SETTING:,}, not {value}")
             return
     try:
-        make = _make_elsewhere if is_user_sampler(name) else optuna_sampler
-        make(name, settings, 0)
+        optuna_sampler(name, settings, 0)
     except SamplerError as error:
         key, _, rest = str(error).partition(": ")
         yield Mistake((key,), rest) if key in settings else Mistake((), str(error))
-    parameters = () if space is None else space.parameters.values()
-    if name == "cmaes" and parameters and all(isinstance(p, Categorical) for p in parameters):
-        yield Mistake((), "cmaes searches among numbers, and all parameters are categories")
 
 
 def _check_step(
@@ -458,19 +410,6 @@ def _box(parameter: Float | Integer, step: Step) -> tuple[float, float]:
     return parameter.low if low is None else low, parameter.high if high is None else high
 
 
-def _make_elsewhere(name: str, settings: Mapping[str, Any], seed: int) -> None:
-    """Try whether a sampler of the user takes its settings."""
-    seconds = processes.IMPORT_SECONDS
-    bounds = processes.Bounds(seconds, late=f"it took longer than {seconds:g} s to begin")
-    process = processes.Conversation(processes.Forked(SERVICE, name, "make", bounds))
-    try:
-        process.ask({"settings": dict(settings), "seed": seed})
-    except processes.HostError as error:
-        raise SamplerError(str(error)) from error
-    finally:
-        process.close()
-
-
 Metric = Literal["rte", "kitti", "rpe", "ape", "ms_per_scan", "cpu", "memory"]
 """What a trial can be judged by; `offline.objective` explains each."""
 TIMED = ("ms_per_scan", "cpu", "memory")
@@ -479,12 +418,13 @@ _Weighted = Annotated[dict[Metric, Annotated[float, Field(gt=0, le=1e9)]], Field
 
 
 def _weighted(given: Any) -> Any:
-    """Write every objective, a metric or a weighted sum of metrics, as a weighted sum."""
-    objectives = given if isinstance(given, list | tuple) else [given]
-    weighted = tuple({one: 1.0} if isinstance(one, str) else one for one in objectives)
-    if any(weights in weighted[:i] for i, weights in enumerate(weighted)):
-        raise ValueError("names an objective twice")
-    return weighted
+    """Write a metric as a weighted sum."""
+    if isinstance(given, list | tuple):
+        raise ValueError(  # noqa: TRY004
+            "several objectives are gone, because the first one decided: give it alone, or a "
+            "weighted sum; `adaptune compare` draws error over CPU time of all trials"
+        )
+    return {given: 1.0} if isinstance(given, str) else given
 
 
 class Limit(StrictModel):
@@ -506,11 +446,9 @@ class OfflineConfig(StrictModel):
     batch: int = Field(16, ge=1, le=1000)
     seed: int = Field(0, ge=0, lt=2**32)
     workers: int | None = Field(None, ge=1, le=256)
-    objective: Annotated[tuple[_Weighted, ...], BeforeValidator(_weighted), Field(min_length=1)] = (
-        {"rte": 1.0},
-    )
+    objective: Annotated[_Weighted, BeforeValidator(_weighted)] = Field({"rte": 1.0})
     limits: dict[Metric, Limit] = Field(default_factory=dict)
-    runs: Literal["restart", "whole"] = "restart"
+    runs: Literal["restart", "whole"] | None = None  # see `OfflineStudyConfig.runs`
     repeats: int = Field(1, ge=1, le=100)
     baseline_runs: int | None = Field(None, ge=1, le=1000)
     augment: Annotated[tuple[ViewConfig, ...], Field(max_length=MOST_VIEWS)] = ()
@@ -518,8 +456,6 @@ class OfflineConfig(StrictModel):
 
     @model_validator(mode="after")
     def _check_pruning(self) -> Self:
-        if self.pruning != "none" and len(self.objective) > 1:
-            raise ValueError("pruning goes by one objective; give one, or set pruning: none")
         if self.pruning != "none" and self.sets == "own":
             raise ValueError(
                 "pruning spares trials further sequences, and with sets: own each runs on one; "
@@ -536,7 +472,7 @@ class OfflineConfig(StrictModel):
     @property
     def metrics(self) -> set[str]:
         """All metrics that a trial is judged by."""
-        return {*self.limits, *(metric for weights in self.objective for metric in weights)}
+        return {*self.limits, *self.objective}
 
     @property
     def budgeted(self) -> bool:
@@ -546,18 +482,12 @@ class OfflineConfig(StrictModel):
     def mistakes(self, space: ParameterSpace | None) -> Iterable[Mistake]:
         """Find mistakes in the sampler and its settings."""
         key, n = ("sampler_settings",), 1 if space is None else len(space.baselines)
-        if n > 1 and (
-            self.sampler not in (*STATELESS, "random") or "grid" in self.sampler_settings
-        ):
-            message = "with several odometries, choose tpe, gp or random, without a grid"
+        if n > 1 and (self.sampler not in ("tpe", "random") or "grid" in self.sampler_settings):
+            message = "with several odometries, choose tpe or random, without a grid"
             yield Mistake(("sampler",), message)
         if self.trials is not None and self.trials < n:
             message = f"{n} odometries need {n} trials at least, to try the parameters of each"
             yield Mistake(("trials",), message)
-        if len(self.objective) > 1 and self.sampler in SINGLE_OBJECTIVE:
-            others = ", ".join(sorted(set(NAMES) - set(SINGLE_OBJECTIVE)))
-            message = f"{self.sampler} minimises one objective only; choose one of {others}"
-            yield Mistake(("sampler",), message)
         if self.sampler in SETTINGS:
             found: list[Mistake] = []
             validated(SETTINGS[self.sampler], self.sampler_settings, key, found)
@@ -566,7 +496,7 @@ class OfflineConfig(StrictModel):
                 return
         elif self.sampler != "tpe":  # which is always there, and need not be imported
             try:
-                check_class(self.sampler)
+                optuna_class(self.sampler)
             except SamplerError as error:
                 yield Mistake(("sampler",), str(error))
                 return
@@ -595,6 +525,15 @@ class OfflineStudyConfig(StudyConfig):
             views[f"{view.name}{same + 1}" if same else view.name] = view
         return views
 
+    @property
+    def runs(self) -> Literal["restart", "whole"]:
+        """What a trial does where it loses track: a start in a new container costs too much."""
+        costly = any(
+            one.name == "rustle" and one.settings.get("play") == "lockstep"
+            for one in self.odometries.values()
+        )
+        return self.offline.runs or ("whole" if costly else "restart")
+
     def mistakes(self, space: ParameterSpace | None) -> Iterable[Mistake]:
         """See `StudyConfig.mistakes`."""
         return (mistake.below(("offline",)) for mistake in self.offline.mistakes(space))
@@ -602,6 +541,7 @@ class OfflineStudyConfig(StudyConfig):
     def resolved(self) -> dict[str, Any]:
         """See `StudyConfig.resolved`."""
         resolved, offline = super().resolved(), self.offline
+        resolved["offline"]["runs"] = self.runs
         if settings := SETTINGS.get(offline.sampler):
             given = settings.model_validate(offline.sampler_settings)
             whole = given.model_dump(mode="json", exclude_none=True)

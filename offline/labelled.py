@@ -35,6 +35,7 @@ from adaptune.model.weights import MEMBER_POOL_SIZE, MemberWeights
 from adaptune.odometry.registry import Factory
 from adaptune.recording.scan import origin, places, stretch_numbers
 from adaptune.space import ParameterSets
+from adaptune.study.config import WORTH
 from adaptune.study.study import MIN_RECORDINGS, PER_STRETCH
 from offline.campaign import mean_values, read_whole_runs, whole_errors, whole_values
 from offline.config import OfflineStudyConfig
@@ -361,6 +362,7 @@ class LabelledData(NamedTuple):
     costs: Costs = Costs({}, np.nan)  # of the sets, as far as they are known
     # Milliseconds of CPU time a scan that may be spent, live evidence included.
     budget: float | None = None
+    worth: float = WORTH  # share of the error that a bank has to spare
     live: bool = True  # whether the odometry changes from one set to another between scans
 
     def subset(self, trials: Sequence[int]) -> "LabelledData":
@@ -589,11 +591,12 @@ def labelled_data(
             for trial in eligible.intersection(run[name])
         }
         # Whether the objective on some frames follows from the errors there.
-        by_frames = set(config.offline.objective[0]) == {"rte"}
+        by_frames = set(config.offline.objective) == {"rte"}
         errors_of = whole_errors(archive, name, whole, s.known) if by_frames else None
         labelled.append(replace(s, vectors=vectors, whole=whole, whole_errors=errors_of))
     costs = measured_costs(archive, run, sets, odometry)
-    return LabelledData(labelled, sets, costs, config.online.budget, odometry.description.live)
+    online, live = config.online, odometry.description.live
+    return LabelledData(labelled, sets, costs, online.budget, online.worth, live)
 
 
 def _eligible(
@@ -630,7 +633,7 @@ def _labelled(
     # All trials know the same frames, but for those before an odometry's first pose.
     ran = np.column_stack([errors[:, ~np.isnan(errors).all(axis=0)], baseline])
     known = np.flatnonzero(~np.isnan(ran).any(axis=1))
-    objective, n_repeats = config.offline.objective[0], config.offline.repeats
+    objective, n_repeats = config.offline.objective, config.offline.repeats
     summaries = [archive.finished(name)[trial] if trial in run else None for trial in sets]
     values = [weighted(objective, s.metrics) if s and s.usable else np.inf for s in summaries]
     # Of the baseline, there may be more runs.

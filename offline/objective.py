@@ -64,21 +64,18 @@ UNUSABLE = (
     "narrow the ranges of the parameters (odometry.parameters)"
 )
 
-Value = float | tuple[float, ...]
-"""What samplers minimise: a tuple if there are several objectives."""
-
 
 class Verdict(NamedTuple):
     """How a parameter set did on the sequences on which it was run."""
 
     parameters: ParameterSet
-    values: tuple[float, ...]  # mean of every objective over the sequences
+    value: float  # mean of the objective over the sequences
     # Excess over every limit, as a share of the limit; negative if the limit is kept.
     constraints: tuple[float, ...] = ()
-    # Distance from the first value to the upper end of its one-sided 95 % confidence interval; 0
+    # Distance from the value to the upper end of its one-sided 95 % confidence interval; 0
     # unless trials are repeated.
     margin: float = 0.0
-    # Whether the set was run on all sequences; if not, its values are estimates.
+    # Whether the set was run on all sequences; if not, its value is an estimate.
     complete: bool = True
     sequences: tuple[str, ...] = ()  # the sequences on which it was run
     usable: bool = True  # see `Summary.usable`; on all sequences
@@ -90,8 +87,8 @@ class Verdict(NamedTuple):
 
     @property
     def bound(self) -> float:
-        """What the first value surely is below: the upper end of its interval."""
-        return self.values[0] + self.margin
+        """What the value surely is below: the upper end of its interval."""
+        return self.value + self.margin
 
     @property
     def feasible(self) -> bool:
@@ -103,7 +100,7 @@ class SamplerResult(NamedTuple):
     """The result of a trial as samplers receive it."""
 
     parameters: ParameterSet
-    value: Value  # samplers minimise it
+    value: float  # samplers minimise it
     constraints: tuple[float, ...] = ()  # see `Verdict`
 
 
@@ -144,10 +141,7 @@ def joined(T_odom_sensor: Poses, lost_steps: Mapping[int, Poses]) -> Poses:
 def judge(config: OfflineConfig, runs: Sequence[Summary]) -> Verdict:
     """Judge a parameter set by its trials on some sequences."""
     metrics = [run.metrics for run in runs]
-    values = tuple(
-        float(mean_value(np.array([weighted(weights, of_run) for of_run in metrics])))
-        for weights in config.objective
-    )
+    value = float(mean_value(np.array([weighted(config.objective, one) for one in metrics])))
     usable = all(run.usable for run in runs)
     constraints = tuple(
         max(max(of_run[name] for of_run in metrics) / limit.max - 1.0, -1.0 if usable else PENALTY)
@@ -156,8 +150,8 @@ def judge(config: OfflineConfig, runs: Sequence[Summary]) -> Verdict:
     above = 0.0
     # Without repeats, nothing is known of the other sets' intervals.
     if config.repeats > 1 and all(run.repeats for run in runs):
-        above = float(margin(np.array([repeated(config.objective[0], r.repeats) for r in runs])))
-    return Verdict(runs[0].parameters, values, constraints, above, usable=usable)
+        above = float(margin(np.array([repeated(config.objective, r.repeats) for r in runs])))
+    return Verdict(runs[0].parameters, value, constraints, above, usable=usable)
 
 
 def weighted(weights: Mapping[Metric, float], metrics: Mapping[str, float]) -> float:
@@ -192,13 +186,11 @@ def margin(repeats: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def sampler_results(verdicts: Sequence[Verdict]) -> list[SamplerResult]:
     """The results of trials as samplers receive them; the first one is the baseline's."""
-    found = []
-    for v in verdicts:
-        least = [0.0 if v.usable else PENALTY * (of or 1.0) for of in verdicts[0].values]
-        values = tuple(map(max, v.values, least))
-        value = values if len(values) > 1 else values[0]
-        found.append(SamplerResult(v.parameters, value, v.constraints))
-    return found
+    worst = PENALTY * (verdicts[0].value or 1.0) if verdicts else 0.0
+    return [
+        SamplerResult(v.parameters, max(v.value, 0.0 if v.usable else worst), v.constraints)
+        for v in verdicts
+    ]
 
 
 def penalised(history: Sequence[SamplerResult]) -> list[SamplerResult]:
@@ -209,14 +201,13 @@ def penalised(history: Sequence[SamplerResult]) -> list[SamplerResult]:
     """
     if not any(result.constraints for result in history):
         return list(history)
-    made = []
-    for parameters, value, constraints in history:
-        values, baseline = np.atleast_1d(value), np.atleast_1d(history[0].value)
-        if (excess := exceeded(constraints)) > 0.0:
-            values = values + PENALTY * np.where(baseline, baseline, 1.0) * (1.0 + excess)
-        several = tuple(values.tolist())
-        made.append(SamplerResult(parameters, several if len(several) > 1 else several[0]))
-    return made
+    baseline = history[0].value or 1.0
+    excesses = (exceeded(result.constraints) for result in history)
+    penalties = (PENALTY * baseline * (1.0 + excess) if excess else 0.0 for excess in excesses)
+    return [
+        SamplerResult(result.parameters, result.value + penalty)
+        for result, penalty in zip(history, penalties, strict=True)
+    ]
 
 
 def best_by_trials(config: OfflineConfig, verdicts: Mapping[int, Verdict]) -> int:
@@ -227,7 +218,7 @@ def best_by_trials(config: OfflineConfig, verdicts: Mapping[int, Verdict]) -> in
 def candidates(config: OfflineConfig, verdicts: Mapping[int, Verdict]) -> list[int]:
     """Trial numbers of the candidates for the fixed set, the best by their trials first.
 
-    These are the `CANDIDATES` sets with the least first objective among those that keep all limits,
+    These are the `CANDIDATES` sets with the least objective among those that keep all limits,
     and the baseline if it keeps them. If trials are repeated, the upper end of the confidence
     interval counts. Of equal sets, the first one comes first.
 
@@ -301,7 +292,7 @@ def choose_fixed(whole: Mapping[int, float], trials: Mapping[int, float]) -> int
     Of candidates that are nearly as good, the one with the best trials is chosen: the best of a few
     runs owes something to chance.
 
-    `whole` has by trial number the first objective in whole runs, its mean over the sequences, and
+    `whole` has by trial number the objective in whole runs, its mean over the sequences, and
     `trials` the same in trials, see `Verdict.bound`.
     """
     most = EQUAL_WITHIN * min(whole.values())
@@ -328,7 +319,7 @@ def failed_in_words(verdicts: Mapping[int, Verdict]) -> list[str]:
 
 def baseline_words(config: OfflineConfig, runs: Sequence[Summary]) -> list[str]:
     """A sentence about the spread of the baseline over its runs, if it was run several times."""
-    objective = config.objective[0]
+    objective = config.objective
     if not all(run.repeats for run in runs) or set(objective) <= set(TIMED):
         return []
     found = np.mean([repeated(objective, run.repeats) for run in runs], axis=0)
@@ -337,18 +328,3 @@ def baseline_words(config: OfflineConfig, runs: Sequence[Summary]) -> list[str]:
         f"in the mean, {found.min():.4g} to {found.max():.4g}, "
         f"standard deviation {found.std(ddof=1):.2g}."
     ]
-
-
-def pareto_front(values: NDArray[np.float64]) -> NDArray[np.intp]:
-    """Rows that no other row dominates: as good in every column, and better in one.
-
-    Returns shape (m,): indices of these rows, by rising value of the first column; of equal rows
-    the first one.
-    """
-    unique, first = np.unique(values, axis=0, return_index=True)
-    front = [
-        number
-        for row, number in zip(unique, first, strict=True)
-        if not ((unique <= row).all(axis=1) & (unique < row).any(axis=1)).any()
-    ]
-    return np.array(front, np.intp)

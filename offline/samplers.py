@@ -1,6 +1,5 @@
 """Samplers: what proposes the next parameter sets, in batches, and no set twice."""
 
-import json
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterable, Iterator, Sequence
@@ -13,7 +12,7 @@ import optuna
 from numpy.typing import NDArray
 from scipy.stats import qmc
 
-from adaptune.processes import Answer, Conversation, Forked, HostError, Message
+from adaptune.errors import in_a_line
 from adaptune.space import (
     ODOMETRY,
     Categorical,
@@ -24,18 +23,13 @@ from adaptune.space import (
 )
 from offline.annealing import AnnealingSampler
 from offline.config import (
-    QUASI,
-    SERVICE,
-    STATELESS,
     AnnealingSettings,
     Grid,
+    GridSettings,
     OfflineConfig,
-    RandomSettings,
     SamplerError,
     distribution,
-    is_user_sampler,
     make_grid,
-    optuna_class,
     optuna_sampler,
 )
 from offline.objective import SamplerResult, exceeded, penalised
@@ -137,7 +131,7 @@ class GridSampler(Sampler):
     """The baseline, then the other points of a grid, in row-major or in random order."""
 
     def _propose(self, numbers: range, history: Sequence[SamplerResult]) -> list[ParameterSet]:  # noqa: ARG002
-        settings = RandomSettings.model_validate(self.config.sampler_settings)
+        settings = GridSettings.model_validate(self.config.sampler_settings)
         grid = make_grid(self.space, settings.grid or {})
         order: Iterable[int] = range(grid.size)
         if self.config.sampler == "random":
@@ -159,7 +153,8 @@ def _shuffled(size: int, seed: int, n: int) -> Iterator[int]:
     yield from drawn[np.sort(at)].tolist()
 
 
-optuna.logging.set_verbosity(optuna.logging.WARNING)
+# Without warnings that a sampler draws some parameters independently.
+optuna.logging.set_verbosity(optuna.logging.ERROR)
 
 CONSTRAINED = (
     optuna.samplers.TPESampler,
@@ -203,19 +198,17 @@ class AskedSampler(Sampler):
             else distribution(p)
             for name, p in space.parameters.items()
         }
-        self._forgetful = config.sampler in STATELESS
+        self._forgetful = config.sampler == "tpe"
         self._begin(0, ())
         self.constrained = isinstance(self._study.sampler, CONSTRAINED)
 
     def _begin(self, seed: int, history: Sequence[SamplerResult]) -> None:
-        self._study = optuna.create_study(
-            sampler=self._sampler(seed), directions=["minimize"] * len(self.config.objective)
-        )
+        self._study = optuna.create_study(sampler=self._sampler(seed))
         self._study.add_trials(
             optuna.trial.create_trial(
                 params=self._encode(result.parameters),
                 distributions=self._distributions,
-                values=np.atleast_1d(result.value).tolist(),
+                value=result.value,
                 constraints={str(i): by for i, by in enumerate(result.constraints)},
             )
             for result in history
@@ -229,19 +222,19 @@ class AskedSampler(Sampler):
         if config.sampler == "annealing":
             settings = AnnealingSettings.model_validate(config.sampler_settings)
             return AnnealingSampler(settings, n_startup_trials=config.initial, seed=config.seed)
-        all_usual: dict[str, dict[str, Any]] = {
-            "cmaes": {"n_startup_trials": config.initial, "warn_independent_sampling": False},
-            "gp": {"n_startup_trials": 1, "warn_independent_sampling": False},
-            "nsga2": {"population_size": max(config.batch, 2)},
-            **{n: {"scramble": True, "warn_independent_sampling": False} for n in QUASI},
-            # The initial points are the start-up; TPE needs no random points of its own.
-            "tpe": {"n_startup_trials": 1},
-        }
-        usual = all_usual.get(config.sampler, {})
+        # The initial points are the start-up; TPE needs no random points of its own.
+        usual = {"n_startup_trials": 1} if config.sampler == "tpe" else {}
         seed = int(np.random.SeedSequence((config.seed, batch)).generate_state(1)[0])
         return optuna_sampler(config.sampler, usual | config.sampler_settings, seed)
 
     def _propose(self, numbers: range, history: Sequence[SamplerResult]) -> list[ParameterSet]:
+        try:
+            return self._asked(numbers, history)
+        except Exception as error:  # it may be a class of the user
+            where = f"{self.config.sampler}, trials {numbers.start} to {numbers.stop - 1}"
+            raise SamplerError(f"offline.sampler: {where}: {in_a_line(error)}") from error
+
+    def _asked(self, numbers: range, history: Sequence[SamplerResult]) -> list[ParameterSet]:
         if self._history != list(history[: len(self._history)]):
             self._begin(0, ())
         while len(self._history) < numbers.start and not self._forgetful:
@@ -260,9 +253,8 @@ class AskedSampler(Sampler):
             self.end = "all chains have stalled"
         elif not self._waiting:
             tried = {key(result.parameters) for result in self._history}
-            n_initial = 1 if self.config.sampler in QUASI else self.config.initial
             given = [self.space.baseline][numbers.start :]
-            rest = range(numbers.start + len(given), min(numbers.stop, n_initial))
+            rest = range(numbers.start + len(given), min(numbers.stop, self.config.initial))
             given += sobol_points(self.space, self.config.seed, rest)
             for number, first in zip_longest(numbers, given):
                 if not self._ask_once(number, first, tried):
@@ -402,9 +394,9 @@ class PooledSampler(Sampler):
 
 
 def _best(history: Sequence[SamplerResult]) -> float:
-    """The least first value of a set that keeps the limits."""
+    """The least value of a set that keeps the limits."""
     kept = (result.value for result in history if not exceeded(result.constraints))
-    return min((float(np.atleast_1d(value)[0]) for value in kept), default=np.inf)
+    return min(kept, default=np.inf)
 
 
 def _spread(sets: dict[str, list[ParameterSet]], first: int) -> list[ParameterSet]:
@@ -415,71 +407,12 @@ def _spread(sets: dict[str, list[ParameterSet]], first: int) -> list[ParameterSe
     return [own for _, own in sorted(placed, key=itemgetter(0))]
 
 
-class HostedSampler(Sampler):
-    """A sampler of the user; `AskedSampler` asks it in the other process."""
-
-    constrained = True  # the other process sees to constraints
-
-    def __init__(self, space: ParameterSpace, config: OfflineConfig):
-        super().__init__(space, config)
-        self._process = Conversation(Forked(SERVICE, config.sampler, "propose"))
-        self._about = {"space": space.dump(), "config": config.model_dump(mode="json")}
-
-    def _propose(self, numbers: range, history: Sequence[SamplerResult]) -> list[ParameterSet]:
-        try:
-            answer = self._process.ask(self._about | {"history": history})
-        except HostError as error:
-            trials = f"trials {numbers.start} to {numbers.stop - 1}"
-            raise SamplerError(f"offline.sampler, at {trials}: {error}") from error
-        sets: list[ParameterSet] = answer.header["sets"]
-        return sets
-
-
 def make_sampler(space: ParameterSpace, config: OfflineConfig) -> Sampler:
     """Make the sampler that a configuration names."""
     if isinstance(space, PooledSpace):
         return PooledSampler(space, config)
-    if config.sampler_settings.get("grid") is not None and config.sampler in ("grid", "random"):
-        return GridSampler(space, config)
-    if config.sampler == "random":
+    if config.sampler == "random" and config.sampler_settings.get("grid") is None:
         return RandomSampler(space, config)
-    if is_user_sampler(config.sampler):
-        return HostedSampler(space, config)
+    if config.sampler in ("grid", "random"):
+        return GridSampler(space, config)
     return AskedSampler(space, config)
-
-
-# What follows runs in the process of a sampler of the user.
-
-
-def load(name: str) -> None:
-    """Import a sampler."""
-    optuna_class(name)
-
-
-def make(name: str) -> Answer:
-    """Make a sampler and say how that went."""
-
-    def answer(message: Message) -> dict[str, Any]:
-        optuna_sampler(name, message.header["settings"], message.header["seed"])
-        return {}
-
-    return answer
-
-
-def propose(_: str) -> Answer:
-    """Propose one batch after another."""
-    made: dict[str, AskedSampler] = {}
-
-    def answer(message: Message) -> dict[str, Any]:
-        about = message.header
-        key = json.dumps([about["space"], about["config"]])
-        if key not in made:
-            space = ParameterSpace.load(about["space"])
-            made[key] = AskedSampler(space, OfflineConfig.model_validate(about["config"]))
-        history = [
-            SamplerResult(set_, tuple(value) if isinstance(value, list) else value, tuple(by))
-            for set_, value, by in about["history"]
-        ]
-        return {"sets": made[key].propose(history)}
-
-    return answer

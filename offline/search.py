@@ -1,36 +1,29 @@
 """Searches for parameter sets: one over all training sequences, or one for each."""
 
 import json
-import logging
-import re
 import time
-import warnings
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cached_property, partial
 from itertools import count, islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from adaptune.archive import OF_SLOT, Archive, Summary
 from adaptune.errors import AdaptuneError
-from adaptune.files import needing_room, write_text
+from adaptune.files import write_text
 from adaptune.space import ParameterSet, ParameterSpace
-from offline.config import OfflineConfig, distribution
+from offline.config import OfflineConfig
 from offline.objective import Verdict, judge, sampler_results, weighted
 
 if TYPE_CHECKING:
-    import optuna
-
     from offline.samplers import Sampler
-
-_log = logging.getLogger(__name__)
 
 # Pruning: the first batch runs in full, and shows which sequences are hard. Later trials run on
 # these first, and stop where they cannot win any more, or where a signed-rank test finds them worse
-# than the best trial on the same sequences (Optuna's `WilcoxonPruner`).
+# than the best trial on the same sequences, as Optuna's `WilcoxonPruner` does.
 
 
 SIGNIFICANCE = 0.1
@@ -60,19 +53,13 @@ def survivors(batch: Mapping[int, Values], before: Mapping[int, Values]) -> list
 
 
 def _worse(values: Values, best: Values) -> bool:
-    import optuna  # takes a second, and few studies need it
+    from scipy import stats  # slow to import
 
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
-        pruner = optuna.pruners.WilcoxonPruner(p_threshold=SIGNIFICANCE)
-    study = optuna.create_study(pruner=pruner)
-    steps = {i: float(value) for i, value in enumerate(best)}
-    mean = float(np.mean(best))
-    study.add_trial(optuna.trial.create_trial(value=mean, intermediate_values=steps))
-    trial = study.ask()
-    for i, value in enumerate(values):
-        trial.report(value, i)
-    return trial.should_prune()
+    if len(values) < 2 or np.mean(values) <= np.mean(best):
+        return False
+    differences = np.subtract(values, best[: len(values)])
+    test = stats.wilcoxon(differences, alternative="greater", zero_method="zsplit")
+    return bool(test.pvalue < SIGNIFICANCE)
 
 
 def estimate(values: Values, baseline: Values) -> float:
@@ -260,7 +247,7 @@ class Search:
         of = (self._config, self.sequences, self._finished)
         self.verdicts += [assess(n, self.sequences, *of) for n in self.numbers]
         self._closed += self.numbers
-        ranks = [(not v.complete, not v.usable, v.excess, v.values[0]) for v in self.verdicts]
+        ranks = [(not v.complete, not v.usable, v.excess, v.value) for v in self.verdicts]
         self.best = min((self.best, *range(first, len(ranks))), key=ranks.__getitem__)
         if len(self.numbers) < self._config.batch and len(self.verdicts) != self._limit:
             self.end = self._sampler.end
@@ -273,7 +260,7 @@ class Search:
         return n_trials * len(self.sequences)
 
     def _hardest_first(self) -> list[str]:
-        """The sequences by falling mean of the first objective over the first batch."""
+        """The sequences by falling mean of the objective over the first batch."""
         first = [self.number(i) for i in range(min(self._config.batch, len(self.verdicts)))]
         means = {
             name: np.mean([self._value(self._finished[name][n]) for n in first])
@@ -293,7 +280,7 @@ class Search:
         }
 
     def _value(self, run: Summary) -> float:
-        return weighted(self._config.objective[0], run.metrics)
+        return weighted(self._config.objective, run.metrics)
 
 
 def assess(
@@ -303,20 +290,17 @@ def assess(
     sequences: Sequence[str],
     finished: Finished,
 ) -> Verdict:
-    """Judge a trial; estimate its values if it was not run on all sequences."""
+    """Judge a trial; estimate its value if it was not run on all sequences."""
     seen = tuple(name for name in sequences if name in counted and number in finished[name])
     found = judge(config, [finished[name][number] for name in seen])
     if len(seen) == len(sequences):
         return found._replace(sequences=seen)
     order = (*seen, *(name for name in sequences if name not in seen))
-    values = tuple(
-        estimate(
-            [weighted(weights, finished[name][number].metrics) for name in seen],
-            [weighted(weights, finished[name][0].metrics) for name in order],
-        )
-        for weights in config.objective
+    value = estimate(
+        [weighted(config.objective, finished[name][number].metrics) for name in seen],
+        [weighted(config.objective, finished[name][0].metrics) for name in order],
     )
-    return found._replace(values=values, complete=False, sequences=seen)
+    return found._replace(value=value, complete=False, sequences=seen)
 
 
 def make_searches(
@@ -344,98 +328,3 @@ def make_searches(
 def owner(slots: Mapping[str, int], number: int) -> str | None:
     """The sequence whose own search proposed a trial's set; None for a shared search."""
     return next((name for name, slot in slots.items() if slot == number // OF_SLOT), None)
-
-
-# A study's trials in a journal of Optuna's, for its own tools. The archive is the truth: nothing is
-# read back. Optuna takes a second to import, which a campaign with nothing to do does not need.
-
-
-JOURNAL = "optuna.log"
-"""The journal, in the study's folder."""
-
-_NUMBER = "adaptune trial"
-# The line of a trial in the journal.
-_LINE = re.compile(rb'"adaptune trial":(\d+)[^\n]*\n')
-
-
-class MirrorRow(NamedTuple):
-    """A trial as the mirror receives it."""
-
-    parameters: ParameterSet
-    values: tuple[float, ...]  # the value of each objective
-    attributes: Mapping[str, Any] = {}  # further figures, as plain data
-    constraints: Mapping[str, float] = {}  # excess over every limit; negative if the limit is kept
-
-
-class Mirror:
-    """An Optuna study in a study's folder, with its name, that receives every trial once.
-
-    No other process may work in the folder. A damaged journal is written again.
-    """
-
-    def __init__(self, folder: Path, n_objectives: int, space: ParameterSpace):
-        self._path, self._n_objectives, self._space = folder / JOURNAL, n_objectives, space
-        self._study: optuna.Study | None = None
-        # A killed driver may have left its lock.
-        self._path.with_name(JOURNAL + ".lock").unlink(missing_ok=True)
-
-    def report(self, numbers: Collection[int], row: Callable[[int], MirrorRow]) -> None:
-        """Report trials in this order; `row` is called for those that the mirror lacks."""
-        # Opening the journal takes long: Optuna reads all of it.
-        if self._study is None and _reported(self._path).issuperset(numbers):
-            return
-        with needing_room(self._path):
-            try:
-                self._study = self._study or self._opened()
-            except (ValueError, KeyError, TypeError, AssertionError) as error:
-                _log.warning("%s: is damaged; it is written again (%s)", self._path, error)
-                self._path.unlink(missing_ok=True)
-                self._study = self._opened()
-            self._add(self._study, numbers, row)
-
-    def _opened(self) -> "optuna.Study":
-        import optuna
-        from optuna.storages import JournalStorage
-        from optuna.storages.journal import JournalFileBackend
-
-        if self._path.exists() and not self._path.read_bytes().endswith(b"\n"):
-            self._path.unlink()
-        return optuna.create_study(
-            storage=JournalStorage(JournalFileBackend(str(self._path))),
-            study_name=self._path.parent.name,
-            load_if_exists=True,
-            directions=["minimize"] * self._n_objectives,
-        )
-
-    def _add(
-        self, study: "optuna.Study", numbers: Collection[int], row: Callable[[int], MirrorRow]
-    ) -> None:
-        from optuna.trial import TrialState, create_trial
-
-        every = {n: distribution(p) for n, p in self._space.parameters.items()}
-        trials = study.get_trials(deepcopy=False)
-        reported = {trial.user_attrs.get(_NUMBER, trial.number) for trial in trials}
-        for number in numbers:
-            if number in reported:
-                continue
-            trial = row(number)
-            finite = np.isfinite(trial.values).all()
-            parameters = self._space.flat(trial.parameters)
-            study.add_trial(
-                create_trial(
-                    state=TrialState.COMPLETE if finite else TrialState.FAIL,
-                    params=parameters,
-                    distributions={name: every[name] for name in parameters},
-                    values=trial.values if finite else None,
-                    user_attrs={_NUMBER: number} | dict(trial.attributes),
-                    constraints=dict(trial.constraints),
-                )
-            )
-
-
-def _reported(path: Path) -> set[int]:
-    """Trial numbers in a journal."""
-    try:
-        return {int(number) for number in _LINE.findall(path.read_bytes())}
-    except FileNotFoundError:
-        return set()

@@ -7,7 +7,6 @@ import logging
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,7 +24,6 @@ from adaptune.progress import Progress, unseen
 from adaptune.recording.config import NO_REFERENCE
 from adaptune.recording.scan import origin
 from adaptune.report import tables
-from adaptune.report.drawing import draw_chart
 from adaptune.space import ParameterSet, ParameterSets, ParameterSpace, in_words
 from adaptune.study.config import SwitchingConfig
 from adaptune.study.references import (
@@ -46,8 +44,7 @@ from offline.campaign import (
     watch_tasks,
     whole_values,
 )
-from offline.charts import pareto_chart
-from offline.config import TIMED, Metric, OfflineConfig, OfflineStudy, OfflineStudyConfig
+from offline.config import TIMED, OfflineConfig, OfflineStudy, OfflineStudyConfig
 from offline.labelled import LabelledData, labelled_data, measured_costs
 from offline.objective import (
     UNUSABLE,
@@ -62,7 +59,6 @@ from offline.objective import (
     judge,
     label,
     or_baseline,
-    pareto_front,
 )
 from offline.search import BUDGETS, Finished
 from offline.trial import TrialSettings, TrialSetup
@@ -116,9 +112,9 @@ def train(study: OfflineStudy, progress: Progress = unseen, cluster: str | None 
     """Estimate the references that are lacking, run the trials that are, and fit the model.
 
     The study's folder receives the archive, the error model, the fixed set (see `write_fixed`),
-    tables of the trials (``trials``) and of the training sequences (``training``), and with
-    several objectives their Pareto front (``pareto``). `cluster` is the address of a Dask
-    scheduler whose workers run the trials. Trials of other inputs than now are run again.
+    and tables of the trials (``trials``) and of the training sequences (``training``). `cluster`
+    is the address of a Dask scheduler whose workers run the trials. Trials of other inputs than
+    now are run again.
 
     Raises
     ------
@@ -153,11 +149,8 @@ def train(study: OfflineStudy, progress: Progress = unseen, cluster: str | None 
         before = ErrorModel.load(study.model_path)
     model = _fitted(study, archive, verdicts, fixed, before)
     write_fixed(study, verdicts[fixed].parameters)
-    table = _trial_rows(config, space, verdicts, finished)
-    trials = list(table.values())
+    trials = _trial_rows(config, space, verdicts, finished)
     tables.write_rows(study.folder, "trials", trials)
-    if len(config.objective) > 1:
-        _write_pareto(study.folder, config.objective, verdicts, fixed, table)
     estimates = estimates_of(study.sequences, names)
     errors = {name: stored.error(model.length) for name, stored in estimates.items()}
     rows = _training_rows(config, verdicts, finished, fixed, whole, errors, space)
@@ -183,9 +176,8 @@ def _ready_archive(study: OfflineStudy, progress: Progress) -> Archive:
     ensure_references(study.sequences, study.training, length, progress)
     archive = study.archive(more={"offline": study.config.search_inputs})
     if archive.renew(study.training):
-        # The search is told again what has been run; where nothing has, its time begins anew.
-        elapsed = () if archive.sets() else study.folder.glob("elapsed*.json")
-        for path in (*study.folder.glob("optuna.log*"), *elapsed):
+        # Where nothing has been run, the search's time begins anew.
+        for path in () if archive.sets() else study.folder.glob("elapsed*.json"):
             path.unlink()
     archive.tidy()
     return archive
@@ -258,6 +250,11 @@ def trial_workers(
     n = config.workers or available()
     where = cluster or f"{n} worker{'s' if n > 1 else ''}"
     _log.info("trials run on %s; each sequence is prepared before its first one", where)
+    if config.runs is None and study.config.runs == "whole":
+        _log.info(
+            "a start takes a new container, so trials run on where they lose track "
+            "(offline.runs: whole)"
+        )
     odometry = study.odometry.changed(user_code=True)
     setup = TrialSetup(TrialSettings.of(study.config), odometry, study.sequences)
     memory = 0.25 * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
@@ -324,7 +321,7 @@ def _evidence(
         for name in names
     }
     switching = config.online.switching.model_dump(mode="json", include={"size", "sets"})
-    online = (config.online.period, config.online.budget, switching)
+    online = (config.online.period, config.online.budget, config.online.worth, switching)
     about = [provenance, trials, online, fixed]
     found = hashlib.blake2b(json.dumps(about).encode(), digest_size=16)
     for name in names:
@@ -341,16 +338,15 @@ def _trial_rows(
     space: ParameterSpace,
     verdicts: Mapping[int, Verdict],
     finished: Finished,
-) -> dict[int, dict[str, Any]]:
+) -> list[dict[str, Any]]:
     """A row for every trial: its parameters, how it was judged, its mean errors in percent."""
-    rows: dict[int, dict[str, Any]] = {}
+    rows = []
     for n, verdict in verdicts.items():
         runs = [finished[name][n] for name in verdict.sequences]
-        row = rows[n] = {"trial": n, **space.row(verdict.parameters)}
+        row: dict[str, Any] = {"trial": n, **space.row(verdict.parameters)}
         row[COST] = float(np.mean([run.cost for run in runs]))
         if config.metrics != {"rte"}:
-            judged = zip(config.objective, verdict.values, strict=True)
-            row |= {label(weights): value for weights, value in judged}
+            row[label(config.objective)] = verdict.value
             for metric in sorted(config.metrics):
                 row[metric] = float(np.mean([run.metrics[metric] for run in runs]))
         if config.limits:
@@ -361,6 +357,7 @@ def _trial_rows(
         row["mean"] = mean
         for name, trials in finished.items():
             row[name] = trials[n].mean_error if n in trials else None
+        rows.append(row)
     return rows
 
 
@@ -397,27 +394,6 @@ def _training_rows(
     return rows
 
 
-def _write_pareto(
-    folder: Path,
-    objective: Sequence[Mapping[Metric, float]],
-    verdicts: Mapping[int, Verdict],
-    fixed: int,
-    trials: Mapping[int, Mapping[str, Any]],
-) -> None:
-    """Write and draw the sets within the limits that no other set beats in every objective."""
-    feasible = [n for n, verdict in verdicts.items() if verdict.feasible and verdict.complete]
-    values = np.array([verdicts[n].values for n in feasible])
-    front = sorted((feasible[i] for i in pareto_front(values)), key=lambda n: verdicts[n].values)
-    tables.write_rows(folder, "pareto", [trials[n] for n in front])
-    chart = pareto_chart(
-        [label(weights, units=True) for weights in objective],
-        values,
-        np.array([verdicts[n].values for n in front]),
-        {name: verdicts[n].values for name, n in (("baseline", 0), ("fixed", fixed))},
-    )
-    draw_chart(chart, folder / "pareto.png", folder / "pareto.svg")
-
-
 def fit(
     data: LabelledData,
     fixed: int,
@@ -448,6 +424,7 @@ def fit(
         paired=DO_NOT_ADAPT,
         bank_settings=NO_BANK,
         budget=data.budget,
+        worth=data.worth,
         costs=data.costs,
     )
 

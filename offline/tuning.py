@@ -217,7 +217,7 @@ def choose(
         # The bank rests, and joins in where it measures that the fixed set fails.
         return Policy(DO_NOT_ADAPT, NO_BANK, banks[0] if banks else [], {})
     n_single = len(PAIRED_SETTINGS) if one_set else 0
-    return least_loss(np.concatenate(logs), recordings, banks, n_single)
+    return least_loss(np.concatenate(logs), recordings, banks, n_single, data.worth)
 
 
 def least_loss(
@@ -225,11 +225,13 @@ def least_loss(
     recordings: Sequence[str],
     banks: Sequence[list[int]],
     n_single: int,
+    worth: float,
 ) -> Policy:
     """The settings with the least loss, of one set at a time and of a bank.
 
     `logs` is of shape (n_stretches, n_single + len(banks) * len(BANK_SETTINGS)); its first
-    `n_single` columns are about one set at a time. `banks` has the members of each.
+    `n_single` columns are about one set at a time. `banks` has the members of each, `worth` the
+    share of the error that a bank has to spare.
     """
     losses = np.array([expected_loss(column, recordings) for column in logs.T])
     losses[~(np.abs(losses) > ROUNDING)] = 0.0
@@ -245,8 +247,8 @@ def least_loss(
         expected[BANK] = figures(logs[:, best], recordings)
         way, which = divmod(best - n_single, len(BANK_SETTINGS))
         members = banks[way]
-        worth = is_worth(expected[BANK].geometric, expected[BANK].high)
-        if worth and losses[best] < min(0.0, losses[:n_single].min(initial=0.0)):
+        spares = is_worth(expected[BANK].geometric, expected[BANK].high, worth)
+        if spares and losses[best] < min(0.0, losses[:n_single].min(initial=0.0)):
             bank = BANK_SETTINGS[which]
     return Policy(one_set, bank, members, expected)
 

@@ -267,10 +267,8 @@ def leave_out(
     costs = {"baseline": alone(0), "fixed": alone(data.fixed), PAIRED: driven}
     costs |= {name: alone(trial) for name, trial in of_rivals.items()}
     errors |= {name: capped[:, data.sets.column(trial)] for name, trial in of_rivals.items()}
-    of_periods = np.array([capped[period == p].mean(axis=0) for p in range(len(first))])
-    # The best set in hindsight, of the whole sequence and of each frame's period.
+    # The best set in hindsight.
     errors["oracle, sequence"] = capped[:, int(np.argmin(capped.mean(axis=0)))]
-    errors["oracle, period"] = capped[frames, of_periods[period].argmin(axis=1)]
     about = (sequence.name, sequence.recording, sequence.stretch, sequence.block)
     return LeftOut(*about, errors, adapted, costs)
 
@@ -314,7 +312,7 @@ def validate(study: OfflineStudy, progress: Progress = unseen) -> Validated:
         validation = leave_one_out(data, progress, bank)
     except ValidationError as error:
         raise ValidationError(f"{error}. {online}") from error
-    rows = _rows(validation, _rate(data))
+    rows = _rows(validation)
     tables.write_rows(study.folder, "validation", rows)
     stretches = _stretch_rows(validation)
     tables.write_rows(study.folder, "stretches", stretches)
@@ -378,18 +376,8 @@ def _labelled(study: OfflineStudy, model: ErrorModel) -> LabelledData:
     return data
 
 
-def _rate(data: LabelledData) -> float:
-    """Scans a second."""
-    stamps = [s.simulation.stamps for s in data.sequences]
-    seconds = sum(float(of[-1] - of[0]) * 1e-9 for of in stamps)
-    return sum(map(len, stamps)) / seconds
-
-
-def _rows(validation: Validation, rate: float) -> list[dict[str, Any]]:
-    """Ratios to the fixed set's error, intervals of the default rule's, and costs.
-
-    Costs become cores by the `rate` in scans a second.
-    """
+def _rows(validation: Validation) -> list[dict[str, Any]]:
+    """Ratios to the fixed set's error, intervals of the default rule's, and costs."""
     default = (*validation.modes, PAIRED)[0]
     modes = [mode for mode in validation.ratios if mode != "fixed"]
     rows: list[dict[str, Any]] = []
@@ -416,8 +404,6 @@ def _rows(validation: Validation, rate: float) -> list[dict[str, Any]]:
     costs = {mode: validation.cost(mode) for mode in ["fixed", *modes]}
     if np.isfinite(list(costs.values())).any():
         add("ms a scan", costs["fixed"], costs)
-        cores = {mode: 1e-3 * rate * cost for mode, cost in costs.items()}
-        add("cores", cores["fixed"], cores)
     summaries = {mode: validation.summary(mode) for mode in modes}
     for key in ("geometric", "arithmetic", "worst_tenth", "worst"):
         ends = summaries[default]["low"], summaries[default]["high"]

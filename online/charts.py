@@ -59,7 +59,7 @@ def comparison_chart(rows: Sequence[ComparisonRow]) -> Chart | None:
         texts = [f"{row.mode}, {row.sequence}" for row in some]
         return Points(ratios, places, name, texts=texts, **look)
 
-    drawn: list[Drawn] = [Mark(1.0, axis="x")]
+    drawn: list[Drawn] = [Mark(1.0)]
     ends = [(*row.ratio_interval, i) for i, row in enumerate(last) if row.ratio_interval]
     if ends:
         x = [value for low, high, _ in ends for value in (low, high, np.nan)]
@@ -123,7 +123,7 @@ def scene_spans(
 
 
 class ModeReplay(NamedTuple):
-    """Errors, selections and times of one mode along a sequence: n scans, m selections."""
+    """Errors and selections of one mode along a sequence: n scans, m selections."""
 
     seconds: NDArray[np.float64]  # since the first scan, of shape (n,)
     errors: NDArray[np.float64]  # sub-trajectory RTE in percent, of shape (n,)
@@ -139,9 +139,6 @@ class ModeReplay(NamedTuple):
     lost: NDArray[np.bool_]  # of shape (m,): whether the bank was lost
     places: NDArray[np.float64]  # (n, 2): metres, by the reference where there is one
     familiarity: NDArray[np.float64]  # (m,): of each selection, see `Selection`; NaN if unknown
-    selection_ms: NDArray[np.float64]  # (m,): that it took; NaN where none was made
-    scan_ms: NDArray[np.float64]  # (n,): to prepare and register a scan
-    late_ms: NDArray[np.float64]  # (n,): from a scan to its pose, in real time; empty otherwise
 
     @property
     def span(self) -> NDArray[np.float64]:
@@ -228,9 +225,6 @@ def _read_mode(replay: StoredReplay, reference: Reference, model: ErrorModel | N
         replay.lost,
         places,
         replay.selections["familiarity"],
-        replay.selections["ms"],
-        replay.frames["prepare_ms"] + replay.frames["register_ms"],
-        replay.frames["late_ms"],
     )
 
 
@@ -251,10 +245,7 @@ def _seen_from(trajectory: Trajectory) -> NDArray[np.float64]:
     return np.asarray((invert(T[0]) @ T)[:, :2, 3])
 
 
-# Charts of selections: how familiar the surroundings were, and how long all took.
-
-
-_BINS = 40
+# How familiar the surroundings were.
 
 
 def familiarity_chart(replayed: ReplayedSequence) -> Chart | None:
@@ -272,60 +263,6 @@ def familiarity_chart(replayed: ReplayedSequence) -> Chart | None:
         "unlike all training. A mode that loses where familiarity is low should not trust its "
         "training there.",
     )
-
-
-def latency_chart(replayed: ReplayedSequence) -> Chart | None:
-    """How long selections and scans took in each mode, as histograms."""
-    period = _scan_period(replayed.modes)
-    kinds: dict[str, Callable[[ModeReplay], NDArray[np.float64]]] = {
-        "to select": lambda of: of.selection_ms,
-        "to prepare and register a scan": lambda of: of.scan_ms,
-        "from a scan to its pose, in real time": lambda of: of.late_ms,
-    }
-    panels = []
-    for what, get in kinds.items():
-        times = {mode: ms for mode, of in replayed.modes.items() if (ms := _positive(get(of))).size}
-        if not times:
-            continue
-        selects = what == "to select"
-        marks = () if selects else (Mark(period, "scan period", "x"),)
-        panels.append(
-            Panel(
-                Axis(f"time {what} [ms]", log=True),
-                Axis(f"share of the {'selections' if selects else 'scans'} [%]"),
-                (*histograms(times), *marks),
-            )
-        )
-    if not panels:
-        return None
-    return Chart(
-        f"{replayed.name}-latency",
-        f"{replayed.name}: how long it took",
-        tuple(panels),
-        "Histograms with bins of equal width on the logarithmic axis. What lies right of the scan "
-        "period takes longer than there is until the next scan.",
-    )
-
-
-def _positive(ms: NDArray[np.float64]) -> NDArray[np.float64]:
-    return ms[np.isfinite(ms) & (ms > 0.0)]
-
-
-def _scan_period(modes: Mapping[str, ModeReplay]) -> float:
-    """Milliseconds from scan to scan."""
-    seconds = next(iter(modes.values())).seconds
-    return 1e3 * float(np.median(np.diff(seconds))) if len(seconds) > 1 else np.nan
-
-
-def histograms(times: Mapping[str, NDArray[np.float64]]) -> list[Line]:
-    """Share of each mode's times in bins that all modes have, in percent, as steps."""
-    every = np.concatenate(list(times.values()))
-    edges = np.geomspace(0.99 * every.min(), 1.01 * every.max(), _BINS + 1)
-    made = []
-    for mode, ms in times.items():
-        shares = 100.0 * np.histogram(ms, edges)[0] / len(ms)
-        made.append(Line(edges, [*shares, 0.0], mode, steps=True))
-    return made
 
 
 TIME = Axis("time [s]")
@@ -351,7 +288,6 @@ def charts_of_replays(replayed: ReplayedSequence) -> Charts:
             or f"No errors of the replays of {sequence}: it has no reference.",
             choice_chart(replayed),
             familiarity_chart(replayed),
-            latency_chart(replayed),
         )
     )
 
@@ -477,7 +413,7 @@ def _weights(replayed: ReplayedSequence) -> Iterator[Panel]:
         shares = np.column_stack([shares, shares[:, -1]])
         # Shares hide what is shaded.
         ends = [] if replayed.scenes is None else replayed.scenes.edges[1:-1]
-        edges = (Mark(float(edge), axis="x") for edge in ends)
+        edges = (Mark(float(edge)) for edge in ends)
         drawn = (*_scenes(replayed), Shares(track.span, shares, tuple(track.weights)), *edges)
         y = Axis("weight [%]", limits=(0.0, 100.0))
         yield Panel(TIME, y, drawn, f"{mode} applies a bank: weights of its members")

@@ -1,6 +1,6 @@
 """The comparison of baseline, fixed and adaptive on the replayed sequences."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -52,7 +52,7 @@ from online.statistics import (
     ALL,
     ERROR_FACTOR,
     NO_DIFFERENCE,
-    ORACLES,
+    ORACLE,
     ComparisonRow,
     JudgedModes,
     Ratio,
@@ -62,7 +62,7 @@ from online.statistics import (
     allowing_for,
     compare_modes,
     mean_of,
-    oracle_rows,
+    oracle_row,
 )
 from online.tables import CALLED, decided, remarks, tables, verdict
 
@@ -102,51 +102,27 @@ def compared_modes(study: Study) -> ComparedModes:
         raise StoredReplayError("test: name at least one sequence to compare on")
     if not finished:
         ReplaySummary.read(replays / names[0] / "fixed")
-    lacking = {mode: tuple(n for n in finished if mode not in made[n]) for mode in modes}
+    lacking = {mode: [n for n in finished if mode not in made[n]] for mode in modes}
     compared = tuple(mode for mode in modes if not lacking[mode])
     unasked = {*RIVALS, *ALSO} - every.intersection(ALSO) - {*setup.also}
     missing = {mode: on for mode, on in lacking.items() if on and mode not in unasked}
     if modes == WITHOUT_MODEL and not every.issubset(WITHOUT_MODEL):
-        missing = {"fixed": tuple(finished)}
-    unfinished = {n: there for n, there in made.items() if n not in finished}
-    words = _unfinished(unfinished, compared, setup.also)
-    words += _missing(missing, tuple(finished), setup.also)
-    return ComparedModes(tuple(finished), compared, tuple(unfinished), words)
-
-
-def _unfinished(
-    unfinished: Mapping[str, Sequence[str]], modes: Sequence[str], asked: Sequence[str]
-) -> list[str]:
-    """A sentence about sequences that lack replays, given the modes that each has."""
-    if not unfinished:
-        return []
-    due = [m for m in modes if m not in ALSO or modes == WITHOUT_MODEL]
-    lacking = (
-        f"{name} ({', '.join(f'`{mode}`' for mode in due if mode not in there)})"
-        for name, there in unfinished.items()
-    )
-    command = replayed_by(asked, UNTRAINED if modes == WITHOUT_MODEL else "fixed")
-    return [
-        f"Not compared, because replays are missing: {', '.join(lacking)}; {command} makes them."
+        missing = {"fixed": finished}
+    unfinished = tuple(name for name in made if name not in finished)
+    for mode in compared:
+        on = [name for name in unfinished if mode not in made[name]]
+        if on and (mode not in ALSO or modes == WITHOUT_MODEL):
+            missing[mode] = on
+    without = WITHOUT_MODEL if modes == WITHOUT_MODEL else ()
+    told: dict[str, list[str]] = {}
+    for mode, on in missing.items():
+        command = replayed_by(setup.also, UNTRAINED if mode in without else mode)
+        told.setdefault(command, []).append(f"`{mode}` on {' and '.join(on)}")
+    words = [
+        f"Not compared, because replays are missing: {', '.join(those)}; {command} makes them."
+        for command, those in told.items()
     ]
-
-
-def _missing(
-    missing: Mapping[str, tuple[str, ...]], sequences: tuple[str, ...], asked: Sequence[str]
-) -> list[str]:
-    """Sentences about modes that were not replayed, given on which sequences."""
-    said = []
-    for names in dict.fromkeys(missing.values()):
-        modes = [mode for mode, on in missing.items() if on == names]
-        are = "are" if len(modes) > 1 else "is"
-        each = " and ".join(f"`{mode}`" for mode in modes)
-        on = "any sequence" if names == sequences else " and ".join(names)
-        command = " or ".join(dict.fromkeys(replayed_by(asked, mode) for mode in modes))
-        said.append(
-            f"{each} {are} not compared: there is no replay on {on}; {command} makes what is "
-            f"missing."
-        )
-    return said
+    return ComparedModes(tuple(finished), compared, unfinished, words)
 
 
 def replayed_by(asked: Sequence[str], mode: str) -> str:
@@ -175,32 +151,23 @@ def pooled(
     known = [one for one in judged if one.rows[0].rte is not None]
     modes = [row.mode for row in known[0].rows]
     made = [_pooled(mode, known) for mode in modes]
-    in_hindsight = [
-        _mean_row(mode, rows)
-        for mode in ORACLES
-        if len(rows := [row for row in oracles if row.mode == mode]) == len(known)
-    ]
-    return [*with_gaps(made, in_hindsight), *in_hindsight]
+    in_hindsight = [_mean_row(ORACLE, oracles)] if len(oracles) == len(known) else []
+    return [*made, *in_hindsight]
 
 
 def _pooled(mode: str, judged: Sequence[JudgedModes]) -> ComparisonRow:
     rows = [row for one in judged for row in one.rows if row.mode == mode]
-    recordings = len({one.recording or one.name for one in judged})
-    row = replace(_mean_row(mode, rows), recordings=recordings)
+    row = _mean_row(mode, rows)
     if mode == row.yardstick:
         return row
-    ends = [row.ratio_interval for row in rows if row.ratio_interval is not None]
     logs = _of_stretches(judged, mode)
     enough = len(logs) >= LEAST_STRETCHES
     return replace(
         row,
         ratio_interval=ratio_to(judged, mode).interval,
         worst_tenth=float(np.exp(worst_tenth(logs))) if enough else None,
-        stretches=len(logs),
         better=sum(row.ratio < 1.0 - NO_DIFFERENCE for row in rows if row.ratio is not None),
         worse=sum(row.ratio > 1.0 + NO_DIFFERENCE for row in rows if row.ratio is not None),
-        surely_better=sum(high < 1.0 for _, high in ends) if ends else None,
-        surely_worse=sum(low > 1.0 for low, _ in ends) if ends else None,
     )
 
 
@@ -294,23 +261,6 @@ def _of_stretches(judged: Sequence[JudgedModes], mode: str) -> NDArray[np.float6
         n = max(1, errors.shape[1] // (PER_STRETCH * one.block))
         found += [_log(part) for part in np.array_split(errors, n, axis=1)]
     return np.array(found)
-
-
-def with_gaps(
-    rows: Sequence[ComparisonRow], oracles: Sequence[ComparisonRow]
-) -> list[ComparisonRow]:
-    """Fill in the share of what the best set of each sequence gains over the fixed set."""
-    best = {row.mode: row.rte for row in oracles}.get(ORACLES[0])
-    others: Mapping[str, float | None] = {row.mode: row.rte for row in rows}
-    fixed = others.get("fixed")
-    if best is None or fixed is None or best >= fixed:
-        return list(rows)
-    return [
-        replace(row, gap_closed=(fixed - row.rte) / (fixed - best))
-        if row.rte is not None and row.mode != "fixed"
-        else row
-        for row in rows
-    ]
 
 
 # Replays that are not of what the study is now: neither compared nor drawn.
@@ -427,13 +377,8 @@ class ComparedReplays(NamedTuple):
     rows: list[ComparisonRow]
     verdict: list[str]  # sentences: what to do, and why
     details: list[str]  # sentences: what must be known to trust it
+    advised: str = ""  # the mode to drive; empty where nobody can say
     unfinished: Sequence[str] = ()  # sequences that are not compared, for want of replays
-
-    @property
-    def advised(self) -> str:
-        """The mode to drive; empty where nobody can say."""
-        best = decided(self.rows)
-        return "" if best is None else best.mode
 
 
 def compare(study: Study) -> ComparedReplays:
@@ -474,14 +419,15 @@ def compare(study: Study) -> ComparedReplays:
         wrong += [f"On {name}, {what}." for what in read_contradictions(folder)]
         of_modes = compare_modes(name, every, reference)
         judged.append(of_modes._replace(recording=study.sequences.recorded_in(name)))
-        oracle = None if model is None else oracle_errors(study.archive("oracle"), name, model)
-        if oracle is not None and model is not None:
-            period = study.config.online.period
-            oracles += oracle_rows(judged[-1], oracle, model.fixed, period)
+        errors = None if model is None else oracle_errors(study.archive("oracle"), name, model)
+        if errors is not None and model is not None:
+            oracle = oracle_row(judged[-1], errors, model.fixed)
+            oracles += [] if oracle is None else [oracle]
     rows = _rows(judged, oracles)
     obstacle = "" if ADAPTIVE in modes else ReplaySetup.of(study).obstacle(ADAPTIVE, model)
     said = wrong[:1] or _lost(study, judged, rows)
-    said += verdict(rows, study.config.sub_trajectory, obstacle)
+    length, worth = study.config.sub_trajectory, study.config.online.worth
+    said += verdict(rows, length, obstacle, worth)
     details = [
         *wrong,
         *remarks(rows),
@@ -492,9 +438,9 @@ def compare(study: Study) -> ComparedReplays:
     details += _without_oracle(judged, oracles) if model is not None else []
     folder = study.folder / "comparison"
     report.write_rows(folder, "comparison", [row.columns() for row in rows])
-    made = tables(rows, study.config.sub_trajectory)
-    report.write_tables(folder, study.name, made, [*said, *details])
-    return ComparedReplays(rows, said, details, compared.unfinished)
+    report.write_tables(folder, study.name, tables(rows, length), [*said, *details])
+    advised = "" if (best := decided(rows, worth)) is None else best.mode
+    return ComparedReplays(rows, said, details, advised, compared.unfinished)
 
 
 def _lost(study: Study, judged: Sequence[JudgedModes], rows: Sequence[ComparisonRow]) -> list[str]:
@@ -558,7 +504,7 @@ def _rows(judged: Sequence[JudgedModes], oracles: Sequence[ComparisonRow]) -> li
     if len(judged) > 1:
         last = pooled(judged, oracles)
     else:
-        last, rows = [*with_gaps(rows, oracles), *oracles], []
+        last, rows = [*rows, *oracles], []
     return [*rows, *(_against(row, known, last) for row in last)]
 
 

@@ -24,7 +24,7 @@ from adaptune.recording.scan import Recording, Scan, part_name
 from adaptune.reference.check import mean_difference
 from adaptune.selector import AnySelector, Selector, UntrainedSelector, untrained_sets
 from adaptune.space import ParameterSet, ParameterSets, Selection
-from adaptune.study.config import RealTimeConfig, StudyConfig, SwitchingConfig
+from adaptune.study.config import WORTH, RealTimeConfig, StudyConfig, SwitchingConfig
 from adaptune.study.references import contradictions_of, ensure_references
 from adaptune.study.study import (
     RIVALS,
@@ -46,7 +46,7 @@ from online.record import (
     write_reference,
     write_replay,
 )
-from online.replay import Look, ReplayRecord, replay
+from online.replay import ReplayRecord, replay
 
 BASELINE, FIXED, ADAPTIVE, PAPER = "baseline", "fixed", "adaptive", "paper"
 EVEN, UNTRAINED = "even", "untrained"
@@ -123,6 +123,7 @@ class ReplaySetup:
     lost_track: float  # metres a second by which the members of a bank may differ and agree
     descriptors: tuple[str, ...]  # those that the study names
     budget: float | None = None  # milliseconds of CPU time a scan
+    worth: float = WORTH  # share of the error that a bank has to spare
     real_time: RealTimeConfig | None = None
     also: tuple[str, ...] = ()  # modes on demand, see `OnlineConfig`
 
@@ -139,6 +140,7 @@ class ReplaySetup:
             config.lost_track,
             config.descriptor,
             config.online.budget,
+            config.online.worth,
             config.online.real_time,
             config.online.also,
         )
@@ -244,9 +246,12 @@ class ReplaySetup:
     def check(self, model: ErrorModel, path: Path) -> None:
         """Refuse a model for another bank, or with a descriptor of somebody else's, from `path`."""
         model.check_descriptors(self.descriptors, path)
-        if model.budget != self.budget:
+        other = "budget" if model.budget != self.budget else ""
+        if model.worth not in (None, self.worth):
+            other = "worth"
+        if other:
             raise ModeError(
-                f"online.budget: {path} was fitted for another budget; run `adaptune offline` "
+                f"online.{other}: {path} was fitted for another one; run `adaptune offline` "
                 f"again, which fits it to the finished trials"
             )
         is_even = EVEN in self.also and not self.obstacle(EVEN, model)
@@ -324,7 +329,6 @@ def run_replays(
     study: Study,
     model_path: Path,
     progress: Progress = unseen,
-    look: Look = lambda *_: None,
     repeats: int = 1,
 ) -> int:
     """Replay every test sequence in every mode, as often as asked, unless that was done before.
@@ -338,8 +342,6 @@ def run_replays(
         The error model.
     progress
         Called about every scan.
-    look
-        Sees every scan, see `adaptune.commands.terminal.Dashboard.look`.
     repeats
         How often each mode is replayed on a sequence.
 
@@ -365,13 +367,12 @@ def run_replays(
         names = " and ".join(name for name in asked if obstacles[name] == why)
         _log.warning("not replayed: %s, because %s", names, why)
     modes = setup.modes(model)
-    return _replay_all(study, study.config.test, modes, progress, look, repeats, model_path)
+    return _replay_all(study, study.config.test, modes, progress, repeats, model_path)
 
 
 def run_untrained(
     study: Study,
     progress: Progress = unseen,
-    look: Look = lambda *_: None,
     repeats: int = 1,
 ) -> int:
     """Replay sequences with the baseline, and with a bank that needs no model.
@@ -386,7 +387,7 @@ def run_untrained(
     """
     ReplaySetup.of(study).mode(UNTRAINED)  # or an error
     names = sequences_without_model(study.config)
-    return _replay_all(study, names, WITHOUT_MODEL, progress, look, repeats)
+    return _replay_all(study, names, WITHOUT_MODEL, progress, repeats)
 
 
 class _Run(NamedTuple):
@@ -403,7 +404,6 @@ def _replay_all(
     sequences: Sequence[str],
     modes: Sequence[str],
     progress: Progress,
-    look: Look,
     repeats: int,
     model_path: Path | None = None,
 ) -> int:
@@ -435,7 +435,7 @@ def _replay_all(
             release_memory()
             try:
                 with closing(setup.instance(mode, name)) as odometry:
-                    record = _replayed(study, recording, odometry, mode, run.what, progress, look)
+                    record = _replayed(study, recording, odometry, mode, run.what, progress)
             except DescriptorError as error:
                 raise ReplayError(f"sequences.{name}: {error}") from error
             if i == 0:
@@ -493,14 +493,12 @@ def _replayed(
     mode: Mode,
     what: str,
     progress: Progress,
-    look: Look,
 ) -> ReplayRecord:
     """Make a replay."""
     online, make, n = study.config.online, mode.selector, recording.n_messages
 
     def watch(record: ReplayRecord) -> None:
         progress(what, record.done, n)
-        look(what, n, record)
 
     given = recording, odometry, study.config.health
     if online.real_time is None:

@@ -257,8 +257,6 @@ class ReplayRecord:
 
 Watch = Callable[[ReplayRecord], None]
 """Called after every scan."""
-Look = Callable[[str, int, ReplayRecord], None]
-"""Called after every scan with what is driven, and how many scans there are (0: nobody knows)."""
 
 
 def replay(

@@ -36,7 +36,7 @@ from online.live import CLOUD, IMU, LiveScans, RosMessages, Uncertainty, placed
 from online.modes import UNTRAINED, WITHOUT_MODEL, Mode, ReplaySetup, needed
 from online.real_time import RealTimeDrive, SelectorProcess
 from online.record import FRAME_COLUMNS, SELECTION_COLUMNS, frame_row, selection_row
-from online.replay import Choice, Look, ReplayRecord
+from online.replay import Choice, ReplayRecord, Watch
 
 # What a drive leaves on disk, written while it lasts.
 
@@ -299,12 +299,12 @@ class RobotDrive:
         else:
             self._mode = setup.mode(mode, model)
 
-    def run(self, link: RosLink, look: Look = lambda *_: None) -> DriveRecord:
+    def run(self, link: RosLink, watch: Watch = lambda _: None) -> DriveRecord:
         """Drive until Ctrl-C, or until `stop` is called.
 
         Where the clock goes back, all begins anew.
 
-        `look` is called after every scan, see `adaptune.commands.terminal.Dashboard.look`.
+        `watch` is called after every scan.
         """
         done = 0
         with ExitStack() as stack:
@@ -320,7 +320,7 @@ class RobotDrive:
             while driven is None or not (scans.stopped or self._stopped):
                 odometry = steered or self._setup.instance(self._mode)
                 with closing(odometry):
-                    driven = self._part(odometry, selector, publisher, look, done)
+                    driven = self._part(odometry, selector, publisher, watch, done)
                 done = driven.scans
         return driven
 
@@ -345,7 +345,7 @@ class RobotDrive:
         odometry: OdometryInstance,
         selector: SelectorProcess | None,
         publisher: "_Publisher",
-        look: Look,
+        watch: Watch,
         done: int,
     ) -> DriveRecord:
         """Drive until the clock goes back; so many scans were there before."""
@@ -371,7 +371,7 @@ class RobotDrive:
             try:
                 for arrival in self._scans.arrivals():
                     publisher.step(drive.step(arrival), record)
-                    look("drive", 0, record)
+                    watch(record)
             except KeyboardInterrupt:
                 self._scans.stop()
             drive.finish()

@@ -37,20 +37,17 @@ ESTIMATED, LOST = "estimated [%]", "lost [s]"
 """Columns of what a bank has measured of itself."""
 REFERENCE = "reference"
 """Column of the kind of reference."""
-GAP = "gap closed [%]"
-"""Column of the share of what the best set of each sequence would gain."""
 NO_DIFFERENCE = 0.01
 """Share of the yardstick's error by which others may differ without it being told."""
-ORACLES = ("oracle, sequence", "oracle, period")
-"""Rows of what the best set of each sequence, and of each period, has in its trials."""
+ORACLE = "oracle, sequence"
+"""Row of what the best set of each sequence has in its trials."""
 Interval = tuple[float, float] | None
 """Ends of a 95 % interval, where it is known."""
 
 
 _FOR_FILES = (
-    *("reference_error", "poor_scans", "rte_interval", "ratio_interval", "blocks", "median"),
-    *("estimated_interval", "repeats", "worst_tenth", "stretches", "better", "worse"),
-    *("surely_better", "surely_worse", "gap_closed"),
+    *("reference_error", "poor_scans", "rte_interval", "ratio_interval", "estimated_interval"),
+    *("repeats", "worst_tenth", "better", "worse"),
 )
 """What only files have of a row; intervals are columns of their ends."""
 
@@ -96,9 +93,7 @@ class ComparisonRow:
     first_pose: float = 0.0  # seconds until then, at most; scans before it do not count
     rte_interval: Interval = None
     ratio_interval: Interval = None
-    median: float | None = None  # of the sub-trajectory RTE, percent
     standard: StandardErrors | None = None
-    blocks: int | None = None  # independent pieces of the recording
     first_restart: float | None = None  # seconds from the start
     unhealthy: tuple[str, ...] = ()  # what the health check found
     yardstick: str = "fixed"  # the mode that others are compared with
@@ -113,17 +108,11 @@ class ComparisonRow:
     memory_mb: float | None = None  # most megabytes of all processes
     real_time: Mapping[str, float] | None = None  # see `ReplaySummary`
     repeats: int = 1  # replays of which errors are means
-    # Over all sequences: geometric mean of the ratios over the worst tenth of the stretches, on how
-    # many sequences the mode has less and more error by what counts, on how many of them surely,
-    # and the share of what the best set of each sequence would gain.
+    # Over all sequences: geometric mean of the ratios over the worst tenth of the stretches, and on
+    # how many sequences the mode has less and more error by what counts.
     worst_tenth: float | None = None
-    stretches: int | None = None
-    recordings: int | None = None  # over all sequences, that they are of
     better: int | None = None
     worse: int | None = None
-    surely_better: int | None = None
-    surely_worse: int | None = None
-    gap_closed: float | None = None
     # By mode, that of this mode's error to the other one's; of controls and rivals.
     against: Mapping[str, Ratio] = field(default_factory=dict)
 
@@ -182,12 +171,11 @@ class ComparisonRow:
 
     def summary_columns(self) -> dict[str, Any]:
         """The row of the table of the modes, over all sequences or on the only one."""
-        shown, driven = self._shown(), self.mode not in ORACLES
+        shown, driven = self._shown(), self.mode != ORACLE
         head = {key: shown.pop(key) for key in list(shown)[:4]}
         over_all = {
             "worst tenth": self.worst_tenth,
             "better / worse": None if self.better is None else f"{self.better} / {self.worse}",
-            GAP: None if self.gap_closed is None else f"{100.0 * self.gap_closed:.0f}",
         }
         changed = {
             LOST: self.lost_seconds or None,
@@ -370,8 +358,6 @@ def _with_errors(row: ComparisonRow, judged: JudgedModes) -> ComparisonRow:
         ratio=float(mine.mean()) / max(float(others.mean()), 1e-12),
         rte_interval=rte_interval,
         ratio_interval=ratio_interval,
-        median=float(np.median(mine)),
-        blocks=len(mine) // judged.block,
     )
 
 
@@ -459,12 +445,8 @@ def _estimated(repeats: Sequence[StoredReplay]) -> tuple[float | None, Interval]
 # What the best choice in hindsight would have had, from trials on the test sequences.
 
 
-def oracle_rows(
-    judged: JudgedModes, oracle: OracleErrors, fixed: int, period: float
-) -> list[ComparisonRow]:
-    """Rows of the best set of the sequence, and of the best set of every period.
-
-    Half of what one set errs on a short stretch is chance, so the latter is out of reach.
+def oracle_row(judged: JudgedModes, oracle: OracleErrors, fixed: int) -> ComparisonRow | None:
+    """Row of the best set of the sequence; None where nothing is known.
 
     Parameters
     ----------
@@ -474,22 +456,14 @@ def oracle_rows(
         Errors of some sets there.
     fixed
         Trial number of the fixed set; without its trial, nothing is known.
-    period
-        Seconds between selections.
     """
     yardstick = judged.rows[0].yardstick
     rte = next(row.rte for row in judged.rows if row.mode == yardstick)
     errors = cap(oracle.errors)
     known = ~np.isnan(errors).any(axis=1)
     if rte is None or fixed not in oracle.trials or not known.any():
-        return []
-    errors, stamps = errors[known], oracle.stamps[known]
-    _, number = np.unique((stamps - oracle.stamps[0]) // int(period * 1e9), return_inverse=True)
-    sums = np.stack([np.bincount(number, of) for of in errors.T], axis=1)
-    best = errors.mean(axis=0).min(), sums.min(axis=1).sum() / len(errors)
+        return None
+    means = errors[known].mean(axis=0)
     # Trials restart at the reference, and replays do not: only the ratio carries over.
-    of_fixed = max(float(errors[:, oracle.trials.index(fixed)].mean()), 1e-12)
-    return [
-        ComparisonRow(judged.name, mode, rte * of / of_fixed, of / of_fixed, yardstick=yardstick)
-        for mode, of in zip(ORACLES, map(float, best), strict=True)
-    ]
+    ratio = float(means.min()) / max(float(means[oracle.trials.index(fixed)]), 1e-12)
+    return ComparisonRow(judged.name, ORACLE, rte * ratio, ratio, yardstick=yardstick)

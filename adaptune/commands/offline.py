@@ -88,8 +88,6 @@ def offline(
         say(sentence)
     say(driven(model, loaded.config.online, loaded.odometry, loaded.mechanism))
     say_fixed(loaded)
-    if len(loaded.config.offline.objective) > 1:
-        say(f"The sets that no other set beats in every objective: {loaded.folder / 'pareto'}.*")
     show_table(
         f"RTE [%] over {model.length:g} m in training, {n} parameter sets",
         training.rows,
@@ -103,10 +101,6 @@ def trials(
     study: StudyFile,
     override: Override = [],  # noqa: B006
     folder: Folder = None,
-    where: Annotated[
-        list[str],
-        typer.Option(metavar="CONDITION", help="As in `--where 'mean < 1'`. May be repeated."),
-    ] = [],  # noqa: B006
     sort: Annotated[
         str | None,
         typer.Option(metavar="COLUMN", help="With `-` before it, the largest first."),
@@ -135,7 +129,7 @@ def trials(
     finished = table.rows(archive, names)
     if not finished:
         raise AdaptuneError(f"{archive.folder}: no trial is finished yet; run `adaptune offline`")
-    chosen = table.select(finished, where, sort, top)
+    chosen = table.select(finished, sort, top)
     labels = loaded.odometry.space.labels
     if csv:
         sys.stdout.write(csv_text(chosen))
@@ -180,7 +174,7 @@ def validate(
     show_table(
         "Error as a ratio to the fixed set's, each recording or stretch left out in turn",
         rows,
-        "Oracles know the errors: the best set of the sequence, and of every period. Intervals: "
+        "The oracle knows the errors: the best set of the sequence. Intervals: "
         "for a recording, a block bootstrap over time, if it is long enough; for the geometric "
         "mean over the stretches, what is expected elsewhere.",
     )
@@ -205,14 +199,6 @@ Given = Annotated[
     str | None,
     typer.Option("--reference", metavar="TOPIC|FILE", help="A given reference to compare with."),
 ]
-Prior = Annotated[
-    str | None,
-    typer.Option(
-        "--position-prior",
-        metavar="TOPIC|FILE",
-        help="Positions to join that are right over long distances, as those of a GPS.",
-    ),
-]
 Length = Annotated[
     float | None,
     typer.Option(
@@ -232,7 +218,6 @@ def reference(
     folder: Out = None,
     points: Annotated[str | None, typer.Option(metavar="TOPIC", help="Topic of the scans.")] = None,
     given: Given = None,
-    prior: Prior = None,
     length: Length = None,
 ) -> None:
     """Estimate the reference of a recording from its scans, without ground truth.
@@ -243,10 +228,10 @@ def reference(
     if target.suffix not in (".yaml", ".yml"):
         if override:
             raise AdaptuneError(f"{target}: -o is for studies; give a study's YAML")
-        _of_recording(target, folder or Path(), (points, given, prior), length)
+        _of_recording(target, folder or Path(), points, given, length)
         return
     options: dict[str, str | float | None] = {"--points": points, "--reference": given}
-    options |= {"--position-prior": prior, "--length": length}
+    options["--length"] = length
     if wrong := [name for name, value in options.items() if value is not None]:
         raise AdaptuneError(
             f"{wrong[0]} is for a single recording; of a study, the YAML says it, see "
@@ -259,7 +244,8 @@ def reference(
 def _of_recording(
     target: Path,
     out: Path,
-    topics: tuple[str | None, str | None, str | None],
+    points: str | None,
+    given: str | None,
     length: float | None,
 ) -> None:
     """Estimate the reference of a recording, write it, and say what it is worth."""
@@ -267,13 +253,10 @@ def _of_recording(
     from adaptune.recording.inspect import inspect
     from adaptune.recording.recording import open_sequence
     from adaptune.reference import check, estimate
-    from adaptune.reference.graph import warn_of_unused
     from adaptune.reference.stored import write_estimate
 
-    points, given, prior = topics
     config = check.recording_config(inspect(target), points, given)
     scans = open_sequence(config)
-    joined = None if prior is None else check.read_prior(config, prior)
     path = out / f"{target.resolve().stem}_reference.tum"
     # What can fail is found before the estimate, which takes minutes.
     check.check_writable(path)
@@ -286,10 +269,8 @@ def _of_recording(
         there = None
     # Only on one core do results repeat bit by bit.
     with pin(os.getpid()), progress() as show:
-        found = estimate.estimate_reference(scans, partial(show, "estimating"), joined)
-        warn_of_unused(scans.name, joined, found)
+        found = estimate.estimate_reference(scans, partial(show, "estimating"))
         about = {"recording": str(target.resolve()), "points": config.points}
-        about["position_prior"] = prior
         metres = length or check.proposed_sub_trajectory(found.trajectory())
         stored = write_estimate(path, found, about, metres)
         if there is not None:

@@ -1,6 +1,7 @@
 """Commands of the online stage."""
 
 import logging
+import math
 import os
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
@@ -13,7 +14,6 @@ import typer
 
 from adaptune.commands.terminal import (
     Cluster,
-    Dashboard,
     Folder,
     Override,
     StudyFile,
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from offline.config import OfflineStudy, OfflineStudyConfig
     from online.charts import ReplayedSequence
     from online.compare import ComparedReplays
+    from online.replay import ReplayRecord
     from online.statistics import ComparisonRow
 
 
@@ -154,11 +155,10 @@ def replay_missing(
     """Make the replays that are missing; how many were made."""
     from online.modes import run_replays, run_untrained
 
-    dashboard = Dashboard()
-    with _alone(loaded), progress(dashboard) as show:
+    with _alone(loaded), progress() as show:
         if untrained:
-            return run_untrained(loaded, show, dashboard.look, repeats)
-        return run_replays(loaded, model or loaded.model_path, show, dashboard.look, repeats)
+            return run_untrained(loaded, show, repeats)
+        return run_replays(loaded, model or loaded.model_path, show, repeats)
 
 
 def _drive(
@@ -173,12 +173,25 @@ def _drive(
     mode = UNTRAINED if untrained else mode or next(iter(loaded.config.online.rules), "adaptive")
     path = None if mode in WITHOUT_MODEL else model or loaded.model_path
     drive = RobotDrive(loaded, mode, path)
-    link, dashboard = Ros2(loaded.config.online.ros.router) if ros2 else local_ros1(), Dashboard()
-    with closing(link), _alone(loaded), progress(dashboard):
+    link = Ros2(loaded.config.online.ros.router) if ros2 else local_ros1()
+    with closing(link), _alone(loaded), progress() as show:
         log.info("drive, %s: Ctrl-C ends it", mode)
-        driven = drive.run(link, dashboard.look)
+        driven = drive.run(link, lambda of: show("drive", of.done, of.done, now(of)))
     dropped = f", {driven.record.dropped} of them dropped" if driven.record.dropped else ""
     say(f"{driven.scans} scans{dropped}: {driven.folder}/")
+
+
+def now(record: "ReplayRecord") -> str:
+    """How a drive goes, in a few words."""
+    late = {"dropped": record.dropped, "selections missed": record.missed}
+    words = [f"{n} {what}" for what, n in late.items() if n]
+    if (choice := record.newest) is not None:
+        words.append(f"trial {choice.selection.trial}")
+        if math.isfinite(error := choice.selection.estimated_error):
+            words.append(f"error {error:.2f} %")
+        if choice.selection.lost:
+            words.append("lost: do not rely on the pose")
+    return ", ".join(words)
 
 
 def compare(
@@ -330,7 +343,7 @@ def _search(study: "OfflineStudy") -> "PageSection":
         return replace(section, missing=(*section.missing, f"{error}."))
     if not finished:
         return section
-    best = archive.select([row for row in finished if row["mean"] is not None], [], "mean", _BEST)
+    best = archive.select([row for row in finished if row["mean"] is not None], "mean", _BEST)
     title = f"The best {len(best)} of {len(finished)} trials, in training"
     listed = archive.with_units(best, study.training, study.odometry.space.labels)
     return replace(section, tables=(Listing(title, listed),))

@@ -1,15 +1,14 @@
 """What every command shares: where it prints, its progress, and its exit after an error."""
 
 import logging
-import math
 import os
 import shlex
 import shutil
 import signal
 import sys
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -22,11 +21,8 @@ from adaptune.progress import Progress
 
 if TYPE_CHECKING:
     from rich.progress import Task, TaskID
-    from rich.table import Table
 
-    from adaptune.space import Selection
     from offline.config import OfflineStudy
-    from online.replay import ReplayRecord
 
 
 # Text of files is printed as it is: no markup, no emoji.
@@ -80,15 +76,10 @@ MOST_FINISHED = 8
 
 
 @contextmanager
-def progress(above: Any = None) -> Iterator[Progress]:
-    """Show a bar for each thing that is done; without a terminal, write a line now and then.
-
-    In a terminal, `above` stands over the bars: something that rich can render, again and again.
-    """
+def progress() -> Iterator[Progress]:
+    """Show a bar for each thing that is done; without a terminal, write a line now and then."""
     begin_work()
     from rich import progress as columns
-    from rich.console import Group
-    from rich.live import Live
 
     bars = columns.Progress(
         columns.TextColumn("{task.description}", markup=False),
@@ -122,10 +113,7 @@ def progress(above: Any = None) -> Iterator[Progress]:
             told = time.monotonic()
             log.info("%s: %d of %d%s", what, done, total, words and f", {words}")
 
-    live: AbstractContextManager[object] = nullcontext()
-    if errors.is_terminal:
-        live = Live(bars if above is None else Group(above, bars), console=errors)
-    with live:
+    with bars if errors.is_terminal else nullcontext():
         yield show
 
 
@@ -138,103 +126,6 @@ def _time_left(task: "Task") -> str:
         if seconds > 2.0 * length:
             return f"about {seconds / length:.0f} {unit} left"
     return f"about {seconds:.0f} s left"
-
-
-NEWEST = 1000
-"""Scans, and selections, whose milliseconds are shown."""
-
-
-class Dashboard:
-    """Shows what a replay, or a drive, does now; rich renders it as often as it likes."""
-
-    def __init__(self) -> None:
-        self._what = ""
-
-    def look(self, what: str, total: int, record: "ReplayRecord") -> None:
-        """Take note of a scan.
-
-        Parameters
-        ----------
-        what
-            What is replayed or driven; where it changes, all begins anew.
-        total
-            How many scans there are; 0 if nobody knows.
-        record
-            What became of the scans so far.
-        """
-        step = record.steps[-1]
-        if what != self._what:
-            self._what, self._begun, self._first = what, time.perf_counter(), step.stamp
-            self._restarts = 0
-        self._restarts += step.unhealthy is not None
-        self._total, self._record = total, record
-
-    def __rich__(self) -> "Table":
-        from rich.table import Table
-        from rich.text import Text
-
-        table = Table.grid(padding=(0, 2))
-        table.add_column(style="bold")
-        table.add_column()
-        for name, words, *style in self._lines() if self._what else ():
-            table.add_row(Text(name), Text(words, *style))
-        return table
-
-    def _lines(self) -> Iterator[tuple[str, ...]]:
-        """Names, words and, of some, styles."""
-        record = self._record
-        # Copies: the replay goes on.
-        steps = list(record.steps)[-NEWEST:]
-        driven = (steps[-1].stamp - self._first) * 1e-9
-        speed = driven / max(time.perf_counter() - self._begun, 1e-9)
-        yield self._what, f"{driven:.1f} s driven, {speed:.1f} times as fast as recorded"
-        of = f" of {self._total}" if self._total else ""
-        restarts = f", restarted {self._restarts} times" if self._restarts else ""
-        took = _in_ms(step.prepare_seconds + step.register_seconds for step in steps)
-        yield "scans", f"{record.done}{of}{restarts}; {took} a scan"
-        if record.rate is not None:
-            words = f"pose {_in_ms(list(record.late)[-NEWEST:])} after the scan"
-            words += f"; scans dropped: {record.dropped}, selections missed: {record.missed}"
-            yield "latency", words, "yellow" if record.dropped + record.missed else ""
-        if (choice := record.newest) is None:
-            return
-        applied, rejected = list(record.choices), list(record.rejected)
-        took = _in_ms(one.seconds for one in (applied + rejected)[-NEWEST:])
-        yield "selections", f"{took}; not applied: {len(rejected)}"
-        yield from _chosen(choice.selection)
-        if why := choice.why_not or choice.fallen_back:
-            yield "warning", why, "yellow"
-
-
-def _chosen(selection: "Selection") -> Iterator[tuple[str, ...]]:
-    """Of a selection: the set or weights, what is predicted, and what was measured."""
-    from adaptune.report.drawing import plain
-
-    if selection.weights is None:
-        values = ", ".join(
-            f"{name} {plain(value) if isinstance(value, int | float) else value}"
-            for name, value in selection.parameters.items()
-        )
-        yield "chosen", f"trial {selection.trial}: {values}"
-    else:
-        heaviest = sorted(selection.weights.items(), key=lambda pair: -pair[1])
-        yield "weights", ", ".join(f"trial {trial} {100.0 * w:.0f} %" for trial, w in heaviest)
-    if math.isfinite(selection.predicted_error):
-        fixed = f"{selection.predicted_fixed:.3f} %"
-        yield "predicted", f"{selection.predicted_error:.3f} %, of the fixed set {fixed}"
-    if math.isfinite(selection.estimated_error):
-        low, high = selection.estimated_low, selection.estimated_high
-        yield "measured", f"{selection.estimated_error:.3f} % ({low:.3f}-{high:.3f} %)"
-    if selection.lost:
-        yield "lost", "do not rely on the pose", "bold red"
-
-
-def _in_ms(seconds: Iterable[float]) -> str:
-    """Median and 99th percentile, in milliseconds."""
-    import numpy as np
-
-    half, most = 1e3 * np.percentile(list(seconds) or [0.0], (50, 99))
-    return f"{half:.1f} ms (99 %: {most:.1f})"
 
 
 def say_fixed(study: "OfflineStudy", advised: bool = True) -> None:
@@ -294,14 +185,6 @@ StudyFile = Annotated[
 ]
 
 
-def _complete_override(incomplete: str) -> list[str]:
-    """Keys and values for `-o`, when the shell asks."""
-    from adaptune.study.config import complete
-    from offline.config import NAMES, OfflineStudyConfig
-
-    return complete(OfflineStudyConfig, incomplete, {"offline.sampler": NAMES})
-
-
 Override = Annotated[
     list[str],
     typer.Option(
@@ -310,7 +193,6 @@ Override = Annotated[
         metavar="KEY=VALUE",
         help="Replace a value of the YAML, as in `-o offline.trials=128`. May be repeated.",
         show_default=False,
-        autocompletion=_complete_override,
     ),
 ]
 Folder = Annotated[

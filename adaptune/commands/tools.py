@@ -1,36 +1,18 @@
-"""Commands that need no study: the cache, odometries for other programs, RUSTLE's files."""
+"""Commands that need no study: odometries for other programs, RUSTLE's files."""
 
 import logging
 import os
 import sys
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 
-from adaptune.commands.terminal import begin_work, console, say, say_next
+from adaptune.commands.terminal import begin_work, say, say_next
 from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
 
 _log = logging.getLogger(__name__)
-
-
-def cache(
-    action: Annotated[Literal["list", "clear"], typer.Argument(help="List or clear it.")] = "list",
-) -> None:
-    """List or clear the decoded recordings on disk.
-
-    adaptune decodes a bag once, and then maps it into memory. `ADAPTUNE_CACHE` names another
-    folder; `ADAPTUNE_CACHE_GB` limits its size (50), and 0 turns it off.
-    """
-    from adaptune.recording.cache import clear_cache
-    from adaptune.recording.inspect import render_cache
-
-    if action == "clear":
-        say(f"Freed {clear_cache() / 1e9:.2f} GB. Bags are decoded again when they are read.")
-    else:
-        console.print(render_cache())
-        say_next("free all of it", "cache", "clear")
 
 
 def serve(

@@ -20,6 +20,7 @@ from adaptune.commands.terminal import (
     progress,
     say,
     say_next,
+    say_next_of_study,
     show_table,
 )
 from adaptune.errors import AdaptuneError
@@ -43,7 +44,7 @@ def inspect(
         Path,
         typer.Argument(
             metavar="FILE",
-            help="A bag, a folder, a file of poses, an error model, or a study's folder.",
+            help="A bag, a folder, a file of poses, an error model, a study or its folder.",
             show_default=False,
         ),
     ],
@@ -56,9 +57,13 @@ def inspect(
     """Show what is in a recording, what each stage lacks, and how to name it in a study.
 
     Of an error model, or of a study's folder, show its sets, sequences, provenance and validation.
+    Of a study's YAML with a ROS 1 image, run it on twenty seconds: which way of playing fits?
     """
     if file.suffix == MODEL_SUFFIX or (file / f"model{MODEL_SUFFIX}").exists():
         _show_model(file)
+        return
+    if file.suffix in (".yaml", ".yml"):
+        _try_system(file)
         return
     check_no_study(file)
     if study is not None and study.exists():
@@ -85,6 +90,18 @@ def inspect(
     if study is not None:
         write_text(study, f"{found.entry}\n{rest}")
     say_next("train on a part of it", "offline", path, first=first)
+
+
+def _try_system(file: Path) -> None:
+    from adaptune.study.tried import SECONDS, try_system
+
+    study = load(file, [], None, runs=True)
+    with progress() as show:
+        said, rows = try_system(study, show)
+    for sentence in said:
+        say(sentence)
+    show_table(f"{SECONDS:g} s of {study.training[0]}, with the baseline", rows)
+    say_next_of_study("run trials, fit the error model", "offline", "write this; then ")
 
 
 def check_no_study(path: Path) -> None:

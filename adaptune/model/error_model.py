@@ -117,6 +117,7 @@ class _Header(BaseModel):
     expected: dict[str, dict[str, float]]
     validation: dict[str, Any]
     budget: float | None
+    worth: float | None = None
     rivals: dict[str, int]
     costs: Costs | None
 
@@ -155,6 +156,8 @@ class ErrorModel:
     expected: dict[str, dict[str, float]] = field(default_factory=dict)
     validation: dict[str, Any] = field(default_factory=dict)  # by rule, what `validate` found
     budget: float | None = None  # milliseconds of CPU time a scan, live evidence included
+    # Share of the error that a bank had to spare to be driven; None if nobody asked.
+    worth: float | None = None
     # By name, trial numbers of what could be driven instead, see `offline.tuning.rivals`.
     rivals: dict[str, int] = field(default_factory=dict)
     costs: Costs | None = None  # what the sets cost; None if it was not measured
@@ -280,7 +283,7 @@ class ErrorModel:
             "sets": self.sets.parameters,
             "paired": self.paired.model_dump(),
             "bank_settings": self.bank_settings.model_dump(),
-        } | {name: getattr(self, name) for name in (*plain, "bank", "budget")}
+        } | {name: getattr(self, name) for name in (*plain, "bank", "budget", "worth")}
 
     @property
     def digest(self) -> str:

@@ -514,7 +514,8 @@ def poses_at(trajectory: Trajectory, stamps: NDArray[np.int64]) -> Poses:
         begin, end = (1e-9 * trajectory.stamps[[0, -1]]).tolist()
         raise OdometryError(
             f"its poses are of {begin:.3f} s to {end:.3f} s, the scans of "
-            f"{1e-9 * stamps[0]:.3f} s to {1e-9 * stamps[-1]:.3f} s"
+            f"{1e-9 * stamps[0]:.3f} s to {1e-9 * stamps[-1]:.3f} s: the program must stamp poses "
+            f"as the scans are"
         )
     return T
 

@@ -44,11 +44,11 @@ class HealthCheck(StrictModel):
     """
 
     max_speed: float = Field(40.0, gt=0, le=1e9)  # metres a second
+
     # Seconds for which the pose may stay where it is to the micrometre, after a step faster than
     # half a metre a second. A robot slows down before it stops, and the noise of its scans moves
     # the pose: only an odometry that has given up stops dead.
-    max_freeze: float = Field(1.0, gt=0, le=1e9)
-
+    max_freeze: ClassVar[float] = 1.0
     # Metres a second squared, of the step's mean velocity against the last healthy one's; generous
     # enough for the noise of two differentiations. Irregular stamps widen it. What counts is the
     # mean velocity over up to a second: what is taken back within it does not. In the first second

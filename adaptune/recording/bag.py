@@ -15,7 +15,6 @@ from collections.abc import (
 )
 from contextlib import contextmanager
 from functools import cache, partial
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -133,7 +132,7 @@ def _fields(header: bytes) -> dict[bytes, bytes]:
     return fields
 
 
-POINTS_TYPES = ("sensor_msgs/msg/PointCloud2", *clouds.LIVOX_TYPES, *clouds.VELODYNE_TYPES)
+POINTS_TYPES = ("sensor_msgs/msg/PointCloud2", *clouds.LIVOX_TYPES)
 IMU_TYPES = ("sensor_msgs/msg/Imu",)
 
 
@@ -293,8 +292,6 @@ class BagSource:
         types = tuple(types)
         fitting = sorted(t for t, kind in self.topics.items() if kind in types)
         if name is None:
-            # Packets are often recorded together with the points that were made of them.
-            fitting = [t for t in fitting if self.topics[t] not in clouds.VELODYNE_TYPES] or fitting
             if len(fitting) != 1:
                 help_ = f", name one of them: {', '.join(fitting)}" if fitting else self._list()
                 raise SequenceError(f"{self.name}: {len(fitting)} topics with {what}{help_}")
@@ -305,19 +302,6 @@ class BagSource:
             raise SequenceError(f"{self.name}: {name} is {self.topics[name]}, not {what}")
         help_ = nearest(name, self.topics) + self._list()
         raise SequenceError(f"{self.name}: no topic {name}; {help_}")
-
-    def check(self, reference: str | None, imu: str | None) -> None:
-        """Make sure that the named topics are there, and that the points can be decoded."""
-        if (
-            self.topics[self.points] in clouds.VELODYNE_TYPES
-            and find_spec("velodyne_decoder") is None
-        ):
-            help_ = "install adaptune[velodyne] to decode them"
-            raise SequenceError(f"{self.name}: {self.points} holds a Velodyne's packets; {help_}")
-        if reference is not None:
-            self.topic(reference, POSES, "poses")
-        if imu is not None:
-            self.topic(imu, IMU_TYPES, "an IMU's measurements")
 
     def _list(self) -> str:
         topics = sorted(f"{topic} ({kind})" for topic, kind in self.topics.items())
@@ -354,6 +338,11 @@ class BagSource:
                 f"short, repair it first (`rosbag reindex`, `ros2 bag reindex` or `mcap recover`)"
             ) from error
         try:
+            if not all(isinstance(c.msgcount, int) for c in reader.connections):
+                what = (
+                    "metadata.yaml counts messages in what are no numbers; run `ros2 bag reindex`"
+                )
+                raise SequenceError(f"{self.name}: {what}")
             yield reader
         finally:
             reader.close()
@@ -385,8 +374,6 @@ class BagSource:
 
     def _decoder(self, reader: AnyReader) -> Callable[[bytes], Scan]:
         kind, definitions = self.topics[self.points], reader.typestore.fielddefs
-        if kind in clouds.VELODYNE_TYPES:
-            return clouds.decoder(reader.is2)
         livox = kind in clouds.LIVOX_TYPES
         point = kind.replace("Msg", "Point") if livox else "sensor_msgs/msg/PointField"
         self._check_standard(definitions, ("std_msgs/msg/Header", point, kind), reader.is2)

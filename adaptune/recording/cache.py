@@ -14,7 +14,6 @@ import tempfile
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, Self
@@ -217,52 +216,20 @@ def tee(scans: Iterable[Scan], key: str, about: dict[str, Any]) -> Iterator[Scan
             writer.done()
 
 
-@dataclass(frozen=True)
-class CacheEntry:
-    """A decoded sequence on disk."""
-
-    name: str  # the recording
-    path: Path  # folder of the entry
-    size: int  # bytes
-    used: float  # when it was last opened, in seconds since 1970
-    n_scans: int
-
-
-def list_cache() -> list[CacheEntry]:
-    """All entries, the last used first."""
-    entries = []
-    for path in folder().glob("[!.]*"):
-        try:
-            about = path / _ABOUT
-            name = json.loads(about.read_text("utf-8"))["name"]
-            n_scans = len(np.load(path / _INDEX, mmap_mode="r"))
-            entry = CacheEntry(name, path, _size(path), about.stat().st_mtime, n_scans)
-        except (OSError, ValueError, KeyError):
-            continue
-        entries.append(entry)
-    return sorted(entries, key=lambda entry: -entry.used)
-
-
-def clear_cache() -> int:
-    """Remove all entries and the remains of dead writers, and return the freed bytes."""
-    freed = 0
-    for path in folder().glob("*"):
-        # Other files in a shared folder stay.
-        if path.name.startswith(".writing-") or (path / _INDEX).exists():
-            freed += _size(path)
-            shutil.rmtree(path, ignore_errors=True)
-    return freed
-
-
 def _make_room(size: int) -> None:
-    entries = list_cache()
-    total = sum(entry.size for entry in entries) + size
-    for entry in reversed(entries):
+    """Remove the entries that were used least recently, so that another one has room."""
+    entries = []
+    for index in folder().glob(f"[!.]*/{_INDEX}"):
+        with suppress(OSError):  # another process may remove it
+            used = (index.parent / _ABOUT).stat().st_mtime
+            entries.append((used, _size(index.parent), index.parent))
+    total = sum(of for _, of, _ in entries) + size
+    for _, of, path in sorted(entries):
         if total <= cap():
             return
         # Processes that have mapped it keep their arrays.
-        shutil.rmtree(entry.path, ignore_errors=True)
-        total -= entry.size
+        shutil.rmtree(path, ignore_errors=True)
+        total -= of
 
 
 def _sweep(root: Path) -> None:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from adaptune import geometry
 from adaptune.geometry import Poses
-from adaptune.recording.scan import Imu, Scan
+from adaptune.recording.scan import Scan
 from adaptune.trajectory import Trajectory
 
 # Rotation changes slowly: between these many moments of a scan it is taken as constant.
@@ -36,7 +36,15 @@ def compensate(scan: Scan, T_start_end: Poses, duration: float) -> Scan:
     twist = Rotation.from_matrix(T_start_end[:3, :3]).as_rotvec() / duration
     velocity = T_start_end[:3, 3] / duration
     moments = np.linspace(0.0, max(float(scan.times.max()), 1e-9), _MOMENTS)
-    points = _rotate(scan, moments, Rotation.from_rotvec(moments[:, None] * twist))
+    matrices = Rotation.from_rotvec(moments[:, None] * twist).as_matrix().astype(np.float32)
+    # The rotation of a point is looked up on a grid fine enough that the step between neighbours,
+    # a 64th of the scan's rotation, is met by interpolating the rotated points linearly.
+    place = np.clip(scan.times / np.float32(moments[1]), 0, _MOMENTS - 1)
+    low = np.minimum(place.astype(np.intp), _MOMENTS - 2)
+    share = (place - low)[:, None]
+    before = np.einsum("nij,nj->ni", matrices[low], scan.points)
+    after = np.einsum("nij,nj->ni", matrices[low + 1], scan.points)
+    points = before + share * (after - before)
     points += scan.times[:, None] * velocity.astype(np.float32)
     return replace(scan, points=points, times=np.zeros_like(scan.times))
 
@@ -105,51 +113,10 @@ def turning_of(scans: Iterable[Scan]) -> tuple[NDArray[np.int64], NDArray[np.flo
     return np.array(stamps, np.int64), np.array(rates, np.float64)
 
 
-def compensate_rotation(scan: Scan, imu: Imu) -> Scan:
-    """Undo the rotation that a gyroscope measured during the scan.
-
-    Translation stays. A scan without times, or without measurements around it, is returned as it
-    is. Both are on the same clock.
-    """
-    if scan.times is None or not len(scan):
-        return scan
-    span = float(scan.times.max())
-    first, last = np.searchsorted(imu.stamps, [scan.stamp, scan.stamp + round(span * 1e9)])
-    # One measurement before the scan and one after it.
-    if first == 0 or last >= len(imu):
-        return scan
-    part = slice(first - 1, last + 1)
-    seconds = (imu.stamps[part] - scan.stamp) * 1e-9
-    rates = imu.angular_velocity[part] @ imu.T_sensor_imu[:3, :3].T
-    from scipy.spatial.transform import Rotation
-
-    moments = np.linspace(0.0, max(span, 1e-9), _MOMENTS)
-    at = np.stack([np.interp(moments, seconds, rates[:, i]) for i in range(3)], axis=1)
-    steps = Rotation.from_rotvec((at[1:] + at[:-1]) * 0.5 * np.diff(moments)[:, None])
-    rotations = [Rotation.identity()]
-    for step in steps:
-        rotations.append(rotations[-1] * step)
-    return replace(scan, points=_rotate(scan, moments, Rotation.concatenate(rotations)))
-
-
-def _rotate(scan: Scan, moments: NDArray[np.float64], rotations: Any) -> NDArray[np.float32]:
-    """Rotate each point by the rotation at its time.
-
-    The rotation of a point is looked up on a grid fine enough that the step between neighbours,
-    a 64th of the scan's rotation, is met by interpolating the rotated points linearly.
-    """
-    assert scan.times is not None
-    matrices = rotations.as_matrix().astype(np.float32)
-    place = np.clip(scan.times / np.float32(moments[1]), 0, _MOMENTS - 1)
-    low = np.minimum(place.astype(np.intp), _MOMENTS - 2)
-    share = (place - low)[:, None]
-    before = np.einsum("nij,nj->ni", matrices[low], scan.points)
-    after = np.einsum("nij,nj->ni", matrices[low + 1], scan.points)
-    return np.asarray(before + share * (after - before))
-
-
 _LEAST_CORRELATION = 0.8
 """Of two rates of turning that show the same motion."""
+_RATE = 50.0
+"""Samples per second to compare."""
 _AMBIGUOUS = 0.95
 """Share of the best correlation with which another offset could be the right one."""
 
@@ -158,7 +125,6 @@ def clock_offset(
     trajectory: Trajectory,
     stamps: NDArray[np.int64],
     turning: NDArray[np.float64],
-    rate: float = 50.0,
 ) -> list[float]:
     """Seconds to add to a trajectory's stamps so that it turns when a gyroscope or a LiDAR does.
 
@@ -171,8 +137,6 @@ def clock_offset(
         On its own clock.
     stamps, turning
         Nanoseconds on the other clock and radians per second, of shape (n,).
-    rate
-        Samples per second to compare.
 
     Returns
     -------
@@ -187,27 +151,27 @@ def clock_offset(
     middles = (trajectory.stamps[:-1] - trajectory.stamps[0]) * 1e-9 + seconds / 2
     other = (stamps - stamps[0]) * 1e-9
     # Each is a mean over the time between its samples: it is averaged over the other's too.
-    a = _sampled(middles, turned / seconds, rate, float(np.median(np.diff(other))))
-    b = _sampled(other, turning, rate, float(np.median(seconds)))
-    if min(len(a), len(b)) < 2 * rate:
+    a = _sampled(middles, turned / seconds, float(np.median(np.diff(other))))
+    b = _sampled(other, turning, float(np.median(seconds)))
+    if min(len(a), len(b)) < 2 * _RATE:
         return []
     coefficients, lags = _correlation(a, b)
     best = int(np.argmax(coefficients))
-    others = np.where(np.abs(lags - lags[best]) > rate, coefficients, -1.0)
+    others = np.where(np.abs(lags - lags[best]) > _RATE, coefficients, -1.0)
     other = int(np.argmax(others))
     start = (stamps[0] - trajectory.stamps[0]) * 1e-9 - middles[0]
     least = max(_LEAST_CORRELATION, _AMBIGUOUS * float(coefficients[best]))
     fit = [best] if coefficients[best] >= _LEAST_CORRELATION else []
     fit += [other] if fit and others[other] >= least else []
-    return [float(start + lags[at] / rate) for at in fit]
+    return [float(start + lags[at] / _RATE) for at in fit]
 
 
 def _sampled(
-    seconds: NDArray[np.float64], values: NDArray[np.float64], rate: float, over: float
+    seconds: NDArray[np.float64], values: NDArray[np.float64], over: float
 ) -> NDArray[np.float64]:
     # Ten hours at 50 Hz; anything longer is a stamp gone wrong.
-    grid = np.arange(seconds[0], min(seconds[-1], seconds[0] + 36000.0), 1.0 / rate)
-    window = min(max(round(over * rate), 1), max(len(grid), 1))
+    grid = np.arange(seconds[0], min(seconds[-1], seconds[0] + 36000.0), 1.0 / _RATE)
+    window = min(max(round(over * _RATE), 1), max(len(grid), 1))
     return np.convolve(np.interp(grid, seconds, values), np.ones(window) / window, mode="same")
 
 

@@ -21,14 +21,14 @@ from adaptune.files import expand_user
 from adaptune.recording.scan import USUAL, Imu, ImuNoise, Mark, Part, SequenceError, Unit
 from adaptune.strict import StrictModel
 
-Compensation = Literal["constant_velocity", "gyro"] | None
+Compensation = Literal["constant_velocity"] | None
 """How motion within a scan is undone; none if it is left as it is."""
 MOST_VIEWS = 16
 """Views of one sequence, and views to train on; each costs time with every scan."""
 REFERENCE_FILES = (".tum", ".txt", ".csv")
 ESTIMATED, NO_REFERENCE = "estimated", "none"
 """In place of a `reference`: it is estimated from the scans, or there is none."""
-_SOURCES = ("bag", "kitti", "folder", "evalio")
+_SOURCES = ("bag", "kitti", "folder")
 _STANDARD_GRAVITY = 9.80665
 
 
@@ -218,15 +218,14 @@ class ImuConfig(StrictModel):
 
 
 class SequenceConfig(_Part):
-    """A recording, from one of `bag`, `kitti`, `folder` and `evalio`, and what of it to use."""
+    """A recording, from one of `bag`, `kitti` and `folder`, and what of it to use."""
 
     # Bags that follow each other: files, ROS 2 folders, folders of bags, patterns.
     bag: Annotated[str | tuple[str, ...] | None, BeforeValidator(_resolve_bags)] = None
-    # Folder of a KITTI odometry sequence, or of a drive of KITTI raw or KITTI-360.
+    # Folder of a KITTI odometry sequence.
     kitti: Annotated[str, AfterValidator(resolve)] | None = None
     # Folder of ``.pcd``, ``.ply``, ``.npy`` or ``.bin`` files.
     folder: Annotated[str, AfterValidator(resolve)] | None = None
-    evalio: str | None = None  # one of evalio's sequences, as ``newer_college_2020/short``
     points: str | None = None  # topic of the point clouds
     frame: str | None = None  # `frame_id` of the point clouds, where the topic has several
     stamp: Mark = "auto"  # what a stamp marks of its scan
@@ -239,8 +238,6 @@ class SequenceConfig(_Part):
     # `estimated` from the scans, also where there are poses; `none`. Left out, the recording's own
     # poses, and where it has none, estimated.
     reference: Annotated[str, AfterValidator(_resolve_file)] | None = None
-    # Poses like those of a `reference`, right over long distances only, that an estimate joins.
-    position_prior: Annotated[str, AfterValidator(_resolve_file)] | None = None
     child_frame: str | None = None  # of the transforms, where `reference` is a topic of them
     extrinsic: Transform | None = None  # the LiDAR's pose in the frame of the reference poses
     # Seconds to add to the reference's stamps, as far as those of other clocks lie.
@@ -248,10 +245,9 @@ class SequenceConfig(_Part):
     # Seconds. The reference is unknown between poses further apart.
     max_gap: float = Field(1.0, gt=0, le=1e9)
     imu: ImuConfig | None = None
-    # Degrees by which to turn up every ray of a `kitti` recording; 0.205 for the odometry
-    # benchmark and the raw drives when left out.
+    # Degrees by which to turn up every ray of a `kitti` recording; 0.205 when left out.
     elevation: float | None = Field(None, ge=-5, le=5)
-    # Undo the motion since the scan before, or the rotation that the IMU measured.
+    # Undo the motion within scans, as fast as it was since the scan before.
     compensate: Compensation = None
     views: Annotated[tuple[ViewConfig, ...], Field(max_length=MOST_VIEWS)] = ()
     cache: bool = True  # whether to keep decoded bags in the cache
@@ -267,15 +263,6 @@ class SequenceConfig(_Part):
                 raise ValueError(f"`{key}` is for a bag; {given[0]} has none")
         if self.elevation is not None and given[0] != "kitti":
             raise ValueError(f"`elevation` is for kitti; {given[0]} has none")
-        if self.compensate == "gyro" and self.imu is None:
-            raise ValueError("`compensate: gyro` needs `imu`")
-        if self.position_prior in (ESTIMATED, NO_REFERENCE):
-            raise ValueError("`position_prior` names a topic or a file of poses")
-        if self.position_prior is not None and self.reference not in (None, ESTIMATED):
-            raise ValueError(
-                f"`position_prior` joins an estimated reference: write `reference: {ESTIMATED}`, "
-                f"or leave `position_prior` out"
-            )
         return self
 
     @property
@@ -293,10 +280,3 @@ class SequenceConfig(_Part):
     def bags(self) -> list[Path]:
         """Bags to open; a SequenceError if there is no such bag."""
         return bag_paths((self.bag,) if isinstance(self.bag, str) else self.bag or ())
-
-    def paths(self) -> list[Path]:
-        """Files and folders that it is read from; a SequenceError if there is no such bag."""
-        paths = [*self.bags(), *(Path(given) for given in (self.kitti, self.folder) if given)]
-        of_poses = (self.reference, self.position_prior)
-        paths += [Path(file) for file in of_poses if file and file.endswith(REFERENCE_FILES)]
-        return paths

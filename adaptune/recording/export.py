@@ -9,11 +9,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune import geometry
 from adaptune.files import write_text
-from adaptune.geometry import Poses
 from adaptune.recording.scan import Imu, Scan
-from adaptune.trajectory import write_kitti
 
 Message = tuple[str, int, Any]
 """Topic, nanoseconds at which it is sent, content."""
@@ -23,11 +20,6 @@ Layout = Literal["bag", "ros2", "kitti"]
 
 POINTS, IMU = "/points", "/imu"
 """Topics of the bags."""
-
-T_CAMERA_LIDAR = np.array(
-    [[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
-)
-"""A camera in the LiDAR's place which looks ahead, z forward, as KITTI's do."""
 
 _KINDS = {"<f4": 7, "<u2": 4}
 
@@ -167,10 +159,8 @@ def measurements(messages: Messages, imu: Imu, topic: str) -> Iterator[Message]:
         yield topic, stamp, messages.imu(messages.header(topic, stamp, "imu"), gyro, accel)
 
 
-def write_kitti_sequence(
-    scans: Iterable[Scan], root: Path, name: str = "00", T_camera_lidar: Poses | None = None
-) -> None:
-    """Write a sequence of the KITTI odometry benchmark, without its poses.
+def write_kitti_sequence(scans: Iterable[Scan], root: Path, name: str = "00") -> None:
+    """Write a sequence of the KITTI odometry benchmark, its camera in the LiDAR's frame, no poses.
 
     Parameters
     ----------
@@ -180,9 +170,6 @@ def write_kitti_sequence(
         Folder of the benchmark; it receives ``sequences/<name>``.
     name
         Of the sequence, which is not there yet.
-    T_camera_lidar
-        Pose of shape (4, 4) for ``calib.txt``: KITTI's poses are those of the camera. The camera
-        is in the LiDAR's frame when left out.
     """
     sequence = root / "sequences" / name
     (sequence / "velodyne").mkdir(parents=True)
@@ -196,20 +183,6 @@ def write_kitti_sequence(
         (sequence / "velodyne" / f"{number:06d}.bin").write_bytes(cloud.tobytes())
     seconds = (np.array(stamps) - stamps[0]) * 1e-9
     write_text(sequence / "times.txt", "".join(f"{t:.6e}\n" for t in seconds))
-    T = np.eye(4) if T_camera_lidar is None else T_camera_lidar
-    rows = " ".join(f"{v:.12e}" for v in T[:3].ravel())
-    camera = " ".join(f"{v:.12e}" for v in np.eye(3, 4).ravel())
-    lines = [*(f"P{i}: {camera}\n" for i in range(4)), f"Tr: {rows}\n"]
-    write_text(sequence / "calib.txt", "".join(lines))
-
-
-def write_kitti_poses(
-    T_world_lidar: Poses, root: Path, name: str = "00", T_camera_lidar: Poses | None = None
-) -> None:
-    """Write ``poses/<name>.txt`` of the KITTI odometry benchmark: the camera's, the first at 0.
-
-    `T_world_lidar` are of shape (n, 4, 4), one a scan. For the rest see `write_kitti_sequence`.
-    """
-    T = np.eye(4) if T_camera_lidar is None else T_camera_lidar
-    of_lidar = geometry.invert(T_world_lidar[0]) @ T_world_lidar
-    write_kitti(root / "poses" / f"{name}.txt", T @ of_lidar @ geometry.invert(T))
+    identity = " ".join(f"{v:.12e}" for v in np.eye(3, 4).ravel())
+    names = ("P0", "P1", "P2", "P3", "Tr")
+    write_text(sequence / "calib.txt", "".join(f"{of}: {identity}\n" for of in names))

@@ -21,7 +21,7 @@ from adaptune.errors import NotInstalledError
 from adaptune.geometry import Poses
 from adaptune.recording.clouds import PointCloudError, from_fields
 from adaptune.recording.scan import AUTO, Frame, Imu, Scan, SequenceError, Timing
-from adaptune.trajectory import Trajectory, TrajectoryError, read_kitti, read_oxts
+from adaptune.trajectory import Trajectory, read_kitti
 
 SUFFIXES = (".bin", ".npy", ".pcd", ".ply")
 ELEVATION = 0.205
@@ -186,24 +186,15 @@ def _named_stamps(files: Sequence[Path], period: float) -> NDArray[np.int64]:
 
 
 def kitti(folder: Path, elevation: float | None = None) -> FileSource:
-    """Scans of a KITTI odometry sequence, a KITTI raw drive or a KITTI-360 drive.
+    """Scans of a sequence of the KITTI odometry benchmark.
 
-    The content of the folder shows the kind: ``velodyne/`` with ``times.txt`` and ``calib.txt``
-    (poses in ``poses.txt``, or ``poses/`` two folders up), or ``velodyne_points/data/`` (poses
-    from ``oxts/``, or from ``data_poses/`` two folders up). Every ray is turned up by `elevation`
-    degrees: 0.205 when left out, and 0 for KITTI-360.
+    It holds ``velodyne/``, ``times.txt`` and ``calib.txt``; poses are in ``poses.txt``, or in
+    ``poses/`` two folders up. Every ray is turned up by `elevation` degrees, 0.205 when left out.
     """
-    if (folder / "velodyne").is_dir():
-        return _kitti_odometry(folder, ELEVATION if elevation is None else elevation)
-    if (folder / "velodyne_points" / "data").is_dir():
-        return _kitti_drive(folder, elevation)
     if not folder.is_dir():
         raise SequenceError(f"{folder}: there is no such folder")
-    what = "not a KITTI sequence; it has neither velodyne/ nor velodyne_points/data/"
-    raise SequenceError(f"{folder}: {what}")
-
-
-def _kitti_odometry(folder: Path, elevation: float) -> FileSource:
+    if not (folder / "velodyne").is_dir():
+        raise SequenceError(f"{folder}: not a KITTI sequence; it has no velodyne/")
     files = _scans(folder / "velodyne")
     stamps = _seconds(folder / "times.txt")
     if len(files) > len(stamps):
@@ -226,98 +217,23 @@ def _kitti_odometry(folder: Path, elevation: float) -> FileSource:
         files,
         _by_number(files, stamps),
         own_poses=poses if found else None,
-        elevation=elevation,
+        elevation=ELEVATION if elevation is None else elevation,
         stamp_files=[folder / "times.txt"],
         pose_files=[found, folder / "calib.txt"] if found else [],
     )
 
 
-def _kitti_drive(folder: Path, elevation: float | None) -> FileSource:
-    points = folder / "velodyne_points"
-    files = _scans(points / "data")
-    started = points / "timestamps_start.txt"
-    path = started if started.exists() else points / "timestamps.txt"
-    stamps = _by_number(files, _dates(path))
-    poses: Callable[[], Trajectory] | None = None
-    pose_files: list[Path] = []
-    if (folder / "oxts" / "data").is_dir():
-        poses = partial(_oxts_poses, folder)
-        pose_files = sorted((folder / "oxts" / "data").glob("*.txt"))
-        pose_files += [folder / "oxts/timestamps.txt", folder.parent / "calib_imu_to_velo.txt"]
-    elif (record := folder.parent.parent / "data_poses" / folder.name).is_dir():
-        poses = partial(_kitti_360_poses, record, _dates(path))
-        calibrations = record.parent.parent / "calibration"
-        pose_files = [record / "poses.txt", *sorted(calibrations.glob("*.txt"))]
-    if elevation is None:
-        # Only the raw drives record the start of each turn; KITTI-360 has another LiDAR.
-        elevation = ELEVATION if started.exists() else 0.0
-    return FileSource(
-        str(folder),
-        files,
-        stamps,
-        own_poses=poses,
-        elevation=elevation,
-        stamp_files=[path],
-        pose_files=[file for file in pose_files if file.is_file()],
-    )
-
-
-def _oxts_poses(folder: Path) -> Trajectory:
-    files = sorted((folder / "oxts" / "data").glob("*.txt"))
-    stamps = _by_number(files, _dates(folder / "oxts" / "timestamps.txt"))
-    path = folder.parent / "calib_imu_to_velo.txt"
-    rotation, translation = _numbers(path, "R", 9).reshape(3, 3), _numbers(path, "T", 3)
-    T_sensor_imu = _pose(np.column_stack([rotation, translation]))
-    T_world_imu = read_oxts(files)
-    _, first = np.unique(stamps, return_index=True)
-    T = T_sensor_imu @ geometry.invert(T_world_imu[0]) @ T_world_imu @ geometry.invert(T_sensor_imu)
-    return Trajectory(stamps[first], T[first])
-
-
-def _kitti_360_poses(record: Path, stamps: NDArray[np.int64]) -> Trajectory:
-    path = record / "poses.txt"
-    try:
-        rows = np.loadtxt(path, ndmin=2)
-    except (OSError, ValueError) as error:
-        raise TrajectoryError(f"{path}: cannot be read ({error})") from error
-    if rows.shape[1] != 13 or not len(rows) or not np.isfinite(rows).all():
-        raise TrajectoryError(f"{path}: lines must hold a frame and the 12 numbers of a pose")
-    frames = rows[:, 0].astype(np.int64)
-    if np.any(np.diff(frames) <= 0) or frames[0] < 0 or frames[-1] >= len(stamps):
-        raise TrajectoryError(f"{path}: its frames are not in order, or not those of the drive")
-    folder = record.parent.parent / "calibration"
-    T_body_camera = _matrix(folder / "calib_cam_to_pose.txt", "image_00")
-    T_sensor_camera = _matrix(folder / "calib_cam_to_velo.txt")
-    T_world_body = _pose(rows[:, 1:].reshape(-1, 3, 4))
-    T_world_sensor = T_world_body @ T_body_camera @ geometry.invert(T_sensor_camera)
-    return Trajectory(stamps[frames], T_world_sensor)
-
-
-def _matrix(path: Path, key: str = "") -> Poses:
-    """A 3x4 matrix of the line `key:` of a file, or of one that holds nothing else, as a pose."""
-    return _pose(_numbers(path, key, 12).reshape(3, 4))
-
-
-def _numbers(path: Path, key: str, count: int) -> NDArray[np.float64]:
-    text = _text(path)
-    if key:
-        lines = (line.partition(":") for line in text.splitlines())
-        text = next((numbers for name, _, numbers in lines if name.strip() == key), "")
+def _matrix(path: Path, key: str) -> Poses:
+    """A 3x4 matrix of the line `key:` of a file, as a pose."""
+    lines = (line.partition(":") for line in _text(path).splitlines())
+    text = next((numbers for name, _, numbers in lines if name.strip() == key), "")
     try:
         numbers = np.array([float(field) for field in text.split()])
     except ValueError:
         numbers = np.empty(0)
-    if len(numbers) != count:
-        where = f"no line `{key}:` with {count}" if key else f"does not hold {count}"
-        raise SequenceError(f"{path}: {where} numbers")
-    return numbers
-
-
-def _pose(rows: NDArray[np.float64]) -> Poses:
-    """Complete matrices of shape (..., 3, 4)."""
-    T = np.zeros((*rows.shape[:-2], 4, 4))
-    T[..., :3, :], T[..., 3, 3] = rows, 1.0
-    return T
+    if len(numbers) != 12:
+        raise SequenceError(f"{path}: no line `{key}:` with 12 numbers")
+    return np.vstack([numbers.reshape(3, 4), [0.0, 0.0, 0.0, 1.0]])
 
 
 def _scans(folder: Path) -> list[Path]:
@@ -341,16 +257,6 @@ def _seconds(path: Path) -> NDArray[np.int64]:
         return np.array([int(s.scaleb(9).to_integral_value()) for s in seconds], np.int64)
     except (InvalidOperation, ValueError, OverflowError) as error:
         raise SequenceError(f"{path}: a line is not a time in seconds") from error
-
-
-def _dates(path: Path) -> NDArray[np.int64]:
-    lines = [line.strip() for line in _text(path).splitlines()]
-    try:
-        # An empty line stands for a scan that was lost; it has no file.
-        dates = np.array([line or "NaT" for line in lines], "datetime64[ns]")
-    except ValueError as error:
-        raise SequenceError(f"{path}: a line is not a date and time ({error})") from error
-    return np.asarray(dates.astype(np.int64))
 
 
 def _text(path: Path) -> str:

@@ -1,6 +1,5 @@
 """Inspect a recording: what it holds, what is odd about it, and how to name it in a study."""
 
-import datetime
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -17,7 +16,7 @@ from rosbags.highlevel import AnyReader
 from adaptune import files, geometry
 from adaptune.errors import AdaptuneError
 from adaptune.progress import Progress, unseen
-from adaptune.recording import Scan, SequenceConfig, SequenceError, cache
+from adaptune.recording import Scan, SequenceConfig, SequenceError
 from adaptune.recording.bag import IMU_TYPES, POINTS_TYPES, BagSource, IndexReader
 from adaptune.recording.clouds import (
     DATATYPES,
@@ -37,7 +36,6 @@ from adaptune.trajectory import Trajectory, is_kitti, read_kitti, read_trajector
 LEAST_POINTS = 20
 """Valid points that an odometry needs."""
 
-_KITTI_FOLDERS = ("velodyne", "velodyne_points")
 # What each stage uses.
 _INPUTS = {
     "offline": ("points", "reference"),
@@ -183,7 +181,7 @@ class Inspection:
 def inspect(path: Path, deep: bool = False, show: Progress = unseen) -> Inspection:
     """Read a recording and report what it holds: a sample of it if it is long and not `deep`.
 
-    It is a bag, a folder with bags, a KITTI sequence or drive, a folder of scans, or a file of
+    It is a bag, a folder with bags, a KITTI sequence, a folder of scans, or a file of
     poses. An AdaptuneError says that it cannot be opened at all. What fails later is among the
     faults.
     """
@@ -195,7 +193,7 @@ def inspect(path: Path, deep: bool = False, show: Progress = unseen) -> Inspecti
         return _inspect_poses(path)
     if not path.is_dir():
         return _inspect_bags(path, deep, show)
-    if any((path / name).is_dir() for name in _KITTI_FOLDERS):
+    if (path / "velodyne").is_dir():
         return _inspect_scans(path, "kitti", deep, show)
     # Files of a ROS 2 folder may be compressed, and then have other suffixes.
     if {p.suffix for p in path.iterdir()} & {*BAG_SUFFIXES} or (path / "metadata.yaml").exists():
@@ -344,7 +342,6 @@ class _Survey:
         self._of = {name: of for of, name in found.used.items()}
         if points is not None:
             try:
-                source.check(None, None)
                 self._load = source.loader(reader)
             except SequenceError as error:
                 del self._of[source.points]
@@ -688,7 +685,7 @@ def _scan_span(topic: Topic) -> tuple[int, int]:
     return int(stamps.min()), int(stamps.max())
 
 
-# Show an inspected recording, and the cache, on a terminal.
+# Show an inspected recording on a terminal.
 
 
 def render_inspection(inspection: Inspection, accuracy: str = "") -> RenderableType:
@@ -784,16 +781,3 @@ def _reference_text(reference: Trajectory, complete: bool) -> str:
     # Poses without stamps are numbered by nanoseconds.
     lasted = f" in {seconds:.1f} s" if seconds > 1e-3 else ""
     return f"{len(reference):,} {words}{length:.1f} m{lasted}"
-
-
-def render_cache() -> RenderableType:
-    """The decoded sequences on disk, for a terminal."""
-    entries = cache.list_cache()
-    table = Table(box=None, pad_edge=False)
-    for column in ("sequence", "scans", "size", "last used"):
-        table.add_column(column, justify="left" if column == "sequence" else "right")
-    for entry in entries:
-        used = datetime.datetime.fromtimestamp(entry.used).strftime("%Y-%m-%d %H:%M")
-        table.add_row(entry.name, str(entry.n_scans), f"{entry.size / 1e6:,.1f} MB", used)
-    total, most = sum(entry.size for entry in entries) / 1e9, cache.cap() / 1e9
-    return Group(table, Text(f"{cache.folder()}: {total:.2f} GB of at most {most:g} GB"))

@@ -94,21 +94,14 @@ def _leap(last: Frame | None, frame: Frame) -> int:
 # Opening recordings, and what they are read from, without reading their scans.
 
 
-PRIOR_GAP = 3.0
-"""Seconds. The default of `max_gap` for a prior: a GPS may give a position a second, and miss
-one."""
-
-
 def open_sequence(config: SequenceConfig) -> Recording:
     """Open what a study describes; scans are not read before they are asked for.
 
     A SequenceError says why it cannot be opened as described.
     """
     sequence: Recording = RecordedSequence(config)
-    if config.compensate == "constant_velocity":
+    if config.compensate is not None:
         sequence = views.without_motion(sequence)
-    elif config.compensate == "gyro":
-        sequence = views.without_rotation(sequence)
     for view in config.views:
         sequence = views.VIEWS[view.name](sequence, getattr(view, view.name))
     return sequence
@@ -121,41 +114,13 @@ def check_sequence(config: SequenceConfig) -> None:
     reference is of another time.
     """
     RecordedSequence(config).check()
-    if config.position_prior is None:
-        return
-    if not wants_estimate(config):
-        raise SequenceError(
-            f"position_prior: joins an estimated reference, and the recording has poses of its "
-            f"own; write `reference: {ESTIMATED}`, or leave `position_prior` out"
-        )
-    RecordedSequence(of_prior(config)).check()
 
 
 def wants_estimate(config: SequenceConfig) -> bool:
     """Whether the reference of a sequence is to be estimated; a SequenceError if it cannot tell."""
     if config.reference is not None or config.bag is not None:
         return config.reference in (None, ESTIMATED)
-    source, _ = _source(config)
-    if config.evalio is not None:
-        return source.poses(None, None) is None
-    return not source.pose_files
-
-
-def position_prior(config: SequenceConfig) -> Trajectory | None:
-    """Poses of the LiDAR that are right over long distances only, if the sequence names any."""
-    return None if config.position_prior is None else RecordedSequence(of_prior(config)).reference()
-
-
-def prior_files(config: SequenceConfig) -> Sequence[Path]:
-    """The files of these poses, where they are not in the recording."""
-    return () if config.position_prior is None else sequence_files(of_prior(config)).reference
-
-
-def of_prior(config: SequenceConfig) -> SequenceConfig:
-    """The sequence with the poses of its prior as its reference."""
-    gap = config.max_gap if "max_gap" in config.model_fields_set else PRIOR_GAP
-    of = {"reference": config.position_prior, "position_prior": None, "max_gap": gap}
-    return config.model_copy(update=of)
+    return not _source(config)[0].pose_files
 
 
 class SequenceFiles(NamedTuple):
@@ -201,11 +166,6 @@ def _source(config: SequenceConfig) -> tuple[Source, str | None]:
         return kitti(Path(config.kitti), config.elevation), None
     if config.folder is not None:
         return scan_folder(Path(config.folder), timing), None
-    if config.evalio is not None:
-        # evalio is an optional package.
-        from adaptune.recording.evalio import evalio_source
-
-        return evalio_source(config.evalio), None
     paths = config.bags()
     if not config.cache or not cache.cap():
         return BagSource(paths, config.points, timing, config.frame), None
@@ -222,11 +182,13 @@ def _source(config: SequenceConfig) -> tuple[Source, str | None]:
 def _check_topics(source: Source, config: SequenceConfig) -> None:
     """Find topics that are named and not there."""
     from adaptune.recording.bag import IMU_TYPES, BagSource
+    from adaptune.recording.clouds import POSES
 
     topic = None if config.imu is None else config.imu.topic
     if isinstance(source, BagSource):
-        source.check(config.poses_topic, topic)
-        if config.imu is not None and config.bag is not None:
+        if config.poses_topic is not None:
+            source.topic(config.poses_topic, POSES, "poses")
+        if config.imu is not None:
             source.topic(topic, IMU_TYPES, "an IMU's measurements")
     elif config.poses_topic or config.child_frame or topic:
         raise SequenceError(

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptune import geometry
-from adaptune.recording.compensation import compensate_neighbours, compensate_rotation
+from adaptune.recording.compensation import compensate_neighbours
 from adaptune.recording.config import DropConfig, NoiseConfig, SpeedConfig
 from adaptune.recording.scan import Imu, Recording, Scan, SequenceError
 from adaptune.trajectory import Trajectory
@@ -81,18 +81,6 @@ def without_motion(sequence: Recording) -> View:
     The velocity is that since the scan read before, which is registered for it.
     """
     return View(sequence, lambda scans: compensate_neighbours(_timed(sequence, scans)))
-
-
-def without_rotation(sequence: Recording) -> View:
-    """Points as if the sensor had not turned since the scan's start, by its gyroscope."""
-    imu = once(sequence.imu)
-
-    def compensated(scans: Iterator[Scan]) -> Iterable[Scan]:
-        if (measured := imu()) is None:
-            return scans
-        return (compensate_rotation(scan, measured) for scan in _timed(sequence, scans))
-
-    return View(sequence, compensated)
 
 
 def _timed(sequence: Recording, scans: Iterator[Scan]) -> Iterator[Scan]:

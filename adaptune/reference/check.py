@@ -28,9 +28,8 @@ from adaptune.live.hops import LENGTHS as HOPS
 from adaptune.live.hops import Hop, HopCloud, Hops, register
 from adaptune.metrics import cap, sub_trajectory_rte, travelled
 from adaptune.recording.compensation import neighbour_motions
-from adaptune.recording.config import ESTIMATED, SequenceConfig
+from adaptune.recording.config import SequenceConfig
 from adaptune.recording.inspect import Inspection
-from adaptune.recording.recording import position_prior
 from adaptune.recording.scan import Recording, Scan
 from adaptune.reference.stored import EstimateError, StoredEstimate
 from adaptune.trajectory import Trajectory
@@ -246,7 +245,7 @@ def diagnose_reference(
     given = reference.T_world_sensor @ invert(T_given_sensor)
     turned = rotation_angle(invert(given[:1]) @ given).max()
     if turned < 1e-6 and rotation_angle(hops.T_start_end).max() > np.radians(2.0):
-        mend = "use its positions only: `reference: estimated`, with this one as `position_prior`"
+        mend = "use `reference: estimated`"
         return Cause("without orientation (all are alike)", mend, before, np.nan)
 
     def at_scans(T_world_given: Poses) -> Poses:
@@ -260,7 +259,7 @@ def diagnose_reference(
         *_clock(reference, stamps, hops),
         *_places(at_scans(given) @ invert(T_given_sensor), hops, T_given_sensor),
     ]
-    return _likeliest(candidates, hops, errors) or _sparse(reference, stamps, hops, before)
+    return _likeliest(candidates, hops, errors)
 
 
 def diagnose_odometry(T_odom_sensor: Poses, hops: Hops) -> Cause | None:
@@ -488,25 +487,6 @@ def _lever(T: Poses, measured: Poses, R_body_sensor: NDArray[np.float64]) -> NDA
         residuals = np.linalg.norm(A @ t - b, axis=1)
         weights = 1.0 / np.sqrt(np.maximum(residuals, 1e-2 + np.median(residuals)))
     return np.asarray(t)
-
-
-def _sparse(
-    reference: Trajectory, stamps: NDArray[np.int64], hops: Hops, before: float
-) -> Cause | None:
-    """Whether there are too few poses to interpolate, by what half of them would lose."""
-    between = float(np.median(np.diff(reference.stamps))) * 1e-9
-    scans = float(np.median(np.diff(stamps))) * 1e-9
-    if between < 2.0 * scans or len(reference) < 5:
-        return None
-    thin = Trajectory(reference.stamps[::2], reference.T_world_sensor[::2], 2.0 * reference.max_gap)
-    whole, half = (t.at(stamps) for t in (reference, thin))
-    # Interpolation errs by the square of the time between poses: half of them, by four times; and
-    # by as much where the motion is faster than both.
-    shown = hops._replace(T_start_end=invert(whole[hops.start]) @ whole[hops.end])
-    if not _mean(mismatch(half, shown)) / 2.0 > 0.3 * before:
-        return None
-    what = f"too rare to interpolate, one every {between:.2g} s with a scan every {scans:.2g} s"
-    return Cause(what, "give a denser one, or `reference: estimated`", before, np.nan)
 
 
 def contradictions(
@@ -760,21 +740,6 @@ def recording_config(
     chosen = {"points": points, "reference": reference}
     given |= {key: value for key, value in chosen.items() if value is not None}
     return SequenceConfig(**given)
-
-
-def read_prior(config: SequenceConfig, source: str) -> Trajectory:
-    """Positions that are right over long distances, from a topic of the recording or a file.
-
-    There is an `AdaptuneError` if there are none, or they are of another time.
-    """
-    given = config.model_dump(exclude_unset=True, exclude={"max_gap"})
-    joined = {"reference": ESTIMATED, "position_prior": source}
-    prior = position_prior(SequenceConfig(**given | joined))
-    if prior is None:
-        raise EstimateError(
-            f"--position-prior {source}: holds no pose; name a topic or a file of poses"
-        )
-    return prior
 
 
 def check_writable(path: Path) -> None:

@@ -19,15 +19,12 @@ from adaptune.reference.graph import (
     Edge,
     Guess,
     Pass,
-    Positions,
     closed,
     loops,
     optimised,
     pass_over,
-    positions,
 )
 from adaptune.reference.stored import EstimatedReference, EstimateError, Registrations
-from adaptune.trajectory import Trajectory
 
 VERSION = 1
 """Counts changes after which the same recording has another estimate."""
@@ -50,9 +47,7 @@ Advance = Callable[[int, int], None]
 """Called with how many scans are done, and about how many there are."""
 
 
-def estimate_reference(
-    scans: Recording, advance: Advance = lambda *_: None, priors: Trajectory | None = None
-) -> EstimatedReference:
+def estimate_reference(scans: Recording, advance: Advance = lambda *_: None) -> EstimatedReference:
     """Estimate the reference of a recording; its own is not used.
 
     Neither a reference nor the trials of a study are used: what judges an odometry is made by a
@@ -62,8 +57,6 @@ def estimate_reference(
     ----------
     advance
         Called after every scan, and after each of `N_GRAPHS` pose graphs.
-    priors
-        Positions that are right over long distances only, as those of a GPS.
 
     Raises
     ------
@@ -76,15 +69,12 @@ def estimate_reference(
     found = pass_over(scans, lambda done: advance(done, max(n, done) + N_GRAPHS * after))
     last = max(n, len(found.stamps))
     total = last + N_GRAPHS * after
-    return estimated(
-        scans.name, found, priors, scans, lambda graphs: advance(last + graphs * after, total)
-    )
+    return estimated(scans.name, found, scans, lambda of: advance(last + of * after, total))
 
 
 def estimated(
     name: str,
     found: Pass,
-    priors: Trajectory | None = None,
     scans: Iterable[Scan] = (),
     advance: Callable[[int], None] = lambda _: None,
 ) -> EstimatedReference:
@@ -96,19 +86,18 @@ def estimated(
     _check(name, found)
     T_odom_sensor, edges = _revised(found)
     T = optimised(T_odom_sensor, edges)
-    places = None if priors is None else positions(priors, found.stamps, T)
     again = loops(T, np.unique([edge.end for edge in edges]))
     by_loops = closed(scans, again, T) if again else []
     advance(1)
-    if places is not None or by_loops:
-        T = optimised(T_odom_sensor, [*edges, *by_loops], places, T)
+    if by_loops:
+        T = optimised(T_odom_sensor, [*edges, *by_loops], T)
     advance(2)
     registrations = _judged(found.guesses, edges, T)
     reference = EstimatedReference(
         found.stamps,
         T,
         _trusted(T, registrations, edges),
-        _halves(found, [*edges, *by_loops], places, T, advance),
+        _halves(found, [*edges, *by_loops], T, advance),
         registrations,
     )
     if (share := reference.unknown_share()) > MOST_UNKNOWN:
@@ -259,7 +248,6 @@ def _in_every_direction(
 def _halves(
     found: Pass,
     edges: Sequence[Edge],
-    places: Positions | None,
     T_world_sensor: Poses,
     advance: Callable[[int], None],
 ) -> Poses:
@@ -269,7 +257,7 @@ def _halves(
     for half, members in enumerate(HALVES):
         T = _chained(T_world_sensor[0], _steps_of(found, T_world_sensor, members))
         own = [edge for edge in edges if ends[edge.end] == half]
-        halves.append(optimised(T, own, places, T_world_sensor))
+        halves.append(optimised(T, own, T_world_sensor))
         advance(3 + half)
     return np.array(halves)
 

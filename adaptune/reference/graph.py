@@ -3,7 +3,6 @@
 Solved by GTSAM (Dellaert and Kaess, *Factor Graphs for Robot Perception*, 2017).
 """
 
-import logging
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -20,9 +19,7 @@ from adaptune.odometry.base import InProcess
 from adaptune.odometry.registry import odometry_class
 from adaptune.odometry.tracker import HealthCheck, Tracker
 from adaptune.recording.scan import Scan
-from adaptune.reference.stored import EstimatedReference
 from adaptune.space import ParameterSet, Selection
-from adaptune.trajectory import Trajectory
 
 # One pass over a recording: the consensus, and registrations of scans to scans before them.
 
@@ -265,11 +262,6 @@ towards no motion. So they count as more wrong: in metres as the way is shorter,
 square root."""
 _UNKNOWN = 10.0
 """Metres by which a registration is wrong along a direction that it does not tell."""
-_OF_A_PRIOR = 1.0
-"""Metres by which a given position is wrong, about."""
-_PRIORS_EVERY = 1_000_000_000
-"""Nanoseconds from one position that counts to the next: their errors are alike."""
-_FEWEST_PRIORS = 3
 _ITERATIONS = 50
 
 
@@ -285,7 +277,6 @@ class Edge(NamedTuple):
 def optimised(
     T_odom_sensor: Poses,
     edges: Sequence[Edge],
-    places: "Positions | None" = None,
     T_first_guess: Poses | None = None,
 ) -> Poses:
     """The poses, of shape (n, 4, 4), on which motions and registrations agree best.
@@ -296,8 +287,6 @@ def optimised(
     ----------
     T_odom_sensor
         Poses of shape (n, 4, 4) whose motions from scan to scan count.
-    places
-        Where scans are by other means, in about the same frame.
     T_first_guess
         Where the search begins, of shape (n, 4, 4); `T_odom_sensor` when left out.
     """
@@ -317,57 +306,13 @@ def optimised(
         motion = gtsam.Pose3(edge.hop.T_start_end)
         noise = _robust(_noise(edge), bounded=not edge.again)
         graph.add(gtsam.BetweenFactorPose3(edge.start, edge.end, motion, noise))
-    # Positions say themselves where the first pose is.
-    first = gtsam.noiseModel.Isotropic.Sigma(6, 1e-6 if places is None else _UNKNOWN)
+    first = gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)
     graph.add(gtsam.PriorFactorPose3(0, values.atPose3(0), first))
-    if places is not None:
-        noise = _robust(gtsam.noiseModel.Isotropic.Sigma(3, _OF_A_PRIOR), bounded=False)
-        for number, metres in zip(places.numbers.tolist(), places.metres, strict=True):
-            graph.add(gtsam.GPSFactor(number, metres, noise))
     options = gtsam.LevenbergMarquardtParams()
     options.setMaxIterations(_ITERATIONS)
     found = gtsam.LevenbergMarquardtOptimizer(graph, values, options).optimize()
     T = np.array([found.atPose3(i).matrix() for i in range(len(T_odom_sensor))])
     return np.asarray(rectify(invert(T[0]) @ T))
-
-
-class Positions(NamedTuple):
-    """Where some of the scans are, of shape (m, 3), by their numbers."""
-
-    numbers: NDArray[np.intp]
-    metres: NDArray[np.float64]
-
-
-def positions(
-    priors: Trajectory, stamps: NDArray[np.int64], T_world_sensor: Poses
-) -> Positions | None:
-    """Positions of scans once a second, brought near to their poses; None if there are too few.
-
-    Of the priors, such as those of a GPS, only positions count, in any frame. Stamps of the scans
-    are of shape (n,), in nanoseconds; their poses without priors of shape (n, 4, 4).
-    """
-    at = priors.at(stamps)[:, :3, 3]
-    due = np.diff((stamps - stamps[0]) // _PRIORS_EVERY, prepend=-1) > 0
-    numbers = np.flatnonzero(due & np.isfinite(at).all(axis=1))
-    if len(numbers) < _FEWEST_PRIORS:
-        return None
-    T = _aligned(at[numbers], T_world_sensor[numbers, :3, 3])
-    return Positions(numbers, at[numbers] @ T[:3, :3].T + T[:3, 3])
-
-
-def _aligned(of: NDArray[np.float64], to: NDArray[np.float64]) -> Poses:
-    """The rigid motion that brings positions of shape (n, 3) nearest to others."""
-    from scipy.spatial.transform import Rotation
-
-    T = np.eye(4)
-    if len(of) > 2:
-        # Along a straight way, only what is up tells how the path lies: the sensor's at the start.
-        up = np.array([[0.0, 0.0, np.ptp(to, axis=0).max()]])
-        pairs = (np.concatenate([x - x.mean(axis=0), up]) for x in (to, of))
-        R, _ = Rotation.align_vectors(*pairs)
-        T[:3, :3] = R.as_matrix()
-        T[:3, 3] = to.mean(axis=0) - T[:3, :3] @ of.mean(axis=0)
-    return T
 
 
 def _sigmas(metres: float, radians: float) -> Any:
@@ -470,20 +415,3 @@ def closed(scans: Iterable[Scan], wanted: Sequence[Loop], T_world_sensor: Poses)
         if hop is not None and np.linalg.norm(hop.T_start_end[:3, 3] - T[:3, 3]) <= most:
             edges.append(Edge(start, end, hop, again=True))
     return edges
-
-
-# Whether positions that are right over long distances were of use to an estimate.
-
-_log = logging.getLogger(__name__)
-
-
-def warn_of_unused(name: str, prior: Trajectory | None, found: EstimatedReference) -> None:
-    """Warn if there was a prior, and too few scans have a position by it."""
-    if prior is None or positions(prior, found.stamps, found.T_world_sensor) is not None:
-        return
-    _log.warning(
-        "%s: the position prior was not used: too few scans lie between two of its positions that "
-        "are at most %g s apart; give a larger max_gap, or check clock_offset",
-        name,
-        prior.max_gap,
-    )

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,19 +50,6 @@ class Points:
 
 
 @dataclass(frozen=True)
-class Cloud:
-    """Thousands of points, drawn as pixels; the last one lies on top."""
-
-    x: Values
-    y: Values
-    colour: Values  # a number for every point, shown on a colour bar
-    colour_label: str
-    colour_limits: tuple[float, float]
-    log_colour: bool = False
-    size: int = 1  # of a point, pixels
-
-
-@dataclass(frozen=True)
 class Band:
     """The space between two lines, as of an interval."""
 
@@ -100,11 +87,9 @@ class Spans:
 
 @dataclass(frozen=True)
 class Mark:
-    """A line at a value of x or y, with a few words on it."""
+    """A dashed line across the panel, at a value of x."""
 
     at: float
-    words: str = ""
-    axis: Literal["x", "y"] = "y"
 
 
 @dataclass(frozen=True)
@@ -116,7 +101,7 @@ class Words:
     words: Sequence[str]
 
 
-Drawn = Line | Points | Cloud | Band | Bars | Shares | Spans | Mark | Words
+Drawn = Line | Points | Band | Bars | Shares | Spans | Mark | Words
 
 
 @dataclass(frozen=True)

@@ -1,11 +1,8 @@
 """Draw charts with Vega-Lite: in a browser and, by vl-convert, as PNG and SVG without one."""
 
-import base64
 import json
 import re
-import struct
 import textwrap
-import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import chain, cycle
@@ -21,7 +18,6 @@ from adaptune.report.charts import (
     Band,
     Bars,
     Chart,
-    Cloud,
     Drawn,
     Line,
     Mark,
@@ -58,7 +54,6 @@ MODES = {
     "even": Look("#117733", (3, 3), "triangle-right"),
     "paper": Look("#000000", (4, 4), "triangle-up"),
     "oracle, sequence": Look("#009e73", shape="diamond"),
-    "oracle, period": Look("#009e73", shape=_TIMES),
 }
 """Looks of the modes; the lines of the first lie lowest."""
 _COLOURS = ("#d55e00", "#56b4e9", "#009e73", "#cc79a7", "#888888", "#b8a800")
@@ -113,7 +108,7 @@ def _layer(item: Drawn) -> float:
         return 5.0 + 0.5 * item.dashed + place / 100.0
     if isinstance(item, Mark | Words):
         return 7.0
-    order = (Spans, Cloud, Shares, Bars, Band)
+    order = (Spans, Shares, Bars, Band)
     return float(order.index(type(item))) if isinstance(item, order) else 6.0
 
 
@@ -178,8 +173,6 @@ _Extent = tuple[tuple[float, float], tuple[float, float]]
 _OUTLINE: dict[str, Any] = {"stroke": "black", "strokeWidth": 0.5}
 NO_DATA = "no data"
 """What an empty panel says."""
-_DOTS = 2
-"""Pixels of a cloud's picture to one of the chart."""
 _CONFIG: Spec = {
     "font": "Liberation Sans, Arial, Helvetica, sans-serif",
     "view": {"stroke": None},
@@ -279,10 +272,8 @@ def _height(panel: Panel) -> float:
 def _beside(panel: Panel) -> float:
     """Pixels for what stands left and right of a panel."""
     names = [part for name in panel.y.names or () for part in wrapped(name, 32)]
-    bar = not panel.equal and any(
-        isinstance(item, Cloud) or (isinstance(item, Points) and item.colour is not None)
-        for item in panel.drawn
-    )
+    coloured = (isinstance(item, Points) and item.colour is not None for item in panel.drawn)
+    bar = not panel.equal and any(coloured)
     return 44.0 + max(22.0, _LETTER * max(map(len, names), default=0)) + 110.0 * bar
 
 
@@ -290,7 +281,7 @@ def _coordinates(panel: Panel) -> Iterator[tuple[NDArray[np.float64], NDArray[np
     """X and y of what a panel shows, flat."""
     for item in panel.drawn:
         match item:
-            case Line() | Points() | Cloud():
+            case Line() | Points():
                 yield numbers(item.x, panel.x), numbers(item.y, panel.y)
             case Band():
                 x = numbers(item.x, panel.x)
@@ -314,9 +305,9 @@ def _extent(panel: Panel, which: Literal["x", "y"]) -> tuple[float, float]:
         return axis.limits
     if axis.names is not None:
         return -0.6, len(axis.names) - 0.4
-    marks = (item for item in panel.drawn if isinstance(item, Mark) and item.axis == which)
+    marks = [item.at for item in panel.drawn if isinstance(item, Mark) and which == "x"]
     found = [pair[which == "y"] for pair in _coordinates(panel)]
-    values = np.concatenate([*found, numbers([mark.at for mark in marks], axis)])
+    values = np.concatenate([*found, marks])
     values = values[np.isfinite(values)]
     if not len(values):
         return 1.0, 10.0
@@ -385,7 +376,6 @@ class _Drawing:
         draw: dict[type, Callable[[Any], Iterator[Spec]]] = {
             Line: self._line,
             Points: self._points,
-            Cloud: self._cloud,
             Band: self._band,
             Bars: self._bars,
             Shares: self._shares,
@@ -481,39 +471,6 @@ class _Drawing:
         scale = {"type": "log" if log else "linear", "domain": limits, "range": _MAP}
         return {"field": "c", "type": "quantitative", "scale": scale, "legend": legend}
 
-    def _cloud(self, cloud: Cloud) -> Iterator[Spec]:
-        wide, high = _DOTS * self._width, _DOTS * self._height
-        spots = []
-        for which, values, n in (("x", cloud.x, wide), ("y", cloud.y, high)):
-            low, end = self._extent[which]
-            spots.append(np.floor((numbers(values, Axis("")) - low) / (end - low) * n))
-        x, y = spots
-        value = numbers(cloud.colour, Axis("", log=cloud.log_colour))
-        limits = np.array(cloud.colour_limits)
-        if cloud.log_colour:
-            value, limits = np.log(value), np.log(limits)
-        share = np.clip((value - limits[0]) / (limits[1] - limits[0]), 0.0, 1.0)
-        kept = np.isfinite(x + y + share)
-        x, y, share = x[kept].astype(int), y[kept].astype(int), share[kept]
-        ends = np.array([[int(c[i : i + 2], 16) for i in (1, 3, 5)] for c in _MAP], float)
-        at = share * (len(_MAP) - 1)
-        colours = np.column_stack([np.interp(at, range(len(_MAP)), c) for c in ends.T])
-        pixels = np.zeros((high, wide, 4), np.uint8)
-        for right in range(_DOTS * cloud.size):
-            for up in range(_DOTS * cloud.size):
-                there = (x + right >= 0) & (x + right < wide) & (y + up >= 0) & (y + up < high)
-                opaque = np.column_stack([colours[there], np.full(there.sum(), 255.0)])
-                pixels[high - 1 - y[there] - up, x[there] + right] = opaque
-        url = "data:image/png;base64," + base64.b64encode(_png(pixels)).decode()
-        size: Spec = {"width": self._width, "height": self._height, "aspect": False}
-        image: Spec = {"type": "image", "url": url, "x": 0, "y": 0, "align": "left"}
-        yield {"data": _table(i=[0]), "mark": image | size | {"baseline": "top"}, "encoding": {}}
-        bar = self._colour_bar(cloud.colour_label, cloud.colour_limits, cloud.log_colour)
-        # Points without a size, for the axes and the colour bar.
-        yield self._drawn(
-            {"type": "point", "size": 0}, self._extent | {"c": cloud.colour_limits}, color=bar
-        )
-
     def _band(self, band: Band) -> Iterator[Spec]:
         look, panel = self._look(band.name), self._panel
         x, high = numbers(band.x, panel.x), numbers(band.high, panel.y)
@@ -563,18 +520,10 @@ class _Drawing:
             yield from _read_anywhere(words, _table(x=[0.5 * (begin + end)]), {"x": self._x})
 
     def _mark(self, mark: Mark) -> Iterator[Spec]:
-        """A line across the panel, and its words."""
-        low, high = sorted(self._extent[mark.axis])
-        if not low <= mark.at <= high:
-            return
-        encoding: Spec = {mark.axis: self._x if mark.axis == "x" else self._y}
-        data = _table(**{mark.axis: [mark.at]})
-        rule: Spec = {"type": "rule", "color": _DARK, "strokeDash": (5, 3)}
-        yield {"data": data, "mark": rule, "encoding": encoding}
-        words: Spec = {"text": mark.words, "align": "right", "dy": -2}
-        words |= {"x": self._width - 3} if mark.axis == "y" else {"y": 3, "angle": -90}
-        if mark.words:
-            yield from _read_anywhere(words, data, encoding)
+        low, high = sorted(self._extent["x"])
+        if low <= mark.at <= high:
+            rule: Spec = {"type": "rule", "color": _DARK, "strokeDash": (5, 3)}
+            yield {"data": _table(x=[mark.at]), "mark": rule, "encoding": {"x": self._x}}
 
     def _words(self, words: Words) -> Iterator[Spec]:
         x, y = numbers(words.x, self._panel.x), numbers(words.y, self._panel.y)
@@ -620,20 +569,6 @@ def _read_anywhere(words: Spec, data: Spec, encoding: Spec) -> Iterator[Spec]:
     halo = {"stroke": "white", "strokeWidth": 4, "strokeOpacity": 0.8}
     for mark in (text | halo, text):
         yield {"data": data, "mark": mark, "encoding": encoding}
-
-
-def _png(pixels: NDArray[np.uint8]) -> bytes:
-    """Pixels of shape (height, width, 4), red, green, blue and alpha, as a PNG file."""
-    height, width, _ = pixels.shape
-
-    def chunk(kind: bytes, data: bytes) -> bytes:
-        check = struct.pack(">I", zlib.crc32(kind + data))
-        return struct.pack(">I", len(data)) + kind + data + check
-
-    lines = np.column_stack([np.zeros((height, 1), np.uint8), pixels.reshape(height, -1)])
-    header = struct.pack(">IIBBBBB", width, height, 8, 6, 0, 0, 0)
-    body = chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(lines.tobytes(), 6))
-    return b"\x89PNG\r\n\x1a\n" + body + chunk(b"IEND", b"")
 
 
 def _legend(chart: Chart, every: dict[str, Look]) -> list[Spec]:

@@ -45,14 +45,13 @@ def ros_python() -> str:
     )
 
 
-def local_ros1(python: str | None = None) -> "Ros1":
+def local_ros1() -> "Ros1":
     """A node in the ROS 1 that runs on this machine, or that ROS_MASTER_URI names.
 
-    `python` imports ROS; it is found if left out. There is a `LinkError` if none can import it, or
-    no roscore answers.
+    There is a `LinkError` if no Python can import it, or no roscore answers.
     """
     here, there = socket.socketpair()
-    command = [python or ros_python(), ros1_node.__file__, str(there.fileno())]
+    command = [ros_python(), ros1_node.__file__, str(there.fileno())]
     # A session of its own: Ctrl-C ends adaptune, and that ends the node.
     process = subprocess.Popen(
         command, pass_fds=[there.fileno()], stdout=subprocess.DEVNULL, start_new_session=True

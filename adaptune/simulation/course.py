@@ -1,7 +1,7 @@
 """Configuration of a simulated recording."""
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -26,7 +26,7 @@ class Sensor:
     """A LiDAR."""
 
     # Radians above the sensor's horizon, by the ring number its driver gives: upwards on Velodynes,
-    # downwards on Ousters. On a Livox, the offset of each of its lines, of shape (n_rings,).
+    # downwards on Ousters; of shape (n_rings,).
     elevations: NDArray[np.float64]
     columns: int  # firings in a turn; all rings fire at once
     rate: float  # turns in a second
@@ -35,8 +35,6 @@ class Sensor:
     range: tuple[float, float]
     noise: float  # standard deviation of a range in metres
     dropout: float  # share of echoes lost for no reason
-    # Whether it turns about its vertical axis, or draws a rosette ahead which never repeats.
-    pattern: Literal["spin", "rosette"] = "spin"
 
     @property
     def rings(self) -> int:
@@ -44,10 +42,8 @@ class Sensor:
         return len(self.elevations)
 
 
-def _sensor(
-    degrees: NDArray[np.floating], columns: int, reach: tuple[float, float], noise: float = 0.015
-) -> Sensor:
-    return Sensor(np.radians(degrees), columns, 10.0, reach, noise, 0.005)
+def _sensor(degrees: NDArray[np.floating], columns: int, reach: tuple[float, float]) -> Sensor:
+    return Sensor(np.radians(degrees), columns, 10.0, reach, 0.015, 0.005)
 
 
 # Two blocks of 32 lasers: a third of a degree apart above, half a degree below.
@@ -60,55 +56,26 @@ SENSORS: Mapping[str, Sensor] = {
     "hdl64e": _sensor(_HDL64E, 2083, (0.9, 120.0)),
     "os0-64": _sensor(np.linspace(45.0, -45.0, 64), 1024, (0.3, 50.0)),
     "os1-128": _sensor(np.linspace(22.5, -22.5, 128), 1024, (0.5, 120.0)),
-    "avia": replace(
-        _sensor((np.arange(6) - 2.5) * 0.6, 4000, (1.0, 190.0), 0.02), pattern="rosette"
-    ),
 }
 """LiDARs by name."""
 
-_PRISMS = (7294.0 / 60.0, -4664.0 / 60.0)
-"""Turns in a second of the two prisms of a Livox. Their ratio closes no rosette within hours."""
-
-_FIELD = np.radians((70.4, 77.2)) / 2.0
-"""Half of the Avia's horizontal and vertical field of view."""
-
 
 @cache
-def _spin(name: str, columns: int) -> NDArray[np.float32]:
-    elevations = SENSORS[name].elevations
+def directions(name: str, columns: int) -> NDArray[np.float32]:
+    """Where a sensor looks during one turn of some firings (`columns`).
+
+    Unit vectors of shape (columns, n_rings, 3) are in the sensor's frame: x ahead, y to the left,
+    z up.
+    """
+    elevation = SENSORS[name].elevations
     # A Velodyne turns clockwise seen from above. The seam lies behind, away from what is ahead.
     azimuth = np.pi - 2.0 * np.pi * np.arange(columns) / columns
-    directions = _unit(azimuth, elevations)
-    directions.setflags(write=False)
-    return directions
-
-
-def _rosette(sensor: Sensor, times: NDArray[np.float64]) -> NDArray[np.float32]:
-    first, second = (2.0 * np.pi * f * times for f in _PRISMS)
-    lines = sensor.elevations - sensor.elevations.mean()
-    azimuth = _FIELD[0] * (np.cos(first) + np.cos(second)) / 2.0
-    elevation = (_FIELD[1] - lines.max()) * (np.sin(first) + np.sin(second)) / 2.0
-    return _unit(azimuth, elevation[:, None] + lines)
-
-
-def _unit(azimuth: NDArray[np.float64], elevation: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Unit vectors at the azimuths of columns and the elevations of rings."""
     level = np.cos(elevation)
     x, y = level * np.cos(azimuth)[:, None], level * np.sin(azimuth)[:, None]
     z = np.broadcast_to(np.sin(elevation), x.shape)
-    return np.stack([x, y, z], axis=-1).astype(np.float32)
-
-
-def directions(name: str, columns: int, start: float, rate: float) -> NDArray[np.float32]:
-    """Where a sensor looks during one scan of some firings (`columns`).
-
-    The scan starts `start` seconds after the recording, which has `rate` scans a second. Unit
-    vectors of shape (columns, n_rings, 3) are in the sensor's frame: x ahead, y to the left, z up.
-    """
-    sensor = SENSORS[name]
-    if sensor.pattern == "spin":
-        return _spin(name, columns)
-    return _rosette(sensor, start + np.arange(columns) / (columns * rate))
+    looks = np.stack([x, y, z], axis=-1).astype(np.float32)
+    looks.setflags(write=False)
+    return looks
 
 
 # Ways of carrying a sensor.
@@ -158,28 +125,6 @@ MOTIONS: Mapping[str, Motion] = {
 """Ways of carrying a sensor, by name."""
 
 
-# Effect of weather on a LiDAR.
-
-
-@dataclass(frozen=True)
-class Weather:
-    """Effect of the air on rays."""
-
-    extinction: float  # share of the light lost in a metre, each way (1/m)
-    # Chance in a metre that drops send back an echo before the target does (1/m).
-    backscatter: float
-    reach: float  # metres within which such an echo is strong enough to be seen
-
-
-WEATHERS: Mapping[str, Weather] = {
-    "clear": Weather(0.0, 0.0, 0.0),
-    # 10 mm/h, and fog through which one sees some 150 m (3.9 / extinction).
-    "rain": Weather(0.003, 0.0015, 20.0),
-    "fog": Weather(0.026, 0.012, 12.0),
-}
-"""Weathers by name."""
-
-
 LONGEST = 20_000.0
 """Metres; a longer course is most likely a mistake."""
 
@@ -224,8 +169,6 @@ class Course(StrictModel):
     imu: Literal[200, 400] | None = None
     # Seconds at rest before it drives off, as a LiDAR-inertial odometry needs them to begin.
     stand: float = Field(default=0.0, ge=0.0, le=600.0)
-    moving_objects: bool = False  # whether cars and walkers move about
-    weather: Annotated[str, _known("weather", WEATHERS)] = "clear"
     # How motion within a scan is undone, as for a recorded sequence.
     compensate: Compensation = None
     # Whether a recording's headers mark the start or the end of each scan.
@@ -242,8 +185,6 @@ class Course(StrictModel):
             raise ValueError(f"{what}: it needs at least {least:g}")
         if sum(length for _, length in self.legs) > LONGEST:
             raise ValueError(f"a course is at most {LONGEST:g} m long")
-        if self.compensate == "gyro" and self.imu is None:
-            raise ValueError("`compensate: gyro` needs `imu`, as in `imu: 200`")
         return self
 
     @property

@@ -95,45 +95,10 @@ def aim(directions: F32, T_world_sensor: F64, origin: F64) -> F32:
 
 
 @numba.njit(cache=True)
-def towards(
-    rays: F32, rings: int, centres: F64, yaw: F64, radius: float
-) -> tuple[NDArray[np.int64], F32]:
-    """Pick the rays that pass a moving object: their indices, and the rays in the object's frame.
-
-    Parameters
-    ----------
-    rays, rings
-        Of shape (n_columns * n_rings, 6), and how many there are in a column.
-    centres, yaw
-        The object's origin (n_columns, 3) and heading in radians (n_columns,) at each column.
-    radius
-        Metres around its origin within which all of it lies.
-    """
-    picked = np.empty(len(rays), np.int64)
-    local = np.empty((len(rays), 6), np.float32)
-    m = 0
-    for n in range(len(rays)):
-        c = n // rings
-        x, y = rays[n, 0] - centres[c, 0], rays[n, 1] - centres[c, 1]
-        z = rays[n, 2] - centres[c, 2]
-        u, v, w = rays[n, 3], rays[n, 4], rays[n, 5]
-        along = -(x * u + y * v + z * w)
-        if along < -radius or x * x + y * y + z * z - along * along > radius * radius:
-            continue
-        cos, sin = np.cos(yaw[c]), np.sin(yaw[c])
-        picked[m] = n
-        local[m, 0], local[m, 1], local[m, 2] = cos * x + sin * y, cos * y - sin * x, z
-        local[m, 3], local[m, 4], local[m, 5] = cos * u + sin * v, cos * v - sin * u, w
-        m += 1
-    return picked[:m], local[:m]
-
-
-@numba.njit(cache=True)
 def receive(
     directions: F32,
     cast: Cast,
     sensor: Receiver,
-    air: tuple[float, float, float],
     chance: F32,
     normal: F32,
 ) -> tuple[F32, F32, NDArray[np.int64]]:
@@ -145,10 +110,8 @@ def receive(
         Unit vectors in the sensor's frame, of shape (n, 3).
     cast, sensor
         The rays with their hits, and the receiver.
-    air
-        Extinction, backscatter and its reach: see `adaptune.simulation.course.Weather`.
     chance, normal
-        Uniform random numbers of shape (2, n), and normal ones of shape (n,).
+        Uniform and normal random numbers, of shape (n,).
 
     Returns
     -------
@@ -164,24 +127,18 @@ def receive(
     n = len(rays)
     points, intensities = np.empty((n, 3), np.float32), np.empty(n, np.float32)
     kept = np.empty(n, np.int64)
-    extinction, backscatter, air_reach = air
     m = 0
     for i in range(n):
-        distance, power = float(hits[i]), 0.0
-        if backscatter > 0.0:
-            echo = -np.log(1.0 - chance[1, i]) / backscatter
-            if echo < min(distance, air_reach):
-                distance, power = echo, 0.01
-        if not nearest <= distance <= farthest or chance[0, i] < dropout:
+        distance = float(hits[i])
+        if not nearest <= distance <= farthest or chance[i] < dropout:
             continue
-        if power == 0.0:
-            cosine = abs(
-                normals[i, 0] * rays[i, 3] + normals[i, 1] * rays[i, 4] + normals[i, 2] * rays[i, 5]
-            )
-            power = reflectivity[i] * cosine * np.exp(-2.0 * extinction * distance)
-            # The echo weakens with the square of the distance; a tenth is seen to the full range.
-            if distance * distance > farthest * farthest * power * 10.0:
-                continue
+        cosine = abs(
+            normals[i, 0] * rays[i, 3] + normals[i, 1] * rays[i, 4] + normals[i, 2] * rays[i, 5]
+        )
+        power = reflectivity[i] * cosine
+        # The echo weakens with the square of the distance; a tenth is seen to the full range.
+        if distance * distance > farthest * farthest * power * 10.0:
+            continue
         distance += noise * normal[i]
         for j in range(3):
             points[m, j] = distance * directions[i, j]

@@ -47,11 +47,10 @@ class Material(IntEnum):
     LEAVES = 10
     WATER = 11
     WOOD = 12
-    CLOTH = 13
 
 
 # Diffuse reflectivity of each material near 905 nm, indexed by `Material`.
-_SHARES = [0.25, 0.35, 0.15, 0.35, 0.30, 0.60, 0.40, 0.05, 0.50, 0.25, 0.45, 0.02, 0.45, 0.40]
+_SHARES = [0.25, 0.35, 0.15, 0.35, 0.30, 0.60, 0.40, 0.05, 0.50, 0.25, 0.45, 0.02, 0.45]
 REFLECTIVITY = np.array(_SHARES, np.float32)
 
 
@@ -142,12 +141,10 @@ _BOX_TRIANGLES = np.array(
 )
 
 
-def box(
-    size: ArrayLike, material: Material, at: ArrayLike = (0.0, 0.0, 0.0), yaw: float = 0.0
-) -> Mesh:
+def box(size: ArrayLike, material: Material, at: ArrayLike = (0.0, 0.0, 0.0)) -> Mesh:
     """Make a box of length, width and height `size` whose base is centred on `at`."""
     model = mesh(_BOX * np.asarray(size, np.float64), _BOX_TRIANGLES, material)
-    return place(model, at, yaw)
+    return place(model, at)
 
 
 def tube(rings: ArrayLike, material: Material, sides: int = 8) -> Mesh:
@@ -259,21 +256,6 @@ def car() -> Mesh:
     rim = np.column_stack([0.31 * np.cos(turn), 0.31 + 0.31 * np.sin(turn)])
     wheels = [[x, y, 0.0] for x in (-1.3, 1.35) for y in (-0.78, 0.78)]
     return merge([body, cabin, roof, place(_extrude(rim, 0.2, Material.METAL), wheels)])
-
-
-@cache
-def walker() -> Mesh:
-    """Person of 1.75 m in mid-step."""
-    torso = [[0.0, 0.0, 0.85, 0.16], [0.0, 0.0, 1.1, 0.17]]
-    limbs = [
-        [[-0.25, 0.1, 0.0, 0.06], [-0.05, 0.1, 0.5, 0.07], [0.0, 0.08, 0.9, 0.1]],
-        [[0.3, -0.1, 0.0, 0.06], [0.15, -0.1, 0.5, 0.07], [0.0, -0.08, 0.9, 0.1]],
-        [*torso, [0.02, 0.0, 1.42, 0.19], [0.02, 0.0, 1.5, 0.06]],
-        [[0.03, 0.0, 1.48, 0.06], [0.04, 0.0, 1.62, 0.1], [0.04, 0.0, 1.75, 0.03]],
-        [[0.2, 0.26, 0.85, 0.04], [0.02, 0.24, 1.4, 0.05]],
-        [[-0.2, -0.26, 0.85, 0.04], [0.02, -0.24, 1.4, 0.05]],
-    ]
-    return merge([tube(limb, Material.CLOTH, 8) for limb in limbs])
 
 
 @cache

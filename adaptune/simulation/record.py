@@ -1,32 +1,27 @@
 """Recordings of simulated courses: ROS bags and KITTI odometry folders."""
 
 import heapq
-import tempfile
-from collections.abc import Iterator, Mapping
-from contextlib import ExitStack
+from collections.abc import Iterator
 from dataclasses import dataclass
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from adaptune import files, geometry
-from adaptune.files import replacing, replacing_folder
+from adaptune.files import replacing
 from adaptune.geometry import Poses, invert
 from adaptune.progress import Progress, unseen
 from adaptune.recording.export import (
-    T_CAMERA_LIDAR,
     Message,
     Messages,
     measurements,
     structured,
-    write_kitti_poses,
-    write_kitti_sequence,
 )
 from adaptune.recording.scan import Imu, Scan
-from adaptune.report.charts import Axis, Chart, Cloud, Line, Panel
+from adaptune.report.charts import Axis, Chart, Line, Panel, Points
 from adaptune.report.drawing import draw_chart
 from adaptune.simulation import kernels
 from adaptune.simulation.course import (
@@ -37,14 +32,13 @@ from adaptune.simulation.course import (
     POSES,
     SENSORS,
     T_IMU_LIDAR,
-    WEATHERS,
     Course,
     SimulationError,
     directions,
 )
 from adaptune.simulation.mesh import REFLECTIVITY, Mesh
 from adaptune.simulation.scenes import SCENES, TILE
-from adaptune.simulation.world import RADIUS, Ride, Road, World, model, populate
+from adaptune.simulation.world import Ride, Road, World
 from adaptune.trajectory import Trajectory, write_tum
 
 # Drive through a world and scan it.
@@ -90,25 +84,25 @@ class Drive:
     def scans(self) -> Iterator[SimulatedScan]:
         """Scan the world from one end of the drive to the other."""
         course, sensor = self.course, SENSORS[self.course.sensor]
-        air = WEATHERS[course.weather]
         columns = course.columns or sensor.columns
         rings = np.tile(np.arange(sensor.rings, dtype=np.uint16), columns)
         offsets = np.arange(columns) / (columns * course.turns)
         times = np.repeat(offsets, sensor.rings).astype(np.float32)
+        looks = directions(course.sensor, columns)
         receiver = kernels.Receiver(*sensor.range, sensor.noise, sensor.dropout)
         caster = _Caster(self, sensor.range[1])
         for number, stamp in enumerate(self.stamps()[:-1].tolist()):
             start = (stamp - EPOCH) * 1e-9
             T_world_sensor = self.ride.poses(start + offsets)
-            looks = directions(course.sensor, columns, start, course.turns)
-            cast = caster.cast(looks, T_world_sensor, start + offsets)
+            cast = caster.cast(looks, T_world_sensor)
             rng = np.random.default_rng([course.seed, 6, number])
+            # Two numbers for each ray, so that a seed gives the recording that it always gave.
+            chance, _ = rng.random((2, len(cast.rays)), np.float32)
             points, intensities, kept = kernels.receive(
                 looks.reshape(-1, 3),
                 cast,
                 receiver,
-                (air.extinction, air.backscatter, air.reach),
-                rng.random((2, len(cast.rays)), np.float32),
+                chance,
                 rng.standard_normal(len(cast.rays), np.float32),
             )
             yield SimulatedScan(
@@ -128,13 +122,8 @@ class _Caster:
         self._road, self._sight = drive.road, sight
         self._world = World(drive.road)
         self._here: int | None = None
-        self._movers = populate(drive.road) if drive.course.moving_objects else []
-        kinds = {mover.kind for mover in self._movers}
-        self._models = {kind: _Target(model(kind), np.zeros(3)) for kind in kinds}
 
-    def cast(
-        self, looks: NDArray[np.float32], T_world_sensor: Poses, times: NDArray[np.float64]
-    ) -> kernels.Cast:
+    def cast(self, looks: NDArray[np.float32], T_world_sensor: Poses) -> kernels.Cast:
         """Cast rays from each column's pose."""
         station = float(self._road.station(T_world_sensor[0, 0, 3]))
         tile = int(station // TILE)
@@ -144,25 +133,7 @@ class _Caster:
             self._target = _Target(mesh, self._origin)
             self._here = tile
         rays = kernels.aim(looks, T_world_sensor, self._origin)
-        hits, normals, reflectivity = self._target.cast(rays)
-        for mover in self._movers:
-            if abs(mover.middle - station) > mover.swing + self._sight:
-                continue
-            centres, yaw = mover.at(self._road, times)
-            picked, local = kernels.towards(
-                rays, looks.shape[1], centres - self._origin, yaw, RADIUS[mover.kind]
-            )
-            if not len(picked):
-                continue
-            nearer, turned, shine = self._models[mover.kind].cast(local)
-            hit = nearer < hits[picked]
-            picked, turned, heading = picked[hit], turned[hit], yaw[picked[hit] // looks.shape[1]]
-            hits[picked], reflectivity[picked] = nearer[hit], shine[hit]
-            cos, sin = np.cos(heading), np.sin(heading)
-            normals[picked, 0] = cos * turned[:, 0] - sin * turned[:, 1]
-            normals[picked, 1] = sin * turned[:, 0] + cos * turned[:, 1]
-            normals[picked, 2] = turned[:, 2]
-        return kernels.Cast(rays, hits, normals, reflectivity)
+        return kernels.Cast(rays, *self._target.cast(rays))
 
 
 class _Target:
@@ -239,97 +210,47 @@ def measure(ride: Ride, times: NDArray[np.float64], rate: float, seed: int) -> I
     return gyro, accel + error(2e-2, NOISE.accelerometer_walk, NOISE.accelerometer)
 
 
-Layout = Literal["ros1", "ros2", "mcap", "kitti"]
-"""ROS 1 bag, ROS 2 folder with sqlite3, one MCAP file, KITTI odometry folder."""
-
 _GEOMETRY = ("Point", "Quaternion", "Pose", "PoseStamped")
-_BY_SUFFIX: Mapping[str, Layout] = {".bag": "ros1", ".mcap": "mcap"}
-_MARKS = {"ros2": "metadata.yaml", "kitti": "sequences"}
-"""Marks of a recording's folder, which may be overwritten."""
 
 
 def record(
-    course: Course,
-    path: Path,
-    *,
-    layout: Layout | None = None,
-    overwrite: bool = False,
-    progress: Progress = unseen,
+    course: Course, path: Path, *, overwrite: bool = False, progress: Progress = unseen
 ) -> None:
-    """Simulate a course and write its recording, its ground truth and a preview.
+    """Simulate a course and write a ROS 1 bag, its ground truth and a preview.
 
-    The truth, in the TUM format, and the preview, as PNG and SVG, are named after the recording.
-    All are written whole or not at all.
+    The truth, in the TUM format, and the preview, as PNG and SVG, are named after the bag. All are
+    written whole or not at all.
 
     Parameters
     ----------
     course
         The course to simulate.
     path
-        Where to write the recording.
-    layout
-        Format. If not given, the name decides: ``.bag`` is ROS 1, ``.mcap`` a ROS 2 file,
-        anything else a ROS 2 folder.
+        Where to write the bag.
     overwrite
-        Whether to replace an existing recording; no other file or folder is replaced.
+        Whether to replace files that are there.
     progress
-        Notes every scan, under the recording's name.
+        Notes every scan, under the bag's name.
     """
-    path = Path(path)
-    layout = layout or _BY_SUFFIX.get(path.suffix, "ros2")
-    stem = path.name if layout in _MARKS else path.stem
-    truth = path.with_name(f"{stem}.tum")
-    previews = [path.with_name(f"{stem}{suffix}") for suffix in (".png", ".svg")]
+    truth, *previews = (path.with_suffix(suffix) for suffix in (".tum", ".png", ".svg"))
     for file in (path, truth, *previews):
-        _check(file, overwrite, _MARKS.get(layout) if file is path else None)
+        if file.exists() and not overwrite:
+            raise SimulationError(f"{file} exists already; give --overwrite to replace it")
     drive = Drive(course)
     if not len(drive):
         raise SimulationError("the course is over before its first scan is: make it longer")
-    with ExitStack() as stack:
-        temporary_truth = stack.enter_context(replacing(truth))
-        picture = Preview(drive)
-        scans = picture.watched(progress, path.stem)
-        new = stack.enter_context((replacing_folder if layout in _MARKS else replacing)(path))
-        if layout == "kitti":
-            _write_kitti(drive, scans, new)
-        elif layout == "mcap":
-            with tempfile.TemporaryDirectory(prefix=f".{path.stem}.", dir=path.parent) as name:
-                _write_bag(drive, scans, Path(name) / "bag", 2, mcap=True)
-                (file,) = Path(name).glob("bag/*.mcap")
-                file.replace(new)
-        else:
-            # The writer makes the file itself.
-            new.unlink(missing_ok=True)
-            _write_bag(drive, scans, new, 1 if layout == "ros1" else 2)
-        stamps = drive.stamps()
-        write_tum(temporary_truth, Trajectory(stamps, drive.ride.poses(drive.seconds(stamps))))
-        draw_chart(picture.chart(), *previews)
-
-
-def _check(path: Path, overwrite: bool, mark: str | None) -> None:
-    """Refuse to replace a recording without `overwrite`, and anything else."""
-    if not path.exists():
-        return
-    if not overwrite:
-        raise SimulationError(f"{path} exists already; give --overwrite to replace it")
-    if path.is_dir() and (mark is None or not (path / mark).exists()):
-        raise SimulationError(f"{path} is a folder, but no recording of this kind: not replaced")
-    if mark is not None and not path.is_dir():
-        raise SimulationError(f"{path} is a file, the recording would be a folder: not replaced")
-
-
-def _write_bag(
-    drive: Drive,
-    scans: Iterator[SimulatedScan],
-    path: Path,
-    version: Literal[1, 2],
-    mcap: bool = False,
-) -> None:
-    ros = Messages(version)
+    ros = Messages(1)
     topics = {POINTS: "sensor_msgs/msg/PointCloud2", POSES: "geometry_msgs/msg/PoseStamped"}
-    if drive.course.imu is not None:
+    if course.imu is not None:
         topics[IMU] = "sensor_msgs/msg/Imu"
-    ros.write(path, topics, _messages(ros, drive, scans), mcap)
+    seen: list[NDArray[np.float64]] = []
+    with replacing(truth) as new_truth, replacing(path) as new:
+        # The writer makes the file itself.
+        new.unlink(missing_ok=True)
+        ros.write(new, topics, _messages(ros, drive, _watched(drive, path.stem, progress, seen)))
+        stamps = drive.stamps()
+        write_tum(new_truth, Trajectory(stamps, drive.ride.poses(drive.seconds(stamps))))
+        draw_chart(_preview(drive, np.concatenate([np.empty((0, 3)), *seen])), *previews)
 
 
 def _messages(ros: Messages, drive: Drive, scans: Iterator[SimulatedScan]) -> Iterator[Message]:
@@ -365,98 +286,43 @@ def _messages(ros: Messages, drive: Drive, scans: Iterator[SimulatedScan]) -> It
     yield from heapq.merge(inertial, seen(), key=itemgetter(1))
 
 
-def _write_kitti(drive: Drive, scans: Iterator[SimulatedScan], folder: Path) -> None:
-    """Write sequence 00."""
-    T_world_lidar: list[geometry.Poses] = []
-
-    def seen() -> Iterator[Scan]:
-        for scan in scans:
-            T_world_lidar.append(scan.T_world_sensor)
-            yield standing(drive, scan)
-
-    write_kitti_sequence(seen(), folder, T_camera_lidar=T_CAMERA_LIDAR)
-    write_kitti_poses(np.array(T_world_lidar), folder, T_camera_lidar=T_CAMERA_LIDAR)
-
-
-def standing(drive: Drive, scan: SimulatedScan) -> Scan:
-    """A scan as KITTI has it: undistorted to the scan's start, intensities from 0 to 1."""
-    light = scan.intensities / np.float32(255.0)
-    return Scan(scan.stamp, undistort(drive, scan), intensities=light)
-
-
-def undistort(drive: Drive, scan: SimulatedScan) -> NDArray[np.float32]:
-    """Points (n, 3) as if all had been measured at the scan's stamp, by the true motion."""
-    assert scan.times is not None
-    times, column = np.unique(scan.times, return_inverse=True)
-    T_world_column = drive.ride.poses((scan.stamp - drive.stamps()[0]) * 1e-9 + times.astype(float))
-    T = (geometry.invert(scan.T_world_sensor) @ T_world_column)[column]
-    points = np.einsum("nij,nj->ni", T[:, :3, :3], scan.points) + T[:, :3, 3]
-    return np.asarray(points, np.float32)
-
-
 # A picture of a simulated recording.
 
 
-_MAP_SCANS, _MAP_POINTS = 150, 4000
-"""Number of scans in the map, and points of each."""
+_MAP_POINTS = 4000
+"""Points of the map, about, of all scans together."""
 
 
-class Preview:
-    """The picture of a drive, whose content is collected scan by scan."""
+def _watched(
+    drive: Drive, name: str, progress: Progress, seen: list[NDArray[np.float64]]
+) -> Iterator[SimulatedScan]:
+    """The scans of a drive; `seen` receives x and y in the world of points near each, and height.
 
-    def __init__(self, drive: Drive) -> None:
-        self._drive = drive
-        self._map: list[NDArray[np.float64]] = []
-        self._scan: SimulatedScan | None = None
-
-    def watched(self, progress: Progress, name: str) -> Iterator[SimulatedScan]:
-        """The scans of the drive; `progress` is told of each."""
-        n = len(self._drive)
-        for i, scan in enumerate(self._drive.scans()):
-            if i % max(n // _MAP_SCANS, 1) == 0 and len(scan):
-                T = scan.T_world_sensor
-                points = scan.points[:: max(len(scan) // _MAP_POINTS, 1)]
-                near = points[np.linalg.norm(points[:, :2], axis=1) < 45.0]
-                # Height above the sensor, in its own upright frame.
-                self._map.append(np.column_stack([near @ T[:2, :3].T + T[:2, 3], near @ T[2, :3]]))
-            if i == n // 2:
-                self._scan = scan
-            yield scan
-            progress(name, i + 1, n)
-
-    def chart(self) -> Chart:
-        """The map with the path, and the middle scan from above and as a panorama."""
-        course, n = self._drive.course, len(self._drive)
-        title = (
-            f"{' - '.join(name for name, _ in course.legs)}, {course.sensor}, {course.motion}, "
-            f"seed {course.seed}: {n} scans, {self._drive.road.length:.0f} m"
-        )
-        panels = [self._map_panel()]
-        if self._scan is not None and len(self._scan):
-            panels += _scan_panels(self._scan.points)
-        return Chart("preview", title, tuple(panels))
-
-    def _map_panel(self) -> Panel:
-        points = np.concatenate(self._map) if self._map else np.empty((0, 3))
-        x, y, z = points[np.argsort(points[:, 2], kind="stable")].T
-        T = self._drive.ride.poses(np.linspace(0.0, self._drive.ride.duration, 2000))
-        cloud = Cloud(x, y, z, "height above the sensor [m]", (-1.5, 4.0))
-        drawn = cloud, Line(T[:, 0, 3], T[:, 1, 3], "path")
-        title = "the recording from above"
-        return Panel(Axis("x [m]"), Axis("y [m]"), drawn, title, equal=True, height=1.5)
+    `progress` is told of each, under a name.
+    """
+    n = len(drive)
+    for i, scan in enumerate(drive.scans()):
+        T, few = scan.T_world_sensor, max(_MAP_POINTS // n, 1)
+        points = scan.points[:: max(len(scan) // few, 1)]
+        near = points[np.linalg.norm(points[:, :2], axis=1) < 45.0]
+        # Height above the sensor, in its own upright frame.
+        seen.append(np.column_stack([near @ T[:2, :3].T + T[:2, 3], near @ T[2, :3]]))
+        yield scan
+        progress(name, i + 1, n)
 
 
-def _scan_panels(points: NDArray[np.float32]) -> list[Panel]:
-    away = np.linalg.norm(points, axis=1)
-    span = float(np.percentile(np.abs(points[:, :2]).max(axis=1), 97))
-    look: Any = {"colour_label": "range [m]", "colour_limits": (1.0, 80.0), "log_colour": True}
-    x, y = (Axis(f"{name} [m]", limits=(-span, span)) for name in "xy")
-    above = Cloud(points[:, 0], points[:, 1], away, **look)
-    azimuth = np.degrees(np.arctan2(points[:, 1], points[:, 0]))
-    elevation = np.degrees(np.arcsin(points[:, 2] / away))
-    seen = Cloud(azimuth, elevation, away, **look, size=4)
-    around = Axis("azimuth [deg]", limits=(180.0, -180.0))
-    return [
-        Panel(x, y, (above,), "one scan from above", equal=True, height=1.2),
-        Panel(around, Axis("elevation [deg]"), (seen,), "the same scan as the sensor sees it"),
-    ]
+def _preview(drive: Drive, points: NDArray[np.float64]) -> Chart:
+    """The path from above, and points of shape (n, 3) of what was seen: x, y and height."""
+    course = drive.course
+    title = (
+        f"{' - '.join(name for name, _ in course.legs)}, {course.sensor}, {course.motion}, "
+        f"seed {course.seed}: {len(drive)} scans, {drive.road.length:.0f} m"
+    )
+    x, y, z = points.T
+    T = drive.ride.poses(np.linspace(0.0, drive.ride.duration, 2000))
+    height = np.clip(z, -1.5, 4.0)
+    drawn = (
+        Points(x, y, "points", height, "height above the sensor [m]"),
+        Line(T[:, 0, 3], T[:, 1, 3], "path"),
+    )
+    return Chart("preview", title, (Panel(Axis("x [m]"), Axis("y [m]"), drawn, equal=True),))

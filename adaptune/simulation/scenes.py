@@ -137,8 +137,6 @@ class Scene:
     pace: float = 1.0  # share of its usual speed at which a vehicle goes
     # Whether it winds from its mouth on, however long the bends before it are.
     winds_at_once: bool = False
-    # What moves about in it: kinds of mover with the offset they keep.
-    movers: tuple[tuple[str, float], ...] = ()
 
 
 def paved(*bands: tuple[float, Material]) -> Callable[[Floats], NDArray[np.uint8]]:
@@ -421,7 +419,6 @@ CORRIDOR = Scene(
     slope=0.0,
     shake=0.4,
     pace=0.5,
-    movers=(("walker", 0.9),),
 )
 
 
@@ -572,7 +569,6 @@ GARDEN = Scene(
     slope=0.06,
     shake=1.2,
     pace=0.6,
-    movers=(("walker", 1.1), ("walker", -1.2)),
 )
 
 
@@ -742,7 +738,6 @@ STREET = Scene(
     bend=45.0,
     slope=0.012,
     shake=0.6,
-    movers=(("car", 1.9), ("walker", _KERB + 2.2), ("walker", -_KERB - 2.0)),
 )
 
 

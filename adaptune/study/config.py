@@ -1,15 +1,13 @@
 """The configuration of a study: the settings that both stages share."""
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Annotated, Any, Literal, NamedTuple, get_args, get_origin
+from collections.abc import Iterable, Mapping
+from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import (
     AfterValidator,
-    BaseModel,
     BeforeValidator,
     Field,
-    field_validator,
     model_validator,
 )
 
@@ -21,7 +19,7 @@ from adaptune.recording.scan import Fractions, part_name, read_part
 from adaptune.ros.link import SetCommand
 from adaptune.simulation.course import Course
 from adaptune.space import ParameterSpace, Value
-from adaptune.strict import Mistake, StrictModel, alternatives
+from adaptune.strict import Mistake, StrictModel
 
 
 def _file_name(name: str) -> str:
@@ -34,6 +32,8 @@ def _file_name(name: str) -> str:
 
 Name = Annotated[str, AfterValidator(_file_name)]
 """Becomes the name of a file."""
+WORTH = 0.1
+"""Share of the error that a bank has to spare, surely, to be worth its CPU time."""
 
 
 class OdometryConfig(StrictModel):
@@ -163,7 +163,8 @@ class OnlineConfig(StrictModel):
     """How to replay: seconds between selections, modes, switching, and what it may cost.
 
     `modes` are replayed besides baseline, fixed set and rivals; `all` of them is a choice, too.
-    The budget is in milliseconds of CPU time a scan, all members and live evidence together.
+    The budget is in milliseconds of CPU time a scan, all members and live evidence together; a
+    bank has to spare the share `worth` of the error to be driven.
     Without `real_time`, a replay is as fast as it goes and always the same.
     """
 
@@ -174,13 +175,9 @@ class OnlineConfig(StrictModel):
     )
     switching: SwitchingConfig = SwitchingConfig()
     budget: float | None = Field(None, gt=0, le=1e6)
+    worth: float = Field(WORTH, ge=0, le=1)
     real_time: RealTimeConfig | None = None
     ros: RosConfig = RosConfig()
-
-    @field_validator("modes", mode="before")
-    @classmethod
-    def _all(cls, modes: Any) -> Any:
-        return (*RULES, *ALSO) if modes == "all" else modes
 
     @property
     def rules(self) -> tuple[str, ...]:
@@ -231,33 +228,6 @@ class StudyConfig(StrictModel):
     def resolved(self) -> dict[str, Any]:
         """The configuration as plain data, with nothing left to defaults."""
         return self.model_dump(mode="json")
-
-
-# The keys of a study's YAML, for the completion of `-o`.
-
-
-def complete(
-    model: type[BaseModel], incomplete: str, more: Mapping[str, Sequence[str]] | None = None
-) -> list[str]:
-    """What ``KEY=VALUE`` can become; `more` has values of keys whose type names none."""
-    key, equals, _ = incomplete.partition("=")
-    keys = {name: (more or {}).get(name, values) for name, values in _keys(model, "")}
-    if equals:
-        return [t for v in keys.get(key, ()) if (t := f"{key}={v}").startswith(incomplete)]
-    return [f"{name}=" for name in keys if name.startswith(incomplete)]
-
-
-def _keys(model: type[BaseModel], prefix: str) -> Iterator[tuple[str, Sequence[str]]]:
-    """Every key below a section that has none below it, and its values if they are listed."""
-    for name, field in model.model_fields.items():
-        types = list(alternatives(field.annotation))
-        sections = [type_ for type_ in types if isinstance(type_, type(BaseModel))]
-        for section in sections:
-            yield from _keys(section, f"{prefix}{name}.")
-        if not sections:
-            listed = [get_args(type_) for type_ in types if get_origin(type_) is Literal]
-            listed += [("true", "false")] * (bool in types)
-            yield prefix + name, [str(value) for values in listed for value in values]
 
 
 # The sequences that a study names for training and test, and parts of them.

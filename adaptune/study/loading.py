@@ -291,6 +291,7 @@ DELETED = {
     "online.modes=paired": "is now called adaptive",
     **{f"online.modes={mode}": _NO_MODE for mode in ("one_set", "bank", "bank_learned", "random")},
     "health.max_acceleration": "is gone: 30 m/s^2 is the bound; leave it out",
+    "health.max_freeze": "is gone: 1 s is the bound; leave it out",
     "health.max_turn_rate": "is gone: 360 degrees a second are the bound; leave it out",
     "health.max_unregistered": "is gone: 10 scans in a row are the bound; leave it out",
     "odometry.settings.drain": "is gone: adaptune waits until the system rests; leave it out",
@@ -299,12 +300,30 @@ DELETED = {
     "offline.pruning=halving": _NO_PRUNING,
     "offline.pruning=hyperband": _NO_PRUNING,
     "offline.memory": "is gone: workers keep scans in a quarter of the machine's memory",
+    **{
+        f"offline.sampler={old}": f"is gone; give optuna.samplers:{name}, with its own settings"
+        for old, name in (
+            ("cmaes", "CmaEsSampler"),
+            ("gp", "GPSampler"),
+            ("nsga2", "NSGAIISampler"),
+            ("qmc", "QMCSampler"),
+            ("sobol", "QMCSampler"),
+        )
+    },
     "offline.preset": "is gone; for the paper's, give trials: 256, sets: own, runs: whole",
     "offline.target": "is gone; give trials, hours or stagnation",
-    "offline.storage": "is gone: the trials are in a journal of Optuna's in the study's folder",
+    "offline.storage": "is gone: the trials are files in the study's folder, and in trials.csv",
     "offline.max_frames": "is gone: the error model keeps all frames; leave it out",
+    "sequences.*.position_prior": "is gone: it changed nothing over 50 m; leave it out",
+    "sequences.*.evalio": "is gone: give the data set's files, as `bag`, `kitti` or `folder`",
+    "sequences.*.compensate=gyro": "is gone; give constant_velocity, which needs no IMU",
+    "courses.*.compensate=gyro": "is gone; give constant_velocity, which needs no IMU",
+    "courses.*.moving_objects": "is gone: nothing moves in simulated places; leave it out",
+    "courses.*.weather": "is gone: the air is always clear; leave it out",
+    "courses.*.sensor=avia": "is gone; choose a sensor that turns",
 }
-"""Keys, and values of keys, of earlier versions that are gone, and what became of them."""
+"""Keys, and values of keys, of earlier versions that are gone, and what became of them; a star
+stands for any name."""
 
 _MOST_BYTES = 10**6
 
@@ -361,7 +380,10 @@ def _deleted(mistake: Mistake, data: Any) -> Mistake:
         value = reduce(getitem, mistake.key, data)
     except (LookupError, TypeError):
         return mistake
-    key = ".".join(part for part in mistake.key if isinstance(part, str))
+    parts = [part for part in mistake.key if isinstance(part, str)]
+    if parts[:1] in (["sequences"], ["courses"]):
+        parts[1:2] = ["*"]
+    key = ".".join(parts)
     if key in DELETED:
         return mistake._replace(message=DELETED[key])
     gone = DELETED.get(f"{key}={value}")

@@ -10,18 +10,13 @@ from typing import Any
 from adaptune import manifest
 from adaptune.geometry import Poses
 from adaptune.processes import pin
-from adaptune.recording.cache import fingerprints
 from adaptune.recording.recording import (
     RecordedSequence,
-    of_prior,
-    position_prior,
-    prior_files,
     wants_estimate,
 )
 from adaptune.recording.scan import origin
 from adaptune.reference import estimate
 from adaptune.reference.check import SUSPICIOUS, contradictions
-from adaptune.reference.graph import warn_of_unused
 from adaptune.reference.stored import (
     EstimatedReference,
     EstimateError,
@@ -122,32 +117,22 @@ def _ensure(
 
 def _about(sequences: StudySequences, name: str) -> dict[str, Any]:
     """Everything that an estimated reference depends on, as plain data."""
-    given, prior = sequences.unseen(name), None
     scans = sequences.identity(name)
     scans["sequences"][name] |= dict.fromkeys(_OF_VIEWS)
-    if given.position_prior is not None:
-        files = prior_files(given)
-        keys = {"child_frame", "extrinsic", "clock_offset", "max_gap"}
-        prior = of_prior(given).model_dump(mode="json", include=keys)
-        prior["poses"] = fingerprints(files) if files else given.position_prior
-    about = {"estimator": estimate.VERSION, "position_prior": prior} | scans
-    return dict(manifest.plain(about))
+    return dict(manifest.plain({"estimator": estimate.VERSION} | scans))
 
 
 def _estimate(
     sequences: StudySequences, name: str, advance: Callable[[int, int], None]
 ) -> EstimatedReference | str:
     """The reference of a sequence, or why it cannot be estimated."""
-    given = sequences.unseen(name)
-    scans, prior = RecordedSequence(given), position_prior(given)
+    scans = RecordedSequence(sequences.unseen(name))
     # GTSAM's sums may depend on its threads: only on one core do results repeat bit by bit.
     try:
         with pin(os.getpid()):
-            found = estimate.estimate_reference(scans, advance, prior)
+            return estimate.estimate_reference(scans, advance)
     except EstimateError as error:
         return str(error) if scans.name in str(error) else f"{scans.name}: {error}"
-    warn_of_unused(name, prior, found)
-    return found
 
 
 def _accuracy(stored: StoredEstimate, length: float) -> str:

@@ -52,12 +52,11 @@ from adaptune.study.config import (
 # The sequences of a study by name: recordings, simulated courses, and views of them.
 
 
-_PATHS = ("bag", "kitti", "folder", "evalio")
+_PATHS = ("bag", "kitti", "folder")
 _OF_POSES = ("reference", "child_frame", "extrinsic", "clock_offset", "max_gap")
 """Keys of a sequence that change its reference only."""
 _AS_ESTIMATED = {
     **{key: SequenceConfig.model_fields[key].default for key in _OF_POSES},
-    "position_prior": None,
     # A gap as long says where the estimate is not to be trusted.
     "max_gap": BREAK,
 }
@@ -484,13 +483,14 @@ PER_STRETCH = 4
 """Sub-trajectories of a stretch, the unit of evidence."""
 MIN_RECORDINGS = 6
 """With as many, whole recordings are left out; with fewer, stretches of them."""
-WORTH = 0.1
-"""Share of the error that a bank has to spare, surely, to be worth its CPU time."""
 
 
-def is_worth(ratio: float, high: float) -> bool:
-    """Whether a ratio of errors, whose 95 % interval ends at `high`, is worth the CPU time."""
-    return ratio <= 1.0 - WORTH and high < 1.0
+def is_worth(ratio: float, high: float, worth: float) -> bool:
+    """Whether a ratio of errors, whose 95 % interval ends at `high`, is worth the CPU time.
+
+    It is if it surely spares some of the error, and about the share `worth`.
+    """
+    return ratio <= 1.0 - worth and high < 1.0
 
 
 BANK, ONE_SET = "bank", "one set"
@@ -704,7 +704,6 @@ class OracleErrors(NamedTuple):
     A trial restarts at the reference after a lost track. A replay does not.
     """
 
-    stamps: NDArray[np.int64]  # (n_frames,): nanoseconds
     trials: tuple[int, ...]  # numbers of the sets, the fixed one's first if it is among them
     # (n_frames, n_sets): sub-trajectory RTE in percent, NaN without a sub-trajectory, infinite
     # where the track was lost.
@@ -730,5 +729,4 @@ def oracle_errors(archive: Archive, name: str, model: ErrorModel) -> OracleError
         _log.warning(words, name, "; ".join(changes))
         return None
     trials = tuple(sorted(known, key=lambda trial: (trial != model.fixed, trial)))
-    stamps = archive.read_frames(name).stamps
-    return OracleErrors(stamps, trials, archive.read_errors(name, trials))
+    return OracleErrors(trials, archive.read_errors(name, trials))

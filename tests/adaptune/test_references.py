@@ -4,14 +4,11 @@ import drives
 import estimates
 import numpy as np
 import pytest
-from rooms import along_x
 
 from adaptune.recording.config import SequenceConfig
 from adaptune.recording.recording import open_sequence, wants_estimate
 from adaptune.reference.stored import EstimateError
-from adaptune.strict import ConfigurationError
 from adaptune.study.references import ensure_references, estimates_as_data, estimates_of
-from adaptune.trajectory import Trajectory, write_tum
 from offline.config import load_study
 
 LEFT_OUT = "sequences.one.reference="
@@ -109,73 +106,22 @@ def test_a_file_that_was_estimated_is_called_so(load, tmp_path):
         assert named.sequences.estimate("one") is None
 
 
-def test_it_is_estimated_again_when_something_has_changed(
-    estimator, load, tmp_path, monkeypatch, caplog
-):
+def test_it_is_estimated_again_when_something_has_changed(estimator, load, monkeypatch, caplog):
     ensure(load(LEFT_OUT), ["one"])
-    prior = tmp_path / "gps.tum"
-    with_prior = (LEFT_OUT, f"sequences.one.position_prior={prior}")
-    for overrides, change in (
-        ((LEFT_OUT, "sequences.one.stop=3"), "sequences.one.stop is new"),
-        (with_prior, "position_prior is new; sequences.one.stop is gone"),
-        (with_prior, "position_prior.poses changed from "),
-    ):
+    shorter = LEFT_OUT, "sequences.one.stop=3"
+    for overrides, change in ((shorter, "stop is new"), ([LEFT_OUT], "stop is gone")):
         caplog.clear()
-        write_tum(prior, truth(len(estimator.asked)))
         ensure(load(*overrides), ["one"])
-        assert caplog.messages[0].startswith(f"one: its reference is estimated again: {change}")
+        words = f"one: its reference is estimated again: sequences.one.{change}"
+        assert caplog.messages[0].startswith(words)
         ensure(load(*overrides), ["one"])
-    assert len(estimator.asked) == 4
+    assert len(estimator.asked) == 3
     monkeypatch.setattr("adaptune.reference.estimate.VERSION", 0)
-    ensure(load(*with_prior), ["one"])
+    ensure(load(LEFT_OUT), ["one"])
     assert "again: estimator changed from 1 to 0" in caplog.text
 
 
-def truth(aside=0.0):
-    stamps = drives.FIRST_STAMP + np.arange(40) * 10**8
-    T = along_x(0.3 * np.arange(40))
-    T[:, 1, 3] = aside
-    return Trajectory(stamps, T)
-
-
-def test_a_prior_is_seen_from_the_lidar(estimator, load):
-    ensure(load(LEFT_OUT, "sequences.one.position_prior=/truth", EXTRINSIC), ["one"])
-    ((_, prior),) = estimator.asked
-    assert len(prior) == 40
-    np.testing.assert_allclose(prior.T_world_sensor[:, 1, 3], 2.0)
-
-
-@pytest.mark.parametrize(("gap", "used"), [([], True), (["sequences.one.max_gap=1.5"], False)])
-def test_a_prior_may_have_a_position_every_two_seconds(
-    estimator, load, tmp_path, caplog, gap, used
-):
-    path, few = tmp_path / "gps.tum", truth()
-    write_tum(path, Trajectory(few.stamps[::19], few.T_world_sensor[::19]))
-    ensure(load(LEFT_OUT, f"sequences.one.position_prior={path}", *gap), ["one"])
-    ((_, prior),) = estimator.asked
-    known = np.isfinite(prior.at(few.stamps[:38])[:, 0, 3])
-    assert known.mean() == (1.0 if used else pytest.approx(0.05, abs=0.03))
-    assert ("one: the position prior was not used" in caplog.text) == (not used)
-
-
-@pytest.mark.parametrize(
-    ("given", "words"),
-    [
-        ("reference=none", "`position_prior` joins an estimated reference: write `reference: e"),
-        ("reference=/truth", "`position_prior` joins an estimated reference: write `reference: e"),
-        ("position_prior=/points", "/points is"),
-        ("position_prior=no.tum", "no.tum"),
-    ],
-)
-def test_a_prior_that_cannot_be_joined_is_refused(load, given, words):
-    overrides = ["sequences.one.reference=", "sequences.one.position_prior=/truth"]
-    with pytest.raises(ConfigurationError, match=r"sequences\.one") as caught:
-        load(*overrides, f"sequences.one.{given}")
-    assert words in str(caught.value)
-    assert len(str(caught.value).splitlines()) == 1
-
-
-def test_a_recording_with_poses_of_its_own_keeps_them(tmp_path, study_file):
+def test_a_recording_with_poses_of_its_own_keeps_them(tmp_path):
     kitti = tmp_path / "kitti"
     (kitti / "velodyne").mkdir(parents=True)
     for i in range(3):
@@ -191,9 +137,6 @@ def test_a_recording_with_poses_of_its_own_keeps_them(tmp_path, study_file):
         config = SequenceConfig(kitti=str(kitti), reference=word)
         assert wants_estimate(config) == wanted
         assert open_sequence(config).reference() is None
-    entry = f"sequences.three={{kitti: {kitti}, position_prior: gps.tum}}"
-    with pytest.raises(ConfigurationError, match=r"position_prior: .* has poses of its own; write"):
-        load_study(study_file, [entry], tmp_path / "run")
 
 
 def test_a_recording_that_allows_none_is_named_and_not_tried_again(estimator, load, caplog):
@@ -241,3 +184,12 @@ def test_an_interruption_leaves_those_that_are_done(estimator, load, monkeypatch
     assert os.sched_getaffinity(0) == before
     assert study.sequences.estimate("one") is not None
     assert study.sequences.estimate("two") is None
+
+
+@pytest.mark.usefixtures("estimator")
+def test_a_damaged_note_is_told(load):
+    study = load(LEFT_OUT)
+    ensure(study, ["one"])
+    (study.folder / "references/one.json").write_text("{")
+    with pytest.raises(EstimateError, match=r"one\.json: is damaged .* remove it and one\.tum"):
+        ensure(study, ["one"])

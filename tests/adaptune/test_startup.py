@@ -40,12 +40,12 @@ def test_configuration_imports_nothing_heavy(code):
 
 ZSH = {
     "_ADAPTUNE_COMPLETE": "complete_zsh",
-    "_TYPER_COMPLETE_ARGS": "adaptune offline my.yaml -o offline.tr",
+    "_TYPER_COMPLETE_ARGS": "adaptune offline my.yaml --over",
 }
 BASH = {
     "_ADAPTUNE_COMPLETE": "complete_bash",
-    "COMP_WORDS": "adaptune offline my.yaml -o offline.tr",
-    "COMP_CWORD": "4",
+    "COMP_WORDS": "adaptune offline my.yaml --over",
+    "COMP_CWORD": "3",
 }
 
 
@@ -59,9 +59,9 @@ def test_the_shell_is_answered(shell, tmp_path):
         text=True,
         check=False,
     )
-    assert "offline.trials=" in done.stdout
+    assert "--override" in done.stdout
     imported = {line.rpartition("|")[2].strip().split(".")[0] for line in done.stderr.splitlines()}
-    assert "pydantic" in imported
+    assert "typer" in imported
     assert not imported & HEAVY
 
 

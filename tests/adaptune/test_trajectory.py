@@ -12,7 +12,6 @@ from adaptune.trajectory import (
     TrajectoryError,
     is_kitti,
     read_kitti,
-    read_oxts,
     read_trajectory,
     read_tum,
     write_kitti,
@@ -112,26 +111,6 @@ def test_of_poses_with_one_stamp_the_first_counts(tmp_path, caplog):
     trajectory = read_trajectory(tmp_path / "a.tum")
     assert trajectory.T_world_sensor[:, 0, 3].tolist() == list(range(12))
     assert "1 of 13 poses repeat the stamp before, first on line 7" in caplog.text
-
-
-def test_oxts_files_are_metres_east_and_north(tmp_path):
-    files = []
-    for i, (latitude, longitude) in enumerate([(49.0, 8.4), (49.0, 8.401), (49.001, 8.4)]):
-        files.append(tmp_path / f"{i}.txt")
-        files[-1].write_text(f"{latitude} {longitude} {100 + i} 0.1 0.2 0.3 1 2 3\n")
-    T = read_oxts(files)
-    circle = 2 * np.pi * 6378137.0
-    np.testing.assert_allclose(T[0][:3, 3], 0, atol=1e-9)
-    np.testing.assert_allclose(
-        T[1][:3, 3], [circle * 0.001 / 360 * np.cos(np.deg2rad(49)), 0, 1], atol=1e-3
-    )
-    np.testing.assert_allclose(T[2][:3, 3], [0, circle * 0.001 / 360, 2], atol=1e-2)
-    # Roll about x first, then pitch, then yaw.
-    cr, sr, cp, sp, cy, sy = (f(a) for a in (0.1, 0.2, 0.3) for f in (np.cos, np.sin))
-    Rz = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
-    Ry = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
-    Rx = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
-    np.testing.assert_allclose(T[0][:3, :3], Rz @ Ry @ Rx, atol=1e-12)
 
 
 TUM_LINE = "1.5 0 0 0 0 0 0 1\n"

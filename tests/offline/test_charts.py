@@ -7,13 +7,15 @@ from made_trials import SPACE, made_table, write_trials
 from adaptune import files
 from adaptune.archive import Summary
 from adaptune.errors import AdaptuneError
-from adaptune.report.charts import Axis, Band, Line, Points
+from adaptune.report.charts import Band, Line, Points
 from offline.charts import (
+    TrialTable,
+    TriedSet,
     charts_of_trials,
     charts_of_validation,
+    cost_chart,
     importances,
     iteration_chart,
-    pareto_chart,
     read_trials,
     scatter_chart,
     stretch_chart,
@@ -60,16 +62,20 @@ def test_a_trial_beyond_a_limit_is_no_best():
     np.testing.assert_allclose(of_kind(panel, Line)[0].y, [1.0, 0.9, 0.9, 0.7])
 
 
-def test_a_front_is_a_line_of_two_objectives_and_none_of_three():
-    values = np.array([[0.5, 9.0, 1.0], [0.7, 5.0, 2.0], [4.0, 2.0, 3.0], [30.0, 7.0, 4.0]])
-    names, marked = ["rte [%]", "memory [MB]", "cpu [% of a core]"], {"fixed": (0.5, 9.0, 1.0)}
-    (panel,) = pareto_chart(names[:2], values[:, :2], values[:3, :2], {"fixed": (0.5, 9.0)}).panels
-    named = [d.name for d in panel.drawn]
-    assert named == ["tried", "Pareto front", "Pareto front", "fixed"]
-    assert (panel.x, panel.y) == (Axis("rte [%]", log=True), Axis("memory [MB]"))
-    first, second = pareto_chart(names, values, values[:3], marked).panels
-    assert (first.x.label, first.y.label, second.y.label) == tuple(names)
-    assert not any(isinstance(d, Line) for panel in (first, second) for d in panel.drawn)
+def test_the_front_has_less_error_for_more_time():
+    table = TrialTable(
+        SPACE,
+        ["one"],
+        [
+            TriedSet(n, SPACE.baseline, {"one": error}, error, True, cost)
+            for n, (cost, error) in enumerate(
+                [(5.0, 3.0), (1.0, 9.0), (1.0, 8.0), (7.0, 3.0), (9.0, 1.0), (np.nan, 0.1)]
+            )
+        ],
+    )
+    (panel,) = cost_chart(table).panels
+    (front,) = of_kind(panel, Line)
+    assert list(zip(front.x, front.y, strict=True)) == [(1.0, 8.0), (5.0, 3.0), (9.0, 1.0)]
 
 
 def test_a_study_is_read(study_file, tmp_path):

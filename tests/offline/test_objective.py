@@ -1,9 +1,6 @@
 import drives
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from hypothesis.extra.numpy import arrays
 from setups import made_of, setup_of
 
 from adaptune.archive import Archive, Summary
@@ -19,7 +16,6 @@ from offline.objective import (
     choose_fixed,
     joined,
     judge,
-    pareto_front,
 )
 from offline.train import train
 
@@ -33,7 +29,7 @@ def test_a_sum_is_a_mean_over_sequences_and_a_limit_holds_on_each():
     runs = [Summary({"a": 1}, 1.0, 0, 0, 10.0), Summary({"a": 1}, 3.0, 0, 0, 30.0)]
     verdict = judge(of, runs)
     assert verdict.parameters == {"a": 1}
-    assert verdict.values == pytest.approx((0.5 * (1.0 + 1.0) + 0.5 * (3.0 + 3.0),))
+    assert verdict.value == pytest.approx(0.5 * (1.0 + 1.0) + 0.5 * (3.0 + 3.0))
     assert verdict.constraints == pytest.approx((0.5,))
     assert verdict.excess == pytest.approx(0.5)
     assert judge(of, runs[:1]).feasible
@@ -41,7 +37,7 @@ def test_a_sum_is_a_mean_over_sequences_and_a_limit_holds_on_each():
 
 
 def test_a_set_that_breaks_a_limit_is_never_the_fixed_one():
-    verdicts = [Verdict({}, (2.0,)), Verdict({}, (1.0,), (0.1,)), Verdict({}, (2.0,), (-0.1,))]
+    verdicts = [Verdict({}, 2.0), Verdict({}, 1.0, (0.1,)), Verdict({}, 2.0, (-0.1,))]
     assert best_by_trials(config(), dict(enumerate(verdicts))) == 0
     of = config(limits={"ms_per_scan": {"max": 20}})
     with pytest.raises(
@@ -51,7 +47,7 @@ def test_a_set_that_breaks_a_limit_is_never_the_fixed_one():
 
 
 def test_the_best_few_and_the_baseline_are_candidates():
-    verdicts = {n: Verdict({}, (float(value),)) for n, value in enumerate([9, 7, 5, 3, 4, 6])}
+    verdicts = {n: Verdict({}, float(value)) for n, value in enumerate([9, 7, 5, 3, 4, 6])}
     assert candidates(config(), verdicts) == [3, 4, 2, 5, 0]
     verdicts[3] = verdicts[3]._replace(complete=False)
     verdicts[0] = verdicts[0]._replace(constraints=(0.1,))
@@ -78,7 +74,7 @@ def test_of_repeated_trials_the_surely_best_is_taken():
     # The standard error of the mean of two means of three, times Student's t with four degrees.
     error = np.sqrt(np.var([0.2, 0.9, 1.9], ddof=1) / 3) / 2
     assert verdicts[1].margin == pytest.approx(2.1318 * error, rel=1e-4)
-    assert verdicts[1].values < verdicts[0].values
+    assert verdicts[1].value < verdicts[0].value
     assert best_by_trials(config(), dict(enumerate(verdicts))) == 0
     assert judge(config(), [Summary({}, 1.0, 0, 0, 1.0)]).margin == 0.0
 
@@ -87,7 +83,7 @@ def test_runs_of_the_baseline_alone_give_it_no_margin_but_a_sentence():
     repeats = [{"rte": e, "rpe": 0.1 * e} for e in (1.0, 2.0, 3.0)]
     runs = [Summary({}, 2.0, 0, 0, 1.0, {"rpe": 0.2}, repeats)] * 2
     once = config(baseline_runs=3, objective="rpe")
-    assert judge(once, runs).bound == judge(once, runs).values[0] == pytest.approx(0.2)
+    assert judge(once, runs).bound == judge(once, runs).value == pytest.approx(0.2)
     assert baseline_words(once, runs) == [
         "The baseline ran 3 times: rpe [m] 0.2 in the mean, 0.1 to 0.3, standard deviation 0.1."
     ]
@@ -95,21 +91,6 @@ def test_runs_of_the_baseline_alone_give_it_no_margin_but_a_sentence():
     assert baseline_words(config(objective="cpu"), runs) == []
     with pytest.raises(ValueError, match=r"baseline_runs must be 3 \(repeats\) or more"):
         config(repeats=3, baseline_runs=2)
-
-
-@given(arrays(float, st.tuples(st.integers(1, 20), st.integers(1, 3)), elements=st.integers(0, 5)))
-def test_the_front_is_what_nothing_dominates(values):
-    front = pareto_front(values)
-
-    def dominates(a, b):
-        return (a <= b).all() and (a < b).any()
-
-    for i, row in enumerate(values):
-        dominated = any(dominates(other, row) for other in values)
-        twin = any((values[j] == row).all() for j in front)
-        assert dominated != twin
-        assert not (dominated and i in front)
-    assert (np.diff(values[front, 0]) >= 0).all()
 
 
 def test_new_starts_are_undone():

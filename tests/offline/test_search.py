@@ -95,7 +95,7 @@ def test_each_sequence_searches_for_itself(study_of):
     means = {
         n: np.mean([archive.finished(name)[n].mean_error for name in NAMES]) for n in (0, fixed)
     }
-    assert verdicts[fixed].values == pytest.approx((means[fixed],))
+    assert verdicts[fixed].value == pytest.approx(means[fixed])
     assert means[fixed] < means[0]
     # The searches differ from each other, in their initial points too.
     assert (
@@ -106,9 +106,8 @@ def test_each_sequence_searches_for_itself(study_of):
 SAMPLERS = {
     "tpe": "{}",
     "annealing": "{chains: 1}",
-    "nsga2": "{}",
-    "cmaes": "{}",
-    "qmc": "{}",
+    "optuna.samplers:NSGAIISampler": "{population_size: 4}",
+    "optuna.samplers:CmaEsSampler": "{}",
     "random": "{}",
     "grid": "{grid: {max_correspondence_distance: [1, 1, 4], keyframe_interval: [1, 2, 5]}}",
 }
@@ -222,7 +221,7 @@ def test_verdicts_belong_to_their_trials_where_numbers_are_left_out():
 
 
 def verdicts(*values):
-    return [Verdict({"x": float(i)}, (value,)) for i, value in enumerate(values)]
+    return [Verdict({"x": float(i)}, value) for i, value in enumerate(values)]
 
 
 @pytest.mark.parametrize(

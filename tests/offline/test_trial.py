@@ -302,3 +302,21 @@ def test_preparations_that_a_pass_does_not_use_make_room():
     # Of two that are used, none makes room for the other.
     passes(shared, one, other)
     assert (shared.n_kept(one), shared.n_kept(other)) == (1, N - 1)
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "given", "runs"),
+    [
+        ("rustle", {"play": "lockstep"}, None, "whole"),
+        ("rustle", {"play": "lockstep"}, "restart", "restart"),
+        ("rustle", {}, None, "restart"),
+        ("gicp", {}, None, "restart"),
+    ],
+)
+def test_trials_run_on_where_a_start_is_a_new_container(study_file, name, settings, given, runs):
+    config = load_study(study_file).config
+    odometry = config.odometry.model_copy(update={"name": name, "settings": settings})
+    offline = config.offline.model_copy(update={"runs": given})
+    changed = config.model_copy(update={"odometry": odometry, "offline": offline})
+    assert changed.runs == TrialSettings.of(changed).runs == runs
+    assert changed.search_inputs["runs"] == runs

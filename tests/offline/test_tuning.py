@@ -93,7 +93,7 @@ def test_the_least_loss_wins():
     banks = [[0, 1], [0, 2]]
 
     def best():
-        return tuning.least_loss(logs, names, banks, len(PAIRED_SETTINGS))
+        return tuning.least_loss(logs, names, banks, len(PAIRED_SETTINGS), 0.1)
 
     assert (best().one_set, best().bank) == (DO_NOT_ADAPT, NO_BANK)
     logs[:, 5] = -0.2
@@ -109,16 +109,18 @@ def test_the_least_loss_wins():
     assert found.expected["bank"].loss == expected_loss(logs[:, second + 3], names)
     # A bank costs several times as much: it has to gain a tenth, and surely.
     logs[:] = 0.0
-    for gain, spread, n, adapts in (
-        (0.3, 0.0, 8, True),
-        (0.08, 0.0, 8, False),
-        (0.3, 0.2, 8, True),
-        (0.3, 0.2, 2, False),
-        (0.3, 0.0, 1, False),
+    for gain, spread, n, worth, adapts in (
+        (0.3, 0.0, 8, 0.1, True),
+        (0.08, 0.0, 8, 0.1, False),
+        (0.08, 0.0, 8, 0.05, True),
+        (0.3, 0.0, 8, 0.5, False),
+        (0.3, 0.2, 8, 0.1, True),
+        (0.3, 0.2, 2, 0.0, False),
+        (0.3, 0.0, 1, 0.1, False),
     ):
         logs[:, second + 3] = -gain + spread * (-1.0) ** np.arange(8)
-        found = tuning.least_loss(logs[:n], names[:n], banks, len(PAIRED_SETTINGS))
-        assert found.bank.adapt == adapts, (gain, spread, n)
+        found = tuning.least_loss(logs[:n], names[:n], banks, len(PAIRED_SETTINGS), worth)
+        assert found.bank.adapt == adapts, (gain, spread, n, worth)
         if n > 1:
             assert found.expected["bank"].loss == expected_loss(logs[:n, second + 3], names[:n])
     # What rounding gains is no gain.

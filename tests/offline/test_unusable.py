@@ -1,7 +1,5 @@
 """A parameter set with which the odometry gives no poses is never chosen."""
 
-import csv
-
 import fragile
 import numpy as np
 import pytest
@@ -18,7 +16,6 @@ from offline.validate import validate
 GOOD = Summary({"x": 1}, 2.0, 0, 0, 10.0)
 FAILS = [Summary({"x": 2}, 1.0, 0, 10, 0.01), Summary({"x": 2}, 1.0, 0, 1, 0.01, without_pose=0.1)]
 FAST = "offline.objective={rte: 0.001, ms_per_scan: 1.0}"
-TWO_FOLD = "offline.objective=[ms_per_scan, rte]"
 LIMIT = "offline.limits={ms_per_scan: {max: 1000}}"
 
 
@@ -32,7 +29,6 @@ def trained(study_file, folder, fails, *given):
     ("fails", "given"),
     [
         ("always", [FAST]),
-        ("always", [TWO_FOLD]),
         ("always", [FAST, LIMIT]),
         ("always", ["offline.sets=own", FAST]),
         ("every fifth", [FAST]),
@@ -56,9 +52,6 @@ def test_a_set_that_fails_is_never_chosen(study_file, tmp_path, fails, given):
     rule = NearestNeighbours().fit(data)
     assert not failing & {rule.select(feature).trial for feature in data.features[::9]}
     assert not failing & set(model.allowed())
-    if TWO_FOLD in given:
-        with (study.folder / "pareto.csv").open() as file:
-            assert not failing & {int(row["trial"]) for row in csv.DictReader(file)}
     if fails == "in two":
         assert validate(study).rows
 

@@ -8,8 +8,9 @@ from dataclasses import replace
 import drives
 import numpy as np
 import pytest
-from commands import refused, succeeded
+from typer.testing import CliRunner
 
+from adaptune.commands.cli import app
 from adaptune.model import BankSettings, ErrorModel, PairedSettings
 from adaptune.study.config import ALSO
 from offline.config import load_study
@@ -93,33 +94,27 @@ def test_they_are_made_once_and_again_for_another_model(own):
     assert {row.mode for row in compare(plain).rows} == set(EVERY)
 
 
-@pytest.fixture
-def on_two(own, tmp_path):
-    """Loads the copy with a second test sequence."""
+def test_what_is_missing_somewhere_is_told_and_left_out(own, tmp_path):
     bag = drives.write_bag(tmp_path / "four.bag", drives.scans(4, 40))
     four = f"sequences.four={{bag: {bag}, points: /points, reference: /truth}}"
-    return lambda *overrides: own("test=[three, four]", four, *overrides)
-
-
-def test_what_is_missing_somewhere_is_told_and_left_out(on_two):
-    both = on_two("online.modes=[adaptive, paper, even]")
+    both = own("test=[three, four]", four, "online.modes=[adaptive, paper, even]")
     run_replays(both, both.model_path)
     shutil.rmtree(both.folder / "replays/four/paper")
     shutil.rmtree(both.folder / "replays/three/baseline")
     assert {row.mode for row in compare(both).rows} == {"fixed", "adaptive", "even"}
     assert compared_modes(both).words == [
-        "`baseline` is not compared: there is no replay on three; `adaptune online` makes what is "
-        "missing.",
-        "`untrained` and `paper` are not compared: there is no replay on four; `adaptune online "
-        "--untrained` or `adaptune online` makes what is missing.",
+        "Not compared, because replays are missing: `baseline` on three, `paper` on four; "
+        "`adaptune online` makes them.",
+        "Not compared, because replays are missing: `untrained` on four; `adaptune online "
+        "--untrained` makes them.",
     ]
     shutil.rmtree(both.folder / "replays/four/fixed")
     run_untrained(both)
     compared = compared_modes(both)
     assert (compared.sequences, compared.unfinished) == (("three",), ("four",))
     assert (
-        "Not compared, because replays are missing: four (`fixed`, `paper`); `adaptune online` "
-        "makes them."
+        "Not compared, because replays are missing: `fixed` on four, `paper` on four; `adaptune "
+        "online` makes them."
     ) in compare(both).details
     assert any("`equal_cost` is the fixed set" in said for said in compare(both).details)
     shutil.rmtree(both.folder / "replays/three/fixed")
@@ -129,7 +124,7 @@ def test_what_is_missing_somewhere_is_told_and_left_out(on_two):
     }
     assert not any("`equal_cost` is the fixed set" in said for said in compare(both).details)
     (said,) = compared_modes(both).words
-    assert said.startswith("`fixed` is not compared: there is no replay on any sequence; `adaptune")
+    assert said.endswith("missing: `fixed` on three and four; `adaptune online` makes them.")
     shutil.rmtree(both.folder / "replays/four/untrained")
     assert compared_modes(both).sequences == ("three",)
     shutil.rmtree(both.folder / "replays/three/untrained")
@@ -137,14 +132,16 @@ def test_what_is_missing_somewhere_is_told_and_left_out(on_two):
         compare(both)
 
 
-def test_where_only_some_were_replayed_without_a_model_those_are_compared(on_two):
-    both = on_two()
+def test_where_only_some_were_replayed_without_a_model_those_are_compared(own, tmp_path):
+    bag = drives.write_bag(tmp_path / "four.bag", drives.scans(4, 40))
+    four = f"sequences.four={{bag: {bag}, points: /points, reference: /truth}}"
+    both = own("test=[three, four]", four)
     shutil.rmtree(both.folder / "replays", ignore_errors=True)
     run_untrained(both)
     shutil.rmtree(both.folder / "replays/three/baseline")
     assert {row.sequence for row in compare(both).rows} == {"four"}
     assert (
-        "Not compared, because replays are missing: three (`baseline`); `adaptune online "
+        "Not compared, because replays are missing: `baseline` on three; `adaptune online "
         "--untrained` makes them."
     ) in compare(both).details
 
@@ -181,14 +178,19 @@ def test_every_mode_is_repeated(own):
 
 def test_the_command_line(own, study_file):
     folder = own().folder
-    words = [study_file, "--folder", folder]
-    done = succeeded("online", *words, "-o", "online.modes=all")
+    words = [str(study_file), "--folder", str(folder)]
+    done = CliRunner().invoke(app, ["online", *words, "-o", "online.modes=all"])
+    assert done.exit_code == 0, done.output
     assert "All replays were there already" in done.stdout
     assert "-o online.modes=all" in done.stdout.splitlines()[-1]
     shutil.rmtree(folder / "replays/three/paper")
-    assert "paper" not in succeeded("compare", *words).stdout
-    done = succeeded("compare", *words, "--details")
-    assert "`paper` is not compared: there is no replay on any sequence" in done.stdout
-    for value, said in (("[even, even]", "one of them is named twice"), ("[odd]", "not 'odd'")):
-        assert said in refused("online", *words, "-o", f"online.modes={value}")
+    done = CliRunner().invoke(app, ["compare", *words])
+    assert done.exit_code == 0, done.output
+    assert "paper" not in done.stdout
+    done = CliRunner().invoke(app, ["compare", *words, "--details"])
+    assert "replays are missing: `paper` on three" in done.stdout
+    for value, words_ in (("[even, even]", "one of them is named twice"), ("[odd]", "not 'odd'")):
+        done = CliRunner().invoke(app, ["online", *words, "-o", f"online.modes={value}"])
+        assert done.exit_code == 2
+        assert words_ in done.stderr
     assert set(ALSO) < set(EVERY)

@@ -67,6 +67,9 @@ def test_a_model_for_another_budget_is_refused(tmp_path):
     for given, fitted in ((9.0, None), (None, 9.0), (9.0, 8.0)):
         with pytest.raises(ModeError, match=r"online\.budget: .* run `adaptune offline` again"):
             setup(given).check(replace(model, budget=fitted), tmp_path)
+    setup().check(replace(model, worth=0.1), tmp_path)
+    with pytest.raises(ModeError, match=r"online\.worth: .* run `adaptune offline` again"):
+        setup().check(replace(model, worth=0.2), tmp_path)
 
 
 def test_a_mode_is_replayed_where_it_is_possible():

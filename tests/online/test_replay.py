@@ -162,10 +162,10 @@ def test_after_a_dropped_scan_the_last_motion_goes_on_for_longer():
     np.testing.assert_allclose(restart[2:], [0.5, 0.3])
 
 
-def test_a_frozen_pose_restarts():
+def test_a_frozen_pose_restarts(monkeypatch):
     odometry = Scripted([0.1, 0.1] + [0.0] * 6 + [0.1])
-    check = HEALTH.model_copy(update={"max_freeze": 0.45})
-    result = replay(scans(0.1 * np.arange(9)), InProcess(odometry), check)
+    monkeypatch.setattr(HealthCheck, "max_freeze", 0.45)
+    result = replay(scans(0.1 * np.arange(9)), InProcess(odometry), HEALTH)
     assert np.flatnonzero(result.restarted).tolist() == [7]
     np.testing.assert_allclose(result.trajectory.T_world_sensor[7, 0, 3], 0.3)
 

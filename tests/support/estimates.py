@@ -13,11 +13,11 @@ class Estimator:
 
     def __init__(self, factor=1.001, halves=(1.003, 0.999), untrusted=()):
         self.factor, self.halves, self.untrusted = factor, halves, list(untrusted)
-        self.asked = []  # the name of every recording, and the prior
+        self.asked = []  # the name of every recording
         self.refusal = None
 
-    def __call__(self, scans, advance=lambda *_: None, priors=None):
-        self.asked.append((scans.name, priors))
+    def __call__(self, scans, advance=lambda *_: None):
+        self.asked.append(scans.name)
         if self.refusal is not None:
             raise self.refusal
         stamps = np.array([scan.stamp for scan in scans], np.int64)
@@ -34,7 +34,7 @@ class Estimator:
 
     @property
     def names(self):
-        return [name.rpartition("/")[2] for name, _ in self.asked]
+        return [name.rpartition("/")[2] for name in self.asked]
 
     @staticmethod
     def _poses(stamps, factor):

@@ -13,7 +13,6 @@ SCENES = Spans([0.0, 8.0, 20.0], ("cave", "open"))
 
 def replay(**changed):
     """A replay of 20 s that changes its parameters twice."""
-    n = len(SECONDS)
     made = ModeReplay(
         seconds=SECONDS,
         errors=np.where(SECONDS < 15.0, 0.7 + 0.1 * np.sin(SECONDS), np.nan),
@@ -27,9 +26,6 @@ def replay(**changed):
         lost=np.zeros(3, bool),
         places=XY,
         familiarity=np.full(3, np.nan),
-        selection_ms=np.full(3, 5.0),
-        scan_ms=np.linspace(1.0, 9.0, n),
-        late_ms=np.empty(0),
     )
     return made._replace(**changed)
 
@@ -39,7 +35,7 @@ def kept():
     fixed = {"distance": [0.7], "kernel": ["none"]}
     one = {"choice_seconds": np.zeros(1), "choices": fixed, "lost": np.zeros(1, bool)}
     unknown = np.full((1, 3), np.nan)
-    return replay(**one, estimated=unknown, familiarity=unknown[:, 0], selection_ms=np.full(1, 5.0))
+    return replay(**one, estimated=unknown, familiarity=unknown[:, 0])
 
 
 def bank(**changed):

@@ -20,8 +20,7 @@ def over_time() -> Chart:
         scenes,
         Line(t, error, "fixed"),
         Line(t, np.where((t > 60.0) & (t < 70.0), np.nan, 0.8 * error), "adaptive"),
-        Mark(0.7, "goal"),
-        Mark(120.0, "door opens", "x"),
+        Mark(120.0),
     )
     k = np.arange(0.0, 241.0, 20.0)
     estimate = (
@@ -74,7 +73,7 @@ def comparison() -> Chart:
             Panel(
                 Axis("error over the fixed set's [-]"),
                 Axis("parameter", names=("voxel_size", "max_range", "iterations")),
-                (Bars([1.4, 0.8, 1.05], "fixed"), Mark(1.0, "as good", "x")),
+                (Bars([1.4, 0.8, 1.05], "fixed"), Mark(1.0)),
             ),
         ),
         columns=2,
@@ -100,7 +99,7 @@ def empty() -> Chart:
         Bars([], "bars"),
         Band([], [], [], "band"),
         Shares([], np.zeros((2, 0)), ("a", "b")),
-        Mark(1.0, "goal"),
+        Mark(1.0),
     )
     panel = Panel(Axis("x [-]", log=True), Axis("y [-]", log=True), drawn)
     return Chart("empty", "Nothing was measured", (panel,))

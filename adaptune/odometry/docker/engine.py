@@ -32,6 +32,10 @@ _NOBODY = 65534
 _SIGNALS = {int(one) for one in signal.Signals}
 _PERIOD = 100_000
 """Microseconds over which the use of cores is counted."""
+_WEIGHT = 10 * 1024
+"""Of a core against other processes: at any load, a system has the cores that it may use."""
+_MOST_WRITTEN = 4 * 1024**3
+"""Bytes of a file; a process that writes more gets SIGXFSZ."""
 _TAIL = 50
 _BETWEEN_LOOKS = 0.02
 """Seconds."""
@@ -216,8 +220,8 @@ class Container:
         bare: bool = False,
         hurried: bool = False,
     ):
+        from docker.types import LogConfig, Ulimit
         from docker.types import Mount as Bind
-        from docker.types import Ulimit
 
         self.image, self._cpus = settings.image, settings.cpus
         digest, client = image_digest(settings.image), engine()
@@ -233,11 +237,16 @@ class Container:
             memswap_limit=limit,
             cpu_period=_PERIOD,
             cpu_quota=-1 if hurried else int(settings.cpus * _PERIOD),
+            cpu_shares=min(max(int(settings.cpus * _WEIGHT), 2), 262_144),
             pids_limit=settings.pids,
             cap_drop=["ALL"],
             security_opt=["no-new-privileges"],
             init=True,
-            ulimits=[Ulimit(name="core", soft=0, hard=0)],
+            ulimits=[
+                Ulimit(name="core", soft=0, hard=0),
+                Ulimit(name="fsize", soft=_MOST_WRITTEN, hard=_MOST_WRITTEN),
+            ],
+            log_config=LogConfig(config={"max-size": "64m"}),
         )
         try:
             with _telling(settings.image):

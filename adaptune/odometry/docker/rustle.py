@@ -167,6 +167,8 @@ def read_poses(store: Typestore, kind: str, data: bytes) -> list[Pose]:
 _CLOUD, _IMU = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/Imu"
 _MOST_SILENT = 30
 """Scans in a row without a pose that are a fault."""
+_LEAST_ANSWERED = 0.75
+"""Least share of scans with a pose, of so many or more since the first one."""
 _BETWEEN_LOOKS = 1.0
 """Seconds between looks at what the system has used."""
 _EARLY = 1_000_000
@@ -194,6 +196,13 @@ class Lockstep(Faulting):
         self._waiting = self._has_run = False
         self._shown = (0, -np.inf)  # stamp of the last scan, and when it was published
         self._looked = -np.inf
+        self.patience = min(settings.patience, limits.seconds)
+        self.start_seconds = 0.0  # until it hears scans
+
+    @property
+    def pose_stamp(self) -> int | None:
+        """Stamp of the system's pose of the last scan; None if it gave none."""
+        return None if self._silent or self._before is None else self._before[0]
 
     @property
     def ended(self) -> bool:
@@ -222,11 +231,15 @@ class Lockstep(Faulting):
         self._T_step = np.eye(4) if T_previous_current is None else np.array(T_previous_current)
         self._T_odom_own: Poses | None = None
         self._silent, self._stamp, self._poses = 0, prepared.stamp, []
+        self._n_shown = self._n_answered = 0  # since its first pose
         self._shown = (prepared.stamp, -np.inf)
         self._late: int | None = None
+        self._steady = True  # whether all poses are as late as the first one
         self._before: tuple[int, Poses] | None = None
+        begin = time.monotonic()
         try:
             self._begin(prepared)
+            self.start_seconds = time.monotonic() - begin
             self._show(prepared)
             self._correct()
         except (OdometryError, LinkError) as error:
@@ -353,21 +366,29 @@ class Lockstep(Faulting):
 
     def _correct(self) -> bool:
         """Correct the predicted pose; False if the system gave none."""
-        seconds = min(self._settings.patience, self._limits.seconds)
-        found = self._pose(seconds)
+        found = self._pose(self.patience)
         assert self._system is not None
+        self._n_shown += bool(self._n_answered) or found is not None
         if found is None:
             self._silent += 1
-            self._system.state()
+            try:
+                self._system.state()
+            except OdometryError as error:
+                if self._n_answered:
+                    raise
+                help_ = "if it knows no points but the bag's own, set odometry.settings.play: bag"
+                raise OdometryError(f"{error} before its first pose; {help_}") from error
             if self._silent >= _MOST_SILENT:
                 published = self._system.link.topics().keys() - {"/clock", "/rosout", *self._topics}
                 raise OdometryError(
                     f"no pose on {self._settings.odometry} for {_MOST_SILENT} scans in a row; "
                     f"topics that are published: {', '.join(sorted(published)) or 'none'}"
                 )
+            self._check_answered()
             return False
         stamp, T_own = found
         self._silent, self._has_run = 0, True
+        self._n_answered += 1
         if wrong := pose_fault(T_own):
             raise OdometryError(f"it gave a pose {wrong}")
         T_own = T_own @ self._T_base_sensor
@@ -379,10 +400,20 @@ class Lockstep(Faulting):
         self._T_odom_sensor = self._T_odom_own @ T_own
         return True
 
+    def _check_answered(self) -> None:
+        n, answered = self._n_shown, self._n_answered
+        if n >= _MOST_SILENT and answered < _LEAST_ANSWERED * n:
+            raise OdometryError(
+                f"it gave poses for {answered} of {n} scans, and lockstep needs one for each; set "
+                f"odometry.settings.play: bag"
+            )
+
     def _at_scan(self, stamp: int, T_own_sensor: Poses) -> Poses:
         """The pose at the scan's stamp, if the system gives that at the scan's end."""
         before, self._before = self._before, (stamp, T_own_sensor)
-        if before is None or not before[0] <= self._stamp < stamp:
+        # Stamps of a clock say nothing.
+        self._steady &= abs(stamp - self._stamp - (self._late or 0)) < _MAX_SCATTER
+        if before is None or not before[0] <= self._stamp < stamp or not self._steady:
             return T_own_sensor
         both = Trajectory(np.array([before[0], stamp]), np.stack([before[1], T_own_sensor]))
         T: Poses = both.at(np.array([self._stamp], np.int64), 1e9)[0]
@@ -520,6 +551,13 @@ class Drain:
 class PlayedBag(WholeRun):
     """A ROS 1 system that hears a bag, from its beginning to its end."""
 
+    pose_stamps = np.empty(0, np.int64)  # as the system gave them
+
+    @property
+    def start_seconds(self) -> float:
+        """Seconds until it hears the bag."""
+        return sum(self._seconds.get(step, 0.0) for step in ("container", "ready"))
+
     def trajectory(self, given: ProgramInput, folder: Path) -> Trajectory:
         self._seconds: dict[str, float] = {}
         self._end = time.monotonic() + self._limits.seconds * len(given.stamps)
@@ -634,7 +672,7 @@ class PlayedBag(WholeRun):
     def _checked(self, recorder: PoseRecorder, given: ProgramInput) -> Trajectory:
         """The trajectory, if its stamps are those of the data, or each scan has one pose."""
         poses = recorder.poses()
-        stamps = np.array([stamp for stamp, *_ in poses], np.int64)
+        stamps = self.pose_stamps = np.array([stamp for stamp, *_ in poses], np.int64)
         try:
             check_stamps(stamps, given.stamps)
         except OdometryError as error:

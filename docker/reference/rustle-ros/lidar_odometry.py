@@ -1,8 +1,12 @@
 """adaptune's keyframe GICP, as the programs of the reference image run it."""
 
+import os
+import sys
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+import yaml
 
 from adaptune.geometry import to_quaternions
 from adaptune.odometry.keyframe import KeyframeGicp
@@ -45,6 +49,23 @@ def tuned(given: Any) -> dict[str, Any]:
         whole = isinstance(KeyframeGicp.space.parameters[name], Integer)
         values[name] = int(value) if whole else float(value)
     return values
+
+
+def habits(given: Any, environment: Mapping[str, str] = os.environ) -> dict[str, Any]:
+    """Habits of other systems: what a file says, and each IMITATE_<NAME> of the environment."""
+    prefix = "IMITATE_"
+    names = [name for name in environment if name.startswith(prefix)]
+    own = {name.removeprefix(prefix).lower(): yaml.safe_load(environment[name]) for name in names}
+    return (given if isinstance(given, dict) else {}) | own
+
+
+def check_layout(message: Any, wanted: list[str] | None) -> None:
+    """Die, as systems do that know one layout of points, where a cloud has other fields."""
+    names = [field.name for field in message.fields]
+    if wanted and names != wanted:
+        sys.stderr.write(f"gicp: the fields are {names}, not {wanted}\n")
+        sys.stderr.flush()
+        os._exit(1)
 
 
 def to_scan(message: Any, stamp: int) -> Scan:

@@ -2,15 +2,26 @@
 """A ROS 1 node named /gicp: an odometry for a PointCloud2 topic, and habits of other systems."""
 
 import os
+import queue
 import sys
 import threading
 import time
 from collections import deque
 from types import SimpleNamespace
 
+import numpy as np
 import rospy
 from dynamic_reconfigure.server import Server
-from lidar_odometry import POINTS_TOPIC, LidarOdometry, limits, quaternion, to_scan, tuned
+from lidar_odometry import (
+    POINTS_TOPIC,
+    LidarOdometry,
+    check_layout,
+    habits,
+    limits,
+    quaternion,
+    to_scan,
+    tuned,
+)
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import PointCloud2
 
@@ -51,15 +62,20 @@ class GicpNode:
     """Scans wait in a queue until the main thread takes them, one after the other."""
 
     def __init__(self) -> None:
-        imitate = rospy.get_param("/imitate", {})
-        self._imitate = imitate if isinstance(imitate, dict) else {}
+        self._imitate = habits(rospy.get_param("/imitate", {}))
         if self._imitate.get("quit_launch"):
             sys.exit(0)
         parameters = tuned(rospy.get_param("~", {}))
         self._odometry = LidarOdometry(parameters, self._imitate.get("frame"))
+        self._map = LidarOdometry(parameters, self._imitate.get("frame"))
+        self._T_map_odom = np.eye(4)
         self._changed: dict = {}
         self._scans: deque = deque(maxlen=self._imitate.get("queue_size", QUEUE_SIZE))
         self._came = threading.Semaphore(0)
+        self._to_map: queue.Queue = queue.Queue()
+        self._to_publish: queue.Queue = queue.Queue()
+        for loop in (self._map_scans, self._publish_late):
+            threading.Thread(target=loop, daemon=True).start()
         self._n = 0
         self._publisher = rospy.Publisher("/Odometry", Odometry, queue_size=1000)
         if not self._imitate.get("read_once"):
@@ -92,15 +108,40 @@ class GicpNode:
             if self._scans:
                 self._work(self._scans.popleft())
 
+    def _map_scans(self) -> None:
+        """Correct the odometry by the newest scan; what came while one was mapped is left out."""
+        while True:
+            scan, T_odom = self._to_map.get()
+            while not self._to_map.empty():
+                scan, T_odom = self._to_map.get()
+            time.sleep(self._imitate["background"])
+            self._T_map_odom = self._map.register(scan) @ np.linalg.inv(T_odom)
+
+    def _publish_late(self) -> None:
+        """Publish poses some seconds after they were found, stamped with the present time."""
+        while True:
+            due, T = self._to_publish.get()
+            time.sleep(max(0.0, due - time.monotonic()))
+            self._publish(rospy.Time.now(), T)
+
     def _work(self, message: PointCloud2) -> None:
+        check_layout(message, self._imitate.get("layout"))
+        self._n += 1
+        if self._n <= self._imitate.get("late", 0):
+            return
         changed, self._changed = self._changed, {}
         self._odometry.configure(changed)
-        T = self._odometry.register(to_scan(message, message.header.stamp.to_nsec()))
-        self._n += 1
+        scan = to_scan(message, message.header.stamp.to_nsec())
+        T = self._odometry.register(scan)
+        if "background" in self._imitate:
+            self._to_map.put((scan, T))
+            T = self._T_map_odom @ T
         time.sleep(self._imitate.get("seconds_per_scan", 0.0))
         if self._n == self._imitate.get("jump"):
             T = T * float("nan")
-        if not self._imitate.get("silent"):
+        if "own_clock" in self._imitate:
+            self._to_publish.put((time.monotonic() + self._imitate["own_clock"], T))
+        elif not self._imitate.get("silent") and not (self._n - 1) % self._imitate.get("one_of", 1):
             self._publish(message.header.stamp, T)
         if self._n == self._imitate.get("die_at"):
             sys.stderr.write(f"gicp: terminating after {self._n} scans: the map is corrupt\n")
@@ -111,7 +152,7 @@ class GicpNode:
     def _publish(self, stamp, T) -> None:
         said = Odometry()
         later = rospy.Duration(self._imitate.get("stamp_later", 0.0))
-        said.header.stamp = rospy.Time.now() if self._imitate.get("stamp_now") else stamp + later
+        said.header.stamp = stamp + later
         said.header.frame_id, said.child_frame_id = "odom", "base_link"
         position, orientation = said.pose.pose.position, said.pose.pose.orientation
         position.x, position.y, position.z = T[:3, 3]

@@ -11,7 +11,16 @@ import time
 from pathlib import Path
 
 import yaml
-from lidar_odometry import POINTS_TOPIC, LidarOdometry, quaternion, to_scan, tuned
+from genpy import Time
+from lidar_odometry import (
+    POINTS_TOPIC,
+    LidarOdometry,
+    check_layout,
+    habits,
+    quaternion,
+    to_scan,
+    tuned,
+)
 from rosbag import Bag
 
 DATA, PARAMETERS, OUTPUT = Path("/data"), Path("/parameters.yaml"), Path("/output/trajectory.tum")
@@ -25,14 +34,22 @@ def main() -> None:
     given = (yaml.safe_load(PARAMETERS.read_text()) if PARAMETERS.exists() else None) or {}
     topic = (given.get("common") or {}).get("points_topic", POINTS_TOPIC)
     topic = sys.argv[1] if len(sys.argv) > 1 else os.environ.get("POINTS_TOPIC", topic)
-    imitate = given.get("imitate") or {}
+    imitate = habits(given.get("imitate"))
+    time.sleep(imitate.get("ready_delay", 0.0))
     odometry = LidarOdometry(tuned(given.get("gicp")), imitate.get("frame"))
     lines = []
     with Bag(str(bags[0])) as bag:
-        for _, message, _ in bag.read_messages([topic]):
+        for i, (_, message, _) in enumerate(bag.read_messages([topic])):
+            check_layout(message, imitate.get("layout"))
+            if i < imitate.get("late", 0):
+                continue
             stamp = message.header.stamp
             T = odometry.register(to_scan(message, stamp.to_nsec()))
             time.sleep(imitate.get("seconds_per_scan", 0.0))
+            if i % imitate.get("one_of", 1):
+                continue
+            if "own_clock" in imitate:
+                stamp = Time.from_sec(time.time())
             numbers = [*T[:3, 3], *quaternion(T)]
             pose = " ".join(f"{number:.9f}" for number in numbers)
             lines.append(f"{stamp.secs}.{stamp.nsecs:09d} {pose}\n")

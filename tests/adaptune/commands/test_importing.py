@@ -187,7 +187,7 @@ def test_a_grid_keeps_its_points_and_its_weights(rustle, caplog):
     }
     config = check(rustle / "study.yaml")
     assert config.sampler == "grid"
-    assert config.objective == ({"ape": 0.25, "rpe": 0.75},)
+    assert config.objective == {"ape": 0.25, "rpe": 0.75}
     assert (config.stagnation, config.hours, config.trials) == (4, None, None)
     (sequence,) = study["sequences"].values()
     assert sequence["start"] == 10.0

@@ -20,15 +20,16 @@ def bag(study_file):
 
 @pytest.fixture
 def adaptune(tmp_path, monkeypatch):
-    """A command that succeeds; estimates are made up."""
+    """Call the command line; estimates are made up."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(terminal.console, "width", 100)
     monkeypatch.setattr(estimate, "estimate_reference", estimates.Estimator())
-    return lambda *words: commands.succeeded("reference", *words)
+    return lambda *words: commands.call("reference", *words)
 
 
 def test_a_recording_gets_files_and_sentences(adaptune, bag, tmp_path):
     done = adaptune(bag)
+    assert done.exit_code == 0, done.stderr
     assert "Estimated reference: 11.7 m, 40 scans." in done.stdout
     assert re.search(r"It is wrong by about \d.* % over 2 m, as its two halves tell", done.stdout)
     assert "It is known everywhere." in done.stdout
@@ -37,12 +38,13 @@ def test_a_recording_gets_files_and_sentences(adaptune, bag, tmp_path):
     assert "write `reference: one_reference.tum` under" in done.stdout.splitlines()[-1]
     assert len(read_tum(tmp_path / "one_reference.tum")) == 40
     stored = StoredEstimate.read(tmp_path / "one_reference.tum")
-    assert stored.about == {"recording": str(bag), "points": "/points", "position_prior": None}
+    assert stored.about == {"recording": str(bag), "points": "/points"}
 
 
 def test_where_it_is_lost_is_said(adaptune, bag, tmp_path, monkeypatch):
     monkeypatch.setattr(estimate, "estimate_reference", estimates.Estimator(untrusted=[9]))
     done = adaptune(bag, "--out", "refs", "--length", "1.5")
+    assert done.exit_code == 0, done.stderr
     assert re.search(
         r"unknown for \d.* % of the scans, which have no pose: 0.9-2.0 s \(.*\) after", done.stdout
     )
@@ -50,37 +52,48 @@ def test_where_it_is_lost_is_said(adaptune, bag, tmp_path, monkeypatch):
     assert (tmp_path / "refs/one_reference.json").exists()
 
 
-@pytest.mark.usefixtures("adaptune")
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
         (["none.bag"], "there is no such file"),
         (["BAG", "--points", "/none"], "/none"),
         (["BAG", "--reference", "/none"], "/none"),
-        (["BAG", "--position-prior", "/none"], "/none"),
         (["BAG", "-o", "training=[one]"], "-o is for studies"),
         (["STUDY", "--length", "3"], "--length is for a single recording"),
-        (["STUDY", "--position-prior", "/gps"], "--position-prior is for a single recording"),
         (["STUDY"], "every sequence has a reference"),
         (["poses.tum"], "is a file of poses"),
-        (["BAG", "--out", "a_file/refs"], "a_file/refs: cannot be written to"),
-        (["BAG", "--out", "mine"], "mine/one_reference.tum: is there, and is not of an estimate"),
-        (["BAG", "--reference", "poses.tum"], "covers 1.000 s to 2.000 s"),
-        (["BAG", "--position-prior", "bad.tum"], "bad.tum"),
     ],
 )
-def test_mistakes_are_told_before_the_estimate(
-    bag, study_file, tmp_path, monkeypatch, words, expected
-):
-    (tmp_path / "a_file").touch()
+def test_mistakes_are_told_in_a_sentence(adaptune, bag, study_file, tmp_path, words, expected):
     (tmp_path / "poses.tum").write_text("1 0 0 0 0 0 0 1\n2 1 0 0 0 0 0 1\n")
-    (tmp_path / "bad.tum").write_text("x y z\n")
+    named = {"BAG": bag, "STUDY": study_file}
+    done = adaptune(*(named.get(word, word) for word in words))
+    assert done.exit_code == 2
+    assert expected in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["--out", "a_file/refs"], "a_file/refs: cannot be written to"),
+        (["--out", "mine"], "mine/one_reference.tum: is there, and is not of an estimate"),
+        (["--reference", "early.tum"], "covers 1.000 s to 2.000 s"),
+    ],
+)
+def test_what_is_wrong_is_told_before_the_estimate(adaptune, bag, tmp_path, words, expected):
+    (tmp_path / "a_file").touch()
+    (tmp_path / "early.tum").write_text("1 0 0 0 0 0 0 1\n2 1 0 0 0 0 0 1\n")
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine/one_reference.tum").write_text("mine")
-    monkeypatch.setattr(estimate, "estimate_reference", None)
-    named = {"BAG": bag, "STUDY": study_file}
-    said = commands.refused("reference", *(named.get(word, word) for word in words))
-    assert expected in said
+
+    def estimated(*_):
+        raise AssertionError
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(estimate, "estimate_reference", estimated)
+        done = adaptune(bag, *words)
+    assert done.exit_code == 2
+    assert expected in done.stderr
     assert (tmp_path / "mine/one_reference.tum").read_text() == "mine"
 
 
@@ -93,6 +106,7 @@ def test_a_reference_of_another_time_that_was_not_asked_for_hinders_nothing(
     monkeypatch.setattr(RecordedSequence, "reference", fail)
     monkeypatch.setattr(estimate, "estimate_reference", estimates.Estimator())
     done = adaptune(bag)
+    assert done.exit_code == 0, done.stderr
     assert "is not compared with: the reference covers another time" in done.stdout
     assert "The two differ" not in done.stdout
 
@@ -114,6 +128,7 @@ def test_of_a_study_those_that_it_lacks_are_estimated(
     one = text.replace("one.bag, points: /points, reference: /truth", "one.bag, points: /points")
     (tmp_path / "study.yaml").write_text(one)
     done = adaptune("study.yaml", "--folder", "run")
+    assert done.exit_code == 0, done.stderr
     assert re.search(r"one +40 +11\.\d", done.stdout)
     assert "adaptune offline study.yaml --folder run" in done.stdout.splitlines()[-1]
     assert asked == ["one.bag"]
@@ -126,8 +141,7 @@ def test_of_a_study_those_that_it_lacks_are_estimated(
     write_estimate(
         tmp_path / "run/references/stale.tum", made(open_sequence(SequenceConfig(bag=str(bag)))), {}
     )
-    given = ("study.yaml", "--folder", "run", "-o", "training=[two, one]")
-    done = commands.call("reference", *given)
+    done = adaptune("study.yaml", "--folder", "run", "-o", "training=[two, one]")
     assert done.exit_code == 2
     assert "sequences.two: " in done.stderr
     assert "the robot moves 0.1 m only" in done.stderr

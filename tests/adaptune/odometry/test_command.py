@@ -192,7 +192,9 @@ def test_too_many_scans_before_the_first_pose_are_a_failure(make):
 def test_what_it_takes_is_measured_and_can_be_limited(make):
     kept = "{cpu: {max: 100000}, ms_per_scan: {max: 1000}}"
     once = "offline.trials=1"
-    study = make("work", "offline.objective=[rte, memory]", f"offline.limits={kept}", once)
+    study = make(
+        "work", "offline.objective={rte: 1, memory: 0.001}", f"offline.limits={kept}", once
+    )
     trial, _ = run(study)
     # It computes for half a second in a child, beside a child of 200 MB, over 40 scans of 3.9 s.
     assert 12.5 <= 1e3 * np.median(trial.seconds) < 200.0

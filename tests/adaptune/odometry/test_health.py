@@ -63,7 +63,7 @@ def test_who_stops_dead_has_frozen(steps, faults):
     assert unhealthy(HealthCheck(), np.array(motions), stamps, np.ones(len(stamps), bool)) == faults
 
 
-@pytest.mark.parametrize("bounds", [{"max_speed": 0}, {"max_freeze": -1}, {"max_jerk": 1}])
+@pytest.mark.parametrize("bounds", [{"max_speed": 0}, {"max_speed": -1}, {"max_jerk": 1}])
 def test_bounds_that_make_no_sense(bounds):
     with pytest.raises(ValidationError):
         HealthCheck(**bounds)
@@ -73,7 +73,8 @@ def test_what_would_have_been_said_of_a_drive(monkeypatch):
     monkeypatch.setattr(HealthCheck, "max_acceleration", 20.0)
     monkeypatch.setattr(HealthCheck, "max_unregistered", 3)
     steps = [0.1, 0.1, 9.0, 0.1, 0.1, np.nan, 0.1, *[0.0] * 6, 0.1, *[0.8] * 10, *[0.1] * 5]
-    check = HealthCheck(max_speed=10.0, max_freeze=0.45)
+    monkeypatch.setattr(HealthCheck, "max_freeze", 0.45)
+    check = HealthCheck(max_speed=10.0)
     registered = np.ones(len(steps) + 1, bool)
     registered[-4:] = False
     said = unhealthy(

@@ -1,3 +1,5 @@
+import re
+
 import fuzz
 import numpy as np
 import pytest
@@ -63,6 +65,14 @@ def test_bare_files_and_folders_without_metadata_are_read(tmp_path):
     assert same(list(opened(tmp_path / "a.mcap" / "a.mcap.mcap")), whole)
     assert same(list(opened(folder)), whole)
     assert same(list(opened(next(folder.glob("*.db3")))), whole)
+
+
+def test_metadata_that_count_in_words_are_refused(tmp_path):
+    folder = rec.drive(tmp_path / "a.sqlite3")
+    metadata = folder / "metadata.yaml"
+    metadata.write_text(re.sub(r"message_count: \d+", "message_count: many", metadata.read_text()))
+    with pytest.raises(SequenceError, match="counts messages in what are no numbers"):
+        list(opened(folder))
 
 
 @pytest.mark.parametrize("suffix", [".bag", ".mcap"])

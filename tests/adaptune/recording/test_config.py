@@ -30,10 +30,9 @@ def test_paths_are_of_the_studys_folder_and_know_variables(tmp_path, monkeypatch
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({}, "give one of bag, kitti, folder, evalio, not none"),
+        ({}, "give one of bag, kitti, folder, not none"),
         ({"kitti": "b", "points": "/p"}, "`points` is for a bag; kitti has none"),
         ({"bag": "a", "start": 3, "stop": 2}, r"start \(3\) must be less than stop \(2\)"),
-        ({"bag": "a", "compensate": "gyro"}, "needs `imu`"),
         ({"bag": "a", "extrinsic": [1, 2, 3, 0, 0, 0, 0]}, "has not length 1"),
         ({"bag": "a", "extrinsic": np.diag([1, 1, -1, 1]).tolist()}, "not a rotation"),
         ({"bag": "a", "topic": "/p"}, "Extra inputs"),

@@ -25,7 +25,6 @@ from adaptune.reference import estimate
 from adaptune.reference.estimate import estimate_reference, estimated
 from adaptune.reference.graph import HALVES, Consensus, Guess, pass_over
 from adaptune.reference.stored import EstimateError
-from adaptune.trajectory import Trajectory
 
 N = 121
 TRUTH = winding(N)
@@ -274,20 +273,6 @@ class TestHalves:
         motions[1:, 4] = np.nan
         found = estimated("a", made_pass(TRUTH, guesses(TRUTH), motions))
         assert found.error(5.0) < 0.05
-
-
-def test_positions_are_right_over_long_ways():
-    T = winding(500, 2.0)
-    wrong = chained(steps(T) @ moved(yaw=1e-4))
-    # Registrations share the bias.
-    made = made_pass(wrong, guesses(wrong, pairs(500, (1, 3, 5), 1)), seconds=0.5)
-    given = moved(100.0, 200.0, yaw=1.0) @ T
-    alone = estimated("a", made)
-    joined = estimated("a", made, Trajectory(made.stamps, given))
-    before, after = (
-        np.nanmean(sub_trajectory_rte(T, found.T_world_sensor, 500.0)) for found in (alone, joined)
-    )
-    assert after < 0.3 * before
 
 
 def test_where_the_path_comes_by_again_scans_are_registered(monkeypatch):

@@ -11,7 +11,6 @@ from adaptune.report.charts import (
     Band,
     Bars,
     Chart,
-    Cloud,
     Line,
     Mark,
     Panel,
@@ -61,24 +60,15 @@ def test_colours_of_points_are_on_a_bar_and_unknown_ones_are_grey(tmp_path):
     assert svg.count("#bbbbbb") == 1
 
 
-def test_a_cloud_is_a_picture_with_a_colour_bar(tmp_path):
-    rng = np.random.default_rng(0)
-    cloud = Cloud(*rng.normal(size=(2, 50_000)), rng.random(50_000), "height z [m]", (0.0, 1.0))
-    texts, svg = drawn(chart_of(cloud, Points([0.0], [0.0], "LiDAR"), equal=True), tmp_path)
-    assert {"LiDAR", "0.5"} <= set(texts)
-    assert "height z" in " ".join(texts)
-    assert svg.count("data:image/png;base64,") == 1
-    assert len(svg) < 2_000_000
-
-
-def test_spans_are_named_above_and_marks_carry_their_words(tmp_path):
+def test_spans_are_named_above_and_marks_widen_the_axis(tmp_path):
     spans = Spans([0, 10, 11, 50, 100], ("cave", "street", "", "garden"))
-    items = spans, Line([0, 100], [1, 2], "fixed"), Mark(1.5, "goal"), Mark(60, "door", "x")
-    texts, _ = drawn(chart_of(*items, Mark(9.0, "beyond")), tmp_path)
-    assert {"cave", "garden", "goal", "door"} <= set(texts)
+    items = spans, Line([0, 100], [1, 2], "fixed"), Mark(60.0)
+    texts, svg = drawn(chart_of(*items), tmp_path)
+    assert {"cave", "garden"} <= set(texts)
     assert texts.count("street") == 0  # too short for its name
-    # A mark may widen the axis, so that it is seen.
-    assert "beyond" in texts
+    texts, wider = drawn(chart_of(*items, Mark(190.0)), tmp_path)
+    assert "180" in texts
+    assert wider.count("stroke-dasharray") == svg.count("stroke-dasharray") + 1
 
 
 def test_names_stand_along_an_axis_also_long_ones(tmp_path):

@@ -3,17 +3,15 @@ import pytest
 from pictures import texts
 from rosbags.highlevel import AnyReader
 
-from adaptune.geometry import invert, rotation_angle, steps
 from adaptune.recording.config import SequenceConfig
 from adaptune.recording.recording import open_sequence
 from adaptune.simulation import Course, SimulationError
-from adaptune.simulation.record import Drive, record, simulate, undistort
-from adaptune.trajectory import read_kitti, read_tum
+from adaptune.simulation.record import Drive, record, simulate
+from adaptune.trajectory import read_tum
 
 COURSE = Course(
     scenes=("corridor",), length=10.0, sensor="vlp16", columns=60, imu=200, motion="car"
 )
-RECORDINGS = {"ros1": "run.bag", "mcap": "run.mcap", "ros2": "run"}
 # A point as Velodyne's driver writes it, without padding.
 CLOUD = np.dtype(
     [*((name, "<f4") for name in ("x", "y", "z", "intensity")), ("ring", "<u2"), ("time", "<f4")]
@@ -25,9 +23,9 @@ def scans():
     return list(simulate(COURSE))
 
 
-@pytest.fixture(scope="module", params=RECORDINGS)
-def recording(request, tmp_path_factory):
-    path = tmp_path_factory.mktemp(request.param) / RECORDINGS[request.param]
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    path = tmp_path_factory.mktemp("recording") / "run.bag"
     record(COURSE, path)
     return path
 
@@ -87,11 +85,9 @@ def test_inertial_measurements_read_back(recording, scans):
 
 
 def test_a_preview_lies_beside(recording):
-    picture = recording.with_suffix(".png")
-    for label in ("x [m]", "y [m]", "azimuth [deg]", "elevation [deg]", "range [m]", "path"):
-        assert label in texts(picture)
-    # Its points are one image, not thousands of shapes.
-    assert picture.with_suffix(".svg").stat().st_size < 2_000_000
+    for label in ("x [m]", "y [m]", "height above the sensor [m]", "path"):
+        assert label in texts(recording.with_suffix(".png"))
+    assert recording.with_suffix(".svg").stat().st_size < 2_000_000
     assert len(list(recording.parent.iterdir())) == 4
 
 
@@ -110,33 +106,6 @@ def test_the_reader_of_sequences_takes_it(tmp_path, scans, stamp):
     np.testing.assert_allclose(reference, [s.T_world_sensor for s in scans], atol=1e-9)
 
 
-def test_kitti_folder(tmp_path, scans):
-    path = tmp_path / "kitti"
-    record(COURSE, path, layout="kitti")
-    sequence = path / "sequences" / "00"
-    clouds = sorted((sequence / "velodyne").iterdir())
-    assert [c.name for c in clouds[:2]] == ["000000.bin", "000001.bin"]
-    assert len(clouds) == len(scans)
-    drive = Drive(COURSE)
-    found = np.fromfile(clouds[3], "<f4").reshape(-1, 4)
-    np.testing.assert_array_equal(found[:, :3], undistort(drive, scans[3]))
-    assert found[:, 3].max() <= 1.0
-    np.testing.assert_allclose(
-        np.loadtxt(sequence / "times.txt"), np.arange(len(scans)) / 10.0, atol=1e-6
-    )
-    rows = dict(line.split(": ") for line in (sequence / "calib.txt").read_text().splitlines())
-    T_camera_lidar = np.eye(4)
-    T_camera_lidar[:3] = np.array(rows["Tr"].split(), float).reshape(3, 4)
-    T = read_kitti(path / "poses" / "00.txt")
-    np.testing.assert_allclose(T[0], np.eye(4), atol=1e-9)
-    lidar = steps(invert(T_camera_lidar) @ T @ T_camera_lidar)
-    truth = steps(np.array([s.T_world_sensor for s in scans]))
-    np.testing.assert_allclose(lidar, truth, atol=1e-6)
-    # A camera looks along z: that is where the robot goes.
-    assert (T[-1, :3, 3] > 5.0).tolist() == [False, False, True]
-    assert rotation_angle(lidar).max() < 0.1
-
-
 def test_what_is_there_is_not_touched_unasked(tmp_path):
     path = tmp_path / "run.bag"
     for name in ("run.bag", "run.tum", "run.png", "run.svg"):
@@ -150,25 +119,12 @@ def test_what_is_there_is_not_touched_unasked(tmp_path):
     assert path.stat().st_size > 1000
 
 
-def test_a_folder_of_something_else_stays(tmp_path):
-    folder = tmp_path / "thesis"
-    folder.mkdir()
-    (folder / "chapter.tex").write_text("mine")
-    with pytest.raises(SimulationError, match="no recording of this kind: not replaced"):
-        record(COURSE, folder, overwrite=True)
-    for _ in range(2):
-        record(COURSE, tmp_path / "run", overwrite=True)
-    assert (folder / "chapter.tex").read_text() == "mine"
-
-
-@pytest.mark.parametrize("layout", ["ros1", "mcap", "ros2", "kitti"])
-def test_nothing_is_left_of_an_interrupted_recording(tmp_path, layout):
+def test_nothing_is_left_of_an_interrupted_recording(tmp_path):
     def interrupt(name, done, total):
-        assert (name, total) == ("run" if layout != "kitti" else "kitti", len(Drive(COURSE)))
+        assert (name, total) == ("run", len(Drive(COURSE)))
         if done == 3:
             raise KeyboardInterrupt
 
-    path = tmp_path / RECORDINGS.get(layout, "kitti")
     with pytest.raises(KeyboardInterrupt):
-        record(COURSE, path, layout=layout, progress=interrupt)
+        record(COURSE, tmp_path / "run.bag", progress=interrupt)
     assert list(tmp_path.iterdir()) == []

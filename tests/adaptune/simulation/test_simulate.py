@@ -9,7 +9,7 @@ from adaptune.odometry.registry import odometry_class
 from adaptune.simulation import SCENES, SENSORS, Course, SceneLeg
 from adaptune.simulation.mesh import fractal
 from adaptune.simulation.record import EPOCH, Drive, simulate
-from adaptune.simulation.world import World, populate
+from adaptune.simulation.world import World
 
 
 def course(*scenes, **given):
@@ -32,7 +32,7 @@ def surface(drive, station, reach):
 
 
 def test_the_same_seed_gives_the_same_bytes():
-    given = course("street", "garden", moving_objects=True, weather="rain", seed=5)
+    given = course("street", "garden", seed=5)
     for a, b in zip(some(given, 6), some(given, 6), strict=True):
         assert a.stamp == b.stamp
         for name in ("points", "times", "intensities", "rings", "T_world_sensor"):
@@ -85,30 +85,6 @@ def test_every_sensor_scans(name):
     assert away.min() > sensor.range[0] - 0.1
     assert away.max() < sensor.range[1] + 0.1
     assert set(scan.rings.tolist()) == set(range(sensor.rings))
-
-
-def test_movers_are_hit_where_they_are():
-    given = course("street", moving_objects=True, length=20.0, seed=2, columns=450)
-    drive = Drive(given)
-    still = list(Drive(given.model_copy(update={"moving_objects": False})).scans())
-    near = 0
-    for scan, without in zip(drive.scans(), still, strict=True):
-        t = np.array([(scan.stamp - EPOCH) * 1e-9 + 0.05])
-        points = scan.points @ scan.T_world_sensor[:3, :3].T + scan.T_world_sensor[:3, 3]
-        others = without.points @ without.T_world_sensor[:3, :3].T + without.T_world_sensor[:3, 3]
-        for mover in populate(drive.road):
-            centre = mover.at(drive.road, t)[0][0] + [0.0, 0.0, 0.9]
-            close = [np.sum(np.linalg.norm(p - centre, axis=1) < 0.8) for p in (points, others)]
-            near += close[0] > close[1] + 10
-    assert near > 5
-
-
-def test_weather_thins_the_far_and_fills_the_near():
-    clear, fog = (some(course("open", weather=w, columns=900), 1)[0] for w in ("clear", "fog"))
-    away = [np.linalg.norm(scan.points, axis=1) for scan in (clear, fog)]
-    assert np.sum(away[1] > 20.0) < 0.5 * np.sum(away[0] > 20.0)
-    up = [scan.points[:, 2] > 0.1 * a for scan, a in zip((clear, fog), away, strict=True)]
-    assert up[1].sum() > up[0].sum() + 20
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])

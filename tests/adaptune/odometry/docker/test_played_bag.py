@@ -26,6 +26,7 @@ from rosbags.highlevel import AnyReader
 
 from adaptune.odometry import OdometryError
 from adaptune.odometry.docker import ros_container
+from adaptune.odometry.docker import rustle as rustle_system
 from adaptune.odometry.docker.engine import image_digest
 from adaptune.odometry.docker.rustle import PlayedBag, Rustle
 from adaptune.odometry.remote import Limits
@@ -49,6 +50,9 @@ TRIALS = {
         "imitate": {"die_at": 3},
         "settings": {"rate": 0.1, "arguments": ("required:=false",)},
     },
+    "silent": {"imitate": {"silent": True}},
+    "other topic": {"settings": {"odometry": "/Odom"}},
+    "NaN": {"imitate": {"jump": 11}},
 }
 
 
@@ -82,6 +86,7 @@ def ran(folder):
     reference_image()
     with pytest.MonkeyPatch.context() as patch, ThreadPoolExecutor(SIDE_BY_SIDE) as pool:
         patch.setattr(ros_container, "_OTHERS_ONLY", 2.0)
+        patch.setattr(rustle_system, "_FIRST", 2.0)
         trials = {name: pool.submit(run, folder / name, **given) for name, given in TRIALS.items()}
         yield lambda name: trials[name].result()
         for trial in trials.values():
@@ -142,6 +147,19 @@ def test_one_that_dies_is_a_fault_at_once(ran):
     assert re.match(r"node /gicp died: ", fault), fault
     assert "terminating after 3 scans: the map is corrupt" in fault
     assert np.isnan(trial.poses[-1]).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("silent", "nothing was published on /Odometry until the system had rested .*at rest at"),
+        ("other topic", "nothing was published on /Odom, but on .*/Odometry.*; name its topic as"),
+        ("NaN", r"1 of 40 poses are no poses \(NaN, or no rotation\)"),
+    ],
+)
+def test_what_is_published_is_no_trajectory(ran, name, words):
+    (fault,) = ran(name).odometry.faults
+    assert re.match(words, fault), fault
 
 
 def test_an_image_without_ros(tmp_path):

@@ -161,14 +161,21 @@ FAULTS = {
     "no such program": ("no-such-program", r"its process ended with code 127: .*not found"),
     "memory": ("python3 -c 'bytearray(10**9)'", r"out of isolation\.memory = 0\.3 GB: Killed"),
     "hang": ("echo waiting; exec sleep 300", "it took longer than isolation.seconds.*: waiting"),
+    "deaf": ("trap '' TERM; echo I stay; sleep 300; sleep 300", r"it took longer .*: I stay"),
+    "prints": ("yes", r"it took longer than isolation.seconds.*: y( \| y)+"),
+    "disk": (
+        "exec dd if=/dev/zero of=/output/big bs=1M count=20",
+        r"its process was ended by SIGXFSZ \(it wrote too large a file\)(: .*)?",
+    ),
 }
 
 
 @pytest.mark.usefixtures("nothing_left")
 @pytest.mark.parametrize("fault", FAULTS)
-def test_faults_are_told_with_the_last_lines(fault, tmp_path, given, caplog):
+def test_faults_are_told_with_the_last_lines(fault, tmp_path, given, caplog, monkeypatch):
     script, words = FAULTS[fault]
-    seconds = 2.0 / N_SCANS if fault == "hang" else 60.0
+    monkeypatch.setattr("adaptune.odometry.docker.engine._MOST_WRITTEN", 10**6)
+    seconds = 2.0 / N_SCANS if fault in ("hang", "deaf", "prints") else 60.0
     limits = Limits(seconds=seconds, memory=0.3 if fault == "memory" else 2.0)
     odometry = made(shell(tmp_path, script), given, limits)
     poses = drive(odometry)

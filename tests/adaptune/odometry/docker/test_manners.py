@@ -1,0 +1,108 @@
+"""Manners of real systems, by way of playing: the polite system's figure, or a refusal that helps.
+
+Trials run side by side.
+"""
+
+import re
+import sys
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+from contained import FIXED, VALUES, containers, template
+from needs import ROOT, reference_image
+from setups import setup_of
+
+from adaptune.odometry.docker import ros_container
+from offline.config import load_study
+
+MANNERS = {
+    "late": {"late": 2},
+    "own clock": {"own_clock": 0.1},
+    "background": {"background": 0.005},
+    "own layout": {"layout": ["x", "y", "z"]},
+    "slow start": {"ready_delay": 2.0},
+    "one of two": {"one_of": 2},
+}
+WAYS = ("bag", "lockstep", "command")
+REFUSED = {
+    ("own clock", "command"): r"its poses are of .* the program must stamp poses as the scans are",
+    (
+        "own layout",
+        "lockstep",
+    ): r"\S+: node /gicp died before its first pose; .*\.play: bag: ",
+    ("one of two", "lockstep"): r"it gave poses for 1\d of \d\d scans, and .*\.play: bag: ",
+}
+TABLE = [(m, w) for m in MANNERS for w in WAYS if (m, w) != ("background", "command")]
+PATIENCE = {"late": 2.0, "one of two": 0.3}
+RANGES = [f"{name}: {{type: float, low: 1, high: 9, baseline: {v}}}" for name, v in VALUES.items()]
+PARAMETERS = f"odometry.parameters={{{', '.join(RANGES)}}}"
+
+
+def trial(study_file, folder, imitate, way, patience=60.0):
+    folder.mkdir()
+    rate = 1 if "background" in imitate else 4
+    settings = f"image: {reference_image()}, template: {template(folder / 'p.yaml', **imitate)}"
+    name = "rustle"
+    if way == "command":
+        name, settings = "docker_command", f"{settings}, command: [odometry-plain, '{{points}}']"
+    else:
+        settings += f", odometry: /Odometry, rate: {rate}, play: {way}, patience: {patience}"
+    given = [f"odometry.name={name}", f"odometry.settings={{{settings}}}", PARAMETERS]
+    given.append("isolation.seconds=1")
+    setup = setup_of(load_study(study_file, given, folder / "run"), runs="whole")
+    (found,) = setup.run(setup.prepare("one", 1e9), [VALUES])
+    return found
+
+
+@pytest.fixture(scope="module")
+def trials(study_file, tmp_path_factory):
+    reference_image()
+    folder = tmp_path_factory.mktemp("manners")
+    with pytest.MonkeyPatch.context() as patch, ThreadPoolExecutor(3) as pool:
+        patch.setattr(ros_container, "_OTHERS_ONLY", 2.0)
+        jobs = {
+            (manner, way): pool.submit(
+                trial,
+                *(study_file, folder / f"{manner} {way}", MANNERS[manner], way),
+                PATIENCE.get(manner, 60.0),
+            )
+            for manner, way in TABLE
+        }
+        yield lambda *of: jobs[of].result()
+        for job in jobs.values():
+            job.cancel()
+    assert not containers()
+
+
+@pytest.fixture(scope="module")
+def polite(study_file, tmp_path_factory):
+    given = ["odometry.name=gicp", "odometry.settings={}", "odometry.parameters=null"]
+    study = load_study(study_file, given, tmp_path_factory.mktemp("polite") / "run")
+    setup = setup_of(study, runs="whole")
+    (found,) = setup.run(setup.prepare("one", 1e9), [VALUES | FIXED])
+    return found.mean_error
+
+
+@pytest.mark.services
+@pytest.mark.parametrize(("manner", "way"), TABLE)
+def test_a_manner(trials, polite, manner, way):
+    found = trials(manner, way)
+    if words := REFUSED.get((manner, way)):
+        assert re.match(words, found.faults[0]), found.faults
+        return
+    assert not found.faults
+    assert found.mean_error == pytest.approx(polite, rel=0.1)
+    assert manner != "late" or "first_pose" in found.usage
+
+
+def test_each_manner_is_a_variable_of_the_environment(monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "docker/reference/rustle-ros")
+    from lidar_odometry import habits
+
+    given = {"IMITATE_LATE": "3", "IMITATE_LAYOUT": "[x, y]", "HOME": "/"}
+    assert habits({"late": 1, "silent": True}, given) == {
+        "late": 3,
+        "layout": ["x", "y"],
+        "silent": True,
+    }
+    sys.modules.pop("lidar_odometry")

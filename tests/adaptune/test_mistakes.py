@@ -1,0 +1,138 @@
+import re
+
+import fuzz
+import pytest
+
+from adaptune.strict import ConfigurationError
+from offline.config import load_study
+
+FOREIGN = re.compile(r"pydantic|https://|Input should|validation|Value error|tuple|dict|None")
+"""Words of pydantic's and of Python's."""
+
+
+def failure(file, *overrides):
+    with pytest.raises(ConfigurationError) as caught:
+        load_study(file, overrides)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("sub_trajectory=true", "sub_trajectory: give a number, not true"),
+        ("sub_trajectory=", "sub_trajectory: give a number, not nothing"),
+        ("sub_trajectory={a: 1}", "sub_trajectory: give a number, not keys with values"),
+        (
+            "odometry.settings.iterations=100000000000",
+            "odometry.settings.iterations: give a number of at most 10,000, not 100000000000",
+        ),
+        ("odometry.parameters.keyframe_interval={type: [1]}", "keyframe_interval: give its type"),
+        ("odometry.settings=3", "odometry.settings: give keys with values, not 3"),
+        ("odometry={settings: {}}", "odometry.name: this key is missing"),
+        ("sequences.o@ne={bag: one.bag}", "sequences.o@ne: becomes the name of a file: give"),
+        ("sequences.one.bag=~nobodyx/a.bag", "sequences.one.bag: ~nobodyx/a.bag: there is no such"),
+        ("sequences.one.bag=''", "sequences.one.bag: give a path, not an empty text"),
+        (
+            "sequences.one.reference=" + "a" * 300 + ".tum",
+            "sequences.one.reference: cannot be reached (File name too long)",
+        ),
+        ("sequences.one.clock_offset=1e300", "clock_offset: give a number of at most 3e+09, not"),
+        ("sequences.one.cache=maybe", "sequences.one.cache: give true or false, not 'maybe'"),
+        (
+            "sequences.one.views=[" + "{reverse: true}," * 2000 + "]",
+            "sequences.one.views: give at most 16, not 2,000",
+        ),
+        ("sequences.one.views=[{reverse: 3}]", "views.0.reverse: give true, not 3"),
+        ("sequences.one.extrinsic=abc", "sequences.one.extrinsic: give numbers: x y z qx qy qz"),
+        (
+            "sequences.one.extrinsic=[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [1, 2, 3, 1]]",
+            "sequences.one.extrinsic: its last row is not 0 0 0 1; is it transposed?",
+        ),
+        (
+            "courses.x={scenes: [{scene: cave, lenght: 3}]}",
+            "courses.x.scenes.0.lenght: unknown key; did you mean 'length'?",
+        ),
+        ("training=[]", "training: give at least one, not none"),
+        ("health.max_speed=.nan", "health.max_speed: give a finite number, not NaN"),
+        ("health.max_speed=1" + "0" * 400, "health.max_speed: give a number of at most 1"),
+        ("descriptor.window=3", "window is gone, they are averaged over 3 s"),
+        ("online.modes=[paired]", "online.modes.0: paired is now called adaptive"),
+        (
+            "online.switching.sets=[true, 3]",
+            "online.switching.sets.0: give a whole number or keys with values, not true",
+        ),
+        ("offline.seed=1e400", "offline.seed: give a finite number, not Infinity"),
+        ("offline.limits={rtf: {max: 3}}", "offline.limits.rtf: give 'rte', 'kitti', 'rpe', 'ape'"),
+        (
+            "offline={sampler: grid, sampler_settings: {grid: {keyframe_interval: 3}}}",
+            "offline.sampler_settings.grid.keyframe_interval: give keys with values or a list, not",
+        ),
+    ],
+)
+def test_a_mistake_is_told_once_in_plain_words(study_file, override, message):
+    told = failure(study_file, override)
+    first, *others = told.splitlines()
+    assert first.startswith("-o: ")
+    assert message in first
+    assert others == []
+    # The words of the test itself are quoted, not said.
+    assert not FOREIGN.search(told)
+    assert len(told) < 250
+
+
+def test_all_mistakes_are_told_together(study_file):
+    file = study_file.with_name("all.yaml")
+    file.write_text(
+        study_file.read_text()
+        .replace("downsampling: 0.5", "downsampling: true")
+        .replace("bag: one.bag", "bag: one.bag, stride: 0")
+        .replace("points: /points, reference: /truth}\n  three", "points: /p}\n  three")
+        .replace("test: [three]", "test: [threee]")
+        .replace("sub_trajectory: 3.0", "sub_trajectory: abc")
+        .replace("trials: 10", "trials: 0, sampler_settings: {gama: 1}")
+        + "online: {switching: {mechanism: lively, sets: [0]}}\n"
+    )
+    lines = failure(file).splitlines()
+    assert [re.sub(r".*, line (\d+): ([\w.]+): .*", r"\1 \2", line) for line in lines] == [
+        "3 odometry.settings.downsampling",
+        "8 sequences.one.stride",
+        "9 sequences.two",
+        "12 test.0",
+        "13 sub_trajectory",
+        "14 offline.trials",
+        "14 offline.sampler_settings.gama",
+        "15 online.switching.mechanism",
+        "15 online.switching.sets",
+    ]
+
+
+def test_what_needs_the_odometry_is_told_beside_other_mistakes(study_file):
+    steps = "sampler_settings: {steps: {keyframe: {mu: 1}}}"
+    offline = f"offline={{sampler: annealing, trials: 0, {steps}}}"
+    told = failure(study_file, offline, "sequences.one.stride=0", "online.period=abc")
+    assert "offline.sampler_settings.steps.keyframe: no parameter 'keyframe' is tuned" in told
+    assert len(told.splitlines()) == 4
+
+
+@pytest.mark.parametrize("given", ["abc", "-1", "nan", "inf", "1e400"])
+def test_a_wrong_size_of_the_cache_is_told_once(study_file, monkeypatch, given):
+    monkeypatch.setenv("ADAPTUNE_CACHE_GB", given)
+    with pytest.raises(Exception, match=r"^ADAPTUNE_CACHE_GB is .*; give gigabytes, 0 or more"):
+        load_study(study_file)
+
+
+@pytest.mark.parametrize("kind", ["folder", "device", "large"])
+def test_what_cannot_be_a_study_is_not_read(tmp_path, kind):
+    path = tmp_path / "study.yaml"
+    if kind == "folder":
+        path.mkdir()
+    elif kind == "device":
+        path.symlink_to("/dev/zero")
+    else:
+        path.write_text("a: b\n" * 300_000)
+    assert failure(path) == f"{path}: a study is a file of YAML, of 1 MB at most"
+
+
+def test_damaged_studies_give_a_study_or_an_error(tmp_path):
+    counts = fuzz.fuzz_studies(100, 1, tmp_path)
+    assert min(counts["errors"], counts["studies"]) > 0

@@ -1,0 +1,103 @@
+import collections
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from adaptune.space import ODOMETRY, Categorical, Float, Integer, ParameterSpace, PooledSpace
+from offline.config import OfflineConfig
+from offline.samplers import make_sampler
+
+SPACE = PooledSpace(
+    {
+        "gicp": ParameterSpace.of(
+            distance=Float(low=0.1, high=10.0, baseline=1.0, log=True),
+            passes=Integer(low=1, high=40, baseline=20),
+        ),
+        "ndt": ParameterSpace.of(distance=Float(low=0.5, high=20.0, baseline=4.0, log=True)),
+        "kiss": ParameterSpace.of(voxel=Float(low=0.1, high=3.0, baseline=1.0)),
+    }
+)
+
+
+def error(parameters):
+    if parameters[ODOMETRY] == "gicp":
+        return 0.5 + abs(parameters["distance"] - 2.0)
+    return 20.0 + (parameters.get("distance") or parameters["voxel"])
+
+
+def run(config, n_batches, known=()):
+    sampler = make_sampler(SPACE, config)
+    history = list(known)
+    for _ in range(n_batches):
+        history += [(s, error(s)) for s in sampler.propose(history)]
+    return history
+
+
+@pytest.fixture(params=["tpe", "random"])
+def config(request):
+    return OfflineConfig(sampler=request.param, batch=8, initial=12, seed=5)
+
+
+def labels(history):
+    return [s[ODOMETRY] for s, _ in history]
+
+
+def test_the_first_trials_are_the_baselines_and_then_all_take_turns(config):
+    history = run(config, 2)
+    assert [s for s, _ in history[:3]] == SPACE.baselines
+    assert labels(history[:8]) == ["gicp", "ndt", "kiss"] * 2 + ["gicp", "ndt"]
+    assert min(collections.Counter(labels(history)).values()) >= 4
+
+
+@pytest.mark.parametrize("known", [0, 1, 3])
+def test_resumes_exactly(config, known):
+    history = run(config, 4)
+    assert run(config, 4 - known, history[: 8 * known]) == history
+
+
+@given(
+    n=st.integers(2, 6),
+    batch=st.integers(6, 20),
+    errors=st.lists(st.floats(0.0, 9.0), min_size=6, max_size=6),
+)
+def test_batches_are_split_by_rank_and_nobody_is_left_out(n, batch, errors):
+    of = {str(i): error for i, error in enumerate(errors[:n])}
+    space = PooledSpace(dict.fromkeys(of, SPACE.spaces["kiss"]))
+    sampler = make_sampler(space, OfflineConfig(sampler="random", batch=batch, initial=batch))
+    history = [(s, of[s[ODOMETRY]]) for s in sampler.propose([])]
+    proposed = [s[ODOMETRY] for s in sampler.propose(history)]
+    counts = collections.Counter(proposed)
+    assert counts.total() == batch
+    ranked = [counts[label] for label in sorted(of, key=of.__getitem__)]
+    assert min(ranked) >= 1
+    assert ranked == sorted(ranked, reverse=True)
+
+
+@pytest.mark.parametrize("batch", [4, 8, 16])
+def test_a_finite_pool_is_tried_to_its_end(config, batch):
+    few, many = (ParameterSpace.of(n=Integer(low=1, high=n, baseline=1)) for n in (3, 17))
+    # Python takes 1 and True for equal.
+    equal = ParameterSpace.of(kernel=Categorical(choices=(1, True, "x"), baseline=1))
+    space = PooledSpace({"few": few, "many": many, "equal": equal})
+    sampler = make_sampler(space, config.model_copy(update={"batch": batch, "initial": 6}))
+    history = []
+    while sets := sampler.propose(history):
+        history += [(s, 1.0) for s in sets]
+        if len(sets) < batch:
+            break
+    assert len(history) == len({repr(s) for s, _ in history}) == 23
+
+
+def late_sets(limit):
+    """The last sets of two alike odometries; a smaller voxel is better."""
+    space = PooledSpace(dict.fromkeys(("one", "other"), SPACE.spaces["kiss"]))
+    sampler, history = make_sampler(space, OfflineConfig(batch=9, initial=18, seed=5)), []
+    for _ in range(8):
+        history += [(s, s["voxel"], limit(s)) for s in sampler.propose(history)]
+    return [s for s, *_ in history[45:]]
+
+
+def test_sets_that_break_limits_earn_no_share():
+    late = late_sets(lambda s: (1.0 if s[ODOMETRY] == "one" else -1.0,))
+    assert collections.Counter(s[ODOMETRY] for s in late) == {"one": 9, "other": 18}

@@ -1,0 +1,101 @@
+import numpy as np
+from made_replays import SCENES, SECONDS, bank, kept, replay, sequence
+
+from adaptune.report.charts import Band, Line, Mark, Points, Shares, Spans
+from offline.config import load_study
+from online.charts import (
+    charts_of_replays,
+    choice_chart,
+    error_chart,
+    read_replays,
+    switches,
+)
+
+
+def of_kind(panel, kind):
+    return [d for d in panel.drawn if isinstance(d, kind)]
+
+
+def test_errors_of_all_modes_are_drawn_with_their_switches():
+    modes = {"fixed": kept(), "paper": replay(), "another": bank()}
+    (panel,) = error_chart(sequence(**modes)).panels
+    assert [line.name for line in of_kind(panel, Line)] == list(modes)
+    # A bank changes its weights, and no parameters.
+    (marks,) = of_kind(panel, Points)
+    assert marks.name == "paper"
+    np.testing.assert_allclose(marks.x, [8.0, 9.0])
+    assert of_kind(panel, Spans) == [SCENES]
+
+
+def test_only_changes_are_switches():
+    nan = {"distance": [0.7, 0.7, 0.9], "resolution": [np.nan, np.nan, np.nan]}
+    np.testing.assert_array_equal(switches(replay(choices=nan)), [9.0])
+    assert not len(switches(kept()))
+    assert not len(switches(bank()))
+
+
+def test_restarts_are_marked():
+    restarted = np.zeros(len(SECONDS), bool)
+    restarted[50] = True
+    (panel,) = error_chart(sequence(fixed=kept(), paper=replay(restarted=restarted))).panels
+    last = of_kind(panel, Points)[-1]
+    assert (last.name, list(last.x)) == ("restarted by the health check", [SECONDS[50]])
+
+
+def test_what_a_mode_measured_of_itself_has_a_panel():
+    estimated = np.array([[np.nan] * 3, [0.7, 0.4, 1.2], [0.8, 0.5, 1.3]])
+    lost = np.array([True, False, True])
+    behind = np.where(SECONDS > 5.0, 0.7, np.nan)
+    made = bank(estimated=estimated, lost=lost, errors_behind=behind)
+    _, own = error_chart(sequence(fixed=kept(), adaptive=made)).panels
+    assert "adaptive" in own.title
+    (spans,) = of_kind(own, Spans)
+    assert list(spans.edges) == [0.0, 8.0, 9.0, SECONDS[-1]]
+    assert spans.names == ("lost", "", "lost")
+    (band,) = of_kind(own, Band)
+    np.testing.assert_array_equal(band.high, estimated[:, 2])
+    assert [line.name for line in of_kind(own, Line)] == ["true", "measured while driving"]
+    # Without a reference, that is all there is.
+    blind = {"errors": np.full(len(SECONDS), np.nan)}
+    (alone,) = error_chart(sequence(adaptive=bank(estimated=estimated, lost=lost, **blind))).panels
+    assert alone.title == own.title
+    assert error_chart(sequence(fixed=replay(**blind))) is None
+
+
+def test_choices_last_until_the_next_one():
+    chart = choice_chart(sequence(fixed=kept(), paper=replay(), adaptive=bank()))
+    distance, kernel, weights = chart.panels
+    constant, steps = of_kind(distance, Line)
+    assert steps.steps
+    assert (constant.dashed, steps.dashed) == (True, False)
+    np.testing.assert_allclose(steps.x, [0.0, 8.0, 9.0, SECONDS[-1]])
+    assert list(steps.y) == [0.7, 0.9, 0.9, 0.9]
+    assert distance.y.log
+    assert kernel.y.names == ("huber", "none")
+    assert list(of_kind(kernel, Line)[1].y) == [1.0, 1.0, 0.0, 0.0]
+    (shares,) = of_kind(weights, Shares)
+    np.testing.assert_allclose(shares.shares.sum(axis=0), 100.0)
+    np.testing.assert_allclose(shares.shares[:, -1], [60.0, 10.0, 30.0])
+    assert shares.names == ("trial 4", "trial 17", "trial 2")
+    # Shares hide what is shaded: a line shows where a scene ends.
+    assert [mark.at for mark in of_kind(weights, Mark)] == [8.0]
+
+
+def test_weights_that_never_change_are_not_drawn():
+    even = replay(weights={"trial 4": [0.5] * 3, "trial 17": [0.5] * 3})
+    assert choice_chart(sequence(adaptive=even)) is None
+
+
+def test_sets_of_several_odometries_leave_gaps():
+    mixed = {"odometry": ["gicp", "ndt", "ndt"], "resolution": [np.nan, 2.0, 2.0]}
+    mixed["kernel"] = ["huber", "", ""]
+    panels = choice_chart(sequence(paper=replay(choices=mixed))).panels
+    by_name = {panel.title: of_kind(panel, Line)[0] for panel in panels}
+    np.testing.assert_array_equal(by_name["kernel"].y, [0.0, np.nan, np.nan, np.nan])
+    np.testing.assert_array_equal(by_name["resolution"].y, [np.nan, 2.0, 2.0, 2.0])
+
+
+def test_a_sequence_without_replays_says_so(study_file, tmp_path):
+    study = load_study(study_file, [], tmp_path / "study")
+    missing = ["No replays of three: run `adaptune online`."]
+    assert charts_of_replays(read_replays(study, "three")) == ([], missing)
