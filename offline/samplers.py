@@ -1,5 +1,6 @@
 """Samplers: what proposes the next parameter sets, in batches, and no set twice."""
 
+import json
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterable, Iterator, Sequence
@@ -12,7 +13,7 @@ import optuna
 from numpy.typing import NDArray
 from scipy.stats import qmc
 
-from adaptune.errors import in_a_line
+from adaptune.processes import Answer, Conversation, Forked, HostError, Message
 from adaptune.space import (
     ODOMETRY,
     Categorical,
@@ -23,13 +24,16 @@ from adaptune.space import (
 )
 from offline.annealing import AnnealingSampler
 from offline.config import (
+    SERVICE,
     AnnealingSettings,
     Grid,
     GridSettings,
     OfflineConfig,
     SamplerError,
     distribution,
+    is_user_sampler,
     make_grid,
+    optuna_class,
     optuna_sampler,
 )
 from offline.objective import SamplerResult, exceeded, penalised
@@ -228,13 +232,6 @@ class AskedSampler(Sampler):
         return optuna_sampler(config.sampler, usual | config.sampler_settings, seed)
 
     def _propose(self, numbers: range, history: Sequence[SamplerResult]) -> list[ParameterSet]:
-        try:
-            return self._asked(numbers, history)
-        except Exception as error:  # it may be a class of the user
-            where = f"{self.config.sampler}, trials {numbers.start} to {numbers.stop - 1}"
-            raise SamplerError(f"offline.sampler: {where}: {in_a_line(error)}") from error
-
-    def _asked(self, numbers: range, history: Sequence[SamplerResult]) -> list[ParameterSet]:
         if self._history != list(history[: len(self._history)]):
             self._begin(0, ())
         while len(self._history) < numbers.start and not self._forgetful:
@@ -407,6 +404,26 @@ def _spread(sets: dict[str, list[ParameterSet]], first: int) -> list[ParameterSe
     return [own for _, own in sorted(placed, key=itemgetter(0))]
 
 
+class HostedSampler(Sampler):
+    """A sampler of the user; `AskedSampler` asks it in the other process."""
+
+    constrained = True  # the other process sees to constraints
+
+    def __init__(self, space: ParameterSpace, config: OfflineConfig):
+        super().__init__(space, config)
+        self._process = Conversation(Forked(SERVICE, config.sampler, "propose"))
+        self._about = {"space": space.dump(), "config": config.model_dump(mode="json")}
+
+    def _propose(self, numbers: range, history: Sequence[SamplerResult]) -> list[ParameterSet]:
+        try:
+            answer = self._process.ask(self._about | {"history": history})
+        except HostError as error:
+            trials = f"trials {numbers.start} to {numbers.stop - 1}"
+            raise SamplerError(f"offline.sampler, at {trials}: {error}") from error
+        sets: list[ParameterSet] = answer.header["sets"]
+        return sets
+
+
 def make_sampler(space: ParameterSpace, config: OfflineConfig) -> Sampler:
     """Make the sampler that a configuration names."""
     if isinstance(space, PooledSpace):
@@ -415,4 +432,40 @@ def make_sampler(space: ParameterSpace, config: OfflineConfig) -> Sampler:
         return RandomSampler(space, config)
     if config.sampler in ("grid", "random"):
         return GridSampler(space, config)
+    if is_user_sampler(config.sampler):
+        return HostedSampler(space, config)
     return AskedSampler(space, config)
+
+
+# What follows runs in the process of a sampler of the user.
+
+
+def load(name: str) -> None:
+    """Import a sampler."""
+    optuna_class(name)
+
+
+def make(name: str) -> Answer:
+    """Make a sampler and say how that went."""
+
+    def answer(message: Message) -> dict[str, Any]:
+        optuna_sampler(name, message.header["settings"], message.header["seed"])
+        return {}
+
+    return answer
+
+
+def propose(_: str) -> Answer:
+    """Propose one batch after another."""
+    made: dict[str, AskedSampler] = {}
+
+    def answer(message: Message) -> dict[str, Any]:
+        about = message.header
+        key = json.dumps([about["space"], about["config"]])
+        if key not in made:
+            space = ParameterSpace.load(about["space"])
+            made[key] = AskedSampler(space, OfflineConfig.model_validate(about["config"]))
+        history = [SamplerResult(set_, value, tuple(by)) for set_, value, by in about["history"]]
+        return {"sets": made[key].propose(history)}
+
+    return answer
