@@ -23,7 +23,7 @@ from adaptune.commands.terminal import (
     say_next_of_study,
     show_table,
 )
-from adaptune.errors import AdaptuneError
+from adaptune.errors import AdaptuneError, OdometryError
 from adaptune.files import plain_name, write_text
 from adaptune.progress import Progress
 
@@ -96,8 +96,11 @@ def _try_system(file: Path) -> None:
     from adaptune.study.tried import SECONDS, try_system
 
     study = load(file, [], None, runs=True)
-    with progress() as show:
-        said, rows = try_system(study, show)
+    try:
+        with progress() as show:
+            said, rows = try_system(study, show)
+    except OdometryError as error:
+        raise AdaptuneError(f"{file}: {error}") from error
     for sentence in said:
         say(sentence)
     show_table(f"{SECONDS:g} s of {study.training[0]}, with the baseline", rows)

@@ -80,8 +80,7 @@ def try_system(study: Study, progress: Progress) -> tuple[list[str], list[dict[s
     factory, name = study.odometry, study.training[0]
     if not isinstance(factory, OdometryFactory) or factory.name != "rustle":
         raise OdometryError(
-            f"{study.name}: odometry.name: only rustle has several ways of playing to try; run "
-            f"`adaptune offline`"
+            "odometry.name: only rustle has several ways of playing to try; run `adaptune offline`"
         )
     given, settings = study.sequences.program_input(name), factory.settings
     with temporary_folder() as folder:
