@@ -148,7 +148,13 @@ PAIRED_SETTINGS = [
 BANK_FRAMES = 1000
 """Nearest frames of each stretch in a bank: products of errors need more frames than means do."""
 BANK_SETTINGS = [
-    BankSettings(sharpness=48.0, min_fixed_share=share, prior_windows=windows, n_frames=BANK_FRAMES)
+    BankSettings(
+        sharpness=12.0,
+        clip=18.0,
+        min_fixed_share=share,
+        prior_windows=windows,
+        n_frames=BANK_FRAMES,
+    )
     for share, windows in ((0.0, 3.0), (0.0, 10.0), (0.25, 3.0), (0.75, 10.0))
 ]
 """A bank is driven with one of these; of equally good ones the first."""
