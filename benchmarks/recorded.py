@@ -54,7 +54,7 @@ CARS = ("town", "road", "city", "street")
 # compensates by itself.
 COMPENSATING = ("kiss_icp",)
 # Keyframes once a second: a gap of 39 s, steps of 1.2 m at most.
-CAMPUS = {"health": {"max_speed": 5.0, "max_freeze": 10.0}, "lost_track": 0.5}
+CAMPUS = {"health": {"max_speed": 5.0}, "lost_track": 0.5}
 
 
 @dataclass(frozen=True)

@@ -31,6 +31,9 @@ _SETTLED = 1.0
 in a car at 12 m/s moves after half a second, and then catches up for 0.3 s at twice that speed."""
 _RECENT = 0.5
 """Seconds of healthy motion whose mean goes on where the odometry restarts: one step is noisy."""
+_FROZEN_SCANS = 10
+"""Scans, at their usual interval, for which a pose may stay where it is, whatever `max_freeze`:
+keyframes that come once a second may look alike."""
 _PATIENCE = 1.0
 """Seconds within which an odometry may take back a jump. A noisy one jumps back and forth, and is
 worse off if it is restarted; one that has run away does not come back."""
@@ -179,7 +182,8 @@ class Guard:
             return False
         T, seconds = self._moving
         speed = float(np.linalg.norm(T[:3, 3])) / seconds
-        if speed <= _WALK or self._still <= self._health.max_freeze:
+        most = max(self._health.max_freeze, _FROZEN_SCANS * median(self._intervals))
+        if speed <= _WALK or self._still <= most:
             return False
         self._healthy, self._still = self._moving, 0.0
         self._recent = deque([self._moving])

@@ -291,7 +291,7 @@ DELETED = {
     "online.modes=paired": "is now called adaptive",
     **{f"online.modes={mode}": _NO_MODE for mode in ("one_set", "bank", "bank_learned", "random")},
     "health.max_acceleration": "is gone: 30 m/s^2 is the bound; leave it out",
-    "health.max_freeze": "is gone: 1 s is the bound; leave it out",
+    "health.max_freeze": "is gone: 10 scans, and a second at least, are the bound; leave it out",
     "health.max_turn_rate": "is gone: 360 degrees a second are the bound; leave it out",
     "health.max_unregistered": "is gone: 10 scans in a row are the bound; leave it out",
     "odometry.settings.drain": "is gone: adaptune waits until the system rests; leave it out",

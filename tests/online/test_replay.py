@@ -10,6 +10,7 @@ import pytest
 
 from adaptune.bank.bank import Bank
 from adaptune.errors import AdaptuneError, OdometryError
+from adaptune.odometry import tracker
 from adaptune.odometry.base import InProcess, Odometry, Registration, Usage
 from adaptune.odometry.keyframe import KeyframeGicp
 from adaptune.odometry.tracker import HealthCheck
@@ -165,6 +166,7 @@ def test_after_a_dropped_scan_the_last_motion_goes_on_for_longer():
 def test_a_frozen_pose_restarts(monkeypatch):
     odometry = Scripted([0.1, 0.1] + [0.0] * 6 + [0.1])
     monkeypatch.setattr(HealthCheck, "max_freeze", 0.45)
+    monkeypatch.setattr(tracker, "_FROZEN_SCANS", 1)
     result = replay(scans(0.1 * np.arange(9)), InProcess(odometry), HEALTH)
     assert np.flatnonzero(result.restarted).tolist() == [7]
     np.testing.assert_allclose(result.trajectory.T_world_sensor[7, 0, 3], 0.3)

@@ -3,6 +3,7 @@ import pytest
 from pydantic import ValidationError
 from rooms import moved
 
+from adaptune.odometry import tracker
 from adaptune.odometry.tracker import Guard, HealthCheck, unhealthy
 
 
@@ -63,6 +64,13 @@ def test_who_stops_dead_has_frozen(steps, faults):
     assert unhealthy(HealthCheck(), np.array(motions), stamps, np.ones(len(stamps), bool)) == faults
 
 
+@pytest.mark.parametrize(("seconds", "faults"), [(9, {}), (12, {"max_freeze": 1})])
+def test_keyframes_once_a_second_may_look_alike(seconds, faults):
+    motions = np.array([moved(1.0)] * 20 + [np.eye(4)] * seconds)
+    stamps = np.arange(len(motions) + 1) * 10**9
+    assert unhealthy(HealthCheck(), motions, stamps, np.ones(len(stamps), bool)) == faults
+
+
 @pytest.mark.parametrize("bounds", [{"max_speed": 0}, {"max_speed": -1}, {"max_jerk": 1}])
 def test_bounds_that_make_no_sense(bounds):
     with pytest.raises(ValidationError):
@@ -74,6 +82,7 @@ def test_what_would_have_been_said_of_a_drive(monkeypatch):
     monkeypatch.setattr(HealthCheck, "max_unregistered", 3)
     steps = [0.1, 0.1, 9.0, 0.1, 0.1, np.nan, 0.1, *[0.0] * 6, 0.1, *[0.8] * 10, *[0.1] * 5]
     monkeypatch.setattr(HealthCheck, "max_freeze", 0.45)
+    monkeypatch.setattr(tracker, "_FROZEN_SCANS", 1)
     check = HealthCheck(max_speed=10.0)
     registered = np.ones(len(steps) + 1, bool)
     registered[-4:] = False
