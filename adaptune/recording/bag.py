@@ -359,6 +359,7 @@ class BagSource:
         while True:
             try:
                 message = next(messages)
+                len(message[2])  # a row of a damaged database may hold none
             except StopIteration:
                 return
             except Exception as error:

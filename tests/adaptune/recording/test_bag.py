@@ -1,4 +1,6 @@
 import re
+import sqlite3
+from contextlib import closing
 
 import fuzz
 import numpy as np
@@ -72,6 +74,17 @@ def test_metadata_that_count_in_words_are_refused(tmp_path):
     metadata = folder / "metadata.yaml"
     metadata.write_text(re.sub(r"message_count: \d+", "message_count: many", metadata.read_text()))
     with pytest.raises(SequenceError, match="counts messages in what are no numbers"):
+        list(opened(folder))
+
+
+def test_a_message_without_bytes_is_damage(tmp_path):
+    folder = rec.drive(tmp_path / "a.sqlite3")
+    with closing(sqlite3.connect(next(folder.glob("*.db3")))) as database, database:
+        database.execute("CREATE TABLE copied AS SELECT * FROM messages")  # which may have gaps
+        database.execute("DROP TABLE messages")
+        database.execute("ALTER TABLE copied RENAME TO messages")
+        database.execute("UPDATE messages SET data = NULL WHERE id = 5")
+    with pytest.raises(SequenceError, match="the bag is damaged"):
         list(opened(folder))
 
 
