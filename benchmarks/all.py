@@ -52,11 +52,11 @@ BENCHMARKS = {
         ["reading.py", "--large", "10"],
         ["reading.py", "--scans", "20"],
         [
-            Figure("a cloud of 29,000 points decoded", "", rf"decode .* {N} ms", "ms", 0.3),
+            Figure("a cloud of 29,000 points decoded", "", rf"decode .*? {N} ms", "ms", 0.3),
             Figure("bag to clouds", READ, rf"uncompressed .* {N} of the least", "", 1.15),
             Figure("bag to clouds, LZ4", READ, rf"LZ4 .* {N} of the least", "", 1.15),
-            Figure("10,000 cached scans opened", "", rf"to the first .* {N} ms", "ms", 200),
-            Figure("memory of a pass over 10 GB", "", rf"over 10 GB .* {N} MB", "MB", 500),
+            Figure("10,000 cached scans opened", "", rf"to the first .*? {N} ms", "ms", 200),
+            Figure("memory of a pass over 10 GB", "", rf"over 10 GB .*? {N} MB", "MB", 500),
         ],
     ),
     "inspecting": Benchmark(

@@ -138,8 +138,8 @@ def rounds(study: OfflineStudy, n: int, as_it_is: bool) -> tuple[float, float]:
     # All but the baseline's clouds are prepared while trials run.
     sets = [study.odometry.space.baseline | {"downsampling": d} for d in (0.25, 0.35, 0.7)]
     for i, name in enumerate(n * study.training):
-        sequences.run(Task(name, (0,), (sets[i % len(sets)],)), lambda _: None)
-    kept = 1e-6 * sum(one.nbytes for one in sequences._ready.values())
+        sequences.run(Task(name, (0,), (sets[i % len(sets)],)), lambda *_: None)
+    kept = 1e-6 * sum(one.shared.nbytes for one in sequences._ready.values())
     return (_memory() - before) / kept, time.process_time() - begin
 
 

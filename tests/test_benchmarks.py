@@ -131,6 +131,7 @@ def test_the_table_of_benchmarks_is_made_from_their_logs(tmp_path):
     (tmp_path / "reading.log").write_text(
         "bag to clouds, uncompressed                  0.8 ms   1.20 of the least (limit 1.15)\n"
         "bag to clouds, LZ4                           0.9 ms   0.84 of the least (limit 1.15)\n"
+        "memory of a pass over 10 GB                    220 MB   500 MB (10 s)\n"
     )
     (tmp_path / "campaign.log").write_text(
         "bare loop                 10.0 s\n2 workers                  5.0 s: 1.90 times faster\n"
@@ -150,7 +151,8 @@ def test_the_table_of_benchmarks_is_made_from_their_logs(tmp_path):
         in text
     )
     assert "| campaign, two workers | 1.90 times | one worker | at least 1.8 |" in text
-    assert text.count("\n| ") == 4
+    assert "| memory of a pass over 10 GB | 220 MB |  | at most 500 |" in text
+    assert text.count("\n| ") == 5
 
 
 def test_all_benchmarks_print_their_figures(tmp_path):
