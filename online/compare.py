@@ -419,14 +419,12 @@ def compare(study: Study) -> ComparedReplays:
         wrong += [f"On {name}, {what}." for what in read_contradictions(folder)]
         of_modes = compare_modes(name, every, reference)
         judged.append(of_modes._replace(recording=study.sequences.recorded_in(name)))
-        errors = None if model is None else oracle_errors(study.archive("oracle"), name, model)
-        if errors is not None and model is not None:
-            oracle = oracle_row(judged[-1], errors, model.fixed)
-            oracles += [] if oracle is None else [oracle]
+        oracles += [] if model is None else _in_hindsight(study, judged[-1], model)
     rows = _rows(judged, oracles)
     obstacle = "" if ADAPTIVE in modes else ReplaySetup.of(study).obstacle(ADAPTIVE, model)
-    said = wrong[:1] or _lost(study, judged, rows)
     length, worth = study.config.sub_trajectory, study.config.online.worth
+    best = decided(rows, worth)
+    said = wrong[:1] or ([] if best is None else _lost(study, judged, best.mode))
     said += verdict(rows, length, obstacle, worth)
     details = [
         *wrong,
@@ -439,19 +437,24 @@ def compare(study: Study) -> ComparedReplays:
     folder = study.folder / "comparison"
     report.write_rows(folder, "comparison", [row.columns() for row in rows])
     report.write_tables(folder, study.name, tables(rows, length), [*said, *details])
-    advised = "" if (best := decided(rows, worth)) is None else best.mode
+    advised = "" if best is None else best.mode
     return ComparedReplays(rows, said, details, advised, compared.unfinished)
 
 
-def _lost(study: Study, judged: Sequence[JudgedModes], rows: Sequence[ComparisonRow]) -> list[str]:
+def _in_hindsight(study: Study, judged: JudgedModes, model: ErrorModel) -> list[ComparisonRow]:
+    """The row of the best set of a sequence; none where its trials are not known."""
+    errors = oracle_errors(study.archive("oracle"), judged.name, model)
+    row = None if errors is None else oracle_row(judged, errors, model.fixed)
+    return [] if row is None else [row]
+
+
+def _lost(study: Study, judged: Sequence[JudgedModes], best: str) -> list[str]:
     """A sentence where even the best mode has lost its way."""
-    if (best := decided(rows)) is None:
-        return []
-    every = [row for one in judged for row in one.rows if row.mode == best.mode]
+    every = [row for one in judged for row in one.rows if row.mode == best]
     errors = {row.sequence: row.rte for row in every if row.rte is not None}
     worst = max(errors, key=lambda name: errors[name])
     return lost_in_words(
-        CALLED[best.mode],
+        CALLED[best],
         errors,
         study.odometry.name,
         lambda: hard_to_track(study.sequences.open(worst)),
