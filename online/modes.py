@@ -246,12 +246,10 @@ class ReplaySetup:
     def check(self, model: ErrorModel, path: Path) -> None:
         """Refuse a model for another bank, or with a descriptor of somebody else's, from `path`."""
         model.check_descriptors(self.descriptors, path)
-        other = "budget" if model.budget != self.budget else ""
-        if model.worth not in (None, self.worth):
-            other = "worth"
-        if other:
+        same = {"budget": model.budget == self.budget, "worth": model.worth in (None, self.worth)}
+        if others := [key for key, is_same in same.items() if not is_same]:
             raise ModeError(
-                f"online.{other}: {path} was fitted for another one; run `adaptune offline` "
+                f"online.{others[0]}: {path} was fitted for another one; run `adaptune offline` "
                 f"again, which fits it to the finished trials"
             )
         is_even = EVEN in self.also and not self.obstacle(EVEN, model)

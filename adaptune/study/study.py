@@ -488,7 +488,7 @@ MIN_RECORDINGS = 6
 def is_worth(ratio: float, high: float, worth: float) -> bool:
     """Whether a ratio of errors, whose 95 % interval ends at `high`, is worth the CPU time.
 
-    It is if it surely spares some of the error, and about the share `worth`.
+    It is where the error is less by the share `worth`, and the interval shows no loss.
     """
     return ratio <= 1.0 - worth and high < 1.0
 

@@ -16,6 +16,7 @@ from rosbags.rosbag1 import Writer
 from adaptune import files
 from adaptune.errors import OdometryError, UnavailableError
 from adaptune.files import temporary_folder
+from adaptune.odometry.docker.rustle import MAX_SCATTER
 from adaptune.odometry.program import ProgramInput
 from adaptune.odometry.registry import OdometryFactory
 from adaptune.progress import Progress
@@ -24,8 +25,6 @@ from adaptune.study.study import Study
 
 SECONDS = 20.0
 """Of the recording."""
-_CONSTANT = 5e-3
-"""Seconds by which the stamps of scans, or of what follows them steadily, may differ."""
 
 
 class Tried(NamedTuple):
@@ -49,12 +48,12 @@ class Tried(NamedTuple):
     def by_clock(self) -> bool:
         """Whether the system stamps by a clock: not by the scans, nor steadily later."""
         off = np.abs(self.late - np.median(self.late)) if len(self.late) else self.late
-        return len(off) > 0 and float(np.percentile(off, 95)) > _CONSTANT
+        return len(off) > 0 and float(np.percentile(off, 95)) > 1e-9 * MAX_SCATTER
 
     def row(self, begin: int) -> dict[str, Any]:
         """What is shown, where the first scan has the stamp `begin`."""
         late = float(np.median(self.late)) if len(self.late) else 0.0
-        of_scan = f"{late:.2f} s after the scan's" if late > _CONSTANT else "the scan's"
+        of_scan = f"{late:.2f} s after the scan's" if late > 1e-9 * MAX_SCATTER else "the scan's"
         return {
             "play": self.play,
             "start [s]": self.start,

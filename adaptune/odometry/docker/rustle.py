@@ -368,7 +368,8 @@ class Lockstep(Faulting):
         """Correct the predicted pose; False if the system gave none."""
         found = self._pose(self.patience)
         assert self._system is not None
-        self._n_shown += bool(self._n_answered) or found is not None
+        if self._n_answered or found is not None:
+            self._n_shown += 1
         if found is None:
             self._silent += 1
             try:
@@ -412,7 +413,7 @@ class Lockstep(Faulting):
         """The pose at the scan's stamp, if the system gives that at the scan's end."""
         before, self._before = self._before, (stamp, T_own_sensor)
         # Stamps of a clock say nothing.
-        self._steady &= abs(stamp - self._stamp - (self._late or 0)) < _MAX_SCATTER
+        self._steady &= abs(stamp - self._stamp - (self._late or 0)) < MAX_SCATTER
         if before is None or not before[0] <= self._stamp < stamp or not self._steady:
             return T_own_sensor
         both = Trajectory(np.array([before[0], stamp]), np.stack([before[1], T_own_sensor]))
@@ -467,7 +468,7 @@ _IDLE = 0.1
 """Cores that a system may use while it rests: nodes wake up with the clock."""
 _STEADY = 0.9
 """Least share of poses whose stamps are as far from the scans' as those of the others."""
-_MAX_SCATTER = 5_000_000
+MAX_SCATTER = 5_000_000
 """Nanoseconds by which these may differ: a clock differs by more."""
 
 _log = logging.getLogger(__name__)
@@ -741,7 +742,7 @@ def check_stamps(stamps: NDArray[np.int64], scans: NDArray[np.int64]) -> None:
     i = np.searchsorted(scans, stamps).clip(1, len(scans) - 1)
     off = np.minimum(np.abs(stamps - scans[i]), np.abs(stamps - scans[i - 1])).astype(float)
     scatter = np.abs(off - np.median(off))
-    if np.mean(scatter < _MAX_SCATTER) < _STEADY:
+    if np.mean(scatter < MAX_SCATTER) < _STEADY:
         by = 1e-9 * float(np.percentile(scatter, 95))
         raise OdometryError(f"its stamps scatter by up to {by:.3f} s: {_OWN_CLOCK}")
 
