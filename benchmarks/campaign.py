@@ -28,6 +28,7 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -42,6 +43,7 @@ import drives
 from adaptune import files
 from adaptune.archive import Archive, Frames, Trial
 from adaptune.odometry.keyframe import crop
+from adaptune.odometry.tracker import HealthCheck
 from adaptune.simulation.record import record
 from offline import train as training
 from offline import trial, workers
@@ -187,7 +189,9 @@ class Drawn:
     def wait(self) -> list[tuple[int, TaskResult]]:
         """Draw its trials."""
         assert self._task is not None
-        pairs = zip(self._task.numbers, self._task.sets, strict=True)
+        health = HealthCheck().model_dump() if self._task.whole else {}
+        drawn = map(_drawn, self._task.numbers, self._task.sets)
+        trials = [replace(trial, health=health) for trial in drawn]
         frames = Frames(
             np.arange(N_FRAMES) * 10**8,
             np.tile(np.eye(4), (N_FRAMES, 1, 1)),
@@ -195,7 +199,7 @@ class Drawn:
             {"ndt": 90},
             np.zeros(N_FRAMES, np.float32),
         )
-        return [(0, TaskResult([_drawn(*p) for p in pairs], frames if self._task.frames else None))]
+        return [(0, TaskResult(trials, frames if self._task.frames else None))]
 
 
 def _drawn(number: int, parameters: dict[str, Any]) -> Trial:
