@@ -175,7 +175,7 @@ def advice(bag: Tried, stepped: Tried, own: dict[str, Any], settings: Any) -> li
     if chosen.by_clock and settings.use_sim_time is None:
         words["use_sim_time"] = True
     lines = "".join(f"\n    {files.dump({k: v}).strip()}" for k, v in words.items() if v)
-    why = "nothing is lost, and it can adapt" if chosen is stepped else "lockstep does not fit"
-    said = [f"Write under odometry.settings, as {why}:{lines}"]
+    why = "nothing is lost and it can adapt" if chosen is stepped else "lockstep does not fit"
+    said = [f"Write under odometry.settings, because {why}:{lines}"]
     other = stepped if chosen is bag else bag
     return said + ([f"With play: {other.play}: {other.fault}"] if other.fault else [])
