@@ -6,6 +6,7 @@ import logging
 import os
 import shutil
 import socket
+import struct
 import subprocess
 import threading
 from collections.abc import Callable, Mapping, Sequence
@@ -25,6 +26,8 @@ _WAITING = 1000
 """Messages of a topic that may wait; more are dropped."""
 _ANSWER = 5.0
 """Seconds in which it must answer; it waits less for others."""
+_DEAF = 30.0
+"""Seconds in which it must read what is sent."""
 
 _log = logging.getLogger(__name__)
 
@@ -87,6 +90,9 @@ class Ros1:
         text = "geometry_msgs/TransformStamped[] transforms\n"
         self.store.register(get_types_from_msg(text, "tf2_msgs/msg/TFMessage"))
         self._running, self._end = running, end
+        # For sending alone: a thread may wait for messages as long as it likes.
+        limit = struct.pack("ll", int(_DEAF), int(_DEAF % 1 * 1e6))
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, limit)
         self._stream = processes.SocketStream(connection)
         self._sending = threading.Lock()
         self._numbers = itertools.count()
@@ -189,6 +195,8 @@ class Ros1:
         try:
             with self._sending:
                 processes.send(self._stream, header, data=data)
+        except BlockingIOError as error:
+            raise LinkError(f"ROS 1: adaptune's node has read nothing for {_DEAF:g} s") from error
         except (OSError, ValueError) as error:
             raise LinkError("ROS 1: adaptune's node has ended") from error
 

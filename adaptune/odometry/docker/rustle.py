@@ -367,41 +367,53 @@ class Lockstep(Faulting):
     def _correct(self) -> bool:
         """Correct the predicted pose; False if the system gave none."""
         found = self._pose(self.patience)
+        if found is not None and self._late is None and self._silent:
+            # It may be of an earlier scan; then others follow, though nothing more was sent.
+            time.sleep(self.patience)
+            found = self._pose(0.0)
         assert self._system is not None
         if self._n_answered or found is not None:
             self._n_shown += 1
         if found is None:
             self._silent += 1
-            try:
-                self._system.state()
-            except OdometryError as error:
-                if self._n_answered:
-                    raise
-                help_ = "if it knows no points but the bag's own, set odometry.settings.play: bag"
-                raise OdometryError(f"{error} before its first pose; {help_}") from error
-            if self._silent >= _MOST_SILENT:
-                published = self._system.link.topics().keys() - {"/clock", "/rosout", *self._topics}
-                raise OdometryError(
-                    f"no pose on {self._settings.odometry} for {_MOST_SILENT} scans in a row; "
-                    f"topics that are published: {', '.join(sorted(published)) or 'none'}"
-                )
-            self._check_answered()
+            self._check_silent(self._system)
             return False
         stamp, T_own = found
         self._silent, self._has_run = 0, True
         self._n_answered += 1
         if wrong := pose_fault(T_own):
             raise OdometryError(f"it gave a pose {wrong}")
-        T_own = T_own @ self._T_base_sensor
         if self._late is None:
             self._late = stamp - self._stamp
-        T_own = self._at_scan(stamp, T_own)
+        if abs(stamp - self._stamp - self._late) >= MAX_SCATTER:
+            self._steady = False
+            if silent := self._n_shown - self._n_answered:
+                raise OdometryError(
+                    f"{_OWN_CLOCK}, and {silent} scans had no pose after {self.patience:g} s, so a "
+                    f"late pose cannot be told from the next one; raise odometry.settings.patience "
+                    f"and isolation.seconds"
+                )
+        T_own = self._at_scan(stamp, T_own @ self._T_base_sensor)
         if self._T_odom_own is None:
             self._T_odom_own = self._T_odom_sensor @ invert(T_own)
         self._T_odom_sensor = self._T_odom_own @ T_own
         return True
 
-    def _check_answered(self) -> None:
+    def _check_silent(self, system: RosSystem) -> None:
+        """Raise an `OdometryError` where a scan without a pose is one too many."""
+        try:
+            system.state()
+        except OdometryError as error:
+            if self._n_answered:
+                raise
+            help_ = "if it knows no points but the bag's own, set odometry.settings.play: bag"
+            raise OdometryError(f"{error} before its first pose; {help_}") from error
+        if self._silent >= _MOST_SILENT:
+            published = system.link.topics().keys() - {"/clock", "/rosout", *self._topics}
+            raise OdometryError(
+                f"no pose on {self._settings.odometry} for {_MOST_SILENT} scans in a row; "
+                f"topics that are published: {', '.join(sorted(published)) or 'none'}"
+            )
         n, answered = self._n_shown, self._n_answered
         if n >= _MOST_SILENT and answered < _LEAST_ANSWERED * n:
             raise OdometryError(
@@ -413,7 +425,6 @@ class Lockstep(Faulting):
         """The pose at the scan's stamp, if the system gives that at the scan's end."""
         before, self._before = self._before, (stamp, T_own_sensor)
         # Stamps of a clock say nothing.
-        self._steady &= abs(stamp - self._stamp - (self._late or 0)) < MAX_SCATTER
         if before is None or not before[0] <= self._stamp < stamp or not self._steady:
             return T_own_sensor
         both = Trajectory(np.array([before[0], stamp]), np.stack([before[1], T_own_sensor]))

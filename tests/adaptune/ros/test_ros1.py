@@ -14,9 +14,11 @@ import numpy as np
 import pytest
 from needs import needs_ros1
 
+from adaptune import processes
 from adaptune.keeper import descendants
+from adaptune.ros import ros1
 from adaptune.ros.link import LinkError
-from adaptune.ros.ros1 import local_ros1, ros_python
+from adaptune.ros.ros1 import Ros1, local_ros1, ros_python
 from adaptune.trajectory import read_tum
 from offline.config import load_study
 from offline.train import train
@@ -147,6 +149,17 @@ def test_a_node_that_is_killed_is_noticed(link):
         other.topics()
     other.close()
     assert link.alive
+
+
+def test_a_node_that_reads_nothing_any_more_is_an_error(monkeypatch):
+    monkeypatch.setattr(ros1, "_DEAF", 0.2)
+    here, there = socket.socketpair()
+    processes.send(processes.SocketStream(there), {"type": "ready"})
+    link = Ros1(here, lambda: True, there.close)
+    publish = link.advertise("/points", "sensor_msgs/msg/PointCloud2")
+    with pytest.raises(LinkError, match=r"has read nothing for 0\.2 s"):
+        publish(local_link.cloud(0, np.zeros((1_000_000, 3), np.float32)))
+    link.close()
 
 
 def test_the_command_drives_until_ctrl_c(link, gicp_study_file, tmp_path):

@@ -128,6 +128,13 @@ def test_parameters_get_there_as_numbers_and_change_while_it_runs(make, systems,
         odometry.apply(Selection(0, {"max_correspondence_distance": 30.0}))
 
 
+def test_a_clock_s_stamps_do_not_say_which_scan_is_late(make):
+    odometry = make(imitate={"own_clock": 0.5}, settings={"patience": 0.3})
+    drive(odometry)
+    words = r"by its own clock, .*\d scans had no pose after 0\.3 s, .*; raise .*patience"
+    assert re.search(words, odometry.faults[0])
+
+
 def test_nobody_says_whether_a_node_without_reconfigure_reads_them_again(make, systems, caplog):
     odometry = make(imitate={"read_once": True, "jump": 11}, settings={"node": "/gicp"})
     odometry.start(scans()[0], np.eye(4))
