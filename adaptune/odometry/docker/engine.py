@@ -310,25 +310,16 @@ class Container:
         return Ended(0, 1e-9 * cpu, 1e-6 * held)
 
     def run(self, command: str, environment: Mapping[str, str] | None = None) -> str:
-        """Begin a command in a login shell; a name for `finished`."""
-        return self._exec(["/bin/bash", "-l", "-c", command], environment, detach=True)[0]
+        """Begin a command in a login shell; a name for `finished`.
 
-    def call(self, command: Sequence[str]) -> tuple[int, str]:
-        """Run a command; its exit code and what it wrote."""
-        name, output = self._exec(command, None, detach=False)
-        return int(engine().api.exec_inspect(name)["ExitCode"] or 0), output.decode(
-            errors="replace"
-        )
-
-    def _exec(
-        self, command: Sequence[str], environment: Mapping[str, str] | None, detach: bool
-    ) -> tuple[str, bytes]:
+        Nobody waits for what it writes: the engine may hold that open when it has ended.
+        """
         with _telling(self.image):
-            made = engine().api.exec_create(
-                self.id, list(command), environment=dict(environment or {})
-            )
-            output = engine().api.exec_start(made["Id"], detach=detach)
-        return made["Id"], b"" if detach else output
+            name: str = engine().api.exec_create(
+                self.id, ["/bin/bash", "-l", "-c", command], environment=dict(environment or {})
+            )["Id"]
+            engine().api.exec_start(name, detach=True)
+        return name
 
     def finished(self, name: str) -> int | None:
         """Exit code of a command that `run` began; None while it runs."""

@@ -243,8 +243,14 @@ class RosSystem:
         return self._clock
 
     def run(self, command: list[str]) -> tuple[int, str]:
-        """Run a command of the image; its exit code and what it wrote."""
-        return self._container.call(["/bin/bash", "-l", "-c", shlex.join(command)])
+        """Run a command of the image; its exit code and the last lines that it wrote."""
+        run = self._container.run(f"{shlex.join(command)} > {_FOLDER}/run.log 2>&1")
+        end = time.monotonic() + self._settings.ready
+        while (code := self._container.finished(run)) is None:
+            if time.monotonic() > end:
+                raise OdometryError(f"{command[0]} did not end in {self._settings.ready:g} s")
+            time.sleep(_TICK)
+        return code, self._last_lines("run.log")
 
     def words(self) -> str:
         """The last lines that the system wrote."""

