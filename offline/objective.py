@@ -174,11 +174,13 @@ def margin(repeats: NDArray[np.float64]) -> NDArray[np.float64]:
     """From a mean over sequences to the upper end of its one-sided 95 % confidence interval.
 
     The interval is Student's. Runs of a set vary, the sequences do not. `repeats` has the shape
-    (..., n_sequences, n_repeats).
+    (..., n_sequences, n_repeats). A single run does not show how they vary: then it is 0.
     """
     from scipy import stats
 
     n_sequences, n_repeats = repeats.shape[-2:]
+    if n_repeats < 2:
+        return np.zeros(repeats.shape[:-2])
     variance = repeats.var(axis=-1, ddof=1).sum(axis=-1)
     error = np.sqrt(variance / n_repeats) / n_sequences
     return np.asarray(stats.t.ppf(0.95, n_sequences * (n_repeats - 1)) * error)
