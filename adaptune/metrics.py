@@ -231,7 +231,8 @@ def lost_in_words(
     if not (mean := sum(errors.values()) / len(errors)) > LOST_ABOVE:
         return []
     where = ", ".join(name for name, error in errors.items() if error > LOST_ABOVE)
-    lost = f"Even {best} does not track on {where}: {mean:.1f} % is more than {LOST_ABOVE:g} %. "
+    over = f"{mean:.1f} % is more than {LOST_ABOVE:g} %"
+    lost = f"Even with {best} track is lost on {where}: {over}. "
     if cause := find_cause():
         return [
             f"{lost}The likeliest cause: {cause}. Drive slower or record more scans a second, or "

@@ -308,7 +308,7 @@ def test_of_many_files_some_are_listed(tmp_path):
 def test_where_every_set_is_lost_it_is_said_first(make):
     said = train(make("jump", "offline.trials=2")).words
     assert said[0].startswith(
-        "Even the fixed set, the best of 2 parameter sets, does not track on one: "
+        "Even with the fixed set, the best of 2 parameter sets, track is lost on one: "
     )
     assert "compare with `gicp`" in said[0]
 
