@@ -318,10 +318,11 @@ def _why_not(
     if ratio.value <= 1.0 - worth:
         more = "drive more test recordings, or longer ones, to know"
         return [f"Adapting had {has}, which may be chance: {more}."]
-    surely = ratio.interval is not None and ratio.interval[0] > 1.0
-    what = "did worse" if surely else "did no better"
     if ratio.value <= 1.0:
         what = "is not worth its cost"
+    else:
+        surely = ratio.interval is not None and ratio.interval[0] > 1.0
+        what = "did worse" if surely else "did no better"
     return [f"Adapting {what} {_where(rows)}: {has}."]
 
 
