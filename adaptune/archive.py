@@ -558,7 +558,7 @@ _HEADINGS = {
     "rpe": "RPE [m]",
     "ape": "APE [m]",
     "kitti": "KITTI [%]",
-    "ms_per_scan": "ms a scan",
+    "ms_per_scan": "odometry [ms]",
     "cpu": "cpu [%]",
     "memory": "memory [MB]",
     "cost": "cost [ms]",

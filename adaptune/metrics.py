@@ -221,22 +221,22 @@ def lost_in_words(
     best: str,
     errors: Mapping[str, float],
     odometry: str,
-    find_cause: Callable[[], str] = lambda: "",
+    find_cause: Callable[[str], str],
 ) -> list[str]:
     """A sentence where even the best does not track: the likeliest cause, and what to try.
 
     `errors` has by sequence the mean error of the best, in percent. Where it does not track,
-    `find_cause` says what is known of the cause.
+    `find_cause` says what is known of the cause on the worst sequence.
     """
     if not (mean := sum(errors.values()) / len(errors)) > LOST_ABOVE:
         return []
     where = ", ".join(name for name, error in errors.items() if error > LOST_ABOVE)
     over = f"{mean:.1f} % is more than {LOST_ABOVE:g} %"
     lost = f"Even with {best} track is lost on {where}: {over}. "
-    if cause := find_cause():
+    if cause := find_cause(max(errors, key=lambda name: errors[name])):
         return [
-            f"{lost}The likeliest cause: {cause}. Drive slower or record more scans a second, or "
-            f"try an odometry that uses an IMU (`rko_lio`)."
+            f"{lost}The likeliest cause: {cause}. Drive slower, record more scans a second, or, "
+            f"where there is an IMU, try `rko_lio`."
         ]
     return [
         f"{lost}The likeliest cause is none of the tuned parameters: the odometry does not suit "

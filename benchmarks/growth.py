@@ -3,11 +3,11 @@
     python benchmarks/growth.py length [SCANS ...] [--points 30000] [--folder SCRATCH]
     python benchmarks/growth.py members [SCANS]
 
-*length* writes bags of random clouds (1000, 4000 and 20,000 SCANS) with a slow reference to a
-scratch folder, 0.7 MB a scan, and runs a campaign of two trials of GICP on two workers over each:
-once, which decodes the bag into the cache, too. It prints the time, the memory of all processes
-without the pages of the cache (limit 4 GB), the disk that the cache takes, and how the time of a
-scan grows from the shortest bag to the longest (limit 1.2).
+*length* writes bags (1000, 4000 and 20,000 SCANS of as many points) of a robot that drives up and
+down a simulated street to a scratch folder, 0.7 MB a scan, and runs a campaign of two trials of
+GICP on two workers over each: once, which decodes the bag into the cache, too. It prints the time,
+the memory of all processes without the pages of the cache (limit 4 GB), the disk that the cache
+takes, and how the time of a scan grows from the shortest bag to the longest (limit 1.2).
 
 *members* drives banks of 1, 2, 4 and 6 GICP with the same preparation along a simulated street of
 so many SCANS (200), on one core, and prints CPU time a scan, over that of one instance.
@@ -24,7 +24,7 @@ from itertools import islice
 from pathlib import Path
 
 import numpy as np
-from reading import write
+from reading import cloud, write
 
 from adaptune import files, processes
 from adaptune.bank.bank import Bank
@@ -36,8 +36,8 @@ from adaptune.simulation.record import simulate
 from adaptune.trajectory import Trajectory, write_tum
 from online.replay import replay
 
-STEP = 0.02
-"""Metres from scan to scan: nothing moves in the clouds, and the reference hardly does."""
+TURN = 200
+"""Scans after which the robot goes back."""
 
 
 def private(root: int) -> float:
@@ -63,16 +63,21 @@ def private(root: int) -> float:
 
 def campaign(folder: Path, scans: int, points: int) -> float:
     """Run one over a bag of so many scans, and return its seconds a scan."""
-    write(folder / "drive.bag", scans, points=points)
-    poses = np.tile(np.eye(4), (scans, 1, 1))
-    poses[:, 0, 3] = STEP * np.arange(scans)
+    street = list(islice(simulate(Course(scenes=("street",), length=300.0, seed=1)), TURN))
+    street += street[-2:0:-1]
+    rng, clouds = np.random.default_rng(0), []
+    for scan in street:
+        xyz = rng.choice(scan.points, points) + rng.normal(0, 0.01, (points, 3))
+        clouds.append(cloud(rng, 0, points, xyz))
+    write(folder / "drive.bag", scans, clouds=clouds)
+    poses = np.array([street[i % len(street)].T_world_sensor for i in range(scans)])
     stamps = 10**18 + np.arange(scans) * 10**8
     write_tum(folder / "truth.tum", Trajectory(stamps, poses))
     study = {
         "odometry": {"name": "gicp"},
         "sequences": {"drive": {"bag": "drive.bag", "reference": "truth.tum"}},
         "training": ["drive"],
-        "sub_trajectory": 10 * STEP,
+        "sub_trajectory": 5.0,
         "offline": {"trials": 2, "initial": 2, "batch": 2, "workers": 2},
     }
     (folder / "study.yaml").write_text(files.dump(study))
@@ -100,6 +105,8 @@ def campaign(folder: Path, scans: int, points: int) -> float:
 def length(sizes: list[int], points: int, scratch: Path | None) -> None:
     """Print what campaigns take over recordings of several lengths."""
     found = []
+    if scratch is not None:
+        scratch.mkdir(parents=True, exist_ok=True)
     for scans in sizes:
         with tempfile.TemporaryDirectory(dir=scratch) as folder:
             found.append(campaign(Path(folder), scans, points))

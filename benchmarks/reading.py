@@ -12,11 +12,12 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag1 import Writer
 from rosbags.typesys import Stores, get_typestore
@@ -40,8 +41,10 @@ STORE = get_typestore(Stores.ROS1_NOETIC)
 KIND = "sensor_msgs/msg/PointCloud2"
 
 
-def cloud(rng: np.random.Generator, stamp: int, points: int = POINTS) -> Any:
-    """One turn of a VLP-16, as its driver publishes it."""
+def cloud(
+    rng: np.random.Generator, stamp: int, points: int = POINTS, xyz: NDArray[Any] | None = None
+) -> Any:
+    """One turn of a VLP-16, as its driver publishes it: of noise, unless it is given."""
     names = [name for name, _, _ in FIELDS]
     formats = [{7: "<f4", 4: "<u2"}[kind] for _, _, kind in FIELDS]
     offsets = [offset for _, offset, _ in FIELDS]
@@ -49,8 +52,9 @@ def cloud(rng: np.random.Generator, stamp: int, points: int = POINTS) -> Any:
         points,
         np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": STEP}),
     )
-    for axis in "xyz":
-        raw[axis] = rng.normal(0, 10, points).round(3)
+    given = rng.normal(0, 10, (points, 3)).round(3) if xyz is None else xyz
+    for axis, column in zip("xyz", given.T, strict=True):
+        raw[axis] = column
     raw["ring"] = np.arange(points) % 16
     raw["time"] = np.linspace(0, 0.1, points)
     types = STORE.types
@@ -172,10 +176,17 @@ def streaming(path: Path, gigabytes: float) -> None:
     )
 
 
-def write(path: Path, scans: int, compression: str | None = None, points: int = POINTS) -> None:
-    """Write a bag of so many scans."""
+def write(
+    path: Path,
+    scans: int,
+    compression: str | None = None,
+    points: int = POINTS,
+    clouds: Sequence[Any] = (),
+) -> None:
+    """Write a bag of so many scans: of noise, or of clouds that come again and again."""
     rng = np.random.default_rng(0)
-    kinds = [STORE.serialize_ros1(cloud(rng, 0, points), KIND) for _ in range(8)]
+    clouds = clouds or [cloud(rng, 0, points) for _ in range(8)]
+    kinds = [STORE.serialize_ros1(each, KIND) for each in clouds]
     writer = Writer(path)
     if compression:
         writer.set_compression(Writer.CompressionFormat[compression])

@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune import files
 from adaptune.archive import OF_SLOT, Archive, Summary
 from adaptune.errors import AdaptuneError
 from adaptune.recording.scan import OF_VIEW
@@ -94,9 +93,7 @@ def read_trials(study: OfflineStudy) -> TrialTable:
     """Read the finished trials of a study on its training sequences; there may be none."""
     archive = Archive(study.folder / "trials")
     finished = {name: archive.finished(name) for name in study.training}
-    path = study.folder / "fixed.yaml"  # which the offline stage writes at its end
-    fixed = files.Document.of_file(path).data if path.exists() else None
-    return trial_table(study.config.offline, study.odometry.space, finished, fixed)
+    return trial_table(study.config.offline, study.odometry.space, finished, study.fixed)
 
 
 def trial_table(

@@ -23,6 +23,7 @@ from adaptune.processes import available
 from adaptune.progress import Progress, unseen
 from adaptune.recording.config import NO_REFERENCE
 from adaptune.recording.scan import origin
+from adaptune.reference.check import hard_to_track
 from adaptune.report import tables
 from adaptune.space import ParameterSet, ParameterSets, ParameterSpace, in_words
 from adaptune.study.config import SwitchingConfig
@@ -32,7 +33,14 @@ from adaptune.study.references import (
     estimates_in_words,
     estimates_of,
 )
-from adaptune.study.study import BANK, ONE_SET, OracleErrors, expected_in_words, oracle_errors
+from adaptune.study.study import (
+    BANK,
+    FIXED_SET,
+    ONE_SET,
+    OracleErrors,
+    expected_in_words,
+    oracle_errors,
+)
 from offline.campaign import (
     Campaign,
     WholeRuns,
@@ -89,18 +97,15 @@ class Training(NamedTuple):
             for mode in ("baseline", "fixed")
         )
         sets, fixed, costs, n = self.model.sets, self.model.fixed, self.model.costs, len(self.rows)
-        errors = {row["sequence"]: row["fixed, whole run"] for row in self.rows}
-        best = f"the fixed set, the best of {len(self.trials)} parameter sets,"
-        said = [*lost_in_words(best, errors, self.model.odometry["name"]), *self.said]
         baseline = f"Parameters of the baseline: {in_words(sets.space.baseline)}"
         where = f"in whole runs in training ({n} sequence{'s' if n > 1 else ''})"
         if fixed == 0:
             beaten = f"No set clearly beat the baseline's {own:.3f} % {where}"
-            return [*said, f"{beaten}; the fixed set is the baseline.", baseline]
+            return [*self.said, f"{beaten}; the fixed set is the baseline.", baseline]
         ms = np.nan if costs is None else costs.alone(fixed)
         cost = f"; it costs {ms:.1f} ms of CPU time a scan" if np.isfinite(ms) else ""
         return [
-            *said,
+            *self.said,
             f"Fixed: {of_fixed:.3f} % against the baseline's {own:.3f} % {where}.",
             f"Parameters of the fixed set: {in_words(sets[fixed])}{cost}",
             baseline,
@@ -155,7 +160,13 @@ def train(study: OfflineStudy, progress: Progress = unseen, cluster: str | None 
     errors = {name: stored.error(model.length) for name, stored in estimates.items()}
     rows = _training_rows(config, verdicts, finished, fixed, whole, errors, space)
     tables.write_rows(study.folder, "training", rows)
-    said = beyond if before is None else [*beyond, *changes(before, model)]
+    said = lost_in_words(
+        f"the fixed set, the best of {len(trials)} parameter sets,",
+        {row["sequence"]: row["fixed, whole run"] for row in rows},
+        study.odometry.name,
+        lambda worst: hard_to_track(study.sequences.open(worst)),
+    )
+    said += beyond if before is None else [*beyond, *changes(before, model)]
     said += [*estimates_in_words(estimates, model.length, intervals=True)]
     said += failed_in_words(verdicts)
     said += baseline_words(config, [runs[0] for runs in finished.values()])
@@ -193,7 +204,7 @@ def write_fixed(study: OfflineStudy, fixed: ParameterSet) -> None:
     for path in study.folder.glob("fixed_*"):
         if path.stem in ours and (own is None or path != own[0]):
             path.unlink()
-    write_text(study.folder / "fixed.yaml", files.dump(fixed))
+    write_text(study.folder / FIXED_SET, files.dump(fixed))
     if own is not None:
         write_text(own[0], own[1].text)
 

@@ -403,7 +403,7 @@ def _rows(validation: Validation) -> list[dict[str, Any]]:
         add(sequence.name, fixed.mean(), of, intervals and intervals[1])
     costs = {mode: validation.cost(mode) for mode in ["fixed", *modes]}
     if np.isfinite(list(costs.values())).any():
-        add("ms a scan", costs["fixed"], costs)
+        add("cost [ms]", costs["fixed"], costs)
     summaries = {mode: validation.summary(mode) for mode in modes}
     for key in ("geometric", "arithmetic", "worst_tenth", "worst"):
         ends = summaries[default]["low"], summaries[default]["high"]

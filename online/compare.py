@@ -452,12 +452,11 @@ def _lost(study: Study, judged: Sequence[JudgedModes], best: str) -> list[str]:
     """A sentence where even the best mode has lost its way."""
     every = [row for one in judged for row in one.rows if row.mode == best]
     errors = {row.sequence: row.rte for row in every if row.rte is not None}
-    worst = max(errors, key=lambda name: errors[name])
     return lost_in_words(
         CALLED[best],
         errors,
         study.odometry.name,
-        lambda: hard_to_track(study.sequences.open(worst)),
+        lambda worst: hard_to_track(study.sequences.open(worst)),
     )
 
 

@@ -139,7 +139,7 @@ class ComparisonRow:
             LOST: self.lost_seconds,
             "restarts": self.restarts,
             "switches": self.switches,
-            "ms a scan": self.cpu_ms,
+            "cost [ms]": self.cpu_ms,
             "cores": self.cores,
             "memory [MB]": self.memory_mb,
             REFERENCE: self.reference,

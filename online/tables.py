@@ -33,7 +33,7 @@ def tables(rows: Sequence[ComparisonRow], length: float) -> list[Listing]:
     return made if standard is None else [*made, standard]
 
 
-_DECIDES = ("mode", "RTE [%]", "95 %", "worst tenth", "restarts", "ms a scan")
+_DECIDES = ("mode", "RTE [%]", "95 %", "worst tenth", "restarts", "cost [ms]")
 
 
 def decision_table(rows: Sequence[ComparisonRow], length: float) -> Listing:

@@ -55,11 +55,14 @@ def _main(
     from rich.logging import RichHandler
 
     plain: Any = {"markup": False, "highlighter": NullHighlighter(), "keywords": []}
+    # Of rich, each line is as wide as the terminal.
+    bars = errors.is_terminal
+    rich = RichHandler(console=errors, show_path=False, show_level=False, **plain)
     logging.basicConfig(
         level=logging.DEBUG if verbose else logging.INFO,
-        format="%(message)s",
+        format="%(message)s" if bars else "%(asctime)s %(message)s",
         datefmt="[%X]",
-        handlers=[RichHandler(console=errors, show_path=False, show_level=False, **plain)],
+        handlers=[rich if bars else logging.StreamHandler()],
     )
     for chatty in ("numba", "asyncio"):
         logging.getLogger(chatty).setLevel(logging.WARNING)

@@ -323,11 +323,11 @@ def _comparison(
 
     title = "What adapting gained"
     if isinstance(found, str):
-        return PageSection(title, missing=(found,))
+        return PageSection(title, notes=(found,))
     made = *tables(found.rows, length), modes_in_words(found.rows)
     charts = partial(charts_of_comparison, found.rows, read)
     section = _of_charts(title, charts)
-    return replace(section, missing=(*section.missing, *found.details), tables=made)
+    return replace(section, notes=(*section.notes, *found.details), tables=made)
 
 
 def _search(study: "OfflineStudy") -> "PageSection":
@@ -340,7 +340,7 @@ def _search(study: "OfflineStudy") -> "PageSection":
     try:
         finished = archive.rows(Archive(study.folder / "trials"), study.training)
     except AdaptuneError as error:
-        return replace(section, missing=(*section.missing, f"{error}."))
+        return replace(section, notes=(*section.notes, f"{error}."))
     if not finished:
         return section
     best = archive.select([row for row in finished if row["mean"] is not None], "mean", _BEST)
@@ -372,8 +372,8 @@ def _of_charts(title: str, make: "Callable[[], Charts]") -> "PageSection":
     try:
         charts, notes = make()
     except AdaptuneError as error:
-        return PageSection(title, missing=(f"{error}.",))
-    return PageSection(title, missing=tuple(notes), charts=tuple(charts))
+        return PageSection(title, notes=(f"{error}.",))
+    return PageSection(title, notes=tuple(notes), charts=tuple(charts))
 
 
 def _compare_several(

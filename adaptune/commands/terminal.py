@@ -130,15 +130,15 @@ def _time_left(task: "Task") -> str:
 
 def say_fixed(study: "OfflineStudy", advised: bool = True) -> None:
     """Say where the fixed set is, and where it is as the odometry's own tool reads it."""
-    from adaptune.files import Document
+    from adaptune.study.study import FIXED_SET
 
-    path = study.folder / "fixed.yaml"
-    fixed = Document.of_file(path).data if path.exists() else None
+    fixed = study.fixed
     own = None if fixed is None else study.own_file(fixed)
     there = own is not None and own[0].exists()
     more = f"; for the odometry's own tool: {own[0]} ({own[1].use})" if own and there else ""
+    advised = advised or fixed == study.odometry.space.baseline
     what = "The parameters" if advised else "The fixed set, which is not advised here"
-    say(f"{what}: {path}{more}.")
+    say(f"{what}: {study.folder / FIXED_SET}{more}.")
 
 
 # The command to run next, which every command names at its end.

@@ -73,7 +73,7 @@ def inspect(
 
     with progress() as show:
         found = inspect_file(file, deep, show)
-        length, accuracy = _sub_trajectory(found, deep, show)
+        share, length, accuracy = _proposed(found, deep, show)
     console.print(render_inspection(found, accuracy), crop=False)
     if not found.name:
         return
@@ -83,7 +83,7 @@ def inspect(
             "serve, write `reference: estimated`"
         )
         return
-    rest = roles([found.name], length, ["gicp"])
+    rest = roles([found.name], length, ["gicp"], share)
     say(rest)
     path = study or Path(f"{found.name}.yaml")
     first = "" if study else f"put the lines from `sequences:` on in {path}; then "
@@ -129,35 +129,45 @@ def _show_model(file: Path) -> None:
         say_next(why, "online", study, "--folder", file.parent, *other)
 
 
-def _sub_trajectory(found: "Inspection", deep: bool, show: Progress) -> tuple[str, str]:
-    """The length of sub-trajectories to propose, and how wrong the reference is, if it is measured.
+def _proposed(found: "Inspection", deep: bool, show: Progress) -> tuple[float | None, str, str]:
+    """The split to propose, the length of sub-trajectories, and how wrong the reference is.
 
     Only what can be used to train is measured. What the scans say against it joins the faults.
     """
+    if found.name:
+        _undo_motion([found], ["gicp"])
     if found.reference is None or not found.name or found.missing.get("offline"):
-        return UNKNOWN_LENGTH, ""
+        return None, UNKNOWN_LENGTH, ""
     from adaptune.recording.inspect import Fault
     from adaptune.recording.recording import open_sequence
     from adaptune.reference import check
     from adaptune.reference.check import diagnose_reference, measured_motions
 
-    usual = check.proposed_sub_trajectory(found.reference)
+    share = _share(found.reference)
+    usual = check.proposed_sub_trajectory(found.reference, training=share)
     if not deep:
-        return str(usual), "`--deep` also measures how wrong it is"
+        return share, str(usual), "`--deep` also measures how wrong it is"
     try:
         scans = open_sequence(found.config())
         if (reference := scans.reference()) is None:
-            return str(usual), ""
+            return share, str(usual), ""
         measured = check.measure_reference(scans, reference, partial(show, "registering"))
         motions = measured_motions(scans, len(measured.stamps))
         if (cause := diagnose_reference(reference, measured.stamps, motions)) is not None:
             what = f"the reference contradicts the scans: {cause}"
             found.faults.append(Fault(what, "reference"))
     except AdaptuneError as error:
-        return str(usual), f"its error cannot be measured: {error}"
-    length = check.proposed_sub_trajectory(reference, measured)
+        return share, str(usual), f"its error cannot be measured: {error}"
+    length = check.proposed_sub_trajectory(reference, measured, share)
     words = check.accuracy_words(measured, usual, length), check.advice(measured, reference)
-    return str(length), "; ".join(filter(None, words))
+    return share, str(length), "; ".join(filter(None, words))
+
+
+def _undo_motion(recordings: Sequence["Inspection"], odometries: Sequence[str]) -> None:
+    """Propose to undo the motion within scans for odometries that do not do so themselves."""
+    for one in recordings if set(odometries) <= DISTORTED else ():
+        if one.scan is not None and one.scan.times is not None and one.scan.times.any():
+            one.given["compensate"] = "constant_velocity"
 
 
 # A study of recordings, and nothing else: what it says beside their names.
@@ -346,10 +356,7 @@ def _decided(
         names = chain([one.name], (f"{one.name}_{i}" for i in count(2)))
         named[next(name for name in names if name not in named)] = one
     odometries = odometries_of(odometry, all("imu" in one.given for one in found))
-    if set(odometries) <= DISTORTED:
-        for one in found:
-            if one.scan is not None and one.scan.times is not None and one.scan.times.any():
-                one.given["compensate"] = "constant_velocity"
+    _undo_motion(found, odometries)
     trials, minutes = budget
     if trials is None and minutes is None:
         trials = max(TRIALS, EACH * len(odometries))
@@ -510,7 +517,7 @@ def say_odometries(study: "OfflineStudy", training: "Training") -> None:
                 "odometry": label,
                 "its own parameters [%]": mine[0]["mean"] if mine else None,
                 "tuned [%]": None if best is None else best["mean"],
-                "ms a scan": None if best is None else best[COST],
+                COST: None if best is None else best[COST],
             }
         )
     rows.sort(key=lambda row: row["tuned [%]"] if row["tuned [%]"] is not None else float("inf"))

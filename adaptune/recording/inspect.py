@@ -476,6 +476,7 @@ def _describe(found: Inspection, message: Any) -> None:
 
 _FASTEST = 100.0  # metres per second
 _STILL = 0.01  # metres
+_MISSED = 0.01  # of the messages of a topic: fewer are not told
 _SUB_TRAJECTORY = 25.0  # metres, where a study sets no other
 
 _UNDECODED = {
@@ -577,11 +578,13 @@ def _stamp_faults(topic: Topic, of: str) -> Iterator[Fault]:
 def _count_faults(topic: Topic, of: str) -> Iterator[Fault]:
     """Messages that are missing outside the sample, by their number in the whole recording."""
     usual = np.median(topic.steps) if len(topic.steps) else np.inf
+    steps = topic.steps[np.abs(topic.steps - usual) < 0.2 * usual]
     # Only what comes regularly has a number to expect.
-    if len(topic.steps) < 5 or np.mean(np.abs(topic.steps - usual) < 0.2 * usual) < 0.9:
+    if len(topic.steps) < 5 or len(steps) < 0.9 * len(topic.steps):
         return
-    expected = 1 + round(int(np.ptp(topic.times)) * 1e-9 / float(usual))
-    if topic.count < 0.9 * expected:
+    expected = 1 + round(int(np.ptp(topic.times)) * 1e-9 / float(steps.mean()))
+    doubt = max(_MISSED, 3.0 * float(steps.std() / steps.mean()) / len(steps) ** 0.5)
+    if topic.count < (1.0 - doubt) * expected:
         what = f"about {expected - topic.count:,} of {expected:,} messages are missing"
         help_ = "gaps that the sample does not show, `--deep` finds them"
         yield Fault(f"{topic.name}: {what}: {help_}", of)

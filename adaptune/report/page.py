@@ -23,7 +23,7 @@ class PageSection:
     """A heading, and what is below it in this order."""
 
     title: str
-    missing: tuple[str, ...] = ()  # what is not there, and why
+    notes: tuple[str, ...] = ()  # what must be known, and what is not there and why
     charts: tuple[Chart, ...] = ()
     tables: tuple[Listing, ...] = ()
 

@@ -219,6 +219,8 @@ CONFIGURATION = "study.yaml"
 """The resolved configuration."""
 MODEL = "model.safetensors"
 """The error model."""
+FIXED_SET = "fixed.yaml"
+"""The fixed set."""
 
 WINDOW = 3.0
 """Seconds over which a selector averages descriptors."""
@@ -290,6 +292,12 @@ class Study(Generic[C_co]):
             self.config.isolation,
             self.sequences.program_input if described.whole else None,
         )
+
+    @property
+    def fixed(self) -> ParameterSet | None:
+        """The fixed set, once training has chosen it."""
+        path = self.folder / FIXED_SET
+        return files.Document.of_file(path).data if path.exists() else None
 
     def own_file(self, fixed: ParameterSet) -> tuple[Path, OwnFile] | None:
         """The fixed set as its odometry's own tool reads it, and where; None if it has none."""

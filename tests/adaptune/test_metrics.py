@@ -177,10 +177,16 @@ def test_bootstrap_of_a_ratio_is_paired():
 
 
 def test_a_large_error_has_words():
-    assert lost_in_words("the best", {"one": 5.0}, "ndt") == []
-    assert lost_in_words("the best", {"one": math.nan}, "ndt") == []
-    (said,) = lost_in_words("the best", {"one": 1.0, "two": 10.0}, "ndt")
-    assert said.startswith("Even with the best track is lost on two: 5.5 % is more than 5 %. ")
-    assert "compare with `gicp`" in said
-    (said,) = lost_in_words("the best", {"one": 9.0}, "gicp")
-    assert "compare with `kiss_icp`" in said
+    def said(errors, odometry="ndt", **causes):
+        return lost_in_words("the best", errors, odometry, lambda worst: causes.get(worst, ""))
+
+    assert said({"one": 5.0}) == []
+    assert said({"one": math.nan}) == []
+    (words,) = said({"one": 1.0, "two": 10.0})
+    assert words.startswith("Even with the best track is lost on two: 5.5 % is more than 5 %. ")
+    assert "compare with `gicp`" in words
+    (words,) = said({"one": 9.0}, "gicp")
+    assert "compare with `kiss_icp`" in words
+    # The worst sequence tells.
+    (words,) = said({"one": 1.0, "two": 10.0}, two="night")
+    assert "The likeliest cause: night." in words

@@ -123,7 +123,7 @@ def test_validates_a_study(study_file, trained_folder, tmp_path, caplog):
     assert verdicts[0] == driven(
         ErrorModel.load(study.model_path), study.config.online, study.odometry, study.mechanism
     )
-    ends = ["ms a scan", "geometric", "arithmetic", "worst tenth", "worst"]
+    ends = ["cost [ms]", "geometric", "arithmetic", "worst tenth", "worst"]
     assert [row["left out"] for row in rows] == ["one", "two", *ends]
     assert rows[0]["adaptive"] == pytest.approx(validation.ratios["adaptive"][0])
     # Four sub-trajectories tell nothing; a dozen would.

@@ -23,8 +23,8 @@ def write(study, label, **parameters):
     assert files.Document.of_file(study.folder / "fixed.yaml").data == fixed
 
 
-def said(study, capsys):
-    terminal.say_fixed(study)
+def said(study, capsys, **options):
+    terminal.say_fixed(study, **options)
     (line,) = capsys.readouterr().out.splitlines()
     return line
 
@@ -41,6 +41,9 @@ def test_the_fixed_set_s_odometry_decides(study, capsys):
     own.unlink()
     assert said(study, capsys) == f"{alone}."
     write(study, "kiss_icp")
+    assert "which is not advised here" in said(study, capsys, advised=False)
     write(study, "gicp")
+    # It is the baseline.
+    assert said(study, capsys, advised=False) == f"{alone}."
     assert sorted(study.folder.glob("fixed*")) == [study.folder / "fixed.yaml", users]
     assert said(study, capsys) == f"{alone}."

@@ -81,7 +81,7 @@ def test_the_model_knows_what_its_sets_cost(trained):
 def test_it_is_validated_against_its_rivals(trained):
     study, _ = trained
     found = validate(study)
-    (last,) = [row for row in found.rows if row["left out"] == "ms a scan"]
+    (last,) = [row for row in found.rows if row["left out"] == "cost [ms]"]
     assert last["adaptive"] > 0.0
     assert BEST_DEFAULT in last
     assert EQUAL_COST in last

@@ -114,9 +114,9 @@ def test_all_sequences_have_mean_errors_and_kittis_over_all_sub_trajectories():
 
 def test_what_a_mode_costs_is_in_its_columns():
     cells = replace(row("a", None), cpu_ms=12.5, cores=0.125, memory_mb=300.0).columns()
-    assert (cells["ms a scan"], cells["cores"], cells["memory [MB]"]) == (12.5, 0.125, 300.0)
+    assert (cells["cost [ms]"], cells["cores"], cells["memory [MB]"]) == (12.5, 0.125, 300.0)
     old = row("a", None).columns()
-    assert old["ms a scan"] is old["cores"] is old["memory [MB]"] is None
+    assert old["cost [ms]"] is old["cores"] is old["memory [MB]"] is None
     costs = [(10.0, 0.1, 200.0), (20.0, 0.3, 400.0)]
     rows = [
         replace(row(name, None), cpu_ms=ms, cores=cores, memory_mb=mb)

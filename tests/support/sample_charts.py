@@ -137,7 +137,7 @@ def sample_page() -> Page:
             PageSection("Trials", charts=(trials(), from_above())),
             PageSection(
                 "What is missing",
-                missing=("drive_7 has no reference.",),
+                notes=("drive_7 has no reference.",),
                 charts=(empty(),),
                 tables=(Listing("Costs", []),),
             ),

@@ -153,6 +153,11 @@ def test_a_recording_that_stands_for_long_is_split_by_its_path(tmp_path, monkeyp
     study = load_study(tmp_path / "runs/late/late.yaml", [], tmp_path / "other")
     # It stands for 9 s of 15; 60 % of the way are over after 12.5 s.
     assert study.config.test == ("late_84-100",)
+    # `inspect` proposes the same.
+    commands.succeeded("inspect", "late.bag", "--study", "proposed.yaml")
+    proposed = load_study(tmp_path / "proposed.yaml", [], tmp_path / "another")
+    for key in ("test", "sub_trajectory", "sequences"):
+        assert getattr(proposed.config, key) == getattr(study.config, key), key
 
 
 @pytest.mark.usefixtures("decided")

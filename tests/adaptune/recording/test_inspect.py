@@ -330,6 +330,14 @@ def test_a_sound_bag_is_sound_in_a_sample(tmp_path, every):
 
 
 @pytest.mark.usefixtures("sampled")
+def test_messages_that_come_a_little_early_or_late_are_not_missing(tmp_path):
+    for seed in range(10):
+        late = np.random.default_rng(seed).uniform(0.0, 0.015, 400)
+        stamps = (0.1 * np.arange(400) + late).tolist()
+        assert texts(inspect(long_drive(tmp_path / f"{seed}.bag", stamps=stamps))) == []
+
+
+@pytest.mark.usefixtures("sampled")
 def test_deep_reads_all_and_shows_how_far_it_is(tmp_path):
     shown = []
     bag = long_drive(tmp_path / "a.bag")
@@ -352,6 +360,10 @@ def test_deep_reads_all_and_shows_how_far_it_is(tmp_path):
         (
             {"stamps": [0.1 * i for i in (*range(100), *range(300, 400))]},
             "/points: about 200 of 400 messages are missing",
+        ),
+        (
+            {"stamps": [0.1 * i for i in (*range(203), *range(209, 400))]},
+            "/points: about 6 of 400 messages are missing",
         ),
     ],
 )
