@@ -392,7 +392,7 @@ def compare(study: Study) -> ComparedReplays:
     ----------
     study
         The study; ``comparison`` in its folder receives ``comparison.csv`` and ``.json``, and
-        the tables as Markdown (``tables.md``) and LaTeX (``tables.tex``).
+        the tables as Markdown (``tables.md``).
 
     Raises
     ------

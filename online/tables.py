@@ -1,4 +1,4 @@
-"""Tables of a comparison, for the terminal, Markdown and LaTeX."""
+"""Tables of a comparison, for the terminal and Markdown."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -13,12 +13,9 @@ from online.statistics import (
     ORACLE,
     ComparisonRow,
     Ratio,
-    mean_of,
 )
 
 _COUNTS = ("restarts", "switches")
-_ERRORS = ("RTE [%]", "APE [m]", "RPE [m]", "height [%]", "KITTI [%]", "[deg/100 m]")
-"""Columns of which the least is the best."""
 
 
 def tables(rows: Sequence[ComparisonRow], length: float) -> list[Listing]:
@@ -65,48 +62,6 @@ def modes_in_words(rows: Sequence[ComparisonRow]) -> Listing:
     return Listing("What the modes are", cells)
 
 
-def side_by_side(studies: Mapping[str, Sequence[ComparisonRow]]) -> list[Listing]:
-    """Errors of several studies on each sequence, and over all, as in the paper's Table II.
-
-    Sub-trajectories of all have the same length.
-    """
-    found = {
-        (name, row.sequence, row.mode): row.rte for name, rows in studies.items() for row in rows
-    }
-    modes = {
-        name: [m for m in dict.fromkeys(row.mode for row in rows) if m != ORACLE]
-        for name, rows in studies.items()
-    }
-    of_study = [{row.sequence for row in rows} - {ALL} for rows in studies.values()]
-    every = [row.sequence for rows in studies.values() for row in rows if row.sequence != ALL]
-    common = [name for name in dict.fromkeys(every) if all(name in of for of in of_study)]
-
-    def line(label: str, sequences: Sequence[str]) -> dict[str, Any]:
-        cells: dict[str, Any] = {"sequence": label}
-        for name in studies:
-            for mode in modes[name]:
-                errors = [found.get((name, sequence, mode)) for sequence in sequences]
-                cells[f"{name}: {mode}"] = mean_of(errors)
-        return cells
-
-    of_sequences = [line(name, [name]) for name in dict.fromkeys(every)]
-    caption = ""
-    if len(common) > 1:
-        of_sequences.append(line("average", common))
-        n = len(of_sequences) - 1 - len(common)
-        caption = f"Average: over the {len(common)} sequences that all studies have." if n else ""
-    changes = [
-        {"study": name, **_change(row, rows)}
-        for name, rows in studies.items()
-        for row in _last(rows)
-        if row.standard is not None and any(of.mode == "baseline" for of in rows)
-    ]
-    return [
-        Listing("RTE [%] of all studies", of_sequences, caption, "row"),
-        Listing("What each study changes against its baseline", changes),
-    ]
-
-
 def _last(rows: Sequence[ComparisonRow]) -> list[ComparisonRow]:
     """The rows over all sequences, or those of the only one."""
     return [row for row in rows if row.sequence == rows[-1].sequence]
@@ -120,14 +75,10 @@ def _of_modes(rows: Sequence[ComparisonRow], length: float) -> Listing:
     empty = {k for k in cells[0] if all(row[k] is None for row in cells)} - {"RTE [%]"}
     empty |= {k for k in _COUNTS if not any(row[k] for row in cells)}
     cells = [{k: v for k, v in row.items() if k not in empty} for row in cells]
-    for row, of in zip(cells, last, strict=True):
-        row["_in_hindsight"] = of.mode == ORACLE
     n = len({row.sequence for row in rows if row.rte is not None} - {ALL})
     where = f"on {n} sequences" if last[0].sequence == ALL else f"on {last[0].sequence}"
     repeats = f", {last[0].repeats} replays each" if last[0].repeats > 1 else ""
-    return Listing(
-        f"RTE over {length:g} m {where}{repeats}", cells, _caption(rows, cells[0]), _ERRORS
-    )
+    return Listing(f"RTE over {length:g} m {where}{repeats}", cells, _caption(rows, cells[0]))
 
 
 def _caption(rows: Sequence[ComparisonRow], shown: Mapping[str, Any]) -> str:
@@ -162,7 +113,7 @@ def _of_sequences(rows: Sequence[ComparisonRow], length: float) -> Listing:
         if judged:
             line["reference"] = "" if name == ALL else next(iter(of.values())).reference
         cells.append(line)
-    return Listing(f"RTE [%] over {length:g} m on each sequence", cells, "", "row")
+    return Listing(f"RTE [%] over {length:g} m on each sequence", cells)
 
 
 def _standard(rows: Sequence[ComparisonRow]) -> Listing | None:
@@ -183,19 +134,7 @@ def _standard(rows: Sequence[ComparisonRow]) -> Listing | None:
         + "." * of_all
     )
     cells = [row.standard_columns(kitti) for row in last]
-    return Listing(title, cells, caption, _ERRORS)
-
-
-def _change(row: ComparisonRow, rows: Sequence[ComparisonRow]) -> dict[str, Any]:
-    """Errors of a mode, and by how many percent they differ from the baseline's."""
-    (before,) = [other for other in _last(rows) if other.mode == "baseline"]
-    mine, others = (of.summary_columns() | of.standard_columns() for of in (row, before))
-    cells: dict[str, Any] = {"mode": row.mode}
-    for key in ("RTE [%]", "RPE [m]", "APE [m]"):
-        cells[key], change = mine[key], f"{key[:3]} change [%]"
-        known = mine[key] and others[key]
-        cells[change] = f"{100 * (mine[key] / others[key] - 1):+.1f}" if known else None
-    return cells
+    return Listing(title, cells, caption)
 
 
 # The decision: what to drive, what that gives, and at what cost.

@@ -18,7 +18,6 @@ from adaptune.commands.terminal import (
     Override,
     StudyFile,
     begin_work,
-    console,
     load,
     progress,
     say,
@@ -35,7 +34,6 @@ if TYPE_CHECKING:
     from online.charts import ReplayedSequence
     from online.compare import ComparedReplays
     from online.replay import ReplayRecord
-    from online.statistics import ComparisonRow
 
 
 log = logging.getLogger(__name__)
@@ -195,16 +193,9 @@ def now(record: "ReplayRecord") -> str:
 
 
 def compare(
-    studies: Annotated[
-        list[Path],
-        typer.Argument(metavar="STUDY...", help="YAML or folder of a study, or of several."),
-    ],
+    study: StudyFile,
     override: Override = [],  # noqa: B006
     folder: Folder = None,
-    to: Annotated[
-        Path | None,
-        typer.Option(help="Of several studies, where their tables go.", file_okay=False),
-    ] = None,
     details: Details = False,
 ) -> None:
     """Compare the replays: what to drive, what adapting gained, and at what cost.
@@ -216,20 +207,8 @@ def compare(
 
     The study's folder receives a page (HTML) of all that is known of the study, also of one that
     is not finished. It opens without a network, and its charts lie beside it as PNG and SVG. All
-    tables are there as CSV, JSON, Markdown and LaTeX, too; `--details` prints them. With several
-    studies, their errors also stand side by side.
+    tables are there as CSV, JSON and Markdown, too; `--details` prints them.
     """
-    if len(studies) == 1:
-        if to is not None:
-            raise AdaptuneError("--to is for several studies; one has its tables in its folder")
-        _compare_one(studies[0], override, folder, details=details)
-        return
-    if folder is not None:
-        raise AdaptuneError("--folder is for one study; several have their own under runs/")
-    _compare_several(studies, override, to, details=details)
-
-
-def _compare_one(study: Path, override: list[str], folder: Path | None, *, details: bool) -> None:
     from adaptune.study.study import MIN_RECORDINGS
 
     loaded = load(study, override, folder)
@@ -271,7 +250,7 @@ def compared(loaded: "OfflineStudy", *, details: bool = False) -> "ComparedRepla
     for sentence in found.details if details else ():
         say(sentence)
     for made in shown:
-        show_table(*made[:3])
+        show_table(*made)
     return found
 
 
@@ -374,33 +353,6 @@ def _of_charts(title: str, make: "Callable[[], Charts]") -> "PageSection":
     except AdaptuneError as error:
         return PageSection(title, notes=(f"{error}.",))
     return PageSection(title, notes=tuple(notes), charts=tuple(charts))
-
-
-def _compare_several(
-    studies: list[Path], override: list[str], to: Path | None, *, details: bool
-) -> None:
-    from adaptune.report.tables import write_tables
-    from online.tables import side_by_side
-
-    loaded = [load(study, override, None) for study in studies]
-    if len({one.name for one in loaded}) < len(loaded):
-        raise AdaptuneError("two of the studies have the same name; rename one of the files")
-    if len(lengths := {one.config.sub_trajectory for one in loaded}) > 1:
-        found = " and ".join(f"{length:g}" for length in sorted(lengths))
-        raise AdaptuneError(
-            f"sub_trajectory: the studies have errors over {found} m, which cannot be compared"
-        )
-    rows: dict[str, list[ComparisonRow]] = {}
-    for one in loaded:
-        console.rule(one.name)
-        rows[one.name] = compared(one, details=details).rows
-    console.rule("side by side")
-    made = side_by_side(rows)
-    for listing in made:
-        show_table(*listing[:3])
-    folder = to or loaded[0].folder.with_name("+".join(rows))
-    write_tables(folder, " and ".join(rows), made)
-    say(f"Tables: {folder}/")
 
 
 def record(

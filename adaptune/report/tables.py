@@ -2,17 +2,15 @@
 
 import csv
 import io
-import itertools
 import json
 import re
 import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import rich.box
-from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
@@ -27,16 +25,12 @@ _WIDEST = 10_000
 class Listing(NamedTuple):
     """Rows of equal keys, with what they are about.
 
-    Keys that start with an underscore are for files only. ``group: name`` stands below a heading
-    that it shares with its neighbours where there is room for it.
+    Keys that start with an underscore are for files only.
     """
 
     title: str
     rows: Sequence[Mapping[str, Any]]
     caption: str = ""
-    # The least number of each row is set in bold, in each group of columns, or that of the columns
-    # that are named. Rows with a true ``_in_hindsight`` do not count.
-    least: Literal["row"] | tuple[str, ...] = ()
 
     @property
     def keys(self) -> list[str]:
@@ -73,7 +67,7 @@ def tables_within(listing: Listing, width: int) -> list[Table | Text]:
 
     Where the columns have no room, they go on in a next table, below the first column again.
     """
-    whole = table(*listing[:3])
+    whole = table(*listing)
     if Console(width=_WIDEST).measure(whole).maximum <= width:
         return [whole]
     headings, needed = {}, {}
@@ -108,88 +102,12 @@ def cell_text(value: Any) -> str:
 
 def markdown(listing: Listing) -> str:
     """The table in Markdown, with its title and caption."""
-    keys, cells = _printed(listing)
+    keys = listing.keys
     lines = [keys, [":--", *["--:"] * (len(keys) - 1)][: len(keys)]]
-    lines += [[f"**{text}**" if bold else text for text, bold in row] for row in cells]
+    lines += [[cell_text(row[key]) for key in keys] for row in listing.rows]
     escaped = ([text.replace("|", r"\|") for text in line] for line in lines)
     body = "\n".join(f"| {' | '.join(line)} |" for line in escaped)
     return "\n\n".join(filter(None, (f"**{listing.title}**", body, listing.caption))) + "\n"
-
-
-def latex(listing: Listing, label: str) -> str:
-    """The table as a LaTeX float with rules of booktabs.
-
-    Parameters
-    ----------
-    listing
-        The table.
-    label
-        Follows ``tab:`` in its label.
-    """
-    keys, cells = _printed(listing)
-    groups, names = zip(*(key.rpartition(": ")[::2] for key in keys), strict=True)
-    lines = []
-    if any(groups):
-        heads, rules, end = [], [], 0
-        for group, same in itertools.groupby(groups):
-            begin, end = end + 1, end + len(list(same))
-            heads.append(rf"\multicolumn{{{end - begin + 1}}}{{c}}{{{_escaped(group)}}}")
-            if group:
-                rules.append(rf"\cmidrule(lr){{{begin}-{end}}}")
-        lines += [" & ".join(heads) + r" \\", " ".join(rules)]
-    lines += [" & ".join(map(_escaped, names)) + r" \\", r"\midrule"]
-    for row in cells:
-        texts = [rf"\textbf{{{_escaped(text)}}}" if bold else _escaped(text) for text, bold in row]
-        lines.append(" & ".join(texts) + r" \\")
-    caption = _escaped(f"{listing.title}. {listing.caption}").removesuffix(". ")
-    rows = "\n".join(lines)
-    return rf"""\begin{{table}}
-\centering
-\caption{{{caption}}}
-\label{{tab:{label}}}
-\begin{{tabular}}{{l{"r" * (len(keys) - 1)}}}
-\toprule
-{rows}
-\bottomrule
-\end{{tabular}}
-\end{{table}}
-"""
-
-
-def _printed(listing: Listing) -> tuple[list[str], list[list[tuple[str, bool]]]]:
-    """Keys that are printed, and for each row its texts and whether they are set in bold."""
-    rows, keys = listing.rows, listing.keys
-    numbers = np.full((len(rows), len(keys)), np.nan)
-    for i, row in enumerate(rows):
-        if not row.get("_in_hindsight"):
-            numbers[i] = [row[key] if isinstance(row[key], float) else np.nan for key in keys]
-    bold = np.zeros(numbers.shape, bool)
-    if listing.least == "row":
-        groups = np.array([key.rpartition(": ")[0] for key in keys])
-        for group in set(groups.tolist()):
-            bold[:, groups == group] = _least(numbers[:, groups == group], axis=1)
-    else:
-        columns = [key in listing.least for key in keys]
-        bold[:, columns] = _least(numbers[:, columns], axis=0)
-    texts = [[cell_text(row[key]) for key in keys] for row in rows]
-    return keys, [list(zip(*pair, strict=True)) for pair in zip(texts, bold.tolist(), strict=True)]
-
-
-def _least(numbers: NDArray[np.float64], axis: int) -> NDArray[np.bool_]:
-    """Which numbers are the least along an axis, where there is a choice; NaN is none."""
-    known = np.isfinite(numbers)
-    least = np.where(known, numbers, np.inf).min(axis=axis, keepdims=True, initial=np.inf)
-    return np.asarray(known & (numbers == least) & (known.sum(axis=axis, keepdims=True) > 1))
-
-
-_SPECIAL = str.maketrans(
-    {c: rf"\{c}" for c in "&%$#_{}"}
-    | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
-)
-
-
-def _escaped(text: str) -> str:
-    return text.translate(_SPECIAL).replace("`", "")
 
 
 def csv_text(rows: Sequence[Mapping[str, Any]]) -> str:
@@ -218,21 +136,6 @@ def write_rows(folder: Path, name: str, rows: Sequence[Mapping[str, Any]]) -> No
 def write_tables(
     folder: Path, name: str, listings: Sequence[Listing], words: Sequence[str] = ()
 ) -> None:
-    """Write sentences and tables as ``tables.md``, and the tables as ``tables.tex``.
-
-    Parameters
-    ----------
-    folder
-        Where to.
-    name
-        What they are about; it begins the labels of the LaTeX tables.
-    listings
-        The tables.
-    words
-        Sentences that stand before them.
-    """
+    """Write tables as ``tables.md``, below the name of what they are about and sentences."""
     text = "\n".join([f"# {name}\n", *(f"- {said}" for said in words), ""])
     write_text(folder / "tables.md", "\n".join([text, *map(markdown, listings)]))
-    stem = re.sub(r"[^A-Za-z0-9]+", "-", name)
-    floats = [latex(one, f"{stem}-{i + 1}") for i, one in enumerate(listings)]
-    write_text(folder / "tables.tex", "\n".join(["% Needs \\usepackage{booktabs}.", *floats]))

@@ -331,4 +331,3 @@ def test_unknown_cells_are_empty(replayed):
     folder = replayed.folder / "comparison"
     assert "nan" not in (folder / "comparison.csv").read_text()
     assert (folder / "tables.md").read_text().startswith("# study\n\n- ")
-    assert r"\label{tab:study-1}" in (folder / "tables.tex").read_text()

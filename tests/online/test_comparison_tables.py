@@ -6,7 +6,7 @@ import pytest
 from adaptune.metrics import KittiError
 from online.modes import MODES
 from online.statistics import ALL, ORACLE, ComparisonRow, StandardErrors
-from online.tables import modes_in_words, side_by_side, tables
+from online.tables import modes_in_words, tables
 
 SHORT = KittiError(np.nan, np.nan, ())
 
@@ -80,18 +80,3 @@ def test_oracles_are_among_the_modes_only():
     assert modes.rows[-1]["mode"] == ORACLE
     assert ORACLE not in sequences.rows[0]
     assert len(standard.rows) == 3
-
-
-def test_studies_stand_side_by_side():
-    other = [replace(row, rte=None if row.rte is None else 2 * row.rte) for row in ROWS]
-    errors, changes = side_by_side({"gicp": ROWS, "ndt": other})
-    assert [row["sequence"] for row in errors.rows] == ["a", "b", "average"]
-    assert errors.rows[2]["gicp: adaptive"] == 1.0
-    assert errors.rows[2]["ndt: adaptive"] == 2.0
-    assert errors.least == "row"
-    assert changes.rows[2] == {
-        "study": "gicp", "mode": "adaptive",
-        "RTE [%]": 1.0, "RTE change [%]": "-75.0",
-        "RPE [m]": 0.05, "RPE change [%]": "-75.0",
-        "APE [m]": 1.0, "APE change [%]": "-75.0",
-    }  # fmt: skip

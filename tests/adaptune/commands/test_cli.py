@@ -1,7 +1,6 @@
 import os
 import re
 import shlex
-import shutil
 import signal
 import subprocess
 import sys
@@ -111,6 +110,7 @@ def test_inspect_proposes_a_study_without_a_reference_too(tmp_path):
         (["simulate", "STUDY"], "there is none to simulate; add one"),
         (["online", "STUDY"], "model.safetensors: there is no such model"),
         (["compare", "STUDY"], "run `adaptune online`"),
+        (["compare", "."], ".: is no study's folder"),
         (["online", "STUDY", "--model", "STUDY"], "is not an error model, or damaged"),
     ],
 )
@@ -205,23 +205,6 @@ def test_a_finished_study_has_a_page_of_everything(finished):
     assert figures == {path.stem for path in (finished / "report/figures").glob("*.png")}
     for mode in ("baseline", "fixed", "adaptive", "paper"):
         assert f">{mode}</td>" in page
-
-
-@pytest.mark.services
-def test_studies_are_compared_side_by_side_by_their_folders(finished, tmp_path):
-    other = shutil.copytree(finished, tmp_path / "other")
-    ended = call("compare", finished, other, "--to", tmp_path / "both")
-    assert ended.exit_code == 0
-    text = (tmp_path / "both/tables.md").read_text()
-    assert "study: fixed" in text
-    assert "other: fixed" in text
-    assert (tmp_path / "both/tables.tex").exists()
-    ended = call("compare", finished, other, "--folder", tmp_path)
-    assert ended.exit_code == 2
-    ended = call("compare", finished, other, "-o", "sub_trajectory=2")
-    assert ended.exit_code == 2
-    ended = call("compare", tmp_path)
-    assert "is no study's folder" in ended.output
 
 
 @pytest.mark.parametrize(("rules", "next_one"), [(("paired",), "offline"), ((), "record")])
