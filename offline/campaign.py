@@ -113,15 +113,14 @@ class Campaign:
         if self._config.sets == "own":
             return f"{what} in the mean of {len(best)} sequences"
         (search,) = self._searches
-        feasible = "" if best[0].excess == 0.0 else ", which does not keep the limits"
-        return f"{what} (trial {search.number(search.best)}){feasible}"
+        return f"{what} (trial {search.number(search.best)})"
 
     def _run_everywhere(self) -> None:
         """Run the best set of each sequence on the others, to choose the fixed one among them."""
         best = {}
         for search in self._searches:
-            if any(verdict.feasible for verdict in search.verdicts):
-                number = best_by_trials(self._config, search.done)
+            if any(verdict.usable for verdict in search.verdicts):
+                number = best_by_trials(search.done)
                 best[number] = search.done[number]
         missing = [
             (name, {n: v.parameters for n, v in best.items() if n not in self._finished[name]})
@@ -232,17 +231,15 @@ def run_whole(
 def whole_values(config: OfflineConfig, runs: WholeRuns) -> dict[str, dict[int, float]]:
     """By sequence, the objective in whole runs of every candidate for the fixed set.
 
-    Candidates have whole runs on all sequences, and keep the limits there if one does. The
-    objective of those that are not usable there is infinite.
+    Candidates have whole runs on all sequences. The objective of those that are not usable there
+    is infinite.
     """
     numbers = set.intersection(*(set(of_sequence) for of_sequence in runs.values()))
     verdicts = {n: judge(config, [runs[name][n] for name in runs]) for n in sorted(numbers)}
-    within = any(verdict.feasible for verdict in verdicts.values())
-    kept = [n for n, v in verdicts.items() if v.feasible or not (v.usable and within)]
     return {
         name: {
-            n: weighted(config.objective, of_sequence[n].metrics) if verdicts[n].usable else np.inf
-            for n in kept
+            n: weighted(config.objective, of_sequence[n].metrics) if verdict.usable else np.inf
+            for n, verdict in verdicts.items()
         }
         for name, of_sequence in runs.items()
     }
@@ -272,7 +269,7 @@ def baseline_warning(
     if 0 not in whole or best == 0 or whole[0] >= whole.get(best, np.inf):
         return None
     what = label(config.objective)
-    other = f"{whole[best]:.3g}" if best in whole else "beyond the limits, or not known"
+    other = f"{whole[best]:.3g}" if best in whole else "not known"
     beaten = (
         f"In whole runs with the health check, the baseline is better than the trials suggested: "
         f"its {what} is {whole[0]:.3g}, that of trial {best}, the best by its trials, {other}"

@@ -39,7 +39,7 @@ class TriedSet(NamedTuple):
     parameters: ParameterSet
     by_sequence: Mapping[str, float]  # the objective on the sequences on which it was run
     value: float  # its mean over all training sequences, NaN if not run on all
-    feasible: bool  # whether it keeps all limits
+    usable: bool  # whether it may be chosen
     cost: float  # milliseconds of CPU time a scan, NaN if unknown
 
 
@@ -104,7 +104,7 @@ def trial_table(
 ) -> TrialTable:
     """Finished trials as columns: by training sequence, `finished` has them by their numbers.
 
-    Of `config`, the objective and the limits count; `fixed` is the fixed set, once chosen.
+    Of `config`, the objective counts; `fixed` is the fixed set, once chosen.
     """
     objective, trials = config.objective, []
     for number in sorted({number for of_sequence in finished.values() for number in of_sequence}):
@@ -113,7 +113,7 @@ def trial_table(
         by_sequence = {name: weighted(objective, run.metrics) for name, run in runs.items()}
         value = verdict.value if len(runs) == len(finished) else np.nan
         cost = float(np.mean([run.cost for run in runs.values()]))
-        about = (number, verdict.parameters, by_sequence, value, verdict.feasible, cost)
+        about = (number, verdict.parameters, by_sequence, value, verdict.usable, cost)
         trials.append(TriedSet(*about))
     named = "RTE [%]" if objective == {"rte": 1.0} else label(objective, units=True)
     chosen = next((trial.number for trial in trials if trial.parameters == fixed), None)
@@ -192,7 +192,7 @@ def iteration_chart(table: TrialTable) -> Chart | None:
         number, errors = table.numbers[kept] - OF_SLOT * slot, values[kept]
         if len(number) < 2:
             continue
-        allowed = np.where([trial.feasible for trial in table.some(kept).trials], errors, np.inf)
+        allowed = np.where([trial.usable for trial in table.some(kept).trials], errors, np.inf)
         least = np.minimum.accumulate(allowed)
         drawn: list[Drawn] = [
             Points(number, errors, "trial", texts=[f"trial {n}" for n in table.numbers[kept]]),
@@ -208,8 +208,8 @@ def iteration_chart(table: TrialTable) -> Chart | None:
         "iterations",
         "The search for parameters",
         tuple(panels),
-        "Error of each trial in the order of the search, and the least so far of those within the "
-        "limits. A flat end means that more trials promise little.",
+        "Error of each trial in the order of the search, and the least so far. "
+        "A flat end means that more trials promise little.",
         columns=min(2, len(panels)),
     )
 

@@ -321,7 +321,7 @@ def distribution(parameter: Float | Integer | Categorical) -> Any:
     return FloatDistribution(parameter.low, parameter.high, log=parameter.log)
 
 
-_SET_BY_KEY = {"seed": "seed", "n_startup_trials": "initial", "constraints_func": "limits"}
+_SET_BY_KEY = {"seed": "seed", "n_startup_trials": "initial"}
 """Settings of Optuna's samplers that adaptune sets, and from which key."""
 _BOX = ("low", "high")
 _MAX_SETTING = 100_000
@@ -457,12 +457,6 @@ def _weighted(given: Any) -> Any:
     return {given: 1.0} if isinstance(given, str) else given
 
 
-class Limit(StrictModel):
-    """What a metric may not exceed, on any training sequence."""
-
-    max: float = Field(gt=0, le=1e9)
-
-
 class OfflineConfig(StrictModel):
     """How to search for parameter sets; ``docs/reference-study.md`` describes every key."""
 
@@ -477,7 +471,6 @@ class OfflineConfig(StrictModel):
     seed: int = Field(0, ge=0, lt=2**32)
     workers: int | None = Field(None, ge=1, le=256)
     objective: Annotated[_Weighted, BeforeValidator(_weighted)] = Field({"rte": 1.0})
-    limits: dict[Metric, Limit] = Field(default_factory=dict)
     runs: Literal["restart", "whole"] | None = None  # see `OfflineStudyConfig.runs`
     repeats: int = Field(1, ge=1, le=100)
     baseline_runs: int | None = Field(None, ge=1, le=1000)
@@ -502,7 +495,7 @@ class OfflineConfig(StrictModel):
     @property
     def metrics(self) -> set[str]:
         """All metrics that a trial is judged by."""
-        return {*self.limits, *self.objective}
+        return set(self.objective)
 
     @property
     def budgeted(self) -> bool:
@@ -536,7 +529,7 @@ class OfflineConfig(StrictModel):
 
 _SEARCH = (
     *("sampler", "sampler_settings", "sets", "initial", "batch", "seed"),
-    *("objective", "limits", "runs", "repeats", "baseline_runs", "pruning"),
+    *("objective", "runs", "repeats", "baseline_runs", "pruning"),
 )
 """Settings by which a search differs from another."""
 

@@ -1,4 +1,4 @@
-"""How to judge a trial: metrics, weighted sums of them, and limits.
+"""How to judge a trial: metrics, and weighted sums of them.
 
 Metrics of one parameter set on one sequence:
 
@@ -46,10 +46,7 @@ CANDIDATES = 4
 EQUAL_WITHIN = 1.02
 """Whole runs whose values differ by no larger factor count as equal."""
 PENALTY = 10.0
-"""A set that breaks a limit is worse by so many times the baseline's value.
-
-One that is not usable has so many times the baseline's value at least, and exceeds every limit so
-many times: nobody knows what it would cost."""
+"""A set that is not usable has so many times the baseline's value at least: samplers keep away."""
 
 
 class NothingUsableError(AdaptuneError):
@@ -70,8 +67,6 @@ class Verdict(NamedTuple):
 
     parameters: ParameterSet
     value: float  # mean of the objective over the sequences
-    # Excess over every limit, as a share of the limit; negative if the limit is kept.
-    constraints: tuple[float, ...] = ()
     # Distance from the value to the upper end of its one-sided 95 % confidence interval; 0
     # unless trials are repeated.
     margin: float = 0.0
@@ -81,19 +76,9 @@ class Verdict(NamedTuple):
     usable: bool = True  # see `Summary.usable`; on all sequences
 
     @property
-    def excess(self) -> float:
-        """Sum of the excesses over all limits, each as a share of the limit."""
-        return exceeded(self.constraints)
-
-    @property
     def bound(self) -> float:
         """What the value surely is below: the upper end of its interval."""
         return self.value + self.margin
-
-    @property
-    def feasible(self) -> bool:
-        """Whether the set may be chosen: it is usable, and keeps all limits."""
-        return self.usable and self.excess == 0.0
 
 
 class SamplerResult(NamedTuple):
@@ -101,12 +86,6 @@ class SamplerResult(NamedTuple):
 
     parameters: ParameterSet
     value: float  # samplers minimise it
-    constraints: tuple[float, ...] = ()  # see `Verdict`
-
-
-def exceeded(constraints: Sequence[float]) -> float:
-    """Sum of the excesses."""
-    return sum(max(0.0, by) for by in constraints)
 
 
 def trajectory_metrics(
@@ -143,15 +122,11 @@ def judge(config: OfflineConfig, runs: Sequence[Summary]) -> Verdict:
     metrics = [run.metrics for run in runs]
     value = float(mean_value(np.array([weighted(config.objective, one) for one in metrics])))
     usable = all(run.usable for run in runs)
-    constraints = tuple(
-        max(max(of_run[name] for of_run in metrics) / limit.max - 1.0, -1.0 if usable else PENALTY)
-        for name, limit in config.limits.items()
-    )
     above = 0.0
     # Without repeats, nothing is known of the other sets' intervals.
     if config.repeats > 1 and all(run.repeats for run in runs):
         above = float(margin(np.array([repeated(config.objective, r.repeats) for r in runs])))
-    return Verdict(runs[0].parameters, value, constraints, above, usable=usable)
+    return Verdict(runs[0].parameters, value, above, usable=usable)
 
 
 def weighted(weights: Mapping[Metric, float], metrics: Mapping[str, float]) -> float:
@@ -189,76 +164,30 @@ def margin(repeats: NDArray[np.float64]) -> NDArray[np.float64]:
 def sampler_results(verdicts: Sequence[Verdict]) -> list[SamplerResult]:
     """The results of trials as samplers receive them; the first one is the baseline's."""
     worst = PENALTY * (verdicts[0].value or 1.0) if verdicts else 0.0
-    return [
-        SamplerResult(v.parameters, max(v.value, 0.0 if v.usable else worst), v.constraints)
-        for v in verdicts
-    ]
+    return [SamplerResult(v.parameters, max(v.value, 0.0 if v.usable else worst)) for v in verdicts]
 
 
-def penalised(history: Sequence[SamplerResult]) -> list[SamplerResult]:
-    """Put limits into the values, for samplers without constraints.
-
-    A set that breaks limits is worse by `PENALTY` times the baseline's value, and more with a
-    larger excess: the sampler keeps away from it.
-    """
-    if not any(result.constraints for result in history):
-        return list(history)
-    baseline = history[0].value or 1.0
-    excesses = (exceeded(result.constraints) for result in history)
-    penalties = (PENALTY * baseline * (1.0 + excess) if excess else 0.0 for excess in excesses)
-    return [
-        SamplerResult(result.parameters, result.value + penalty)
-        for result, penalty in zip(history, penalties, strict=True)
-    ]
-
-
-def best_by_trials(config: OfflineConfig, verdicts: Mapping[int, Verdict]) -> int:
+def best_by_trials(verdicts: Mapping[int, Verdict]) -> int:
     """Trial number of the first of `candidates`."""
-    return candidates(config, verdicts)[0]
+    return candidates(verdicts)[0]
 
 
-def candidates(config: OfflineConfig, verdicts: Mapping[int, Verdict]) -> list[int]:
+def candidates(verdicts: Mapping[int, Verdict]) -> list[int]:
     """Trial numbers of the candidates for the fixed set, the best by their trials first.
 
-    These are the `CANDIDATES` sets with the least objective among those that keep all limits,
-    and the baseline if it keeps them. If trials are repeated, the upper end of the confidence
-    interval counts. Of equal sets, the first one comes first.
+    These are the `CANDIDATES` usable sets with the least objective, and the baseline if it is
+    usable. If trials are repeated, the upper end of the confidence interval counts. Of equal sets,
+    the first one comes first.
 
     Raises
     ------
-    AdaptuneError
-        If no set is usable and keeps all limits.
+    NothingUsableError
+        If no set is usable.
     """
     complete = [n for n, verdict in verdicts.items() if verdict.complete and verdict.usable]
     if not complete:
         raise NothingUsableError(UNUSABLE.format(n=len(verdicts)))
-    feasible = [n for n in complete if verdicts[n].feasible]
-    if not feasible:
-        raise AdaptuneError(_beyond(config, verdicts, complete))
-    return best_candidates({n: verdicts[n].bound for n in feasible})
-
-
-def _beyond(config: OfflineConfig, verdicts: Mapping[int, Verdict], usable: list[int]) -> str:
-    """That no usable set keeps all limits, and what to do."""
-    nearest = min(usable, key=lambda n: verdicts[n].excess)
-    limits = ", ".join(f"{name} <= {limit.max:g}" for name, limit in config.limits.items())
-    return (
-        f"offline.limits: no usable parameter set that ran everywhere keeps {limits} on every "
-        f"sequence; trial {nearest} comes nearest, {verdicts[nearest].excess:.0%} beyond "
-        f"(`adaptune trials` lists all): loosen the limits, widen the ranges of the parameters, "
-        f"or run more trials"
-    )
-
-
-def or_baseline(
-    config: OfflineConfig, verdicts: Mapping[int, Verdict]
-) -> tuple[dict[int, Verdict], list[str]]:
-    """The verdicts, and a sentence if no set keeps all limits: then the baseline may break them."""
-    usable = [n for n, verdict in verdicts.items() if verdict.complete and verdict.usable]
-    if 0 not in usable or any(verdicts[n].feasible for n in usable):
-        return dict(verdicts), []
-    said = f"{_beyond(config, verdicts, usable)}. Until then the fixed set is the baseline."
-    return {**verdicts, 0: verdicts[0]._replace(constraints=())}, [said]
+    return best_candidates({n: verdicts[n].bound for n in complete})
 
 
 def best_candidates(bounds: Mapping[int, float]) -> list[int]:

@@ -36,7 +36,7 @@ from offline.config import (
     optuna_class,
     optuna_sampler,
 )
-from offline.objective import SamplerResult, exceeded, penalised
+from offline.objective import SamplerResult
 
 _ENUMERABLE = 4096
 _DRAWS = 1000
@@ -47,11 +47,9 @@ class Sampler(ABC):
 
     Proposals depend on the seed and on the results of the batches before, and on nothing else: not
     on the number of trials, nor on who runs them. Trial 0 is the baseline, and no set is proposed
-    twice. Samplers without constraints receive bad values for sets that break limits.
+    twice.
     """
 
-    constrained = False
-    """Whether the sampler takes constraints."""
     end = "there is nothing else to try"
     """Why the search ends when the sampler proposes fewer sets than a batch."""
 
@@ -63,7 +61,7 @@ class Sampler(ABC):
         """Propose the parameter sets of the next batch.
 
         The history has the results of all trials of the batches before, in their order:
-        `SamplerResult`, or tuples of its first values.
+        `SamplerResult`, or tuples like it.
 
         Returns
         -------
@@ -75,8 +73,6 @@ class Sampler(ABC):
         if first % self.config.batch:
             raise ValueError(f"batches have {self.config.batch} trials; {first} is not a multiple")
         results = [SamplerResult(*result) for result in history]
-        if not self.constrained:
-            results = penalised(results)
         return self._propose(range(first, first + self.config.batch), results)
 
     @abstractmethod
@@ -160,13 +156,6 @@ def _shuffled(size: int, seed: int, n: int) -> Iterator[int]:
 # Without warnings that a sampler draws some parameters independently.
 optuna.logging.set_verbosity(optuna.logging.ERROR)
 
-CONSTRAINED = (
-    optuna.samplers.TPESampler,
-    optuna.samplers.GPSampler,
-    optuna.samplers.NSGAIISampler,
-    optuna.samplers.NSGAIIISampler,
-)
-"""Samplers that take constraints."""
 _ATTEMPTS = 32
 _ROUNDED = 1e-6
 """By how much a proposal may exceed its range."""
@@ -204,7 +193,6 @@ class AskedSampler(Sampler):
         }
         self._forgetful = config.sampler == "tpe"
         self._begin(0, ())
-        self.constrained = isinstance(self._study.sampler, CONSTRAINED)
 
     def _begin(self, seed: int, history: Sequence[SamplerResult]) -> None:
         self._study = optuna.create_study(sampler=self._sampler(seed))
@@ -213,7 +201,6 @@ class AskedSampler(Sampler):
                 params=self._encode(result.parameters),
                 distributions=self._distributions,
                 value=result.value,
-                constraints={str(i): by for i, by in enumerate(result.constraints)},
             )
             for result in history
         )
@@ -293,8 +280,6 @@ class AskedSampler(Sampler):
         self._waiting = {}
 
     def _tell(self, trial: optuna.Trial, result: SamplerResult) -> None:
-        for i, by in enumerate(result.constraints):
-            trial.set_constraint(str(i), by)
         self._study.tell(trial, result.value)
 
     # For Optuna, as for Python, the choices 1 and True are equal: it receives their index.
@@ -342,7 +327,6 @@ class PooledSampler(Sampler):
             label: make_sampler(own, config.model_copy(update={"initial": initial, "seed": seed}))
             for (label, own), initial, seed in of_each
         }
-        self.constrained = all(sampler.constrained for sampler in self._samplers.values())
 
     def _propose(self, numbers: range, history: Sequence[SamplerResult]) -> list[ParameterSet]:
         of = {label: self._own(label, history) for label in self._samplers}
@@ -391,9 +375,8 @@ class PooledSampler(Sampler):
 
 
 def _best(history: Sequence[SamplerResult]) -> float:
-    """The least value of a set that keeps the limits."""
-    kept = (result.value for result in history if not exceeded(result.constraints))
-    return min(kept, default=np.inf)
+    """The least value."""
+    return min((result.value for result in history), default=np.inf)
 
 
 def _spread(sets: dict[str, list[ParameterSet]], first: int) -> list[ParameterSet]:
@@ -406,8 +389,6 @@ def _spread(sets: dict[str, list[ParameterSet]], first: int) -> list[ParameterSe
 
 class HostedSampler(Sampler):
     """A sampler of the user; `AskedSampler` asks it in the other process."""
-
-    constrained = True  # the other process sees to constraints
 
     def __init__(self, space: ParameterSpace, config: OfflineConfig):
         super().__init__(space, config)
@@ -465,7 +446,6 @@ def propose(_: str) -> Answer:
         if key not in made:
             space = ParameterSpace.load(about["space"])
             made[key] = AskedSampler(space, OfflineConfig.model_validate(about["config"]))
-        history = [SamplerResult(set_, value, tuple(by)) for set_, value, by in about["history"]]
-        return {"sets": made[key].propose(history)}
+        return {"sets": made[key].propose(about["history"])}
 
     return answer

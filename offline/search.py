@@ -41,8 +41,7 @@ def rungs(pruning: bool, batch: int, n: int) -> list[int]:
 def survivors(batch: Mapping[int, Values], before: Mapping[int, Values]) -> list[int]:
     """Numbers of the trials of a batch that continue.
 
-    Values are by trial number, of this batch and of all trials before, of those that keep all
-    limits.
+    Values are by trial number, of this batch and of all usable trials before.
     """
     if not before:
         return list(batch)
@@ -247,7 +246,7 @@ class Search:
         of = (self._config, self.sequences, self._finished)
         self.verdicts += [assess(n, self.sequences, *of) for n in self.numbers]
         self._closed += self.numbers
-        ranks = [(not v.complete, not v.usable, v.excess, v.value) for v in self.verdicts]
+        ranks = [(not v.complete, not v.usable, v.value) for v in self.verdicts]
         self.best = min((self.best, *range(first, len(ranks))), key=ranks.__getitem__)
         if len(self.numbers) < self._config.batch and len(self.verdicts) != self._limit:
             self.end = self._sampler.end
@@ -269,14 +268,14 @@ class Search:
         return sorted(means, key=lambda name: -means[name])
 
     def _values(self, numbers: Iterable[int], seen: Sequence[str]) -> dict[int, list[float]]:
-        """Values of the trials that keep the limits, on the sequences on which they were run."""
+        """Values of the usable trials, on the sequences on which they were run."""
         of_numbers = {
             n: [run for name in seen if (run := self._finished[name].get(n))] for n in numbers
         }
         return {
             n: [self._value(run) for run in runs]
             for n, runs in of_numbers.items()
-            if judge(self._config, runs).feasible
+            if all(run.usable for run in runs)
         }
 
     def _value(self, run: Summary) -> float:

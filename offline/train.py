@@ -66,7 +66,6 @@ from offline.objective import (
     failed_in_words,
     judge,
     label,
-    or_baseline,
 )
 from offline.search import BUDGETS, Finished
 from offline.trial import TrialSettings, TrialSetup
@@ -134,7 +133,6 @@ def train(study: OfflineStudy, progress: Progress = unseen, cluster: str | None 
     with trial_workers(study, names, cluster) as workers:
         run_baseline(study, archive, workers, progress)
         verdicts = Campaign(study, archive, workers, progress).run()
-        verdicts, beyond = or_baseline(config, verdicts)
         finished = {
             name: {n: archive.finished(name)[n] for n, v in verdicts.items() if name in v.sequences}
             for name in names
@@ -143,9 +141,9 @@ def train(study: OfflineStudy, progress: Progress = unseen, cluster: str | None 
         if (budget := study.config.online.budget) is not None:
             costs = measured_costs(archive, finished, every_set, study.odometry)
             affordable_ones = {n: verdicts[n] for n in affordable(costs, list(verdicts), budget)}
-        best = candidates(config, affordable_ones)
+        best = candidates(affordable_ones)
         # Rivals may cost more.
-        rivals = {*candidates(config, verdicts), *every_set.defaults}
+        rivals = {*candidates(verdicts), *every_set.defaults}
         sets = {n: verdicts[n].parameters for n in sorted({0, *best, *rivals})}
         whole = run_whole(names, sets, study.config.health, archive, workers, progress)
     fixed, remark = _fixed(config, verdicts, best, whole)
@@ -166,7 +164,7 @@ def train(study: OfflineStudy, progress: Progress = unseen, cluster: str | None 
         study.odometry.name,
         lambda worst: hard_to_track(study.sequences.open(worst)),
     )
-    said += beyond if before is None else [*beyond, *changes(before, model)]
+    said += [] if before is None else changes(before, model)
     said += [*estimates_in_words(estimates, model.length, intervals=True)]
     said += failed_in_words(verdicts)
     said += baseline_words(config, [runs[0] for runs in finished.values()])
@@ -293,12 +291,10 @@ def _fitted(
     if before is not None and before.provenance == provenance:
         manifest.record(study.model_inputs_path, inputs)
         return before
-    # Sets that are not usable show where not to go.
-    known = {n: verdict for n, verdict in verdicts.items() if verdict.excess == 0.0}
     data = labelled_data(
         archive,
-        {name: [n for n, v in known.items() if name in v.sequences] for name in study.training},
-        _sets_of(study.odometry.space, known),
+        {name: [n for n, v in verdicts.items() if name in v.sequences] for name in study.training},
+        _sets_of(study.odometry.space, verdicts),
         config,
         study.window,
         study.sequences.recorded_in,
@@ -360,8 +356,6 @@ def _trial_rows(
             row[label(config.objective)] = verdict.value
             for metric in sorted(config.metrics):
                 row[metric] = float(np.mean([run.metrics[metric] for run in runs]))
-        if config.limits:
-            row["excess"] = verdict.excess
         if config.repeats > 1:
             row["margin"] = verdict.margin
         mean = float(np.mean([run.mean_error for run in runs])) if verdict.complete else None
@@ -384,8 +378,7 @@ def _training_rows(
     """A row for every training sequence; its own best set is found as the fixed one is."""
     rows = []
     for name, runs in finished.items():
-        judged, _ = or_baseline(config, {n: judge(config, [run]) for n, run in runs.items()})
-        best = best_by_trials(config, judged)
+        best = best_by_trials({n: judge(config, [run]) for n, run in runs.items()})
         error = reference_errors.get(origin(name))
         row = {
             "sequence": name,

@@ -440,7 +440,7 @@ def reference_poses(
     if "kitti" in settings.metrics and not (window_ends(T_ref_sensor, shortest) >= 0).any():
         raise AdaptuneError(
             f"{key}: its path holds no sub-trajectory of {shortest:g} m, the shortest "
-            f"of KITTI's error; judge by another metric (offline.objective, offline.limits)"
+            f"of KITTI's error; judge by another metric (offline.objective)"
         )
     return T_ref_sensor
 

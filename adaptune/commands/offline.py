@@ -141,8 +141,8 @@ def trials(
             say(f"Best mean: {best['mean']:.3f} %, of trial {best['trial']}.")
         if (fixed := loaded.fixed) is not None:
             same = (row["trial"] for row in finished if fixed.items() <= row.items())
-            if (chosen := next(same, None)) is not None:
-                say(f"The fixed set is trial {chosen}: whole runs decide.")
+            if (number := next(same, None)) is not None:
+                say(f"The fixed set is trial {number}: whole runs decide.")
         estimates = estimates_of(loaded.sequences, names)
         for sentence in estimates_in_words(estimates, loaded.config.sub_trajectory):
             say(sentence)

@@ -295,6 +295,8 @@ DELETED = {
     "health.max_turn_rate": "is gone: 360 degrees a second are the bound; leave it out",
     "health.max_unregistered": "is gone: 10 scans in a row are the bound; leave it out",
     "odometry.settings.drain": "is gone: adaptune waits until the system rests; leave it out",
+    "offline.limits": "is gone: give online.budget, the CPU time of a scan, or weigh costs in "
+    "offline.objective",
     "offline.sets=both": "is gone; give shared, or own",
     "offline.runs=episodes": "is gone; give restart, or whole",
     "offline.pruning=halving": _NO_PRUNING,

@@ -62,7 +62,7 @@ def failure(file, *overrides):
             "online.switching.sets.0: give a whole number or keys with values, not true",
         ),
         ("offline.seed=1e400", "offline.seed: give a finite number, not Infinity"),
-        ("offline.limits={rtf: {max: 3}}", "offline.limits.rtf: give 'rte', 'kitti', 'rpe', 'ape'"),
+        ("offline.objective={rtf: 3}", "offline.objective.rtf: give 'rte', 'kitti', 'rpe', 'ape'"),
         (
             "offline={sampler: grid, sampler_settings: {grid: {keyframe_interval: 3}}}",
             "offline.sampler_settings.grid.keyframe_interval: give keys with values or a list, not",

@@ -184,12 +184,6 @@ def test_a_single_fault_is_told(caplog):
             check_baseline("mine", "one", replace(run, **failed))
 
 
-def test_a_best_set_that_breaks_a_limit_in_whole_runs_is_told(study_file, tmp_path):
-    config = load_study(study_file, [], tmp_path).config.offline
-    told = campaign.baseline_warning(config, {0: 2.0, 8: 1.5}, 7, 8)
-    assert "trial 7, the best by its trials, beyond the limits" in told
-
-
 @pytest.mark.parametrize(
     ("settings", "words"),
     [

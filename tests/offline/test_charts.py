@@ -52,13 +52,19 @@ def test_a_scatter_has_a_panel_for_each_sequence_and_the_mean():
     assert scatter_chart(table, ["distance"], ["one"]) is None
 
 
-def test_a_trial_beyond_a_limit_is_no_best():
-    config = OfflineConfig.model_validate({"limits": {"ms_per_scan": {"max": 5.0}}})
+def test_a_trial_that_is_not_usable_is_no_best():
     runs = {
-        i: Summary(SPACE.baseline | {"points": i + 1}, 1.0 - 0.1 * i, 0, 0, 9.0 if i == 2 else 1.0)
+        i: Summary(
+            SPACE.baseline | {"points": i + 1},
+            1.0 - 0.1 * i,
+            0,
+            0,
+            1.0,
+            without_pose=0.5 * (i == 2),
+        )
         for i in range(4)
     }
-    (panel,) = iteration_chart(trial_table(config, SPACE, {"one": runs})).panels
+    (panel,) = iteration_chart(trial_table(OfflineConfig(), SPACE, {"one": runs})).panels
     np.testing.assert_allclose(of_kind(panel, Line)[0].y, [1.0, 0.9, 0.9, 0.7])
 
 

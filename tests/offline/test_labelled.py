@@ -30,7 +30,7 @@ def labelled(runs):
 def verdicts(runs):
     """The same as the campaign judges it."""
     config = OfflineConfig(repeats=len(runs[0][0]))
-    return config, {
+    return {
         trial: judge(
             config,
             [
@@ -45,9 +45,9 @@ def verdicts(runs):
 def test_the_fixed_set_is_surely_good_here_as_in_the_campaign():
     # The second set has the least mean by luck; the third is surely better than the first.
     runs = [[[1.0, 1.0, 1.1], [0.1, 0.2, 2.3], [0.9, 0.91, 0.92]]] * 2
-    config, found = verdicts(runs)
+    found = verdicts(runs)
     assert min(found, key=lambda trial: found[trial].value) == 2
-    assert best_by_trials(config, found) == 5
+    assert best_by_trials(found) == 5
     data = labelled(runs)
     assert data.fixed() == 5
     assert data.training_data()[0].fixed == 5

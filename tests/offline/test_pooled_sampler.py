@@ -87,17 +87,3 @@ def test_a_finite_pool_is_tried_to_its_end(config, batch):
         if len(sets) < batch:
             break
     assert len(history) == len({repr(s) for s, _ in history}) == 23
-
-
-def late_sets(limit):
-    """The last sets of two alike odometries; a smaller voxel is better."""
-    space = PooledSpace(dict.fromkeys(("one", "other"), SPACE.spaces["kiss"]))
-    sampler, history = make_sampler(space, OfflineConfig(batch=9, initial=18, seed=5)), []
-    for _ in range(8):
-        history += [(s, s["voxel"], limit(s)) for s in sampler.propose(history)]
-    return [s for s, *_ in history[45:]]
-
-
-def test_sets_that_break_limits_earn_no_share():
-    late = late_sets(lambda s: (1.0 if s[ODOMETRY] == "one" else -1.0,))
-    assert collections.Counter(s[ODOMETRY] for s in late) == {"one": 9, "other": 18}

@@ -150,40 +150,6 @@ def test_begins_with_points_that_spread_evenly_in_ratio(name):
     assert counts.min() >= 14
 
 
-CONSTRAINED = ["tpe", "optuna.samplers:NSGAIISampler"]
-
-
-@pytest.mark.parametrize("name", [*CONSTRAINED, "annealing", "optuna.samplers:CmaEsSampler"])
-def test_keeps_limits(name):
-    space = ParameterSpace({n: SPACE.parameters[n] for n in ("distance", "gain")})
-    settings = SETTINGS.get(name, {})
-    config = OfflineConfig(sampler=name, sampler_settings=settings, batch=8, initial=16, seed=5)
-
-    def result(s):
-        return s, 2.0 + s["gain"], (-s["gain"], s["gain"] - 0.9)
-
-    sampler, history = make_sampler(space, config), []
-    for _ in range(10):
-        history += [result(s) for s in sampler.propose(history)]
-    late = [s["gain"] for s, *_ in history[24:]]
-    assert np.mean([gain >= 0.0 for gain in late]) > 0.6
-    assert np.mean([0.0 <= gain < 0.45 for gain in late]) > 0.4
-    resumed = make_sampler(space, config)
-    assert resumed.propose(history[:32]) == [s for s, *_ in history[32:40]]
-    # Who knows of constraints is told the truth, others are told of a bad value.
-    trials = [t for t in sampler._study.get_trials() if t.values]
-    broken = [t for t in trials if t.params["gain"] < 0.0]
-    assert broken
-    for trial in broken:
-        gain = trial.params["gain"]
-        if name in CONSTRAINED:
-            assert trial.value == 2.0 + gain
-            assert trial.constraints == {"0": -gain, "1": gain - 0.9}
-        else:
-            assert trial.value > 2.0 + gain + 20.0
-            assert trial.constraints == {}
-
-
 def test_ends_when_all_chains_have_stalled():
     settings = {"chains": 2, "stall_accepted": 4}
     config = OfflineConfig(

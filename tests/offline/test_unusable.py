@@ -9,14 +9,13 @@ from adaptune.errors import AdaptuneError
 from adaptune.model.knn import NearestNeighbours
 from offline.campaign import whole_values
 from offline.config import OfflineConfig, load_study
-from offline.objective import candidates, judge, penalised, sampler_results
+from offline.objective import candidates, judge, sampler_results
 from offline.train import train
 from offline.validate import validate
 
 GOOD = Summary({"x": 1}, 2.0, 0, 0, 10.0)
 FAILS = [Summary({"x": 2}, 1.0, 0, 10, 0.01), Summary({"x": 2}, 1.0, 0, 1, 0.01, without_pose=0.1)]
 FAST = "offline.objective={rte: 0.001, ms_per_scan: 1.0}"
-LIMIT = "offline.limits={ms_per_scan: {max: 1000}}"
 
 
 def trained(study_file, folder, fails, *given):
@@ -29,7 +28,6 @@ def trained(study_file, folder, fails, *given):
     ("fails", "given"),
     [
         ("always", [FAST]),
-        ("always", [FAST, LIMIT]),
         ("always", ["offline.sets=own", FAST]),
         ("every fifth", [FAST]),
         ("in two", [FAST]),
@@ -46,8 +44,8 @@ def test_a_set_that_fails_is_never_chosen(study_file, tmp_path, fails, given):
     assert not failing & {model.fixed, *model.bank, *model.rivals.values()}
     said = [text for text in training.words if "never chosen" in text]
     assert [text.split()[0] for text in said] == [str(len(failing))]
-    # They show the rules where not to go. Of limits, nobody knows whether they keep them.
-    assert set(model.sets) == set(sets) - (failing if LIMIT in given else set())
+    # They show the rules where not to go.
+    assert set(model.sets) == set(sets)
     data = model.training_data(model.pca())
     rule = NearestNeighbours().fit(data)
     assert not failing & {rule.select(feature).trial for feature in data.features[::9]}
@@ -64,18 +62,17 @@ def test_where_all_others_fail_the_baseline_is_left(study_file, tmp_path):
 
 @pytest.mark.parametrize("fails", FAILS)
 def test_a_set_that_fails_on_one_sequence_is_not_usable(fails):
-    of = OfflineConfig(objective="ms_per_scan", limits={"ms_per_scan": {"max": 20}})
+    of = OfflineConfig(objective="ms_per_scan")
     good, bad = judge(of, [GOOD, GOOD]), judge(of, [GOOD, fails])
     assert (good.usable, bad.usable) == (True, False)
-    assert bad.excess > 1.0
-    assert candidates(of, {0: good, 1: bad}) == [0]
+    assert candidates({0: good, 1: bad}) == [0]
     assert whole_values(of, {"one": {0: GOOD, 1: fails}}) == {"one": {0: 10.0, 1: np.inf}}
     # Samplers are told that it is bad.
-    for found in (sampler_results([good, bad]), penalised(sampler_results([good, bad]))):
-        assert found[0].value == 10.0
-        assert 100.0 <= found[1].value < 1e6
+    found = sampler_results([good, bad])
+    assert found[0].value == 10.0
+    assert 100.0 <= found[1].value < 1e6
     with pytest.raises(AdaptuneError, match=r"none of 1 parameter sets gives poses .*: mend"):
-        candidates(of, {1: bad})
+        candidates({1: bad})
 
 
 def test_a_fault_now_and_then_does_no_harm():

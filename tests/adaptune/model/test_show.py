@@ -9,7 +9,7 @@ from adaptune.commands.cli import app
 from adaptune.model import BankSettings, ErrorModel
 from adaptune.model.rules import Costs, SetCost
 from adaptune.space import Categorical, Float, ParameterSets, ParameterSpace
-from offline.config import Limit, OfflineConfig
+from offline.config import OfflineConfig
 
 
 @pytest.fixture
@@ -73,8 +73,7 @@ LITERAL = ("my[v2]", "[/b]", ":x:", "[red]")
 def test_no_model_shows_raw_data(model, tmp_path):
     summary = dict.fromkeys(("geometric", "low", "high", "worst", "arithmetic"), 0.9)
     augment = [{"name": "noise", "sigma": 0.1}, {"name": "cut", "start": None}]
-    limits = {"rte": Limit(max=3.0)}
-    config = OfflineConfig(objective={"rte": 1.0, "ape": 0.5}, limits=limits)
+    config = OfflineConfig(objective={"rte": 1.0, "ape": 0.5})
     extrinsic = {"translation": [0, 0.5, 1]}
     settings = {"command": ["slam", "--fast"], "extrinsic": extrinsic, "gpu": True}
     for changes in (

@@ -1,4 +1,3 @@
-import dataclasses
 import json
 import re
 import sys
@@ -189,12 +188,10 @@ def test_too_many_scans_before_the_first_pose_are_a_failure(make):
     assert trial.mean_error > 1.0
 
 
-def test_what_it_takes_is_measured_and_can_be_limited(make):
-    kept = "{cpu: {max: 100000}, ms_per_scan: {max: 1000}}"
+def test_what_it_takes_is_measured(make):
     once = "offline.trials=1"
-    study = make(
-        "work", "offline.objective={rte: 1, memory: 0.001}", f"offline.limits={kept}", once
-    )
+    objective = "{rte: 1, memory: 0.001, cpu: 0.001, ms_per_scan: 0.001}"
+    study = make("work", f"offline.objective={objective}", once)
     trial, _ = run(study)
     # It computes for half a second in a child, beside a child of 200 MB, over 40 scans of 3.9 s.
     assert 12.5 <= 1e3 * np.median(trial.seconds) < 200.0
@@ -209,11 +206,6 @@ def test_what_it_takes_is_measured_and_can_be_limited(make):
     assert trial.faults
     assert 1e3 * np.median(trial.seconds) >= 20.0
     assert trial.usage["memory"] > 5.0
-    limited = make("work", "offline.limits={ms_per_scan: {max: 1}}", once)
-    limited = dataclasses.replace(limited, folder=limited.folder.with_name("limited"))
-    training = train(limited)
-    assert training.model.fixed == 0
-    assert "ms_per_scan <= 1 on every sequence; trial 0 comes nearest" in training.words[0]
 
 
 def test_another_frame(make):
