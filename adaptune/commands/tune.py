@@ -254,9 +254,9 @@ def tune(
 ) -> None:
     """Tune an odometry on recordings, and say what to drive.
 
-    It keeps the last 40 % of one recording, or the last one of several, for the test. It tries
-    parameter sets on the rest, replays the test with the odometry's own parameters, the best set,
-    and adapting, and compares.
+    It keeps the last 40 % of one recording (of its path, where the robot stands for long), or the
+    last one of several, for the test. It tries parameter sets on the rest, replays the test with
+    the odometry's own parameters, the best set, and adapting, and compares.
 
     What it decides is written to a study file in its folder, with which all other commands work.
     Run the same command again to resume.

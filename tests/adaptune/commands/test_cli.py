@@ -158,6 +158,8 @@ def test_ctrl_c_leaves_a_study_that_resumes(adaptune, gicp_study_file, tmp_path)
     assert campaign.returncode == 130
     assert "run the same command again" in said
     assert "Traceback" not in said
+    # Lines of a log are as long as what they say.
+    assert all(re.match(r"\[\d\d:\d\d:\d\d\] .*\S$", line) for line in said.splitlines()[:-1])
     finished = {p: p.stat().st_mtime_ns for p in archive.folder.glob("*/0000[0-3].npz")}
     assert adaptune("offline", gicp_study_file).exit_code == 0
     assert {p: p.stat().st_mtime_ns for p in finished} == finished
