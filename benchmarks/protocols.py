@@ -233,13 +233,13 @@ def commands(name: str, folder: Path, n_sets: int) -> list[list[str]]:
     protocol = PROTOCOLS[name]
     study = str(CONFIGS / f"{protocol.study}.yaml")
     stages = ("simulate", "offline", "online") if protocol.simulated else ("offline", "online")
-    made, folders = [], []
+    made: list[list[str]] = []
     for variant, own in protocol.variants.items():
-        folders.append(str(folder / "runs" / "-".join(filter(None, (name, variant)))))
+        own_folder = str(folder / "runs" / "-".join(filter(None, (name, variant))))
         given = [f"offline.trials={n_sets}", *protocol.overrides, *own]
-        options = ["--folder", folders[-1], *(word for key in given for word in ("-o", key))]
-        made += [["adaptune", stage, study, *options] for stage in stages]
-    return [*made, ["adaptune", "compare", *folders]]
+        options = ["--folder", own_folder, *(word for key in given for word in ("-o", key))]
+        made += [["adaptune", stage, study, *options] for stage in (*stages, "compare")]
+    return made
 
 
 def main() -> None:

@@ -321,8 +321,12 @@ def distribution(parameter: Float | Integer | Categorical) -> Any:
     return FloatDistribution(parameter.low, parameter.high, log=parameter.log)
 
 
-_SET_BY_KEY = {"seed": "seed", "n_startup_trials": "initial"}
-"""Settings of Optuna's samplers that adaptune sets, and from which key."""
+_NOT_SET = {
+    "seed": "is set by offline.seed",
+    "n_startup_trials": "is set by offline.initial",
+    "constraints_func": "is a function, which a study cannot give; leave it out",
+}
+"""Settings of Optuna's samplers that a study does not have, and why."""
 _BOX = ("low", "high")
 _MAX_SETTING = 100_000
 """Candidates, or members of a population: more of them take hours, or all memory."""
@@ -369,8 +373,8 @@ def check_sampler(
 
 
 def _check_optuna(name: str, settings: Mapping[str, Any]) -> Iterable[Mistake]:
-    if taken := next((key for key in _SET_BY_KEY if key in settings), None):
-        yield Mistake((taken,), f"is set by offline.{_SET_BY_KEY[taken]}")
+    if taken := next((key for key in _NOT_SET if key in settings), None):
+        yield Mistake((taken,), _NOT_SET[taken])
         return
     for key, value in settings.items():
         if isinstance(value, int) and abs(value) > _MAX_SETTING:

@@ -240,7 +240,7 @@ class LabelledSequence:
     stretch: NDArray[np.intp]  # (n,): number of each frame's stretch, the same in a view
     # (n, n_sets): percent, infinite where the track was lost, NaN where a set was not run.
     errors: NDArray[np.float32]
-    baseline: NDArray[np.float64]  # (n,): errors of the baseline, which may exceed limits
+    baseline: NDArray[np.float64]  # (n,): errors of the baseline
     blocks: Mapping[str, int]  # by name, in order, the lengths of the descriptors
     # By trial number (n, 3): errors of the best sets as vectors, see `adaptune.model.TrainingData`.
     vectors: Mapping[int, NDArray[np.float32]] = field(default_factory=dict)

@@ -61,7 +61,7 @@ class Sampler(ABC):
         """Propose the parameter sets of the next batch.
 
         The history has the results of all trials of the batches before, in their order:
-        `SamplerResult`, or tuples like it.
+        `SamplerResult`, or tuples of a set and its value.
 
         Returns
         -------

@@ -223,7 +223,7 @@ def _pick(waiting: list[Task], near: dict[W, set[str]], worker: W) -> Task:
 
 
 MOST_PREPARED = 1.5e9
-"""Bytes of prepared scans that a worker keeps: with twice as many, no campaign was faster."""
+"""Bytes of prepared scans that a worker keeps; others are prepared again for each batch."""
 
 
 class Sequences:
@@ -274,7 +274,7 @@ def attempt(
 
 
 class Workers:
-    """Processes on this machine, which share `memory` bytes for prepared scans.
+    """Processes on this machine, which share `memory` bytes, or less, for prepared scans.
 
     Use it as a context: leaving it ends the processes.
     """
@@ -393,8 +393,8 @@ class Cluster:
     A worker reads recordings that it has under the same path. Others are decoded and sent to it
     once; it keeps them in its cache of decoded sequences, under a digest of their contents.
 
-    Its workers share `memory` bytes for prepared scans. Use it as a context: leaving it cancels the
-    tasks that are not done.
+    Its workers share `memory` bytes, or less, for prepared scans. Use it as a context: leaving it
+    cancels the tasks that are not done.
 
     Raises
     ------

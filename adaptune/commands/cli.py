@@ -55,7 +55,7 @@ def _main(
     from rich.logging import RichHandler
 
     plain: Any = {"markup": False, "highlighter": NullHighlighter(), "keywords": []}
-    # Of rich, each line is as wide as the terminal.
+    # In a file, rich would pad every line to the console's width.
     bars = errors.is_terminal
     rich = RichHandler(console=errors, show_path=False, show_level=False, **plain)
     logging.basicConfig(

@@ -142,7 +142,7 @@ def trials(
         if (fixed := loaded.fixed) is not None:
             same = (row["trial"] for row in finished if fixed.items() <= row.items())
             if (number := next(same, None)) is not None:
-                say(f"The fixed set is trial {number}: whole runs decide.")
+                say(f"The fixed set is trial {number}, as whole runs decided.")
         estimates = estimates_of(loaded.sequences, names)
         for sentence in estimates_in_words(estimates, loaded.config.sub_trajectory):
             say(sentence)

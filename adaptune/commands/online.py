@@ -230,7 +230,7 @@ def compared(loaded: "OfflineStudy", *, details: bool = False) -> "ComparedRepla
     With `details`, print all sentences and tables of the page, too.
     """
     from online.compare import compare as compare_replays
-    from online.modes import ADAPTIVE, FIXED
+    from online.modes import ADAPTIVE, BASELINE, FIXED
     from online.tables import decision_table, tables
 
     begin_work()
@@ -244,7 +244,8 @@ def compared(loaded: "OfflineStudy", *, details: bool = False) -> "ComparedRepla
     page, length = _write_page(loaded, found), loaded.config.sub_trajectory
     say(" ".join(found.verdict))
     if found.rows[0].yardstick == "fixed":
-        say_fixed(loaded, advised=found.advised in ("", FIXED, ADAPTIVE))
+        same = (BASELINE,) if loaded.fixed == loaded.odometry.space.baseline else ()
+        say_fixed(loaded, advised=found.advised in ("", FIXED, ADAPTIVE, *same))
     say(f"More: {page}")
     shown = tables(found.rows, length) if details else [decision_table(found.rows, length)]
     for sentence in found.details if details else ():

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 # Text of files is printed as it is: no markup, no emoji.
 _literal: Any = {"markup": False, "emoji": False, "highlight": False}
-# In a pipe, tables and logs are not wrapped, unless COLUMNS gives a width.
+# In a pipe, tables are not wrapped, unless COLUMNS gives a width.
 _wide = None if "COLUMNS" in os.environ else 200
 console = Console(width=None if sys.stdout.isatty() else _wide, **_literal)
 errors = Console(stderr=True, width=None if sys.stderr.isatty() else _wide, **_literal)
@@ -136,7 +136,6 @@ def say_fixed(study: "OfflineStudy", advised: bool = True) -> None:
     own = None if fixed is None else study.own_file(fixed)
     there = own is not None and own[0].exists()
     more = f"; for the odometry's own tool: {own[0]} ({own[1].use})" if own and there else ""
-    advised = advised or fixed == study.odometry.space.baseline
     what = "The parameters" if advised else "The fixed set, which is not advised here"
     say(f"{what}: {study.folder / FIXED_SET}{more}.")
 

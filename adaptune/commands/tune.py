@@ -136,7 +136,7 @@ def _proposed(found: "Inspection", deep: bool, show: Progress) -> tuple[float | 
     """
     if found.name:
         _undo_motion([found], ["gicp"])
-    if found.reference is None or not found.name or found.missing.get("offline"):
+    if found.reference is None or len(found.reference) < 2 or found.missing.get("offline"):
         return None, UNKNOWN_LENGTH, ""
     from adaptune.recording.inspect import Fault
     from adaptune.recording.recording import open_sequence
@@ -159,7 +159,7 @@ def _proposed(found: "Inspection", deep: bool, show: Progress) -> tuple[float | 
     except AdaptuneError as error:
         return share, str(usual), f"its error cannot be measured: {error}"
     length = check.proposed_sub_trajectory(reference, measured, share)
-    words = check.accuracy_words(measured, usual, length), check.advice(measured, reference)
+    words = check.accuracy_words(measured, usual, length), check.advice(measured, reference, share)
     return share, str(length), "; ".join(filter(None, words))
 
 
@@ -481,7 +481,7 @@ def _share(reference: "Trajectory") -> float:
     of_path = float(np.interp(TRAINING, time, metres / max(float(metres[-1]), 1e-9)))
     if abs(of_path - TRAINING) <= UNEVEN:
         return TRAINING
-    return round(float(np.interp(TRAINING * metres[-1], metres, time)), 2)
+    return round(float(np.interp(TRAINING * metres[-1], metres, time).clip(0.01, 0.99)), 2)
 
 
 def _estimate(study: "OfflineStudy", names: Sequence[str]) -> None:

@@ -174,6 +174,8 @@ class Inspection:
             return text
         hint = "    # reference: a topic, or a TUM, KITTI or EuRoC file; estimated if left out\n"
         text += hint if "reference" not in self.used else ""
+        if "compensate" in self.given:
+            text += "    # without `compensate` for an odometry that undoes the motion itself\n"
         hint = "    # stamp: end - if headers mark scans' ends and times count from the start\n"
         return text + (hint if self.scan is not None and self.scan.times is not None else "")
 
@@ -534,9 +536,11 @@ def _topic_faults(topic: Topic, of: str, complete: bool, apart: bool) -> Iterato
         what = "are not in the sample, `--deep` reads them"
         yield Fault(f"{topic.name}: its {topic.count} messages {what}", of)
     if any(topic.stamps) and not apart:
-        yield from _stamp_faults(topic, of)
-        if sum(map(len, topic.stamps)) < topic.count and not complete:
-            yield from _count_faults(topic, of)
+        faults = [*_stamp_faults(topic, of)]
+        yield from faults
+        sampled = not complete and sum(map(len, topic.stamps)) < topic.count
+        if sampled or not faults:
+            yield from _count_faults(topic, of, sampled)
 
 
 def _stamp_faults(topic: Topic, of: str) -> Iterator[Fault]:
@@ -575,8 +579,8 @@ def _stamp_faults(topic: Topic, of: str) -> Iterator[Fault]:
         yield Fault(f"{name}: {what}{_LEFT_OUT['points'] if of == 'points' else ''}", of)
 
 
-def _count_faults(topic: Topic, of: str) -> Iterator[Fault]:
-    """Messages that are missing outside the sample, by their number in the whole recording."""
+def _count_faults(topic: Topic, of: str, sampled: bool) -> Iterator[Fault]:
+    """Messages that are missing, by their number in the whole recording."""
     usual = np.median(topic.steps) if len(topic.steps) else np.inf
     steps = topic.steps[np.abs(topic.steps - usual) < 0.2 * usual]
     # Only what comes regularly has a number to expect.
@@ -586,8 +590,8 @@ def _count_faults(topic: Topic, of: str) -> Iterator[Fault]:
     doubt = max(_MISSED, 3.0 * float(steps.std() / steps.mean()) / len(steps) ** 0.5)
     if topic.count < (1.0 - doubt) * expected:
         what = f"about {expected - topic.count:,} of {expected:,} messages are missing"
-        help_ = "gaps that the sample does not show, `--deep` finds them"
-        yield Fault(f"{topic.name}: {what}: {help_}", of)
+        help_ = ": `--deep` looks for the gaps" if sampled else ", one or a few at a time"
+        yield Fault(f"{topic.name}: {what}{help_}", of)
 
 
 def _cloud_faults(topic: Topic, valid: list[int]) -> Iterator[Fault]:

@@ -710,11 +710,11 @@ def accuracy_words(measured: MeasuredReference, *lengths: float) -> str:
     return f"wrong by {', '.join(words)}, as registrations of scans tell"
 
 
-def advice(measured: MeasuredReference, reference: Trajectory) -> str:
+def advice(measured: MeasuredReference, reference: Trajectory, training: float = TRAINING) -> str:
     """What to do about a reference that is too noisy for the usual length; empty if it is not."""
-    if not is_noisy(measured.error(proposed_sub_trajectory(reference))):
+    if not is_noisy(measured.error(proposed_sub_trajectory(reference, training=training))):
         return ""
-    length = proposed_sub_trajectory(reference, measured)
+    length = proposed_sub_trajectory(reference, measured, training)
     less = "sets that differ by less cannot be told apart"
     if is_noisy(measured.error(length)):
         return f"{less}, at no length that fits: use `reference: estimated`"

@@ -301,7 +301,7 @@ DELETED = {
     "offline.runs=episodes": "is gone; give restart, or whole",
     "offline.pruning=halving": _NO_PRUNING,
     "offline.pruning=hyperband": _NO_PRUNING,
-    "offline.memory": "is gone: workers keep scans in a quarter of the machine's memory",
+    "offline.memory": "is gone: each worker keeps 1.5 GB of prepared scans at most",
     **{
         f"offline.sampler={old}": f"is gone; give optuna.samplers:{name}, with its own settings"
         for old, name in (

@@ -90,7 +90,7 @@ def test_each_sequence_searches_for_itself(study_of):
         assert names == (NAMES if everywhere else [owner_of(archive, n)])
         assert verdicts[n].complete == everywhere
         assert list(verdicts[n].sequences) == names
-    fixed = best_by_trials(study.config.offline, verdicts)
+    fixed = best_by_trials(verdicts)
     assert fixed in {0, *best.values()}
     means = {
         n: np.mean([archive.finished(name)[n].mean_error for name in NAMES]) for n in (0, fixed)
@@ -187,7 +187,7 @@ def test_what_a_place_has_found_is_not_known_where_it_is_left_out(study_of):
     assert np.isnan(data.sequences[0].errors).any()
     complete = data.complete()
     assert list(complete.sets) == [n for n, v in verdicts.items() if v.complete]
-    assert complete.fixed() == best_by_trials(study.config.offline, verdicts)
+    assert complete.fixed() == best_by_trials(verdicts)
     for sequence in complete.sequences:
         assert sequence.own.tolist() == [
             owner_of(archive, n) == sequence.name for n in complete.sets

@@ -53,6 +53,7 @@ def test_one_command_tunes_compares_and_resumes(bag, tmp_path):
     assert (folder / "model.safetensors").stat().st_mtime_ns == model
     done = commands.call("tune", bag, *FAKE, "--trials", 6)
     assert len(commands.call("trials", folder, "--csv").stdout.splitlines()) == 7, done.output
+    assert "The fixed set is trial " in commands.call("trials", folder).stdout
     # Other commands take the file that it wrote.
     commands.succeeded("compare", folder / f"{folder.name}.yaml")
 
@@ -156,7 +157,7 @@ def test_a_recording_that_stands_for_long_is_split_by_its_path(tmp_path, monkeyp
     # `inspect` proposes the same.
     commands.succeeded("inspect", "late.bag", "--study", "proposed.yaml")
     proposed = load_study(tmp_path / "proposed.yaml", [], tmp_path / "another")
-    for key in ("test", "sub_trajectory", "sequences"):
+    for key in ("training", "test", "sub_trajectory", "sequences"):
         assert getattr(proposed.config, key) == getattr(study.config, key), key
 
 
@@ -169,6 +170,9 @@ def test_motion_within_scans_is_undone_where_the_odometry_does_not(tmp_path, mon
         failed("street.bag", "--odometry", odometry, "--folder", odometry)
         study = load_study(tmp_path / odometry / f"{odometry}.yaml", [], tmp_path / "other")
         assert study.config.sequences["street"].compensate == how
+    commands.succeeded("inspect", "street.bag", "--study", "proposed.yaml")
+    proposed = load_study(tmp_path / "proposed.yaml", [], tmp_path / "other")
+    assert proposed.config.sequences["street"].compensate == "constant_velocity"
 
 
 @pytest.mark.usefixtures("decided")
