@@ -284,8 +284,9 @@ def _write_page(study: "OfflineStudy", found: "ComparedReplays | str") -> Path:
     sections.append(_search(study))
     validation = partial(charts_of_validation, study.folder)
     sections += [_of_charts("With recordings left out", validation), _settings(config)]
+    n = len(config.training)
     subtitle = (
-        f"{', '.join(config.odometries)}: trained on {len(config.training)} sequences, tested on "
+        f"{', '.join(config.odometries)}: trained on {n} sequence{'s' * (n != 1)}, tested on "
         f"{len(config.test)}, errors over {config.sub_trajectory:g} m, seed {config.offline.seed}"
     )
     words = () if isinstance(found, str) else tuple(found.verdict)

@@ -272,8 +272,8 @@ def tune(
         _write(path, made_by + text)
     elif not path.read_text("utf-8").startswith(made_by):
         raise AdaptuneError(
-            f"{path}: was made by another command, see its first line; give that one to resume it, "
-            f"or another --folder"
+            f"{path}: another `adaptune tune` made it, for what its first line says; name the same "
+            f"to resume it, or another --folder"
         )
     else:
         overrides = _keep_limits(path, _limits(trials, minutes))

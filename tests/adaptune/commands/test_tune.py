@@ -87,7 +87,7 @@ def test_what_the_user_changed_stays(bag, tmp_path):
     assert failed(bag, "--trials", 7).endswith("one.yaml offline.trials=7")
     assert "\n  trials: 5" in path.read_text()
     said = failed(bag, "--reference", "estimated")
-    assert "runs/one/one.yaml: was made by another command, see its first line" in said
+    assert "runs/one/one.yaml: another `adaptune tune` made it, for what its first line" in said
 
 
 @pytest.mark.usefixtures("decided")
