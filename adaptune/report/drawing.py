@@ -96,20 +96,17 @@ def _names(item: Drawn) -> tuple[str, ...]:
     return tuple(filter(None, item.names if isinstance(item, Shares) else named))
 
 
+_LAYERS = (Spans, Shares, Bars, Band, Line, Points, Mark, Words)
+
+
 def _layer(item: Drawn) -> float:
     """What a panel shows, from the lowest to the highest."""
-    if isinstance(item, Line | Points) and item.faint:
-        return 4.0
-    if isinstance(item, Points) and len(item.x) > _MANY:
-        return 4.5
+    place = float(_LAYERS.index(type(item)))
     if isinstance(item, Line):
         # Of lines that coincide, one is seen between the dashes of the other.
-        place = list(MODES).index(item.name) if item.name in MODES else len(MODES)
-        return 5.0 + 0.5 * item.dashed + place / 100.0
-    if isinstance(item, Mark | Words):
-        return 7.0
-    order = (Spans, Shares, Bars, Band)
-    return float(order.index(type(item))) if isinstance(item, order) else 6.0
+        return place + 0.5 * item.dashed - 0.6 * item.faint
+    behind = isinstance(item, Points) and (item.faint or len(item.x) > _MANY)
+    return place - 1.5 if behind else place
 
 
 def plain(value: float) -> str:
@@ -148,16 +145,10 @@ def thinned(*columns: NDArray[np.float64], most: int = _MOST) -> NDArray[np.intp
     return np.array(sorted(kept))
 
 
-class _Wrapper(textwrap.TextWrapper):
-    """Breaks long names, too, where it is best."""
-
-    wordsep_simple_re = re.compile(r"(\s+|(?<=[_/.])(?=\D))")
-
-
 def wrapped(words: str, letters: float) -> list[str]:
     """Words on lines of at most so many letters, where they can be broken."""
-    wrapper = _Wrapper(max(int(letters), 8), break_on_hyphens=False)
-    return [part for line in words.splitlines() for part in wrapper.wrap(line)] or [""]
+    width = max(int(letters), 8)
+    return [part for line in words.splitlines() for part in textwrap.wrap(line, width)] or [""]
 
 
 # The drawing, as a specification of Vega-Lite.
@@ -193,6 +184,7 @@ _CONFIG: Spec = {
     "title": {"anchor": "start", "fontSize": 13, "fontWeight": "normal", "color": _DARK},
     "text": {"fontSize": 12},
     "concat": {"spacing": 18},
+    "scale": {"invalid": {"color": {"value": _UNKNOWN}}},
 }
 
 
@@ -366,8 +358,8 @@ class _Drawing:
             words = wrapped(panel.title, self._width / _LETTER)
             made["title"] = {"text": words, "offset": 6, "frame": "group"}
         if _is_empty(panel):
-            self._x["axis"] |= {"values": []}
-            self._y["axis"] |= {"values": []}
+            for channel in (self._x, self._y):
+                channel["axis"] |= {"values": []}
             empty = self._drawn({"type": "point"}, {"x": [np.nan], "y": [np.nan]})
             middle = {"x": 0.5 * self._width, "y": 0.5 * self._height}
             text = {"type": "text", "text": NO_DATA, "color": "#666666", **middle}
@@ -451,15 +443,12 @@ class _Drawing:
             yield self._drawn(mark, columns, tooltip=tips)
             return
         columns["c"] = colour = numbers(points.colour, Axis("", log=points.log_colour))
-        known = np.isfinite(colour)
-        unknown, columns = (
-            {name: np.array(of)[kept] for name, of in columns.items()} for kept in (~known, known)
-        )
-        yield self._drawn(mark | {"color": _UNKNOWN}, unknown, tooltip=tips)
-        if known.any():
-            limits = float(colour[known].min()), float(colour[known].max())
+        if (known := colour[np.isfinite(colour)]).size:
+            limits = float(known.min()), float(known.max())
             bar = self._colour_bar(points.colour_label, limits, points.log_colour)
             yield self._drawn(mark, columns, tooltip=tips, color=bar)
+        else:
+            yield self._drawn(mark | {"color": _UNKNOWN}, columns, tooltip=tips)
 
     def _colour_bar(self, words: str, limits: tuple[float, float], log: bool) -> Spec:
         legend: Spec = {"title": wrapped(words, 16), "gradientOpacity": 1.0}
@@ -520,10 +509,8 @@ class _Drawing:
             yield from _read_anywhere(words, _table(x=[0.5 * (begin + end)]), {"x": self._x})
 
     def _mark(self, mark: Mark) -> Iterator[Spec]:
-        low, high = sorted(self._extent["x"])
-        if low <= mark.at <= high:
-            rule: Spec = {"type": "rule", "color": _DARK, "strokeDash": (5, 3)}
-            yield {"data": _table(x=[mark.at]), "mark": rule, "encoding": {"x": self._x}}
+        rule: Spec = {"type": "rule", "color": _DARK, "strokeDash": (5, 3), "clip": True}
+        yield {"data": _table(x=[mark.at]), "mark": rule, "encoding": {"x": self._x}}
 
     def _words(self, words: Words) -> Iterator[Spec]:
         x, y = numbers(words.x, self._panel.x), numbers(words.y, self._panel.y)
