@@ -120,7 +120,7 @@ class Panel:
 class Chart:
     """A figure of one panel or several."""
 
-    key: str  # of its files and its anchor
+    key: str  # names its files and its anchor
     title: str
     panels: tuple[Panel, ...]  # row by row
     caption: str = ""  # what it shows, in a sentence or two

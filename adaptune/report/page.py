@@ -4,7 +4,6 @@ import json
 import re
 from dataclasses import dataclass
 from importlib.resources import files
-from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -39,24 +38,13 @@ class Page:
 
 
 def write_page(path: Path, page: Page) -> None:
-    """Write a page, and its charts as PNG and SVG into the folder `FIGURES` beside it.
+    """Write a page, and its charts as PNG and SVG into the folder `FIGURES` beside its HTML file.
 
-    Parameters
-    ----------
-    path
-        Of the HTML file.
-    page
-        What it says. The keys of its charts name the files, as far as names of files may.
-
-    Raises
-    ------
-    FullError
-        If there is no room for it.
+    The keys of its charts are distinct and names of files. There is a FullError without room.
     """
     charts = [chart for section in page.sections for chart in section.charts]
-    names = file_names([chart.key for chart in charts])
     with processes(len(charts), [__name__]) as pool:
-        figures = [path.parent / FIGURES / names[chart.key] for chart in charts]
+        figures = [path.parent / FIGURES / chart.key for chart in charts]
         files = ([f"{figure}.{kind}" for figure in figures] for kind in ("png", "svg"))
         drawn = pool.map(draw_chart, charts, *(map(Path, of_kind) for of_kind in files))
         text = page_text(page)
@@ -65,7 +53,7 @@ def write_page(path: Path, page: Page) -> None:
 
 
 def page_text(page: Page) -> str:
-    """A page as HTML; the keys of its charts are distinct."""
+    """A page as HTML."""
     import jinja2
     import vl_convert
     from markupsafe import Markup, escape
@@ -79,29 +67,14 @@ def page_text(page: Page) -> str:
         "cell": cell_text,
         "sorted_by": _sorted_by,
     }
-    charts = [chart for section in page.sections for chart in section.charts]
-    names = file_names([chart.key for chart in charts])
     return environment.from_string(here.joinpath("page.html").read_text("utf-8")).render(
         page=page,
         css=here.joinpath("page.css").read_text("utf-8"),
         figures=FIGURES,
-        names=names,
-        charts={names[chart.key]: spec(chart, titled=False) for chart in charts},
+        charts={c.key: spec(c, titled=False) for part in page.sections for c in part.charts},
         columns=_columns,
         vega=vl_convert.javascript_bundle("window.vegaEmbed = vegaEmbed;"),
     )
-
-
-def file_names(keys: list[str]) -> dict[str, str]:
-    """By the key of a chart, the name of its file, which is its anchor, too."""
-    named: dict[str, str] = {}
-    for key in keys:
-        name = base = re.sub(r"[^\w.-]+|^\.", "_", key) or "chart"
-        again = count(2)
-        while name.lower() in map(str.lower, named.values()):
-            name = f"{base}-{next(again)}"
-        named[key] = name
-    return named
 
 
 def _columns(table: Listing) -> dict[str, str]:
