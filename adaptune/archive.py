@@ -338,24 +338,9 @@ class Archive:
         return self._finished
 
     def sets(self) -> dict[int, ParameterSet]:
-        """The parameter sets of all finished trials, also on sequences that a study has left out.
-
-        Raises
-        ------
-        ArchiveError
-            If two trials of one number have different sets.
-        """
-        found: dict[int, tuple[str, ParameterSet]] = {}
-        for name, trials in self._all().items():
-            for number, summary in trials.items():
-                first, parameters = found.setdefault(number, (name, summary.parameters))
-                if parameters != summary.parameters:
-                    one, other = (self.trial_path(n, number) for n in (first, name))
-                    raise ArchiveError(
-                        f"{other}: has other parameters than {one}; remove the one that is not "
-                        f"of this study, and run again"
-                    )
-        return {number: parameters for number, (_, parameters) in found.items()}
+        """The parameter sets of all finished trials, also on sequences that are no more used."""
+        every = self._all().values()
+        return {number: run.parameters for trials in every for number, run in trials.items()}
 
     def slots(self, names: Iterable[str] = ()) -> dict[str, int]:
         """The slot of every sequence that has one, or is among `names`; a sequence keeps its slot.
@@ -387,10 +372,8 @@ class Archive:
                 yield key, indexed.get(key) or summarise(self.read(path.name, number))
 
     def _index(self) -> str:
-        try:
-            return (self.folder / INDEX).read_text("utf-8", errors="replace")
-        except FileNotFoundError:
-            return ""
+        path = self.folder / INDEX
+        return path.read_text("utf-8", errors="replace") if path.exists() else ""
 
     def has_frames(self, sequence: str, names: Sequence[str]) -> bool:
         """Whether the data that all trials on a sequence share exists, with these descriptors."""
@@ -440,7 +423,6 @@ class Archive:
         with replacing(path) as temporary, temporary.open("wb") as file:
             np.savez(
                 file,
-                place=_packed([sequence, number, whole]),
                 parameters=_packed(trial.parameters),
                 T_odom_sensor=trial.T_odom_sensor,
                 errors=trial.errors.astype(np.float32),
@@ -462,7 +444,6 @@ class Archive:
         """Read a trial."""
         path = self.trial_path(sequence, number, whole)
         data = _read(path)
-        _check_place(path, data, [sequence, number, whole])
         try:
             plain = {name: _unpacked(data[name]) for name in _PLAIN}
             plain |= {name: tuple(plain[name]) for name in ("faults", "repeats")}
@@ -489,9 +470,7 @@ class Archive:
                 continue
             path = self.trial_path(sequence, number)
             # Arrays are loaded one by one. Poses, most of the file, are not needed.
-            data = _read(path, ["errors", "place"])
-            _check_place(path, data, [sequence, number, False])
-            errors = data["errors"]
+            errors = _read(path, ["errors"])["errors"]
             if read is None:
                 read = np.full((len(errors), len(numbers)), np.nan, np.float32)
             if len(errors) != len(read):
@@ -521,18 +500,6 @@ def _damaged(path: Path, error: Exception) -> ArchiveError:
     # NumPy says how to load such a file unsafely.
     why = "it does not hold NumPy's numbers" if "pickle" in str(error) else error
     return ArchiveError(f"{path}: is damaged ({why}); remove it and run again")
-
-
-def _check_place(path: Path, data: Mapping[str, NDArray[Any]], place: list[Any]) -> None:
-    """Refuse the file of another trial."""
-    try:
-        sequence, number, whole = found = _unpacked(data["place"])
-    except (KeyError, ValueError, TypeError) as error:
-        raise _damaged(path, error) from error
-    if found != place:
-        what = f"{'the whole run of ' if whole else ''}trial {number} on {sequence}"
-        why = "it was copied over the trial of its name; remove it and run again"
-        raise ArchiveError(f"{path}: holds {what}, so {why}")
 
 
 def _read(path: Path, names: Sequence[str] | None = None) -> dict[str, NDArray[Any]]:
@@ -567,10 +534,6 @@ _HEADINGS = {
 """Columns as a table for reading names them."""
 
 
-class TrialsError(AdaptuneError):
-    """A column that there is not."""
-
-
 def rows(archive: Archive, names: Sequence[str]) -> list[Row]:
     """A row for every trial that is finished on at least one of the sequences.
 
@@ -590,7 +553,7 @@ def rows(archive: Archive, names: Sequence[str]) -> list[Row]:
         trials = {name: finished[name].get(number) for name in names}
         there = [trial for trial in trials.values() if trial is not None]
         row: Row = {"trial": number} | {name: there[0].parameters.get(name) for name in parameters}
-        errors = {name: t.mean_error if t is not None else None for name, t in trials.items()}
+        errors = {name: t.mean_error if t else None for name, t in trials.items()}
         row |= {"mean": _mean(list(errors.values()))} | errors
         row |= {"lost": sum(t.lost for t in there), "faults": sum(t.faults for t in there)}
         row["unhealthy"] = sum(sum(t.unhealthy.values()) for t in there)
@@ -620,7 +583,7 @@ def select(table: Sequence[Row], sort: str | None = None, top: int | None = None
     column = _COLUMN.get(name, name)
     if table and column not in table[0]:
         known = nearest(column, table[0])
-        raise TrialsError(f"--sort {sort}: there is no column {column!r}: {known}")
+        raise AdaptuneError(f"--sort {sort}: there is no column {column!r}: {known}")
     chosen = [row for row in table if row[column] is not None]
     chosen.sort(key=lambda row: row[column], reverse=sort.startswith("-"))
     return [*chosen, *(row for row in table if row[column] is None)][:top]

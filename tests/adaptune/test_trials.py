@@ -4,7 +4,8 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from adaptune.archive import Archive, Frames, Trial, TrialsError, export, rows, select, with_units
+from adaptune.archive import Archive, Frames, Trial, export, rows, select, with_units
+from adaptune.errors import AdaptuneError
 from adaptune.trajectory import read_tum
 from offline.config import Metric
 
@@ -88,7 +89,7 @@ def test_selecting(arguments, numbers):
 
 
 def test_a_column_that_there_is_not_is_told():
-    with pytest.raises(TrialsError, match=r"--sort means: .* did you mean 'mean'"):
+    with pytest.raises(AdaptuneError, match=r"--sort means: .* did you mean 'mean'"):
         select(TABLE, "means")
 
 

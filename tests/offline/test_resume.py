@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from random_models import random_model
 
-from adaptune.archive import Archive
 from adaptune.errors import AdaptuneError
 from adaptune.model import ErrorModel, PairedSettings
 from adaptune.study.study import ONE_SET
@@ -104,14 +103,6 @@ def test_with_nothing_to_do_nothing_is_done(trained):
     more = load_study(trained.folder.parent / "small.yaml", ["offline.trials=5"], trained.folder)
     assert not train(more).model.validation
     assert len(first.trials) == 4
-
-
-@pytest.mark.parametrize("place", [("two", 2), ("one", 3)])
-def test_a_trial_copied_over_another_is_named(trained, place):
-    folder = trained.folder / "trials"
-    shutil.copy2(folder / "one/00002.npz", Archive(folder).trial_path(*place))
-    with pytest.raises(AdaptuneError, match=r"holds trial 2 on one, so it was copied over"):
-        train(trained)
 
 
 @pytest.mark.usefixtures("study")
