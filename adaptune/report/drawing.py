@@ -83,6 +83,7 @@ def looks(chart: Chart) -> dict[str, Look]:
     shares = dict.fromkeys(n for item in items if isinstance(item, Shares) for n in item.names)
     known = dict(zip(shares, map(Look, cycle(_SHARES)), strict=False)) | MODES
     known |= dict(zip(places, map(Look, cycle(_PLACES)), strict=False))
+    known |= {item.name: Look(_SHADE) for item in items if isinstance(item, Spans) and item.name}
     names = dict.fromkeys(name for item in items for name in _names(item)) | places
     taken = {known[name].colour for name in names if name in known}
     colours = cycle([colour for colour in _COLOURS if colour not in taken])
@@ -416,16 +417,25 @@ class _Drawing:
     def _line(self, line: Line) -> Iterator[Spec]:
         x, y = numbers(line.x, self._panel.x), numbers(line.y, self._panel.y)
         kept = thinned(x, y, most=_MOST_FAINT if line.faint else _MOST)
+        look, (width, opacity) = (
+            self._look(line.name),
+            (1.2, 0.4) if line.faint else (line.width, 1.0),
+        )
         mark: Spec = {"type": "line", "strokeJoin": "round", "tooltip": line.name}
-        mark |= {"interpolate": "step-after" if line.steps else "linear"}
+        mark |= {"interpolate": "step-after" if line.steps else "linear", "color": look.colour}
+        mark |= {"strokeWidth": width, "opacity": opacity}
+        mark |= {"strokeDash": (5, 3) if line.dashed else look.dash}
         # Drawn in the order of the points, and not from left to right.
         data, order = {"x": x[kept], "y": y[kept]}, {"value": None}
-        yield self._drawn(mark | _stroke(line, self._look(line.name)), data, order=order)
+        yield self._drawn(mark, data, order=order)
 
     def _points(self, points: Points) -> Iterator[Spec]:
         panel = self._panel
         columns: dict[str, Any] = {"x": numbers(points.x, panel.x), "y": numbers(points.y, panel.y)}
-        mark = _marker(points, self._look(points.name))
+        look = self._look(points.name)
+        shape = points.shape or look.shape
+        mark: Spec = {"type": "point", "filled": True, "shape": shape, "color": look.colour}
+        mark |= {"size": 60 if shape.startswith("M") else 45, "opacity": 1.0}
         if len(points.x) > _MANY:
             mark |= {"size": 12, "opacity": 0.7}
         if points.faint:
@@ -467,7 +477,8 @@ class _Drawing:
         if panel.y.log:
             low = np.where(np.isfinite(high) & np.isnan(low), self._extent["y"][0], low)
         kept = thinned(x, low, high)
-        mark: Spec = {"type": "area", "strokeOpacity": 0.6, "tooltip": band.name} | _shade(look)
+        mark: Spec = {"type": "area", "tooltip": band.name, "color": look.colour}
+        mark |= {"fillOpacity": 0.25, "stroke": look.colour, "strokeOpacity": 0.6}
         yield self._drawn(mark, {"x": x[kept], "y": low[kept], "y2": high[kept]})
 
     def _bars(self, bars: Bars) -> Iterator[Spec]:
@@ -491,8 +502,7 @@ class _Drawing:
     def _spans(self, spans: Spans) -> Iterator[Spec]:
         for begin, end, name in _shaded(spans):
             mark: Spec = {"type": "rect", "stroke": "white", "tooltip": None, "clip": True}
-            colour = _SHADE if spans.name else self._look(name).colour
-            mark |= {"color": colour, "fillOpacity": _TINT}
+            mark |= {"color": self._look(spans.name or name).colour, "fillOpacity": _TINT}
             encoding = {"x": self._x, "x2": {"field": "x2"}}
             yield {"data": _table(x=[begin], x2=[end]), "mark": mark, "encoding": encoding}
 
@@ -559,62 +569,32 @@ def _read_anywhere(words: Spec, data: Spec, encoding: Spec) -> Iterator[Spec]:
 
 
 def _legend(chart: Chart, every: dict[str, Look]) -> list[Spec]:
-    """The legend above the panels: of each name what is drawn of it, and the name."""
-    kinds: dict[str, dict[type, Any]] = {}
+    """The legend above the panels, of a view that shows nothing else: a symbol of each name."""
     items = [item for panel in chart.panels for item in panel.drawn]
     written = {word for item in items if isinstance(item, Words) for word in item.words}
-    for item in items:
-        for name in {*_names(item)} - written:
-            if not (isinstance(item, Line | Points) and not len(item.x)):
-                kinds.setdefault(name, {}).setdefault(type(item), item)
-    layers: list[Spec] = []
-    x, y = 0.0, 0.5 * _LINE
-    for name in (name for name in every if name in kinds):
-        wide = 44.0 + _LETTER * len(name) + 14.0
-        if x and x + wide > _WIDTH:
-            x, y = 0.0, y + 1.4 * _LINE
-        layers += _glyphs(kinds[name], every[name], x, y)
-        text: Spec = {"type": "text", "text": name, "align": "left", "baseline": "middle"}
-        layers.append({"mark": text | {"x": x + 38.0, "y": y, "color": _DARK}})
-        x += wide
-    if not layers or all(map(_is_empty, chart.panels)):
+    symbols: dict[str, tuple[str, str, tuple[float, ...]]] = {}
+    for item in sorted(items, key=_layer):
+        if not (isinstance(item, Line | Points) and not len(item.x)):
+            symbols |= {name: _symbol(item, every[name]) for name in _names(item)}
+    names = [name for name in every if name in symbols and name not in written]
+    if not names or all(map(_is_empty, chart.panels)):
         return []
-    size = {"width": _WIDTH - 60, "height": round(y + 0.5 * _LINE)}
-    # A layer without an encoding is none.
-    return [size | {"data": _table(i=[0]), "layer": [{"encoding": {}} | of for of in layers]}]
+    columns = max(int(_WIDTH / (_LETTER * max(map(len, names)) + 50.0)), 1)
+    legend: Spec = {"title": None, "orient": "top", "columns": columns, "labelLimit": _WIDTH}
+    legend |= {"offset": 0, "symbolSize": 120, "symbolStrokeWidth": 2.0, "symbolOpacity": 1.0}
+    colours, shapes, dashes = zip(*(symbols[name] for name in names), strict=True)
+    ranges = {"fill": colours, "stroke": colours, "shape": shapes, "strokeDash": dashes}
+    named: Spec = {"field": "name", "type": "nominal", "legend": legend}
+    encoding = {key: named | {"scale": {"domain": names, "range": ranges[key]}} for key in ranges}
+    view = {"width": _WIDTH - 60, "height": 1, "data": {"values": []}, "mark": "point"}
+    return [view | {"encoding": encoding}]
 
 
-def _glyphs(kinds: dict[type, Any], look: Look, x: float, y: float) -> Iterator[Spec]:
-    """What is drawn of a name, small."""
-    fill: Spec = {"type": "rect", "x": x, "x2": x + 32.0, "y": y - 6.0, "y2": y + 6.0}
-    if Spans in kinds:
-        yield {"mark": fill | {"color": _SHADE, "fillOpacity": _TINT}}
-    if Band in kinds:
-        yield {"mark": fill | _shade(look)}
-    if Bars in kinds or Shares in kinds:
-        yield {"mark": fill | {"color": look.colour} | _OUTLINE}
-    if line := kinds.get(Line):
-        ends = {"x": {"value": x}, "x2": {"value": x + 32.0}, "y": {"value": y}}
-        yield {"mark": {"type": "rule"} | _stroke(line, look), "encoding": ends}
-    if points := kinds.get(Points):
-        colour = {"color": _MAP[3]} if points.colour is not None else {}
-        yield {"mark": _marker(points, look) | {"x": x + 16.0, "y": y} | colour | _OUTLINE}
-
-
-# How a name is drawn, in a panel and in the legend.
-
-
-def _stroke(line: Line, look: Look) -> Spec:
-    width, opacity = (1.2, 0.4) if line.faint else (line.width, 1.0)
-    dash = (5, 3) if line.dashed else look.dash
-    return {"color": look.colour, "strokeWidth": width, "strokeDash": dash, "opacity": opacity}
-
-
-def _shade(look: Look) -> Spec:
-    return {"color": look.colour, "fillOpacity": 0.25, "stroke": look.colour}
-
-
-def _marker(points: Points, look: Look) -> Spec:
-    shape = points.shape or look.shape
-    mark: Spec = {"type": "point", "filled": True, "shape": shape, "color": look.colour}
-    return mark | {"size": 60 if shape.startswith("M") else 45, "opacity": 1.0}
+def _symbol(item: Drawn, look: Look) -> tuple[str, str, tuple[float, ...]]:
+    """Colour, shape and dashes of what stands for an item in the legend."""
+    if isinstance(item, Line):
+        return look.colour, "stroke", (5, 3) if item.dashed else look.dash
+    if isinstance(item, Points):
+        colour = look.colour if item.colour is None else _MAP[3]
+        return colour, item.shape or look.shape, ()
+    return look.colour, "square", ()
