@@ -81,27 +81,30 @@ _LONGEST = 60
 """Characters of a value that a message quotes."""
 
 _NUMBER, _WHOLE, _LIST, _MAPPING = "a number", "a whole number", "a list", "keys with values"
-_WANTED = {
-    **dict.fromkeys(("float_type", "float_parsing"), _NUMBER),
-    **dict.fromkeys(("int_type", "int_parsing", "int_from_float", "int_parsing_size"), _WHOLE),
-    "finite_number": "a finite number",
-    "string_type": "text",
-    **dict.fromkeys(("bool_type", "bool_parsing"), "true or false"),
-    **dict.fromkeys(("tuple_type", "list_type", "set_type", "frozen_set_type"), _LIST),
-    **dict.fromkeys(("dict_type", "model_type", "model_attributes_type", "mapping_type"), _MAPPING),
-    "none_required": "nothing",
-    "greater_than": "a number above {gt}",
-    "greater_than_equal": "a number of at least {ge}",
-    "less_than": "a number below {lt}",
-    "less_than_equal": "a number of at most {le}",
-    "too_short": "at least {min_length}",
-    "too_long": "at most {max_length}",
-    "string_too_short": "at least {min_length} characters",
-    "string_too_long": "at most {max_length} characters",
-    "literal_error": "{expected}",
+_TYPES = {
+    **dict.fromkeys(("tuple", "list", "set", "frozen"), _LIST),
+    **dict.fromkeys(("dict", "model"), _MAPPING),
+    "float": _NUMBER,
+    "int": _WHOLE,
+    "finite": "a finite number",
+    "bool": "true or false",
+    "string": "text",
+    "none": "nothing",
 }
-"""What to give, by pydantic's type of a mistake."""
-_OF_VALUES = {kind for kind, wanted in _WANTED.items() if "{" in wanted}
+"""What to give, by the first word of pydantic's type of a mistake."""
+_BOUNDS = {
+    "greater_than": "a number above {gt:,.10g}",
+    "greater_than_equal": "a number of at least {ge:,.10g}",
+    "less_than": "a number below {lt:,.10g}",
+    "less_than_equal": "a number of at most {le:,.10g}",
+    "too_short": "at least {min_length:,}",
+    "too_long": "at most {max_length:,}",
+    "string_too_short": "at least {min_length:,} characters",
+    "string_too_long": "at most {max_length:,} characters",
+    "literal_error": "{expected}",
+    "string_pattern_mismatch": "",  # pydantic's own words are better
+}
+"""What to give in place of a value of the right type."""
 
 
 def plain_words(error: ValidationError, data: Any) -> dict[Key, str]:
@@ -150,10 +153,10 @@ def _message(details: Sequence[Any]) -> str:
     if "missing" in kinds:
         return "this key is missing"
     for detail in details:
-        if detail["type"] not in _WANTED:
+        if not _wanted(detail):
             return _plain(str(detail["msg"]))
     # A value of the right type comes nearest.
-    nearest = [detail for detail in details if detail["type"] in _OF_VALUES] or list(details)
+    nearest = [detail for detail in details if detail["type"] in _BOUNDS] or list(details)
     wanted = [_wanted(detail) for detail in nearest]
     if _NUMBER in wanted and _WHOLE in wanted:
         wanted.remove(_WHOLE)
@@ -161,23 +164,18 @@ def _message(details: Sequence[Any]) -> str:
 
 
 def _wanted(detail: Any) -> str:
-    figures = {
-        name: f"{value:,}" if isinstance(value, int) else f"{value:g}"
-        for name, value in detail.get("ctx", {}).items()
-        if isinstance(value, int | float)
-    }
-    if detail["type"] == "literal_error":
-        return str(detail["ctx"]["expected"]).replace("True", "true").replace("False", "false")
-    if detail["type"] == "too_short" and figures["min_length"] == "1":
-        return "at least one"
-    return _WANTED[detail["type"]].format(**figures)
+    """What to give; nothing for a mistake that pydantic has other words for."""
+    kind = detail["type"]
+    words = _BOUNDS.get(kind, _TYPES.get(kind.partition("_")[0], ""))
+    words = words.format(**detail.get("ctx", {}))
+    return words.replace("True", "true").replace("False", "false")
 
 
 def _given(detail: Any) -> str:
     """A value in few words, as YAML has it."""
     value = detail["input"]
     if detail["type"] in ("too_short", "too_long"):
-        return f"{len(value):,}" if len(value) else "none"
+        return f"{len(value):,}"
     if value is None:
         return "nothing"
     if isinstance(value, dict):
