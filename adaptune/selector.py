@@ -57,17 +57,10 @@ class AnySelector(Protocol):
         """Forget all scans and selections, as before a new recording."""
 
     def observe(self, stamp: int, scan: Scan, motions: Motions) -> None:
-        """See a scan, before it is registered.
+        """See a scan, before it is registered; `stamp` is in nanoseconds.
 
-        Parameters
-        ----------
-        stamp
-            Nanoseconds.
-        scan
-            The scan.
-        motions
-            What the odometry, or the bank and its members, moved over the scan before; see
-            `adaptune.odometry.base.OdometryInstance`.
+        The motions are what the odometry, or the bank and its members, moved over the scan before,
+        see `adaptune.odometry.base.OdometryInstance`.
         """
 
     def select(self) -> Selection:
@@ -412,10 +405,7 @@ anew."""
 class Schedule:
     """Says when a selection is due: at the first scan, and at the first of every further period.
 
-    Parameters
-    ----------
-    period
-        In the unit of what `due` is asked, such as nanoseconds or metres.
+    The period is in the unit of what `due` is asked, such as nanoseconds.
     """
 
     def __init__(self, period: float):
@@ -446,12 +436,10 @@ class TimedSelector:
 
     Parameters
     ----------
-    selector : Selector, UntrainedSelector, or what has their methods
+    selector
         Nothing else may use it.
     period
         Seconds between selections, by the scans' stamps.
-    distance
-        Metres between selections; the period then does not count.
 
     Attributes
     ----------
@@ -461,18 +449,12 @@ class TimedSelector:
         Scans at which the selector raised an error, which is logged.
     """
 
-    def __init__(
-        self,
-        selector: AnySelector,
-        period: float = 1.0,
-        distance: float | None = None,
-    ):
-        if not (period if distance is None else distance) > 0:
-            raise ValueError("period and distance must be above 0")
+    def __init__(self, selector: AnySelector, period: float = 1.0):
+        if not period > 0:
+            raise ValueError("the period must be above 0")
         self.ignored = self.failed = 0
         self._selector = selector
-        self._by_distance = distance is not None
-        self._schedule = Schedule(period * 1e9 if distance is None else distance)
+        self._schedule = Schedule(period * 1e9)
         self._lock = threading.Lock()
         self._begin()
 
@@ -480,7 +462,6 @@ class TimedSelector:
         self._selector.reset()
         self._schedule.reset()
         self._stamp: int | None = None
-        self._metres = 0.0
         self._unmeasured = self._failing = False
         self._owed: Selection | None = None  # for the next update to return
 
@@ -490,21 +471,10 @@ class TimedSelector:
         A selection takes some milliseconds. After each, `measure` takes some tens of milliseconds;
         the next update does that first if nobody has done it.
 
-        Parameters
-        ----------
-        stamp
-            Nanoseconds. Scans that are not newer than the one before are ignored; if the stamp goes
-            back by more than `BACK`, all is forgotten as before another drive.
-        scan
-            The scan.
-        motions
-            What the odometry moved over the scan before, see
-            `adaptune.odometry.base.OdometryInstance`.
-
-        Returns
-        -------
-        Selection or None
-            What to apply before the scan is registered; None to leave the odometry as it is.
+        Scans that are not newer than the one before are ignored; if the stamp, in nanoseconds, goes
+        back by more than `BACK`, all is forgotten as before another drive. For the motions see
+        `AnySelector.observe`. Returns what to apply before the scan is registered; None to leave
+        the odometry as it is.
         """
         with self._lock:
             if self._stamp is not None and stamp <= self._stamp:
@@ -544,9 +514,7 @@ class TimedSelector:
     def _selected(self, stamp: int, scan: Scan, motions: Motions) -> Selection | None:
         self._measure()
         self._selector.observe(stamp, scan, motions)
-        moved = float(np.linalg.norm(motions.T_previous_current[:3, 3]))
-        self._metres += moved if np.isfinite(moved) else 0.0
-        if not self._schedule.due(self._metres if self._by_distance else stamp):
+        if not self._schedule.due(stamp):
             return None
         selection = self._selector.select()
         self._unmeasured, self._failing = True, False
@@ -573,24 +541,12 @@ CANDIDATES = 16
 
 
 def untrained_sets(space: ParameterSpace, n: int = 4) -> ParameterSets:
-    """The baseline, and sets around it that are far from each other.
+    """The baseline, and sets around it that are far from each other, numbered from 0.
 
     Of several odometries, the baselines of all come first, then sets of the first one. The
     candidates are points of a scrambled Sobol sequence, moved half-way to the baseline: what
     the odometry's authors chose is the best guess there is. Each next set is the one that is
-    farthest from those chosen before.
-
-    Parameters
-    ----------
-    space
-        The parameters.
-    n
-        How many sets.
-
-    Returns
-    -------
-    ParameterSets
-        Numbered from 0, the baseline; fewer than `n` if the candidates have fewer values.
+    farthest from those chosen before. There are fewer than `n` if the candidates are equal.
     """
     chosen = space.baselines[:n]
     if isinstance(space, PooledSpace):
@@ -616,22 +572,9 @@ def untrained_sets(space: ParameterSpace, n: int = 4) -> ParameterSets:
 class UntrainedSelector(_Measuring):
     """Weighs the members of a bank of which nothing is known in advance.
 
-    It has the methods of `adaptune.selector.Selector`, and needs no model. The baseline has all the
-    weight until live evidence confirms other members.
-
-    Parameters
-    ----------
-    sets
-        Of the members, the baseline first; see `untrained_sets`.
-    length
-        Metres of a sub-trajectory: what the estimated error stands for.
-
-    Attributes
-    ----------
-    fixed : int
-        Number of the set to begin with.
-    members : tuple of int
-        Numbers of the bank's members.
+    It needs no model. The baseline, which is the first of the sets (see `untrained_sets`), has all
+    the weight until live evidence confirms other members. An estimated error stands for a
+    sub-trajectory of `length` metres. Attributes are those of `Selector`.
     """
 
     def __init__(self, sets: ParameterSets, length: float):
