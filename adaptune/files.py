@@ -4,6 +4,7 @@ import ctypes
 import errno
 import os
 import re
+import secrets
 import shutil
 import tempfile
 import tokenize
@@ -76,18 +77,11 @@ def replacing(path: Path) -> Iterator[Path]:
     if path.exists() and not path.is_file() and not path.is_dir():
         yield path
         return
-    with needing_room(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(path.suffix, f".{path.stem}.", path.parent)
-    os.close(handle)
-    temporary = Path(name)
+    temporary = path.with_name(f".{path.stem}.{secrets.token_hex(4)}{path.suffix}")
     try:
         with needing_room(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
             yield temporary
-        # mkstemp makes the file private. Users receive it as readable as any new file.
-        umask = os.umask(0)
-        os.umask(umask)
-        temporary.chmod(0o666 & ~umask)
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
@@ -176,18 +170,8 @@ _Loader.add_implicit_resolver(_PREFIX + "bool", _BOOL, list("tTfF"))
 
 
 _NO_CHARACTER = re.compile("[\0\ud800-\udfff]")
-_LONGEST_INT = 1000
-"""Digits."""
 _MOST = 100_000
 """Values in a document. Aliases of aliases make more out of a few lines than fit in memory."""
-
-
-def _int(loader: Any, node: Any) -> int:
-    text = loader.construct_scalar(node)
-    if len(text) > _LONGEST_INT:
-        line = node.start_mark.line + 1
-        raise YamlError(f"line {line}: a number of {len(text):,} digits; give a smaller one")
-    return int(text)
 
 
 def _str(loader: Any, node: Any) -> str:
@@ -198,7 +182,8 @@ def _str(loader: Any, node: Any) -> str:
     return text
 
 
-_Loader.add_constructor(_PREFIX + "int", _int)
+# PyYAML takes 010 for eight.
+_Loader.add_constructor(_PREFIX + "int", lambda loader, node: int(loader.construct_scalar(node)))
 _Loader.add_constructor(_PREFIX + "str", _str)
 
 
@@ -218,35 +203,13 @@ def _count(node: Any, counted: dict[int, int]) -> int:
 class _Foreign(yaml.SafeLoader):
     """What ROS 1 reads: YAML 1.1, where 1e3 is a text; of a key that comes twice, the last counts.
 
-    Keys stay as they are written. `remarks` names what its author may not expect.
+    Keys stay as they are written.
     """
-
-    def __init__(self, text: str):
-        super().__init__(text)
-        self.remarks: list[str] = []
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
         """Construct a mapping."""
-        seen: dict[str, int] = {}
-        for key, _ in node.value:
-            line = key.start_mark.line + 1
-            if (before := seen.get(str(key.value))) and key.value != "<<":
-                what = f"line {line}: {key.value} was given before, in line {before}"
-                self.remarks.append(f"{what}; the last one counts, as for ROS")
-            seen[str(key.value)] = line
         self.flatten_mapping(node)
         return {str(key.value): self.construct_object(value, deep) for key, value in node.value}
-
-    def text(self, node: Any) -> str:
-        """Construct a text."""
-        text: str = self.construct_scalar(node)
-        if not node.style and _FLOAT.match(text):
-            line, number = node.start_mark.line + 1, dump([float(text)]).removeprefix("- ").strip()
-            self.remarks.append(f"line {line}: {text} is a text for ROS 1; for a number, {number}")
-        return text
-
-
-_Foreign.add_constructor(_PREFIX + "str", _Foreign.text)
 
 
 class Document:
@@ -262,7 +225,6 @@ class Document:
             if self._node is not None and _count(self._node, {}) > _MOST:
                 raise YamlError(f"holds more than {_MOST:,} values, or an alias of itself")
             self.data = None if self._node is None else loader.construct_document(self._node)
-            self.remarks = loader.remarks if isinstance(loader, _Foreign) else []
         except yaml.MarkedYAMLError as error:
             mark = error.problem_mark or error.context_mark
             where = f"line {mark.line + 1}: " if mark else ""
@@ -274,7 +236,8 @@ class Document:
             raise YamlError(" ".join(str(error).split())) from error
         except (ValueError, LookupError, AttributeError) as error:
             # PyYAML's constructors raise these.
-            raise YamlError("a tag (!!...) does not fit its value; leave tags out") from error
+            what = "a tag (!!...) does not fit its value, or a number has thousands of digits"
+            raise YamlError(f"{what}; leave tags out, and give a smaller one") from error
 
     @classmethod
     def of_file(cls, path: Path) -> Self:

@@ -14,7 +14,7 @@ import tomllib
 from abc import abstractmethod
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
-from functools import cache, reduce
+from functools import reduce
 from operator import getitem
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, Self
@@ -77,13 +77,12 @@ class Template:
         if path.suffix not in (*_YAML, *_FORMATS):
             raise OdometryError(f"{path}: a template is a file of {', '.join((*_YAML, *_FORMATS))}")
         self._data: Any
-        self.remarks: list[str] = []
         try:
             # Ends of lines stay as they are.
             self._text = path.read_bytes().decode()
             if path.suffix in _YAML:
                 self._document = files.Document(self._text, foreign=True)
-                self._data, self.remarks = self._document.data, self._document.remarks
+                self._data = self._document.data
             else:
                 self._data = _FORMATS[path.suffix][0](self._text)
         except FileNotFoundError as error:
@@ -176,11 +175,6 @@ def _places(data: Any, path: tuple[str, ...] = (), keys: tuple[Any, ...] = ()) -
 _EXPONENT = re.compile(r"[-+]?[.\d]+[eE][-+]?\d+")
 
 
-@cache
-def _remark(path: Path, remark: str) -> None:
-    _log.warning("%s, %s", path, remark)
-
-
 _PLACEHOLDER = re.compile(r"\{([\w./-]+)\}")
 
 
@@ -203,9 +197,6 @@ def check_names(
     parameters: ParameterSet, template: Template | None, command: Collection[str]
 ) -> None:
     """Raise an `OdometryError` if a parameter is neither in the template nor in the arguments."""
-    if template is not None:
-        for remark in template.remarks:
-            _remark(template.path, remark)
     inside = {name for argument in command for name in placeholders(argument)}
     for name in parameters:
         if name in inside or (template is not None and template.path_of(name)):
