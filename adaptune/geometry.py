@@ -134,21 +134,9 @@ def interpolate(
 ) -> Poses:
     """Interpolate poses at other stamps: linearly in translation, spherically in rotation.
 
-    Parameters
-    ----------
-    stamps
-        Strictly increasing nanoseconds, of shape (n,).
-    T_world_sensor
-        Poses at `stamps`, of shape (n, 4, 4).
-    at
-        Nanoseconds, of shape (m,).
-    max_gap
-        Nanoseconds. Nothing is interpolated between poses further apart than this.
-
-    Returns
-    -------
-    ndarray of shape (m, 4, 4)
-        NaN where `at` lies outside `stamps` or inside a gap.
+    Stamps of shape (n,) are strictly increasing nanoseconds, those `at` which to interpolate are of
+    shape (m,). Poses are of shape (n, 4, 4), those found of shape (m, 4, 4): NaN outside `stamps`,
+    and between poses that are further apart than `max_gap` nanoseconds.
     """
     T = np.full((len(at), 4, 4), np.nan)
     if not len(stamps) or not len(at):
@@ -183,21 +171,17 @@ _FARTHEST = 1e6
 def to_pose(given: Any) -> Poses:
     """Pose of shape (4, 4) from ``x y z qx qy qz qw`` or a matrix's rows; else a ValueError."""
     what = "give numbers: x y z qx qy qz qw, or the four rows of a 4x4 matrix"
-    rows = given if isinstance(given, list | tuple) else ()
-    nested = any(isinstance(row, list | tuple) for row in rows)
-    for row in rows if nested else (rows,):
-        for number in row if isinstance(row, list | tuple) else (row,):
-            real = isinstance(number, int | float) and not isinstance(number, bool)
-            if not (real and abs(number) <= _FARTHEST):
-                raise ValueError(f"holds {number!r:.20}; {what}")
-    values = np.array(rows, np.float64) if len({np.shape(row) for row in rows}) == 1 else None
-    if values is not None and values.shape == (7,):
+    try:
+        values = np.array(given, np.float64)
+    except (ValueError, TypeError, OverflowError) as error:
+        raise ValueError(what) from error
+    if values.shape not in ((7,), (4, 4), (3, 4)) or not np.abs(values).max() <= _FARTHEST:
+        raise ValueError(what)
+    if values.shape == (7,):
         if not 0.99 < np.linalg.norm(values[3:]) < 1.01:
             raise ValueError("its quaternion (qx qy qz qw, the last four) has not length 1")
         pose: Poses = from_quaternions(values[None, :3], values[None, 3:])[0]
         return pose
-    if values is None or values.shape not in ((4, 4), (3, 4)):
-        raise ValueError(what)
     R = values[:3, :3]
     if np.abs(R @ R.T - np.eye(3)).max() > 1e-2 or np.linalg.det(R) < 0:
         raise ValueError("its first three columns and rows are not a rotation")

@@ -76,25 +76,13 @@ def sub_trajectory_vectors(
     length: float,
     restarted: NDArray[np.bool_] | None = None,
 ) -> NDArray[np.float64]:
-    """Error vector at the end of the sub-trajectory that starts at every frame.
+    """Error vector at the end of the sub-trajectory that starts at every frame, of shape (n, 3).
 
-    Parameters
-    ----------
-    T_ref_sensor
-        Reference poses of shape (n, 4, 4); NaN where there is none.
-    T_odom_sensor
-        The odometry's poses, of shape (n, 4, 4).
-    length
-        Length of the sub-trajectories in metres.
-    restarted
-        Frames at which the odometry lost track and restarted at the reference, of shape (n,).
-
-    Returns
-    -------
-    ndarray of shape (n, 3)
-        Percent of `length`, in the frame of the sub-trajectory's start: NaN for frames without a
-        full sub-trajectory, infinity for those whose sub-trajectory contains a lost track or poses
-        that are not finite.
+    In percent of `length`, which is in metres, in the frame of the sub-trajectory's start: NaN for
+    frames without a full sub-trajectory, infinity for those whose sub-trajectory contains a lost
+    track or poses that are not finite. Poses are of shape (n, 4, 4), those of the reference NaN
+    where there is none. `restarted`, of shape (n,), are the frames at which the odometry lost track
+    and restarted at the reference.
     """
     ends = window_ends(T_ref_sensor, length)
     starts = np.flatnonzero(ends >= 0)
@@ -249,23 +237,13 @@ def lost_in_words(
 def bootstrap(
     errors: NDArray[np.float64], fixed: NDArray[np.float64], block: int
 ) -> tuple[tuple[float, float], tuple[float, float]] | None:
-    """95 % intervals of the mean error, and of its ratio to the fixed set's.
+    """95 % intervals of the mean error, and of its ratio to the fixed set's: the ends of both.
 
     A moving-block bootstrap (Künsch, Annals of Statistics 1989): errors of neighbouring frames
-    share most of their sub-trajectories and are drawn together. The interval holds for this
-    recording, not for other places. With few blocks it is too narrow, above all for skewed errors.
-
-    Parameters
-    ----------
-    errors, fixed
-        Percent, of the same frames, of shape (n,).
-    block
-        Frames drawn together.
-
-    Returns
-    -------
-    tuple, or None
-        The ends of both intervals; None with fewer than `MIN_BLOCKS` blocks.
+    share most of their sub-trajectories, and `block` frames are drawn together. The interval holds
+    for this recording, not for other places. With few blocks it is too narrow, above all for skewed
+    errors; there is none with fewer than `MIN_BLOCKS`. Errors, of shape (n,), are in percent, and
+    those of the fixed set are of the same frames.
     """
     if len(errors) < MIN_BLOCKS * block:
         return None
@@ -278,20 +256,9 @@ def bootstrap(
 def resampled_means(
     values: NDArray[np.float64], block: int, rng: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Means of the resamples of a moving-block bootstrap.
+    """Means of the resamples of a moving-block bootstrap, of shape (k, RESAMPLES).
 
-    Parameters
-    ----------
-    values
-        Of shape (k, n): k values of each frame, which are drawn together.
-    block
-        Frames drawn together, n at most.
-    rng
-        Draws them.
-
-    Returns
-    -------
-    ndarray of shape (k, RESAMPLES)
+    Values of shape (k, n) are k of each frame; `block` frames, n at most, are drawn together.
     """
     n = values.shape[1]
     n_blocks = -(-n // block)
@@ -305,11 +272,7 @@ def worst_tenth(logs: NDArray[np.float64]) -> float:
     """Mean logarithm over the worst tenth of the stretches, over one stretch at least.
 
     It is the conditional value at risk: where a tenth is no whole number, a stretch counts in part.
-
-    Parameters
-    ----------
-    logs
-        Logarithms of the ratio to the fixed set's error, a number for each stretch.
+    `logs` are logarithms of the ratio to the fixed set's error, a number for each stretch.
     """
     share = max(1.0, WORST * len(logs))
     counts = np.clip(share - np.arange(len(logs)), 0.0, 1.0)

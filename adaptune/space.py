@@ -229,18 +229,18 @@ class ParameterSpace:
             for row in unit.tolist()
         ]
 
-    def dump(self) -> dict[str, dict[str, Any]]:
+    def dump(self, units: bool = False) -> dict[str, dict[str, Any]]:
         """The space as plain data, without units: what trials depend on."""
-        return {
-            name: p.model_dump(mode="json", exclude={"unit"}) for name, p in self.parameters.items()
-        }
+        made = {}
+        for name, p in self.parameters.items():
+            made[name] = p.model_dump(mode="json", exclude={"unit"})
+            if units and p.unit:
+                made[name]["unit"] = p.unit
+        return made
 
     def definition(self) -> dict[str, dict[str, Any]]:
         """The space as plain data, with the units that are known: what a study file may say."""
-        return {
-            name: of | ({"unit": unit} if (unit := self.parameters[name].unit) else {})
-            for name, of in self.dump().items()
-        }
+        return self.dump(units=True)
 
     @classmethod
     def load(cls, data: Mapping[str, Any]) -> Self:
@@ -444,44 +444,38 @@ class PooledSpace(ParameterSpace):
         self.spaces[label].check(own)
 
     def to_unit(self, sets: Sequence[Mapping[str, Value]]) -> NDArray[np.float64]:
-        """Map parameter sets to the unit cube.
+        """Map parameter sets to the unit cube, of shape (n_sets, n_odometries + n_parameters).
 
-        Returns
-        -------
-        ndarray of shape (n_sets, n_odometries + n_parameters)
-            For each odometry 1 or 0, for whether the set is its; then its parameters, 0.5 where the
-            set is another's. So sets of two odometries are farther apart than most of one.
+        For each odometry 1 or 0, for whether the set is its; then its parameters, 0.5 where the set
+        is another's. So sets of two odometries are farther apart than most of one.
         """
-        sizes = [len(space) for space in self.spaces.values()]
-        begins = len(sizes) + np.concatenate([[0], np.cumsum(sizes)])
-        unit = np.full((len(sets), int(begins[-1])), 0.5)
-        unit[:, : len(sizes)] = 0.0
         labels = list(self.spaces)
+        unit = np.full((len(sets), len(self)), 0.5)
+        unit[:, : len(labels)] = 0.0
         for row, given in zip(unit, sets, strict=True):
             label, own = self.split(given)
-            at = labels.index(label)
-            row[at] = 1.0
-            row[begins[at] : begins[at + 1]] = self.spaces[label].to_unit([own])[0]
+            row[labels.index(label)] = 1.0
+            row[self._columns(label)] = self.spaces[label].to_unit([own])[0]
         return unit
 
     def from_unit(self, unit: NDArray[np.float64]) -> list[ParameterSet]:
         """Map what `to_unit` returns to parameter sets; the highest of the first columns counts."""
-        sizes = [len(space) for space in self.spaces.values()]
-        begins = len(sizes) + np.concatenate([[0], np.cumsum(sizes)])
         labels, sets = list(self.spaces), []
         for row in unit:
-            at = int(np.argmax(row[: len(sizes)]))
-            own = self.spaces[labels[at]].from_unit(row[None, begins[at] : begins[at + 1]])
-            sets.append({ODOMETRY: labels[at], **own[0]})
+            label = labels[int(np.argmax(row[: len(labels)]))]
+            own = self.spaces[label].from_unit(row[None, self._columns(label)])
+            sets.append({ODOMETRY: label, **own[0]})
         return sets
 
-    def dump(self) -> dict[str, dict[str, Any]]:
-        """The spaces by label, as plain data."""
-        return {label: space.dump() for label, space in self.spaces.items()}
+    def _columns(self, label: str) -> slice:
+        """Where the parameters of an odometry are in the unit cube."""
+        before = list(self.spaces).index(label)
+        begin = len(self.spaces) + sum(map(len, list(self.spaces.values())[:before]))
+        return slice(begin, begin + len(self.spaces[label]))
 
-    def definition(self) -> dict[str, dict[str, Any]]:
-        """The spaces by label, as plain data with units."""
-        return {label: space.definition() for label, space in self.spaces.items()}
+    def dump(self, units: bool = False) -> dict[str, dict[str, Any]]:
+        """The spaces by label, as plain data."""
+        return {label: space.dump(units) for label, space in self.spaces.items()}
 
 
 def load_space(data: Mapping[str, Any]) -> ParameterSpace:
