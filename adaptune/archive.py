@@ -242,12 +242,7 @@ class Archive:
         """Set aside what was computed from other inputs than there are now, and say why.
 
         Earlier results of these inputs count again. Of trials on other sequences than these, only
-        what all share is compared.
-
-        Returns
-        -------
-        bool
-            Whether trials were moved.
+        what all share is compared. Returns whether trials were moved.
         """
         assert self._sources is not None
         self._statuses = {name: self._sources.statuses(name) for name in sequences}

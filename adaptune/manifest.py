@@ -18,8 +18,6 @@ FILE = "inputs.json"
 """In the folder of a result."""
 EARLIER = "earlier"
 """Folder of results of other inputs than there are now."""
-MAX_NAMED_FILES = 64
-"""Of a recording of more, its folder is named."""
 _MAX_VALUE = 60
 """Characters of a value in words."""
 _CONTENTS = ("content", "descriptors", "recording", "reference", "scans")
@@ -57,13 +55,7 @@ def record(path: Path, inputs: Inputs) -> None:
 
 
 def recorded(path: Path) -> dict[str, Any] | None:
-    """What a result was computed from; None if that was not recorded.
-
-    Raises
-    ------
-    ConfigurationError
-        If the record is damaged.
-    """
+    """What a result was computed from; None if that was not recorded, an error if it is damaged."""
     try:
         about = json.loads(path.read_text(encoding="utf-8"))
         inputs = dict(about["inputs"])
@@ -85,14 +77,8 @@ def changes(
 ) -> list[str]:
     """In what inputs differ from those of a result, in words; empty if in nothing.
 
-    Parameters
-    ----------
-    before
-        Of the result; None if they were not recorded.
-    now
-        As they are.
-    files
-        By dotted key of a list of digests, the files that these are of.
+    Those of the result are None if they were not recorded. `files` has, by the dotted key of a list
+    of digests, the files that these are of.
     """
     if before is None:
         return ["an older adaptune did not record what it depends on"]
@@ -131,8 +117,6 @@ def _words(key: str, was: Any, now: Any, files: Mapping[str, Sequence[Path]]) ->
 def _changed_files(was: Sequence[str], now: Sequence[str], files: Sequence[Path]) -> list[Any]:
     if len(was) == len(now) == len(files):
         return [file for file, a, b in zip(files, was, now, strict=True) if a != b]
-    if 0 < len(files) < MAX_NAMED_FILES:
-        return list(files)
     return [files[0].parent if files else "the reference"]
 
 
@@ -153,12 +137,9 @@ def set_aside(folder: Path, result: Path, before: Inputs | None, files: Iterable
 
 
 def bring_back(folder: Path, result: Path, now: Inputs) -> list[Path]:
-    """Move back the files of a result that was set aside with just these inputs.
+    """Move back the files of a result that was set aside with just these inputs, and return them.
 
-    Returns
-    -------
-    list of Path
-        The files that are there again; none that is there already is replaced.
+    None that is there already is replaced.
     """
     kept, found = earlier(folder, result, now), []
     for file in sorted(kept.rglob("*")) if kept.exists() else ():

@@ -440,19 +440,11 @@ class TimedSelector:
         Nothing else may use it.
     period
         Seconds between selections, by the scans' stamps.
-
-    Attributes
-    ----------
-    ignored : int
-        Scans that were not newer than the one before.
-    failed : int
-        Scans at which the selector raised an error, which is logged.
     """
 
     def __init__(self, selector: AnySelector, period: float = 1.0):
         if not period > 0:
             raise ValueError("the period must be above 0")
-        self.ignored = self.failed = 0
         self._selector = selector
         self._schedule = Schedule(period * 1e9)
         self._lock = threading.Lock()
@@ -479,7 +471,6 @@ class TimedSelector:
         with self._lock:
             if self._stamp is not None and stamp <= self._stamp:
                 if self._stamp - stamp <= BACK:
-                    self.ignored += 1
                     return None
                 _log.warning(
                     "the clock went back by %.1f s: the selector begins anew",
@@ -522,7 +513,6 @@ class TimedSelector:
 
     def _after_failure(self) -> Selection | None:
         """What to fall back to, unless the odometry has it since the last failure."""
-        self.failed += 1
         self._unmeasured = False
         self._selector.reset()
         if self._failing:

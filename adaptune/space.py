@@ -1,6 +1,7 @@
 """The parameters of an odometry: their types, their ranges, and their map to the unit cube."""
 
 import math
+from collections import ChainMap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -386,22 +387,14 @@ class PooledSpace(ParameterSpace):
 
     @property
     def logarithmic(self) -> list[str]:
-        """Those of `names` that every odometry which has them spaces evenly in ratio."""
-        every = self.spaces.values()
-        return [
-            name
-            for name in self.names[1:]
-            if all(name in space.logarithmic for space in every if name in space.names)
-        ]
+        """Those of `names` that some odometry spaces evenly in ratio."""
+        every = [name for space in self.spaces.values() for name in space.logarithmic]
+        return list(dict.fromkeys(every))
 
     @property
     def labels(self) -> dict[str, str]:
-        """See `ParameterSpace.labels`; with a unit only where all odometries have the same."""
-        every: dict[str, set[str]] = {name: set() for name in self.names}
-        for space in self.spaces.values():
-            for name, said in space.labels.items():
-                every[name].add(said)
-        return {name: said.pop() if len(said) == 1 else name for name, said in every.items()}
+        """See `ParameterSpace.labels`; of a name that several odometries have, by the first one."""
+        return {ODOMETRY: ODOMETRY, **ChainMap(*(space.labels for space in self.spaces.values()))}
 
     @property
     def baselines(self) -> list[ParameterSet]:

@@ -306,19 +306,9 @@ class PluginError(AdaptuneError):
 def path_of(name: str, kind: str, ours: Mapping[str, str], group: str, sort: str) -> str:
     """Where an object is, as ``module:attribute``, without importing it.
 
-    Parameters
-    ----------
-    name
-        One of `ours`, one that an installed package announces in the entry-point group, or
-        ``module:attribute``.
-    kind
-        Word for the object in messages, as "odometry".
-    ours
-        The built-in objects by name, as ``module:attribute``.
-    group
-        The entry-point group.
-    sort
-        Kind of Python object: ``Class``, or ``function``.
+    It is named as one of `ours`, the built-in ones, by what an installed package announces in the
+    entry-point group, or as ``module:attribute``. Messages call it a `kind`, as "odometry", and a
+    ``Class`` or a ``function``, which is its sort.
     """
     path = ours.get(name) or (name if ":" in name else None)
     if path is None:

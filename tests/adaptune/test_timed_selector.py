@@ -86,7 +86,6 @@ def test_scans_that_come_twice_or_late_are_ignored():
     timed = TimedSelector(selector)
     assert trials(timed, [0, 10**8])[0] == 7
     assert set(trials(timed, [10**8, 5 * 10**7]).values()) == {None}
-    assert timed.ignored == 2
     assert 5 * 10**7 not in selector.calls
 
 
@@ -106,7 +105,6 @@ def test_errors_cost_a_selection_and_not_the_drive(caplog):
         selected = trials(timed, stamps)
     # The fixed set once, nothing while it goes on failing, then selections again.
     assert list(selected.values()) == [7, 7, 0, None, None, 7, 7, 7]
-    assert timed.failed == 3
     assert caplog.text.count("the fixed set is used") == caplog.text.count("out of luck\n") == 1
 
 
@@ -118,7 +116,6 @@ def test_an_error_of_the_measurement_shows_at_the_next_scan(caplog):
     timed = TimedSelector(Failing())
     trials(timed, [0])
     timed.measure()
-    assert timed.failed == 1
     assert "out of luck" in caplog.text
     assert trials(timed, [1, 2, 10**9]) == {1: 0, 2: None, 10**9: 7}
 
@@ -137,7 +134,7 @@ def test_falls_back_to_the_fixed_set_or_to_members_that_never_rest(members, rese
     assert not any(untrained.weights.values())
 
 
-def test_the_guide_s_example(tmp_path, monkeypatch):
+def test_the_guide_s_example(tmp_path, monkeypatch, caplog):
     blocks = re.findall(r"^```python\n(.*?)^```", GUIDE.read_text(), re.MULTILINE | re.DOTALL)
     (example,) = [block for block in blocks if "TimedSelector(" in block]
     monkeypatch.chdir(tmp_path)
@@ -160,4 +157,4 @@ def test_the_guide_s_example(tmp_path, monkeypatch):
     thread.start()
     thread.join()
     np.testing.assert_allclose(poses[-1][:3, 3], [24 * 0.3, 0.0, 0.0], atol=0.15)
-    assert names["timed"].failed == 0
+    assert "no parameters can be selected" not in caplog.text
