@@ -1,19 +1,13 @@
 """Damages messages, bags and studies at random, and looks at what the readers make of them.
 
-    python tests/support/fuzz.py [--messages 8000] [--bags 2000] [--studies 4000] [--seed 0]
-
 Whatever is damaged must become scans or a study that can be, or an error that says so: no other
-exception, no crash, no more than a few seconds of the processor, no more than two gigabytes.
+exception, no crash, no more than a few seconds of the processor. `benchmarks/fuzz.py` takes longer.
 """
 
-import argparse
 import contextlib
-import faulthandler
 import re
-import resource
 import signal
 import struct
-import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -23,27 +17,20 @@ from unittest.mock import patch
 
 import drives
 import numpy as np
-from rosbags import rosbag1, rosbag2
-from rosbags.typesys import get_types_from_msg
+import rec
 
 from adaptune.errors import AdaptuneError
 from adaptune.recording import Scan, SequenceConfig, clouds
 from adaptune.recording.clouds import PointCloudError
-from adaptune.recording.export import Messages
 from adaptune.recording.inspect import inspect, render_inspection
 from adaptune.recording.recording import open_sequence
 from offline.config import load_study
 
-SECONDS, BYTES = 10, 2 << 30
+SECONDS = 10
 START = 1_700_000_000_123_456_789
 CLOUD, LIVOX = "sensor_msgs/msg/PointCloud2", clouds.LIVOX_TYPES[0]
 # What a count or an offset is most wrong with.
 WORDS = (0, 1, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFE, 0xFFFFFFFF, 0x10000, 0x7FC00000, 0x7F800000)
-LAYOUTS = {
-    "velodyne": [*((a, "<f4") for a in "xyz"), ("ring", "<u2"), ("time", "<f4")],
-    "plain": [(a, "<f4") for a in "xyz"],
-}
-
 # What a value of a study is most wrong with; RAN is the path of a file that code would make.
 HOSTILE = (
     *("true", "false", "", "null", "''", "0", "-1", ".nan", "-.inf", "1e300", "1e-300", "1e400"),
@@ -63,50 +50,33 @@ _VALUE = re.compile(r"(?<=[:\[,{] )[^\s,\[\]{}]+|(?<=[\[{])[^\s,\[\]{}:]+(?=[,\]
 Decode = Callable[[bytes], Scan]
 
 
-def stores() -> dict[bool, Messages]:
-    """What makes messages of ROS 1 and of ROS 2, Livox's among them."""
-    made = {False: Messages(1), True: Messages(2)}
-    types: Any = {}
-    for name, text in clouds.DEFINITIONS.items():
-        types.update(get_types_from_msg(text, name))
-    for messages in made.values():
-        with contextlib.suppress(Exception):  # registered before
-            messages.typestore.register(types)
-    return made
-
-
-def message(made: Messages, kind: str, stamp: int, rng: np.random.Generator, n: int = 30) -> Any:
-    """A cloud or a Livox message of `n` points."""
-    header = made.header("/points", stamp, "lidar")
-    points = rng.normal(0, 10, (n, 3)).astype(np.float32)
-    if kind == LIVOX:
-        t = made.types
-        each = [
-            t[LIVOX.replace("Msg", "Point")](i * 1000, *map(float, p), 1, 2, i % 6)
-            for i, p in enumerate(points)
-        ]
-        return t[LIVOX](header, stamp, n, 1, np.zeros(3, np.uint8), each)
-    raw = np.zeros(n, LAYOUTS[kind])
-    raw["x"], raw["y"], raw["z"] = points.T
+def message(store: Any, kind: str, stamp: int, rng: np.random.Generator, n: int = 30) -> Any:
+    """A cloud, `plain` or of a `velodyne`, or a Livox message of `n` points."""
+    points = rng.normal(0, 10, (n, 3)).astype("<f4")
     if kind == "velodyne":
-        raw["ring"], raw["time"] = np.arange(n) % 16, np.linspace(0, 0.1, n)
-    return made.cloud(header, raw)
+        return rec.cloud(rec.velodyne(points), stamp, store)
+    if kind == "plain":
+        return rec.cloud(points.view([(axis, "<f4") for axis in "xyz"])[:, 0], stamp, store)
+    point = store.types[LIVOX.replace("Msg", "Point")]
+    each = [point(i * 1000, *map(float, p), 1, 2, i % 6) for i, p in enumerate(points)]
+    header = rec.header(stamp, store=store)
+    return store.types[LIVOX](header, stamp, n, 1, np.zeros(3, np.uint8), each)
 
 
 def samples() -> Iterator[tuple[bytes, Decode]]:
     """Serialised messages of every kind, each with what decodes it."""
     rng = np.random.default_rng(0)
-    for cdr, made in stores().items():
-        store = made.typestore
-        for kind in (*LAYOUTS, LIVOX):
+    for store in (rec.ROS1, rec.ROS2):
+        for kind in ("velodyne", "plain", LIVOX):
             typename = LIVOX if kind == LIVOX else CLOUD
-            sound = message(made, kind, START, rng)
-            decode = partial(clouds.decode_livox if kind == LIVOX else clouds.decode_cloud, cdr=cdr)
-            if cdr:
-                yield bytes(store.serialize_cdr(sound, typename)), decode
-                yield bytes(store.serialize_cdr(sound, typename, little_endian=False)), decode
-            else:
-                yield bytes(store.serialize_ros1(sound, typename)), decode
+            sound = message(store, kind, rec.START, rng)
+            read = clouds.decode_livox if kind == LIVOX else clouds.decode_cloud
+            if store is rec.ROS1:
+                yield bytes(store.serialize_ros1(sound, typename)), partial(read, cdr=False)
+                continue
+            for little in (True, False):
+                data = store.serialize_cdr(sound, typename, little_endian=little)
+                yield bytes(data), partial(read, cdr=True)
 
 
 def damage(data: bytes, rng: np.random.Generator) -> bytes:
@@ -168,28 +138,16 @@ def bags(folder: Path, scans: int = 16) -> list[Path]:
     """Bags of every format and compression; of ROS 2, the files themselves and their folders."""
     made = []
     rng = np.random.default_rng(0)
-    for cdr, messages in stores().items():
-        store = messages.typestore
-        options: list[Any] = [None, "BZ2", "LZ4"]
-        if cdr:
-            options = [(s, c) for s in ("SQLITE3", "MCAP") for c in (None, "MESSAGE", "FILE")]
-            options += [("MCAP", "STORAGE")]
-        for option in options:
-            path = folder / f"{'ros2' if cdr else 'ros1'}_{option}.bag".replace("'", "")
-            path = path.with_suffix("") if cdr else path
-            with _writer(path, cdr, option) as writer:
-                topics = {
-                    kind: writer.add_connection(f"/{name}", kind, typestore=store)
-                    for name, kind in (("points", CLOUD), ("livox", LIVOX))
-                }
-                for i in range(scans):
-                    stamp = START + i * 10**8
-                    for kind, topic in topics.items():
-                        layout = "velodyne" if kind == CLOUD else LIVOX
-                        given = message(messages, layout, stamp, rng)
-                        serialise = store.serialize_cdr if cdr else store.serialize_ros1
-                        writer.write(topic, stamp, serialise(given, kind))
-            made.append(path)
+    kinds = [("bag", how) for how in (None, "BZ2", "LZ4")]
+    kinds += [(kind, how) for kind in ("sqlite3", "mcap") for how in (None, "MESSAGE", "FILE")]
+    for kind, compression in (*kinds, ("mcap", "STORAGE")):
+        path = folder / f"{compression}.{kind}"
+        messages = [
+            (topic, stamp, message(rec.store_of(path), layout, stamp, rng))
+            for stamp in range(rec.START, rec.START + scans * 10**8, 10**8)
+            for topic, layout in (("/points", "velodyne"), ("/livox", LIVOX))
+        ]
+        made.append(rec.write_bag(path, messages, compression))
     return made
 
 
@@ -235,20 +193,6 @@ def _worse(text: str, rng: np.random.Generator) -> str:
         case _:
             lines[at] = damage(lines[at].encode(), rng).decode(errors="replace")
     return "".join(lines) or text
-
-
-def _writer(path: Path, cdr: bool, option: Any) -> Any:
-    if not cdr:
-        writer = rosbag1.Writer(path)
-        if option:
-            writer.set_compression(rosbag1.Writer.CompressionFormat[option])
-        return writer
-    storage, mode = option
-    plugin = rosbag2.StoragePlugin[storage]
-    folder = rosbag2.Writer(path, version=9, storage_plugin=plugin)
-    if mode:
-        folder.set_compression(rosbag2.CompressionMode[mode], rosbag2.CompressionFormat.ZSTD)
-    return folder
 
 
 @patch("adaptune.recording.inspect.SECONDS", 0.0)
@@ -302,27 +246,3 @@ def case(what: str) -> Iterator[None]:
     finally:
         signal.setitimer(signal.ITIMER_PROF, 0)
         signal.signal(signal.SIGPROF, before)
-
-
-def main() -> None:
-    """Fuzz, and tell what became of all."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--messages", type=int, default=8000)
-    parser.add_argument("--bags", type=int, default=2000)
-    parser.add_argument("--studies", type=int, default=4000)
-    parser.add_argument("--seed", type=int, default=0)
-    options = parser.parse_args()
-    faulthandler.enable()
-    print(f"messages: {dict(fuzz_messages(options.messages, options.seed))}", flush=True)  # noqa: T201
-    with tempfile.TemporaryDirectory() as folder:
-        print(f"bags: {dict(fuzz_bags(options.bags, options.seed, Path(folder)))}")  # noqa: T201
-    with tempfile.TemporaryDirectory() as folder:
-        studies = fuzz_studies(options.studies, options.seed, Path(folder))
-        print(f"studies: {dict(studies)}")  # noqa: T201
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    print(f"seed {options.seed}, peak memory {peak:.0f} MB")  # noqa: T201
-    assert peak < BYTES >> 20
-
-
-if __name__ == "__main__":
-    main()

@@ -410,8 +410,8 @@ def test_bags_of_every_format_are_sampled(tmp_path):
 
 def without_chunks(path, clouds):
     """An mcap file as `ros2 bag record --storage-preset-profile fastwrite` leaves it."""
-    made, rng = fuzz.stores()[True], np.random.default_rng(0)
-    definition, _ = made.typestore.generate_msgdef(fuzz.CLOUD, ros_version=2)
+    store, rng = rec.ROS2, np.random.default_rng(0)
+    definition, _ = store.generate_msgdef(fuzz.CLOUD, ros_version=2)
 
     def text(given):
         return struct.pack("<I", len(given)) + given.encode()
@@ -425,7 +425,7 @@ def without_chunks(path, clouds):
     parts = [record(1, text("ros2"), text("")), record(3, *schema), record(4, *channel)]
     for i in range(clouds):
         t = START + i * 10**8
-        data = made.typestore.serialize_cdr(fuzz.message(made, "plain", t, rng), fuzz.CLOUD)
+        data = store.serialize_cdr(fuzz.message(store, "plain", t, rng), fuzz.CLOUD)
         parts.append(record(5, struct.pack("<HIQQ", 1, i, t, t), bytes(data)))
     magic = b"\x89MCAP0\r\n"
     path.write_bytes(magic + b"".join(parts) + record(2, bytes(20)) + magic)
