@@ -123,41 +123,12 @@ def mistakes_of(path, overrides, folder):
     return []
 
 
-def test_the_table_of_benchmarks_is_made_from_their_logs(tmp_path):
-    module = benchmark("all")
-    assert {b.arguments[0] for b in module.BENCHMARKS.values()} <= {
-        p.name for p in FOLDER.glob("*")
-    }
-    (tmp_path / "reading.log").write_text(
-        "bag to clouds, uncompressed                  0.8 ms   1.20 of the least (limit 1.15)\n"
-        "bag to clouds, LZ4                           0.9 ms   0.84 of the least (limit 1.15)\n"
-        "memory of a pass over 10 GB                    220 MB   500 MB (10 s)\n"
-    )
-    (tmp_path / "campaign.log").write_text(
-        "bare loop                 10.0 s\n2 workers                  5.0 s: 1.90 times faster\n"
-    )
-    table = tmp_path / "table.md"
-    table.write_text("# Benchmarks\n\nWhat.\n\n## Figures\n\nold\n")
-    module.write_table(tmp_path, table, quick=False)
-    text = table.read_text()
-    assert text.startswith("# Benchmarks\n\nWhat.\n\n## Figures\n\n")
-    assert "old" not in text
-    assert (
-        "| bag to clouds | 1.20 times | rosbags and one copy of each field | at most 1.15, **mis"
-        in text
-    )
-    assert (
-        "| bag to clouds, LZ4 | 0.84 times | rosbags and one copy of each field | at most 1.15 |"
-        in text
-    )
-    assert "| campaign, two workers | 1.90 times | one worker | at least 1.8 |" in text
-    assert "| memory of a pass over 10 GB | 220 MB |  | at most 500 |" in text
-    assert text.count("\n| ") == 5
-
-
 def test_all_benchmarks_print_their_figures(tmp_path):
     """Those that take seconds on little."""
     module = benchmark("all")
+    assert {b.arguments[0] for b in module.BENCHMARKS.values()} <= {
+        p.name for p in FOLDER.iterdir()
+    }
     names = ["reading", "campaign", "length", "members"]
     module.logs(names, tmp_path, quick=True)
     for name in names:

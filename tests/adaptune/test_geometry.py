@@ -111,15 +111,6 @@ def test_interpolation_follows_a_screw_free_motion(seed, offset):
     np.testing.assert_array_equal(got[3], [0, 0, 0, 1])
 
 
-@modest
-@given(seeds)
-def test_interpolation_at_the_stamps_gives_the_very_poses(seed):
-    T = random_poses(seed, 8)
-    stamps = BEGIN + np.cumsum(np.random.default_rng(seed).integers(1, 10**10, 8))
-    np.testing.assert_array_equal(interpolate(stamps, T, stamps, 0), T)
-    np.testing.assert_array_equal(interpolate(stamps, T, stamps[[5, 2, 5]], 0), T[[5, 2, 5]])
-
-
 def test_nothing_is_interpolated_outside_or_in_gaps():
     stamps = np.array([0, 10, 20, 50, 60])
     T = np.array([moved(x=float(s)) for s in stamps])

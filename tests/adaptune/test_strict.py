@@ -26,8 +26,6 @@ class Outer(StrictModel):
 @pytest.mark.parametrize(
     ("given", "key", "message"),
     [
-        ({"x": True}, ("x",), "give a number, not true"),
-        ({"x": float("nan")}, ("x",), "give a finite number, not NaN"),
         ({"x": 1e101}, ("x",), "give a number of at most 1e+100, not 1e+101"),
         ({"n": False}, ("n",), "give a whole number, not false"),
         ({"n": 1.5}, ("n",), "give a whole number, not 1.5"),

@@ -104,9 +104,6 @@ def test_reads_a_study(gicp_study_file, tmp_path):
     ],
 )
 def test_names_each_mistake(study_file, override, words):
-    if words is None:
-        load_study(study_file, [override])
-        return
     message = failure(study_file, override)
     assert message.startswith("-o")
     for word in words:
