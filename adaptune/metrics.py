@@ -116,10 +116,10 @@ def height_error(T_ref_sensor: Poses, T_odom_sensor: Poses, length: float) -> fl
 class KittiError(NamedTuple):
     """Mean errors over sub-trajectories of several lengths."""
 
-    translation: float  # percent; NaN when the path is shorter than every length
-    rotation: float  # degrees a metre
+    translation: float = np.nan  # percent; NaN when the path is shorter than every length
+    rotation: float = np.nan  # degrees a metre
     # The lengths in metres for which there was at least one sub-trajectory.
-    lengths: tuple[float, ...]
+    lengths: tuple[float, ...] = ()
     n: int = 0  # number of sub-trajectories
 
     @classmethod
@@ -127,7 +127,7 @@ class KittiError(NamedTuple):
         """The mean over the sub-trajectories of several paths, as the benchmark takes it."""
         known = [error for error in errors if error.n]
         if not known:
-            return cls(np.nan, np.nan, ())
+            return cls()
         n = [error.n for error in known]
         means = [np.average([e[i] for e in known], weights=n) for i in (0, 1)]
         lengths = sorted({length for error in known for length in error.lengths})
@@ -157,14 +157,10 @@ def kitti_error(
         rotations.append(rotation_angle(T) / length)
         used.append(length)
     if not used:
-        return KittiError(np.nan, np.nan, ())
+        return KittiError()
     translation, rotation = np.concatenate(translations), np.concatenate(rotations)
-    return KittiError(
-        100.0 * float(np.mean(translation)),
-        float(np.degrees(np.mean(rotation))),
-        tuple(used),
-        len(translation),
-    )
+    means = 100.0 * float(np.mean(translation)), float(np.degrees(np.mean(rotation)))
+    return KittiError(*means, tuple(used), len(translation))
 
 
 def absolute_error(T_ref_sensor: Poses, T_odom_sensor: Poses) -> float:
@@ -222,10 +218,8 @@ def lost_in_words(
     over = f"{mean:.1f} % is more than {LOST_ABOVE:g} %"
     lost = f"Even with {best} track is lost on {where}: {over}. "
     if cause := find_cause(max(errors, key=lambda name: errors[name])):
-        return [
-            f"{lost}The likeliest cause: {cause}. Drive slower, record more scans a second, or, "
-            f"where there is an IMU, try `rko_lio`."
-        ]
+        help_ = "Drive slower, record more scans a second, or, where there is an IMU, try `rko_lio`"
+        return [f"{lost}The likeliest cause: {cause}. {help_}."]
     return [
         f"{lost}The likeliest cause is none of the tuned parameters: the odometry does not suit "
         f"the recording (compare with `{'kiss_icp' if odometry == 'gicp' else 'gicp'}`), or "

@@ -244,16 +244,10 @@ def validated_rest(
 ) -> M | None:
     """Validate what is left of a section without its mistakes, with `needed` where it lacks keys.
 
-    What is not mistaken by itself may still not go together. None if nothing can be left.
+    None if what is not mistaken by itself does not go together.
     """
-    keys, given = [mistake.key for mistake in mistakes], data
-    while (rest := needed | _without(data, keys)) != given:
-        found: list[Mistake] = []
-        if (valid := validated(model, rest, (), found, context)) is not None:
-            return valid
-        given = rest
-        keys += [mistake.key for mistake in found]
-    return None
+    rest = needed | _without(data, [mistake.key for mistake in mistakes])
+    return validated(model, rest, (), [], context)
 
 
 def _without(data: dict[str, Any], keys: Iterable[Key]) -> dict[str, Any]:

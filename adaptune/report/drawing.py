@@ -170,8 +170,6 @@ _CONFIG: Spec = {
     "view": {"stroke": None},
     "axis": {
         "gridColor": "#e6e6e6",
-        "domainColor": "#888888",
-        "tickColor": "#888888",
         "labelColor": _DARK,
         "titleColor": _DARK,
         "labelFontSize": 12,
