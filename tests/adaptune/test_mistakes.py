@@ -2,18 +2,12 @@ import re
 
 import fuzz
 import pytest
+from setups import failure
 
-from adaptune.strict import ConfigurationError
 from offline.config import load_study
 
 FOREIGN = re.compile(r"pydantic|https://|Input should|validation|Value error|tuple|dict|None")
 """Words of pydantic's and of Python's."""
-
-
-def failure(file, *overrides):
-    with pytest.raises(ConfigurationError) as caught:
-        load_study(file, overrides)
-    return str(caught.value)
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 import pytest
 import yaml
+from setups import failure
 
 from adaptune.strict import ConfigurationError
 from offline.config import load_study
@@ -13,12 +14,6 @@ def written(study_file, name, **changes):
     file = study_file.with_name(f"{name}.yaml")
     file.write_text(yaml.safe_dump(study, sort_keys=False))
     return file
-
-
-def failure(file, *overrides):
-    with pytest.raises(ConfigurationError) as caught:
-        load_study(file, overrides)
-    return str(caught.value)
 
 
 def test_parts_become_sequences_of_their_own(study_file, tmp_path):

@@ -3,6 +3,7 @@ import sys
 
 import pytest
 from needs import needs_evalio
+from setups import failure
 
 from adaptune.errors import import_extra
 from adaptune.strict import ConfigurationError
@@ -10,12 +11,6 @@ from adaptune.study.loading import DELETED
 from offline.config import load_study
 
 STIFF = ["odometry.name=mad_icp", "odometry.parameters=", "odometry.settings={}"]
-
-
-def failure(file, *overrides):
-    with pytest.raises(ConfigurationError) as caught:
-        load_study(file, overrides)
-    return str(caught.value)
 
 
 def test_switching_that_the_odometry_has_not(study_file):

@@ -1,8 +1,12 @@
-"""What trials of a study need."""
+"""What trials of a study need, and what is wrong with a study."""
 
 import dataclasses
 
+import pytest
+
 from adaptune.odometry import InProcess
+from adaptune.strict import ConfigurationError
+from offline.config import load_study
 from offline.trial import TrialSettings, TrialSetup
 
 
@@ -22,3 +26,10 @@ def made_of(odometry_class, study, made=None):
         return InProcess(odometry)
 
     return make
+
+
+def failure(file, *overrides):
+    """The mistakes in a study."""
+    with pytest.raises(ConfigurationError) as caught:
+        load_study(file, overrides)
+    return str(caught.value)
