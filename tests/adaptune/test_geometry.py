@@ -13,7 +13,6 @@ from adaptune.geometry import (
     rectify,
     rotation_angle,
     scale,
-    steps,
     to_quaternions,
 )
 
@@ -56,16 +55,6 @@ def test_rectified_rotations_are_rotations(seed, noise):
     assert np.abs(R - exact[:, :3, :3]).max() < 4 * noise
     np.testing.assert_array_equal(T, before)
     np.testing.assert_array_equal(rectify(T)[:, :, 3], T[:, :, 3])
-
-
-@modest
-@given(seeds)
-def test_steps_lead_from_the_first_pose_to_the_last(seed):
-    T = random_poses(seed, 6)
-    reached = T[0]
-    for step in steps(T):
-        reached = reached @ step
-    np.testing.assert_allclose(reached, T[-1], atol=1e-10)
 
 
 @pytest.mark.parametrize(
