@@ -133,17 +133,14 @@ def thinned(*columns: NDArray[np.float64], most: int = _MOST) -> NDArray[np.intp
     n = len(columns[0])
     if n <= most:
         return np.arange(n)
-    gaps = np.isnan(np.sum(columns, axis=0))
-    kept = {0, n - 1}
+    kept = [0, n - 1]
     for some in np.array_split(np.arange(n), most // (2 * len(columns) + 2)):
-        missing = gaps[some]
-        kept.add(int(some[0]))
-        if missing.any():
-            kept.add(int(some[missing.argmax()]))
+        missing = np.isnan([column[some] for column in columns]).any(axis=0)
+        kept += [some[0], some[missing.argmax()]]
         there = some[~missing]
         for column in columns if len(there) else ():
-            kept |= {int(there[column[there].argmin()]), int(there[column[there].argmax()])}
-    return np.array(sorted(kept))
+            kept += [there[column[there].argmin()], there[column[there].argmax()]]
+    return np.unique(np.array(kept, np.intp))
 
 
 def wrapped(words: str, letters: float) -> list[str]:
@@ -188,15 +185,7 @@ _CONFIG: Spec = {
 
 
 def spec(chart: Chart, titled: bool = True) -> Spec:
-    """A chart as a specification of Vega-Lite 6.
-
-    Parameters
-    ----------
-    chart
-        What to draw.
-    titled
-        Whether its title stands above it.
-    """
+    """A chart as a specification of Vega-Lite 6; `titled` if its title stands above it."""
     columns = max(1, min(chart.columns, len(chart.panels)))
     rows = [chart.panels[i : i + columns] for i in range(0, len(chart.panels), columns)]
     beside = sum(max(map(_beside, chart.panels[c::columns])) for c in range(columns))
