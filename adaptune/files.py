@@ -174,6 +174,10 @@ _MOST = 100_000
 """Values in a document. Aliases of aliases make more out of a few lines than fit in memory."""
 
 
+def _int(loader: Any, node: Any) -> int:
+    return int(loader.construct_scalar(node))  # PyYAML takes 010 for eight
+
+
 def _str(loader: Any, node: Any) -> str:
     text: str = loader.construct_scalar(node)
     if _NO_CHARACTER.search(text):
@@ -182,8 +186,7 @@ def _str(loader: Any, node: Any) -> str:
     return text
 
 
-# PyYAML takes 010 for eight.
-_Loader.add_constructor(_PREFIX + "int", lambda loader, node: int(loader.construct_scalar(node)))
+_Loader.add_constructor(_PREFIX + "int", _int)
 _Loader.add_constructor(_PREFIX + "str", _str)
 
 
