@@ -1,12 +1,12 @@
 import pickle
 
 import pytest
-from drives import STUDY
+from drives import study_with
+from setups import failure
 
 from adaptune.odometry.keyframe import KeyframeGicp, KeyframeVgicp
 from adaptune.odometry.registry import OdometryPool
 from adaptune.space import ODOMETRY
-from adaptune.strict import ConfigurationError
 from offline.config import load_study
 
 TWO = """
@@ -18,25 +18,18 @@ TWO = """
 
 @pytest.fixture
 def study_of(study_file, tmp_path):
-    """Load the study with other odometries, which are given as YAML."""
-    rest = STUDY[STUDY.index("sequences:") :].replace("bag: ", f"bag: {study_file.parent}/")
+    """The study with other odometries, which are given as YAML."""
 
-    def load(odometry, *overrides):
+    def write(odometry):
         path = tmp_path / "several.yaml"
-        path.write_text(f"odometry:{odometry}\n{rest}")
-        return load_study(path, list(overrides), runs=tmp_path)
+        path.write_text(study_with(f"odometry:{odometry}\n", study_file.parent))
+        return path
 
-    return load
-
-
-def refused(study_of, odometry, *overrides):
-    with pytest.raises(ConfigurationError) as caught:
-        study_of(odometry, *overrides)
-    return str(caught.value)
+    return write
 
 
-def test_a_study_of_two(study_of):
-    study = study_of(TWO)
+def test_a_study_of_two(study_of, tmp_path):
+    study = load_study(study_of(TWO), runs=tmp_path)
     pool = study.odometry
     assert isinstance(pool, OdometryPool)
     assert pool.name == "gicp, vgicp"
@@ -71,20 +64,20 @@ def test_a_study_of_two(study_of):
     ],
 )
 def test_lists_that_are_refused(study_of, odometry, said):
-    assert said in refused(study_of, odometry)
+    assert said in failure(study_of(odometry))
 
 
 def test_mistakes_have_the_line_of_their_odometry(study_of):
-    text = refused(study_of, "\n  - gicp\n  - vgicp\n  - {name: ndt, settings: {iteration: 3}}")
+    text = failure(study_of("\n  - gicp\n  - vgicp\n  - {name: ndt, settings: {iteration: 3}}"))
     assert "line 4: odometry.2.settings.iteration: unknown key" in text
 
 
 def test_sets_of_a_bank_say_which_odometry_they_are_for(study_of):
     sets = "online.switching.sets=[{resolution: 2.0}, {odometry: gicp}]"
-    text = refused(study_of, TWO, sets)
+    text = failure(study_of(TWO), sets)
     assert "online.switching.sets.0: odometry: names no odometry; there is 'gicp', 'vgicp'" in text
 
 
 def test_none_of_several_is_changed_live(study_of):
-    text = refused(study_of, TWO, "online.switching.mechanism=live")
+    text = failure(study_of(TWO), "online.switching.mechanism=live")
     assert "gicp, vgicp cannot change parameters between scans" in text
