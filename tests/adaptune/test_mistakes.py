@@ -16,12 +16,7 @@ FOREIGN = re.compile(r"pydantic|https://|Input should|validation|Value error|tup
         ("sub_trajectory=true", "sub_trajectory: give a number, not true"),
         ("sub_trajectory=", "sub_trajectory: give a number, not nothing"),
         ("sub_trajectory={a: 1}", "sub_trajectory: give a number, not keys with values"),
-        (
-            "odometry.settings.iterations=100000000000",
-            "odometry.settings.iterations: give a number of at most 10,000, not 100000000000",
-        ),
         ("odometry.parameters.keyframe_interval={type: [1]}", "keyframe_interval: give its type"),
-        ("odometry.settings=3", "odometry.settings: give keys with values, not 3"),
         ("odometry={settings: {}}", "odometry.name: this key is missing"),
         ("sequences.o@ne={bag: one.bag}", "sequences.o@ne: becomes the name of a file: give"),
         ("sequences.one.bag=~nobodyx/a.bag", "sequences.one.bag: ~nobodyx/a.bag: there is no such"),
@@ -58,7 +53,6 @@ FOREIGN = re.compile(r"pydantic|https://|Input should|validation|Value error|tup
             "online.switching.sets=[true, 3]",
             "online.switching.sets.0: give a whole number or keys with values, not true",
         ),
-        ("offline.seed=1e400", "offline.seed: give a finite number, not Infinity"),
         ("offline.objective={rtf: 3}", "offline.objective.rtf: give 'rte', 'kitti', 'rpe', 'ape'"),
         (
             "offline={sampler: grid, sampler_settings: {grid: {keyframe_interval: 3}}}",
