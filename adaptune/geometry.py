@@ -110,20 +110,17 @@ def from_quaternions(translations: ArrayLike, quaternions: ArrayLike) -> Poses:
 
     Quaternions are normalised.
     """
+    from scipy.spatial.transform import Rotation
+
     translations = np.asarray(translations, np.float64).reshape(-1, 3)
     T = np.tile(np.eye(4), (len(translations), 1, 1))
-    if len(translations):
-        from scipy.spatial.transform import Rotation
-
-        T[:, :3, :3] = Rotation.from_quat(np.asarray(quaternions, np.float64)).as_matrix()
-        T[:, :3, 3] = translations
+    T[:, :3, :3] = Rotation.from_quat(np.reshape(quaternions, (-1, 4))).as_matrix()
+    T[:, :3, 3] = translations
     return T
 
 
 def to_quaternions(T_target_source: Poses) -> NDArray[np.float64]:
     """Quaternions x, y, z, w (w >= 0) of poses of shape (n, 4, 4), of shape (n, 4)."""
-    if not len(T_target_source):
-        return np.empty((0, 4))
     from scipy.spatial.transform import Rotation
 
     return np.asarray(Rotation.from_matrix(T_target_source[:, :3, :3]).as_quat(canonical=True))
