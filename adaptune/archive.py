@@ -178,8 +178,9 @@ SLOTS = "slots.json"
 """Of each sequence that is searched for sets of its own, the hundred thousand of its trials."""
 OF_SLOT = 100_000
 """Trial numbers of a slot; the first hundred thousand are of sets that all sequences share."""
-_PLAIN = ("faults", "metrics", "usage", "repeats", "unhealthy", "health")
-"""Parts of a trial that are stored as JSON, as its parameters are."""
+_ARRAYS, _SINGLE = ("T_odom_sensor", "restarted", "registered"), ("errors", "seconds")
+_PLAIN = ("parameters", "faults", "metrics", "usage", "repeats", "unhealthy", "health")
+"""Parts of a trial that are stored as they are, in single precision, and as JSON."""
 _TRIAL = re.compile(r"\d{5,}\.npz")
 
 
@@ -399,18 +400,11 @@ class Archive:
         """Write a trial."""
         self._note(sequence)
         path = self.trial_path(sequence, number, whole)
-        plain: dict[str, Any] = {name: _packed(getattr(trial, name)) for name in _PLAIN}
+        data = {name: getattr(trial, name) for name in _ARRAYS}
+        data |= {name: getattr(trial, name).astype(np.float32) for name in _SINGLE}
+        data |= {name: _packed(getattr(trial, name)) for name in _PLAIN}
         with replacing(path) as temporary, temporary.open("wb") as file:
-            np.savez(
-                file,
-                parameters=_packed(trial.parameters),
-                T_odom_sensor=trial.T_odom_sensor,
-                errors=trial.errors.astype(np.float32),
-                restarted=trial.restarted,
-                registered=trial.registered,
-                seconds=trial.seconds.astype(np.float32),
-                **plain,
-            )
+            np.savez(file, **data)
         if whole:
             return
         status, summary = path.stat(), summarise(trial)
@@ -425,17 +419,11 @@ class Archive:
         path = self.trial_path(sequence, number, whole)
         data = _read(path)
         try:
-            plain = {name: _unpacked(data[name]) for name in _PLAIN}
-            plain |= {name: tuple(plain[name]) for name in ("faults", "repeats")}
-            return Trial(
-                _unpacked(data["parameters"]),
-                data["T_odom_sensor"],
-                data["errors"].astype(np.float64),
-                data["restarted"],
-                data["registered"],
-                data["seconds"].astype(np.float64),
-                **plain,
-            )
+            parts: dict[str, Any] = {name: data[name] for name in _ARRAYS}
+            parts |= {name: data[name].astype(np.float64) for name in _SINGLE}
+            parts |= {name: _unpacked(data[name]) for name in _PLAIN}
+            parts |= {name: tuple(parts[name]) for name in ("faults", "repeats")}
+            return Trial(**parts)
         except (KeyError, ValueError) as error:
             raise _damaged(path, error) from error
 
