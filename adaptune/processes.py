@@ -256,12 +256,7 @@ def server(service: str, name: str) -> Server:
     """Server of a piece of user code, started at the first call.
 
     The service is a module. Its function ``load(name)`` imports the user code, and others make an
-    `Answer` from the name.
-
-    Raises
-    ------
-    HostError
-        If it cannot be imported, with the last lines that it wrote.
+    `Answer` from the name. If it cannot be imported, a `HostError` has the last lines that it wrote.
     """
     here, there = socket.socketpair(type=socket.SOCK_SEQPACKET)
     path = os.pathsep.join(folder or str(Path.cwd()) for folder in sys.path)
@@ -363,11 +358,8 @@ class Conversation:
     def receive(self) -> Message:
         """Wait for the next answer.
 
-        Raises
-        ------
-        HostError
-            It says why there is none; the conversation is over then. A `RefusedError` says what the
-            other process refuses, and does not end it.
+        A `HostError` says why there is none; the conversation is over then. A `RefusedError` says
+        what the other process refuses, and does not end it.
         """
         return accepted(self.next_message())
 

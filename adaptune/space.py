@@ -245,13 +245,7 @@ class ParameterSpace:
 
     @classmethod
     def load(cls, data: Mapping[str, Any]) -> Self:
-        """Make a space from what `dump` or `definition` returned.
-
-        Raises
-        ------
-        pydantic.ValidationError
-            If it is none.
-        """
+        """Make a space of what `dump` or `definition` returned; else a pydantic.ValidationError."""
         return cls({name: _adapter.validate_python(p) for name, p in data.items()})
 
 
@@ -409,10 +403,7 @@ class PooledSpace(ParameterSpace):
     def split(self, parameters: Mapping[str, object]) -> tuple[str, dict[str, Any]]:
         """The label of a set's odometry, and the values of its parameters.
 
-        Raises
-        ------
-        SpaceError
-            If there is no such odometry.
+        There is a `SpaceError` if there is no such odometry.
         """
         own = dict(parameters)
         label = own.pop(ODOMETRY, None)
@@ -472,13 +463,7 @@ class PooledSpace(ParameterSpace):
 
 
 def load_space(data: Mapping[str, Any]) -> ParameterSpace:
-    """Make a space, of one odometry or of several, from the result of its `dump`.
-
-    Raises
-    ------
-    pydantic.ValidationError
-        If it is none.
-    """
+    """Make a space, of one odometry or of several, of what its `dump` returned; see `load`."""
     # A parameter has a type, and an odometry has parameters.
     spaces = [of for of in data.values() if isinstance(of, Mapping)]
     pooled = len(spaces) == len(data) and not any(isinstance(of.get("type"), str) for of in spaces)
