@@ -256,7 +256,7 @@ def server(service: str, name: str) -> Server:
     """Server of a piece of user code, started at the first call.
 
     The service is a module. Its function ``load(name)`` imports the user code, and others make an
-    `Answer` from the name. If it cannot be imported, a `HostError` has the last lines that it wrote.
+    `Answer` from the name. If it is not imported, a `HostError` has the last lines that it wrote.
     """
     here, there = socket.socketpair(type=socket.SOCK_SEQPACKET)
     path = os.pathsep.join(folder or str(Path.cwd()) for folder in sys.path)
@@ -642,18 +642,14 @@ def processes(most: int, preload: Sequence[str] = ()) -> Iterator[Executor]:
     context = get_context("forkserver")
     context.set_forkserver_preload(list(preload))
     n = max(1, min(most, available()))
-    pool = ProcessPoolExecutor(n, context, _ignore_interrupts)
+    # Ctrl-C reaches all processes; the first of them decides what happens.
+    pool = ProcessPoolExecutor(n, context, signal.signal, (signal.SIGINT, signal.SIG_IGN))
     try:
         yield pool
     except BrokenProcessPool as error:
         raise AdaptuneError("a process was ended from outside; was the memory full?") from error
     finally:
         pool.shutdown(cancel_futures=True)
-
-
-def _ignore_interrupts() -> None:
-    # Ctrl-C reaches all processes; the first of them decides what happens.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 if __name__ == "__main__":
