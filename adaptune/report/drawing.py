@@ -404,10 +404,8 @@ class _Drawing:
     def _line(self, line: Line) -> Iterator[Spec]:
         x, y = numbers(line.x, self._panel.x), numbers(line.y, self._panel.y)
         kept = thinned(x, y, most=_MOST_FAINT if line.faint else _MOST)
-        look, (width, opacity) = (
-            self._look(line.name),
-            (1.2, 0.4) if line.faint else (line.width, 1.0),
-        )
+        look = self._look(line.name)
+        width, opacity = (1.2, 0.4) if line.faint else (line.width, 1.0)
         mark: Spec = {"type": "line", "strokeJoin": "round", "tooltip": line.name}
         mark |= {"interpolate": "step-after" if line.steps else "linear", "color": look.colour}
         mark |= {"strokeWidth": width, "opacity": opacity}
@@ -436,25 +434,23 @@ class _Drawing:
         if points.texts is not None:
             columns["text"] = points.texts
             tips.insert(0, {"field": "text", "title": points.name or "point"})
-        if points.colour is None:
-            yield self._drawn(mark, columns, tooltip=tips)
-            return
-        columns["c"] = colour = numbers(points.colour, Axis("", log=points.log_colour))
-        if (known := colour[np.isfinite(colour)]).size:
-            limits = float(known.min()), float(known.max())
-            bar = self._colour_bar(points.colour_label, limits, points.log_colour)
-            yield self._drawn(mark, columns, tooltip=tips, color=bar)
-        else:
-            yield self._drawn(mark | {"color": _UNKNOWN}, columns, tooltip=tips)
+        encoding: Spec = {"tooltip": tips}
+        if points.colour is not None:
+            columns["c"] = numbers(points.colour, Axis("", log=points.log_colour))
+            mark |= {"color": _UNKNOWN}
+            if np.isfinite(columns["c"]).any():
+                encoding["color"] = self._colour_bar(points.colour_label, points.log_colour)
+        yield self._drawn(mark, columns, **encoding)
 
-    def _colour_bar(self, words: str, limits: tuple[float, float], log: bool) -> Spec:
-        legend: Spec = {"title": wrapped(words, 16), "gradientOpacity": 1.0}
+    def _colour_bar(self, words: str, log: bool) -> Spec:
+        legend: Spec = {"title": wrapped(words, 16), "gradientOpacity": 1.0, "tickCount": 5}
         legend["gradientLength"] = min(self._height - 40, 220)
         if self._panel.equal:
             legend |= {"title": words, "orient": "bottom", "titleOrient": "left"}
             legend |= {"gradientLength": 0.5 * self._width, "gradientThickness": 10}
-        legend |= {"values": ticks(*limits), "format": "~r"} if log else {"tickCount": 5}
-        scale = {"type": "log" if log else "linear", "domain": limits, "range": _MAP}
+        scale: Spec = {"type": "log" if log else "linear", "range": _MAP, "nice": False}
+        scale |= {} if log else {"zero": False}
+        legend |= {"format": "~r"} if log else {}
         return {"field": "c", "type": "quantitative", "scale": scale, "legend": legend}
 
     def _band(self, band: Band) -> Iterator[Spec]:
