@@ -190,7 +190,7 @@ class ErrorModel:
         """Principal components of the training frames' descriptors."""
         from adaptune.model.knn import ScaledPCA  # not needed to load a model
 
-        return ScaledPCA(blocks=tuple(self.blocks.values())).fit(self.descriptors)
+        return ScaledPCA(self.blocks.values()).fit(self.descriptors)
 
     def stretches(self) -> NDArray[np.intp]:
         """Number of every frame's stretch among all of the model, of shape (n_frames,)."""
