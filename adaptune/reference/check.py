@@ -75,7 +75,7 @@ class MeasuredReference:
                     float(self.stamps[end]) * 1e-9,
                     self.T_ref_sensor[start],
                     self.T_ref_sensor[end],
-                    self.hops.hop(i),
+                    Hop(self.hops.T_start_end[i], self.hops.projection[i]),
                 )
             )
         found = errors.estimate() if reach >= MIN_REACH * longer else None
