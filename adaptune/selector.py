@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from adaptune.bank.members import share
 from adaptune.geometry import Poses
 from adaptune.live.evidence import LiveEvidence
 from adaptune.metrics import FAILURE
@@ -26,7 +27,6 @@ from adaptune.model.rules import NOVEL_FAMILIARITY, PairedExpectedRatio
 from adaptune.model.weights import (
     SMOOTHED_SELECTIONS,
     measured_weights,
-    renormalised,
     smooth_weights,
     weighted_selection,
 )
@@ -120,7 +120,10 @@ class _Measuring:
 
     def _weighted(self, weights: NDArray[np.float64]) -> Selection:
         """A selection of the members' weights, shared by those that are present."""
-        weights = renormalised(weights, self._live.present())
+        present = self._live.present()
+        if not present.all():
+            weights = share(weights, present)
+            weights = weights / weights.sum()
         return weighted_selection(
             self._sets, dict(zip(self.members, weights.tolist(), strict=True))
         )

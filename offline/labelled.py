@@ -479,7 +479,7 @@ class LabelledData(NamedTuple):
         from adaptune.model.knn import ScaledPCA  # takes long to import
 
         descriptors = np.concatenate([s.descriptors for s in self.sequences])
-        pca = ScaledPCA(blocks=tuple(self.sequences[0].blocks.values()))
+        pca = ScaledPCA(self.sequences[0].blocks.values())
         data = TrainingData(
             pca.fit(descriptors).transform(descriptors),
             self.stretches(),

@@ -79,10 +79,9 @@ _NEAR = 1.0
 
 
 class ShortRegistrations:
-    """Mean distances of the newest scan from earlier ones, where motions place it.
+    """Mean distances of the newest scan from earlier ones, where motions place it: an `Alignment`.
 
-    Scans are only kept. Work is done where somebody asks. Calling it gives what
-    `adaptune.bank.members.Alignment` describes.
+    Scans are only kept. Work is done where somebody asks.
     """
 
     def __init__(self) -> None:
@@ -160,9 +159,8 @@ class Lateness:
     """Collects the poses of members that are in time, and does not wait for the others.
 
     A member in another process has until the next scan is due. One that needs longer is late: it
-    has no motion over that scan, and takes part again as soon as it is done. Members of this
-    process are never late, for everything waits for them. Scans come `rate` times as fast as
-    recorded; if that is None, the bank waits for everybody.
+    has no motion over that scan, and takes part again as soon as it is done. Scans come `rate`
+    times as fast as recorded; if that is None, the bank waits for everybody.
 
     Attributes
     ----------
@@ -201,9 +199,6 @@ class Lateness:
     def begin(self) -> None:
         """A scan is there: take what came late. Members that still work are absent."""
         self._begun = self._clock.now()
-        if self._rate is None:
-            self.absent = self.resting.copy()
-            return
         for i in np.flatnonzero(self._owing).tolist():
             if self._members[i].ready(0.0):
                 self._members[i].collect()
@@ -231,7 +226,8 @@ class Lateness:
         self._intervals.append(interval)
         found = [Registration(np.full((4, 4), np.nan), registered=False)] * len(self._members)
         for i in order:
-            if self._is_in_time(i):
+            left = self._begun + median(self._intervals) / (self._rate or 1.0) - self._clock.now()
+            if not self.absent[i] and (self._rate is None or self._members[i].ready(left)):
                 self._behind[i] = 0.0
                 found[i] = self._members[i].collect()
             else:
@@ -243,12 +239,6 @@ class Lateness:
                 self._owing[first], self._behind[first] = False, 0.0
                 found[first] = self._members[first].collect()
         return found
-
-    def _is_in_time(self, i: int) -> bool:
-        if self.absent[i] or self._rate is None:
-            return not self.absent[i]
-        left = self._begun + median(self._intervals) / self._rate - self._clock.now()
-        return self._members[i].ready(left)
 
     def _note(self, i: int, interval: float) -> None:
         if self.removed[i] or self.resting[i] or self.away[i]:
@@ -272,15 +262,14 @@ class Lateness:
             return np.full((4, 4), np.nan)
         T_moved = self._members[i].motions.T_previous_current
         T_given = self._T_odom_given[i]
-        if self._rate is None or np.array_equal(T_given, T_odom_previous):
+        if np.array_equal(T_given, T_odom_previous):
             return T_moved
         missed: Poses = invert(T_odom_previous) @ T_given
         return np.asarray(missed @ T_moved)
 
     def given(self, T_odom_sensor: Poses) -> None:
         """Take note of the bank's pose at a scan that all present members were given."""
-        if self._rate is not None:
-            self._T_odom_given[~self.absent] = T_odom_sensor
+        self._T_odom_given[~self.absent] = T_odom_sensor
 
     def back(self, i: int, T_odom_sensor: Poses) -> None:
         """A member has restarted, and seen the scan of this pose of the bank's."""
@@ -303,10 +292,8 @@ class Bank(OdometryInstance):
     """Several instances, each with its own parameters and each on every scan.
 
     The pose moves by the weighted mean of the motions of members that agree, see `Agreement`. The
-    others restart on the scans of the last seconds, at most once a second. So does a member that a
-    fault has ended, until it has had too many of them: it costs its weight, and nothing else.
-    Members that rest see no scans; when they are to work again, they begin on those of the last
-    seconds, too. `restarts` counts how often a member was restarted.
+    others restart on the scans of the last seconds, at most once a second, and so do members that a
+    fault has ended, or that have rested. `restarts` counts how often a member was restarted.
 
     Parameters
     ----------
@@ -414,8 +401,8 @@ class Bank(OdometryInstance):
         self._returning.clear()
         for member in self._present:
             member.start(prepared.by(member), T_odom_sensor, T_previous_current)
-        self._T_previous_current = self._member_motions(T_odom_sensor)
         self.late.given(T_odom_sensor)
+        self._T_previous_current = self._member_motions(T_odom_sensor)
         self._agreement.start()
         self._short.start(prepared.stamp, prepared.scan.points)
         self._past = deque([PastScan(prepared, T_odom_sensor, T_previous_current)])

@@ -329,11 +329,10 @@ Returns mean distances of shape (n_members,) in metres; infinite where there is 
 class Agreement:
     """Tells which members of a bank agree, scan after scan.
 
-    Motions over the last second are compared, not motions over a scan. Each pose of a member in
-    this second is a vector: the way, and the turn as the way it makes at `LEVER` metres. A straight
-    line through these vectors says how far the member came; so a jump back and forth hardly counts,
-    and a slow departure does. Two members are near each other if they differ, in a second, by no
-    more than ::
+    Each pose of a member in the last second is a vector: the way, and the turn as the way it makes
+    at `LEVER` metres. A straight line through these vectors says how far the member came; so a jump
+    back and forth hardly counts, and a slow departure does. Two members are near each other if they
+    differ, in a second, by no more than ::
 
         least = max(FLOOR, SHARE * way)
         min(max(least, SPREAD * usual difference), MAX_TIMES_LEAST * least, lost_track)
@@ -341,10 +340,6 @@ class Agreement:
     and, over the newest scan alone, by no more than `lost_track` metres a second. Before the first
     half second, the newest scan alone counts. The heaviest group of members that are all near each
     other agrees. Every member votes with its weight.
-
-    A simulation along recorded motions calls `judge` for every scan but the first, and moves by
-    `T_previous_current`. It restarts the members that are `due` as far as it can, says so by
-    `restarted`, and calls `start` where the bank itself begins anew.
 
     Attributes
     ----------

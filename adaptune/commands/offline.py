@@ -276,7 +276,7 @@ def _of_recording(
         found = estimate.estimate_reference(scans, partial(show, "estimating"))
         about = {"recording": str(target.resolve()), "points": config.points}
         metres = length or check.proposed_sub_trajectory(found.trajectory())
-        stored = write_estimate(path, found, about, metres)
+        stored = write_estimate(path, found, about)
         if there is not None:
             measured = check.measure_reference(scans, there, partial(show, "given reference"))
     _say_estimate(stored, found.gaps(), metres)

@@ -48,10 +48,6 @@ class Hops(NamedTuple):
     T_start_end: Poses  # (n, 4, 4)
     projection: NDArray[np.float64]  # (n, 3, 3): see `Hop`
 
-    def hop(self, i: int) -> Hop:
-        """One of them."""
-        return Hop(self.T_start_end[i], self.projection[i])
-
     def part(self, first: int, stop: int) -> "Hops":
         """Those between the frames from `first` to before `stop`, whose numbers begin anew."""
         inside = (self.start >= first) & (self.end < stop)
@@ -65,12 +61,10 @@ class Hops(NamedTuple):
     @classmethod
     def of(cls, hops: Sequence[tuple[int, int, Hop]]) -> "Hops":
         """Gather hops with their frames."""
+        T_start_end = np.array([hop.T_start_end for *_, hop in hops]).reshape(-1, 4, 4)
+        projection = np.array([hop.projection for *_, hop in hops]).reshape(-1, 3, 3)
         start, end = (np.array([hop[i] for hop in hops], np.intp) for i in (0, 1))
-        found = [[hop[0] for *_, hop in hops], [hop[1] for *_, hop in hops]]
-        T, projection = (
-            np.array(arrays).reshape(-1, n, n) for arrays, n in zip(found, (4, 3), strict=True)
-        )
-        return cls(start, end, T, projection)
+        return cls(start, end, T_start_end, projection)
 
 
 class HopCloud:
@@ -121,28 +115,23 @@ def register(
     """
     if start.prepared is None or end.prepared is None:
         return None
+    import small_gicp
+
     (target, tree), (source, _) = start.prepared, end.prepared
-    for guess in guesses:
-        result = _align(target, source, tree, guess)
+    for T_start_end in guesses:
+        for reach in _REACHES:
+            result = small_gicp.align(
+                *(target, source, tree),
+                init_T_target_source=T_start_end,
+                max_correspondence_distance=reach,
+                max_iterations=_ITERATIONS,
+                num_threads=1,
+            )
+            T_start_end = result.T_target_source  # noqa: PLW2901
         T = rectify(result.T_target_source)
         if np.isfinite(T).all() and result.num_inliers >= min_inliers * source.size():
             return Hop(T, T[:3, :3] @ _known_directions(result) @ T[:3, :3].T)
     return None
-
-
-def _align(target: Any, source: Any, tree: Any, T_target_guess: Poses) -> Any:
-    import small_gicp
-
-    for reach in _REACHES:
-        result = small_gicp.align(
-            *(target, source, tree),
-            init_T_target_source=T_target_guess,
-            max_correspondence_distance=reach,
-            max_iterations=_ITERATIONS,
-            num_threads=1,
-        )
-        T_target_guess = result.T_target_source
-    return result
 
 
 def _known_directions(result: Any) -> NDArray[np.float64]:

@@ -67,8 +67,6 @@ DESCRIPTORS = {
     "ndt": "adaptune.model.ndt:describe",
     MOTION: "adaptune.model.descriptor:unknown",
 }
-GONE = ("ring_heights", "range_image", "fpfh", "intensity")
-"""Descriptors of earlier versions, which did no better than `ndt`."""
 
 
 class DescriptorError(AdaptuneError):
@@ -86,8 +84,6 @@ def where(name: str) -> str:
     `name` is one of `DESCRIPTORS`, one that an installed package announces in the entry-point group
     ``adaptune.descriptors``, or ``module:function``; else there is a DescriptorError.
     """
-    if name in GONE:
-        raise DescriptorError(f"{name} is gone, for it did no better; choose ndt or motion")
     try:
         return strict.path_of(name, "descriptor", DESCRIPTORS, ENTRY_POINTS, "function")
     except strict.PluginError as error:

@@ -3,14 +3,15 @@
 import hashlib
 import json
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import MISSING, asdict, dataclass, field, fields, replace
+from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Annotated, Any, Self, get_type_hints
 
 import numpy as np
 import yaml
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, PositiveInt
+from pydantic import BaseModel, ConfigDict, Field, PositiveInt, create_model
 from rich.console import Group, RenderableType
 from rich.text import Text
 from safetensors import SafetensorError, safe_open
@@ -20,7 +21,6 @@ from adaptune import __version__
 from adaptune.archive import compact
 from adaptune.errors import AdaptuneError
 from adaptune.files import replacing
-from adaptune.metrics import cap
 from adaptune.model.descriptor import DESCRIPTORS
 from adaptune.model.rules import (
     Costs,
@@ -54,7 +54,7 @@ def digest(header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> str
     return found.hexdigest()[:16]
 
 
-def _read(path: Path) -> tuple["_Header", dict[str, Any]]:
+def _read(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     """Read a header and arrays, in about as much memory as the file is large.
 
     A damaged file leads to one of many errors, that of another format to a `ModelError`.
@@ -62,15 +62,11 @@ def _read(path: Path) -> tuple["_Header", dict[str, Any]]:
     with path.open("rb"), safe_open(path, "np") as file:
         text = json.loads((file.metadata() or {})["adaptune"])
         found, version = int(text["format"]), str(text["version"])
-        if found > FORMAT:
+        if found != FORMAT:
             raise ModelError(
-                f"{path}: written by adaptune {version}, which is newer than this "
-                f"({__version__}); update adaptune, or fit the model again"
-            )
-        if found < FORMAT:
-            raise ModelError(
-                f"{path}: written by an older adaptune ({version}); run `adaptune offline` again, "
-                f"which fits the model to the finished trials"
+                f"{path}: written by adaptune {version}, which is "
+                f"{'newer' if found > FORMAT else 'older'} than this ({__version__}); run "
+                f"`adaptune offline` again, which fits the model to the finished trials"
             )
         arrays = {name: file.get_tensor(name) for name in sorted(file.keys())}
     if digest(text["header"], arrays) != text["digest"]:
@@ -79,7 +75,7 @@ def _read(path: Path) -> tuple["_Header", dict[str, Any]]:
         if arrays[name].dtype.str not in known:
             raise ValueError(f"{name} holds {arrays[name].dtype}, not {' or '.join(known)}")
     # Only in JSON are the trials' numbers texts.
-    return _Header.model_validate_json(json.dumps(text["header"])), arrays
+    return dict(_header_model().model_validate_json(json.dumps(text["header"]))), arrays
 
 
 SAME_SENSOR = 3.0
@@ -95,33 +91,6 @@ _TYPES = {
 """The arrays in a file, and the types that they may have."""
 
 
-class _Header(BaseModel):
-    """The text in a file, in which another version may say more."""
-
-    model_config = ConfigDict(strict=True)
-
-    odometry: dict[str, Any]
-    space: dict[str, Any]
-    trials: list[int]
-    sets: list[dict[str, Any]]
-    fixed: int
-    length: float = Field(gt=0, allow_inf_nan=False)
-    sequences: list[str]
-    blocks: dict[str, PositiveInt]
-    window: PositiveInt
-    elevations: list[float]
-    paired: PairedSettings
-    bank: list[int]
-    bank_settings: BankSettings
-    provenance: dict[str, Any]
-    expected: dict[str, dict[str, float]]
-    validation: dict[str, Any]
-    budget: float | None
-    worth: float | None = None
-    rivals: dict[str, int]
-    costs: Costs | None
-
-
 @dataclass(frozen=True, eq=False)
 class ErrorModel:
     """Everything that selection needs to know about a study."""
@@ -129,11 +98,11 @@ class ErrorModel:
     odometry: dict[str, Any]  # its name and settings
     sets: ParameterSets  # by the numbers of their trials
     fixed: int  # trial number of the set that is best over all training sequences
-    length: float  # metres of a sub-trajectory
+    length: Annotated[float, Field(gt=0, allow_inf_nan=False)]  # metres of a sub-trajectory
     sequences: list[str]  # names of the training sequences
-    blocks: dict[str, int]  # by name, in order, the number of features of each descriptor
+    blocks: dict[str, PositiveInt]  # by name, in order, the number of features of each descriptor
     # Number of descriptors that are averaged: a selection's and those of the selections before.
-    window: int
+    window: PositiveInt
     descriptors: NDArray[np.float32]  # (n_frames, n_features): averaged
     sequence: NDArray[np.intp]  # (n_frames,): number of each frame's sequence
     # (n_frames, n_sets): percent, infinite where the track was lost, NaN where a set was not run.
@@ -154,7 +123,8 @@ class ErrorModel:
     # By way to adapt (`BANK`, `ONE_SET`) what was expected of it when it was chosen, see
     # `offline.tuning.Figures`; empty where too little is known to compare.
     expected: dict[str, dict[str, float]] = field(default_factory=dict)
-    validation: dict[str, Any] = field(default_factory=dict)  # by rule, what `validate` found
+    # By rule, what `validate` found.
+    validation: dict[str, dict[str, Any]] = field(default_factory=dict)
     budget: float | None = None  # milliseconds of CPU time a scan, live evidence included
     # Share of the error that a bank had to spare to be driven; None if nobody asked.
     worth: float | None = None
@@ -190,7 +160,7 @@ class ErrorModel:
         """Principal components of the training frames' descriptors."""
         from adaptune.model.knn import ScaledPCA  # not needed to load a model
 
-        return ScaledPCA(blocks=tuple(self.blocks.values())).fit(self.descriptors)
+        return ScaledPCA(self.blocks.values()).fit(self.descriptors)
 
     def stretches(self) -> NDArray[np.intp]:
         """Number of every frame's stretch among all of the model, of shape (n_frames,)."""
@@ -321,8 +291,7 @@ class ErrorModel:
         """
         path = Path(path)
         try:
-            content, arrays = _read(path)
-            header = dict(content)
+            header, arrays = _read(path)
             space = load_space(header.pop("space"))
             sets = ParameterSets(space, tuple(header.pop("trials")), tuple(header.pop("sets")))
             arrays["descriptors"] = arrays["descriptors"].astype(np.float32)
@@ -380,6 +349,20 @@ class ErrorModel:
             self.sets.space.check(parameters)
 
 
+@cache
+def _header_model() -> type[BaseModel]:
+    """What the text in a file holds: all but the arrays. Another version may say more."""
+    types = get_type_hints(ErrorModel, include_extras=True)
+    own: dict[str, Any] = {
+        of.name: (types[of.name], ... if of.default is MISSING else of.default)
+        for of in fields(ErrorModel)
+        if of.name not in _TYPES
+    }
+    own["space"], own["trials"] = (dict[str, Any], ...), (list[int], ...)
+    own["sets"] = (list[dict[str, Any]], ...)
+    return create_model("_Header", __config__=ConfigDict(strict=True), **own)
+
+
 N_BEST = 5
 """Sets to show, besides the fixed one, the bank's and the rivals."""
 
@@ -389,9 +372,13 @@ def render(model: ErrorModel, path: Path) -> RenderableType:
     n_frames, n_sets = model.errors.shape
     blocks = ", ".join(f"{name} ({n} numbers)" for name, n in model.blocks.items())
     window = f", as a mean over {model.window} selections in a row" if model.window > 1 else ""
+    told = _given({"settings": model.odometry.get("settings"), "from": model.provenance})
     size, n = path.stat().st_size / 1e3, len(model.sequences)
     caption = "Mean error over all sequences."
-    validated = [{"rule": rule} | _numbers(found) for rule, found in model.validation.items()]
+    validated = [
+        {"rule": rule} | {key: value for key, value in found.items() if isinstance(value, float)}
+        for rule, found in model.validation.items()
+    ]
     return Group(
         Text(
             f"Error model of {model.odometry.get('name', 'an odometry')}: {n_sets} parameter sets "
@@ -401,7 +388,7 @@ def render(model: ErrorModel, path: Path) -> RenderableType:
         tables.table("Sequences", _sequences(model), "Mean capped errors; a lost track is 30 %."),
         tables.table(f"The best sets of {n_sets}", _sets(model), caption),
         Text("\n".join(_driven(model))),
-        Text(_as_yaml({"settings": model.odometry.get("settings"), "from": model.provenance})),
+        Text(yaml.safe_dump(told, allow_unicode=True, sort_keys=False) if told else ""),
         tables.table("Validation", validated, "Ratios to the fixed set's error on what is left out")
         if validated
         else Text("Not validated yet: `adaptune validate` shows what adapting gains."),
@@ -427,42 +414,33 @@ def _driven(model: ErrorModel) -> Iterator[str]:
         yield f"Budget: {model.budget:g} ms of CPU time a scan."
 
 
-def _as_yaml(data: Mapping[str, Any]) -> str:
-    """Plain data in words; what is not given is left out."""
-    given = _given(data)
-    return yaml.safe_dump(given, allow_unicode=True, sort_keys=False) if given else ""
-
-
 def _given(data: Any) -> Any:
+    """Plain data without what is not given."""
     if isinstance(data, Mapping):
         found = {key: _given(value) for key, value in data.items()}
         return {key: value for key, value in found.items() if value not in (None, [], {})}
     return [_given(value) for value in data] if isinstance(data, list | tuple) else data
 
 
-def _numbers(found: Any) -> dict[str, float]:
-    """The numbers of what validation found; a later version may have found something else."""
-    known = found if isinstance(found, Mapping) else {}
-    return {key: value for key, value in known.items() if isinstance(value, float)}
-
-
 def _sequences(model: ErrorModel) -> list[dict[str, Any]]:
     rows = []
     fixed = model.sets.column(model.fixed)
-    for s, name in enumerate(model.sequences):
+    for s in np.unique(model.sequence):
         errors = model.errors[model.sequence == s]
-        run = ~np.isnan(errors).all(axis=0)
-        row: dict[str, Any] = {"sequence": name, "frames": len(errors), "sets": int(run.sum())}
-        row |= {"fixed [%]": None, "best [%]": None, "best set": None, "lost frames, fixed": None}
-        if run.any():
-            means = np.full(len(run), np.inf)
-            means[run] = np.nanmean(cap(errors[:, run]), axis=0)
-            best = int(np.argmin(means))
-            row |= {"best [%]": float(means[best]), "best set": model.sets.trials[best]}
-        if run.any() and run[fixed]:
-            row["fixed [%]"] = float(means[fixed])
-            row["lost frames, fixed"] = int(np.isinf(errors[:, fixed]).sum())
-        rows.append(row)
+        # Infinite where a set was not run.
+        means = mean_errors(errors, np.zeros(len(errors), np.intp))
+        best, was_run = int(np.argmin(means)), bool(np.isfinite(means[fixed]))
+        rows.append(
+            {
+                "sequence": model.sequences[s],
+                "frames": len(errors),
+                "sets": int(np.isfinite(means).sum()),
+                "fixed [%]": float(means[fixed]) if was_run else None,
+                "best [%]": float(means[best]),
+                "best set": model.sets.trials[best],
+                "lost frames, fixed": int(np.isinf(errors[:, fixed]).sum()) if was_run else None,
+            }
+        )
     return rows
 
 

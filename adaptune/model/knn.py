@@ -1,14 +1,12 @@
 """The published selection: k nearest neighbours over descriptors, by their principal components."""
 
-from collections.abc import Sequence
-from typing import Any, Self
+from collections.abc import Iterable
+from typing import Self
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin, TransformerMixin
 from sklearn.decomposition import PCA
-from sklearn.utils.validation import check_array, check_is_fitted, validate_data
 
 from adaptune.metrics import FAILURE
 from adaptune.model.rules import Rule, TrainingData
@@ -18,12 +16,12 @@ N_COMPONENTS = 10
 """Of each descriptor."""
 
 
-class ScaledPCA(TransformerMixin, BaseEstimator):  # type: ignore[misc]
+class ScaledPCA:
     """Principal components, divided by the mean of their standard deviations.
 
     One divisor for all keeps the components' shares in a distance, and gives distances a size that
-    does not depend on the sensor's number of points. Each of the `blocks` of a descriptor (one if
-    left out) has up to `N_COMPONENTS` components and a divisor of its own.
+    does not depend on the sensor's number of points. Each of the `blocks` of a descriptor has up to
+    `N_COMPONENTS` components and a divisor of its own.
 
     Attributes
     ----------
@@ -33,13 +31,13 @@ class ScaledPCA(TransformerMixin, BaseEstimator):  # type: ignore[misc]
     scale_ : ndarray of shape (n_components,)
     """
 
-    def __init__(self, blocks: Sequence[int] | None = None):
-        self.blocks = blocks
+    def __init__(self, blocks: Iterable[int]):
+        self.blocks = tuple(blocks)
 
-    def fit(self, X: NDArray[np.floating], y: Any = None) -> Self:  # noqa: ARG002
+    def fit(self, X: NDArray[np.floating]) -> Self:
         """Learn from descriptors of shape (n_scans, n_features)."""
-        X = validate_data(self, X, dtype=np.float64)
-        ends = np.cumsum(X.shape[1:] if self.blocks is None else self.blocks)
+        X = X.astype(np.float64)
+        ends = np.cumsum(self.blocks)
         self.mean_ = np.empty(X.shape[1])
         components, scales = [], []
         for begin, end in zip([0, *ends[:-1]], ends, strict=True):
@@ -59,13 +57,15 @@ class ScaledPCA(TransformerMixin, BaseEstimator):  # type: ignore[misc]
 
     def transform(self, X: NDArray[np.floating]) -> NDArray[np.float64]:
         """Map descriptors to shape (n_scans, n_components)."""
-        check_is_fitted(self)
-        X = validate_data(self, X, dtype=np.float64, reset=False)
-        return np.asarray((X - self.mean_) @ self.components_.T / self.scale_)
+        return np.asarray((X.astype(np.float64) - self.mean_) @ self.components_.T / self.scale_)
 
 
-class ProductKNeighborsRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):  # type: ignore[misc]
-    """k-nearest-neighbour regression over pairs of a frame and a parameter set.
+class NearestNeighbours(Rule):
+    """Mean error of the k nearest pairs of a frame and a parameter set, least over the sets.
+
+    After Koide et al., IROS 2021: a k-nearest-neighbour regressor on the concatenation of
+    descriptor and parameters, here with the parameters in the unit cube, divided by the mean of
+    their standard deviations as the descriptor's components are.
 
     The prediction is that of `sklearn.neighbors.KNeighborsRegressor` on a row ``[frame, set]`` for
     every pair that was run, with none of these rows made. A squared distance between rows is that
@@ -76,82 +76,6 @@ class ProductKNeighborsRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator
     Of pairs at the same distance, the one with the nearer frame comes first, then the one with the
     earlier frame, then that with the earlier set. (scikit-learn leaves the order to its search.)
     Where there are fewer than k pairs, all are averaged.
-
-    Parameters
-    ----------
-    sets : array-like of shape (n_sets, n_parameters), optional
-        The parameter sets, in units that are comparable to the frames'. Without them, all sets are
-        at one place.
-    n_neighbors : int
-        k.
-    """
-
-    def __init__(self, sets: Any = None, n_neighbors: int = 5):
-        self.sets = sets
-        self.n_neighbors = n_neighbors
-
-    def fit(self, X: Any, y: Any) -> Self:
-        """Learn from frames of shape (n_frames, n_features) and the targets of all pairs.
-
-        Targets are of shape (n_frames, n_sets) or (n_frames,), NaN where a pair was never run. A
-        ValueError reports shapes that do not go together, or that there is no pair at all.
-        """
-        of_y = {"dtype": (np.float64, np.float32), "ensure_all_finite": "allow-nan"}
-        checks = ({"dtype": np.float64}, of_y | {"ensure_2d": False})
-        X, y = validate_data(self, X, y, validate_separately=checks)
-        self._shape = y.shape[1:]
-        self._y = np.ascontiguousarray(y.reshape(len(y), -1))
-        sets = np.zeros((self._y.shape[1], 1)) if self.sets is None else check_array(self.sets)
-        # Frames that have seen the same sets lie together, usually those of a sequence, each
-        # group's in their order.
-        seen = ~np.isnan(self._y)
-        if len(X) != len(y) or len(sets) != seen.shape[1] or not seen.any() or self.n_neighbors < 1:
-            what = f"{len(X)} frames, {len(sets)} sets, {seen.sum()} targets of shape {seen.shape}"
-            raise ValueError(f"inconsistent numbers: {what}, {self.n_neighbors} neighbours")
-        patterns: dict[bytes, list[int]] = {}
-        for frame, pattern in enumerate(np.packbits(seen, axis=1)):
-            patterns.setdefault(pattern.tobytes(), []).append(frame)
-        groups = [frames for frames in patterns.values() if seen[frames[0]].any()]
-        self._frames = np.concatenate(groups)
-        self._bounds = np.cumsum([0, *map(len, groups)])
-        self._X = X[self._frames]
-        seen_sets = [np.flatnonzero(seen[frames[0]]) for frames in groups]
-        self._near_squared, self._near_sets = _nearest_sets(sets, seen_sets, self.n_neighbors)
-        return self
-
-    def predict(self, X: Any) -> NDArray[np.float64]:
-        """Targets of all sets for frames of shape (n_queries, n_features).
-
-        Returns shape (n_queries, n_sets), or (n_queries,) where `y` was of shape (n_frames,).
-        """
-        check_is_fitted(self)
-        X = validate_data(self, X, dtype=np.float64, order="C", reset=False)
-        return np.array([self.predict_one(x) for x in X]).reshape(len(X), *self._shape)
-
-    def predict_one(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Targets of all sets for one frame of shape (n_features,), unchecked: it is quicker."""
-        near = _nearest_of_groups(self._X, self._bounds, x, self.n_neighbors)
-        squared, frames, group = near[0], self._frames[near[1]], near[2]
-        # Of equally near frames the earlier one first, whatever group it is of.
-        order = np.lexsort((frames, squared))
-        predicted: NDArray[np.float64] = _mean_of_nearest(
-            squared[order],
-            frames[order],
-            group[order],
-            self._near_squared,
-            self._near_sets,
-            self._y,
-            self.n_neighbors,
-        )
-        return predicted
-
-
-class NearestNeighbours(Rule):
-    """Mean error of the k nearest pairs of a frame and a parameter set, least over the sets.
-
-    After Koide et al., IROS 2021: a k-nearest-neighbour regressor on the concatenation of
-    descriptor and parameters, here with the parameters in the unit cube, divided by the mean of
-    their standard deviations as the descriptor's components are.
     """
 
     def __init__(self, k: int = 5):
@@ -165,13 +89,37 @@ class NearestNeighbours(Rule):
             self._allowed &= np.isin(data.sets.trials, data.candidates)
         unit = data.sets.unit
         sets = unit / (float(unit.std(axis=0).mean()) or 1.0)
-        errors = np.minimum(data.errors, np.float32(FAILURE))
-        self.regressor_ = ProductKNeighborsRegressor(sets, self.k).fit(data.features, errors)
+        self._errors = np.ascontiguousarray(np.minimum(data.errors, np.float32(FAILURE)))
+        # Frames that have seen the same sets lie together, usually those of a sequence, each
+        # group's in their order.
+        seen = ~np.isnan(self._errors)
+        patterns: dict[bytes, list[int]] = {}
+        for frame, pattern in enumerate(np.packbits(seen, axis=1)):
+            patterns.setdefault(pattern.tobytes(), []).append(frame)
+        groups = [frames for frames in patterns.values() if seen[frames[0]].any()]
+        self._frames = np.concatenate(groups)
+        self._bounds = np.cumsum([0, *map(len, groups)])
+        self._features = data.features[self._frames]
+        seen_sets = [np.flatnonzero(seen[frames[0]]) for frames in groups]
+        self._near_squared, self._near_sets = _nearest_sets(sets, seen_sets, self.k)
         return self
 
     def predict(self, feature: NDArray[np.float64]) -> NDArray[np.float64]:
         """Predicted error of every set in percent; infinite for those that may not be chosen."""
-        return np.where(self._allowed, self.regressor_.predict_one(feature), np.inf)
+        near = _nearest_of_groups(self._features, self._bounds, feature, self.k)
+        squared, frames, group = near[0], self._frames[near[1]], near[2]
+        # Of equally near frames the earlier one first, whatever group it is of.
+        order = np.lexsort((frames, squared))
+        predicted = _mean_of_nearest(
+            squared[order],
+            frames[order],
+            group[order],
+            self._near_squared,
+            self._near_sets,
+            self._errors,
+            self.k,
+        )
+        return np.where(self._allowed, predicted, np.inf)
 
     def select(self, feature: NDArray[np.float64]) -> Selection:
         """See `Rule.select`."""

@@ -151,9 +151,6 @@ class Costs:
     sets: Mapping[int, SetCost]
     evidence: float  # milliseconds of CPU time a scan that live evidence takes
 
-    def __contains__(self, trial: object) -> bool:
-        return trial in self.sets
-
     def alone(self, trial: int) -> float:
         """Milliseconds of CPU time a scan of one instance, no live evidence; NaN if unknown."""
         return self.sets[trial].alone if trial in self.sets else np.nan
@@ -356,8 +353,7 @@ class PairedExpectedRatio(Rule):
     For each training sequence, the rule divides a set's mean error on the frames nearest to the
     scan by the fixed set's on the same frames. Sequences are weighted by how near those frames
     are, neighbouring sets share their evidence, and a set must promise enough to replace the fixed
-    one. A rare failure weighs as much as it costs, and what makes a sequence hard for all sets
-    cancels out.
+    one.
 
     The rule chooses among sets that were run on every sequence, unless the data name candidates;
     other sets count as neighbours. A sequence on which neither a set nor a close one was run does
@@ -378,20 +374,16 @@ class PairedExpectedRatio(Rule):
     def fit(self, data: TrainingData) -> Self:
         """See `Rule.fit`."""
         self.data_ = data
-        self.candidates_ = self._candidates()
+        if not self.settings.adapt:
+            self.candidates_: tuple[int, ...] = (data.fixed,)
+        else:
+            self.candidates_ = data.candidates or tuple(complementary(data, self.settings.n_sets))
         self._known = self._with_baseline()
         self._fixed_at = self.candidates_.index(data.fixed)
         self.fixed_errors_ = data.fixed_errors
         self.errors_ = self._mixed_errors()
         self.nearest_ = NearestFrames(N_FRAMES).fit(data.features, data.sequence)
         return self
-
-    def _candidates(self) -> tuple[int, ...]:
-        if not self.settings.adapt:
-            return (self.data_.fixed,)
-        if self.data_.candidates is not None:
-            return self.data_.candidates
-        return tuple(complementary(self.data_, self.settings.n_sets))
 
     def _with_baseline(self) -> tuple[int, ...]:
         """The candidates, and behind them the baseline if it is none of them but may be chosen."""

@@ -15,7 +15,6 @@ from pydantic import (
     PositiveInt,
 )
 
-from adaptune.bank.members import share
 from adaptune.live.hops import LiveSquares, blend
 from adaptune.metrics import FAILURE
 from adaptune.model.rules import (
@@ -90,22 +89,17 @@ class NearProducts(NamedTuple):
 class BankRule(Rule):
     """Weigh the members of a bank so that the mean of their motions has the least expected error.
 
-    While errors are small, the error of a weighted mean of motions is the weighted mean of the
-    errors. With weights w its mean square is w'Sw, where S_jk is the mean product of the errors of
-    members j and k, which are vectors: two members that err in different directions are worth more
-    together than the better one alone (as with forecasts: Bates and Granger, Operational Research
-    Quarterly 1969).
+    While errors are small, the mean square error of a weighted mean of motions is w'Sw, where S_jk
+    is the mean product of the errors of members j and k, which are vectors (as with forecasts:
+    Bates and Granger, Operational Research Quarterly 1969).
 
     For each training sequence S is taken over the frames nearest to the scan and divided by the
     fixed set's mean square there. Sequences weigh as in `PairedExpectedRatio`, and no weight is
     negative.
 
     What is measured while the robot drives (`adaptune.live`) is blended with it, each weighted by
-    the number of its windows. The less familiar the scene, the fewer the training counts as.
-
-    The weights of a single scan are noise in part, and members' errors of some seconds cancel only
-    while the weights stay the same. So a bank applies the mean over a few selections, see
-    `smooth_weights`.
+    the number of its windows. The less familiar the scene, the fewer the training counts as. A bank
+    applies the mean over a few selections, see `smooth_weights`.
     """
 
     gated = True
@@ -230,17 +224,6 @@ def measured_weights(n_members: int, live: LiveSquares | None) -> NDArray[np.flo
 def _untried(n_members: int) -> NDArray[np.float64]:
     """Mean products of the errors of members of which the training says nothing."""
     return np.diag([1.0, *[UNTRIED_MEAN_SQUARE] * (n_members - 1)])
-
-
-def renormalised(weights: NDArray[np.float64], present: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Weights of the members that are present, adding up to 1; the others have none.
-
-    Both are of shape (n_members,).
-    """
-    if present.all():
-        return weights
-    shares = share(weights, present)
-    return np.asarray(shares / shares.sum())
 
 
 def smooth_weights(weights: NDArray[np.float64]) -> NDArray[np.float64]:

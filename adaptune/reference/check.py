@@ -1,6 +1,6 @@
 """Who is wrong, and by how much: a reference, or an odometry, by direct registrations of scans."""
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import accumulate, islice
@@ -16,7 +16,6 @@ from scipy.spatial.transform import Rotation
 from adaptune.geometry import (
     Poses,
     from_quaternions,
-    interpolate,
     invert,
     nearest_rotation,
     rotation_angle,
@@ -76,7 +75,7 @@ class MeasuredReference:
                     float(self.stamps[end]) * 1e-9,
                     self.T_ref_sensor[start],
                     self.T_ref_sensor[end],
-                    self.hops.hop(i),
+                    Hop(self.hops.T_start_end[i], self.hops.projection[i]),
                 )
             )
         found = errors.estimate() if reach >= MIN_REACH * longer else None
@@ -253,9 +252,9 @@ def diagnose_reference(
         return Trajectory(reference.stamps, T, reference.max_gap).at(stamps)
 
     backwards = "give the poses in the order of their stamps"
+    conventions = [*_conventions(given), _Candidate("reversed in time", backwards, given[::-1])]
     candidates = [
-        *_conventions(given, at_scans),
-        _Candidate("reversed in time", backwards, at_scans(given[::-1])),
+        *(one._replace(T_world_sensor=at_scans(one.T_world_sensor)) for one in conventions),
         *_clock(reference, stamps, hops),
         *_places(at_scans(given) @ invert(T_given_sensor), hops, T_given_sensor),
     ]
@@ -276,8 +275,7 @@ def diagnose_odometry(T_odom_sensor: Poses, hops: Hops) -> Cause | None:
             "let the odometry return the pose of each scan in the frame of the first one",
             np.array([*accumulate(steps, np.matmul)]),
         ),
-        *_conventions(T_odom_sensor, lambda T: T),
-        _moment(T_odom_sensor, hops),
+        *_conventions(T_odom_sensor),
         *_places(T_odom_sensor, hops, np.eye(4), of_odometry=True),
     ]
     return _likeliest(candidates, hops, errors)
@@ -311,54 +309,34 @@ def _likeliest(
     return Cause(what, mend, before, fit[0][1])
 
 
-def _conventions(T: Poses, at_scans: Callable[[Poses], Poses]) -> Iterator[_Candidate]:
+def _conventions(T: Poses) -> Iterator[_Candidate]:
     """Poses as they would be if the file, or the odometry, wrote them by another convention."""
     known = np.isfinite(T[:, 0, 0])
     safe = np.where(np.isfinite(T), T, np.eye(4))
-    translations, q = safe[:, :3, 3], to_quaternions(safe)
-
-    def placed(translations: NDArray[np.float64], quaternions: NDArray[np.float64]) -> Poses:
-        T = from_quaternions(translations, quaternions)
-        T[~known] = np.nan
-        return at_scans(T)
-
-    for where, right, columns in (
-        ("began", "qx qy qz qw", (1, 2, 3, 0)),
-        ("ended", "qw qx qy qz", (3, 0, 1, 2)),
-    ):
-        what = f"as if their quaternions {where} with w"
-        T_right = placed(translations, q[:, columns])
-        yield _Candidate(what, f"write the quaternions as {right}", T_right)
-    inverse = np.where(known[:, None, None], invert(safe), np.nan)
-    yield _Candidate("inverted", "write the poses of the LiDAR in the world", at_scans(inverse))
-    yield _Candidate(
-        "as if their rotations were transposed",
-        "write the rotations from the LiDAR to the world",
-        placed(translations, q * (-1.0, -1.0, -1.0, 1.0)),
-    )
+    at, q = safe[:, :3, 3], to_quaternions(safe)
+    first, last = from_quaternions(at, q[:, [1, 2, 3, 0]]), from_quaternions(at, q[:, [3, 0, 1, 2]])
+    found = [
+        ("as if their quaternions began with w", "write the quaternions as qx qy qz qw", first),
+        ("as if their quaternions ended with w", "write the quaternions as qw qx qy qz", last),
+        ("inverted", "write the poses of the LiDAR in the world", invert(safe)),
+        (
+            "as if their rotations were transposed",
+            "write the rotations from the LiDAR to the world",
+            from_quaternions(at, q * (-1.0, -1.0, -1.0, 1.0)),
+        ),
+    ]
     for axis, name in enumerate("xyz"):
-        sign = np.ones(3)
-        sign[axis] = -1.0
-        yield _Candidate(
-            f"mirrored along {name}",
-            f"change the sign of {name}",
-            placed(translations * sign, q),
-        )
+        sign = np.where(np.arange(3) == axis, -1.0, 1.0)
+        mirrored = from_quaternions(at * sign, q)
+        found.append((f"mirrored along {name}", f"change the sign of {name}", mirrored))
         # A rotation in a mirrored world: its axis is mirrored, and it turns the other way.
-        yield _Candidate(
-            f"left-handed ({name} points the other way)",
-            f"convert them to right-handed axes: change the signs of {name} and of the quaternion's"
-            f" other two",
-            placed(translations * sign, q * np.append(-sign, 1.0)),
-        )
-    for a, b in ((0, 1), (1, 2), (0, 2)):
-        order = np.arange(3)
-        order[[a, b]] = b, a
-        yield _Candidate(
-            f"as if {'xyz'[a]} and {'xyz'[b]} of their positions were swapped",
-            "write the positions as x y z",
-            placed(translations[:, order], q),
-        )
+        what = f"left-handed ({name} points the other way)"
+        mend = f"change the signs of {name} and of the quaternion's other two"
+        right = from_quaternions(at * sign, q * np.append(-sign, 1.0))
+        found.append((what, f"convert them to right-handed axes: {mend}", right))
+    for what, mend, T_right in found:
+        T_right[~known] = np.nan
+        yield _Candidate(what, mend, T_right)
 
 
 def _clock(reference: Trajectory, stamps: NDArray[np.int64], hops: Hops) -> Iterator[_Candidate]:
@@ -384,8 +362,13 @@ def _clock(reference: Trajectory, stamps: NDArray[np.int64], hops: Hops) -> Iter
     if not np.isfinite(costs).any():
         return
 
+    def left(offset: float) -> float:
+        error = _mean(mismatch(shifted(offset, stamps), hops))
+        return 100.0 if np.isnan(error) else error
+
     rough = float(offsets[costs.argmin()])
-    best = _shift(lambda offset: shifted(offset, stamps), hops, rough - step, rough + step)
+    bounds, options = (rough - step, rough + step), {"xatol": 1e-3}
+    best = float(minimize_scalar(left, bounds=bounds, method="bounded", options=options).x)
     if abs(best) < SAME_CLOCK:
         return
     away = np.abs(offsets - rough) > max(1.0, 2.0 * float(np.median(seconds)))
@@ -395,34 +378,6 @@ def _clock(reference: Trajectory, stamps: NDArray[np.int64], hops: Hops) -> Iter
         also = offsets[others][costs[others].argmin()]
         mend += f" (ambiguous, turns repeat: {also:.1f} fits nearly as well)"
     yield _Candidate("like those of another clock", mend, shifted(best, stamps))
-
-
-def _shift(shifted: Callable[[float], Poses], hops: Hops, low: float, high: float) -> float:
-    """By how much the poses must be shifted in time to fit the measured motions best."""
-
-    def left(offset: float) -> float:
-        error = _mean(mismatch(shifted(offset), hops))
-        return 100.0 if np.isnan(error) else error
-
-    options = {"xatol": 1e-3}
-    return float(minimize_scalar(left, bounds=(low, high), method="bounded", options=options).x)
-
-
-def _moment(T_odom_sensor: Poses, hops: Hops) -> _Candidate:
-    """The poses as they are if they are not those at the stamps, but of a later moment of the scan.
-
-    What moves during a scan that is not compensated looks as from the middle of the scan.
-    """
-    at = np.arange(len(T_odom_sensor), dtype=np.int64) * 10**9  # stamps that count scans
-    known = np.isfinite(T_odom_sensor).all(axis=(1, 2))
-
-    def shifted(scans: float) -> Poses:
-        return interpolate(at[known], T_odom_sensor[known], at - round(scans * 1e9), 10**9)
-
-    best = _shift(shifted, hops, 0.0, 1.0)
-    what = f"like those of {best:.2g} scans after their stamps"
-    mend = "undo the motion within scans (`compensate`), or return each pose at its scan's stamp"
-    return _Candidate(what, mend, shifted(best))
 
 
 def _turned_moved(T: Poses) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -75,7 +75,7 @@ class EstimatedReference:
             known[i + 1 : max(int(end), i + 2)] = False
         return known
 
-    def gaps(self) -> list["Gap"]:
+    def gaps(self) -> list[Gap]:
         """Where the reference is unknown, and why."""
         seconds = (self.stamps - self.stamps[0]) * 1e-9
         edges = np.flatnonzero(np.diff(self.known.astype(int), prepend=1, append=1))
@@ -192,10 +192,8 @@ class StoredEstimate(NamedTuple):
             ) from error
 
 
-def write_estimate(
-    path: Path, found: EstimatedReference, about: dict[str, Any], length: float = 25.0
-) -> StoredEstimate:
-    """Write ``.png``, which tells the error over `length` metres, ``.tum`` and, last, ``.json``.
+def write_estimate(path: Path, found: EstimatedReference, about: dict[str, Any]) -> StoredEstimate:
+    """Write ``.png``, ``.tum`` and, last, ``.json``.
 
     If it is interrupted, no ``.json`` is there, and so nothing that counts as an estimate.
     """
@@ -203,8 +201,7 @@ def write_estimate(
     path.parent.mkdir(parents=True, exist_ok=True)
     # What is known of an estimate before is not of these poses.
     path.with_suffix(".json").unlink(missing_ok=True)
-    chart = estimate_chart(path.stem, found, stored, length)
-    draw_chart(chart, path.with_suffix(".png"))
+    draw_chart(estimate_chart(path.stem, found), path.with_suffix(".png"))
     write_tum(path, found.trajectory())
     known = stored._asdict() | {"error_percent": stored.errors}
     known["unknown_seconds"] = [
@@ -237,67 +234,28 @@ class Refusal(NamedTuple):
         write_text(path.with_suffix(".json"), json.dumps(self._asdict(), indent=1) + "\n")
 
 
-# Picture of an estimated reference.
-
-_MARGIN = 20.0
-"""Metres around the known path in which the unknown is drawn."""
-_LONGEST_BREAK = 20.0
-"""Seconds; longer ones are drawn as this."""
-
-
-def estimate_chart(
-    title: str, found: EstimatedReference, stored: StoredEstimate, length: float
-) -> Chart:
+def estimate_chart(title: str, found: EstimatedReference) -> Chart:
     """The path, the residuals of the registrations, and where it is not to be trusted."""
-    panels = _path_panel(found), _residual_panel(found)
-    return Chart("estimate", f"{title}: {_in_words(stored, length)}", panels)
-
-
-def _in_words(stored: StoredEstimate, length: float) -> str:
-    error = stored.error(length)
-    wrong = "" if math.isnan(error) else f", wrong by {error:.2g} % over {length:g} m"
-    share = 100.0 * stored.unknown_share
-    unknown = f", unknown for {max(share, 0.1):.1f} % of the scans" if share else ""
-    return f"{stored.metres:.0f} m{wrong}{unknown}"
-
-
-def _path_panel(found: EstimatedReference) -> Panel:
-    x, y = found.T_world_sensor[:, :2, 3].T
-    known = found.known
-    drawn: list[Drawn] = [Line(np.where(known, x, np.nan), np.where(known, y, np.nan), "path")]
-    if known.any() and not known.all():
-        # Beyond a gap, the unknown path may lead anywhere.
-        inside = [(a > a[known].min() - _MARGIN) & (a < a[known].max() + _MARGIN) for a in (x, y)]
-        shown = inside[0] & inside[1]
-        unknown = np.where(shown, x, np.nan), np.where(shown, y, np.nan)
-        drawn.append(Line(*unknown, "unknown path", dashed=True, faint=True))
-    drawn.append(Points(x[:1], y[:1], "start", shape="cross"))
-    return Panel(Axis("x [m]"), Axis("y [m]"), tuple(drawn), "path", equal=True)
-
-
-def _residual_panel(found: EstimatedReference) -> Panel:
-    seconds = (found.stamps - found.stamps[0]) * 1e-9
-    # A long break, as between two recordings, would hide all else.
-    drawn_at = np.append(0.0, np.cumsum(np.minimum(np.diff(seconds), _LONGEST_BREAK)))
-    of = found.registrations
-    at, differs = drawn_at[of.end], 100.0 * of.residual
+    x, y = found.known_poses[:, :2, 3].T
+    drawn: tuple[Drawn, ...] = Line(x, y, "path"), Points(x[:1], y[:1], "start", shape="cross")
+    path = Panel(Axis("x [m]"), Axis("y [m]"), drawn, "path", equal=True)
+    seconds, of = (found.stamps - found.stamps[0]) * 1e-9, found.registrations
+    differs = 100.0 * of.residual
     failed = np.isnan(differs)
-    top = 2.0 * float(np.max(differs[~failed], initial=1.0))
-    y = np.where(failed, top, np.maximum(differs, 0.01))
-    drawn: list[Drawn] = [
-        Points(at[which], y[which], f"{int(which.sum())} {words}")
-        for words, which in (
+    centimetres = np.where(failed, 2.0 * np.max(differs[~failed], initial=1.0), differs)
+    drawn = tuple(
+        Points(
+            seconds[of.end[which]], np.maximum(centimetres[which], 0.01), f"{which.sum()} {what}"
+        )
+        for what, which in (
             ("differ", ~of.accepted & ~failed),
             ("agree", of.accepted),
             ("failed", failed),
         )
         if which.any()
-    ]
-    for gap in found.gaps():
-        begin, end = np.interp((gap.begin, gap.end), seconds, drawn_at)
-        drawn.append(Spans((begin, end), ("unknown",), "unknown"))
-    shortened = drawn_at[-1] < seconds[-1] - 1e-6
-    time = f"time [s], breaks drawn as {_LONGEST_BREAK:g} s" if shortened else "time [s]"
-    x = Axis(time, limits=(0.0, max(float(drawn_at[-1]), 1.0)))
+    )
+    gaps = [Spans((gap.begin, gap.end), ("unknown",), "unknown") for gap in found.gaps()]
+    time = Axis("time [s]", limits=(0.0, max(float(seconds[-1]), 1.0)))
     differ = Axis("differ from the reference by [cm]", log=True)
-    return Panel(x, differ, tuple(drawn), "registrations over 2, 5 and 10 m")
+    of_hops = Panel(time, differ, (*drawn, *gaps), "registrations over 2, 5 and 10 m")
+    return Chart("estimate", title, (path, of_hops))

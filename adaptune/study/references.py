@@ -105,7 +105,7 @@ def _ensure(
     if refusal is None or changes:
         found = _estimate(sequences, name, advance)
         if isinstance(found, EstimatedReference):
-            stored = write_estimate(path, found, about, length)
+            stored = write_estimate(path, found, about)
             accuracy = _accuracy(stored, length)
             message = "%s: its reference is estimated, %.0f m; %s (%s)"
             _log.info(message, name, stored.metres, accuracy, path)

@@ -89,7 +89,6 @@ def test_descriptors_of_other_packages(monkeypatch):
     ("name", "message"),
     [
         ("ntd", "there is no descriptor 'ntd': did you mean 'ndt'.*module:function"),
-        ("fpfh", "fpfh is gone, .* choose ndt or motion"),
         ("no_such_module:f", "cannot import no_such_module .*PYTHONPATH"),
         ("my_descriptors:other", "not a function"),
         ("my_descriptors:grows", r"scan 0 by an array of shape \(2,\), instead of \(1,\)"),

@@ -78,7 +78,7 @@ def test_no_model_shows_raw_data(model, tmp_path):
     settings = {"command": ["slam", "--fast"], "extrinsic": extrinsic, "gpu": True}
     for changes in (
         {"validation": {"bank": summary, "paper": summary | {"low": np.nan}}},
-        {"validation": {"adaptive": {"kept": ["a", {"b": None}]}, "x": "y"}},
+        {"validation": {"adaptive": {"kept": ["a", {"b": None}]}}},
         {"provenance": {"versions": {"numpy": "2"}, "augment": augment}},
         {"provenance": config.model_dump(mode="json")},
         {"odometry": {"name": "command", "settings": settings}},

@@ -84,7 +84,6 @@ def carried(T):
         (quaternions([1, 2, 3, 0]), "ended with w", "qw qx qy qz"),
         (with_positions(lambda p: p * (1, -1, 1)), "mirrored along y", "sign of y"),
         (left_handed, "left-handed", "right-handed"),
-        (with_positions(lambda p: p[:, [1, 0, 2]]), "swapped", "x y z"),
         (with_positions(lambda p: 1000.0 * p), "times as long", "metres"),
         (with_positions(lambda p: 1.1 * p), "1.1 times as long", "metres"),
         (invert, "inverted", "LiDAR in the world"),
@@ -176,8 +175,6 @@ def test_what_the_place_does_not_show_contradicts_nothing():
         ),
         (turned, "other axes"),
         (carried, "lever arm"),
-        (lambda T: T[np.minimum(np.arange(len(T)) + 1, len(T) - 1)], "1 scans after their stamps"),
-        (lambda _: poses(SCANS + 50_000_000), "0.5 scans after their stamps"),
     ],
 )
 def test_what_an_odometry_returns_instead_of_poses_is_named(spoil, what):
@@ -193,14 +190,6 @@ def test_an_odometry_that_is_lost_breaks_no_convention():
     lost[200:, :3, 3] += np.arange(len(lost) - 200)[:, None] * 0.2
     assert diagnose_odometry(lost, hops()) is None
     assert diagnose_odometry(np.full_like(lost, np.nan), hops()) is None
-
-
-def test_motions_that_a_cause_cannot_show_speak_neither_for_nor_against_it():
-    begins_late = poses(SCANS)
-    begins_late[:15] = begins_late[15]
-    some = Hops(*(array[:6] for array in hops()))
-    # Poses that are shifted to later scans do not reach the first motion, which is the worst.
-    assert diagnose_odometry(begins_late, some) is None
 
 
 class Recorded:

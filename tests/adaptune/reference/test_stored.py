@@ -23,7 +23,7 @@ from adaptune.reference.stored import (
     estimate_chart,
     write_estimate,
 )
-from adaptune.report.charts import Line, Points, Spans
+from adaptune.report.charts import Points, Spans
 
 ABOUT = {"bag": "drive.bag", "topics": ["/points"], "version": 1}
 
@@ -140,44 +140,16 @@ def test_what_was_known_before_is_not_of_new_poses(tmp_path, monkeypatch, at):
 NAN = float("nan")
 
 
-def chart_of(found, title="drive"):
-    stored = StoredEstimate.of(Path("a.tum"), found, {})
-    return estimate_chart(title, found, stored, 10.0)
-
-
-def drawn(found, kind):
-    return [d for panel in chart_of(found).panels for d in panel.drawn if isinstance(d, kind)]
-
-
-def registered(n=201, lost=(), accepted=(), residual=()):
-    m = len(residual)
-    found = made_of(np.arange(n, dtype=np.int64) * 10**8, straight(n), lost=lost)
-    starts, ends = np.arange(m) % 10, 20 + np.arange(m)
-    of = Registrations(starts, ends, np.array(accepted, bool), np.array(residual, float))
-    return replace(found, registrations=of)
-
-
 def test_registrations_are_counted_by_what_became_of_them():
-    found = registered(
-        accepted=[1, 1, 1, 0, 0, 0], residual=[0.01, 0.0, 0.02, 0.5, 0.7, NAN], lost=[60, 120]
-    )
-    named = [points.name for points in drawn(found, Points)]
-    assert named == ["start", "2 differ", "3 agree", "1 failed"]
-    assert len(drawn(found, Spans)) == 2
-    assert [line.name for line in drawn(found, Line)] == ["path", "unknown path"]
-
-
-def test_the_title_says_how_accurate_it_is_and_what_is_unknown():
-    found = registered(lost=[100])
-    assert chart_of(found, "the drive").title == (
-        f"the drive: 76 m, wrong by {found.error(10.0):.2g} % over 10 m, "
-        "unknown for 5.0 % of the scans"
-    )
-    assert "% over 10 m" in chart_of(registered(61)).title
-    assert "wrong" not in chart_of(registered(9)).title  # too short
-    assert "unknown" not in chart_of(registered()).title
-    # A little is not nothing.
-    assert "unknown for 0.1 % of the scans" in chart_of(registered(4001, lost=[3999])).title
+    found = made_of(np.arange(201, dtype=np.int64) * 10**8, straight(201), lost=[60, 120])
+    accepted = np.array([1, 1, 1, 0, 0, 0], bool)
+    residual = np.array([0.01, 0.0, 0.02, 0.5, 0.7, NAN])
+    of = Registrations(np.arange(6), 20 + np.arange(6), accepted, residual)
+    path, registrations = estimate_chart("a", replace(found, registrations=of)).panels
+    points = [one.name for one in registrations.drawn if isinstance(one, Points)]
+    assert points == ["2 differ", "3 agree", "1 failed"]
+    assert sum(isinstance(one, Spans) for one in registrations.drawn) == 2
+    assert np.isnan(path.drawn[0].x[60:80]).any()
 
 
 NONE = np.zeros(0, np.intp)
