@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import BaseModel, BeforeValidator, Field, model_validator
 
 from adaptune import strict
-from adaptune.errors import AdaptuneError, nearest
+from adaptune.errors import AdaptuneError, in_a_line, nearest
 from adaptune.recording.config import MOST_VIEWS, ViewConfig
 from adaptune.space import (
     Categorical,
@@ -109,6 +109,8 @@ def optuna_class(name: str) -> type[Any]:
         found = strict.load(name, path, "class")
     except strict.PluginError as error:
         raise SamplerError(str(error)) from error
+    except Exception as error:  # of a module of the user
+        raise SamplerError(f"{name}: cannot be imported: {in_a_line(error)}") from error
     if not (isinstance(found, type) and issubclass(found, BaseSampler)):
         raise SamplerError(f"{name}: is not a class derived from optuna.samplers.BaseSampler")
     return found

@@ -86,6 +86,13 @@ def test_one_that_goes_wrong_is_named(name, words):
         sampler.propose(first)
 
 
+def test_one_that_cannot_be_imported(tmp_path, study_file):
+    (tmp_path / "broken_samplers.py").write_text("1 / 0")
+    words = "broken_samplers:It: cannot be imported: ZeroDivisionError: division by zero"
+    with pytest.raises(ConfigurationError, match=words):
+        load_study(study_file, ["offline.sampler=broken_samplers:It"])
+
+
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
