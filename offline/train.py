@@ -44,7 +44,6 @@ from adaptune.study.study import (
 from offline.campaign import (
     Campaign,
     WholeRuns,
-    baseline_warning,
     mean_values,
     run_baseline,
     run_whole,
@@ -85,7 +84,6 @@ class Training(NamedTuple):
     trials: list[dict[str, Any]]  # a row each, as in trials.csv
     # For every training sequence what the baseline, the fixed set and its own best set do there.
     rows: list[dict[str, Any]]
-    remark: str | None  # see `baseline_warning`
     said: Sequence[str] = ()  # further sentences
 
     @property
@@ -108,7 +106,6 @@ class Training(NamedTuple):
             f"Fixed: {of_fixed:.3f} % against the baseline's {own:.3f} % {where}.",
             f"Parameters of the fixed set: {in_words(sets[fixed])}{cost}",
             baseline,
-            *([self.remark] if self.remark else []),
         ]
 
 
@@ -146,7 +143,7 @@ def train(study: OfflineStudy, progress: Progress = unseen, cluster: str | None 
         rivals = {*candidates(verdicts), *every_set.defaults}
         sets = {n: verdicts[n].parameters for n in sorted({0, *best, *rivals})}
         whole = run_whole(names, sets, study.config.health, archive, workers, progress)
-    fixed, remark = _fixed(config, verdicts, best, whole)
+    fixed = _fixed(config, verdicts, best, whole)
     before = None
     with contextlib.suppress(ModelError):
         before = ErrorModel.load(study.model_path)
@@ -168,7 +165,7 @@ def train(study: OfflineStudy, progress: Progress = unseen, cluster: str | None 
     said += [*estimates_in_words(estimates, model.length, intervals=True)]
     said += failed_in_words(verdicts)
     said += baseline_words(config, [runs[0] for runs in finished.values()])
-    return Training(model, trials, rows, remark, said)
+    return Training(model, trials, rows, said)
 
 
 def _ready_archive(study: OfflineStudy, progress: Progress) -> Archive:
@@ -241,14 +238,13 @@ def _sets_of(space: ParameterSpace, verdicts: Mapping[int, Verdict]) -> Paramete
 
 def _fixed(
     config: OfflineConfig, verdicts: Mapping[int, Verdict], best: Sequence[int], whole: WholeRuns
-) -> tuple[int, str | None]:
-    """Trial number of the fixed set, one of the best, and what `baseline_warning` says of it."""
+) -> int:
+    """Trial number of the fixed set, one of the best."""
     rivals = {name: {n: runs[n] for n in best} for name, runs in whole.items()}
     values = mean_values(list(whole_values(config, rivals).values()))
     if np.isinf(min(values.values())):
         raise NothingUsableError(UNUSABLE.format(n=f"the {len(best)} best"))
-    fixed = choose_fixed(values, {n: verdicts[n].bound for n in best})
-    return fixed, baseline_warning(config, values, best[0], fixed)
+    return choose_fixed(values, {n: verdicts[n].bound for n in best})
 
 
 def trial_workers(
