@@ -547,7 +547,7 @@ def check_files(sequences: StudySequences, name: str, there: Mapping[Path, str])
     here: dict[Path, str] = {}
     with contextlib.suppress(AdaptuneError):
         here = contents(sequences, name)
-    for path in there | here:
+    for path in {**there, **here}:
         if here.get(path) != there.get(path):
             what = "has another content than where you run this" if path.exists() else "is missing"
             raise ClusterError(
