@@ -395,10 +395,9 @@ class Cluster:
         self._files = {name: contents(self._setup.sequences, name) for name in names}
         # Distinguishes this campaign from others on the same workers.
         self._token = uuid4().hex
-        self._places: dict[str, tuple[str, int]] = {}  # of a worker its host, and its number there
+        self._hosts: dict[str, str] = {}  # of every worker
         self._futures: dict[str, Any] = {}
         self._done = threading.Event()
-        self._waits = False
         try:
             self._client = distributed.Client(address, timeout=_TIMEOUT, set_as_default=False)
         except (OSError, ValueError) as error:
@@ -427,31 +426,26 @@ class Cluster:
 
     def workers(self) -> Collection[str]:
         """See `Pool`."""
-        hosts = self._hosts()
-        for gone in self._places.keys() - hosts.keys():
-            del self._places[gone]
-        if new := [worker for worker in hosts if worker not in self._places]:
+        hosts = self._found()
+        if new := [worker for worker in hosts if worker not in self._hosts]:
             self._check(new)
-            for worker in new:
-                taken = {rank for host, rank in self._places.values() if host == hosts[worker]}
-                rank = next(r for r in range(len(taken) + 1) if r not in taken)
-                self._places[worker] = hosts[worker], rank
-        if not hosts and not self._waits:
+        if self._hosts and not hosts:
             _log.warning("%s: no worker is left; waiting for others", self._address)
-        self._waits = not hosts
-        return list(self._places)
+        self._hosts = hosts
+        return list(hosts)
 
     def start(self, worker: str, task: Task) -> None:
         """See `Pool`."""
-        memory = self._memory / max(len(self._places), 1)
+        # Workers of a host keep to different cores.
+        of_host = [other for other, host in self._hosts.items() if host == self._hosts[worker]]
         future = self._client.submit(
             perform,
             self._token,
             self._setup,
             self._files[task.sequence],
             task,
-            self._places[worker][1],
-            memory,
+            of_host.index(worker),
+            self._memory / len(self._hosts),
             workers=[worker],
             allow_other_workers=False,
             pure=False,
@@ -464,7 +458,7 @@ class Cluster:
         # Dask does not report the death of a worker: look now and then.
         self._done.wait(_PERIOD)
         self._done.clear()
-        hosts = self._hosts()
+        hosts = self._found()
         outcomes = []
         for worker, future in list(self._futures.items()):
             if not future.done() and worker in hosts:
@@ -484,7 +478,7 @@ class Cluster:
         self._client.cancel([future], force=True)
         return Death(f"worker {worker} has gone")
 
-    def _hosts(self) -> dict[str, str]:
+    def _found(self) -> dict[str, str]:
         """The host of every worker that the scheduler knows."""
         if self._client.status == "running":
             with contextlib.suppress(OSError):
