@@ -105,14 +105,6 @@ class AnnealingSampler(BaseSampler):
         Trials before the chains begin.
     seed
         Seed of all random numbers.
-
-    Examples
-    --------
-    >>> import optuna
-    >>> study = optuna.create_study(sampler=AnnealingSampler(seed=1))
-    >>> study.optimize(lambda trial: trial.suggest_float("x", -10.0, 10.0) ** 2, n_trials=50)
-    >>> study.best_value < 0.1
-    True
     """
 
     def __init__(

@@ -258,27 +258,6 @@ def mean_values(values: Sequence[Mapping[int, float]]) -> dict[int, float]:
     return {n: float(mean_value(np.array([of[n] for of in values]))) for n in sorted(numbers)}
 
 
-def baseline_warning(
-    config: OfflineConfig, whole: Mapping[int, float], best: int, fixed: int
-) -> str | None:
-    """In words where the baseline is better than the trials suggested.
-
-    `whole` has by trial number the objective in whole runs, its mean over the sequences;
-    `best` is the set with the best trials.
-    """
-    if 0 not in whole or best == 0 or whole[0] >= whole.get(best, np.inf):
-        return None
-    what = label(config.objective)
-    other = f"{whole[best]:.3g}" if best in whole else "not known"
-    beaten = (
-        f"In whole runs with the health check, the baseline is better than the trials suggested: "
-        f"its {what} is {whole[0]:.3g}, that of trial {best}, the best by its trials, {other}"
-    )
-    if fixed == 0:
-        return f"{beaten}. So the fixed set is the baseline."
-    return f"{beaten}. So the fixed set is trial {fixed}, with {whole[fixed]:.3g}."
-
-
 class BaselineError(AdaptuneError):
     """An odometry that fails with its own parameters."""
 

@@ -9,8 +9,8 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, BeforeValidator, Field, model_validator
 
-from adaptune import processes, strict
-from adaptune.errors import AdaptuneError, nearest
+from adaptune import strict
+from adaptune.errors import AdaptuneError, in_a_line, nearest
 from adaptune.recording.config import MOST_VIEWS, ViewConfig
 from adaptune.space import (
     Categorical,
@@ -28,13 +28,6 @@ from adaptune.study.study import Study
 OPTUNA = {"tpe": "optuna.samplers:TPESampler"}
 """Optuna's samplers that have a name; their settings are the keywords of the class."""
 NAMES = ("annealing", "grid", "random", *OPTUNA)
-SERVICE = "offline.samplers"
-"""What a server does with a sampler of the user."""
-
-
-def is_user_sampler(name: str) -> bool:
-    """Whether a sampler is a class that is neither adaptune's nor Optuna's."""
-    return ":" in name and name.partition(":")[0].partition(".")[0] != "optuna"
 
 
 class SamplerError(AdaptuneError):
@@ -116,6 +109,8 @@ def optuna_class(name: str) -> type[Any]:
         found = strict.load(name, path, "class")
     except strict.PluginError as error:
         raise SamplerError(str(error)) from error
+    except Exception as error:  # of a module of the user
+        raise SamplerError(f"{name}: cannot be imported: {in_a_line(error)}") from error
     if not (isinstance(found, type) and issubclass(found, BaseSampler)):
         raise SamplerError(f"{name}: is not a class derived from optuna.samplers.BaseSampler")
     return found
@@ -332,17 +327,6 @@ _MAX_SETTING = 100_000
 """Candidates, or members of a population: more of them take hours, or all memory."""
 
 
-def check_class(name: str) -> None:
-    """Refuse a name that leads to no Optuna sampler; the user's are imported elsewhere."""
-    if not is_user_sampler(name):
-        optuna_class(name)
-        return
-    try:
-        processes.server(SERVICE, name)
-    except processes.HostError as error:
-        raise SamplerError(str(error)) from error
-
-
 def check_sampler(
     name: str, settings: Mapping[str, Any], space: ParameterSpace | None, budgeted: bool
 ) -> Iterable[Mistake]:
@@ -381,8 +365,7 @@ def _check_optuna(name: str, settings: Mapping[str, Any]) -> Iterable[Mistake]:
             yield Mistake((key,), f"give a number of at most {_MAX_SETTING:,}, not {value}")
             return
     try:
-        make = _make_elsewhere if is_user_sampler(name) else optuna_sampler
-        make(name, settings, 0)
+        optuna_sampler(name, settings, 0)
     except SamplerError as error:
         key, _, rest = str(error).partition(": ")
         yield Mistake((key,), rest) if key in settings else Mistake((), str(error))
@@ -429,19 +412,6 @@ def _box(parameter: Float | Integer, step: Step) -> tuple[float, float]:
     """Bounds of the walk."""
     low, high = step.low, step.high
     return parameter.low if low is None else low, parameter.high if high is None else high
-
-
-def _make_elsewhere(name: str, settings: Mapping[str, Any], seed: int) -> None:
-    """Try whether a sampler of the user takes its settings."""
-    seconds = processes.IMPORT_SECONDS
-    bounds = processes.Bounds(seconds, late=f"it took longer than {seconds:g} s to begin")
-    process = processes.Conversation(processes.Forked(SERVICE, name, "make", bounds))
-    try:
-        process.ask({"settings": dict(settings), "seed": seed})
-    except processes.HostError as error:
-        raise SamplerError(str(error)) from error
-    finally:
-        process.close()
 
 
 Metric = Literal["rte", "kitti", "rpe", "ape", "ms_per_scan", "cpu", "memory"]
@@ -523,7 +493,7 @@ class OfflineConfig(StrictModel):
                 return
         elif self.sampler != "tpe":  # which is always there, and need not be imported
             try:
-                check_class(self.sampler)
+                optuna_class(self.sampler)
             except SamplerError as error:
                 yield Mistake(("sampler",), str(error))
                 return

@@ -90,9 +90,6 @@ class BankSimulation:
     # The motions of some sets, by trial numbers, over every scan but the first, of shape (n_frames
     # - 1, n_sets, 4, 4), see `recorded_motions`.
     motions: Callable[[tuple[int, ...]], Poses]
-    _agreeing: dict[tuple[tuple[int, ...], bytes], NDArray[np.bool_]] = field(
-        default_factory=dict, init=False
-    )
     _live: dict[tuple[int, ...], list[LiveSquares | None]] = field(default_factory=dict, init=False)
 
     @cached_property
@@ -102,11 +99,8 @@ class BankSimulation:
 
     def live(self, members: tuple[int, ...]) -> list[LiveSquares | None]:
         """What is measured of members before the first frame of each period."""
-        if members not in self._live:
-            self._live[members] = self._measured(members)
-        return self._live[members]
-
-    def _measured(self, members: tuple[int, ...]) -> list[LiveSquares | None]:
+        if members in self._live:
+            return self._live[members]
         start, end, T_start_end, projection = self.hops
         T_previous_current = self.motions(members)
         known = np.asarray(np.isfinite(T_previous_current).all(axis=(-2, -1)))
@@ -119,7 +113,7 @@ class BankSimulation:
         unknown = np.concatenate([np.zeros((1, len(members)), np.intp), np.cumsum(~known, axis=0)])
         errors[unknown[end] > unknown[start]] = np.nan
         hops = HopErrors(errors, metres[start], metres[end], seconds[end])
-        return [
+        self._live[members] = [
             live_squares(
                 HopErrors(*(array[end < frame] for array in hops)).recent(
                     float(metres[frame]), float(seconds[frame])
@@ -127,6 +121,7 @@ class BankSimulation:
             )
             for frame in np.unique(self.period, return_index=True)[1]
         ]
+        return self._live[members]
 
     def agreeing(self, votes: MemberWeights) -> NDArray[np.bool_]:
         """Over which scans each member agrees with the others, of shape (n_frames - 1, n_members).
@@ -134,22 +129,19 @@ class BankSimulation:
         Members vote with the weights that are given. The reference takes the place of the short
         registrations: it tells a member that is lost from one that is sound.
         """
-        key = votes.members, votes.weights.tobytes()
-        if key not in self._agreeing:
-            T_previous_current = self.motions(votes.members)
-            agreement = Agreement(len(votes.members), self.lost_track)
-            agreeing = np.zeros(T_previous_current.shape[:2], bool)
-            of_steps = self._of_steps(votes)
-            for i, seconds in enumerate(np.diff(self.stamps) * 1e-9):
-                agreeing[i] = agreement.judge(
-                    T_previous_current[i], seconds, of_steps[i], partial(self._misplaced, i + 1)
-                )
-                if agreeing[i].any():
-                    agreement.restarted(agreement.due)
-                else:
-                    agreement.start()
-            self._agreeing[key] = agreeing
-        return self._agreeing[key]
+        T_previous_current = self.motions(votes.members)
+        agreement = Agreement(len(votes.members), self.lost_track)
+        agreeing = np.zeros(T_previous_current.shape[:2], bool)
+        of_steps = self._of_steps(votes)
+        for i, seconds in enumerate(np.diff(self.stamps) * 1e-9):
+            agreeing[i] = agreement.judge(
+                T_previous_current[i], seconds, of_steps[i], partial(self._misplaced, i + 1)
+            )
+            if agreeing[i].any():
+                agreement.restarted(agreement.due)
+            else:
+                agreement.start()
+        return agreeing
 
     def _of_steps(self, weights: MemberWeights) -> NDArray[np.float64]:
         """Weights at every scan but the first, of shape (n_frames - 1, n_members)."""
@@ -167,14 +159,14 @@ class BankSimulation:
         return np.asarray(np.where(np.isnan(found), np.inf, found))
 
     def errors(
-        self, weights: MemberWeights, votes: MemberWeights | None = None
+        self, weights: MemberWeights, agreeing: NDArray[np.bool_] | None = None
     ) -> NDArray[np.float64]:
         """Capped errors of a bank at every frame, NaN without a sub-trajectory.
 
-        Members vote about who agrees with `votes`; with `weights` when left out.
+        Who agrees is found with the same weights when left out, see `agreeing`.
         """
         T_previous_current = self.motions(weights.members)
-        agreeing = self.agreeing(weights if votes is None else votes)
+        agreeing = self.agreeing(weights) if agreeing is None else agreeing
         none = np.asarray(~agreeing.any(axis=1))
         believed = np.where(agreeing[..., None, None], T_previous_current, np.eye(4))
         moved = mean_motion(believed, share(self._of_steps(weights), agreeing | none[:, None]))
@@ -375,7 +367,7 @@ class LabelledData(NamedTuple):
         """The same with the usable sets that were run on all sequences, on every frame."""
         missing = np.array([np.isnan(s.errors).any(axis=0) for s in self.sequences])
         everywhere = [self.sets.trials[c] for c in np.flatnonzero(~missing.any(axis=0))]
-        return self.subset([n for n in everywhere if self.costs is None or self.costs.usable(n)])
+        return self.subset([n for n in everywhere if self.costs.usable(n)])
 
     @property
     def recordings(self) -> list[str]:

@@ -1,6 +1,5 @@
 """Samplers: what proposes the next parameter sets, in batches, and no set twice."""
 
-import json
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterable, Iterator, Sequence
@@ -13,7 +12,7 @@ import optuna
 from numpy.typing import NDArray
 from scipy.stats import qmc
 
-from adaptune.processes import Answer, Conversation, Forked, HostError, Message
+from adaptune.errors import in_a_line
 from adaptune.space import (
     ODOMETRY,
     Categorical,
@@ -24,16 +23,13 @@ from adaptune.space import (
 )
 from offline.annealing import AnnealingSampler
 from offline.config import (
-    SERVICE,
     AnnealingSettings,
     Grid,
     GridSettings,
     OfflineConfig,
     SamplerError,
     distribution,
-    is_user_sampler,
     make_grid,
-    optuna_class,
     optuna_sampler,
 )
 from offline.objective import SamplerResult
@@ -254,7 +250,11 @@ class AskedSampler(Sampler):
                     return False
             if given is not None:
                 self._study.enqueue_trial(self._encode(given))
-            trial = self._study.ask(self._distributions)
+            try:
+                trial = self._study.ask(self._distributions)
+            except Exception as error:
+                what = f"offline.sampler, at trial {number}: {self.config.sampler}"
+                raise SamplerError(f"{what}: {in_a_line(error)}") from error
             parameters, given = given or self._decode(trial.params), None
             name = key(parameters)
             if name in self._known:
@@ -299,7 +299,7 @@ class AskedSampler(Sampler):
                 continue
             inside = min(max(value, p.low), p.high)
             if not math.isclose(value, inside, rel_tol=_ROUNDED, abs_tol=_ROUNDED):
-                what = f"{self.config.sampler} proposed {value!r} for {name}"
+                what = f"offline.sampler: {self.config.sampler} proposed {value!r} for {name}"
                 raise SamplerError(f"{what}, which is not between {p.low:g} and {p.high:g}")
             decoded[name] = float(inside) if isinstance(p, Float) else int(inside)
         return decoded
@@ -387,24 +387,6 @@ def _spread(sets: dict[str, list[ParameterSet]], first: int) -> list[ParameterSe
     return [own for _, own in sorted(placed, key=itemgetter(0))]
 
 
-class HostedSampler(Sampler):
-    """A sampler of the user; `AskedSampler` asks it in the other process."""
-
-    def __init__(self, space: ParameterSpace, config: OfflineConfig):
-        super().__init__(space, config)
-        self._process = Conversation(Forked(SERVICE, config.sampler, "propose"))
-        self._about = {"space": space.dump(), "config": config.model_dump(mode="json")}
-
-    def _propose(self, numbers: range, history: Sequence[SamplerResult]) -> list[ParameterSet]:
-        try:
-            answer = self._process.ask(self._about | {"history": history})
-        except HostError as error:
-            trials = f"trials {numbers.start} to {numbers.stop - 1}"
-            raise SamplerError(f"offline.sampler, at {trials}: {error}") from error
-        sets: list[ParameterSet] = answer.header["sets"]
-        return sets
-
-
 def make_sampler(space: ParameterSpace, config: OfflineConfig) -> Sampler:
     """Make the sampler that a configuration names."""
     if isinstance(space, PooledSpace):
@@ -413,39 +395,4 @@ def make_sampler(space: ParameterSpace, config: OfflineConfig) -> Sampler:
         return RandomSampler(space, config)
     if config.sampler in ("grid", "random"):
         return GridSampler(space, config)
-    if is_user_sampler(config.sampler):
-        return HostedSampler(space, config)
     return AskedSampler(space, config)
-
-
-# What follows runs in the process of a sampler of the user.
-
-
-def load(name: str) -> None:
-    """Import a sampler."""
-    optuna_class(name)
-
-
-def make(name: str) -> Answer:
-    """Make a sampler and say how that went."""
-
-    def answer(message: Message) -> dict[str, Any]:
-        optuna_sampler(name, message.header["settings"], message.header["seed"])
-        return {}
-
-    return answer
-
-
-def propose(_: str) -> Answer:
-    """Propose one batch after another."""
-    made: dict[str, AskedSampler] = {}
-
-    def answer(message: Message) -> dict[str, Any]:
-        about = message.header
-        key = json.dumps([about["space"], about["config"]])
-        if key not in made:
-            space = ParameterSpace.load(about["space"])
-            made[key] = AskedSampler(space, OfflineConfig.model_validate(about["config"]))
-        return {"sets": made[key].propose(about["history"])}
-
-    return answer

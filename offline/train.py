@@ -1,8 +1,6 @@
 """The offline stage: run the trials, choose the fixed set, fit the error model."""
 
 import contextlib
-import hashlib
-import json
 import logging
 import os
 from collections.abc import Mapping, Sequence
@@ -34,17 +32,13 @@ from adaptune.study.references import (
     estimates_of,
 )
 from adaptune.study.study import (
-    BANK,
     FIXED_SET,
-    ONE_SET,
     OracleErrors,
-    expected_in_words,
     oracle_errors,
 )
 from offline.campaign import (
     Campaign,
     WholeRuns,
-    baseline_warning,
     mean_values,
     run_baseline,
     run_whole,
@@ -52,7 +46,7 @@ from offline.campaign import (
     watch_tasks,
     whole_values,
 )
-from offline.config import TIMED, OfflineConfig, OfflineStudy, OfflineStudyConfig
+from offline.config import TIMED, OfflineConfig, OfflineStudy
 from offline.labelled import LabelledData, labelled_data, measured_costs
 from offline.objective import (
     UNUSABLE,
@@ -85,7 +79,6 @@ class Training(NamedTuple):
     trials: list[dict[str, Any]]  # a row each, as in trials.csv
     # For every training sequence what the baseline, the fixed set and its own best set do there.
     rows: list[dict[str, Any]]
-    remark: str | None  # see `baseline_warning`
     said: Sequence[str] = ()  # further sentences
 
     @property
@@ -108,7 +101,6 @@ class Training(NamedTuple):
             f"Fixed: {of_fixed:.3f} % against the baseline's {own:.3f} % {where}.",
             f"Parameters of the fixed set: {in_words(sets[fixed])}{cost}",
             baseline,
-            *([self.remark] if self.remark else []),
         ]
 
 
@@ -137,7 +129,8 @@ def train(study: OfflineStudy, progress: Progress = unseen, cluster: str | None 
             name: {n: archive.finished(name)[n] for n, v in verdicts.items() if name in v.sequences}
             for name in names
         }
-        every_set, affordable_ones = _sets_of(space, verdicts), verdicts
+        tried = tuple(verdict.parameters for verdict in verdicts.values())
+        every_set, affordable_ones = ParameterSets(space, tuple(verdicts), tried), verdicts
         if (budget := study.config.online.budget) is not None:
             costs = measured_costs(archive, finished, every_set, study.odometry)
             affordable_ones = {n: verdicts[n] for n in affordable(costs, list(verdicts), budget)}
@@ -146,11 +139,8 @@ def train(study: OfflineStudy, progress: Progress = unseen, cluster: str | None 
         rivals = {*candidates(verdicts), *every_set.defaults}
         sets = {n: verdicts[n].parameters for n in sorted({0, *best, *rivals})}
         whole = run_whole(names, sets, study.config.health, archive, workers, progress)
-    fixed, remark = _fixed(config, verdicts, best, whole)
-    before = None
-    with contextlib.suppress(ModelError):
-        before = ErrorModel.load(study.model_path)
-    model = _fitted(study, archive, verdicts, fixed, before)
+    fixed = _fixed(config, verdicts, best, whole)
+    model = _fitted(study, archive, every_set, finished, fixed)
     write_fixed(study, verdicts[fixed].parameters)
     trials = _trial_rows(config, space, verdicts, finished)
     tables.write_rows(study.folder, "trials", trials)
@@ -164,11 +154,10 @@ def train(study: OfflineStudy, progress: Progress = unseen, cluster: str | None 
         study.odometry.name,
         lambda worst: hard_to_track(study.sequences.open(worst)),
     )
-    said += [] if before is None else changes(before, model)
     said += [*estimates_in_words(estimates, model.length, intervals=True)]
     said += failed_in_words(verdicts)
     said += baseline_words(config, [runs[0] for runs in finished.values()])
-    return Training(model, trials, rows, remark, said)
+    return Training(model, trials, rows, said)
 
 
 def _ready_archive(study: OfflineStudy, progress: Progress) -> Archive:
@@ -207,48 +196,15 @@ def write_fixed(study: OfflineStudy, fixed: ParameterSet) -> None:
         write_text(own[0], own[1].text)
 
 
-def changes(before: ErrorModel, after: ErrorModel) -> list[str]:
-    """What differs from the model before, a sentence each: sequences, fixed set, what is driven."""
-    said = []
-    if new := [name for name in after.sequences if name not in before.sequences]:
-        said.append(f"Trained on {', '.join(new)}, too.")
-    if before.fixed != after.fixed:
-        said.append(f"The fixed set was trial {before.fixed}, is trial {after.fixed}.")
-    (was, was_expected), (now, now_expected) = _driven(before), _driven(after)
-    if was != now:
-        said.append(f"Driven: was {was}, is {now}.")
-    if was_expected != now_expected:
-        said.append(f"Expected before: {was_expected}. Now: {now_expected}.")
-    return said
-
-
-def _driven(model: ErrorModel) -> tuple[str, str]:
-    """What a model drives, and what is expected of it, in words."""
-    way = BANK if model.bank_adapts else ONE_SET if model.paired.adapt else None
-    of = {
-        BANK: f"the bank of trials {', '.join(map(str, model.bank))}",
-        ONE_SET: "one set at a time",
-        None: "the fixed set",
-    }
-    expected = model.expected.get(way) if way else None
-    return of[way], "no gain" if expected is None else expected_in_words(expected)
-
-
-def _sets_of(space: ParameterSpace, verdicts: Mapping[int, Verdict]) -> ParameterSets:
-    sets = tuple(verdict.parameters for verdict in verdicts.values())
-    return ParameterSets(space, tuple(verdicts), sets)
-
-
 def _fixed(
     config: OfflineConfig, verdicts: Mapping[int, Verdict], best: Sequence[int], whole: WholeRuns
-) -> tuple[int, str | None]:
-    """Trial number of the fixed set, one of the best, and what `baseline_warning` says of it."""
+) -> int:
+    """Trial number of the fixed set, one of the best."""
     rivals = {name: {n: runs[n] for n in best} for name, runs in whole.items()}
     values = mean_values(list(whole_values(config, rivals).values()))
     if np.isinf(min(values.values())):
         raise NothingUsableError(UNUSABLE.format(n=f"the {len(best)} best"))
-    fixed = choose_fixed(values, {n: verdicts[n].bound for n in best})
-    return fixed, baseline_warning(config, values, best[0], fixed)
+    return choose_fixed(values, {n: verdicts[n].bound for n in best})
 
 
 def trial_workers(
@@ -271,11 +227,7 @@ def trial_workers(
 
 
 def _fitted(
-    study: OfflineStudy,
-    archive: Archive,
-    verdicts: Mapping[int, Verdict],
-    fixed: int,
-    before: ErrorModel | None,
+    study: OfflineStudy, archive: Archive, sets: ParameterSets, finished: Finished, fixed: int
 ) -> ErrorModel:
     """The study's error model: the one before, if that was fitted to just this, or fitted now."""
     config, inputs = study.config, study.model_inputs
@@ -286,15 +238,23 @@ def _fitted(
     estimates = estimates_of(study.sequences, study.training)
     if judged := estimates_as_data(estimates, config.sub_trajectory):
         provenance |= {"estimated_references": judged}
-    about = (config, archive, study.training, verdicts, fixed)
-    provenance["evidence"] = _evidence(*about, provenance)
+    trials = {
+        name: {n: (run.mean_error, run.lost, judge(config.offline, [run])) for n, run in of.items()}
+        for name, of in finished.items()
+    }
+    switching = config.online.switching.model_dump(mode="json", include={"size", "sets"})
+    online = (config.online.period, config.online.budget, config.online.worth, switching)
+    provenance["evidence"] = manifest.digest((trials, online, fixed))
+    before = None
+    with contextlib.suppress(ModelError):
+        before = ErrorModel.load(study.model_path)
     if before is not None and before.provenance == provenance:
         manifest.record(study.model_inputs_path, inputs)
         return before
     data = labelled_data(
         archive,
-        {name: [n for n, v in verdicts.items() if name in v.sequences] for name in study.training},
-        _sets_of(study.odometry.space, verdicts),
+        finished,
+        sets,
         config,
         study.window,
         study.sequences.recorded_in,
@@ -308,36 +268,6 @@ def _fitted(
     model.save(study.model_path)
     manifest.record(study.model_inputs_path, inputs)
     return model
-
-
-def _evidence(
-    config: OfflineStudyConfig,
-    archive: Archive,
-    names: Sequence[str],
-    verdicts: Mapping[int, Verdict],
-    fixed: int,
-    provenance: Mapping[str, Any],
-) -> str:
-    """Digest of everything that a model of the study depends on."""
-    trials = {
-        name: [
-            (n, run.mean_error, run.lost, judge(config.offline, [run]))
-            for n, run in sorted(archive.finished(name).items())
-            if n in verdicts and name in verdicts[n].sequences
-        ]
-        for name in names
-    }
-    switching = config.online.switching.model_dump(mode="json", include={"size", "sets"})
-    online = (config.online.period, config.online.budget, config.online.worth, switching)
-    about = [provenance, trials, online, fixed]
-    found = hashlib.blake2b(json.dumps(about).encode(), digest_size=16)
-    for name in names:
-        frames = archive.read_frames(name)
-        described = (frames.stamps, frames.T_ref_sensor, frames.descriptors, frames.elevations)
-        # Not the time that hops took, which differs from run to run.
-        for array in (*described, *frames.hops):
-            found.update(np.ascontiguousarray(array).tobytes())
-    return found.hexdigest()
 
 
 def _trial_rows(

@@ -37,7 +37,6 @@ from adaptune.odometry.registry import Factory
 from adaptune.odometry.tracker import HealthCheck, Tracker, unhealthy
 from adaptune.processes import apart
 from adaptune.progress import Progress, unseen
-from adaptune.recording.recording import RecordedSequence
 from adaptune.recording.scan import Scan
 from adaptune.space import ParameterSet
 from adaptune.study.study import StudySequences
@@ -276,10 +275,6 @@ def with_measured_hops(
     return replace(frames, hops=hops, evidence_ms=1e3 * seconds / n)
 
 
-_CLOCK_TOLERANCE = 1.0
-"""Seconds by which a reference's clock may differ from the scans' while its length is looked at."""
-
-
 @dataclass(frozen=True)
 class TrialSettings:
     """What a trial depends on besides odometry, sequence and parameter set."""
@@ -331,7 +326,9 @@ class PreparedSequence:
         self.shared = SharedScans(scans, memory)
         self._baseline = partial(setup.odometry, isolated=settings.isolated)
         self._odometry: OdometryInstance | None = None
-        reference = _reference(key, scans, settings)
+        reference = scans.reference()
+        if reference is None:
+            raise AdaptuneError(f"{key}: training needs a reference trajectory")
         stamps, descriptors, elevations, full, enough = [], [], [], False, False
         try:
             describe = Describer(settings.descriptors)
@@ -383,38 +380,6 @@ def _watched(scans: Iterable[Any], n: int, what: str, progress: Progress) -> Ite
     progress(what, done, done)
 
 
-def _reference(key: str, scans: recording.Recording, settings: TrialSettings) -> Trajectory:
-    """The reference; an AdaptuneError if it alone shows that no error can be measured."""
-    reference = scans.reference()
-    if reference is None:
-        raise AdaptuneError(
-            f"{key}: training needs a reference trajectory; name its topic or file (reference: "
-            f"...), or let adaptune estimate one (reference: estimated)"
-        )
-    T = reference.T_world_sensor[_during(scans, reference)]
-    if len(T) and travelled(T)[-1] < settings.sub_trajectory:
-        raise _too_short(key, T, settings)
-    return reference
-
-
-def _during(scans: recording.Recording, reference: Trajectory) -> NDArray[np.bool_]:
-    """Which poses of a reference may be of the scans' time, of shape (n,)."""
-    span = scans.source.span() if isinstance(scans, RecordedSequence) else None
-    if span is None or not isinstance(scans, RecordedSequence):
-        return np.ones(len(reference.stamps), bool)
-    seconds = (reference.stamps - span[0]) * 1e-9
-    stop = np.inf if scans.stop is None else scans.stop
-    inside = (seconds > scans.start - _CLOCK_TOLERANCE) & (seconds < stop + _CLOCK_TOLERANCE)
-    return np.asarray(inside)
-
-
-def _too_short(key: str, T: Poses, settings: TrialSettings) -> AdaptuneError:
-    return AdaptuneError(
-        f"{key}: its path of {travelled(T)[-1]:.1f} m holds no sub-trajectory of "
-        f"{settings.sub_trajectory:g} m; make sub_trajectory shorter or the sequence longer"
-    )
-
-
 def reference_poses(
     key: str, reference: Trajectory, stamps: NDArray[np.int64], settings: TrialSettings
 ) -> Poses:
@@ -435,7 +400,11 @@ def reference_poses(
             f"are of the same recording and clock"
         )
     if not whole:
-        raise _too_short(key, T_ref_sensor[~np.isnan(T_ref_sensor[:, 0, 0])], settings)
+        metres = travelled(T_ref_sensor[~np.isnan(T_ref_sensor[:, 0, 0])])[-1]
+        raise AdaptuneError(
+            f"{key}: its path of {metres:.1f} m holds no sub-trajectory of "
+            f"{settings.sub_trajectory:g} m; make sub_trajectory shorter or the sequence longer"
+        )
     shortest = min(KITTI_LENGTHS)
     if "kitti" in settings.metrics and not (window_ends(T_ref_sensor, shortest) >= 0).any():
         raise AdaptuneError(

@@ -335,13 +335,13 @@ def bank_errors(
     of_bank = replace(data, fixed=members[0], candidates=members, vectors=vectors)
     scans = pca.transform(simulation.descriptors[periods(simulation.period)[0]])
     near, live = BankRule(settings[0]).fit(of_bank).near(scans), simulation.live(members)
-    votes: MemberWeights | None = None
+    agreeing: NDArray[np.bool_] | None = None
     for one in settings:
         weights, _ = bank_weights(near, one, live)
         smoothed = MemberWeights(members, smooth_weights(weights))
         # Who agrees takes long to find, and hangs on the settings but little.
-        votes = smoothed if votes is None else votes
-        yield simulation.errors(smoothed, votes)[left_out.known], smoothed
+        agreeing = simulation.agreeing(smoothed) if agreeing is None else agreeing
+        yield simulation.errors(smoothed, agreeing)[left_out.known], smoothed
 
 
 def _paired_errors(

@@ -32,7 +32,6 @@ from adaptune.study.study import (
     driven,
     expected_in_words,
 )
-from offline.campaign import baseline_warning
 from offline.charts import stretch_chart
 from offline.config import OfflineStudy
 from offline.labelled import LabelledData, LabelledSequence, comparable, labelled_data, periods
@@ -320,11 +319,7 @@ def validate(study: OfflineStudy, progress: Progress = unseen) -> Validated:
         draw_chart(chart, *(study.folder / f"validation.{kind}" for kind in ("png", "svg")))
     summaries = {mode: validation.summary(mode) for mode in validation.modes}
     replace(model, validation=summaries).save(study.model_path)
-    bounds = data.bounds()
-    best = min(bounds, key=lambda n: bounds[n])
-    warning = baseline_warning(study.config.offline, data.whole(), best, data.fixed())
     said = [online, *_verdicts(study.rules, study.mechanism == "bank", validation)]
-    said += [warning] if warning else []
     estimates = estimates_of(study.sequences, study.training)
     said += estimates_in_words(estimates, model.length, intervals=True)
     return Validated(validation, rows, said)

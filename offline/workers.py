@@ -1,10 +1,6 @@
 """Processes that run trials, and keep the sequences that they have prepared."""
 
-import base64
 import contextlib
-import dataclasses
-import hashlib
-import io
 import logging
 import multiprocessing as mp
 import os
@@ -17,23 +13,16 @@ from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, 
 from dataclasses import replace
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerProcess
+from pathlib import Path
 from typing import Any, Generic, NamedTuple, Protocol, Self, TypeVar
 from uuid import uuid4
-
-import numpy as np
-from numpy.typing import NDArray
 
 from adaptune import __version__
 from adaptune.archive import Frames, Trial
 from adaptune.errors import AdaptuneError, in_a_line
-from adaptune.geometry import Poses
 from adaptune.processes import apart, how_it_ended, pin
 from adaptune.progress import Progress, unseen
-from adaptune.recording import Scan, SequenceConfig, cache
 from adaptune.recording.cache import fingerprints
-from adaptune.recording.recording import sequence_files
-from adaptune.recording.scan import Imu, ImuNoise
-from adaptune.recording.views import with_imu
 from adaptune.space import ParameterSet
 from adaptune.study.study import StudySequences
 from offline.trial import PreparedSequence, TrialSetup, with_measured_hops
@@ -370,9 +359,6 @@ def now_and_then(send: Callable[[TaskProgress], None]) -> Progress:
     return some
 
 
-CHUNK = 1 << 26
-"""Bytes of scans in one message."""
-
 _TIMEOUT = 10.0
 _PERIOD = 1.0
 
@@ -383,15 +369,10 @@ class ClusterError(AdaptuneError):
     """A cluster that cannot be used."""
 
 
-class LackingError(AdaptuneError):
-    """A worker does not have the sequence."""
-
-
 class Cluster:
     """The workers of a Dask cluster, as a `Pool`.
 
-    A worker reads recordings that it has under the same path. Others are decoded and sent to it
-    once; it keeps them in its cache of decoded sequences, under a digest of their contents.
+    A worker reads the recordings, which must be under the same path there.
 
     Its workers share `memory` bytes, or less, for prepared scans. Use it as a context: leaving it
     cancels the tasks that are not done.
@@ -408,18 +389,15 @@ class Cluster:
         except ImportError as error:
             raise ClusterError("--cluster needs Dask: pip install 'adaptune[dask]'") from error
         self._killed = distributed.KilledWorker
-        self._sequences = setup.sequences
         self._memory = memory
         self._address = address
-        self._digests = {name: recording_digest(setup.sequences.config(name)) for name in names}
-        self._away = _away(setup, self._digests)
+        self._setup = _elsewhere(setup)
+        self._files = {name: contents(self._setup.sequences, name) for name in names}
         # Distinguishes this campaign from others on the same workers.
         self._token = uuid4().hex
-        self._places: dict[str, tuple[str, int]] = {}  # of a worker its host, and its number there
-        self._tasks: dict[str, Task] = {}
+        self._hosts: dict[str, str] = {}  # of every worker
         self._futures: dict[str, Any] = {}
         self._done = threading.Event()
-        self._waits = False
         try:
             self._client = distributed.Client(address, timeout=_TIMEOUT, set_as_default=False)
         except (OSError, ValueError) as error:
@@ -448,31 +426,26 @@ class Cluster:
 
     def workers(self) -> Collection[str]:
         """See `Pool`."""
-        hosts = self._hosts()
-        for gone in self._places.keys() - hosts.keys():
-            del self._places[gone]
-        if new := [worker for worker in hosts if worker not in self._places]:
+        hosts = self._found()
+        if new := [worker for worker in hosts if worker not in self._hosts]:
             self._check(new)
-            for worker in new:
-                taken = {rank for host, rank in self._places.values() if host == hosts[worker]}
-                rank = next(r for r in range(len(taken) + 1) if r not in taken)
-                self._places[worker] = hosts[worker], rank
-        if not hosts and not self._waits:
+        if self._hosts and not hosts:
             _log.warning("%s: no worker is left; waiting for others", self._address)
-        self._waits = not hosts
-        return list(self._places)
+        self._hosts = hosts
+        return list(hosts)
 
     def start(self, worker: str, task: Task) -> None:
         """See `Pool`."""
-        memory = self._memory / max(len(self._places), 1)
-        self._tasks[worker] = task
+        # Workers of a host keep to different cores.
+        of_host = [other for other, host in self._hosts.items() if host == self._hosts[worker]]
         future = self._client.submit(
             perform,
             self._token,
-            self._away,
+            self._setup,
+            self._files[task.sequence],
             task,
-            self._places[worker][1],
-            memory,
+            of_host.index(worker),
+            self._memory / len(self._hosts),
             workers=[worker],
             allow_other_workers=False,
             pure=False,
@@ -485,19 +458,13 @@ class Cluster:
         # Dask does not report the death of a worker: look now and then.
         self._done.wait(_PERIOD)
         self._done.clear()
-        hosts = self._hosts()
+        hosts = self._found()
         outcomes = []
         for worker, future in list(self._futures.items()):
             if not future.done() and worker in hosts:
                 continue
-            task = self._tasks.pop(worker)
             del self._futures[worker]
-            outcome = self._outcome(worker, future)
-            if isinstance(outcome, LackingError):
-                self._send(worker, task.sequence)
-                self.start(worker, task)
-            else:
-                outcomes.append((worker, outcome))
+            outcomes.append((worker, self._outcome(worker, future)))
         return outcomes
 
     def _outcome(self, worker: str, future: Any) -> Outcome:
@@ -507,11 +474,11 @@ class Cluster:
         if future.status == "error":
             error = future.exception()
             if not isinstance(error, self._killed):
-                return ClusterError(f"worker {worker}: {type(error).__name__}: {error}")
+                return ClusterError(f"worker {worker}: {in_a_line(error)}")
         self._client.cancel([future], force=True)
         return Death(f"worker {worker} has gone")
 
-    def _hosts(self) -> dict[str, str]:
+    def _found(self) -> dict[str, str]:
         """The host of every worker that the scheduler knows."""
         if self._client.status == "running":
             with contextlib.suppress(OSError):
@@ -542,179 +509,59 @@ class Cluster:
                     f"{__version__}; install the same version there"
                 )
 
-    def _send(self, worker: str, name: str) -> None:
-        """Send a sequence to a worker, unless a worker on the same host has received it."""
-        digest = self._digests[name]
-        try:
-            if self._client.run(_has, digest, workers=[worker])[worker]:
-                return
-            sequence = self._sequences.open(name)
-            _log.info("%s: sending it to %s", name, worker)
-            self._client.run(_begin, digest, sequence.name, workers=[worker])
-            stamps = []
-            for scans in _chunks(sequence):
-                stamps += [scan.stamp for scan in scans]
-                self._client.run(_append, digest, scans, workers=[worker])
-            motion = _pack(sequence, np.array(stamps, np.int64), imu=self._sequences.with_imu)
-            if self._client.run(_end, digest, motion, workers=[worker])[worker]:
-                return
-            problem = "see its log"
-        except OSError as error:
-            problem = str(error)
-        # `wait` notices a worker that has gone.
-        if worker in self._hosts():
-            raise ClusterError(
-                f"worker {worker} cannot keep the sequence {name} in its cache ({problem})"
-            )
 
-
-def _away(setup: TrialSetup, digests: Mapping[str, str]) -> TrialSetup:
-    """The setup for workers, which may not have the recordings."""
-    given = vars(setup.sequences) | {"folder": setup.sequences.folder.absolute()}
-    sequences = AwaySequences(**given, digests=digests)
+def _elsewhere(setup: TrialSetup) -> TrialSetup:
+    """The setup for workers, which run in other folders."""
+    sequences = replace(setup.sequences, folder=setup.sequences.folder.absolute())
     odometry = setup.odometry.changed(program_input=sequences.program_input)
-    return TrialSetup(setup.settings, odometry, sequences)
+    return replace(setup, odometry=odometry, sequences=sequences)
 
 
-def _chunks(scans: Iterable[Scan]) -> Iterator[list[Scan]]:
-    chunk: list[Scan] = []
-    size = 0
-    for scan in scans:
-        chunk.append(scan)
-        size += scan.points.nbytes
-        if size > CHUNK:
-            yield chunk
-            chunk, size = [], 0
-    if chunk:
-        yield chunk
-
-
-def _pack(sequence: Any, stamps: NDArray[np.int64], *, imu: bool) -> str:
-    """Reference poses, and the IMU's measurements, as text."""
-    arrays = {}
-    if (reference := sequence.reference()) is not None:
-        arrays["T_ref_sensor"] = reference.at(stamps)
-    if imu and (measured := sequence.imu()) is not None:
-        arrays |= {f.name: np.asarray(getattr(measured, f.name)) for f in dataclasses.fields(Imu)}
-    packed = io.BytesIO()
-    np.savez(packed, **arrays)
-    return base64.b64encode(packed.getvalue()).decode()
-
-
-def recording_digest(config: SequenceConfig) -> str:
-    """Digest of a recording's content and its settings; paths and times of change do not count.
-
-    Raises
-    ------
-    AdaptuneError
-        If a file is missing or cannot be read.
-    """
-    settings = config.model_dump_json(exclude={"bag", "kitti", "folder", "reference", "cache"})
-    files = sequence_files(config)
-    topic = None if files.reference else config.reference
-    found = [*fingerprints(files.recording), *fingerprints(files.reference)]
-    about = f"{__version__} {settings} {topic} {' '.join(found)}"
-    return hashlib.blake2b(about.encode(), digest_size=16).hexdigest()
+def contents(sequences: StudySequences, name: str) -> dict[Path, str]:
+    """The files of a sequence with their `fingerprints`, the folder of files that have but one."""
+    found: dict[Path, str] = {}
+    for files in sequences.files(name):
+        known = fingerprints(files) if files else []
+        named = files if len(known) == len(files) else [files[0].parent]
+        found |= zip(named, known, strict=True)
+    return found
 
 
 # What follows runs on the workers.
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class AwaySequences(StudySequences):
-    """The sequences of a study on a worker, which may not have the recordings."""
+def check_files(sequences: StudySequences, name: str, there: Mapping[Path, str]) -> None:
+    """Refuse to read other files of a sequence than those `there`, where the campaign was started.
 
-    digests: Mapping[str, str]  # `recording_digest` of every sequence at the driver
-
-    def open(self, name: str) -> Any:
-        """See `StudySequences.open`.
-
-        Raises
-        ------
-        LackingError
-            If the sequence is not here and was not sent.
-        """
-        digest = self.digests[name]
-        with contextlib.suppress(AdaptuneError, OSError):
-            if recording_digest(self.config(name)) == digest:
-                return super().open(name)
-        entry = cache.find(digest)
-        if entry is None:
-            raise LackingError(name)
-        sent: Any = _Sent(entry)
-        return with_imu(sent) if self.with_imu else sent
-
-
-class _Sent:
-    """A sequence that was sent."""
-
-    def __init__(self, entry: cache.CachedScans):
-        self._entry = entry
-        self._motion = np.load(io.BytesIO(base64.b64decode(entry.about["motion"])))
-        self.name: str = entry.about["name"]
-        self.n_messages = len(entry)
-
-    def __iter__(self) -> Iterator[Scan]:
-        return iter(self._entry)
-
-    def reference(self) -> "_Known | None":
-        """Poses at the scans' stamps."""
-        if "T_ref_sensor" not in self._motion:
-            return None
-        return _Known(self._entry.stamps, self._motion["T_ref_sensor"])
-
-    def imu(self) -> Imu | None:
-        """Measurements of the IMU, if the odometry needs them."""
-        if "stamps" not in self._motion:
-            return None
-        of_imu = {f.name: self._motion[f.name] for f in dataclasses.fields(Imu)}
-        return Imu(**of_imu | {"noise": ImuNoise(*of_imu["noise"].tolist())})
-
-    def played_at(self, stamps: NDArray[np.int64]) -> NDArray[np.int64]:
-        """See `Sequence`."""
-        return stamps
-
-
-class _Known(NamedTuple):
-    """A trajectory that is known at some stamps."""
-
-    stamps: NDArray[np.int64]
-    T_world_sensor: Poses
-
-    def at(self, stamps: NDArray[np.int64]) -> Poses:
-        """Poses at known stamps, of shape (n, 4, 4)."""
-        return self.T_world_sensor[np.searchsorted(self.stamps, stamps)]
+    Raises
+    ------
+    ClusterError
+        It names a file that is missing here, or has another content.
+    """
+    here: dict[Path, str] = {}
+    with contextlib.suppress(AdaptuneError):
+        here = contents(sequences, name)
+    for path in {**there, **here}:
+        if here.get(path) != there.get(path):
+            what = "has another content than where you run this" if path.exists() else "is missing"
+            raise ClusterError(
+                f"{path}: {what}; copy it there under the same path, or share its folder with all "
+                f"machines"
+            )
 
 
 _lock = threading.Lock()
 _held: tuple[str, Sequences] | None = None
-_writers: dict[str, cache.Writer] = {}
 
 
-def perform(token: str, setup: TrialSetup, task: Task, core: int, memory: float) -> Outcome:
+def perform(
+    token: str, setup: TrialSetup, files: Mapping[Path, str], task: Task, core: int, memory: float
+) -> Outcome:
     """Do a task, with the sequences that earlier tasks of the same campaign have prepared."""
     global _held  # noqa: PLW0603 (a Dask worker keeps nothing else from task to task)
+    check_files(setup.sequences, task.sequence, files)
     with _lock:
         pin(core)
         if _held is None or _held[0] != token:
             _held = token, Sequences(setup, memory)
         return attempt(_held[1], task)
-
-
-def _has(digest: str) -> bool:
-    return cache.find(digest) is not None
-
-
-def _begin(digest: str, name: str) -> None:
-    _writers[digest] = cache.Writer(digest, {"name": name, "left_out": {}})
-
-
-def _append(digest: str, scans: list[Scan]) -> None:
-    for scan in scans:
-        _writers[digest].append(scan)
-
-
-def _end(digest: str, motion: str) -> bool:
-    with _writers.pop(digest) as writer:
-        writer.done(motion=motion)
-    return _has(digest)

@@ -20,7 +20,6 @@ from typing import Any, Self
 
 import numpy as np
 import platformdirs
-from numpy.typing import NDArray
 
 from adaptune.errors import AdaptuneError
 from adaptune.files import DAMAGED_NPZ, expand_user
@@ -108,11 +107,6 @@ class CachedScans:
     def __iter__(self) -> Iterator[Scan]:
         return (self[i] for i in range(len(self)))
 
-    @property
-    def stamps(self) -> NDArray[np.int64]:
-        """Stamps of the scans, of shape (n,)."""
-        return np.asarray(self._index[:, 0])
-
     def _map(self, name: str, length: int) -> Any:
         kind, columns = _ARRAYS[name]
         shape = (length, columns)[: 2 if columns > 1 else 1]
@@ -168,9 +162,8 @@ class Writer:
             row += [-1, -1] if values is None else [begin, begin + len(values)]
         self._index.append(row)
 
-    def done(self, **about: Any) -> None:
-        """Mark the entry as complete, and note more of the sequence."""
-        self._about |= about
+    def done(self) -> None:
+        """Mark the entry as complete."""
         self._done = True
 
     def __exit__(self, kind: object, error: object, trace: object) -> None:

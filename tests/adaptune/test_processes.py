@@ -43,7 +43,7 @@ def mine(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(
     ("fault", "kind"),
-    [*((fault, "odometry") for fault in IMPORTS), ("end", "descriptor"), ("end", "sampler")],
+    [*((fault, "odometry") for fault in IMPORTS), ("end", "descriptor")],
 )
 def test_an_import_that_goes_wrong_is_one_error(mine, monkeypatch, study_file, fault, kind):
     text, words = IMPORTS[fault]
@@ -69,7 +69,6 @@ with Path(__file__).with_name("imported").open("a") as file:
     file.write(f"{os.getpid()} ")
 
 import numpy as np
-import optuna
 from pydantic import Field
 from adaptune.odometry import BaseSettings, Odometry, Registration
 from adaptune.space import Float, ParameterSpace
@@ -92,9 +91,6 @@ class Mine(Odometry):
 
 def described(scan):
     return [len(scan), scan.points[:, 0].mean() if len(scan) else 0.0]
-
-class Random(optuna.samplers.RandomSampler):
-    pass
 """
 
 
@@ -107,7 +103,7 @@ def test_the_driver_imports_no_code_of_the_user_s(mine, study_file, tmp_path, ca
         "odometry.parameters=",
         "odometry.settings={step: 0.3}",
         "descriptor=users_own:described",
-        "offline={sampler: 'users_own:Random', trials: 4, initial: 2, batch: 2, workers: 1}",
+        "offline={trials: 4, initial: 2, batch: 2, workers: 1}",
         "online.switching.mechanism=live",
     ]
     study = load_study(study_file, overrides, tmp_path / "study")

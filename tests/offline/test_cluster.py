@@ -101,32 +101,20 @@ def test_the_cluster_gives_the_local_trials(study_file, tmp_path, scheduler, wor
 
 
 @pytest.mark.usefixtures("workers")
-def test_recordings_that_workers_lack_are_sent_once(
-    study_file, tmp_path, scheduler, local, monkeypatch
-):
-    own, digests = cluster.recording_digest, []
+@pytest.mark.parametrize("what", ["has another content than", "is missing"])
+def test_a_worker_without_the_recording_is_told(study_file, tmp_path, scheduler, monkeypatch, what):
+    own = cluster.contents
 
-    def elsewhere(config):
-        digests.append(f"{own(config)}-sent")
-        return digests[-1]
+    def elsewhere(sequences, name):
+        found = own(sequences, name)
+        return dict.fromkeys(found, "another") if what != "is missing" else {lost: ""} | found
 
-    # The workers, which are not patched, find that theirs are other recordings.
-    monkeypatch.setattr(cluster, "recording_digest", elsewhere)
-    monkeypatch.setattr(cluster, "CHUNK", 1 << 18)
-    sent = []
-    run = distributed.Client.run
-
-    def count(self, function, *args, **kwargs):
-        if function.__name__ == "_end":
-            sent.append(args[0])
-        return run(self, function, *args, **kwargs)
-
-    monkeypatch.setattr(distributed.Client, "run", count)
+    # The workers, which are not patched, find theirs.
+    monkeypatch.setattr(cluster, "contents", elsewhere)
     study = load_study(study_file, [], tmp_path / "study")
-    train(study, cluster=scheduler[0])
-    assert kills.contents(study.folder) == local
-    # The workers share a cache.
-    assert sorted(sent) == sorted(set(digests))
+    lost = study_file.parent / "lost.bag"
+    with pytest.raises(ClusterError, match=rf"worker tcp://.*: {study_file.parent}.*bag: {what}"):
+        train(study, cluster=scheduler[0])
 
 
 def test_a_killed_worker_s_trials_run_elsewhere(study_file, tmp_path, scheduler, workers, local):

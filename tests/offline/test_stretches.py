@@ -272,7 +272,7 @@ def test_members_vote_with_their_weights_and_the_reference_judges():
     # Other weights than those that vote: the mean of the members that agree.
     votes = MemberWeights((0, 1, 2), np.tile([0.8, 0.1, 0.1], (6, 1)))
     even = MemberWeights((0, 1, 2), np.full((6, 3), 1.0 / 3.0))
-    assert simulation.errors(even, votes)[known].max() < 12.0
+    assert simulation.errors(even, simulation.agreeing(votes))[known].max() < 12.0
     # Where the reference is unknown, nobody judges.
     unknown = replace(simulation, T_ref_sensor=np.full_like(simulation.T_ref_sensor, np.nan))
     assert np.isinf(unknown._misplaced(5, np.tile(np.eye(4), (2, 3, 1, 1)), (1, 3))).all()

@@ -208,7 +208,7 @@ def test_repeats_are_averaged_and_kept(study):
 
 
 @pytest.mark.parametrize("part", [None, (0.0, 0.3)])
-def test_a_path_that_is_too_short_is_found_before_scans_are_read(study, tmp_path, part):
+def test_a_path_that_is_too_short_is_told(study, tmp_path, part):
     bag, name = tmp_path / "hall.bag", "hall" if part is None else "hall_0-30"
     drives.write_bag(bag, drives.scans(0, 9 if part is None else 40))
     config = SequenceConfig(bag=str(bag), points="/points", reference="/truth", part=part)
@@ -216,10 +216,8 @@ def test_a_path_that_is_too_short_is_found_before_scans_are_read(study, tmp_path
     settings = TrialSettings(sub_trajectory=3.0 if part is None else 9.0)
     setup = dataclasses.replace(setup_of(study), sequences=sequences, settings=settings)
     key = r"sequences\.hall" if part is None else r"\[hall: 0-30%\]"
-    read = []
     with pytest.raises(AdaptuneError, match=rf"^{key}: its path of .* holds no sub-trajectory"):
-        setup.prepare(name, 1e9, lambda *progress: read.append(progress))
-    assert read == []
+        setup.prepare(name, 1e9)
 
 
 def test_a_reference_with_too_few_poses_names_max_gap():

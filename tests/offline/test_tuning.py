@@ -152,9 +152,9 @@ def test_a_bank_is_simulated_with_smoothed_weights(monkeypatch):
     seen = []
     simulate = BankSimulation.errors
 
-    def errors(self, weights, votes):
+    def errors(self, weights, agreeing):
         seen.append(weights.weights)
-        return simulate(self, weights, votes)
+        return simulate(self, weights, agreeing)
 
     def bank_weights(near, _, live):
         assert len(live) == len(near.fixed)
