@@ -16,6 +16,7 @@ from adaptune.recording.scan import OF_VIEW
 from adaptune.report.charts import (
     Axis,
     Band,
+    Bars,
     Chart,
     Charts,
     Drawn,
@@ -26,7 +27,7 @@ from adaptune.report.charts import (
 )
 from adaptune.space import ODOMETRY, Categorical, Float, Integer, ParameterSet, ParameterSpace
 from adaptune.space import label as parameter_label
-from offline.config import OfflineConfig, OfflineStudy
+from offline.config import OfflineConfig, OfflineStudy, distribution
 from offline.objective import judge, label, weighted
 from offline.tuning import figures
 
@@ -78,6 +79,10 @@ class TrialTable:
         few = [trial for trial, its in zip(self.trials, kept, strict=True) if its]
         return replace(self, trials=few)
 
+    def shared(self) -> "TrialTable":
+        """The same of the trials whose sets all sequences share."""
+        return self.some(self.numbers < OF_SLOT)
+
     def odometries(self) -> dict[str, "TrialTable"]:
         """By the name of an odometry its trials; of the only one by no name."""
         names = [str(trial.parameters.get(ODOMETRY, "")) for trial in self.trials]
@@ -115,6 +120,8 @@ def trial_table(
     return TrialTable(space, list(finished), trials, named, chosen)
 
 
+FEW = 8
+"""With fewer trials, importances mean nothing."""
 MOST_PANELS = 12
 """Panels of a chart; further sequences are not shown."""
 _COLOURED = 4.0
@@ -248,6 +255,69 @@ def on_axis(values: Sequence[Any], parameter: Parameter) -> NDArray[np.float64]:
     return np.array([np.nan if value is None else at(value) for value in values], np.float64)
 
 
+FOREST: Any = {"n_trees": 16, "max_depth": 8, "seed": 0}
+"""Size of the forest, which bounds the time that it takes."""
+
+
+def importances(table: TrialTable) -> dict[str, float]:
+    """Share of each parameter in the variance of the error's logarithm, by falling share.
+
+    It is functional ANOVA, Optuna's default, on a small forest: Optuna's own takes minutes for some
+    thousand trials, and gives the same shares. The trials are of one odometry. There is none with
+    fewer than `FEW` finished trials, one parameter, or equal errors.
+    """
+    known = table.some(np.isfinite(table.values) & (table.values > 0.0))
+    parameters = {
+        name: p
+        for name, p in table.space.parameters.items()
+        if all(value is not None for value in known.column(name))
+        and len(set(map(repr, known.column(name)))) > 1
+    }
+    logs = np.log(known.values)
+    if len(known) < FEW or len(parameters) < 2 or np.ptp(logs) < 1e-9:
+        return {}
+    import optuna
+
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    distributions = {name: distribution(p) for name, p in parameters.items()}
+    columns = {name: known.column(name) for name in parameters}
+    study = optuna.create_study()
+    study.add_trials(
+        optuna.trial.create_trial(
+            params={name: column[i] for name, column in columns.items()},
+            distributions=distributions,
+            value=float(log),
+        )
+        for i, log in enumerate(logs)
+    )
+    evaluator = optuna.importance.FanovaImportanceEvaluator(**FOREST)
+    found = optuna.importance.get_param_importances(study, evaluator=evaluator)
+    return {name: float(share) for name, share in found.items()}
+
+
+def importance_chart(by_odometry: Mapping[str, Mapping[str, float]]) -> Chart | None:
+    """What `importances` found, a panel for each odometry; "" if there is only one."""
+    panels = []
+    for odometry, shares in by_odometry.items():
+        if not shares:
+            continue
+        names = tuple(reversed(list(shares)))
+        percent = [100.0 * shares[name] for name in names]
+        bars = Bars(percent, "")
+        x = Axis("share of the error's variance [%]", limits=(0.0, 100.0))
+        panels.append(Panel(x, Axis("", names=names), (bars,), odometry))
+    if not panels:
+        return None
+    return Chart(
+        "importance",
+        "Which parameters matter",
+        tuple(panels),
+        "How much of the variance of the error (of its logarithm) over all trials a parameter "
+        "explains (functional ANOVA). Where the search has hardly varied a parameter, it seems "
+        "less important than it is. Few trials say little.",
+    )
+
+
 MOST_NAMED = 8
 """With more recordings, stretches do not show of which they are."""
 RATIO = "error over the fixed set's [-]"
@@ -309,17 +379,27 @@ def charts_of_trials(study: OfflineStudy) -> Charts:
     return charts_of(_of_trials(table))
 
 
-def _of_trials(table: TrialTable) -> Iterator[Chart | None]:
+def _of_trials(table: TrialTable) -> Iterator[Chart | str | None]:
     names = [name for name in table.names if OF_VIEW not in name]
+    found = {name: importances(of) for name, of in table.shared().odometries().items()}
     yield iteration_chart(table)
+    yield importance_chart(found) or (
+        f"No importance of parameters: it takes {FEW} finished trials and two parameters."
+    )
     for odometry, of in table.odometries().items():
-        shared = [n for n in of.space.parameters if all(v is not None for v in of.column(n))]
-        chart = scatter_chart(of, shared[:2], names)
+        pair = most_important(of, found.get(odometry, {}))
+        chart = scatter_chart(of, pair, names)
         if chart is not None and odometry:
             key, title = f"{chart.key}-{odometry}", f"{odometry}: {chart.title}"
             chart = replace(chart, key=key, title=title)
         yield chart
     yield cost_chart(table)
+
+
+def most_important(table: TrialTable, shares: Mapping[str, float]) -> list[str]:
+    """Names of two parameters: those that matter most, or the first that all sets have."""
+    every = [n for n in table.space.parameters if all(v is not None for v in table.column(n))]
+    return [*shares, *(name for name in every if name not in shares)][:2]
 
 
 def charts_of_validation(folder: Path) -> Charts:

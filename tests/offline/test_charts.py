@@ -14,6 +14,7 @@ from offline.charts import (
     charts_of_trials,
     charts_of_validation,
     cost_chart,
+    importances,
     iteration_chart,
     read_trials,
     scatter_chart,
@@ -95,6 +96,24 @@ def test_a_study_is_read(study_file, tmp_path):
     assert read_trials(study).fixed == 2
 
 
+def error_of_kernels(_, parameters):
+    slow = 1.0 if parameters["kernel"] == "none" else 1.3
+    return slow * (0.2 + abs(np.log(parameters["distance"] / 3.0)))
+
+
+def test_what_changes_the_error_matters_most():
+    found = importances(made_table(error_of_kernels, 120))
+    assert list(found) == ["distance", "kernel", "points"]
+    assert sum(found.values()) == pytest.approx(1.0)
+    assert found["distance"] > 0.9
+    assert importances(made_table(error_of_kernels, 120)) == found
+
+
+def test_few_trials_and_equal_errors_say_nothing():
+    assert importances(made_table(error_of_kernels, 7)) == {}
+    assert importances(made_table(lambda *_: 1.0, 40)) == {}
+
+
 BOTH = """\
 odometry: [{name: gicp}, {name: ndt}]
 courses: {a: {scenes: [cave]}}
@@ -111,8 +130,10 @@ def test_trials_have_their_charts(study):
     assert charts_of_trials(study) == ([], ["No trials: run `adaptune offline`."])
     write_trials(study, lambda _, p: p["keyframe_interval"], 20)
     charts, notes = charts_of_trials(study)
-    assert [chart.key for chart in charts] == ["iterations", "parameter-scatter"]
+    assert [chart.key for chart in charts] == ["iterations", "importance", "parameter-scatter"]
     assert notes == []
+    # The most important one comes first.
+    assert charts[-1].panels[0].x.label == "keyframe_interval [m]"
 
 
 def test_each_of_several_odometries_has_a_scatter(tmp_path):
@@ -123,6 +144,8 @@ def test_each_of_several_odometries_has_a_scatter(tmp_path):
     keys = [chart.key for chart in charts]
     assert keys.count("parameter-scatter-gicp") == keys.count("parameter-scatter-ndt") == 1
     assert len(set(keys)) == len(keys)
+    importance = charts[keys.index("importance")]
+    assert {panel.title for panel in importance.panels} <= {"gicp", "ndt"}
 
 
 def test_validation_is_read_or_missed(study):
