@@ -42,7 +42,7 @@ def reference(path: Path, course: Course) -> None:
     """Estimate the reference of a course, and keep it."""
     scans = list(simulate(course))
     begin = time.process_time()
-    found = estimated(path.stem, pass_over(scans))
+    found = estimated(path.stem, pass_over(scans), scans=scans)
     seconds = (time.process_time() - begin) / len(scans)
     T = np.where(found.known[:, None, None], found.T_world_sensor, np.nan)
     with replacing(path) as temporary, temporary.open("wb") as file:

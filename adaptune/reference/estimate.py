@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from adaptune.bank.members import LEVER
 from adaptune.geometry import Poses, invert, mean_motion, rectify, rotation_angle, steps
-from adaptune.recording.scan import Recording
+from adaptune.recording.scan import Recording, Scan
 from adaptune.reference.graph import (
     HALVES,
     LENGTHS,
@@ -19,12 +19,14 @@ from adaptune.reference.graph import (
     Edge,
     Guess,
     Pass,
+    closed,
+    loops,
     optimised,
     pass_over,
 )
 from adaptune.reference.stored import EstimatedReference, EstimateError, Registrations
 
-VERSION = 2
+VERSION = 1
 """Counts changes after which the same recording has another estimate."""
 SHORTEST = 10.0
 """Metres. On a shorter path, nothing is known about any odometry."""
@@ -61,20 +63,27 @@ def estimate_reference(scans: Recording, advance: Advance = lambda *_: None) -> 
     """
     n = scans.n_messages
     found = pass_over(scans, lambda done: advance(done, round(1.05 * max(n, done))))
-    return estimated(scans.name, found)
+    return estimated(scans.name, found, scans)
 
 
-def estimated(name: str, found: Pass) -> EstimatedReference:
-    """The reference that follows from a pass over a recording, see `estimate_reference`."""
+def estimated(name: str, found: Pass, scans: Iterable[Scan] = ()) -> EstimatedReference:
+    """The reference that follows from a pass over a recording, see `estimate_reference`.
+
+    The scans are read again if the path comes by again.
+    """
     _check(name, found)
     T_odom_sensor, edges = _revised(found)
     T = optimised(T_odom_sensor, edges)
+    again = loops(T, np.unique([edge.end for edge in edges]))
+    by_loops = closed(scans, again, T) if again else []
+    if by_loops:
+        T = optimised(T_odom_sensor, [*edges, *by_loops], T)
     registrations = _judged(found.guesses, edges, T)
     reference = EstimatedReference(
         found.stamps,
         T,
         _trusted(T, registrations, edges),
-        _halves(found, edges, T),
+        _halves(found, [*edges, *by_loops], T),
         registrations,
     )
     if (share := reference.unknown_share()) > MOST_UNKNOWN:

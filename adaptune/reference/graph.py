@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from adaptune.bank.bank import Bank
 from adaptune.geometry import Poses, invert, rectify, rotation_angle, steps
 from adaptune.live.hops import Hop, HopCloud, register
+from adaptune.metrics import travelled
 from adaptune.odometry.base import InProcess
 from adaptune.odometry.registry import odometry_class
 from adaptune.odometry.tracker import HealthCheck, Tracker
@@ -265,11 +266,12 @@ _ITERATIONS = 50
 
 
 class Edge(NamedTuple):
-    """A registration of two scans, by their numbers."""
+    """A registration of two scans, by their numbers; `again` if the path came by again."""
 
     start: int
     end: int
     hop: Hop
+    again: bool = False
 
 
 def optimised(
@@ -302,7 +304,7 @@ def optimised(
         graph.add(gtsam.BetweenFactorPose3(i, i + 1, gtsam.Pose3(T), _robust(noise)))
     for edge in edges:
         motion = gtsam.Pose3(edge.hop.T_start_end)
-        noise = _robust(_noise(edge.hop))
+        noise = _robust(_noise(edge), bounded=not edge.again)
         graph.add(gtsam.BetweenFactorPose3(edge.start, edge.end, motion, noise))
     first = gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)
     graph.add(gtsam.PriorFactorPose3(0, values.atPose3(0), first))
@@ -319,12 +321,13 @@ def _sigmas(metres: float, radians: float) -> Any:
     return gtsam.noiseModel.Diagonal.Sigmas(np.repeat([radians, metres], 3))
 
 
-def _noise(hop: Hop) -> Any:
+def _noise(edge: Edge) -> Any:
     """Noise of a registration: rotation, then translation in the frame of its end."""
     import gtsam
 
+    hop = edge.hop
     way = float(np.linalg.norm(hop.T_start_end[:3, 3]))
-    shorter = _LONG / np.clip(way, LENGTHS[0], _LONG)
+    shorter = 1.0 if edge.again else _LONG / np.clip(way, LENGTHS[0], _LONG)
     metres, radians = (of * shorter**by for of, by in zip(_OF_A_HOP, _SHORTER, strict=True))
     known = np.eye(3) - hop.projection
     if np.abs(known).max() < 1e-6:
@@ -335,9 +338,80 @@ def _noise(hop: Hop) -> Any:
     return gtsam.noiseModel.Gaussian.Covariance(covariance)
 
 
-def _robust(noise: Any) -> Any:
-    """Noise with Cauchy's weights, by which one that is far off hardly counts."""
+def _robust(noise: Any, bounded: bool = True) -> Any:
+    """Noise with Cauchy's weights, by which one that is far off hardly counts, or with Huber's.
+
+    Registrations share what they get wrong, and are many: against them, what holds together over
+    long ways would count as far off.
+    """
     import gtsam
 
-    kernel = gtsam.noiseModel.mEstimator.Cauchy(1.0)
+    of = gtsam.noiseModel.mEstimator
+    kernel = of.Cauchy(1.0) if bounded else of.Huber(1.345)
     return gtsam.noiseModel.Robust.Create(kernel, noise)
+
+
+# Registrations where the path comes by again.
+
+LATER = 30.0
+"""Metres driven until a place counts as one that the path comes by again."""
+NEAR = 3.0
+"""Metres from such a place, at most."""
+EVERY = 5.0
+"""Metres driven from one to the next."""
+MOST = 100
+"""Places. Their scans are in memory at the same time."""
+_DEPARTURE = (0.3, 0.01)
+"""A registration is rejected if it departs by more than so many metres, and by more than this share
+of the way between the two scans: it may be of another place that looks alike."""
+
+
+Loop = tuple[int, int]
+"""Two scans at the same place, by their numbers."""
+
+
+def loops(T_world_sensor: Poses, numbers: NDArray[np.intp]) -> list[Loop]:
+    """Find where a path of shape (n, 4, 4) comes by again, among the poses of these numbers."""
+    from scipy.spatial import cKDTree
+
+    if not len(numbers):
+        return []
+    places, metres = T_world_sensor[numbers, :3, 3], travelled(T_world_sensor)[numbers]
+    found: list[Loop] = []
+    last, tree = -np.inf, cKDTree(places)
+    for j in range(len(numbers)):
+        if metres[j] - last < EVERY:
+            continue
+        if before := [
+            i for i in tree.query_ball_point(places[j], NEAR) if metres[j] - metres[i] > LATER
+        ]:
+            away = np.linalg.norm(places[before] - places[j], axis=1)
+            found.append((int(numbers[before[int(away.argmin())]]), int(numbers[j])))
+            last = metres[j]
+    return found[:: -(-len(found) // MOST)] if found else []
+
+
+def closed(scans: Iterable[Scan], wanted: Sequence[Loop], T_world_sensor: Poses) -> list[Edge]:
+    """Register the scans of loops, which takes another pass over the recording.
+
+    `T_world_sensor`, of shape (n, 4, 4), is the path as it is known so far.
+    """
+    numbers, motions = {number for loop in wanted for number in loop}, steps(T_world_sensor)
+    clouds: dict[int, HopCloud] = {}
+    last: Scan | None = None
+    for number, scan in enumerate(scans):
+        if last is not None and number - 1 in numbers:
+            seconds = (scan.stamp - last.stamp) * 1e-9
+            cloud = clouds[number - 1] = HopCloud(last, motions[number - 1], seconds)
+            _ = cloud.prepared  # the scan itself is not kept
+        last = scan
+    metres, edges = travelled(T_world_sensor), []
+    for start, end in wanted:
+        if start not in clouds or end not in clouds:
+            continue  # the last scan, whose motion is not known
+        T = invert(T_world_sensor[start]) @ T_world_sensor[end]
+        hop = register(clouds[start], clouds[end], [T])
+        most = max(_DEPARTURE[0], _DEPARTURE[1] * (metres[end] - metres[start]))
+        if hop is not None and np.linalg.norm(hop.T_start_end[:3, 3] - T[:3, 3]) <= most:
+            edges.append(Edge(start, end, hop, again=True))
+    return edges

@@ -1,3 +1,5 @@
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from made_passes import (
@@ -16,7 +18,7 @@ from made_passes import (
 )
 from rooms import moved
 
-from adaptune.geometry import steps
+from adaptune.geometry import invert, steps
 from adaptune.metrics import sub_trajectory_rte
 from adaptune.recording.scan import Scan
 from adaptune.reference import estimate
@@ -271,3 +273,28 @@ class TestHalves:
         motions[1:, 4] = np.nan
         found = estimated("a", made_pass(TRUTH, guesses(TRUTH), motions))
         assert found.error(5.0) < 0.05
+
+
+def test_where_the_path_comes_by_again_scans_are_registered(monkeypatch):
+    lap = [moved(x=0.4, yaw=2 * np.pi / 150)] * 300
+    T, asked = chained(lap), []
+    wrong = chained(lap @ moved(yaw=4e-5))
+    made = made_pass(wrong, guesses(wrong))
+
+    def closed(scans, wanted, known):
+        asked.append((scans, wanted))
+        assert np.shape(known) == T.shape
+        return [estimate.Edge(*loop, hop(T, *loop), again=True) for loop in wanted]
+
+    monkeypatch.setattr(estimate, "closed", closed)
+    scans = SimpleNamespace()
+    found = estimated("a", made, scans=scans)
+    ((read, wanted),) = asked
+    assert read is scans
+    assert len(wanted) > 5
+    ends = {g.end for g in made.guesses}
+    assert all(set(loop) <= ends for loop in wanted)
+    for start, end in wanted:
+        back, was, true = (invert(P[start]) @ P[end] for P in (found.T_world_sensor, wrong, T))
+        far = [np.linalg.norm((P - true)[:3, 3]) for P in (back, was)]
+        assert far[0] < 0.3 * far[1]
