@@ -66,7 +66,7 @@ class Drive:
     def __init__(self, course: Course) -> None:
         self.course = course
         self.road = Road([(SCENES[name], length) for name, length in course.legs], course.seed)
-        self.ride = Ride(self.road, MOTIONS[course.motion], course.seed, course.stand)
+        self.ride = Ride(self.road, MOTIONS[course.motion], course.seed)
 
     def __len__(self) -> int:
         """Whole scans in the drive."""
