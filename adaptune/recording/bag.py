@@ -297,7 +297,7 @@ class BagSource:
                 reader.readers = [IndexReader(path) for path in self.paths]
             reader.open()
             if not all(isinstance(c.msgcount, int) for c in reader.connections):
-                raise TypeError("metadata.yaml counts messages in what are no numbers")
+                raise TypeError("metadata.yaml counts in no numbers")  # noqa: TRY301
         except Exception as error:
             # The readers raise what their formats and decompressors raise.
             if re.search("File magic is|not a database", str(error)):
