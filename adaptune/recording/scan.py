@@ -82,7 +82,6 @@ class Reading(NamedTuple):
     last: float = np.nan
     unit: float = 0.0  # seconds per unit of the points' times
     clock: int | None = None  # nanoseconds of the first point, if the sensor gives its own clock
-    marks: int = 0  # points that were dropped because they are farther than any LiDAR sees
 
 
 UNREAD = Reading()
