@@ -2,7 +2,6 @@
 
 import logging
 import re
-import struct
 from collections import Counter, defaultdict, deque
 from collections.abc import (
     Callable,
@@ -22,7 +21,7 @@ import numpy as np
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Connection
 from rosbags.rosbag1 import Reader
-from rosbags.rosbag1.reader import Chunk, ChunkInfo, IndexData, decompressors
+from rosbags.rosbag1.reader import Chunk, IndexData, decompressors
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from adaptune.errors import nearest
@@ -46,7 +45,6 @@ _log = logging.getLogger(__name__)
 # ROS 1 bags that are opened by the index at their end alone.
 
 
-_WORD = struct.Struct("<I").unpack_from
 _NOTHING = Chunk(0, 0, bytes)
 
 
@@ -72,25 +70,6 @@ class IndexReader(Reader):
 
     def read_index_data(self, pos: int, indexes: dict[int, list[IndexData]]) -> None:
         """Nothing, while the bag is opened."""
-
-    def read_chunk_info(self) -> ChunkInfo:
-        """Read a record without a look at the type of each field, which rosbags takes long for."""
-        assert self.bio is not None
-        begin = self.bio.tell()
-        try:
-            fields = _fields(self.bio.read(*_WORD(self.bio.read(4))))
-            kind = fields[b"op"], fields[b"ver"]
-            pos, count = (int.from_bytes(fields[n], "little") for n in (b"chunk_pos", b"count"))
-            times = [struct.unpack("<II", fields[n]) for n in (b"start_time", b"end_time")]
-            _, *numbers = struct.unpack(f"<{1 + 2 * count}I", self.bio.read(4 + 8 * count))
-        except (struct.error, KeyError):
-            kind = None
-        if kind != (b"\x06", b"\x01\0\0\0"):
-            self.bio.seek(begin)
-            return super().read_chunk_info()
-        start, end = (seconds * 10**9 + nanoseconds for seconds, nanoseconds in times)
-        counts = dict(zip(numbers[::2], numbers[1::2], strict=True))
-        return ChunkInfo(pos, start, end + 1, counts)
 
     def is_slow(self) -> bool:
         """Whether its first chunk is packed by BZ2, which unpacks a few megabytes a second."""
@@ -119,17 +98,6 @@ class IndexReader(Reader):
                     super().read_index_data(info.pos, indexes)
         self.indexes = {c.id: sorted(indexes[c.id]) for c in self.connections}
         yield from super().messages(connections, start, stop)
-
-
-def _fields(header: bytes) -> dict[bytes, bytes]:
-    """Values of a record's header by name."""
-    fields, at = {}, 0
-    while at < len(header):
-        (size,) = _WORD(header, at)
-        name, _, value = header[at + 4 : at + 4 + size].partition(b"=")
-        fields[name] = value
-        at += 4 + size
-    return fields
 
 
 POINTS_TYPES = ("sensor_msgs/msg/PointCloud2", *clouds.LIVOX_TYPES)
@@ -328,6 +296,8 @@ class BagSource:
             if by_index and not reader.is2:
                 reader.readers = [IndexReader(path) for path in self.paths]
             reader.open()
+            if not all(isinstance(c.msgcount, int) for c in reader.connections):
+                raise TypeError("metadata.yaml counts in no numbers")  # noqa: TRY301
         except Exception as error:
             # The readers raise what their formats and decompressors raise.
             if re.search("File magic is|not a database", str(error)):
@@ -338,11 +308,6 @@ class BagSource:
                 f"short, repair it first (`rosbag reindex`, `ros2 bag reindex` or `mcap recover`)"
             ) from error
         try:
-            if not all(isinstance(c.msgcount, int) for c in reader.connections):
-                what = (
-                    "metadata.yaml counts messages in what are no numbers; run `ros2 bag reindex`"
-                )
-                raise SequenceError(f"{self.name}: {what}")
             yield reader
         finally:
             reader.close()
@@ -371,15 +336,12 @@ class BagSource:
 
     def loader(self, reader: AnyReader) -> Callable[[bytes, str], Scan]:
         """What decodes a message of the point clouds; its name goes into the SequenceError."""
-        return partial(_load, self._decoder(reader))
-
-    def _decoder(self, reader: AnyReader) -> Callable[[bytes], Scan]:
         kind, definitions = self.topics[self.points], reader.typestore.fielddefs
         livox = kind in clouds.LIVOX_TYPES
         point = kind.replace("Msg", "Point") if livox else "sensor_msgs/msg/PointField"
         self._check_standard(definitions, ("std_msgs/msg/Header", point, kind), reader.is2)
         decode = clouds.decode_livox if livox else clouds.decode_cloud
-        return partial(decode, cdr=reader.is2, timing=self.timing)
+        return partial(_load, partial(decode, cdr=reader.is2, timing=self.timing))
 
     def _check_standard(self, definitions: Any, names: Iterable[str], cdr: bool) -> None:
         """Make sure that messages are laid out as they are decoded."""

@@ -238,13 +238,12 @@ def from_fields(raw: NDArray[Any] | Mapping[str, NDArray[Any]], stamp: int, timi
             _NO_RINGS if ring is None else np.asarray(columns[ring], np.uint16),
             _NO_INTENSITIES if intensity is None else np.asarray(columns[intensity], np.float32),
         )
-    n, marks = len(x), 0
+    n = len(x)
     made = (np.empty((n, 3), np.float32), *(np.empty(len(v), v.dtype) for v in given))
     gather = _kernel(given[0].dtype.str)
     valid, far, low, high = gather(x, y, z, given, made)
     if far or not valid:
         marked = _marks([columns[axis] for axis in "xyz"])
-        marks = int(np.count_nonzero(marked))
         x = np.where(marked, np.float32(np.nan), x)
         valid, _, low, high = gather(x, y, z, given, made)
     if valid < n:
@@ -257,7 +256,6 @@ def from_fields(raw: NDArray[Any] | Mapping[str, NDArray[Any]], stamp: int, timi
     except TimingError as error:
         raise PointCloudError(str(error)) from error
     given_rings, given_lights = rings if ring else None, lights if intensity else None
-    reading = reading._replace(marks=marks)
     return Scan(start, points, seconds, given_rings, None, given_lights, reading)
 
 
@@ -274,16 +272,11 @@ def _marks(columns: Sequence[NDArray[Any]]) -> NDArray[np.bool_]:
     middle = np.median(away[rest]) if rest.any() else 0.0
     if middle <= FARTHEST and np.count_nonzero(marks & rest) <= 0.1 * np.count_nonzero(rest):
         return marks
-    swapped = _norms([column.byteswap() for column in columns])[seen]
-    spread = [np.std(column[rest].astype(np.float64)) for column in columns]
-    if np.mean(swapped < FARTHEST) > 0.9 and np.median(swapped) > 0.1:
-        help_ = "the bytes are in the other order than `is_bigendian` says, correct it in the bag"
-    elif np.linalg.norm(spread) < 0.1 * (middle := np.median(away[rest])):
-        help_ = f"they lie {middle:.3g} m away as on a map, give them in the sensor's frame"
-    else:
-        help_ = "are they in millimetres, or at other offsets than the fields say? Convert the bag"
     share = np.mean(far[seen])
-    raise PointCloudError(f"{share:.0%} of the points are farther than {FARTHEST:g} m; {help_}")
+    raise PointCloudError(
+        f"{share:.0%} of the points are farther than {FARTHEST:g} m: they are in millimetres, on a "
+        f"map, of the other byte order, or at other offsets than the fields say; correct the bag"
+    )
 
 
 def _norms(columns: Sequence[NDArray[Any]]) -> NDArray[np.float64]:

@@ -193,9 +193,9 @@ def kitti(folder: Path, elevation: float | None = None) -> FileSource:
     """
     if not folder.is_dir():
         raise SequenceError(f"{folder}: there is no such folder")
-    if not (folder / "velodyne").is_dir():
-        raise SequenceError(f"{folder}: not a KITTI sequence; it has no velodyne/")
-    files = _scans(folder / "velodyne")
+    files = sorted((folder / "velodyne").glob("*.bin"))
+    if not files:
+        raise SequenceError(f"{folder}: not a KITTI sequence; it has no velodyne/*.bin")
     stamps = _seconds(folder / "times.txt")
     if len(files) > len(stamps):
         raise SequenceError(f"{folder}: {len(stamps)} lines in times.txt for {len(files)} scans")
@@ -234,12 +234,6 @@ def _matrix(path: Path, key: str) -> Poses:
     if len(numbers) != 12:
         raise SequenceError(f"{path}: no line `{key}:` with 12 numbers")
     return np.vstack([numbers.reshape(3, 4), [0.0, 0.0, 0.0, 1.0]])
-
-
-def _scans(folder: Path) -> list[Path]:
-    if files := sorted(folder.glob("*.bin")):
-        return files
-    raise SequenceError(f"{folder}: holds no .bin files")
 
 
 def _by_number(files: Sequence[Path], stamps: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -18,19 +18,10 @@ from adaptune.errors import AdaptuneError
 from adaptune.progress import Progress, unseen
 from adaptune.recording import Scan, SequenceConfig, SequenceError
 from adaptune.recording.bag import IMU_TYPES, POINTS_TYPES, BagSource, IndexReader
-from adaptune.recording.clouds import (
-    DATATYPES,
-    FARTHEST,
-    PATH,
-    POSES,
-    RING_FIELDS,
-    Pose,
-    header_of,
-    usable,
-)
+from adaptune.recording.clouds import FARTHEST, PATH, POSES, Pose, header_of, parse, usable
 from adaptune.recording.config import BAG_SUFFIXES, REFERENCE_FILES, bag_paths
 from adaptune.recording.recording import RecordedSequence, repeats
-from adaptune.recording.scan import SOONEST, TIME_FIELDS, Reading, doubts
+from adaptune.recording.scan import SOONEST, Reading, doubts
 from adaptune.trajectory import Trajectory, is_kitti, read_kitti, read_trajectory
 
 LEAST_POINTS = 20
@@ -40,7 +31,6 @@ LEAST_POINTS = 20
 _INPUTS = {
     "offline": ("points", "reference"),
     "online": ("points",),
-    "comparison with the reference": ("points", "reference"),
     "motion compensation": ("points", "imu"),
 }
 
@@ -92,6 +82,15 @@ class Topic:
         return float(self.steps.max()) if len(self.steps) else None
 
     @property
+    def late(self) -> NDArray[np.float64]:
+        """Seconds that each was recorded later than usual; none where not all have both times."""
+        stamps, recorded = _joined(self.stamps), _joined(self.recorded)
+        if not len(stamps) or len(stamps) != len(recorded):
+            return np.empty(0)
+        late = recorded - stamps
+        return np.asarray((late - np.median(late)) * 1e-9)
+
+    @property
     def _parts(self) -> list[list[int]]:
         return self.stamps if any(self.stamps) else self.recorded
 
@@ -111,10 +110,7 @@ class Inspection:
     used: dict[str, str] = field(default_factory=dict)
     complete: bool = True  # whether it was read to its end or damage, and not only a sample of it
     scan: Scan | None = None  # the first one; none where no scan could be read
-    # Of a PointCloud2 the points in its message, those without a measurement included, and name,
-    # type and offset of their fields.
-    recorded: int = 0
-    layout: tuple[tuple[str, str, int], ...] = ()
+    fields: tuple[str, ...] = ()  # names of those of a point, in a PointCloud2
     valid: list[int] = field(default_factory=list)  # valid points of each cloud that was read
     readings: list[Reading] = field(default_factory=list)  # of each of them
     repeated: int = 0  # how many of them hold the same points as the one before
@@ -435,7 +431,8 @@ class _Survey:
                     first = self._found.scan is None
                     _keep_scan(self._found, self._load(data, "message"))
                     if first and topic.type == POINTS_TYPES[0]:
-                        _describe(self._found, self._reader.deserialize(data, topic.type))
+                        fields = parse(data, self._reader.is2).fields
+                        self._found.fields = tuple(name for name, *_ in fields)
                 case "reference":
                     self._poses += POSES[topic.type](self._reader.deserialize(data, topic.type))
                 case "imu":
@@ -463,23 +460,12 @@ class _Survey:
         return trajectory
 
 
-def _describe(found: Inspection, message: Any) -> None:
-    """Keep the fields of a point of a cloud, and how many points it holds."""
-    layout = []
-    for each in sorted(message.fields, key=lambda each: each.offset):
-        kind = np.dtype(DATATYPES[each.datatype]).name if each.datatype in DATATYPES else "?"
-        kind += f"[{each.count}]" if each.count > 1 else ""
-        layout.append((each.name, kind, int(each.offset)))
-    found.layout, found.recorded = tuple(layout), int(message.height) * int(message.width)
-
-
 # What is wrong with a recording: what it means, and what to do about it.
 
 
 _FASTEST = 100.0  # metres per second
 _STILL = 0.01  # metres
 _MISSED = 0.01  # of the messages of a topic: fewer are not told
-_SUB_TRAJECTORY = 25.0  # metres, where a study sets no other
 
 _UNDECODED = {
     "points": (
@@ -492,11 +478,7 @@ _UNDECODED = {
     ),
     "imu": ("leave `imu` out, or repair the bag", ""),
 }
-_LEFT_OUT = {
-    "points": ": adaptune leaves such scans out",
-    "reference": ": of poses with one stamp the first counts, the others are sorted",
-    "imu": ": of measurements with one stamp the first counts, the others are sorted",
-}
+_LEFT_OUT = ": adaptune leaves such scans out"
 _GAPS = {
     "points": ": odometries lose track there; leave them out with `start`, `stop` or `cut`",
     "reference": ": scans in gaps beyond `max_gap` (1 s) are not labelled",
@@ -544,8 +526,7 @@ def _topic_faults(topic: Topic, of: str, complete: bool, apart: bool) -> Iterato
 
 
 def _stamp_faults(topic: Topic, of: str) -> Iterator[Fault]:
-    name, times, recorded = topic.name, topic.times, _joined(topic.recorded)
-    n = len(times)
+    name, times, n = topic.name, topic.times, len(topic.times)
     if n > 1 and len(np.unique(times)) == 1:
         what = "are zero" if times[0] == 0 else "are the same"
         lacks = {"points": "scans with stamps", "reference": "poses with stamps"}.get(of, "")
@@ -562,21 +543,19 @@ def _stamp_faults(topic: Topic, of: str) -> Iterator[Fault]:
     if of == "points":
         soon = np.count_nonzero((steps > 0) & (steps < SOONEST))
         counts["come less than 1 ms after the one before"] = soon
+    left_out = _LEFT_OUT if of == "points" else ""
     for what, count in counts.items():
         if count:
-            yield Fault(f"{name}: {count} of {n} stamps {what}{_LEFT_OUT.get(of, '')}", of)
+            yield Fault(f"{name}: {count} of {n} stamps {what}{left_out}", of)
     if len(topic.steps):
         gap, usual = topic.steps.max(), np.median(topic.steps)
         if gap > 3.5 * usual and gap > 0.2:
             lost = np.count_nonzero(topic.steps > 3.5 * usual)
             what = f"{lost} gaps, the longest of {gap:.2f} s{_GAPS.get(of, '')}"
             yield Fault(f"{name}: {what}", of)
-    if n != len(recorded):  # there is no recorder's clock, or some messages have no stamp
-        return
-    late = (recorded - times) * 1e-9
-    if leaps := np.count_nonzero(np.abs(late - np.median(late)) > 5.0):
+    if leaps := np.count_nonzero(np.abs(topic.late) > 5.0):
         what = f"{leaps} stamps leap by more than 5 s against the recorder's clock"
-        yield Fault(f"{name}: {what}{_LEFT_OUT['points'] if of == 'points' else ''}", of)
+        yield Fault(f"{name}: {what}{left_out}", of)
 
 
 def _count_faults(topic: Topic, of: str, sampled: bool) -> Iterator[Fault]:
@@ -610,22 +589,17 @@ def _cloud_faults(topic: Topic, valid: list[int]) -> Iterator[Fault]:
 
 def _content_faults(found: Inspection, topic: Topic) -> Iterator[Fault]:
     """Faults of what clouds hold: their frames, their points and the times of these."""
-    name, n, marks = topic.name, len(found.valid), sum(r.marks for r in found.readings)
+    name = topic.name
     if len(topic.frames) > 1:
         ((frame, _), *_) = frames = topic.frames.most_common()
         found.given["frame"] = frame
         many = " and ".join(f"{count} clouds of frame {named!r}" for named, count in frames)
         yield Fault(f"{name}: holds {many}: choose one, as in `frame: {frame}`", "points")
     if found.repeated:
-        what = f"{found.repeated} of {n} clouds hold the same points as the one before"
-        yield Fault(f"{name}: {what}{_LEFT_OUT['points']}", "points")
-    if marks:
-        what = f"{100.0 * marks / (marks + sum(found.valid)):.2g} % of the points are marks"
-        help_ = f"of rays that did not come back, beyond {FARTHEST:g} m: adaptune drops them"
-        yield Fault(f"{name}: {what} {help_}", "points")
-    absolute = [(r.stamp, r.clock) for r in found.readings if r.clock]
-    if any(clock < 1e15 and abs(stamp - clock) < 1e9 for stamp, clock in absolute):
-        yield Fault(f"{name}: adaptune reads times of points as absolute, as the stamps are")
+        what = (
+            f"{found.repeated} of {len(found.valid)} clouds hold the same points as the one before"
+        )
+        yield Fault(f"{name}: {what}{_LEFT_OUT}", "points")
     steps = topic.steps[topic.steps * 1e9 >= SOONEST]
     for doubt in doubts(found.readings, float(np.median(steps)) if len(steps) else 0.0):
         yield Fault(f"{name}: {doubt.text}", doubt.of, doubt.lacks)
@@ -646,18 +620,10 @@ def _reference_faults(reference: Trajectory, complete: bool, timed: bool = True)
         help_ = "errors are per metre; drive, or name another topic or a file of poses"
         yield Fault(f"{what}; {help_}", of, lacks)
         return
-    if still := np.count_nonzero(steps == 0):
-        what = f"the reference repeats the pose before it {still} times"
-        help_ = "harmless while the robot stood, wrong if the poses came less often than the scans"
-        yield Fault(f"{what}: {help_}", of)
     seconds = np.diff(reference.stamps) * 1e-9 if timed else np.full(len(steps), 0.1)
     if jumps := np.count_nonzero(steps > _FASTEST * np.maximum(seconds, 1e-3)):
         help_ = "errors there are not the odometry's; leave them out with `start`, `stop` or `cut`"
         yield Fault(f"the reference jumps {jumps} times: {help_}", of)
-    if complete and steps.sum() < _SUB_TRAJECTORY:
-        what = f"the reference is {steps.sum():.1f} m long"
-        help_ = f"set `sub_trajectory` to less than that (it is {_SUB_TRAJECTORY:g} m if left out)"
-        yield Fault(f"{what}: {help_}", of)
     if complete and timed and (gaps := np.count_nonzero(seconds > reference.max_gap)):
         what = f"the reference has {gaps} gaps beyond {reference.max_gap:g} s"
         what += f", the longest of {seconds.max():.2f} s: their scans get no label"
@@ -684,11 +650,9 @@ def _overlap_faults(reference: Trajectory, scans: tuple[int, int], slack: float)
 
 def _scan_span(topic: Topic) -> tuple[int, int]:
     """First and last stamp of the scans that were read, without those that leap."""
-    stamps, recorded = topic.times, _joined(topic.recorded)
-    if len(stamps) == len(recorded):
-        late = recorded - stamps
-        usual = np.abs(late - np.median(late)) < 5e9
-        stamps = stamps[usual] if usual.any() else stamps  # where half of them leap, who knows
+    stamps, usual = topic.times, np.abs(topic.late) < 5.0
+    # Where half of them leap, who knows.
+    stamps = stamps[usual] if usual.any() else stamps
     return int(stamps.min()), int(stamps.max())
 
 
@@ -707,10 +671,10 @@ def render_inspection(inspection: Inspection, accuracy: str = "") -> RenderableT
     """
     parts: list[RenderableType] = [Text(str(inspection.path), style="bold")]
     parts.append(_topic_table(inspection))
-    if inspection.layout:
-        parts.append(Text(f"point: {', '.join(map(_field_text, inspection.layout))}"))
+    if inspection.fields:
+        parts.append(Text(f"point: {', '.join(inspection.fields)}"))
     if inspection.scan is not None:
-        parts.append(Text(f"first scan: {_scan_text(inspection.scan, inspection.recorded)}"))
+        parts.append(Text(f"first scan: {_scan_text(inspection.scan)}"))
     if inspection.reference is not None:
         text = _reference_text(inspection.reference, inspection.complete)
         parts.append(Text(f"reference: {text}"))
@@ -761,14 +725,8 @@ def _topic_table(inspection: Inspection) -> Table:
     return table
 
 
-def _field_text(field: tuple[str, str, int]) -> str:
-    name, kind, offset = field
-    role = " (time)" if name in TIME_FIELDS else " (ring)" if name in RING_FIELDS else ""
-    return f"{name}{role} {kind}@{offset}"
-
-
-def _scan_text(scan: Scan, recorded: int) -> str:
-    words = [f"{len(scan):,} points" + (f" of {recorded:,}" if recorded > len(scan) else "")]
+def _scan_text(scan: Scan) -> str:
+    words = [f"{len(scan):,} points"]
     times, rings, light = scan.times, scan.rings, scan.intensities
     if len(scan):
         away = np.linalg.norm(scan.points, axis=1)

@@ -8,7 +8,7 @@ from functools import cache as once
 from functools import cached_property
 from itertools import chain, islice
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,11 +26,16 @@ from adaptune.recording.scan import (
     Recording,
     Scan,
     SequenceError,
-    Source,
     Timing,
     doubts,
 )
 from adaptune.trajectory import Trajectory, TrajectoryError, is_kitti, read_kitti, read_trajectory
+
+if TYPE_CHECKING:
+    from adaptune.recording.bag import BagSource
+    from adaptune.recording.folder import FileSource
+
+    Source = BagSource | FileSource
 
 _log = logging.getLogger(__name__)
 
@@ -155,7 +160,7 @@ def interval_of(config: SequenceConfig) -> tuple[float, float]:
     return first + 1e9 * recorded.start, stop
 
 
-def _source(config: SequenceConfig) -> tuple[Source, str | None]:
+def _source(config: SequenceConfig) -> "tuple[Source, str | None]":
     """What reads the recording, and under which key its decoded scans are kept."""
     # Formats import this module, and rosbags takes long to import.
     from adaptune.recording.bag import BagSource
@@ -179,7 +184,7 @@ def _source(config: SequenceConfig) -> tuple[Source, str | None]:
     return BagSource(paths, config.points, timing, config.frame, about), key
 
 
-def _check_topics(source: Source, config: SequenceConfig) -> None:
+def _check_topics(source: "Source", config: SequenceConfig) -> None:
     """Find topics that are named and not there."""
     from adaptune.recording.bag import IMU_TYPES, BagSource
     from adaptune.recording.clouds import POSES
@@ -214,7 +219,7 @@ class RecordedSequence:
 
     Attributes
     ----------
-    source : Source
+    source : BagSource or FileSource
         The whole recording.
     start, stop, stride : float, float or None, int
         The scans to use: those in [start, stop) seconds since the first one, every stride-th.

@@ -1,10 +1,9 @@
 """What recordings consist of: scans, measurements of an IMU, and the formats that give them."""
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Protocol
+from typing import Annotated, Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,7 +82,6 @@ class Reading(NamedTuple):
     last: float = np.nan
     unit: float = 0.0  # seconds per unit of the points' times
     clock: int | None = None  # nanoseconds of the first point, if the sensor gives its own clock
-    marks: int = 0  # points that were dropped because they are farther than any LiDAR sees
 
 
 UNREAD = Reading()
@@ -489,50 +487,3 @@ class Frame(NamedTuple):
     stamp: int  # nanoseconds, as recorded
     recorded: int  # nanoseconds on the clock of the recorder; the stamp where there is none
     load: Callable[[], Scan]  # decodes the scan
-
-
-class Source(Protocol):
-    """One format of recordings.
-
-    Attributes
-    ----------
-    random_access : bool
-        Whether frames hold nothing in memory before they are loaded.
-    """
-
-    random_access: ClassVar[bool]
-
-    @property
-    def name(self) -> str:
-        """Its file, for messages."""
-
-    @property
-    def n_messages(self) -> int:
-        """At least as many as there are scans."""
-
-    @property
-    def begins(self) -> Mapping[str, int]:
-        """Stamps of the first message on the topics of scans and poses, if it has topics."""
-
-    @property
-    def files(self) -> Sequence[Path]:
-        """All files that its scans and its IMU are read from."""
-
-    @property
-    def pose_files(self) -> Sequence[Path]:
-        """All other files that its own poses are read from."""
-
-    def frames(self) -> Iterator[Frame]:
-        """All scans in the order of their recording."""
-
-    def about(self) -> dict[str, Any]:
-        """Plain data to store with its decoded scans."""
-
-    def span(self) -> tuple[int, int] | None:
-        """First stamp, and about the last one; none where there is no scan."""
-
-    def poses(self, name: str | None, child_frame: str | None, /) -> Trajectory | None:
-        """Reference poses of the recording itself, or, of a bag, those of one topic."""
-
-    def imu(self, name: str | None, /) -> Imu | None:
-        """Measurements of its IMU, in the IMU's own units."""

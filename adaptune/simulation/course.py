@@ -167,8 +167,6 @@ class Course(StrictModel):
     columns: int | None = Field(default=None, ge=16, le=8192)
     # Hz of the inertial measurements; none are made if not given.
     imu: Literal[200, 400] | None = None
-    # Seconds at rest before it drives off, as a LiDAR-inertial odometry needs them to begin.
-    stand: float = Field(default=0.0, ge=0.0, le=600.0)
     # How motion within a scan is undone, as for a recorded sequence.
     compensate: Compensation = None
     # Whether a recording's headers mark the start or the end of each scan.

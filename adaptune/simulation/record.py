@@ -1,8 +1,9 @@
-"""Recordings of simulated courses: ROS bags and KITTI odometry folders."""
+"""Recordings of simulated courses: ROS 1 bags with their ground truth."""
 
 import heapq
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
@@ -14,15 +15,8 @@ from adaptune import files, geometry
 from adaptune.files import replacing
 from adaptune.geometry import Poses, invert
 from adaptune.progress import Progress, unseen
-from adaptune.recording.export import (
-    Message,
-    Messages,
-    measurements,
-    structured,
-)
+from adaptune.recording.export import Message, Messages, measurements, structured
 from adaptune.recording.scan import Imu, Scan
-from adaptune.report.charts import Axis, Chart, Line, Panel, Points
-from adaptune.report.drawing import draw_chart
 from adaptune.simulation import kernels
 from adaptune.simulation.course import (
     IMU,
@@ -66,7 +60,7 @@ class Drive:
     def __init__(self, course: Course) -> None:
         self.course = course
         self.road = Road([(SCENES[name], length) for name, length in course.legs], course.seed)
-        self.ride = Ride(self.road, MOTIONS[course.motion], course.seed, course.stand)
+        self.ride = Ride(self.road, MOTIONS[course.motion], course.seed)
 
     def __len__(self) -> int:
         """Whole scans in the drive."""
@@ -129,34 +123,24 @@ class _Caster:
         tile = int(station // TILE)
         if tile != self._here:
             mesh = self._world.around((tile + 0.5) * TILE, self._sight * _DETOUR + TILE / 2.0)
-            self._origin = T_world_sensor[0, :3, 3].copy()
-            self._target = _Target(mesh, self._origin)
+            self._build(mesh, T_world_sensor[0, :3, 3].copy())
             self._here = tile
         rays = kernels.aim(looks, T_world_sensor, self._origin)
-        return kernels.Cast(rays, *self._target.cast(rays))
+        answer = self._scene.cast_rays(self._tensor(np.ascontiguousarray(rays)))
+        triangles = np.minimum(answer["primitive_ids"].numpy(), len(self._reflectivity) - 1)
+        hits, normals = answer["t_hit"].numpy(), answer["primitive_normals"].numpy()
+        return kernels.Cast(rays, hits, normals, self._reflectivity[triangles])
 
-
-class _Target:
-    """A mesh that rays can be cast at, relative to an origin."""
-
-    def __init__(self, mesh: Mesh, origin: NDArray[np.float64]) -> None:
+    def _build(self, mesh: Mesh, origin: NDArray[np.float64]) -> None:
+        """Build what rays are cast at, relative to an origin."""
         o3d: Any = files.load()
-        self._tensor = o3d.core.Tensor.from_numpy
+        self._tensor, self._origin = o3d.core.Tensor.from_numpy, origin
         self._scene = o3d.t.geometry.RaycastingScene()
         vertices = np.ascontiguousarray(mesh.vertices - origin, np.float32)
         triangles = np.ascontiguousarray(mesh.triangles, np.uint32)
         self._scene.add_triangles(self._tensor(vertices), self._tensor(triangles))
         # The last one is for rays that hit nothing.
         self._reflectivity = np.append(REFLECTIVITY[mesh.materials], np.float32(0.0))
-
-    def cast(
-        self, rays: NDArray[np.float32]
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-        """Cast rays of shape (n, 6): metres to the hit, its normal and its reflectivity."""
-        answer = self._scene.cast_rays(self._tensor(np.ascontiguousarray(rays)))
-        triangles = np.minimum(answer["primitive_ids"].numpy(), len(self._reflectivity) - 1)
-        hits, normals = answer["t_hit"].numpy(), answer["primitive_normals"].numpy()
-        return hits, normals, self._reflectivity[triangles]
 
 
 def simulate(course: Course) -> Iterator[SimulatedScan]:
@@ -216,10 +200,9 @@ _GEOMETRY = ("Point", "Quaternion", "Pose", "PoseStamped")
 def record(
     course: Course, path: Path, *, overwrite: bool = False, progress: Progress = unseen
 ) -> None:
-    """Simulate a course and write a ROS 1 bag, its ground truth and a preview.
+    """Simulate a course and write a ROS 1 bag, and its ground truth in the TUM format beside it.
 
-    The truth, in the TUM format, and the preview, as PNG and SVG, are named after the bag. All are
-    written whole or not at all.
+    Both are written whole or not at all.
 
     Parameters
     ----------
@@ -232,8 +215,8 @@ def record(
     progress
         Notes every scan, under the bag's name.
     """
-    truth, *previews = (path.with_suffix(suffix) for suffix in (".tum", ".png", ".svg"))
-    for file in (path, truth, *previews):
+    truth = path.with_suffix(".tum")
+    for file in (path, truth):
         if file.exists() and not overwrite:
             raise SimulationError(f"{file} exists already; give --overwrite to replace it")
     drive = Drive(course)
@@ -243,17 +226,17 @@ def record(
     topics = {POINTS: "sensor_msgs/msg/PointCloud2", POSES: "geometry_msgs/msg/PoseStamped"}
     if course.imu is not None:
         topics[IMU] = "sensor_msgs/msg/Imu"
-    seen: list[NDArray[np.float64]] = []
     with replacing(truth) as new_truth, replacing(path) as new:
         # The writer makes the file itself.
         new.unlink(missing_ok=True)
-        ros.write(new, topics, _messages(ros, drive, _watched(drive, path.stem, progress, seen)))
+        ros.write(new, topics, _messages(ros, drive, partial(progress, path.stem)))
         stamps = drive.stamps()
         write_tum(new_truth, Trajectory(stamps, drive.ride.poses(drive.seconds(stamps))))
-        draw_chart(_preview(drive, np.concatenate([np.empty((0, 3)), *seen])), *previews)
 
 
-def _messages(ros: Messages, drive: Drive, scans: Iterator[SimulatedScan]) -> Iterator[Message]:
+def _messages(
+    ros: Messages, drive: Drive, progress: Callable[[int, int], None]
+) -> Iterator[Message]:
     """All messages in the order in which they are sent: a cloud when its scan is over."""
     stamps, course = drive.stamps(), drive.course
     T_world_sensor = drive.ride.poses(drive.seconds(stamps))
@@ -269,13 +252,14 @@ def _messages(ros: Messages, drive: Drive, scans: Iterator[SimulatedScan]) -> It
         return POSES, stamp, types["PoseStamped"](header=header, pose=pose)
 
     def seen() -> Iterator[Message]:
-        for i, scan in enumerate(scans):
+        for i, scan in enumerate(drive.scans()):
             yield pose(i + 1)
             end, cloud = int(stamps[i + 1]), structured(scan)
             if at_end := course.stamp == "end":
                 cloud["time"] -= np.float32((end - scan.stamp) * 1e-9)
             header = ros.header(POINTS, end if at_end else scan.stamp, "velodyne")
             yield POINTS, end, ros.cloud(header, cloud)
+            progress(i + 1, len(drive))
 
     inertial: Iterator[Message] = iter(())
     if course.imu is not None:
@@ -284,45 +268,3 @@ def _messages(ros: Messages, drive: Drive, scans: Iterator[SimulatedScan]) -> It
         inertial = measurements(ros, Imu(at, *measured), IMU)
     yield pose(0)
     yield from heapq.merge(inertial, seen(), key=itemgetter(1))
-
-
-# A picture of a simulated recording.
-
-
-_MAP_POINTS = 4000
-"""Points of the map, about, of all scans together."""
-
-
-def _watched(
-    drive: Drive, name: str, progress: Progress, seen: list[NDArray[np.float64]]
-) -> Iterator[SimulatedScan]:
-    """The scans of a drive; `seen` receives x and y in the world of points near each, and height.
-
-    `progress` is told of each, under a name.
-    """
-    n = len(drive)
-    for i, scan in enumerate(drive.scans()):
-        T, few = scan.T_world_sensor, max(_MAP_POINTS // n, 1)
-        points = scan.points[:: max(len(scan) // few, 1)]
-        near = points[np.linalg.norm(points[:, :2], axis=1) < 45.0]
-        # Height above the sensor, in its own upright frame.
-        seen.append(np.column_stack([near @ T[:2, :3].T + T[:2, 3], near @ T[2, :3]]))
-        yield scan
-        progress(name, i + 1, n)
-
-
-def _preview(drive: Drive, points: NDArray[np.float64]) -> Chart:
-    """The path from above, and points of shape (n, 3) of what was seen: x, y and height."""
-    course = drive.course
-    title = (
-        f"{' - '.join(name for name, _ in course.legs)}, {course.sensor}, {course.motion}, "
-        f"seed {course.seed}: {len(drive)} scans, {drive.road.length:.0f} m"
-    )
-    x, y, z = points.T
-    T = drive.ride.poses(np.linspace(0.0, drive.ride.duration, 2000))
-    height = np.clip(z, -1.5, 4.0)
-    drawn = (
-        Points(x, y, "points", height, "height above the sensor [m]"),
-        Line(T[:, 0, 3], T[:, 1, 3], "path"),
-    )
-    return Chart("preview", title, (Panel(Axis("x [m]"), Axis("y [m]"), drawn, equal=True),))

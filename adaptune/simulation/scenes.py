@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -29,6 +29,9 @@ from adaptune.simulation.mesh import (
     variants,
 )
 
+if TYPE_CHECKING:
+    from adaptune.simulation.world import Road
+
 # Scenes, and the tiles in which they are built.
 
 
@@ -50,24 +53,11 @@ class Spots:
     d: Floats
 
 
-class RoadLine(Protocol):
-    """The line along which a scene is built: the part of `Road` that scenes use."""
-
-    def heading(self, s: Floats) -> Floats:
-        """Radians from the x axis at each station."""
-
-    def plane(self, s: Floats, d: Floats) -> tuple[Floats, Floats]:
-        """Coordinates x and y of a station and an offset."""
-
-    def ground(self, x: Floats, y: Floats) -> Floats:
-        """Height of the ground."""
-
-
 @dataclass(frozen=True)
 class Tile:
     """A piece of a scene: up to twenty metres of road and its surroundings."""
 
-    road: RoadLine
+    road: "Road"
     index: int  # its number along the road: it begins at station ``index * TILE``
     # Stations of its ends, in metres; a leg may begin or end within it.
     start: float

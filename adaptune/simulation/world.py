@@ -234,8 +234,7 @@ class Ride:
 
     One spline of fifth order through positions and roll, pitch and yaw contains the ground, the
     vehicle and its shake. Poses, velocities and accelerations thus match exactly. The seed is that
-    of its straying, its speed and its shake. It stands for so many seconds first; with none, it is
-    on its way.
+    of its straying, its speed and its shake.
 
     Attributes
     ----------
@@ -243,16 +242,12 @@ class Ride:
         Seconds until the end of the road's drive.
     """
 
-    def __init__(self, road: Road, motion: Motion, seed: int, stand: float = 0.0) -> None:
+    def __init__(self, road: Road, motion: Motion, seed: int) -> None:
         rng = np.random.default_rng([seed, 2])
         s = np.arange(-10.0, road.length + 10.0, _STEP)
         lane = _lane(road, motion, s, rng)
-        begin = int(np.searchsorted(s, 0.0)) if stand else None
-        times = _schedule(road, motion, s, lane, rng, begin)
+        times = _schedule(road, motion, s, lane, rng)
         times -= np.interp(0.0, s, times)
-        if begin is not None:
-            times = np.concatenate([[-2.0], times[begin:] - times[begin] + stand])
-            s, lane = (np.concatenate([a[begin : begin + 1], a[begin:]]) for a in (s, lane))
         self.duration = float(np.interp(road.length, s, times))
         knots = np.arange(np.ceil(times[0] * _KNOTS), np.floor(times[-1] * _KNOTS)) / _KNOTS
         # Smoothed over a third of a second: no vehicle changes its acceleration at once.
@@ -263,8 +258,6 @@ class Ride:
         for leg, share in road.shares(along):
             roughness += share * leg.scene.shake
         shake = _shake(motion, knots, rng) * roughness[:, None]
-        if stand:
-            shake *= np.clip(along - s[0], 0.0, 1.0)[:, None]  # grows over the first metre
         # The mount shakes about its own axes; yaw turns what shakes along and across.
         yaw = values[:, 5]
         values[:, 0] += np.cos(yaw) * shake[:, 0] - np.sin(yaw) * shake[:, 1]
@@ -316,17 +309,9 @@ def _lane(road: Road, motion: Motion, s: Floats, rng: np.random.Generator) -> Fl
 
 
 def _schedule(
-    road: Road,
-    motion: Motion,
-    s: Floats,
-    lane: Floats,
-    rng: np.random.Generator,
-    rest: int | None = None,
+    road: Road, motion: Motion, s: Floats, lane: Floats, rng: np.random.Generator
 ) -> Floats:
-    """Seconds at each station, within the vehicle's speed, acceleration and turning.
-
-    At the station with the number `rest`, it stands still.
-    """
+    """Seconds at each station, within the vehicle's speed, acceleration and turning."""
     swing = gaussian_filter1d(rng.normal(size=len(s)), 12.0 / _STEP, mode="nearest")
     swing *= 0.1 / max(float(swing.std()), 1e-9)
     pace = np.zeros_like(s)
@@ -335,8 +320,6 @@ def _schedule(
     curvature = np.abs(np.gradient(gaussian_filter1d(lane[:, 5], 1.0 / _STEP), s))
     bends = np.sqrt(motion.turning / np.maximum(curvature, 1e-6))
     speed = np.minimum(motion.speed * pace * np.clip(1.0 + swing, 0.7, 1.3), bends)
-    if rest is not None:
-        speed[rest] = 0.0
     gain = 2.0 * motion.acceleration * _STEP
     for i in range(1, len(s)):
         speed[i] = min(speed[i], np.sqrt(speed[i - 1] ** 2 + gain))

@@ -176,10 +176,7 @@ class StudySequences:
         course = self.courses.get(origin(name))
         others = {*_PATHS, *_AS_ESTIMATED, "cache"}
         config = self.config(name).model_dump(mode="json", exclude=others)
-        # A course that never stands is what it was before courses could.
-        standing = course is not None and course.stand
-        of_course = {} if course is None else course.model_dump(mode="json")
-        config |= {key: value for key, value in of_course.items() if key != "stand" or standing}
+        config |= {} if course is None else course.model_dump(mode="json")
         recording = fingerprints(self.files(name).recording)
         return {self._kind(name): {name: config}, "recording": {name: recording}}
 

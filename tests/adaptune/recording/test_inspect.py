@@ -27,9 +27,8 @@ def test_a_sound_bag_has_all_it_needs_and_an_entry_that_opens(tmp_path):
     assert points.count == 10
     assert points.rate == pytest.approx(10)
     assert points.gap == pytest.approx(0.1)
-    assert inspection.layout[3] == ("time", "float32", 12)
+    assert inspection.fields[3] == "time"
     assert len(inspection.scan) == 195
-    assert inspection.recorded == 200
     assert inspection.faults == []
     assert not inspection.missing["offline"]
     assert not inspection.missing["motion compensation"]
@@ -41,7 +40,7 @@ def test_a_sound_bag_has_all_it_needs_and_an_entry_that_opens(tmp_path):
     text = inspection_text(inspection)
     for expected in (
         "/points",
-        "195 points of 200",
+        "195 points",
         "times spanning 0.1000 s",
         "10.00 Hz",
         "36.0 m in 0.9 s",
@@ -49,7 +48,7 @@ def test_a_sound_bag_has_all_it_needs_and_an_entry_that_opens(tmp_path):
     ):
         assert expected in text.replace("\n", "")
     assert "read: all 20 messages" in text
-    assert text.count("has all it needs") == 4
+    assert text.count("has all it needs") == 3
 
 
 @pytest.mark.parametrize(
@@ -60,10 +59,8 @@ def test_a_sound_bag_has_all_it_needs_and_an_entry_that_opens(tmp_path):
         ([0, 0, 0], [], "/points: all 3 stamps are the same"),
         ([0, 0.1, 0.2, 2.3, 2.4], [], "/points: 1 gaps, the longest of 2.10 s"),
         ([0, 0.1, 90, 0.3], [], "/points: 1 stamps leap by more than 5 s"),
-        ([0, 0.1], [(0, 0), (0.1, 0), (0.2, 1)], "repeats the pose before it 1 times"),
         ([0, 0.1], [(0, 0), (0.1, 500)], "the reference jumps 1 times"),
         ([0, 0.1], [(0, 0), (5, 1)], "1 of 1 gaps of the reference are longer than max_gap = 1 s"),
-        ([0, 0.1], [(0, 0), (0.1, 9)], "the reference is 9.0 m long: set `sub_trajectory`"),
         ([0, 9], [(0, 0), (4, 60)], "the scans outside get no label"),
         ([0, 0.1], [(0, 0)], "the reference holds a single pose"),
         ([0, 0.1], [(0, 2), (0.1, 2)], "the reference stands still"),
@@ -108,15 +105,13 @@ def test_messages_that_do_not_decode_are_reported(tmp_path):
     assert len(list(open_sequence(config.model_copy(update={"stop": 0.3})))) == 3
 
 
-def drive_of(path, span=0.1, begin=0.0, kind="<f4", mark=None, later=(), names=("lidar",)):
-    """Ten scans whose times begin at `begin`; a fifth of their points is `mark`."""
+def drive_of(path, span=0.1, begin=0.0, kind="<f4", later=(), names=("lidar",)):
+    """Ten scans whose times begin at `begin`."""
     messages = []
     for i, first in enumerate(np.broadcast_to(begin, 10)):
         raw = np.zeros(200, [*((name, "<f4") for name in "xyz"), ("time", kind)])
         raw["x"], raw["y"], raw["z"] = np.random.default_rng(i).normal(0, 10, (3, 200))
         raw["time"] = first + np.linspace(0, span, 200)
-        if mark is not None:
-            raw["x"][::5] = raw["y"][::5] = raw["z"][::5] = mark
         for after in (0, *later):
             stamp = START + i * 10**8 + after
             header = rec.header(stamp, names[i % len(names)], STORE)
@@ -138,7 +133,6 @@ def drive_of(path, span=0.1, begin=0.0, kind="<f4", mark=None, later=(), names=(
         ({"span": 0.0}, "the same time", "motion compensation", 0),
         ({"span": 0.0}, "the same time", "online", 10),
         ({"begin": 0.3}, "write `stamp: first_point`", "online", 0),
-        ({"mark": 65535.0}, "20 % of the points are marks of rays", "online", 10),
         ({"later": [1000]}, "10 of 20 clouds hold the same points", "online", 10),
         ({"later": [1000]}, "10 of 20 stamps come less than 1 ms after", "online", 10),
         ({"names": ("a", "b")}, "5 clouds of frame 'a' and 5 clouds of frame 'b'", "online", 5),

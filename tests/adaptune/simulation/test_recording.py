@@ -1,6 +1,5 @@
 import numpy as np
 import pytest
-from pictures import texts
 from rosbags.highlevel import AnyReader
 
 from adaptune.recording.config import SequenceConfig
@@ -84,13 +83,6 @@ def test_inertial_measurements_read_back(recording, scans):
     assert messages[0].orientation_covariance[0] == -1.0
 
 
-def test_a_preview_lies_beside(recording):
-    for label in ("x [m]", "y [m]", "height above the sensor [m]", "path"):
-        assert label in texts(recording.with_suffix(".png"))
-    assert recording.with_suffix(".svg").stat().st_size < 2_000_000
-    assert len(list(recording.parent.iterdir())) == 4
-
-
 @pytest.mark.parametrize("stamp", ["start", "end"])
 def test_the_reader_of_sequences_takes_it(tmp_path, scans, stamp):
     path = tmp_path / "run.bag"
@@ -108,7 +100,7 @@ def test_the_reader_of_sequences_takes_it(tmp_path, scans, stamp):
 
 def test_what_is_there_is_not_touched_unasked(tmp_path):
     path = tmp_path / "run.bag"
-    for name in ("run.bag", "run.tum", "run.png", "run.svg"):
+    for name in ("run.bag", "run.tum"):
         (tmp_path / name).write_text("mine")
         with pytest.raises(SimulationError, match=f"{name} exists already; give --overwrite"):
             record(COURSE, path)

@@ -28,20 +28,6 @@ def test_derivatives_belong_to_the_poses(ride):
     np.testing.assert_allclose((w1 - w0) / (2 * h), turn_rate, atol=1e-4)
 
 
-@pytest.mark.parametrize("name", MOTIONS)
-def test_it_stands_before_it_drives_off(name):
-    road, motion = Road([(SCENES["garden"], 60.0)], seed=1), MOTIONS[name]
-    ride, before = Ride(road, motion, 1, 3.0), Ride(road, motion, 1)
-    rest, t = np.arange(0.0, 2.3, 0.02), np.arange(0.0, ride.duration, 0.02)
-    assert np.abs(ride.poses(rest) - ride.poses(rest[:1])).max() < 1e-6
-    assert np.abs(np.concatenate(ride.accelerations(rest))).max() < 1e-3
-    accelerations = np.linalg.norm(ride.accelerations(t)[0][:, :2], axis=1)
-    assert accelerations[t < 6.0].max() < 1.5 * motion.acceleration + 1.0
-    ends = ride.poses(np.array([ride.duration])), before.poses(np.array([before.duration]))
-    assert np.abs(ends[0] - ends[1])[0, :3, 3].max() < 0.2
-    assert ride.duration > before.duration + 3.0
-
-
 def test_vehicle_keeps_to_its_limits_and_the_road(ride):
     ride, motion, road = ride
     t = np.arange(0.0, ride.duration, 0.02)
