@@ -55,7 +55,7 @@ def failure(file, *overrides):
         ("training=[]", "training: give at least one, not none"),
         ("health.max_speed=.nan", "health.max_speed: give a finite number, not NaN"),
         ("health.max_speed=1" + "0" * 400, "health.max_speed: give a number of at most 1"),
-        ("descriptor.window=3", "window is gone, they are averaged over 3 s"),
+        ("descriptor.window=3", "descriptor: give a list, not keys with values"),
         ("online.modes=[paired]", "online.modes.0: paired is now called adaptive"),
         (
             "online.switching.sets=[true, 3]",
