@@ -13,6 +13,7 @@ from adaptune.commands.terminal import (
     Cluster,
     Folder,
     Override,
+    Points,
     StudyFile,
     begin_work,
     errors,
@@ -220,7 +221,7 @@ def reference(
     ],
     override: Override = [],  # noqa: B006
     folder: Out = None,
-    points: Annotated[str | None, typer.Option(metavar="TOPIC", help="Topic of the scans.")] = None,
+    points: Points = None,
     given: Given = None,
     length: Length = None,
 ) -> None:
@@ -229,28 +230,22 @@ def reference(
     It writes the poses (TUM), what is known of their error (JSON), and a picture. Of a study, it
     estimates the references of all sequences that have none, or `reference: estimated`.
     """
-    if target.suffix not in (".yaml", ".yml"):
-        if override:
-            raise AdaptuneError(f"{target}: -o is for studies; give a study's YAML")
+    if target.suffix in (".yaml", ".yml"):
+        if (points, given, length) != (None, None, None):
+            raise AdaptuneError(
+                "--points, --reference and --length are for a single recording; of a study, the "
+                "YAML says it, see docs/reference-study.md"
+            )
+        _of_study(load(target, override, folder))
+        say_next_of_study("run trials, fit the error model", "offline")
+    elif override:
+        raise AdaptuneError(f"{target}: -o is for studies; give a study's YAML")
+    else:
         _of_recording(target, folder or Path(), points, given, length)
-        return
-    options: dict[str, str | float | None] = {"--points": points, "--reference": given}
-    options["--length"] = length
-    if wrong := [name for name, value in options.items() if value is not None]:
-        raise AdaptuneError(
-            f"{wrong[0]} is for a single recording; of a study, the YAML says it, see "
-            f"docs/reference-study.md"
-        )
-    _of_study(load(target, override, folder))
-    say_next_of_study("run trials, fit the error model", "offline")
 
 
 def _of_recording(
-    target: Path,
-    out: Path,
-    points: str | None,
-    given: str | None,
-    length: float | None,
+    target: Path, out: Path, points: str | None, given: str | None, length: float | None
 ) -> None:
     """Estimate the reference of a recording, write it, and say what it is worth."""
     from adaptune.processes import pin

@@ -200,6 +200,9 @@ Folder = Annotated[
         help="The study's folder.", show_default="the YAML's name, under runs/", file_okay=False
     ),
 ]
+Points = Annotated[
+    str | None, typer.Option(metavar="TOPIC", help="Topic of the scans, where there are several.")
+]
 Cluster = Annotated[
     str | None,
     typer.Option(

@@ -65,14 +65,14 @@ def import_rustle(
     """
     from adaptune.study.rustle import import_rustle as make_studies
 
-    studies, skipped = make_studies(file, algorithms, datasets)
+    studies = make_studies(file, algorithms, datasets)
     names = [f"{output.stem}_{study.name}" if studies[1:] else output.stem for study in studies]
     paths = [output.with_name(name + output.suffix) for name in names]
     if len(set(paths)) < len(paths):
         raise AdaptuneError(f"{file}: two tests have the same name; give each its own")
     if there := [str(path) for path in paths if path.exists() and not overwrite]:
         raise AdaptuneError(f"{', '.join(there)}: exists; name another -o, or add --overwrite")
-    for note in dict.fromkeys((*skipped, *(note for study in studies for note in study.notes))):
+    for note in dict.fromkeys(note for study in studies for note in study.notes):
         _log.warning("%s", note)
     for path, study in zip(paths, studies, strict=True):
         write_text(path, study.text)

@@ -4,8 +4,8 @@ import re
 import shlex
 import shutil
 from collections.abc import Sequence
+from contextlib import suppress
 from functools import partial
-from importlib.util import find_spec
 from itertools import chain, count
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -15,6 +15,7 @@ import typer
 
 from adaptune.commands.online import Details, compared, replay_missing
 from adaptune.commands.terminal import (
+    Points,
     console,
     load,
     progress,
@@ -23,7 +24,7 @@ from adaptune.commands.terminal import (
     say_next_of_study,
     show_table,
 )
-from adaptune.errors import AdaptuneError, OdometryError
+from adaptune.errors import AdaptuneError, NotInstalledError, OdometryError
 from adaptune.files import plain_name, write_text
 from adaptune.progress import Progress
 
@@ -33,8 +34,6 @@ if TYPE_CHECKING:
     from offline.config import OfflineStudy
     from offline.train import Training
 
-MODEL_SUFFIX = ".safetensors"
-"""Of files of error models."""
 UNKNOWN_LENGTH = "5.0    # metres; 10.0 for a path of 200 m or more, 25.0 for one of 500 m or more"
 """The length of sub-trajectories to propose where the path is not known."""
 
@@ -59,7 +58,7 @@ def inspect(
     Of an error model, or of a study's folder, show its sets, sequences, provenance and validation.
     Of a study's YAML with a ROS 1 image, run it on twenty seconds: which way of playing fits?
     """
-    if file.suffix == MODEL_SUFFIX or (file / f"model{MODEL_SUFFIX}").exists():
+    if file.suffix == ".safetensors" or (file / "model.safetensors").exists():
         _show_model(file)
         return
     if file.suffix in (".yaml", ".yml"):
@@ -209,9 +208,6 @@ UNEVEN = 0.2
 the path."""
 LEAST_PATH = 2.0
 """Metres that the part for the test has to hold."""
-Points = Annotated[
-    str | None, typer.Option(metavar="TOPIC", help="Topic of the scans, where there are several.")
-]
 Trials = Annotated[
     int | None, typer.Option(help="Parameter sets to try.", min=2, show_default=f"{TRIALS}")
 ]
@@ -381,24 +377,20 @@ def _usable(path: Path, points: str | None, reference: str | None, show: Progres
     """Look at a recording; it has scans of one topic, and a reference or is to get one."""
     from adaptune.recording.bag import POINTS_TYPES
     from adaptune.recording.inspect import inspect as inspect_file
+    from adaptune.reference.check import recording_config
 
     check_no_study(path)
     found = inspect_file(path, False, show)
-    if not found.name:
-        raise AdaptuneError(f"{path}: is a file of poses; give a recording of scans")
     clouds = [topic for topic in found.topics.values() if topic.type in POINTS_TYPES]
     if len(clouds) > 1 and points is None:
         each = ", ".join(f"{one.name} ({one.count:,} of {one.type})" for one in clouds)
         raise AdaptuneError(
             f"{path}: has {len(clouds)} topics of point clouds: {each}; name one with --points"
         )
-    if points is None and (lacking := found.missing["online"]):
-        raise AdaptuneError(f"{path}: lacks {' and '.join(lacking)}; see `adaptune inspect {path}`")
-    if points is not None:
-        found.given["points"] = points
-    if reference is not None:
-        found.given["reference"] = reference
-    elif found.missing["offline"]:
+    recording_config(found, points, reference)
+    chosen = {"points": points, "reference": reference}
+    found.given |= {key: value for key, value in chosen.items() if value is not None}
+    if reference is None and found.missing["offline"]:
         why = "; ".join(fault.text for fault in found.faults if fault.of == "reference")
         say(f"{path}: its reference does not serve ({why}): one is estimated")
         found.given["reference"] = "estimated"
@@ -411,24 +403,19 @@ def odometries_of(given: str, imu: bool) -> list[str]:
 
     if given != "all":
         names = list(dict.fromkeys(filter(None, map(str.strip, given.split(",")))))
-        for name in names:
-            if name in registry.PROGRAMS:
-                raise AdaptuneError(
-                    f"--odometry {name}: a program needs settings; write a study file, see "
-                    f"docs/programs.md"
-                )
-            if registry.is_user_class(name):
-                registry.where(name)
-            else:
-                registry.odometry_class(name)
+        if programs := [name for name in names if name in registry.PROGRAMS]:
+            raise AdaptuneError(
+                f"--odometry {programs[0]}: a program needs settings; write a study file, see "
+                f"docs/programs.md"
+            )
         return names
     there = []
-    for name, where in registry.ODOMETRIES.items():
-        package = registry.PACKAGES.get(name, where.partition(":")[0].rpartition(".")[2])
-        if find_spec(package.replace("-", "_")) is None or name == "evalio_kiss_icp":
-            continue  # the other one is the same KISS-ICP
-        if imu or not registry.declare(name, {}).sound(name)[1].needs_imu:
-            there.append(name)
+    for name in registry.ODOMETRIES:
+        with suppress(NotInstalledError):
+            needs_imu = registry.declare(name, {}).sound(name)[1].needs_imu
+            # The other one is the same KISS-ICP.
+            if name != "evalio_kiss_icp" and (imu or not needs_imu):
+                there.append(name)
     return there
 
 

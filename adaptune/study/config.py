@@ -4,12 +4,7 @@ import re
 from collections.abc import Iterable, Mapping
 from typing import Annotated, Any, Literal, NamedTuple
 
-from pydantic import (
-    AfterValidator,
-    BeforeValidator,
-    Field,
-    model_validator,
-)
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from adaptune.errors import nearest
 from adaptune.odometry.remote import Limits
@@ -65,10 +60,7 @@ def _known_descriptor(name: str) -> str:
     return name
 
 
-def _names(given: Any) -> Any:
-    if isinstance(given, dict):
-        what = "name the descriptors alone, as in `descriptor: [ndt, motion]`"
-        raise ValueError(f"{what}; window is gone, they are averaged over 3 s")  # noqa: TRY004
+def _listed(given: Any) -> Any:
     return (given,) if isinstance(given, str) else given
 
 
@@ -81,7 +73,7 @@ def _once(names: tuple[str, ...]) -> tuple[str, ...]:
 Descriptors = Annotated[
     tuple[Annotated[str, AfterValidator(_known_descriptor)], ...],
     Field(min_length=1),
-    BeforeValidator(_names),
+    BeforeValidator(_listed),
     AfterValidator(_once),
 ]
 """How scans are described."""
@@ -253,18 +245,9 @@ class _Named(NamedTuple):
 def settle_roles(data: dict[str, Any]) -> tuple[dict[str, str], list[Mistake]]:
     """Make every part that `training` and `test` name a sequence or course of its own.
 
-    Parameters
-    ----------
-    data
-        The study's data, changed in place: ``{hall: 0-60%}`` in a list becomes the name
-        ``hall_0-60`` of a new entry.
-
-    Returns
-    -------
-    origins : dict
-        Name of the sequence that each new one is a part of.
-    mistakes : list of Mistake
-        In the lists. Entries that are no names at all are left to the models.
+    The study's data are changed in place: ``{hall: 0-60%}`` in a list becomes the name
+    ``hall_0-60`` of a new entry. Returns of each new sequence the one that it is a part of, and the
+    mistakes in the lists. Entries that are no names at all are left to the models.
     """
     mistakes: list[Mistake] = []
     origins: dict[str, str] = {}
@@ -318,17 +301,15 @@ def _read(data: dict[str, Any], entry: Any, origins: dict[str, str]) -> _Named:
 
 def _check(role: str, named: _Named, found: dict[str, list[_Named]]) -> None:
     """A ValueError says that the same was named before."""
-    name = named.origin
-    why = f"and proves nothing here; to split it, write training: [{name}: 0-60%], "
-    why += f"test: [{name}: 60-100%]"
     if named in found[role]:
         raise ValueError(f"{named.name!r} is named twice")
-    if role == "test" and named in found["training"]:
-        raise ValueError(f"{name!r} is a training sequence, {why}")
     for other in filter(named.overlaps, found["training"]):
         if role == "training":
             raise ValueError(f"{named.name} overlaps {other.name}; name parts that share no scan")
-        raise ValueError(f"{named.name} overlaps {other.name} of training, {why}")
+        raise ValueError(
+            f"{named.name} overlaps {other.name} of training, and proves nothing here; to split "
+            f"it, write training: [{named.origin}: 0-60%], test: [{named.origin}: 60-100%]"
+        )
 
 
 def _add_part(data: dict[str, Any], named: _Named) -> None:

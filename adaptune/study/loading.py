@@ -37,26 +37,6 @@ _KINDS: dict[str, type[Float | Integer | Categorical]] = {
 }
 
 
-def check_odometries(data: Any, mistakes: list[Mistake], folder: Path, needed: bool = True) -> None:
-    """Check each odometry by itself; make paths in its settings absolute.
-
-    Parameters
-    ----------
-    data
-        What stands under `odometry`: one, or a list of several.
-    mistakes
-        Receives what is wrong.
-    folder
-        Where relative paths begin.
-    needed
-        Whether they must be there: installed, and their images on this machine.
-    """
-    for key, one in _entries(data).items():
-        given = {"name": one} if isinstance(one, str) else one
-        if isinstance(given, dict):
-            _check_odometry(given, key, mistakes, folder, needed)
-
-
 def _entries(given: Any) -> dict[Key, Any]:
     """The odometries of a study by their keys."""
     if isinstance(given, list | tuple):
@@ -64,14 +44,10 @@ def _entries(given: Any) -> dict[Key, Any]:
     return {("odometry",): given}
 
 
-def check_together(config: StudyConfig) -> tuple[list[Mistake], ParameterSpace | None]:
+def _check_together(config: StudyConfig) -> tuple[list[Mistake], ParameterSpace | None]:
     """Find what does not fit the other odometries, or the rest of the study.
 
-    Returns
-    -------
-    mistakes : list of Mistake
-    space : ParameterSpace, optional
-        The parameters that are tuned; None if an odometry cannot be described.
+    And the parameters that are tuned; None if an odometry cannot be described.
     """
     entries: dict[Key, OdometryConfig] = _entries(config.odometry)
     try:
@@ -98,16 +74,14 @@ def check_together(config: StudyConfig) -> tuple[list[Mistake], ParameterSpace |
 def _check_each_once(
     entries: Mapping[Key, OdometryConfig], spaces: Mapping[Key, ParameterSpace]
 ) -> Iterable[Mistake]:
-    """Find odometries that would run the same sets twice, and labels that are given twice."""
+    """Find odometries, and labels, that are given twice."""
     for (first, one), (key, other) in combinations(entries.items(), 2):
         settings, others = (declare(o.name, o.settings).settings for o in (one, other))
-        alike = one.name == other.name and settings == others
-        if alike and _have_a_common_set(spaces[first], spaces[key]):
+        if (one.name, settings, spaces[first]) == (other.name, others, spaces[key]):
             yield Mistake(
                 key,
-                f"{other.name} is there already (odometry.{first[-1]}) with the same settings, and "
-                f"their parameters overlap, so sets would run twice; leave one out, or give it "
-                f"other settings or ranges",
+                f"{other.name} is there already (odometry.{first[-1]}) with the same settings and "
+                f"ranges; leave one out, or give it others",
             )
         elif (one.label or one.name) == (other.label or other.name):
             yield Mistake(
@@ -117,24 +91,13 @@ def _check_each_once(
             )
 
 
-def _have_a_common_set(one: ParameterSpace, other: ParameterSpace) -> bool:
-    """Whether two spaces of the same odometry have a set in common."""
-    shared = one.parameters.keys() & other.parameters.keys()
-    return all(_meet(one.parameters[name], other.parameters[name]) for name in shared)
-
-
-def _meet(one: Any, other: Any) -> bool:
-    if isinstance(one, Categorical) and isinstance(other, Categorical):
-        return any(map(one.contains, other.choices))
-    if isinstance(one, Categorical) or isinstance(other, Categorical):
-        return True
-    return bool(one.low <= other.high and other.low <= one.high)
-
-
 def _check_odometry(
     data: dict[str, Any], at: Key, mistakes: list[Mistake], folder: Path, needed: bool
 ) -> None:
-    """Check all that depends on the odometry; make paths in its settings absolute."""
+    """Check an odometry by itself; make paths in its settings absolute.
+
+    It is `needed` if it must be there: installed, and its image on this machine.
+    """
     name, settings = data.get("name"), data.get("settings") or {}
     if not isinstance(name, str) or not isinstance(settings, dict):
         return  # the models find it
@@ -166,7 +129,11 @@ def _check_parameters(name: str, space: ParameterSpace | None, tuned: Any) -> li
         mistakes.append(Mistake((), f"define the parameters: a {name} does not know its own"))
     for parameter, given in tuned.items() if isinstance(tuned, dict) else ():
         if space is not None and parameter not in space.names:
-            mistakes.append(Mistake((parameter,), _why_not_tuned(name, space, parameter)))
+            known = nearest(str(parameter), space.names)
+            message = f"{name} has no parameter {parameter!r}: {known}"
+            if name in ODOMETRIES and parameter in odometry_class(name).space.names:
+                message = f"{parameter} is fixed by settings; leave it out there to tune it"
+            mistakes.append(Mistake((parameter,), message))
         elif isinstance(given, dict):
             whole = whole_definition(space, parameter, given)
             if str(whole.get("type")) in _KINDS:
@@ -174,12 +141,6 @@ def _check_parameters(name: str, space: ParameterSpace | None, tuned: Any) -> li
             else:
                 mistakes.append(Mistake((parameter,), f"give its type, one of {', '.join(_KINDS)}"))
     return mistakes
-
-
-def _why_not_tuned(name: str, space: ParameterSpace, parameter: Any) -> str:
-    if name in ODOMETRIES and parameter in odometry_class(name).space.names:
-        return f"{parameter} is fixed by settings; leave it out there to tune it"
-    return f"{name} has no parameter {parameter!r}: {nearest(str(parameter), space.names)}"
 
 
 def _check_imu(config: StudyConfig, odometry: str) -> Iterable[Mistake]:
@@ -223,11 +184,8 @@ _NOTES = (".txt", ".yaml")
 """Files beside scans: two recordings may have the same."""
 
 
-def overlaps(config: StudyConfig) -> Iterator[Mistake]:
-    """Find test sequences that hold scans of a training sequence, by the content of their files.
-
-    Files are read only where their sizes agree.
-    """
+def _overlaps(config: StudyConfig) -> Iterator[Mistake]:
+    """Find test sequences that hold scans of a training sequence, by the content of their files."""
     for (i, test), training in product(enumerate(config.test), config.training):
         if test != training and _overlap(config, test, training):
             message = (
@@ -242,37 +200,32 @@ def _overlap(config: StudyConfig, one: str, other: str) -> bool:
     if one in config.courses and other in config.courses:
         return config.courses[one] == config.courses[other]
     a, b = config.sequences.get(one), config.sequences.get(other)
-    if a is None or b is None or not _same_files(_scan_files(a), _scan_files(b)):
+    if a is None or b is None:
         return False
+    mine, others = (
+        [file.resolve() for file in sequence_files(of).recording if file.suffix not in _NOTES]
+        for of in (a, b)
+    )
+    if len(mine) >= MANY:
+        mine = [mine[0], mine[len(mine) // 2], mine[-1]]
+    if not set(mine) & set(others):
+        # Files are read only where their sizes agree.
+        sizes = {file.stat().st_size for file in mine} & {file.stat().st_size for file in others}
+        contents, of_others = (
+            {fingerprint(file) for file in files if file.stat().st_size in sizes}
+            for files in (mine, others)
+        )
+        if not contents & of_others:
+            return False
     # Sections are compared by the stamps of their recordings.
     (begin, end), (other_begin, other_end) = interval_of(a), interval_of(b)
     return begin < other_end and other_begin < end
 
 
-def _same_files(mine: Sequence[Path], others: Sequence[Path]) -> bool:
-    if set(mine) & set(others):
-        return True
-    if len(mine) >= MANY:
-        mine = [mine[0], mine[len(mine) // 2], mine[-1]]
-    for file in mine:
-        size = file.stat().st_size
-        alike = [path for path in others if path.stat().st_size == size]
-        if alike and fingerprint(file) in map(fingerprint, alike):
-            return True
-    return False
-
-
-def _scan_files(config: SequenceConfig) -> Sequence[Path]:
-    files = sequence_files(config).recording
-    return [file.resolve() for file in files if file.suffix not in _NOTES]
-
-
 # The file.
 
 
-_NO_HAND_OVER = "is gone with the hand-over, which gained nothing; leave it out"
-_NO_MODE = "is gone: a mode that served research; leave it out"
-_NO_PRUNING = "is gone; give wilcoxon, which saved more"
+_HAND_OVER = ("beside", "catch_up_scans", "full_rate", "stride")
 DELETED = {
     "offline.search": "is gone: a search is always for single sets; leave it out",
     "online.also": "is gone: name these modes in online.modes, too",
@@ -280,37 +233,34 @@ DELETED = {
     "online.rules": "is gone: name these modes in online.modes",
     "online.dwell": "is gone: selections do not wait; leave it out",
     "online.pin": "is gone: fix a parameter by its range (odometry.parameters), or leave it out",
-    "online.switching.beside": _NO_HAND_OVER,
-    "online.switching.catch_up_scans": _NO_HAND_OVER,
-    "online.switching.full_rate": _NO_HAND_OVER,
-    "online.switching.stride": _NO_HAND_OVER,
+    **{
+        f"online.switching.{key}": "is gone with the hand-over, which gained nothing; leave it out"
+        for key in _HAND_OVER
+    },
     "online.switching.cores": "is gone: a bank shares all cores that adaptune may use",
     "online.switching.memory": "is gone: auto spends 16 GB; give mechanism: bank for more",
     "online.switching.warm_up": "is gone: the odometry says it; leave it out",
     "online.switching.mechanism=hand_over": "is gone (it gained nothing); give auto, live or bank",
     "online.modes=paired": "is now called adaptive",
-    **{f"online.modes={mode}": _NO_MODE for mode in ("one_set", "bank", "bank_learned", "random")},
-    "health.max_acceleration": "is gone: 30 m/s^2 is the bound; leave it out",
-    "health.max_freeze": "is gone: 10 scans, and a second at least, are the bound; leave it out",
-    "health.max_turn_rate": "is gone: 360 degrees a second are the bound; leave it out",
-    "health.max_unregistered": "is gone: 10 scans in a row are the bound; leave it out",
+    **{
+        f"online.modes={mode}": "is gone: a mode that served research; leave it out"
+        for mode in ("one_set", "bank", "bank_learned", "random")
+    },
+    **{
+        f"health.max_{what}": "is gone: its bound is fixed; leave it out"
+        for what in ("acceleration", "freeze", "turn_rate", "unregistered")
+    },
     "odometry.settings.drain": "is gone: adaptune waits until the system rests; leave it out",
     "offline.limits": "is gone: give online.budget, the CPU time of a scan, or weigh costs in "
     "offline.objective",
     "offline.sets=both": "is gone; give shared, or own",
     "offline.runs=episodes": "is gone; give restart, or whole",
-    "offline.pruning=halving": _NO_PRUNING,
-    "offline.pruning=hyperband": _NO_PRUNING,
+    "offline.pruning=halving": "is gone; give wilcoxon, which saved more",
+    "offline.pruning=hyperband": "is gone; give wilcoxon, which saved more",
     "offline.memory": "is gone: each worker keeps 1.5 GB of prepared scans at most",
     **{
-        f"offline.sampler={old}": f"is gone; give optuna.samplers:{name}, with its own settings"
-        for old, name in (
-            ("cmaes", "CmaEsSampler"),
-            ("gp", "GPSampler"),
-            ("nsga2", "NSGAIISampler"),
-            ("qmc", "QMCSampler"),
-            ("sobol", "QMCSampler"),
-        )
+        f"offline.sampler={old}": "is gone; give one of optuna.samplers, with its own settings"
+        for old in ("cmaes", "gp", "nsga2", "qmc", "sobol")
     },
     "offline.preset": "is gone; for the paper's, give trials: 256, sets: own, runs: whole",
     "offline.target": "is gone; give trials, hours or stagnation",
@@ -341,27 +291,11 @@ def read_study(
     runs: Path = Path("runs"),
     needed: bool = True,
 ) -> Study[C]:
-    """Read and check the YAML of a study.
+    """Read and check the YAML of a study, with ``key.of.a.key=value`` as overrides.
 
-    Parameters
-    ----------
-    path
-        The YAML.
-    config_type
-        The model of the YAML.
-    overrides
-        ``key.of.a.key=value``, the value in YAML.
-    folder
-        The study's folder; by default the YAML's name under `runs`.
-    runs
-        Folder of all studies.
-    needed
-        Whether the odometry must be there to run.
-
-    Raises
-    ------
-    ConfigurationError
-        It lists all mistakes, each with its line, its key and what to do.
+    The study's folder is by default the YAML's name under `runs`. The odometry is `needed` if it
+    must be there to run. A ConfigurationError lists all mistakes, each with its line, its key and
+    what to do.
     """
     # A wrong variable is no mistake of the study.
     cache.folder()
@@ -436,14 +370,13 @@ def _check(
 ) -> tuple[C | None, list[Mistake]]:
     """Validate a study's data, and find the mistakes that the models cannot find.
 
-    Returns
-    -------
-    config : StudyConfig, optional
-        None if the data are not valid.
-    mistakes : list of Mistake
+    The configuration is None if the data are not valid.
     """
     mistakes: list[Mistake] = []
-    check_odometries(data.get("odometry"), mistakes, folder, needed)
+    for key, one in _entries(data.get("odometry")).items():
+        given = {"name": one} if isinstance(one, str) else one
+        if isinstance(given, dict):
+            _check_odometry(given, key, mistakes, folder, needed)
     origins, in_roles = settle_roles(data)
     mistakes += in_roles
     context = {"folder": folder}
@@ -455,7 +388,7 @@ def _check(
     if config is not None:
         space = None
         if sound:
-            found, space = check_together(config)
+            found, space = _check_together(config)
             mistakes += found
         mistakes += config.mistakes(space)
     sequences, courses = data.get("sequences", {}), data.get("courses", {})
@@ -466,11 +399,10 @@ def _check(
         for name in sequences
         if name in courses
     ]
-    for name, entry in sequences.items():
-        if name not in origins:
-            mistakes += _check_recording(name, entry, folder)
+    recorded = {name: entry for name, entry in sequences.items() if name not in origins}
+    mistakes += _check_recordings(recorded, context)
     if config is not None and not mistakes:
-        mistakes += overlaps(config)
+        mistakes += _overlaps(config)
     return config, [_at_origin(mistake, origins) for mistake in mistakes]
 
 
@@ -482,11 +414,11 @@ def _at_origin(mistake: Mistake, origins: Mapping[str, str]) -> Mistake:
     return mistake
 
 
-def _check_recording(name: str, entry: Any, folder: Path) -> Iterable[Mistake]:
-    """Open a recording; mistakes in the entry itself were found with the whole."""
-    config = validated(SequenceConfig, entry, (), [], {"folder": folder})
-    if config is not None:
-        try:
-            check_sequence(config)
-        except AdaptuneError as error:
-            yield Mistake(("sequences", name), str(error))
+def _check_recordings(sequences: Mapping[str, Any], context: Any) -> Iterable[Mistake]:
+    """Open recordings; mistakes in the entries themselves were found with the whole."""
+    for name, entry in sequences.items():
+        if (config := validated(SequenceConfig, entry, (), [], context)) is not None:
+            try:
+                check_sequence(config)
+            except AdaptuneError as error:
+                yield Mistake(("sequences", name), str(error))

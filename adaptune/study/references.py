@@ -10,10 +10,7 @@ from typing import Any
 from adaptune import manifest
 from adaptune.geometry import Poses
 from adaptune.processes import pin
-from adaptune.recording.recording import (
-    RecordedSequence,
-    wants_estimate,
-)
+from adaptune.recording.recording import RecordedSequence, wants_estimate
 from adaptune.recording.scan import origin
 from adaptune.reference import estimate
 from adaptune.reference.check import SUSPICIOUS, contradictions
@@ -53,30 +50,11 @@ def ensure_references(
 
     An estimate is made from the scans as they were recorded, so the views of a sequence share it.
     It knows nothing of the study's odometry: what judges a bank is not built from its members.
-    One that was refused is not tried again before something has changed.
+    One that was refused is not tried again before something has changed. The study's folder keeps
+    them as ``references/<sequence>.tum``. Their accuracy is told over `length` metres.
 
-    Parameters
-    ----------
-    sequences
-        Those of the study; its folder keeps the estimates as ``references/<sequence>.tum``.
-    names
-        Of sequences, views, or courses, which have a reference of their own.
-    length
-        Metres of a sub-trajectory, over which their accuracy is told.
-    progress
-        Called about every scan.
-    required
-        Whether the sequences are of no use without.
-
-    Returns
-    -------
-    dict of str to str
-        By its name, why the reference of a sequence cannot be estimated.
-
-    Raises
-    ------
-    EstimateError
-        If the reference of a sequence cannot be estimated, and is required.
+    Returns by its name why the reference of a sequence cannot be estimated; where it is
+    `required`, there is an EstimateError.
     """
     refused = {}
     for name in to_estimate(sequences, names):

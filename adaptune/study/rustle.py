@@ -3,14 +3,16 @@
 RUSTLE (https://github.com/mjpc13/rustle) ignores keys that it does not know; so does this module.
 """
 
+import logging
 import math
 import re
 import textwrap
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, TypeVar
+from typing import Annotated, Any, Literal, NamedTuple
 
-from pydantic import AliasChoices, AliasPath, BaseModel, ConfigDict, Field, create_model
+from pydantic import AliasChoices, AliasPath, ConfigDict, Field
 
 from adaptune import files
 from adaptune.errors import AdaptuneError, OdometryError, nearest
@@ -19,6 +21,8 @@ from adaptune.strict import Key, Mistake, StrictModel, validated
 
 _Number = int | float
 _Some = Field(min_length=1)
+
+_log = logging.getLogger(__name__)
 
 
 class RustleError(AdaptuneError):
@@ -34,25 +38,24 @@ class _Section(StrictModel):
     model_config = ConfigDict(extra="ignore")
 
 
-class _Entry(_Section):
+class _Algorithm(_Section):
     name: str
-
-
-class _Algorithm(_Entry):
     image_name: str
     parameters: str  # a file
     odom_topics: Annotated[tuple[str, ...], _Some]
     ros_version: str = "ROS_1"
 
 
-class _Dataset(_Entry):
+class _Dataset(_Section):
+    name: str
     dataset_path: str  # a folder of bags
     ground_truth: str | None = Field(
         None, validation_alias=AliasChoices("ground_truth_topic", "groundtruth_topic")
     )
 
 
-class _Test(_Entry):
+class _Test(_Section):
+    name: str
     dataset_name: str
     algo_list: Annotated[tuple[str, ...], _Some]
     type: Literal["simple", "speed", "drop", "cut"] = _at("test_type.type", ...)
@@ -61,6 +64,14 @@ class _Test(_Entry):
     speed_step: Annotated[float, Field(gt=0)] | None = _at("test_type.speed_step")
     workers: int = 1
     iterations: int = Field(1, validation_alias=AliasChoices("iterations", "num_iterations"))
+
+
+class _Lists(_Section):
+    """What the files of algorithms, data sets and tests hold."""
+
+    algorithms: tuple[_Algorithm, ...] = ()
+    datasets: tuple[_Dataset, ...] = ()
+    test_definitions: tuple[_Test, ...] = ()
 
 
 class _Annealing(_Section):
@@ -87,7 +98,8 @@ class _Annealing(_Section):
 _COUNTS = ("reanneal_fixed", "reanneal_accepted", "reanneal_best", "stall_accepted", "stall_best")
 
 
-class _Tuning(_Entry):
+class _Tuning(_Section):
+    name: str
     algo_name: str
     dataset: str = _at("dataset_settings.name", ...)
     start: float = _at("dataset_settings.start", 0.0)
@@ -99,10 +111,6 @@ class _Tuning(_Entry):
     hours: float | None = _at("time_limit")
     parameters: dict[str, Any] | None = None
     tuning_settings: _Annealing | None = None
-
-
-M = TypeVar("M", bound=BaseModel)
-E = TypeVar("E", bound=_Entry)
 
 
 class _File:
@@ -120,26 +128,17 @@ class _File:
         """An error about the value at a key."""
         return RustleError(f"{self._document.where(self.path, key)}: {Mistake(key, message)}")
 
-    def check(self, model: type[M]) -> M:
+    def check(self, model: type[_Section]) -> Any:
         """The content, or an error that lists the mistakes in it."""
         mistakes: list[Mistake] = []
         if (content := validated(model, self.data, (), mistakes)) is None:
             raise RustleError("\n".join(str(self.error(*mistake)) for mistake in mistakes))
         return content
 
-    def entries(self, key: str, entry: type[E]) -> list[E]:
-        """The list at a key."""
-        field: Any = (list[entry], _Some)  # type: ignore[valid-type]
-        content = self.check(create_model("_Content", __base__=_Section, **{key: field}))
-        entries: list[E] = getattr(content, key)
-        return entries
-
-    def find(
-        self, key: str, entry: type[E], name: str, asking: "_File", asked: Key
-    ) -> tuple[int, E]:
-        """The entry for which another file asks, and its place."""
-        entries = self.entries(key, entry)
-        names = [each.name for each in entries]
+    def find(self, key: str, name: str, asking: "_File", asked: Key) -> tuple[int, Any]:
+        """The entry of a list for which another file asks, and its place."""
+        entries = getattr(self.check(_Lists), key)
+        names = [entry.name for entry in entries]
         if name not in names:
             what = f"{self.path.name} has no {name!r} in {key}: {nearest(name, names)}"
             raise asking.error(asked, what)
@@ -149,8 +148,8 @@ class _File:
 # Searches for parameters in RUSTLE's tunings, as settings of the offline stage.
 
 
-_MOST_POINTS = 10**6
-"""Trials of a random search over a grid, and points on an axis."""
+_MOST_TRIALS = 10**6
+"""Of a random search over a grid."""
 _ALPHA = 0.95
 """What RUSTLE's exponential cooling multiplies the temperature by."""
 
@@ -208,7 +207,7 @@ def _grid(
     if tuning.tuning_algo == "random_search":
         offline["sampler"] = "random"
         if tuning.hours is None:
-            offline["trials"] = min(size + 1, _MOST_POINTS)
+            offline["trials"] = min(size + 1, _MOST_TRIALS)
     if tuning.tolerance is not None and tuning.hours is None:  # as in RUSTLE
         offline["stagnation"] = tuning.tolerance
         what = "early_stopping.delta has no counterpart: any better trial counts as a new best."
@@ -218,12 +217,9 @@ def _grid(
 
 def _axis(file: _File, key: Key, given: list[Any], default: _Number) -> dict[str, Any]:
     """A range that holds the grid's points and the default."""
-    form = "give [first, step, number]"
     if len(given) != 3 or not all(map(_is_number, given)) or not isinstance(given[2], int):
-        raise file.error(key, f"{form}, not {given!r}")
+        raise file.error(key, f"give [first, step, number], not {given!r}")
     first, step, number = given
-    if not 1 <= number <= _MOST_POINTS or (step == 0 and number > 1):
-        raise file.error(key, f"{form}, the number from 1 on and the step not 0")
     points = (first, first + step * (number - 1), default)
     low, high = min(points), max(points)
     return _range(low, high if high > low else low + (abs(step) or 1), default)
@@ -293,43 +289,20 @@ class ImportedStudy(NamedTuple):
     @property
     def text(self) -> str:
         """The study's YAML, with comments."""
-        lines = _wrapped("# ", self.about)
+        fill = partial(textwrap.fill, width=98, break_long_words=False, break_on_hyphens=False)
+        lines = [fill(self.about, initial_indent="# ", subsequent_indent="# ")]
         if self.notes:
             lines.append("# Not taken over, or to be looked at:")
-        for note in self.notes:
-            lines += _wrapped("# - ", note)
+        lines += [fill(n, initial_indent="# - ", subsequent_indent="#   ") for n in self.notes]
         sections = [files.dump({key: value}) for key, value in self.data.items()]
-        return "\n".join([*lines, "", "\n".join(sections)])
+        return "\n".join([*lines, "", *sections])
 
 
-def _wrapped(begin: str, text: str) -> list[str]:
-    lines = textwrap.wrap(text, 98 - len(begin), break_long_words=False, break_on_hyphens=False)
-    return [f"{'# '.ljust(len(begin)) if i else begin}{line}" for i, line in enumerate(lines)]
+def import_rustle(path: Path, algorithms: Path, datasets: Path) -> list[ImportedStudy]:
+    """Make studies of a file of tests, one for every test, algorithm and speed, or of one tuning.
 
-
-def import_rustle(
-    path: Path, algorithms: Path, datasets: Path
-) -> tuple[list[ImportedStudy], list[str]]:
-    """Make studies of a file of tests, or of one tuning.
-
-    Parameters
-    ----------
-    path
-        RUSTLE's tests (``test_definitions``), or a tuning (``tuning_algo``).
-    algorithms, datasets
-        RUSTLE's algorithms and data sets. Paths in them start from their folders.
-
-    Returns
-    -------
-    studies : list of ImportedStudy
-        One for every test, algorithm and speed, or that of the tuning.
-    skipped : list of str
-        What no study was made of, and why.
-
-    Raises
-    ------
-    RustleError
-        It names the file, the line and the key.
+    Paths in RUSTLE's files of algorithms and data sets start from their folders. It is logged what
+    no study is made of. A RustleError names the file, the line and the key of a mistake.
     """
     file = _File(path)
     library = _File(algorithms), _File(datasets)
@@ -337,7 +310,7 @@ def import_rustle(
     if "test_definitions" in keys:
         return _of_tests(file, *library)
     if "tuning_algo" in keys:
-        return [_of_tuning(file, *library)], []
+        return [_of_tuning(file, *library)]
     raise file.error((), "has neither test_definitions, as tests, nor tuning_algo, as a tuning")
 
 
@@ -350,7 +323,7 @@ class _System(NamedTuple):
 
 def _system(algorithms: _File, name: str, asking: _File, asked: Key) -> _System | None:
     """An algorithm; None if it is one for ROS 2."""
-    i, given = algorithms.find("algorithms", _Algorithm, name, asking, asked)
+    i, given = algorithms.find("algorithms", name, asking, asked)
     if given.ros_version.lower().replace("_", "") == "ros2":
         return None
     try:
@@ -382,7 +355,7 @@ def _sequence(
     datasets: _File, name: str, asking: _File, asked: Key, system: _System
 ) -> dict[str, Any]:
     """A data set as a sequence for a system, which gets notes on it."""
-    _, given = datasets.find("datasets", _Dataset, name, asking, asked)
+    _, given = datasets.find("datasets", name, asking, asked)
     folder = datasets.path.parent / given.dataset_path
     bags, topics = sorted(folder.glob("*.bag")), system.settings
     if not bags:
@@ -403,14 +376,12 @@ def _name(*parts: str) -> str:
     return "_".join(re.sub(r"[^\w.-]+", "_", part).strip("._-") or "unnamed" for part in parts)
 
 
-def _of_tests(
-    file: _File, algorithms: _File, datasets: _File
-) -> tuple[list[ImportedStudy], list[str]]:
-    studies, skipped = list[ImportedStudy](), list[str]()
-    for i, test in enumerate(file.entries("test_definitions", _Test)):
+def _of_tests(file: _File, algorithms: _File, datasets: _File) -> list[ImportedStudy]:
+    studies: list[ImportedStudy] = []
+    for i, test in enumerate(file.check(_Lists).test_definitions):
         key = ("test_definitions", i)
         if test.type in ("drop", "cut"):
-            skipped.append(
+            _log.warning(
                 f"Test {test.name!r} is left out: adaptune has no {test.type} tests, which take a "
                 f"sensor's messages away while a system runs. A sequence's `drop` view loses scans."
             )
@@ -418,15 +389,15 @@ def _of_tests(
         for j, name in enumerate(test.algo_list):
             system = _system(algorithms, name, file, (*key, "algo_list", j))
             if system is None:
-                skipped.append(f"Test {test.name!r} is left out for {name}, an image of ROS 2.")
+                _log.warning(f"Test {test.name!r} is left out for {name}, an image of ROS 2.")
                 continue
             asked = (*key, "dataset_name")
             sequence = _sequence(datasets, test.dataset_name, file, asked, system)
             speeds = _speeds(file, key, test)
             studies += [_of_test(file, test, system, sequence, speed) for speed in speeds]
     if not studies:
-        raise RustleError("\n".join([f"{file.path}: no study can be made of it", *skipped]))
-    return studies, skipped
+        raise RustleError(f"{file.path}: no study can be made of it")
+    return studies
 
 
 def _speeds(file: _File, key: Key, test: _Test) -> list[float]:
@@ -439,8 +410,6 @@ def _speeds(file: _File, key: Key, test: _Test) -> list[float]:
         what = "give speed_factors, or speed_range and speed_step"
         raise file.error((*key, "test_type"), what)
     n = math.floor((test.speed_range - 1.0) / test.speed_step + 1e-9) + 1
-    if n > 100:
-        raise file.error((*key, "test_type", "speed_step"), f"makes {n} speeds; 100 at most")
     return [1.0 + i * test.speed_step for i in range(n)]
 
 

@@ -140,12 +140,8 @@ class StudySequences:
     def open(self, name: str) -> Recording:
         """Open a sequence, a recorded course, or a view.
 
-        Raises
-        ------
-        SequenceError
-            If it cannot be opened.
-        ConfigurationError
-            If the course has not been recorded.
+        A SequenceError says that it cannot be opened, a ConfigurationError that the course has not
+        been recorded.
         """
         self._check_recorded(name)
         sequence = open_sequence(self.config(name))
@@ -241,13 +237,6 @@ class Study(Generic[C_co]):
 
     config: C_co
     folder: Path  # keeps trials, model, replays and comparison
-
-    def __repr__(self) -> str:
-        odometries, training, test = (
-            ", ".join(names)
-            for names in (self.config.odometries, self.training, self.config.test or ["none"])
-        )
-        return f"<Study in {self.folder}: {odometries}; training: {training}; test: {test}>"
 
     @property
     def name(self) -> str:
@@ -356,14 +345,9 @@ class Study(Generic[C_co]):
         }
 
     def archive(self, kind: str = "trials", more: Mapping[str, Any] | None = None) -> Archive:
-        """The archive of the trials, or of other ones, which records what they depend on.
+        """The archive of the trials, or of other ones in the folder `kind`.
 
-        Parameters
-        ----------
-        kind
-            Name of its folder.
-        more
-            What they depend on besides odometry, sequences and descriptors.
+        It records what they depend on: odometry, sequences, descriptors, and `more`.
         """
         config = self.config
         shared = self.odometry_inputs | {
@@ -390,11 +374,8 @@ class Study(Generic[C_co]):
     def model(self, path: Path | None = None) -> ErrorModel:
         """Load an error model, by default the study's own.
 
-        Raises
-        ------
-        AdaptuneError
-            If there is none, it is of another odometry, other parameters or other sub-trajectories,
-            or what the study's own was fitted to has changed.
+        There is an AdaptuneError if there is none, it is of another odometry, other parameters or
+        other sub-trajectories, or what the study's own was fitted to has changed.
         """
         path = path or self.model_path
         model = ErrorModel.load(path)
@@ -419,10 +400,7 @@ class Study(Generic[C_co]):
     def open(self) -> None:
         """Make and lock the folder, and write the resolved configuration to it.
 
-        Raises
-        ------
-        ConfigurationError
-            If the folder cannot be made, or another process works in it.
+        There is a ConfigurationError if it cannot be made, or another process works in it.
         """
         folder = self.folder
         try:
@@ -519,12 +497,7 @@ def driven(
 ) -> str:
     """What `adaptune online` will drive with a study's model, in a sentence or two.
 
-    `mechanism` is the study's.
-
-    Raises
-    ------
-    ModeError
-        If the model does not go with the study's bank.
+    `mechanism` is the study's. A ModeError says that the model does not go with the study's bank.
     """
     fixed = f"`online` will drive the fixed set (trial {named(model, model.fixed)}"
     fixed += ")" if model.fixed else ", the baseline)"
@@ -597,10 +570,7 @@ def named(model: ErrorModel, trial: int) -> str:
 def expected_in_words(expected: Mapping[str, float]) -> str:
     """What a way to adapt is expected to gain, what it rests on, and how far that reaches.
 
-    Parameters
-    ----------
-    expected
-        See `offline.tuning.Figures`.
+    The figures are those of `offline.tuning.Figures`.
     """
     gain, low, high = (100.0 * (1.0 - expected[key]) for key in ("geometric", "high", "low"))
     stretches, recordings = int(expected["n_stretches"]), int(expected["n_recordings"])
@@ -624,16 +594,8 @@ def mechanism_of(
 ) -> Mechanism | None:
     """How a mode that adapts changes parameters; None if it cannot.
 
-    Parameters
-    ----------
-    mode
-        A selection rule.
-    model
-        The error model. A bank with more expected loss than one set at a time would only cost.
-    mechanism
-        The study's.
-    live
-        Whether the odometry changes its parameters between scans.
+    The `mechanism` is the study's; `live`: whether the odometry changes its parameters between
+    scans. A bank with more expected loss than one set at a time would only cost.
     """
     # `paper` was published with one instance, and all sets to choose from.
     bank = model.bank_adapts or model.bank_rests if mode == "adaptive" else not live
@@ -645,11 +607,8 @@ def mechanism_of(
 def bank_members(switching: SwitchingConfig, model: ErrorModel) -> dict[int, ParameterSet]:
     """The members of the study's bank by their trial numbers, the fixed set first.
 
-    Raises
-    ------
-    ModeError
-        If the study names a set that the model does not know, or one twice, or the model was
-        fitted for another bank.
+    A ModeError says that the study names a set that the model does not know, or one twice, or that
+    the model was fitted for another bank.
     """
     if switching.sets is None and model.budget is not None:
         return {trial: model.sets[trial] for trial in model.bank}
@@ -718,12 +677,8 @@ class OracleErrors(NamedTuple):
 def oracle_errors(archive: Archive, name: str, model: ErrorModel) -> OracleErrors | None:
     """The errors of a model's sets on a test sequence, from the study's trials on it.
 
-    None where no trials were run; those of other inputs than now are left out, with a warning.
-
-    Raises
-    ------
-    ArchiveError
-        If a file is damaged.
+    None where no trials were run; those of other inputs than now are left out, with a warning. An
+    ArchiveError says that a file is damaged.
     """
     finished = archive.finished(name)
     known = [t for t in model.sets if t in finished and finished[t].parameters == model.sets[t]]

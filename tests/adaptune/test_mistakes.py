@@ -47,7 +47,7 @@ FOREIGN = re.compile(r"pydantic|https://|Input should|validation|Value error|tup
         ("training=[]", "training: give at least 1, not 0"),
         ("health.max_speed=.nan", "health.max_speed: give a finite number, not NaN"),
         ("health.max_speed=1" + "0" * 400, "health.max_speed: give a number of at most 1"),
-        ("descriptor.window=3", "window is gone, they are averaged over 3 s"),
+        ("descriptor.window=3", "descriptor: give a list, not keys with values"),
         ("online.modes=[paired]", "online.modes.0: paired is now called adaptive"),
         (
             "online.switching.sets=[true, 3]",

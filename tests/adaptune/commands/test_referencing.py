@@ -59,7 +59,7 @@ def test_where_it_is_lost_is_said(adaptune, bag, tmp_path, monkeypatch):
         (["BAG", "--points", "/none"], "/none"),
         (["BAG", "--reference", "/none"], "/none"),
         (["BAG", "-o", "training=[one]"], "-o is for studies"),
-        (["STUDY", "--length", "3"], "--length is for a single recording"),
+        (["STUDY", "--length", "3"], "and --length are for a single recording"),
         (["STUDY"], "every sequence has a reference"),
         (["poses.tum"], "is a file of poses"),
     ],
