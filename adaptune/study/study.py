@@ -238,6 +238,13 @@ class Study(Generic[C_co]):
     config: C_co
     folder: Path  # keeps trials, model, replays and comparison
 
+    def __repr__(self) -> str:
+        odometries, training, test = (
+            ", ".join(names)
+            for names in (self.config.odometries, self.training, self.config.test or ["none"])
+        )
+        return f"<Study in {self.folder}: {odometries}; training: {training}; test: {test}>"
+
     @property
     def name(self) -> str:
         """Name of the study: its folder's."""
