@@ -1,6 +1,5 @@
 """The modes of a replay: what each one runs, and what chooses its parameters."""
 
-import itertools
 import logging
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -41,7 +40,6 @@ from online.real_time import SelectorProcess, replay_in_real_time
 from online.record import (
     StoredReplay,
     is_reference_of,
-    repeat_folder,
     replay_changes,
     write_reference,
     write_replay,
@@ -327,21 +325,17 @@ def run_replays(
     study: Study,
     model_path: Path,
     progress: Progress = unseen,
-    repeats: int = 1,
 ) -> int:
-    """Replay every test sequence in every mode, as often as asked, unless that was done before.
+    """Replay every test sequence in every mode, unless that was done before.
 
     Parameters
     ----------
     study
-        The study; ``replays/<sequence>/<mode>`` in its folder receives the results, and
-        ``repeat_2`` in it, and so on, those of repeats.
+        The study; ``replays/<sequence>/<mode>`` in its folder receives the results.
     model_path
         The error model.
     progress
         Called about every scan.
-    repeats
-        How often each mode is replayed on a sequence.
 
     Returns
     -------
@@ -365,13 +359,12 @@ def run_replays(
         names = " and ".join(name for name in asked if obstacles[name] == why)
         _log.warning("not replayed: %s, because %s", names, why)
     modes = setup.modes(model)
-    return _replay_all(study, study.config.test, modes, progress, repeats, model_path)
+    return _replay_all(study, study.config.test, modes, progress, model_path)
 
 
 def run_untrained(
     study: Study,
     progress: Progress = unseen,
-    repeats: int = 1,
 ) -> int:
     """Replay sequences with the baseline, and with a bank that needs no model.
 
@@ -385,7 +378,7 @@ def run_untrained(
     """
     ReplaySetup.of(study).mode(UNTRAINED)  # or an error
     names = sequences_without_model(study.config)
-    return _replay_all(study, names, WITHOUT_MODEL, progress, repeats)
+    return _replay_all(study, names, WITHOUT_MODEL, progress)
 
 
 class _Run(NamedTuple):
@@ -402,7 +395,6 @@ def _replay_all(
     sequences: Sequence[str],
     modes: Sequence[str],
     progress: Progress,
-    repeats: int,
     model_path: Path | None = None,
 ) -> int:
     """Replay what was not replayed before; the number of replays that were made.
@@ -420,8 +412,7 @@ def _replay_all(
     for name in sequences:
         shared = study.replay_inputs(name)
         about = [setup.identity(mode, model, digest) | shared for mode in modes]
-        runs = itertools.product(range(1, repeats + 1), about)  # first all first ones
-        every = (_due(study, name, manifest.plain(of | {"repeat": n})) for n, of in runs)
+        every = [_due(study, name, manifest.plain(inputs)) for inputs in about]
         due = [run for run in every if run is not None]
         folder, poses = study.folder / "replays" / name, study.sequences.reference(name)
         if not due and is_reference_of(folder, poses):
@@ -470,18 +461,16 @@ def _judge(
 
 def _due(study: Study, name: str, inputs: manifest.Inputs) -> _Run | None:
     """A replay that is to be made; one of other inputs is set aside, an earlier one kept."""
-    mode, repeat = inputs["mode"], inputs["repeat"]
-    folder = repeat_folder(study.folder / "replays" / name / mode, repeat)
-    what = f"{name}, {mode}" + ("" if repeat == 1 else f", repeat {repeat}")
+    folder, what = study.folder / "replays" / name / inputs["mode"], f"{name}, {inputs['mode']}"
     changes = replay_changes(folder, inputs, study.sequences.sources(name))
     if changes:
         _log.info("%s: replayed again: %s", what, "; ".join(changes))
-        before, files = manifest.recorded(folder / manifest.FILE), folder.iterdir()
-        manifest.set_aside(study.folder, folder, before, [file for file in files if file.is_file()])
+        before = manifest.recorded(folder / manifest.FILE)
+        manifest.set_aside(study.folder, folder, before, list(folder.iterdir()))
     if changes != [] and manifest.bring_back(study.folder, folder, inputs):
         _log.info("%s: the earlier replay of these inputs counts again", what)
         changes = replay_changes(folder, inputs)
-    return None if changes == [] else _Run(what, mode, folder, inputs)
+    return None if changes == [] else _Run(what, inputs["mode"], folder, inputs)
 
 
 def _replayed(

@@ -77,8 +77,7 @@ def _of_modes(rows: Sequence[ComparisonRow], length: float) -> Listing:
     cells = [{k: v for k, v in row.items() if k not in empty} for row in cells]
     n = len({row.sequence for row in rows if row.rte is not None} - {ALL})
     where = f"on {n} sequences" if last[0].sequence == ALL else f"on {last[0].sequence}"
-    repeats = f", {last[0].repeats} replays each" if last[0].repeats > 1 else ""
-    return Listing(f"RTE over {length:g} m {where}{repeats}", cells, _caption(rows, cells[0]))
+    return Listing(f"RTE over {length:g} m {where}", cells, _caption(rows, cells[0]))
 
 
 def _caption(rows: Sequence[ComparisonRow], shown: Mapping[str, Any]) -> str:
