@@ -345,7 +345,7 @@ def _differing(
         own = setup.identity(mode, model, "" if model is None else model.digest)
         now |= {key: own[key] for key in ("model", "parameters")}
         both = own["switching"], inputs["switching"]
-        automatic = setup.switching.mechanism == "auto" and None not in both
+        automatic = setup.config.online.switching.mechanism == "auto" and None not in both
         # Another machine would choose another mechanism.
         if not automatic or both[0]["mechanism"] == both[1]["mechanism"]:
             now["switching"] = own["switching"]

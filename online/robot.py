@@ -265,8 +265,10 @@ class RobotDrive:
     def __init__(self, study: Study, mode: str, model_path: Path | None):
         config = study.config
         real_time = (config.online.real_time or RealTimeConfig()).model_copy(update={"rate": 1.0})
+        online = config.online.model_copy(update={"real_time": real_time})
+        config = config.model_copy(update={"online": online})
         # What is only compared with is for replays.
-        setup = replace(ReplaySetup.of(study), real_time=real_time, also=())
+        setup = replace(ReplaySetup.of(study), config=config, also=())
         self._study, self._setup, self._settings = study, setup, real_time
         self._ros = config.online.ros
         self._like = _like(config, study.sequences)
@@ -286,7 +288,7 @@ class RobotDrive:
             model = needed(mode, model)
             fixed = {model.fixed: model.sets[model.fixed]}
             # A node that is steered has one set at a time.
-            make = partial(Selector, model, mode, (), setup.descriptors)
+            make = partial(Selector, model, mode, (), config.descriptor)
             self._mode = Mode(mode, fixed, selector=make)
         elif study.odometry.description.whole:
             raise ModeError(
