@@ -292,9 +292,6 @@ def sequences_without_model(config: StudyConfig) -> tuple[str, ...]:
 # The online stage: replay the test sequences in every mode.
 
 
-MIN_SEQUENCES = 1.5
-"""Effective training stretches below which a selection rests on hardly more than one."""
-
 _log = logging.getLogger(__name__)
 
 
@@ -452,21 +449,4 @@ def _replayed(
             process = make and stack.enter_context(closing(SelectorProcess(make, online.period)))
             record = replay_in_real_time(*given, online.real_time, process, watch, what)
     progress(what, n, n)
-    if record.choices:
-        warn_of_scant_evidence(what, [choice.selection for choice in record.choices], mode.fixed)
     return record
-
-
-def warn_of_scant_evidence(what: str, selections: Iterable[Selection], fixed: int) -> None:
-    """Warn of selections that rest on hardly more than one training stretch."""
-    others = [s for s in selections if s.trial != fixed]
-    scant = sum(s.n_sequences < MIN_SEQUENCES for s in others)
-    if scant:
-        _log.warning(
-            "%s: %d of %d selections of another set than the fixed one rest on hardly more than "
-            "one stretch of the training (see selections.csv); more recordings would show whether "
-            "they hold",
-            what,
-            scant,
-            len(others),
-        )
