@@ -138,7 +138,6 @@ class ModeReplay(NamedTuple):
     estimated: NDArray[np.float64]
     lost: NDArray[np.bool_]  # of shape (m,): whether the bank was lost
     places: NDArray[np.float64]  # (n, 2): metres, by the reference where there is one
-    familiarity: NDArray[np.float64]  # (m,): of each selection, see `Selection`; NaN if unknown
 
     @property
     def span(self) -> NDArray[np.float64]:
@@ -224,7 +223,6 @@ def _read_mode(replay: StoredReplay, reference: Reference, model: ErrorModel | N
         replay.estimated,
         replay.lost,
         places,
-        replay.selections["familiarity"],
     )
 
 
@@ -243,26 +241,6 @@ def _seen_from(trajectory: Trajectory) -> NDArray[np.float64]:
     """Positions in the plane of the sensor at the first pose: x forward, y to the left."""
     T = trajectory.T_world_sensor
     return np.asarray((invert(T[0]) @ T)[:, :2, 3])
-
-
-# How familiar the surroundings were.
-
-
-def familiarity_chart(replayed: ReplayedSequence) -> Chart | None:
-    """Familiarity of the surroundings at each selection, over time."""
-    known = {mode: of for mode, of in replayed.modes.items() if np.isfinite(of.familiarity).any()}
-    if not known:
-        return None
-    lines = [Line(of.choice_seconds, of.familiarity, mode) for mode, of in known.items()]
-    y = Axis("familiarity [-]", limits=(0.0, 1.02))
-    return Chart(
-        f"{replayed.name}-familiarity",
-        f"{replayed.name}: how familiar the surroundings were",
-        (Panel(TIME, y, (*_scenes(replayed), *lines)),),
-        "How much the training knows about surroundings like those at each selection: 0 means "
-        "unlike all training. A mode that loses where familiarity is low should not trust its "
-        "training there.",
-    )
 
 
 TIME = Axis("time [s]")
@@ -287,7 +265,6 @@ def charts_of_replays(replayed: ReplayedSequence) -> Charts:
             error_chart(replayed)
             or f"No errors of the replays of {sequence}: it has no reference.",
             choice_chart(replayed),
-            familiarity_chart(replayed),
         )
     )
 

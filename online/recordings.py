@@ -40,12 +40,13 @@ ODOM, SENSOR = "odom", "sensor"
 """Frames: that of all poses, and that of the clouds."""
 _PLACING = ("adaptive", "untrained", "paper", "fixed")
 """Modes whose poses place the clouds, the first that was replayed."""
-_ERRORS = {
+_OF_SELECTIONS = {
     "predicted_error": "predicted_error_percent",
     "predicted_fixed_error": "predicted_fixed_percent",
     "estimated_error": "estimated_error_percent",
     "estimated_error_low": "estimated_low_percent",
     "estimated_error_high": "estimated_high_percent",
+    "familiarity": "familiarity",
     "selection_ms": "ms",
 }
 """Topics of a mode by column of ``selections.csv``."""
@@ -168,7 +169,7 @@ class _Composer:
         """Add what a mode selected, its errors and its times."""
         trajectory, made = replay.trajectory, replay.choice_stamps
         stamps, end = trajectory.stamps, trajectory.stamps[-1:]
-        for name, column in _ERRORS.items():
+        for name, column in _OF_SELECTIONS.items():
             self._numbers(topic(mode, name), made, replay.selections[column])
         self._add_data(topic(mode, "selection"), _TEXT, made, _in_words(replay))
         for name in _TIMES:
