@@ -259,14 +259,9 @@ def charts_of_replays(replayed: ReplayedSequence) -> Charts:
     if not replayed.modes:
         none = [f"No replays of {sequence}: run `adaptune online`."]
         return Charts([], [*replayed.refused] or none)
-    return charts_of(
-        (
-            *replayed.refused,
-            error_chart(replayed)
-            or f"No errors of the replays of {sequence}: it has no reference.",
-            choice_chart(replayed),
-        )
-    )
+    no_errors = f"No errors of the replays of {sequence}: it has no reference."
+    of_errors = error_chart(replayed) or no_errors
+    return charts_of((*replayed.refused, of_errors, choice_chart(replayed)))
 
 
 def error_chart(replayed: ReplayedSequence) -> Chart | None:
@@ -385,8 +380,8 @@ def _place(value: Any, names: tuple[str, ...] | None) -> float:
 def _weights(replayed: ReplayedSequence) -> Iterator[Panel]:
     for mode, track in replayed.modes.items():
         shares = 100.0 * np.array(list(track.weights.values()))
-        if not _changes(shares):
-            continue
+        if len(shares) < 2 or not np.ptp(shares, axis=1).any():
+            continue  # they never change
         shares = np.column_stack([shares, shares[:, -1]])
         # Shares hide what is shaded.
         ends = [] if replayed.scenes is None else replayed.scenes.edges[1:-1]
@@ -394,11 +389,6 @@ def _weights(replayed: ReplayedSequence) -> Iterator[Panel]:
         drawn = (*_scenes(replayed), Shares(track.span, shares, tuple(track.weights)), *edges)
         y = Axis("weight [%]", limits=(0.0, 100.0))
         yield Panel(TIME, y, drawn, f"{mode} applies a bank: weights of its members")
-
-
-def _changes(weights: NDArray[np.float64]) -> bool:
-    """Whether weights, of shape (n_members, m), change along the course."""
-    return bool(len(weights) > 1 and np.ptp(weights, axis=1).max() > 0.0)
 
 
 def _scenes(replayed: ReplayedSequence) -> list[Drawn]:

@@ -416,7 +416,10 @@ def compare(study: Study) -> ComparedReplays:
         wrong += [f"On {name}, {what}." for what in read_contradictions(folder)]
         of_modes = compare_modes(name, every, reference)
         judged.append(of_modes._replace(recording=study.sequences.recorded_in(name)))
-        oracles += [] if model is None else _in_hindsight(study, judged[-1], model)
+        if model is not None:
+            errors = oracle_errors(study.archive("oracle"), name, model)
+            row = None if errors is None else oracle_row(judged[-1], errors, model.fixed)
+            oracles += [] if row is None else [row]
     rows = _rows(judged, oracles)
     obstacle = "" if ADAPTIVE in modes else ReplaySetup.of(study).obstacle(ADAPTIVE, model)
     length, worth = study.config.sub_trajectory, study.config.online.worth
@@ -430,13 +433,6 @@ def compare(study: Study) -> ComparedReplays:
     report.write_tables(folder, study.name, tables(rows, length), [*said, *details])
     advised = "" if best is None else best.mode
     return ComparedReplays(rows, said, details, advised, compared.unfinished)
-
-
-def _in_hindsight(study: Study, judged: JudgedModes, model: ErrorModel) -> list[ComparisonRow]:
-    """The row of the best set of a sequence; none where its trials are not known."""
-    errors = oracle_errors(study.archive("oracle"), judged.name, model)
-    row = None if errors is None else oracle_row(judged, errors, model.fixed)
-    return [] if row is None else [row]
 
 
 def _lost(study: Study, judged: Sequence[JudgedModes], best: str) -> list[str]:

@@ -61,7 +61,7 @@ every scan again. Most sensors give a scan every 100 ms."""
 class EvenSelector:
     """Gives all members of a bank the same weight, always: a control, which looks at nothing.
 
-    `members` are trial numbers among the `sets`; for the methods see `adaptune.selector.Selector`.
+    `members` are trial numbers among the `sets`; see `adaptune.selector.AnySelector`.
     """
 
     def __init__(self, sets: ParameterSets, members: Sequence[int]):
@@ -81,9 +81,7 @@ class EvenSelector:
         """Even weights."""
         return self._selection
 
-    def fall_back(self) -> Selection:
-        """Even weights, too."""
-        return self._selection
+    fall_back = select
 
 
 class Mode(NamedTuple):

@@ -8,7 +8,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import chain, islice
 from multiprocessing.connection import Connection
@@ -39,7 +39,7 @@ _START = 60.0
 _NICE = 10
 """By how much the priority of live evidence is lower."""
 
-Make = Callable[[], AnySelector | None]
+Make = Callable[[], AnySelector]
 """Makes the selector; it pickles."""
 
 
@@ -182,38 +182,20 @@ def _run(connection: Connection, make: Make, period: float, cores: list[int]) ->
         os.sched_setaffinity(0, cores)
     with contextlib.suppress(EOFError, OSError, KeyboardInterrupt):
         try:
-            gentle = _Gentle(make())
+            selector = make()
         except AdaptuneError as error:
             connection.send(str(error))
             return
-        timed = TimedSelector(gentle, period)
-        connection.send(gentle.fall_back())
+        timed = TimedSelector(selector, period)
+        connection.send(selector.fall_back())
         before = time.process_time()
-        while True:
-            stamp, scan, motions = connection.recv()
-            selection = timed.update(stamp, scan, motions)
-            connection.send(Answer(stamp, selection, time.process_time() - before))
-            timed.measure()
-
-
-class _Gentle:
-    """A selector that measures in a thread of lower priority than what else runs."""
-
-    def __init__(self, selector: Any):
-        self._selector = selector
-        self._thread = ThreadPoolExecutor(1, initializer=_lower_priority)
-        self._measuring: Future[None] | None = None
-
-    def measure(self) -> None:
-        """Begin to measure."""
-        self._measuring = self._thread.submit(self._selector.measure)
-
-    def __getattr__(self, name: str) -> Any:
-        # All else waits until it is measured.
-        if (measuring := self._measuring) is not None:
-            self._measuring = None
-            measuring.result()
-        return getattr(self._selector, name)
+        with ThreadPoolExecutor(1, initializer=_lower_priority) as gentle:
+            while True:
+                stamp, scan, motions = connection.recv()
+                selection = timed.update(stamp, scan, motions)
+                connection.send(Answer(stamp, selection, time.process_time() - before))
+                # Only a thread can have a lower priority for a while.
+                gentle.submit(timed.measure).result()
 
 
 def _lower_priority() -> None:

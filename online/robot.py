@@ -64,22 +64,18 @@ class DriveLog:
         self.folder, self.lost = folder, ""
         self._names = names
         self._files: dict[str, IO[str]] = {}
-        heads = {
-            "trajectory.tum": "",
-            "frames.csv": _csv(FRAME_COLUMNS),
-            "selections.csv": _csv((*SELECTION_COLUMNS, *names)),
-        }
         try:
             folder.mkdir(parents=True)
-            for name, head in heads.items():
+            for name in ("trajectory.tum", "frames.csv", "selections.csv"):
                 # A line is on disk when it is written: the robot may be switched off.
                 file = (folder / name).open("w", buffering=1, newline="", encoding="utf-8")
                 self._files[name] = file
-                self._write(name, head)
         except OSError as error:
             if not goes_on:
                 raise
             self._end(error)
+        self._write("frames.csv", _csv(FRAME_COLUMNS))
+        self._write("selections.csv", _csv((*SELECTION_COLUMNS, *names)))
 
     def scan(self, step: RegisteredScan, late: float) -> None:
         """Note a scan: its pose, and how late that was in seconds."""

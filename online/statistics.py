@@ -45,13 +45,6 @@ Interval = tuple[float, float] | None
 """Ends of a 95 % interval, where it is known."""
 
 
-_FOR_FILES = (
-    *("reference_error", "poor_scans", "rte_interval", "ratio_interval", "estimated_interval"),
-    *("worst_tenth", "better", "worse"),
-)
-"""What only files have of a row; intervals are columns of their ends."""
-
-
 class Ratio(NamedTuple):
     """The ratio of the errors of two modes, over several sequences their geometric mean."""
 
@@ -117,13 +110,11 @@ class ComparisonRow:
 
     def columns(self) -> dict[str, Any]:
         """The row of a table; columns that begin with an underscore are for files only."""
-        more: dict[str, Any] = {}
-        for name in _FOR_FILES:
-            value = getattr(self, name)
-            if (stem := name.removesuffix("interval")) != name:
-                more[f"{stem}low"], more[f"{stem}high"] = value or (None, None)
-            else:
-                more[name] = value
+        more: dict[str, Any] = {n: getattr(self, n) for n in ("reference_error", "poor_scans")}
+        for name in ("rte", "ratio", "estimated"):
+            ends = getattr(self, f"{name}_interval")
+            more[f"{name}_low"], more[f"{name}_high"] = ends or (None, None)
+        more |= {n: getattr(self, n) for n in ("worst_tenth", "better", "worse")}
         more |= self._standard() | dict(self.real_time or {})
         return {"sequence": self.sequence, **self._shown()} | {f"_{k}": v for k, v in more.items()}
 
@@ -222,28 +213,19 @@ class Reference(NamedTuple):
 
     def errors_around(self, odometry: Trajectory) -> NDArray[np.float64]:
         """Mean RTE in percent of the sub-trajectories through each pose; NaN without any."""
-        starts, ends, of = self._known(odometry)
-        n = len(odometry) + 1
-        sums, counts = (
-            np.cumsum(np.bincount(starts, w, n) - np.bincount(ends + 1, w, n))[:-1]
-            for w in (of, None)
-        )
-        return np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
+        starts, ends, errors = self._known(odometry)
+        poses = np.arange(len(odometry))
+        return _means(errors, np.searchsorted(ends, poses), np.searchsorted(starts, poses, "right"))
 
     def errors_behind(self, odometry: Trajectory) -> NDArray[np.float64]:
         """Mean RTE in percent of the sub-trajectories that ended in the last `SECONDS`.
 
         It is what an odometry estimates while it drives. NaN where none ended.
         """
-        _, ends, of = self._known(odometry)
-        sums, counts = (
-            np.concatenate([[0.0], np.cumsum(np.bincount(ends, w, len(odometry)))])
-            for w in (of, None)
-        )
-        stop = np.arange(1, len(odometry) + 1)
-        first = np.searchsorted(odometry.stamps, odometry.stamps - int(SECONDS * 1e9))
-        with np.errstate(invalid="ignore"):
-            return np.asarray((sums[stop] - sums[first]) / (counts[stop] - counts[first]))
+        _, ends, errors = self._known(odometry)
+        oldest = np.searchsorted(odometry.stamps, odometry.stamps - int(SECONDS * 1e9))
+        newest = np.searchsorted(ends, np.arange(len(odometry)), "right")
+        return _means(errors, np.searchsorted(ends, oldest), newest)
 
     def _known(
         self, odometry: Trajectory
@@ -266,6 +248,15 @@ class Reference(NamedTuple):
         ape, rpe = absolute_error(T_ref_sensor, T), relative_error(T_ref_sensor, T)
         height = height_error(T_ref_sensor, T, self.length)
         return StandardErrors(ape, rpe, kitti_error(T_ref_sensor, T), height)
+
+
+def _means(
+    values: NDArray[np.float64], first: NDArray[np.intp], stop: NDArray[np.intp]
+) -> NDArray[np.float64]:
+    """Means of ``values[first:stop]`` for each pair of these, NaN where there is none."""
+    sums = np.concatenate([[0.0], np.cumsum(values)])
+    with np.errstate(invalid="ignore"):
+        return np.asarray((sums[stop] - sums[first]) / (stop - first))
 
 
 class JudgedModes(NamedTuple):
