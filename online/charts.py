@@ -39,8 +39,6 @@ from online.statistics import ALL, ComparisonRow, Reference
 
 _LINE, _BELOW = 0.12, 0.3
 """Height of a mode's line, and by which share of it the ratios on each sequence lie lower."""
-_MOST_NAMED = 6
-"""Sequences that each have a look of their own."""
 
 
 def comparison_chart(rows: Sequence[ComparisonRow]) -> Chart | None:
@@ -67,12 +65,9 @@ def comparison_chart(rows: Sequence[ComparisonRow]) -> Chart | None:
     several = last[0].sequence == ALL
     where = "geometric mean over all sequences" if several else last[0].sequence
     drawn.append(points(where, last, 0.0))
-    of_each = [row for row in known if row.mode in modes and row.sequence != ALL] * several
-    names = list(dict.fromkeys(row.sequence for row in of_each))
-    if len(names) > _MOST_NAMED:
+    if several:
+        of_each = [row for row in known if row.mode in modes and row.sequence != ALL]
         drawn.append(points("each sequence", of_each, _BELOW, faint=True, shape="circle"))
-    else:
-        drawn += [points(n, [row for row in of_each if row.sequence == n], _BELOW) for n in names]
     x_axis = Axis(f"error over that of {yardstick} [-]", log=True)
     y_axis = Axis("", names=tuple(modes))
     return Chart(
