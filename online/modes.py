@@ -300,14 +300,7 @@ class ReplayError(AdaptuneError):
 def run_replays(study: Study, model_path: Path, progress: Progress = unseen) -> int:
     """Replay every test sequence in every mode, unless that was done before.
 
-    Parameters
-    ----------
-    study
-        The study; ``replays/<sequence>/<mode>`` in its folder receives the results.
-    model_path
-        The error model.
-    progress
-        Called about every scan.
+    ``replays/<sequence>/<mode>`` in the study's folder receives the results.
 
     Returns
     -------

@@ -23,11 +23,7 @@ from adaptune.trajectory import Trajectory
 from online.compare import current_replays
 from online.live import Placed, RosMessages, placed
 from online.modes import replayed_modes, sequences_without_model
-from online.record import (
-    StoredReplay,
-    StoredReplayError,
-    check_reference,
-)
+from online.record import StoredReplay, StoredReplayError, check_reference
 from online.statistics import Reference
 
 CLOUD_PERIOD = 1.0
@@ -70,18 +66,17 @@ def replayed_sequences(replays: Path, config: StudyConfig, wanted: Sequence[str]
     """
     default = sequences_without_model(config)
     every = dict.fromkeys([*default, *config.sequences, *config.courses])
-    there = [name for name in every if replayed_modes(replays / name)]
     for name in wanted:
         if name not in every:
             raise StoredReplayError(
                 f"{name}: there is no such sequence in the study: {nearest(name, list(every))}"
             )
-        if name not in there:
+        if not replayed_modes(replays / name):
             raise StoredReplayError(
                 f"{name}: there is no replay of it; name it in the `test` of the study, and run "
                 f"`adaptune online`"
             )
-    found = list(dict.fromkeys(wanted)) or [name for name in default if name in there]
+    found = [name for name in dict.fromkeys(wanted or default) if replayed_modes(replays / name)]
     if not found:
         raise StoredReplayError(
             f"{replays}: there is no replay; run `adaptune online` with this study first"

@@ -273,20 +273,12 @@ def replay(
     ----------
     scans
         In order of time.
-    odometry
-        A new instance; with a selector, one that applies selections.
-    health
-        The odometry is restarted where its motion is not healthy.
+    odometry, health, fixed, what
+        See `Driver`.
     selector
         Chooses the parameters; without one they stay.
     period
         Seconds between selections.
-    watch
-        Called after every scan.
-    what
-        What is replayed, for the log.
-    fixed
-        What an adaptive mode returns to where it fails, see `Driver`.
 
     Raises
     ------
