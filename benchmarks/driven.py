@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from adaptune.study.study import Study
 from offline.config import load_study
-from online.record import read_repeats
+from online.record import StoredReplay
 from online.statistics import Reference
 
 MODES = ("baseline", "fixed", "even", "adaptive", "untrained")
@@ -35,7 +35,7 @@ def driven(study: Study, mode: str) -> tuple[list[float], NDArray[np.float64]]:
         reference = Reference.read(
             folder, study.config.sub_trajectory, study.sequences.estimate(name)
         )
-        replay = read_repeats(folder / mode)[0]
+        replay = StoredReplay.read(folder / mode)
         errors.append(float(np.nanmean(reference.errors(replay.trajectory))))
         at = np.searchsorted(replay.trajectory.stamps, replay.choice_stamps)
         true = reference.errors_behind(replay.trajectory)[

@@ -149,7 +149,7 @@ def run(study: OfflineStudy, references: Path) -> list[ComparisonRow]:
     for name in study.config.test:
         folder = study.folder / "replays" / name
         also = [m for m in study.config.online.also if (folder / m / "replay.json").exists()]
-        replays = {mode: [StoredReplay.read(folder / mode)] for mode in (*MODES, *also)}
+        replays = {mode: StoredReplay.read(folder / mode) for mode in (*MODES, *also)}
         reference = Reference.read(
             folder, study.config.sub_trajectory, study.sequences.estimate(name)
         )

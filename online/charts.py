@@ -39,8 +39,6 @@ from online.statistics import ALL, ComparisonRow, Reference
 
 _LINE, _BELOW = 0.12, 0.3
 """Height of a mode's line, and by which share of it the ratios on each sequence lie lower."""
-_MOST_NAMED = 6
-"""Sequences that each have a look of their own."""
 
 
 def comparison_chart(rows: Sequence[ComparisonRow]) -> Chart | None:
@@ -67,12 +65,9 @@ def comparison_chart(rows: Sequence[ComparisonRow]) -> Chart | None:
     several = last[0].sequence == ALL
     where = "geometric mean over all sequences" if several else last[0].sequence
     drawn.append(points(where, last, 0.0))
-    of_each = [row for row in known if row.mode in modes and row.sequence != ALL] * several
-    names = list(dict.fromkeys(row.sequence for row in of_each))
-    if len(names) > _MOST_NAMED:
+    if several:
+        of_each = [row for row in known if row.mode in modes and row.sequence != ALL]
         drawn.append(points("each sequence", of_each, _BELOW, faint=True, shape="circle"))
-    else:
-        drawn += [points(n, [row for row in of_each if row.sequence == n], _BELOW) for n in names]
     x_axis = Axis(f"error over that of {yardstick} [-]", log=True)
     y_axis = Axis("", names=tuple(modes))
     return Chart(
@@ -138,7 +133,6 @@ class ModeReplay(NamedTuple):
     estimated: NDArray[np.float64]
     lost: NDArray[np.bool_]  # of shape (m,): whether the bank was lost
     places: NDArray[np.float64]  # (n, 2): metres, by the reference where there is one
-    familiarity: NDArray[np.float64]  # (m,): of each selection, see `Selection`; NaN if unknown
 
     @property
     def span(self) -> NDArray[np.float64]:
@@ -224,7 +218,6 @@ def _read_mode(replay: StoredReplay, reference: Reference, model: ErrorModel | N
         replay.estimated,
         replay.lost,
         places,
-        replay.selections["familiarity"],
     )
 
 
@@ -245,26 +238,6 @@ def _seen_from(trajectory: Trajectory) -> NDArray[np.float64]:
     return np.asarray((invert(T[0]) @ T)[:, :2, 3])
 
 
-# How familiar the surroundings were.
-
-
-def familiarity_chart(replayed: ReplayedSequence) -> Chart | None:
-    """Familiarity of the surroundings at each selection, over time."""
-    known = {mode: of for mode, of in replayed.modes.items() if np.isfinite(of.familiarity).any()}
-    if not known:
-        return None
-    lines = [Line(of.choice_seconds, of.familiarity, mode) for mode, of in known.items()]
-    y = Axis("familiarity [-]", limits=(0.0, 1.02))
-    return Chart(
-        f"{replayed.name}-familiarity",
-        f"{replayed.name}: how familiar the surroundings were",
-        (Panel(TIME, y, (*_scenes(replayed), *lines)),),
-        "How much the training knows about surroundings like those at each selection: 0 means "
-        "unlike all training. A mode that loses where familiarity is low should not trust its "
-        "training there.",
-    )
-
-
 TIME = Axis("time [s]")
 _MOST_PLACES = 200
 """Points of a path; more would hide each other."""
@@ -281,15 +254,9 @@ def charts_of_replays(replayed: ReplayedSequence) -> Charts:
     if not replayed.modes:
         none = [f"No replays of {sequence}: run `adaptune online`."]
         return Charts([], [*replayed.refused] or none)
-    return charts_of(
-        (
-            *replayed.refused,
-            error_chart(replayed)
-            or f"No errors of the replays of {sequence}: it has no reference.",
-            choice_chart(replayed),
-            familiarity_chart(replayed),
-        )
-    )
+    no_errors = f"No errors of the replays of {sequence}: it has no reference."
+    of_errors = error_chart(replayed) or no_errors
+    return charts_of((*replayed.refused, of_errors, choice_chart(replayed)))
 
 
 def error_chart(replayed: ReplayedSequence) -> Chart | None:
@@ -408,8 +375,8 @@ def _place(value: Any, names: tuple[str, ...] | None) -> float:
 def _weights(replayed: ReplayedSequence) -> Iterator[Panel]:
     for mode, track in replayed.modes.items():
         shares = 100.0 * np.array(list(track.weights.values()))
-        if not _changes(shares):
-            continue
+        if len(shares) < 2 or not np.ptp(shares, axis=1).any():
+            continue  # they never change
         shares = np.column_stack([shares, shares[:, -1]])
         # Shares hide what is shaded.
         ends = [] if replayed.scenes is None else replayed.scenes.edges[1:-1]
@@ -417,11 +384,6 @@ def _weights(replayed: ReplayedSequence) -> Iterator[Panel]:
         drawn = (*_scenes(replayed), Shares(track.span, shares, tuple(track.weights)), *edges)
         y = Axis("weight [%]", limits=(0.0, 100.0))
         yield Panel(TIME, y, drawn, f"{mode} applies a bank: weights of its members")
-
-
-def _changes(weights: NDArray[np.float64]) -> bool:
-    """Whether weights, of shape (n_members, m), change along the course."""
-    return bool(len(weights) > 1 and np.ptp(weights, axis=1).max() > 0.0)
 
 
 def _scenes(replayed: ReplayedSequence) -> list[Drawn]:

@@ -1,6 +1,6 @@
 """The comparison of baseline, fixed and adaptive on the replayed sequences."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -46,7 +46,6 @@ from online.record import (
     StoredReplayError,
     check_reference,
     read_contradictions,
-    read_repeats,
 )
 from online.statistics import (
     ALL,
@@ -57,7 +56,6 @@ from online.statistics import (
     JudgedModes,
     Ratio,
     Reference,
-    Repeats,
     StandardErrors,
     allowing_for,
     compare_modes,
@@ -190,7 +188,6 @@ def _mean_row(mode: str, rows: Sequence[ComparisonRow]) -> ComparisonRow:
         cpu_ms=mean_of([row.cpu_ms for row in rows]),
         cores=mean_of([row.cores for row in rows]),
         memory_mb=max((m for row in rows if (m := row.memory_mb) is not None), default=None),
-        repeats=rows[0].repeats,
     )
 
 
@@ -348,7 +345,7 @@ def _differing(
         own = setup.identity(mode, model, "" if model is None else model.digest)
         now |= {key: own[key] for key in ("model", "parameters")}
         both = own["switching"], inputs["switching"]
-        automatic = setup.switching.mechanism == "auto" and None not in both
+        automatic = setup.config.online.switching.mechanism == "auto" and None not in both
         # Another machine would choose another mechanism.
         if not automatic or both[0]["mechanism"] == both[1]["mechanism"]:
             now["switching"] = own["switching"]
@@ -412,40 +409,30 @@ def compare(study: Study) -> ComparedReplays:
     wrong: list[str] = []
     for name in names:
         folder = study.folder / "replays" / name
-        replays = {mode: read_repeats(folder / mode) for mode in modes}
+        replays = {mode: StoredReplay.read(folder / mode) for mode in modes}
         stored = study.sequences.estimate(name)
         reference = Reference.read(folder, study.config.sub_trajectory, stored)
         every = _with_fixed_rivals(replays, model)
         wrong += [f"On {name}, {what}." for what in read_contradictions(folder)]
         of_modes = compare_modes(name, every, reference)
         judged.append(of_modes._replace(recording=study.sequences.recorded_in(name)))
-        oracles += [] if model is None else _in_hindsight(study, judged[-1], model)
+        if model is not None:
+            errors = oracle_errors(study.archive("oracle"), name, model)
+            row = None if errors is None else oracle_row(judged[-1], errors, model.fixed)
+            oracles += [] if row is None else [row]
     rows = _rows(judged, oracles)
     obstacle = "" if ADAPTIVE in modes else ReplaySetup.of(study).obstacle(ADAPTIVE, model)
     length, worth = study.config.sub_trajectory, study.config.online.worth
     best = decided(rows, worth)
     said = wrong[:1] or ([] if best is None else _lost(study, judged, best.mode))
     said += verdict(rows, length, obstacle, worth)
-    details = [
-        *wrong,
-        *remarks(rows),
-        *_equal_cost(model, modes),
-        *compared.words,
-        *_missing_repeats(judged),
-    ]
+    details = [*wrong, *remarks(rows), *_equal_cost(model, modes), *compared.words]
     details += _without_oracle(judged, oracles) if model is not None else []
     folder = study.folder / "comparison"
     report.write_rows(folder, "comparison", [row.columns() for row in rows])
     report.write_tables(folder, study.name, tables(rows, length), [*said, *details])
     advised = "" if best is None else best.mode
     return ComparedReplays(rows, said, details, advised, compared.unfinished)
-
-
-def _in_hindsight(study: Study, judged: JudgedModes, model: ErrorModel) -> list[ComparisonRow]:
-    """The row of the best set of a sequence; none where its trials are not known."""
-    errors = oracle_errors(study.archive("oracle"), judged.name, model)
-    row = None if errors is None else oracle_row(judged, errors, model.fixed)
-    return [] if row is None else [row]
 
 
 def _lost(study: Study, judged: Sequence[JudgedModes], best: str) -> list[str]:
@@ -468,20 +455,6 @@ def _equal_cost(model: ErrorModel | None, modes: Sequence[str]) -> list[str]:
         "`equal_cost` is the fixed set: in training, no single set that costs no more than what is "
         "driven was better."
     ]
-
-
-def _missing_repeats(judged: Sequence[JudgedModes]) -> list[str]:
-    """Which replays were repeated less often than others."""
-    repeats = max(row.repeats for one in judged for row in one.rows)
-    few = [
-        f"{row.mode} on {one.name} {row.repeats}"
-        for one in judged
-        for row in one.rows
-        if row.repeats < repeats
-    ]
-    command = f"`adaptune online --repeats {repeats}` goes on"
-    what = f"Replayed less often than {repeats} times ({command})"
-    return [f"{what}: {', '.join(few)}."] if few else []
 
 
 def _without_oracle(judged: Sequence[JudgedModes], oracles: Sequence[ComparisonRow]) -> list[str]:
@@ -521,10 +494,10 @@ def _against(
 
 
 def _with_fixed_rivals(
-    replays: Repeats, model: ErrorModel | None
-) -> dict[str, Sequence[StoredReplay]]:
+    replays: Mapping[str, StoredReplay], model: ErrorModel | None
+) -> dict[str, StoredReplay]:
     """The replays by mode; of several odometries, a rival that is the fixed set has its replay."""
-    same: dict[str, Sequence[StoredReplay]] = {}
+    same: dict[str, StoredReplay] = {}
     if model is not None and "fixed" in replays and len(model.sets.space.baselines) > 1:
         of_fixed = [mode for mode in RIVALS if model.rivals.get(mode) == model.fixed]
         same |= dict.fromkeys(of_fixed, replays["fixed"])

@@ -22,7 +22,6 @@ from adaptune.ros.link import LinkError, RosLink
 from adaptune.selector import BACK
 from adaptune.space import Selection
 from online.real_time import Arrival
-from online.replay import ReplayRecord
 
 SILENCE = 2.0
 """Seconds without a scan after which the log says so."""
@@ -56,8 +55,6 @@ class LiveScans:
 
     Attributes
     ----------
-    ignored : int
-        Scans that came twice, or after a newer one.
     frame : str
         Name of the sensor's frame, by the newest cloud.
     stopped : bool
@@ -72,7 +69,6 @@ class LiveScans:
         queue: int = 1,
         imu: ImuConfig | None = None,
     ):
-        self.ignored = 0
         self.frame = "sensor"
         self._link, self._points, self._timing, self._queue = link, points, timing, queue
         self._settings = imu
@@ -102,7 +98,6 @@ class LiveScans:
         while (found := self._next(last)) is not None:
             (scan, came), dropped = found
             if last is not None and scan.stamp <= last:
-                self.ignored += 1
                 continue
             before, last = last, scan.stamp
             yield Arrival(self._with_imu(scan, before), came, dropped)
@@ -218,7 +213,6 @@ def to_scan(message: Any, timing: Timing) -> Scan:
 
 UNKNOWN_ERROR = 5.0
 """Percent of the way that an odometry is believed to err by before anything is known of it."""
-_OK, _WARN, _ERROR = 0, 1, 2
 
 
 class Uncertainty:
@@ -278,7 +272,7 @@ class RosMessages:
         kind: Any = self._types["std_msgs/msg/Header"]
         # ROS 1 counts messages.
         numbered = {"seq": 0} if "seq" in kind.__dataclass_fields__ else {}
-        return kind(stamp=time, frame_id=self._frame if frame is None else frame, **numbered)
+        return kind(stamp=time, frame_id=frame or self._frame, **numbered)
 
     def _vector(self, kind: str, values: Iterable[float]) -> Any:
         return self._types[f"geometry_msgs/msg/{kind}"](*values)
@@ -336,43 +330,6 @@ class RosMessages:
             "why_not": why_not or None,
         }
         return self._make("std_msgs/msg/String", data=json.dumps(found))
-
-    def diagnostics(
-        self, stamp: int, record: ReplayRecord, ignored: int, *, late: bool, restarted: bool
-    ) -> Any:
-        """diagnostic_msgs/DiagnosticArray of a drive so far, in which so many scans were ignored.
-
-        It warns where something was too late since the message before, or the odometry restarted.
-        """
-        selection = None if record.newest is None else record.newest.selection
-        level, said = (_WARN, "was too late") if late else (_OK, "keeps up")
-        if restarted:
-            level, said = _ERROR, "restarts for want of healthy poses"
-        if selection is not None and selection.lost:
-            level, said = _ERROR, "is lost"
-        values = {
-            "pose after the scan [ms]": f"{1e3 * record.late[-1]:.1f}",
-            "dropped scans": str(record.dropped),
-            "ignored scans": str(ignored),
-            "missed selections": str(record.missed),
-        }
-        if selection is not None:
-            values |= {
-                "trial": str(selection.trial),
-                "estimated error [%]": f"{selection.estimated_error:.3f}",
-                "predicted error [%]": f"{selection.predicted_error:.3f}",
-            }
-        kind = "diagnostic_msgs/msg/KeyValue"
-        found = self._make(
-            "diagnostic_msgs/msg/DiagnosticStatus",
-            level=level,
-            name="adaptune: odometry",
-            message=said,
-            hardware_id="",
-            values=[self._make(kind, key=key, value=value) for key, value in values.items()],
-        )
-        header = self.header(stamp, "")
-        return self._make("diagnostic_msgs/msg/DiagnosticArray", header=header, status=[found])
 
 
 def _number(value: float) -> float | None:

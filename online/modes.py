@@ -1,6 +1,5 @@
 """The modes of a replay: what each one runs, and what chooses its parameters."""
 
-import itertools
 import logging
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -24,14 +23,13 @@ from adaptune.recording.scan import Recording, Scan, part_name
 from adaptune.reference.check import mean_difference
 from adaptune.selector import AnySelector, Selector, UntrainedSelector, untrained_sets
 from adaptune.space import ParameterSet, ParameterSets, Selection
-from adaptune.study.config import WORTH, RealTimeConfig, StudyConfig, SwitchingConfig
+from adaptune.study.config import StudyConfig
 from adaptune.study.references import contradictions_of, ensure_references
 from adaptune.study.study import (
     RIVALS,
     Mechanism,
     ModeError,
     Study,
-    StudySequences,
     bank_members,
     cannot_adapt,
     mechanism_of,
@@ -41,7 +39,6 @@ from online.real_time import SelectorProcess, replay_in_real_time
 from online.record import (
     StoredReplay,
     is_reference_of,
-    repeat_folder,
     replay_changes,
     write_reference,
     write_replay,
@@ -64,14 +61,7 @@ every scan again. Most sensors give a scan every 100 ms."""
 class EvenSelector:
     """Gives all members of a bank the same weight, always: a control, which looks at nothing.
 
-    It has the methods of `adaptune.selector.Selector`.
-
-    Parameters
-    ----------
-    sets
-        The parameter sets.
-    members
-        Trial numbers of the bank's members.
+    `members` are trial numbers among the `sets`; see `adaptune.selector.AnySelector`.
     """
 
     def __init__(self, sets: ParameterSets, members: Sequence[int]):
@@ -91,9 +81,7 @@ class EvenSelector:
         """Even weights."""
         return self._selection
 
-    def fall_back(self) -> Selection:
-        """Even weights, too."""
-        return self._selection
+    fall_back = select
 
 
 class Mode(NamedTuple):
@@ -115,35 +103,17 @@ class Mode(NamedTuple):
 class ReplaySetup:
     """What a replay depends on, besides the recording and the model."""
 
+    config: StudyConfig
     odometry: Factory
-    rules: tuple[str, ...]  # selection rules to compare
-    switching: SwitchingConfig
     mechanism: Mechanism | None  # how the odometry changes its parameters
-    sub_trajectory: float  # metres
-    lost_track: float  # metres a second by which the members of a bank may differ and agree
-    descriptors: tuple[str, ...]  # those that the study names
-    budget: float | None = None  # milliseconds of CPU time a scan
-    worth: float = WORTH  # share of the error that a bank has to spare
-    real_time: RealTimeConfig | None = None
+    rules: tuple[str, ...]  # selection rules to compare
     also: tuple[str, ...] = ()  # modes on demand, see `OnlineConfig`
 
     @classmethod
     def of(cls, study: Study) -> Self:
         """The setup of a study."""
-        config = study.config
-        return cls(
-            study.odometry,
-            study.rules,
-            config.online.switching,
-            study.mechanism,
-            config.sub_trajectory,
-            config.lost_track,
-            config.descriptor,
-            config.online.budget,
-            config.online.worth,
-            config.online.real_time,
-            config.online.also,
-        )
+        also = study.config.online.also
+        return cls(study.config, study.odometry, study.mechanism, study.rules, also)
 
     def mode(self, name: str, model: ErrorModel | None = None) -> Mode:
         """What a mode runs.
@@ -160,7 +130,8 @@ class ReplaySetup:
         if name == UNTRAINED:
             sets = self._untrained_sets()
             members = dict(zip(sets.trials, sets.parameters, strict=True))
-            return Mode(name, members, True, partial(UntrainedSelector, sets, self.sub_trajectory))
+            untrained = partial(UntrainedSelector, sets, self.config.sub_trajectory)
+            return Mode(name, members, True, untrained)
         model = needed(name, model)
         if name in (FIXED, *RIVALS):
             trial = model.rivals.get(name, model.fixed)
@@ -169,12 +140,13 @@ class ReplaySetup:
             members = self._always(model)
             even = partial(EvenSelector, model.sets, list(members))
             return Mode(name, members, True, even, _cost(model, members))
+        descriptors = self.config.descriptor
         if self._mechanism(name, model) == "live":
             one = {model.fixed: model.sets[model.fixed]}
-            return Mode(name, one, False, partial(Selector, model, name, (), self.descriptors))
+            return Mode(name, one, False, partial(Selector, model, name, (), descriptors))
         # The bank's reserve joins in by what is measured: only this mode has one.
-        members = bank_members(self.switching, model) if name == ADAPTIVE else self._always(model)
-        make = partial(Selector, model, name, list(members), self.descriptors)
+        members = self._members(model) if name == ADAPTIVE else self._always(model)
+        make = partial(Selector, model, name, list(members), descriptors)
         return Mode(name, members, True, make, _cost(model, members))
 
     def obstacle(self, name: str, model: ErrorModel | None = None) -> str:
@@ -188,7 +160,7 @@ class ReplaySetup:
             why = "no parameters by which the members of a bank would differ (odometry.parameters)"
             return "" if differ else f"{self.odometry.name} has {why}"
         if name == EVEN and model is not None:
-            alone = len(self.switching.sets or model.bank) < 2
+            alone = len(self.config.online.switching.sets or model.bank) < 2
             return "the model's bank has no other member than the fixed set" if alone else ""
         if model is not None and self._mechanism(name, model) is None:
             return cannot_adapt(self.odometry, self.mechanism)
@@ -217,13 +189,13 @@ class ReplaySetup:
         """
         if not mode.bank:
             return self.odometry(mode.sets[mode.fixed], sequence)
+        in_time = self.config.online.real_time
         # Where no scan is dropped, no member is left behind either.
-        waits = self.real_time is None or not self.real_time.queue
-        rate = None if self.real_time is None or waits else self.real_time.rate
+        rate = in_time.rate if in_time is not None and in_time.queue else None
         warm_up = self.odometry.description.warm_up
-        pace = 1.0 if self.real_time is None else self.real_time.rate
+        pace = 1.0 if in_time is None else in_time.rate
         cores = 1 if mode.cost * pace <= ONE_CORE else len(shared_cores())
-        return Bank(self.odometry, mode.sets, warm_up, self.lost_track, cores, rate)
+        return Bank(self.odometry, mode.sets, warm_up, self.config.lost_track, cores, rate)
 
     def identity(
         self, name: str, model: ErrorModel | None = None, digest: str = ""
@@ -240,34 +212,39 @@ class ReplaySetup:
             return about | {"switching": switching | {"members": members}}
         if name != EVEN and self._mechanism(name, needed(name, model)) != "bank":
             return about | {"model": digest, "switching": {"mechanism": "live"}}
-        named = self.switching.model_dump(mode="json", include={"size", "sets"})
+        named = self.config.online.switching.model_dump(mode="json", include={"size", "sets"})
         return about | {"model": digest, "switching": switching | named}
 
     def check(self, model: ErrorModel, path: Path) -> None:
         """Refuse a model for another bank, or with a descriptor of somebody else's, from `path`."""
-        model.check_descriptors(self.descriptors, path)
-        same = {"budget": model.budget == self.budget, "worth": model.worth in (None, self.worth)}
+        model.check_descriptors(self.config.descriptor, path)
+        online = self.config.online
+        same = {
+            "budget": model.budget == online.budget,
+            "worth": model.worth in (None, online.worth),
+        }
         if others := [key for key, is_same in same.items() if not is_same]:
             raise ModeError(
                 f"online.{others[0]}: {path} was fitted for another one; run `adaptune offline` "
                 f"again, which fits it to the finished trials"
             )
-        is_even = EVEN in self.also and not self.obstacle(EVEN, model)
-        if self.mechanism == "bank" or is_even:
-            bank_members(self.switching, model)
+        if self.mechanism == "bank" or (EVEN in self.also and not self.obstacle(EVEN, model)):
+            self._members(model)
 
     def _mechanism(self, name: str, model: ErrorModel) -> Mechanism | None:
         return mechanism_of(name, model, self.mechanism, self.odometry.description.live)
 
+    def _members(self, model: ErrorModel) -> dict[int, ParameterSet]:
+        return bank_members(self.config.online.switching, model)
+
     def _always(self, model: ErrorModel) -> dict[int, ParameterSet]:
         """The bank's members without its reserve, which joins in by what is measured."""
         reserve = model.bank[len(model.bank) - model.bank_settings.reserve :]
-        members = bank_members(self.switching, model)
-        return {trial: own for trial, own in members.items() if trial not in reserve}
+        return {trial: own for trial, own in self._members(model).items() if trial not in reserve}
 
     def _untrained_sets(self) -> ParameterSets:
         """The members of the bank that needs no model."""
-        return untrained_sets(self.odometry.space, self.switching.size)
+        return untrained_sets(self.odometry.space, self.config.online.switching.size)
 
 
 def _cost(model: ErrorModel, members: Iterable[int]) -> float:
@@ -313,9 +290,6 @@ def sequences_without_model(config: StudyConfig) -> tuple[str, ...]:
 # The online stage: replay the test sequences in every mode.
 
 
-MIN_SEQUENCES = 1.5
-"""Effective training stretches below which a selection rests on hardly more than one."""
-
 _log = logging.getLogger(__name__)
 
 
@@ -323,25 +297,10 @@ class ReplayError(AdaptuneError):
     """A study that cannot be replayed."""
 
 
-def run_replays(
-    study: Study,
-    model_path: Path,
-    progress: Progress = unseen,
-    repeats: int = 1,
-) -> int:
-    """Replay every test sequence in every mode, as often as asked, unless that was done before.
+def run_replays(study: Study, model_path: Path, progress: Progress = unseen) -> int:
+    """Replay every test sequence in every mode, unless that was done before.
 
-    Parameters
-    ----------
-    study
-        The study; ``replays/<sequence>/<mode>`` in its folder receives the results, and
-        ``repeat_2`` in it, and so on, those of repeats.
-    model_path
-        The error model.
-    progress
-        Called about every scan.
-    repeats
-        How often each mode is replayed on a sequence.
+    ``replays/<sequence>/<mode>`` in the study's folder receives the results.
 
     Returns
     -------
@@ -359,20 +318,14 @@ def run_replays(
     setup.check(model, model_path)
     if not study.config.test:
         raise ReplayError("test: name at least one sequence to replay")
-    asked = study.config.online.modes
-    obstacles = {name: setup.obstacle(name, model) for name in asked}
+    obstacles = {name: setup.obstacle(name, model) for name in study.config.online.modes}
     for why in dict.fromkeys(filter(None, obstacles.values())):
-        names = " and ".join(name for name in asked if obstacles[name] == why)
+        names = " and ".join(name for name, of in obstacles.items() if of == why)
         _log.warning("not replayed: %s, because %s", names, why)
-    modes = setup.modes(model)
-    return _replay_all(study, study.config.test, modes, progress, repeats, model_path)
+    return _replay_all(study, study.config.test, setup.modes(model), progress, (model, model_path))
 
 
-def run_untrained(
-    study: Study,
-    progress: Progress = unseen,
-    repeats: int = 1,
-) -> int:
+def run_untrained(study: Study, progress: Progress = unseen) -> int:
     """Replay sequences with the baseline, and with a bank that needs no model.
 
     Neither trials nor references are needed. The sequences are those of
@@ -385,16 +338,7 @@ def run_untrained(
     """
     ReplaySetup.of(study).mode(UNTRAINED)  # or an error
     names = sequences_without_model(study.config)
-    return _replay_all(study, names, WITHOUT_MODEL, progress, repeats)
-
-
-class _Run(NamedTuple):
-    """A replay to make."""
-
-    what: str  # in words
-    mode: str
-    folder: Path
-    inputs: manifest.Inputs
+    return _replay_all(study, names, WITHOUT_MODEL, progress)
 
 
 def _replay_all(
@@ -402,12 +346,12 @@ def _replay_all(
     sequences: Sequence[str],
     modes: Sequence[str],
     progress: Progress,
-    repeats: int,
-    model_path: Path | None = None,
+    fitted: tuple[ErrorModel, Path] | None = None,
 ) -> int:
     """Replay what was not replayed before; the number of replays that were made.
 
-    Sequences without a reference get an estimated one before, where that is possible.
+    Sequences without a reference get an estimated one before, where that is possible. `fitted` is
+    the error model and its file.
     """
     study.open()
     length = study.config.sub_trajectory
@@ -415,73 +359,61 @@ def _replay_all(
     for why in refused.values():
         _log.warning("%s; it is replayed without a reference, and not judged", why)
     setup, made = ReplaySetup.of(study), 0
-    model = None if model_path is None else study.model(model_path)
+    model, model_path = fitted or (None, None)
     digest = "" if model is None else model.digest
     for name in sequences:
-        shared = study.replay_inputs(name)
-        about = [setup.identity(mode, model, digest) | shared for mode in modes]
-        runs = itertools.product(range(1, repeats + 1), about)  # first all first ones
-        every = (_due(study, name, manifest.plain(of | {"repeat": n})) for n, of in runs)
-        due = [run for run in every if run is not None]
-        folder, poses = study.folder / "replays" / name, study.sequences.reference(name)
-        if not due and is_reference_of(folder, poses):
+        folder, shared = study.folder / "replays" / name, study.replay_inputs(name)
+        every = [manifest.plain(setup.identity(mode, model, digest) | shared) for mode in modes]
+        due = [inputs for inputs in every if _is_due(study, name, inputs)]
+        if not due and is_reference_of(folder, study.sequences.reference(name)):
             continue
         recording = study.sequences.open(name)
-        judge = partial(_judge, study.sequences, name, recording, folder, poses, length)
-        for i, run in enumerate(due):
-            mode = setup.mode(run.mode, model)
+        for i, inputs in enumerate(due):
+            mode = setup.mode(inputs["mode"], model)
             release_memory()
             try:
                 with closing(setup.instance(mode, name)) as odometry:
-                    record = _replayed(study, recording, odometry, mode, run.what, progress)
+                    what = f"{name}, {mode.name}"
+                    record = _replayed(study, recording, odometry, mode, what, progress)
             except DescriptorError as error:
                 raise ReplayError(f"sequences.{name}: {error}") from error
             if i == 0:
-                judge(record.trajectory)
-            write_replay(run.folder, record, run.inputs, model_path)
+                _judge(study, name, recording, record.trajectory)
+            write_replay(folder / mode.name, record, inputs, model_path)
         if not due:
-            trajectory = StoredReplay.read(folder / modes[0]).trajectory
-            judge(trajectory)
+            _judge(study, name, recording, StoredReplay.read(folder / modes[0]).trajectory)
             _log.info("%s: the reference has changed; no replay depends on it", name)
         made += len(due)
     return made
 
 
-def _judge(
-    sequences: StudySequences,
-    name: str,
-    recording: Recording,
-    folder: Path,
-    about: manifest.Inputs,
-    length: float,
-    replayed: Trajectory,
-) -> None:
+def _judge(study: Study, name: str, recording: Recording, replayed: Trajectory) -> None:
     """Write the reference of a sequence, and what scans say where a replay disagrees with it."""
-    reference, wrong = recording.reference(), list[str]()
+    reference, wrong, sequences = recording.reference(), list[str](), study.sequences
     if reference is not None:
         T_ref_sensor, T_odom_sensor = reference.at(replayed.stamps), replayed.T_world_sensor
-        error = mean_difference(T_ref_sensor, T_odom_sensor, length)
+        error = mean_difference(T_ref_sensor, T_odom_sensor, study.config.sub_trajectory)
         seen = set(replayed.stamps.tolist())
         wrong = contradictions_of(sequences, name, T_odom_sensor, error, seen)
     for what in wrong:
         _log.warning("sequences.%s: %s", name, what)
-    write_reference(folder, reference, replayed, about, wrong)
+    folder = study.folder / "replays" / name
+    write_reference(folder, reference, replayed, sequences.reference(name), wrong)
 
 
-def _due(study: Study, name: str, inputs: manifest.Inputs) -> _Run | None:
-    """A replay that is to be made; one of other inputs is set aside, an earlier one kept."""
-    mode, repeat = inputs["mode"], inputs["repeat"]
-    folder = repeat_folder(study.folder / "replays" / name / mode, repeat)
-    what = f"{name}, {mode}" + ("" if repeat == 1 else f", repeat {repeat}")
+def _is_due(study: Study, name: str, inputs: manifest.Inputs) -> bool:
+    """Whether a replay is to be made; one of other inputs is set aside, an earlier one kept."""
+    mode = inputs["mode"]
+    folder = study.folder / "replays" / name / mode
     changes = replay_changes(folder, inputs, study.sequences.sources(name))
     if changes:
-        _log.info("%s: replayed again: %s", what, "; ".join(changes))
-        before, files = manifest.recorded(folder / manifest.FILE), folder.iterdir()
-        manifest.set_aside(study.folder, folder, before, [file for file in files if file.is_file()])
+        _log.info("%s, %s: replayed again: %s", name, mode, "; ".join(changes))
+        before = manifest.recorded(folder / manifest.FILE)
+        manifest.set_aside(study.folder, folder, before, list(folder.iterdir()))
     if changes != [] and manifest.bring_back(study.folder, folder, inputs):
-        _log.info("%s: the earlier replay of these inputs counts again", what)
+        _log.info("%s, %s: the earlier replay of these inputs counts again", name, mode)
         changes = replay_changes(folder, inputs)
-    return None if changes == [] else _Run(what, mode, folder, inputs)
+    return changes != []
 
 
 def _replayed(
@@ -508,21 +440,4 @@ def _replayed(
             process = make and stack.enter_context(closing(SelectorProcess(make, online.period)))
             record = replay_in_real_time(*given, online.real_time, process, watch, what)
     progress(what, n, n)
-    if record.choices:
-        warn_of_scant_evidence(what, [choice.selection for choice in record.choices], mode.fixed)
     return record
-
-
-def warn_of_scant_evidence(what: str, selections: Iterable[Selection], fixed: int) -> None:
-    """Warn of selections that rest on hardly more than one training stretch."""
-    others = [s for s in selections if s.trial != fixed]
-    scant = sum(s.n_sequences < MIN_SEQUENCES for s in others)
-    if scant:
-        _log.warning(
-            "%s: %d of %d selections of another set than the fixed one rest on hardly more than "
-            "one stretch of the training (see selections.csv); more recordings would show whether "
-            "they hold",
-            what,
-            scant,
-            len(others),
-        )

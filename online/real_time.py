@@ -7,8 +7,8 @@ import os
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import chain, islice
 from multiprocessing.connection import Connection
@@ -27,7 +27,7 @@ from adaptune.recording.scan import Imu, Scan, joined
 from adaptune.selector import AnySelector, Schedule, TimedSelector
 from adaptune.space import Selection
 from adaptune.study.config import RealTimeConfig
-from online.replay import Choice, Driver, ReplayRecord, Watch
+from online.replay import Driver, ReplayRecord, Watch
 
 # A selector in a process of its own: it describes a scan while the odometry works on it.
 
@@ -36,12 +36,10 @@ SLOTS = 4
 """Scans on their way."""
 _START = 60.0
 """Seconds in which the process must be ready."""
-MAX_TOO_LATE = 100
-"""Selections that came too late and are remembered."""
 _NICE = 10
 """By how much the priority of live evidence is lower."""
 
-Make = Callable[[], AnySelector | None]
+Make = Callable[[], AnySelector]
 """Makes the selector; it pickles."""
 
 
@@ -50,7 +48,6 @@ class Answer(NamedTuple):
 
     stamp: int  # nanoseconds
     selection: Selection | None  # None where none was due
-    seconds: float  # from the scan's arrival in the process
     cpu: float  # seconds that the process has used
 
 
@@ -88,7 +85,6 @@ class SelectorProcess:
         self.period, self.unseen, self.cpu, self.alive = period, 0, 0.0, True
         self._owed = 0  # answers
         self._moved: Motions | None = None  # over the scans that were not shown
-        self._too_late: deque[Answer] = deque(maxlen=MAX_TOO_LATE)
         context = multiprocessing.get_context("forkserver")
         context.set_forkserver_preload([__name__])
         self._here, there = context.Pipe()
@@ -114,9 +110,9 @@ class SelectorProcess:
         It waits at most so many seconds for the process to take another scan.
         """
         moved = motions if self._moved is None else _one_after_the_other(self._moved, motions)
-        self._keep(self._take_answers())
+        self._take_answers()
         if self._owed == SLOTS:
-            self._keep(self._take_answers(seconds))
+            self._take_answers(seconds)
         if self._owed == SLOTS:
             self.unseen += 1
             self._moved = moved
@@ -142,19 +138,8 @@ class SelectorProcess:
             if not answers:
                 break
             if answers[-1].stamp == stamp:
-                self._keep(answers[:-1])
                 return answers[-1]
-            self._keep(answers)
         return None
-
-    def too_late(self) -> list[Answer]:
-        """Answers with a selection that nobody waited for, since this was last asked."""
-        late = list(self._too_late)
-        self._too_late.clear()
-        return late
-
-    def _keep(self, answers: Sequence[Answer]) -> None:
-        self._too_late += [answer for answer in answers if answer.selection is not None]
 
     def _take_answers(self, seconds: float = 0.0) -> list[Answer]:
         """The answers that are there, or the first that come in so many seconds."""
@@ -197,40 +182,20 @@ def _run(connection: Connection, make: Make, period: float, cores: list[int]) ->
         os.sched_setaffinity(0, cores)
     with contextlib.suppress(EOFError, OSError, KeyboardInterrupt):
         try:
-            gentle = _Gentle(make())
+            selector = make()
         except AdaptuneError as error:
             connection.send(str(error))
             return
-        timed = TimedSelector(gentle, period)
-        connection.send(gentle.fall_back())
+        timed = TimedSelector(selector, period)
+        connection.send(selector.fall_back())
         before = time.process_time()
-        while True:
-            stamp, scan, motions = connection.recv()
-            begin = time.perf_counter()
-            selection = timed.update(stamp, scan, motions)
-            seconds = time.perf_counter() - begin
-            connection.send(Answer(stamp, selection, seconds, time.process_time() - before))
-            timed.measure()
-
-
-class _Gentle:
-    """A selector that measures in a thread of lower priority than what else runs."""
-
-    def __init__(self, selector: Any):
-        self._selector = selector
-        self._thread = ThreadPoolExecutor(1, initializer=_lower_priority)
-        self._measuring: Future[None] | None = None
-
-    def measure(self) -> None:
-        """Begin to measure."""
-        self._measuring = self._thread.submit(self._selector.measure)
-
-    def __getattr__(self, name: str) -> Any:
-        # All else waits until it is measured.
-        if (measuring := self._measuring) is not None:
-            self._measuring = None
-            measuring.result()
-        return getattr(self._selector, name)
+        with ThreadPoolExecutor(1, initializer=_lower_priority) as gentle:
+            while True:
+                stamp, scan, motions = connection.recv()
+                selection = timed.update(stamp, scan, motions)
+                connection.send(Answer(stamp, selection, time.process_time() - before))
+                # Only a thread can have a lower priority for a while.
+                gentle.submit(timed.measure).result()
 
 
 def _lower_priority() -> None:
@@ -419,14 +384,10 @@ class RealTimeDrive:
 
     def _take(self, answer: Answer | None, stamp: int, due: float) -> None:
         """Apply what was selected, if it is there."""
-        assert self._selector is not None
-        for old in self._selector.too_late():
-            assert old.selection is not None
-            self.record.note(Choice(old.stamp, old.selection, old.seconds, "too late"))
         if answer is None or answer.selection is None:
             self.record.missed += 1
-            return
-        self._driver.take(stamp, answer.selection, self._clock.now() - due)
+        else:
+            self._driver.take(stamp, answer.selection, self._clock.now() - due)
 
     def _left(self, due: float) -> float:
         """Seconds to the deadline."""

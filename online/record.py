@@ -66,36 +66,6 @@ class ReplaySummary(BaseModel):
             raise damaged(path, error) from error
 
 
-def repeat_folder(folder: Path, repeat: int) -> Path:
-    """Folder of a repeat of the replay in `folder`, which is the first."""
-    return folder if repeat == 1 else folder / f"repeat_{repeat}"
-
-
-def read_repeats(folder: Path) -> list["StoredReplay"]:
-    """A mode's replay on a sequence, and its repeats in order.
-
-    What was repeated of something else, such as another model, does not count.
-
-    Parameters
-    ----------
-    folder
-        Of the mode, which holds the first.
-
-    Raises
-    ------
-    StoredReplayError
-        If the first one is missing, or one of them is damaged.
-    """
-    replays = [StoredReplay.read(folder)]
-    inputs = replays[0].summary.inputs
-    while True:
-        repeat = len(replays) + 1
-        of = repeat_folder(folder, repeat)
-        if replay_changes(of, inputs | {"repeat": repeat}) != []:
-            return replays
-        replays.append(StoredReplay.read(of))
-
-
 def replay_changes(
     folder: Path, inputs: manifest.Inputs, files: Mapping[str, Sequence[Path]] | None = None
 ) -> list[str] | None:

@@ -23,11 +23,7 @@ from adaptune.trajectory import Trajectory
 from online.compare import current_replays
 from online.live import Placed, RosMessages, placed
 from online.modes import replayed_modes, sequences_without_model
-from online.record import (
-    StoredReplay,
-    StoredReplayError,
-    check_reference,
-)
+from online.record import StoredReplay, StoredReplayError, check_reference
 from online.statistics import Reference
 
 CLOUD_PERIOD = 1.0
@@ -40,12 +36,13 @@ ODOM, SENSOR = "odom", "sensor"
 """Frames: that of all poses, and that of the clouds."""
 _PLACING = ("adaptive", "untrained", "paper", "fixed")
 """Modes whose poses place the clouds, the first that was replayed."""
-_ERRORS = {
+_OF_SELECTIONS = {
     "predicted_error": "predicted_error_percent",
     "predicted_fixed_error": "predicted_fixed_percent",
     "estimated_error": "estimated_error_percent",
     "estimated_error_low": "estimated_low_percent",
     "estimated_error_high": "estimated_high_percent",
+    "familiarity": "familiarity",
     "selection_ms": "ms",
 }
 """Topics of a mode by column of ``selections.csv``."""
@@ -69,18 +66,17 @@ def replayed_sequences(replays: Path, config: StudyConfig, wanted: Sequence[str]
     """
     default = sequences_without_model(config)
     every = dict.fromkeys([*default, *config.sequences, *config.courses])
-    there = [name for name in every if replayed_modes(replays / name)]
     for name in wanted:
         if name not in every:
             raise StoredReplayError(
                 f"{name}: there is no such sequence in the study: {nearest(name, list(every))}"
             )
-        if name not in there:
+        if not replayed_modes(replays / name):
             raise StoredReplayError(
                 f"{name}: there is no replay of it; name it in the `test` of the study, and run "
                 f"`adaptune online`"
             )
-    found = list(dict.fromkeys(wanted)) or [name for name in default if name in there]
+    found = [name for name in dict.fromkeys(wanted or default) if replayed_modes(replays / name)]
     if not found:
         raise StoredReplayError(
             f"{replays}: there is no replay; run `adaptune online` with this study first"
@@ -168,7 +164,7 @@ class _Composer:
         """Add what a mode selected, its errors and its times."""
         trajectory, made = replay.trajectory, replay.choice_stamps
         stamps, end = trajectory.stamps, trajectory.stamps[-1:]
-        for name, column in _ERRORS.items():
+        for name, column in _OF_SELECTIONS.items():
             self._numbers(topic(mode, name), made, replay.selections[column])
         self._add_data(topic(mode, "selection"), _TEXT, made, _in_words(replay))
         for name in _TIMES:

@@ -158,7 +158,7 @@ _SAMPLED = 10
 _log = logging.getLogger(__name__)
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class ReplayRecord:
     """What a replay, or a drive, did at each scan and at each selection so far."""
 
@@ -185,10 +185,6 @@ class ReplayRecord:
     def __post_init__(self) -> None:
         self._cpu, self._n = 0.0, 0
         self._started = time.perf_counter()
-
-    def __repr__(self) -> str:
-        what = f"{self.done} scans, {len(self.choices)} selections, {self.restarted.sum()} restarts"
-        return f"<ReplayRecord: {what}>"
 
     @property
     def done(self) -> int:
@@ -277,20 +273,12 @@ def replay(
     ----------
     scans
         In order of time.
-    odometry
-        A new instance; with a selector, one that applies selections.
-    health
-        The odometry is restarted where its motion is not healthy.
+    odometry, health, fixed, what
+        See `Driver`.
     selector
         Chooses the parameters; without one they stay.
     period
         Seconds between selections.
-    watch
-        Called after every scan.
-    what
-        What is replayed, for the log.
-    fixed
-        What an adaptive mode returns to where it fails, see `Driver`.
 
     Raises
     ------

@@ -26,7 +26,7 @@ from adaptune.recording.clouds import POSES
 from adaptune.recording.config import ImuConfig, SequenceConfig
 from adaptune.recording.scan import Scan, Timing
 from adaptune.ros.link import RosLink, Steering
-from adaptune.selector import BACK, Schedule, Selector
+from adaptune.selector import BACK, Selector
 from adaptune.space import Selection
 from adaptune.strict import in_one_line
 from adaptune.study.config import RealTimeConfig, RosConfig, SteerConfig, StudyConfig
@@ -64,22 +64,18 @@ class DriveLog:
         self.folder, self.lost = folder, ""
         self._names = names
         self._files: dict[str, IO[str]] = {}
-        heads = {
-            "trajectory.tum": "",
-            "frames.csv": _csv(FRAME_COLUMNS),
-            "selections.csv": _csv((*SELECTION_COLUMNS, *names)),
-        }
         try:
             folder.mkdir(parents=True)
-            for name, head in heads.items():
+            for name in ("trajectory.tum", "frames.csv", "selections.csv"):
                 # A line is on disk when it is written: the robot may be switched off.
                 file = (folder / name).open("w", buffering=1, newline="", encoding="utf-8")
                 self._files[name] = file
-                self._write(name, head)
         except OSError as error:
             if not goes_on:
                 raise
             self._end(error)
+        self._write("frames.csv", _csv(FRAME_COLUMNS))
+        self._write("selections.csv", _csv((*SELECTION_COLUMNS, *names)))
 
     def scan(self, step: RegisteredScan, late: float) -> None:
         """Note a scan: its pose, and how late that was in seconds."""
@@ -229,10 +225,7 @@ def _run(command: list[str]) -> tuple[int, str]:
     return done.returncode, done.stderr or done.stdout
 
 
-SELECTION_TOPIC, DIAGNOSTICS_TOPIC = "adaptune/selection", "/diagnostics"
-_EVERY = 10**9
-"""Nanoseconds from one message of diagnostics to the next."""
-
+SELECTION_TOPIC = "adaptune/selection"
 _PUBLISHED = 5.0
 """Seconds in which a topic that nobody has named must be published."""
 
@@ -268,8 +261,10 @@ class RobotDrive:
     def __init__(self, study: Study, mode: str, model_path: Path | None):
         config = study.config
         real_time = (config.online.real_time or RealTimeConfig()).model_copy(update={"rate": 1.0})
+        online = config.online.model_copy(update={"real_time": real_time})
+        config = config.model_copy(update={"online": online})
         # What is only compared with is for replays.
-        setup = replace(ReplaySetup.of(study), real_time=real_time, also=())
+        setup = replace(ReplaySetup.of(study), config=config, also=())
         self._study, self._setup, self._settings = study, setup, real_time
         self._ros = config.online.ros
         self._like = _like(config, study.sequences)
@@ -289,7 +284,7 @@ class RobotDrive:
             model = needed(mode, model)
             fixed = {model.fixed: model.sets[model.fixed]}
             # A node that is steered has one set at a time.
-            make = partial(Selector, model, mode, (), setup.descriptors)
+            make = partial(Selector, model, mode, (), config.descriptor)
             self._mode = Mode(mode, fixed, selector=make)
         elif study.odometry.description.whole:
             raise ModeError(
@@ -370,7 +365,7 @@ class RobotDrive:
                 self._scans.stop()
             try:
                 for arrival in self._scans.arrivals():
-                    publisher.step(drive.step(arrival), record)
+                    publisher.step(drive.step(arrival), record.late[-1])
                     watch(record)
             except KeyboardInterrupt:
                 self._scans.stop()
@@ -386,8 +381,6 @@ class _Publisher:
         self._messages = RosMessages(link.store, ros.frame)
         self._length = length
         self._selection = link.advertise(SELECTION_TOPIC, "std_msgs/msg/String")
-        diagnostics = "diagnostic_msgs/msg/DiagnosticArray"
-        self._diagnostics = link.advertise(DIAGNOSTICS_TOPIC, diagnostics)
         # A node that is steered publishes its own poses.
         own = ros.steer is None
         self._odometry = link.advertise(ros.odometry, ODOMETRY) if own else None
@@ -399,8 +392,6 @@ class _Publisher:
         self._log = log
         self._uncertainty = Uncertainty(self._length)
         self._last: RegisteredScan | None = None
-        self._due = Schedule(_EVERY)
-        self._late, self._restarted = (0, 0), False
 
     def choice(self, choice: Choice) -> None:
         """Tell of a selection."""
@@ -409,12 +400,14 @@ class _Publisher:
             self._uncertainty.learn(choice.selection)
         self._selection(self._messages.selection(choice.stamp, choice.selection, choice.why_not))
 
-    def step(self, step: RegisteredScan, record: ReplayRecord) -> None:
-        """Tell of a pose."""
-        self._log.scan(step, record.late[-1])
-        if self._last is not None:
-            self._uncertainty.move(invert(self._last.T_odom_sensor) @ step.T_odom_sensor)
-        self._last = step
+    def step(self, step: RegisteredScan, late: float) -> None:
+        """Tell of a pose, which was so many seconds late."""
+        self._log.scan(step, late)
+        last, self._last = self._last, step
+        if last is not None:
+            self._uncertainty.move(invert(last.T_odom_sensor) @ step.T_odom_sensor)
+        if step.unhealthy is not None and (last is None or last.unhealthy is None):
+            _log.warning("the odometry restarts: the health check found %s", step.unhealthy)
         (at,) = placed(step.T_odom_sensor[None])
         where = step.stamp, at, self._scans.frame
         if self._odometry is not None:
@@ -422,18 +415,6 @@ class _Publisher:
             self._odometry(self._messages.odometry(*where, variances))
         if self._tf is not None:
             self._tf(self._messages.transform(*where))
-        self._restarted |= step.unhealthy is not None
-        if self._due.due(step.stamp):
-            before, self._late = self._late, (record.dropped, record.missed)
-            message = self._messages.diagnostics(
-                step.stamp,
-                record,
-                self._scans.ignored,
-                late=self._late != before,
-                restarted=self._restarted,
-            )
-            self._diagnostics(message)
-            self._restarted = False
 
 
 def _like(config: StudyConfig, sequences: StudySequences) -> SequenceConfig:

@@ -45,13 +45,6 @@ Interval = tuple[float, float] | None
 """Ends of a 95 % interval, where it is known."""
 
 
-_FOR_FILES = (
-    *("reference_error", "poor_scans", "rte_interval", "ratio_interval", "estimated_interval"),
-    *("repeats", "worst_tenth", "better", "worse"),
-)
-"""What only files have of a row; intervals are columns of their ends."""
-
-
 class Ratio(NamedTuple):
     """The ratio of the errors of two modes, over several sequences their geometric mean."""
 
@@ -87,8 +80,8 @@ class ComparisonRow:
     # Mean sub-trajectory RTE in percent; None where the reference is unknown.
     rte: float | None = None
     ratio: float | None = None  # to that of the yardstick
-    restarts: int = 0  # by the health check, in all repeats
-    switches: int = 0  # changes of the parameters, in all repeats
+    restarts: int = 0  # by the health check
+    switches: int = 0  # changes of the parameters
     poor_scans: int = 0  # too poor to register
     first_pose: float = 0.0  # seconds until then, at most; scans before it do not count
     rte_interval: Interval = None
@@ -107,7 +100,6 @@ class ComparisonRow:
     cores: float | None = None  # that this takes at the sensor's rate
     memory_mb: float | None = None  # most megabytes of all processes
     real_time: Mapping[str, float] | None = None  # see `ReplaySummary`
-    repeats: int = 1  # replays of which errors are means
     # Over all sequences: geometric mean of the ratios over the worst tenth of the stretches, and on
     # how many sequences the mode has less and more error by what counts.
     worst_tenth: float | None = None
@@ -118,13 +110,11 @@ class ComparisonRow:
 
     def columns(self) -> dict[str, Any]:
         """The row of a table; columns that begin with an underscore are for files only."""
-        more: dict[str, Any] = {}
-        for name in _FOR_FILES:
-            value = getattr(self, name)
-            if (stem := name.removesuffix("interval")) != name:
-                more[f"{stem}low"], more[f"{stem}high"] = value or (None, None)
-            else:
-                more[name] = value
+        more: dict[str, Any] = {n: getattr(self, n) for n in ("reference_error", "poor_scans")}
+        for name in ("rte", "ratio", "estimated"):
+            ends = getattr(self, f"{name}_interval")
+            more[f"{name}_low"], more[f"{name}_high"] = ends or (None, None)
+        more |= {n: getattr(self, n) for n in ("worst_tenth", "better", "worse")}
         more |= self._standard() | dict(self.real_time or {})
         return {"sequence": self.sequence, **self._shown()} | {f"_{k}": v for k, v in more.items()}
 
@@ -223,28 +213,19 @@ class Reference(NamedTuple):
 
     def errors_around(self, odometry: Trajectory) -> NDArray[np.float64]:
         """Mean RTE in percent of the sub-trajectories through each pose; NaN without any."""
-        starts, ends, of = self._known(odometry)
-        n = len(odometry) + 1
-        sums, counts = (
-            np.cumsum(np.bincount(starts, w, n) - np.bincount(ends + 1, w, n))[:-1]
-            for w in (of, None)
-        )
-        return np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
+        starts, ends, errors = self._known(odometry)
+        poses = np.arange(len(odometry))
+        return _means(errors, np.searchsorted(ends, poses), np.searchsorted(starts, poses, "right"))
 
     def errors_behind(self, odometry: Trajectory) -> NDArray[np.float64]:
         """Mean RTE in percent of the sub-trajectories that ended in the last `SECONDS`.
 
         It is what an odometry estimates while it drives. NaN where none ended.
         """
-        _, ends, of = self._known(odometry)
-        sums, counts = (
-            np.concatenate([[0.0], np.cumsum(np.bincount(ends, w, len(odometry)))])
-            for w in (of, None)
-        )
-        stop = np.arange(1, len(odometry) + 1)
-        first = np.searchsorted(odometry.stamps, odometry.stamps - int(SECONDS * 1e9))
-        with np.errstate(invalid="ignore"):
-            return np.asarray((sums[stop] - sums[first]) / (counts[stop] - counts[first]))
+        _, ends, errors = self._known(odometry)
+        oldest = np.searchsorted(odometry.stamps, odometry.stamps - int(SECONDS * 1e9))
+        newest = np.searchsorted(ends, np.arange(len(odometry)), "right")
+        return _means(errors, np.searchsorted(ends, oldest), newest)
 
     def _known(
         self, odometry: Trajectory
@@ -269,13 +250,22 @@ class Reference(NamedTuple):
         return StandardErrors(ape, rpe, kitti_error(T_ref_sensor, T), height)
 
 
+def _means(
+    values: NDArray[np.float64], first: NDArray[np.intp], stop: NDArray[np.intp]
+) -> NDArray[np.float64]:
+    """Means of ``values[first:stop]`` for each pair of these, NaN where there is none."""
+    sums = np.concatenate([[0.0], np.cumsum(values)])
+    with np.errstate(invalid="ignore"):
+        return np.asarray((sums[stop] - sums[first]) / (stop - first))
+
+
 class JudgedModes(NamedTuple):
     """The modes on a sequence, judged by its reference."""
 
     name: str  # of the sequence
     rows: list[ComparisonRow]  # one a mode
-    # Sub-trajectory RTE in percent by mode, each of shape (n,), at the same scans; the mean over
-    # the repeats. NaN where it is unknown.
+    # Sub-trajectory RTE in percent by mode, each of shape (n,), at the same scans. NaN where it is
+    # unknown.
     errors: Mapping[str, NDArray[np.float64]]
     block: int  # frames of a sub-trajectory
     recording: str = ""  # that it is a part of; itself if empty
@@ -289,56 +279,60 @@ class JudgedModes(NamedTuple):
         return both[:, np.isfinite(both).all(axis=0)]
 
 
-Repeats = Mapping[str, Sequence[StoredReplay]]
-"""By mode the replays of a sequence, one or more."""
+def compare_modes(
+    name: str, replays: Mapping[str, StoredReplay], reference: Reference
+) -> JudgedModes:
+    """Compare the modes on a sequence with `fixed`, or where it is not among them, `baseline`.
 
-
-def compare_modes(name: str, replays: Repeats, reference: Reference) -> JudgedModes:
-    """Compare the modes on a sequence with `fixed`, or where it is not among them, `baseline`."""
+    Errors are those at the scans that no replay has dropped.
+    """
     yardstick = "fixed" if "fixed" in replays else "baseline"
     empty = [ComparisonRow(name, mode, yardstick=yardstick) for mode in replays]
-    every = [replay.trajectory.stamps for repeats in replays.values() for replay in repeats]
-    common = reduce(np.intersect1d, every)
-    judged = JudgedModes(name, empty, _errors(replays, reference, common), reference.block)
+    trajectories = {mode: replay.trajectory for mode, replay in replays.items()}
+    common = reduce(np.intersect1d, (odometry.stamps for odometry in trajectories.values()))
+    errors = {
+        mode: reference.errors(odometry)[np.isin(odometry.stamps, common)]
+        for mode, odometry in trajectories.items()
+    }
+    judged = JudgedModes(name, empty, errors, reference.block)
     rows = (_measured(row, replays[row.mode], reference, common) for row in empty)
     return judged._replace(rows=[_with_errors(row, judged) for row in rows])
 
 
 def _measured(
     row: ComparisonRow,
-    repeats: Sequence[StoredReplay],
+    replay: StoredReplay,
     reference: Reference,
     common: NDArray[np.int64],
 ) -> ComparisonRow:
-    """Fill in what was measured while driving, and the errors of each whole trajectory.
+    """Fill in what was measured while driving, and the errors of the whole trajectory.
 
     The latter are those of the scans with the stamps that all replays have in `common`.
     """
     kind = "estimated" if reference.estimated else "given"
-    summaries = [repeat.summary for repeat in repeats]
-    restarts = [r.trajectory.stamps[r.restarted] - r.trajectory.stamps[0] for r in repeats]
-    estimated, interval = _estimated(repeats)
-    of_common = (_at(repeat.trajectory, common) for repeat in repeats)
-    known = [errors for t in of_common if (errors := reference.standard(t)) is not None]
+    summary, odometry = replay.summary, replay.trajectory
+    restarts = (odometry.stamps[replay.restarted] - odometry.stamps[0]) * 1e-9
+    estimated, interval = _estimated(replay.estimated)
+    kept = np.isin(odometry.stamps, common)
+    of_common = Trajectory(odometry.stamps[kept], odometry.T_world_sensor[kept])
     return replace(
         row,
-        restarts=sum(summary.restarts for summary in summaries),
-        switches=int(sum(switched(repeat.choices).sum() for repeat in repeats)),
-        poor_scans=sum(summary.poor_scans for summary in summaries),
-        first_pose=max(summary.first_pose_s for summary in summaries),
-        standard=StandardErrors.pooled(known),
-        first_restart=min((float(at[0]) * 1e-9 for at in restarts if len(at)), default=None),
-        unhealthy=tuple(dict.fromkeys(found for s in summaries for found in s.unhealthy)),
+        restarts=summary.restarts,
+        switches=int(switched(replay.choices).sum()),
+        poor_scans=summary.poor_scans,
+        first_pose=summary.first_pose_s,
+        standard=reference.standard(of_common),
+        first_restart=float(restarts[0]) if len(restarts) else None,
+        unhealthy=tuple(summary.unhealthy),
         estimated=estimated,
         estimated_interval=interval,
-        lost_seconds=sum(summary.lost_seconds for summary in summaries),
+        lost_seconds=summary.lost_seconds,
         reference="none" if reference.trajectory is None else kind,
         reference_error=reference.error,
-        cpu_ms=mean_of([summary.cpu_ms for summary in summaries]),
-        cores=mean_of(list(map(_cores, summaries))),
-        memory_mb=max((s.memory_mb for s in summaries if s.memory_mb is not None), default=None),
-        real_time=summaries[0].real_time,
-        repeats=len(repeats),
+        cpu_ms=summary.cpu_ms,
+        cores=_cores(summary),
+        memory_mb=summary.memory_mb,
+        real_time=summary.real_time,
     )
 
 
@@ -359,23 +353,6 @@ def _with_errors(row: ComparisonRow, judged: JudgedModes) -> ComparisonRow:
         rte_interval=rte_interval,
         ratio_interval=ratio_interval,
     )
-
-
-def _at(trajectory: Trajectory, stamps: NDArray[np.int64]) -> Trajectory:
-    """The poses at some of the stamps."""
-    kept = np.isin(trajectory.stamps, stamps)
-    return Trajectory(trajectory.stamps[kept], trajectory.T_world_sensor[kept])
-
-
-def _errors(
-    replays: Repeats, reference: Reference, common: NDArray[np.int64]
-) -> dict[str, NDArray[np.float64]]:
-    """Percent by mode, each of shape (n,): at the scans that no replay has dropped."""
-    trajectories = {mode: [r.trajectory for r in repeats] for mode, repeats in replays.items()}
-    return {
-        mode: np.mean([reference.errors(t)[np.isin(t.stamps, common)] for t in of], axis=0)
-        for mode, of in trajectories.items()
-    }
 
 
 def mean_of(values: Sequence[float | None]) -> float | None:
@@ -426,13 +403,12 @@ def allowing_for(
     return (true(rte_low), math.hypot(rte_high, error)), interval
 
 
-def _estimated(repeats: Sequence[StoredReplay]) -> tuple[float | None, Interval]:
+def _estimated(estimates: NDArray[np.float64]) -> tuple[float | None, Interval]:
     """Mean of the estimated errors, and of the ends of their intervals.
 
     The interval is right if all estimates err together, and else too wide. There is none where less
     than half of the recording was estimated: the rest may be of another kind.
     """
-    estimates = np.concatenate([repeat.estimated for repeat in repeats])
     known = estimates[np.isfinite(estimates[:, 0])]
     if not len(known):
         return None, None

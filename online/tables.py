@@ -77,8 +77,7 @@ def _of_modes(rows: Sequence[ComparisonRow], length: float) -> Listing:
     cells = [{k: v for k, v in row.items() if k not in empty} for row in cells]
     n = len({row.sequence for row in rows if row.rte is not None} - {ALL})
     where = f"on {n} sequences" if last[0].sequence == ALL else f"on {last[0].sequence}"
-    repeats = f", {last[0].repeats} replays each" if last[0].repeats > 1 else ""
-    return Listing(f"RTE over {length:g} m {where}{repeats}", cells, _caption(rows, cells[0]))
+    return Listing(f"RTE over {length:g} m {where}", cells, _caption(rows, cells[0]))
 
 
 def _caption(rows: Sequence[ComparisonRow], shown: Mapping[str, Any]) -> str:
@@ -154,13 +153,18 @@ _ONE_SET = ("baseline", "fixed", "best_default")
 """Modes that drive one set; those that cost less first."""
 
 
+def _judged(rows: Sequence[ComparisonRow]) -> dict[str, ComparisonRow]:
+    """Those of `_last` by mode that have an error."""
+    return {row.mode: row for row in _last(rows) if row.ratio is not None}
+
+
 def decided(rows: Sequence[ComparisonRow], worth: float = WORTH) -> ComparisonRow | None:
     """What to drive: the one set with the least error, or what is worth its cost.
 
     The rows over all sequences come last. None if no test sequence has a reference. `worth` is the
     share of the error that adapting has to spare.
     """
-    last = {row.mode: row for row in _last(rows) if row.ratio is not None}
+    last = _judged(rows)
     if not last:
         return None
     one = min((last[m] for m in _ONE_SET if m in last), key=lambda row: _ratio(row).value)
@@ -182,7 +186,7 @@ def _to(row: ComparisonRow, one: ComparisonRow) -> Ratio:
 
 def adapting(rows: Sequence[ComparisonRow]) -> ComparisonRow | None:
     """The mode that adapts: `adaptive`, or without a model the untrained bank; None if none is."""
-    last = {row.mode: row for row in _last(rows) if row.ratio is not None}
+    last = _judged(rows)
     return next((last[mode] for mode in ("adaptive", "untrained") if mode in last), None)
 
 
@@ -219,7 +223,9 @@ def verdict(
         said = f"{'Keep' if best.mode == 'baseline' else 'Drive'} {CALLED[best.mode]}: "
         said += f"{errors[best.mode]}{f' instead of {instead},' if instead else ''} {where}"
     if best.mode not in _ONE_SET:
-        return [f"{said}.", f"It has {_times(best)}{_for_cost(best, last[best.yardstick])}."]
+        has = f"It has {best.ratio:.2f} times the {_YARDSTICKS[best.yardstick]}'s error"
+        cost = _for_cost(best, last[best.yardstick])
+        return [f"{said}.", f"{has} ({_interval(_ratio(best))}){cost}."]
     return [f"{said}{_doubt(best, last)}.", *_why_not(main, best, rows, obstacle, worth)]
 
 
@@ -271,13 +277,9 @@ def _is_yardstick(row: ComparisonRow) -> bool:
     return row.ratio is not None and abs(row.ratio - 1.0) < ROUNDING and not row.switches
 
 
-def _judged(rows: Sequence[ComparisonRow]) -> list[str]:
-    return list(dict.fromkeys(r.sequence for r in rows if r.rte is not None and r.sequence != ALL))
-
-
 def _where(rows: Sequence[ComparisonRow]) -> str:
-    names = _judged(rows)
-    return f"on {len(names)} test sequences" if len(names) > 1 else f"on {names[0]}"
+    names = {row.sequence for row in rows if row.rte is not None} - {ALL}
+    return f"on {len(names)} test sequences" if len(names) > 1 else f"on {names.pop()}"
 
 
 def _interval(ratio: Ratio) -> str:
@@ -296,12 +298,6 @@ def _end(ratio: float) -> str:
 def _ratio(row: ComparisonRow) -> Ratio:
     assert row.ratio is not None
     return Ratio(row.ratio, row.ratio_interval)
-
-
-def _times(row: ComparisonRow) -> str:
-    return (
-        f"{row.ratio:.2f} times the {_YARDSTICKS[row.yardstick]}'s error ({_interval(_ratio(row))})"
-    )
 
 
 # What must be known to trust a comparison, in words.

@@ -56,9 +56,6 @@ Model = Annotated[
 Untrained = Annotated[
     bool, typer.Option("--untrained", help="Only the baseline, and a bank that needs no model.")
 ]
-Repeats = Annotated[
-    int, typer.Option(help="How often to replay each mode on a sequence.", min=1, max=20)
-]
 Ros2 = Annotated[bool, typer.Option("--ros2", help="Drive on a robot with ROS 2 over Zenoh.")]
 Details = Annotated[bool, typer.Option("--details", help="Print all sentences and tables.")]
 Oracle = Annotated[
@@ -72,7 +69,6 @@ def online(
     folder: Folder = None,
     model: Model = None,
     untrained: Untrained = False,
-    repeats: Repeats = 1,
     ros: Annotated[bool, typer.Option("--ros", help="Drive on a robot with ROS 1.")] = False,
     ros2: Ros2 = False,
     mode: Mode = None,
@@ -118,7 +114,7 @@ def online(
     if oracle:
         _oracle(loaded, cluster)
     else:
-        made = replay_missing(loaded, model, repeats, untrained=untrained)
+        made = replay_missing(loaded, model, untrained=untrained)
         there = f"{made} replays made" if made else "All replays were there already"
         say(f"{there}: {loaded.folder / 'replays'}/")
     say_next_of_study("table and pictures of the modes", "compare")
@@ -148,15 +144,15 @@ def _alone(study: "OfflineStudy") -> ExitStack:
 
 
 def replay_missing(
-    loaded: "OfflineStudy", model: Path | None = None, repeats: int = 1, *, untrained: bool = False
+    loaded: "OfflineStudy", model: Path | None = None, *, untrained: bool = False
 ) -> int:
     """Make the replays that are missing; how many were made."""
     from online.modes import run_replays, run_untrained
 
     with _alone(loaded), progress() as show:
         if untrained:
-            return run_untrained(loaded, show, repeats)
-        return run_replays(loaded, model or loaded.model_path, show, repeats)
+            return run_untrained(loaded, show)
+        return run_replays(loaded, model or loaded.model_path, show)
 
 
 def _drive(

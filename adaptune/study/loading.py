@@ -229,7 +229,7 @@ _HAND_OVER = ("beside", "catch_up_scans", "full_rate", "stride")
 DELETED = {
     "offline.search": "is gone: a search is always for single sets; leave it out",
     "online.also": "is gone: name these modes in online.modes, too",
-    "online.repeats": "is gone: give `adaptune online` the option --repeats",
+    "online.repeats": "is gone: replay again into another folder (--folder, --model)",
     "online.rules": "is gone: name these modes in online.modes",
     "online.dwell": "is gone: selections do not wait; leave it out",
     "online.pin": "is gone: fix a parameter by its range (odometry.parameters), or leave it out",

@@ -1,4 +1,4 @@
-"""Modes on demand, repeats of replays, and what is compared where some are missing."""
+"""Modes on demand, and what is compared where some are missing."""
 
 import csv
 import json
@@ -6,7 +6,6 @@ import shutil
 from dataclasses import replace
 
 import drives
-import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -16,7 +15,7 @@ from adaptune.study.config import ALSO
 from offline.config import load_study
 from online.compare import compare, compared_modes
 from online.modes import run_replays, run_untrained
-from online.record import StoredReplayError, read_repeats, repeat_folder
+from online.record import StoredReplayError
 
 EVERY = ["baseline", "fixed", "adaptive", "untrained", "even", "paper"]
 
@@ -144,36 +143,6 @@ def test_where_only_some_were_replayed_without_a_model_those_are_compared(own, t
         "Not compared, because replays are missing: `baseline` on three; `adaptune online "
         "--untrained` makes them."
     ) in compare(both).details
-
-
-def test_every_mode_is_repeated(own):
-    study = own()
-    kept = study.folder / "replays/three"
-    assert run_replays(study, study.model_path, repeats=3) == 8
-    assert run_replays(study, study.model_path, repeats=3) == 0
-    adaptive = read_repeats(kept / "adaptive")
-    assert [replay.summary.inputs["repeat"] for replay in adaptive] == [1, 2, 3]
-    for replay in adaptive[1:]:
-        np.testing.assert_array_equal(
-            replay.trajectory.T_world_sensor, adaptive[0].trajectory.T_world_sensor
-        )
-    assert [len(read_repeats(kept / mode)) for mode in ("paper", "even")] == [3, 1]
-    # What is left of an interrupted run is made again, and nothing else.
-    (repeat_folder(kept / "paper", 2) / "frames.csv").unlink()
-    assert len(read_repeats(kept / "paper")) == 1
-    assert run_replays(study, study.model_path, repeats=3) == 1
-    shutil.rmtree(kept / "fixed/repeat_3")
-    (said,) = (said for said in compare(study).details if said.startswith("Replayed less often"))
-    assert "less often than 3 times (`adaptune online --repeats 3` goes on): " in said
-    assert "fixed on three 2" in said
-    assert "paper" not in said
-    assert "even on three 1" in said
-    # Repeats of something else do not count.
-    other = own("online.period=2", "online.modes=[adaptive]")
-    run_replays(other, other.model_path)
-    assert len(read_repeats(kept / "adaptive")) == 1
-    with pytest.raises(StoredReplayError, match="there is no replay"):
-        read_repeats(kept / "nothing")
 
 
 def test_the_command_line(own, study_file):

@@ -1,6 +1,5 @@
 import csv
 import json
-import math
 import shutil
 from dataclasses import replace
 
@@ -11,12 +10,11 @@ import pytest
 from adaptune import manifest
 from adaptune.errors import AdaptuneError
 from adaptune.model import BankSettings, ErrorModel, PairedSettings
-from adaptune.space import Selection
 from adaptune.study.study import ModeError, bank_members
 from adaptune.trajectory import read_tum
 from offline.config import load_study
 from online.compare import compare
-from online.modes import run_replays, warn_of_scant_evidence
+from online.modes import run_replays
 from online.record import StoredReplay, StoredReplayError
 from online.statistics import ComparisonRow
 from online.tables import remarks
@@ -262,16 +260,6 @@ def test_a_damaged_replay_is_named(replayed, file, text):
         assert "https://" not in str(caught.value)
     finally:
         path.write_text(before)
-
-
-def test_a_warning_of_selections_that_rest_on_one_sequence(caplog):
-    def selection(trial, n_sequences):
-        return Selection(trial, {}, n_sequences=n_sequences)
-
-    warn_of_scant_evidence("a", [selection(0, 1.0), selection(1, 3.0), selection(1, math.nan)], 0)
-    assert not caplog.messages
-    warn_of_scant_evidence("b", [selection(0, 1.0), selection(1, 1.2), selection(1, 3.0)], 0)
-    assert caplog.messages[0].startswith("b: 1 of 2 selections of another set")
 
 
 def rows_of(sequence="a", **ratios):

@@ -35,27 +35,18 @@ def test_modes_stand_below_each_other_from_the_least_error():
     (panel,) = comparison_chart(ROWS).panels
     assert panel.y.names == ("baseline", "adaptive", "oracle, sequence")  # from below
     points = drawn(ROWS, Points)
-    assert list(points) == ["geometric mean over all sequences", "one", "two"]
+    assert list(points) == ["geometric mean over all sequences", "each sequence"]
     means = points["geometric mean over all sequences"]
     assert list(zip(means.x, means.y, strict=True)) == [(1.3, 0.0), (0.85, 1.0), (0.6, 2.0)]
     (interval,) = drawn(ROWS, Line).values()
     np.testing.assert_array_equal(interval.x, [0.8, 0.95, np.nan])
     assert list(interval.y) == [1.0] * 3
     # What lies lower still belongs to the line.
-    one = points["one"]
-    assert list(one.x) == [1.4, 0.8]
-    assert np.ceil(one.y).tolist() == [0.0, 1.0]
-    assert one.texts == ["baseline, one", "adaptive, one"]
-
-
-def test_many_sequences_have_one_look():
-    few, many = ([row(f"s{i}", "adaptive", 0.8) for i in range(n)] for n in (6, 7))
-    last = [row("all", "adaptive", 0.8)]
-    assert len(drawn(few + last, Points)) == 7
-    points = drawn(many + last, Points)
-    assert len(points) == 2
-    assert len(points["each sequence"].x) == 7
-    assert points["each sequence"].faint
+    each = points["each sequence"]
+    assert list(each.x) == [1.4, 0.8, 1.2, 0.9]
+    assert np.ceil(each.y).tolist() == [0.0, 1.0, 0.0, 1.0]
+    assert each.texts == ["baseline, one", "adaptive, one", "baseline, two", "adaptive, two"]
+    assert each.faint
 
 
 def test_of_one_sequence_there_is_nothing_below():

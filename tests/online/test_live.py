@@ -12,7 +12,6 @@ from adaptune.recording.scan import Timing
 from adaptune.space import Selection
 from online import live
 from online.live import UNKNOWN_ERROR, LiveScans, RosMessages, Uncertainty, placed
-from online.replay import Choice, ReplayRecord
 
 TENTH = 10**8
 START = 1_700_000_000 * 10**9
@@ -67,7 +66,6 @@ def test_doubled_and_reordered_scans_are_ignored_and_missing_ones_are_missed(lin
     scans = topic(link)
     play(link, [0, 1, 1, 2, 4, 3, 4, 9])
     assert numbers(scans) == [0, 1, 2, 4, 9]
-    assert scans.ignored == 3
 
 
 def test_the_newest_wait(link):
@@ -85,7 +83,6 @@ def test_where_the_clock_goes_back_another_drive_begins(link, caplog):
     assert not scans.stopped
     assert numbers(scans) == [0, 1, 2]
     assert caplog.messages == ["the clock went back by 3.1 s: a new drive"]
-    assert scans.ignored == 0
 
 
 def test_what_is_no_point_cloud_is_left_out(link, caplog):
@@ -153,13 +150,6 @@ def test_an_imu_that_is_silent_does_not_hold_up_the_scans(link, monkeypatch):
 MESSAGES = RosMessages(local_link.STORE, "odom")
 
 
-def record(selection):
-    made = ReplayRecord(1.0, dropped=3, late=[0.5, 0.0123])
-    if selection is not None:
-        made.note(Choice(0, selection, 0.0))
-    return made
-
-
 def ahead(metres):
     T = np.eye(4)
     T[0, 3] = metres
@@ -208,7 +198,6 @@ def test_all_messages_are_those_of_ros_2_too():
         messages.odometry(5, *placed(np.eye(4)[None]), "lidar", (0.1, 0.2)),
         messages.transform(5, *placed(np.eye(4)[None]), "lidar"),
         messages.selection(5, selection, ""),
-        messages.diagnostics(5, record(selection), 0, late=True, restarted=False),
     ):
         raw = store.serialize_cdr(made, made.__msgtype__)
         found = store.deserialize_cdr(raw, made.__msgtype__)
@@ -224,24 +213,3 @@ def test_what_is_not_known_is_null():
         {"voxel": 0.5},
         "too late",
     )
-
-
-@pytest.mark.parametrize(
-    ("selection", "since", "level", "said"),
-    [
-        (None, (False, False), 0, "keeps up"),
-        (None, (True, False), 1, "was too late"),
-        (None, (True, True), 2, "restarts for want of healthy poses"),
-        (Selection(3, {}, lost=True), (True, True), 2, "is lost"),
-    ],
-)
-def test_diagnostics(selection, since, level, said):
-    late, restarted = since
-    message = MESSAGES.diagnostics(0, record(selection), 4, late=late, restarted=restarted)
-    (found,) = message.status
-    assert (found.level, found.message) == (level, said)
-    values = {one.key: one.value for one in found.values}
-    assert values["pose after the scan [ms]"] == "12.3"
-    assert values["ignored scans"] == "4"
-    assert values["dropped scans"] == "3"
-    assert ("trial" in values) == (selection is not None)

@@ -11,24 +11,17 @@ from adaptune.model.rules import Costs, SetCost
 from adaptune.odometry.registry import OdometryFactory, OdometryPool, odometry_class
 from adaptune.odometry.remote import Limits
 from adaptune.space import ParameterSpace
-from adaptune.study.config import ALSO, RealTimeConfig, SwitchingConfig
+from adaptune.study.config import ALSO, RealTimeConfig, StudyConfig
 from adaptune.study.study import ModeError
 from online.modes import ReplaySetup
 
 
-def setup(budget=None):
+def setup(mechanism="live", size=4, **online):
     gicp = odometry_class("gicp")
     factory = OdometryFactory("gicp", {}, gicp.space, Limits())
-    return ReplaySetup(
-        factory,
-        ("adaptive", "paper"),
-        SwitchingConfig(mechanism="live"),
-        "live",
-        25.0,
-        3.0,
-        ("ndt",),
-        budget,
-    )
+    online["switching"] = {"mechanism": mechanism, "size": size}
+    config = StudyConfig(odometry={"name": "gicp"}, training=("a",), online=online)
+    return ReplaySetup(config, factory, mechanism, ("adaptive", "paper"))
 
 
 def test_rivals_are_driven_where_the_model_has_some():
@@ -63,10 +56,10 @@ def test_a_rival_keeps_its_parameters():
 def test_a_model_for_another_budget_is_refused(tmp_path):
     model = random_model()
     setup().check(model, tmp_path)
-    setup(9.0).check(replace(model, budget=9.0), tmp_path)
+    setup(budget=9.0).check(replace(model, budget=9.0), tmp_path)
     for given, fitted in ((9.0, None), (None, 9.0), (9.0, 8.0)):
         with pytest.raises(ModeError, match=r"online\.budget: .* run `adaptune offline` again"):
-            setup(given).check(replace(model, budget=fitted), tmp_path)
+            setup(budget=given).check(replace(model, budget=fitted), tmp_path)
     setup().check(replace(model, worth=0.1), tmp_path)
     with pytest.raises(ModeError, match=r"online\.worth: .* run `adaptune offline` again"):
         setup().check(replace(model, worth=0.2), tmp_path)
@@ -76,8 +69,7 @@ def test_a_mode_is_replayed_where_it_is_possible():
     model = random_model()
     asked = replace(setup(), also=ALSO)
     every = ("baseline", "fixed", "adaptive", "untrained", "even", "paper")
-    odometry = replace(asked.odometry, space=odometry_class("gicp").space)
-    asked = replace(asked, odometry=odometry)
+    odometry = asked.odometry
     assert asked.modes(model) == every
     # A bank of one member, and an odometry that cannot change its set.
     alone = replace(model, bank=[4], vectors=np.zeros((50, 1, 3), np.float32))
@@ -91,8 +83,7 @@ def test_a_mode_is_replayed_where_it_is_possible():
 
 def test_what_each_mode_drives():
     model = replace(random_model(), rivals={"equal_cost": 6})
-    live = replace(setup(), switching=SwitchingConfig(size=2))
-    bank = replace(live, mechanism="bank")
+    live, bank = (setup(mechanism, size=2) for mechanism in ("live", "bank"))
     assert list(live.mode("adaptive", model).sets) == [model.fixed]
     assert live.identity("adaptive", model, "of it")["switching"] == {"mechanism": "live"}
     assert bank.identity("adaptive", model, "of it")["switching"]["mechanism"] == "bank"
@@ -105,11 +96,10 @@ def test_what_each_mode_drives():
     vectors = np.zeros((len(model.errors), 3, 3), np.float32)
     members = [*model.bank, 0]
     reserve = replace(model, bank=members, vectors=vectors, bank_settings=BankSettings(reserve=1))
-    few = replace(bank, switching=SwitchingConfig(size=2))
-    assert list(few.mode("adaptive", reserve).sets) == reserve.bank
-    assert list(few.mode("even", reserve).sets) == reserve.bank[:-1]
+    assert list(bank.mode("adaptive", reserve).sets) == reserve.bank
+    assert list(bank.mode("even", reserve).sets) == reserve.bank[:-1]
     # What was published has one instance, and all sets to choose from.
-    assert few.mode("paper", reserve).sets == {model.fixed: model.sets[model.fixed]}
+    assert bank.mode("paper", reserve).sets == {model.fixed: model.sets[model.fixed]}
     assert bank.identity("even", model, "of it")["model"] == "of it"
 
 
@@ -127,24 +117,23 @@ def test_a_cheap_bank_runs_on_one_core(monkeypatch):
     monkeypatch.setattr("online.modes.shared_cores", lambda: {0, 1, 2})
     made = []
     monkeypatch.setattr("online.modes.Bank", lambda *given: made.append(given[4]))
-    model, two = random_model(), SwitchingConfig(size=2)
-    bank = replace(setup(), mechanism="bank", switching=two)
+    model = random_model()
     # Two members, which share what they prepare, and live evidence.
     for register, pace, cores in ((5.0, None, 1), (5.0, 3.0, 1), (5.0, 4.0, 3), (25.0, None, 3)):
         costs = Costs({trial: SetCost(register, 4.0, 0) for trial in model.sets}, 1.0)
         in_real_time = None if pace is None else RealTimeConfig(rate=pace)
-        given = replace(bank, real_time=in_real_time)
+        given = setup("bank", size=2, real_time=in_real_time)
         given.instance(given.mode("adaptive", replace(model, costs=costs)))
         assert made.pop() == cores, (register, pace)
+    bank = setup("bank", size=2)
     bank.instance(bank.mode("adaptive", replace(model, costs=None)))
     assert made == [3]
 
 
 def test_sets_that_fail_are_missing_in_no_bank():
-    model, bank = random_model(), replace(setup(), mechanism="bank")  # of four, fitted for two
+    model, four = random_model(), setup("bank", size=4)  # fitted for two
     given = {trial: SetCost(5.0 if trial in model.bank else np.inf, 4.0, 0) for trial in model.sets}
     failing = replace(model, costs=Costs(given, 1.0))
-    four = replace(bank, switching=SwitchingConfig(size=4))
     assert list(four.mode("adaptive", failing).sets) == model.bank
     with pytest.raises(ModeError, match="another bank"):
         four.mode("adaptive", model)

@@ -51,6 +51,7 @@ def selections():
             {"max_correspondence_distance": 1.0 + i, "kernel": ["none", "huber"][i % 2]},
             predicted_error=0.7,
             predicted_fixed=0.9,
+            familiarity=0.25,
             weights={2: 0.75, 5: 0.25},
             estimated_error=estimated[0],
             estimated_low=estimated[1],
@@ -140,6 +141,7 @@ def test_an_mcap_holds_what_was_chosen_and_how_it_went(study):
     made, end = STAMPS[::10].tolist(), int(STAMPS[-1])
     assert numbers(found, "/adaptive/predicted_error") == (made, [0.7] * 4)
     assert numbers(found, "/adaptive/predicted_fixed_error") == (made, [0.9] * 4)
+    assert numbers(found, "/adaptive/familiarity") == (made, [0.25] * 4)
     # What is not known yet is left out.
     assert numbers(found, "/adaptive/estimated_error") == (made[1:], [2.0, 3.0, 4.0])
     assert numbers(found, "/adaptive/estimated_error_high") == (made[1:], [3.0] * 3)

@@ -10,7 +10,6 @@ import pytest
 
 from adaptune.bank.bank import Bank
 from adaptune.errors import AdaptuneError, OdometryError
-from adaptune.odometry import tracker
 from adaptune.odometry.base import InProcess, Odometry, Registration, Usage
 from adaptune.odometry.keyframe import KeyframeGicp
 from adaptune.odometry.tracker import HealthCheck
@@ -132,19 +131,6 @@ def test_an_impossible_step_restarts_at_the_last_healthy_motion(jump):
     assert start[2:] == pytest.approx((0.45, 0.15))
 
 
-def test_an_impossible_turn_restarts():
-    class Turning(Scripted):
-        def register(self, prepared):
-            T = super().register(prepared).T_odom_sensor
-            if prepared == 300_000_000:
-                T[:2, :2] = [[0.0, -1.0], [1.0, 0.0]]  # 900 degrees a second
-            return Registration(T)
-
-    result = replay(scans(np.arange(6) / 10), InProcess(Turning()), HEALTH)
-    assert np.flatnonzero(result.restarted).tolist() == [3]
-    np.testing.assert_allclose(result.trajectory.T_world_sensor[-1, :3, :3], np.eye(3))
-
-
 def test_a_platform_that_did_change_its_motion_is_believed_in_the_end():
     # From 0.1 to 0.45 m a scan is 3.5 m/s at once; the bound grows with the time unseen.
     odometry = Scripted([*[0.1] * 12, *[0.45] * 18])
@@ -163,23 +149,6 @@ def test_after_a_dropped_scan_the_last_motion_goes_on_for_longer():
     np.testing.assert_allclose(restart[2:], [0.5, 0.3])
 
 
-def test_a_frozen_pose_restarts(monkeypatch):
-    odometry = Scripted([0.1, 0.1] + [0.0] * 6 + [0.1])
-    monkeypatch.setattr(HealthCheck, "max_freeze", 0.45)
-    monkeypatch.setattr(tracker, "_FROZEN_SCANS", 1)
-    result = replay(scans(0.1 * np.arange(9)), InProcess(odometry), HEALTH)
-    assert np.flatnonzero(result.restarted).tolist() == [7]
-    np.testing.assert_allclose(result.trajectory.T_world_sensor[7, 0, 3], 0.3)
-
-
-def test_poor_scans_are_counted(tmp_path):
-    odometry = Scripted([0.1, None, 0.1])
-    result = replay(scans(np.arange(5) / 10), InProcess(odometry), HEALTH)
-    assert result.registered.tolist() == [True, True, False, True, True]
-    write_replay(tmp_path, result, ABOUT, MODEL)
-    assert json.loads((tmp_path / "replay.json").read_text())["poor_scans"] == 1
-
-
 def test_too_many_scans_that_do_not_register_restart(tmp_path, monkeypatch):
     monkeypatch.setattr(HealthCheck, "max_unregistered", 3)
     odometry = Scripted([0.1, 0.1, *[None] * 7, 0.1])
@@ -189,6 +158,7 @@ def test_too_many_scans_that_do_not_register_restart(tmp_path, monkeypatch):
     write_replay(tmp_path, result, ABOUT, MODEL)
     summary = json.loads((tmp_path / "replay.json").read_text())
     assert summary["unhealthy"] == {"max_unregistered": 2}
+    assert summary["poor_scans"] == (~result.registered).sum() == 7
 
 
 class Losing(Chooser):

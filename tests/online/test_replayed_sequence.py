@@ -1,4 +1,3 @@
-import csv
 import shutil
 
 import numpy as np
@@ -32,23 +31,17 @@ def test_replays_are_read_with_what_was_measured(study):
     assert list(replayed.modes) == ["baseline", "fixed", "adaptive", "paper"]
     assert replayed.scenes is None
     for mode, of in replayed.modes.items():
-        n, m = len(of.seconds), len(of.choice_seconds)
-        assert of.places.shape == (n, 2)
-        assert of.familiarity.shape == (m,)
+        assert of.places.shape == (len(of.seconds), 2)
         assert of.adapts == (mode in ("adaptive", "paper"))
         # The reference goes straight on; the odometry nearly so.
         assert abs(of.places[:, 1]).max() < 1e-6
         assert (np.isfinite(of.errors_around) >= np.isfinite(of.errors)).all()
-    with (study.folder / "replays/three/paper/selections.csv").open() as file:
-        told = [float(row["familiarity"]) for row in csv.DictReader(file)]
-    np.testing.assert_array_equal(replayed.modes["paper"].familiarity, told)
     assert read_replays(study, "one").modes == {}
 
 
 def test_all_charts_are_made(study):
     charts, notes = charts_of_replays(read_replays(study, "three"))
-    keys = {chart.key for chart in charts}
-    assert {"three-errors", "three-choices", "three-familiarity"} <= keys
+    assert [chart.key for chart in charts] == ["three-errors", "three-choices"]
     assert all(chart.caption and chart.title.startswith("three: ") for chart in charts)
     assert notes == []
 

@@ -25,7 +25,6 @@ def replay(**changed):
         estimated=np.full((3, 3), np.nan),
         lost=np.zeros(3, bool),
         places=XY,
-        familiarity=np.full(3, np.nan),
     )
     return made._replace(**changed)
 
@@ -34,8 +33,7 @@ def kept():
     """A replay that keeps its parameters."""
     fixed = {"distance": [0.7], "kernel": ["none"]}
     one = {"choice_seconds": np.zeros(1), "choices": fixed, "lost": np.zeros(1, bool)}
-    unknown = np.full((1, 3), np.nan)
-    return replay(**one, estimated=unknown, familiarity=unknown[:, 0])
+    return replay(**one, estimated=np.full((1, 3), np.nan))
 
 
 def bank(**changed):
