@@ -228,7 +228,6 @@ class Pipeline(OwnFrameOdometry):
 
     def _begin(self, prepared: EvalioScan) -> None:
         pipelines, types, _ = evalio_modules()
-        self._shape = prepared.shape
         parameters = self._values(self.settings.deskew and prepared.duration > 0)
         # Pipelines divide by the length of the scan, and some end the process where it is 0.
         self._needs_times = bool(parameters.get("deskew"))
@@ -237,7 +236,7 @@ class Pipeline(OwnFrameOdometry):
         pipeline = pipelines.all_pipelines()[self.pipeline]()
         pipeline.set_params(parameters)
         ranges = {"min_range": self.settings.min_range, "max_range": self.settings.max_range}
-        rows, columns = self._shape
+        rows, columns = prepared.shape
         lidar = types.LidarParams(num_rows=rows, num_columns=columns, **ranges)
         pipeline.set_lidar_params(lidar)
         self._T_imu_sensor = np.eye(4)
@@ -312,14 +311,6 @@ class GridPipeline(RingedPipeline):
     def _layout(self, scan: Scan) -> tuple[NDArray[np.float32], tuple[int, int]]:
         points, shape = super()._layout(scan)
         return points if len(scan) < MIN_POINTS else image(scan, points, *shape), shape
-
-    def _estimate(self, prepared: EvalioScan) -> Poses | None:
-        if prepared.shape != self._shape:
-            before, now = ("{} x {}".format(*shape) for shape in (self._shape, prepared.shape))
-            raise OdometryError(
-                f"{self.pipeline} began with scans of {before} points and cannot go on with {now}"
-            )
-        return super()._estimate(prepared)
 
 
 # The pipelines of evalio that need a LiDAR only.

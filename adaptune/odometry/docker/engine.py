@@ -419,13 +419,11 @@ def remove_shared(folder: Path, image: str, user: str) -> None:
 
 
 @contextmanager
-def kept_log(
-    run: Any, logs: Path | None, fault: str | None, seconds: Mapping[str, float], **about: Any
-) -> Iterator[Path | None]:
+def kept_log(run: Any, logs: Path | None, fault: str | None, **about: Any) -> Iterator[Path | None]:
     """A folder for the block to fill, which then replaces that of the same set; None if not kept.
 
     `logs` is the folder of the sequence's logs. ``trial.yaml`` holds what the run of a recording
-    has used, the seconds of each step, and what `about` says.
+    has used, and what `about` says.
     """
     if logs is None:
         yield None
@@ -438,7 +436,6 @@ def kept_log(
         digest = image_digest(settings.image)
         note = {"image": settings.image, "digest": digest, "parameters": parameters, **about}
         note |= {"cpu": round(usage.cpu, 3), "memory": round(usage.memory or 0.0, 1)}
-        note["seconds"] = {name: round(value, 2) for name, value in seconds.items()}
         if fault:
             note["fault"] = fault
         (temporary / "trial.yaml").write_text(files.dump(note), encoding="utf-8")

@@ -89,7 +89,7 @@ class DockerCommand(FileRun):
         with closing(container):
             failure = self._watch(container, len(given.stamps))
             self._words = container.last_lines()
-            with kept_log(self, given.logs, failure, {}) as kept:
+            with kept_log(self, given.logs, failure) as kept:
                 if kept is not None:
                     (kept / "output.log").write_bytes(container.log())
         try:

@@ -13,8 +13,8 @@ import tempfile
 import threading
 import time
 import weakref
-from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from collections.abc import Callable
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -23,7 +23,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, model_validator
 from rosbags.highlevel import AnyReader
-from rosbags.rosbag1 import Writer
 from rosbags.serde import SerdeError
 from rosbags.typesys.store import Typestore
 
@@ -521,14 +520,6 @@ class PoseRecorder:
     def _poses(self, kind: str, data: bytes) -> list[Pose]:
         return read_poses(self.store, kind, data)
 
-    def write(self, path: Path) -> None:
-        """Write a ROS 1 bag of them, at their stamps."""
-        with Writer(path) as bag:
-            connection = bag.add_connection(self.topic, self.received[0][0], typestore=self.store)
-            for kind, data in self.received:
-                stamps = [stamp for stamp, *_ in self._poses(kind, data)]
-                bag.write(connection, max(stamps, default=0), data)
-
 
 class Drain:
     """Tells when nothing comes any more of a system whose bag of n scans is over.
@@ -564,28 +555,23 @@ class PlayedBag(WholeRun):
     """A ROS 1 system that hears a bag, from its beginning to its end."""
 
     pose_stamps = np.empty(0, np.int64)  # as the system gave them
-
-    @property
-    def start_seconds(self) -> float:
-        """Seconds until it hears the bag."""
-        return sum(self._seconds.get(step, 0.0) for step in ("container", "ready"))
+    start_seconds = 0.0  # until it hears the bag
 
     def trajectory(self, given: ProgramInput, folder: Path) -> Trajectory:
-        self._seconds: dict[str, float] = {}
-        self._end = time.monotonic() + self._limits.seconds * len(given.stamps)
+        begin = time.monotonic()
+        self._end = begin + self._limits.seconds * len(given.stamps)
         template, text = filled(self.settings, self.parameters)
         source = given.path.resolve()
         # As RUSTLE mounts the folder of a data set.
         bag = Mount(source, f"/rustle/dataset/{source.name}")
-        with self._timed("container"):
-            system = RosSystem(self.settings, self._limits.memory, text, folder, [bag])
+        system = RosSystem(self.settings, self._limits.memory, text, folder, [bag])
         recorder, fault = PoseRecorder(system.link, self.settings.odometry), ""
         with closing(system):
             try:
                 renamed = self._renamed(given)
-                with self._timed("ready"):
-                    system.wait(renamed.get(given.points, given.points))
-                    keys = server_keys(template, self.parameters, system.link.ask("parameters"))
+                system.wait(renamed.get(given.points, given.points))
+                keys = server_keys(template, self.parameters, system.link.ask("parameters"))
+                self.start_seconds = time.monotonic() - begin
                 self._play(system, recorder, given, bag.target)
                 warn_of_unread(system.link, self.name, keys)
                 self._check_published(system, recorder)
@@ -594,13 +580,7 @@ class PlayedBag(WholeRun):
                 fault = str(error)
                 raise
             finally:
-                self._finish(system, recorder, given, fault)
-
-    @contextmanager
-    def _timed(self, what: str) -> Iterator[None]:
-        begin = time.monotonic()
-        yield
-        self._seconds[what] = time.monotonic() - begin
+                self._finish(system, given, fault)
 
     def _renamed(self, given: ProgramInput) -> dict[str, str]:
         """Topics of the recording that the system expects by another name."""
@@ -615,24 +595,21 @@ class PlayedBag(WholeRun):
         self, system: RosSystem, recorder: PoseRecorder, given: ProgramInput, bag: str
     ) -> None:
         """Play the bag and wait until nothing comes any more."""
-        n = len(given.stamps)
-        with self._timed("bag"):
-            looked = time.monotonic()
-            system.play(bag, self.settings.rate, self._renamed(given))
-            while not system.played():
-                time.sleep(_BETWEEN_TOPIC_LOOKS)
-                if time.monotonic() - looked > _BETWEEN_STATES:
-                    looked = time.monotonic()
-                    self._see(system, n)
-                self._check_time()
-        with self._timed("drained"):
-            # Nodes that sleep by the clock must wake up to finish.
-            system.run_clock(_end_of(given.path), self.settings.rate)
-            drain = Drain(recorder, n, int(given.stamps[-1]), lambda: self._see(system, n))
-            while not drain.over():
-                time.sleep(_BETWEEN_TOPIC_LOOKS)
-                self._check_time()
-            self._see(system, n)
+        n, looked = len(given.stamps), time.monotonic()
+        system.play(bag, self.settings.rate, self._renamed(given))
+        while not system.played():
+            time.sleep(_BETWEEN_TOPIC_LOOKS)
+            if time.monotonic() - looked > _BETWEEN_STATES:
+                looked = time.monotonic()
+                self._see(system, n)
+            self._check_time()
+        # Nodes that sleep by the clock must wake up to finish.
+        system.run_clock(_end_of(given.path), self.settings.rate)
+        drain = Drain(recorder, n, int(given.stamps[-1]), lambda: self._see(system, n))
+        while not drain.over():
+            time.sleep(_BETWEEN_TOPIC_LOOKS)
+            self._check_time()
+        self._see(system, n)
 
     def _see(self, system: RosSystem, n: int) -> float:
         """See whether the system runs, and how many seconds of CPU time it has used.
@@ -665,21 +642,15 @@ class PlayedBag(WholeRun):
             f"odometry.settings.odometry"
         )
 
-    def _finish(
-        self, system: RosSystem, recorder: PoseRecorder, given: ProgramInput, fault: str
-    ) -> None:
+    def _finish(self, system: RosSystem, given: ProgramInput, fault: str) -> None:
         """End the system, and keep what is left of the run."""
         self._words, written = system.words(), system.log()
-        with self._timed("removed"):
-            system.stop()
+        system.stop()
         limits = {"input": str(given.path), "rate": self.settings.rate, "cpus": self.settings.cpus}
-        with kept_log(self, given.logs, fault, self._seconds, **limits) as kept:
-            if kept is None:
-                return
-            (kept / "roscore.log").write_bytes(written)
-            system.keep(kept)
-            if recorder.received and recorder.received[0][0] in POSES:
-                recorder.write(kept / "odometry.bag")
+        with kept_log(self, given.logs, fault, **limits) as kept:
+            if kept is not None:
+                (kept / "roscore.log").write_bytes(written)
+                system.keep(kept)
 
     def _checked(self, recorder: PoseRecorder, given: ProgramInput) -> Trajectory:
         """The trajectory, if its stamps are those of the data, or each scan has one pose."""

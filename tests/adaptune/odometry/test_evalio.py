@@ -89,13 +89,6 @@ def test_more_lasers_than_rows():
         Loam(settings=settings).prepare(turns.turn(0))
 
 
-def test_an_image_of_another_size_does_not_reach_the_pipeline():
-    odometry, wide = Loam(), Loam(settings=Loam.settings_type(columns=512))
-    odometry.start(odometry.prepare(turns.turn(0)), np.eye(4))
-    with pytest.raises(OdometryError, match="began with scans of 32 x 450"):
-        odometry.register(wide.prepare(turns.turn(1)))
-
-
 def test_a_scan_without_times_among_others_with_them_keeps_the_last_motion():
     # It would end the process.
     odometry = odometry_class("evalio_kiss_icp")()

@@ -17,12 +17,10 @@ from contained import (
     host_poses,
     recording,
     rustle,
-    scans,
     template,
     truth,
 )
 from needs import reference_image
-from rosbags.highlevel import AnyReader
 
 from adaptune.odometry import OdometryError
 from adaptune.odometry.docker import ros_container
@@ -116,18 +114,11 @@ def test_what_is_kept_of_a_trial(ran, folder):
     assert isinstance(held["gicp"]["iterations"], int)
     assert held["other"] == {"voxel": 2}
     assert "ready for /points" in (logs / "roslaunch.log").read_text()
-    with AnyReader([logs / "odometry.bag"]) as bag:
-        assert {c.topic: c.msgtype for c in bag.connections} == {
-            "/Odometry": "nav_msgs/msg/Odometry"
-        }
-        stamps = [stamp for _, stamp, _ in bag.messages()]
-    assert stamps == [scan.stamp for scan in scans()]
     note = yaml.safe_load((logs / "trial.yaml").read_text())
     assert note["image"] == "adaptune-reference"
     assert note["digest"] == image_digest("adaptune-reference")
     assert note["parameters"] == VALUES | {"other.voxel": 2}
     assert note["rate"] == 4.0
-    assert note["seconds"].keys() == {"container", "ready", "bag", "drained", "removed"}
     assert note["input"].endswith("/plain/drive.bag")
 
 
