@@ -65,6 +65,17 @@ def is_user_class(name: str) -> bool:
     return name not in ODOMETRIES and name not in PROGRAMS
 
 
+def where(name: str) -> str:
+    """Where the class of an odometry is, as ``module:Class``, without importing it.
+
+    An `OdometryError` names the nearest one if there is none.
+    """
+    try:
+        return strict.path_of(name, "odometry", ODOMETRIES | PROGRAMS, ENTRY_POINTS, "Class")
+    except strict.PluginError as error:
+        raise OdometryError(str(error)) from error
+
+
 def odometry_class(name: str) -> type[Any]:
     """Class of an odometry, by its name as in a study.
 
@@ -74,8 +85,7 @@ def odometry_class(name: str) -> type[Any]:
         If there is no such odometry, with the nearest name, or if the class cannot be used.
     """
     try:
-        path = strict.path_of(name, "odometry", ODOMETRIES | PROGRAMS, ENTRY_POINTS, "Class")
-        found = strict.load(name, path, "class")
+        found = strict.load(name, where(name), "class")
     except strict.PluginError as error:
         if name in ODOMETRIES and isinstance(error.__cause__, ImportError):
             what = f"{name} cannot be imported ({error.__cause__})"
