@@ -30,8 +30,7 @@ from adaptune.space import Selection
 #
 # A hop is shorter than the sub-trajectories whose error is wanted, and an odometry's errors over a
 # few metres are much like the registration's. So hops that follow each other are chained, until
-# they reach over a sub-trajectory. There the odometry's errors, above all those of its rotation,
-# are several times the chain's.
+# they reach over a sub-trajectory, where the odometry's errors are several times the chain's.
 
 MIN_COVERED = 0.5
 """Least share of a chain that its hops cover; in between, the odometry's own motion is taken."""
@@ -211,12 +210,8 @@ class LiveEvidence:
     motion. Memory is bounded: it keeps the scans of the last metres, one a metre, and the errors of
     the last hops.
 
-    Parameters
-    ----------
-    members
-        Trial numbers of a bank's members, as in `Motions`; empty for a single odometry.
-    length
-        Metres of the sub-trajectories whose mean error `own_error` estimates.
+    `members` are trial numbers of a bank's members, as in `Motions`; empty for a single odometry.
+    `length` is that of the sub-trajectories whose mean error `own_error` estimates, in metres.
     """
 
     def __init__(self, members: tuple[int, ...] = (), length: float = 25.0):

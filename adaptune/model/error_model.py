@@ -167,15 +167,10 @@ class ErrorModel:
         return stretch_numbers(places(self.sequences)[self.sequence], self.stretch)
 
     def training_data(self, pca: "ScaledPCA", members: Sequence[int] | None = None) -> TrainingData:
-        """What selection rules are fitted to.
+        """What selection rules are fitted to; `pca` is what `pca` returned.
 
-        `pca` is what `pca` returned. Some of the bank's `members` may be the only candidates; the
-        first counts as the fixed one.
-
-        Raises
-        ------
-        ModelError
-            If the bank does not hold one of them.
+        Some of the bank's `members` may be the only candidates; the first counts as the fixed one.
+        There is a `ModelError` if the bank does not hold one of them.
         """
         data = TrainingData(
             pca.transform(self.descriptors),
@@ -211,13 +206,9 @@ class ErrorModel:
     def check_descriptors(
         self, descriptors: Collection[str], where: Path | str = "the model"
     ) -> None:
-        """Refuse a model that would run code which was not asked for.
+        """Refuse, by a `ModelError`, a model that would run code which was not asked for.
 
         Those of `descriptors` may be used besides adaptune's own.
-
-        Raises
-        ------
-        ModelError
         """
         for name in self.blocks:
             if name not in DESCRIPTORS and name not in descriptors:
@@ -261,11 +252,7 @@ class ErrorModel:
         return digest(self._header(), self._arrays())
 
     def save(self, path: Path | str) -> None:
-        """Write the model to one file, in the safetensors format. Numbers keep all their bits.
-
-        They are not compressed: a compressed file would be a tenth smaller, take ten times as long
-        to load, and could demand a thousand times its size in memory.
-        """
+        """Write the model to one file, in the safetensors format. Numbers keep all their bits."""
         header, arrays = self._header(), self._arrays()
         header |= {
             name: getattr(self, name)
@@ -282,13 +269,7 @@ class ErrorModel:
 
     @classmethod
     def load(cls, path: Path | str) -> Self:
-        """Read a model.
-
-        Raises
-        ------
-        ModelError
-            If there is none, or it is damaged, or of a newer or older adaptune.
-        """
+        """Read a model; a `ModelError` if there is none, it is damaged, or of another adaptune."""
         path = Path(path)
         try:
             header, arrays = _read(path)
@@ -312,13 +293,7 @@ class ErrorModel:
         return model
 
     def check(self) -> None:
-        """Refuse a model whose parts do not go together.
-
-        Raises
-        ------
-        ValueError
-        SpaceError
-        """
+        """Refuse a model whose parts do not go together, by a ValueError or a SpaceError."""
         n_frames, n_sets = self.errors.shape
         if self.descriptors.shape != (n_frames, sum(self.blocks.values())):
             raise ValueError("the errors are not of as many frames as the descriptors")

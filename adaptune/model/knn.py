@@ -68,14 +68,11 @@ class NearestNeighbours(Rule):
     their standard deviations as the descriptor's components are.
 
     The prediction is that of `sklearn.neighbors.KNeighborsRegressor` on a row ``[frame, set]`` for
-    every pair that was run, with none of these rows made. A squared distance between rows is that
-    between the frames plus that between the sets. So among frames that have seen the same sets,
-    the k nearest pairs are made of the k nearest frames and the k nearest sets; frames that have
-    seen others are searched apart, and their best pairs merged.
+    every pair that was run. Among frames that have seen the same sets, the k nearest pairs are made
+    of the k nearest frames and the k nearest sets; frames that have seen others are searched apart.
 
     Of pairs at the same distance, the one with the nearer frame comes first, then the one with the
-    earlier frame, then that with the earlier set. (scikit-learn leaves the order to its search.)
-    Where there are fewer than k pairs, all are averaged.
+    earlier frame, then that with the earlier set. Of fewer than k pairs, all are averaged.
     """
 
     def __init__(self, k: int = 5):

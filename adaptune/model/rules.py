@@ -263,18 +263,13 @@ def mean_errors(errors: NDArray[np.floating], sequence: NDArray[np.intp]) -> NDA
 
 
 def complementary(data: TrainingData, size: int, spending: Spending | None = None) -> list[int]:
-    """Choose sets so that at every training frame one of them does well.
+    """Choose sets so that at every training frame one does well: trials, the fixed set's first.
 
     The search is greedy and begins with the fixed set. Each next set is the one that lowers the
     mean error most if the best of the chosen sets were known at every frame.
 
     `size` sets, or fewer where another one would lower nothing, or would cost too much. A set that
     was not run on every sequence is not chosen.
-
-    Returns
-    -------
-    list of int
-        Trial numbers, the fixed set's first.
     """
     everywhere = np.isfinite(mean_errors(data.errors, data.sequence)) & data.allows()
     capped = np.where(np.isnan(data.errors) | ~everywhere, np.inf, cap(data.errors))

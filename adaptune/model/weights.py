@@ -110,10 +110,8 @@ class BankRule(Rule):
     def fit(self, data: TrainingData) -> Self:
         """See `Rule.fit`.
 
-        Raises
-        ------
-        ValueError
-            If the data name no members, the fixed set first, or hold no error vectors of them.
+        There is a ValueError if the data name no members, the fixed set first, or hold no error
+        vectors of them.
         """
         members = data.candidates
         if members is None or data.vectors is None or members[0] != data.fixed:
@@ -177,13 +175,8 @@ def bank_weights(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Weights of the members, and the root mean square that is expected of their mean.
 
-    `live` is what was measured of the members before each scan.
-
-    Returns
-    -------
-    weights : ndarray of shape (n_scans, n_members)
-    ratio : ndarray of shape (n_scans,)
-        To the fixed set's.
+    `live` is what was measured of the members before each scan. Weights are of shape (n_scans,
+    n_members), ratios to the fixed set's root mean square of shape (n_scans,).
     """
     relative = near.products / (near.fixed + ERROR_FLOOR**2)[..., None, None]
     of_sequences = near.evidence.weights(settings.sharpness)
@@ -247,12 +240,8 @@ def clip_errors(
     Vectors are percent, of shape (n_frames, n_sets, 3), not finite where the track was lost;
     `fixed_at` is the fixed set's column.
 
-    Returns
-    -------
-    vectors : ndarray of shape (n_frames, n_sets, 3)
-        Zero where the track was lost.
-    lost : ndarray of shape (n_frames, n_sets)
-        What counts there instead, in no direction; zero elsewhere.
+    Returns vectors of the same shape, zero where the track was lost, and what counts there instead,
+    in no direction, of shape (n_frames, n_sets), zero elsewhere.
     """
     lengths = np.linalg.norm(vectors, axis=-1)
     lost = ~(lengths <= FAILURE)
@@ -293,7 +282,7 @@ def choose_members(
     size: int,
     spending: Spending | None = None,
 ) -> list[int]:
-    """Choose sets whose errors cancel each other.
+    """Choose sets whose errors cancel each other: trial numbers, the fixed set's first.
 
     The search is greedy and begins with the fixed set. Each next member is the one that most
     lowers the mean over the sequences of the root mean square of a weighted mean, if the best
@@ -303,11 +292,6 @@ def choose_members(
     3); a set without them is not chosen. `errors` has for every sequence percent of shape
     (n_frames, n_sets), NaN where a set was not run; a set that was not run on every sequence is
     not chosen.
-
-    Returns
-    -------
-    list of int
-        Trial numbers, the fixed set's first.
     """
     number = np.repeat(np.arange(len(errors)), [len(e) for e in errors])
     means = mean_errors(np.concatenate(errors), number)

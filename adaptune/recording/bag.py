@@ -119,16 +119,9 @@ class BagSource:
     All methods raise a SequenceError where the bags cannot be opened or read, lack a topic, or hold
     no usable message on it. It names the bags and the message, or the topics that there are.
 
-    Parameters
-    ----------
-    paths
-        ROS 1 ``.bag`` files, or ROS 2 folders and files, as `bag_paths` gives them.
-    points
-        Topic of the point clouds; may be left out where there is only one.
-    timing, frame
-        Meaning of the stamps, and frame of the point clouds where the topic has several.
-    about
-        Result of `about` when they were opened before; the bags are then not opened now.
+    `paths` are as `bag_paths` gives them. The topic of the point clouds may be left out where there
+    is only one, and their frame where the topic has only one. Given the result of `about` from
+    when they were opened before, the bags are not opened now.
     """
 
     random_access: ClassVar[bool] = False

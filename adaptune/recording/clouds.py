@@ -205,21 +205,10 @@ def decode_cloud(data: bytes | memoryview, cdr: bool, timing: Timing = AUTO) -> 
 
 
 def from_fields(raw: NDArray[Any] | Mapping[str, NDArray[Any]], stamp: int, timing: Timing) -> Scan:
-    """Make a scan of points given field by field.
+    """Make a scan of points given field by field, and the header's stamp in nanoseconds.
 
-    Parameters
-    ----------
-    raw
-        A structured array of shape (n,), or arrays of shape (n,) by name, with x, y and z.
-    stamp
-        The header's, in nanoseconds.
-    timing
-        Meaning of the stamps.
-
-    Raises
-    ------
-    PointCloudError
-        If x, y or z are not single numbers, or if they or the times cannot be.
+    `raw` is a structured array of shape (n,), or arrays of shape (n,) by name, with x, y and z.
+    There is a PointCloudError if these are not single numbers, or if they or the times cannot be.
     """
     names = raw.dtype.names or () if isinstance(raw, np.ndarray) else tuple(raw)
     time = next((name for name in TIME_FIELDS if name in names), None)
@@ -231,10 +220,11 @@ def from_fields(raw: NDArray[Any] | Mapping[str, NDArray[Any]], stamp: int, timi
     for name, column in columns.items():
         if column.ndim != 1 or column.dtype.kind not in "iuf":
             raise PointCloudError(f"field {name!r} is not one number for each point")
+    native = None if time is None else columns[time].dtype.newbyteorder("=")
     with np.errstate(over="ignore", invalid="ignore"):
         x, y, z = (np.asarray(columns[axis], np.float32) for axis in "xyz")
         given = (
-            _NO_TIMES if time is None else _native(columns[time]),
+            _NO_TIMES if time is None else columns[time].astype(native, copy=False),
             _NO_RINGS if ring is None else np.asarray(columns[ring], np.uint16),
             _NO_INTENSITIES if intensity is None else np.asarray(columns[intensity], np.float32),
         )
@@ -262,7 +252,8 @@ def from_fields(raw: NDArray[Any] | Mapping[str, NDArray[Any]], stamp: int, timi
 @np.errstate(over="ignore", invalid="ignore")
 def _marks(columns: Sequence[NDArray[Any]]) -> NDArray[np.bool_]:
     """Which points are marks of lost rays; a PointCloudError if the coordinates are misread."""
-    away = _norms(columns)
+    x, y, z = (np.asarray(column, np.float64) for column in columns)
+    away = np.hypot(np.hypot(x, y), z)
     seen = np.isfinite(away) & (away > 0)
     # Marks are all at one distance. Nothing that is measured is.
     far = seen & (away > FARTHEST)
@@ -279,19 +270,8 @@ def _marks(columns: Sequence[NDArray[Any]]) -> NDArray[np.bool_]:
     )
 
 
-def _norms(columns: Sequence[NDArray[Any]]) -> NDArray[np.float64]:
-    """Distances of points given axis by axis."""
-    x, y, z = (np.asarray(column, np.float64) for column in columns)
-    return np.asarray(np.hypot(np.hypot(x, y), z))
-
-
 _NO_TIMES, _NO_RINGS = np.empty(0, np.float32), np.empty(0, np.uint16)
 _NO_INTENSITIES = np.empty(0, np.float32)
-
-
-def _native(values: NDArray[Any]) -> NDArray[Any]:
-    """Values in the machine's byte order."""
-    return values.astype(values.dtype.newbyteorder("="), copy=False)
 
 
 # Single precision keeps the loop fast.

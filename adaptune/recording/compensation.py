@@ -129,20 +129,11 @@ def clock_offset(
     """Seconds to add to a trajectory's stamps so that it turns when a gyroscope or a LiDAR does.
 
     The rates of turning, which no choice of frames changes, are correlated at every offset at
-    which the shorter recording lies at least half inside the other.
+    which the shorter recording lies at least half inside the other. `stamps` are nanoseconds on
+    the other clock, `turning` radians per second, both of shape (n,).
 
-    Parameters
-    ----------
-    trajectory
-        On its own clock.
-    stamps, turning
-        Nanoseconds on the other clock and radians per second, of shape (n,).
-
-    Returns
-    -------
-    list of float
-        The best one, and another if others fit nearly as well because turns repeat. Empty if the
-        two do not show the same motion.
+    Returns the best one, and another if others fit nearly as well because turns repeat; nothing if
+    the two do not show the same motion.
     """
     if len(trajectory) < 3 or len(stamps) < 3:
         return []

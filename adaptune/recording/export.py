@@ -89,16 +89,8 @@ class Messages:
     ) -> None:
         """Write a bag where nothing is yet: a file of ROS 1, or a folder of ROS 2.
 
-        Parameters
-        ----------
-        path
-            The file or the folder.
-        types
-            Of the messages on each topic.
-        messages
-            In the order in which they are sent.
-        mcap
-            Whether the files of a ROS 2 bag are MCAP, and not SQLite.
+        `types` are those of the messages by topic, which come in the order in which they are sent.
+        The files of a ROS 2 bag are SQLite, or MCAP if `mcap`.
         """
         from rosbags import rosbag1, rosbag2
 
@@ -162,14 +154,8 @@ def measurements(messages: Messages, imu: Imu, topic: str) -> Iterator[Message]:
 def write_kitti_sequence(scans: Iterable[Scan], root: Path, name: str = "00") -> None:
     """Write a sequence of the KITTI odometry benchmark, its camera in the LiDAR's frame, no poses.
 
-    Parameters
-    ----------
-    scans
-        In order of time. Intensities are 0 where they have none.
-    root
-        Folder of the benchmark; it receives ``sequences/<name>``.
-    name
-        Of the sequence, which is not there yet.
+    Scans are in order of time; intensities are 0 where they have none. The benchmark's folder
+    `root` receives ``sequences/<name>``, which is not there yet.
     """
     sequence = root / "sequences" / name
     (sequence / "velodyne").mkdir(parents=True)

@@ -660,15 +660,7 @@ def _scan_span(topic: Topic) -> tuple[int, int]:
 
 
 def render_inspection(inspection: Inspection, accuracy: str = "") -> RenderableType:
-    """The inspection for a terminal.
-
-    Parameters
-    ----------
-    inspection
-        What was found.
-    accuracy
-        How wrong its reference is, or how to find out.
-    """
+    """The inspection for a terminal, and how wrong its reference is, or how to find out."""
     parts: list[RenderableType] = [Text(str(inspection.path), style="bold")]
     parts.append(_topic_table(inspection))
     if inspection.fields:

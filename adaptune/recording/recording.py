@@ -149,10 +149,7 @@ def sequence_files(config: SequenceConfig) -> SequenceFiles:
 def interval_of(config: SequenceConfig) -> tuple[float, float]:
     """From which stamp to before which one a sequence uses its recording, in nanoseconds.
 
-    Raises
-    ------
-    SequenceError
-        If it cannot be opened.
+    A SequenceError if it cannot be opened.
     """
     recorded = RecordedSequence(config)
     first, _ = recorded.source.span() or (0, 0)

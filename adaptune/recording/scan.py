@@ -438,14 +438,9 @@ def places(names: Sequence[str]) -> NDArray[np.intp]:
 
 
 def stretch_numbers(place: NDArray[np.intp], stretch: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Number stretches of all places from 0 on, of shape (n_frames,).
+    """Number stretches of all places from 0 on.
 
-    Parameters
-    ----------
-    place
-        Number of each frame's place, of shape (n_frames,).
-    stretch
-        Number of its stretch there, of shape (n_frames,).
+    All of shape (n_frames,): each frame's number, that of its place, and of its stretch there.
     """
     _, number = np.unique(np.stack([place, stretch], axis=1), axis=0, return_inverse=True)
     return np.asarray(number.ravel())

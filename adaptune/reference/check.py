@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import accumulate, islice
 from pathlib import Path
-from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -152,10 +151,9 @@ def mean_difference(T_one: Poses, T_other: Poses, length: float) -> float:
 
 # The likeliest cause where poses contradict the scans, and what mends it.
 #
-# Motions that registrations of scans have measured owe nothing to a reference nor to an odometry.
-# Poses that do not show them break a convention: another order of numbers, another frame, another
-# clock. Each convention predicts the poses as they would be without it; the one that fits the
-# measured motions is the likeliest.
+# Poses that do not show the motions that registrations of scans have measured break a convention:
+# another order of numbers, another frame, another clock. Each convention predicts the poses as they
+# would be without it; the one that fits the measured motions is the likeliest.
 
 SUSPICIOUS = 1.5
 """Percent. Poses that differ less from what scans show break no convention."""
@@ -224,17 +222,9 @@ def diagnose_reference(
 ) -> Cause | None:
     """Why a reference contradicts measured motions; None if it does not, or nobody can tell.
 
-    Parameters
-    ----------
-    reference
-        Poses of the LiDAR.
-    stamps
-        Of the scans, in nanoseconds, of shape (n_scans,).
-    hops
-        Measured motions between scans.
-    place
-        The LiDAR's pose in the frame of the poses that were given, of shape (4, 4), as the study
-        states it; by default they are the LiDAR's own.
+    The stamps of the scans are nanoseconds, of shape (n_scans,). `place` is the LiDAR's pose in the
+    frame of the poses that were given, of shape (4, 4), as the study states it; by default they are
+    the LiDAR's own.
     """
     errors = mismatch(reference.at(stamps), hops)
     before = _mean(errors)
@@ -457,12 +447,11 @@ def contradictions(
     Parameters
     ----------
     scans
-        They are read once more, as far as needed.
+        Read once more, as far as needed, where `error` is large.
     T_odom_sensor
         The odometry's poses, of shape (n_scans, 4, 4), which owe nothing to the reference.
     error
-        Percent by which the odometry differs from the reference. Where it is small, nothing is
-        wrong, and nothing is read.
+        Percent by which the odometry differs from the reference.
     place
         The LiDAR's pose in the reference's frame as a study states it (`extrinsic`).
     given
@@ -698,15 +687,9 @@ def recording_config(
 
 
 def check_writable(path: Path) -> None:
-    """Make sure that an estimate can be written, and that nothing of the user's is overwritten.
-
-    There is an `EstimateError` if the folder of the TUM file cannot be written to, or there is a
-    file that is no estimate.
-    """
+    """Make the folder of an estimate; an `EstimateError` if a file there is no estimate."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with TemporaryFile(dir=path.parent):
-            pass
     except OSError as error:
         raise EstimateError(
             f"{path.parent}: cannot be written to ({error.strerror}); write elsewhere with --out"

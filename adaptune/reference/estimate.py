@@ -48,18 +48,10 @@ Advance = Callable[[int, int], None]
 def estimate_reference(scans: Recording, advance: Advance = lambda *_: None) -> EstimatedReference:
     """Estimate the reference of a recording; its own is not used.
 
-    Neither a reference nor the trials of a study are used: what judges an odometry is made by a
-    pool of others. Only the scans of the last metres are kept in memory.
-
-    Parameters
-    ----------
-    advance
-        Called after every scan. The pose graphs take about a twentieth of the time, after that.
-
-    Raises
-    ------
-    EstimateError
-        If the recording does not allow it: the robot hardly moves, or nothing can be registered.
+    What judges an odometry is made by a pool of others. Only the scans of the last metres are kept
+    in memory. `advance` is called after every scan; the pose graphs take about a twentieth of the
+    time, after that. There is an EstimateError if the recording does not allow it: the robot hardly
+    moves, or nothing can be registered.
     """
     n = scans.n_messages
     found = pass_over(scans, lambda done: advance(done, round(1.05 * max(n, done))))

@@ -63,13 +63,8 @@ class Ros2:
     on any machine; the nodes on the robot reach each other without it. There is a `LinkError` if
     the extra ``ros2`` is not installed, or no router answers.
 
-    Parameters
-    ----------
-    router
-        Where the robot's Zenoh router listens, as ``host:port``, or as Zenoh writes it
-        (``tls/host:port``).
-    domain
-        The robot's ROS domain; None for that of the environment (``ROS_DOMAIN_ID``), or 0.
+    The robot's Zenoh router is named as ``host:port``, or as Zenoh writes it (``tls/host:port``).
+    Where no ROS domain is given, it is that of the environment (``ROS_DOMAIN_ID``), or 0.
     """
 
     def __init__(self, router: str = f"127.0.0.1:{PORT}", domain: int | None = None):
@@ -97,7 +92,14 @@ class Ros2:
 
         There is a `LinkError` if the topic is published with another type than this as known here.
         """
-        self._check_type(topic, kind)
+        # What would never bring a message: its place depends on the type's hash.
+        known = kind, self._hash(topic, kind)
+        there = [token[1:] for token in self._tokens("PUBLISHER") if token[0] == _full(topic)]
+        if there and known not in there:
+            raise LinkError(
+                f"{topic} is published as {there[0][0]} with the type hash {there[0][1]}, not as "
+                f"{kind} with {known[1]}; known are the types of ROS 2 Jazzy"
+            )
         with self._naming(topic):
             channel = self._zenoh.handlers.FifoChannel(_WAITING)
             subscriber = self._session.declare_subscriber(self._key(topic, kind), channel)
@@ -106,16 +108,6 @@ class Ros2:
         samples = (sample for sample in subscriber if not self._closed)
         take_one = lambda sample: take(self._message(sample.payload, kind))  # noqa: E731
         self._threads.append(take_all(topic, samples, take_one))
-
-    def _check_type(self, topic: str, kind: str) -> None:
-        """Refuse what would never bring a message: its place depends on the type's hash."""
-        type_hash = self._hash(topic, kind)
-        there = [(k, h) for name, k, h in self._tokens("PUBLISHER") if name == _full(topic)]
-        if there and (kind, type_hash) not in there:
-            raise LinkError(
-                f"{topic} is published as {there[0][0]} with the type hash {there[0][1]}, not as "
-                f"{kind} with {type_hash}; known are the types of ROS 2 Jazzy"
-            )
 
     def _message(self, payload: Any, kind: str) -> Any:
         """A message; its arrays are views of the bytes that came."""
@@ -181,7 +173,11 @@ class Ros2:
             if there or not patient:
                 break
             time.sleep(_PAUSE)
-        raise LinkError(self._silence(node, place))
+        there = sorted(name for name, *_ in self._tokens("SERVICE"))
+        raise LinkError(
+            f"{node} does not answer: {place} in ROS domain {self._domain}; the services there are "
+            f"{', '.join(there) or 'none'}"
+        )
 
     def _ask(self, key: str, request: bytes, seconds: float) -> Any:
         """Send a request; the replies, which end at once if nobody is there."""
@@ -195,15 +191,6 @@ class Ros2:
                 consolidation=self._zenoh.ConsolidationMode.NONE,
                 timeout=seconds,
             )
-
-    def _silence(self, node: str, service: str) -> str:
-        """What to say of a node that does not answer."""
-        ending = "/set_parameters"
-        services = sorted({name for name, *_ in self._tokens("SERVICE")})
-        nodes = [name.removesuffix(ending) for name in services if name.endswith(ending)]
-        there = f"the nodes there are {', '.join(nodes)}" if nodes else "no node there has any"
-        silent = "is there, but does not answer" if node in nodes else "is not there"
-        return f"{node} {silent}: {service} in ROS domain {self._domain}; {there}"
 
     def topics(self) -> Mapping[str, str]:
         return {name: kind for name, kind, _ in self._tokens("PUBLISHER")}

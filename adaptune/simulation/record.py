@@ -202,18 +202,8 @@ def record(
 ) -> None:
     """Simulate a course and write a ROS 1 bag, and its ground truth in the TUM format beside it.
 
-    Both are written whole or not at all.
-
-    Parameters
-    ----------
-    course
-        The course to simulate.
-    path
-        Where to write the bag.
-    overwrite
-        Whether to replace files that are there.
-    progress
-        Notes every scan, under the bag's name.
+    Both are written whole or not at all; `overwrite` replaces files that are there. `progress`
+    notes every scan, under the bag's name.
     """
     truth = path.with_suffix(".tum")
     for file in (path, truth):

@@ -177,18 +177,10 @@ def test_a_refusal_gives_the_reason(link):
         link.set_parameters("/robot/slam", {"bounds": [1]})
 
 
-@pytest.mark.parametrize(
-    ("node", "words"),
-    [
-        (
-            "/other",
-            "is not there: .* in ROS domain 0; the nodes .* are /deaf, /robot/slam, /secret",
-        ),
-        ("/deaf", "is there, but does not answer"),
-    ],
-)
-def test_a_node_that_is_not_there_or_does_not_answer_is_named(link, node, words):
-    with pytest.raises(LinkError, match=f"{node} {words}"):
+@pytest.mark.parametrize("node", ["/other", "/deaf"])
+def test_a_node_that_is_not_there_or_does_not_answer_is_named(link, node):
+    words = "in ROS domain 0; the services there are /deaf/.*, /robot/slam/.*, /secret/"
+    with pytest.raises(LinkError, match=f"{node} does not answer: .* {words}"):
         link.set_parameters(node, {"voxel_size": 1.0})
 
 
