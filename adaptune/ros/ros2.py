@@ -173,10 +173,10 @@ class Ros2:
             if there or not patient:
                 break
             time.sleep(_PAUSE)
-        there = sorted(name for name, *_ in self._tokens("SERVICE"))
+        services = sorted({name for name, *_ in self._tokens("SERVICE")})
         raise LinkError(
             f"{node} does not answer: {place} in ROS domain {self._domain}; the services there are "
-            f"{', '.join(there) or 'none'}"
+            f"{', '.join(services) or 'none'}"
         )
 
     def _ask(self, key: str, request: bytes, seconds: float) -> Any:
