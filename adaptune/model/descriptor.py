@@ -152,10 +152,7 @@ class Describer:
 
     The motion descriptor stays zero. `adaptune.model.descriptor.fill_in` fills it in.
 
-    Attributes
-    ----------
-    blocks : dict
-        By name, in order, how many numbers each descriptor has.
+    `blocks` says by name, in order, how many numbers each descriptor has.
     """
 
     def __init__(self, names: Iterable[str]):

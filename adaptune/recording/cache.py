@@ -260,10 +260,7 @@ remembered: dict[str, str] = {}
 def fingerprints(files: Sequence[Path]) -> list[str]:
     """Hash the content of each file; `MANY` or more files are hashed as one.
 
-    Raises
-    ------
-    AdaptuneError
-        If a file cannot be read, or changes while it is read.
+    There is an AdaptuneError if a file cannot be read, or changes while it is read.
     """
     new: dict[str, str] = {}
     found = []

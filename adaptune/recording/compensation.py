@@ -54,12 +54,8 @@ def neighbour_motions(scans: Iterable[Scan]) -> Iterator[tuple[Scan, Poses | Non
 
     Both were measured in the same motion, so that its distortion hardly matters.
 
-    Yields
-    ------
-    scan : Scan
-    T_before_scan : ndarray of shape (4, 4), or None where it is not known
-    seconds : float
-        Between their stamps; negative where scans are read backwards.
+    Yields each scan, ``T_before_scan`` of shape (4, 4), or None where it is not known, and the
+    seconds between their stamps, which are negative where scans are read backwards.
     """
     import small_gicp
 

@@ -228,23 +228,12 @@ class Timing:
     ) -> tuple[int, NDArray[np.float32] | None, Reading]:
         """Find the start of a scan, and the time of each point since then.
 
-        Parameters
-        ----------
-        stamp
-            The header's, in nanoseconds.
-        values
-            Times of the valid points as the driver wrote them, of shape (n,): relative to the
-            stamp, or absolute. All finite.
-        extent
-            The least and the greatest of them.
+        The header's stamp is nanoseconds. `values` are the times of the valid points as the driver
+        wrote them, of shape (n,): relative to the stamp, or absolute, all finite; `extent` is the
+        least and the greatest of them.
 
-        Returns
-        -------
-        start : int
-            Nanoseconds.
-        times : ndarray of shape (n,)
-            float32 seconds since `start`, none below zero.
-        reading : Reading
+        Returns the start in nanoseconds, and the float32 seconds of the points since then, of
+        shape (n,), none below zero.
         """
         if values is None or not len(values) or self.unit == "none":
             start = stamp - round(self.period * 1e9) if self.stamp == "end" else stamp

@@ -25,14 +25,9 @@ class RosLink(Protocol):
 
     Messages are those of `store`, by names such as ``sensor_msgs/msg/PointCloud2`` in ROS 1, too.
     Every method may be called from any thread.
-
-    Attributes
-    ----------
-    store : Typestore
-        The types of all messages.
     """
 
-    store: "Typestore"
+    store: "Typestore"  # the types of all messages
 
     def subscribe(self, topic: str, kind: str, take: Callable[[Any], None]) -> None:
         """Have every message of a topic taken, one after the other, in a thread of its own."""
@@ -43,10 +38,7 @@ class RosLink(Protocol):
     def set_parameters(self, node: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
         """Set parameters of another node; what it then holds, as far as it tells.
 
-        Raises
-        ------
-        LinkError
-            If the node is not there, does not answer, or refuses a value.
+        There is a LinkError if the node is not there, does not answer, or refuses a value.
         """
 
     def topics(self) -> Mapping[str, str]:

@@ -104,23 +104,11 @@ def receive(
 ) -> tuple[F32, F32, NDArray[np.int64]]:
     """Decide which rays come back, and with what range and intensity.
 
-    Parameters
-    ----------
-    directions
-        Unit vectors in the sensor's frame, of shape (n, 3).
-    cast, sensor
-        The rays with their hits, and the receiver.
-    chance, normal
-        Uniform and normal random numbers, of shape (n,).
+    The directions of rays are unit vectors in the sensor's frame, of shape (n, 3); `chance` and
+    `normal` are uniform and normal random numbers, of shape (n,).
 
-    Returns
-    -------
-    points : ndarray of shape (m, 3)
-        In the sensor's frame at the time of each ray.
-    intensities : ndarray of shape (m,)
-        From 0 to 255.
-    kept : ndarray of shape (m,)
-        Which rays came back.
+    Returns points in the sensor's frame at the time of each ray, of shape (m, 3), intensities from
+    0 to 255, of shape (m,), and which rays came back, of shape (m,).
     """
     rays, hits, normals, reflectivity = cast
     nearest, farthest, noise, dropout = sensor

@@ -88,14 +88,8 @@ def merge(meshes: Sequence[Mesh]) -> Mesh:
 def place(model: Mesh, at: ArrayLike, yaw: ArrayLike = 0.0, scale: ArrayLike = 1.0) -> Mesh:
     """Put copies of a model, whose origin is on the ground, in the world.
 
-    Parameters
-    ----------
-    at
-        Metres, of shape (3,) or (n, 3).
-    yaw
-        Radians, one or n.
-    scale
-        One, n, or of shape (n, 3) for an own factor along each axis.
+    `at` is metres, of shape (3,) or (n, 3), `yaw` radians, one or n. There is one `scale`, or n, or
+    it is of shape (n, 3) for an own factor along each axis.
     """
     at = np.atleast_2d(np.asarray(at, np.float64))
     n = len(at)

@@ -43,12 +43,8 @@ class Road:
     It stays within 70 degrees of the x axis and so never meets itself: each x belongs to one
     station. Each scene comes with the metres driven in it; the seed is that of bends and slopes.
 
-    Attributes
-    ----------
-    legs : list of Leg
-        The scenes along it; neighbours of one kind are one leg.
-    length : float
-        Metres of the drive.
+    Its `legs` are the scenes along it; neighbours of one kind are one leg. The drive's `length` is
+    in metres.
     """
 
     def __init__(self, scenes: Sequence[tuple[Scene, float]], seed: int) -> None:
@@ -236,10 +232,7 @@ class Ride:
     vehicle and its shake. Poses, velocities and accelerations thus match exactly. The seed is that
     of its straying, its speed and its shake.
 
-    Attributes
-    ----------
-    duration : float
-        Seconds until the end of the road's drive.
+    Its `duration` is seconds until the end of the road's drive.
     """
 
     def __init__(self, road: Road, motion: Motion, seed: int) -> None:
