@@ -10,7 +10,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from adaptune.errors import AdaptuneError, OdometryError, nearest
+from adaptune.errors import OdometryError, nearest
 from adaptune.geometry import Poses, invert, rectify, scale
 from adaptune.recording.scan import Scan
 from adaptune.space import ParameterSet, ParameterSpace, Selection
@@ -381,8 +381,6 @@ class PreparedScan:
 class InProcess(OdometryInstance):
     """Runs an adapter, which nothing else may use, in this process, and notes what it takes."""
 
-    faults: Sequence[str] = ()
-
     def __init__(self, odometry: Odometry):
         self.odometry = odometry
         self._cpu = 0.0
@@ -428,10 +426,6 @@ _TOLERANCE = 1e-3
 LOST = Registration(np.full((4, 4), np.nan), registered=False)
 """What an odometry gives where there is no pose."""
 LOST.T_odom_sensor.setflags(write=False)
-
-
-class FaultError(AdaptuneError):
-    """An odometry that has ended: one of its user's, or one in another process."""
 
 
 class Faulting(OdometryInstance):

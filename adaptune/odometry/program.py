@@ -300,7 +300,9 @@ def check_frame(T_own_sensor: Poses, T_ref_sensor: Poses | None) -> None:
     """
     if T_ref_sensor is None:
         return
-    T_own, T_true = _motions(T_own_sensor, T_ref_sensor, 1.0)
+    ends = window_ends(T_ref_sensor, 1.0)
+    starts = np.flatnonzero(ends >= 0)
+    T_own, T_true = (invert(T[starts]) @ T[ends[starts]] for T in (T_own_sensor, T_ref_sensor))
     known = np.isfinite(T_own).all(axis=(1, 2))
     own, true = T_own[known, :3, 3], T_true[known, :3, 3]
     if len(own) < _MIN_FRAMES:
@@ -315,14 +317,6 @@ def check_frame(T_own_sensor: Poses, T_ref_sensor: Poses | None) -> None:
             f"the program's poses are those of another frame: turned by {angle:.0f} degrees, they "
             f"are the reference's; give the LiDAR's pose in it (odometry.settings.extrinsic)"
         )
-
-
-def _motions(T_odom_sensor: Poses, T_ref_sensor: Poses, length: float) -> tuple[Poses, Poses]:
-    """Motions of both while the reference moves so many metres."""
-    ends = window_ends(T_ref_sensor, length)
-    starts = np.flatnonzero(ends >= 0)
-    own, true = (invert(T[starts]) @ T[ends[starts]] for T in (T_odom_sensor, T_ref_sensor))
-    return own, true
 
 
 # Odometries that run once on a whole recording.

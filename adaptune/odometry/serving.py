@@ -12,7 +12,7 @@ import numpy as np
 from adaptune import processes
 from adaptune.errors import OdometryError
 from adaptune.odometry import wire
-from adaptune.odometry.base import Description, FaultError, Registration
+from adaptune.odometry.base import Description, Registration
 from adaptune.odometry.registry import (
     check_served,
     declare,
@@ -29,7 +29,7 @@ _log = logging.getLogger(__name__)
 
 
 class _Guarding(Isolated):
-    """An odometry in a process of its own; where it ends, there is a `FaultError`."""
+    """An odometry in a process of its own; where it ends, there is a `HostError`."""
 
     def configure(self, parameters: ParameterSet) -> None:
         self.apply(Selection(0, parameters))
@@ -37,7 +37,7 @@ class _Guarding(Isolated):
     def register(self, prepared: Scan) -> Registration:
         registration = super().register(prepared)
         if self.faults and not np.isfinite(registration.T_odom_sensor).all():
-            raise FaultError(self.faults[-1])
+            raise processes.HostError(self.faults[-1])
         return registration
 
 

@@ -15,8 +15,8 @@ from pydantic import ValidationError
 
 from adaptune.errors import OdometryError, nearest
 from adaptune.geometry import Poses
-from adaptune.odometry.base import Description, FaultError, Registration
-from adaptune.processes import Answer, Message
+from adaptune.odometry.base import Description, Registration
+from adaptune.processes import Answer, HostError, Message
 from adaptune.recording.scan import Imu, ImuNoise, Scan
 from adaptune.space import ParameterSet, ParameterSpace
 from adaptune.strict import in_one_line
@@ -55,7 +55,7 @@ def to_scan(message: Message) -> Scan:
 
 Make = Callable[[str, ParameterSet, Any], tuple[Any, Description]]
 """Makes an odometry by its name and settings, and describes it; what is made does what `Odometry`
-does, and a fault of it is a `FaultError`."""
+does, and a fault of it is a `HostError`."""
 
 
 def hello(odometry: str | None, parameters: ParameterSet, settings: Any) -> dict[str, Any]:
@@ -91,7 +91,7 @@ def conversation(name: str | None, make: Make) -> Answer:
             raise OdometryError("the first message must be a hello")
         try:
             return answered(odometry, message)
-        except FaultError as fault:
+        except HostError as fault:
             return {"type": "fault", "message": str(fault)}
 
     return answer

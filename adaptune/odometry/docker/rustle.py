@@ -604,7 +604,9 @@ class PlayedBag(WholeRun):
                 self._see(system, n)
             self._check_time()
         # Nodes that sleep by the clock must wake up to finish.
-        system.run_clock(_end_of(given.path), self.settings.rate)
+        with AnyReader([given.path]) as reader:
+            end = int(reader.end_time)
+        system.run_clock(end, self.settings.rate)
         drain = Drain(recorder, n, int(given.stamps[-1]), lambda: self._see(system, n))
         while not drain.over():
             time.sleep(_BETWEEN_TOPIC_LOOKS)
@@ -727,8 +729,3 @@ def check_stamps(stamps: NDArray[np.int64], scans: NDArray[np.int64]) -> None:
     if np.mean(scatter < MAX_SCATTER) < _STEADY:
         by = 1e-9 * float(np.percentile(scatter, 95))
         raise OdometryError(f"its stamps scatter by up to {by:.3f} s: {_OWN_CLOCK}")
-
-
-def _end_of(bag: Path) -> int:
-    with AnyReader([bag]) as reader:
-        return int(reader.end_time)

@@ -380,14 +380,3 @@ def test_mistakes_in_the_study(make, override, words):
     with pytest.raises(ConfigurationError) as caught:
         make("none", override)
     assert words in str(caught.value)
-
-
-def test_what_is_not_tuned_stays_as_it_is(tmp_path):
-    path = tmp_path / "params.yaml"
-    path.write_text(
-        "# for the robot\na: yes\nb: {c: 0.5, d: [1, 2.0]}  # near\ne: 010\nf: 1e3\ng: 3.0\n"
-    )
-    text = Template(path).fill({"b/c": 1e-05, "b/d/1": 3, "g": 4})
-    assert text == (
-        "# for the robot\na: yes\nb: {c: 1.0e-05, d: [1, 3.0]}  # near\ne: 010\nf: 1e3\ng: 4.0\n"
-    )

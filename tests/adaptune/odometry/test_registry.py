@@ -190,11 +190,14 @@ def package(tmp_path, monkeypatch):
     return folder
 
 
-def test_a_class_is_its_module(package):
-    before = odometry_content("theirs.odometry:Mine", None)
-    assert list(before) == ["module theirs.odometry"]
-    (package / "odometry.py").write_text("# another\n")
-    assert odometry_content("theirs.odometry:Mine", None) != before
+@pytest.mark.parametrize("written_in", ["odometry", "inner"])
+def test_a_class_is_its_module_and_the_one_in_which_it_is_written(package, written_in):
+    (package / "inner.py").write_text("1")
+    what = "theirs.odometry:Mine", None, f"theirs.{written_in}"
+    before = odometry_content(*what)
+    assert set(before) == {"module theirs.odometry", f"module theirs.{written_in}"}
+    (package / f"{written_in}.py").write_text("# another\n")
+    assert odometry_content(*what) != before
     assert not any(name.startswith("theirs") for name in sys.modules)
 
 
@@ -208,14 +211,14 @@ def test_a_built_in_one_is_the_version_of_its_package(name, package):
 
 
 def test_a_program_is_its_files(tmp_path):
-    script, template = tmp_path / "run.py", tmp_path / "template.yaml"
-    script.write_text("1")
-    template.write_text("a: 1")
-    arguments = (sys.executable, str(script), "{input}", "x" * 5000, "\0")
+    script, template, option = (tmp_path / name for name in ("run.py", "p.yaml", "c.txt"))
+    for file in (script, template, option):
+        file.write_text("a: 1")
+    arguments = (sys.executable, str(script), f"--c={option}", "{input}", "x" * 5000, "\0")
     settings = CommandSettings(command=arguments, template=str(template))
     before = odometry_content("command", settings)
-    assert set(before) == {sys.executable, str(script), str(template)}
-    for file in (script, template):
+    assert set(before) == {sys.executable, str(script), str(template), str(option)}
+    for file in (script, template, option):
         file.write_text("b: 2")
         assert odometry_content("command", settings)[str(file)] != before[str(file)]
     served = ProcessSettings(command=(sys.executable, str(script)))
@@ -231,17 +234,3 @@ def test_descriptors_of_the_user_are_their_modules(package):
     after = descriptor_content(["ndt", "theirs.odometry:describe"])
     assert before.keys() == after.keys() == {"module theirs.odometry"}
     assert before != after
-
-
-def test_a_class_is_also_the_module_in_which_it_is_written(package):
-    (package / "inner.py").write_text("1")
-    before = odometry_content("theirs.odometry:Mine", None, "theirs.inner")
-    assert set(before) == {"module theirs.odometry", "module theirs.inner"}
-    (package / "inner.py").write_text("2")
-    assert odometry_content("theirs.odometry:Mine", None, "theirs.inner") != before
-
-
-def test_a_file_behind_an_option_is_part_of_a_program(tmp_path):
-    (tmp_path / "c.txt").write_text("1")
-    settings = CommandSettings(command=(sys.executable, f"--config={tmp_path}/c.txt"))
-    assert set(odometry_content("command", settings)) == {sys.executable, f"{tmp_path}/c.txt"}
