@@ -19,6 +19,7 @@ from adaptune.odometry.remote import Limits
 from adaptune.simulation import Course
 from adaptune.simulation.record import simulate
 from adaptune.space import ParameterSets, ParameterSpace
+from adaptune.study.study import StudySequences
 from offline.config import OfflineConfig
 from offline.labelled import (
     BankSimulation,
@@ -28,7 +29,7 @@ from offline.labelled import (
     recorded_motions,
 )
 from offline.samplers import make_sampler
-from offline.trial import SharedScan, SharedScans, TrialSettings, run_trials, with_measured_hops
+from offline.trial import SharedScan, SharedScans, TrialSettings, TrialSetup, with_measured_hops
 
 MEMORY = 3e9
 """Bytes of prepared scans."""
@@ -40,6 +41,8 @@ WINDOW = 3
 """Selections whose descriptors are averaged."""
 PERIOD = 10
 """Scans from one selection to the next."""
+NO_SEQUENCES = StudySequences({}, {}, {}, Path())
+"""Of a study: the courses are in no study."""
 
 
 def training_courses(seed: int, length: float) -> dict[str, Course]:
@@ -96,7 +99,7 @@ def run(path: Path, course: Course, odometry: str, seed: int) -> None:
     sets = make_sampler(factory.space, config).propose([])
     frames = with_measured_hops(scans, frames)
     course_scans: Any = SharedCourse(path.stem, scans, frames)
-    trials = run_trials(settings, factory, course_scans, sets)
+    trials = TrialSetup(settings, factory, NO_SEQUENCES).run(course_scans, sets)
     length = settings.sub_trajectory
     vectors = [error_vectors(frames.T_ref_sensor, trial, length) for trial in trials]
     motions = recorded_motions(frames, trials)[..., :3, :]

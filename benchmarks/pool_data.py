@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from gain_data import PERIOD, WINDOW, SharedCourse, in_place, training_courses
+from gain_data import NO_SEQUENCES, PERIOD, WINDOW, SharedCourse, in_place, training_courses
 from numpy.typing import NDArray
 
 from adaptune.archive import PREPARE_MS, REGISTER_MS, Frames
@@ -28,7 +28,7 @@ from offline.labelled import (
     recorded_motions,
 )
 from offline.samplers import sobol_points
-from offline.trial import TrialSettings, run_trials, with_measured_hops
+from offline.trial import TrialSettings, TrialSetup, with_measured_hops
 
 POINTS: dict[str, tuple[int, ...]] = {
     "gicp": tuple(range(16)),
@@ -101,7 +101,8 @@ def _write(path: Path, odometry: str, sets: list[ParameterSet], course: SharedCo
     """Run sets of an odometry, and keep their errors, motions and costs."""
     settings, frames = TrialSettings(), course.frames
     scans: Any = course
-    trials = run_trials(settings, pool().factories[odometry], scans, sets)
+    setup = TrialSetup(settings, pool().factories[odometry], NO_SEQUENCES)
+    trials = setup.run(scans, sets)
     T_ref_sensor, length = frames.T_ref_sensor, settings.sub_trajectory
     vectors = [error_vectors(T_ref_sensor, trial, length) for trial in trials]
     motions = recorded_motions(frames, trials)[..., :3, :]

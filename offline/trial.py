@@ -414,48 +414,59 @@ def reference_poses(
     return T_ref_sensor
 
 
-def run_trials(
-    settings: TrialSettings,
-    odometry: Factory,
-    scans: PreparedSequence,
-    sets: Sequence[ParameterSet],
-    whole: bool = False,
-    progress: Progress = unseen,
-) -> list[Trial]:
-    """Run an odometry with several parameter sets on one pass over a sequence.
+@dataclass(frozen=True)
+class TrialSetup:
+    """Everything that a process needs to run trials."""
 
-    With ``runs: restart``, an odometry that loses track restarts at the reference with that scan.
-    The sub-trajectories across that frame count as failures; later ones are judged on their own.
-    `OfflineConfig` describes other kinds. With `whole`, it is driven from end to end as a replay
-    drives it: without reference, and restarted by the health check.
-    """
-    frames = scans.frames
-    lost_track = settings.lost_track if settings.runs == "restart" else None
+    settings: TrialSettings
+    odometry: Factory
+    sequences: StudySequences
 
-    def repeat(parameters: ParameterSet) -> TrialRun:
-        make = partial(odometry, parameters, scans.name, isolated=settings.isolated)
-        if whole:
-            return DrivenRun(make, frames, settings.health)
-        return TrialRun(make, frames, lost_track)
+    def prepare(self, name: str, memory: float, progress: Progress = unseen) -> PreparedSequence:
+        """Read and prepare a sequence, see `PreparedSequence`."""
+        return PreparedSequence(self, name, memory, progress)
 
-    runs = [[repeat(s) for _ in range(_n_runs(settings, odometry, s))] for s in sets]
-    each = [run for of_set in runs for run in of_set]
-    with ExitStack() as ended:
-        for run in each:
-            ended.callback(run.close)
-        for i, scan in enumerate(_watched(scans, len(frames.stamps), "running", progress)):
+    def run(
+        self,
+        scans: PreparedSequence,
+        sets: Sequence[ParameterSet],
+        whole: bool = False,
+        progress: Progress = unseen,
+    ) -> list[Trial]:
+        """Run the odometry with several parameter sets on one pass over a sequence.
+
+        With ``runs: restart``, an odometry that loses track restarts at the reference with that
+        scan. The sub-trajectories across that frame count as failures; later ones are judged on
+        their own. `OfflineConfig` describes other kinds. With `whole`, it is driven from end to end
+        as a replay drives it: without reference, and restarted by the health check.
+        """
+        runs = [self._begin(scans, parameters, whole) for parameters in sets]
+        each = [run for of_set in runs for run in of_set]
+        n_frames = len(scans.frames.stamps)
+        with ExitStack() as ended:
             for run in each:
-                run.step(i, scan)
-    return [
-        _mean(s, [_trial(settings, s, scans, run) for run in of_set])
-        for s, of_set in zip(sets, runs, strict=True)
-    ]
+                ended.callback(run.close)
+            for i, scan in enumerate(_watched(scans, n_frames, "running", progress)):
+                for run in each:
+                    run.step(i, scan)
+        return [
+            _mean(s, [_trial(self.settings, s, scans, run) for run in of_set])
+            for s, of_set in zip(sets, runs, strict=True)
+        ]
 
-
-def _n_runs(settings: TrialSettings, odometry: Factory, parameters: ParameterSet) -> int:
-    if settings.baseline_runs is None or parameters not in odometry.space.baselines:
-        return settings.repeats
-    return settings.baseline_runs
+    def _begin(
+        self, scans: PreparedSequence, parameters: ParameterSet, whole: bool
+    ) -> list[TrialRun]:
+        """The runs of a parameter set."""
+        settings, odometry = self.settings, self.odometry
+        make = partial(odometry, parameters, scans.name, isolated=settings.isolated)
+        n = settings.repeats
+        if settings.baseline_runs is not None and parameters in odometry.space.baselines:
+            n = settings.baseline_runs
+        if whole:
+            return [DrivenRun(make, scans.frames, settings.health) for _ in range(n)]
+        lost_track = settings.lost_track if settings.runs == "restart" else None
+        return [TrialRun(make, scans.frames, lost_track) for _ in range(n)]
 
 
 def _trial(
@@ -529,26 +540,3 @@ def _mean(parameters: ParameterSet, repeats: Sequence[Trial]) -> Trial:
         max(repeats, key=lambda trial: trial.unhealthy.get("no_pose", 0)).unhealthy,
         repeats[0].health,
     )
-
-
-@dataclass(frozen=True)
-class TrialSetup:
-    """Everything that a process needs to run trials."""
-
-    settings: TrialSettings
-    odometry: Factory
-    sequences: StudySequences
-
-    def prepare(self, name: str, memory: float, progress: Progress = unseen) -> PreparedSequence:
-        """Read and prepare a sequence, see `PreparedSequence`."""
-        return PreparedSequence(self, name, memory, progress)
-
-    def run(
-        self,
-        scans: PreparedSequence,
-        sets: Sequence[ParameterSet],
-        whole: bool = False,
-        progress: Progress = unseen,
-    ) -> list[Trial]:
-        """Run trials, see `run_trials`."""
-        return run_trials(self.settings, self.odometry, scans, sets, whole, progress)

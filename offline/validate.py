@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from adaptune.archive import Archive
 from adaptune.errors import AdaptuneError
-from adaptune.metrics import bootstrap, cap
+from adaptune.metrics import cap
 from adaptune.model import RULES, ErrorModel, ModelError, PairedExpectedRatio, Rule
 from adaptune.model.knn import NearestNeighbours
 from adaptune.model.rules import ERROR_FLOOR
@@ -64,7 +64,6 @@ class LeftOut(NamedTuple):
     name: str
     recording: str  # that it is a part of
     stretch: NDArray[np.intp]  # (n,): of each frame
-    block: int  # frames of a sub-trajectory
     # For every mode the capped error in percent at each frame, of shape (n,).
     errors: dict[str, NDArray[np.float64]]
     # For every rule the share of periods in which it did not choose the fixed set; of a bank, the
@@ -268,8 +267,7 @@ def leave_out(
     errors |= {name: capped[:, data.sets.column(trial)] for name, trial in of_rivals.items()}
     # The best set in hindsight.
     errors["oracle, sequence"] = capped[:, int(np.argmin(capped.mean(axis=0)))]
-    about = (sequence.name, sequence.recording, sequence.stretch, sequence.block)
-    return LeftOut(*about, errors, adapted, costs)
+    return LeftOut(sequence.name, sequence.recording, sequence.stretch, errors, adapted, costs)
 
 
 class Validated(NamedTuple):
@@ -372,38 +370,29 @@ def _labelled(study: OfflineStudy, model: ErrorModel) -> LabelledData:
 
 
 def _rows(validation: Validation) -> list[dict[str, Any]]:
-    """Ratios to the fixed set's error, intervals of the default rule's, and costs."""
+    """Ratios to the fixed set's error, the interval of the default rule's mean, and costs."""
     default = (*validation.modes, PAIRED)[0]
     modes = [mode for mode in validation.ratios if mode != "fixed"]
     rows: list[dict[str, Any]] = []
 
-    def add(
-        name: str,
-        fixed: float | None,
-        of: dict[str, float],
-        interval: tuple[float, float] | None = None,
-    ) -> None:
+    def add(name: str, fixed: float | None, of: dict[str, float], interval: str = "") -> None:
         rows.append({"left out": name, "fixed [%]": fixed})
         for mode in modes:
             rows[-1][mode] = of[mode]
             if mode == default:
-                ends = interval and f"{interval[0]:.2f}-{interval[1]:.2f}"
-                rows[-1][f"{mode}, 95 %"] = ends
+                rows[-1][f"{mode}, 95 %"] = interval or None
 
     for i, sequence in enumerate(validation.left_out):
         of = {mode: float(validation.ratios[mode][i]) for mode in modes}
-        errors, fixed = sequence.errors[default], sequence.errors["fixed"]
-        # It is about this sequence, and says nothing about other places.
-        intervals = bootstrap(errors, fixed, sequence.block)
-        add(sequence.name, fixed.mean(), of, intervals and intervals[1])
+        add(sequence.name, sequence.errors["fixed"].mean(), of)
     costs = {mode: validation.cost(mode) for mode in ["fixed", *modes]}
     if np.isfinite(list(costs.values())).any():
         add("cost [ms]", costs["fixed"], costs)
     summaries = {mode: validation.summary(mode) for mode in modes}
     for key in ("geometric", "arithmetic", "worst_tenth", "worst"):
-        ends = summaries[default]["low"], summaries[default]["high"]
+        ends = f"{summaries[default]['low']:.2f}-{summaries[default]['high']:.2f}"
         of = {mode: summaries[mode][key] for mode in modes}
-        add(key.replace("_", " "), None, of, ends if key == "geometric" else None)
+        add(key.replace("_", " "), None, of, ends if key == "geometric" else "")
     return rows
 
 

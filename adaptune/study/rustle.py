@@ -410,6 +410,8 @@ def _speeds(file: _File, key: Key, test: _Test) -> list[float]:
         what = "give speed_factors, or speed_range and speed_step"
         raise file.error((*key, "test_type"), what)
     n = math.floor((test.speed_range - 1.0) / test.speed_step + 1e-9) + 1
+    if n > 100:
+        raise file.error((*key, "test_type", "speed_step"), f"makes {n} speeds; 100 at most")
     return [1.0 + i * test.speed_step for i in range(n)]
 
 

@@ -259,6 +259,7 @@ def test_nothing_is_overwritten_unasked(rustle):
             "line 6: test_definitions.0.algo_list.0: algorithms.yaml has no 'faster' in",
         ),
         ("tests", "type: simple", "type: slow", "test_definitions.0.test_type.type: give"),
+        ("tests", "speed_step: 1", "speed_step: 1e-6", "speed_step: makes 2000001 speeds; 100"),
         ("algorithms", "config/params.yaml", "no.yaml", "algorithms.yaml, line 6: algorithms.0."),
         ("datasets", "datasets:", "- 1", "datasets.yaml: "),
         ("tuning", "filter_size_surf", "filter_size", "parameters.filter_size: params.yaml has no"),
