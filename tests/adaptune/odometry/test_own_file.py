@@ -161,8 +161,11 @@ def test_a_published_parameter_file_is_read_as_ros_reads_it(tmp_path):
         for key in template.path_of(name):
             value = value[int(key) if isinstance(value, list) else key]
         assert template.value(name) == value
-    text = template.fill({"filter_size_surf": 0.25, "gyr_cov": 1, "empty": 7.0})
+    text = template.fill(
+        {"filter_size_surf": 0.25, "gyr_cov": 1, "extrinsic_T/2": 1e-5, "empty": 7.0}
+    )
     expected = PUBLISHED.replace(b"0.4 #", b"0.25 #").replace(b"1e-2", b"1.0")
+    expected = expected.replace(b"0.28", b"1.0e-05")
     assert text.encode() == expected.replace(b"empty:", b"empty: 7.0")
     assert template.fill({}).encode() == PUBLISHED
 

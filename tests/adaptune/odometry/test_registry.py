@@ -1,6 +1,7 @@
 import pickle
 import subprocess
 import sys
+from functools import partial
 from importlib import metadata
 
 import pytest
@@ -56,6 +57,7 @@ other = 3
 @pytest.fixture
 def mine(tmp_path, monkeypatch):
     (tmp_path / "my_odometry.py").write_text(MINE)
+    (tmp_path / "my_lacking.py").write_text(MINE.replace(", baseline=0.5", ""))
     monkeypatch.syspath_prepend(str(tmp_path))
     yield
     sys.modules.pop("my_odometry", None)
@@ -67,6 +69,7 @@ def mine(tmp_path, monkeypatch):
     [
         ("gipc", "there is no odometry 'gipc': did you mean 'gicp'.*module:Class"),
         ("no_such_module:Mine", "cannot import no_such_module .*PYTHONPATH"),
+        ("my_lacking:Mine", r"cannot import my_lacking \(Float: baseline: this key is missing\)"),
         ("my_odometry:Mime", "my_odometry has no Mime"),
         ("my_odometry:", "my_odometry has no class"),
         ("my_odometry:other", "not a class derived from adaptune.odometry.Odometry"),
@@ -80,14 +83,6 @@ def mine(tmp_path, monkeypatch):
 def test_names_that_do_not_do(name, message):
     with pytest.raises(OdometryError, match=message):
         odometry_class(name)
-
-
-def test_a_parameter_without_its_baseline_is_named(tmp_path, monkeypatch):
-    (tmp_path / "my_lacking.py").write_text(MINE.replace(", baseline=0.5", ""))
-    monkeypatch.syspath_prepend(str(tmp_path))
-    told = r"my_lacking:Mine: cannot import my_lacking \(Float: baseline: this key is missing\)"
-    with pytest.raises(OdometryError, match=told):
-        odometry_class("my_lacking:Mine")
 
 
 @pytest.mark.usefixtures("mine")
@@ -184,17 +179,31 @@ def package(tmp_path, monkeypatch):
     """A package of the user whose modules must not be imported."""
     folder = tmp_path / "theirs"
     folder.mkdir()
-    (folder / "__init__.py").write_text("raise SystemExit\n")
-    (folder / "odometry.py").write_text("raise SystemExit\n")
+    for name in ("__init__", "odometry", "inner"):
+        (folder / f"{name}.py").write_text("raise SystemExit\n")
     monkeypatch.syspath_prepend(str(tmp_path))
     return folder
 
 
-def test_a_class_is_its_module(package):
-    before = odometry_content("theirs.odometry:Mine", None)
-    assert list(before) == ["module theirs.odometry"]
-    (package / "odometry.py").write_text("# another\n")
-    assert odometry_content("theirs.odometry:Mine", None) != before
+@pytest.mark.parametrize(
+    ("content", "modules"),
+    [
+        (partial(odometry_content, "theirs.odometry:Mine", None), ["odometry"]),
+        # It is also the module in which it is written.
+        (
+            partial(odometry_content, "theirs.odometry:Mine", None, "theirs.inner"),
+            ["inner", "odometry"],
+        ),
+        (partial(descriptor_content, ["ndt", "motion", "theirs.inner:describe"]), ["inner"]),
+        (partial(descriptor_content, ["ndt", "motion"]), []),
+    ],
+)
+def test_what_is_the_user_s_is_its_modules(package, content, modules):
+    before = content()
+    assert sorted(before) == [f"module theirs.{name}" for name in modules]
+    for name in modules:
+        (package / f"{name}.py").write_text("# another\n")
+        assert content()[f"module theirs.{name}"] != before[f"module theirs.{name}"]
     assert not any(name.startswith("theirs") for name in sys.modules)
 
 
@@ -208,40 +217,17 @@ def test_a_built_in_one_is_the_version_of_its_package(name, package):
 
 
 def test_a_program_is_its_files(tmp_path):
-    script, template = tmp_path / "run.py", tmp_path / "template.yaml"
-    script.write_text("1")
-    template.write_text("a: 1")
-    arguments = (sys.executable, str(script), "{input}", "x" * 5000, "\0")
+    script, option, template = files = [tmp_path / name for name in ("run.py", "c.txt", "t.yaml")]
+    for file in files:
+        file.write_text("a: 1")
+    arguments = (sys.executable, str(script), "{input}", f"--config={option}", "x" * 5000, "\0")
     settings = CommandSettings(command=arguments, template=str(template))
     before = odometry_content("command", settings)
-    assert set(before) == {sys.executable, str(script), str(template)}
-    for file in (script, template):
+    assert set(before) == {sys.executable, *map(str, files)}
+    for file in files:
         file.write_text("b: 2")
         assert odometry_content("command", settings)[str(file)] != before[str(file)]
     served = ProcessSettings(command=(sys.executable, str(script)))
     assert set(odometry_content("process", served)) == {sys.executable, str(script)}
     away = ProcessSettings(address="tcp://there:1")
     assert odometry_content("process", away) == {}
-
-
-def test_descriptors_of_the_user_are_their_modules(package):
-    assert descriptor_content(["ndt", "motion"]) == {}
-    before = descriptor_content(["ndt", "theirs.odometry:describe"])
-    (package / "odometry.py").write_text("# another\n")
-    after = descriptor_content(["ndt", "theirs.odometry:describe"])
-    assert before.keys() == after.keys() == {"module theirs.odometry"}
-    assert before != after
-
-
-def test_a_class_is_also_the_module_in_which_it_is_written(package):
-    (package / "inner.py").write_text("1")
-    before = odometry_content("theirs.odometry:Mine", None, "theirs.inner")
-    assert set(before) == {"module theirs.odometry", "module theirs.inner"}
-    (package / "inner.py").write_text("2")
-    assert odometry_content("theirs.odometry:Mine", None, "theirs.inner") != before
-
-
-def test_a_file_behind_an_option_is_part_of_a_program(tmp_path):
-    (tmp_path / "c.txt").write_text("1")
-    settings = CommandSettings(command=(sys.executable, f"--config={tmp_path}/c.txt"))
-    assert set(odometry_content("command", settings)) == {sys.executable, f"{tmp_path}/c.txt"}

@@ -318,15 +318,20 @@ def test_a_message_is_the_same_however_it_is_serialised(frame):
 
 
 @pytest.mark.parametrize("cdr", [False, True])
-def test_a_message_cut_short_or_too_long_is_refused(cdr):
-    store = rec.ROS2 if cdr else rec.ROS1
-    message = rec.cloud(rec.velodyne(rec.scans(1, 3)[0]), store=store)
+@pytest.mark.parametrize("livox", [False, True])
+def test_a_message_cut_short_or_too_long_is_refused(cdr, livox):
+    store, points = rec.ROS2 if cdr else rec.ROS1, rec.scans(1, 3)[0]
+    if livox:
+        message, decode = rec.livox(store, clouds.LIVOX_TYPES[0], points), clouds.decode_livox
+    else:
+        message, decode = rec.cloud(rec.velodyne(points), store=store), clouds.decode_cloud
     serialise = store.serialize_cdr if cdr else store.serialize_ros1
     data = bytes(serialise(message, message.__msgtype__))
-    assert len(clouds.decode_cloud(data, cdr)) == 3
-    for damaged in [*(data[:n] for n in range(len(data))), data + bytes(4)]:
-        with pytest.raises(PointCloudError, match="not a whole PointCloud2"):
-            clouds.decode_cloud(damaged, cdr)
+    assert len(decode(data, cdr)) == 3
+    wrong = [data[:n] for n in range(len(data))]
+    for part in wrong if livox else [*wrong, data + bytes(4)]:
+        with pytest.raises(PointCloudError, match="not a whole"):
+            decode(part, cdr)
 
 
 @settings(max_examples=200, deadline=None)
