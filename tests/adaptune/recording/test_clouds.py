@@ -79,9 +79,7 @@ def test_any_layout_gives_the_points_written(dtype, width, *, height, padding, d
         raw["ring"] = (np.arange(n) % 100).reshape(height, width)
     rows = [row.tobytes() + bytes(padding) for row in raw]
     message = rec.cloud(
-        raw,
-        data=np.frombuffer(b"".join(rows), np.uint8),
-        row_step=width * dtype.itemsize + padding,
+        raw, data=np.frombuffer(b"".join(rows), np.uint8), row_step=width * dtype.itemsize + padding
     )
 
     scan = decode(message)
@@ -181,11 +179,7 @@ def test_times_count_from_the_start_of_the_scan_in_every_dialect(
 
 @pytest.mark.parametrize(
     ("mark", "values", "shift"),
-    [
-        ("end", [0.0, 0.1], -0.1),
-        ("start", [-0.1, 0.0], 0.0),
-        ("end", [S, S + 0.1], -0.1),
-    ],
+    [("end", [0.0, 0.1], -0.1), ("start", [-0.1, 0.0], 0.0), ("end", [S, S + 0.1], -0.1)],
 )
 def test_what_the_stamp_marks_can_be_set(mark, values, shift):
     raw = raw_of(2, timestamp=("<f8", values))
