@@ -69,6 +69,16 @@ def cloud(raw, stamp=START, store=ROS2, **changes):
     return store.types["sensor_msgs/msg/PointCloud2"](**(given | changes))
 
 
+def livox(store, kind, points):
+    """A message of Livox's driver, of one of the types that say the same."""
+    t = store.types
+    each = [
+        t[kind.replace("Msg", "Point")](i * 1000, *map(float, p), 10, 16, i % 6)
+        for i, p in enumerate(points)
+    ]
+    return t[kind](header(START, "x", store), START, len(each), 1, np.zeros(3, np.uint8), each)
+
+
 def pose(stamp, position, quaternion, store):
     made = bare_pose(position, quaternion, store)
     return store.types["geometry_msgs/msg/PoseStamped"](header(stamp, "map", store), made)
@@ -92,14 +102,16 @@ def imu(stamp, rate, force, store=ROS2):
     )
 
 
-def write_bag(path, messages, compression=None, topics=()):
+def write_bag(path, messages, compression=None, topics=(), chunk=1 << 20):
     """Write a ROS 1 bag, or a ROS 2 one where the path says so: ``.sqlite3``, ``.mcap``.
 
-    Messages are made by `store_of(path)`. `topics` are pairs of topic and type without messages.
+    Messages are made by `store_of(path)`. `topics` are pairs of topic and type without messages;
+    a `chunk` of ROS 1 has at least so many bytes.
     """
     store = store_of(path)
     if store is ROS1:
         writer = rosbag1.Writer(path)
+        writer.chunk_threshold = chunk
         if compression:
             writer.set_compression(rosbag1.Writer.CompressionFormat[compression])
     else:

@@ -29,6 +29,8 @@ STEP = 0.4
 N_SCANS = 16
 START = 10**10
 """Nanoseconds; ROS has no stamp of zero."""
+POOR = {"NaN": np.nan, "near": 0.005, "far": 1e4}
+"""Factors of scans that hold nothing to register."""
 LOCKSTEP = "rustle, lockstep"
 """The other way to run `rustle`."""
 TEMPLATE = """\
@@ -167,9 +169,12 @@ def scan(i):
 
 
 def poor_scan(n, i=0):
-    """A scan of `n` points all over the place, or one that is all NaN, in the place of scan `i`."""
-    if n == "NaN":
-        return Scan(START + i * 10**8, np.full((5000, 3), np.nan, np.float32))
+    """A scan of `n` points all over the place, in the place of scan `i`.
+
+    Or scan `i` itself with points that are all NaN, too near or too far.
+    """
+    if n in POOR:
+        return Scan(START + i * 10**8, scan(i).points * np.float32(POOR[n]))
     points = np.random.default_rng(n).uniform(2.0, 9.0, (n, 3))
     return Scan(START + i * 10**8, points.astype(np.float32))
 

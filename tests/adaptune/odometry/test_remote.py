@@ -155,19 +155,6 @@ def test_a_replay_goes_on_at_the_last_healthy_motion():
     np.testing.assert_allclose(result.trajectory.T_world_sensor[:, 0, 3], 0.1 * np.arange(8))
 
 
-def exchange(*messages):
-    sent, answered = io.BytesIO(), io.BytesIO()
-    for header, arrays in messages:
-        processes.send(sent, header, **arrays)
-    sent.seek(0)
-    processes.answer_all(sent, answered, wire.conversation(None, make_here))
-    answered.seek(0)
-    answers = []
-    while (message := processes.receive(answered)) is not None:
-        answers.append(message)
-    return answers
-
-
 HELLO = {
     "type": "hello",
     "version": 2,
@@ -212,7 +199,13 @@ def test_what_an_imu_measured_arrives():
     ],
 )
 def test_what_a_server_refuses(first, message):
-    (answer,) = exchange((first, {}))
+    sent, answered = io.BytesIO(), io.BytesIO()
+    processes.send(sent, first)
+    sent.seek(0)
+    processes.answer_all(sent, answered, wire.conversation(None, make_here))
+    answered.seek(0)
+    answer = processes.receive(answered)
+    assert processes.receive(answered) is None
     assert answer.header["type"] == "refused"
     assert message in answer.header["message"]
     assert "https://" not in answer.header["message"]
@@ -266,7 +259,7 @@ def test_faults_are_told_and_another_start_goes_on(fault, caplog):
 
 
 def test_equal_faults_are_told_once(caplog):
-    odometry = Process({}, program("no pose"), Limits(seconds=20.0))
+    odometry = Process({}, program("no pose"), LIMITS)
     for _ in range(2):
         odometry.start(scan(0), np.eye(4))
         for i in (1, 2, 3):

@@ -79,9 +79,7 @@ def test_any_layout_gives_the_points_written(dtype, width, *, height, padding, d
         raw["ring"] = (np.arange(n) % 100).reshape(height, width)
     rows = [row.tobytes() + bytes(padding) for row in raw]
     message = rec.cloud(
-        raw,
-        data=np.frombuffer(b"".join(rows), np.uint8),
-        row_step=width * dtype.itemsize + padding,
+        raw, data=np.frombuffer(b"".join(rows), np.uint8), row_step=width * dtype.itemsize + padding
     )
 
     scan = decode(message)
@@ -181,11 +179,7 @@ def test_times_count_from_the_start_of_the_scan_in_every_dialect(
 
 @pytest.mark.parametrize(
     ("mark", "values", "shift"),
-    [
-        ("end", [0.0, 0.1], -0.1),
-        ("start", [-0.1, 0.0], 0.0),
-        ("end", [S, S + 0.1], -0.1),
-    ],
+    [("end", [0.0, 0.1], -0.1), ("start", [-0.1, 0.0], 0.0), ("end", [S, S + 0.1], -0.1)],
 )
 def test_what_the_stamp_marks_can_be_set(mark, values, shift):
     raw = raw_of(2, timestamp=("<f8", values))
@@ -318,15 +312,20 @@ def test_a_message_is_the_same_however_it_is_serialised(frame):
 
 
 @pytest.mark.parametrize("cdr", [False, True])
-def test_a_message_cut_short_or_too_long_is_refused(cdr):
-    store = rec.ROS2 if cdr else rec.ROS1
-    message = rec.cloud(rec.velodyne(rec.scans(1, 3)[0]), store=store)
+@pytest.mark.parametrize("livox", [False, True])
+def test_a_message_cut_short_or_too_long_is_refused(cdr, livox):
+    store, points = rec.ROS2 if cdr else rec.ROS1, rec.scans(1, 3)[0]
+    if livox:
+        message, decode = rec.livox(store, clouds.LIVOX_TYPES[0], points), clouds.decode_livox
+    else:
+        message, decode = rec.cloud(rec.velodyne(points), store=store), clouds.decode_cloud
     serialise = store.serialize_cdr if cdr else store.serialize_ros1
     data = bytes(serialise(message, message.__msgtype__))
-    assert len(clouds.decode_cloud(data, cdr)) == 3
-    for damaged in [*(data[:n] for n in range(len(data))), data + bytes(4)]:
-        with pytest.raises(PointCloudError, match="not a whole PointCloud2"):
-            clouds.decode_cloud(damaged, cdr)
+    assert len(decode(data, cdr)) == 3
+    wrong = [data[:n] for n in range(len(data))]
+    for part in wrong if livox else [*wrong, data + bytes(4)]:
+        with pytest.raises(PointCloudError, match="not a whole"):
+            decode(part, cdr)
 
 
 @settings(max_examples=200, deadline=None)

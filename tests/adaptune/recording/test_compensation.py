@@ -5,39 +5,31 @@ from scipy.spatial.transform import Rotation
 
 from adaptune import geometry
 from adaptune.recording import Imu, Scan, SequenceConfig, SequenceError
-from adaptune.recording.compensation import (
-    clock_offset,
-    compensate,
-    compensate_neighbours,
-)
+from adaptune.recording.compensation import clock_offset, compensate, compensate_neighbours
 from adaptune.recording.recording import open_sequence
 from adaptune.trajectory import Trajectory
 
-RATE = np.array([0.3, -0.2, 1.5])
-VELOCITY = np.array([3.0, 0.5, -0.2])
+TWIST = np.array([3.0, 0.5, -0.2, 0.3, -0.2, 1.5])
+"""Metres and radians a second."""
 
 
-def moving_scan(velocity, n=500):
-    """A scan of a still world from a sensor in motion, and the world as seen from its start."""
-    rng = np.random.default_rng(0)
-    world = rng.normal(0, 20, (n, 3))
-    times = np.sort(rng.uniform(0, 0.1, n))
-    turned = Rotation.from_rotvec(times[:, None] * RATE)
-    points = turned.inv().apply(world - times[:, None] * velocity)
-    return Scan(10**18, points.astype(np.float32), times.astype(np.float32)), world
+def motion(twist, seconds=0.1):
+    """How far a velocity and a rate lead in a time."""
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = Rotation.from_rotvec(twist[3:] * seconds).as_matrix(), twist[:3] * seconds
+    return T
 
 
 def test_constant_velocity_is_undone():
-    scan, world = moving_scan(VELOCITY)
+    world = np.random.default_rng(0).normal(0, 20, (500, 3))
+    scan = drive_through(world, 10**18, np.eye(4), TWIST)
     assert np.abs(scan.points - world).max() > 1
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = Rotation.from_rotvec(RATE * 0.2).as_matrix(), VELOCITY * 0.2
-    np.testing.assert_allclose(compensate(scan, T, 0.2).points, world, atol=1e-4)
+    compensated = compensate(scan, motion(TWIST, 0.2), 0.2)
+    np.testing.assert_allclose(compensated.points, world, atol=1e-4)
 
 
 def test_a_scan_without_times_stays_as_it_is():
-    scan, _ = moving_scan(np.zeros(3))
-    timeless = Scan(1, scan.points)
+    timeless = Scan(1, np.ones((5, 3), np.float32))
     assert compensate(timeless, np.eye(4), 0.1) is timeless
 
 
@@ -69,13 +61,11 @@ def test_the_velocity_since_the_scan_before_is_undone(backward):
     rng = np.random.default_rng(0)
     twist = np.array([2.0, 0.3, 0.0, 0.0, 0.0, 0.8])
     T, scans, worlds = np.eye(4), [], []
-    step = np.eye(4)
-    step[:3, :3], step[:3, 3] = Rotation.from_rotvec(twist[3:] * 0.1).as_matrix(), twist[:3] * 0.1
     for i in range(4):
         worlds.append(room(rng))
         scans.append(drive_through(worlds[-1], 10**18 + i * 10**8, T, twist))
         worlds[-1] = (worlds[-1] - T[:3, 3]) @ T[:3, :3]
-        T = T @ step
+        T = T @ motion(twist)
     order = slice(None, None, -1 if backward else 1)
     scans, worlds = scans[order], worlds[order]
     compensated = list(compensate_neighbours(scans))
@@ -88,11 +78,9 @@ def test_the_velocity_since_the_scan_before_is_undone(backward):
 def test_the_motion_known_last_holds_for_a_second():
     rng = np.random.default_rng(0)
     twist = np.array([2.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-    step = np.eye(4)
-    step[:3, 3] = twist[:3] * 0.1
     first, second = (
         drive_through(room(rng), 10**18 + i * 10**8, T, twist)
-        for i, T in enumerate((np.eye(4), step))
+        for i, T in enumerate((np.eye(4), motion(twist)))
     )
     few = [
         Scan(10**18 + stamp, np.ones((5, 3), np.float32), np.full(5, 0.1, np.float32))

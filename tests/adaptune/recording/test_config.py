@@ -50,20 +50,13 @@ def test_the_two_ways_to_write_a_pose_agree():
     np.testing.assert_allclose(T[:3, :3] @ [1, 0, 0], [0, 1, 0], atol=1e-15)
 
 
-def tum(path, seconds, start):
-    stamps = start + np.rint(np.array(seconds) * 1e9).astype(np.int64)
-    write_tum(path, Trajectory(stamps, along_x(seconds)))
-    return str(path)
-
-
 def test_a_reference_is_moved_to_the_lidar_and_its_clock(tmp_path):
-    bag = str(rec.drive(tmp_path / "a.bag"))
-    reference = tum(tmp_path / "a.tum", [0, 1, 2], rec.START - 5 * 10**9)
-    extrinsic = [0, 0, 2, 0, 0, 1, 0]  # 2 m above, looking back
-    sequence = open_sequence(
-        SequenceConfig(bag=bag, reference=reference, extrinsic=extrinsic, clock_offset=5)
-    )
-    trajectory = sequence.reference()
+    bag, reference = str(rec.drive(tmp_path / "a.bag")), tmp_path / "a.tum"
+    stamps = rec.START + np.arange(-5, -2) * 10**9
+    write_tum(reference, Trajectory(stamps, along_x([0, 1, 2])))
+    given = {"reference": str(reference), "clock_offset": 5}
+    given["extrinsic"] = [0, 0, 2, 0, 0, 1, 0]  # 2 m above, looking back
+    trajectory = open_sequence(SequenceConfig(bag=bag, **given)).reference()
     T = trajectory.at(np.array([rec.START + 500_000_000]))[0]
     np.testing.assert_allclose(T[:3, 3], [0.5, 0, 2])
     np.testing.assert_allclose(T[:3, 0], [-1, 0, 0], atol=1e-12)
@@ -71,8 +64,9 @@ def test_a_reference_is_moved_to_the_lidar_and_its_clock(tmp_path):
 
 def test_what_would_fail_later_is_found_at_once(tmp_path):
     bag = rec.drive(tmp_path / "a.bag")
-    write_tum(tmp_path / "late.tum", at(rec.START + 10**12, 3))
-    write_kitti(tmp_path / "short.txt", np.tile(np.eye(4), (3, 1, 1)))
+    stamps = rec.START + 10**12 + np.arange(3) * 10**8
+    write_tum(tmp_path / "late.tum", Trajectory(stamps, along_x([0, 0, 0])))
+    write_kitti(tmp_path / "short.txt", along_x([0, 0, 0]))
     study = tmp_path / "study.yaml"
     for entry, told in [
         ({"start": 100.0}, r"start = 100 s is beyond its end, it lasts 2\.0 s"),
@@ -91,10 +85,6 @@ def test_what_would_fail_later_is_found_at_once(tmp_path):
                 load_study(study)
             list(open_sequence(SequenceConfig(bag=str(bag))))
     check_sequence(SequenceConfig(bag=str(bag), reference="/poses", start=1.5))
-
-
-def at(stamp, n):
-    return Trajectory(stamp + np.arange(n) * 10**8, np.tile(np.eye(4), (n, 1, 1)))
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,6 @@
 import runpy
 import struct
 from pathlib import Path
-from types import SimpleNamespace
 
 import fuzz
 import numpy as np
@@ -24,9 +23,7 @@ def test_a_sound_bag_has_all_it_needs_and_an_entry_that_opens(tmp_path):
     bag = drive(tmp_path / "my drive.bag", seconds, [(s, 40 * s) for s in seconds])
     inspection = inspect(bag)
     points = inspection.topics["/points"]
-    assert points.count == 10
-    assert points.rate == pytest.approx(10)
-    assert points.gap == pytest.approx(0.1)
+    assert (points.count, points.rate, points.gap) == pytest.approx((10, 10, 0.1))
     assert inspection.fields[3] == "time"
     assert len(inspection.scan) == 195
     assert inspection.faults == []
@@ -93,9 +90,8 @@ def test_clouds_without_valid_points_are_reported(tmp_path, of):
 
 def test_messages_that_do_not_decode_are_reported(tmp_path):
     times = [START + i * 10**8 for i in range(5)]
-    given = [
-        ("/points", t, (bad_cloud(t, "cut") if i == 3 else cloud(t))) for i, t in enumerate(times)
-    ]
+    given = [("/points", t, cloud(t)) for t in times]
+    given[3] = ("/points", times[3], bad_cloud(times[3], "cut"))
     inspection = inspect(write(tmp_path / "a.bag", given))
     (text,) = texts(inspection)
     assert "/points: 1 of 5 messages do not decode, the first at 0.3 s" in text
@@ -223,19 +219,16 @@ def test_the_poses_of_a_kitti_folder_are_inspected(tmp_path):
     assert inspect(tmp_path).missing["offline"] == ("a reference trajectory",)
 
 
-def _text(path):
-    path.write_text("<html>Sign in to download</html>\n" * 100)
-    return path
-
-
 def test_files_that_are_no_recording_are_refused(tmp_path):
-    (tmp_path / "a.yaml").write_text("text")
+    for name in ("a.yaml", "a.bag", "a.mcap"):
+        (tmp_path / name).write_text("<html>Sign in to download</html>\n" * 100)
     (tmp_path / "empty").mkdir()
     for path, message in [
         (tmp_path / "none.bag", "there is no such file or folder"),
         (tmp_path / "a.yaml", "not a bag"),
         (tmp_path / "empty", r"holds no scan \(.*\) and no bag"),
-        *((_text(tmp_path / f"a{kind}"), "is no bag, whatever") for kind in (".bag", ".mcap")),
+        (tmp_path / "a.bag", "is no bag, whatever"),
+        (tmp_path / "a.mcap", "is no bag, whatever"),
     ]:
         with pytest.raises(SequenceError, match=message):
             inspect(path)
@@ -256,18 +249,14 @@ def test_files_of_poses_are_inspected(tmp_path, name, content, timed):
     inspection = inspect(tmp_path / name)
     (topic,) = inspection.topics.values()
     assert topic.count == 20
-    assert topic.rate == (pytest.approx(10) if timed else None)
-    assert topic.gap == (pytest.approx(0.1) if timed else None)
+    assert (topic.rate, topic.gap) == (pytest.approx((10, 0.1)) if timed else (None, None))
     assert texts(inspection) == []
-    text = inspection_text(inspection, width=1000)
-    assert (
-        "reference: 20 poses, 57.0 m in 1.9 s" if timed else "reference: 20 poses, 57.0 m\n"
-    ) in text
+    length = "reference: 20 poses, 57.0 m" + (" in 1.9 s" if timed else "\n")
+    assert length in inspection_text(inspection, width=1000)
     bag = drive(tmp_path / "a.bag", [s for s, _ in POSES], [])
     given = files.Document(inspection.entry).data
     config = SequenceConfig(bag=str(bag), clock_offset=START * 1e-9 if timed else 0.0, **given)
-    sequence = open_sequence(config)
-    assert sequence.reference() is not None
+    assert open_sequence(config).reference() is not None
 
 
 def test_a_study_of_the_printed_lines_opens_from_any_folder(tmp_path, monkeypatch):
@@ -292,19 +281,17 @@ def sampled(monkeypatch):
     monkeypatch.setattr(module, "SECONDS", 0.0)
 
 
-def long_drive(path, every=1, **changes):
+TENTHS = [0.1 * i for i in range(400)]
+
+
+def long_drive(path, every=1, *, stamps=None, speed=2.0, offset=0.0, cloud=cloud):
     """40 s at 10 Hz, 2 m/s; `every` n-th scan has a pose."""
-    options = SimpleNamespace(stamps=[0.1 * i for i in range(400)], speed=2.0, offset=0.0)
-    vars(options).update(changes)
     messages = []
-    for s in options.stamps:
+    for s in TENTHS if stamps is None else stamps:
         when = START + round(s * 1e9)
-        messages.append(
-            ("/points", when, options.cloud(when) if changes.get("cloud") else cloud(when))
-        )
+        messages.append(("/points", when, cloud(when)))
         if round(10 * s) % every == 0:
-            moved = pose(when + round(options.offset * 1e9), options.speed * s)
-            messages.append(("/poses", when, moved))
+            messages.append(("/poses", when, pose(when + round(offset * 1e9), speed * s)))
     return write(path, messages)
 
 
@@ -326,13 +313,12 @@ def test_a_sound_bag_is_sound_in_a_sample(tmp_path, every):
 @pytest.mark.usefixtures("sampled")
 def test_messages_that_come_a_little_early_or_late_are_not_missing(tmp_path):
     for seed in range(10):
-        late = np.random.default_rng(seed).uniform(0.0, 0.015, 400)
-        stamps = (0.1 * np.arange(400) + late).tolist()
+        stamps = (TENTHS + np.random.default_rng(seed).uniform(0.0, 0.015, 400)).tolist()
         assert texts(inspect(long_drive(tmp_path / f"{seed}.bag", stamps=stamps))) == []
 
 
 def test_single_messages_that_are_missing_are_counted(tmp_path):
-    stamps = [0.1 * i for i in range(400) if i % 40 != 20]
+    stamps = [s for i, s in enumerate(TENTHS) if i % 40 != 20]
     told = texts(inspect(long_drive(tmp_path / "a.bag", stamps=stamps), deep=True))
     assert told == [
         f"{topic}: about 10 of 400 messages are missing, one or a few at a time"
@@ -360,14 +346,8 @@ def test_deep_reads_all_and_shows_how_far_it_is(tmp_path):
         ({"cloud": lambda when: bad_cloud(when, "NaN")}, "clouds hold fewer than 20"),
         ({"cloud": lambda when: bad_cloud(when, "cut")}, "messages do not decode"),
         ({"cloud": lambda _: cloud(START)}, "stamps are the same"),
-        (
-            {"stamps": [0.1 * i for i in (*range(100), *range(300, 400))]},
-            "/points: about 200 of 400 messages are missing",
-        ),
-        (
-            {"stamps": [0.1 * i for i in (*range(203), *range(209, 400))]},
-            "/points: about 6 of 400 messages are missing",
-        ),
+        ({"stamps": TENTHS[:100] + TENTHS[300:]}, "/points: about 200 of 400 messages are missing"),
+        ({"stamps": TENTHS[:203] + TENTHS[209:]}, "/points: about 6 of 400 messages are missing"),
     ],
 )
 def test_a_sample_shows_the_faults_of_the_whole(tmp_path, changes, expected):

@@ -11,10 +11,6 @@ from adaptune.trajectory import read_tum
 COURSE = Course(
     scenes=("corridor",), length=10.0, sensor="vlp16", columns=60, imu=200, motion="car"
 )
-# A point as Velodyne's driver writes it, without padding.
-CLOUD = np.dtype(
-    [*((name, "<f4") for name in ("x", "y", "z", "intensity")), ("ring", "<u2"), ("time", "<f4")]
-)
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +37,7 @@ def read(path, topic):
         ]
 
 
-def test_clouds_read_back(recording, scans):
+def test_clouds_are_as_velodyne_s_driver_writes_them(recording, scans):
     messages = read(recording, "/velodyne_points")
     assert len(messages) == len(scans)
     for (sent, message), scan in zip(messages, scans, strict=True):
@@ -52,12 +48,8 @@ def test_clouds_read_back(recording, scans):
             *(("x", 0, 7), ("y", 4, 7), ("z", 8, 7), ("intensity", 12, 7)),
             *(("ring", 16, 4), ("time", 18, 7)),
         ]
-        cloud = message.data.view(CLOUD)
-        assert message.width == len(cloud) == len(scan)
-        np.testing.assert_array_equal(np.stack([cloud[a] for a in "xyz"], 1), scan.points)
-        np.testing.assert_array_equal(cloud["time"], scan.times)
-        np.testing.assert_array_equal(cloud["ring"], scan.rings)
-        np.testing.assert_array_equal(cloud["intensity"], scan.intensities)
+        assert message.point_step == 22
+        assert message.width == len(scan)
 
 
 def test_truth_reads_back(recording, scans):
@@ -91,7 +83,8 @@ def test_the_reader_of_sequences_takes_it(tmp_path, scans, stamp):
     sequence = open_sequence(SequenceConfig.model_validate(config))
     for found, scan in zip(sequence, scans, strict=True):
         assert abs(found.stamp - scan.stamp) < 1_000_000
-        np.testing.assert_array_equal(found.points, scan.points)
+        for name in ("points", "rings", "intensities"):
+            np.testing.assert_array_equal(getattr(found, name), getattr(scan, name))
         drift = (found.stamp - scan.stamp) * 1e-9
         np.testing.assert_allclose(found.times + drift, scan.times, atol=1e-6)
     reference = sequence.reference().at(np.array([scan.stamp for scan in scans]))

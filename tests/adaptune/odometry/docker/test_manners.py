@@ -26,10 +26,7 @@ MANNERS = {
 WAYS = ("bag", "lockstep", "command")
 REFUSED = {
     ("own clock", "command"): r"its poses are of .* the program must stamp poses as the scans are",
-    (
-        "own layout",
-        "lockstep",
-    ): r"\S+: node /gicp died before its first pose; .*\.play: bag: ",
+    ("own layout", "lockstep"): r"\S+: node /gicp died before its first pose; .*\.play: bag: ",
     ("one of two", "lockstep"): r"it gave poses for 1\d of \d\d scans, and .*\.play: bag: ",
 }
 TABLE = [(m, w) for m in MANNERS for w in WAYS if (m, w) != ("background", "command")]

@@ -49,8 +49,6 @@ TRIALS = {
         "settings": {"rate": 0.1, "arguments": ("required:=false",)},
     },
     "silent": {"imitate": {"silent": True}},
-    "other topic": {"settings": {"odometry": "/Odom"}},
-    "NaN": {"imitate": {"jump": 11}},
 }
 
 
@@ -140,16 +138,9 @@ def test_one_that_dies_is_a_fault_at_once(ran):
     assert np.isnan(trial.poses[-1]).all()
 
 
-@pytest.mark.parametrize(
-    ("name", "words"),
-    [
-        ("silent", "nothing was published on /Odometry until the system had rested .*at rest at"),
-        ("other topic", "nothing was published on /Odom, but on .*/Odometry.*; name its topic as"),
-        ("NaN", r"1 of 40 poses are no poses \(NaN, or no rotation\)"),
-    ],
-)
-def test_what_is_published_is_no_trajectory(ran, name, words):
-    (fault,) = ran(name).odometry.faults
+def test_nothing_is_published(ran):
+    (fault,) = ran("silent").odometry.faults
+    words = "nothing was published on /Odometry until the system had rested .*at rest at"
     assert re.match(words, fault), fault
 
 
