@@ -116,6 +116,8 @@ def test_windows_with_a_lost_track_are_failures_and_the_others_sound(study):
     assert np.flatnonzero(np.isinf(trial.errors)).tolist() == list(range(10))
     assert trial.errors[10:29].max() < 3.0
     assert trial.mean_error == pytest.approx((10 * 30.0 + trial.errors[10:29].sum()) / 29)
+    assert trial.metrics["rpe"] == pytest.approx(5.0 / np.sqrt(39), rel=0.02)
+    assert trial.metrics["ape"] > 1.0
     # What the odometry did counts, not the new start.
     assert trial.unhealthy == {"max_speed": 1}
     (whole,) = setup.run(sequence, [GOOD], whole=True)
