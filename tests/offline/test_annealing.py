@@ -34,12 +34,6 @@ def objective(trial):
     return x**2 + abs(n - 7) + (c != "blue")
 
 
-def optimize(n_trials, sampler, **given):
-    study = optuna.create_study(sampler=sampler, **given)
-    study.optimize(objective, n_trials=n_trials)
-    return study
-
-
 def history(study):
     return [(trial.params, trial.value) for trial in study.trials]
 
@@ -47,31 +41,14 @@ def history(study):
 # As a sampler of Optuna's.
 
 
-class _Cases:
+class TestSampler(
+    pytest_samplers.BasicSamplerTestCase,
+    pytest_samplers.RelativeSamplerTestCase,
+    pytest_samplers.SingleOnlySamplerTestCase,
+):
     @pytest.fixture
     def sampler(self):
         return AnnealingSampler
-
-
-class TestBasic(_Cases, pytest_samplers.BasicSamplerTestCase):
-    pass
-
-
-class TestRelative(_Cases, pytest_samplers.RelativeSamplerTestCase):
-    pass
-
-
-class TestSingleOnly(_Cases, pytest_samplers.SingleOnlySamplerTestCase):
-    pass
-
-
-def test_tells_when_all_chains_have_stalled():
-    sampler = AnnealingSampler(settings(chains=3, stall_best=5), seed=1)
-    study = optuna.create_study(sampler=sampler)
-    while not sampler.stalled(study):
-        study.optimize(lambda t: 0.0 * objective(t), n_trials=1)
-    # Each of three chains needs five steps after the first trial, and they take turns.
-    assert len(study.trials) == 1 + 3 * 5
 
 
 def test_failed_and_infinite_trials_do_no_harm():

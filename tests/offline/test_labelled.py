@@ -94,25 +94,16 @@ def test_a_candidate_of_all_sequences_is_none_where_its_luck_is_left_out():
     assert others._replace(sequences=some).fixed() != others.fixed()
 
 
-def alone(values):
-    """Each stretch is a recording."""
-    return [str(i) for i in range(len(values))]
-
-
-def test_one_stretch_shows_nothing():
-    assert expected_loss(np.array([-1.0]), ["one"]) == np.inf
-
-
 def test_one_disaster_outweighs_small_gains():
-    values = np.full(24, -0.05)
-    assert expected_loss(values, alone(values)) < 0.0
+    values, names = np.full(24, -0.05), [str(i) for i in range(24)]
+    assert expected_loss(values, names) < 0.0
     values[7] = np.log(10.0)
     assert values.mean() < 0.06
-    assert expected_loss(values, alone(values)) > 0.5
+    assert expected_loss(values, names) > 0.5
     # A small harm does not outweigh what is gained elsewhere.
     values = np.full(24, -0.5)
     values[7] = np.log(1.2)
-    assert expected_loss(values, alone(values)) < 0.0
+    assert expected_loss(values, names) < 0.0
 
 
 def test_the_worst_tenth_counts_parts_of_stretches():

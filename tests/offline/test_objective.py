@@ -1,11 +1,8 @@
 import drives
 import numpy as np
 import pytest
-from setups import made_of, setup_of
 
 from adaptune.archive import Archive, Summary
-from adaptune.odometry import Registration
-from adaptune.odometry.keyframe import KeyframeGicp
 from offline.config import OfflineConfig, load_study
 from offline.objective import (
     Verdict,
@@ -89,29 +86,6 @@ def test_new_starts_are_undone():
     twice = joined(T, {3: sideways, 5: sideways})
     np.testing.assert_allclose(twice[:, 1, 3], [0, 0, 0, 5, 5, 10])
     np.testing.assert_array_equal(joined(T, {}), T)
-
-
-class Sideways(KeyframeGicp):
-    """Loses 5 m to the side at scan 10."""
-
-    scan = 0
-
-    def register(self, prepared):
-        self.scan += 1
-        T, ok = super().register(prepared)
-        if self.scan == 10:
-            T = T.copy()
-            T[1, 3] += 5.0
-        return Registration(T, ok)
-
-
-def test_a_lost_track_is_in_the_metrics_of_the_trajectory(study_file, tmp_path):
-    study = load_study(study_file, [], tmp_path / "study")
-    setup = setup_of(study, made_of(Sideways, study))
-    (trial,) = setup.run(setup.prepare("one", 1e9), [study.odometry.space.baseline])
-    assert np.flatnonzero(trial.restarted).tolist() == [10]
-    assert trial.metrics["rpe"] == pytest.approx(5.0 / np.sqrt(39), rel=0.02)
-    assert trial.metrics["ape"] > 1.0
 
 
 def test_memory_is_that_of_a_process_of_its_own(study_file, tmp_path):

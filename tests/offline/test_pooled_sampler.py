@@ -50,12 +50,6 @@ def test_the_first_trials_are_the_baselines_and_then_all_take_turns(config):
     assert min(collections.Counter(labels(history)).values()) >= 4
 
 
-@pytest.mark.parametrize("known", [0, 1, 3])
-def test_resumes_exactly(config, known):
-    history = run(config, 4)
-    assert run(config, 4 - known, history[: 8 * known]) == history
-
-
 @given(
     n=st.integers(2, 6),
     batch=st.integers(6, 20),

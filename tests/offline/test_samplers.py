@@ -30,26 +30,18 @@ FINITE = ParameterSpace(
         "kernel": Categorical(choices=("huber", "none", True), baseline="none"),
     }
 )
-SETTINGS = {
+SAMPLERS = {
+    "random": {},
+    "random, of a grid": {"grid": GRID},
     "grid": {"grid": GRID},
+    "tpe": {},
     "annealing": {"chains": 4},
     "annealing, one chain": {"reanneal_best": 5, "steps": {"gain": {"mu": 0.1, "sigma": 0.3}}},
-    "random, of a grid": {"grid": GRID},
-    "optuna.samplers:QMCSampler": {"qmc_type": "halton"},
+    "optuna.samplers:CmaEsSampler": {},
     "optuna.samplers:NSGAIISampler": {"population_size": 8},
+    "optuna.samplers:QMCSampler": {"qmc_type": "halton"},
+    "optuna.samplers:RandomSampler": {},
 }
-SAMPLERS = [
-    "random",
-    "random, of a grid",
-    "grid",
-    "tpe",
-    "annealing",
-    "annealing, one chain",
-    "optuna.samplers:CmaEsSampler",
-    "optuna.samplers:NSGAIISampler",
-    "optuna.samplers:QMCSampler",
-    "optuna.samplers:RandomSampler",
-]
 
 
 def bowl(parameters):
@@ -64,14 +56,8 @@ def bowl(parameters):
 
 @pytest.fixture(params=SAMPLERS)
 def config(request):
-    settings = SETTINGS.get(request.param, {})
-    name = request.param.partition(",")[0]
+    settings, name = SAMPLERS[request.param], request.param.partition(",")[0]
     return OfflineConfig(sampler=name, sampler_settings=settings, batch=8, initial=12, seed=5)
-
-
-but_for_the_grid = pytest.mark.parametrize(
-    "config", [name for name in SAMPLERS if name != "grid"], indirect=True
-)
 
 
 def run(config, n_batches, space=SPACE, error=bowl):
@@ -82,19 +68,14 @@ def run(config, n_batches, space=SPACE, error=bowl):
     return history
 
 
-def test_sets_are_of_the_space(config):
-    history = run(config, 6)
-    assert len(history) == 48
+def test_sets_are_of_the_space_and_differ(config):
+    history = run(config, 8)
+    assert len({repr(parameters) for parameters, _ in history}) == len(history) == 64
     for parameters, _ in history:
         SPACE.check(parameters)
         types = [type(value) for value in parameters.values()]
         assert types[:4] == [float, float, int, int]
         assert list(parameters) == list(SPACE.names)
-
-
-def test_sets_differ(config):
-    sets = [repr(s) for s, _ in run(config, 8)]
-    assert len(set(sets)) == len(sets) == 64
 
 
 @pytest.mark.parametrize("known", [0, 1, 3, 4])
@@ -107,7 +88,7 @@ def test_resumes_exactly(config, known):
         ]
 
 
-@but_for_the_grid
+@pytest.mark.parametrize("config", [name for name in SAMPLERS if name != "grid"], indirect=True)
 def test_heeds_the_log_scale(config):
     config = config.model_copy(update={"initial": 48})
     sets = [s for s, _ in run(config, 12, error=lambda _: 1.0)]

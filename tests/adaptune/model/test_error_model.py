@@ -34,30 +34,36 @@ def test_views_are_of_one_place():
     assert apart.training_data(apart.pca()).sequence.tolist() == apart.sequence.tolist()
 
 
-def test_a_model_survives_bit_for_bit(tmp_path):
-    model = random_model()
-    path = saved(tmp_path)
+def several_odometries():
+    sets = random_model().sets
+    own = tuple({ODOMETRY: "ab"[i % 2]} | one for i, one in enumerate(sets.parameters))
+    return ParameterSets(PooledSpace({"a": sets.space, "b": sets.space}), sets.trials, own)
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {},
+        {
+            "errors": np.where(np.arange(6) < 3, random_model().errors, np.float32(np.nan)),
+            "blocks": {"mine:shape": 88, "two": 2},
+            "window": 3,
+            "descriptors": np.random.default_rng(1).normal(size=(50, 90)).astype(np.float32),
+            "validation": {"adaptive": {"geometric": 0.6, "verdict": "Adapt."}},
+            "stretch": np.arange(50) // 7,
+            "expected": {"bank": {"loss": -0.2, "n_stretches": 4.0}},
+        },
+        {"sets": several_odometries()},
+    ],
+)
+def test_a_model_survives_bit_for_bit(tmp_path, given):
+    model = dataclasses.replace(random_model(), **given)
+    path = saved(tmp_path, **given)
     loaded = ErrorModel.load(path)
     assert_same(loaded, model)
     assert list(tmp_path.iterdir()) == [path]
     loaded.save(tmp_path / "again.safetensors")
     assert_same(ErrorModel.load(tmp_path / "again.safetensors"), model)
-
-
-def test_missing_pairs_descriptors_that_are_no_counts_and_figures_survive(tmp_path):
-    model = random_model()
-    model.errors[model.sequence == 1, 3:] = np.nan
-    model = dataclasses.replace(
-        model,
-        blocks={"mine:shape": 88, "two": 2},
-        window=3,
-        descriptors=np.random.default_rng(1).normal(size=(50, 90)).astype(np.float32),
-        validation={"adaptive": {"geometric": 0.6, "verdict": "Adapt."}},
-        stretch=np.arange(50) // 7,
-        expected={"bank": {"loss": -0.2, "n_stretches": 4.0}},
-    )
-    model.save(tmp_path / "model.safetensors")
-    assert_same(ErrorModel.load(tmp_path / "model.safetensors"), model)
 
 
 def test_the_digest_is_of_what_selections_depend_on(tmp_path):
@@ -93,7 +99,7 @@ def test_another_format_is_refused_by_name(tmp_path, other, word):
 
 
 @pytest.mark.parametrize(
-    "header",
+    "changes",
     [
         {"fixed": 1},
         {"trials": [0, 2, 4, 6, 8, 8]},
@@ -105,29 +111,26 @@ def test_another_format_is_refused_by_name(tmp_path, other, word):
         {"length": 0.0},
         {"blocks": {"ndt": 80}},
         {"window": 0},
+        {"costs": {"evidence": 0.0}},
+        {"costs": {"evidence": 0.0, "sets": {"0": [1.0]}}},
+        {"rivals": {"equal_cost": 99}},
+        *(
+            {"arrays": arrays}
+            for arrays in (
+                {"descriptors": np.zeros((49, 90), np.uint16)},
+                {"sequence": np.zeros(49, np.uint32)},
+                {"sequence": np.full(50, 2, np.uint32)},
+                {"errors": np.zeros(50, np.float32)},
+                {"errors": np.full((50, 6), np.nan, np.float32)},
+                {"errors": np.full((50, 6), -1.0, np.float32)},
+                {"descriptors": np.full((50, 90), np.nan, np.float32)},
+            )
+        ),
     ],
 )
-def test_parts_that_do_not_go_together_are_refused(tmp_path, header):
+def test_parts_that_do_not_go_together_are_refused(tmp_path, changes):
     path = saved(tmp_path)
-    rewrite(path, **header)
-    refused(path)
-
-
-@pytest.mark.parametrize(
-    "arrays",
-    [
-        {"descriptors": np.zeros((49, 90), np.uint16)},
-        {"sequence": np.zeros(49, np.uint32)},
-        {"sequence": np.full(50, 2, np.uint32)},
-        {"errors": np.zeros(50, np.float32)},
-        {"errors": np.full((50, 6), np.nan, np.float32)},
-        {"errors": np.full((50, 6), -1.0, np.float32)},
-        {"descriptors": np.full((50, 90), np.nan, np.float32)},
-    ],
-)
-def test_arrays_that_do_not_go_together_are_refused(tmp_path, arrays):
-    path = saved(tmp_path)
-    rewrite(path, arrays)
+    rewrite(path, **changes)
     refused(path)
 
 
@@ -222,30 +225,6 @@ def test_costs_rivals_and_a_budget_survive(tmp_path):
     # Live evidence included, but for the fixed set.
     assert loaded.allowed() == (0, 2, 4, 6)
     assert loaded.training_data(loaded.pca()).allowed == (0, 2, 4, 6)
-
-
-def test_a_model_of_several_odometries_survives(tmp_path):
-    model = random_model()
-    pooled = PooledSpace({"a": model.sets.space, "b": model.sets.space})
-    sets = tuple({ODOMETRY: "ab"[i % 2]} | own for i, own in enumerate(model.sets.parameters))
-    pool = {"sets": ParameterSets(pooled, model.sets.trials, sets)}
-    loaded = ErrorModel.load(saved(tmp_path, **pool))
-    assert_same(loaded, dataclasses.replace(model, **pool))
-    assert isinstance(loaded.sets.space, PooledSpace)
-
-
-@pytest.mark.parametrize(
-    "damage",
-    [
-        {"costs": {"evidence": 0.0}},
-        {"costs": {"evidence": 0.0, "sets": {"0": [1.0]}}},
-        {"rivals": {"equal_cost": 99}},
-    ],
-)
-def test_damaged_costs_and_rivals_are_refused(tmp_path, damage):
-    path = saved(tmp_path)
-    rewrite(path, **damage)
-    refused(path)
 
 
 def test_evidence_is_of_stretches():

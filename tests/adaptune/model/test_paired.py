@@ -157,33 +157,6 @@ def test_it_chooses_among_those_named_on_the_evidence_of_all(seed, n_frames, n_s
     assert fixed.select(np.zeros(3)).trial == data.fixed
 
 
-def two_sets(fixed, other, n=40):
-    """One sequence on which a set far from the fixed one has these errors."""
-    errors = np.tile(np.array([[fixed, other]], np.float32), (n, 1))
-    return TrainingData(
-        np.random.default_rng(0).normal(size=(n, 2)),
-        np.zeros(n, int),
-        errors,
-        table([[0.0, 0.0], [1.0, 1.0]]),
-        0,
-    )
-
-
-@pytest.mark.parametrize(
-    ("fixed", "other", "chosen"),
-    [
-        (1.0, 0.9, 1),  # ln((0.9 + 0.02) / (1 + 0.02)) = -0.103
-        (1.0, 0.91, 0),  # -0.092
-        (0.05, 0.0, 1),
-        (np.inf, 20.0, 1),
-    ],
-)
-def test_a_set_must_promise_enough(fixed, other, chosen):
-    selection = PairedExpectedRatio().fit(two_sets(fixed, other)).select(np.zeros(2))
-    assert selection.trial == chosen
-    assert selection.predicted_fixed == pytest.approx(min(fixed, 30.0), rel=1e-6)
-
-
 def test_a_sequence_says_nothing_of_sets_it_has_not_seen():
     n = 40
     errors = np.ones((2 * n, 3), np.float32)

@@ -38,15 +38,8 @@ def test_a_set_that_was_not_run_everywhere_is_not_chosen():
     assert chosen(errors, [0, 0, 1], 4) == [0, 1, 2]
 
 
-COSTS = Costs(
-    {
-        0: SetCost(3.0, 5.0, 0),
-        4: SetCost(4.0, 5.0, 0),
-        7: SetCost(30.0, 0.0, 1),
-        9: SetCost(2.0, 9.0, 2),
-    },
-    evidence=2.5,
-)
+OF_SETS = {0: (3.0, 5.0, 0), 4: (4.0, 5.0, 0), 7: (30.0, 0.0, 1), 9: (2.0, 9.0, 2)}
+COSTS = Costs({trial: SetCost(*cost) for trial, cost in OF_SETS.items()}, evidence=2.5)
 NONE = ParameterSpace({})
 
 
@@ -54,19 +47,11 @@ def sets(n):
     return ParameterSets(NONE, tuple(range(n)), tuple({} for _ in range(n)))
 
 
-def test_a_set_alone_has_no_live_evidence():
+def test_costs_are_of_all_that_is_driven():
+    # A set alone has no live evidence; members share prepared scans.
     assert COSTS.alone(4) == 9.0
-    assert np.isnan(COSTS.alone(5))
-
-
-def test_members_share_prepared_scans():
-    assert COSTS.adaptive([4]) == 11.5
-    assert COSTS.adaptive([0, 4]) == 14.5
-    assert COSTS.adaptive([0, 4, 7, 9]) == 55.5
-    assert np.isnan(COSTS.adaptive([0, 5]))
-
-
-def test_a_budget_holds_for_all_together():
+    assert [COSTS.adaptive(of) for of in ([4], [0, 4], [0, 4, 7, 9])] == [11.5, 14.5, 55.5]
+    assert np.isnan([COSTS.alone(5), COSTS.adaptive([0, 5])]).all()
     assert Spending(COSTS, 14.5).allows([0, 4])
     assert not Spending(COSTS, 14.4).allows([0, 4])
     assert not Spending(COSTS).allows([0, 5])  # of unknown cost
