@@ -15,6 +15,7 @@ from adaptune.live.evidence import SPACING
 from adaptune.live.hops import HopErrors, Hops, LiveSquares, live_squares
 from adaptune.metrics import (
     cap,
+    span,
     sub_trajectory_rte,
     sub_trajectory_vectors,
     travelled,
@@ -242,6 +243,7 @@ class LabelledSequence:
     # (n_sets,): sets that were searched for on this sequence or a view of it alone, if any. Where
     # the sequence is left out, they are unknown.
     own: NDArray[np.bool_] | None = None
+    block: int = 1  # frames of a sub-trajectory
     elevation: float = np.nan  # degrees, see `adaptune.model.descriptor.lowest_elevation`
     # By trial number, the objective in whole runs of the candidates for the fixed set.
     whole: Mapping[int, float] = field(default_factory=dict)
@@ -661,5 +663,6 @@ def _labelled(
         values=np.array(values),
         repeats=np.array(repeats) if n_repeats > 1 else None,
         own=np.array(own),
+        block=span(frames.T_ref_sensor, length),
         elevation=float(np.nanmedian(frames.elevations)),
     )

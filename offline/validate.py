@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from adaptune.archive import Archive
 from adaptune.errors import AdaptuneError
-from adaptune.metrics import cap
+from adaptune.metrics import bootstrap, cap
 from adaptune.model import RULES, ErrorModel, ModelError, PairedExpectedRatio, Rule
 from adaptune.model.knn import NearestNeighbours
 from adaptune.model.rules import ERROR_FLOOR
@@ -64,6 +64,7 @@ class LeftOut(NamedTuple):
     name: str
     recording: str  # that it is a part of
     stretch: NDArray[np.intp]  # (n,): of each frame
+    block: int  # frames of a sub-trajectory
     # For every mode the capped error in percent at each frame, of shape (n,).
     errors: dict[str, NDArray[np.float64]]
     # For every rule the share of periods in which it did not choose the fixed set; of a bank, the
@@ -267,7 +268,8 @@ def leave_out(
     errors |= {name: capped[:, data.sets.column(trial)] for name, trial in of_rivals.items()}
     # The best set in hindsight.
     errors["oracle, sequence"] = capped[:, int(np.argmin(capped.mean(axis=0)))]
-    return LeftOut(sequence.name, sequence.recording, sequence.stretch, errors, adapted, costs)
+    about = (sequence.name, sequence.recording, sequence.stretch, sequence.block)
+    return LeftOut(*about, errors, adapted, costs)
 
 
 class Validated(NamedTuple):
@@ -370,29 +372,38 @@ def _labelled(study: OfflineStudy, model: ErrorModel) -> LabelledData:
 
 
 def _rows(validation: Validation) -> list[dict[str, Any]]:
-    """Ratios to the fixed set's error, the interval of the default rule's mean, and costs."""
+    """Ratios to the fixed set's error, intervals of the default rule's, and costs."""
     default = (*validation.modes, PAIRED)[0]
     modes = [mode for mode in validation.ratios if mode != "fixed"]
     rows: list[dict[str, Any]] = []
 
-    def add(name: str, fixed: float | None, of: dict[str, float], interval: str = "") -> None:
+    def add(
+        name: str,
+        fixed: float | None,
+        of: dict[str, float],
+        interval: tuple[float, float] | None = None,
+    ) -> None:
         rows.append({"left out": name, "fixed [%]": fixed})
         for mode in modes:
             rows[-1][mode] = of[mode]
             if mode == default:
-                rows[-1][f"{mode}, 95 %"] = interval or None
+                ends = interval and f"{interval[0]:.2f}-{interval[1]:.2f}"
+                rows[-1][f"{mode}, 95 %"] = ends
 
     for i, sequence in enumerate(validation.left_out):
         of = {mode: float(validation.ratios[mode][i]) for mode in modes}
-        add(sequence.name, sequence.errors["fixed"].mean(), of)
+        errors, fixed = sequence.errors[default], sequence.errors["fixed"]
+        # It is about this sequence, and says nothing about other places.
+        intervals = bootstrap(errors, fixed, sequence.block)
+        add(sequence.name, fixed.mean(), of, intervals and intervals[1])
     costs = {mode: validation.cost(mode) for mode in ["fixed", *modes]}
     if np.isfinite(list(costs.values())).any():
         add("cost [ms]", costs["fixed"], costs)
     summaries = {mode: validation.summary(mode) for mode in modes}
     for key in ("geometric", "arithmetic", "worst_tenth", "worst"):
-        ends = f"{summaries[default]['low']:.2f}-{summaries[default]['high']:.2f}"
+        ends = summaries[default]["low"], summaries[default]["high"]
         of = {mode: summaries[mode][key] for mode in modes}
-        add(key.replace("_", " "), None, of, ends if key == "geometric" else "")
+        add(key.replace("_", " "), None, of, ends if key == "geometric" else None)
     return rows
 
 

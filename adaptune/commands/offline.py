@@ -179,8 +179,9 @@ def validate(
     show_table(
         "Error as a ratio to the fixed set's, each recording or stretch left out in turn",
         rows,
-        "The oracle knows the errors: the best set of the sequence. The interval of the geometric "
-        "mean over the stretches is what is expected elsewhere.",
+        "The oracle knows the errors: the best set of the sequence. Intervals: "
+        "for a recording, a block bootstrap over time, if it is long enough; for the geometric "
+        "mean over the stretches, what is expected elsewhere.",
     )
     say(f"Tables and picture: {loaded.folder / 'validation'}.*, {loaded.folder / 'stretches'}.*")
     say_next_online(loaded)

@@ -114,8 +114,11 @@ def test_validates_a_study(study_file, trained_folder, tmp_path, caplog):
     ends = ["cost [ms]", "geometric", "arithmetic", "worst tenth", "worst"]
     assert [row["left out"] for row in rows] == ["one", "two", *ends]
     assert rows[0]["adaptive"] == pytest.approx(validation.ratios["adaptive"][0])
+    # Four sub-trajectories tell nothing; a dozen would.
+    assert rows[0]["adaptive, 95 %"] is None
     summary = validation.summary("adaptive")
     assert rows[3]["adaptive, 95 %"] == f"{summary['low']:.2f}-{summary['high']:.2f}"
+    assert validation.left_out[0].block > 1
     for name in ("validation.csv", "validation.svg", "stretches.csv"):
         assert (study.folder / name).exists()
     other_range = "odometry.parameters.keyframe_interval.high=20"
@@ -222,7 +225,7 @@ def test_stretches_of_one_recording_are_left_out():
 def test_the_baseline_is_better_only_where_the_interval_shows_it(errors, better):
     one_stretch = np.zeros(9, int)
     left_out = [
-        LeftOut(*2 * [f"s{i}"], one_stretch, {"baseline": of, "fixed": np.ones(9)}, {}, {})
+        LeftOut(*2 * [f"s{i}"], one_stretch, 1, {"baseline": of, "fixed": np.ones(9)}, {}, {})
         for i, of in enumerate(np.outer(errors, np.ones(9)))
     ]
     said = baseline_in_words(Validation(left_out))
