@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import accumulate, islice
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -687,9 +688,14 @@ def recording_config(
 
 
 def check_writable(path: Path) -> None:
-    """Make the folder of an estimate; an `EstimateError` if a file there is no estimate."""
+    """Make the folder of an estimate; an `EstimateError` if that cannot be written to.
+
+    There is one, too, if a file there is no estimate.
+    """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        with TemporaryFile(dir=path.parent):
+            pass
     except OSError as error:
         raise EstimateError(
             f"{path.parent}: cannot be written to ({error.strerror}); write elsewhere with --out"
