@@ -2,11 +2,10 @@
 
 import logging
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from adaptune.archive import Archive, ArchiveError, Summary, Trial, summarise
 from adaptune.errors import AdaptuneError
@@ -243,13 +242,6 @@ def whole_values(config: OfflineConfig, runs: WholeRuns) -> dict[str, dict[int, 
         }
         for name, of_sequence in runs.items()
     }
-
-
-def whole_errors(
-    archive: Archive, name: str, numbers: Iterable[int], frames: NDArray[np.intp]
-) -> dict[int, NDArray[np.float64]]:
-    """Errors in whole runs on some frames, by trial number, each of shape (n,)."""
-    return {n: archive.read(name, n, whole=True).errors[frames] for n in numbers}
 
 
 def mean_values(values: Sequence[Mapping[int, float]]) -> dict[int, float]:

@@ -37,7 +37,7 @@ from adaptune.recording.scan import origin, places, stretch_numbers
 from adaptune.space import ParameterSets
 from adaptune.study.config import WORTH
 from adaptune.study.study import MIN_RECORDINGS, PER_STRETCH
-from offline.campaign import mean_values, read_whole_runs, whole_errors, whole_values
+from offline.campaign import mean_values, read_whole_runs, whole_values
 from offline.config import OfflineStudyConfig
 from offline.objective import (
     affordable,
@@ -584,7 +584,9 @@ def labelled_data(
         }
         # Whether the objective on some frames follows from the errors there.
         by_frames = set(config.offline.objective) == {"rte"}
-        errors_of = whole_errors(archive, name, whole, s.known) if by_frames else None
+        errors_of = None
+        if by_frames:
+            errors_of = {n: archive.read(name, n, whole=True).errors[s.known] for n in whole}
         labelled.append(replace(s, vectors=vectors, whole=whole, whole_errors=errors_of))
     costs = measured_costs(archive, run, sets, odometry)
     online, live = config.online, odometry.description.live
