@@ -26,14 +26,6 @@ def error(parameters):
     return 20.0 + (parameters.get("distance") or parameters["voxel"])
 
 
-def run(config, n_batches, known=()):
-    sampler = make_sampler(SPACE, config)
-    history = list(known)
-    for _ in range(n_batches):
-        history += [(s, error(s)) for s in sampler.propose(history)]
-    return history
-
-
 @pytest.fixture(params=["tpe", "random"])
 def config(request):
     return OfflineConfig(sampler=request.param, batch=8, initial=12, seed=5)
@@ -44,7 +36,9 @@ def labels(history):
 
 
 def test_the_first_trials_are_the_baselines_and_then_all_take_turns(config):
-    history = run(config, 2)
+    sampler, history = make_sampler(SPACE, config), []
+    for _ in range(2):
+        history += [(s, error(s)) for s in sampler.propose(history)]
     assert [s for s, _ in history[:3]] == SPACE.baselines
     assert labels(history[:8]) == ["gicp", "ndt", "kiss"] * 2 + ["gicp", "ndt"]
     assert min(collections.Counter(labels(history)).values()) >= 4

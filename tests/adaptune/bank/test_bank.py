@@ -10,20 +10,17 @@ from walker import at, kept, makes, selected, x_of, x_on
 from adaptune.bank.bank import Bank
 from adaptune.odometry import OdometryError
 from adaptune.odometry.base import MOST_FAULTS, InProcess
-from adaptune.odometry.keyframe import KeyframeGicp
 from adaptune.odometry.remote import Isolated, Limits
 from adaptune.space import Selection
-
-NEAR = {"max_correspondence_distance": 2.0, "keyframe_interval": 1.0}
-FAR = {"max_correspondence_distance": 1.0, "keyframe_interval": 4.0}
-
-
-def gicp(parameters):
-    return InProcess(KeyframeGicp(parameters))
 
 
 def weigh(bank, *weights):
     bank.apply(Selection(bank.trials[0], {}, dict(zip(bank.trials, weights, strict=True))))
+
+
+def steps_of(bank, n):
+    """How far the bank comes along x with each of so many scans, ten a second."""
+    return np.diff(x_of(bank, 0.1 * np.arange(n)))
 
 
 def test_the_mean_of_all_motions_is_taken_by_their_weights():
@@ -60,10 +57,8 @@ def test_a_member_restarts_once_a_second_at_most():
     make, made = makes({1.02: dict.fromkeys(range(60), 4.0)})
     sets = {7: {"speed": 1.0}, 3: {"speed": 1.02}, 5: {"speed": 1.06}}
     odometry = Bank(make, sets, 2.0, 3.0)
-    odometry.start(odometry.prepare(at(0)), np.eye(4))
-    x = [odometry.register(odometry.prepare(at(0.1 * i))).T_odom_sensor[0, 3] for i in range(1, 41)]
     # It is lost all the time.
-    np.testing.assert_allclose(np.diff(x), 1.0)
+    np.testing.assert_allclose(steps_of(odometry, 41), 1.0)
     assert odometry.restarts == len(made[1].starts) - 1 == 4
 
 
@@ -162,25 +157,6 @@ def test_motions_of_the_members_by_trial_number():
     assert bank.usage.cpu == sum(instance.usage.cpu for instance in made)
 
 
-def drive(odometry, switch=None, n=30):
-    poses = [np.eye(4)]
-    for i in range(n):
-        if switch and i and i % 5 == 0:
-            odometry.apply(selected(switch[i // 5 % len(switch)]))
-        prepared = odometry.prepare(turns.turn(i % 15))
-        if i == 0:
-            odometry.start(prepared, np.eye(4))
-        else:
-            poses.append(odometry.register(prepared).T_odom_sensor)
-    return np.array(poses)
-
-
-def test_a_bank_of_equal_instances_is_the_single_run():
-    bank = Bank(lambda _: gicp(NEAR), {0: NEAR, 1: FAR}, warm_up=1.0)
-    switched = drive(bank, [0, 1], n=15)
-    np.testing.assert_allclose(switched, drive(gicp(NEAR), n=15), atol=1e-12)
-
-
 def with_faulty(fault):
     """A bank of a walker and an odometry in another process, with their numbers 7 and 3."""
     walkers, _ = makes()
@@ -193,13 +169,6 @@ def with_faulty(fault):
 
     sets = {3: {"odometry": "mine", "x": 0.1}, 7: {"speed": 0.1}}
     return Bank(make, sets, 2.0)
-
-
-def steps_of(bank, n):
-    """How far the bank comes along x with each of so many scans, ten a second."""
-    bank.start(bank.prepare(at(0)), np.eye(4))
-    x = [bank.register(bank.prepare(at(0.1 * i))).T_odom_sensor[0, 3] for i in range(1, n)]
-    return np.diff(x)
 
 
 def test_a_member_that_a_fault_has_ended_is_told_once_and_starts_again(caplog):

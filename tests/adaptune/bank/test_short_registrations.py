@@ -1,23 +1,15 @@
 import numpy as np
 import pytest
-from rooms import along_x
+from rooms import along_x, scan_at, street
 
 from adaptune.bank.bank import ShortRegistrations
 
 SECOND = 10**9
+WORLD = street()
 
 
 def room(x, seed):
-    """Points on four walls, a floor and some pillars, seen from `x` along the way."""
-    rng = np.random.default_rng(seed)
-    n = 8000
-    around = rng.uniform(-1.0, 1.0, (n, 3)) * [20.0, 8.0, 2.0]
-    around[: n // 4, 1] = 8.0
-    around[n // 4 : n // 2, 0] = 20.0
-    around[n // 2 : 3 * n // 4, 2] = -2.0
-    pillars = rng.uniform(-15.0, 15.0, (12, 1)).repeat(n // 48, axis=0)
-    around[-len(pillars) :, :2] = np.hstack([pillars, 0.3 * pillars + 2.0])
-    return (around - [x, 0.0, 0.0]).astype(np.float32)
+    return scan_at(WORLD, x, seed=seed).points
 
 
 def seen(n=11, step=0.1):

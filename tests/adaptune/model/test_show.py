@@ -3,9 +3,8 @@ import re
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from commands import succeeded
 
-from adaptune.commands.cli import app
 from adaptune.model import BankSettings, ErrorModel
 from adaptune.model.rules import Costs, SetCost
 from adaptune.space import Categorical, Float, ParameterSets, ParameterSpace
@@ -45,9 +44,7 @@ def model():
 
 def shown(model, folder):
     model.save(folder / "model.safetensors")
-    result = CliRunner().invoke(app, ["inspect", str(folder / "model.safetensors")])
-    assert result.exit_code == 0, result.output
-    return re.sub(r"\s+", " ", result.output)
+    return re.sub(r"\s+", " ", succeeded("inspect", folder / "model.safetensors").output)
 
 
 def test_a_model_is_explained(model, tmp_path):

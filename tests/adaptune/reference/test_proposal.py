@@ -60,6 +60,12 @@ def test_longer_drives_and_faster_ones_get_longer_ones(metres, seconds, length):
     assert proposed_sub_trajectory(path(metres, seconds)) == length
 
 
+def test_the_way_before_the_test_does_not_count():
+    reference = path(20.0)
+    reference.T_world_sensor[:60, 0, 3] *= 100.0
+    assert proposed_sub_trajectory(reference) == 5.0
+
+
 def test_the_sequence_is_the_one_that_inspect_proposes(study_file, tmp_path):
     found = inspect(study_file.parent / "one.bag")
     config = recording_config(found)
