@@ -34,10 +34,6 @@ def objective(trial):
     return x**2 + abs(n - 7) + (c != "blue")
 
 
-def history(study):
-    return [(trial.params, trial.value) for trial in study.trials]
-
-
 # As a sampler of Optuna's.
 
 
@@ -120,7 +116,7 @@ def test_energies_are_divided_by_that_of_the_first_trial():
             sampler=AnnealingSampler(settings(energy_scale=scale, initial_temperature=1.0), seed=1)
         )
         study.optimize(lambda t: 1e3 * (1.0 + objective(t)), n_trials=60)
-        return history(study)
+        return [(trial.params, trial.value) for trial in study.trials]
 
     first = spread(None)
     assert first == spread(first[0][1])

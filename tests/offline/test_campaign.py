@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from kills import contents
+from setups import setup_of
 
 from adaptune.archive import Archive, Trial
 from adaptune.errors import AdaptuneError
@@ -16,7 +17,6 @@ from offline import campaign
 from offline.campaign import BaselineError, check_baseline, run_baseline
 from offline.config import load_study
 from offline.train import train
-from offline.trial import TrialSettings, TrialSetup
 from offline.workers import WorkerError, Workers
 
 
@@ -71,19 +71,6 @@ def test_number_of_workers_changes_nothing(trained, study_file, tmp_path):
     alone = load_study(study_file, ["offline.workers=1"], tmp_path / "study")
     train(alone)
     assert contents(alone.folder) == contents(study.folder)
-
-
-def test_more_trials_go_on_where_fewer_stopped(trained, study_file, tmp_path):
-    study, _ = trained
-    folder = tmp_path / "study"
-    train(load_study(study_file, ["offline.trials=5"], folder))
-    before = {p: p.stat().st_mtime_ns for p in folder.glob("trials/*/0000?.npz")}
-    assert len(before) == 10
-    train(load_study(study_file, [], folder))
-    assert {p: p.stat().st_mtime_ns for p in before} == before
-    # The whole runs of the smaller study's fixed set are not the larger one's.
-    ours, theirs = contents(folder), contents(study.folder)
-    assert {k: ours[k] for k in theirs} == theirs
 
 
 @pytest.mark.services
@@ -149,16 +136,17 @@ def test_views_are_trained_on_beside_their_origin(gicp_study_file, tmp_path):
 FEW = ["offline.trials=3", "offline.initial=3", "offline.workers=1"]
 
 
-def study_of(study_file, folder, *given, **settings):
+def study_of(study_file, folder, *given, name="Stumbling", **settings):
     """The study with a stumbling odometry."""
     text = ", ".join(f"{name}: {value}" for name, value in settings.items())
-    odometry = f"odometry={{name: 'stumbling:Stumbling', settings: {{{text}}}}}"
+    odometry = f"odometry={{name: 'stumbling:{name}', settings: {{{text}}}}}"
     return load_study(study_file, [odometry, *FEW, *given], folder)
 
 
+@pytest.mark.parametrize("name", ["Stumbling", "Apart"])
 @pytest.mark.parametrize("fault", ["constructor", "prepare", "start", "register", "nothing", "NaN"])
-def test_a_baseline_that_fails_stops_the_campaign(study_file, tmp_path, fault):
-    study = study_of(study_file, tmp_path / "study", fault=fault)
+def test_a_baseline_that_fails_stops_the_campaign(study_file, tmp_path, name, fault):
+    study = study_of(study_file, tmp_path / "study", name=name, fault=fault)
     reason = {"nothing": "returned None", "NaN": "pose"}.get(fault, "no licence")
     with pytest.raises(AdaptuneError, match=rf"sequences\.(one|two): .*baseline.*{reason}.*again"):
         train(study)
@@ -166,7 +154,7 @@ def test_a_baseline_that_fails_stops_the_campaign(study_file, tmp_path, fault):
     assert not study.model_path.exists()
     if fault == "register":
         # Once it is mended, the same command works, and nothing has stayed.
-        train(study_of(study_file, tmp_path / "study"))
+        train(study_of(study_file, tmp_path / "study", name=name))
         assert not Archive(study.folder / "trials").read("one", 0).faults
 
 
@@ -220,25 +208,18 @@ def test_the_baseline_wins_where_trials_flatter(study_file, tmp_path):
         )
 
 
-def study_of_two(study_file, folder, second):
-    """The study with a stumbling odometry and another."""
-    return load_study(study_file, [f"odometry=[{{name: 'stumbling:Stumbling'}}, {second}]"], folder)
-
-
-def run_baselines(study):
-    """Run the baselines, and return the archive."""
-    archive = Archive(study.folder / "trials")
-    setup = TrialSetup(TrialSettings.of(study.config), study.odometry, study.sequences)
-    with Workers(setup, 1, 1e9) as workers:
-        run_baseline(study, archive, workers, lambda *_: None)
-    return archive
-
-
 @pytest.mark.services
 def test_the_baseline_of_every_odometry_is_run_once(study_file, tmp_path, monkeypatch):
-    second = "{name: 'stumbling:Stumbling', label: apart, settings: {step: 0.31}}"
-    study = study_of_two(study_file, tmp_path / "study", second)
-    archive = run_baselines(study)
+    second = "{name: 'stumbling:Apart', label: apart, settings: {step: 0.31}}"
+    odometries = f"odometry=[{{name: 'stumbling:Stumbling'}}, {second}]"
+    study = load_study(study_file, [odometries], tmp_path / "study")
+    archive = Archive(study.folder / "trials")
+
+    def run_baselines():
+        with Workers(setup_of(study), 1, 1e9) as workers:
+            run_baseline(study, archive, workers, lambda *_: None)
+
+    run_baselines()
     for name in ("one", "two"):
         for number, parameters in enumerate(study.odometry.space.baselines):
             assert archive.read(name, number, whole=True).parameters == parameters
@@ -247,5 +228,5 @@ def test_the_baseline_of_every_odometry_is_run_once(study_file, tmp_path, monkey
     monkeypatch.setattr(campaign, "check_baseline", lambda *told: ran.append(told[:2]))
     ran = []
     archive.trial_path("two", 1, whole=True).unlink()
-    run_baselines(study)
+    run_baselines()
     assert ran == [("apart", "two")]

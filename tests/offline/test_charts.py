@@ -167,23 +167,13 @@ def test_a_damaged_validation_is_named(study, text):
         charts_of_validation(study.folder)
 
 
-def stretches(n_recordings=2, n=6):
-    rng = np.random.default_rng(0)
-    return [
-        {
-            "recording": f"drive_{r}",
-            "stretch": i,
-            "fixed [%]": 0.5,
-            "one set": 1.0,
-            "adaptive": float(np.exp(rng.normal(-0.2, 0.1))),
-        }
-        for r in range(n_recordings)
-        for i in range(n)
-    ]
-
-
 def test_stretches_are_sorted_and_have_the_interval_of_their_mean():
-    rows = stretches()
+    ratio = np.exp(np.random.default_rng(0).normal(-0.2, 0.1, 12))
+    of_drives = [{"recording": f"drive_{i // 6}", "stretch": i % 6} for i in range(12)]
+    rows = [
+        row | {"fixed [%]": 0.5, "one set": 1.0, "adaptive": float(adaptive)}
+        for row, adaptive in zip(of_drives, ratio, strict=True)
+    ]
     (panel,) = stretch_chart(rows).panels  # one set is the fixed set
     points = [d for d in panel.drawn if isinstance(d, Points)]
     assert [p.name for p in points] == ["drive_0", "drive_1"]

@@ -2,10 +2,9 @@ import shutil
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from commands import succeeded
 
 from adaptune.archive import Archive
-from adaptune.commands.cli import app
 from adaptune.metrics import cap
 from adaptune.model import ErrorModel
 from adaptune.study.study import oracle_errors
@@ -25,15 +24,14 @@ def load(study_file, trained_folder, tmp_path):
 def oracle(study_file, trained_folder, tmp_path_factory):
     """A study, and what the oracle's command printed; not to be changed."""
     folder = shutil.copytree(trained_folder, tmp_path_factory.mktemp("oracle") / "study")
-    words = ["online", str(study_file), "--folder", str(folder), "--oracle"]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("adaptune.commands.online.ORACLE_SETS", N)
-        return load_study(study_file, [], folder), CliRunner().invoke(app, words)
+        done = succeeded("online", study_file, "--folder", folder, "--oracle")
+    return load_study(study_file, [], folder), done
 
 
 def test_errors_on_test_sequences_are_read(oracle):
     study, done = oracle
-    assert done.exit_code == 0, done.output
     model = ErrorModel.load(study.model_path)
     archive = study.archive("oracle")
     found = oracle_errors(archive, "three", model)

@@ -7,7 +7,6 @@ import re
 from functools import partial
 
 import drawn
-import drives
 import numpy as np
 import pytest
 
@@ -320,42 +319,27 @@ def test_what_is_surely_worse_than_the_best_is_given_up():
     assert survivors({5: (best[:2] + 1.0).tolist()}, before) == [5]
 
 
-@pytest.fixture(scope="module")
-def pruning_study(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("pruned")
-    names = [f"s{i}" for i in range(4)]
-    for i, name in enumerate(names):
-        drives.write_bag(folder / f"{name}.bag", drives.scans(i, 16))
-    bags = "\n".join(f"  {n}: {{bag: {n}.bag, points: /points, reference: /truth}}" for n in names)
-    (folder / "pruned.yaml").write_text(
-        f"odometry:\n  name: gicp\n  settings: {{downsampling: 0.5, min_range: 0.5}}\n"
-        f"  parameters:\n    max_correspondence_distance: {{low: 0.05, high: 5.0, log: true}}\n"
-        f"    keyframe_interval: {{low: 0.5, high: 15.0, baseline: 1.0, log: true}}\n"
-        f"sequences:\n{bags}\ntraining: [{', '.join(names)}]\nsub_trajectory: 3.0\n"
-        f"offline: {{trials: 9, initial: 6, batch: 3, seed: 3, workers: 2, pruning: wilcoxon}}\n"
-    )
-    return folder / "pruned.yaml"
-
-
-def test_what_a_pruned_trial_has_seen_feeds_the_model(pruning_study, tmp_path):
-    study = load_study(pruning_study, [], tmp_path / "study")
+def test_what_a_pruned_trial_has_seen_feeds_the_model(gicp_study_file, tmp_path):
+    given = ["training=[one, two, three]", "test=[]", "offline.trials=9", "offline.initial=6"]
+    given += ["offline.batch=3", "offline.pruning=wilcoxon"]
+    study = load_study(gicp_study_file, given, tmp_path / "study")
     training = train(study)
     archive = Archive(study.folder / "trials")
     seen = [[n in archive.finished(name) for name in study.training] for n in range(9)]
     n_seen = np.sum(seen, axis=1)
-    assert (n_seen[:3] == 4).all()
-    assert 2 <= n_seen.min() < 4
+    assert (n_seen[:3] == 3).all()
+    assert n_seen.min() == 2
     model = ErrorModel.load(study.folder / "model.safetensors")
     for s, (name, row) in enumerate(zip(study.training, np.transpose(seen), strict=True)):
         errors = model.errors[model.sequence == s]
         assert (np.isnan(errors).all(axis=0) == ~row).all()
         assert (np.isnan(errors).any(axis=0) == ~row).all()
         assert [trial[name] is None for trial in training.trials] == (~row).tolist()
-    assert n_seen[training.model.fixed] == 4
+    assert n_seen[training.model.fixed] == 3
     rows = list(csv.DictReader((study.folder / "trials.csv").open()))
-    assert [row["mean"] == "" for row in rows] == (n_seen < 4).tolist()
+    assert [row["mean"] == "" for row in rows] == (n_seen < 3).tolist()
     validation = validate(study).validation
-    assert len(validation.left_out) == 4
+    assert len(validation.left_out) == 3
     before = (study.folder / "model.safetensors").read_bytes()
 
     # Some of it lost, as to a killed driver, and made again.

@@ -175,21 +175,14 @@ def test_an_exception_is_a_fault_of_its_trial(study, where, whole):
 def test_repeats_are_averaged_and_kept(study):
     made = []
 
-    class Wavering(KeyframeGicp):
-        """The second instance drifts to the side, the third loses track."""
+    class Wavering(Slipping):
+        """Of three instances that run, the second drifts to the side, the third loses track."""
 
         def __init__(self, *args):
             super().__init__(*args)
             made.append(self)
-            self.number, self.scan = len(made), 0
-
-        def register(self, prepared):
-            self.scan += 1
-            T, ok = super().register(prepared)
-            T = T.copy()
-            T[1, 3] += 0.01 * self.scan * (self.number == 3)
-            T[1, 3] += 5.0 * (self.number == 4 and self.scan == 10)
-            return Registration(T, ok)
+            drift, loss = dict.fromkeys(range(40), 0.01), {10: 5.0, 11: -5.0}
+            self.slips = {3: drift, 4: loss}.get(len(made), {})
 
     wavering = made_of(Wavering, study)
     sequence = setup_of(study, wavering).prepare("one", 1e9)

@@ -80,7 +80,9 @@ def test_mistakes_are_told_in_a_sentence(adaptune, bag, study_file, tmp_path, wo
         (["--reference", "early.tum"], "covers 1.000 s to 2.000 s"),
     ],
 )
-def test_what_is_wrong_is_told_before_the_estimate(adaptune, bag, tmp_path, words, expected):
+def test_what_is_wrong_is_told_before_the_estimate(
+    adaptune, bag, tmp_path, monkeypatch, words, expected
+):
     (tmp_path / "a_file").touch()
     (tmp_path / "early.tum").write_text("1 0 0 0 0 0 0 1\n2 1 0 0 0 0 0 1\n")
     (tmp_path / "mine").mkdir()
@@ -89,9 +91,8 @@ def test_what_is_wrong_is_told_before_the_estimate(adaptune, bag, tmp_path, word
     def estimated(*_):
         raise AssertionError
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(estimate, "estimate_reference", estimated)
-        done = adaptune(bag, *words)
+    monkeypatch.setattr(estimate, "estimate_reference", estimated)
+    done = adaptune(bag, *words)
     assert done.exit_code == 2
     assert expected in done.stderr
     assert (tmp_path / "mine/one_reference.tum").read_text() == "mine"
@@ -104,7 +105,6 @@ def test_a_reference_of_another_time_that_was_not_asked_for_hinders_nothing(
         raise SequenceError("the reference covers another time")
 
     monkeypatch.setattr(RecordedSequence, "reference", fail)
-    monkeypatch.setattr(estimate, "estimate_reference", estimates.Estimator())
     done = adaptune(bag)
     assert done.exit_code == 0, done.stderr
     assert "is not compared with: the reference covers another time" in done.stdout

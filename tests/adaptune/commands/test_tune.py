@@ -1,6 +1,7 @@
 """Tuning from recordings alone, with no study file."""
 
 import shutil
+from pathlib import Path
 from types import SimpleNamespace
 
 import commands
@@ -21,9 +22,18 @@ def failed(*arguments):
     return commands.refused("tune", *arguments)
 
 
-@pytest.fixture
-def bag(study_file, tmp_path, monkeypatch):
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+
+
+def study_in(file):
+    """The study that was written to a file."""
+    return load_study(Path(file), [], Path("elsewhere"))
+
+
+@pytest.fixture
+def bag(study_file, tmp_path):
     (tmp_path / "one.bag").symlink_to(study_file.parent / "one.bag")
     return tmp_path / "one.bag"
 
@@ -63,7 +73,7 @@ def test_what_it_decides_stands_in_a_study_file(bag, tmp_path):
     assert failed(bag) == "error: runs/one/one.yaml"
     text = (tmp_path / "runs/one/one.yaml").read_text()
     assert text.startswith(f"# adaptune tune {bag.resolve()} --odometry gicp\n")
-    study = load_study(tmp_path / "runs/one/one.yaml", [], tmp_path / "elsewhere")
+    study = study_in("runs/one/one.yaml")
     assert study.training == ["one_0-60"]
     assert study.config.test == ("one_60-100",)
     assert study.config.sub_trajectory == 2.0
@@ -95,7 +105,7 @@ def test_the_last_of_several_bags_is_the_test(bag, study_file, tmp_path):
     (tmp_path / "other").mkdir()
     shutil.copy(study_file.parent / "three.bag", tmp_path / "other/one.bag")
     failed(bag, study_file.parent / "two.bag", "other/one.bag", "--minutes", 6)
-    study = load_study(tmp_path / "runs/one_and_more/one_and_more.yaml", [], tmp_path / "new")
+    study = study_in("runs/one_and_more/one_and_more.yaml")
     assert study.training == ["one", "two"]
     assert study.config.test == ("one_2",)
     assert (study.config.offline.trials, study.config.offline.hours) == (None, 0.1)
@@ -122,11 +132,9 @@ def test_of_several_odometries_the_replayed_one_is_named(monkeypatch):
 
 
 @pytest.mark.usefixtures("decided")
-def test_several_odometries_share_a_study(bag, tmp_path):
+def test_several_odometries_share_a_study(bag):
     failed(bag, "--odometry", "gicp,kiss_icp")
-    study = load_study(
-        tmp_path / "runs/one_gicp+kiss_icp/one_gicp+kiss_icp.yaml", [], tmp_path / "other"
-    )
+    study = study_in("runs/one_gicp+kiss_icp/one_gicp+kiss_icp.yaml")
     assert list(study.config.odometries) == ["gicp", "kiss_icp"]
     assert study.config.offline.trials == 2 * tune.EACH
     every = tune.odometries_of("all", imu=False)
@@ -135,8 +143,7 @@ def test_several_odometries_share_a_study(bag, tmp_path):
 
 
 @pytest.mark.usefixtures("decided")
-def test_a_drive_too_short_to_split_is_refused(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_a_drive_too_short_to_split_is_refused(tmp_path):
     short = drives.write_bag(tmp_path / "short.bag", drives.scans(n_scans=12))
     said = failed(short)
     assert "short: moves 1.2 m in the part for the test, which takes 2 m at least" in said
@@ -144,40 +151,37 @@ def test_a_drive_too_short_to_split_is_refused(tmp_path, monkeypatch):
 
 
 @pytest.mark.usefixtures("decided")
-def test_a_recording_that_stands_for_long_is_split_by_its_path(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_a_recording_that_stands_for_long_is_split_by_its_path(tmp_path):
     moving = drives.scans(n_scans=60)
     first, points, T = moving[0]
     standing = [(first - i * 100_000_000, points, T) for i in range(90, 0, -1)]
     late = drives.write_bag(tmp_path / "late.bag", standing + moving)
     failed(late)
-    study = load_study(tmp_path / "runs/late/late.yaml", [], tmp_path / "other")
+    study = study_in("runs/late/late.yaml")
     # It stands for 9 s of 15; 60 % of the way are over after 12.5 s.
     assert study.config.test == ("late_84-100",)
     # `inspect` proposes the same.
     commands.succeeded("inspect", "late.bag", "--study", "proposed.yaml")
-    proposed = load_study(tmp_path / "proposed.yaml", [], tmp_path / "another")
+    proposed = study_in("proposed.yaml")
     for key in ("training", "test", "sub_trajectory", "sequences"):
         assert getattr(proposed.config, key) == getattr(study.config, key), key
 
 
 @pytest.mark.usefixtures("decided")
-def test_motion_within_scans_is_undone_where_the_odometry_does_not(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_motion_within_scans_is_undone_where_the_odometry_does_not(tmp_path):
     course = Course(scenes=("street",), length=15.0, columns=100)
     record(course, tmp_path / "street.bag")
     for odometry, how in (("gicp", "constant_velocity"), ("kiss_icp", None)):
         failed("street.bag", "--odometry", odometry, "--folder", odometry)
-        study = load_study(tmp_path / odometry / f"{odometry}.yaml", [], tmp_path / "other")
+        study = study_in(f"{odometry}/{odometry}.yaml")
         assert study.config.sequences["street"].compensate == how
     commands.succeeded("inspect", "street.bag", "--study", "proposed.yaml")
-    proposed = load_study(tmp_path / "proposed.yaml", [], tmp_path / "other")
+    proposed = study_in("proposed.yaml")
     assert proposed.config.sequences["street"].compensate == "constant_velocity"
 
 
 @pytest.mark.usefixtures("decided")
-def test_of_two_topics_one_is_to_be_named(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_of_two_topics_one_is_to_be_named(tmp_path):
     clouds = [(topic, s, drives.cloud(s, xyz)) for s, xyz, _ in drives.scans() for topic in "ab"]
     truth = [
         ("/truth", s, rec.pose(s, T[:3, 3].tolist(), (0.0, 0.0, 0.0, 1.0), rec.ROS1))
@@ -189,7 +193,7 @@ def test_of_two_topics_one_is_to_be_named(tmp_path, monkeypatch):
     assert "both.bag: has 2 topics of point clouds: /a (60 of sensor_msgs" in said
     assert said.endswith("name one with --points")
     failed("both.bag", "--points", "/b")
-    study = load_study(tmp_path / "runs/both/both.yaml", [], tmp_path / "other")
+    study = study_in("runs/both/both.yaml")
     assert study.config.sequences["both"].points == "/b"
 
 

@@ -3,6 +3,7 @@ from importlib import metadata
 
 import numpy as np
 import pytest
+import rooms
 import turns
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -164,18 +165,10 @@ modest = settings(max_examples=20, deadline=None)
 seeds = st.integers(0, 2**32 - 1)
 
 
-def street(seed=0, n=4000):
-    """Points of a ground, two walls, poles and a few bushes, float32 of shape (about n, 3)."""
-    rng = np.random.default_rng(seed)
-    u = rng.uniform(-1, 1, (n, 3))
-    ground = np.c_[25 * u[:, 0], 25 * u[:, 1], np.full(n, -1.73)][: n // 3]
-    walls = np.c_[30 * u[:, 0], 9.3 * np.sign(u[:, 1]), 4 + 5 * u[:, 2]][: n // 3]
-    at = rng.uniform(-20, 20, (12, 2))[rng.integers(0, 12, n // 6)]
-    poles = np.c_[at, rng.uniform(-1.7, 5, n // 6)]
-    at = rng.uniform(-15, 15, (6, 3))[rng.integers(0, 6, n // 6)]
-    points = np.concatenate([ground, walls, poles, at + rng.normal(0, 0.5, at.shape)])
-    points += rng.normal(0, 0.02, points.shape)
-    return points.astype(np.float32)
+def street(seed=0):
+    """Points of a street, float32 of shape (n, 3)."""
+    points = rooms.street(20.0, seed)
+    return (points + np.random.default_rng(seed).normal(0.0, 0.02, points.shape)).astype(np.float32)
 
 
 def plain_histogram(points):
