@@ -220,7 +220,8 @@ def trial_workers(
             "a start takes a new container, so trials run on where they lose track "
             "(offline.runs: whole)"
         )
-    setup = TrialSetup(TrialSettings.of(study.config), study.odometry, study.sequences)
+    odometry = study.odometry.changed(user_code=True)
+    setup = TrialSetup(TrialSettings.of(study.config), odometry, study.sequences)
     memory = 0.25 * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     return Cluster(setup, names, memory, cluster) if cluster else Workers(setup, n, memory)
 

@@ -45,6 +45,7 @@ class Task(NamedTuple):
     sets: tuple[ParameterSet, ...]  # the parameter sets of the trials
     whole: bool = False  # run them from end to end, without restarts at the reference
     frames: bool = False  # return the frames, which all trials on the sequence share, too
+    apart: bool = False  # run classes of the user in processes of their own, also clean ones
 
     @property
     def key(self) -> tuple[str, tuple[int, ...]]:
@@ -190,6 +191,8 @@ class _Queue(Generic[W]):
         self._progress(self._what, sum(self._done.values()), self._total, at_work)
 
     def _again(self, task: Task, death: Death) -> None:
+        # A class that is not as clean as it says then costs its own trial only.
+        task = task._replace(apart=True)
         self.waiting.insert(0, task)
         self._deaths[task.key] += 1
         if self._deaths[task.key] == MOST_DEATHS:
@@ -217,27 +220,30 @@ class Sequences:
 
     def __init__(self, setup: TrialSetup, memory: float):
         self._setup = setup
+        self._apart = replace(setup, odometry=setup.odometry.changed(user_code=False))
         self._memory = min(memory, MOST_PREPARED)
-        self._ready: dict[str, PreparedSequence] = {}
+        self._ready: dict[tuple[str, bool], PreparedSequence] = {}
 
     def run(self, task: Task, progress: Progress) -> TaskResult:
         """Do a task."""
-        sequence = self._prepared(task.sequence, progress)
-        trials = self._setup.run(sequence, task.sets, task.whole, progress)
+        setup = self._apart if task.apart else self._setup
+        sequence = self._prepared(setup, task, progress)
+        trials = setup.run(sequence, task.sets, task.whole, progress)
         frames = None
         if task.frames:  # which reads the scans again
             frames = with_measured_hops(sequence.scans, sequence.frames, progress)
         return TaskResult(trials, frames)
 
-    def _prepared(self, name: str, progress: Progress) -> PreparedSequence:
-        sequence = self._ready.pop(name, None)
+    def _prepared(self, setup: TrialSetup, task: Task, progress: Progress) -> PreparedSequence:
+        key = task.sequence, setup is self._setup
+        sequence = self._ready.pop(key, None)
         if sequence is None:
             # Make room: drop the sequences that were not used for longest.
             while self._ready and self._used() > self._memory / 2:
                 del self._ready[next(iter(self._ready))]
             with apart():
-                sequence = self._setup.prepare(name, self._memory - self._used(), progress)
-        self._ready[name] = sequence
+                sequence = setup.prepare(task.sequence, self._memory - self._used(), progress)
+        self._ready[key] = sequence
         return sequence
 
     def _used(self) -> int:

@@ -248,8 +248,8 @@ class Odometry(ABC):
     live : bool
         Whether `configure` may be called between scans.
     clean : bool
-        Of adaptune's own: whether a second instance in the same process knows nothing of the first,
-        and no scan ends the process. All others run in processes of their own.
+        Whether a second instance in the same process knows nothing of the first, and no scan ends
+        the process. Others run in a process of their own.
     needs_imu : bool
         Whether scans must bring along what an IMU measured.
     warm_up : float

@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, RootModel
 from adaptune import processes, strict
 from adaptune.errors import NotInstalledError, OdometryError
 from adaptune.odometry.base import Description, InProcess, Odometry, OdometryInstance, OwnFile
-from adaptune.odometry.remote import SERVICE, Isolated, Limits
+from adaptune.odometry.remote import SERVICE, Guarded, Isolated, Limits
 from adaptune.space import ParameterSet, ParameterSpace, PooledSpace
 from adaptune.strict import Mistake, validated
 
@@ -303,6 +303,9 @@ class OdometryFactory:
     limits: Limits  # of odometries in processes of their own
     # gives the recording of a sequence, for programs that run whole recordings
     program_input: Callable[[str], "ProgramInput"] | None = None
+    # Whether classes of the user may run in this process, if they are clean. Only processes that
+    # the user can do without may allow it.
+    user_code: bool = False
     description: Description = field(init=False)  # what a study must know of the odometry
 
     def __post_init__(self) -> None:
@@ -320,7 +323,7 @@ class OdometryFactory:
         return odometry_content(self.name, self.settings, self.description.module)
 
     def changed(self, **changes: Any) -> "OdometryFactory":
-        """The same with another `program_input`."""
+        """The same with another `user_code` or `program_input`."""
         return replace(self, **changes)
 
     @property
@@ -363,8 +366,11 @@ class OdometryFactory:
             program: Any = odometry_class(self.name)
             made: OdometryInstance = program.instance(given, self.settings, self.limits, read)
             return made
-        if isolated or self.apart:
+        is_users = is_user_class(self.name)
+        if isolated or not self.description.clean or (is_users and not self.user_code):
             return Isolated(self.name, given, self.settings, self.limits)
+        if is_users:
+            return Guarded(self.name, odometry_class, given, self.settings, self.limits.seconds)
         cls: Any = odometry_class(self.name)
         return InProcess(cls(given, self.settings))
 

@@ -10,7 +10,7 @@ import numpy as np
 from adaptune.odometry import BaseSettings, Odometry, Registration
 from adaptune.space import Float, ParameterSpace
 
-ELSEWHERE = ("init", "prepare", "leaves", "start", "nothing", "hangs in init")
+ELSEWHERE = ("init", "prepare", "start", "nothing", "hangs in init")
 """Faults that do not happen at the scan, and a registration that returns nothing."""
 n_instances = 0
 
@@ -84,3 +84,9 @@ class Faulty(Odometry):
                 T[:3, :3] *= 1.1
             case "mirrored":
                 T[2, 2] = -1.0
+
+
+class Clean(Faulty):
+    """Says that no scan ends its process."""
+
+    clean = True

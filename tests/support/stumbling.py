@@ -1,6 +1,5 @@
 """Odometries that know the way, and fail where they are told to."""
 
-import drives
 import numpy as np
 
 from adaptune.odometry import BaseSettings, Odometry, Registration
@@ -22,11 +21,11 @@ class Stumbling(Odometry):
 
     space = ParameterSpace({"x": Float(low=0.0, high=1.0, baseline=0.5)})
     settings_type = Settings
-    live = False
+    live, clean = False, True
 
     def __init__(self, *args):
         super().__init__(*args)
-        self.lost = 0
+        self.scan, self.lost = 0, 0
         if self.settings.fault == "constructor":
             raise RuntimeError("no licence")
 
@@ -40,7 +39,8 @@ class Stumbling(Odometry):
             raise RuntimeError("no licence")
         self.T, self.lost = T_odom_sensor, 0
 
-    def register(self, prepared):
+    def register(self, _prepared):
+        self.scan += 1
         if self.settings.fault == "register":
             raise RuntimeError("no licence")
         if self.settings.fault == "nothing":
@@ -49,10 +49,15 @@ class Stumbling(Odometry):
         if self.settings.fault == "NaN":
             T[:] = np.nan
         step = self.settings.step * (1.0 if self.parameters["x"] > 0.6 else 0.8)
-        stumbles = prepared.stamp == drives.FIRST_STAMP + 10 * 10**8
-        if self.parameters["x"] > 0.6 and (self.lost or stumbles):
+        if self.parameters["x"] > 0.6 and (self.lost or self.scan == 10):
             self.lost += 1
             step = max(step - 0.15 * self.lost, -0.05)
         T[self.settings.axis, 3] += step
         self.T = T
         return Registration(T, registered=True)
+
+
+class Apart(Stumbling):
+    """The same in a process of its own."""
+
+    clean = False

@@ -1,5 +1,6 @@
 import io
 import os
+import pickle
 import re
 import socket
 import struct
@@ -23,7 +24,7 @@ from adaptune.odometry import OdometryError, wire
 from adaptune.odometry.base import MOST_FAULTS, InProcess
 from adaptune.odometry.keyframe import KeyframeGicp
 from adaptune.odometry.registry import OdometryFactory, make_here
-from adaptune.odometry.remote import SERVICE, Limits, Process, ProcessSettings
+from adaptune.odometry.remote import SERVICE, Guarded, Isolated, Limits, Process, ProcessSettings
 from adaptune.odometry.tracker import HealthCheck
 from adaptune.recording import Imu, Scan
 from adaptune.recording.scan import ImuNoise
@@ -37,9 +38,12 @@ TOLD = {
     "abort": "ended by SIGABRT: about to go wrong",
     "segmentation fault": "ended by SIGSEGV: about to go wrong",
     "memory": r"out of isolation\.memory = 1 GB",
+    "mirrored": "it gave a pose that is not rigid",
+}
+"""Faults of classes in processes of their own."""
+HERE = {
     "init": "RuntimeError: no planes in init",
     "prepare": "RuntimeError: no planes in prepare",
-    "leaves": "its process ended with code 3",
     "start": "RuntimeError: no planes in start",
     "raise": "RuntimeError: no planes here",
     "exit": "SystemExit|ended with code 0: about to go wrong|ended",
@@ -48,16 +52,19 @@ TOLD = {
     "nothing": "TypeError: register returned None, not a Registration.pose",
     "NaN": "it gave a pose that is not finite",
     "not rigid": "it gave a pose that is not rigid",
-    "mirrored": "it gave a pose that is not rigid",
     "shape": r"it gave a pose of shape \(3, 4\)",
 }
+"""Those that clean classes have in this process, too."""
+CASES = [*((f, False) for f in TOLD | HERE), *((f, True) for f in HERE)]
+
+
+def factory(fault="none", here=False, name="faulty:Clean"):
+    limits = Limits(seconds=0.3 if "hang" in fault else 60.0, memory=1.0)
+    return OdometryFactory(name, {"fault": fault}, faulty.Clean.space, limits, user_code=here)
 
 
 def isolated(fault, **parameters):
-    limits = Limits(seconds=0.3 if "hang" in fault else 60.0, memory=1.0)
-    return OdometryFactory("faulty:Faulty", {"fault": fault}, faulty.Faulty.space, limits)(
-        parameters
-    )
+    return factory(fault)(parameters)
 
 
 def scan(i):
@@ -71,21 +78,22 @@ def drive(odometry, n=6):
     return np.array([T[0, 3] for T in poses])
 
 
-@pytest.mark.parametrize("fault", TOLD)
-def test_every_fault_is_told_and_another_start_goes_on(fault):
-    odometry = isolated(fault)
+@pytest.mark.parametrize(("fault", "here"), CASES)
+def test_every_fault_is_told_and_another_start_goes_on(fault, here):
+    odometry = factory(fault, here)()
+    assert isinstance(odometry, Guarded) == here
     x, n = drive(odometry), 0 if fault in (*faulty.ELSEWHERE, "shape") else 2
     np.testing.assert_allclose(x[:n], 0.1 * np.arange(1, n + 1))
     assert np.isnan(x[n:]).all()
     (told,) = odometry.faults
-    assert re.search(TOLD[fault], told), told
+    assert re.search((TOLD | HERE)[fault], told), told
     T = moved(y=4.0)
     odometry.start(odometry.prepare(scan(6)), T)
     T, registered = odometry.register(odometry.prepare(scan(7)))
     if n:
         np.testing.assert_allclose(T[:3, 3], [0.1, 4.0, 0.0])
         # The class counts its instances in a variable of its module.
-        assert registered
+        assert registered or here
     if "hang" not in fault:
         for _ in range(20):
             odometry.start(odometry.prepare(scan(0)), np.eye(4))
@@ -93,26 +101,43 @@ def test_every_fault_is_told_and_another_start_goes_on(fault):
         assert len(odometry.faults) == MOST_FAULTS
 
 
-def test_parameters_change_and_stay_from_start_to_start():
-    odometry = isolated("none", x=0.2)
-    np.testing.assert_allclose(drive(odometry), 0.1 * np.arange(1, 6))
-    odometry.apply(Selection(0, {"x": 0.95}))
-    T = odometry.register(odometry.prepare(scan(6))).T_odom_sensor
-    assert T[0, 3] == pytest.approx(0.8)
+def test_only_who_says_so_runs_clean_classes_here():
+    assert isinstance(factory()(), Isolated)
+    assert isinstance(factory(here=True)(isolated=True), Isolated)
+    assert isinstance(factory(here=True, name="faulty:Faulty")(), Isolated)
+    assert isinstance(pickle.loads(pickle.dumps(factory(here=True)))(), Guarded)
+    assert factory().description.module == "faulty"
+
+
+def test_a_class_is_the_same_odometry_here_and_there():
+    here, there = (factory(here=here)({"x": 0.2}) for here in (True, False))
+    np.testing.assert_array_equal(drive(here), drive(there))
+    for odometry in (here, there):
+        odometry.apply(Selection(0, {"x": 0.95}))
+    for i in (6, 7):
+        a, b = (o.register(o.prepare(scan(i))).T_odom_sensor for o in (here, there))
+        np.testing.assert_array_equal(a, b)
+        assert a[0, 3] == pytest.approx(0.5 + 0.3 * (i - 5))
+        np.testing.assert_array_equal(
+            here.motions.T_previous_current, there.motions.T_previous_current
+        )
+    assert here.usage.cpu > 0.0
+    assert here.usage.memory is None
     # A process that begins later has the parameters, too.
-    np.testing.assert_allclose(drive(odometry, 2), [0.3])
+    for odometry in (here, there):
+        np.testing.assert_allclose(drive(odometry, 2), [0.3])
 
 
 def test_settings_are_checked_in_another_process():
-    with pytest.raises(OdometryError, match=r"faulty:Faulty: settings: fualt: .*'fault'"):
-        OdometryFactory("faulty:Faulty", {"fualt": "hang"}, faulty.Faulty.space, Limits())
+    with pytest.raises(OdometryError, match=r"faulty:Clean: settings: fualt: .*'fault'"):
+        OdometryFactory("faulty:Clean", {"fualt": "hang"}, faulty.Clean.space, Limits())
 
 
 def test_a_server_that_was_killed_is_replaced():
     odometry = isolated("none")
     odometry.start(scan(0), np.eye(4))
-    processes.server(SERVICE, "faulty:Faulty").process.kill()
-    processes.server(SERVICE, "faulty:Faulty").process.wait()
+    processes.server(SERVICE, "faulty:Clean").process.kill()
+    processes.server(SERVICE, "faulty:Clean").process.wait()
     # Those it has forked live on.
     assert odometry.register(scan(1)).T_odom_sensor[0, 3] == pytest.approx(0.1)
     odometry.start(scan(2), np.eye(4))
@@ -147,6 +172,22 @@ def test_a_trial_keeps_its_faults_and_goes_on_at_the_reference(study_file, tmp_p
     with Workers(setup, 1, 1e9) as workers:
         results = [result for _, result in run(workers, tasks)]
     assert ["SIGABRT" in result.trials[0].faults[0] for result in results] == [True, True]
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [("leaves", "its process ended with code 3"), ("prepare", "no planes in prepare")],
+)
+def test_a_class_that_ends_the_worker_then_runs_apart(study_file, tmp_path, fault, words):
+    overrides = ["odometry.name=faulty:Clean", "odometry.parameters=", "odometry.settings="]
+    study = load_study(study_file, overrides, tmp_path / "study")
+    with Workers(setup_of(study, factory(fault, here=True)), 1, 1e9) as workers:
+        ((_, result),) = run(workers, [Task("one", (0,), ({"x": 0.5},), frames=True)])
+        ((process, _),) = workers._workers.values()
+        # It may end its process group.
+        assert os.getpgid(process.pid) == process.pid
+    assert result.frames is not None
+    assert words in result.trials[0].faults[0]
 
 
 def test_a_replay_goes_on_at_the_last_healthy_motion():
