@@ -381,6 +381,8 @@ class PreparedScan:
 class InProcess(OdometryInstance):
     """Runs an adapter, which nothing else may use, in this process, and notes what it takes."""
 
+    faults: Sequence[str] = ()
+
     def __init__(self, odometry: Odometry):
         self.odometry = odometry
         self._cpu = 0.0

@@ -23,6 +23,11 @@ def tune(sequences):
     return choose(labelled(sequences), 0)
 
 
+def bank_only(sequences):
+    """Labelled data of an odometry that cannot change its parameters between scans."""
+    return labelled(sequences)._replace(live=False)
+
+
 def test_settings_are_chosen_on_the_sequences_at_hand():
     sequences = two_kinds(np.random.default_rng(0))
     # Set 2 everywhere, 0 in one kind of place and 4 in the other.
@@ -56,6 +61,30 @@ def test_a_small_harm_is_outweighed_and_a_disaster_is_not(odd, gains):
     (of_odd,) = [rest for left, rest in data.folds() if left.name == "odd"]
     assert of_odd.fixed() == TRIALS[2]
     assert choose(data, 0).one_set.adapt is gains
+
+
+def test_a_bank_that_gains_nothing_does_not_adapt():
+    rng = np.random.default_rng(7)
+    sequences = [with_motions(f"s{i}", rng, 100) for i in range(7)]
+    # All members err alike: nothing cancels.
+    alike = [
+        replace(
+            s,
+            errors=np.repeat(s.errors[:, :1], 5, axis=1),
+            vectors=dict.fromkeys(TRIALS, s.vectors[0]),
+            simulation=replace(
+                s.simulation, motions=lambda m, of=s.simulation.motions: of((0,) * len(m))
+            ),
+        )
+        for s in sequences
+    ]
+    found = choose(bank_only(alike), [0, 3, 4])
+    assert found.bank == NO_BANK
+    assert found.members == [0, 3, 4]
+    found = choose(bank_only(sequences), [0, 8])
+    assert found.bank in BANK_SETTINGS
+    # Two recordings are enough where the gain is large.
+    assert choose(bank_only(sequences[:3]), [0, 8]).bank.adapt
 
 
 def test_the_least_loss_wins():
@@ -136,7 +165,7 @@ def test_a_bank_is_simulated_with_smoothed_weights(monkeypatch):
 
     monkeypatch.setattr(BankSimulation, "errors", errors)
     monkeypatch.setattr(tuning, "bank_weights", bank_weights)
-    choose(labelled(sequences)._replace(live=False), [0, 8])
+    choose(bank_only(sequences), [0, 8])
     assert len(seen) == 3 * len(BANK_SETTINGS)
     for weights in seen:
         np.testing.assert_allclose(weights[:2], [[1.0, 0.0], [0.5, 0.5]], atol=0.01)
