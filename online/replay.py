@@ -186,6 +186,10 @@ class ReplayRecord:
         self._cpu, self._n = 0.0, 0
         self._started = time.perf_counter()
 
+    def __repr__(self) -> str:
+        what = f"{self.done} scans, {len(self.choices)} selections, {self.restarted.sum()} restarts"
+        return f"<ReplayRecord: {what}>"
+
     @property
     def done(self) -> int:
         """Scans so far, with those that were dropped."""
