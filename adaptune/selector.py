@@ -2,9 +2,9 @@
 
 import logging
 import threading
-from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Collection, Mapping, Sequence
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,6 +50,29 @@ SELECTIONS_TO_JUDGE_PLACE = 5
 _log = logging.getLogger(__name__)
 
 
+class AnySelector(Protocol):
+    """What chooses parameters on the way; see `Selector`."""
+
+    def reset(self) -> None:
+        """Forget all scans and selections, as before a new recording."""
+
+    def observe(self, stamp: int, scan: Scan, motions: Motions) -> None:
+        """See a scan, before it is registered; `stamp` is in nanoseconds.
+
+        The motions are what the odometry, or the bank and its members, moved over the scan before,
+        see `adaptune.odometry.base.OdometryInstance`.
+        """
+
+    def select(self) -> Selection:
+        """Choose what to apply before the newest scan is registered."""
+
+    def measure(self) -> None:
+        """Measure how wrong the odometry was, for the next selections."""
+
+    def fall_back(self) -> Selection:
+        """What to apply where nothing can be chosen."""
+
+
 def used_instead(fallen_back: Selection) -> str:
     """What is used where nothing can be chosen, in words."""
     if fallen_back.weights is None:
@@ -57,8 +80,8 @@ def used_instead(fallen_back: Selection) -> str:
     return "members that agree are used"
 
 
-class AnySelector(ABC):
-    """What chooses parameters on the way, and measures how wrong those were; see `Selector`."""
+class _Measuring:
+    """What selectors of a bank, or of a single odometry, have in common: they measure it."""
 
     def __init__(
         self, sets: ParameterSets, fixed: int, members: Sequence[int], length: float, weighs: bool
@@ -73,16 +96,8 @@ class AnySelector(ABC):
         self._live.reset()
 
     def observe(self, stamp: int, scan: Scan, motions: Motions) -> None:
-        """See a scan, before it is registered; `stamp` is in nanoseconds.
-
-        The motions are what the odometry, or the bank and its members, moved over the scan before,
-        see `adaptune.odometry.base.OdometryInstance`.
-        """
+        """See `AnySelector.observe`."""
         self._live.observe(stamp, scan, motions)
-
-    @abstractmethod
-    def select(self) -> Selection:
-        """Choose what to apply before the newest scan is registered."""
 
     def measure(self) -> None:
         """Measure how wrong the odometry, or each member of the bank, was over the last metres.
@@ -118,7 +133,7 @@ class AnySelector(ABC):
         return self._weighted(measured_weights(len(self.members), self._live.squares()))
 
 
-class Selector(AnySelector):
+class Selector(_Measuring):
     """Chooses parameters for an odometry, or weights for a bank, by an error model.
 
     Show it every scan with `observe`; ask it to `select` whenever a selection is due, usually once
@@ -547,7 +562,7 @@ def untrained_sets(space: ParameterSpace, n: int = 4) -> ParameterSets:
     return ParameterSets(space, tuple(range(len(chosen))), tuple(chosen))
 
 
-class UntrainedSelector(AnySelector):
+class UntrainedSelector(_Measuring):
     """Weighs the members of a bank of which nothing is known in advance.
 
     It needs no model. The baseline, which is the first of the sets (see `untrained_sets`), has all
