@@ -5,6 +5,7 @@ import ctypes
 import gc
 import itertools
 import json
+import math
 import os
 import re
 import resource
@@ -274,18 +275,33 @@ def server(service: str, name: str) -> Server:
             start_new_session=True,
         )
         there.close()
-        if answer := here.recv(1 << 16):
+        try:
+            wrong = _wait_for_import(process, here)
+        except RefusedError:
+            process.wait()
+            raise
+        if wrong is not None:
+            here.close()
+            raise HostError(f"{name}: {quoting(wrong, last_lines(output))}")
+    return Server(process, here)
+
+
+def _wait_for_import(process: subprocess.Popen[bytes], control: socket.socket) -> str | None:
+    """Wait until a server has imported user code; how it went wrong, if it did."""
+    control.settimeout(IMPORT_SECONDS)
+    what = f"it cannot be imported: that took longer than {IMPORT_SECONDS:g} s"
+    with contextlib.suppress(TimeoutError):
+        if answer := control.recv(1 << 16):
+            control.settimeout(None)
             if refused := json.loads(answer):
-                process.wait()
                 raise RefusedError(refused)
-            return Server(process, here)
-        here.close()
-        code = process.wait()
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
-        late = f"that took longer than {IMPORT_SECONDS:g} s"
-        what = late if code == -signal.SIGALRM else how_it_ended(code)
-        raise HostError(f"{name}: {quoting(f'it cannot be imported: {what}', last_lines(output))}")
+            return None
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            what = f"it cannot be imported: {how_it_ended(process.wait(1.0))}"
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    return what
 
 
 class Transport:
@@ -438,16 +454,19 @@ def answer_all(reader: Readable, writer: BinaryIO, answer: Answer) -> None:
 # the user code. For every socket that it receives it forks a watcher, which forks the process and
 # reports how that ended.
 
+_LONGER = 5
+"""Seconds by which the limit on the import is longer here: it is for servers left behind."""
+
 
 def main(control: socket.socket, seconds: float, module: str, name: str) -> None:
     """Fork a process for every socket received, until the other side closes."""
-    signal.setitimer(signal.ITIMER_REAL, seconds)
+    signal.alarm(math.ceil(seconds) + _LONGER)
     service, refused = import_module(module), None
     try:
         service.load(name)
     except AdaptuneError as error:
         refused = str(error)
-    signal.setitimer(signal.ITIMER_REAL, 0.0)
+    signal.alarm(0)
     control.send(json.dumps(refused).encode())
     while refused is None:
         request, sockets, _, _ = socket.recv_fds(control, 1 << 12, 1)
