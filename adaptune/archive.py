@@ -19,7 +19,9 @@ from adaptune.geometry import Poses
 from adaptune.live.hops import Hops
 from adaptune.metrics import cap
 from adaptune.odometry.base import MOST_FAULTS
+from adaptune.recording.cache import status_key
 from adaptune.space import ODOMETRY, ParameterSet, in_words
+from adaptune.strict import ConfigurationError
 from adaptune.trajectory import Trajectory, write_tum
 
 # In `Trial.usage`; the last one in seconds, where the first scan has no pose.
@@ -172,6 +174,10 @@ class Sources(NamedTuple):
         inputs: dict[str, Any] = manifest.plain({**self.shared, **self.of_sequence(sequence)})
         return inputs
 
+    def statuses(self, sequence: str) -> dict[Path, str]:
+        """By file of a sequence, what shows that it is the same as before."""
+        return {file: status_key(file) for of in self.files(sequence).values() for file in of}
+
 
 INDEX = "index.jsonl"
 SLOTS = "slots.json"
@@ -203,6 +209,7 @@ class Archive:
     def __init__(self, folder: Path, sources: Sources | None = None):
         self.folder = folder
         self._sources = sources
+        self._statuses: dict[str, dict[Path, str]] = {}
         self._finished: dict[str, dict[int, Summary]] | None = None
 
     def __repr__(self) -> str:
@@ -211,8 +218,15 @@ class Archive:
     def _note(self, sequence: str) -> None:
         """Record what the trials on a sequence depend on, before the first of them is written."""
         path = self.folder / sequence / manifest.FILE
-        if self._sources is not None and not path.exists():
-            manifest.record(path, self._sources.inputs(sequence))
+        if self._sources is None or path.exists():
+            return
+        now = self._sources.statuses(sequence)
+        if changed := dict(now.items() ^ self._statuses.get(sequence, now).items()):
+            raise ConfigurationError(
+                f"{next(iter(changed))}: has changed while {sequence} was read, and nothing on "
+                f"{sequence} is stored; run the same command again"
+            )
+        manifest.record(path, self._sources.inputs(sequence))
 
     def inputs(self, sequence: str) -> dict[str, Any]:
         """All that trials on a sequence depend on now."""
@@ -232,6 +246,7 @@ class Archive:
         what all share is compared. Returns whether trials were moved.
         """
         assert self._sources is not None
+        self._statuses = {name: self._sources.statuses(name) for name in sequences}
         moved: list[Path] = []
         why: dict[str, None] = {}
         for folder in sorted(self.folder.glob("*/")):

@@ -239,6 +239,19 @@ def test_a_descriptor_that_was_edited_describes_again(load, tmp_path, caplog):
     assert not any("frames" in name for name in files(load()))
 
 
+def test_what_changes_while_it_is_read_is_not_recorded(load, tmp_path):
+    study = load()
+    archive = study.archive()
+    archive.renew(study.training)
+    poses = tmp_path / "one.tum"
+    poses.write_text(poses.read_text().replace(" 0.3", " 0.4", 1) + "\n")
+    with pytest.raises(ConfigurationError, match=r"one\.tum: has changed while one was read"):
+        archive.write("one", 0, trial({"a": 0}))
+    assert not (study.folder / "trials/one/inputs.json").exists()
+    archive.write("two", 0, trial({"a": 0}))
+    load().archive().write("one", 0, trial({"a": 0}))
+
+
 def test_trials_with_faults_depend_on_the_limits(load, tmp_path, caplog):
     overrides, _ = mine(tmp_path)
     archive = load(*overrides).archive()
