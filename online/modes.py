@@ -58,7 +58,7 @@ ONE_CORE = 50.0
 every scan again. Most sensors give a scan every 100 ms."""
 
 
-class EvenSelector(AnySelector):
+class EvenSelector:
     """Gives all members of a bank the same weight, always: a control, which looks at nothing.
 
     `members` are trial numbers among the `sets`; see `adaptune.selector.AnySelector`.

@@ -388,8 +388,6 @@ def _usable(path: Path, points: str | None, reference: str | None, show: Progres
             f"{path}: has {len(clouds)} topics of point clouds: {each}; name one with --points"
         )
     recording_config(found, points, reference)
-    chosen = {"points": points, "reference": reference}
-    found.given |= {key: value for key, value in chosen.items() if value is not None}
     if reference is None and found.missing["offline"]:
         why = "; ".join(fault.text for fault in found.faults if fault.of == "reference")
         say(f"{path}: its reference does not serve ({why}): one is estimated")

@@ -672,7 +672,7 @@ def advice(measured: MeasuredReference, reference: Trajectory, training: float =
 def recording_config(
     found: Inspection, points: str | None = None, reference: str | None = None
 ) -> SequenceConfig:
-    """The sequence that an inspected recording is.
+    """The sequence that an inspected recording is, with what the user chose written to `found`.
 
     `points` and `reference` are topics in place of those that were found; the reference may be a
     file, too. There is an `EstimateError` if there are no scans.
@@ -681,10 +681,9 @@ def recording_config(
         raise EstimateError(f"{found.path}: is a file of poses; give a recording of scans")
     if points is None and (lacking := found.missing["online"]):
         raise EstimateError(f"{found.path}: lacks {' and '.join(lacking)}; see `adaptune inspect`")
-    given = found.config().model_dump(exclude_unset=True)
     chosen = {"points": points, "reference": reference}
-    given |= {key: value for key, value in chosen.items() if value is not None}
-    return SequenceConfig(**given)
+    found.given |= {key: value for key, value in chosen.items() if value is not None}
+    return found.config()
 
 
 def check_writable(path: Path) -> None:
