@@ -468,9 +468,11 @@ class Cluster:
         return outcomes
 
     def _outcome(self, worker: str, future: Any) -> Outcome:
-        if future.status == "finished":
-            outcome: Outcome = future.result()
-            return outcome
+        # Dask waits for ever for a result that its worker has taken along.
+        while future.status == "finished" and worker in self._found():
+            with contextlib.suppress(TimeoutError, self._killed):
+                outcome: Outcome = future.result(timeout=_TIMEOUT)
+                return outcome
         if future.status == "error":
             error = future.exception()
             if not isinstance(error, self._killed):

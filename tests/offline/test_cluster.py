@@ -117,15 +117,32 @@ def test_a_worker_without_the_recording_is_told(study_file, tmp_path, scheduler,
         train(study, cluster=scheduler[0])
 
 
-def test_a_killed_worker_s_trials_run_elsewhere(study_file, tmp_path, scheduler, workers, local):
+def test_a_killed_worker_s_trials_run_elsewhere(
+    study_file, tmp_path, scheduler, workers, local, monkeypatch
+):
+    monkeypatch.setattr(cluster, "_TIMEOUT", 2.0)
     study = load_study(study_file, [], tmp_path / "study")
+    pids, read, lost = {}, Cluster._outcome, []
 
-    def kill(_what, done, *_):
-        if done:
-            os.kill(workers[0].pid, signal.SIGKILL)
+    def kill_first(self, worker, future):
+        # A worker that dies with a result that nobody has read.
+        if not lost and future.status == "finished":
+            pids.update(self._client.run(os.getpid))
+            lost.append(worker)
+            os.kill(pids[worker], signal.SIGKILL)
+        return read(self, worker, future)
 
-    train(study, kill, cluster=scheduler[0])
+    def kill_at_work(_what, done, *_):
+        for worker, pid in pids.items():
+            if done and len(lost) == 1 and worker not in lost:
+                lost.append(worker)
+                os.kill(pid, signal.SIGKILL)
+
+    monkeypatch.setattr(Cluster, "_outcome", kill_first)
+    train(study, kill_at_work, cluster=scheduler[0])
     assert kills.contents(study.folder) == local
+    assert len(lost) == 2
+    assert sum(process.poll() is None for process in workers) == 1
 
 
 def test_workers_of_another_version_are_refused(study_file, tmp_path, scheduler):
