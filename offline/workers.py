@@ -515,7 +515,8 @@ class Cluster:
 def _elsewhere(setup: TrialSetup) -> TrialSetup:
     """The setup for workers, which run in other folders."""
     sequences = replace(setup.sequences, folder=setup.sequences.folder.absolute())
-    odometry = setup.odometry.changed(program_input=sequences.program_input)
+    # Alarms need a main thread, and Dask runs tasks in others: processes end what hangs.
+    odometry = setup.odometry.changed(user_code=False, program_input=sequences.program_input)
     return replace(setup, odometry=odometry, sequences=sequences)
 
 
