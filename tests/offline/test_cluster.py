@@ -3,15 +3,19 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
+import drives
+import faulty
 import kills
 import pytest
 from setups import setup_of
 
+from adaptune.odometry.remote import Limits
 from offline import workers as cluster
 from offline.config import load_study
 from offline.train import train
-from offline.workers import Cluster, ClusterError
+from offline.workers import Cluster, ClusterError, Task, run
 
 pytestmark = pytest.mark.services
 
@@ -115,6 +119,21 @@ def test_a_worker_without_the_recording_is_told(study_file, tmp_path, scheduler,
     lost = study_file.parent / "lost.bag"
     with pytest.raises(ClusterError, match=rf"worker tcp://.*: {study_file.parent}.*bag: {what}"):
         train(study, cluster=scheduler[0])
+
+
+def test_a_class_of_the_user_that_hangs_is_ended(study_file, tmp_path, scheduler, workers):
+    assert len(workers) == 3
+    overrides = ["odometry.name=faulty:Clean", "odometry.parameters=", "odometry.settings="]
+    study = load_study(study_file, overrides, tmp_path / "study")
+    hangs = replace(
+        study.odometry,
+        settings=faulty.Settings(fault="hang", at=drives.FIRST_STAMP + 12 * 10**8),
+        limits=Limits(seconds=1.0),
+        user_code=True,
+    )
+    with Cluster(setup_of(study, hangs), ["one"], 1e9, scheduler[0]) as pool:
+        ((_, result),) = run(pool, [Task("one", (0,), ({"x": 0.5},))])
+    assert "a scan took longer than" in result.trials[0].faults[0]
 
 
 def test_a_killed_worker_s_trials_run_elsewhere(
