@@ -364,7 +364,6 @@ class Selector(_Measuring):
             parameters=self._sets[self.fixed],
             predicted_error=fixed,
             familiarity=0.0,
-            n_sequences=np.nan,
         )
         if not self.members or selection.weights is None:
             return unknown

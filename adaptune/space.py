@@ -493,9 +493,6 @@ class Selection(NamedTuple):
     familiarity : float
         Share of the training frames that are farther from the other training stretches than the
         scan is from all of them; NaN where the rule does not compute it.
-    n_sequences : float
-        Effective number of training stretches that the selection rests on: one over the sum of
-        their squared weights; NaN where they have none.
     estimated_error, estimated_low, estimated_high : float
         Percent, the odometry's own error over the last metres as it was measured without ground
         truth, and its 95 % interval; NaN where nothing was measured.
@@ -513,7 +510,6 @@ class Selection(NamedTuple):
     predicted_error: float = math.nan
     predicted_fixed: float = math.nan
     familiarity: float = math.nan
-    n_sequences: float = math.nan
     estimated_error: float = math.nan
     estimated_low: float = math.nan
     estimated_high: float = math.nan

@@ -223,7 +223,7 @@ def _lost_seconds(replay: ReplayRecord) -> float:
 
 _ESTIMATED = ("estimated_error_percent", "estimated_low_percent", "estimated_high_percent")
 _NUMBERS = (
-    *("trial", "predicted_error_percent", "predicted_fixed_percent", "familiarity", "sequences"),
+    *("trial", "predicted_error_percent", "predicted_fixed_percent", "familiarity"),
     *(*_ESTIMATED, "lost", "ms"),
 )
 SELECTION_COLUMNS = (*("stamp_ns", *_NUMBERS[:-1], "weights", "ms", "why_not", "fallen_back"),)
@@ -248,7 +248,6 @@ def selection_row(choice: Choice, names: Sequence[str]) -> list[Any]:
         selection.predicted_error,
         selection.predicted_fixed,
         selection.familiarity,
-        selection.n_sequences,
         selection.estimated_error,
         selection.estimated_low,
         selection.estimated_high,

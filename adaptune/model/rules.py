@@ -444,7 +444,6 @@ class PairedExpectedRatio(Rule):
             predicted_error=float(expected[best]) * fixed,
             predicted_fixed=fixed,
             familiarity=float(near.evidence.familiarity[0]),
-            n_sequences=float(1.0 / (weights @ weights)),
         )
 
     def _ratios(

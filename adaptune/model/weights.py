@@ -152,7 +152,6 @@ class BankRule(Rule):
         `live` is what was measured of them, in their order; None if nothing was.
         """
         (weights,), (ratio,) = bank_weights(near, self.settings, [live])
-        (of_sequences,) = near.evidence.weights(self.settings.sharpness)
         fixed = self.predicted_fixed(near)
         of_members = dict.fromkeys(self.members_, 0.0)
         of_members |= dict(zip(near.members, weights.tolist(), strict=True))
@@ -160,7 +159,6 @@ class BankRule(Rule):
             predicted_error=float(ratio) * fixed,
             predicted_fixed=fixed,
             familiarity=float(near.evidence.familiarity[0]),
-            n_sequences=float(1.0 / (of_sequences @ of_sequences)),
         )
 
 

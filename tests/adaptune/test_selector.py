@@ -127,7 +127,7 @@ def test_a_banks_weights_change_slowly(monkeypatch):
 
     def weigh(*_):
         weights = left.pop(0) if left else (1.0, 0.0)
-        return Selection(3, {}, dict(zip((3, 5), weights, strict=True)), 0.2, 1.0, 1.0, 2.0)
+        return Selection(3, {}, dict(zip((3, 5), weights, strict=True)), 0.2, 1.0, 1.0)
 
     monkeypatch.setattr(BankRule, "weigh", weigh)
     selector = Selector(model)
