@@ -263,8 +263,6 @@ def _fitted(
     identity, length = study.odometry.identity, config.sub_trajectory
     model = fit(data, fixed, identity, length, study.window, provenance)
     model = tuned(model, data, config.online.switching)
-    if before is not None and before.digest == model.digest:
-        model = replace(model, validation=before.validation)
     model.save(study.model_path)
     manifest.record(study.model_inputs_path, inputs)
     return model

@@ -7,7 +7,7 @@ looked up, period by period; no odometry runs.
 
 import logging
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -286,7 +286,7 @@ def validate(study: OfflineStudy, progress: Progress = unseen) -> Validated:
     """Validate the selection rules on a study's training sequences.
 
     The study's folder receives ``validation`` (CSV, JSON and a picture) and ``stretches`` (CSV,
-    JSON), and its model the summary.
+    JSON).
 
     Raises
     ------
@@ -317,8 +317,6 @@ def validate(study: OfflineStudy, progress: Progress = unseen) -> Validated:
     tables.write_rows(study.folder, "stretches", stretches)
     if (chart := stretch_chart(stretches)) is not None:
         draw_chart(chart, *(study.folder / f"validation.{kind}" for kind in ("png", "svg")))
-    summaries = {mode: validation.summary(mode) for mode in validation.modes}
-    replace(model, validation=summaries).save(study.model_path)
     said = [online, *_verdicts(study.rules, study.mechanism == "bank", validation)]
     estimates = estimates_of(study.sequences, study.training)
     said += estimates_in_words(estimates, model.length, intervals=True)

@@ -123,8 +123,6 @@ class ErrorModel:
     # By way to adapt (`BANK`, `ONE_SET`) what was expected of it when it was chosen, see
     # `offline.tuning.Figures`; empty where too little is known to compare.
     expected: dict[str, dict[str, float]] = field(default_factory=dict)
-    # By rule, what `validate` found.
-    validation: dict[str, dict[str, Any]] = field(default_factory=dict)
     budget: float | None = None  # milliseconds of CPU time a scan, live evidence included
     # Share of the error that a bank had to spare to be driven; None if nobody asked.
     worth: float | None = None
@@ -255,8 +253,7 @@ class ErrorModel:
         """Write the model to one file, in the safetensors format. Numbers keep all their bits."""
         header, arrays = self._header(), self._arrays()
         header |= {
-            name: getattr(self, name)
-            for name in ("provenance", "expected", "validation", "rivals", "costs")
+            name: getattr(self, name) for name in ("provenance", "expected", "rivals", "costs")
         }
         header["costs"] = None if self.costs is None else asdict(self.costs)
         # Through JSON, so that the digest is of what is read.
@@ -343,17 +340,13 @@ N_BEST = 5
 
 
 def render(model: ErrorModel, path: Path) -> RenderableType:
-    """Describe the model in a file: its odometry, its training, and what validation found."""
+    """Describe the model in a file: its odometry, and its training."""
     n_frames, n_sets = model.errors.shape
     blocks = ", ".join(f"{name} ({n} numbers)" for name, n in model.blocks.items())
     window = f", as a mean over {model.window} selections in a row" if model.window > 1 else ""
     told = _given({"settings": model.odometry.get("settings"), "from": model.provenance})
     size, n = path.stat().st_size / 1e3, len(model.sequences)
     caption = "Mean error over all sequences."
-    validated = [
-        {"rule": rule} | {key: value for key, value in found.items() if isinstance(value, float)}
-        for rule, found in model.validation.items()
-    ]
     return Group(
         Text(
             f"Error model of {model.odometry.get('name', 'an odometry')}: {n_sets} parameter sets "
@@ -364,9 +357,6 @@ def render(model: ErrorModel, path: Path) -> RenderableType:
         tables.table(f"The best sets of {n_sets}", _sets(model), caption),
         Text("\n".join(_driven(model))),
         Text(yaml.safe_dump(told, allow_unicode=True, sort_keys=False) if told else ""),
-        tables.table("Validation", validated, "Ratios to the fixed set's error on what is left out")
-        if validated
-        else Text("Not validated yet: `adaptune validate` shows what adapting gains."),
     )
 
 
