@@ -170,8 +170,6 @@ CLOCK = 30.0
 """Seconds by which clocks may differ to be found."""
 SAME_CLOCK = 0.01
 """Seconds by which two clocks may differ and count as the same."""
-AMBIGUOUS = 1.5
-"""Another offset of the clock that fits by less than this times as badly could be the right one."""
 
 
 class Cause(NamedTuple):
@@ -362,12 +360,7 @@ def _clock(reference: Trajectory, stamps: NDArray[np.int64], hops: Hops) -> Iter
     best = float(minimize_scalar(left, bounds=bounds, method="bounded", options=options).x)
     if abs(best) < SAME_CLOCK:
         return
-    away = np.abs(offsets - rough) > max(1.0, 2.0 * float(np.median(seconds)))
-    others = away & (costs < AMBIGUOUS * max(float(costs.min()), 0.01))
     mend = f"add {best:.3f} to `clock_offset`"
-    if others.any():
-        also = offsets[others][costs[others].argmin()]
-        mend += f" (ambiguous, turns repeat: {also:.1f} fits nearly as well)"
     yield _Candidate("like those of another clock", mend, shifted(best, stamps))
 
 
