@@ -90,18 +90,12 @@ def estimated(name: str, found: Pass, scans: Iterable[Scan] = ()) -> EstimatedRe
 def _check(name: str, found: Pass) -> None:
     """Refuse a recording by which nothing can be judged."""
     way = _way(found.T_odom_sensor[:, :3, 3]) if len(found.stamps) else 0.0
-    if way >= SHORTEST:
-        return
-    if 2 * np.count_nonzero(~found.registered) > len(found.stamps):
+    if way < SHORTEST:
         raise EstimateError(
-            f"{name}: most of its {len(found.stamps)} scans cannot be registered to each other: "
-            f"see with `adaptune inspect` how many points they have"
+            f"{name}: by its scans, the robot comes {way:.1f} m far, and a reference needs "
+            f"{SHORTEST:g} m: name another part, or record a longer drive, in a place that does "
+            f"not look the same all along"
         )
-    raise EstimateError(
-        f"{name}: by its scans, the robot comes {way:.1f} m far, and a reference needs "
-        f"{SHORTEST:g} m: name another part, or record a longer drive, in a place that does not "
-        f"look the same all along"
-    )
 
 
 def _way(positions: NDArray[np.float64]) -> float:

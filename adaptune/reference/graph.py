@@ -64,16 +64,16 @@ class Consensus:
         self._bank.apply(Selection(trial=0, parameters={}, weights=even))
         self._tracker = Tracker(self._bank, HealthCheck())
 
-    def register(self, scan: Scan) -> tuple[Poses, Poses, bool]:
+    def register(self, scan: Scan) -> tuple[Poses, Poses]:
         """Register the next scan.
 
-        Returns the consensus's pose, of shape (4, 4); the motions of the members, of shape
-        (n_members, 4, 4), NaN where one has none; and whether any member could register the scan.
+        Returns the consensus's pose, of shape (4, 4), and the motions of the members, of shape
+        (n_members, 4, 4), NaN where one has none.
         """
         found = self._tracker.register(scan)
         members = self._bank.motions.members
         T_previous_current = np.array([members[i] for i in range(len(POOL))])
-        return found.T_odom_sensor, T_previous_current, found.registered
+        return found.T_odom_sensor, T_previous_current
 
 
 LENGTHS = (2.0, 5.0, 10.0)
@@ -111,7 +111,6 @@ class Pass:
     T_odom_sensor: Poses  # (n, 4, 4): of the consensus
     # (n, n_members, 4, 4): motions of the members; NaN where one has none
     T_previous_current: Poses
-    registered: NDArray[np.bool_]  # (n,): whether any member could register the scan
     guesses: Sequence[Guess]  # all registrations, by end, start, and member
 
 
@@ -135,21 +134,18 @@ def pass_over(scans: Iterable[Scan], advance: Callable[[int], None] = lambda _: 
     stamps: list[int] = []
     poses: list[Poses] = []
     motions: list[Poses] = []
-    registered: list[bool] = []
     for scan in scans:
-        T_odom_sensor, T_previous_current, sound = consensus.register(scan)
+        T_odom_sensor, T_previous_current = consensus.register(scan)
         registering.add(scan, T_odom_sensor, T_previous_current)
         stamps.append(scan.stamp)
         poses.append(T_odom_sensor)
         motions.append(T_previous_current)
-        registered.append(sound)
         advance(len(stamps))
     registering.end()
     return Pass(
         np.array(stamps, np.int64),
         np.array(poses).reshape(-1, 4, 4),
         np.array(motions).reshape(-1, Consensus.n_members, 4, 4),
-        np.array(registered, bool),
         registering.guesses,
     )
 

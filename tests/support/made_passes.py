@@ -92,6 +92,5 @@ def made_pass(T, found, members=None, seconds=0.1):
         stamps,
         T,
         members,
-        np.ones(len(T), bool),
         sorted(found, key=lambda g: (g.end, g.start, g.member)),
     )
