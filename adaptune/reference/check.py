@@ -240,10 +240,8 @@ def diagnose_reference(
         T = T_world_given @ T_given_sensor
         return Trajectory(reference.stamps, T, reference.max_gap).at(stamps)
 
-    backwards = "give the poses in the order of their stamps"
-    conventions = [*_conventions(given), _Candidate("reversed in time", backwards, given[::-1])]
     candidates = [
-        *(one._replace(T_world_sensor=at_scans(one.T_world_sensor)) for one in conventions),
+        *(one._replace(T_world_sensor=at_scans(one.T_world_sensor)) for one in _conventions(given)),
         *_clock(reference, stamps, hops),
         *_places(at_scans(given) @ invert(T_given_sensor), hops, T_given_sensor),
     ]
@@ -302,28 +300,11 @@ def _conventions(T: Poses) -> Iterator[_Candidate]:
     """Poses as they would be if the file, or the odometry, wrote them by another convention."""
     known = np.isfinite(T[:, 0, 0])
     safe = np.where(np.isfinite(T), T, np.eye(4))
-    at, q = safe[:, :3, 3], to_quaternions(safe)
-    first, last = from_quaternions(at, q[:, [1, 2, 3, 0]]), from_quaternions(at, q[:, [3, 0, 1, 2]])
-    found = [
-        ("as if their quaternions began with w", "write the quaternions as qx qy qz qw", first),
-        ("as if their quaternions ended with w", "write the quaternions as qw qx qy qz", last),
+    in_order = from_quaternions(safe[:, :3, 3], to_quaternions(safe)[:, [1, 2, 3, 0]])
+    for what, mend, T_right in (
+        ("as if their quaternions began with w", "write the quaternions as qx qy qz qw", in_order),
         ("inverted", "write the poses of the LiDAR in the world", invert(safe)),
-        (
-            "as if their rotations were transposed",
-            "write the rotations from the LiDAR to the world",
-            from_quaternions(at, q * (-1.0, -1.0, -1.0, 1.0)),
-        ),
-    ]
-    for axis, name in enumerate("xyz"):
-        sign = np.where(np.arange(3) == axis, -1.0, 1.0)
-        mirrored = from_quaternions(at * sign, q)
-        found.append((f"mirrored along {name}", f"change the sign of {name}", mirrored))
-        # A rotation in a mirrored world: its axis is mirrored, and it turns the other way.
-        what = f"left-handed ({name} points the other way)"
-        mend = f"change the signs of {name} and of the quaternion's other two"
-        right = from_quaternions(at * sign, q * np.append(-sign, 1.0))
-        found.append((what, f"convert them to right-handed axes: {mend}", right))
-    for what, mend, T_right in found:
+    ):
         T_right[~known] = np.nan
         yield _Candidate(what, mend, T_right)
 
