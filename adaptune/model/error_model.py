@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Self, get_type_hints
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, PositiveInt, create_model
 from rich.console import Group, RenderableType
@@ -344,7 +343,6 @@ def render(model: ErrorModel, path: Path) -> RenderableType:
     n_frames, n_sets = model.errors.shape
     blocks = ", ".join(f"{name} ({n} numbers)" for name, n in model.blocks.items())
     window = f", as a mean over {model.window} selections in a row" if model.window > 1 else ""
-    told = _given({"settings": model.odometry.get("settings"), "from": model.provenance})
     size, n = path.stat().st_size / 1e3, len(model.sequences)
     caption = "Mean error over all sequences."
     return Group(
@@ -356,7 +354,6 @@ def render(model: ErrorModel, path: Path) -> RenderableType:
         tables.table("Sequences", _sequences(model), "Mean capped errors; a lost track is 30 %."),
         tables.table(f"The best sets of {n_sets}", _sets(model), caption),
         Text("\n".join(_driven(model))),
-        Text(yaml.safe_dump(told, allow_unicode=True, sort_keys=False) if told else ""),
     )
 
 
@@ -377,14 +374,6 @@ def _driven(model: ErrorModel) -> Iterator[str]:
         )
     if model.budget is not None:
         yield f"Budget: {model.budget:g} ms of CPU time a scan."
-
-
-def _given(data: Any) -> Any:
-    """Plain data without what is not given."""
-    if isinstance(data, Mapping):
-        found = {key: _given(value) for key, value in data.items()}
-        return {key: value for key, value in found.items() if value not in (None, [], {})}
-    return [_given(value) for value in data] if isinstance(data, list | tuple) else data
 
 
 def _sequences(model: ErrorModel) -> list[dict[str, Any]]:

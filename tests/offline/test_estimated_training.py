@@ -1,13 +1,8 @@
-import io
-import re
-
 import estimates
 import pytest
-from rich.console import Console
 
 from adaptune.errors import AdaptuneError
 from adaptune.model import ErrorModel
-from adaptune.model.error_model import render
 from offline.config import load_study
 from offline.train import train
 from offline.validate import validate
@@ -30,9 +25,6 @@ def test_trials_model_and_validation_say_what_judged(load, monkeypatch, caplog):
     assert training.rows[1]["_reference_error"] == pytest.approx(0.31, abs=0.01)
     model = ErrorModel.load(load().model_path)
     assert list(model.provenance["estimated_references"]) == ["one", "two"]
-    shown = io.StringIO()
-    Console(width=200, file=shown).print(render(model, load().model_path))
-    assert re.search(r"estimated_references:.*two:\s+error_percent", shown.getvalue(), re.DOTALL)
     said = validate(load()).verdicts
     assert said[-1] == training.words[0]
     # Nothing is left to do.
