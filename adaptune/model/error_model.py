@@ -358,7 +358,7 @@ def render(model: ErrorModel, path: Path) -> RenderableType:
 
 
 def _driven(model: ErrorModel) -> Iterator[str]:
-    """What is selected along the way, what it costs, and what may be spent."""
+    """What is selected along the way."""
     if model.bank_adapts:
         yield f"Driven: the bank of trials {', '.join(map(str, model.bank))}."
     else:
@@ -366,14 +366,6 @@ def _driven(model: ErrorModel) -> Iterator[str]:
     if (model.bank_adapts or model.bank_rests) and model.reserve:
         reserve = ", ".join(map(str, model.reserve))
         yield f"Members that work only in new places and after failures: {reserve}."
-    costs = model.costs
-    if costs is not None and model.bank and np.isfinite(cost := costs.adaptive(model.bank)):
-        yield (
-            f"All members of the bank together cost {cost:.1f} ms of CPU time a scan, "
-            f"{costs.evidence:.1f} ms of it for live evidence."
-        )
-    if model.budget is not None:
-        yield f"Budget: {model.budget:g} ms of CPU time a scan."
 
 
 def _sequences(model: ErrorModel) -> list[dict[str, Any]]:
