@@ -55,7 +55,7 @@ def inspect(
 ) -> None:
     """Show what is in a recording, what each stage lacks, and how to name it in a study.
 
-    Of an error model, or of a study's folder, show its sets and sequences.
+    Of an error model, or of a study's folder, show what it is of and its best sets.
     Of a study's YAML with a ROS 1 image, run it on twenty seconds: which way of playing fits?
     """
     if file.suffix == ".safetensors" or (file / "model.safetensors").exists():

@@ -343,15 +343,14 @@ def render(model: ErrorModel, path: Path) -> RenderableType:
     n_frames, n_sets = model.errors.shape
     blocks = ", ".join(f"{name} ({n} numbers)" for name, n in model.blocks.items())
     window = f", as a mean over {model.window} selections in a row" if model.window > 1 else ""
-    size, n = path.stat().st_size / 1e3, len(model.sequences)
-    caption = "Mean error over all sequences."
+    size = path.stat().st_size / 1e3
+    caption = "Mean error over all sequences; a lost track counts as 30 %."
     return Group(
         Text(
             f"Error model of {model.odometry.get('name', 'an odometry')}: {n_sets} parameter sets "
-            f"on {n_frames} frames of {n} sequence{'s' if n > 1 else ''}, {size:,.0f} kB\n"
+            f"on {n_frames} frames of {', '.join(model.sequences)}, {size:,.0f} kB\n"
             f"Errors over {model.length:g} m. Scans are described by {blocks}{window}."
         ),
-        tables.table("Sequences", _sequences(model), "Mean capped errors; a lost track is 30 %."),
         tables.table(f"The best sets of {n_sets}", _sets(model), caption),
         Text("\n".join(_driven(model))),
     )
@@ -366,28 +365,6 @@ def _driven(model: ErrorModel) -> Iterator[str]:
     if (model.bank_adapts or model.bank_rests) and model.reserve:
         reserve = ", ".join(map(str, model.reserve))
         yield f"Members that work only in new places and after failures: {reserve}."
-
-
-def _sequences(model: ErrorModel) -> list[dict[str, Any]]:
-    rows = []
-    fixed = model.sets.column(model.fixed)
-    for s in np.unique(model.sequence):
-        errors = model.errors[model.sequence == s]
-        # Infinite where a set was not run.
-        means = mean_errors(errors, np.zeros(len(errors), np.intp))
-        best, was_run = int(np.argmin(means)), bool(np.isfinite(means[fixed]))
-        rows.append(
-            {
-                "sequence": model.sequences[s],
-                "frames": len(errors),
-                "sets": int(np.isfinite(means).sum()),
-                "fixed [%]": float(means[fixed]) if was_run else None,
-                "best [%]": float(means[best]),
-                "best set": model.sets.trials[best],
-                "lost frames, fixed": int(np.isinf(errors[:, fixed]).sum()) if was_run else None,
-            }
-        )
-    return rows
 
 
 def _sets(model: ErrorModel) -> list[dict[str, Any]]:

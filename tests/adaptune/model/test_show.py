@@ -49,10 +49,8 @@ def shown(model, folder):
 def test_a_model_is_explained(model, tmp_path):
     text = shown(model, tmp_path)
     for said in (
-        "gicp: 3 parameter sets on 4 frames of 2 sequences, 2 kB",
+        "gicp: 3 parameter sets on 4 frames of cave, street, 2 kB",
         "ndt (90 numbers), as a mean over 3 selections in a row",
-        "cave 2 3 4.000 1.000 1 0",
-        "street 2 3 2.000 2.000 0 0",
         "0, fixed 3.000 distance 4, kernel none",
         "1 3.000 distance 2, kernel [huber]",
         "Driven: one set at a time.",
