@@ -55,7 +55,7 @@ def _check_together(config: StudyConfig) -> tuple[list[Mistake], ParameterSpace 
         spaces = {key: tuned_space(one, described[key]) for key, one in entries.items()}
     except OdometryError:
         return [], None
-    mistakes = list(_check_each_once(entries, spaces))
+    mistakes = list(_check_labels(entries))
     if len(entries) > 1:
         for key, about in described.items():
             if about.whole:
@@ -71,19 +71,10 @@ def _check_together(config: StudyConfig) -> tuple[list[Mistake], ParameterSpace 
     return mistakes, space
 
 
-def _check_each_once(
-    entries: Mapping[Key, OdometryConfig], spaces: Mapping[Key, ParameterSpace]
-) -> Iterable[Mistake]:
-    """Find odometries, and labels, that are given twice."""
+def _check_labels(entries: Mapping[Key, OdometryConfig]) -> Iterable[Mistake]:
+    """Find labels that are given twice."""
     for (first, one), (key, other) in combinations(entries.items(), 2):
-        settings, others = (declare(o.name, o.settings).settings for o in (one, other))
-        if (one.name, settings, spaces[first]) == (other.name, others, spaces[key]):
-            yield Mistake(
-                key,
-                f"{other.name} is there already (odometry.{first[-1]}) with the same settings and "
-                f"ranges; leave one out, or give it others",
-            )
-        elif (one.label or one.name) == (other.label or other.name):
+        if (one.label or one.name) == (other.label or other.name):
             yield Mistake(
                 (*key, "label"),
                 f"{one.label or one.name!r} is what odometry.{first[-1]} is called; give one of "

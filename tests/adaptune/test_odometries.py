@@ -49,10 +49,6 @@ def test_a_study_of_two(study_of, tmp_path):
     ("odometry", "said"),
     [
         (
-            "\n  - gicp\n  - {name: gicp, label: again}",
-            "odometry.1: gicp is there already (odometry.0) with the same settings",
-        ),
-        (
             "\n  - gicp\n  - {name: gicp, settings: {downsampling: 1.0}}",
             "odometry.1.label: 'gicp' is what odometry.0 is called",
         ),
