@@ -2,7 +2,6 @@
 
 import math
 import os
-import sys
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -107,7 +106,6 @@ def trials(
         typer.Option(metavar="COLUMN", help="With `-` before it, the largest first."),
     ] = None,
     top: Annotated[int | None, typer.Option(help="Number of trials to show.", min=1)] = None,
-    csv: Annotated[bool, typer.Option("--csv", help="Write CSV to standard output.")] = False,
     export: Annotated[
         Path | None,
         typer.Option(help="Write their trajectories to this folder, as TUM.", file_okay=False),
@@ -122,7 +120,6 @@ def trials(
     loaded = load(study, override, folder)
     from adaptune import archive as table
     from adaptune.archive import Archive
-    from adaptune.report.tables import csv_text
     from adaptune.study.references import estimates_in_words, estimates_of
     from offline.search import has_ended
 
@@ -132,25 +129,22 @@ def trials(
         raise AdaptuneError(f"{archive.folder}: no trial is finished yet; run `adaptune offline`")
     chosen = table.select(finished, sort, top)
     labels = loaded.odometry.space.labels
-    if csv:
-        sys.stdout.write(csv_text(chosen))
+    title = f"{len(chosen)} of {len(finished)} trials"
+    show_table(title, table.with_units(chosen, names, labels))
+    if judged := [row for row in finished if row["mean"] is not None]:
+        best = min(judged, key=lambda row: row["mean"])
+        say(f"Best mean: {best['mean']:.3f} %, of trial {best['trial']}.")
+    if (fixed := loaded.fixed) is not None:
+        same = (row["trial"] for row in finished if fixed.items() <= row.items())
+        if (number := next(same, None)) is not None:
+            say(f"The fixed set is trial {number}, as whole runs decided.")
+    estimates = estimates_of(loaded.sequences, names)
+    for sentence in estimates_in_words(estimates, loaded.config.sub_trajectory):
+        say(sentence)
+    if has_ended(loaded.folder):
+        say_next_of_trained(loaded, len(names) > 1)
     else:
-        title = f"{len(chosen)} of {len(finished)} trials"
-        show_table(title, table.with_units(chosen, names, labels))
-        if judged := [row for row in finished if row["mean"] is not None]:
-            best = min(judged, key=lambda row: row["mean"])
-            say(f"Best mean: {best['mean']:.3f} %, of trial {best['trial']}.")
-        if (fixed := loaded.fixed) is not None:
-            same = (row["trial"] for row in finished if fixed.items() <= row.items())
-            if (number := next(same, None)) is not None:
-                say(f"The fixed set is trial {number}, as whole runs decided.")
-        estimates = estimates_of(loaded.sequences, names)
-        for sentence in estimates_in_words(estimates, loaded.config.sub_trajectory):
-            say(sentence)
-        if has_ended(loaded.folder):
-            say_next_of_trained(loaded, len(names) > 1)
-        else:
-            say_next_of_study("run the trials that are left, fit", "offline")
+        say_next_of_study("run the trials that are left, fit", "offline")
     if export is not None:
         begin_work()
         n = table.export(archive, names, [row["trial"] for row in chosen], export)
