@@ -120,7 +120,6 @@ def trials(
     loaded = load(study, override, folder)
     from adaptune import archive as table
     from adaptune.archive import Archive
-    from adaptune.study.references import estimates_in_words, estimates_of
     from offline.search import has_ended
 
     names, archive = loaded.training, Archive(loaded.folder / "trials")
@@ -138,9 +137,6 @@ def trials(
         same = (row["trial"] for row in finished if fixed.items() <= row.items())
         if (number := next(same, None)) is not None:
             say(f"The fixed set is trial {number}, as whole runs decided.")
-    estimates = estimates_of(loaded.sequences, names)
-    for sentence in estimates_in_words(estimates, loaded.config.sub_trajectory):
-        say(sentence)
     if has_ended(loaded.folder):
         say_next_of_trained(loaded, len(names) > 1)
     else:
