@@ -3,7 +3,6 @@
 import logging
 import os
 import shlex
-import shutil
 import signal
 import sys
 import time
@@ -145,10 +144,7 @@ def say_fixed(study: "OfflineStudy", advised: bool = True) -> None:
 
 def say_next(why: str, *words: object, first: str = "") -> None:
     """Print a command, ready to copy, what it is for, and what to do first."""
-    called = Path(sys.argv[0])
-    typed = called.name == "adaptune" and shutil.which("adaptune") is None
-    program = str(called) if typed else "adaptune"
-    say(f"Next: {first}{shlex.join([program, *map(str, words)])}    # {why}")
+    say(f"Next: {first}{shlex.join(['adaptune', *map(str, words)])}    # {why}")
 
 
 _study_words: list[object] = []
