@@ -180,25 +180,17 @@ def _read(path: Path, csv: bool) -> Trajectory:
     named, rows = _table(path)
     need = max([7, *named.values()]) + 1
     for number, fields in rows:
-        if len(fields) < need or not (named or csv or len(fields) in (8, 11)):
+        if len(fields) < need or not (named or csv or len(fields) == 8):
             what = f"a {'CSV' if csv else 'TUM'} line has {need} numbers, this has {len(fields)}"
             help_ = f"name other columns in the first line ({' '.join(_COLUMNS)})"
             raise TrajectoryError(f"{path}, line {number}: {what}; {help_}")
     at = named.get("timestamp", 0)
     pair = named.get("nanoseconds") == at + 1
     stamps, nanoseconds = _stamps(path, rows, [at, at + 1] if pair else [at])
-
-    def read(order: Sequence[int]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        values = _numbers(path, [(n, [fields[column] for column in order]) for n, fields in rows])
-        return values, np.abs(np.linalg.norm(values[:, 3:], axis=1) - 1.0) > 1e-2
-
     quaternion = (5, 6, 7, 4) if csv and nanoseconds else (4, 5, 6, 7)
     order = [named[name] for name in _COLUMNS[1:]] if named else [1, 2, 3, *quaternion]
-    values, wrong = read(order)
-    if wrong.any() and not named and min(len(fields) for _, fields in rows) > 10:
-        # Roll, pitch and yaw may come before the quaternion.
-        others = read([1, 2, 3, 7, 8, 9, 10])
-        values, wrong = (values, wrong) if others[1].any() else others
+    values = _numbers(path, [(n, [fields[column] for column in order]) for n, fields in rows])
+    wrong = np.abs(np.linalg.norm(values[:, 3:], axis=1) - 1.0) > 1e-2
     if wrong.any():
         i, columns = int(np.argmax(wrong)), ", ".join(str(column + 1) for column in order[3:])
         what = f"its quaternion has length {np.linalg.norm(values[i, 3:]):.3g}, not 1"
@@ -224,7 +216,7 @@ def read_tum(path: Path) -> Trajectory:
 def read_trajectory(path: Path) -> Trajectory:
     """Read poses with stamps: of a ``.csv`` in nanoseconds as EuRoC writes them, else as TUM does.
 
-    A header of names gives any other order. Roll, pitch and yaw may come before the quaternion.
+    A header of names gives any other order.
     """
     return _read(path, csv=path.suffix == ".csv")
 

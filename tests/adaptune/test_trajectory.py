@@ -72,7 +72,6 @@ S, MS, NS = (("1700000000" + zeros, "1700000001" + zeros) for zeros in ("", "000
         (ROS, f"{{}},lidar,{AT},{TURN},9\n", NS),
         (f"{EUROC}v_x\n", f"{{}},{AT},.70710678,0,0,.70710678,9,9,9\n", NS),
         (f"{EUROC}q_RS_y [], q_RS_z [], v_x\n", f"{{}},{AT},.70710678,0,0,.70710678,5\n", NS),
-        ("", f"{{}},{AT},0,0,1.5707963,{TURN}\n", NS),
     ],
 )
 def test_poses_are_found_in_columns_of_any_order(tmp_path, header, row, stamps):
