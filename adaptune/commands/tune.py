@@ -272,7 +272,8 @@ def tune(
             f"to resume it, or another --folder"
         )
     else:
-        overrides = _keep_limits(path, _limits(trials, minutes))
+        limits = _limits(trials, minutes)
+        overrides = [f"offline.{key}={value}" for key, value in limits.items()]
     from offline.train import train
 
     loaded = load(path, overrides, folder, runs=True)
@@ -283,16 +284,6 @@ def tune(
     compared(loaded, details=details)
     say_odometries(loaded, training)
     say_next("replays to look at in Foxglove", "record", folder)
-
-
-def _keep_limits(path: Path, limits: dict[str, str]) -> list[str]:
-    """Write a new budget to a study, and return it as overrides: its author may write otherwise."""
-    text = path.read_text("utf-8")
-    if limits and (found := re.search(r"(?m)^offline: \{([\w:., ]*)\}", text)):
-        now = dict(re.findall(r"(\w+): ([\w.]+)", found[1])) | limits
-        line = ", ".join(f"{key}: {value}" for key, value in now.items())
-        _write(path, text.replace(found[0], f"offline: {{{line}}}", 1))
-    return [f"offline.{key}={value}" for key, value in limits.items()]
 
 
 def _write(path: Path, text: str) -> None:

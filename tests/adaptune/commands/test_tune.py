@@ -91,11 +91,6 @@ def test_what_the_user_changed_stays(bag, tmp_path):
         "one.yaml offline.trials=9 offline.hours=0.05"
     )
     assert "lost_track: 2.0" in path.read_text()
-    # What other commands read agrees with it.
-    assert "\noffline: {trials: 9, hours: 0.05}    # parameter sets" in path.read_text()
-    path.write_text(path.read_text().replace("{trials: 9, hours: 0.05}", "\n  trials: 5"))
-    assert failed(bag, "--trials", 7).endswith("one.yaml offline.trials=7")
-    assert "\n  trials: 5" in path.read_text()
     said = failed(bag, "--reference", "estimated")
     assert "runs/one/one.yaml: another `adaptune tune` made it, for what its first line" in said
 
