@@ -4,7 +4,7 @@ import json
 import re
 import types
 import typing
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from importlib import import_module
 from importlib.metadata import entry_points
@@ -233,33 +233,6 @@ def validated(
             help_ = f"; {nearest(str(path[-1]), _keys(model, path[:-1]))}" if unknown else ""
             mistakes.append(Mistake(key + path, message + help_))
         return None
-
-
-def validated_rest(
-    model: type[M],
-    data: dict[str, Any],
-    needed: dict[str, Any],
-    mistakes: Iterable[Mistake],
-    context: dict[str, Any],
-) -> M | None:
-    """Validate what is left of a section without its mistakes, with `needed` where it lacks keys.
-
-    None if what is not mistaken by itself does not go together.
-    """
-    rest = needed | _without(data, [mistake.key for mistake in mistakes])
-    return validated(model, rest, (), [], context)
-
-
-def _without(data: dict[str, Any], keys: Iterable[Key]) -> dict[str, Any]:
-    """Leave out what the keys lead to; where there is no such key, the section that lacks it."""
-    rest = {}
-    for name, value in data.items():
-        below = [key[1:] for key in keys if key[:1] == (name,)]
-        if not below:
-            rest[name] = value
-        elif isinstance(value, dict) and all(key and key[0] in value for key in below):
-            rest[name] = _without(value, below)
-    return rest
 
 
 def alternatives(annotation: Any) -> Iterator[Any]:

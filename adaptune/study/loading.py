@@ -1,4 +1,4 @@
-"""Reading a study: its YAML, the overrides, and all mistakes with their lines."""
+"""Reading a study: its YAML, the overrides, and its mistakes with their lines."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import reduce
@@ -23,7 +23,7 @@ from adaptune.recording.cache import MANY, fingerprint
 from adaptune.recording.config import SequenceConfig
 from adaptune.recording.recording import check_sequence, interval_of, sequence_files
 from adaptune.space import Categorical, Float, Integer, ParameterSpace, PooledSpace, SpaceError
-from adaptune.strict import ConfigurationError, Key, Mistake, validated, validated_rest
+from adaptune.strict import ConfigurationError, Key, Mistake, validated
 from adaptune.study.config import RULES, OdometryConfig, StudyConfig, settle_roles
 from adaptune.study.study import Study, declared_odometry, tuned_space, whole_definition
 
@@ -285,7 +285,7 @@ def read_study(
     """Read and check the YAML of a study, with ``key.of.a.key=value`` as overrides.
 
     The study's folder is by default the YAML's name under `runs`. The odometry is `needed` if it
-    must be there to run. A ConfigurationError lists all mistakes, each with its line, its key and
+    must be there to run. A ConfigurationError lists mistakes, each with its line, its key and
     what to do.
     """
     # A wrong variable is no mistake of the study.
@@ -373,9 +373,6 @@ def _check(
     context = {"folder": folder}
     config = validated(config_type, data, (), mistakes, context)
     sound = all(mistake.key[:1] != ("odometry",) for mistake in mistakes)
-    if config is None:
-        least = {"odometry": {"name": ""}, "training": [""]}
-        config = validated_rest(config_type, data, least, mistakes, context)
     if config is not None:
         space = None
         if sound:

@@ -91,18 +91,9 @@ def test_all_mistakes_are_told_together(study_file):
         "12 test.0",
         "13 sub_trajectory",
         "14 offline.trials",
-        "14 offline.sampler_settings.gama",
         "15 online.switching.mechanism",
         "15 online.switching.sets",
     ]
-
-
-def test_what_needs_the_odometry_is_told_beside_other_mistakes(study_file):
-    steps = "sampler_settings: {steps: {keyframe: {mu: 1}}}"
-    offline = f"offline={{sampler: annealing, trials: 0, {steps}}}"
-    told = failure(study_file, offline, "sequences.one.stride=0", "online.period=abc")
-    assert "offline.sampler_settings.steps.keyframe: no parameter 'keyframe' is tuned" in told
-    assert len(told.splitlines()) == 4
 
 
 @pytest.mark.parametrize("given", ["abc", "-1", "nan", "inf", "1e400"])
