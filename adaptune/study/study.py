@@ -516,7 +516,6 @@ def driven(
     if "adaptive" not in online.rules:
         return "`online` will drive `paper`, and not `adaptive` (online.modes)."
     how = mechanism_of("adaptive", model, mechanism, odometry.description.live)
-    joining = _who_joins_in(switching, model) if how == "bank" else ""
     why = (
         f"there is too little to compare ways to adapt, which takes "
         f"{2 * PER_STRETCH * model.length:g} m of recordings, or a smaller sub_trajectory"
@@ -529,7 +528,7 @@ def driven(
         if model.costs is not None and math.isfinite(cost := model.costs.adaptive(trials)):
             words += f", at {cost:.1f} ms of CPU time a scan"
         why = f", because it is worth that: {expected[BANK]}" if BANK in expected else ""
-        return f"{words}{why}.{joining}"
+        return f"{words}{why}."
     if how == "live" and model.paired.adapt:
         words = "`online` will drive one set at a time as `adaptive`, changed live"
         if ONE_SET in expected:
@@ -540,7 +539,7 @@ def driven(
         way = min(compared, key=lambda way: model.expected[way]["loss"])
         best = f"{'a bank' if way == BANK else 'one set at a time'}: {expected[way]}"
         why = f"nothing else is worth its cost; the best alternative is {best}"
-    return f"{fixed} as `adaptive`, because {why}.{joining}"
+    return f"{fixed} as `adaptive`, because {why}."
 
 
 def cannot_adapt(odometry: Factory, mechanism: Mechanism | None) -> str:
@@ -553,19 +552,6 @@ def cannot_adapt(odometry: Factory, mechanism: Mechanism | None) -> str:
     return (
         f"{odometry.name} cannot change its parameters between scans: that takes a bank, and {why}"
     )
-
-
-def _who_joins_in(switching: SwitchingConfig, model: ErrorModel) -> str:
-    """Which members of a bank rest, and when they do not; empty if none rests."""
-    always = always_at_work(switching, model)
-    others = [named(model, t) for t in bank_members(switching, model) if t not in always]
-    if not others:
-        return ""
-    # With a single stretch, nothing tells what is far from it.
-    knows = len(np.unique(model.stretches())) > 1
-    is_new = "In places that training does not know, and after" if knows else "After"
-    who = "trials {} join in" if len(others) > 1 else "trial {} joins in"
-    return f" {is_new} failures, {who.format(', '.join(others))}."
 
 
 def named(model: ErrorModel, trial: int) -> str:
