@@ -190,19 +190,6 @@ Out = Annotated[
         file_okay=False,
     ),
 ]
-Given = Annotated[
-    str | None,
-    typer.Option("--reference", metavar="TOPIC|FILE", help="A given reference to compare with."),
-]
-Length = Annotated[
-    float | None,
-    typer.Option(
-        metavar="METRES",
-        help="Length of the sub-trajectories over which errors are told.",
-        min=0.01,
-        show_default="25, or what fits",
-    ),
-]
 
 
 def reference(
@@ -212,8 +199,6 @@ def reference(
     override: Override = [],  # noqa: B006
     folder: Out = None,
     points: Points = None,
-    given: Given = None,
-    length: Length = None,
 ) -> None:
     """Estimate the reference of a recording from its scans, without ground truth.
 
@@ -221,22 +206,17 @@ def reference(
     estimates the references of all sequences that have none, or `reference: estimated`.
     """
     if target.suffix in (".yaml", ".yml"):
-        if (points, given, length) != (None, None, None):
-            raise AdaptuneError(
-                "--points, --reference and --length are for a single recording; of a study, the "
-                "YAML says it, see docs/reference-study.md"
-            )
+        if points is not None:
+            raise AdaptuneError("--points is for a single recording; of a study, the YAML says it")
         _of_study(load(target, override, folder))
         say_next_of_study("run trials, fit the error model", "offline")
     elif override:
         raise AdaptuneError(f"{target}: -o is for studies; give a study's YAML")
     else:
-        _of_recording(target, folder or Path(), points, given, length)
+        _of_recording(target, folder or Path(), points)
 
 
-def _of_recording(
-    target: Path, out: Path, points: str | None, given: str | None, length: float | None
-) -> None:
+def _of_recording(target: Path, out: Path, points: str | None) -> None:
     """Estimate the reference of a recording, write it, and say what it is worth."""
     from adaptune.processes import pin
     from adaptune.recording.inspect import inspect
@@ -244,35 +224,16 @@ def _of_recording(
     from adaptune.reference import check, estimate
     from adaptune.reference.stored import write_estimate
 
-    config = check.recording_config(inspect(target), points, given)
-    scans = open_sequence(config)
+    config = check.recording_config(inspect(target), points)
     path = out / f"{target.resolve().stem}_reference.tum"
     # What can fail is found before the estimate, which takes minutes.
     check.check_writable(path)
-    try:
-        there = scans.reference()
-    except AdaptuneError as error:
-        if given is not None:
-            raise
-        say(f"The given reference is not compared with: {error}")
-        there = None
     # Only on one core do results repeat bit by bit.
     with pin(os.getpid()), progress() as show:
-        found = estimate.estimate_reference(scans, partial(show, "estimating"))
+        found = estimate.estimate_reference(open_sequence(config), partial(show, "estimating"))
         about = {"recording": str(target.resolve()), "points": config.points}
-        metres = length or check.proposed_sub_trajectory(found.trajectory())
         stored = write_estimate(path, found, about)
-        if there is not None:
-            measured = check.measure_reference(scans, there, partial(show, "given reference"))
-    _say_estimate(stored, found.gaps(), metres)
-    if there is not None:
-        of = "" if config.reference is None else f" ({config.reference})"
-        say(f"Given reference{of}: {check.accuracy_words(measured, metres)}.")
-        difference = check.mean_difference(there.at(found.stamps), found.known_poses, metres)
-        if math.isnan(difference):
-            say(f"The two share no stretch of {metres:g} m.")
-        else:
-            say(f"The two differ by {difference:.2g} % over {metres:g} m.")
+    _say_estimate(stored, found.gaps(), check.proposed_sub_trajectory(found.trajectory()))
     say(f"Files: {path}, {path.with_suffix('.json').name}, {path.with_suffix('.png').name}")
     first = f"write `reference: {path}` under this sequence in a study; then "
     say_next("train with it, as with a given one", "offline", "STUDY.yaml", first=first)
