@@ -22,7 +22,6 @@ from adaptune.odometry.base import MOST_FAULTS
 from adaptune.recording.cache import status_key
 from adaptune.space import ODOMETRY, ParameterSet, in_words
 from adaptune.strict import ConfigurationError
-from adaptune.trajectory import Trajectory, write_tum
 
 # In `Trial.usage`; the last one in seconds, where the first scan has no pose.
 REGISTER_MS, PREPARE_MS, FIRST_POSE = "register_ms", "prepare_ms", "first_pose"
@@ -496,7 +495,7 @@ def _read(path: Path, names: Sequence[str] | None = None) -> dict[str, NDArray[A
         raise _damaged(path, error) from error
 
 
-# The table of the trials in a study's archive: sort and export it.
+# The table of the trials in a study's archive: sort it.
 
 
 Row = dict[str, Any]
@@ -591,25 +590,3 @@ def _short(row: Row) -> Row:
     short = {"trial": row["trial"], ODOMETRY: parameters.pop(ODOMETRY)}
     short["parameters"] = in_words(parameters)
     return short | {key: row[key] for key in keys[last:]}
-
-
-def export(archive: Archive, names: Sequence[str], numbers: Sequence[int], folder: Path) -> int:
-    """Write trajectories as TUM: ``<sequence>/<number>.tum``, and ``<sequence>/reference.tum``.
-
-    Unfinished trials are left out. Returns the number of trials' trajectories.
-    """
-    written = 0
-    for name in names:
-        present = [n for n in numbers if n in archive.finished(name)]
-        if not present:
-            continue
-        frames = archive.read_frames(name)
-        known = ~np.isnan(frames.T_ref_sensor[:, 0, 0])
-        reference = Trajectory(frames.stamps[known], frames.T_ref_sensor[known])
-        write_tum(folder / name / "reference.tum", reference)
-        for number in present:
-            T_odom_sensor = archive.read(name, number).T_odom_sensor
-            path = folder / name / f"{number:05d}.tum"
-            write_tum(path, Trajectory(frames.stamps, T_odom_sensor))
-        written += len(present)
-    return written

@@ -14,8 +14,6 @@ from adaptune.commands.terminal import (
     Override,
     Points,
     StudyFile,
-    begin_work,
-    errors,
     load,
     progress,
     say,
@@ -106,10 +104,6 @@ def trials(
         typer.Option(metavar="COLUMN", help="With `-` before it, the largest first."),
     ] = None,
     top: Annotated[int | None, typer.Option(help="Number of trials to show.", min=1)] = None,
-    export: Annotated[
-        Path | None,
-        typer.Option(help="Write their trajectories to this folder, as TUM.", file_okay=False),
-    ] = None,
 ) -> None:
     """List the study's finished trials, also while it runs.
 
@@ -141,10 +135,6 @@ def trials(
         say_next_of_trained(loaded, len(names) > 1)
     else:
         say_next_of_study("run the trials that are left, fit", "offline")
-    if export is not None:
-        begin_work()
-        n = table.export(archive, names, [row["trial"] for row in chosen], export)
-        errors.print(f"{n} trajectories: {export}/")
 
 
 def validate(

@@ -4,9 +4,8 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from adaptune.archive import Archive, Frames, Trial, export, rows, select, with_units
+from adaptune.archive import Archive, Trial, rows, select, with_units
 from adaptune.errors import AdaptuneError
-from adaptune.trajectory import read_tum
 from offline.config import Metric
 
 STAMPS = 1_700_000_000_123_456_789 + np.arange(20) * 100_000_000
@@ -91,20 +90,3 @@ def test_selecting(arguments, numbers):
 def test_a_column_that_there_is_not_is_told():
     with pytest.raises(AdaptuneError, match=r"--sort means: .* did you mean 'mean'"):
         select(TABLE, "means")
-
-
-def test_trajectories_are_exported(archive, tmp_path):
-    n = len(STAMPS)
-    nothing = np.zeros((n, 90), np.float32)
-    frames = Frames(STAMPS, drive(9), nothing, {"ndt": 90}, np.zeros(n, np.float32))
-    archive.write_frames("cave", frames)
-    assert export(archive, ["cave", "street"], [1, 3, 8], tmp_path / "out") == 2
-    assert sorted(p.name for p in (tmp_path / "out/cave").iterdir()) == [
-        "00001.tum",
-        "00003.tum",
-        "reference.tum",
-    ]
-    written = read_tum(tmp_path / "out/cave/00003.tum")
-    np.testing.assert_array_equal(written.stamps, STAMPS)
-    T = archive.read("cave", 3).T_odom_sensor
-    np.testing.assert_allclose(written.T_world_sensor[:, :3, 3], T[:, :3, 3], atol=1e-8)
