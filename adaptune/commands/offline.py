@@ -24,11 +24,11 @@ from adaptune.commands.terminal import (
     say_next_online,
     show_table,
 )
+from adaptune.commands.tune import check_no_study
 from adaptune.errors import AdaptuneError
 
 if TYPE_CHECKING:
     from adaptune.reference.stored import Gap, StoredEstimate
-    from offline.config import OfflineStudy
 
 
 def simulate(
@@ -170,58 +170,35 @@ def validate(
 # The command that estimates references.
 
 
-Out = Annotated[
-    Path | None,
-    typer.Option(
-        "--folder",
-        "--out",
-        help="Where to write; of a study, its folder.",
-        show_default="here; of a study, the YAML's name, under runs/",
-        file_okay=False,
-    ),
-]
-
-
 def reference(
-    target: Annotated[
-        Path, typer.Argument(help="A recording, or a study's YAML.", show_default=False)
+    recording: Annotated[
+        Path, typer.Argument(metavar="BAG", help="A bag, or a folder.", show_default=False)
     ],
-    override: Override = [],  # noqa: B006
-    folder: Out = None,
+    out: Annotated[
+        Path, typer.Option(help="Where to write.", show_default="here", file_okay=False)
+    ] = Path(),
     points: Points = None,
 ) -> None:
     """Estimate the reference of a recording from its scans, without ground truth.
 
-    It writes the poses (TUM), what is known of their error (JSON), and a picture. Of a study, it
-    estimates the references of all sequences that have none, or `reference: estimated`.
+    It writes the poses (TUM), what is known of their error (JSON), and a picture. Of a study,
+    `adaptune offline` and `online` estimate the references that are lacking.
     """
-    if target.suffix in (".yaml", ".yml"):
-        if points is not None:
-            raise AdaptuneError("--points is for a single recording; of a study, the YAML says it")
-        _of_study(load(target, override, folder))
-        say_next_of_study("run trials, fit the error model", "offline")
-    elif override:
-        raise AdaptuneError(f"{target}: -o is for studies; give a study's YAML")
-    else:
-        _of_recording(target, folder or Path(), points)
-
-
-def _of_recording(target: Path, out: Path, points: str | None) -> None:
-    """Estimate the reference of a recording, write it, and say what it is worth."""
     from adaptune.processes import pin
     from adaptune.recording.inspect import inspect
     from adaptune.recording.recording import open_sequence
     from adaptune.reference import check, estimate
     from adaptune.reference.stored import write_estimate
 
-    config = check.recording_config(inspect(target), points)
-    path = out / f"{target.resolve().stem}_reference.tum"
+    check_no_study(recording)
+    config = check.recording_config(inspect(recording), points)
+    path = out / f"{recording.resolve().stem}_reference.tum"
     # What can fail is found before the estimate, which takes minutes.
     check.check_writable(path)
     # Only on one core do results repeat bit by bit.
     with pin(os.getpid()), progress() as show:
         found = estimate.estimate_reference(open_sequence(config), partial(show, "estimating"))
-        about = {"recording": str(target.resolve()), "points": config.points}
+        about = {"recording": str(recording.resolve()), "points": config.points}
         stored = write_estimate(path, found, about)
     _say_estimate(stored, found.gaps(), check.proposed_sub_trajectory(found.trajectory()))
     say(f"Files: {path}, {path.with_suffix('.json').name}, {path.with_suffix('.png').name}")
@@ -243,35 +220,3 @@ def _say_estimate(stored: "StoredEstimate", unknown: "list[Gap]", length: float)
         say(f"It is unknown for {share}, which have no pose: {where} after the first scan.")
     else:
         say("It is known everywhere.")
-
-
-def _of_study(study: "OfflineStudy") -> None:
-    """Estimate the references that a study lacks, and say what each is worth."""
-    from adaptune.study.references import ensure_references, estimates_of, to_estimate
-
-    names = to_estimate(study.sequences, (*study.config.training, *study.config.test))
-    if not names:
-        raise AdaptuneError(
-            f"{study.name}: every sequence has a reference; write `reference: estimated` where it "
-            f"is to be estimated"
-        )
-    study.open()
-    length = study.config.sub_trajectory
-    with progress() as show:
-        refused = ensure_references(study.sequences, names, length, show, required=False)
-    rows = [
-        {
-            "reference": name,
-            "scans": stored.scans,
-            "metres": stored.metres,
-            "its error [%]": stored.error(length),
-            "unknown [% of the scans]": 100.0 * stored.unknown_share,
-        }
-        for name, stored in estimates_of(study.sequences, names).items()
-    ]
-    if rows:
-        caption = f"Errors are estimates over {length:g} m. A picture of each shows where it fails."
-        show_table("Estimated references", rows, caption)
-        say(f"Files: {study.folder / 'references'}/")
-    if refused:
-        raise AdaptuneError("\n".join(refused.values()))

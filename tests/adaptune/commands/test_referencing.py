@@ -5,10 +5,8 @@ import estimates
 import pytest
 
 from adaptune.commands import terminal
-from adaptune.recording.config import SequenceConfig
-from adaptune.recording.recording import open_sequence
 from adaptune.reference import estimate
-from adaptune.reference.stored import EstimateError, StoredEstimate, write_estimate
+from adaptune.reference.stored import StoredEstimate
 from adaptune.trajectory import read_tum
 
 
@@ -53,9 +51,7 @@ def test_where_it_is_lost_is_said(adaptune, bag, tmp_path, monkeypatch):
     [
         (["none.bag"], "there is no such file"),
         (["BAG", "--points", "/none"], "/none"),
-        (["BAG", "-o", "training=[one]"], "-o is for studies"),
-        (["STUDY", "--points", "/points"], "--points is for a single recording"),
-        (["STUDY"], "every sequence has a reference"),
+        (["STUDY"], "is a study, not a recording"),
         (["poses.tum"], "is a file of poses"),
     ],
 )
@@ -89,42 +85,3 @@ def test_what_is_wrong_is_told_before_the_estimate(
     assert done.exit_code == 2
     assert expected in done.stderr
     assert (tmp_path / "mine/one_reference.tum").read_text() == "mine"
-
-
-def test_of_a_study_those_that_it_lacks_are_estimated(
-    adaptune, bag, study_file, tmp_path, monkeypatch
-):
-    made = estimates.Estimator()
-    asked = []
-
-    def estimated(scans, *given):
-        asked.append(scans.name.rpartition("/")[2])
-        if "two" in scans.name:
-            raise EstimateError("the robot moves 0.1 m only")
-        return made(scans, *given)
-
-    monkeypatch.setattr(estimate, "estimate_reference", estimated)
-    text = study_file.read_text().replace("bag: ", f"bag: {study_file.parent}/")
-    one = text.replace("one.bag, points: /points, reference: /truth", "one.bag, points: /points")
-    (tmp_path / "study.yaml").write_text(one)
-    done = adaptune("study.yaml", "--folder", "run")
-    assert done.exit_code == 0, done.stderr
-    assert re.search(r"one +40 +11\.\d", done.stdout)
-    assert "adaptune offline study.yaml --folder run" in done.stdout.splitlines()[-1]
-    assert asked == ["one.bag"]
-    # One that is refused leaves the others; one that is not asked for is not listed.
-    (tmp_path / "study.yaml").write_text(
-        text.replace("reference: /truth", "reference: estimated").replace(
-            "test: [three]", "test: []"
-        )
-    )
-    write_estimate(
-        tmp_path / "run/references/stale.tum", made(open_sequence(SequenceConfig(bag=str(bag)))), {}
-    )
-    done = adaptune("study.yaml", "--folder", "run", "-o", "training=[two, one]")
-    assert done.exit_code == 2
-    assert "sequences.two: " in done.stderr
-    assert "the robot moves 0.1 m only" in done.stderr
-    assert re.search(r"one +40 +11\.\d", done.stdout)
-    assert "stale" not in done.stdout
-    assert asked == ["one.bag", "two.bag"]
