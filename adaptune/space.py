@@ -322,11 +322,6 @@ class ParameterSets:
         """Trial numbers of the sets that are the baseline of an odometry."""
         return [trial for trial in self.trials if self[trial] in self.space.baselines]
 
-    def find(self, parameters: ParameterSet) -> int | None:
-        """Trial number of the first set with these values, the others at their baseline."""
-        whole = self.space.complete(parameters)
-        return next((t for t in self.trials if self[t] == whole), None)
-
     def subset(self, trials: Sequence[int]) -> "ParameterSets":
         """A table of some of the sets."""
         return ParameterSets(self.space, tuple(trials), tuple(self[trial] for trial in trials))

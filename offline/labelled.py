@@ -570,7 +570,7 @@ def labelled_data(
             )
         one = _labelled(archive, name, set(counted), sets, config, window, recorded_in(name))
         read[name] = one.cut_as(read[origin(name)]) if origin(name) in read else one
-    eligible = _eligible(list(read.values()), sets, config)
+    eligible = _eligible(list(read.values()), sets)
     bounds = LabelledData(list(read.values()), sets).bounds()
     rivals = [*best_candidates(bounds), *sets.defaults]
     runs = read_whole_runs(archive, list(run), rivals, config.health)
@@ -593,9 +593,7 @@ def labelled_data(
     return LabelledData(labelled, sets, costs, online.budget, online.worth, live)
 
 
-def _eligible(
-    sequences: Sequence[LabelledSequence], sets: ParameterSets, config: OfflineStudyConfig
-) -> set[int]:
+def _eligible(sequences: Sequence[LabelledSequence], sets: ParameterSets) -> set[int]:
     """Trials whose sets may be members of a bank, and so need error vectors.
 
     With a sequence left out, others than now may be among the best. To read the poses of thousands
@@ -604,9 +602,7 @@ def _eligible(
     number = np.repeat(np.arange(len(sequences)), [len(s.errors) for s in sequences])
     means = mean_errors(np.concatenate([s.errors for s in sequences]), number)
     best = [sets.trials[c] for c in np.argsort(means, kind="stable")[: 2 * MEMBER_POOL_SIZE]]
-    found = {t for t in (BASELINE, *best) if t in sets and np.isfinite(means[sets.column(t)])}
-    named = (n if isinstance(n, int) else sets.find(n) for n in config.online.switching.sets or ())
-    return found | {trial for trial in named if trial is not None and trial in sets}
+    return {t for t in (BASELINE, *best) if t in sets and np.isfinite(means[sets.column(t)])}
 
 
 def _labelled(

@@ -364,11 +364,9 @@ def fit(
 def tuned(model: ErrorModel, data: LabelledData, switching: SwitchingConfig) -> ErrorModel:
     """Choose what is driven: the rule's settings, the bank and those of its weights."""
     complete = data.complete()
-    bank = named_members(model, switching, complete) or switching.size
-    chosen = choose(complete, bank, fixed=model.fixed)
+    chosen = choose(complete, switching.size, fixed=model.fixed)
     members = chosen.members or [model.fixed]
-    # Where the user names the members, there are no others.
-    besides = reserve(members, complete) if isinstance(bank, int) else []
+    besides = reserve(members, complete)
     members = [*members, *besides]
     return replace(
         model,
@@ -383,22 +381,6 @@ def tuned(model: ErrorModel, data: LabelledData, switching: SwitchingConfig) -> 
         },
         rivals=rivals(complete, driven_cost(complete, chosen, model.fixed)),
     )
-
-
-def named_members(
-    model: ErrorModel, switching: SwitchingConfig, complete: LabelledData
-) -> list[int]:
-    """Trial numbers of the members that the study names; empty if they cannot be a bank."""
-    named = [model.trial(n) for n in switching.sets or ()]
-    members = [trial for trial in named if trial is not None and trial in complete.sets]
-    if len(set(members)) == len(named):
-        return members
-    _log.warning(
-        "online.switching.sets: one of them was not run on every training sequence, gave no pose "
-        "for many scans, or is named twice; the bank is chosen without them (trials.csv lists the "
-        "sets)"
-    )
-    return []
 
 
 def run_oracle(

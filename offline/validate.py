@@ -303,10 +303,9 @@ def validate(study: OfflineStudy, progress: Progress = unseen) -> Validated:
         )
     data = _labelled(study, model)
     online = driven(model, study.config.online, study.odometry, study.mechanism)
-    bank: int | list[int] = 0
+    bank = 0
     if study.mechanism == "bank" and PAIRED in study.rules:
-        switching = study.config.online.switching
-        bank = switching.size if switching.sets is None else model.bank
+        bank = study.config.online.switching.size
     try:
         validation = leave_one_out(data, progress, bank)
     except ValidationError as error:

@@ -160,7 +160,7 @@ class ReplaySetup:
             why = "no parameters by which the members of a bank would differ (odometry.parameters)"
             return "" if differ else f"{self.odometry.name} has {why}"
         if name == EVEN and model is not None:
-            alone = len(self.config.online.switching.sets or model.bank) < 2
+            alone = len(model.bank) < 2
             return "the model's bank has no other member than the fixed set" if alone else ""
         if model is not None and self._mechanism(name, model) is None:
             return cannot_adapt(self.odometry, self.mechanism)

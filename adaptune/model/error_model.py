@@ -31,7 +31,7 @@ from adaptune.model.rules import (
 from adaptune.model.weights import BankSettings
 from adaptune.recording.scan import places, stretch_numbers
 from adaptune.report import tables
-from adaptune.space import ParameterSet, ParameterSets, SpaceError, in_words, load_space
+from adaptune.space import ParameterSets, SpaceError, in_words, load_space
 from adaptune.strict import in_one_line
 
 if TYPE_CHECKING:
@@ -181,8 +181,8 @@ class ErrorModel:
             return data
         if unknown := [trial for trial in members if trial not in self.bank]:
             raise ModelError(
-                f"the model's bank does not hold trial {unknown[0]}, only {self.bank}; name its "
-                f"sets in online.switching.sets and run `adaptune offline` again"
+                f"the model's bank does not hold trial {unknown[0]}, only {self.bank}; run "
+                f"`adaptune offline` again"
             )
         vectors = self.vectors[:, [self.bank.index(trial) for trial in members]]
         return replace(data, fixed=members[0], candidates=tuple(members), vectors=vectors)
@@ -190,15 +190,6 @@ class ErrorModel:
     def allowed(self) -> tuple[int, ...] | None:
         """See `allowed_sets`."""
         return allowed_sets(self.costs, self.budget, self.sets, self.fixed)
-
-    def trial(self, named: int | ParameterSet) -> int | None:
-        """Trial number of a set that is named by it, or by its values that are not the baseline's.
-
-        None if the model does not know the set.
-        """
-        if isinstance(named, int):
-            return named if named in self.sets else None
-        return self.sets.find(named)
 
     def check_descriptors(
         self, descriptors: Collection[str], where: Path | str = "the model"

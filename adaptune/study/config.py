@@ -13,7 +13,7 @@ from adaptune.recording.config import SequenceConfig, Transform, ViewConfig
 from adaptune.recording.scan import Fractions, part_name, read_part
 from adaptune.ros.link import SetCommand
 from adaptune.simulation.course import Course
-from adaptune.space import ParameterSpace, Value
+from adaptune.space import ParameterSpace
 from adaptune.strict import Mistake, StrictModel
 
 
@@ -93,10 +93,6 @@ class SwitchingConfig(StrictModel):
 
     mechanism: Literal["auto", "live", "bank"] = "auto"
     size: int = Field(4, ge=2, le=MOST_MEMBERS)
-    sets: Annotated[
-        tuple[Annotated[int, Field(ge=0, le=10**9)] | dict[str, Value], ...] | None,
-        Field(min_length=2, max_length=MOST_MEMBERS),
-    ] = None
 
 
 class RealTimeConfig(StrictModel):

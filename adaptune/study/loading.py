@@ -22,7 +22,7 @@ from adaptune.recording import cache
 from adaptune.recording.cache import MANY, fingerprint
 from adaptune.recording.config import SequenceConfig
 from adaptune.recording.recording import check_sequence, interval_of, sequence_files
-from adaptune.space import Categorical, Float, Integer, ParameterSpace, PooledSpace, SpaceError
+from adaptune.space import Categorical, Float, Integer, ParameterSpace, PooledSpace
 from adaptune.strict import ConfigurationError, Key, Mistake, validated
 from adaptune.study.config import RULES, OdometryConfig, StudyConfig, settle_roles
 from adaptune.study.study import Study, declared_odometry, tuned_space, whole_definition
@@ -67,7 +67,7 @@ def _check_together(config: StudyConfig) -> tuple[list[Mistake], ParameterSpace 
     labelled = {one.label or one.name: spaces[key] for key, one in entries.items()}
     space = PooledSpace(labelled) if len(entries) > 1 else next(iter(spaces.values()))
     if not mistakes:
-        mistakes += _check_switching(config, list(described.values()), space)
+        mistakes += _check_switching(config, list(described.values()))
     return mistakes, space
 
 
@@ -145,17 +145,9 @@ def _check_imu(config: StudyConfig, odometry: str) -> Iterable[Mistake]:
             yield Mistake(("courses", name), f"{needs}; simulate one, imu: 200")
 
 
-def _check_switching(
-    config: StudyConfig, described: list[Description], space: ParameterSpace
-) -> Iterable[Mistake]:
+def _check_switching(config: StudyConfig, described: list[Description]) -> Iterable[Mistake]:
     online, names = config.online, ", ".join(config.odometries)
     modes, mechanism = ("online", "modes"), ("online", "switching", "mechanism")
-    for i, given in enumerate(online.switching.sets or ()):
-        if isinstance(given, dict):
-            try:
-                space.check(space.complete(given))
-            except SpaceError as error:
-                yield Mistake(("online", "switching", "sets", i), str(error))
     if any(one.whole for one in described):
         message = f"{names} runs whole recordings and cannot change parameters; leave this out"
         # A study's folder holds the defaults, too.
@@ -229,6 +221,7 @@ DELETED = {
         for key in _HAND_OVER
     },
     "online.switching.cores": "is gone: a bank shares all cores that adaptune may use",
+    "online.switching.sets": "is gone: training chooses the bank; give its size",
     "online.switching.memory": "is gone: auto spends 16 GB; give mechanism: bank for more",
     "online.switching.warm_up": "is gone: the odometry says it; leave it out",
     "online.switching.mechanism=hand_over": "is gone (it gained nothing); give auto, live or bank",

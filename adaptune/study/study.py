@@ -323,9 +323,7 @@ class Study(Generic[C_co]):
             return None
         if switching.mechanism != "auto":
             return switching.mechanism
-        instances = switching.size if switching.sets is None else len(switching.sets)
-        if switching.sets is None and self.config.online.budget is not None:
-            instances = MOST_MEMBERS
+        instances = switching.size if self.config.online.budget is None else MOST_MEMBERS
         if available() > 1 and instances * self.config.isolation.memory <= BANK_MEMORY:
             return "bank"
         return "live" if described.live else None
@@ -600,56 +598,26 @@ def mechanism_of(
 def bank_members(switching: SwitchingConfig, model: ErrorModel) -> dict[int, ParameterSet]:
     """The members of the study's bank by their trial numbers, the fixed set first.
 
-    A ModeError says that the study names a set that the model does not know, or one twice, or that
-    the model was fitted for another bank.
+    A ModeError says that the model was fitted for another bank.
     """
-    if switching.sets is None and model.budget is not None:
+    if model.budget is not None:
         return {trial: model.sets[trial] for trial in model.bank}
-    if switching.sets is None:
-        # Sets that are never chosen, because they fail, are in no bank.
-        complete = np.asarray(~np.isnan(model.errors).any(axis=0))
-        usable = [
-            c for c, t in enumerate(model.sets) if model.costs is None or model.costs.usable(t)
-        ]
-        n = len(model.bank) - model.bank_settings.reserve
-        if n < min(switching.size, int(complete[usable].sum())):
-            raise _another_bank("size")
-        if model.bank[0] != model.fixed:
-            raise _another_bank("sets")
-        chosen = (*model.bank[:n][: switching.size], *model.bank[n:])
-        return {trial: model.sets[trial] for trial in chosen}
-    members: dict[int, ParameterSet] = {}
-    for i, named in enumerate(switching.sets):
-        trial, where = model.trial(named), f"online.switching.sets.{i}"
-        if trial is None:
-            raise ModeError(
-                f"{where}: is none of the {len(model.sets)} parameter sets of the model, so "
-                f"its errors are unknown; name the number of a trial, or the parameters of one "
-                f"(trials.csv lists them)"
-            )
-        if trial in members:
-            raise ModeError(f"{where}: is in the bank already")
-        if np.isnan(model.errors[:, model.sets.column(trial)]).any():
-            raise ModeError(
-                f"{where}: was not run on every training sequence, so it cannot be compared "
-                f"with the others; name another set (trials.csv lists them)"
-            )
-        members[trial] = model.sets[trial]
-    if list(members) != model.bank:
-        raise _another_bank("sets")
-    return members
+    # Sets that are never chosen, because they fail, are in no bank.
+    complete = np.asarray(~np.isnan(model.errors).any(axis=0))
+    usable = [c for c, t in enumerate(model.sets) if model.costs is None or model.costs.usable(t)]
+    n = len(model.bank) - model.bank_settings.reserve
+    if n < min(switching.size, int(complete[usable].sum())):
+        raise ModeError(
+            "online.switching.size: the model was fitted for another bank; run `adaptune offline` "
+            "again, which fits it to the finished trials"
+        )
+    chosen = (*model.bank[:n][: switching.size], *model.bank[n:])
+    return {trial: model.sets[trial] for trial in chosen}
 
 
 def always_at_work(switching: SwitchingConfig, model: ErrorModel) -> list[int]:
     """The members of the study's bank that work everywhere; see `ErrorModel.reserve`."""
     return [trial for trial in bank_members(switching, model) if trial not in model.reserve]
-
-
-def _another_bank(key: str) -> ModeError:
-    return ModeError(
-        f"online.switching.{key}: the model was fitted for another bank; run `adaptune offline` "
-        f"again, which fits it to the finished trials"
-    )
 
 
 # What trials on the test sequences found, for the best choice in hindsight. Nothing learns from it.

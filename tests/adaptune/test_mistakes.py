@@ -49,10 +49,6 @@ FOREIGN = re.compile(r"pydantic|https://|Input should|validation|Value error|tup
         ("health.max_speed=1" + "0" * 400, "health.max_speed: give a number of at most 1"),
         ("descriptor.window=3", "descriptor: give a list, not keys with values"),
         ("online.modes=[paired]", "online.modes.0: paired is now called adaptive"),
-        (
-            "online.switching.sets=[true, 3]",
-            "online.switching.sets.0: give a whole number or keys with values, not true",
-        ),
         ("offline.objective={rtf: 3}", "offline.objective.rtf: give 'rte', 'kitti', 'rpe', 'ape'"),
         (
             "offline={sampler: grid, sampler_settings: {grid: {keyframe_interval: 3}}}",
@@ -81,7 +77,7 @@ def test_all_mistakes_are_told_together(study_file):
         .replace("test: [three]", "test: [threee]")
         .replace("sub_trajectory: 3.0", "sub_trajectory: abc")
         .replace("trials: 10", "trials: 0, sampler_settings: {gama: 1}")
-        + "online: {switching: {mechanism: lively, sets: [0]}}\n"
+        + "online: {switching: {mechanism: lively, size: 0}}\n"
     )
     lines = failure(file).splitlines()
     assert [re.sub(r".*, line (\d+): ([\w.]+): .*", r"\1 \2", line) for line in lines] == [
@@ -92,7 +88,7 @@ def test_all_mistakes_are_told_together(study_file):
         "13 sub_trajectory",
         "14 offline.trials",
         "15 online.switching.mechanism",
-        "15 online.switching.sets",
+        "15 online.switching.size",
     ]
 
 

@@ -68,12 +68,6 @@ def test_mistakes_have_the_line_of_their_odometry(study_of):
     assert "line 4: odometry.2.settings.iteration: unknown key" in text
 
 
-def test_sets_of_a_bank_say_which_odometry_they_are_for(study_of):
-    sets = "online.switching.sets=[{resolution: 2.0}, {odometry: gicp}]"
-    text = failure(study_of(TWO), sets)
-    assert "online.switching.sets.0: odometry: names no odometry; there is 'gicp', 'vgicp'" in text
-
-
 def test_none_of_several_is_changed_live(study_of):
     text = failure(study_of(TWO), "online.switching.mechanism=live")
     assert "gicp, vgicp cannot change parameters between scans" in text

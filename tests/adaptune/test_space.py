@@ -173,13 +173,6 @@ def test_sets_are_known_by_their_trials():
     np.testing.assert_allclose(few.unit, sets.unit[[2, 0]])
 
 
-def test_a_set_is_found_by_what_differs_from_the_baseline():
-    sets = table([[0.5, 0.2], [0.3, 0.5], [0.3, 0.5]], (1, 2, 3))
-    assert sets.find({"p1": 0.2}) == 1
-    assert sets.find({"p0": 0.3}) == 2
-    assert sets.find({"p0": 0.4}) is None
-
-
 GICP = ParameterSpace.of(
     distance=Float(low=0.1, high=10.0, baseline=1.0, log=True),
     kernel=Categorical(choices=("huber", "none"), baseline="none"),
@@ -226,7 +219,6 @@ def test_baselines():
     parameters = (POOLED.baselines[1], {ODOMETRY: "ndt", "distance": 3.0, "passes": 3})
     table = ParameterSets(POOLED, (4, 7), parameters)
     assert table.defaults == [4]
-    assert table.find({ODOMETRY: "ndt", "distance": 3.0}) == 7
 
 
 @pytest.mark.parametrize(

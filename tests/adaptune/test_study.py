@@ -83,10 +83,6 @@ def test_reads_a_study(gicp_study_file, tmp_path):
         ("offline.objective=[rte, rpe]", ["offline.objective: several objectives are gone"]),
         ("offline.trial=3", ["offline.trial", "did you mean 'trials'?"]),
         ("online.switching.mechanism=hand_over", ["hand_over is gone", "give auto, live or bank"]),
-        (
-            "online.switching.sets=[0, {keyframe_intervall: 1.0}]",
-            ["online.switching.sets.1", "did you mean 'keyframe_interval'?"],
-        ),
         ("test=[three, three]", ["test.1", "named twice"]),
         ("sequences.one.bag=four.bag", ["sequences.one", "four.bag", "no such bag"]),
         ("sequences.one.bag=${NO_SUCH_VARIABLE}/a.bag", ["NO_SUCH_VARIABLE"]),

@@ -137,38 +137,6 @@ def test_a_bank_that_pays_is_weighed(own, study_file):
     more = load_study(study_file, ["online.switching.mechanism=bank"], own.folder)
     with pytest.raises(ModeError, match=r"switching\.size: the model was fitted for another"):
         bank_members(more.config.online.switching, replace(model, bank=model.bank[:3]))
-    with pytest.raises(ModeError, match=r"switching\.sets: the model was fitted for another"):
-        bank_members(more.config.online.switching, replace(model, bank=model.bank[::-1]))
-
-
-def test_the_sets_of_a_bank_are_named_by_number_or_by_value(trained, study_file):
-    model = ErrorModel.load(trained.folder / "model.safetensors")
-    bank = "online.switching.mechanism=bank"
-    named = load_study(study_file, [bank, "online.switching.sets=[3, 0]"], trained.folder)
-    of_two = replace(model, bank=[3, 0])
-    members = bank_members(named.config.online.switching, of_two)
-    assert list(members.items()) == [(3, model.sets[3]), (0, model.sets[0])]
-    values = "{" + ", ".join(f"{k}: {v!r}" for k, v in model.sets[4].items()) + "}"
-    named = load_study(study_file, [bank, f"online.switching.sets=[{values}, 1]"], trained.folder)
-    assert list(bank_members(named.config.online.switching, replace(model, bank=[4, 1]))) == [4, 1]
-    # They go by their trials, whatever sets were left out of the model.
-    some = replace(model, sets=model.sets.subset(model.sets.trials[2:]), bank=[3, 2])
-    some = replace(some, errors=model.errors[:, 2:], fixed=2)
-    by_number = load_study(study_file, [bank, "online.switching.sets=[3, 2]"], trained.folder)
-    assert list(bank_members(by_number.config.online.switching, some)) == [3, 2]
-    twice = load_study(study_file, [bank, "online.switching.sets=[3, 3]"], trained.folder)
-    with pytest.raises(ModeError, match=r"switching\.sets\.1: is in the bank already"):
-        run_replays(twice, trained.folder / "model.safetensors")
-    with pytest.raises(ModeError, match=r"switching\.sets: the model was fitted for another"):
-        bank_members(named.config.online.switching, replace(model, bank=[0, 1, 2]))
-    errors = model.errors.copy()
-    errors[:3, 4] = np.nan
-    with pytest.raises(ModeError, match=r"switching\.sets\.0: was not run on every"):
-        bank_members(named.config.online.switching, replace(model, errors=errors))
-    for unknown in ("[0, 10]", "[{keyframe_interval: 1.2345}, 0]"):
-        study = load_study(study_file, [bank, f"online.switching.sets={unknown}"], trained.folder)
-        with pytest.raises(ModeError, match=r"switching\.sets\..: is none of the 10"):
-            bank_members(study.config.online.switching, model)
 
 
 def test_replays_are_made_once(replayed, study_file):
