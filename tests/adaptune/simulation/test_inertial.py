@@ -13,7 +13,7 @@ RATE = 400
 
 @pytest.fixture(scope="module")
 def ride():
-    return Ride(Road([(SCENES["garden"], 60.0)], seed=2), MOTIONS["handheld"], seed=2)
+    return Ride(Road([(SCENES["garden"], 60.0)], seed=2), MOTIONS["robot"], seed=2)
 
 
 def test_integrating_the_measurements_gives_the_truth_back(ride):
