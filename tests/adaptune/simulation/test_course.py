@@ -9,7 +9,7 @@ from adaptune.simulation.course import directions
 @pytest.mark.parametrize(
     ("given", "says"),
     [
-        ({"scenes": ["moon"]}, "no scene 'moon'; choose from cave, corridor, field, garden"),
+        ({"scenes": ["moon"]}, "no scene 'moon'; choose from cave, corridor, garden"),
         ({"scenes": ["cave"], "length": 0}, "greater than or equal to 10"),
         ({"scenes": ["cave"], "sensor": "vlp17"}, "no sensor 'vlp17'; choose from hdl32e, hdl64e"),
         ({"scenes": ["cave"], "rate": 5.0}, "a robot moves too fast for 5 scans a second"),

@@ -9,7 +9,7 @@ from adaptune.simulation.world import Ride, Road
 
 @pytest.fixture(scope="module", params=MOTIONS)
 def ride(request):
-    road = Road([(SCENES["street"], 60.0), (SCENES["field"], 60.0)], seed=1)
+    road = Road([(SCENES["street"], 60.0), (SCENES["garden"], 60.0)], seed=1)
     return Ride(road, MOTIONS[request.param], seed=1), MOTIONS[request.param], road
 
 
