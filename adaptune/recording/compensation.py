@@ -122,7 +122,7 @@ def clock_offset(
     stamps: NDArray[np.int64],
     turning: NDArray[np.float64],
 ) -> list[float]:
-    """Seconds to add to a trajectory's stamps so that it turns when a gyroscope or a LiDAR does.
+    """Seconds to add to a trajectory's stamps so that it turns when the LiDAR does.
 
     The rates of turning, which no choice of frames changes, are correlated at every offset at
     which the shorter recording lies at least half inside the other. `stamps` are nanoseconds on

@@ -430,28 +430,17 @@ class RecordedSequence:
         )
 
     def _proposal(self, trajectory: Trajectory) -> str:
-        """The offset found from the gyroscope, or from the scans if there is none."""
+        """The offset found from how the scans turn."""
+        _log.info("%s: comparing how its scans turn with the reference", self.name)
         try:
-            imu = self.source.imu(self._config.imu.topic if self._config.imu else None)
+            turns = compensation.turning_of(islice(self._decode(Counter()), _MOST_SCANS))
         except AdaptuneError:
-            imu = None
-        if imu is not None:
-            stamps, turning = imu.stamps, np.linalg.norm(imu.angular_velocity, axis=1)
-            what = "gyroscope measured"
-        else:
-            _log.info("%s: comparing how its scans turn with the reference", self.name)
-            try:
-                stamps, turning = compensation.turning_of(
-                    islice(self._decode(Counter()), _MOST_SCANS)
-                )
-            except AdaptuneError:
-                return ""
-            what = "scans show"
-        found = compensation.clock_offset(trajectory, stamps, turning)
+            return ""
+        found = compensation.clock_offset(trajectory, *turns)
         # The stamps already include the offset that is set.
         offsets = [f"{self._config.clock_offset + offset:.3f}" for offset in found]
         also = f"; turns repeat: others, as {offsets[1]}, fit nearly as well" if offsets[1:] else ""
-        same = f" (the {what} the same motion with clock_offset: "
+        same = " (the scans show the same motion with clock_offset: "
         return f"{same}{offsets[0]}{also})" if offsets else ""
 
 
