@@ -113,26 +113,23 @@ _LEAST_CORRELATION = 0.8
 """Of two rates of turning that show the same motion."""
 _RATE = 50.0
 """Samples per second to compare."""
-_AMBIGUOUS = 0.95
-"""Share of the best correlation with which another offset could be the right one."""
 
 
 def clock_offset(
     trajectory: Trajectory,
     stamps: NDArray[np.int64],
     turning: NDArray[np.float64],
-) -> list[float]:
+) -> float | None:
     """Seconds to add to a trajectory's stamps so that it turns when the LiDAR does.
 
     The rates of turning, which no choice of frames changes, are correlated at every offset at
     which the shorter recording lies at least half inside the other. `stamps` are nanoseconds on
     the other clock, `turning` radians per second, both of shape (n,).
 
-    Returns the best one, and another if others fit nearly as well because turns repeat; nothing if
-    the two do not show the same motion.
+    Returns None if the two do not show the same motion.
     """
     if len(trajectory) < 3 or len(stamps) < 3:
-        return []
+        return None
     turned = geometry.rotation_angle(geometry.steps(trajectory.T_world_sensor))
     seconds = np.diff(trajectory.stamps) * 1e-9
     middles = (trajectory.stamps[:-1] - trajectory.stamps[0]) * 1e-9 + seconds / 2
@@ -141,16 +138,13 @@ def clock_offset(
     a = _sampled(middles, turned / seconds, float(np.median(np.diff(other))))
     b = _sampled(other, turning, float(np.median(seconds)))
     if min(len(a), len(b)) < 2 * _RATE:
-        return []
+        return None
     coefficients, lags = _correlation(a, b)
     best = int(np.argmax(coefficients))
-    others = np.where(np.abs(lags - lags[best]) > _RATE, coefficients, -1.0)
-    other = int(np.argmax(others))
+    if coefficients[best] < _LEAST_CORRELATION:
+        return None
     start = (stamps[0] - trajectory.stamps[0]) * 1e-9 - middles[0]
-    least = max(_LEAST_CORRELATION, _AMBIGUOUS * float(coefficients[best]))
-    fit = [best] if coefficients[best] >= _LEAST_CORRELATION else []
-    fit += [other] if fit and others[other] >= least else []
-    return [float(start + lags[at] / _RATE) for at in fit]
+    return float(start + lags[best] / _RATE)
 
 
 def _sampled(

@@ -436,12 +436,11 @@ class RecordedSequence:
             turns = compensation.turning_of(islice(self._decode(Counter()), _MOST_SCANS))
         except AdaptuneError:
             return ""
-        found = compensation.clock_offset(trajectory, *turns)
+        if (offset := compensation.clock_offset(trajectory, *turns)) is None:
+            return ""
         # The stamps already include the offset that is set.
-        offsets = [f"{self._config.clock_offset + offset:.3f}" for offset in found]
-        also = f"; turns repeat: others, as {offsets[1]}, fit nearly as well" if offsets[1:] else ""
-        same = " (the scans show the same motion with clock_offset: "
-        return f"{same}{offsets[0]}{also})" if offsets else ""
+        offset += self._config.clock_offset
+        return f" (the scans show the same motion with clock_offset: {offset:.3f})"
 
 
 @once
