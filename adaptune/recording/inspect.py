@@ -53,21 +53,21 @@ class Topic:
     count: int  # messages in the recording
     stamped: bool = True
     n_read: int = 0
-    # Nanoseconds of the messages that were read; a list for every part of a sample.
+    # Nanoseconds of the messages that were read, on the recorder's clock if they have no stamps; a
+    # list for every part of a sample.
     stamps: list[list[int]] = field(default_factory=list)
-    recorded: list[list[int]] = field(default_factory=list)  # on the recorder's clock
     undecoded: list[tuple[float, str]] = field(default_factory=list)  # seconds, and why
     frames: Counter[str] = field(default_factory=Counter)  # messages of each frame of reference
 
     @property
     def times(self) -> NDArray[np.int64]:
         """Nanoseconds of the stamps; of the recording, if messages have none."""
-        return _joined(self._parts)
+        return np.array([time for part in self.stamps for time in part], np.int64)
 
     @property
     def steps(self) -> NDArray[np.float64]:
         """Seconds from each message to the next one of its part, where it is later."""
-        steps = [np.diff(np.array(part, np.int64)) * 1e-9 for part in self._parts]
+        steps = [np.diff(np.array(part, np.int64)) * 1e-9 for part in self.stamps]
         joined = np.concatenate([np.empty(0), *steps])
         return joined[joined > 0]
 
@@ -80,23 +80,6 @@ class Topic:
     def gap(self) -> float | None:
         """Longest time between one message and the next, in seconds."""
         return float(self.steps.max()) if len(self.steps) else None
-
-    @property
-    def late(self) -> NDArray[np.float64]:
-        """Seconds that each was recorded later than usual; none where not all have both times."""
-        stamps, recorded = _joined(self.stamps), _joined(self.recorded)
-        if not len(stamps) or len(stamps) != len(recorded):
-            return np.empty(0)
-        late = recorded - stamps
-        return np.asarray((late - np.median(late)) * 1e-9)
-
-    @property
-    def _parts(self) -> list[list[int]]:
-        return self.stamps if any(self.stamps) else self.recorded
-
-
-def _joined(parts: list[list[int]]) -> NDArray[np.int64]:
-    return np.array([time for part in parts for time in part], np.int64)
 
 
 @dataclass(eq=False)
@@ -390,7 +373,6 @@ class _Survey:
             chosen = [name] if name else [t for t in found.topics if t not in rare]
             for topic in chosen:
                 found.topics[topic].stamps.append([])
-                found.topics[topic].recorded.append([])
             try:
                 for at, when, data in self._messages(name, span):
                     if at in chosen:
@@ -414,8 +396,7 @@ class _Survey:
     def _take(self, topic: Topic, when: int, data: bytes) -> None:
         """Keep when a message was made and recorded, and decode it where it is used."""
         topic.n_read += 1
-        topic.recorded[-1].append(when)
-        stamp, frame = header_of(data, self._reader.is2) if topic.stamped else (None, "")
+        stamp, frame = header_of(data, self._reader.is2) if topic.stamped else (when, "")
         if stamp is not None:
             topic.stamps[-1].append(stamp)
             topic.frames[frame] += 1
@@ -503,7 +484,7 @@ def _find_faults(found: Inspection, apart: bool, slack: float) -> None:
     complete = poses is None or found.complete or poses.count == 1
     found.faults += _reference_faults(reference, complete)
     if scans is not None and any(scans.stamps) and (found.complete or len(reference) > 1):
-        found.faults += _overlap_faults(reference, _scan_span(scans), slack)
+        found.faults += _overlap_faults(reference, scans.times, slack)
 
 
 def _topic_faults(topic: Topic, of: str, complete: bool, apart: bool) -> Iterator[Fault]:
@@ -517,7 +498,7 @@ def _topic_faults(topic: Topic, of: str, complete: bool, apart: bool) -> Iterato
     if of and topic.count and not topic.n_read and not complete:
         what = "are not in the sample, `--deep` reads them"
         yield Fault(f"{topic.name}: its {topic.count} messages {what}", of)
-    if any(topic.stamps) and not apart:
+    if topic.stamped and any(topic.stamps) and not apart:
         faults = [*_stamp_faults(topic, of)]
         yield from faults
         sampled = not complete and sum(map(len, topic.stamps)) < topic.count
@@ -553,9 +534,6 @@ def _stamp_faults(topic: Topic, of: str) -> Iterator[Fault]:
             lost = np.count_nonzero(topic.steps > 3.5 * usual)
             what = f"{lost} gaps, the longest of {gap:.2f} s{_GAPS.get(of, '')}"
             yield Fault(f"{name}: {what}", of)
-    if leaps := np.count_nonzero(np.abs(topic.late) > 5.0):
-        what = f"{leaps} stamps leap by more than 5 s against the recorder's clock"
-        yield Fault(f"{name}: {what}{left_out}", of)
 
 
 def _count_faults(topic: Topic, of: str, sampled: bool) -> Iterator[Fault]:
@@ -630,9 +608,12 @@ def _reference_faults(reference: Trajectory, complete: bool, timed: bool = True)
         yield Fault(reference.sparse or what, of)
 
 
-def _overlap_faults(reference: Trajectory, scans: tuple[int, int], slack: float) -> Iterator[Fault]:
+def _overlap_faults(
+    reference: Trajectory, stamps: NDArray[np.int64], slack: float
+) -> Iterator[Fault]:
     """Scans outside the reference; both may go on for `slack` seconds beyond what was read."""
     begin, end = int(reference.stamps[0]), int(reference.stamps[-1])
+    scans = int(stamps.min()), int(stamps.max())
     times = [f"{stamp * 1e-9:.3f}" for stamp in (begin, end, *scans)]
     spans = f"covers {times[0]} to {times[1]} s, the scans cover {times[2]} to {times[3]} s"
     if (max(begin, scans[0]) - min(end, scans[1])) * 1e-9 > slack:
@@ -646,14 +627,6 @@ def _overlap_faults(reference: Trajectory, scans: tuple[int, int], slack: float)
     lost = sum(s for s in outside if s > slack + 1.0)
     if lost > 0.05 * seconds:
         yield Fault(f"the reference {spans}: the scans outside get no label", "reference")
-
-
-def _scan_span(topic: Topic) -> tuple[int, int]:
-    """First and last stamp of the scans that were read, without those that leap."""
-    stamps, usual = topic.times, np.abs(topic.late) < 5.0
-    # Where half of them leap, who knows.
-    stamps = stamps[usual] if usual.any() else stamps
-    return int(stamps.min()), int(stamps.max())
 
 
 # Show an inspected recording on a terminal.
