@@ -20,7 +20,7 @@ from adaptune.recording import Scan, SequenceConfig, SequenceError
 from adaptune.recording.bag import IMU_TYPES, POINTS_TYPES, BagSource, IndexReader
 from adaptune.recording.clouds import FARTHEST, PATH, POSES, Pose, header_of, parse, usable
 from adaptune.recording.config import BAG_SUFFIXES, REFERENCE_FILES, bag_paths
-from adaptune.recording.recording import RecordedSequence, repeats
+from adaptune.recording.recording import RecordedSequence
 from adaptune.recording.scan import SOONEST, Reading, doubts
 from adaptune.trajectory import Trajectory, is_kitti, read_kitti, read_trajectory
 
@@ -96,8 +96,6 @@ class Inspection:
     fields: tuple[str, ...] = ()  # names of those of a point, in a PointCloud2
     valid: list[int] = field(default_factory=list)  # valid points of each cloud that was read
     readings: list[Reading] = field(default_factory=list)  # of each of them
-    repeated: int = 0  # how many of them hold the same points as the one before
-    last: Scan | None = None  # the newest of them
     reference: Trajectory | None = None  # as far as it was read
     faults: list[Fault] = field(default_factory=list)
 
@@ -227,8 +225,7 @@ def _keep_scan(found: Inspection, scan: Scan) -> None:
     with np.errstate(over="ignore"):
         found.valid.append(geometry.count_within(scan.points, 0.0, FARTHEST))
     found.readings.append(scan.reading)
-    found.repeated += found.last is not None and repeats(scan, found.last)
-    found.scan, found.last = found.scan or scan, scan
+    found.scan = found.scan or scan
 
 
 # Reading bags: a sample of their messages, or all of them.
@@ -573,11 +570,6 @@ def _content_faults(found: Inspection, topic: Topic) -> Iterator[Fault]:
         found.given["frame"] = frame
         many = " and ".join(f"{count} clouds of frame {named!r}" for named, count in frames)
         yield Fault(f"{name}: holds {many}: choose one, as in `frame: {frame}`", "points")
-    if found.repeated:
-        what = (
-            f"{found.repeated} of {len(found.valid)} clouds hold the same points as the one before"
-        )
-        yield Fault(f"{name}: {what}{_LEFT_OUT}", "points")
     steps = topic.steps[topic.steps * 1e9 >= SOONEST]
     for doubt in doubts(found.readings, float(np.median(steps)) if len(steps) else 0.0):
         yield Fault(f"{name}: {doubt.text}", doubt.of, doubt.lacks)
