@@ -51,9 +51,8 @@ def test_a_sound_bag_has_all_it_needs_and_an_entry_that_opens(tmp_path):
 @pytest.mark.parametrize(
     ("stamps", "poses", "expected"),
     [
-        ([0, 0.1, 0.1, 0.3], [], "/points: 1 of 4 stamps repeat the one before"),
-        ([0, 0.2, 0.1, 0.3], [], "/points: 1 of 4 stamps go back in time"),
-        ([0, 0, 0], [], "/points: all 3 stamps are the same"),
+        ([0, 0.2, 0.1, 0.3], [], "/points: 1 of 4 stamps do not come after the one before"),
+        ([0, 0, 0], [], "/points: 2 of 3 stamps do not come after the one before"),
         ([0, 0.1, 0.2, 2.3, 2.4], [], "/points: 1 gaps, the longest of 2.10 s"),
         ([0, 0.1], [(0, 0), (0.1, 500)], "the reference jumps 1 times"),
         ([0, 0.1], [(0, 0), (5, 1)], "1 of 1 gaps of the reference are longer than max_gap = 1 s"),
@@ -100,17 +99,16 @@ def test_messages_that_do_not_decode_are_reported(tmp_path):
     assert len(list(open_sequence(config.model_copy(update={"stop": 0.3})))) == 3
 
 
-def drive_of(path, span=0.1, begin=0.0, kind="<f4", later=(), names=("lidar",)):
+def drive_of(path, span=0.1, begin=0.0, kind="<f4", names=("lidar",)):
     """Ten scans whose times begin at `begin`."""
     messages = []
     for i, first in enumerate(np.broadcast_to(begin, 10)):
         raw = np.zeros(200, [*((name, "<f4") for name in "xyz"), ("time", kind)])
         raw["x"], raw["y"], raw["z"] = np.random.default_rng(i).normal(0, 10, (3, 200))
         raw["time"] = first + np.linspace(0, span, 200)
-        for after in (0, *later):
-            stamp = START + i * 10**8 + after
-            header = rec.header(stamp, names[i % len(names)], STORE)
-            messages.append(("/points", stamp, rec.cloud(raw, stamp, STORE, header=header)))
+        stamp = START + i * 10**8
+        header = rec.header(stamp, names[i % len(names)], STORE)
+        messages.append(("/points", stamp, rec.cloud(raw, stamp, STORE, header=header)))
     return write(path, messages)
 
 
@@ -128,7 +126,6 @@ def drive_of(path, span=0.1, begin=0.0, kind="<f4", later=(), names=("lidar",)):
         ({"span": 0.0}, "the same time", "motion compensation", 0),
         ({"span": 0.0}, "the same time", "online", 10),
         ({"begin": 0.3}, "write `stamp: first_point`", "online", 0),
-        ({"later": [1000]}, "10 of 20 stamps come less than 1 ms after", "online", 10),
         ({"names": ("a", "b")}, "5 clouds of frame 'a' and 5 clouds of frame 'b'", "online", 5),
     ],
 )
@@ -343,7 +340,7 @@ def test_deep_reads_all_and_shows_how_far_it_is(tmp_path):
         ({"offset": 100.0}, "set `clock_offset`"),
         ({"cloud": lambda when: bad_cloud(when, "NaN")}, "clouds hold fewer than 20"),
         ({"cloud": lambda when: bad_cloud(when, "cut")}, "messages do not decode"),
-        ({"cloud": lambda _: cloud(START)}, "stamps are the same"),
+        ({"cloud": lambda _: cloud(START)}, "stamps do not come after"),
         ({"stamps": TENTHS[:100] + TENTHS[300:]}, "/points: about 200 of 400 messages are missing"),
         ({"stamps": TENTHS[:203] + TENTHS[209:]}, "/points: about 6 of 400 messages are missing"),
     ],
