@@ -1,6 +1,5 @@
 """Inspect a recording: what it holds, what is odd about it, and how to name it in a study."""
 
-from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -57,7 +56,6 @@ class Topic:
     # list for every part of a sample.
     stamps: list[list[int]] = field(default_factory=list)
     undecoded: list[tuple[float, str]] = field(default_factory=list)  # seconds, and why
-    frames: Counter[str] = field(default_factory=Counter)  # messages of each frame of reference
 
     @property
     def times(self) -> NDArray[np.int64]:
@@ -393,10 +391,9 @@ class _Survey:
     def _take(self, topic: Topic, when: int, data: bytes) -> None:
         """Keep when a message was made and recorded, and decode it where it is used."""
         topic.n_read += 1
-        stamp, frame = header_of(data, self._reader.is2) if topic.stamped else (when, "")
+        stamp = header_of(data, self._reader.is2)[0] if topic.stamped else when
         if stamp is not None:
             topic.stamps[-1].append(stamp)
-            topic.frames[frame] += 1
         if topic.type == PATH and topic.name in self._of:
             self._path = data  # each path repeats the one before: the last one will do
         else:
@@ -473,7 +470,7 @@ def _find_faults(found: Inspection, apart: bool, slack: float) -> None:
         found.faults += _topic_faults(topic, of.get(topic.name, ""), found.complete, apart)
     scans = found.topics.get(found.used.get("points", ""))
     if scans is not None:
-        found.faults += [*_cloud_faults(scans, found.valid), *_content_faults(found, scans)]
+        found.faults += [*_cloud_faults(scans, found.valid), *_time_faults(found, scans)]
     if (reference := found.reference) is None:
         return
     poses = found.topics.get(found.used.get("reference", ""))
@@ -547,17 +544,11 @@ def _cloud_faults(topic: Topic, valid: list[int]) -> Iterator[Fault]:
         yield Fault(f"{name}: {few} of {n} clouds hold {rule}{_GAPS['points']}", "points")
 
 
-def _content_faults(found: Inspection, topic: Topic) -> Iterator[Fault]:
-    """Faults of what clouds hold: their frames, their points and the times of these."""
-    name = topic.name
-    if len(topic.frames) > 1:
-        ((frame, _), *_) = frames = topic.frames.most_common()
-        found.given["frame"] = frame
-        many = " and ".join(f"{count} clouds of frame {named!r}" for named, count in frames)
-        yield Fault(f"{name}: holds {many}: choose one, as in `frame: {frame}`", "points")
+def _time_faults(found: Inspection, topic: Topic) -> Iterator[Fault]:
+    """Faults of the times of the points."""
     steps = topic.steps[topic.steps * 1e9 >= SOONEST]
     for doubt in doubts(found.readings, float(np.median(steps)) if len(steps) else 0.0):
-        yield Fault(f"{name}: {doubt.text}", doubt.of, doubt.lacks)
+        yield Fault(f"{topic.name}: {doubt.text}", doubt.of, doubt.lacks)
 
 
 def _reference_faults(reference: Trajectory, complete: bool, timed: bool = True) -> Iterator[Fault]:
