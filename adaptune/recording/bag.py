@@ -329,22 +329,9 @@ class BagSource:
 
     def loader(self, reader: AnyReader) -> Callable[[bytes, str], Scan]:
         """What decodes a message of the point clouds; its name goes into the SequenceError."""
-        kind, definitions = self.topics[self.points], reader.typestore.fielddefs
-        livox = kind in clouds.LIVOX_TYPES
-        point = kind.replace("Msg", "Point") if livox else "sensor_msgs/msg/PointField"
-        self._check_standard(definitions, ("std_msgs/msg/Header", point, kind), reader.is2)
+        livox = self.topics[self.points] in clouds.LIVOX_TYPES
         decode = clouds.decode_livox if livox else clouds.decode_cloud
         return partial(_load, partial(decode, cdr=reader.is2, timing=self.timing))
-
-    def _check_standard(self, definitions: Any, names: Iterable[str], cdr: bool) -> None:
-        """Make sure that messages are laid out as they are decoded."""
-        standard = _typestore().fielddefs
-        for name in names:
-            _, found = definitions.get(name, ((), ()))
-            fields = [field for field in found if cdr or field[0] != "seq"]
-            if fields != standard[name][1]:
-                given = ", ".join(field for field, _ in fields)
-                raise SequenceError(f"{self.name}: its {name} is not as ROS defines it ({given})")
 
 
 def _load(decode: Callable[[bytes], Scan], data: bytes, what: str) -> Scan:

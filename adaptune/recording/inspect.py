@@ -317,11 +317,7 @@ class _Survey:
         self._usual = found.n_messages if points is None else points.count
         self._of = {name: of for of, name in found.used.items()}
         if points is not None:
-            try:
-                self._load = source.loader(reader)
-            except SequenceError as error:
-                del self._of[source.points]
-                found.faults.append(Fault(str(error), "points", "point clouds that can be read"))
+            self._load = source.loader(reader)
         self._poses: list[Pose] = []
         self._path = b""
         self.slack = 0.0  # seconds between two parts of the sample
