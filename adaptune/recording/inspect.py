@@ -488,11 +488,9 @@ def _topic_faults(topic: Topic, of: str, complete: bool, apart: bool) -> Iterato
         what = "are not in the sample, `--deep` reads them"
         yield Fault(f"{topic.name}: its {topic.count} messages {what}", of)
     if topic.stamped and any(topic.stamps) and not apart:
-        faults = [*_stamp_faults(topic, of)]
-        yield from faults
-        sampled = not complete and sum(map(len, topic.stamps)) < topic.count
-        if sampled or not faults:
-            yield from _count_faults(topic, of, sampled)
+        yield from _stamp_faults(topic, of)
+        if not complete and sum(map(len, topic.stamps)) < topic.count:
+            yield from _count_faults(topic, of)
 
 
 def _stamp_faults(topic: Topic, of: str) -> Iterator[Fault]:
@@ -511,8 +509,8 @@ def _stamp_faults(topic: Topic, of: str) -> Iterator[Fault]:
             yield Fault(f"{name}: {what}", of)
 
 
-def _count_faults(topic: Topic, of: str, sampled: bool) -> Iterator[Fault]:
-    """Messages that are missing, by their number in the whole recording."""
+def _count_faults(topic: Topic, of: str) -> Iterator[Fault]:
+    """Messages that are missing between the parts of a sample, by their number in the whole."""
     usual = np.median(topic.steps) if len(topic.steps) else np.inf
     steps = topic.steps[np.abs(topic.steps - usual) < 0.2 * usual]
     # Only what comes regularly has a number to expect.
@@ -522,8 +520,7 @@ def _count_faults(topic: Topic, of: str, sampled: bool) -> Iterator[Fault]:
     doubt = max(_MISSED, 3.0 * float(steps.std() / steps.mean()) / len(steps) ** 0.5)
     if topic.count < (1.0 - doubt) * expected:
         what = f"about {expected - topic.count:,} of {expected:,} messages are missing"
-        help_ = ": `--deep` looks for the gaps" if sampled else ", one or a few at a time"
-        yield Fault(f"{topic.name}: {what}{help_}", of)
+        yield Fault(f"{topic.name}: {what}: `--deep` looks for the gaps", of)
 
 
 def _cloud_faults(topic: Topic, valid: list[int]) -> Iterator[Fault]:
