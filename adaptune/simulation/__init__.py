@@ -1,6 +1,6 @@
 """Simulated worlds, where the truth is known."""
 
-from adaptune.simulation.course import MOTIONS, SENSORS, Course, SceneLeg, SimulationError
+from adaptune.simulation.course import MOTIONS, SENSORS, Course, SimulationError
 from adaptune.simulation.scenes import SCENES
 
-__all__ = ["MOTIONS", "SCENES", "SENSORS", "Course", "SceneLeg", "SimulationError"]
+__all__ = ["MOTIONS", "SCENES", "SENSORS", "Course", "SimulationError"]

@@ -130,28 +130,20 @@ class SimulationError(AdaptuneError):
 
 
 def _known(kind: str, names: Collection[str]) -> AfterValidator:
-    def check(name: Any) -> Any:
-        if isinstance(name, str) and name not in names:
+    def check(name: str) -> str:
+        if name not in names:
             raise ValueError(f"there is no {kind} {name!r}; choose from {', '.join(sorted(names))}")
         return name
 
     return AfterValidator(check)
 
 
-class SceneLeg(StrictModel):
-    """One scene of a course."""
-
-    scene: Annotated[str, _known("scene", SCENES)]
-    # Metres driven in it; the course's `length` if not given.
-    length: Annotated[float, Field(ge=10.0, le=LONGEST)] | None = None
-
-
 class Course(StrictModel):
     """A simulated recording: its scenes, its sensor and its motion."""
 
-    # Scenes in driving order, by name or with a length of their own.
-    scenes: tuple[Annotated[str | SceneLeg, _known("scene", SCENES)], ...] = Field(min_length=1)
-    # Metres driven in every scene that has no length of its own.
+    # Scenes in driving order.
+    scenes: tuple[Annotated[str, _known("scene", SCENES)], ...] = Field(min_length=1)
+    # Metres driven in every scene; twice as many where it is named twice.
     length: float = Field(default=60.0, ge=10.0, le=LONGEST)
     sensor: Annotated[str, _known("sensor", SENSORS)] = "hdl32e"
     motion: Annotated[str, _known("motion", MOTIONS)] = "robot"
@@ -177,15 +169,14 @@ class Course(StrictModel):
         if rate < least:
             what = f"a {self.motion} moves too fast for {rate:g} scans a second"
             raise ValueError(f"{what}: it needs at least {least:g}")
-        if sum(length for _, length in self.legs) > LONGEST:
+        if self.length * len(self.scenes) > LONGEST:
             raise ValueError(f"a course is at most {LONGEST:g} m long")
         return self
 
     @property
     def legs(self) -> list[tuple[str, float]]:
         """Name and metres of each scene in driving order."""
-        legs = [SceneLeg(scene=s) if isinstance(s, str) else s for s in self.scenes]
-        return [(leg.scene, self.length if leg.length is None else leg.length) for leg in legs]
+        return [(scene, self.length) for scene in self.scenes]
 
     @property
     def turns(self) -> float:

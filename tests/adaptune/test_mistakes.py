@@ -41,8 +41,8 @@ FOREIGN = re.compile(r"pydantic|https://|Input should|validation|Value error|tup
             "sequences.one.extrinsic: its last row is not 0 0 0 1; is it transposed?",
         ),
         (
-            "courses.x={scenes: [{scene: cave, lenght: 3}]}",
-            "courses.x.scenes.0.lenght: unknown key; did you mean 'length'?",
+            "courses.x={scenes: [cave], lenght: 3}",
+            "courses.x.lenght: unknown key; did you mean 'length'?",
         ),
         ("training=[]", "training: give at least 1, not 0"),
         ("health.max_speed=.nan", "health.max_speed: give a finite number, not NaN"),

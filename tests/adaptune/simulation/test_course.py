@@ -22,15 +22,6 @@ def test_bad_input_is_told(given, says):
         Course.model_validate(given)
 
 
-def test_legs_take_the_courses_length_unless_they_have_their_own():
-    course = Course.model_validate(
-        {"scenes": ["cave", {"scene": "street", "length": 25.0}, {"scene": "open"}], "length": 40.0}
-    )
-    assert course.legs == [("cave", 40.0), ("street", 25.0), ("open", 40.0)]
-    assert course.turns == 10.0
-    assert Course(scenes=("cave",), rate=20.0).turns == 20.0
-
-
 @pytest.mark.parametrize(
     ("name", "rings", "first", "second", "last"),
     [

@@ -6,7 +6,7 @@ import pytest
 from adaptune import files
 from adaptune.metrics import sub_trajectory_rte
 from adaptune.odometry.registry import odometry_class
-from adaptune.simulation import SCENES, SENSORS, Course, SceneLeg
+from adaptune.simulation import SCENES, SENSORS, Course
 from adaptune.simulation.mesh import fractal
 from adaptune.simulation.record import EPOCH, Drive, simulate
 from adaptune.simulation.world import World
@@ -95,8 +95,7 @@ def test_a_robot_can_drive_through_every_scene_into_every_other(seed):
         for _ in range(len(names)):
             i = (i + step) % len(names)
             order.append(names[i])
-    legs = tuple(SceneLeg(scene=name, length=15.0) for name in order)
-    drive = Drive(Course(scenes=legs, seed=seed))
+    drive = Drive(Course(scenes=tuple(order), length=15.0, seed=seed))
     to_surface = surface(drive, drive.road.length / 2.0, drive.road.length)
     t = np.arange(0.0, drive.ride.duration, 0.1)
     T = drive.ride.poses(t)
