@@ -123,40 +123,7 @@ Transform = Annotated[_Numbers | tuple[_Numbers, ...], BeforeValidator(_pose)]
 """A pose as seven numbers, or as the rows of a matrix."""
 
 
-class _Part(StrictModel):
-    """Seconds since the first scan."""
-
-    start: float = Field(0.0, ge=0, le=1e9)
-    stop: float | None = Field(None, gt=0, le=1e9)
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        if self.stop is not None and self.stop <= self.start:
-            raise ValueError(f"start ({self.start:g}) must be less than stop ({self.stop:g})")
-        return self
-
-
 _Seconds = Annotated[float, Field(ge=0, le=1e9)]
-
-
-class DropConfig(_Part):
-    """The share of the scans from `start` to `stop` that is lost."""
-
-    share: float = Field(gt=0, lt=1)
-    seed: int = Field(0, ge=0, lt=2**32)
-
-
-class SpeedConfig(_Part):
-    """How many times faster the scans from `start` to `stop` arrive."""
-
-    factor: float = Field(ge=1e-3, le=1e3)
-
-
-class NoiseConfig(StrictModel):
-    """Metres by which points are moved along their rays."""
-
-    sigma: float = Field(gt=0, le=1e3)
-    seed: int = Field(0, ge=0, lt=2**32)
 
 
 class ViewConfig(StrictModel):
@@ -164,10 +131,10 @@ class ViewConfig(StrictModel):
 
     # Only these parts, in seconds since the first scan.
     cut: tuple[tuple[_Seconds, _Seconds], ...] | None = Field(None, min_length=1, max_length=1000)
-    drop: DropConfig | None = None
-    speed: SpeedConfig | None = None
+    drop: float | None = Field(None, gt=0, lt=1)  # share of the scans that is lost
+    speed: float | None = Field(None, ge=1e-3, le=1e3)  # how many times faster scans arrive
     reverse: Literal[True] | None = None
-    noise: NoiseConfig | None = None
+    noise: float | None = Field(None, gt=0, le=1e3)  # metres by which points move on their rays
     transform: Transform | None = None  # pose of the LiDAR in the frame from which to see it
 
     @model_validator(mode="after")
@@ -217,9 +184,12 @@ class ImuConfig(StrictModel):
         return replace(imu, acceleration=acceleration, T_sensor_imu=T, noise=noise)
 
 
-class SequenceConfig(_Part):
+class SequenceConfig(StrictModel):
     """A recording, from one of `bag`, `kitti` and `folder`, and what of it to use."""
 
+    # Seconds since the first scan.
+    start: _Seconds = 0.0
+    stop: _Seconds | None = None
     # Bags that follow each other: files, ROS 2 folders, folders of bags, patterns.
     bag: Annotated[str | tuple[str, ...] | None, BeforeValidator(_resolve_bags)] = None
     # Folder of a KITTI odometry sequence.
@@ -258,6 +228,8 @@ class SequenceConfig(_Part):
         if len(given) != 1:
             found = " and ".join(given) or "none"
             raise ValueError(f"give one of {', '.join(_SOURCES)}, not {found}")
+        if self.stop is not None and self.stop <= self.start:
+            raise ValueError(f"start ({self.start:g}) must be less than stop ({self.stop:g})")
         for key in ("points", "frame"):
             if getattr(self, key) is not None and given[0] != "bag":
                 raise ValueError(f"`{key}` is for a bag; {given[0]} has none")

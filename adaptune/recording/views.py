@@ -1,7 +1,7 @@
 """Views of a sequence: parts, losses, speeds and disturbances, without a copy of its clouds.
 
-A view changes a scan depending on the scan and the view's seed alone. The same scans are lost and
-the same noise is added in every process, in either direction, whatever was cut before.
+A view changes a scan depending on the scan alone. The same scans are lost and the same noise is
+added in every process, in either direction, whatever was cut before.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from adaptune import geometry
 from adaptune.recording.compensation import compensate_neighbours
-from adaptune.recording.config import DropConfig, NoiseConfig, SpeedConfig
 from adaptune.recording.scan import Imu, Recording, Scan, SequenceError
 from adaptune.trajectory import Trajectory
 
@@ -123,38 +122,24 @@ def with_imu(sequence: Recording) -> View:
     return View(sequence, carrying)
 
 
-def _is_within(sequence: Recording) -> Callable[[Scan, float, float | None], bool]:
-    """Whether a scan is in [start, stop) seconds since the first one, to the end if None."""
-    first = once(lambda: next(iter(sequence)).stamp)
-
-    def within(scan: Scan, start: float, stop: float | None) -> bool:
-        seconds = (scan.stamp - first()) * 1e-9
-        return seconds >= start and (stop is None or seconds < stop)
-
-    return within
-
-
 def _cut(sequence: Recording, parts: Sequence[tuple[float, float]]) -> View:
     """Only these parts of it; stamps stay as they are."""
-    within = _is_within(sequence)
-    return View(
-        sequence, lambda scans: (s for s in scans if any(within(s, *part) for part in parts))
-    )
+    first = once(lambda: next(iter(sequence)).stamp)
+
+    def kept(scan: Scan) -> bool:
+        seconds = (scan.stamp - first()) * 1e-9
+        return any(start <= seconds < stop for start, stop in parts)
+
+    return View(sequence, partial(filter, kept))
 
 
-def _drop(sequence: Recording, given: DropConfig) -> View:
-    """Lose a share of the scans of a part, each at random by itself."""
-    within = _is_within(sequence)
-
-    def lost(scan: Scan) -> bool:
-        chance = within(scan, given.start, given.stop)
-        return chance and _rng(given.seed, scan).random() < given.share
-
-    return View(sequence, lambda scans: (scan for scan in scans if not lost(scan)))
+def _drop(sequence: Recording, share: float) -> View:
+    """Lose a share of the scans, each at random by itself."""
+    return View(sequence, partial(filter, lambda scan: _rng(scan).random() >= share))
 
 
-def _speed(sequence: Recording, given: SpeedConfig) -> View:
-    """A part of it arrives `given.factor` times faster.
+def _speed(sequence: Recording, factor: float) -> View:
+    """Arrive so many times faster.
 
     Scans, stamps and poses stay the same. Only `played_at` changes, for odometries that run
     against the clock.
@@ -162,23 +147,18 @@ def _speed(sequence: Recording, given: SpeedConfig) -> View:
     first = once(lambda: next(iter(sequence)).stamp)
 
     def arrival(stamps: NDArray[np.int64]) -> NDArray[np.int64]:
-        start = first() + round(given.start * 1e9)
-        # Later than any stamp, and small enough to subtract from.
-        stop = 2**62 if given.stop is None else first() + round(given.stop * 1e9)
-        stamps = sequence.played_at(stamps)
-        inside = np.clip(stamps, start, stop) - start
-        saved: NDArray[np.int64] = np.rint(inside * (1.0 - 1.0 / given.factor)).astype(np.int64)
-        return stamps - saved
+        since = sequence.played_at(stamps) - first()
+        return np.asarray(first() + np.rint(since / factor).astype(np.int64))
 
     return View(sequence, clock=arrival)
 
 
-def _noise(sequence: Recording, given: NoiseConfig) -> View:
+def _noise(sequence: Recording, sigma: float) -> View:
     """Move every point along its ray by a normal error."""
 
     def disturb(scan: Scan) -> Scan:
         ranges = np.linalg.norm(scan.points, axis=1)
-        error = _rng(given.seed, scan).normal(0.0, given.sigma, len(scan)).astype(np.float32)
+        error = _rng(scan).normal(0.0, sigma, len(scan)).astype(np.float32)
         # A point does not come out behind the sensor.
         scale = np.maximum(1.0 + error / ranges, 1e-3)
         return replace(scan, points=scan.points * scale[:, None])
@@ -243,5 +223,5 @@ VIEWS: dict[str, Callable[[Recording, Any], View]] = {
 """By the names of a study's views, each with its settings."""
 
 
-def _rng(seed: int, scan: Scan) -> np.random.Generator:
-    return np.random.default_rng([seed, scan.stamp % 2**64])
+def _rng(scan: Scan) -> np.random.Generator:
+    return np.random.default_rng([0, scan.stamp % 2**64])

@@ -116,7 +116,7 @@ def test_a_task_that_kills_every_worker_is_told(study_file, tmp_path, monkeypatc
 
 def test_views_are_trained_on_beside_their_origin(gicp_study_file, tmp_path):
     overrides = [
-        "offline.augment=[{noise: {sigma: 0.02}}, {reverse: true}, {noise: {sigma: 0.1}}]",
+        "offline.augment=[{noise: 0.02}, {reverse: true}, {noise: 0.1}]",
         "offline.trials=2",
         "training=[one]",
     ]
