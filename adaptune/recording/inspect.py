@@ -308,10 +308,6 @@ class _Survey:
         self._source, self._reader, self._found = source, reader, found
         self._begin = reader.start_time
         self._length = reader.end_time - reader.start_time
-        # Whether a part can be read without what is before it: not in mcap files without chunks.
-        storages = [getattr(r, "storage", None) for r in reader.readers]
-        opened = [file for s in storages for file in getattr(s, "storages", [s])]
-        self._indexed = all(getattr(file, "chunks", True) for file in opened)
         # Number of clouds; where there are none, of messages.
         points = found.topics.get(source.points)
         self._usual = found.n_messages if points is None else points.count
@@ -323,7 +319,15 @@ class _Survey:
         self.slack = 0.0  # seconds between two parts of the sample
 
     def n_parts(self) -> int:
-        """Parts of a sample; 0 if the recording is short enough to be read completely."""
+        """Parts of a sample; 0 if the recording is to be read completely.
+
+        It is if it is short, or a part cannot be read without what is before it: in mcap files
+        without chunks.
+        """
+        storages = [getattr(r, "storage", None) for r in self._reader.readers]
+        opened = [file for s in storages for file in getattr(s, "storages", [s])]
+        if not all(getattr(file, "chunks", True) for file in opened):
+            return 0
         size = sum(path.stat().st_size for path in self._source.files)
         try:
             readers = self._reader.readers
@@ -342,8 +346,6 @@ class _Survey:
         """Parts of the recording in which a topic of so many messages has some each."""
         if not number or number * _EACH >= count:
             return [(None, None)]
-        if not self._indexed:
-            return [(self._begin, self._begin + round(self._length * number * _EACH / count))]
         width = _EACH / count
         starts = self._begin + np.linspace(0.0, (1.0 - width) * self._length, number).astype(int)
         return [(start, start + round(width * self._length) + 1) for start in starts.tolist()]
@@ -354,8 +356,7 @@ class _Survey:
         spans = self._spans(number, self._usual)
         found.complete = spans == [(None, None)]
         if not found.complete:
-            gaps = len(spans) - 1
-            self.slack = self._length * 1e-9 / gaps if gaps else np.inf
+            self.slack = self._length * 1e-9 / (len(spans) - 1)
         # What comes more rarely than the clouds has parts of its own.
         rare = [t for t in self._of if found.topics[t].count < self._usual and not found.complete]
         jobs: list[tuple[str | None, Span]] = [(None, span) for span in spans]
@@ -365,9 +366,9 @@ class _Survey:
             for topic in chosen:
                 found.topics[topic].stamps.append([])
             try:
-                for at, when, data in self._messages(name, span):
-                    if at in chosen:
-                        self._take(found.topics[at], when, data)
+                for connection, when, data in self._source.read(self._reader, name, span):
+                    if connection.topic in chosen:
+                        self._take(found.topics[connection.topic], when, data)
                     done += 1
                     if done % 100 == 0:
                         show("reading", done, found.n_messages)
@@ -376,13 +377,6 @@ class _Survey:
                 if fault not in found.faults:
                     found.faults.append(fault)
         show("reading", found.n_messages, found.n_messages)
-
-    def _messages(self, topic: str | None, span: Span) -> Iterator[tuple[str, int, bytes]]:
-        asked: Span = span if self._indexed else (None, None)
-        for connection, when, data in self._source.read(self._reader, topic, asked):
-            if span[1] is not None and when >= span[1]:
-                return
-            yield connection.topic, when, data
 
     def _take(self, topic: Topic, when: int, data: bytes) -> None:
         """Keep when a message was made and recorded, and decode it where it is used."""

@@ -1,5 +1,4 @@
 import runpy
-import struct
 from pathlib import Path
 
 import fuzz
@@ -364,42 +363,6 @@ def test_bags_of_every_format_are_sampled(tmp_path):
         assert points.rate == pytest.approx(10)
         assert inspection.missing["online"] == ()
         assert len(list(open_sequence(*entry(inspection).values()))) == 60
-
-
-def without_chunks(path, clouds):
-    """An mcap file as `ros2 bag record --storage-preset-profile fastwrite` leaves it."""
-    store, rng = rec.ROS2, np.random.default_rng(0)
-    definition, _ = store.generate_msgdef(fuzz.CLOUD, ros_version=2)
-
-    def text(given):
-        return struct.pack("<I", len(given)) + given.encode()
-
-    def record(op, *parts):
-        body = b"".join(parts)
-        return struct.pack("<BQ", op, len(body)) + body
-
-    schema = (struct.pack("<H", 1), text(fuzz.CLOUD), text("ros2msg"), text(definition))
-    channel = (struct.pack("<HH", 1, 1), text("/points"), text("cdr"), bytes(4))
-    parts = [record(1, text("ros2"), text("")), record(3, *schema), record(4, *channel)]
-    for i in range(clouds):
-        t = START + i * 10**8
-        data = store.serialize_cdr(fuzz.message(store, "plain", t, rng), fuzz.CLOUD)
-        parts.append(record(5, struct.pack("<HIQQ", 1, i, t, t), bytes(data)))
-    magic = b"\x89MCAP0\r\n"
-    path.write_bytes(magic + b"".join(parts) + record(2, bytes(20)) + magic)
-    return path
-
-
-@pytest.mark.usefixtures("sampled")
-def test_the_sample_of_an_mcap_file_without_chunks_is_its_beginning(tmp_path):
-    bag = without_chunks(tmp_path / "a.mcap", 200)
-    inspection = inspect(bag)
-    assert inspection.n_read == (13, 13)
-    (topic,) = inspection.topics.values()
-    assert topic.count == 200
-    assert topic.times.tolist() == [START + i * 10**8 for i in range(13)]
-    assert texts(inspection) == []
-    assert inspect(bag, deep=True).n_read == (200, 200)
 
 
 @pytest.mark.parametrize("name", ["a.bag", "a.mcap"])
