@@ -1,15 +1,13 @@
-"""The time that adapters add to their odometries, and what becomes of faults.
+"""The time that adapters add to their odometries.
 
     python benchmarks/odometry.py adapters RECORDING.bag [METRES]
-    python benchmarks/odometry.py faults
 
 The recording is that of a simulated course, as `adaptune simulate` writes it, or another one with
 the same topics. *adapters* runs every installed odometry with its default parameters. It prints the
 time for a scan, the part of it that is not spent in the odometry's own code, and the time that a
 process of its own adds. Limit: 5 % of the odometry's time, or 0.3 ms where that is more.
 The RTE is over 25 m, or the given METRES.
-All times are CPU time on one core, medians, so that other work on the machine counts less. *faults*
-plants each kind of fault at the fourth scan.
+All times are CPU time on one core, medians, so that other work on the machine counts less.
 """
 
 import sys
@@ -156,31 +154,9 @@ def adapters(path: Path, length: float) -> None:
         )
 
 
-def faults() -> None:
-    """Print the message of every kind of fault, and whether the odometry went on."""
-    sys.path.insert(0, str(Path(__file__).parent.parent / "tests" / "support"))
-    import faulty
-
-    for fault in faulty.FAULTS:
-        settings = faulty.Settings(fault=fault)
-        odometry = Isolated("faulty:Faulty", {}, settings, Limits(seconds=1.0, memory=1.0))
-        scans = [Scan(i * 10**8, np.zeros((5, 3), np.float32)) for i in range(6)]
-        odometry.start(scans[0], np.eye(4))
-        lost = [i for i in range(1, 6) if np.isnan(odometry.register(scans[i]).T_odom_sensor).any()]
-        odometry.start(scans[5], np.eye(4))
-        again = fault == "shape" or np.isfinite(odometry.register(scans[5]).T_odom_sensor).all()
-        print(
-            f"{fault:20} lost from scan {lost[0]}, {'goes' if again else 'does not go'} on: ",
-            end="",
-        )
-        print(odometry.faults[0])
-
-
 if __name__ == "__main__":
     processes.pin(1)
     if len(sys.argv) in (3, 4) and sys.argv[1] == "adapters":
         adapters(Path(sys.argv[2]), float(sys.argv[3]) if len(sys.argv) == 4 else LENGTH)
-    elif sys.argv[1:] == ["faults"]:
-        faults()
     else:
         sys.exit(__doc__)
