@@ -40,10 +40,10 @@ def test_a_bank_has_a_budget(study_file, monkeypatch):
 
 
 def test_an_odometry_that_needs_an_imu(study_file):
-    needy = ["odometry.name=inertial:Inertial", "odometry.parameters=", "odometry.settings={}"]
+    needy = ["odometry.name=faulty:Inertial", "odometry.parameters=", "odometry.settings={}"]
     text = failure(study_file, *needy, "courses.sim={scenes: [garden]}")
-    assert "sequences.one: inertial:Inertial needs an IMU; name its topic" in text
-    assert "courses.sim: inertial:Inertial needs an IMU; simulate one, imu: 200" in text
+    assert "sequences.one: faulty:Inertial needs an IMU; name its topic" in text
+    assert "courses.sim: faulty:Inertial needs an IMU; simulate one, imu: 200" in text
 
 
 def test_reads_a_study(gicp_study_file, tmp_path):

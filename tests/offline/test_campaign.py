@@ -139,15 +139,15 @@ FEW = ["offline.trials=3", "offline.initial=3", "offline.workers=1"]
 def study_of(study_file, folder, *given, name="Stumbling", **settings):
     """The study with a stumbling odometry."""
     text = ", ".join(f"{name}: {value}" for name, value in settings.items())
-    odometry = f"odometry={{name: 'stumbling:{name}', settings: {{{text}}}}}"
+    odometry = f"odometry={{name: 'faulty:{name}', settings: {{{text}}}}}"
     return load_study(study_file, [odometry, *FEW, *given], folder)
 
 
 @pytest.mark.parametrize("name", ["Stumbling", "Apart"])
-@pytest.mark.parametrize("fault", ["constructor", "prepare", "start", "register", "nothing", "NaN"])
+@pytest.mark.parametrize("fault", ["init", "prepare", "start", "register", "nothing", "shape"])
 def test_a_baseline_that_fails_stops_the_campaign(study_file, tmp_path, name, fault):
     study = study_of(study_file, tmp_path / "study", name=name, fault=fault)
-    reason = {"nothing": "returned None", "NaN": "pose"}.get(fault, "no licence")
+    reason = {"nothing": "returned None", "shape": "pose"}.get(fault, "no planes")
     with pytest.raises(AdaptuneError, match=rf"sequences\.(one|two): .*baseline.*{reason}.*again"):
         train(study)
     assert not list(study.folder.rglob("*.npz"))
@@ -191,7 +191,7 @@ def test_an_odometry_that_contradicts_the_scans_is_told(
         assert not told
         return
     assert len(told) == 2
-    assert told[0].startswith("sequences.one, stumbling:Stumbling: the odometry's poses contradict")
+    assert told[0].startswith("sequences.one, faulty:Stumbling: the odometry's poses contradict")
     assert words in told[0]
 
 
@@ -210,8 +210,8 @@ def test_the_baseline_wins_where_trials_flatter(study_file, tmp_path):
 
 @pytest.mark.services
 def test_the_baseline_of_every_odometry_is_run_once(study_file, tmp_path, monkeypatch):
-    second = "{name: 'stumbling:Apart', label: apart, settings: {step: 0.31}}"
-    odometries = f"odometry=[{{name: 'stumbling:Stumbling'}}, {second}]"
+    second = "{name: 'faulty:Apart', label: apart, settings: {step: 0.31}}"
+    odometries = f"odometry=[{{name: 'faulty:Stumbling'}}, {second}]"
     study = load_study(study_file, [odometries], tmp_path / "study")
     archive = Archive(study.folder / "trials")
 
