@@ -1,8 +1,6 @@
 """The limits that keep files and functions small; ruff knows that of parameters."""
 
 import ast
-import subprocess
-from collections.abc import Iterable
 from pathlib import Path
 
 import pytest
@@ -13,55 +11,33 @@ SOURCES = (*PACKAGES, "benchmarks", "docker")
 MAX_FILE_LINES, MAX_FUNCTION_LINES = 800, 60
 
 
-def tracked(*folders: str) -> list[str]:
-    """Python files of folders: those that git tracks, or all outside a repository."""
-    listed = subprocess.run(
-        ["git", "ls-files", *(f"{folder}/*.py" for folder in folders)],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-    ).stdout.split()
-    found = listed or [
-        str(path.relative_to(ROOT)) for folder in folders for path in (ROOT / folder).rglob("*.py")
-    ]
-    # A file that was just removed is still in the index.
-    return sorted(file for file in found if (ROOT / file).exists())
-
-
-def breaches(file: str) -> list[str]:
-    """Functions of a source file that are beyond the limit."""
-    found = []
-    for function in ast.walk(ast.parse((ROOT / file).read_text("utf-8"), file)):
-        if isinstance(function, ast.FunctionDef | ast.AsyncFunctionDef):
-            n = (function.end_lineno or 0) - function.lineno + 1
-            if n > MAX_FUNCTION_LINES:
-                found.append(f"{file}:{function.lineno} {function.name}: {n} lines")
-    return found
-
-
-def report(breaches: Iterable[str]) -> None:
-    """Fail and list all breaches, if there are any."""
-    if text := "\n".join(breaches):
-        pytest.fail(text, pytrace=False)
+def nodes(folder, *kinds):
+    """What of these kinds is in the Python files of a folder, each with its place."""
+    for path in sorted((ROOT / folder).rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text("utf-8"), path)):
+            if isinstance(node, kinds):
+                yield f"{path.relative_to(ROOT)}:{getattr(node, 'lineno', 1)}", node
 
 
 @pytest.mark.parametrize("folder", [*SOURCES, "tests"])
-def test_files_are_short(folder: str) -> None:
-    lines = {file: (ROOT / file).read_text("utf-8").count("\n") for file in tracked(folder)}
-    report(f"{file}: {n} lines" for file, n in lines.items() if n > MAX_FILE_LINES)
+def test_files_are_short(folder):
+    lines = {path: path.read_text("utf-8").count("\n") for path in (ROOT / folder).rglob("*.py")}
+    assert [(str(path), n) for path, n in lines.items() if n > MAX_FILE_LINES] == []
 
 
 @pytest.mark.parametrize("folder", SOURCES)
-def test_functions_are_short(folder: str) -> None:
-    report(breach for file in tracked(folder) for breach in breaches(file))
+def test_functions_are_short(folder):
+    found = nodes(folder, ast.FunctionDef, ast.AsyncFunctionDef)
+    lengths = [(where, one.name, one.end_lineno - one.lineno + 1) for where, one in found]
+    assert [function for function in lengths if function[2] > MAX_FUNCTION_LINES] == []
 
 
-def test_tests_import_no_private_names_of_ours() -> None:
-    found = []
-    for file in tracked("tests"):
-        for node in ast.walk(ast.parse((ROOT / file).read_text("utf-8"), file)):
-            if isinstance(node, ast.ImportFrom) and str(node.module).split(".")[0] in PACKAGES:
-                names = [name.name for name in node.names if name.name.startswith("_")]
-                found += [f"{file}:{node.lineno} {node.module}.{name}" for name in names]
-    report(found)
+def test_tests_import_no_private_names_of_ours():
+    found = [
+        (where, name.name)
+        for where, node in nodes("tests", ast.ImportFrom)
+        if str(node.module).split(".")[0] in PACKAGES
+        for name in node.names
+        if name.name.startswith("_")
+    ]
+    assert found == []
