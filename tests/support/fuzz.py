@@ -27,7 +27,6 @@ from adaptune.recording.recording import open_sequence
 from offline.config import load_study
 
 SECONDS = 10
-START = 1_700_000_000_123_456_789
 CLOUD, LIVOX = "sensor_msgs/msg/PointCloud2", clouds.LIVOX_TYPES[0]
 # What a count or an offset is most wrong with.
 WORDS = (0, 1, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFE, 0xFFFFFFFF, 0x10000, 0x7FC00000, 0x7F800000)
@@ -50,17 +49,14 @@ _VALUE = re.compile(r"(?<=[:\[,{] )[^\s,\[\]{}]+|(?<=[\[{])[^\s,\[\]{}:]+(?=[,\]
 Decode = Callable[[bytes], Scan]
 
 
-def message(store: Any, kind: str, stamp: int, rng: np.random.Generator, n: int = 30) -> Any:
-    """A cloud, `plain` or of a `velodyne`, or a Livox message of `n` points."""
-    points = rng.normal(0, 10, (n, 3)).astype("<f4")
+def message(store: Any, kind: str, stamp: int, rng: np.random.Generator) -> Any:
+    """A cloud, `plain` or of a `velodyne`, or a Livox message of 30 points."""
+    points = rng.normal(0, 10, (30, 3)).astype("<f4")
     if kind == "velodyne":
         return rec.cloud(rec.velodyne(points), stamp, store)
     if kind == "plain":
         return rec.cloud(points.view([(axis, "<f4") for axis in "xyz"])[:, 0], stamp, store)
-    point = store.types[LIVOX.replace("Msg", "Point")]
-    each = [point(i * 1000, *map(float, p), 1, 2, i % 6) for i, p in enumerate(points)]
-    header = rec.header(stamp, store=store)
-    return store.types[LIVOX](header, stamp, n, 1, np.zeros(3, np.uint8), each)
+    return rec.livox(store, LIVOX, points, stamp)
 
 
 def samples() -> Iterator[tuple[bytes, Decode]]:

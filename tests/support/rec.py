@@ -69,14 +69,14 @@ def cloud(raw, stamp=START, store=ROS2, **changes):
     return store.types["sensor_msgs/msg/PointCloud2"](**(given | changes))
 
 
-def livox(store, kind, points):
+def livox(store, kind, points, stamp=START):
     """A message of Livox's driver, of one of the types that say the same."""
     t = store.types
     each = [
         t[kind.replace("Msg", "Point")](i * 1000, *map(float, p), 10, 16, i % 6)
         for i, p in enumerate(points)
     ]
-    return t[kind](header(START, "x", store), START, len(each), 1, np.zeros(3, np.uint8), each)
+    return t[kind](header(stamp, "x", store), stamp, len(each), 1, np.zeros(3, np.uint8), each)
 
 
 def pose(stamp, position, quaternion, store):

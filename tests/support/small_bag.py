@@ -10,10 +10,6 @@ STORE = rec.ROS1
 write = rec.write_bag
 
 
-def header(stamp):
-    return rec.header(stamp, store=STORE)
-
-
 def cloud(stamp, n=200):
     raw = np.zeros(n, [(name, "<f4") for name in ("x", "y", "z", "time")])
     raw["x"], raw["y"], raw["z"] = np.random.default_rng(stamp).normal(0, 10, (n, 3)).T
