@@ -4,7 +4,7 @@ import numpy as np
 
 from adaptune.odometry import InProcess, Odometry, Registration
 from adaptune.recording import Scan
-from adaptune.space import Float, ParameterSpace, Selection
+from adaptune.space import Float, ParameterSpace
 
 
 class Walker(Odometry):
@@ -39,25 +39,11 @@ def at(second):
     return Scan(round(second * 1e9), np.zeros((0, 3), np.float32))
 
 
-def selected(what):
-    """A selection of parameters, or of a trial."""
-    return Selection(0, what) if isinstance(what, dict) else Selection(what, {})
-
-
-def x_of(odometry, seconds, switches=()):
-    """Where an odometry is along x at every scan, with selections applied before some."""
-    switches = dict(switches)
-    x = []
-    for i, second in enumerate(seconds):
-        if second in switches:
-            odometry.apply(selected(switches[second]))
-        prepared = odometry.prepare(at(second))
-        if i == 0:
-            odometry.start(prepared, np.eye(4))
-            x.append(0.0)
-        else:
-            x.append(float(odometry.register(prepared).T_odom_sensor[0, 3]))
-    return x
+def x_of(odometry, seconds):
+    """Where an odometry that starts at the first scan is along x at every scan."""
+    first, *others = seconds
+    odometry.start(odometry.prepare(at(first)), np.eye(4))
+    return [0.0, *x_on(odometry, others)]
 
 
 def x_on(odometry, seconds):
@@ -72,13 +58,3 @@ def makes(scripts=None):
         return InProcess(made[-1])
 
     return make, made
-
-
-def kept(make):
-    instances = []
-
-    def keep(parameters):
-        instances.append(make(parameters))
-        return instances[-1]
-
-    return keep, instances
