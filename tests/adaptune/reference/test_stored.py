@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from estimates import made_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_passes import straight
-from made_references import made_of
 
 from adaptune.metrics import window_ends
 from adaptune.reference.stored import (
