@@ -2,7 +2,8 @@ import json
 
 import numpy as np
 import pytest
-from made_trials import SPACE, made_table, write_trials
+from made_trials import made_table, write_trials
+from random_models import SPACE
 
 from adaptune import files
 from adaptune.archive import Summary

@@ -6,9 +6,9 @@ import os
 import re
 from functools import partial
 
-import drawn
 import numpy as np
 import pytest
+from made_trials import Drawn
 
 from adaptune.archive import Archive, Summary
 from adaptune.model import ErrorModel
@@ -54,7 +54,7 @@ def error(sequence, parameters):
 
 
 def run(study):
-    pool = drawn.Drawn(error)
+    pool = Drawn(error)
     archive = Archive(study.folder / "trials")
     verdicts = Campaign(study, archive, pool).run()
     seen = {
@@ -146,7 +146,7 @@ def test_sequences_are_added_and_removed(study_of, sampler, kind):
 
     def run_on(names, trials, folder=None):
         study = study_of(folder, trials=trials, training=names, **given)
-        pool = drawn.Drawn(error)
+        pool = Drawn(error)
         verdicts = Campaign(study, Archive(study.folder / "trials"), pool).run()
         return study.folder, verdicts, {(t.sequence, n) for t in pool.tasks for n in t.numbers}
 

@@ -1,48 +1,75 @@
-"""Trials whose errors are made up, as a study's archive holds them and as a table."""
+"""Trials whose errors are made up: in a study's archive, in a table, and of a pool of workers.
+
+The error of a set on a sequence is told by a function of both.
+"""
 
 import numpy as np
+from random_models import SPACE
+from rooms import along_x
 
-from adaptune.archive import Archive, Summary, Trial
-from adaptune.space import Categorical, Float, Integer, ParameterSpace
+from adaptune.archive import Archive, Frames, Summary, Trial
 from offline.charts import trial_table
 from offline.config import OfflineConfig
+from offline.workers import TaskResult
 
-SPACE = ParameterSpace(
-    {
-        "distance": Float(low=1.0, high=10.0, baseline=4.0, log=True),
-        "points": Integer(low=1, high=50, baseline=20),
-        "kernel": Categorical(choices=("none", "huber"), baseline="none"),
-    }
-)
+N_FRAMES = 40
 
 
-def made_sets(n, space=SPACE, seed=0):
+def made_trial(parameters, error):
+    nothing, poses = np.zeros(N_FRAMES, bool), np.tile(np.eye(4), (N_FRAMES, 1, 1))
+    errors, seconds = np.full(N_FRAMES, error), np.full(N_FRAMES, 1e-3)
+    return Trial(parameters, poses, errors, nothing, ~nothing, seconds)
+
+
+def made_sets(n, space):
     """The baseline and random sets."""
-    drawn = space.from_unit(np.random.default_rng(seed).random((n - 1, len(space))))
-    return [space.baseline, *drawn]
+    return [space.baseline, *space.from_unit(np.random.default_rng(0).random((n - 1, len(space))))]
 
 
-def made_table(error, n=40, names=("one", "two"), space=SPACE, fixed=None):
-    """A table of trials whose error on a sequence is told by a function of name and set."""
-    sets = made_sets(n, space)
+def made_table(error, n=40, fixed=None):
+    """A table of trials on two sequences."""
+    sets = made_sets(n, SPACE)
     finished = {
         name: {
             i: Summary(p, error(name, p), 0, 0, 1.0, {"register_ms": 1.0 + i, "prepare_ms": 1.0})
             for i, p in enumerate(sets)
         }
-        for name in names
+        for name in ("one", "two")
     }
-    return trial_table(OfflineConfig(), space, finished, None if fixed is None else sets[fixed])
+    return trial_table(OfflineConfig(), SPACE, finished, None if fixed is None else sets[fixed])
 
 
 def write_trials(study, error, n):
     """Fill a study's archive, with the same sets on all training sequences."""
-    archive, frames = Archive(study.folder / "trials"), 4
-    nothing = np.zeros(frames, bool)
-    poses = np.tile(np.eye(4), (frames, 1, 1))
+    archive = Archive(study.folder / "trials")
     for name in study.training:
         for number, parameters in enumerate(made_sets(n, study.odometry.space)):
-            errors = np.full(frames, error(name, parameters))
-            seconds = np.full(frames, 1e-3)
-            trial = Trial(parameters, poses, errors, nothing, ~nothing, seconds)
-            archive.write(name, number, trial)
+            archive.write(name, number, made_trial(parameters, error(name, parameters)))
+
+
+class Drawn:
+    """A pool of one worker, which takes no time."""
+
+    def __init__(self, error):
+        self.error = error
+        self.tasks = []
+        self._task = None
+
+    def workers(self):
+        return [0]
+
+    def start(self, _worker, task):
+        self.tasks.append(task)
+        self._task = task
+
+    def wait(self):
+        task, self._task = self._task, None
+        frames = Frames(
+            np.arange(N_FRAMES) * 10**8,
+            along_x(0.3 * np.arange(N_FRAMES)),
+            np.random.default_rng(len(task.sequence)).random((N_FRAMES, 90)).astype(np.float32),
+            {"ndt": 90},
+            np.zeros(N_FRAMES, np.float32),
+        )
+        trials = [made_trial(one, self.error(task.sequence, one)) for one in task.sets]
+        return [(0, TaskResult(trials, frames if task.frames else None))]

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from model_files import assert_same, refused, rewrite, saved
-from random_models import random_model
+from random_models import assert_same, random_model, refused, rewrite, saved
 
 from adaptune.model import ErrorModel, ModelError
 from adaptune.model.error_model import FORMAT
