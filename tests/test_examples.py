@@ -3,12 +3,14 @@
 import re
 import shlex
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from textwrap import dedent
 from typing import Any
 
 import click
 import drives
+import numpy as np
 import pandas as pd
 import pytest
 from commands import call
@@ -16,9 +18,13 @@ from typer.main import get_command
 
 from adaptune import files
 from adaptune.commands.cli import app
+from adaptune.model import BankSettings, PairedSettings
 from adaptune.odometry.registry import declare_here
 from adaptune.recording import SequenceConfig
-from offline.config import OfflineStudyConfig
+from adaptune.trajectory import read_tum
+from offline.config import OfflineStudyConfig, load_study
+from offline.train import train
+from online.modes import run_replays
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -103,9 +109,29 @@ def test_commands_work(pages):
         assert result.output
 
 
+def test_the_readme_s_example_is_what_adaptune_online_does(folder):
+    overrides = ["online.switching.mechanism=bank"]
+    study = load_study(folder / "my.yaml", overrides)
+    model = train(study).model
+    (example,) = (code for page, code in blocks("python") if page == "README.md")
+    example = example.replace('"my.yaml"', f'"my.yaml", {overrides}')
+    last = "    T_odom_sensor = tracker.register(scan).T_odom_sensor\n"
+    assert last in example
+    for bank in (True, False):
+        settings = BankSettings() if bank else BankSettings(adapt=False)
+        replace(model, paired=PairedSettings(), bank_settings=settings).save(study.model_path)
+        run_replays(study, study.model_path)
+        poses = []
+        exec(example.replace(last, last + "    poses.append(T_odom_sensor)\n"), {"poses": poses})
+        replays = study.folder / "replays/home/adaptive"
+        replayed = read_tum(replays / "trajectory.tum")
+        np.testing.assert_allclose(replayed.T_world_sensor, poses, atol=1e-8)
+        assert (":" in (replays / "selections.csv").read_text()) is bank
+
+
 @pytest.mark.usefixtures("folder")
 def test_python_works():
-    # The README's is run and compared in test_readme.py; this one trains the study of the others.
+    # The README's is run and compared above; this one trains the study of the others.
     found = sorted(blocks("python"), key=lambda block: block[0] != "python.md")
     found = [(page, code) for page, code in found if page != "README.md"]
     assert len(found) > 5
