@@ -10,14 +10,13 @@ import drives
 import fake_odometry
 import hypothesis
 import pytest
-from in_process import InProcess
 from needs import lacking
 
 from adaptune.odometry.registry import ODOMETRIES
 from offline import train as training
 from offline.config import load_study
 from offline.train import train
-from offline.workers import Workers
+from offline.workers import Sequences, TaskProgress, Workers, attempt
 
 hypothesis.settings.register_profile("untimed", deadline=None)
 hypothesis.settings.load_profile("untimed")
@@ -40,7 +39,6 @@ def recorded() -> Path:
     folder = os.environ.get("ADAPTUNE_TEST_DATA")
     if not folder or not Path(folder).is_dir():
         lacking("data", "ADAPTUNE_TEST_DATA does not name the folder of recorded sequences")
-        raise AssertionError
     return Path(folder)
 
 
@@ -66,6 +64,36 @@ def _fake() -> Iterator[None]:
         support = [str(SUPPORT), os.environ.get("PYTHONPATH", "")]
         patch.setenv("PYTHONPATH", os.pathsep.join(filter(None, support)))
         yield
+
+
+class InProcess:
+    """Stands in for `Workers`: as many workers, one after another, when an outcome is asked for."""
+
+    def __init__(self, setup, n, memory):
+        self.setup, self.n, self.memory = setup, n, memory
+        self._sequences = [Sequences(setup, memory / n) for _ in range(n)]
+        self._tasks = {}
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        pass
+
+    def workers(self):
+        return range(self.n)
+
+    def start(self, worker, task):
+        self._tasks[worker] = task
+
+    def wait(self):
+        worker, said = next(iter(self._tasks)), []
+        outcome = attempt(
+            self._sequences[worker],
+            self._tasks.pop(worker),
+            lambda *now: said.append((worker, TaskProgress(*now))),
+        )
+        return [*said, (worker, outcome)]
 
 
 @pytest.fixture(scope="session", autouse=True)
