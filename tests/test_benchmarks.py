@@ -1,12 +1,11 @@
 """Benchmarks that run with nothing but their argument."""
 
-import importlib.util
 import re
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from needs import module_of
 
 from adaptune import files
 from adaptune.geometry import invert
@@ -23,12 +22,7 @@ FOLDER = Path(__file__).parents[1] / "benchmarks"
 
 
 def benchmark(name):
-    """A benchmark's module."""
-    spec = importlib.util.spec_from_file_location(name, FOLDER / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module
-    spec.loader.exec_module(module)
-    return module
+    return module_of(f"benchmarks/{name}.py")
 
 
 @pytest.mark.parametrize("name", sorted(path.stem for path in FOLDER.glob("*.py")))

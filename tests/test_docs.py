@@ -1,6 +1,5 @@
 """The documentation leads where it says, and names commands that exist."""
 
-import importlib.util
 import re
 import sys
 from functools import cache
@@ -11,6 +10,7 @@ from typing import Any
 import drives
 import numpy as np
 import pytest
+from needs import module_of
 from setups import setup_of
 from typer.main import get_command
 
@@ -78,17 +78,8 @@ def test_the_guide_is_short():
     assert sum(len(page.read_text("utf-8").split()) for page in pages) <= 20_000
 
 
-@cache
-def site() -> Any:
-    """The module docs/conf.py, which makes references from the code."""
-    spec = importlib.util.spec_from_file_location("docs_conf", ROOT / "docs/conf.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 def test_the_site_lists_all_keys_commands_and_objects():
-    made = {mark: text() for mark, text in site().MADE.items()}
+    made = {mark: text() for mark, text in module_of("docs/conf.py").MADE.items()}
     pages = "".join(page.read_text("utf-8") for page in GUIDE)
     assert all(pages.count(mark) == 1 for mark in made)
     keys = made["<!-- settings -->"]
@@ -101,7 +92,8 @@ def test_the_site_lists_all_keys_commands_and_objects():
 
 def test_the_tables_of_settings_are_those_of_the_code():
     schema = OfflineStudyConfig.model_json_schema()
-    defaults = {key: told for key, _, told in site().keys(schema, schema["$defs"], "")}
+    keys = module_of("docs/conf.py").keys(schema, schema["$defs"], "")
+    defaults = {key: told for key, _, told in keys}
     text = (ROOT / "docs/reference-study.md").read_text("utf-8")
     table = text[text.index("## The odometry") : text.index("## Objectives")]
     rows = re.findall(r"^\| (`.+?`) \| .* \| ?(.*?) \|$", table, re.MULTILINE)

@@ -4,32 +4,30 @@ import fcntl
 import importlib.util
 import os
 import shutil
-from functools import cache
+import sys
+from functools import cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import pytest
 
 ROOT = Path(__file__).parents[2]
 
 
-def lacking(name: str, reason: str) -> None:
+def lacking(name: str, reason: str) -> NoReturn:
     """Skip for want of `name`; fail if ADAPTUNE_REQUIRE names it (comma-separated)."""
     if name in os.environ.get("ADAPTUNE_REQUIRE", "").split(","):
         pytest.fail(f"ADAPTUNE_REQUIRE names {name}, but {reason}")
     pytest.skip(reason)
 
 
-def needs_evalio() -> None:
-    """Skip where evalio is not installed."""
-    if importlib.util.find_spec("evalio") is None:
-        lacking("evalio", "evalio is not installed: pip install 'adaptune[evalio]'")
+def needs(package: str, extra: str) -> None:
+    """Skip where a package of an extra is not installed."""
+    if importlib.util.find_spec(package) is None:
+        lacking(extra, f"{package} is not installed: pip install 'adaptune[{extra}]'")
 
 
-def needs_ros2() -> None:
-    """Skip where what speaks to ROS 2 is not installed."""
-    if importlib.util.find_spec("zenoh_ros2_sdk") is None:
-        lacking("ros2", "zenoh-ros2-sdk is not installed: pip install 'adaptune[ros2]'")
+needs_evalio = partial(needs, "evalio", "evalio")
 
 
 def needs_ros1() -> None:
@@ -40,40 +38,26 @@ def needs_ros1() -> None:
 
 def needs_browser() -> str:
     """Skip where there is no Chromium, or nothing to drive it; otherwise its path."""
-    if importlib.util.find_spec("playwright") is None:
-        lacking("browser", "playwright is not installed: pip install 'adaptune[dev]'")
-    chromium = shutil.which("chromium")
+    chromium = shutil.which("chromium") if importlib.util.find_spec("playwright") else None
     if chromium is None:
-        lacking("browser", "there is no chromium: make services")
-        raise AssertionError
+        lacking("browser", "there is no chromium, or no playwright to drive it: make services")
     return chromium
 
 
 @cache
-def image_builder() -> Any:
-    """The module docker/build.py."""
-    spec = importlib.util.spec_from_file_location("docker_build", ROOT / "docker/build.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
+def module_of(file: str) -> Any:
+    """The module in a file of the repository, which lies in no package."""
+    name = file.removesuffix(".py").replace("/", "_")
+    spec = importlib.util.spec_from_file_location(name, ROOT / file)
+    sys.modules[name] = module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
 
 
-def needs_docker() -> None:
-    """Skip where no Docker engine answers."""
-    builder = image_builder()
-    try:
-        builder.engine().close()
-    except builder.LackingError as error:
-        lacking("docker", str(error))
-
-
 @cache
 def reference_image() -> str:
-    """Build the reference image, once in a run of pytest, and return its tag."""
-    needs_docker()
-    builder = image_builder()
+    """Build the reference image, once in a run of pytest; skip where none can. Returns its tag."""
+    builder = module_of("docker/build.py")
     lock = ROOT / "build/docker.lock"
     lock.parent.mkdir(exist_ok=True)
     run = os.environ.get("PYTEST_XDIST_TESTRUNUID", "")
@@ -87,7 +71,6 @@ def reference_image() -> str:
             tag: str = builder.build("reference")
         except builder.LackingError as error:
             lacking("docker", str(error))
-            raise
         held.truncate(0)
         held.write(run)
     return tag

@@ -32,7 +32,7 @@ HASHES = {  # as ROS 2 Jazzy has them
 
 @pytest.fixture(scope="module", autouse=True)
 def _installed():
-    needs.needs_ros2()
+    needs.needs("zenoh_ros2_sdk", "ros2")
 
 
 @pytest.fixture(scope="module")
