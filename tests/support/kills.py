@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+from wicked import children
 
 from adaptune.archive import INDEX, Archive
 from adaptune.model import ErrorModel
@@ -48,16 +49,7 @@ def begin(study_file: Path, folder: Path, *overrides: str) -> subprocess.Popen[s
 
 def workers(driver: int) -> list[int]:
     """Process numbers of a driver's workers: what its fork server has forked."""
-    return [worker for server in _children(driver) for worker in _children(server)]
-
-
-def _children(process: int) -> list[int]:
-    try:
-        return [
-            int(n) for n in Path(f"/proc/{process}/task/{process}/children").read_text().split()
-        ]
-    except OSError:
-        return []
+    return [worker for server in children(driver) for worker in children(server)]
 
 
 def files(folder: Path) -> dict[Path, tuple[int, int]]:
@@ -83,21 +75,22 @@ def disturb(
     finished since the last one, be it while the driver starts or while the model is fitted.
     Returns how many drivers and workers were killed.
     """
-    killed = [0, 0]
-    finished: dict[Path, tuple[int, int]] = {}
-    driver = begin(study_file, folder, *overrides)
+    killed, finished = [0, 0], {}
     while True:
-        while sum(killed) < kills:
+        driver = begin(study_file, folder, *overrides)
+        while sum(killed) < kills and driver.poll() is None:
             n = min(len(files(folder)) + int(rng.integers(n_files // 5 + 1)), n_files)
+            while len(files(folder)) < n and driver.poll() is None:
+                time.sleep(0.05)
+            time.sleep(float(rng.uniform(0.0, PAUSE)))
             of_workers = bool(rng.random() < 0.5)
-            victim = _victim(driver, folder, n, of_workers, float(rng.uniform(0.0, PAUSE)), rng)
-            if victim is None:
-                break
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(victim, signal.SIGKILL)
-                killed[of_workers] += 1
-            if not of_workers:
-                break
+            pool = workers(driver.pid) if of_workers else [driver.pid]
+            if pool and driver.poll() is None:
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(int(rng.choice(pool)), signal.SIGKILL)
+                    killed[of_workers] += 1
+                if not of_workers:
+                    break
         _, said = driver.communicate()
         now = files(folder)
         assert now.items() >= finished.items(), "a finished trial was lost or run again"
@@ -106,26 +99,6 @@ def disturb(
             return killed[0], killed[1]
         # By chance, several workers may have been killed at the same trials.
         assert driver.returncode == -signal.SIGKILL or "workers died" in said, said
-        driver = begin(study_file, folder, *overrides)
-
-
-def _victim(
-    driver: subprocess.Popen[str],
-    folder: Path,
-    n: int,
-    of_workers: bool,
-    pause: float,
-    rng: np.random.Generator,
-) -> int | None:
-    """Wait for `n` trials, then `pause` seconds; tell whom to kill, None if all is over."""
-    while driver.poll() is None:
-        pool = workers(driver.pid) if of_workers else [driver.pid]
-        if pool and len(list((folder / "trials").glob("*/[0-9]*.npz"))) >= n:
-            time.sleep(pause)
-            pool = workers(driver.pid) if of_workers else pool
-            return int(rng.choice(pool)) if pool and driver.poll() is None else None
-        time.sleep(0.05)
-    return None
 
 
 def check_once(folder: Path, n_trials: int, sequences: list[str]) -> None:

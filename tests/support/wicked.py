@@ -27,9 +27,11 @@ def gone(process):
 
 
 def children(process):
-    """Numbers of the processes that a process has started."""
+    """Numbers of the processes that a process has started; none if it has ended."""
     path = Path(f"/proc/{process}/task/{process}/children")
-    return map(int, path.read_text().split())
+    with contextlib.suppress(OSError):
+        return list(map(int, path.read_text().split()))
+    return []
 
 
 def tell(service, name, what=signal.SIGKILL):
