@@ -25,14 +25,6 @@ Factory = pytest.TempPathFactory
 SUPPORT = Path(__file__).parent / "support"
 
 
-@pytest.fixture(scope="session", autouse=True)
-def _cache(tmp_path_factory: Factory) -> Iterator[None]:
-    """Keep decoded scans in a folder of the tests, not in the user's cache."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("ADAPTUNE_CACHE", str(tmp_path_factory.mktemp("cache")))
-        yield
-
-
 @pytest.fixture(scope="session")
 def recorded() -> Path:
     """Folder of recorded sequences."""
@@ -53,17 +45,6 @@ def shared(factory: Factory, name: str, make: Callable[[Path], object]) -> Path:
             make(folder)
             made.touch()
     return folder
-
-
-@pytest.fixture(scope="session", autouse=True)
-def _fake() -> Iterator[None]:
-    """Let the fake odometry run in this process, as if it were adaptune's own."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(ODOMETRIES, fake_odometry.NAME, fake_odometry.NAME)
-        # Commands in processes of their own find it, too.
-        support = [str(SUPPORT), os.environ.get("PYTHONPATH", "")]
-        patch.setenv("PYTHONPATH", os.pathsep.join(filter(None, support)))
-        yield
 
 
 class InProcess:
@@ -97,9 +78,15 @@ class InProcess:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _in_process() -> Iterator[None]:
-    """Run trials in this process, which takes no time to start; see `processes`."""
+def _quick_and_apart(tmp_path_factory: Factory) -> Iterator[None]:
+    """Run trials and the fake odometry in this process; leave the user's cache alone."""
     with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ADAPTUNE_CACHE", str(tmp_path_factory.mktemp("cache")))
+        patch.setitem(ODOMETRIES, fake_odometry.NAME, fake_odometry.NAME)
+        # Commands in processes of their own find it, too.
+        support = [str(SUPPORT), os.environ.get("PYTHONPATH", "")]
+        patch.setenv("PYTHONPATH", os.pathsep.join(filter(None, support)))
+        # It takes no time to start; see `processes`.
         patch.setattr(training, "Workers", InProcess)
         yield
 
