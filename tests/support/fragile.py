@@ -23,19 +23,14 @@ class Fragile(Fake):
 
     settings_type = Settings
 
-    def __init__(self, *args):
-        super().__init__(*args)
-        self.scan = 0
-
     def register(self, prepared):
         if self.fails(zlib.crc32(prepared.points[:64].tobytes())):
             raise RuntimeError("too coarse")
         return super().register(prepared)
 
     def fails(self, scan):
-        if self.settings.fails == "but the baseline":
-            return self.parameters["keyframe_interval"] != 1.0
-        if self.parameters["keyframe_interval"] <= MOST:
-            return False
-        every_fifth = self.settings.fails == "every fifth"
-        return scan % 5 == 0 if every_fifth else self.settings.fails == "always" or scan in TWO
+        interval, fails = self.parameters["keyframe_interval"], self.settings.fails
+        if fails == "but the baseline":
+            return interval != 1.0
+        now = {"always": True, "every fifth": scan % 5 == 0, "in two": scan in TWO}
+        return interval > MOST and now[fails]

@@ -1,9 +1,15 @@
-"""Small ROS 1 bags with clouds and poses."""
+"""Small ROS 1 bags with clouds and poses, and what tests look for when they are inspected."""
 
 import os
 
 import numpy as np
 import rec
+from pydantic import TypeAdapter
+from rich.console import Console
+
+from adaptune import files
+from adaptune.recording import SequenceConfig
+from adaptune.recording.inspect import render_inspection
 
 START = 1_700_000_000_000_000_000
 STORE = rec.ROS1
@@ -51,3 +57,20 @@ def drive(path, stamps, poses):
     ]
     messages += [("/poses", START, pose(START + round(s * 1e9), x)) for s, x in poses]
     return write(path, messages)
+
+
+def inspection_text(inspection, width=100):
+    console = Console(width=width, color_system=None, force_terminal=False)
+    with console.capture() as capture:
+        console.print(render_inspection(inspection))
+    return capture.get()
+
+
+def entry(inspection):
+    """The proposed entry, read back as a study would."""
+    data = files.Document(inspection.entry).data["sequences"]
+    return TypeAdapter(dict[str, SequenceConfig]).validate_python(data)
+
+
+def texts(inspection):
+    return [fault.text for fault in inspection.faults]

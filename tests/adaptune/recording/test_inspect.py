@@ -5,9 +5,19 @@ import fuzz
 import numpy as np
 import pytest
 import rec
-from inspected import entry, inspection_text, texts
 from rosbags.highlevel import AnyReader
-from small_bag import START, STORE, bad_cloud, cloud, drive, pose, write
+from small_bag import (
+    START,
+    STORE,
+    bad_cloud,
+    cloud,
+    drive,
+    entry,
+    inspection_text,
+    pose,
+    texts,
+    write,
+)
 
 from adaptune import files
 from adaptune.recording import SequenceConfig, SequenceError
