@@ -9,7 +9,9 @@ from functools import cache
 
 import drives
 import numpy as np
+import street
 from needs import reference_image
+from rooms import along_x
 
 from adaptune.odometry.base import InProcess
 from adaptune.odometry.docker.engine import engine
@@ -42,9 +44,7 @@ def scans():
 
 
 def truth():
-    T = np.tile(np.eye(4), (N_SCANS, 1, 1))
-    T[:, 0, 3] = 0.3 * np.arange(N_SCANS)
-    return T
+    return along_x(0.3 * np.arange(N_SCANS))
 
 
 def recording(folder, logs=None):
@@ -66,10 +66,7 @@ def rustle(file, **settings):
 
 
 def drive(odometry, first=0, T=None):
-    T = np.eye(4) if T is None else T
-    prepared = [odometry.prepare(scan) for scan in scans()[first:]]
-    odometry.start(prepared[0], T)
-    return np.array([T, *(odometry.register(p).T_odom_sensor for p in prepared[1:])])
+    return street.drive(odometry, [odometry.prepare(scan) for scan in scans()[first:]], T)
 
 
 @cache
