@@ -54,20 +54,6 @@ def built(project: Path, folder: Path) -> Path:
     return wheel
 
 
-def run(folder: Path, path: list[Path], *arguments: str) -> str:
-    """Run adaptune in a folder with these packages only, and return what it prints."""
-    done = subprocess.run(
-        [sys.executable, "-P", "-m", "adaptune", *arguments],
-        cwd=folder,
-        env=os.environ | {"PYTHONPATH": os.pathsep.join(map(str, path))},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout
-
-
 @pytest.mark.services
 def test_the_wheel_tunes_a_bag_without_the_repository(tmp_path):
     wheel = built(ROOT, tmp_path / "dist")
@@ -78,7 +64,9 @@ def test_the_wheel_tunes_a_bag_without_the_repository(tmp_path):
         *("adaptune", "offline", "online")
     }
     drives.write_bag(tmp_path / "drive.bag", drives.scans(n_scans=60))
-    said = run(tmp_path, [tmp_path / "installed"], "tune", "drive.bag", "--trials", "2")
+    command = [sys.executable, "-P", "-m", "adaptune", "tune", "drive.bag", "--trials", "2"]
+    alone = os.environ | {"PYTHONPATH": str(tmp_path / "installed")}
+    said = subprocess.check_output(command, cwd=tmp_path, env=alone, text=True)
     assert "runs/drive/report/report.html" in said
     assert (tmp_path / "runs/drive/report/report.html").stat().st_size > 100_000
 
@@ -91,9 +79,8 @@ def test_a_package_of_others_adds_an_odometry_and_a_descriptor(tmp_path, monkeyp
     monkeypatch.setenv("PYTHONPATH", str(target), prepend=os.pathsep)
     monkeypatch.syspath_prepend(target)
     study = drives.write_study(tmp_path)
-    _, rest = study.read_text().split("sequences:")
-    text = "odometry: {name: scan_to_scan}\ndescriptor: [range_deciles]\nsequences:"
-    study.write_text(text + rest)
+    text = "odometry: {name: scan_to_scan}\ndescriptor: [range_deciles]\n"
+    study.write_text(drives.study_with(text, tmp_path))
     setup = setup_of(load_study(study))
     scans = setup.prepare("one", 1e9)
     (trial,) = setup.run(scans, [{"voxel": 0.4}])
