@@ -47,8 +47,8 @@ class Faulty(Odometry):
             os._exit(3)
         return scan
 
-    def start(self, prepared, T_odom_sensor, T_previous_current=None):
-        self.T, self.began_with = T_odom_sensor, (prepared, T_previous_current)
+    def start(self, _prepared, T_odom_sensor, _motion=None):
+        self.T = T_odom_sensor
         self.raise_in("start")
         if self.settings.fault == "never begins":
             os.abort()

@@ -22,10 +22,9 @@ class Walker(Odometry):
     def prepare(self, scan):
         return round(scan.stamp / 1e9)
 
-    def start(self, prepared, T_odom_sensor, T_previous_current=None):
+    def start(self, prepared, T_odom_sensor, _motion=None):
         self.seen.append(prepared)
         self.starts.append((prepared, T_odom_sensor[0, 3]))
-        self.motion = T_previous_current
         self.T = T_odom_sensor.copy()
 
     def register(self, prepared):
