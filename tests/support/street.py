@@ -18,9 +18,9 @@ from needs import reference_image
 
 from adaptune.odometry.base import InProcess
 from adaptune.odometry.keyframe import KeyframeGicp
-from adaptune.odometry.program import Command, ProgramInput
-from adaptune.odometry.registry import odometry_class
-from adaptune.odometry.remote import Limits, Process
+from adaptune.odometry.program import ProgramInput
+from adaptune.odometry.registry import ODOMETRIES, odometry_class
+from adaptune.odometry.remote import Limits
 from adaptune.odometry.serving import listen
 from adaptune.recording import Scan
 from adaptune.space import Float, ParameterSpace
@@ -39,58 +39,59 @@ gicp: {max_correspondence_distance: 1.0, keyframe_interval: 1.0, downsampling: 0
 """
 
 
+FILED = ("command", "docker_command", "rustle", LOCKSTEP)
+"""Programs that read all parameters in a file."""
+
+
 def make(name, parameters=None):
     """A new instance; of programs, keyframe GICP that is served and program.py."""
+    given = parameters or {}
+    if name in ODOMETRIES:
+        return InProcess(odometry_class(name)(given))
+    if name in FILED:
+        given = space_of(name).baseline | given
     if name in ("docker_command", "rustle"):
-        given = space_of(name).baseline | (parameters or {})
         return copy.deepcopy(_that_has_run(name, tuple(given.items())))
-    if name in ("docker_process", LOCKSTEP):
-        given = parameters or {}
-        return _contained(
-            name, given if name == "docker_process" else space_of(name).baseline | given
-        )
-    if name == "process":
-        return Process(parameters or {}, served(), Limits(seconds=60.0))
-    if name == "command":
-        given = space_of(name).baseline | (parameters or {})
-        settings, recording = command_on_the_street()
-        Command.check(settings, given)
-        return Command(given, settings, Limits(seconds=10.0), lambda: recording)
-    return InProcess(odometry_class(name)(parameters))
+    return _program(name, given)
 
 
 @cache
 def _that_has_run(name, parameters):
     """One that has run on the drive, which takes seconds."""
-    odometry = _contained(name, dict(parameters))
+    odometry = _program(name, dict(parameters))
     odometry.start(odometry.prepare(scan(0)), np.eye(4))
     return odometry
 
 
-def _contained(name, parameters):
-    """A new instance whose program is in a container."""
-    from adaptune.odometry.docker.programs import DockerProcess
-
-    kind = odometry_class("rustle" if name == LOCKSTEP else name)
-    image, file = reference_image(), Path(_folder.name) / "params.yaml"
-    file.write_text(TEMPLATE)
-    given = {
-        "docker_command": {"command": ("odometry-plain", "{points}"), "template": str(file)},
-        "docker_process": {"command": ("odometry-serve", "{socket}")},
-        "rustle": {"template": str(file), "odometry": "/Odometry", "rate": 4.0},
-        LOCKSTEP: {"play": "lockstep", "node": "/gicp", "patience": 60.0},
-    }
-    given[LOCKSTEP] |= {"template": str(file), "odometry": "/Odometry"}
-    settings = kind.settings_type(image=image, **given[name])
-    if kind is not DockerProcess:
+def _program(name, parameters):
+    kind, settings = _kind(name), _settings(name)
+    if name in FILED:
         kind.check(settings, parameters)
-    recording = command_on_the_street()[1]
-    return kind.instance(parameters, settings, Limits(seconds=60.0), lambda: recording)
+    return kind.instance(parameters, settings, Limits(seconds=60.0), recording)
 
 
-def parameters_of(odometry):
-    """The present parameters of what `make` has made."""
-    return (odometry.odometry if isinstance(odometry, InProcess) else odometry).parameters
+def _kind(name):
+    return odometry_class("rustle" if name == LOCKSTEP else name)
+
+
+@cache
+def _settings(name):
+    template, file = Path(_folder.name) / "params.yaml", Path(_folder.name) / "program.json"
+    template.write_text(TEMPLATE)
+    file.write_text('{"registration": {"voxel": 1, "distance": 1}, "speed": 4.0}')
+    arguments = (program.__file__, "{input}", "{points}", "{output}", "{parameters}")
+    given = {
+        "command": {"command": (sys.executable, *arguments), "template": str(file)},
+        "docker_command": {"command": ("odometry-plain", "{points}"), "template": str(template)},
+        "docker_process": {"command": ("odometry-serve", "{socket}")},
+        "rustle": {"template": str(template), "odometry": "/Odometry", "rate": 4.0},
+    }
+    given[LOCKSTEP] = given["rustle"] | {"play": "lockstep", "node": "/gicp", "patience": 60.0}
+    if name == "process":
+        own = {"address": listening("tcp://127.0.0.1:0", "gicp")}
+    else:
+        own = given[name] | ({} if name == "command" else {"image": reference_image()})
+    return _kind(name).settings_type(**own)
 
 
 def space_of(name):
@@ -101,12 +102,10 @@ def space_of(name):
                 "registration.distance": Float(low=0.5, high=4.0, baseline=2.0, log=True),
             }
         )
-    if name in ("docker_command", "rustle", LOCKSTEP):
+    if name in FILED:
         tuned = ("max_correspondence_distance", "keyframe_interval")
         return ParameterSpace({key: KeyframeGicp.space.parameters[key] for key in tuned})
-    if name == "docker_process":
-        return KeyframeGicp.space
-    return Process.describe(served()).space if name == "process" else odometry_class(name).space
+    return odometry_class(name if name in ODOMETRIES else "gicp").space
 
 
 def listening(where, name):
@@ -117,29 +116,15 @@ def listening(where, name):
 
 
 def is_live(name):
-    if name in ("command", "docker_command", "rustle"):
-        return False
-    return name in ("process", "docker_process", LOCKSTEP) or odometry_class(name).live
+    return name not in FILED[:3] and (name not in ODOMETRIES or odometry_class(name).live)
 
 
 @cache
-def served():
-    return Process.settings_type(address=listening("tcp://127.0.0.1:0", "gicp"))
-
-
-@cache
-def command_on_the_street():
-    """A program's settings, and the drive as a bag for it."""
-    folder = Path(_folder.name)
+def recording():
+    """The drive as a bag, for programs."""
     scans = [(scan(i).stamp, scan(i).points, np.eye(4)) for i in range(N_SCANS)]
-    bag = drives.write_bag(folder / "drive.bag", scans)
-    (folder / "program.json").write_text('{"registration": {"voxel": 1, "distance": 1}}')
-    arguments = (program.__file__, "{input}", "{points}", "{output}", "{parameters}")
-    settings = Command.settings_type(
-        command=(sys.executable, *arguments), template=str(folder / "program.json")
-    )
-    stamps = np.array([stamp for stamp, *_ in scans], np.int64)
-    return settings, ProgramInput(bag, "/points", "", stamps, None)
+    bag = drives.write_bag(Path(_folder.name) / "drive.bag", scans)
+    return ProgramInput(bag, "/points", "", np.array([stamp for stamp, *_ in scans]), None)
 
 
 _folder = tempfile.TemporaryDirectory()

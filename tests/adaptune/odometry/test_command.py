@@ -186,7 +186,7 @@ def test_what_it_takes_is_measured(make):
     objective = "{rte: 1, memory: 0.001, cpu: 0.001, ms_per_scan: 0.001}"
     study = make("work", f"offline.objective={objective}", once)
     trial, _ = run(study)
-    # It computes for half a second in a child, beside a child of 200 MB, over 40 scans of 3.9 s.
+    # It computes for half a second with 200 MB, over 40 scans of 3.9 s.
     assert 12.5 <= 1e3 * np.median(trial.seconds) < 200.0
     assert 100 * 0.5 / 3.9 <= trial.usage["cpu"] < 200.0
     assert 200.0 <= trial.usage["memory"] < 1000.0
