@@ -3,16 +3,15 @@
 import threading
 from collections import defaultdict
 
-import numpy as np
 import rec
 from drives import cloud
 
 from adaptune.ros.link import LinkError
-from online.live import CLOUD, IMU
+from online.live import CLOUD, IMU, RosMessages, placed
 
 STORE = rec.ROS1
 TYPES = STORE.types
-__all__ = ["STORE", "TYPES", "LocalLink", "cloud", "header", "imu", "odometry"]
+__all__ = ["STORE", "TYPES", "LocalLink", "cloud", "imu", "odometry"]
 
 
 class LocalLink:
@@ -70,22 +69,9 @@ class LocalLink:
         pass
 
 
-def header(stamp, frame="lidar"):
-    return rec.header(stamp, frame, STORE)
-
-
 def imu(stamp, rate=0.0):
-    made = rec.imu(stamp, (0.0, 0.0, rate), (0.0, 0.0, 9.81), STORE)
-    made.header = header(stamp)
-    return made
+    return rec.imu(stamp, (0.0, 0.0, rate), (0.0, 0.0, 9.81), STORE)
 
 
 def odometry(stamp, T):
-    """nav_msgs/Odometry of a pose without rotation."""
-    zero = TYPES["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0)
-    still = rec.bare_pose(map(float, T[:3, 3]), (0.0, 0.0, 0.0, 1.0), STORE)
-    pose = TYPES["geometry_msgs/msg/PoseWithCovariance"](still, np.zeros(36))
-    twist = TYPES["geometry_msgs/msg/TwistWithCovariance"](
-        TYPES["geometry_msgs/msg/Twist"](zero, zero), np.zeros(36)
-    )
-    return TYPES["nav_msgs/msg/Odometry"](header(stamp, "odom"), "base", pose, twist)
+    return RosMessages(STORE, "odom").odometry(stamp, placed(T[None])[0], "base")

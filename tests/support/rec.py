@@ -27,15 +27,9 @@ def header(stamp, frame="lidar", store=ROS2):
 
 def velodyne(points, span=0.1):
     """Points of shape (n, 3) with the fields of Velodyne's driver, its odd offsets included."""
-    dtype = np.dtype(
-        {
-            "names": ["x", "y", "z", "intensity", "ring", "time"],
-            "formats": ["<f4", "<f4", "<f4", "<f4", "<u2", "<f4"],
-            "offsets": [0, 4, 8, 12, 16, 18],
-            "itemsize": 22,
-        }
-    )
-    raw = np.zeros(len(points), dtype)
+    floats = [(name, "<f4") for name in ("x", "y", "z", "intensity")]
+    raw = np.zeros(len(points), [*floats, ("ring", "<u2"), ("time", "<f4")])
+    assert raw.itemsize == 22
     for i, axis in enumerate("xyz"):
         raw[axis] = points[:, i]
     raw["ring"] = np.arange(len(points)) % 16
