@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from needs import module_of
+from setups import failure
 
 from adaptune import files
 from adaptune.geometry import invert
@@ -13,7 +14,6 @@ from adaptune.odometry.docker import rustle
 from adaptune.recording.config import SequenceConfig
 from adaptune.recording.recording import open_sequence
 from adaptune.simulation.record import Drive
-from adaptune.strict import ConfigurationError
 from offline.config import load_study
 
 pytestmark = pytest.mark.services
@@ -103,18 +103,11 @@ def test_commands_of_a_protocol_lack_nothing_but_their_data(name, tmp_path, monk
         assert stage in ("simulate", "offline", "online", "compare")
         assert folder in compared
         assert "offline.trials=32" in options
-        mistakes = mistakes_of(Path(path), options[1::2], Path(folder))
-        assert all("there is no such" in line for line in mistakes)
-        assert bool(mistakes) == bool(protocol.variable)
-
-
-def mistakes_of(path, overrides, folder):
-    """The lines of what is wrong with a study."""
-    try:
-        load_study(path, overrides, folder)
-    except ConfigurationError as error:
-        return str(error).splitlines()
-    return []
+        if protocol.variable:
+            mistakes = failure(Path(path), *options[1::2]).splitlines()
+            assert all("there is no such" in line for line in mistakes)
+        else:
+            load_study(Path(path), options[1::2], Path(folder))
 
 
 def test_all_benchmarks_print_their_figures(tmp_path):
