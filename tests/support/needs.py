@@ -30,18 +30,11 @@ def needs(package: str, extra: str) -> None:
 needs_evalio = partial(needs, "evalio", "evalio")
 
 
-def needs_ros1() -> None:
-    """Skip where there is no ROS 1."""
-    if shutil.which("roscore") is None:
-        lacking("ros1", "there is no roscore: make services")
-
-
-def needs_browser() -> str:
-    """Skip where there is no Chromium, or nothing to drive it; otherwise its path."""
-    chromium = shutil.which("chromium") if importlib.util.find_spec("playwright") else None
-    if chromium is None:
-        lacking("browser", "there is no chromium, or no playwright to drive it: make services")
-    return chromium
+def needs_program(program: str, service: str) -> str:
+    """The path of a program of a service; skip where there is none."""
+    if (path := shutil.which(program)) is None:
+        lacking(service, f"there is no {program}: make services")
+    return path
 
 
 @cache

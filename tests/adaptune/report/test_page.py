@@ -5,7 +5,7 @@ from dataclasses import replace
 from html.parser import HTMLParser
 
 import pytest
-from needs import needs_browser
+from needs import needs_program
 from sample_charts import empty, sample_page
 
 from adaptune.report.page import Page, PageSection, page_text, write_page
@@ -99,8 +99,8 @@ def test_charts_lie_beside_the_page_as_files(tmp_path):
 
 @pytest.fixture(scope="module")
 def opened(tmp_path_factory):
-    chromium, told = needs_browser(), []
-    from playwright.sync_api import sync_playwright
+    chromium, told = needs_program("chromium", "browser"), []
+    sync_playwright = pytest.importorskip("playwright.sync_api").sync_playwright
 
     path = tmp_path_factory.mktemp("report") / "index.html"
     path.write_text(page_text(sample_page()), "utf-8")

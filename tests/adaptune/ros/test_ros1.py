@@ -12,7 +12,7 @@ import drives
 import local_link
 import numpy as np
 import pytest
-from needs import needs_ros1
+from needs import needs_program
 
 from adaptune import processes
 from adaptune.keeper import descendants
@@ -31,7 +31,7 @@ ROBOT = Path(drives.__file__).with_name("ros1_robot.py")
 
 @pytest.fixture(scope="module", autouse=True)
 def master():
-    needs_ros1()
+    needs_program("roscore", "ros1")
     with socket.socket() as bound:
         bound.bind(("127.0.0.1", 0))
         port = bound.getsockname()[1]
