@@ -9,6 +9,7 @@ import threading
 from pathlib import Path
 
 import numpy as np
+import rec
 from rosbags.typesys import Stores, get_typestore
 
 HZ = 50
@@ -22,26 +23,15 @@ SERVICES = {
 }
 
 
-def header(types, n):
-    stamp = types["builtin_interfaces/msg/Time"](sec=n, nanosec=999_999_999)
-    return types["std_msgs/msg/Header"](stamp=stamp, frame_id="lidar")
+def header(store, n):
+    return rec.header(n * 10**9 + 999_999_999, store=store)
 
 
-def cloud(types, n):
-    """The fields of the cloud of a number: of as many bytes as a real one, more or less."""
-    size = 30_000 + n % 7
-    field = types["sensor_msgs/msg/PointField"]
-    return {
-        "header": header(types, n),
-        "height": 1,
-        "width": size,
-        "fields": [field(name, 4 * i, 7, 1) for i, name in enumerate("xyz")],
-        "is_bigendian": False,
-        "point_step": 12,
-        "row_step": 12 * size,
-        "data": np.random.default_rng(n).integers(0, 256, 12 * size, np.uint8),
-        "is_dense": True,
-    }
+def cloud(store, n):
+    """The cloud of a number: of as many bytes as a real one, more or less."""
+    rows = np.random.default_rng(n).integers(0, 256, (30_000 + n % 7, 12), np.uint8)
+    points = rows.view([(axis, "<f4") for axis in "xyz"])[:, 0]
+    return rec.cloud(points, store=store, header=header(store, n))
 
 
 def write_definitions(folder, *messages):
@@ -117,7 +107,7 @@ def main(port, folder):
     threading.Thread(target=lambda: (sys.stdin.read(), ended.set()), daemon=True).start()
     n = 0
     while not ended.wait(1.0 / HZ):
-        points.publish(**cloud(session.store.types, n))
+        points.publish(**vars(cloud(session.store, n)))
         n += 1
     for each in (points, echo, *kept):
         each.close()

@@ -112,7 +112,7 @@ def test_clouds_arrive_whole_in_order_and_in_a_thread_of_their_own(link):
     assert numbers == sorted(set(numbers))  # a busy machine may drop some
     for n, cloud in zip(numbers, clouds, strict=True):
         assert isinstance(cloud, STORE.types[ros2_node.POINTS])
-        sent = STORE.types[ros2_node.POINTS](**ros2_node.cloud(STORE.types, n))
+        sent = ros2_node.cloud(STORE, n)
         assert STORE.serialize_cdr(cloud, ros2_node.POINTS) == STORE.serialize_cdr(
             sent, ros2_node.POINTS
         )
@@ -132,7 +132,7 @@ def odometry(n):
         vector(*rng.normal(size=3)), vector(*rng.normal(size=3))
     )
     return types[ros2_node.ODOMETRY](
-        ros2_node.header(types, n),
+        ros2_node.header(STORE, n),
         "base_link",
         types["geometry_msgs/msg/PoseWithCovariance"](pose, rng.normal(size=36)),
         types["geometry_msgs/msg/TwistWithCovariance"](twist, rng.normal(size=36)),
