@@ -16,12 +16,10 @@ import json
 import multiprocessing as mp
 import os
 import resource
-import shutil
 import sys
 import tempfile
 import time
 import warnings
-from collections import Counter
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -38,7 +36,6 @@ from random_models import random_model
 
 from adaptune import files, processes
 from adaptune.archive import Archive, Frames, Trial, rows
-from adaptune.errors import AdaptuneError
 from adaptune.model import ErrorModel
 from adaptune.model.error_model import render
 from adaptune.odometry import wire
@@ -54,11 +51,9 @@ from adaptune.trajectory import Trajectory, read_trajectory, write_kitti, write_
 BYTES = 3 << 30
 ODOMETRY = "nav_msgs/msg/Odometry"
 STAMPS = drives.FIRST_STAMP + np.arange(30) * 10**8
-Case = Callable[[np.random.Generator], object]
-"""Damages something and reads it; it raises an `AdaptuneError`, or returns what was read."""
 
 
-def of_files(folder: Path, read: Callable[[Path], object], without: str = "") -> Case:
+def of_files(folder: Path, read: Callable[[Path], object], without: str = "") -> fuzz.Case:
     """Damage one file in a folder, but for those of a name, read it, and put it back."""
     there = (path for path in sorted(folder.rglob("*")) if path.is_file() and path.name != without)
     sound = {path: path.read_bytes() for path in there}
@@ -84,7 +79,7 @@ def poses(n: int = len(STAMPS)) -> np.ndarray:
     return T
 
 
-def trajectories(folder: Path) -> Case:
+def trajectories(folder: Path) -> fuzz.Case:
     """Files of poses: a reference, or what a program leaves."""
     write_tum(folder / "a.tum", Trajectory(STAMPS, poses()))
     write_kitti(folder / "b.txt", poses())
@@ -106,7 +101,7 @@ def trajectories(folder: Path) -> Case:
     return of_files(folder, read)
 
 
-def model(folder: Path) -> Case:
+def model(folder: Path) -> fuzz.Case:
     """Error models, with and without the digest of what is damaged."""
     random_model().save(folder / "model.safetensors")
 
@@ -118,7 +113,7 @@ def model(folder: Path) -> Case:
     return of_files(folder, read)
 
 
-def archive(folder: Path) -> Case:
+def archive(folder: Path) -> fuzz.Case:
     """Trials of a study."""
     made, n = Archive(folder), len(STAMPS)
     rng = np.random.default_rng(0)
@@ -142,7 +137,7 @@ def archive(folder: Path) -> Case:
     return of_files(folder, read)
 
 
-def cache(folder: Path) -> Case:
+def cache(folder: Path) -> fuzz.Case:
     """Decoded scans; their notes in JSON only adaptune itself writes, on this machine."""
     os.environ["ADAPTUNE_CACHE"] = str(folder / "cache")
     bag = drives.write_bag(folder / "drive.bag", drives.scans(n_scans=6))
@@ -155,7 +150,7 @@ def cache(folder: Path) -> Case:
     return of_files(folder / "cache", read, "about.json")
 
 
-def clouds(folder: Path) -> Case:
+def clouds(folder: Path) -> fuzz.Case:
     """Scans in files of their own; not PCD and PLY, on some of which Open3D itself crashes."""
     points = drives.scans(n_scans=1)[0][1][:200]
     np.save(folder / "1.npy", points)
@@ -163,7 +158,7 @@ def clouds(folder: Path) -> Case:
     return of_files(folder, lambda path: fuzz.check(read_scan(path, 0)))
 
 
-def estimate(folder: Path) -> Case:
+def estimate(folder: Path) -> fuzz.Case:
     """What is told of an estimated reference."""
     told = {"about": {}, "scans": 30, "metres": 15.0, "unknown_share": 0.1}
     told |= {"error_percent": {"5.0": 0.1, "25.0": 0.05}, "unknown_seconds": [[0, 1, "a"]]}
@@ -176,7 +171,7 @@ def estimate(folder: Path) -> Case:
     return of_files(folder, read)
 
 
-def templates(folder: Path) -> Case:
+def templates(folder: Path) -> fuzz.Case:
     """Parameter files of programs."""
     data = {"mapping": {"voxel": 1.0, "names": ["a", "b"]}, "rate": 10, "on": True}
     (folder / "a.yaml").write_text(files.dump(data))
@@ -190,7 +185,7 @@ def templates(folder: Path) -> Case:
     return of_files(folder, read)
 
 
-def programs(_: Path) -> Case:
+def programs(_: Path) -> fuzz.Case:
     """Messages of a program that takes scans, or of somebody who is served."""
     scan = Scan(int(STAMPS[0]), drives.scans(n_scans=1)[0][1][:50])
     space: dict[str, Any] = {"a": {"type": "float", "low": 0, "high": 1, "baseline": 0.5}}
@@ -213,7 +208,7 @@ def programs(_: Path) -> Case:
     return one
 
 
-def containers(_: Path) -> Case:
+def containers(_: Path) -> fuzz.Case:
     """Messages of poses that a system in a container publishes."""
     link: Any = local_link.LocalLink()
     link.record = lambda *_: None  # the messages are put there
@@ -229,40 +224,17 @@ def containers(_: Path) -> Case:
     return one
 
 
-def counted(target: Callable[..., Counter[str]], number: int, folder: Path | None = None) -> Case:
-    """So many cases of a function of `tests/support/fuzz.py`, each time in an empty folder."""
-
-    def one(rng: np.random.Generator) -> object:
-        if folder is None:
-            return target(number, int(rng.integers(2**31)))
-        shutil.rmtree(folder, ignore_errors=True)
-        folder.mkdir()
-        return target(number, int(rng.integers(2**31)), folder)
-
-    return one
-
-
-def messages(_: Path) -> Case:
-    """Point clouds in messages."""
-    return counted(fuzz.fuzz_messages, 20)
-
-
-def bags(folder: Path) -> Case:
-    """Bags of ROS 1 and ROS 2."""
-    return counted(fuzz.fuzz_bags, 60, folder)
-
-
-def studies(folder: Path) -> Case:
-    """Study files."""
-    return counted(fuzz.fuzz_studies, 20, folder)
-
-
-TARGETS: dict[str, Callable[[Path], Case]] = {
-    made.__name__: made
-    for made in (
-        *(messages, bags, clouds, cache, trajectories, estimate, model, archive, studies),
-        *(templates, programs, containers),
-    )
+TARGETS: dict[str, Callable[[Path], fuzz.Case]] = {
+    "messages": fuzz.of_messages,
+    "bags": fuzz.of_bags,
+    "studies": fuzz.of_studies,
+    **{
+        made.__name__: made
+        for made in (
+            *(clouds, cache, trajectories, estimate, model, archive, templates, programs),
+            containers,
+        )
+    },
 }
 
 
@@ -271,20 +243,11 @@ def run(name: str, minutes: float, seed: int) -> None:
     faulthandler.enable()
     resource.setrlimit(resource.RLIMIT_AS, (8 << 30, 8 << 30))
     warnings.simplefilter("ignore")
-    counts: Counter[str] = Counter()
     with tempfile.TemporaryDirectory() as folder:
         one = TARGETS[name](Path(folder))
         end = time.monotonic() + 60 * minutes
-        for number in itertools.count():
-            if time.monotonic() > end:
-                break
-            with fuzz.case(f"{name} {number} of seed {seed}"):
-                try:
-                    found = one(np.random.default_rng((seed, number)))
-                except AdaptuneError:
-                    counts["errors"] += 1
-                else:
-                    counts.update(found if isinstance(found, Counter) else {"read": 1})
+        in_time = itertools.takewhile(lambda _: time.monotonic() < end, itertools.count())
+        counts = fuzz.counted(one, seed, in_time)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss << 10
     assert peak < BYTES, f"{name}: {peak / 1e9:.1f} GB of memory"
     print(f"{name}: {dict(counts)}, at most {peak / 1e6:.0f} MB", flush=True)

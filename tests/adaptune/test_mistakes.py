@@ -112,5 +112,5 @@ def test_what_cannot_be_a_study_is_not_read(tmp_path, kind):
 
 
 def test_damaged_studies_give_a_study_or_an_error(tmp_path):
-    counts = fuzz.fuzz_studies(100, 1, tmp_path)
-    assert min(counts["errors"], counts["studies"]) > 0
+    counts = fuzz.counted(fuzz.of_studies(tmp_path), 1, range(100))
+    assert min(counts["errors"], counts["read"]) > 0

@@ -9,7 +9,7 @@ import re
 import signal
 import struct
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,6 @@ import rec
 
 from adaptune.errors import AdaptuneError
 from adaptune.recording import Scan, SequenceConfig, clouds
-from adaptune.recording.clouds import PointCloudError
 from adaptune.recording.inspect import inspect, render_inspection
 from adaptune.recording.recording import open_sequence
 from offline.config import load_study
@@ -47,6 +46,8 @@ KEYS = ("descriptor", "health", "online", "isolation", "courses", "lost_track", 
 _VALUE = re.compile(r"(?<=[:\[,{] )[^\s,\[\]{}]+|(?<=[\[{])[^\s,\[\]{}:]+(?=[,\]])")
 
 Decode = Callable[[bytes], Scan]
+Case = Callable[[np.random.Generator], object]
+"""Damages something and reads it; it raises an `AdaptuneError`, or returns what was read."""
 
 
 def message(store: Any, kind: str, stamp: int, rng: np.random.Generator) -> Any:
@@ -113,21 +114,15 @@ def check(scan: Scan) -> None:
         assert scan.times.max() <= 10.001
 
 
-def fuzz_messages(number: int, seed: int) -> Counter[str]:
-    """Decode so many damaged messages, and count what became of them."""
-    rng = np.random.default_rng(seed)
+def of_messages(_: Path | None = None) -> Case:
+    """Decodes damaged messages."""
     sound = list(samples())
-    counts: Counter[str] = Counter()
-    for i in range(number):
-        data, decode = sound[i % len(sound)]
-        damaged = damage(data, rng)
-        with case(f"message {i} of seed {seed}"):
-            try:
-                check(decode(damaged))
-                counts["scans"] += 1
-            except PointCloudError:
-                counts["errors"] += 1
-    return counts
+
+    def one(rng: np.random.Generator) -> None:
+        data, decode = sound[int(rng.integers(len(sound)))]
+        check(decode(damage(data, rng)))
+
+    return one
 
 
 def bags(folder: Path, scans: int = 16) -> list[Path]:
@@ -147,27 +142,27 @@ def bags(folder: Path, scans: int = 16) -> list[Path]:
     return made
 
 
-def fuzz_studies(number: int, seed: int, folder: Path) -> Counter[str]:
-    """Read so many damaged studies, and count what became of them."""
-    rng = np.random.default_rng(seed)
+def of_studies(folder: Path) -> Case:
+    """Reads damaged studies."""
     sound = drives.write_study(folder).read_text("utf-8")
     ran, file = folder / "ran", folder / "damaged.yaml"
-    counts: Counter[str] = Counter()
-    for i in range(number):
+
+    def one(rng: np.random.Generator) -> None:
         text = sound
         for _ in range(rng.integers(1, 4)):
             text = _worse(text, rng).replace("RAN", str(ran))
         file.write_text(text, "utf-8")
         said = ""
-        with case(f"study {i} of seed {seed}:\n{text}"):
-            try:
-                load_study(file)
-            except AdaptuneError as error:
-                said = str(error)
-            assert not ran.exists()
-            assert not re.search("pydantic|Error:|Input should", said)
-        counts["errors" if said else "studies"] += 1
-    return counts
+        try:
+            load_study(file)
+        except AdaptuneError as error:
+            said = str(error)
+            raise
+        finally:
+            assert not ran.exists(), text
+            assert not re.search("pydantic|Error:|Input should", said), text
+
+    return one
 
 
 def _worse(text: str, rng: np.random.Generator) -> str:
@@ -191,38 +186,44 @@ def _worse(text: str, rng: np.random.Generator) -> str:
     return "".join(lines) or text
 
 
-@patch("adaptune.recording.inspect.SECONDS", 0.0)
-def fuzz_bags(number: int, seed: int, folder: Path) -> Counter[str]:
-    """Read so many damaged bags, and count what became of them; inspect samples of half of them."""
-    rng = np.random.default_rng(seed)
+def of_bags(folder: Path) -> Case:
+    """Inspects damaged bags, samples of half of them, and reads them."""
     sound = bags(folder)
-    counts: Counter[str] = Counter()
-    for i in range(number):
-        original = sound[i % len(sound)]
+
+    @patch("adaptune.recording.inspect.SECONDS", 0.0)
+    def one(rng: np.random.Generator) -> None:
+        original = sound[int(rng.integers(len(sound)))]
         files = sorted(original.iterdir()) if original.is_dir() else [original]
         hit = files[int(rng.integers(len(files)))]
         whole = hit.read_bytes()
         hit.write_bytes(damage(whole, rng))
         # A file is read alone as well as in its folder.
         bare = hit.suffix in (".mcap", ".db3") and rng.random() < 0.5
-        path = hit if bare else original
+        path = str(hit if bare else original)
         topic = str(rng.choice(["/points", "/livox"]))
         try:
-            with case(f"bag {i} of seed {seed}, {path.name}"):
-                try:
-                    scans = list(
-                        open_sequence(SequenceConfig(bag=str(path), points=topic, cache=False))
-                    )
-                    for scan in scans:
-                        check(scan)
-                    assert (np.diff([scan.stamp for scan in scans]) > 0).all()
-                    counts["scans"] += 1
-                except AdaptuneError:
-                    counts["errors"] += 1
-                with contextlib.suppress(AdaptuneError):
-                    render_inspection(inspect(path, deep=i // len(sound) % 2 == 0))
+            with contextlib.suppress(AdaptuneError):
+                render_inspection(inspect(Path(path), deep=rng.random() < 0.5))
+            scans = list(open_sequence(SequenceConfig(bag=path, points=topic, cache=False)))
+            for scan in scans:
+                check(scan)
+            assert (np.diff([scan.stamp for scan in scans]) > 0).all()
         finally:
             hit.write_bytes(whole)
+
+    return one
+
+
+def counted(one: Case, seed: int, numbers: Iterable[int]) -> Counter[str]:
+    """Count what became of the cases of these numbers: they were read, or gave errors."""
+    counts: Counter[str] = Counter()
+    for number in numbers:
+        with case(f"case {number} of seed {seed}"):
+            try:
+                one(np.random.default_rng((seed, number)))
+                counts["read"] += 1
+            except AdaptuneError:
+                counts["errors"] += 1
     return counts
 
 

@@ -462,10 +462,10 @@ def test_only_chunks_of_the_time_are_looked_up(tmp_path):
 
 
 def test_damaged_messages_give_scans_or_an_error():
-    counts = fuzz.fuzz_messages(600, seed=1)
-    assert min(counts["scans"], counts["errors"]) > 100
+    counts = fuzz.counted(fuzz.of_messages(), 1, range(600))
+    assert min(counts["read"], counts["errors"]) > 100
 
 
 def test_damaged_bags_give_scans_or_an_error(tmp_path):
-    counts = fuzz.fuzz_bags(50, 1, tmp_path)
-    assert min(counts["scans"], counts["errors"]) > 5
+    counts = fuzz.counted(fuzz.of_bags(tmp_path), 3, range(50))
+    assert min(counts["read"], counts["errors"]) > 5
