@@ -23,15 +23,11 @@ SERVICES = {
 }
 
 
-def header(store, n):
-    return rec.header(n * 10**9 + 999_999_999, store=store)
-
-
 def cloud(store, n):
     """The cloud of a number: of as many bytes as a real one, more or less."""
     rows = np.random.default_rng(n).integers(0, 256, (30_000 + n % 7, 12), np.uint8)
     points = rows.view([(axis, "<f4") for axis in "xyz"])[:, 0]
-    return rec.cloud(points, store=store, header=header(store, n))
+    return rec.cloud(points, n * 10**9 + 999_999_999, store)
 
 
 def write_definitions(folder, *messages):

@@ -18,6 +18,7 @@ from adaptune.ros.link import LinkError
 from adaptune.ros.ros2 import Ros2, message_types
 from adaptune.trajectory import read_tum
 from offline.config import load_study
+from online.live import RosMessages
 from online.robot import RobotDrive
 
 pytestmark = pytest.mark.services
@@ -122,20 +123,9 @@ def test_clouds_arrive_whole_in_order_and_in_a_thread_of_their_own(link):
 
 
 def odometry(n):
-    rng, types = np.random.default_rng(n), STORE.types
-    pose = types["geometry_msgs/msg/Pose"](
-        types["geometry_msgs/msg/Point"](*rng.normal(size=3)),
-        types["geometry_msgs/msg/Quaternion"](*rng.normal(size=4)),
-    )
-    vector = types["geometry_msgs/msg/Vector3"]
-    twist = types["geometry_msgs/msg/Twist"](
-        vector(*rng.normal(size=3)), vector(*rng.normal(size=3))
-    )
-    return types[ros2_node.ODOMETRY](
-        ros2_node.header(STORE, n),
-        "base_link",
-        types["geometry_msgs/msg/PoseWithCovariance"](pose, rng.normal(size=36)),
-        types["geometry_msgs/msg/TwistWithCovariance"](twist, rng.normal(size=36)),
+    position, quaternion = np.split(np.random.default_rng(n).normal(size=7), [3])
+    return RosMessages(STORE, "odom").odometry(
+        n * 10**9 + 999_999_999, (position.tolist(), quaternion.tolist()), "base_link", (0.1, 0.2)
     )
 
 
