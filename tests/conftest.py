@@ -2,7 +2,6 @@
 
 import fcntl
 import os
-import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -101,18 +100,6 @@ def processes(monkeypatch: pytest.MonkeyPatch) -> None:
 def study_file(tmp_path_factory: Factory) -> Path:
     """A study of three short drives with the fake odometry, and its bags; not to be changed."""
     return shared(tmp_path_factory, "study", drives.write_study) / drives.STUDY_FILE
-
-
-@pytest.fixture(scope="session")
-def gicp_study_file(study_file: Path, tmp_path_factory: Factory) -> Path:
-    """The same with keyframe GICP."""
-
-    def make(folder: Path) -> None:
-        shutil.copytree(study_file.parent, folder)
-        text = study_file.read_text()
-        (folder / drives.STUDY_FILE).write_text(text.replace(f'"{fake_odometry.NAME}"', "gicp"))
-
-    return shared(tmp_path_factory, "gicp", make) / drives.STUDY_FILE
 
 
 @pytest.fixture(scope="session")

@@ -46,11 +46,11 @@ def test_an_odometry_that_needs_an_imu(study_file):
     assert "courses.sim: faulty:Inertial needs an IMU; simulate one, imu: 200" in text
 
 
-def test_reads_a_study(gicp_study_file, tmp_path):
-    study = load_study(gicp_study_file, ["offline.trials=7"], runs=tmp_path)
+def test_reads_a_study(study_file, tmp_path):
+    study = load_study(study_file, ["odometry.name=gicp", "offline.trials=7"], runs=tmp_path)
     assert study.folder == tmp_path / "small"
     assert study.config.offline.trials == 7
-    assert study.config.sequences["one"].bag == str(gicp_study_file.parent / "one.bag")
+    assert study.config.sequences["one"].bag == str(study_file.parent / "one.bag")
     assert study.odometry.space.names == ("max_correspondence_distance", "keyframe_interval")
     assert study.odometry.space.parameters["keyframe_interval"].low == 0.5
     assert study.odometry().odometry.settings.downsampling == 0.5
@@ -163,8 +163,9 @@ def test_folder_goes_on_only_with_the_same_study(study_file, tmp_path):
     assert "trials: 99" in (folder / "study.yaml").read_text()
 
 
-def test_a_parameter_that_a_setting_fixes_is_not_tuned(gicp_study_file):
-    text = failure(gicp_study_file, "odometry.parameters.downsampling={baseline: 0.5}")
+def test_a_parameter_that_a_setting_fixes_is_not_tuned(study_file):
+    fixed = "odometry.parameters.downsampling={baseline: 0.5}"
+    text = failure(study_file, "odometry.name=gicp", fixed)
     assert (
         "odometry.parameters.downsampling: downsampling is fixed by settings; leave it out" in text
     )

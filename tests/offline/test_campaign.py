@@ -114,13 +114,14 @@ def test_a_task_that_kills_every_worker_is_told(study_file, tmp_path, monkeypatc
         train(study)
 
 
-def test_views_are_trained_on_beside_their_origin(gicp_study_file, tmp_path):
+def test_views_are_trained_on_beside_their_origin(study_file, tmp_path):
     overrides = [
         "offline.augment=[{noise: 0.02}, {reverse: true}, {noise: 0.1}]",
         "offline.trials=2",
         "training=[one]",
+        "odometry.name=gicp",
     ]
-    study = load_study(gicp_study_file, overrides, tmp_path / "study")
+    study = load_study(study_file, overrides, tmp_path / "study")
     names = ["one", "one+noise", "one+reverse", "one+noise2"]
     training = train(study)
     assert training.model.sequences == names

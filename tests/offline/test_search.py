@@ -319,10 +319,10 @@ def test_what_is_surely_worse_than_the_best_is_given_up():
     assert survivors({5: (best[:2] + 1.0).tolist()}, before) == [5]
 
 
-def test_what_a_pruned_trial_has_seen_feeds_the_model(gicp_study_file, tmp_path):
+def test_what_a_pruned_trial_has_seen_feeds_the_model(study_file, tmp_path):
     given = ["training=[one, two, three]", "test=[]", "offline.trials=9", "offline.initial=6"]
-    given += ["offline.batch=3", "offline.pruning=wilcoxon"]
-    study = load_study(gicp_study_file, given, tmp_path / "study")
+    given += ["offline.batch=3", "offline.pruning=wilcoxon", "odometry.name=gicp"]
+    study = load_study(study_file, given, tmp_path / "study")
     training = train(study)
     archive = Archive(study.folder / "trials")
     seen = [[n in archive.finished(name) for name in study.training] for n in range(9)]

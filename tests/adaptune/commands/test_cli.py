@@ -119,11 +119,11 @@ def test_help_and_version(adaptune):
 
 
 @pytest.mark.services
-def test_ctrl_c_leaves_a_study_that_resumes(adaptune, gicp_study_file, tmp_path):
-    command = [sys.executable, "-m", "adaptune.commands.cli", "offline", str(gicp_study_file)]
+def test_ctrl_c_leaves_a_study_that_resumes(adaptune, study_file, tmp_path):
+    given = ["offline", str(study_file), "-o", "odometry.name=gicp"]
     many = ["-o", "offline.trials=400", "-o", "offline.batch=4"]
     campaign = subprocess.Popen(
-        command + many,
+        [sys.executable, "-m", "adaptune.commands.cli", *given, *many],
         cwd=tmp_path,
         stderr=subprocess.PIPE,
         text=True,
@@ -145,7 +145,7 @@ def test_ctrl_c_leaves_a_study_that_resumes(adaptune, gicp_study_file, tmp_path)
     assert log
     assert all(re.match(r"\[\d\d:\d\d:\d\d\] .*\S$", line) for line in log)
     finished = {p: p.stat().st_mtime_ns for p in archive.folder.glob("*/0000[0-3].npz")}
-    assert adaptune("offline", gicp_study_file).exit_code == 0
+    assert adaptune(*given).exit_code == 0
     assert {p: p.stat().st_mtime_ns for p in finished} == finished
 
 
@@ -169,9 +169,10 @@ def test_a_deep_inspection_measures_the_reference(adaptune, study_file, tmp_path
 
 
 @pytest.fixture(scope="module")
-def finished(gicp_study_file, tmp_path_factory):
+def finished(study_file, tmp_path_factory):
     """The folder of a study that was trained and replayed."""
-    study = load_study(gicp_study_file, [], tmp_path_factory.mktemp("run") / "study")
+    folder = tmp_path_factory.mktemp("run") / "study"
+    study = load_study(study_file, ["odometry.name=gicp"], folder)
     train(study)
     run_replays(study, study.model_path)
     return study.folder

@@ -162,25 +162,17 @@ def test_a_node_that_reads_nothing_any_more_is_an_error(monkeypatch):
     link.close()
 
 
-def test_the_command_drives_until_ctrl_c(link, gicp_study_file, tmp_path):
-    folder = tmp_path / "run"
-    train(load_study(gicp_study_file, ["offline.trials=4"], folder))
-    extra = ["-o", "online.ros.points=/velodyne", "-o", "online.ros.odometry=/found"]
+def test_the_command_drives_until_ctrl_c(link, study_file, tmp_path):
+    folder, given = tmp_path / "run", ["odometry.name=gicp", "offline.trials=4"]
+    train(load_study(study_file, given, folder))
+    extra = ["-o", given[0], "-o", given[1]]
+    extra += ["-o", "online.ros.points=/velodyne", "-o", "online.ros.odometry=/found"]
     # Nothing is too late, also where the tests share a core.
     extra += ["-o", "online.real_time={deadline: 60, queue: 0}"]
     poses = taken(link, "/found", "nav_msgs/msg/Odometry")
     chosen = taken(link, "/adaptune/selection", "std_msgs/msg/String")
     cloud = link.advertise("/velodyne", "sensor_msgs/msg/PointCloud2")
-    command = [
-        sys.executable,
-        "-m",
-        "adaptune",
-        "online",
-        str(gicp_study_file),
-        "--ros",
-        "-o",
-        "offline.trials=4",
-    ]
+    command = [sys.executable, "-m", "adaptune", "online", str(study_file), "--ros"]
     process = subprocess.Popen(
         [*command, "--folder", str(folder), *extra],
         stderr=subprocess.PIPE,
