@@ -6,7 +6,6 @@ import subprocess
 import sys
 import tomllib
 import zipfile
-from importlib.util import find_spec
 from pathlib import Path
 
 import drives
@@ -46,8 +45,7 @@ def test_extras_are_named_as_every_pip_reads_them():
 
 def built(project: Path, folder: Path) -> Path:
     """The wheel of a project, built without a network."""
-    if find_spec("hatchling") is None:
-        pytest.skip("hatchling is not installed: pip install 'adaptune[dev]'")
+    pytest.importorskip("hatchling", reason="pip install 'adaptune[dev]'")
     command = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", folder]
     subprocess.run(command, cwd=project, check=True, capture_output=True)
     (wheel,) = folder.glob("*.whl")
