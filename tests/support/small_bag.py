@@ -12,8 +12,6 @@ from adaptune.recording import SequenceConfig
 from adaptune.recording.inspect import render_inspection
 
 START = 1_700_000_000_000_000_000
-STORE = rec.ROS1
-write = rec.write_bag
 
 
 def cloud(stamp, n=200):
@@ -21,7 +19,7 @@ def cloud(stamp, n=200):
     raw["x"], raw["y"], raw["z"] = np.random.default_rng(stamp).normal(0, 10, (n, 3)).T
     raw["time"][5:] = np.linspace(0, 0.1, n - 5)
     raw[:5] = np.nan
-    return rec.cloud(raw, stamp, STORE)
+    return rec.cloud(raw, stamp, rec.ROS1)
 
 
 def bad_cloud(stamp, of):
@@ -39,7 +37,7 @@ def bad_cloud(stamp, of):
 
 
 def pose(stamp, x):
-    return rec.pose(stamp, (x, 0, 0), (0, 0, 0, 1), STORE)
+    return rec.pose(stamp, (x, 0, 0), (0, 0, 0, 1), rec.ROS1)
 
 
 def replace_bag(path, offset=0):
@@ -56,7 +54,7 @@ def drive(path, stamps, poses):
         ("/points", START + i * 10**8, cloud(START + round(s * 1e9))) for i, s in enumerate(stamps)
     ]
     messages += [("/poses", START, pose(START + round(s * 1e9), x)) for s, x in poses]
-    return write(path, messages)
+    return rec.write_bag(path, messages)
 
 
 def inspection_text(inspection, width=100):

@@ -6,18 +6,7 @@ import numpy as np
 import pytest
 import rec
 from rosbags.highlevel import AnyReader
-from small_bag import (
-    START,
-    STORE,
-    bad_cloud,
-    cloud,
-    drive,
-    entry,
-    inspection_text,
-    pose,
-    texts,
-    write,
-)
+from small_bag import START, bad_cloud, cloud, drive, entry, inspection_text, pose, texts
 
 from adaptune import files
 from adaptune.recording import SequenceConfig, SequenceError
@@ -85,11 +74,11 @@ def test_faults_are_reported_with_what_to_do(tmp_path, stamps, poses, expected):
 def test_clouds_without_valid_points_are_reported(tmp_path, of):
     times = [START + i * 10**8 for i in range(5)]
     bad = [("/points", t, bad_cloud(t, of)) for t in times]
-    inspection = inspect(write(tmp_path / "all.bag", bad))
+    inspection = inspect(rec.write_bag(tmp_path / "all.bag", bad))
     assert "all 5 clouds hold fewer than 20 valid points" in " ".join(texts(inspection))
     assert inspection.missing["online"] == ("clouds with points",)
     some = [("/points", t, cloud(t)) for t in times[:4]] + bad[4:]
-    inspection = inspect(write(tmp_path / "some.bag", some))
+    inspection = inspect(rec.write_bag(tmp_path / "some.bag", some))
     assert "1 of 5 clouds hold fewer than 20 valid points" in " ".join(texts(inspection))
     assert inspection.missing["online"] == ()
     assert "online: can run, but see" in inspection_text(inspection)
@@ -99,7 +88,7 @@ def test_messages_that_do_not_decode_are_reported(tmp_path):
     times = [START + i * 10**8 for i in range(5)]
     given = [("/points", t, cloud(t)) for t in times]
     given[3] = ("/points", times[3], bad_cloud(times[3], "cut"))
-    inspection = inspect(write(tmp_path / "a.bag", given))
+    inspection = inspect(rec.write_bag(tmp_path / "a.bag", given))
     (text,) = texts(inspection)
     assert "/points: 1 of 5 messages do not decode, the first at 0.3 s" in text
     assert "set `stop` before it" in text
@@ -116,8 +105,8 @@ def drive_of(path, span=0.1, begin=0.0, kind="<f4"):
         raw["x"], raw["y"], raw["z"] = np.random.default_rng(i).normal(0, 10, (3, 200))
         raw["time"] = first + np.linspace(0, span, 200)
         stamp = START + i * 10**8
-        messages.append(("/points", stamp, rec.cloud(raw, stamp, STORE)))
-    return write(path, messages)
+        messages.append(("/points", stamp, rec.cloud(raw, stamp, rec.ROS1)))
+    return rec.write_bag(path, messages)
 
 
 @pytest.mark.parametrize(
@@ -168,9 +157,9 @@ def test_a_bag_that_is_damaged_in_the_middle_says_so(tmp_path):
 def test_an_imu_that_is_not_finite_is_reported(tmp_path):
     messages = [("/points", t, cloud(t)) for t in (START, START + 10**8)]
     messages += [
-        ("/imu", START, rec.imu(START, (0, 0, z), (0, 0, z), STORE)) for z in (9.81, np.nan)
+        ("/imu", START, rec.imu(START, (0, 0, z), (0, 0, z), rec.ROS1)) for z in (9.81, np.nan)
     ]
-    inspection = inspect(write(tmp_path / "a.bag", messages))
+    inspection = inspect(rec.write_bag(tmp_path / "a.bag", messages))
     assert "/imu: 1 of 2 messages do not decode" in " ".join(texts(inspection))
     text = inspection_text(inspection, width=1000)
     assert "online: has all it needs" in text
@@ -294,7 +283,7 @@ def long_drive(path, every=1, *, stamps=None, speed=2.0, offset=0.0, cloud=cloud
         messages.append(("/points", when, cloud(when)))
         if round(10 * s) % every == 0:
             messages.append(("/poses", when, pose(when + round(offset * 1e9), speed * s)))
-    return write(path, messages)
+    return rec.write_bag(path, messages)
 
 
 @pytest.mark.usefixtures("sampled")
@@ -355,7 +344,7 @@ def test_poses_between_the_parts_of_a_sample_are_no_claim(tmp_path):
     poses = [(START + 3 * 10**9 + i * 10**7, 0.1 * i) for i in range(400)]
     messages = [("/points", t, cloud(t)) for t in range(START, START + 40 * 10**9, 10**8)]
     messages += [("/poses", t, pose(t, x)) for t, x in poses]
-    inspection = inspect(write(tmp_path / "a.bag", sorted(messages, key=lambda m: m[1])))
+    inspection = inspect(rec.write_bag(tmp_path / "a.bag", sorted(messages, key=lambda m: m[1])))
     expected = "/poses: its 400 messages are not in the sample, `--deep` reads them"
     assert texts(inspection) == [expected]
     assert inspection.missing["offline"] == ()
@@ -415,7 +404,7 @@ def test_recorded_data(recorded, name, points, rings, brightest, reference, alon
 def test_bags_that_do_not_follow_each_other_are_named(tmp_path):
     def bag(name, begin):
         stamps = [START + round((begin + 0.1 * i) * 1e9) for i in range(100)]
-        write(tmp_path / name, [("/points", when, cloud(when)) for when in stamps])
+        rec.write_bag(tmp_path / name, [("/points", when, cloud(when)) for when in stamps])
 
     bag("a.bag", 0.0)
     bag("b.bag", 11.0)
