@@ -4,7 +4,7 @@ import json
 import logging
 import os
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -179,10 +179,6 @@ class Sources(NamedTuple):
 
 
 INDEX = "index.jsonl"
-SLOTS = "slots.json"
-"""Of each sequence that is searched for sets of its own, the hundred thousand of its trials."""
-OF_SLOT = 100_000
-"""Trial numbers of a slot; the first hundred thousand are of sets that all sequences share."""
 _ARRAYS, _SINGLE = ("T_odom_sensor", "restarted", "registered"), ("errors", "seconds")
 _PLAIN = ("parameters", "faults", "metrics", "usage", "repeats", "unhealthy", "health")
 """Parts of a trial that are stored as they are, in single precision, and as JSON."""
@@ -336,24 +332,6 @@ class Archive:
         """The parameter sets of all finished trials, also on sequences that are no more used."""
         every = self._all().values()
         return {number: run.parameters for trials in every for number, run in trials.items()}
-
-    def slots(self, names: Iterable[str] = ()) -> dict[str, int]:
-        """The slot of every sequence that has one, or is among `names`; a sequence keeps its slot.
-
-        Its own search numbers its trials from `OF_SLOT` times the slot, which begin at 1.
-        """
-        path = self.folder / SLOTS
-        try:
-            text = path.read_text("utf-8") if path.exists() else "{}"
-            slots = {str(name): int(slot) for name, slot in json.loads(text).items()}
-        except (OSError, ValueError, TypeError, AttributeError, OverflowError) as error:
-            why = f"{path}: is damaged ({error}); give the study another folder"
-            raise ArchiveError(why) from error
-        for name in (new := [name for name in names if name not in slots]):
-            slots[name] = max(slots.values(), default=0) + 1
-        if new:
-            write_text(path, json.dumps(slots) + "\n")
-        return slots
 
     def _entries(self) -> Iterator[tuple[_Key, Summary]]:
         """Entries that the index should have."""

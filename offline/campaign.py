@@ -1,4 +1,4 @@
-"""The campaign: run the trials of all searches, batch by batch."""
+"""The campaign: run the trials of the search, batch by batch."""
 
 import logging
 import math
@@ -14,15 +14,15 @@ from adaptune.progress import Progress, unseen
 from adaptune.space import ParameterSet, PooledSpace
 from adaptune.study.references import contradictions_of
 from offline.config import OfflineConfig, OfflineStudy
-from offline.objective import Verdict, best_by_trials, judge, label, mean_value, weighted
-from offline.search import Clock, assess, make_searches, rungs
+from offline.objective import Verdict, judge, label, mean_value, weighted
+from offline.search import Clock, make_search, rungs
 from offline.workers import Pool, Task, TaskResult, run
 
 _log = logging.getLogger(__name__)
 
 
 class Campaign:
-    """Runs the searches of a study, side by side."""
+    """Runs the search of a study."""
 
     def __init__(
         self,
@@ -35,45 +35,35 @@ class Campaign:
         self._progress = progress
         self._config, self._names = study.config.offline, study.training
         self._finished = {name: archive.finished(name) for name in self._names}
-        self._searches = make_searches(self._config, study.odometry.space, self._names, archive)
+        self._search = make_search(self._config, study.odometry.space, self._names, archive)
         described = study.config.descriptor
         self._without_frames = [
             name for name in self._names if not archive.has_frames(name, described)
         ]
         self._best = ""  # in words
-        # For each trial number, the sequences that count.
-        self._counted: dict[int, Sequence[str]] = {}
 
     def run(self) -> dict[int, Verdict]:
         """Run all trials that are not in the archive yet, and judge all of them by number."""
         clock = Clock(self._study.folder / "elapsed.json")
-        batch = 0
-        while at_work := [s for s in self._searches if s.begin(clock.hours(batch))]:
+        batch, search = 0, self._search
+        while search.begin(clock.hours(batch)):
             begun = False
-            for m in rungs(self._config.pruning == "wilcoxon", batch, len(at_work[0].sequences)):
-                if tasks := self._tasks([of for search in at_work for of in search.missing(m)]):
+            for m in rungs(self._config.pruning == "wilcoxon", batch, len(self._names)):
+                if tasks := self._tasks(search.missing(m)):
                     begun = True
                     with clock.running(batch):
                         self._run_tasks(tasks)
-                for search in at_work:
-                    search.prune(m)
-            numbers = sorted({n for search in at_work for n in search.numbers})
-            for search in at_work:
-                self._counted |= dict.fromkeys(search.numbers, search.sequences)
-                search.close()
-            self._counted[0] = self._names
+                search.prune(m)
+            numbers = search.numbers
+            search.close()
             self._best = self._best_in_words()
             if begun:
                 self._show(self._n_done())
-                _log.debug("trials %d to %d done; %s", numbers[0], numbers[-1], self._best)
+                _log.debug("trials %d to %d done; %s", min(numbers), max(numbers), self._best)
             batch += 1
-        for search in self._searches:
-            where = f" on {search.sequences[0]}" if self._config.sets == "own" else ""
-            _log.info("the search%s ends: %s", where, search.end)
+        _log.info("the search ends: %s", search.end)
         self._show(self._n_done())
-        if self._config.sets == "own":
-            self._run_everywhere()
-        return {n: self._verdict(n) for n in sorted(self._counted)}
+        return dict(sorted(search.done.items()))
 
     def _run_tasks(self, tasks: list[Task]) -> None:
         before = self._n_done()
@@ -89,53 +79,26 @@ class Campaign:
 
     def _n_done(self) -> int:
         """Runs that are done, with those that will not be run."""
-        closed = sum(len(search.verdicts) * len(search.sequences) for search in self._searches)
-        return closed + sum(
-            number in self._finished[name]
-            for search in self._searches
-            for name in search.sequences
-            for number in search.numbers
-        )
+        search, finished = self._search, self._finished.values()
+        closed = len(search.verdicts) * len(self._names)
+        return closed + sum(number in of for of in finished for number in search.numbers)
 
     def _show(self, done: float, at_work: str = "") -> None:
         runs = [run for of in self._finished.values() for run in of.values()]
         failed = sum(run.lost > 0 or run.faults > 0 for run in runs)
         remarks = [at_work, self._best, f"{failed} lost track or failed" if failed else ""]
-        total = sum(search.total() for search in self._searches)
-        self._progress("runs", done, total, ", ".join(filter(None, remarks)))
+        self._progress("runs", done, self._search.total(), ", ".join(filter(None, remarks)))
 
     def _best_in_words(self) -> str:
-        """The best value so far, or its mean where each search has a sequence of its own."""
-        best = [search.verdicts[search.best] for search in self._searches]
-        value = float(np.mean([verdict.value for verdict in best]))
-        what = f"best {label(self._config.objective)} {value:.3f}"
-        if self._config.sets == "own":
-            return f"{what} in the mean of {len(best)} sequences"
-        (search,) = self._searches
-        return f"{what} (trial {search.number(search.best)})"
-
-    def _run_everywhere(self) -> None:
-        """Run the best set of each sequence on the others, to choose the fixed one among them."""
-        best = {}
-        for search in self._searches:
-            if any(verdict.usable for verdict in search.verdicts):
-                number = best_by_trials(search.done)
-                best[number] = search.done[number]
-        missing = [
-            (name, {n: v.parameters for n, v in best.items() if n not in self._finished[name]})
-            for name in self._names
-        ]
-        what = "best sets of each on the others"
-        watch_tasks(self._archive, self._workers, self._tasks(missing), what, self._progress)
-        self._counted |= dict.fromkeys(best, self._names)
+        """The best value so far."""
+        search = self._search
+        value, number = search.verdicts[search.best].value, search.number(search.best)
+        return f"best {label(self._config.objective)} {value:.3f} (trial {number})"
 
     def _tasks(self, missing: Sequence[tuple[str, Mapping[int, ParameterSet]]]) -> list[Task]:
         without_frames, self._without_frames = self._without_frames, []
         n_workers = len(self._workers.workers())
         return trial_tasks(missing, without_frames, n_workers, self._study.odometry.one_by_one)
-
-    def _verdict(self, n: int) -> Verdict:
-        return assess(n, self._counted[n], self._config, self._names, self._finished)
 
 
 def trial_tasks(

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune.archive import OF_SLOT, Archive, Summary
+from adaptune.archive import Archive, Summary
 from adaptune.errors import AdaptuneError
 from adaptune.recording.scan import OF_VIEW
 from adaptune.report.charts import (
@@ -78,10 +78,6 @@ class TrialTable:
         """The same of some of the trials."""
         few = [trial for trial, its in zip(self.trials, kept, strict=True) if its]
         return replace(self, trials=few)
-
-    def shared(self) -> "TrialTable":
-        """The same of the trials whose sets all sequences share."""
-        return self.some(self.numbers < OF_SLOT)
 
     def odometries(self) -> dict[str, "TrialTable"]:
         """By the name of an odometry its trials; of the only one by no name."""
@@ -178,39 +174,26 @@ def _marked(table: TrialTable, x: NDArray[Any], y: NDArray[Any]) -> list[Drawn]:
 
 
 def iteration_chart(table: TrialTable) -> Chart | None:
-    """Error of each trial, and the least so far, over the trial's number: one panel a search."""
-    panels = []
-    slots = table.numbers // OF_SLOT
-    for slot in np.unique(slots).tolist()[:MOST_PANELS]:
-        values, title = table.values, ""
-        if slot:
-            # A search of its own is on one sequence.
-            own = table.some(slots == slot)
-            of = max(table.names, key=lambda name: np.isfinite(own.on(name)).sum())
-            values, title = table.on(of), f"{of} alone"
-        kept = (slots == slot) & np.isfinite(values)
-        number, errors = table.numbers[kept] - OF_SLOT * slot, values[kept]
-        if len(number) < 2:
-            continue
-        allowed = np.where([trial.usable for trial in table.some(kept).trials], errors, np.inf)
-        least = np.minimum.accumulate(allowed)
-        drawn: list[Drawn] = [
-            Points(number, errors, "trial", texts=[f"trial {n}" for n in table.numbers[kept]]),
-            Line(number, np.where(np.isfinite(least), least, np.nan), "best so far", steps=True),
-        ]
-        first = number == 0
-        drawn += [Points(number[first], errors[first], "baseline")] if first.any() else []
-        log = bool((errors > 0.0).all())
-        panels.append(Panel(Axis("trial [-]"), Axis(table.objective, log), tuple(drawn), title))
-    if not panels:
+    """Error of each trial, and the least so far, over the trial's number."""
+    table = table.some(np.isfinite(table.values))
+    number, errors = table.numbers, table.values
+    if len(number) < 2:
         return None
+    allowed = np.where([trial.usable for trial in table.trials], errors, np.inf)
+    least = np.minimum.accumulate(allowed)
+    drawn: list[Drawn] = [
+        Points(number, errors, "trial", texts=[f"trial {n}" for n in number]),
+        Line(number, np.where(np.isfinite(least), least, np.nan), "best so far", steps=True),
+    ]
+    first = number == 0
+    drawn += [Points(number[first], errors[first], "baseline")] if first.any() else []
+    log = bool((errors > 0.0).all())
     return Chart(
         "iterations",
         "The search for parameters",
-        tuple(panels),
+        (Panel(Axis("trial [-]"), Axis(table.objective, log), tuple(drawn)),),
         "Error of each trial in the order of the search, and the least so far. "
         "A flat end means that more trials promise little.",
-        columns=min(2, len(panels)),
     )
 
 
@@ -381,7 +364,7 @@ def charts_of_trials(study: OfflineStudy) -> Charts:
 
 def _of_trials(table: TrialTable) -> Iterator[Chart | str | None]:
     names = [name for name in table.names if OF_VIEW not in name]
-    found = {name: importances(of) for name, of in table.shared().odometries().items()}
+    found = {name: importances(of) for name, of in table.odometries().items()}
     yield iteration_chart(table)
     yield importance_chart(found) or (
         f"No importance of parameters: it takes {FEW} finished trials and two parameters."

@@ -436,7 +436,6 @@ class OfflineConfig(StrictModel):
 
     sampler: str = "tpe"
     sampler_settings: dict[str, Any] = Field(default_factory=dict)
-    sets: Literal["shared", "own"] = "shared"
     trials: int | None = Field(None, ge=1, le=10**6)
     hours: float | None = Field(None, gt=0, le=1e5)
     stagnation: int | None = Field(None, ge=1, le=10**6)
@@ -450,15 +449,6 @@ class OfflineConfig(StrictModel):
     baseline_runs: int | None = Field(None, ge=1, le=1000)
     augment: Annotated[tuple[ViewConfig, ...], Field(max_length=MOST_VIEWS)] = ()
     pruning: Literal["none", "wilcoxon"] = "none"
-
-    @model_validator(mode="after")
-    def _check_pruning(self) -> Self:
-        if self.pruning != "none" and self.sets == "own":
-            raise ValueError(
-                "pruning spares trials further sequences, and with sets: own each runs on one; "
-                "set pruning: none, or sets: shared"
-            )
-        return self
 
     @model_validator(mode="after")
     def _check_baseline_runs(self) -> Self:
@@ -502,7 +492,7 @@ class OfflineConfig(StrictModel):
 
 
 _SEARCH = (
-    *("sampler", "sampler_settings", "sets", "initial", "batch", "seed"),
+    *("sampler", "sampler_settings", "initial", "batch", "seed"),
     *("objective", "runs", "repeats", "baseline_runs", "pruning"),
 )
 """Settings by which a search differs from another."""
@@ -549,7 +539,8 @@ class OfflineStudyConfig(StudyConfig):
     def search_inputs(self) -> dict[str, Any]:
         """What makes the trials of a study those that they are: another search has others."""
         offline = self.resolved()["offline"]
-        return {key: value for key in _SEARCH if (value := offline.get(key))}
+        # The sets are shared, as trials of earlier versions have it recorded.
+        return {"sets": "shared"} | {k: value for k in _SEARCH if (value := offline.get(k))}
 
 
 OfflineStudy = Study[OfflineStudyConfig]

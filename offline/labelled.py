@@ -48,7 +48,6 @@ from offline.objective import (
     repeated,
     weighted,
 )
-from offline.search import owner
 
 if TYPE_CHECKING:
     from adaptune.model.knn import ScaledPCA
@@ -240,9 +239,6 @@ class LabelledSequence:
     values: NDArray[np.float64] | None = None
     # (n_sets, n_repeats): where trials are repeated, the objective of every run.
     repeats: NDArray[np.float64] | None = None
-    # (n_sets,): sets that were searched for on this sequence or a view of it alone, if any. Where
-    # the sequence is left out, they are unknown.
-    own: NDArray[np.bool_] | None = None
     block: int = 1  # frames of a sub-trajectory
     elevation: float = np.nan  # degrees, see `adaptune.model.descriptor.lowest_elevation`
     # By trial number, the objective in whole runs of the candidates for the fixed set.
@@ -342,7 +338,6 @@ class LabelledSequence:
             errors=self.errors[:, columns],
             values=None if self.values is None else self.values[columns],
             repeats=None if self.repeats is None else self.repeats[columns],
-            own=None if self.own is None else self.own[columns],
         )
 
 
@@ -494,23 +489,6 @@ class LabelledData(NamedTuple):
         )
 
 
-def comparable(
-    sequence: LabelledSequence, others: LabelledData
-) -> tuple[LabelledSequence, LabelledData]:
-    """Restrict both to the sets that were run on the sequence left out, but not found there alone.
-
-    Other sets have no recorded error there, or would be unknown without that sequence.
-    """
-    run = np.asarray(~np.isnan(sequence.errors).any(axis=0))
-    if sequence.own is not None:
-        run &= ~sequence.own
-    if run.all():
-        return sequence, others
-    few = others.subset([t for t, its in zip(others.sets, run, strict=True) if its])
-    left = [s for s in few.sequences if not np.isnan(s.errors).all()]
-    return sequence.subset(np.flatnonzero(run)), few._replace(sequences=left)
-
-
 def periods(period: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """First frame of every period, and number of every frame's period among them.
 
@@ -631,8 +609,6 @@ def _labelled(
         [np.nan] * n_repeats if s is None else repeated(objective, s.repeats)[:n_repeats]
         for s in summaries
     ]
-    slots, place = archive.slots(), origin(name)
-    own = [(by := owner(slots, trial)) is not None and origin(by) == place for trial in sets]
     read = cache(partial(archive.read, name))
 
     @lru_cache(maxsize=1)  # one bank after the other is asked for, each many times
@@ -660,7 +636,6 @@ def _labelled(
         frames.blocks,
         values=np.array(values),
         repeats=np.array(repeats) if n_repeats > 1 else None,
-        own=np.array(own),
         block=span(frames.T_ref_sensor, length),
         elevation=float(np.nanmedian(frames.elevations)),
     )

@@ -1,17 +1,17 @@
-"""Searches for parameter sets: one over all training sequences, or one for each."""
+"""The search for parameter sets that all training sequences share."""
 
 import json
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import cached_property, partial
+from functools import cached_property
 from itertools import count, islice
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from adaptune.archive import OF_SLOT, Archive, Summary
+from adaptune.archive import Archive, Summary
 from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
 from adaptune.space import ParameterSet, ParameterSpace
@@ -153,11 +153,10 @@ Finished = Mapping[str, Mapping[int, Summary]]
 
 
 class Search:
-    """One search, batch by batch.
+    """The search, batch by batch.
 
-    Each search has a slot of trial numbers, see `adaptune.archive.OF_SLOT`; all of them share trial
-    0, the baseline. So numbers depend neither on a budget nor on the other searches. A number keeps
-    its set: one that ran on any sequence is not proposed anew where others are added.
+    Trial 0 is the baseline, and numbers do not depend on a budget. A number keeps its set: one that
+    ran on any sequence is not proposed anew where others are added.
     """
 
     def __init__(
@@ -167,7 +166,6 @@ class Search:
         sequences: Sequence[str],
         finished: Finished,
         known: Mapping[int, ParameterSet],
-        slot: int = 0,
     ):
         self.sequences = list(sequences)
         self.verdicts: list[Verdict] = []  # of the trials of all batches that are closed
@@ -179,7 +177,7 @@ class Search:
         self._make_sampler, self._config = sampler, config
         self._limit = max_trials(config)
         self._finished = finished
-        self._known, self._slot = known, slot
+        self._known = known
         self._alive: list[int] = []
         self._sets: dict[int, ParameterSet] = {}
 
@@ -190,9 +188,7 @@ class Search:
 
     def number(self, i: int) -> int:
         """Trial number in the study of trial `i` of this search."""
-        if i < len(self._closed):
-            return self._closed[i]
-        return OF_SLOT * self._slot + i if i else 0
+        return self._closed[i] if i < len(self._closed) else i
 
     @property
     def done(self) -> dict[int, Verdict]:
@@ -244,7 +240,7 @@ class Search:
         """Close the batch, whose trials have all finished or stopped."""
         first = len(self.verdicts)
         of = (self._config, self.sequences, self._finished)
-        self.verdicts += [assess(n, self.sequences, *of) for n in self.numbers]
+        self.verdicts += [assess(n, *of) for n in self.numbers]
         self._closed += self.numbers
         ranks = [(not v.complete, not v.usable, v.value) for v in self.verdicts]
         self.best = min((self.best, *range(first, len(ranks))), key=ranks.__getitem__)
@@ -283,14 +279,10 @@ class Search:
 
 
 def assess(
-    number: int,
-    counted: Sequence[str],
-    config: OfflineConfig,
-    sequences: Sequence[str],
-    finished: Finished,
+    number: int, config: OfflineConfig, sequences: Sequence[str], finished: Finished
 ) -> Verdict:
     """Judge a trial; estimate its value if it was not run on all sequences."""
-    seen = tuple(name for name in sequences if name in counted and number in finished[name])
+    seen = tuple(name for name in sequences if number in finished[name])
     found = judge(config, [finished[name][number] for name in seen])
     if len(seen) == len(sequences):
         return found._replace(sequences=seen)
@@ -302,28 +294,15 @@ def assess(
     return found._replace(value=value, complete=False, sequences=seen)
 
 
-def make_searches(
+def make_search(
     config: OfflineConfig, space: ParameterSpace, names: Sequence[str], archive: Archive
-) -> list[Search]:
-    """Make the searches over some sequences, in their order: one over all, or one for each."""
+) -> Search:
+    """Make the search over some sequences, in their order."""
 
-    def sampler_of(config: OfflineConfig) -> "Sampler":
+    def sampler() -> "Sampler":
         from offline.samplers import make_sampler  # Optuna takes a second to import
 
         return make_sampler(space, config)
 
-    finished, known = {name: archive.finished(name) for name in names}, archive.sets()
-    if config.sets == "shared":
-        return [Search(partial(sampler_of, config), config, names, finished, known)]
-    slots, searches = archive.slots(names), []
-    for name in names:
-        seeds = np.random.SeedSequence((config.seed, slots[name] - 1))
-        seed = {"seed": int(seeds.generate_state(1)[0])}
-        sampler = partial(sampler_of, config.model_copy(update=seed))
-        searches.append(Search(sampler, config, [name], finished, known, slots[name]))
-    return searches
-
-
-def owner(slots: Mapping[str, int], number: int) -> str | None:
-    """The sequence whose own search proposed a trial's set; None for a shared search."""
-    return next((name for name, slot in slots.items() if slot == number // OF_SLOT), None)
+    finished = {name: archive.finished(name) for name in names}
+    return Search(sampler, config, names, finished, archive.sets())

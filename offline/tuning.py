@@ -31,7 +31,7 @@ from adaptune.study.study import (
     ONE_SET,
     is_worth,
 )
-from offline.labelled import LabelledData, LabelledSequence, comparable, periods
+from offline.labelled import LabelledData, LabelledSequence, periods
 
 if TYPE_CHECKING:
     from adaptune.model.knn import ScaledPCA
@@ -289,7 +289,6 @@ def _logs(
     Returns shape (n_stretches, n_ways): first those of one set at a time with each of
     `PAIRED_SETTINGS`, then those of each bank with each of `BANK_SETTINGS`.
     """
-    left_out, others = comparable(left_out, others)
     fitted = data, pca = others.training_data()
     fixed = cap(left_out.errors[:, data.sets.column(data.fixed)])
     columns = []
@@ -297,7 +296,7 @@ def _logs(
         columns += list(_paired_errors(left_out, data, pca))
     known: dict[tuple[int, ...], list[NDArray[np.float64]]] = {}
     for make in choosers:
-        found = [trial for trial in make(others, data.fixed) if trial in data.sets]
+        found = make(others, data.fixed)
         # Whatever the order of the others is, they are the same bank.
         members = (*found[:1], *sorted(found[1:]))
         if members not in known and len(members) < 2:

@@ -34,7 +34,7 @@ from adaptune.study.study import (
 )
 from offline.charts import stretch_chart
 from offline.config import OfflineStudy
-from offline.labelled import LabelledData, LabelledSequence, comparable, labelled_data, periods
+from offline.labelled import LabelledData, LabelledSequence, labelled_data, periods
 from offline.tuning import (
     MOST_FOLDS,
     Figures,
@@ -232,10 +232,6 @@ def leave_out(
     by_recording: bool,
 ) -> LeftOut:
     """Fit on the others, and look up what happens on what is left out."""
-    n_sets = len(others.sets)
-    sequence, others = comparable(sequence, others)
-    if not isinstance(bank, int) and len(others.sets) < n_sets:
-        bank = len(bank)
     fitted = data, pca = others.training_data()
     features = pca.transform(sequence.descriptors)
     capped = cap(sequence.errors)

@@ -237,7 +237,7 @@ DELETED = {
     "odometry.settings.drain": "is gone: adaptune waits until the system rests; leave it out",
     "offline.limits": "is gone: give online.budget, the CPU time of a scan, or weigh costs in "
     "offline.objective",
-    "offline.sets=both": "is gone; give shared, or own",
+    "offline.sets": "is gone: all training sequences share their sets; leave it out",
     "offline.runs=episodes": "is gone; give restart, or whole",
     "offline.pruning=halving": "is gone; give wilcoxon, which saved more",
     "offline.pruning=hyperband": "is gone; give wilcoxon, which saved more",
@@ -246,7 +246,7 @@ DELETED = {
         f"offline.sampler={old}": "is gone; give one of optuna.samplers, with its own settings"
         for old in ("cmaes", "gp", "nsga2", "qmc", "sobol")
     },
-    "offline.preset": "is gone; for the paper's, give trials: 256, sets: own, runs: whole",
+    "offline.preset": "is gone; for the paper's, give trials: 256, runs: whole",
     "offline.target": "is gone; give trials, hours or stagnation",
     "offline.storage": "is gone: the trials are files in the study's folder, and in trials.csv",
     "offline.max_frames": "is gone: the error model keeps all frames; leave it out",

@@ -12,15 +12,14 @@ from made_trials import Drawn
 
 from adaptune.archive import Archive, Summary
 from adaptune.model import ErrorModel
-from adaptune.space import Categorical, ParameterSets, ParameterSpace
+from adaptune.space import Categorical, ParameterSpace
 from offline.campaign import Campaign
 from offline.config import OfflineConfig, load_study
-from offline.labelled import labelled_data
-from offline.objective import Verdict, best_by_trials
+from offline.objective import Verdict
 from offline.samplers import make_sampler
-from offline.search import Clock, Search, has_ended, owner, spent, survivors
+from offline.search import Clock, Search, has_ended, spent, survivors
 from offline.train import train
-from offline.validate import leave_one_out, validate
+from offline.validate import validate
 
 NAMES = ["one", "two", "three"]
 
@@ -56,50 +55,12 @@ def error(sequence, parameters):
 def run(study):
     pool = Drawn(error)
     archive = Archive(study.folder / "trials")
-    verdicts = Campaign(study, archive, pool).run()
-    seen = {
-        n: [name for name in NAMES if n in archive.finished(name)]
-        for n in sorted(set().union(*(archive.finished(name) for name in NAMES)))
-    }
-    return verdicts, seen, archive
-
-
-def owner_of(archive, number):
-    return owner(archive.slots(), number)
+    return Campaign(study, archive, pool).run(), archive
 
 
 def sets(archive):
     """All parameter sets in the archive, by sequence and number."""
     return {(name, n): s.parameters for name in NAMES for n, s in archive.finished(name).items()}
-
-
-def test_each_sequence_searches_for_itself(study_of):
-    study = study_of(sets="own")
-    verdicts, seen, archive = run(study)
-    numbers = [0, *(100_000 * slot + i for slot in (1, 2, 3) for i in range(1, 11))]
-    assert list(verdicts) == list(seen) == numbers
-    best = {}
-    for name in NAMES:
-        of = archive.finished(name)
-        mine = [n for n in seen if owner_of(archive, n) in (name, None)]
-        assert len(mine) == 11
-        best[name] = min(mine, key=lambda n: (of[n].mean_error, n))
-    for n, names in seen.items():
-        everywhere = n == 0 or n in best.values()
-        assert names == (NAMES if everywhere else [owner_of(archive, n)])
-        assert verdicts[n].complete == everywhere
-        assert list(verdicts[n].sequences) == names
-    fixed = best_by_trials(verdicts)
-    assert fixed in {0, *best.values()}
-    means = {
-        n: np.mean([archive.finished(name)[n].mean_error for name in NAMES]) for n in (0, fixed)
-    }
-    assert verdicts[fixed].value == pytest.approx(means[fixed])
-    assert means[fixed] < means[0]
-    # The searches differ from each other, in their initial points too.
-    assert (
-        len({str(archive.finished(owner_of(archive, n))[n].parameters) for n in numbers[1:]}) == 30
-    )
 
 
 SAMPLERS = {
@@ -116,17 +77,13 @@ POOL = "[{name: gicp}, {name: vgicp}]"
 
 
 @pytest.mark.parametrize(
-    ("sampler", "kind", "pool"),
-    [
-        *(("tpe", "shared", None), ("tpe", "shared", POOL), ("random", "shared", POOL)),
-        *((sampler, "own", None) for sampler in SAMPLERS),
-    ],
+    ("sampler", "pool"),
+    [*((sampler, None) for sampler in SAMPLERS), ("tpe", POOL), ("random", POOL)],
 )
-def test_stopped_and_resumed_it_is_the_same(study_of, sampler, kind, pool):
-    given = {"sets": kind, "sampler": sampler, "sampler_settings": SAMPLERS[sampler]}
-    given["pool"] = pool
-    expected, _, archive = run(study_of(**given))
-    # With a smaller budget first, which has other sets run everywhere...
+def test_stopped_and_resumed_it_is_the_same(study_of, sampler, pool):
+    given = {"sampler": sampler, "sampler_settings": SAMPLERS[sampler], "pool": pool}
+    expected, archive = run(study_of(**given))
+    # With a smaller budget first...
     fewer = study_of(trials=6, **given)
     run(fewer)
     # ... and some of it lost.
@@ -134,15 +91,14 @@ def test_stopped_and_resumed_it_is_the_same(study_of, sampler, kind, pool):
     trials = sorted(fewer.folder.glob("trials/*/[0-9]*.npz"))
     for path in rng.choice(trials, len(trials) // 3, replace=False):
         path.unlink()
-    again, _, other = run(study_of(fewer.folder, **given))
+    again, other = run(study_of(fewer.folder, **given))
     assert again == expected
     assert sets(archive).items() <= sets(other).items()
 
 
 @pytest.mark.parametrize("sampler", SAMPLERS)
-@pytest.mark.parametrize("kind", ["shared", "own"])
-def test_sequences_are_added_and_removed(study_of, sampler, kind):
-    given = {"sets": kind, "sampler": sampler, "sampler_settings": SAMPLERS[sampler]}
+def test_sequences_are_added_and_removed(study_of, sampler):
+    given = {"sampler": sampler, "sampler_settings": SAMPLERS[sampler]}
 
     def run_on(names, trials, folder=None):
         study = study_of(folder, trials=trials, training=names, **given)
@@ -155,61 +111,28 @@ def test_sequences_are_added_and_removed(study_of, sampler, kind):
     _, verdicts, ran = run_on(NAMES, 10, folder)
     after = sets(Archive(folder / "trials"))
     assert before.items() <= after.items()
-    new = {(name, n) for name, n in ran if name != "three" and n < 300_000}
-    # Only the best set of each sequence may be another one now, and runs everywhere.
-    assert new <= ({(n, t) for n in NAMES for t in verdicts} if kind == "own" else set())
-    shared = [n for n in verdicts if n < 100_000]
-    assert shared == [n for n in first if n < 100_000]
-    assert all(after["three", n] == before["one", n] for n in shared)
+    assert {name for name, _ in ran} == {"three"}
+    assert list(verdicts) == list(first)
+    assert all(after["three", n] == before["one", n] for n in verdicts)
     _, fewer, ran = run_on(["three"], 14, folder)
-    assert max(n for n in fewer if n < 100_000) >= max(shared)
+    assert max(fewer) >= max(verdicts)
     _, _, ran = run_on(NAMES, 14, folder)
     everything = sets(Archive(folder / "trials"))
     assert after.items() <= everything.items()
     numbers = {n: str(s) for (_, n), s in everything.items()}
     assert all(str(s) == numbers[n] for (_, n), s in everything.items())
-    of_search = [text for n, text in numbers.items() if n < 100_000]
-    assert len(set(of_search)) == len(of_search)
+    assert len(set(numbers.values())) == len(numbers)
     assert run_on(NAMES, 14, folder)[2] == set()
-
-
-def test_what_a_place_has_found_is_not_known_where_it_is_left_out(study_of):
-    study = study_of(sets="own")
-    verdicts, _, archive = run(study)
-    sets = ParameterSets(
-        study.odometry.space, tuple(verdicts), tuple(v.parameters for v in verdicts.values())
-    )
-    seen = {name: [n for n, v in verdicts.items() if name in v.sequences] for name in NAMES}
-    data = labelled_data(
-        archive, seen, sets, study.config, study.window, study.sequences.recorded_in, study.odometry
-    )
-    assert np.isnan(data.sequences[0].errors).any()
-    complete = data.complete()
-    assert list(complete.sets) == [n for n, v in verdicts.items() if v.complete]
-    assert complete.fixed() == best_by_trials(verdicts)
-    for sequence in complete.sequences:
-        assert sequence.own.tolist() == [
-            owner_of(archive, n) == sequence.name for n in complete.sets
-        ]
-    # These trials have errors without motions.
-    validation = leave_one_out(complete, bank=0)
-    for left_out in validation.left_out:
-        known = [
-            archive.finished(left_out.name)[n].mean_error
-            for n in complete.sets
-            if owner_of(archive, n) != left_out.name
-        ]
-        assert left_out.errors["oracle, sequence"].mean() == pytest.approx(min(known), rel=1e-5)
 
 
 def test_verdicts_belong_to_their_trials_where_numbers_are_left_out():
     space = ParameterSpace({"k": Categorical(choices=("a", "b", "c"), baseline="a")})
     config = OfflineConfig(trials=8, initial=2, batch=2)
     finished = {"one": {}}
-    # Trial 100003 is known from another sequence.
-    known = {0: {"k": "a"}, 100003: {"k": "b"}}
+    # Trial 3 is known from another sequence.
+    known = {0: {"k": "a"}, 3: {"k": "b"}}
     sampler = partial(make_sampler, space, config)
-    search = Search(sampler, config, ["one"], finished, known, 1)
+    search = Search(sampler, config, ["one"], finished, known)
     while search.begin(0.0):
         for n in search.numbers:
             finished["one"][n] = Summary(search._sets[n], 1.0, 0, 0, 1.0)

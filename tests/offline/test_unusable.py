@@ -28,7 +28,6 @@ def trained(study_file, folder, fails, *given):
     ("fails", "given"),
     [
         ("always", [FAST]),
-        ("always", ["offline.sets=own", FAST]),
         ("every fifth", [FAST]),
         ("in two", [FAST]),
         ("always", ["online.switching={mechanism: bank, size: 6}"]),
