@@ -80,7 +80,7 @@ class Campaign:
     def _n_done(self) -> int:
         """Runs that are done, with those that will not be run."""
         search, finished = self._search, self._finished.values()
-        closed = len(search.verdicts) * len(self._names)
+        closed = len(search.done) * len(self._names)
         return closed + sum(number in of for of in finished for number in search.numbers)
 
     def _show(self, done: float, at_work: str = "") -> None:
@@ -91,9 +91,8 @@ class Campaign:
 
     def _best_in_words(self) -> str:
         """The best value so far."""
-        search = self._search
-        value, number = search.verdicts[search.best].value, search.number(search.best)
-        return f"best {label(self._config.objective)} {value:.3f} (trial {number})"
+        best, done = self._search.best, self._search.done
+        return f"best {label(self._config.objective)} {done[best].value:.3f} (trial {best})"
 
     def _tasks(self, missing: Sequence[tuple[str, Mapping[int, ParameterSet]]]) -> list[Task]:
         without_frames, self._without_frames = self._without_frames, []

@@ -80,23 +80,21 @@ def max_trials(config: OfflineConfig) -> int | None:
     return TRIALS
 
 
-def spent(
-    config: OfflineConfig, verdicts: Sequence[Verdict], best: int, hours: float, number: int
-) -> str | None:
+def spent(config: OfflineConfig, trials: Sequence[int], best: int, hours: float) -> str | None:
     """The budget that is used up after a batch, in words; None if the search continues.
 
-    `best` is the index of the best verdict, `number` its trial number.
+    `trials` has the numbers of the trials that are done, in their order, among them the `best`.
     """
     limit = max_trials(config)
-    if limit is not None and len(verdicts) >= limit:
+    if limit is not None and len(trials) >= limit:
         return f"{limit} trials are done"
     if config.hours is not None and hours >= config.hours:
         return f"{hours:.2f} hours have passed"
-    if not verdicts:
+    if not trials:
         return None
-    since = len(verdicts) - 1 - best
+    since = len(trials) - 1 - trials.index(best)
     if config.stagnation is not None and since >= config.stagnation:
-        return f"none of {since} trials was better than trial {number}"
+        return f"none of {since} trials was better than trial {best}"
     return None
 
 
@@ -168,9 +166,8 @@ class Search:
         known: Mapping[int, ParameterSet],
     ):
         self.sequences = list(sequences)
-        self.verdicts: list[Verdict] = []  # of the trials of all batches that are closed
-        self._closed: list[int] = []  # trial numbers of the verdicts
-        self.best = 0  # index of the best of them
+        self.done: dict[int, Verdict] = {}  # by number, trials of all batches that are closed
+        self.best = 0  # trial number of the best of them
         self.numbers: list[int] = []  # trial numbers of the present batch
         self.order = self.sequences  # in which they are run
         self.end: str | None = None  # why the search has ended
@@ -186,32 +183,22 @@ class Search:
         # Where nothing is to be proposed, it is not needed, and takes long to import.
         return self._make_sampler()
 
-    def number(self, i: int) -> int:
-        """Trial number in the study of trial `i` of this search."""
-        return self._closed[i] if i < len(self._closed) else i
-
-    @property
-    def done(self) -> dict[int, Verdict]:
-        """The verdicts by trial number."""
-        return {self.number(i): verdict for i, verdict in enumerate(self.verdicts)}
-
     def begin(self, hours: float) -> bool:
         """Begin the next batch after so many hours; False if the search has ended."""
         if self.end is None:
-            best = self.number(self.best)
-            self.end = spent(self._config, self.verdicts, self.best, hours, best)
+            self.end = spent(self._config, list(self.done), self.best, hours)
         if self.end is not None:
             return False
-        first, size = len(self.verdicts), self._config.batch
+        first, size = len(self.done), self._config.batch
         stop = first + size if self._limit is None else min(first + size, self._limit)
         # Of a finite space, later ones may have been run before.
-        numbers = (n for n in map(self.number, count(first)) if n not in self._closed)
+        numbers = (n for n in count(first) if n not in self.done)
         self.numbers = list(islice(numbers, stop - first))
         self._sets = {n: self._known[n] for n in self.numbers if n in self._known}
         if first and self._config.pruning == "wilcoxon":
             self.order = self._hardest_first()
         if len(self._sets) < len(self.numbers):
-            proposed = self._sampler.propose(sampler_results(self.verdicts))
+            proposed = self._sampler.propose(sampler_results(list(self.done.values())))
             new = [s for s in proposed if s not in self._sets.values()]
             unknown = [n for n in self.numbers if n not in self._sets]
             self._sets |= zip(unknown, new, strict=False)
@@ -238,25 +225,23 @@ class Search:
 
     def close(self) -> None:
         """Close the batch, whose trials have all finished or stopped."""
-        first = len(self.verdicts)
         of = (self._config, self.sequences, self._finished)
-        self.verdicts += [assess(n, *of) for n in self.numbers]
-        self._closed += self.numbers
-        ranks = [(not v.complete, not v.usable, v.value) for v in self.verdicts]
-        self.best = min((self.best, *range(first, len(ranks))), key=ranks.__getitem__)
-        if len(self.numbers) < self._config.batch and len(self.verdicts) != self._limit:
+        self.done |= {n: assess(n, *of) for n in self.numbers}
+        ranks = {n: (not v.complete, not v.usable, v.value) for n, v in self.done.items()}
+        self.best = min(ranks, key=ranks.__getitem__)
+        if len(self.numbers) < self._config.batch and len(self.done) != self._limit:
             self.end = self._sampler.end
         self.numbers = []
 
     def total(self) -> int:
         """The most runs that the search takes; without a limit, the runs up to this batch."""
-        n_trials = len(self.verdicts) if self.end else self._limit
-        n_trials = len(self.verdicts) + len(self.numbers) if n_trials is None else n_trials
+        n_trials = len(self.done) if self.end else self._limit
+        n_trials = len(self.done) + len(self.numbers) if n_trials is None else n_trials
         return n_trials * len(self.sequences)
 
     def _hardest_first(self) -> list[str]:
         """The sequences by falling mean of the objective over the first batch."""
-        first = [self.number(i) for i in range(min(self._config.batch, len(self.verdicts)))]
+        first = list(self.done)[: self._config.batch]
         means = {
             name: np.mean([self._value(self._finished[name][n]) for n in first])
             for name in self.sequences
