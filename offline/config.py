@@ -423,11 +423,6 @@ _Weighted = Annotated[dict[Metric, Annotated[float, Field(gt=0, le=1e9)]], Field
 
 def _weighted(given: Any) -> Any:
     """Write a metric as a weighted sum."""
-    if isinstance(given, list | tuple):
-        raise ValueError(  # noqa: TRY004
-            "several objectives are gone, because the first one decided: give it alone, or a "
-            "weighted sum; `adaptune compare` draws error over CPU time of all trials"
-        )
     return {given: 1.0} if isinstance(given, str) else given
 
 

@@ -80,7 +80,6 @@ def test_reads_a_study(study_file, tmp_path):
             "{max_correspondence_distance: [1, 5, 0], keyframe_interval: [1, 0, 3]}}}",
             ["grid.max_correspondence_distance", "grid.keyframe_interval"],
         ),
-        ("offline.objective=[rte, rpe]", ["offline.objective: several objectives are gone"]),
         ("offline.trial=3", ["offline.trial", "did you mean 'trials'?"]),
         ("online.switching.mechanism=hand_over", ["hand_over is gone", "give auto, live or bank"]),
         ("test=[three, three]", ["test.1", "named twice"]),
