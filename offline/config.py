@@ -383,10 +383,6 @@ def _check_step(
         if not (low < high and all(map(parameter.contains, box))):
             message = f"the walk's low and high must lie in {describe(parameter)}, low below high"
             yield Mistake(key, message)
-    still = {k: v for k, v in given.items() if k in allowed and k not in _BOX}
-    if still and not any(still.values()) and (allowed[0] != "mu" or "sigma" in still):
-        named = " and ".join(f"{k} {v:g}" for k, v in still.items())
-        yield Mistake(key, f"never moves with {named}")
 
 
 def _check_start(
