@@ -3,7 +3,7 @@
 import json
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cached_property
 from itertools import count, islice
 from pathlib import Path
@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from adaptune.archive import Archive, Summary
-from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
 from adaptune.space import ParameterSet, ParameterSpace
 from offline.config import OfflineConfig
@@ -110,25 +109,15 @@ def has_ended(folder: Path) -> bool:
 class Clock:
     """The time that batches took, kept in a file, so that a resumed search continues counting.
 
-    The last batch of a killed process does not count.
-
-    Raises
-    ------
-    AdaptuneError
-        If the file is damaged.
+    The last batch of a killed process does not count, nor what a damaged file says.
     """
 
     def __init__(self, path: Path):
         self._path = path
         self._seconds: dict[str, float] = {}
-        if path.exists():
-            try:
-                read = json.loads(path.read_text(encoding="utf-8"))
-                self._seconds = {str(int(batch)): float(s) for batch, s in read.items()}
-            except (ValueError, TypeError, AttributeError) as error:
-                raise AdaptuneError(
-                    f"{path}: is damaged ({error}); remove it, and offline.hours restarts at 0"
-                ) from error
+        with suppress(OSError, ValueError, TypeError, AttributeError):
+            read = json.loads(path.read_text(encoding="utf-8"))
+            self._seconds = {str(int(batch)): float(s) for batch, s in read.items()}
 
     def hours(self, n_batches: int) -> float:
         """Hours that the first batches took."""
