@@ -68,7 +68,6 @@ class Death(NamedTuple):
     """The death of a worker at its task."""
 
     cause: str
-    killed: bool = True  # from outside, as systems do where the memory is full
 
 
 class TaskProgress(NamedTuple):
@@ -196,11 +195,9 @@ class _Queue(Generic[W]):
         self.waiting.insert(0, task)
         self._deaths[task.key] += 1
         if self._deaths[task.key] == MOST_DEATHS:
-            help_ = "what they wrote above may say why"
-            if death.killed:
-                help_ = "if they were out of memory, lower offline.workers"
             self.failure = WorkerError(
-                f"{MOST_DEATHS} workers died ({death.cause}) on {task}; {help_}"
+                f"{MOST_DEATHS} workers died ({death.cause}) on {task}; what they wrote above may "
+                f"say why; if they were out of memory, lower offline.workers"
             )
 
 
@@ -312,8 +309,7 @@ class Workers:
             except (EOFError, OSError):
                 connection.close()
                 process.join()
-                code = process.exitcode or 0
-                outcomes.append((w, Death(how_it_ended(code), code == -signal.SIGKILL)))
+                outcomes.append((w, Death(how_it_ended(process.exitcode or 0))))
             if not isinstance(outcomes[-1][1], TaskProgress):
                 self._busy.remove(w)
         return outcomes

@@ -32,15 +32,6 @@ def test_what_a_dead_worker_had_done_does_not_count():
     assert [done for _, done, *_ in calls] == [1.6, 1.6, 2]
 
 
-@pytest.mark.parametrize("killed", [True, False])
-def test_memory_is_named_only_where_workers_were_killed(killed):
-    pool = TwoWords()
-    pool.said = [Death("its process ended", killed)] * workers.MOST_DEATHS
-    with pytest.raises(workers.WorkerError, match="3 workers died") as caught:
-        list(run(pool, [Task("one", (0, 1), ({}, {}))]))
-    assert ("offline.workers" in str(caught.value)) == killed
-
-
 class Elsewhere:
     """A setup whose module a worker does not find."""
 
