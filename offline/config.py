@@ -147,10 +147,6 @@ SETTINGS: dict[str, type[BaseModel]] = {
 """Settings of adaptune's own samplers."""
 
 
-MAX_UNBUDGETED_POINTS = 10_000
-"""Points of the largest grid that a search without a budget may try."""
-
-
 class Grid:
     """All combinations of the axes' values, in row-major order: the last axis changes fastest.
 
@@ -272,29 +268,17 @@ def _untuned(key: str, names: Iterable[str], space: ParameterSpace) -> Iterable[
 
 
 def check_grid(
-    axes: Mapping[str, Span | Sequence[Value]], space: ParameterSpace, bounded: bool
+    axes: Mapping[str, Span | Sequence[Value]], space: ParameterSpace
 ) -> Iterable[Mistake]:
     """Find mistakes in a grid; their keys begin below the sampler's settings."""
     if untuned := list(_untuned("grid", axes, space)):
         yield from untuned
         return
-    made = {}
     for name, parameter in space.parameters.items():
         try:
-            made[name] = _axis(parameter, axes.get(name))
+            _axis(parameter, axes.get(name))
         except ValueError as error:
             yield Mistake(("grid", name), str(error))
-    if len(made) < len(space):
-        return
-    grid = Grid(made)
-    if not bounded and grid.size > MAX_UNBUDGETED_POINTS:
-        yield Mistake(
-            ("grid",),
-            f"has {grid.size:,} points, and the study sets no budget; give offline.trials, hours "
-            f"or stagnation, or a coarser grid (up to {MAX_UNBUDGETED_POINTS:,} points)",
-        )
-    elif grid.size >= 2**62:
-        yield Mistake(("grid",), "has more points than can be numbered; give a coarser grid")
 
 
 def distribution(parameter: Float | Integer | Categorical) -> Any:
@@ -322,7 +306,7 @@ _BOX = ("low", "high")
 
 
 def check_sampler(
-    name: str, settings: Mapping[str, Any], space: ParameterSpace | None, budgeted: bool
+    name: str, settings: Mapping[str, Any], space: ParameterSpace | None
 ) -> Iterable[Mistake]:
     """Find mistakes in a sampler's settings; their keys begin below the settings.
 
@@ -347,7 +331,7 @@ def check_sampler(
     elif name in ("grid", "random"):
         axes = GridSettings.model_validate(settings).grid
         if axes is not None or name == "grid":
-            yield from check_grid(axes or {}, space, bounded=budgeted or name == "random")
+            yield from check_grid(axes or {}, space)
 
 
 def _check_optuna(name: str, settings: Mapping[str, Any]) -> Iterable[Mistake]:
@@ -468,7 +452,7 @@ class OfflineConfig(StrictModel):
             except SamplerError as error:
                 yield Mistake(("sampler",), str(error))
                 return
-        below = check_sampler(self.sampler, self.sampler_settings, space, self.budgeted)
+        below = check_sampler(self.sampler, self.sampler_settings, space)
         yield from (mistake.below(key) for mistake in below)
 
 

@@ -116,12 +116,6 @@ MAX_DISTANCE = "max_correspondence_distance: "
             "max_correspondence_distance: is missing",
         ),
         (GRID + MAX_DISTANCE + "[1, 1, 3],\n keyframe_interval: [1, 0, 3]}}}", 15, "a step of 0"),
-        (
-            GRID.replace("{grid", "{\n grid") + MAX_DISTANCE + "[1, 0.0001, 31623],"
-            " keyframe_interval: {low: 1, high: 9, count: 31623}}}}",
-            15,
-            "has 1,000,014,129 points, and the study sets no budget; give offline.trials, hours or",
-        ),
     ],
 )
 def test_names_mistakes_in_sampler_settings_with_their_lines(study_file, offline, line, words):
