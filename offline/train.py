@@ -46,7 +46,7 @@ from offline.campaign import (
     watch_tasks,
     whole_values,
 )
-from offline.config import TIMED, OfflineConfig, OfflineStudy
+from offline.config import OfflineConfig, OfflineStudy
 from offline.labelled import LabelledData, labelled_data, measured_costs
 from offline.objective import (
     UNUSABLE,
@@ -119,8 +119,6 @@ def train(study: OfflineStudy, progress: Progress = unseen, cluster: str | None 
     """
     archive = _ready_archive(study, progress)
     config = study.config.offline
-    if timed := " and ".join(sorted(config.metrics & set(TIMED))):
-        _log.warning("%s differ from run to run: another run will not find the same sets", timed)
     names, space = study.training, study.odometry.space
     with trial_workers(study, names, cluster) as workers:
         run_baseline(study, archive, workers, progress)
@@ -215,11 +213,6 @@ def trial_workers(
     n = config.workers or available()
     where = cluster or f"{n} worker{'s' if n > 1 else ''}"
     _log.info("trials run on %s; each sequence is prepared before its first one", where)
-    if config.runs is None and study.config.runs == "whole":
-        _log.info(
-            "a start takes a new container, so trials run on where they lose track "
-            "(offline.runs: whole)"
-        )
     odometry = study.odometry.changed(user_code=True)
     setup = TrialSetup(TrialSettings.of(study.config), odometry, study.sequences)
     memory = 0.25 * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
