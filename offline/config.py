@@ -5,9 +5,9 @@ import math
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, Field, model_validator
+from pydantic import BaseModel, BeforeValidator, Field
 
 from adaptune import strict
 from adaptune.errors import AdaptuneError, in_a_line, nearest
@@ -414,12 +414,6 @@ class OfflineConfig(StrictModel):
     baseline_runs: int | None = Field(None, ge=1, le=1000)
     augment: Annotated[tuple[ViewConfig, ...], Field(max_length=MOST_VIEWS)] = ()
     pruning: Literal["none", "wilcoxon"] = "none"
-
-    @model_validator(mode="after")
-    def _check_baseline_runs(self) -> Self:
-        if self.baseline_runs is not None and self.baseline_runs < self.repeats:
-            raise ValueError(f"baseline_runs must be {self.repeats} (repeats) or more")
-        return self
 
     @property
     def metrics(self) -> set[str]:

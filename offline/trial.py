@@ -462,7 +462,7 @@ class TrialSetup:
         make = partial(odometry, parameters, scans.name, isolated=settings.isolated)
         n = settings.repeats
         if settings.baseline_runs is not None and parameters in odometry.space.baselines:
-            n = settings.baseline_runs
+            n = max(n, settings.baseline_runs)
         if whole:
             return [DrivenRun(make, scans.frames, settings.health) for _ in range(n)]
         lost_track = settings.lost_track if settings.runs == "restart" else None
