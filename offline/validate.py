@@ -5,7 +5,6 @@ chosen on the rest. On what is left out, the errors that were recorded for the s
 looked up, period by period; no odometry runs.
 """
 
-import logging
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -45,8 +44,6 @@ from offline.tuning import (
     log_ratios,
     rivals,
 )
-
-_log = logging.getLogger(__name__)
 
 PAIRED = RULES[0]
 """The mode that `adaptune online` drives: what has the least expected loss."""
@@ -347,7 +344,7 @@ def _labelled(study: OfflineStudy, model: ErrorModel) -> LabelledData:
     """The labelled data set of the sets that were run on all training sequences."""
     complete = np.flatnonzero(~np.isnan(model.errors).any(axis=0))
     sets = model.sets.subset([model.sets.trials[column] for column in complete])
-    data = labelled_data(
+    return labelled_data(
         Archive(study.folder / "trials"),
         {name: list(sets) for name in model.sequences},
         sets,
@@ -356,12 +353,6 @@ def _labelled(study: OfflineStudy, model: ErrorModel) -> LabelledData:
         study.sequences.recorded_in,
         study.odometry,
     ).complete()
-    if not set(data.whole()) - {0} and model.fixed != 0:
-        _log.warning(
-            "the candidates for the fixed set have no whole runs with this health check: with a "
-            "sequence left out, it is chosen by trials alone; run `adaptune offline` again"
-        )
-    return data
 
 
 def _rows(validation: Validation) -> list[dict[str, Any]]:
