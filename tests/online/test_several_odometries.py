@@ -10,10 +10,9 @@ from adaptune import files
 from adaptune.archive import Archive
 from adaptune.model import ErrorModel
 from adaptune.space import ODOMETRY, PooledSpace
-from adaptune.study.study import BEST_DEFAULT, EQUAL_COST, driven
+from adaptune.study.study import driven
 from offline.config import load_study
 from offline.train import train
-from offline.validate import validate
 from online.compare import compare
 from online.modes import run_replays
 from online.tables import remarks, tables
@@ -76,16 +75,6 @@ def test_the_model_knows_what_its_sets_cost(trained):
     assert f"({model.sets[model.fixed][ODOMETRY]})" in driven(
         model, study.config.online, study.odometry, study.mechanism
     )
-
-
-def test_it_is_validated_against_its_rivals(trained):
-    study, _ = trained
-    found = validate(study)
-    (last,) = [row for row in found.rows if row["left out"] == "cost [ms]"]
-    assert last["adaptive"] > 0.0
-    assert BEST_DEFAULT in last
-    assert EQUAL_COST in last
-    assert any("the best odometry with its own parameters" in said for said in found.verdicts)
 
 
 def test_it_is_replayed_and_compared(trained):
