@@ -301,8 +301,6 @@ def importance_chart(by_odometry: Mapping[str, Mapping[str, float]]) -> Chart | 
     )
 
 
-MOST_NAMED = 8
-"""With more recordings, stretches do not show of which they are."""
 RATIO = "error over the fixed set's [-]"
 _FACTS = ("recording", "stretch", "fixed [%]")
 
@@ -343,12 +341,7 @@ def _stretch_panel(mode: str, ratios: np.ndarray[Any, Any], recordings: Sequence
         Line(ends, [of.geometric] * 2, "geometric mean", dashed=True),
         Line(ends, [1.0, 1.0], "fixed", faint=True),
     ]
-    named = dict.fromkeys(recordings)
-    few = len(named) <= MOST_NAMED
-    for name in named if few else ("stretch",):
-        mine = [i for i, own in enumerate(recordings) if own == name or not few]
-        texts = [recordings[i] for i in mine]
-        drawn.append(Points(rank[mine], ratios[mine], name, texts=texts))
+    drawn.append(Points(rank, ratios, "stretch", texts=recordings))
     title = f"{mode}: {of.geometric:.2f} ({of.low:.2f}-{of.high:.2f})"
     x = Axis("stretch, by rising ratio [-]", limits=(0.5, float(ends[1])))
     return Panel(x, Axis(RATIO, log=True), tuple(drawn), title)

@@ -176,14 +176,12 @@ def test_stretches_are_sorted_and_have_the_interval_of_their_mean():
         for row, adaptive in zip(of_drives, ratio, strict=True)
     ]
     (panel,) = stretch_chart(rows).panels  # one set is the fixed set
-    points = [d for d in panel.drawn if isinstance(d, Points)]
-    assert [p.name for p in points] == ["drive_0", "drive_1"]
-    ranks = np.concatenate([p.x for p in points])
-    ratios = np.concatenate([p.y for p in points])
-    np.testing.assert_array_equal(np.argsort(ranks), np.argsort(ratios))
+    (points,) = of_kind(panel, Points)
+    assert list(points.texts) == [row["recording"] for row in rows]
+    np.testing.assert_array_equal(np.argsort(points.x), np.argsort(points.y))
     of = figures(np.log([r["adaptive"] for r in rows]), [r["recording"] for r in rows])
     (band,) = (d for d in panel.drawn if isinstance(d, Band))
     assert (band.low[0], band.high[0]) == (of.low, of.high)
     mean = next(d for d in panel.drawn if isinstance(d, Line))
-    assert mean.y[0] == pytest.approx(np.exp(np.log(ratios).mean()))
+    assert mean.y[0] == pytest.approx(np.exp(np.log(points.y).mean()))
     assert panel.title == f"adaptive: {of.geometric:.2f} ({of.low:.2f}-{of.high:.2f})"
