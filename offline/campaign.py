@@ -40,26 +40,19 @@ class Campaign:
         self._without_frames = [
             name for name in self._names if not archive.has_frames(name, described)
         ]
-        self._best = ""  # in words
 
     def run(self) -> dict[int, Verdict]:
         """Run all trials that are not in the archive yet, and judge all of them by number."""
         clock = Clock(self._study.folder / "elapsed.json")
         batch, search = 0, self._search
         while search.begin(clock.hours(batch)):
-            begun = False
             for m in rungs(self._config.pruning == "wilcoxon", batch, len(self._names)):
                 if tasks := self._tasks(search.missing(m)):
-                    begun = True
                     with clock.running(batch):
                         self._run_tasks(tasks)
                 search.prune(m)
-            numbers = search.numbers
             search.close()
-            self._best = self._best_in_words()
-            if begun:
-                self._show(self._n_done())
-                _log.debug("trials %d to %d done; %s", min(numbers), max(numbers), self._best)
+            self._show(self._n_done())
             batch += 1
         _log.info("the search ends: %s", search.end)
         self._show(self._n_done())
@@ -70,7 +63,7 @@ class Campaign:
 
         def show(what: str, done: float, of: int, remark: str = "", /) -> None:
             if what == "runs":
-                self._show(before + done, remark)
+                self._show(before + done)
             else:
                 self._progress(what, done, of, remark)
 
@@ -83,16 +76,12 @@ class Campaign:
         closed = len(search.done) * len(self._names)
         return closed + sum(number in of for of in finished for number in search.numbers)
 
-    def _show(self, done: float, at_work: str = "") -> None:
-        runs = [run for of in self._finished.values() for run in of.values()]
-        failed = sum(run.lost > 0 or run.faults > 0 for run in runs)
-        remarks = [at_work, self._best, f"{failed} lost track or failed" if failed else ""]
-        self._progress("runs", done, self._search.total(), ", ".join(filter(None, remarks)))
-
-    def _best_in_words(self) -> str:
-        """The best value so far."""
-        best, done = self._search.best, self._search.done
-        return f"best {label(self._config.objective)} {done[best].value:.3f} (trial {best})"
+    def _show(self, done: float) -> None:
+        search, remark = self._search, ""
+        if verdict := search.done.get(search.best):
+            what = f"best {label(self._config.objective)} {verdict.value:.3f}"
+            remark = f"{what} (trial {search.best})"
+        self._progress("runs", done, search.total(), remark)
 
     def _tasks(self, missing: Sequence[tuple[str, Mapping[int, ParameterSet]]]) -> list[Task]:
         without_frames, self._without_frames = self._without_frames, []

@@ -109,9 +109,9 @@ def run(
     """Run tasks, and yield each as it is done, with its result.
 
     A task goes to a worker that has prepared its sequence, if there is one. If a worker dies,
-    another one runs its task again. `progress` is called with `what`, the number of runs that are
-    done, and the workers that are at work. It is also called about scans that are read: several
-    workers may read the same sequence.
+    another one runs its task again. `progress` is called with `what` and the number of runs that
+    are done. It is also called about scans that are read: several workers may read the same
+    sequence.
 
     Raises
     ------
@@ -185,9 +185,7 @@ class _Queue(Generic[W]):
             reading = f"{stage} {task.sequence}"
             self._read[reading] = max(scans, self._read.get(reading, 0))
             self._progress(reading, self._read[reading], of, "")
-        n = len(self.running)
-        at_work = f"{n} worker{'s' if n > 1 else ''} at work" if n else ""
-        self._progress(self._what, sum(self._done.values()), self._total, at_work)
+        self._progress(self._what, sum(self._done.values()), self._total, "")
 
     def _again(self, task: Task, death: Death) -> None:
         # A class that is not as clean as it says then costs its own trial only.
