@@ -416,11 +416,6 @@ class OfflineConfig(StrictModel):
     pruning: Literal["none", "wilcoxon"] = "none"
 
     @property
-    def metrics(self) -> set[str]:
-        """All metrics that a trial is judged by."""
-        return set(self.objective)
-
-    @property
     def budgeted(self) -> bool:
         """Whether the study sets a budget."""
         return any((self.trials, self.hours, self.stagnation))

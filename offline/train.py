@@ -273,9 +273,9 @@ def _trial_rows(
         runs = [finished[name][n] for name in verdict.sequences]
         row: dict[str, Any] = {"trial": n, **space.row(verdict.parameters)}
         row[COST] = float(np.mean([run.cost for run in runs]))
-        if config.metrics != {"rte"}:
+        if set(config.objective) != {"rte"}:
             row[label(config.objective)] = verdict.value
-            for metric in sorted(config.metrics):
+            for metric in sorted(config.objective):
                 row[metric] = float(np.mean([run.metrics[metric] for run in runs]))
         if config.repeats > 1:
             row["margin"] = verdict.margin

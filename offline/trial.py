@@ -293,7 +293,7 @@ class TrialSettings:
         """The settings of a study."""
         shared = (config.sub_trajectory, config.lost_track, config.health, config.descriptor)
         offline = config.offline
-        own = (config.runs, offline.repeats, offline.baseline_runs, frozenset(offline.metrics))
+        own = (config.runs, offline.repeats, offline.baseline_runs, frozenset(offline.objective))
         return cls(*shared, *own)
 
     @property
