@@ -384,9 +384,9 @@ def _box(parameter: Float | Integer, step: Step) -> tuple[float, float]:
     return parameter.low if low is None else low, parameter.high if high is None else high
 
 
-Metric = Literal["rte", "kitti", "rpe", "ape", "ms_per_scan", "cpu", "memory"]
+Metric = Literal["rte", "kitti", "rpe", "ape", "ms_per_scan", "cpu"]
 """What a trial can be judged by; `offline.objective` explains each."""
-TIMED = ("ms_per_scan", "cpu", "memory")
+TIMED = ("ms_per_scan", "cpu")
 """Metrics that differ from run to run and from machine to machine."""
 _Weighted = Annotated[dict[Metric, Annotated[float, Field(gt=0, le=1e9)]], Field(min_length=1)]
 

@@ -9,10 +9,9 @@ Metrics of one parameter set on one sequence:
 ``ape``          absolute pose error after alignment as evo gives it, metres
 ``ms_per_scan``  milliseconds that the odometry takes for a prepared scan
 ``cpu``          CPU time over the recording's duration, percent of a core
-``memory``       megabytes that the odometry's process takes at most
 ===============  ==================================================================================
 
-The first four repeat on the same machine, the last three do not.
+The first four repeat on the same machine, the last two do not.
 """
 
 from collections.abc import Mapping, Sequence
@@ -37,7 +36,6 @@ UNITS: dict[Metric, str] = {
     "ape": "m",
     "ms_per_scan": "ms",
     "cpu": "% of a core",
-    "memory": "MB",
 }
 LARGEST_METRIC = 1e6
 """The largest value of a metric, also where it cannot be computed: sums stay finite."""

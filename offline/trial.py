@@ -296,11 +296,6 @@ class TrialSettings:
         own = (config.runs, offline.repeats, offline.baseline_runs, frozenset(offline.objective))
         return cls(*shared, *own)
 
-    @property
-    def isolated(self) -> bool:
-        """Whether every odometry needs a process of its own, to measure its memory."""
-        return "memory" in self.metrics
-
 
 class PreparedSequence:
     """A sequence that is read, prepared and described once, for all trials of a worker.
@@ -321,10 +316,9 @@ class PreparedSequence:
 
     def __init__(self, setup: "TrialSetup", name: str, memory: float, progress: Progress):
         settings, key = setup.settings, setup.sequences.key(name)
-        self.name = name
+        self.name, self._setup = name, setup
         self.scans = scans = setup.sequences.open(name)
         self.shared = SharedScans(scans, memory)
-        self._baseline = partial(setup.odometry, isolated=settings.isolated)
         self._odometry: OdometryInstance | None = None
         reference = scans.reference()
         if reference is None:
@@ -361,7 +355,7 @@ class PreparedSequence:
         """Prepare a scan for the baseline; whether there is no room for another."""
         try:
             if self._odometry is None:
-                self._odometry = self._baseline()
+                self._odometry = self._setup.odometry()
             self.shared.prepared(i, lambda: scan, self._odometry)
         except Exception as error:
             raise AdaptuneError(
@@ -459,7 +453,7 @@ class TrialSetup:
     ) -> list[TrialRun]:
         """The runs of a parameter set."""
         settings, odometry = self.settings, self.odometry
-        make = partial(odometry, parameters, scans.name, isolated=settings.isolated)
+        make = partial(odometry, parameters, scans.name)
         n = settings.repeats
         if settings.baseline_runs is not None and parameters in odometry.space.baselines:
             n = max(n, settings.baseline_runs)

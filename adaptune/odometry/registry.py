@@ -351,12 +351,10 @@ class OdometryFactory:
         self,
         parameters: ParameterSet | None = None,
         sequence: str | None = None,
-        isolated: bool = False,
     ) -> OdometryInstance:
         """Make a new instance; parameters not given keep their baseline.
 
-        Programs that run whole recordings need the name of the sequence on which it will run. An
-        isolated one runs in a process of its own even if it is clean, to measure its memory.
+        Programs that run whole recordings need the name of the sequence on which it will run.
         """
         given = self.space.complete(parameters or {})
         if self.name in PROGRAMS:
@@ -367,7 +365,7 @@ class OdometryFactory:
             made: OdometryInstance = program.instance(given, self.settings, self.limits, read)
             return made
         is_users = is_user_class(self.name)
-        if isolated or not self.description.clean or (is_users and not self.user_code):
+        if not self.description.clean or (is_users and not self.user_code):
             return Isolated(self.name, given, self.settings, self.limits)
         if is_users:
             return Guarded(self.name, odometry_class, given, self.settings, self.limits.seconds)
@@ -447,12 +445,11 @@ class OdometryPool:
         self,
         parameters: ParameterSet | None = None,
         sequence: str | None = None,
-        isolated: bool = False,
     ) -> OdometryInstance:
         """Make a new instance of the odometry that the set names, see `OdometryFactory`."""
         whole = self.space.baseline if parameters is None else parameters
         label, own = self.space.split(whole)
-        return self.factories[label](own, sequence, isolated)
+        return self.factories[label](own, sequence)
 
 
 Factory = OdometryFactory | OdometryPool

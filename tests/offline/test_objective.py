@@ -1,9 +1,8 @@
-import drives
 import numpy as np
 import pytest
 
-from adaptune.archive import Archive, Summary
-from offline.config import OfflineConfig, load_study
+from adaptune.archive import Summary
+from offline.config import OfflineConfig
 from offline.objective import (
     Verdict,
     baseline_words,
@@ -13,7 +12,6 @@ from offline.objective import (
     joined,
     judge,
 )
-from offline.train import train
 
 
 def config(**given):
@@ -84,21 +82,3 @@ def test_new_starts_are_undone():
     twice = joined(T, {3: sideways, 5: sideways})
     np.testing.assert_allclose(twice[:, 1, 3], [0, 0, 0, 5, 5, 10])
     np.testing.assert_array_equal(joined(T, {}), T)
-
-
-def test_memory_is_that_of_a_process_of_its_own(study_file, tmp_path):
-    drives.write_bag(tmp_path / "one.bag", drives.scans(0, 15))
-    study = load_study(
-        study_file,
-        [
-            "offline.objective={rte: 1.0, memory: 0.001}",
-            "offline.trials=2",
-            "training=[one]",
-            f"sequences.one.bag={tmp_path / 'one.bag'}",
-        ],
-        tmp_path / "study",
-    )
-    train(study)
-    metrics = Archive(study.folder / "trials").finished("one")[1].metrics
-    assert 10.0 < metrics["memory"] < 4000.0
-    assert metrics["cpu"] > 0.0

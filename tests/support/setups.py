@@ -19,7 +19,7 @@ def setup_of(study, odometry=None, **settings):
 def made_of(odometry_class, study, made=None):
     """Make instances of a class with a study's settings, and append its odometries to a list."""
 
-    def make(parameters=None, _sequence=None, isolated=False):  # noqa: ARG001
+    def make(parameters=None, _sequence=None):
         odometry = odometry_class(parameters, study.odometry.settings)
         if made is not None:
             made.append(odometry)

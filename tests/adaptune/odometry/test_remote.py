@@ -103,7 +103,6 @@ def test_every_fault_is_told_and_another_start_goes_on(fault, here):
 
 def test_only_who_says_so_runs_clean_classes_here():
     assert isinstance(factory()(), Isolated)
-    assert isinstance(factory(here=True)(isolated=True), Isolated)
     assert isinstance(factory(here=True, name="faulty:Faulty")(), Isolated)
     assert isinstance(pickle.loads(pickle.dumps(factory(here=True)))(), Guarded)
     assert factory().description.module == "faulty"
