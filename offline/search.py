@@ -97,15 +97,6 @@ def spent(config: OfflineConfig, trials: Sequence[int], best: int, hours: float)
     return None
 
 
-def has_ended(folder: Path) -> bool:
-    """Whether a study's table of trials, which a run writes at its end, is newer than them all."""
-    table = folder / "trials.csv"
-    if not table.exists():
-        return False
-    ended = table.stat().st_mtime_ns
-    return all(path.stat().st_mtime_ns <= ended for path in (folder / "trials").glob("*/*.npz"))
-
-
 class Clock:
     """The time that batches took, kept in a file, so that a resumed search continues counting.
 

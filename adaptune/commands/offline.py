@@ -114,7 +114,6 @@ def trials(
     loaded = load(study, override, folder)
     from adaptune import archive as table
     from adaptune.archive import Archive
-    from offline.search import has_ended
 
     names, archive = loaded.training, Archive(loaded.folder / "trials")
     finished = table.rows(archive, names)
@@ -131,7 +130,7 @@ def trials(
         same = (row["trial"] for row in finished if fixed.items() <= row.items())
         if (number := next(same, None)) is not None:
             say(f"The fixed set is trial {number}, as whole runs decided.")
-    if has_ended(loaded.folder):
+    if loaded.model_path.exists():
         say_next_of_trained(loaded, len(names) > 1)
     else:
         say_next_of_study("run the trials that are left, fit", "offline")

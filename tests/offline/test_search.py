@@ -2,7 +2,6 @@ import csv
 import dataclasses
 import itertools
 import json
-import os
 import re
 from functools import partial
 
@@ -16,7 +15,7 @@ from adaptune.space import Categorical, ParameterSpace
 from offline.campaign import Campaign
 from offline.config import OfflineConfig, load_study
 from offline.samplers import make_sampler
-from offline.search import Clock, Search, has_ended, spent, survivors
+from offline.search import Clock, Search, spent, survivors
 from offline.train import train
 from offline.validate import validate
 
@@ -208,17 +207,6 @@ def test_a_grid_is_walked_to_its_end(study_file, tmp_path, caplog):
     assert "the search ends: there is nothing else to try" in caplog.text
     again = train(load_study(study_file, given, tmp_path / "run"))
     assert again.model.sets.parameters == training.model.sets.parameters
-
-
-def test_a_study_has_ended_when_its_table_is_newer_than_all_trials(tmp_path):
-    trial, table = tmp_path / "trials/one/00001.npz", tmp_path / "trials.csv"
-    trial.parent.mkdir(parents=True)
-    trial.touch()
-    assert not has_ended(tmp_path)
-    table.touch()
-    assert has_ended(tmp_path)
-    os.utime(trial, ns=(0, table.stat().st_mtime_ns + 1))
-    assert not has_ended(tmp_path)
 
 
 def test_what_cannot_win_any_more_is_given_up():
