@@ -15,7 +15,7 @@ from adaptune.space import ParameterSet, PooledSpace
 from adaptune.study.references import contradictions_of
 from offline.config import OfflineConfig, OfflineStudy
 from offline.objective import Verdict, judge, label, mean_value, weighted
-from offline.search import Clock, make_search, rungs
+from offline.search import Clock, Search, rungs
 from offline.workers import Pool, Task, TaskResult, run
 
 _log = logging.getLogger(__name__)
@@ -35,7 +35,8 @@ class Campaign:
         self._progress = progress
         self._config, self._names = study.config.offline, study.training
         self._finished = {name: archive.finished(name) for name in self._names}
-        self._search = make_search(self._config, study.odometry.space, self._names, archive)
+        space, known = study.odometry.space, archive.sets()
+        self._search = Search(self._config, space, self._names, self._finished, known)
         described = study.config.descriptor
         self._without_frames = [
             name for name in self._names if not archive.has_frames(name, described)

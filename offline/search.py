@@ -2,7 +2,7 @@
 
 import json
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import cached_property
 from itertools import count, islice
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from adaptune.archive import Archive, Summary
+from adaptune.archive import Summary
 from adaptune.files import write_text
 from adaptune.space import ParameterSet, ParameterSpace
 from offline.config import OfflineConfig
@@ -139,8 +139,8 @@ class Search:
 
     def __init__(
         self,
-        sampler: Callable[[], "Sampler"],
         config: OfflineConfig,
+        space: ParameterSpace,
         sequences: Sequence[str],
         finished: Finished,
         known: Mapping[int, ParameterSet],
@@ -151,17 +151,18 @@ class Search:
         self.numbers: list[int] = []  # trial numbers of the present batch
         self.order = self.sequences  # in which they are run
         self.end: str | None = None  # why the search has ended
-        self._make_sampler, self._config = sampler, config
+        self._config, self._space = config, space
         self._limit = max_trials(config)
-        self._finished = finished
-        self._known = known
+        self._finished, self._known = finished, known
         self._alive: list[int] = []
         self._sets: dict[int, ParameterSet] = {}
 
     @cached_property
     def _sampler(self) -> "Sampler":
-        # Where nothing is to be proposed, it is not needed, and takes long to import.
-        return self._make_sampler()
+        # Where nothing is to be proposed, it is not needed, and Optuna takes a second to import.
+        from offline.samplers import make_sampler
+
+        return make_sampler(self._space, self._config)
 
     def begin(self, hours: float) -> bool:
         """Begin the next batch after so many hours; False if the search has ended."""
@@ -257,17 +258,3 @@ def assess(
         [weighted(config.objective, finished[name][0].metrics) for name in order],
     )
     return found._replace(value=value, complete=False, sequences=seen)
-
-
-def make_search(
-    config: OfflineConfig, space: ParameterSpace, names: Sequence[str], archive: Archive
-) -> Search:
-    """Make the search over some sequences, in their order."""
-
-    def sampler() -> "Sampler":
-        from offline.samplers import make_sampler  # Optuna takes a second to import
-
-        return make_sampler(space, config)
-
-    finished = {name: archive.finished(name) for name in names}
-    return Search(sampler, config, names, finished, archive.sets())

@@ -3,7 +3,6 @@ import dataclasses
 import itertools
 import json
 import re
-from functools import partial
 
 import numpy as np
 import pytest
@@ -14,7 +13,6 @@ from adaptune.model import ErrorModel
 from adaptune.space import Categorical, ParameterSpace
 from offline.campaign import Campaign
 from offline.config import OfflineConfig, load_study
-from offline.samplers import make_sampler
 from offline.search import Clock, Search, spent, survivors
 from offline.train import train
 from offline.validate import validate
@@ -129,8 +127,7 @@ def test_verdicts_belong_to_their_trials_where_numbers_are_left_out():
     finished = {"one": {}}
     # Trial 3 is known from another sequence.
     known = {0: {"k": "a"}, 3: {"k": "b"}}
-    sampler = partial(make_sampler, space, config)
-    search = Search(sampler, config, ["one"], finished, known)
+    search = Search(config, space, ["one"], finished, known)
     while search.begin(0.0):
         for n in search.numbers:
             finished["one"][n] = Summary(search._sets[n], 1.0, 0, 0, 1.0)
