@@ -174,12 +174,6 @@ def trials(folder):
     return {f: f.stat().st_mtime_ns for f in files if f.stem.isdigit()}
 
 
-GRID = (
-    "offline.sampler_settings={grid: {max_correspondence_distance: [1.0, 2.0, 2],"
-    " keyframe_interval: [1.0, 4.0, 3]}}"
-)
-
-
 def test_a_search_ends_where_its_budget_does_and_again_when_resumed(study_file, tmp_path, caplog):
     caplog.set_level("INFO")
     folder = tmp_path / "run"
@@ -192,18 +186,6 @@ def test_a_search_ends_where_its_budget_does_and_again_when_resumed(study_file, 
         assert len(training.model.sets) in (4, 8)
     assert trials(folder) == before
     assert "the search ends: none of" in caplog.text
-
-
-def test_a_grid_is_walked_to_its_end(study_file, tmp_path, caplog):
-    caplog.set_level("INFO")
-    given = ["offline.sampler=grid", GRID, "offline.trials="]
-    training = train(load_study(study_file, given, tmp_path / "run"))
-    pairs = [tuple(s.values()) for s in training.model.sets.parameters]
-    assert pairs[0] == (2.0, 1.0)
-    assert pairs[1:] == [(d, k) for d in (1.0, 3.0) for k in (1.0, 5.0, 9.0)]
-    assert "the search ends: there is nothing else to try" in caplog.text
-    again = train(load_study(study_file, given, tmp_path / "run"))
-    assert again.model.sets.parameters == training.model.sets.parameters
 
 
 def test_what_cannot_win_any_more_is_given_up():
