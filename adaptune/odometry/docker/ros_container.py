@@ -78,8 +78,6 @@ _PROBE = (
 _PLAYER = "player=$(ls /opt/ros/*/lib/rosbag/play /usr/lib/rosbag/play 2>/dev/null | head -n 1); "
 """What `rosbag play` runs; Python takes half a second to find it."""
 _BETWEEN_LOOKS = 0.05
-_OTHERS_ONLY = 30.0
-"""Seconds in which nodes have subscribed to other topics only."""
 _TAIL = 1 << 14
 """Bytes of a log in which its last lines are."""
 _UNTIL_NOTED = 0.5
@@ -197,25 +195,22 @@ class RosSystem:
         An `OdometryError` names the topics to which nodes subscribe if none does in time.
         """
         self._topics.append(topic)
-        begin = changed = time.monotonic()
+        begin = time.monotonic()
         before: AbstractSet[str] = set()
-        while (now := time.monotonic()) - begin < self._settings.ready:
+        while time.monotonic() - begin < self._settings.ready:
             state = self.state()
             heard = state["subscribed"].keys() - {"/clock"}
+            # A node subscribes to one after the other.
             if heard != before:
-                before, changed = heard, now
-            elif topic in heard:
-                # A node subscribes to one after the other.
-                if all(state["sending"].get(one, 0) for one in sent if one in heard):
-                    self._container.hold_to_cores()
-                    return
-            elif heard and now - changed > _OTHERS_ONLY:
-                break
+                before = heard
+            elif topic in heard and all(state["sending"].get(t, 0) for t in sent if t in heard):
+                self._container.hold_to_cores()
+                return
             time.sleep(_BETWEEN_LOOKS)
         others = ", ".join(sorted(before)) or "none"
         raise OdometryError(
-            f"no node subscribed to the clouds' topic {topic} in {now - begin:.0f} s (topics with "
-            f"subscribers: {others}); name the topic that the system hears as "
+            f"no node subscribed to the clouds' topic {topic} in {self._settings.ready:g} s "
+            f"(topics with subscribers: {others}); name the topic that the system hears as "
             f"odometry.settings.points, or change it in the template"
         )
 

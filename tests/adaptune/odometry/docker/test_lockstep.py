@@ -200,12 +200,14 @@ def test_scans_without_a_pose_continue_the_motion(make, monkeypatch):
     ("given", "words"),
     [
         ({"imitate": {"quit_launch": True}}, "roslaunch ended with code 0: "),
-        ({"points": "/velodyne"}, "no node subscribed to the clouds' topic /points .*/velodyne"),
+        (
+            {"points": "/velodyne", "settings": {"ready": 8}},
+            "no node subscribed to the clouds' topic /points .*/velodyne",
+        ),
         ({"settings": {"package": "other"}}, "roslaunch ended with code 1: there is no package"),
     ],
 )
-def test_one_that_cannot_begin_says_why(make, given, words, monkeypatch):
-    monkeypatch.setattr("adaptune.odometry.docker.ros_container._OTHERS_ONLY", 1.0)
+def test_one_that_cannot_begin_says_why(make, given, words):
     odometry = make(**given)
     with pytest.raises(OdometryError, match=f"^{reference_image()}: {words}"):
         odometry.start(scans()[0], np.eye(4))

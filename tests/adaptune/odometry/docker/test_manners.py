@@ -12,7 +12,6 @@ from contained import FIXED, VALUES, containers, template
 from needs import ROOT, reference_image
 from setups import setup_of
 
-from adaptune.odometry.docker import ros_container
 from offline.config import load_study
 
 MANNERS = {
@@ -55,8 +54,7 @@ def trial(study_file, folder, imitate, way, patience=60.0):
 def trials(study_file, tmp_path_factory):
     reference_image()
     folder = tmp_path_factory.mktemp("manners")
-    with pytest.MonkeyPatch.context() as patch, ThreadPoolExecutor(3) as pool:
-        patch.setattr(ros_container, "_OTHERS_ONLY", 2.0)
+    with ThreadPoolExecutor(3) as pool:
         jobs = {
             (manner, way): pool.submit(
                 trial,

@@ -23,7 +23,6 @@ from contained import (
 from needs import reference_image
 
 from adaptune.odometry import OdometryError
-from adaptune.odometry.docker import ros_container
 from adaptune.odometry.docker import rustle as rustle_system
 from adaptune.odometry.docker.engine import image_digest
 from adaptune.odometry.docker.rustle import PlayedBag, Rustle
@@ -81,7 +80,6 @@ def folder(tmp_path_factory):
 def ran(folder):
     reference_image()
     with pytest.MonkeyPatch.context() as patch, ThreadPoolExecutor(SIDE_BY_SIDE) as pool:
-        patch.setattr(ros_container, "_OTHERS_ONLY", 2.0)
         patch.setattr(rustle_system, "_FIRST", 2.0)
         trials = {name: pool.submit(run, folder / name, **given) for name, given in TRIALS.items()}
         yield lambda name: trials[name].result()
