@@ -630,18 +630,12 @@ class PlayedBag(WholeRun):
     def _check_published(self, system: RosSystem, recorder: PoseRecorder) -> None:
         if recorder.received:
             return
-        topic = self.settings.odometry
-        topics = set(system.link.topics()) - {"/clock", "/rosout"}
-        others = ", ".join(sorted(topics - {topic})) or "nothing"
-        if topic in topics:
-            raise OdometryError(
-                f"nothing was published on {topic} until the system had rested for {_FIRST:g} s "
-                f"after the bag, though a node announces it (others publish {others}); does the "
-                f"system need another sensor, or some seconds at rest at the start?"
-            )
+        topics = ", ".join(sorted(system.link.topics().keys() - {"/clock", "/rosout"}))
         raise OdometryError(
-            f"nothing was published on {topic}, but on {others}; name its topic as "
-            f"odometry.settings.odometry"
+            f"nothing was published on {self.settings.odometry} until the system had rested for "
+            f"{_FIRST:g} s after the bag; nodes announce {topics or 'no topics'}. If it is there, "
+            f"does the system need another sensor, or some seconds at rest at the start? If not, "
+            f"name the topic as odometry.settings.odometry"
         )
 
     def _finish(self, system: RosSystem, given: ProgramInput, fault: str) -> None:
