@@ -19,8 +19,6 @@ from adaptune.errors import NotInstalledError, import_extra
 from adaptune.recording import clouds
 from adaptune.ros.link import LinkError, take_all
 
-PORT = 7447
-"""On which a Zenoh router listens."""
 _CONNECT, _ANSWER = 2.0, 2.0
 """Seconds in which a router, and a service, must answer."""
 _PAUSE = 0.05
@@ -67,18 +65,18 @@ class Ros2:
     Where no ROS domain is given, it is that of the environment (``ROS_DOMAIN_ID``), or 0.
     """
 
-    def __init__(self, router: str = f"127.0.0.1:{PORT}", domain: int | None = None):
+    def __init__(self, router: str, domain: int | None = None):
         self._zenoh, self._keys, self._entity, self._qos, self._attachment, self._utils = (
             _packages()
         )
-        self._router = _endpoint(router)
         try:
             self._domain = self._utils.resolve_domain_id(domain)
         except ValueError as error:
             raise LinkError(f"the ROS domain: {error}") from error
         self.store = message_types()
         self._services = {name: _service(self.store, self._utils, name) for name in _DEFINITIONS}
-        self._session = _session(self._zenoh, self._router)
+        place = router if "/" in router else f"tcp/{router}"
+        self._session = _session(self._zenoh, place)
         self._node = self._entity.NodeEntity(
             self._domain, str(self._session.zid()), node_id=0, node_name=_NODE
         )
@@ -314,18 +312,6 @@ def _parameter(store: Typestore, name: str, value: Any) -> Any:
     return store.types["rcl_interfaces/msg/Parameter"](name=name, value=held)
 
 
-def _endpoint(router: str) -> str:
-    """A router's place as Zenoh writes it."""
-    if "/" in router:
-        return router
-    host, colon, port = router.rpartition(":")
-    if not colon:
-        host, port = router, str(PORT)
-    if not host or not port.isdecimal():
-        raise LinkError(f"{router!r} is not the place of a Zenoh router, such as 127.0.0.1:{PORT}")
-    return f"tcp/{host}:{port}"
-
-
 def _session(zenoh: ModuleType, router: str) -> Any:
     """A session as a client of a router."""
     config = zenoh.Config()
@@ -346,7 +332,7 @@ def _session(zenoh: ModuleType, router: str) -> Any:
         why = str(error).split(" at /")[0].rstrip("!. ")
         raise LinkError(
             f"no Zenoh router answers at {router}: run `ros2 run rmw_zenoh_cpp rmw_zenohd` on the "
-            f"robot, which listens on port {PORT}, and check the address ({why})"
+            f"robot, which listens on port 7447, and check the address ({why})"
         ) from error
 
 
