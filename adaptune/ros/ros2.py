@@ -3,7 +3,6 @@
 import contextlib
 import itertools
 import json
-import logging
 import os
 import threading
 import time
@@ -41,8 +40,6 @@ _FIELDS = {bool: "bool_value", int: "integer_value", float: "double_value", str:
 """Where a parameter's value is, in the order of rcl_interfaces/msg/ParameterType, from 1 on."""
 _ARRAYS = {"byte": np.uint8, "bool": np.bool_, "integer": np.int64, "double": np.float64}
 """The arrays that a parameter's value has besides, which stay empty."""
-
-_log = logging.getLogger(__name__)
 
 
 class _Service(NamedTuple):
@@ -134,26 +131,22 @@ class Ros2:
         """
         node = _full(node)
         given = [_parameter(self.store, name, value) for name, value in values.items()]
-        results = self._call(node, "SetParameters", patient=True, parameters=given).results
+        results = self._call(node, "SetParameters", parameters=given).results
         if refused := [
             f"{name} = {value!r} ({result.reason or 'without a reason'})"
             for (name, value), result in zip(values.items(), results, strict=True)
             if not result.successful
         ]:
             raise LinkError(f"{node} refuses {', '.join(refused)}")
-        try:
-            told = self._call(node, "GetParameters", patient=False, names=list(values)).values
-        except LinkError as error:
-            _log.warning("%s has set its parameters, but does not tell them: %s", node, error)
-            return dict(values)
+        told = self._call(node, "GetParameters", names=list(values)).values
         fields = dict(enumerate(_FIELDS.values(), 1))
         held = zip(values, told, strict=False)  # none, where a node does not tell
         return dict(values) | {
             name: getattr(value, fields[value.type]) for name, value in held if value.type in fields
         }
 
-    def _call(self, node: str, name: str, patient: bool, **fields: Any) -> Any:
-        """Call a service of a node; a patient call waits until there is such a one."""
+    def _call(self, node: str, name: str, **fields: Any) -> Any:
+        """Call a service of a node, as soon as there is such a one."""
         service = self._services[name]
         place = f"{node}/{'set' if name == 'SetParameters' else 'get'}_parameters"
         request = self.store.types[service.request](**fields)
@@ -163,13 +156,9 @@ class Ros2:
         raw = bytes(self.store.serialize_cdr(request, service.request))
         end = time.monotonic() + _ANSWER
         while (left := end - time.monotonic()) > 0:
-            there = False
             for reply in self._ask(key, raw, left):
                 if reply.ok is not None:
                     return self._message(reply.ok.payload, service.response)
-                there = True  # but without an answer in time
-            if there or not patient:
-                break
             time.sleep(_PAUSE)
         services = sorted({name for name, *_ in self._tokens("SERVICE")})
         raise LinkError(

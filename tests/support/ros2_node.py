@@ -96,7 +96,6 @@ def main(port, folder):
         serve("/robot/slam/set_parameters", SET, parameters.set),
         serve("/robot/slam/get_parameters", GET, parameters.get),
         serve("/robot/slam/set_parameters_atomically", SET),
-        serve("/secret/set_parameters", SET, parameters.set),
         serve("/deaf/set_parameters", SET),
     ]
     ended = threading.Event()

@@ -170,14 +170,9 @@ def test_a_refusal_gives_the_reason(link):
 
 @pytest.mark.parametrize("node", ["/other", "/deaf"])
 def test_a_node_that_is_not_there_or_does_not_answer_is_named(link, node):
-    words = "in ROS domain 0; the services there are /deaf/.*, /robot/slam/.*, /secret/"
+    words = "in ROS domain 0; the services there are /deaf/.*, /robot/slam/"
     with pytest.raises(LinkError, match=f"{node} does not answer: .* {words}"):
         link.set_parameters(node, {"voxel_size": 1.0})
-
-
-def test_a_node_may_keep_its_parameters_to_itself(link, caplog):
-    assert link.set_parameters("/secret", {"voxel_size": 0.75}) == {"voxel_size": 0.75}
-    assert "/secret has set its parameters, but does not tell them" in caplog.text
 
 
 def test_an_error_while_a_message_is_taken_is_logged_and_the_next_one_comes(link, caplog):
