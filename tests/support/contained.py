@@ -29,7 +29,7 @@ VALUES = {"max_correspondence_distance": 2.0, "keyframe_interval": 1.5}
 FIXED = {"downsampling": 0.7, "iterations": 20}
 """The others, as they stand in the template."""
 TEMPLATE = """\
-use_sim_time: {sim}
+use_sim_time: true
 common: {{points_topic: {points}}}
 gicp: {{max_correspondence_distance: 9.0, keyframe_interval: 9, downsampling: 0.7, iterations: 20}}
 other: {{voxel: 1}}
@@ -55,8 +55,8 @@ def recording(folder, logs=None):
     return ProgramInput(bag, "/points", "", stamps, truth(), logs)
 
 
-def template(path, sim="true", points="/points", **imitate):
-    path.write_text(TEMPLATE.format(sim=sim, points=points, imitate=json.dumps(imitate)))
+def template(path, points="/points", **imitate):
+    path.write_text(TEMPLATE.format(points=points, imitate=json.dumps(imitate)))
     return path
 
 

@@ -2,11 +2,9 @@
 
 import os
 import sys
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-import yaml
 
 from adaptune.geometry import to_quaternions
 from adaptune.odometry.keyframe import KeyframeGicp
@@ -49,14 +47,6 @@ def tuned(given: Any) -> dict[str, Any]:
         whole = isinstance(KeyframeGicp.space.parameters[name], Integer)
         values[name] = int(value) if whole else float(value)
     return values
-
-
-def habits(given: Any, environment: Mapping[str, str] = os.environ) -> dict[str, Any]:
-    """Habits of other systems: what a file says, and each IMITATE_<NAME> of the environment."""
-    prefix = "IMITATE_"
-    names = [name for name in environment if name.startswith(prefix)]
-    own = {name.removeprefix(prefix).lower(): yaml.safe_load(environment[name]) for name in names}
-    return (given if isinstance(given, dict) else {}) | own
 
 
 def check_layout(message: Any, wanted: list[str] | None) -> None:

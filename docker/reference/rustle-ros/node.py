@@ -16,7 +16,6 @@ from lidar_odometry import (
     POINTS_TOPIC,
     LidarOdometry,
     check_layout,
-    habits,
     limits,
     quaternion,
     to_scan,
@@ -62,7 +61,7 @@ class GicpNode:
     """Scans wait in a queue until the main thread takes them, one after the other."""
 
     def __init__(self) -> None:
-        self._imitate = habits(rospy.get_param("/imitate", {}))
+        self._imitate = rospy.get_param("/imitate", {})
         if self._imitate.get("quit_launch"):
             sys.exit(0)
         parameters = tuned(rospy.get_param("~", {}))

@@ -16,7 +16,6 @@ from lidar_odometry import (
     POINTS_TOPIC,
     LidarOdometry,
     check_layout,
-    habits,
     quaternion,
     to_scan,
     tuned,
@@ -34,7 +33,7 @@ def main() -> None:
     given = (yaml.safe_load(PARAMETERS.read_text()) if PARAMETERS.exists() else None) or {}
     topic = (given.get("common") or {}).get("points_topic", POINTS_TOPIC)
     topic = sys.argv[1] if len(sys.argv) > 1 else os.environ.get("POINTS_TOPIC", topic)
-    imitate = habits(given.get("imitate"))
+    imitate = given.get("imitate") or {}
     time.sleep(imitate.get("ready_delay", 0.0))
     odometry = LidarOdometry(tuned(given.get("gicp")), imitate.get("frame"))
     lines = []

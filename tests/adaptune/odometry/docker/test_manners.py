@@ -4,12 +4,11 @@ Trials run side by side.
 """
 
 import re
-import sys
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 from contained import FIXED, VALUES, containers, template
-from needs import ROOT, reference_image
+from needs import reference_image
 from setups import setup_of
 
 from offline.config import load_study
@@ -88,16 +87,3 @@ def test_a_manner(trials, polite, manner, way):
     assert not found.faults
     assert found.mean_error == pytest.approx(polite, rel=0.1)
     assert manner != "late" or "first_pose" in found.usage
-
-
-def test_each_manner_is_a_variable_of_the_environment(monkeypatch):
-    monkeypatch.syspath_prepend(ROOT / "docker/reference/rustle-ros")
-    from lidar_odometry import habits
-
-    given = {"IMITATE_LATE": "3", "IMITATE_LAYOUT": "[x, y]", "HOME": "/"}
-    assert habits({"late": 1, "silent": True}, given) == {
-        "late": 3,
-        "layout": ["x", "y"],
-        "silent": True,
-    }
-    sys.modules.pop("lidar_odometry")
