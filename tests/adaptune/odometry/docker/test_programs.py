@@ -158,7 +158,6 @@ FAULTS = {
     "nothing": ("echo done", r"it left no trajectory\.tum: done"),
     "pipe": ("mkfifo /output/trajectory.tum", r"it left no trajectory\.tum.*"),
     "link": ("ln -s /etc/hostname /output/trajectory.tum", r"it left no trajectory\.tum.*"),
-    "no such program": ("no-such-program", r"its process ended with code 127: .*not found"),
     "memory": ("python3 -c 'bytearray(10**9)'", r"out of isolation\.memory = 0\.3 GB: Killed"),
     "hang": ("echo waiting; exec sleep 300", "it took longer than isolation.seconds.*: waiting"),
     "deaf": ("trap '' TERM; echo I stay; sleep 300; sleep 300", r"it took longer .*: I stay"),
@@ -283,10 +282,6 @@ def test_one_that_is_killed_is_a_fault_and_the_next_start_works(make):
             r"its process ended with code 7 before it listened at its socket: no licence",
         ),
         ("echo waiting; exec sleep 300", r"it does not listen at its socket: waiting"),
-        (
-            "no-such-program",
-            r"its process ended with code 127 before it listened at its socket: .*no-such.*",
-        ),
         (
             "python3 -c 'bytearray(10**9)'",
             r"out of isolation\.memory = 0\.3 GB before it listened at its socket: Killed",
