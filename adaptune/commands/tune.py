@@ -21,10 +21,9 @@ from adaptune.commands.terminal import (
     progress,
     say,
     say_next,
-    say_next_of_study,
     show_table,
 )
-from adaptune.errors import AdaptuneError, NotInstalledError, OdometryError
+from adaptune.errors import AdaptuneError, NotInstalledError
 from adaptune.files import plain_name, write_text
 from adaptune.progress import Progress
 
@@ -43,7 +42,7 @@ def inspect(
         Path,
         typer.Argument(
             metavar="FILE",
-            help="A bag, a folder, a file of poses, an error model, a study or its folder.",
+            help="A bag, a folder, a file of poses, an error model, or a study's folder.",
             show_default=False,
         ),
     ],
@@ -56,13 +55,9 @@ def inspect(
     """Show what is in a recording, what each stage lacks, and how to name it in a study.
 
     Of an error model, or of a study's folder, show what it is of and its best sets.
-    Of a study's YAML with a ROS 1 image, run it on twenty seconds: which way of playing fits?
     """
     if file.suffix == ".safetensors" or (file / "model.safetensors").exists():
         _show_model(file)
-        return
-    if file.suffix in (".yaml", ".yml"):
-        _try_system(file)
         return
     check_no_study(file)
     if study is not None and study.exists():
@@ -89,21 +84,6 @@ def inspect(
     if study is not None:
         write_text(study, f"{found.entry}\n{rest}")
     say_next("train on a part of it", "offline", path, first=first)
-
-
-def _try_system(file: Path) -> None:
-    from adaptune.study.tried import SECONDS, try_system
-
-    study = load(file, [], None, runs=True)
-    try:
-        with progress() as show:
-            said, rows = try_system(study, show)
-    except OdometryError as error:
-        raise AdaptuneError(f"{file}: {error}") from error
-    for sentence in said:
-        say(sentence)
-    show_table(f"{SECONDS:g} s of {study.training[0]}, with the baseline", rows)
-    say_next_of_study("run trials, fit the error model", "offline", "write this; then ")
 
 
 def check_no_study(path: Path) -> None:

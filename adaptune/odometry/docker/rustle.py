@@ -195,13 +195,7 @@ class Lockstep(Faulting):
         self._waiting = self._has_run = False
         self._shown = (0, -np.inf)  # stamp of the last scan, and when it was published
         self._looked = -np.inf
-        self.patience = min(settings.patience, limits.seconds)
-        self.start_seconds = 0.0  # until it hears scans
-
-    @property
-    def pose_stamp(self) -> int | None:
-        """Stamp of the system's pose of the last scan; None if it gave none."""
-        return None if self._silent or self._before is None else self._before[0]
+        self._patience = min(settings.patience, limits.seconds)
 
     @property
     def ended(self) -> bool:
@@ -235,10 +229,8 @@ class Lockstep(Faulting):
         self._late: int | None = None
         self._steady = True  # whether all poses are as late as the first one
         self._before: tuple[int, Poses] | None = None
-        begin = time.monotonic()
         try:
             self._begin(prepared)
-            self.start_seconds = time.monotonic() - begin
             self._show(prepared)
             self._correct()
         except (OdometryError, LinkError) as error:
@@ -365,10 +357,10 @@ class Lockstep(Faulting):
 
     def _correct(self) -> bool:
         """Correct the predicted pose; False if the system gave none."""
-        found = self._pose(self.patience)
+        found = self._pose(self._patience)
         if found is not None and self._late is None and self._silent:
             # It may be of an earlier scan; then others follow, though nothing more was sent.
-            time.sleep(self.patience)
+            time.sleep(self._patience)
             found = self._pose(0.0)
         assert self._system is not None
         if self._n_answered or found is not None:
@@ -384,13 +376,13 @@ class Lockstep(Faulting):
             raise OdometryError(f"it gave a pose {wrong}")
         if self._late is None:
             self._late = stamp - self._stamp
-        if abs(stamp - self._stamp - self._late) >= MAX_SCATTER:
+        if abs(stamp - self._stamp - self._late) >= _MAX_SCATTER:
             self._steady = False
             if silent := self._n_shown - self._n_answered:
                 raise OdometryError(
-                    f"{_OWN_CLOCK}, and {silent} scans had no pose after {self.patience:g} s, so a "
-                    f"late pose cannot be told from the next one; raise odometry.settings.patience "
-                    f"and isolation.seconds"
+                    f"{_OWN_CLOCK}, and {silent} scans had no pose after {self._patience:g} s, so "
+                    f"a late pose cannot be told from the next one; raise "
+                    f"odometry.settings.patience and isolation.seconds"
                 )
         T_own = self._at_scan(stamp, T_own @ self._T_base_sensor)
         if self._T_odom_own is None:
@@ -411,7 +403,8 @@ class Lockstep(Faulting):
             published = system.link.topics().keys() - {"/clock", "/rosout", *self._topics}
             raise OdometryError(
                 f"no pose on {self._settings.odometry} for {_MOST_SILENT} scans in a row; "
-                f"topics that are published: {', '.join(sorted(published)) or 'none'}"
+                f"topics that are published: {', '.join(sorted(published)) or 'none'}; does it "
+                f"need an IMU (odometry.settings.imu), or all that the bag holds (play: bag)?"
             )
         n, answered = self._n_shown, self._n_answered
         if n >= _MOST_SILENT and answered < _LEAST_ANSWERED * n:
@@ -478,7 +471,7 @@ _IDLE = 0.1
 """Cores that a system may use while it rests: nodes wake up with the clock."""
 _STEADY = 0.9
 """Least share of poses whose stamps are as far from the scans' as those of the others."""
-MAX_SCATTER = 5_000_000
+_MAX_SCATTER = 5_000_000
 """Nanoseconds by which these may differ: a clock differs by more."""
 
 _log = logging.getLogger(__name__)
@@ -554,12 +547,8 @@ class Drain:
 class PlayedBag(WholeRun):
     """A ROS 1 system that hears a bag, from its beginning to its end."""
 
-    pose_stamps = np.empty(0, np.int64)  # as the system gave them
-    start_seconds = 0.0  # until it hears the bag
-
     def trajectory(self, given: ProgramInput, folder: Path) -> Trajectory:
-        begin = time.monotonic()
-        self._end = begin + self._limits.seconds * len(given.stamps)
+        self._end = time.monotonic() + self._limits.seconds * len(given.stamps)
         template, text = filled(self.settings, self.parameters)
         source = given.path.resolve()
         # As RUSTLE mounts the folder of a data set.
@@ -571,7 +560,6 @@ class PlayedBag(WholeRun):
                 renamed = self._renamed(given)
                 system.wait(renamed.get(given.points, given.points))
                 keys = server_keys(template, self.parameters, system.link.ask("parameters"))
-                self.start_seconds = time.monotonic() - begin
                 self._play(system, recorder, given, bag.target)
                 warn_of_unread(system.link, self.name, keys)
                 self._check_published(system, recorder)
@@ -651,7 +639,7 @@ class PlayedBag(WholeRun):
     def _checked(self, recorder: PoseRecorder, given: ProgramInput) -> Trajectory:
         """The trajectory, if its stamps are those of the data, or each scan has one pose."""
         poses = recorder.poses()
-        stamps = self.pose_stamps = np.array([stamp for stamp, *_ in poses], np.int64)
+        stamps = np.array([stamp for stamp, *_ in poses], np.int64)
         try:
             check_stamps(stamps, given.stamps)
         except OdometryError as error:
@@ -720,6 +708,6 @@ def check_stamps(stamps: NDArray[np.int64], scans: NDArray[np.int64]) -> None:
     i = np.searchsorted(scans, stamps).clip(1, len(scans) - 1)
     off = np.minimum(np.abs(stamps - scans[i]), np.abs(stamps - scans[i - 1])).astype(float)
     scatter = np.abs(off - np.median(off))
-    if np.mean(scatter < MAX_SCATTER) < _STEADY:
+    if np.mean(scatter < _MAX_SCATTER) < _STEADY:
         by = 1e-9 * float(np.percentile(scatter, 95))
         raise OdometryError(f"its stamps scatter by up to {by:.3f} s: {_OWN_CLOCK}")
