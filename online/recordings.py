@@ -166,7 +166,6 @@ class _Composer:
         stamps, end = trajectory.stamps, trajectory.stamps[-1:]
         for name, column in _OF_SELECTIONS.items():
             self._numbers(topic(mode, name), made, replay.selections[column])
-        self._add_data(topic(mode, "selection"), _TEXT, made, _in_words(replay))
         for name in _TIMES:
             values = replay.frames[name]
             self._numbers(topic(mode, name), stamps[: len(values)], values)
@@ -247,27 +246,3 @@ def _thinned(points: NDArray[np.float32]) -> NDArray[np.float32]:
         return points
     chosen = np.random.default_rng(0).choice(len(points), MAX_POINTS, replace=False)
     return points[np.sort(chosen)]
-
-
-def _in_words(replay: StoredReplay) -> list[str]:
-    """Every selection in words: the members' weights, or the parameters."""
-    said = []
-    for i, lost in enumerate(replay.lost.tolist()):
-        if replay.weights:
-            shares = {trial: weights[i] for trial, weights in replay.weights.items()}
-            what = ", ".join(f"trial {trial}: {share:.0%}" for trial, share in shares.items())
-        else:
-            chosen = {name: values[i] for name, values in replay.choices.items()}
-            # Sets of several odometries have other parameters, which are NaN or empty.
-            known = {name: _plainly(value) for name, value in chosen.items()}
-            what = ", ".join(f"{k} {v}" for k, v in known.items() if v) or "no parameters"
-            trial = replay.selections["trial"][i]
-            what = f"trial {trial:.0f}: {what}" if np.isfinite(trial) else what
-        said.append(f"{what} (lost)" if lost else what)
-    return said
-
-
-def _plainly(value: Any) -> str:
-    if isinstance(value, str):
-        return value
-    return "" if np.isnan(value) else f"{value:.6g}"

@@ -378,4 +378,4 @@ def record(
         written = [record_replays(loaded, name, show) for name in names]
     for path in written:
         say(f"{path} ({path.stat().st_size / 1e6:.1f} MB)")
-    say("Foxglove shows all of it (`Open local file`), Rerun the scans, the motion and the texts.")
+    say("Foxglove shows all of it (`Open local file`), Rerun the scans and the motion.")

@@ -152,10 +152,6 @@ def test_an_mcap_holds_what_was_chosen_and_how_it_went(study):
     assert numbers(found, "/adaptive/lost")[1] == [0.0, 0.0, 1.0, 0.0, 0.0]
     assert numbers(found, "/adaptive/parameters/kernel")[1] == ["none", "huber"] * 2
     assert numbers(found, "/fixed/parameters/kernel") == (made[:1], ["huber"])
-    assert numbers(found, "/adaptive/selection")[1][2] == "trial 2: 75%, trial 5: 25% (lost)"
-    assert numbers(found, "/fixed/selection")[1] == [
-        "max_correspondence_distance 2.5, kernel huber"
-    ]
     assert numbers(found, "/adaptive/selection_ms")[1] == [4.0, 8.0, 12.0, 16.0]
     assert numbers(found, "/adaptive/register_ms")[1] == pytest.approx(2.0 * np.arange(N))
     assert numbers(found, "/adaptive/late_ms")[1] == [20.0] * N
