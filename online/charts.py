@@ -260,7 +260,7 @@ def charts_of_replays(replayed: ReplayedSequence) -> Charts:
 
 
 def error_chart(replayed: ReplayedSequence) -> Chart | None:
-    """Error of every mode over time, with its switches; and what modes have measured themselves."""
+    """Error of every mode over time; and what modes have measured themselves."""
     panels = []
     if any(np.isfinite(of.errors).any() for of in replayed.modes.values()):
         panels.append(_errors(replayed))
@@ -279,8 +279,7 @@ def error_chart(replayed: ReplayedSequence) -> Chart | None:
         f"{replayed.name}-errors",
         f"{replayed.name}: error over time",
         tuple(panels),
-        f"Error of the sub-trajectory of {replayed.length:g} m that begins at each scan. Markers "
-        f"on a line are switches of its parameters.{measured}",
+        f"Error of the sub-trajectory of {replayed.length:g} m that begins at each scan.{measured}",
         shared_x=True,
     )
 
@@ -289,10 +288,6 @@ def _errors(replayed: ReplayedSequence) -> Panel:
     drawn: list[Drawn] = _scenes(replayed)
     for mode, track in replayed.modes.items():
         drawn.append(Line(track.seconds, track.errors, mode))
-        at = np.searchsorted(track.seconds, switches(track))
-        at = at[at < len(track.seconds)]
-        if len(at):
-            drawn.append(Points(track.seconds[at], track.errors[at], mode))
     for mode, track in replayed.modes.items():
         if track.restarted.any():
             x, y = track.seconds[track.restarted], track.errors[track.restarted]
@@ -300,13 +295,6 @@ def _errors(replayed: ReplayedSequence) -> Panel:
             drawn.append(Points(x, y, _RESTARTED, texts=texts, shape="triangle-down"))
     axis = Axis(f"RTE over the next {replayed.length:g} m [%]", log=True)
     return Panel(TIME, axis, tuple(drawn), height=1.6)
-
-
-def switches(track: ModeReplay) -> NDArray[np.float64]:
-    """Seconds of the selections that changed a parameter; none of a bank, which changes weights."""
-    if track.weights or not track.choices:
-        return np.empty(0)
-    return track.choice_seconds[switched(track.choices)]
 
 
 def _estimates(mode: str, track: ModeReplay, replayed: ReplayedSequence) -> Panel:

@@ -8,7 +8,6 @@ from online.charts import (
     choice_chart,
     error_chart,
     read_replays,
-    switches,
 )
 
 
@@ -16,29 +15,18 @@ def of_kind(panel, kind):
     return [d for d in panel.drawn if isinstance(d, kind)]
 
 
-def test_errors_of_all_modes_are_drawn_with_their_switches():
+def test_errors_of_all_modes_are_drawn():
     modes = {"fixed": kept(), "paper": replay(), "another": bank()}
     (panel,) = error_chart(sequence(**modes)).panels
     assert [line.name for line in of_kind(panel, Line)] == list(modes)
-    # A bank changes its weights, and no parameters.
-    (marks,) = of_kind(panel, Points)
-    assert marks.name == "paper"
-    np.testing.assert_allclose(marks.x, [8.0, 9.0])
     assert of_kind(panel, Spans) == [SCENES]
-
-
-def test_only_changes_are_switches():
-    nan = {"distance": [0.7, 0.7, 0.9], "resolution": [np.nan, np.nan, np.nan]}
-    np.testing.assert_array_equal(switches(replay(choices=nan)), [9.0])
-    assert not len(switches(kept()))
-    assert not len(switches(bank()))
 
 
 def test_restarts_are_marked():
     restarted = np.zeros(len(SECONDS), bool)
     restarted[50] = True
     (panel,) = error_chart(sequence(fixed=kept(), paper=replay(restarted=restarted))).panels
-    last = of_kind(panel, Points)[-1]
+    (last,) = of_kind(panel, Points)
     assert (last.name, list(last.x)) == ("restarted by the health check", [SECONDS[50]])
 
 
