@@ -241,8 +241,6 @@ def _seen_from(trajectory: Trajectory) -> NDArray[np.float64]:
 TIME = Axis("time [s]")
 _MOST_PLACES = 200
 """Points of a path; more would hide each other."""
-_COMPACT = 0.5
-"""A path of a larger height, as a share of its width, stands upright beside the errors."""
 _WIDE = 8.0
 """Errors are drawn on a logarithmic axis if the largest is so many times their median."""
 _RESTARTED = "restarted by the health check"
@@ -405,9 +403,6 @@ def overview_chart(
     replayed = read(name)
     replayed = replace(replayed, modes={mode: replayed.modes[mode] for mode in errors[name]})
     places = _turned([*replayed.modes.values()][-1].places)
-    wide, high = np.nanmax(places, axis=0) - np.nanmin(places, axis=0)
-    if aside := bool(high > _COMPACT * wide):
-        places = places[:, ::-1] * (-1.0, 1.0)
     panels = _path(replayed, places), _errors_around(replayed), *_chosen(replayed)
     *means, least = (f"{mode} ({rte:.2g} %)" for mode, rte in errors[name].items())
     last = [*replayed.modes][-1]
@@ -418,7 +413,6 @@ def overview_chart(
         panels,
         f"The error at each moment is the mean of the sub-trajectories of {replayed.length:g} m "
         f"through it. {chose}.",
-        aside=aside,
         shared_x=True,
     )
 

@@ -125,7 +125,6 @@ class Chart:
     panels: tuple[Panel, ...]  # row by row
     caption: str = ""  # what it shows, in a sentence or two
     columns: int = 1
-    aside: bool = False  # the first panel stands left of the others, which are one column
     shared_x: bool = False  # panels below each other have the same x axis, unless they are `equal`
 
 

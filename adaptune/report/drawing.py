@@ -155,8 +155,6 @@ def wrapped(words: str, letters: float) -> list[str]:
 Spec = dict[str, Any]
 _WIDTH, _LETTER, _LINE = 900, 6.5, 14
 """Pixels: width of a chart, width of a letter, about, and height of a line of words."""
-_ASIDE = 0.4
-"""Share of the width of a panel that stands left of the others."""
 _DARK = "#333333"
 _Extent = tuple[tuple[float, float], tuple[float, float]]
 _OUTLINE: dict[str, Any] = {"stroke": "black", "strokeWidth": 0.5}
@@ -189,11 +187,7 @@ def spec(chart: Chart, titled: bool = True) -> Spec:
     columns = max(1, min(chart.columns, len(chart.panels)))
     rows = [chart.panels[i : i + columns] for i in range(0, len(chart.panels), columns)]
     beside = sum(max(map(_beside, chart.panels[c::columns])) for c in range(columns))
-    widths = [round((_WIDTH - beside) / columns)] * len(chart.panels)
-    if chart.aside:
-        first, *others = chart.panels
-        right = round((1.0 - _ASIDE) * _WIDTH - max(map(_beside, others)))
-        widths = [round(_ASIDE * _WIDTH - _beside(first)), *([right] * len(others))]
+    width = round((_WIDTH - beside) / columns)
     usual = 300.0 if len(rows) == 1 else 150.0 if chart.shared_x else 240.0
     extents = [(_extent(panel, "x"), _extent(panel, "y")) for panel in chart.panels]
     sharing = [chart.shared_x and not panel.equal for panel in chart.panels]
@@ -207,13 +201,10 @@ def spec(chart: Chart, titled: bool = True) -> Spec:
         high = round(usual * max(map(_height, rows[i // columns])))
         below = sharing[i] and i + columns < len(chart.panels)
         if panel.equal:
-            most = usual * sum(map(_height, chart.panels[1:])) if chart.aside else 1.6 * high
-            extents[i], high = _equal(extents[i], widths[i], most)
-        panels.append(_Drawing(panel, every, (widths[i], high), extents[i]).spec(below))
-    row: Spec = {"concat": panels, "columns": columns}
-    if chart.aside:
-        row = {"hconcat": [panels[0], {"vconcat": panels[1:]}]}
-    row["resolve"] = {"scale": {"color": "independent"}}
+            extents[i], high = _equal(extents[i], width, 1.6 * high)
+        panels.append(_Drawing(panel, every, (width, high), extents[i]).spec(below))
+    resolve = {"scale": {"color": "independent"}}
+    row = {"concat": panels, "columns": columns, "resolve": resolve}
     made: Spec = {
         "$schema": "https://vega.github.io/schema/vega-lite/v6.json",
         "vconcat": [*_legend(chart, every), row],
