@@ -372,7 +372,7 @@ class _Drawing:
             drawn["labelExpr"] = f"{json.dumps(names)}[datum.value]"
             drawn |= {"grid": False} | ({"labelAngle": -35} if turned else {})
         elif axis.log:
-            drawn = {"values": ticks(low, high), "format": "~r"}
+            drawn["format"] = "~r"
         title: Any = wrapped(axis.label, size / _LETTER) if axis.label else None
         if hidden:
             title, drawn = None, drawn | {"labels": False, "ticks": False}
@@ -508,23 +508,6 @@ class _Drawing:
                 shown.append(i)
                 at, encoding = _table(x=x[[i]], y=y[[i]]), {"x": self._x, "y": self._y}
                 yield from _read_anywhere({"text": text, "dy": -8}, at, encoding)
-
-
-def ticks(low: float, high: float) -> list[float]:
-    """Values to name on a logarithmic axis between two numbers above zero."""
-    if not high > low:
-        return [low]
-    decades = np.log10(high) - np.log10(low)  # the ratio may be too large for a number
-    if decades < 0.5:
-        rough = (high - low) / 4.0
-        power = 10.0 ** np.floor(np.log10(rough))
-        step = power * next(s for s in (1.0, 2.0, 5.0, 10.0) if s * power >= 0.99 * rough)
-        steps = np.arange(np.ceil(low / step - 1e-9), np.floor(high / step + 1e-9) + 1.0)
-        return [float(f"{value:.6g}") for value in step * steps]
-    digits = "1" if decades > 4.0 else "125" if decades > 1.3 else "12357"
-    powers = range(int(np.floor(np.log10(low))), int(np.ceil(np.log10(high))) + 1)
-    values = [float(f"{digit}e{power}") for power in powers for digit in digits]
-    return [value for value in values if low <= value <= high]
 
 
 def _shaded(spans: Spans) -> list[tuple[float, float, str]]:

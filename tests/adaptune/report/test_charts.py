@@ -19,7 +19,7 @@ from adaptune.report.charts import (
     Spans,
     Words,
 )
-from adaptune.report.drawing import MODES, draw_chart, looks, spec, thinned, ticks
+from adaptune.report.drawing import MODES, draw_chart, looks, spec, thinned
 
 
 def drawn(chart, folder):
@@ -160,17 +160,3 @@ def test_long_lines_are_thinned_and_keep_peaks_and_gaps():
     assert kept[-1] == len(y) - 1
     data = spec(trials())["vconcat"][-1]["concat"][0]["layer"]
     assert max(len(layer["data"]["values"]) for layer in data) <= 2000
-
-
-@pytest.mark.parametrize(
-    ("ends", "named"),
-    [
-        ((0.6, 1.4), [0.6, 0.8, 1.0, 1.2, 1.4]),
-        ((0.5, 6.0), [0.5, 0.7, 1.0, 2.0, 3.0, 5.0]),
-        ((0.1, 30.0), [0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0]),
-        ((1e-3, 1e3), [1e-3, 1e-2, 0.1, 1.0, 10.0, 100.0, 1e3]),
-    ],
-)
-def test_logarithmic_axes_name_round_numbers(ends, named):
-    assert ticks(*ends) == named
-    assert ticks(30.0, 30.0) == [30.0]
