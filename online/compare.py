@@ -89,10 +89,11 @@ def compared_modes(study: Study) -> ComparedModes:
     every = {mode for modes in made.values() for mode in modes}
     if names and "fixed" in every:
         model = ErrorModel.load(study.model_path) if study.model_path.exists() else None
-        modes = replace(setup, also=ALSO).modes(model)
+        modes, asked, option = replace(setup, also=ALSO).modes(model), setup.modes(model), ""
         due = every.intersection(("fixed", BASELINE, *setup.rules))
     else:
-        modes, due = WITHOUT_MODEL, set(WITHOUT_MODEL)
+        modes, asked, option = WITHOUT_MODEL, WITHOUT_MODEL, " --untrained"
+        due = set(WITHOUT_MODEL)
     finished = [name for name, there in made.items() if due.issubset(there)]
     # No mode is everywhere: those with the fixed set are compared.
     finished = finished or [name for name in names if "fixed" in made[name]]
@@ -100,27 +101,14 @@ def compared_modes(study: Study) -> ComparedModes:
         raise StoredReplayError("test: name at least one sequence to compare on")
     if not finished:
         ReplaySummary.read(replays / names[0] / "fixed")
-    lacking = {mode: [n for n in finished if mode not in made[n]] for mode in modes}
-    compared = tuple(mode for mode in modes if not lacking[mode])
-    unasked = {*RIVALS, *ALSO} - every.intersection(ALSO) - {*setup.also}
-    missing = {mode: on for mode, on in lacking.items() if on and mode not in unasked}
-    if modes == WITHOUT_MODEL and not every.issubset(WITHOUT_MODEL):
-        missing = {"fixed": finished}
+    compared = tuple(mode for mode in modes if all(mode in made[n] for n in finished))
     unfinished = tuple(name for name in made if name not in finished)
-    for mode in compared:
-        on = [name for name in unfinished if mode not in made[name]]
-        if on and (mode not in ALSO or modes == WITHOUT_MODEL):
-            missing[mode] = on
-    without = WITHOUT_MODEL if modes == WITHOUT_MODEL else ()
-    told: dict[str, list[str]] = {}
-    for mode, on in missing.items():
-        command = replayed_by(setup.also, UNTRAINED if mode in without else mode)
-        told.setdefault(command, []).append(f"`{mode}` on {' and '.join(on)}")
-    words = [
-        f"Not compared, because replays are missing: {', '.join(those)}; {command} makes them."
-        for command, those in told.items()
-    ]
-    return ComparedModes(tuple(finished), compared, unfinished, words)
+    missing = {m: [n for n in made if m not in made[n]] for m in asked if m not in RIVALS}
+    told = ", ".join(f"`{mode}` on {' and '.join(on)}" for mode, on in missing.items() if on)
+    words = (
+        f"Not compared, because replays are missing: {told}; `adaptune online{option}` makes them."
+    )
+    return ComparedModes(tuple(finished), compared, unfinished, [words] if told else [])
 
 
 def replayed_by(asked: Sequence[str], mode: str) -> str:
