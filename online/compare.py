@@ -21,7 +21,6 @@ from adaptune.reference.check import hard_to_track
 from adaptune.report import tables as report
 from adaptune.study.config import ALSO
 from adaptune.study.study import (
-    EQUAL_COST,
     MIN_RECORDINGS,
     PER_STRETCH,
     RIVALS,
@@ -414,7 +413,7 @@ def compare(study: Study) -> ComparedReplays:
     best = decided(rows, worth)
     said = wrong[:1] or ([] if best is None else _lost(study, judged, best.mode))
     said += verdict(rows, length, obstacle, worth)
-    details = [*wrong, *remarks(rows), *_equal_cost(model, modes), *compared.words]
+    details = [*wrong, *remarks(rows), *compared.words]
     details += _without_oracle(judged, oracles) if model is not None else []
     folder = study.folder / "comparison"
     report.write_rows(folder, "comparison", [row.columns() for row in rows])
@@ -433,16 +432,6 @@ def _lost(study: Study, judged: Sequence[JudgedModes], best: str) -> list[str]:
         study.odometry.name,
         lambda worst: hard_to_track(study.sequences.open(worst)),
     )
-
-
-def _equal_cost(model: ErrorModel | None, modes: Sequence[str]) -> list[str]:
-    """That the fixed set is its own rival, if it is and is compared."""
-    if model is None or "fixed" not in modes or model.rivals.get(EQUAL_COST) != model.fixed:
-        return []
-    return [
-        "`equal_cost` is the fixed set: in training, no single set that costs no more than what is "
-        "driven was better."
-    ]
 
 
 def _without_oracle(judged: Sequence[JudgedModes], oracles: Sequence[ComparisonRow]) -> list[str]:
