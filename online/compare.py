@@ -414,7 +414,6 @@ def compare(study: Study) -> ComparedReplays:
     said = wrong[:1] or ([] if best is None else _lost(study, judged, best.mode))
     said += verdict(rows, length, obstacle, worth)
     details = [*wrong, *remarks(rows), *compared.words]
-    details += _without_oracle(judged, oracles) if model is not None else []
     folder = study.folder / "comparison"
     report.write_rows(folder, "comparison", [row.columns() for row in rows])
     report.write_tables(folder, study.name, tables(rows, length), [*said, *details])
@@ -432,19 +431,6 @@ def _lost(study: Study, judged: Sequence[JudgedModes], best: str) -> list[str]:
         study.odometry.name,
         lambda worst: hard_to_track(study.sequences.open(worst)),
     )
-
-
-def _without_oracle(judged: Sequence[JudgedModes], oracles: Sequence[ComparisonRow]) -> list[str]:
-    """On which sequences the best choice in hindsight is not known."""
-    known = {row.sequence for row in oracles}
-    names = [one.name for one in judged if one.rows[0].rte is not None and one.name not in known]
-    if not names:
-        return []
-    where = "" if len(names) == len(judged) else f" on {', '.join(names)}"
-    return [
-        f"What the best set would have gained{where} is not known; "
-        "`adaptune online --oracle` tells."
-    ]
 
 
 def _rows(judged: Sequence[JudgedModes], oracles: Sequence[ComparisonRow]) -> list[ComparisonRow]:

@@ -250,15 +250,6 @@ def test_restarts_are_told_with_their_reason():
     )
 
 
-def test_what_was_possible_in_hindsight_is_not_known_without_the_oracle(replayed, monkeypatch):
-    (said,) = (said for said in compare(replayed).details if "`adaptune online --oracle`" in said)
-    assert said.startswith("What the best set would have gained is not known")
-    best = ComparisonRow("three", "oracle, sequence", 0.5, 0.9, 0, 0, 0)
-    monkeypatch.setattr("online.compare.oracle_errors", lambda *_: "its trials")
-    monkeypatch.setattr("online.compare.oracle_row", lambda *_: best)
-    assert not any("`adaptune online --oracle`" in said for said in compare(replayed).details)
-
-
 def test_restarts_are_those_of_the_stored_replay(own):
     folder = own.folder / "replays/three/adaptive"
     lines = (folder / "frames.csv").read_text().splitlines()
