@@ -173,7 +173,6 @@ def _mean_row(mode: str, rows: Sequence[ComparisonRow]) -> ComparisonRow:
         lost_seconds=sum(row.lost_seconds for row in rows),
         reference=" and ".join(sorted({row.reference for row in rows})),
         cpu_ms=mean_of([row.cpu_ms for row in rows]),
-        cores=mean_of([row.cores for row in rows]),
         memory_mb=max((m for row in rows if (m := row.memory_mb) is not None), default=None),
     )
 

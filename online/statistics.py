@@ -26,7 +26,7 @@ from adaptune.metrics import (
 from adaptune.reference.stored import StoredEstimate
 from adaptune.study.study import OracleErrors
 from adaptune.trajectory import Trajectory, read_tum
-from online.record import ReplaySummary, StoredReplay, switched
+from online.record import StoredReplay, switched
 
 # A row of the comparison: what a mode did on a sequence, or on all of them.
 
@@ -97,7 +97,6 @@ class ComparisonRow:
     reference: str = "given"  # `given`, `estimated` or `none`
     reference_error: float | None = None  # percent, of an estimated one
     cpu_ms: float | None = None  # milliseconds of CPU time a scan
-    cores: float | None = None  # that this takes at the sensor's rate
     memory_mb: float | None = None  # most megabytes of all processes
     real_time: Mapping[str, float] | None = None  # see `ReplaySummary`
     # Over all sequences: geometric mean of the ratios over the worst tenth of the stretches, and on
@@ -130,7 +129,6 @@ class ComparisonRow:
             "restarts": self.restarts,
             "switches": self.switches,
             "cost [ms]": self.cpu_ms,
-            "cores": self.cores,
             "memory [MB]": self.memory_mb,
             REFERENCE: self.reference,
         }
@@ -330,7 +328,6 @@ def _measured(
         reference="none" if reference.trajectory is None else kind,
         reference_error=reference.error,
         cpu_ms=summary.cpu_ms,
-        cores=_cores(summary),
         memory_mb=summary.memory_mb,
         real_time=summary.real_time,
     )
@@ -359,13 +356,6 @@ def mean_of(values: Sequence[float | None]) -> float | None:
     """Mean of those that are known."""
     known = [value for value in values if value is not None]
     return float(np.mean(known)) if known else None
-
-
-def _cores(summary: ReplaySummary) -> float | None:
-    """CPU time over the recording's duration."""
-    if summary.cpu_ms is None or not summary.duration_s:
-        return None
-    return 1e-3 * summary.cpu_ms * summary.scans / summary.duration_s
 
 
 def allowing_for(

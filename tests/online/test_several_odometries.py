@@ -90,7 +90,7 @@ def test_it_is_replayed_and_compared(trained):
     for rival in set(modes) - replayed:
         one, other = ([row for row in rows if row.mode == mode] for mode in (rival, "fixed"))
         assert [replace(row, mode="fixed") for row in one] == other
-    assert all(row.cpu_ms > 0.0 and row.cores > 0.0 and row.memory_mb > 0.0 for row in rows)
+    assert all(row.cpu_ms > 0.0 and row.memory_mb > 0.0 for row in rows)
     assert tables(rows, 3.0)
     # On so little evidence the bank rests: nothing is said of what adapting costs.
     assert len([said for said in remarks(rows) if "CPU time" in said]) == len(rivals)

@@ -113,17 +113,13 @@ def test_all_sequences_have_mean_errors_and_kittis_over_all_sub_trajectories():
 
 
 def test_what_a_mode_costs_is_in_its_columns():
-    cells = replace(row("a", None), cpu_ms=12.5, cores=0.125, memory_mb=300.0).columns()
-    assert (cells["cost [ms]"], cells["cores"], cells["memory [MB]"]) == (12.5, 0.125, 300.0)
+    cells = replace(row("a", None), cpu_ms=12.5, memory_mb=300.0).columns()
+    assert (cells["cost [ms]"], cells["memory [MB]"]) == (12.5, 300.0)
     old = row("a", None).columns()
-    assert old["cost [ms]"] is old["cores"] is old["memory [MB]"] is None
-    costs = [(10.0, 0.1, 200.0), (20.0, 0.3, 400.0)]
-    rows = [
-        replace(row(name, None), cpu_ms=ms, cores=cores, memory_mb=mb)
-        for name, (ms, cores, mb) in zip("ab", costs, strict=True)
-    ]
+    assert old["cost [ms]"] is old["memory [MB]"] is None
+    costs = {"a": (10.0, 200.0), "b": (20.0, 400.0)}
+    rows = [replace(row(name, None), cpu_ms=ms, memory_mb=mb) for name, (ms, mb) in costs.items()]
     of_all = over_all(rows)
     assert of_all.cpu_ms == pytest.approx(15.0)
-    assert of_all.cores == pytest.approx(0.2)
     assert of_all.memory_mb == 400.0
     assert over_all([row("a", None), row("b", None)]).cpu_ms is None
