@@ -37,7 +37,6 @@ class ReplaySummary(BaseModel):
     restarts: int  # how often the health check restarted the odometry
     unhealthy: dict[str, int]  # how often the health check found what
     poor_scans: int  # scans that were too poor to register
-    first_pose_s: float = 0.0  # seconds until then; scans before it do not count
     selections: int
     lost_seconds: float = 0.0  # how long the bank was lost
     cpu_ms: float | None = None  # milliseconds of CPU time a scan, without reading it
@@ -181,7 +180,6 @@ def write_replay(
         restarts=int(replay.restarted.sum()),
         unhealthy=replay.unhealthy,
         poor_scans=int((~replay.registered).sum()),
-        first_pose_s=round(replay.first_pose, 3),
         selections=len(replay.choices),
         lost_seconds=round(_lost_seconds(replay), 3),
         cpu_ms=round(replay.cpu_ms, 3),

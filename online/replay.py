@@ -171,7 +171,6 @@ class ReplayRecord:
     seconds: float = 0.0  # the whole replay, reading included
     cpu_ms: float = math.nan  # milliseconds of CPU time a scan, in all processes, without reading
     memory: float = 0.0  # most megabytes of all processes
-    first_pose: float = 0.0  # seconds until then; the steps begin there
     # In real time:
     dropped: int = 0  # scans that the odometry did not get
     missed: int = 0  # selections that were not there at their deadline
@@ -247,7 +246,6 @@ class ReplayRecord:
         # Scans before the first pose are unknown, unless they are so many that it has failed.
         waiting = sum(1 for _ in takewhile(lambda step: not step.begun, self.steps))
         if 0 < waiting < MAX_SHARE_WITHOUT_POSE * self._n:
-            self.first_pose = (self.steps[waiting].stamp - self.steps[0].stamp) * 1e-9
             del self.steps[:waiting], self.late[:waiting]
         self.seconds = time.perf_counter() - self._started
         self.cpu_ms = 1e3 * (self._cpu + usage.other_cpu + other_cpu) / self._n

@@ -83,7 +83,6 @@ class ComparisonRow:
     restarts: int = 0  # by the health check
     switches: int = 0  # changes of the parameters
     poor_scans: int = 0  # too poor to register
-    first_pose: float = 0.0  # seconds until then, at most; scans before it do not count
     rte_interval: Interval = None
     ratio_interval: Interval = None
     standard: StandardErrors | None = None
@@ -318,7 +317,6 @@ def _measured(
         restarts=summary.restarts,
         switches=int(switched(replay.choices).sum()),
         poor_scans=summary.poor_scans,
-        first_pose=summary.first_pose_s,
         standard=reference.standard(of_common),
         first_restart=float(restarts[0]) if len(restarts) else None,
         unhealthy=tuple(summary.unhealthy),

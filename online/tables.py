@@ -305,8 +305,7 @@ def _ratio(row: ComparisonRow) -> Ratio:
 
 def remarks(rows: Sequence[ComparisonRow]) -> list[str]:
     """How what adapts compares with rivals and controls, and what must be known to trust it."""
-    said = _rivals(rows) + _judges(rows) + _estimates(rows) + _kept_up(rows) + _restarts(rows)
-    return said + _late_begins(rows)
+    return _rivals(rows) + _judges(rows) + _estimates(rows) + _kept_up(rows) + _restarts(rows)
 
 
 def _rivals(rows: Sequence[ComparisonRow]) -> list[str]:
@@ -398,18 +397,6 @@ def _kept_up(rows: Sequence[ComparisonRow]) -> list[str]:
             f"Replayed at {rate:g} times the recorded rate, nothing came too late: {within}."
         )
     return said
-
-
-def _late_begins(rows: Sequence[ComparisonRow]) -> list[str]:
-    """For each sequence a sentence about the modes whose first pose came late."""
-    late: dict[str, list[str]] = {}
-    for row in rows:
-        if row.first_pose:
-            late.setdefault(row.sequence, []).append(f"{row.first_pose:.1f} s (`{row.mode}`)")
-    return [
-        f"On {name} the first pose came after {', '.join(those)}; scans before it do not count."
-        for name, those in late.items()
-    ]
 
 
 def _restarts(rows: Sequence[ComparisonRow]) -> list[str]:
