@@ -6,7 +6,6 @@ import itertools
 import logging
 import subprocess
 import threading
-import time
 from collections import deque
 from collections.abc import Iterable
 from contextlib import ExitStack, closing
@@ -32,7 +31,7 @@ from adaptune.strict import in_one_line
 from adaptune.study.config import RealTimeConfig, RosConfig, SteerConfig, StudyConfig
 from adaptune.study.study import ModeError, Study, StudySequences
 from adaptune.trajectory import Trajectory, tum_lines
-from online.live import CLOUD, IMU, LiveScans, RosMessages, Uncertainty, placed
+from online.live import LiveScans, RosMessages, Uncertainty, placed
 from online.modes import UNTRAINED, WITHOUT_MODEL, Mode, ReplaySetup, needed
 from online.real_time import RealTimeDrive, SelectorProcess
 from online.record import FRAME_COLUMNS, SELECTION_COLUMNS, frame_row, selection_row
@@ -226,8 +225,6 @@ def _run(command: list[str]) -> tuple[int, str]:
 
 
 SELECTION_TOPIC = "adaptune/selection"
-_PUBLISHED = 5.0
-"""Seconds in which a topic that nobody has named must be published."""
 
 _log = logging.getLogger(__name__)
 
@@ -331,8 +328,8 @@ class RobotDrive:
         timing = Timing(like.stamp, like.time_unit, like.period)
         if self._study.odometry.description.needs_imu and self._ros.steer is None:
             imu = like.imu or ImuConfig()
-            imu = imu.model_copy(update={"topic": _topic(link, imu.topic, IMU, "imu.topic")})
-        points = _topic(link, self._ros.points or like.points, CLOUD, "online.ros.points")
+            imu = imu.model_copy(update={"topic": _named(imu.topic, "imu.topic")})
+        points = _named(self._ros.points or like.points, "online.ros.points")
         return LiveScans(link, points, timing, self._settings.queue, imu)
 
     def _part(
@@ -425,19 +422,10 @@ def _like(config: StudyConfig, sequences: StudySequences) -> SequenceConfig:
     return sequences.config(name)
 
 
-def _topic(link: RosLink, name: str | None, kind: str, key: str) -> str:
-    """A topic, or the only one of a kind that is published."""
-    if name is not None:
-        return name
-    end = time.monotonic() + _PUBLISHED
-    found: list[str] = []
-    while not found and time.monotonic() < end:
-        found = sorted(topic for topic, of in link.topics().items() if of == kind)
-        time.sleep(0.0 if found else 0.2)
-    if len(found) != 1:
-        there = ", ".join(found) or "none"
-        raise AdaptuneError(f"{key}: name the topic; of {kind}, {there} is published")
-    return found[0]
+def _named(topic: str | None, key: str) -> str:
+    if topic is None:
+        raise AdaptuneError(f"{key}: name the topic on the robot")
+    return topic
 
 
 def _new_folder(parent: Path) -> Path:
