@@ -383,12 +383,6 @@ def _kept_up(rows: Sequence[ComparisonRow]) -> list[str]:
                 f"{kept['rate']:g} times the recorded rate; 99 % of its poses came within "
                 f"{kept['pose_ms_p99']:.0f} ms of the scans."
             )
-        if late := kept.get("late_members_scans"):
-            removed = f", and {n:.0f} removed" if (n := kept.get("removed_members")) else ""
-            said.append(
-                f"On {row.sequence} members of the bank of `{row.mode}` were late at {late:.0f} "
-                f"scans in all{removed}."
-            )
     if timed and not said:
         rate = timed[0][1]["rate"]
         ms = max(kept["pose_ms_p99"] for _, kept in timed)
