@@ -65,21 +65,17 @@ def replayed_sequences(replays: Path, config: StudyConfig, wanted: Sequence[str]
         If there is none, or not one that is wanted.
     """
     default = sequences_without_model(config)
-    every = dict.fromkeys([*default, *config.sequences, *config.courses])
-    for name in wanted:
-        if name not in every:
-            raise StoredReplayError(
-                f"{name}: there is no such sequence in the study: {nearest(name, list(every))}"
-            )
-        if not replayed_modes(replays / name):
-            raise StoredReplayError(
-                f"{name}: there is no replay of it; name it in the `test` of the study, and run "
-                f"`adaptune online`"
-            )
-    found = [name for name in dict.fromkeys(wanted or default) if replayed_modes(replays / name)]
-    if not found:
+    every = list(dict.fromkeys([*default, *config.sequences, *config.courses]))
+    if unknown := [name for name in wanted if name not in every]:
+        what = f"there is no such sequence in the study: {nearest(unknown[0], every)}"
+        raise StoredReplayError(f"{unknown[0]}: {what}")
+    names = list(dict.fromkeys(wanted or default))
+    found = [name for name in names if replayed_modes(replays / name)]
+    missing = [name for name in names if name not in found]
+    if missing and (wanted or not found):
         raise StoredReplayError(
-            f"{replays}: there is no replay; run `adaptune online` with this study first"
+            f"{missing[0]}: there is no replay; name it in the `test` of the study, and run "
+            f"`adaptune online`"
         )
     return found
 

@@ -222,9 +222,9 @@ def test_ctrl_c_leaves_nothing_half_written(study):
 
 def test_sequences_that_were_not_replayed_are_refused(study, study_file, tmp_path):
     for names, folder, said in (
-        (["one"], study.folder, "one: there is no replay of it; .* `adaptune online`"),
+        (["one"], study.folder, "one: there is no replay; .* `adaptune online`"),
         (["thre"], study.folder, "thre: there is no such sequence in the study: .*three"),
-        ([], tmp_path / "other", "there is no replay; run `adaptune online`"),
+        ([], tmp_path / "other", "three: there is no replay; .* `adaptune online`"),
     ):
         assert re.search(said, refused("record", study_file, *names, "--folder", folder))
 
