@@ -50,7 +50,6 @@ _TIMES = ("prepare_ms", "register_ms", "late_ms")
 """Columns of ``frames.csv`` that are topics."""
 _CLOUD = "sensor_msgs/msg/PointCloud2"
 _TRANSFORM = "tf2_msgs/msg/TFMessage"
-_ODOMETRY = "nav_msgs/msg/Odometry"
 _PATH = "nav_msgs/msg/Path"
 _NUMBER = "std_msgs/msg/Float64"
 _TEXT = "std_msgs/msg/String"
@@ -114,8 +113,6 @@ def record_replays(study: Study, name: str, progress: Progress = unseen) -> Path
         composer.add(REFERENCE, _PATH, composer.path(first, start))
     for mode, replay in replays.items():
         composer.add(topic(mode, "path"), _PATH, composer.path(paths[mode], start))
-        child = SENSOR if mode == placing else f"{SENSOR}_{mode}"
-        composer.add(topic(mode, "odometry"), _ODOMETRY, composer.odometry(paths[mode], child))
         composer.add_mode(mode, replay, reference)
     path = study.folder / "recordings" / name
     with replacing_folder(path) as new:
@@ -225,10 +222,6 @@ class _Composer:
     def transforms(self, trajectory: Trajectory) -> Iterator[tuple[int, Any]]:
         """Where the sensor is."""
         return ((s, self._made.transform(s, at, SENSOR)) for s, at in _poses(trajectory))
-
-    def odometry(self, trajectory: Trajectory, child: str) -> Iterator[tuple[int, Any]]:
-        """Its pose at every scan, in a frame of its own."""
-        return ((s, self._made.odometry(s, at, child)) for s, at in _poses(trajectory))
 
 
 def _poses(trajectory: Trajectory) -> Iterator[tuple[int, Placed]]:
