@@ -61,19 +61,12 @@ def test_rows_and_files(replayed):
         assert (written["kitti_percent"], written["kitti_lengths_m"]) == (None, None)
 
 
-def test_baseline_and_fixed_keep_their_parameters_and_adaptive_has_its_own(replayed):
+def test_baseline_and_fixed_keep_their_parameters(replayed):
     model = ErrorModel.load(replayed.folder / "model.safetensors")
     folder = replayed.folder / "replays/three"
     about = {m: json.loads((folder / m / "inputs.json").read_text())["inputs"] for m in MODES}
     assert about["baseline"]["parameters"] == replayed.odometry.space.baseline
     assert about["fixed"]["parameters"] == model.sets[model.fixed]
-    for mode in ("adaptive", "paper"):
-        with (folder / mode / "selections.csv").open() as file:
-            rows = list(csv.DictReader(file))
-        assert len(rows) == 4  # 40 scans at 10 Hz
-        for row in rows:
-            chosen = model.sets[int(row["trial"])]
-            assert {name: float(row[name]) for name in chosen} == pytest.approx(chosen)
 
 
 def test_values_that_stay_read_as_those_that_change(own):

@@ -75,16 +75,6 @@ def test_the_newest_wait(link):
     assert (round((first.scan.stamp - START) / TENTH), first.dropped) == (3, 3)
 
 
-def test_where_the_clock_goes_back_another_drive_begins(link, caplog):
-    scans = topic(link)
-    play(link, [30, 31, 0, 1, 2])
-    first = [round((a.scan.stamp - START) / TENTH) for a in scans.arrivals()]
-    assert first == [30, 31]
-    assert not scans.stopped
-    assert numbers(scans) == [0, 1, 2]
-    assert caplog.messages == ["the clock went back by 3.1 s: a new drive"]
-
-
 def test_what_is_no_point_cloud_is_left_out(link, caplog):
     scans = topic(link)
     play(link, [0])

@@ -11,7 +11,7 @@ import pytest
 from clocks import SteppedClock
 from noting_selector import Noting, refusing
 
-from adaptune.errors import AdaptuneError, OdometryError
+from adaptune.errors import AdaptuneError
 from adaptune.odometry.base import InProcess, Motions, Registration
 from adaptune.odometry.keyframe import KeyframeGicp
 from adaptune.odometry.tracker import HealthCheck
@@ -40,9 +40,9 @@ class Steady:
 
     live, space = True, None
 
-    def __init__(self, seconds=0.0, refuses=(), prepares=0.0):
+    def __init__(self, seconds=0.0, prepares=0.0):
         self.clock = SteppedClock()
-        self.seconds, self.refuses, self.prepares = seconds, refuses, prepares
+        self.seconds, self.prepares = seconds, prepares
         self.prepared = []
         self.parameters = {"fine": 1}
 
@@ -65,8 +65,6 @@ class Steady:
         return Registration(self.T)
 
     def configure(self, parameters):
-        if parameters.get("fine") in self.refuses:
-            raise OdometryError("too fine")
         self.parameters |= parameters
 
 
@@ -199,20 +197,6 @@ def test_late_selections_are_dropped_and_the_last_set_stays():
     assert not result.choices
     assert odometry.parameters == {"fine": 1}
     assert result.waited == pytest.approx([0.01] * 3)
-
-
-def test_one_that_cannot_be_applied_returns_to_the_fixed_set(caplog):
-    odometry = Steady(refuses=[2])
-    result = run(odometry, 25, Answering(), rate=10.0, deadline=9.0, queue=0)
-    assert [choice.selection.trial for choice in result.choices] == [1, 1]
-    assert result.choices[0].fallen_back == "trial 2 cannot be applied: too fine"
-    # It is not tried again at once.
-    assert [(choice.stamp, choice.why_not) for choice in result.rejected] == [
-        (0, "too fine"),
-        (20 * TENTH, "the odometry failed with it"),
-    ]
-    assert "cannot be applied: too fine at 0.0 s; the fixed set is used" in caplog.text
-    assert len(result.trajectory) == 25
 
 
 def test_an_odometry_that_is_too_slow_drops_scans():

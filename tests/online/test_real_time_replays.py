@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from commands import call, refused, succeeded
 
 from adaptune import manifest
 from adaptune.model import BankSettings, ErrorModel
@@ -95,16 +94,3 @@ def test_replays_in_real_time_are_compared_as_they_are(study, study_file):
     assert {row.real_time["rate"] for row in rows} == {5.0}
     (found,) = [text for text in remarks(rows) if "too late" in text]
     assert "On three `fixed` was too late for 1 scan and 2 selections, at 5 times the" in found
-
-
-@pytest.mark.services
-def test_the_command_takes_a_rate(study_file, trained_folder, tmp_path):
-    folder = shutil.copytree(trained_folder, tmp_path / "run")
-    given = [study_file, "--folder", folder, "-o", "online.modes=[adaptive]"]
-    first, again = (call("online", *given, "-o", "online.real_time.rate=20") for _ in range(2))
-    assert "3 replays made" in first.output
-    assert json.loads((folder / "replays/three/fixed/replay.json").read_text())["real_time"]
-    assert "All replays were there" in again.output
-    succeeded("compare", *given)
-    said = refused("online", *given, "-o", "online.real_time.rate=-1")
-    assert "online.real_time.rate: give a number above 0, not -1" in said

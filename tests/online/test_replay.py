@@ -14,7 +14,6 @@ from adaptune.odometry.base import InProcess, Odometry, Registration, Usage
 from adaptune.odometry.keyframe import KeyframeGicp
 from adaptune.odometry.tracker import HealthCheck
 from adaptune.recording.scan import Scan
-from adaptune.selector import UntrainedSelector, untrained_sets
 from adaptune.space import Float, ParameterSpace, Selection
 from adaptune.trajectory import read_tum
 from online.record import StoredReplay, write_replay
@@ -187,19 +186,6 @@ def test_the_log_says_when_an_odometry_is_lost_and_when_it_goes_on(tmp_path, cap
     summary = json.loads((tmp_path / "replay.json").read_text())
     assert summary["lost_seconds"] == 2.5  # the last selection holds until the end
     assert summary["model_file"] is None
-
-
-def test_a_bank_without_a_model_takes_odometries_that_are_not_live():
-    class Stiff(Scripted):
-        live = False
-
-    sets = untrained_sets(Scripted.space)
-    odometry = Bank(lambda _: InProcess(Stiff()), {n: sets[n] for n in sets})
-    result = replay(scans(np.arange(20) / 10), odometry, HEALTH, UntrainedSelector(sets, 25.0))
-    np.testing.assert_allclose(result.trajectory.T_world_sensor[:, 0, 3], 0.1 * np.arange(20))
-    assert [choice.selection.weights for choice in result.choices] == [
-        {0: 1.0} | dict.fromkeys(list(sets)[1:], 0.0)
-    ] * 2
 
 
 def test_no_scans():

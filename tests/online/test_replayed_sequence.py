@@ -6,7 +6,6 @@ import pytest
 from offline.config import load_study
 from online.charts import charts_of_replays, read_replays, scenes_along
 from online.modes import run_replays
-from online.record import StoredReplayError
 
 COURSE = """\
 odometry: {name: gicp}
@@ -44,18 +43,6 @@ def test_all_charts_are_made(study):
     assert [chart.key for chart in charts] == ["three-errors", "three-choices"]
     assert all(chart.caption and chart.title.startswith("three: ") for chart in charts)
     assert notes == []
-
-
-def test_a_damaged_table_is_refused(study, study_file, tmp_path):
-    own = load_study(study_file, [], shutil.copytree(study.folder, tmp_path / "study"))
-    path = own.folder / "replays/three/paper/selections.csv"
-    header, first, *rest = path.read_text("utf-8").splitlines()
-    column = header.split(",").index("familiarity")
-    cells = first.split(",")
-    cells[column] = "x"
-    path.write_text("\n".join([header, ",".join(cells), *rest]), "utf-8")
-    with pytest.raises(StoredReplayError, match="paper"):
-        read_replays(own, "three")
 
 
 def test_scenes_of_a_part_of_a_course_are_those_of_that_part(tmp_path):
