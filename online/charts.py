@@ -241,8 +241,6 @@ def _seen_from(trajectory: Trajectory) -> NDArray[np.float64]:
 TIME = Axis("time [s]")
 _MOST_PLACES = 200
 """Points of a path; more would hide each other."""
-_WIDE = 8.0
-"""Errors are drawn on a logarithmic axis if the largest is so many times their median."""
 _RESTARTED = "restarted by the health check"
 
 
@@ -456,11 +454,8 @@ def _errors_around(replayed: ReplayedSequence) -> Panel:
         same = fixed is not None and np.array_equal(of.errors, fixed.errors, equal_nan=True)
         # It would hide the line of the fixed set, which it has kept.
         lines.append(Line(of.seconds, of.errors_around, mode, dashed=mode != FIXED and same))
-    known = np.concatenate([line.y for line in lines])
-    most, log = np.nanmax(known), bool(np.nanmax(known) > _WIDE * np.nanmedian(known))
-    y = Axis("error [%]", log, limits=None if log else (0.0, 1.05 * most or 1.0))
     title = f"error (RTE over {replayed.length:g} m) around each moment"
-    return Panel(TIME, y, (*_scenes(replayed), *lines), title, height=1.6)
+    return Panel(TIME, Axis("error [%]", log=True), (*_scenes(replayed), *lines), title, height=1.6)
 
 
 def _chosen(replayed: ReplayedSequence) -> Iterator[Panel]:

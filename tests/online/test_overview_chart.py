@@ -77,12 +77,6 @@ def test_what_kept_the_fixed_set_has_no_panel_and_hides_no_line(choices):
     assert dashed == {"baseline": False, "fixed": False, "adaptive": True}
 
 
-def test_the_axis_is_logarithmic_where_a_mode_is_lost():
-    lost = replay(errors_around=np.where(SECONDS < 10.0, 0.7, 80.0))
-    plain, wide = (overview(sequence(**modes(baseline=of))).panels[1].y for of in (replay(), lost))
-    assert (plain.log, plain.limits[0], wide.log) == (False, 0.0, True)
-
-
 def test_without_a_model_there_are_two_modes():
     of = rows("baseline", baseline=1.4, untrained=0.7)
     chart = overview(sequence(baseline=kept(), untrained=bank()), of)
