@@ -32,8 +32,6 @@ class ReplaySummary(BaseModel):
     """The content of ``replay.json``."""
 
     scans: int
-    duration_s: float  # of the recording
-    replay_s: float  # of its replay
     restarts: int  # how often the health check restarted the odometry
     unhealthy: dict[str, int]  # how often the health check found what
     poor_scans: int  # scans that were too poor to register
@@ -172,11 +170,8 @@ def write_replay(
     late = replay.late if replay.rate is not None else itertools.repeat(math.nan)
     rows = (frame_row(*pair)[: len(columns)] for pair in zip(replay.steps, late, strict=False))
     _write_csv(folder / "frames.csv", columns, rows)
-    stamps = replay.trajectory.stamps
     summary = ReplaySummary(
-        scans=len(stamps),
-        duration_s=round(float(stamps[-1] - stamps[0]) * 1e-9, 3),
-        replay_s=round(replay.seconds, 3),
+        scans=len(replay.steps),
         restarts=int(replay.restarted.sum()),
         unhealthy=replay.unhealthy,
         poor_scans=int((~replay.registered).sum()),

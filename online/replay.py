@@ -168,7 +168,6 @@ class ReplayRecord:
     choices: MutableSequence[Choice] = field(default_factory=list)  # those that were applied
     rejected: MutableSequence[Choice] = field(default_factory=list)  # those that were not
     newest: Choice | None = None  # applied or not
-    seconds: float = 0.0  # the whole replay, reading included
     cpu_ms: float = math.nan  # milliseconds of CPU time a scan, in all processes, without reading
     memory: float = 0.0  # most megabytes of all processes
     # In real time:
@@ -183,7 +182,6 @@ class ReplayRecord:
 
     def __post_init__(self) -> None:
         self._cpu, self._n = 0.0, 0
-        self._started = time.perf_counter()
 
     def __repr__(self) -> str:
         what = f"{self.done} scans, {len(self.choices)} selections, {self.restarted.sum()} restarts"
@@ -247,7 +245,6 @@ class ReplayRecord:
         waiting = sum(1 for _ in takewhile(lambda step: not step.begun, self.steps))
         if 0 < waiting < MAX_SHARE_WITHOUT_POSE * self._n:
             del self.steps[:waiting], self.late[:waiting]
-        self.seconds = time.perf_counter() - self._started
         self.cpu_ms = 1e3 * (self._cpu + usage.other_cpu + other_cpu) / self._n
         self.memory += usage.memory or 0.0
         return self

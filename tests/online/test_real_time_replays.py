@@ -49,8 +49,6 @@ def test_it_is_recorded_how_a_replay_kept_up(study):
         assert (kept["rate"], kept["dropped_scans"], kept["missed_selections"]) == (5.0, 0, 0)
         assert 0.0 < kept["pose_ms_p50"] <= kept["pose_ms_p99"]
         assert (kept["selection_ms_p50"] > 0.0) == (mode == "adaptive")
-        # Forty scans in 0.8 s at least.
-        assert found["replay_s"] > 0.7
         with (study.folder / f"replays/three/{mode}/frames.csv").open() as file:
             late = [float(row["late_ms"]) for row in csv.DictReader(file)]
         assert np.percentile(late, 50) == pytest.approx(kept["pose_ms_p50"], abs=0.01)

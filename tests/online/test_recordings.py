@@ -37,7 +37,7 @@ def replay_of(trajectory, choices=(), **record):
             zip(trajectory.stamps.tolist(), trajectory.T_world_sensor, strict=True)
         )
     ]
-    made = ReplayRecord(steps=steps, seconds=4.0, cpu_ms=1.0, memory=1.0, **record)
+    made = ReplayRecord(steps=steps, cpu_ms=1.0, memory=1.0, **record)
     for choice in choices:
         made.note(choice)
     return made
