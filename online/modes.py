@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, Self
 
 from adaptune import manifest
-from adaptune.bank.bank import Bank
+from adaptune.bank.bank import WARM_UP, Bank
 from adaptune.errors import AdaptuneError
 from adaptune.model import ErrorModel
 from adaptune.model.descriptor import DescriptorError
@@ -192,10 +192,9 @@ class ReplaySetup:
         in_time = self.config.online.real_time
         # Where no scan is dropped, no member is left behind either.
         rate = in_time.rate if in_time is not None and in_time.queue else None
-        warm_up = self.odometry.description.warm_up
         pace = 1.0 if in_time is None else in_time.rate
         cores = 1 if mode.cost * pace <= ONE_CORE else len(shared_cores())
-        return Bank(self.odometry, mode.sets, warm_up, self.config.lost_track, cores, rate)
+        return Bank(self.odometry, mode.sets, WARM_UP, self.config.lost_track, cores, rate)
 
     def identity(
         self, name: str, model: ErrorModel | None = None, digest: str = ""
@@ -205,8 +204,7 @@ class ReplaySetup:
         if name in (BASELINE, FIXED, *RIVALS):
             mode = self.mode(name, model)
             return about | {"parameters": mode.sets[mode.fixed]}
-        warm_up = self.odometry.description.warm_up
-        switching: dict[str, Any] = {"mechanism": "bank", "warm_up": warm_up}
+        switching: dict[str, Any] = {"mechanism": "bank", "warm_up": WARM_UP}
         if name == UNTRAINED:
             members = list(self._untrained_sets().parameters)
             return about | {"switching": switching | {"members": members}}

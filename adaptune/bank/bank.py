@@ -26,6 +26,9 @@ from adaptune.odometry.registry import Factory
 from adaptune.recording.scan import Scan
 from adaptune.space import ODOMETRY, ParameterSet, Selection
 
+WARM_UP = 12.0
+"""Seconds of the last scans that a member sees when it restarts."""
+
 Make = Callable[[ParameterSet], OdometryInstance]
 """Makes a new instance with these parameters."""
 
@@ -315,7 +318,7 @@ class Bank(OdometryInstance):
         self,
         make: Make,
         sets: Mapping[int, ParameterSet],
-        warm_up: float = 12.0,
+        warm_up: float = WARM_UP,
         lost_track: float = 3.0,
         cores: int = 1,
         rate: float | None = None,

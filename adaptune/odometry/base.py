@@ -76,7 +76,6 @@ class Description(NamedTuple):
     space: ParameterSpace | None
     live: bool
     needs_imu: bool = False
-    warm_up: float = 12.0  # seconds of scans that a member of a bank sees when it restarts
     # whether it runs whole recordings only, with one parameter set from end to end
     whole: bool = False
     clean: bool = False  # whether instances in one process know nothing of each other
@@ -252,9 +251,6 @@ class Odometry(ABC):
         the process. Others run in a process of their own.
     needs_imu : bool
         Whether scans must bring along what an IMU measured.
-    warm_up : float
-        Seconds of the last scans that a member of a bank sees when it restarts, unless a study says
-        otherwise.
     parameters : dict
         The present value of every parameter in `space`.
 
@@ -272,7 +268,6 @@ class Odometry(ABC):
     live: ClassVar[bool]
     clean: ClassVar[bool] = False
     needs_imu: ClassVar[bool] = False
-    warm_up: ClassVar[float] = 12.0
 
     def __init__(
         self, parameters: ParameterSet | None = None, settings: BaseSettings | None = None
@@ -283,7 +278,7 @@ class Odometry(ABC):
     @classmethod
     def describe(cls, settings: Any) -> Description:  # noqa: ARG003
         """What a study must know of the odometry with these settings."""
-        known = cls.space, cls.live, cls.needs_imu, cls.warm_up
+        known = cls.space, cls.live, cls.needs_imu
         return Description(*known, clean=cls.clean, module=cls.__module__)
 
     @classmethod

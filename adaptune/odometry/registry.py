@@ -399,15 +399,13 @@ class OdometryPool:
     def description(self) -> Description:
         """What a study must know of all together.
 
-        No instance changes from one odometry to another, so none is live. The longest warm-up is
-        long enough for all.
+        No instance changes from one odometry to another, so none is live.
         """
         every = [factory.description for factory in self.factories.values()]
         return Description(
             self.space,
             live=False,
             needs_imu=any(one.needs_imu for one in every),
-            warm_up=max(one.warm_up for one in every),
             whole=any(one.whole for one in every),
         )
 

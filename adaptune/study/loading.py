@@ -223,7 +223,7 @@ DELETED = {
     "online.switching.cores": "is gone: a bank shares all cores that adaptune may use",
     "online.switching.sets": "is gone: training chooses the bank; give its size",
     "online.switching.memory": "is gone: auto spends 16 GB; give mechanism: bank for more",
-    "online.switching.warm_up": "is gone: the odometry says it; leave it out",
+    "online.switching.warm_up": "is gone: it is always 12 s; leave it out",
     "online.switching.mechanism=hand_over": "is gone (it gained nothing); give auto, live or bank",
     "online.modes=paired": "is now called adaptive",
     **{

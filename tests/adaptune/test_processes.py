@@ -79,7 +79,7 @@ class Settings(BaseSettings):
 class Mine(Odometry):
     space = ParameterSpace({"scale": Float(low=0.5, high=2.0, baseline=1.1)})
     settings_type = Settings
-    live, clean, warm_up = True, True, 0.5
+    live, clean = True, True
     def prepare(self, scan):
         return scan.stamp
     def start(self, prepared, T_odom_sensor, T_previous_current=None):
@@ -108,7 +108,6 @@ def test_the_driver_imports_no_code_of_the_user_s(mine, study_file, tmp_path, ca
     ]
     study = load_study(study_file, overrides, tmp_path / "study")
     assert study.odometry.settings.model_dump() == {"step": 0.3}
-    assert study.odometry.description.warm_up == 0.5
     model = train(study).model
     assert len(model.sets) == 4
     assert run_replays(study, study.model_path) == 4
