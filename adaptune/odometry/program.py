@@ -453,30 +453,23 @@ def _lacking(T_own_sensor: Poses, given: ProgramInput) -> str | None:
     """What is said where too few scans have poses, or too little of the way."""
     known = np.isfinite(T_own_sensor[:, 0, 0])
     if known.mean() < _COVERAGE:
-        return (
-            f"it gave poses for {known.sum()} of {len(known)} scans; {missing(known, given.stamps)}"
-        )
+        what = f"{known.sum()} of {len(known)} scans"
+        return f"it gave poses for {what}; {when_known(known, given.stamps)}"
     if given.T_ref_sensor is not None:
         metres = np.nan_to_num(np.linalg.norm(steps(given.T_ref_sensor)[:, :3, 3], axis=1))
         covered = metres[known[:-1] & known[1:]].sum()
         if covered < _COVERAGE * metres.sum():
             way = f"{covered:.0f} m of {metres.sum():.0f} m"
-            return f"it gave poses for {way} of the way; {missing(known, given.stamps)}"
+            return f"it gave poses for {way} of the way; {when_known(known, given.stamps)}"
     return None
 
 
-def missing(known: NDArray[np.bool_], stamps: NDArray[np.int64]) -> str:
-    """Where scans have no pose, and the cause that this suggests; both of shape (n,)."""
+def when_known(known: NDArray[np.bool_], stamps: NDArray[np.int64]) -> str:
+    """When the first and the last pose come: late, early, or some between are missing."""
     if not known.any():
         return "none at all"
-    seconds, (first, last) = 1e-9 * (stamps - stamps[0]), np.flatnonzero(known)[[0, -1]]
-    causes = {
-        f"at the start (it begins late: first pose after {seconds[first]:.1f} s)": first,
-        "on the way (it drops scans)": int((~known[first : last + 1]).sum()),
-        f"at the end (it stops early: the last pose at {seconds[last]:.1f} s of "
-        f"{seconds[-1]:.1f} s)": len(known) - 1 - last,
-    }
-    return "without one: " + ", ".join(f"{n} {where}" for where, n in causes.items() if n)
+    (first, last), end = 1e-9 * (stamps[known][[0, -1]] - stamps[0]), 1e-9 * np.ptp(stamps)
+    return f"the first pose at {first:.1f} s, the last at {last:.1f} s of {end:.1f} s"
 
 
 def poses_at(trajectory: Trajectory, stamps: NDArray[np.int64]) -> Poses:

@@ -54,7 +54,7 @@ from adaptune.odometry.program import (
     WholeRun,
     WholeSettings,
     check_names,
-    missing,
+    when_known,
 )
 from adaptune.odometry.remote import Limits
 from adaptune.recording.clouds import PATH, POSES, Pose, usable
@@ -664,7 +664,7 @@ class PlayedBag(WholeRun):
         if (~near).sum() > 0.01 * n:
             _log.warning(
                 "%s: %d of %d scans have no pose at rate %g; %s",
-                *(self.name, (~near).sum(), n, self.settings.rate, missing(near, given.stamps)),
+                *(self.name, (~near).sum(), n, self.settings.rate, when_known(near, given.stamps)),
             )
         return trajectory
 
