@@ -27,7 +27,7 @@ from pydantic import AfterValidator
 from adaptune import files, processes
 from adaptune.errors import OdometryError, UnavailableError, nearest
 from adaptune.files import replacing_folder, temporary_folder
-from adaptune.geometry import Poses, invert, nearest_rotation, rotation_angle, steps, to_pose
+from adaptune.geometry import Poses, invert, nearest_rotation, rotation_angle, to_pose
 from adaptune.metrics import window_ends
 from adaptune.odometry.base import (
     BaseSettings,
@@ -322,7 +322,7 @@ def check_frame(T_own_sensor: Poses, T_ref_sensor: Poses | None) -> None:
 # Odometries that run once on a whole recording.
 
 _COVERAGE = 0.9
-"""Least share of the scans, and of the way, for which there must be poses."""
+"""Least share of the scans for which there must be poses."""
 
 
 class WholeSettings(BaseSettings):
@@ -450,18 +450,12 @@ class WholeRun(Faulting):
 
 
 def _lacking(T_own_sensor: Poses, given: ProgramInput) -> str | None:
-    """What is said where too few scans have poses, or too little of the way."""
+    """What is said where too few scans have poses."""
     known = np.isfinite(T_own_sensor[:, 0, 0])
-    if known.mean() < _COVERAGE:
-        what = f"{known.sum()} of {len(known)} scans"
-        return f"it gave poses for {what}; {when_known(known, given.stamps)}"
-    if given.T_ref_sensor is not None:
-        metres = np.nan_to_num(np.linalg.norm(steps(given.T_ref_sensor)[:, :3, 3], axis=1))
-        covered = metres[known[:-1] & known[1:]].sum()
-        if covered < _COVERAGE * metres.sum():
-            way = f"{covered:.0f} m of {metres.sum():.0f} m"
-            return f"it gave poses for {way} of the way; {when_known(known, given.stamps)}"
-    return None
+    if known.mean() >= _COVERAGE:
+        return None
+    what = f"{known.sum()} of {len(known)} scans"
+    return f"it gave poses for {what}; {when_known(known, given.stamps)}"
 
 
 def when_known(known: NDArray[np.bool_], stamps: NDArray[np.int64]) -> str:
