@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from pydantic import Field
 from scipy.spatial.transform import Rotation
 
-from adaptune import files
 from adaptune.errors import OdometryError, import_extra, nearest
 from adaptune.geometry import Poses, invert, squared_ranges
 from adaptune.odometry.base import (
@@ -20,7 +19,6 @@ from adaptune.odometry.base import (
     NO_IMU,
     BaseSettings,
     Description,
-    OwnFile,
     OwnFrameOdometry,
     RangeSettings,
     duration_of,
@@ -185,14 +183,6 @@ class Pipeline(OwnFrameOdometry):
         if settings is not None and settings.parameters:
             cls(settings=settings)  # raises if a parameter is unknown, or a value of another type
         return super().describe(settings)
-
-    @classmethod
-    def own_file(cls, parameters: ParameterSet, settings: Any) -> OwnFile:
-        made = cls(parameters, settings)
-        entry = {"name": "fixed", "pipeline": cls.pipeline, **made._values(settings.deskew)}
-        # evalio refuses a file without data sets, and they are the user's to name.
-        text = files.dump({"datasets": [], "pipelines": [entry]})
-        return OwnFile(".yaml", text, "name data sets in a copy; then evalio run --config COPY")
 
     def _values(self, deskew: bool) -> ParameterSet:
         """All parameters of the pipeline; `deskew` counts unless the settings name it, too."""

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from adaptune import files
 from adaptune.errors import OdometryError, import_extra
 from adaptune.geometry import Poses, count_within
 from adaptune.odometry.base import (
@@ -21,7 +20,6 @@ from adaptune.odometry.base import (
     MIN_POINTS,
     NO_IMU,
     Description,
-    OwnFile,
     OwnFrameOdometry,
     RangeSettings,
 )
@@ -95,11 +93,6 @@ class RkoLio(OwnFrameOdometry):
     def describe(cls, settings: Any) -> Description:
         _bindings()  # raises if there are none
         return super().describe(settings)
-
-    @classmethod
-    def own_file(cls, parameters: ParameterSet, settings: Any) -> OwnFile:
-        text = files.dump({"lio": cls(parameters, settings)._values(settings.deskew)})
-        return OwnFile(".yaml", text, "rko_lio --config FILE DATA")
 
     def _values(self, deskew: bool) -> ParameterSet:
         """Values that may differ from RKO-LIO's defaults."""

@@ -1,23 +1,14 @@
-"""Parameter sets as the odometries' own tools read them, against what the adapters use."""
-
-import importlib.util
-from dataclasses import fields
-from types import SimpleNamespace
+"""Parameter sets as the odometries' own tools read them."""
 
 import pytest
-import turns
 import yaml
-from needs import lacking, needs_evalio
 
 from adaptune.errors import OdometryError
-from adaptune.odometry import evalio
 from adaptune.odometry.kiss_icp import Kiss
 from adaptune.odometry.program import Template
 from adaptune.odometry.registry import OdometryFactory, is_user_class, odometry_class
 from adaptune.odometry.remote import Limits, Process
 from adaptune.space import ParameterSpace
-
-PIPELINES = ("ct_icp", "dlio", "evalio_kiss_icp", "form", "genz_icp", "lio_sam", "loam", "mad_icp")
 
 
 def own_file(name, settings=None, space=None, **parameters):
@@ -52,54 +43,6 @@ def test_kiss_icp_loads_it(tmp_path, monkeypatch, settings):
     assert load_config(path).out_dir == "elsewhere"
 
 
-class Listener:
-    """Stands for a pipeline that begins."""
-
-    def set_params(self, parameters):
-        self.given = dict(parameters)
-
-    def __getattr__(self, _):
-        return lambda *_: None
-
-
-@pytest.mark.parametrize("name", PIPELINES)
-@pytest.mark.parametrize("deskew", [True, False])
-def test_evalio_parses_it(name, deskew, monkeypatch):
-    needs_evalio()
-    from evalio import datasets, pipelines
-
-    own = own_file(name, {"deskew": deskew}, **least(name))
-    cls = odometry_class(name)
-    odometry = cls(least(name), cls.settings_type(deskew=deskew))
-    modules, listener = evalio.evalio_modules(), Listener()
-    silent = SimpleNamespace(all_pipelines=lambda: {cls.pipeline: lambda: listener})
-    monkeypatch.setattr(evalio, "evalio_modules", lambda: (silent, *modules[1:]))
-    odometry._begin(odometry.prepare(turns.measured(0, turns.ROWS, turns.COLUMNS)))
-    # Its command line reads the file so.
-    read = yaml.load(own.text, Loader=yaml.CSafeLoader)
-    pipeline = pipelines.get_pipeline(cls.pipeline)
-    assert pipelines.parse_config(read["pipelines"]) == [("fixed", pipeline, listener.given)]
-    assert datasets.parse_config(read["datasets"]) == []
-
-
-@pytest.mark.parametrize("deskew", [True, False])
-def test_rko_lio_parses_it(deskew, monkeypatch):
-    if importlib.util.find_spec("rko_lio") is None:
-        lacking("rko_lio", "RKO-LIO is not installed: pip install 'adaptune[rko-lio]'")
-    from rko_lio import rko_lio_pybind
-    from rko_lio.config import LIOConfig, PipelineConfig
-
-    settings = {"deskew": deskew, "double_downsample": False, "max_range": 60}
-    own = own_file("rko_lio", settings, **least("rko_lio"))
-    cls, used = odometry_class("rko_lio"), []
-    monkeypatch.setattr(rko_lio_pybind, "_LIO", used.append)
-    odometry = cls(least("rko_lio"), cls.settings_type(**settings))
-    odometry._begin(odometry.prepare(turns.measured(0)))
-    read = PipelineConfig.from_dict(yaml.safe_load(own.text)).lio.to_pybind()
-    for field in fields(LIOConfig):
-        assert getattr(read, field.name) == getattr(used[0], field.name)
-
-
 FLOAT = {"type": "float", "low": 0.0, "high": 1.0, "baseline": 0.5}
 TEMPLATE = "# of the robot\nmap: {voxel: 1.0, size: 1e3}\nuse_sim_time: on\n"
 
@@ -123,7 +66,7 @@ def test_a_template_keeps_all_else(tmp_path, name, settings, use):
 
 
 def test_odometries_without_a_tool_of_their_own():
-    for name in ("gicp", "vgicp", "ndt"):
+    for name in ("gicp", "ndt"):
         assert own_file(name) is None
     assert own_file("command", {"command": ["slam"]}, ParameterSpace({})) is None
     assert Process.own_file({}, None) is None
