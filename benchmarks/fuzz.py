@@ -176,7 +176,6 @@ def templates(folder: Path) -> fuzz.Case:
     data = {"mapping": {"voxel": 1.0, "names": ["a", "b"]}, "rate": 10, "on": True}
     (folder / "a.yaml").write_text(files.dump(data))
     (folder / "b.json").write_text(json.dumps(data))
-    (folder / "c.toml").write_text('rate = 10\n[mapping]\nvoxel = 1.0\nnames = ["a", "b"]\n')
 
     def read(path: Path) -> object:
         template = Template(path)

@@ -10,7 +10,6 @@ import re
 import shutil
 import subprocess
 import time
-import tomllib
 from abc import abstractmethod
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
@@ -20,7 +19,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, Self
 
 import numpy as np
-import tomli_w
 from numpy.typing import NDArray
 from pydantic import AfterValidator
 
@@ -48,14 +46,9 @@ from adaptune.trajectory import Trajectory, TrajectoryError, read_kitti, read_tu
 
 _log = logging.getLogger(__name__)
 
-# Parameter files made from a template: YAML, JSON, TOML, and the layouts of ROS 1 and ROS 2.
+# Parameter files made from a template: YAML, also in the layouts of ROS 1 and ROS 2, and JSON.
 
-_YAML = (".yaml", ".yml")
-_FORMATS: dict[str, tuple[Callable[[str], Any], Callable[[Any], str]]] = {
-    ".json": (json.loads, lambda data: json.dumps(data, indent=2) + "\n"),
-    ".toml": (tomllib.loads, tomli_w.dumps),
-}
-"""Functions that read and write a format, by a file's suffix; in YAML only values are replaced."""
+_SUFFIXES = (".yaml", ".yml", ".json")
 
 _ROS2 = "ros__parameters"
 
@@ -74,23 +67,24 @@ class Template:
 
     def __init__(self, path: Path):
         self.path = path
-        if path.suffix not in (*_YAML, *_FORMATS):
-            raise OdometryError(f"{path}: a template is a file of {', '.join((*_YAML, *_FORMATS))}")
-        self._data: Any
+        if path.suffix not in _SUFFIXES:
+            raise OdometryError(f"{path}: a template is a file of {', '.join(_SUFFIXES)}")
         try:
             # Ends of lines stay as they are.
             self._text = path.read_bytes().decode()
-            if path.suffix in _YAML:
-                self._document = files.Document(self._text, foreign=True)
-                self._data = self._document.data
-            else:
-                self._data = _FORMATS[path.suffix][0](self._text)
+            self._document = self._parsed(self._text)
         except FileNotFoundError as error:
             raise OdometryError(f"{path}: there is no such file") from error
         except (OSError, ValueError, files.YamlError) as error:
             raise OdometryError(f"{path}: {error}") from error
+        self._data: Any = self._document.data
         held = isinstance(self._data, dict | list)
         self._places = list(_places(self._data)) if held else []
+
+    def _parsed(self, text: str) -> files.Document:
+        # JSON is YAML but for tabs, which it has between values only.
+        of_json = self.path.suffix == ".json"
+        return files.Document(text.replace("\t", " ") if of_json else text, foreign=True)
 
     def path_of(self, name: str) -> tuple[str, ...]:
         """Keys of a value, from the outermost on; none if there is no such, an error if several."""
@@ -112,8 +106,8 @@ class Template:
     def fill(self, parameters: Mapping[str, Any]) -> str:
         """The file's text with new values; parameters that are not in it are ignored.
 
-        A real number stays one where the new value is whole. All else in a YAML file stays as it
-        is, byte for byte. An `OdometryError` names a value that cannot be replaced alone.
+        A real number stays one where the new value is whole. All else stays as it is, byte for
+        byte. An `OdometryError` names a value that cannot be replaced alone.
         """
         changed, data = {}, copy.deepcopy(self._data)
         for name, value in parameters.items():
@@ -123,22 +117,22 @@ class Template:
                 real = isinstance(held_in[key], float) or _EXPONENT.fullmatch(str(held_in[key]))
                 held_in[key] = float(value) if real and type(value) is int else value
                 changed[keys] = held_in[key]
-        if self.path.suffix in _YAML:
-            return self._replaced(changed, data)
-        return _FORMATS[self.path.suffix][1](data)
+        return self._replaced(changed, data)
 
     def _replaced(self, changed: Mapping[tuple[Any, ...], Any], data: Any) -> str:
-        """A YAML text with new values in their places, by their keys."""
+        """The text with new values in their places, by their keys."""
         text, spans = self._text, []
         for keys, value in changed.items():
             begin, end = self._document.span(keys) or (0, 0)
             new = files.dump([value]).removeprefix("- ").strip()
+            if self.path.suffix == ".json" and isinstance(value, str):
+                new = json.dumps(value)
             spans.append((begin, end, new if begin < end else f" {new}"))
         for begin, end, new in sorted(spans, reverse=True):
             text = text[:begin] + new + text[end:]
         with suppress(files.YamlError):
             # Where nan is nan.
-            if repr(files.Document(text, foreign=True).data) == repr(data):
+            if repr(self._parsed(text).data) == repr(data):
                 return text
         where = ", ".join(str(self._document.line(keys)) for keys in changed)
         raise OdometryError(
