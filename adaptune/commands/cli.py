@@ -31,7 +31,7 @@ for _command in (
     *(tune.tune, tune.inspect, offline.simulate, offline.reference),
     *(offline.offline, offline.trials, offline.validate),
     *(online.online, online.compare, online.record),
-    *(tools.serve, tools.import_rustle),
+    tools.import_rustle,
 ):
     app.command()(_command)
 

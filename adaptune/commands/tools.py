@@ -1,45 +1,16 @@
-"""Commands that need no study: odometries for other programs, RUSTLE's files."""
+"""The command that needs no study: RUSTLE's files."""
 
 import logging
-import os
-import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from adaptune.commands.terminal import begin_work, say, say_next
+from adaptune.commands.terminal import say, say_next
 from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
 
 _log = logging.getLogger(__name__)
-
-
-def serve(
-    odometry: Annotated[
-        str | None,
-        typer.Argument(help="The only odometry to serve.", show_default="as each hello asks"),
-    ] = None,
-    listen: Annotated[
-        str | None,
-        typer.Option(help="Serve every connection to tcp://HOST:PORT or unix:PATH instead."),
-    ] = None,
-) -> None:
-    """Serve an odometry to another program, over standard input and output.
-
-    The odometry's own output goes to standard error; an odometry in a process of its own reports it
-    with its faults. `docs/programs.md` describes the messages.
-    """
-    from adaptune.odometry import serving
-
-    begin_work()
-    if listen is not None:
-        if odometry is None:
-            raise AdaptuneError("--listen serves one odometry: give its name")
-        serving.listen(listen, odometry, lambda at: say(f"{odometry} at {at}"))
-    with os.fdopen(os.dup(sys.stdout.fileno()), "wb") as writer:
-        os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
-        serving.serve(sys.stdin.buffer, writer, odometry)
 
 
 def import_rustle(

@@ -125,15 +125,8 @@ def _faults(found: type[Odometry]) -> Iterator[str]:
 
 def make_here(name: str, parameters: ParameterSet, settings: Any) -> tuple[Any, Description]:
     """Make an odometry in this process."""
-    checked, described = declare_here(check_served(name), settings).sound(name)
+    checked, described = declare_here(name, settings).sound(name)
     return odometry_class(name)(parameters, checked), described
-
-
-def check_served(name: str) -> str:
-    """Refuse programs of the user."""
-    if name in PROGRAMS:
-        raise OdometryError(f"{name} is a program of the user: serve an odometry such as gicp")
-    return name
 
 
 # What an odometry says of itself. A class of the user is asked in a process of its own.

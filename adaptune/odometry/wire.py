@@ -16,7 +16,7 @@ from pydantic import ValidationError
 from adaptune.errors import OdometryError, nearest
 from adaptune.geometry import Poses
 from adaptune.odometry.base import Description, Registration
-from adaptune.processes import Answer, HostError, Message
+from adaptune.processes import Answer, Message
 from adaptune.recording.scan import Imu, ImuNoise, Scan
 from adaptune.space import ParameterSet, ParameterSpace
 from adaptune.strict import in_one_line
@@ -54,12 +54,11 @@ def to_scan(message: Message) -> Scan:
 
 
 Make = Callable[[str, ParameterSet, Any], tuple[Any, Description]]
-"""Makes an odometry by its name and settings, and describes it; what is made does what `Odometry`
-does, and a fault of it is a `HostError`."""
+"""Makes an odometry by its name and settings, and describes it."""
 
 
 def hello(odometry: str | None, parameters: ParameterSet, settings: Any) -> dict[str, Any]:
-    """First message of a conversation; no name if the other side serves one odometry only."""
+    """First message of a conversation; no name where the other side is one odometry."""
     name: dict[str, Any] = {"type": "hello", "version": VERSION, "odometry": odometry}
     return name | {"parameters": parameters, "settings": settings}
 
@@ -77,8 +76,8 @@ def announced(answer: Message) -> Description:
         raise OdometryError(f"its answer to hello does not describe it: {what}") from error
 
 
-def conversation(name: str | None, make: Make) -> Answer:
-    """Answer messages with an odometry: this one only, or the one that each hello names."""
+def conversation(name: str, make: Make) -> Answer:
+    """Answer messages with an odometry."""
     odometry = None
 
     def answer(message: Message) -> dict[str, Any]:
@@ -89,10 +88,7 @@ def conversation(name: str | None, make: Make) -> Answer:
             return {"version": VERSION, **about}
         if odometry is None:
             raise OdometryError("the first message must be a hello")
-        try:
-            return answered(odometry, message)
-        except HostError as fault:
-            return {"type": "fault", "message": str(fault)}
+        return answered(odometry, message)
 
     return answer
 
@@ -109,15 +105,10 @@ def _check(message: Message) -> None:
         raise OdometryError(f"the message {kind} lacks {', '.join(lacking)}")
 
 
-def _make(hello: Mapping[str, Any], only: str | None, make: Make) -> tuple[Any, dict[str, Any]]:
-    """The odometry that a hello asks for, and what the answer reports about it."""
+def _make(hello: Mapping[str, Any], name: str, make: Make) -> tuple[Any, dict[str, Any]]:
+    """The odometry as a hello asks for it, and what the answer reports about it."""
     if (version := hello["version"]) != VERSION:
         raise OdometryError(f"adaptune speaks version {VERSION} of the protocol, not {version}")
-    name = hello.get("odometry") or only
-    if name is None:
-        raise OdometryError("the hello names no odometry; name it, or serve one: adaptune serve X")
-    if only not in (None, name):
-        raise OdometryError(f"only {only} is served here, not {name}")
     odometry, described = make(name, hello["parameters"], hello["settings"])
     return odometry, {"odometry": name, **about(described)}
 

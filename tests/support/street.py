@@ -6,10 +6,8 @@ Those in containers run the reference image, which is there only when one of the
 import copy
 import sys
 import tempfile
-import threading
 from functools import cache
 from pathlib import Path
-from queue import SimpleQueue
 
 import drives
 import numpy as np
@@ -20,8 +18,7 @@ from adaptune.odometry.base import InProcess
 from adaptune.odometry.keyframe import KeyframeGicp
 from adaptune.odometry.program import ProgramInput
 from adaptune.odometry.registry import ODOMETRIES, odometry_class
-from adaptune.odometry.remote import Limits
-from adaptune.odometry.serving import listen
+from adaptune.odometry.remote import Limits, Process
 from adaptune.recording import Scan
 from adaptune.space import Float, ParameterSpace
 
@@ -33,6 +30,13 @@ POOR = {"NaN": np.nan, "near": 0.005, "far": 1e4}
 """Factors of scans that hold nothing to register."""
 LOCKSTEP = "rustle, lockstep"
 """The other way to run `rustle`."""
+SERVES = """
+import sys
+sys.path[:] = {path}
+from adaptune import processes
+from adaptune.odometry.serving import converse
+processes.answer_all(sys.stdin.buffer, sys.stdout.buffer, converse("gicp"))
+"""
 TEMPLATE = """\
 use_sim_time: true
 gicp: {max_correspondence_distance: 1.0, keyframe_interval: 1.0, downsampling: 0.5, iterations: 20}
@@ -88,10 +92,14 @@ def _settings(name):
     }
     given[LOCKSTEP] = given["rustle"] | {"play": "lockstep", "node": "/gicp", "patience": 60.0}
     if name == "process":
-        own = {"address": listening("tcp://127.0.0.1:0", "gicp")}
-    else:
-        own = given[name] | ({} if name == "command" else {"image": reference_image()})
-    return _kind(name).settings_type(**own)
+        return served()
+    own = {} if name == "command" else {"image": reference_image()}
+    return _kind(name).settings_type(**given[name], **own)
+
+
+def served():
+    """Keyframe GICP that is served by a program."""
+    return Process.settings_type(command=(sys.executable, "-c", SERVES.format(path=sys.path)))
 
 
 def space_of(name):
@@ -106,13 +114,6 @@ def space_of(name):
         tuned = ("max_correspondence_distance", "keyframe_interval")
         return ParameterSpace({key: KeyframeGicp.space.parameters[key] for key in tuned})
     return odometry_class(name if name in ODOMETRIES else "gicp").space
-
-
-def listening(where, name):
-    """Serve an odometry in a thread; returns its address."""
-    there = SimpleQueue()
-    threading.Thread(target=listen, args=(where, name, there.put), daemon=True).start()
-    return there.get(timeout=10.0)
 
 
 def is_live(name):

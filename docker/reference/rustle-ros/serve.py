@@ -2,9 +2,12 @@
 """Serve the odometry on a Unix socket, by the protocol of `adaptune.odometry.wire`."""
 
 import signal
+import socket
 import sys
+import threading
 
-from adaptune.odometry.serving import listen
+from adaptune.odometry.serving import converse
+from adaptune.processes import answer_all
 
 
 def main() -> None:
@@ -13,7 +16,19 @@ def main() -> None:
         sys.exit("usage: odometry-serve PATH")
     # The first process of a container has no default for it.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
-    listen(f"unix:{sys.argv[1]}", "gicp", lambda address: sys.stderr.write(f"{address}\n"))
+    with socket.socket(socket.AF_UNIX) as server:
+        server.bind(sys.argv[1])
+        server.listen()
+        sys.stderr.write(f"unix:{sys.argv[1]}\n")
+        while True:
+            connection, _ = server.accept()
+            threading.Thread(target=answer, args=(connection,), daemon=True).start()
+
+
+def answer(connection: socket.socket) -> None:
+    """Be an instance for whoever has connected."""
+    with connection, connection.makefile("rb") as reader, connection.makefile("wb") as writer:
+        answer_all(reader, writer, converse("gicp"))
 
 
 if __name__ == "__main__":

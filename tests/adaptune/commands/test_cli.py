@@ -104,13 +104,13 @@ def test_mistakes_are_told_in_a_sentence(study_file, tmp_path, arguments, words,
     assert words in said
 
 
-MOST_COMMANDS = 12
+MOST_COMMANDS = 11
 
 
 def test_help_and_version(adaptune):
     done = adaptune("--help")
     assert done.exit_code == 0
-    for command in ("inspect", "simulate", "offline", "validate", "online", "compare", "serve"):
+    for command in ("inspect", "simulate", "offline", "validate", "online", "compare"):
         assert command in done.stdout
     commands = {command.name or command.callback.__name__ for command in app.registered_commands}
     assert len(commands) <= MOST_COMMANDS

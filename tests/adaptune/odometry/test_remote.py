@@ -13,10 +13,9 @@ import numpy as np
 import pytest
 import server
 import turns
-from commands import refused
 from rooms import moved
 from setups import setup_of
-from street import listening
+from street import served
 
 from adaptune import processes
 from adaptune.archive import Archive
@@ -231,8 +230,6 @@ def test_what_an_imu_measured_arrives():
     [
         ({"type": "configure", "parameters": {}}, "the first message must be a hello"),
         (HELLO | {"version": 1}, "speaks version 2 of the protocol, not 1"),
-        (HELLO | {"odometry": None}, "the hello names no odometry"),
-        (HELLO | {"odometry": "gipc"}, "did you mean 'gicp'"),
         (HELLO | {"settings": {"fualt": "hang"}}, "settings: fualt: unknown key"),
         ({"type": "begin"}, "no message of type 'begin'"),
         ({"type": "start", "stamp": 0}, "start lacks points, pose"),
@@ -242,7 +239,7 @@ def test_what_a_server_refuses(first, message):
     sent, answered = io.BytesIO(), io.BytesIO()
     processes.send(sent, first)
     sent.seek(0)
-    processes.answer_all(sent, answered, wire.conversation(None, make_here))
+    processes.answer_all(sent, answered, wire.conversation("faulty:Faulty", make_here))
     answered.seek(0)
     answer = processes.receive(answered)
     assert processes.receive(answered) is None
@@ -345,10 +342,8 @@ def driven(odometry, n=12):
 NEAR = {"max_correspondence_distance": 2.0, "keyframe_interval": 1.0}
 
 
-@pytest.mark.parametrize("kind", ["tcp", "unix"])
-def test_it_is_the_same_odometry_behind_a_socket(tmp_path, kind):
-    where = "tcp://127.0.0.1:0" if kind == "tcp" else f"unix:{tmp_path / 'socket'}"
-    settings = ProcessSettings(address=listening(where, "gicp"), settings={"downsampling": 0.4})
+def test_it_is_the_same_odometry_in_a_program():
+    settings = served().model_copy(update={"settings": {"downsampling": 0.4}})
     described = Process.describe(settings)
     settings_of = KeyframeGicp.settings_type(downsampling=0.4)
     assert described.space == KeyframeGicp.describe(settings_of).space
@@ -360,44 +355,6 @@ def test_it_is_the_same_odometry_behind_a_socket(tmp_path, kind):
     other.start(turns.turn(5), np.eye(4))
     np.testing.assert_array_equal(driven(there), driven(here))
     assert not there.faults
-
-
-def test_it_is_the_same_odometry_behind_the_command_line(monkeypatch):
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, sys.path)))
-    command = (sys.executable, "-m", "adaptune.commands.cli", "serve", "gicp")
-    odometry = Process(NEAR, ProcessSettings(command=command), Limits(seconds=60.0))
-    np.testing.assert_array_equal(driven(odometry), driven(InProcess(KeyframeGicp(NEAR))))
-    assert not odometry.faults
-
-
-@pytest.mark.parametrize(
-    ("name", "words"),
-    [("command", "command is a program of the user: serve"), ("gipc", "did you mean 'gicp'")],
-)
-def test_what_cannot_be_served(name, words):
-    assert words in refused("serve", name, "--listen", "tcp://127.0.0.1:0")
-
-
-def test_a_fault_of_a_served_odometry_arrives():
-    settings = ProcessSettings(
-        address=listening("tcp://127.0.0.1:0", "faulty:Faulty"), settings={"fault": "abort"}
-    )
-    odometry = Process({}, settings, LIMITS)
-    odometry.start(scan(0), np.eye(4))
-    odometry.apply(Selection(0, {"x": 1.0}))
-    assert odometry.register(scan(1)).T_odom_sensor[0, 3] == pytest.approx(0.3)
-    odometry.register(scan(2))
-    assert np.isnan(odometry.register(scan(3)).T_odom_sensor).all()
-    assert odometry.faults == ["its process was ended by SIGABRT: about to go wrong"]
-
-
-def test_garbage_ends_its_own_conversation_only():
-    address = listening("tcp://127.0.0.1:0", "gicp")
-    host, port = address.removeprefix("tcp://").split(":")
-    with socket.create_connection((host, int(port))) as connection:
-        connection.sendall(b"GET / HTTP/1.1\r\n\r\n")
-        assert not connection.recv(100)
-    assert Process.describe(ProcessSettings(address=address)).live
 
 
 def test_a_study_takes_its_space(study_file, tmp_path):
