@@ -158,6 +158,8 @@ _WIDTH, _LETTER, _LINE = 900, 6.5, 14
 _DARK = "#333333"
 _Extent = tuple[tuple[float, float], tuple[float, float]]
 _OUTLINE: dict[str, Any] = {"stroke": "black", "strokeWidth": 0.5}
+NO_DATA = "no data"
+"""What an empty panel says."""
 _CONFIG: Spec = {
     "font": "Liberation Sans, Arial, Helvetica, sans-serif",
     "view": {"stroke": None},
@@ -263,6 +265,10 @@ def _coordinates(panel: Panel) -> Iterator[tuple[NDArray[np.float64], NDArray[np
                 yield np.tile(x, 2), np.r_[0.0 * x, np.sum(item.shares, axis=0)]
 
 
+def _is_empty(panel: Panel) -> bool:
+    return not any(np.isfinite(x).any() and np.isfinite(y).any() for x, y in _coordinates(panel))
+
+
 def _extent(panel: Panel, which: Literal["x", "y"]) -> tuple[float, float]:
     """Where an axis begins and ends."""
     axis = panel.x if which == "x" else panel.y
@@ -330,6 +336,14 @@ class _Drawing:
         if panel.title:
             words = wrapped(panel.title, self._width / _LETTER)
             made["title"] = {"text": words, "offset": 6, "frame": "group"}
+        if _is_empty(panel):
+            for channel in (self._x, self._y):
+                channel["axis"] |= {"values": []}
+            empty = self._drawn({"type": "point"}, {"x": [np.nan], "y": [np.nan]})
+            middle = {"x": 0.5 * self._width, "y": 0.5 * self._height}
+            text = {"type": "text", "text": NO_DATA, "color": "#666666", **middle}
+            said = {"data": _table(i=[0]), "mark": text, "encoding": {}}
+            return made | {"layer": [empty, said]}
         draw: dict[type, Callable[[Any], Iterator[Spec]]] = {
             Line: self._line,
             Points: self._points,
@@ -520,7 +534,7 @@ def _legend(chart: Chart, every: dict[str, Look]) -> list[Spec]:
         if not (isinstance(item, Line | Points) and not len(item.x)):
             symbols |= {name: _symbol(item, every[name]) for name in _names(item)}
     names = [name for name in every if name in symbols and name not in written]
-    if not names:
+    if not names or all(map(_is_empty, chart.panels)):
         return []
     columns = max(int(_WIDTH / (_LETTER * max(map(len, names)) + 50.0)), 1)
     legend: Spec = {"title": None, "orient": "top", "columns": columns, "labelLimit": _WIDTH}

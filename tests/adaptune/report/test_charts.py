@@ -4,7 +4,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from sample_charts import comparison, from_above, over_time, samples, trials
+from sample_charts import comparison, empty, from_above, over_time, samples, trials
 
 from adaptune.report.charts import (
     Axis,
@@ -99,6 +99,11 @@ def test_samples_are_drawn_as_wide_as_a_page(tmp_path, chart):
 def test_names_are_literal(tmp_path):
     texts = drawn(comparison(), tmp_path)[0]
     assert {"tunnel <b>north</b>", "forest_$x_1$", "kiss & tell"} <= set(texts)
+
+
+def test_an_empty_panel_says_so_and_has_no_legend(tmp_path):
+    texts, _ = drawn(empty(), tmp_path)
+    assert sorted(texts) == ["Nothing was measured", "no data", "x [-]", "y [-]"]
 
 
 def test_metres_are_as_long_along_both_axes():

@@ -120,6 +120,7 @@ def opened(tmp_path_factory):
 
 def test_charts_are_drawn_and_say_what_a_point_is(opened):
     assert opened.locator(".drawing svg").count() == 5
+    assert opened.locator("#empty text").filter(has_text="no data").count() == 1
     assert opened.evaluate(
         "[...document.querySelectorAll('.drawing')].every(d => d.scrollWidth <= d.clientWidth)"
     )
