@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from decimal import Decimal, InvalidOperation
 from functools import partial
+from itertools import takewhile
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -132,6 +133,13 @@ def _fields(path: Path) -> NDArray[Any] | dict[str, NDArray[Any]]:
 
 
 def _open3d_fields(path: Path) -> dict[str, NDArray[Any]]:
+    if path.suffix == ".pcd":
+        with path.open("rb") as file:
+            header = takewhile(lambda line: line[:4] != b"DATA", file)
+            pose = next((line.split()[1:8] for line in header if line[:9] == b"VIEWPOINT"), [])
+        if any(abs(float(number)) > 1e-6 for number in pose[:3] + pose[4:]):
+            what = "VIEWPOINT is a pose, and its points may be in the sensor's frame or the world's"
+            raise ValueError(f"{what}: give the sensor's, with VIEWPOINT 0 0 0 1 0 0 0")
     cloud = open3d.load().t.io.read_point_cloud(str(path))
     # Open3D returns an empty cloud for files that it cannot read.
     if "positions" not in cloud.point or not len(cloud.point.positions):

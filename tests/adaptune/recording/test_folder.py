@@ -105,6 +105,31 @@ def test_folders_of_files(tmp_path, suffix):
             assert np.array_equal(scan.times, rec.velodyne(points)["time"])
 
 
+PCD = (
+    "VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 1\nHEIGHT 1\n"
+    "VIEWPOINT {}\nPOINTS 1\nDATA ascii\n1 2 3\n"
+)
+
+
+@pytest.mark.parametrize(
+    ("viewpoint", "fits"),
+    [
+        ("0 0 0 1 0 0 0", True),
+        ("0 0 0 -1 0 0 0", True),
+        ("0 0 1.5 1 0 0 0", False),
+        ("0 0 0 0.7071 0 0 0.7071", False),
+    ],
+)
+def test_points_that_may_be_in_another_frame_are_refused(tmp_path, viewpoint, fits):
+    (tmp_path / "1.pcd").write_text(PCD.format(viewpoint))
+    scans = open_sequence(SequenceConfig(folder=str(tmp_path)))
+    if fits:
+        assert next(iter(scans)).points.tolist() == [[1, 2, 3]]
+    else:
+        with pytest.raises(SequenceError, match=r"1\.pcd: .*VIEWPOINT is a pose.* 0 0 0 1 0 0 0"):
+            list(scans)
+
+
 def test_cloudcompares_intensities_are_read(tmp_path):
     columns = "".join(f"property float {name}\n" for name in ("x", "y", "z", "scalar_intensity"))
     header = f"ply\nformat ascii 1.0\nelement vertex 1\n{columns}end_header\n"
