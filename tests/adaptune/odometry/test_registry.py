@@ -36,9 +36,6 @@ class Lacking(Odometry):
 class OfDict(Mine):
     space = {"x": 1}
 
-class OfType(Mine):
-    settings_type = dict
-
 class Half(Odometry):
     space, live = Mine.space, True
     def prepare(self, scan): ...
@@ -72,7 +69,6 @@ def mine(tmp_path, monkeypatch):
         ("my_odometry:other", "not a class derived from adaptune.odometry.Odometry"),
         ("my_odometry:Lacking", "has no attribute space and no live"),
         ("my_odometry:OfDict", r"its `space` is a dict; write it as space = ParameterSpace\(\{"),
-        ("my_odometry:OfType", "its `settings_type` is <class 'dict'>, and not derived from Base"),
         ("my_odometry:Half", "the class lacks the methods register and start"),
         ("my_odometry:Other", r"its __init__ takes \(voxel\); write __init__\(self, parameters="),
     ],
