@@ -2,7 +2,6 @@
 
 import copy
 import fcntl
-import glob
 import json
 import logging
 import os
@@ -605,15 +604,13 @@ def find_output(folder: Path, output: str) -> Path:
     There is an `OdometryError` if no file fits, or several.
     """
     root = folder.resolve()
-    fitting = (output, *glob.glob(output, root_dir=root))  # noqa: PTH207
-    found = _files_in(root, [root / name for name in fitting])
+    found = _files_in(root, root.glob(output))
     if len(found) == 1:
         return found[0]
-    what = f"{len(found)} files fit {output}:" if found else f"it left no {output}"
+    what = f"{len(found)} files fit {output}" if found else f"it left no {output}"
     if left := found or _files_in(root, root.rglob("*")):
-        names = [str(path.relative_to(root)) for path in left[:5]] + ["..."]
-        what += ("" if found else ", but") + f" {', '.join(names[: len(left)])}"
-        what += "; let odometry.settings.output fit just one file"
+        names = ", ".join(str(path.relative_to(root)) for path in left[:5])
+        what += f"; there are {names}; let odometry.settings.output fit just one file"
     raise OdometryError(what)
 
 
