@@ -6,14 +6,14 @@ or with ``fault`` and a ``message`` if it has ended. The other side ends by clos
 """
 
 import resource
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from adaptune.errors import OdometryError, nearest
+from adaptune.errors import OdometryError
 from adaptune.geometry import Poses
 from adaptune.odometry.base import Description, Registration
 from adaptune.processes import Answer, Message
@@ -22,12 +22,6 @@ from adaptune.space import ParameterSet, ParameterSpace
 from adaptune.strict import in_one_line
 
 VERSION = 2
-_HOLDS = {
-    "hello": ("version", "parameters", "settings"),
-    "start": ("stamp", "points", "pose"),
-    "register": ("stamp", "points"),
-    "configure": ("parameters",),
-}
 _COLUMNS = ("points", "times", "rings", "intensities")
 _IMU = ("imu", "imu_stamps", "imu_pose", "imu_noise")
 
@@ -77,40 +71,20 @@ def announced(answer: Message) -> Description:
 
 
 def conversation(name: str, make: Make) -> Answer:
-    """Answer messages with an odometry."""
-    odometry = None
+    """Answer messages of adaptune with an odometry."""
+    odometry: Any = None
 
     def answer(message: Message) -> dict[str, Any]:
         nonlocal odometry
-        _check(message)
-        if message.header["type"] == "hello":
-            odometry, about = _make(message.header, name, make)
-            return {"version": VERSION, **about}
-        if odometry is None:
-            raise OdometryError("the first message must be a hello")
-        return answered(odometry, message)
+        header = message.header
+        if header["type"] != "hello":
+            return answered(odometry, message)
+        if (version := header["version"]) != VERSION:
+            raise OdometryError(f"adaptune speaks version {VERSION} of the protocol, not {version}")
+        odometry, described = make(name, header["parameters"], header["settings"])
+        return {"version": VERSION, "odometry": name, **about(described)}
 
     return answer
-
-
-def _check(message: Message) -> None:
-    kind = message.header.get("type")
-    if kind not in _HOLDS:
-        raise OdometryError(f"there is no message of type {kind!r}; {nearest(str(kind), _HOLDS)}")
-    there = message.header.keys() | message.arrays.keys()
-    holds = _HOLDS[kind]
-    if "imu" in there:
-        holds += _IMU
-    if lacking := [name for name in holds if name not in there]:
-        raise OdometryError(f"the message {kind} lacks {', '.join(lacking)}")
-
-
-def _make(hello: Mapping[str, Any], name: str, make: Make) -> tuple[Any, dict[str, Any]]:
-    """The odometry as a hello asks for it, and what the answer reports about it."""
-    if (version := hello["version"]) != VERSION:
-        raise OdometryError(f"adaptune speaks version {VERSION} of the protocol, not {version}")
-    odometry, described = make(name, hello["parameters"], hello["settings"])
-    return odometry, {"odometry": name, **about(described)}
 
 
 def about(described: Description) -> dict[str, Any]:

@@ -228,11 +228,8 @@ def test_what_an_imu_measured_arrives():
 @pytest.mark.parametrize(
     ("first", "message"),
     [
-        ({"type": "configure", "parameters": {}}, "the first message must be a hello"),
         (HELLO | {"version": 1}, "speaks version 2 of the protocol, not 1"),
         (HELLO | {"settings": {"fualt": "hang"}}, "settings: fualt: unknown key"),
-        ({"type": "begin"}, "no message of type 'begin'"),
-        ({"type": "start", "stamp": 0}, "start lacks points, pose"),
     ],
 )
 def test_what_a_server_refuses(first, message):
