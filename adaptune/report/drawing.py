@@ -372,7 +372,9 @@ class _Drawing:
             drawn["labelExpr"] = f"{json.dumps(names)}[datum.value]"
             drawn |= {"grid": False} | ({"labelAngle": -35} if turned else {})
         elif axis.log:
-            drawn["format"] = "~r"
+            # Over less than a decade, Vega itself may name only 1.
+            named = {"labelExpr": "format(datum.value, '~r')"}
+            drawn |= named if high < 10.0 * low else {"format": "~r"}
         title: Any = wrapped(axis.label, size / _LETTER) if axis.label else None
         if hidden:
             title, drawn = None, drawn | {"labels": False, "ticks": False}

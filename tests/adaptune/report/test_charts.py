@@ -160,3 +160,11 @@ def test_long_lines_are_thinned_and_keep_peaks_and_gaps():
     assert kept[-1] == len(y) - 1
     data = spec(trials())["vconcat"][-1]["concat"][0]["layer"]
     assert max(len(layer["data"]["values"]) for layer in data) <= 2000
+
+
+def test_within_a_decade_a_logarithmic_axis_names_ticks_on_both_sides_of_1(tmp_path):
+    points = Points([0.75, 2.1], [0.02, 10.0], "fixed")
+    ratios, errors = Axis("ratio [-]", log=True), Axis("error [%]", log=True)
+    assert {"0.8", "1.2", "0.1", "10"} <= set(
+        drawn(chart_of(points, x=ratios, y=errors), tmp_path)[0]
+    )
