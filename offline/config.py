@@ -231,11 +231,15 @@ def _choices(parameter: Categorical, given: Span | Sequence[Value]) -> Sequence[
     for choice in given:
         if not parameter.contains(choice):
             raise ValueError(f"{choice!r} is not one of {describe(parameter)}")
+    if len(set(map(repr, given))) < len(given):
+        raise ValueError("choices repeat themselves")
     return given
 
 
 def _span(parameter: Float | Integer, given: Span) -> list[float]:
     low, high, count = given.low, given.high, given.count
+    if low > high or (count > 1 and low == high):
+        raise ValueError(f"low ({low:g}) must be less than high ({high:g})")
     if isinstance(parameter, Integer) and count > high - low + 1:
         raise ValueError(f"there are no {count} whole numbers from {low:g} to {high:g}")
     if parameter.log and low <= 0:
