@@ -185,7 +185,7 @@ def templates(folder: Path) -> fuzz.Case:
 
 
 def programs(_: Path) -> fuzz.Case:
-    """Messages of a program that takes scans, or of somebody who is served."""
+    """Messages of a program that takes scans."""
     scan = Scan(int(STAMPS[0]), drives.scans(n_scans=1)[0][1][:50])
     space: dict[str, Any] = {"a": {"type": "float", "low": 0, "high": 1, "baseline": 0.5}}
     header = {"type": "done", "version": 2, "odometry": "a", "live": True, "space": space}

@@ -278,11 +278,14 @@ def check_grid(
     if untuned := list(_untuned("grid", axes, space)):
         yield from untuned
         return
+    size = 1
     for name, parameter in space.parameters.items():
         try:
-            _axis(parameter, axes.get(name))
+            size *= len(_axis(parameter, axes.get(name)))
         except ValueError as error:
             yield Mistake(("grid", name), str(error))
+    if size >= 2**63:  # `random` draws the numbers of points
+        yield Mistake(("grid",), "has more points than can be numbered; give a coarser one")
 
 
 def distribution(parameter: Float | Integer | Categorical) -> Any:

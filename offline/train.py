@@ -152,7 +152,7 @@ def train(study: OfflineStudy, progress: Progress = unseen, cluster: str | None 
         study.odometry.name,
         lambda worst: hard_to_track(study.sequences.open(worst)),
     )
-    said += [*estimates_in_words(estimates, model.length, intervals=True)]
+    said += estimates_in_words(estimates, model.length)
     said += failed_in_words(verdicts)
     said += baseline_words(config, [runs[0] for runs in finished.values()])
     return Training(model, trials, rows, said)

@@ -182,7 +182,7 @@ class Policy(NamedTuple):
 
 def choose(
     data: LabelledData,
-    bank: int | Sequence[int],
+    bank: int,
     by_recording: bool | None = None,
     most: int | None = None,
     fixed: int | None = None,
@@ -194,7 +194,7 @@ def choose(
     data
         What the rules will be fitted on, and nothing else.
     bank
-        Number of a bank's members, or their trial numbers; no bank is considered with 0.
+        Number of a bank's members; no bank is considered with 0.
     by_recording
         See `LabelledData.folds`.
     most
@@ -259,11 +259,8 @@ def least_loss(
     return Policy(one_set, bank, members, expected)
 
 
-def _choosers(bank: int | Sequence[int], spending: Spending | None) -> list[Chooser]:
+def _choosers(bank: int, spending: Spending | None) -> list[Chooser]:
     """The ways to choose a bank's members."""
-    if not isinstance(bank, int):
-        named = list(bank)
-        return [lambda *_: named]
     if bank < 2:
         return []
     ways = (cancelling_members, complementary_members)

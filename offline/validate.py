@@ -180,7 +180,7 @@ class Validation:
 
 
 def leave_one_out(
-    data: LabelledData, progress: Progress = unseen, bank: int | Sequence[int] = BANK_SIZE
+    data: LabelledData, progress: Progress = unseen, bank: int = BANK_SIZE
 ) -> Validation:
     """Leave each recording or stretch out in turn, with all views of it.
 
@@ -194,8 +194,7 @@ def leave_one_out(
     progress
         Called about every fold.
     bank
-        Number of a bank's members, or their trial numbers, the first of which counts as the fixed
-        one. No bank is simulated with 0.
+        Number of a bank's members. No bank is simulated with 0.
 
     Raises
     ------
@@ -225,7 +224,7 @@ def leave_one_out(
 def leave_out(
     sequence: LabelledSequence,
     others: LabelledData,
-    bank: int | Sequence[int],
+    bank: int,
     by_recording: bool,
 ) -> LeftOut:
     """Fit on the others, and look up what happens on what is left out."""
@@ -311,7 +310,7 @@ def validate(study: OfflineStudy, progress: Progress = unseen) -> Validated:
         draw_chart(chart, *(study.folder / f"validation.{kind}" for kind in ("png", "svg")))
     said = [online, *_verdicts(study.rules, study.mechanism == "bank", validation)]
     estimates = estimates_of(study.sequences, study.training)
-    said += estimates_in_words(estimates, model.length, intervals=True)
+    said += estimates_in_words(estimates, model.length)
     return Validated(validation, rows, said)
 
 

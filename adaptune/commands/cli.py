@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from adaptune.commands import offline, online, tools, tune
+from adaptune.commands import offline, online, tune
 from adaptune.commands.terminal import Commands, errors, say
 
 # Every command imports what it needs, so that `adaptune --help` answers at once.
@@ -31,7 +31,7 @@ for _command in (
     *(tune.tune, tune.inspect, offline.simulate, offline.reference),
     *(offline.offline, offline.trials, offline.validate),
     *(online.online, online.compare, online.record),
-    tools.import_rustle,
+    offline.import_rustle,
 ):
     app.command()(_command)
 

@@ -1,5 +1,6 @@
-"""Commands of the offline stage."""
+"""Commands of the offline stage, and of what it needs."""
 
+import logging
 import math
 import os
 from functools import partial
@@ -26,9 +27,12 @@ from adaptune.commands.terminal import (
 )
 from adaptune.commands.tune import check_no_study
 from adaptune.errors import AdaptuneError
+from adaptune.files import write_text
 
 if TYPE_CHECKING:
     from adaptune.reference.stored import Gap, StoredEstimate
+
+_log = logging.getLogger(__name__)
 
 
 def simulate(
@@ -40,7 +44,7 @@ def simulate(
     """Record the study's simulated courses as bags with ground truth.
 
     Each course under `courses:` becomes a bag in the BotanicGarden layout, with a TUM file of its
-    ground truth and a picture.
+    ground truth.
     """
     loaded = load(study, override, folder)
     from adaptune.simulation.record import record
@@ -219,3 +223,41 @@ def _say_estimate(stored: "StoredEstimate", unknown: "list[Gap]", length: float)
         say(f"It is unknown for {share}, which have no pose: {where} after the first scan.")
     else:
         say("It is known everywhere.")
+
+
+def import_rustle(
+    file: Annotated[
+        Path,
+        typer.Argument(
+            metavar="FILE", help="RUSTLE's tests, or a tuning, as YAML.", show_default=False
+        ),
+    ],
+    algorithms: Annotated[Path, typer.Option(help="RUSTLE's algorithms.")] = Path(
+        "algorithms.yaml"
+    ),
+    datasets: Annotated[Path, typer.Option(help="RUSTLE's data sets.")] = Path("datasets.yaml"),
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="The study to write.", dir_okay=False)
+    ] = Path("study.yaml"),
+    overwrite: Annotated[bool, typer.Option(help="Replace existing studies.")] = False,
+) -> None:
+    """Make studies of RUSTLE's tests and tunings.
+
+    A test gives a study for each of its algorithms and speeds, a tuning gives one. What has no
+    counterpart is logged, and stands in the comments of the study.
+    """
+    from adaptune.study.rustle import import_rustle as make_studies
+
+    studies = make_studies(file, algorithms, datasets)
+    names = [f"{output.stem}_{study.name}" if studies[1:] else output.stem for study in studies]
+    paths = [output.with_name(name + output.suffix) for name in names]
+    if len(set(paths)) < len(paths):
+        raise AdaptuneError(f"{file}: two tests have the same name; give each its own")
+    if there := [str(path) for path in paths if path.exists() and not overwrite]:
+        raise AdaptuneError(f"{', '.join(there)}: exists; name another -o, or add --overwrite")
+    for note in dict.fromkeys(note for study in studies for note in study.notes):
+        _log.warning("%s", note)
+    for path, study in zip(paths, studies, strict=True):
+        write_text(path, study.text)
+        say(f"{path}: {study.about}")
+    say_next("read its comments; then run trials, fit the error model", "offline", paths[0])

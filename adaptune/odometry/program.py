@@ -81,9 +81,11 @@ class Template:
         self._places = list(_places(self._data)) if held else []
 
     def _parsed(self, text: str) -> files.Document:
-        # JSON is YAML but for tabs, which it has between values only.
-        of_json = self.path.suffix == ".json"
-        return files.Document(text.replace("\t", " ") if of_json else text, foreign=True)
+        if self.path.suffix == ".json":
+            json.loads(text)
+            # JSON is YAML but for tabs, which it has between values only.
+            text = text.replace("\t", " ")
+        return files.Document(text, foreign=True)
 
     def path_of(self, name: str) -> tuple[str, ...]:
         """Keys of a value, from the outermost on; none if there is no such, an error if several."""
@@ -489,7 +491,8 @@ _PLACEHOLDERS = ("input", "output", "parameters", "points", "imu")
 
 
 def _inside(output: str) -> str:
-    if Path(output).is_absolute() or ".." in Path(output).parts:
+    path = Path(output)
+    if path.is_absolute() or ".." in path.parts or not path.name:
         raise ValueError("give a path in the program's working folder, without `..`")
     return output
 

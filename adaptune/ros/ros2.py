@@ -304,17 +304,18 @@ def _parameter(store: Typestore, name: str, value: Any) -> Any:
 def _session(zenoh: ModuleType, router: str) -> Any:
     """A session as a client of a router."""
     config = zenoh.Config()
-    for name, value in (
-        ("mode", "client"),
-        ("connect/endpoints", [router]),
-        ("connect/timeout_ms", round(1e3 * _CONNECT)),
-        ("connect/exit_on_failure", True),
-        ("scouting/multicast/enabled", False),
+    given = {
+        "mode": "client",
+        "connect/endpoints": [router],
+        "connect/timeout_ms": round(1e3 * _CONNECT),
+        "connect/exit_on_failure": True,
+        "scouting/multicast/enabled": False,
         # It leaves files in /dev/shm.
-        ("transport/shared_memory/enabled", False),
-    ):
-        config.insert_json5(name, json.dumps(value))
+        "transport/shared_memory/enabled": False,
+    }
     try:
+        for name, value in given.items():
+            config.insert_json5(name, json.dumps(value))
         return zenoh.open(config)
     except zenoh.ZError as error:
         # Where in Zenoh's own code that was, helps nobody.

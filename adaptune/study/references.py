@@ -127,16 +127,11 @@ def estimates_of(sequences: StudySequences, names: Iterable[str]) -> dict[str, S
     return {name: stored for name, stored in found.items() if stored is not None}
 
 
-def estimates_in_words(
-    estimates: Mapping[str, StoredEstimate], length: float, intervals: bool = False
-) -> list[str]:
-    """A sentence about the sequences that an estimated reference judges, if there are any.
-
-    With `intervals`, it stands beside some that do not include the error of a reference.
-    """
+def estimates_in_words(estimates: Mapping[str, StoredEstimate], length: float) -> list[str]:
+    """A sentence about the sequences that an estimated reference judges, if there are any."""
     each = "; ".join(f"{name} ({_accuracy(of, length)})" for name, of in estimates.items())
-    excluded = " Intervals do not include its error." if intervals else ""
-    return [f"Judged by an estimated reference: {each}.{excluded}"] if each else []
+    words = f"Judged by an estimated reference: {each}. Intervals do not include its error."
+    return [words] if each else []
 
 
 def estimates_as_data(estimates: Mapping[str, StoredEstimate], length: float) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from adaptune.space import Categorical, Float, Integer, ParameterSpace
-from offline.config import OfflineConfig, Span, make_grid
+from offline.config import OfflineConfig, Span, check_grid, make_grid
 from offline.samplers import make_sampler
 
 SPACE = ParameterSpace(
@@ -58,6 +58,12 @@ def test_a_huge_grid_is_drawn_from_without_making_it():
     rows = walk("random", grid, 300)
     assert len(set(rows)) == 300
     assert 4.0 < sum(a for a, *_ in rows) / 300 < 6.0
+
+
+def test_a_grid_has_no_more_points_than_can_be_numbered():
+    space = ParameterSpace({name: Float(low=0.0, high=1.0, baseline=0.5) for name in "abcd"})
+    (mistake,) = check_grid(dict.fromkeys("abcd", Span(low=0.0, high=1.0, count=100_000)), space)
+    assert "coarser" in mistake.message
 
 
 @given(

@@ -28,6 +28,11 @@ def bank_only(sequences):
     return labelled(sequences)._replace(live=False)
 
 
+def choose_bank_of(sequences, members, monkeypatch):
+    monkeypatch.setattr(tuning, "_choosers", lambda *_: [lambda *_: members])
+    return choose(bank_only(sequences), len(members))
+
+
 def test_settings_are_chosen_on_the_sequences_at_hand():
     sequences = two_kinds(np.random.default_rng(0))
     # Set 2 everywhere, 0 in one kind of place and 4 in the other.
@@ -63,7 +68,7 @@ def test_a_small_harm_is_outweighed_and_a_disaster_is_not(odd, gains):
     assert choose(data, 0).one_set.adapt is gains
 
 
-def test_a_bank_that_gains_nothing_does_not_adapt():
+def test_a_bank_that_gains_nothing_does_not_adapt(monkeypatch):
     rng = np.random.default_rng(7)
     sequences = [with_motions(f"s{i}", rng, 100) for i in range(7)]
     # All members err alike: nothing cancels.
@@ -78,13 +83,13 @@ def test_a_bank_that_gains_nothing_does_not_adapt():
         )
         for s in sequences
     ]
-    found = choose(bank_only(alike), [0, 3, 4])
+    found = choose_bank_of(alike, [0, 3, 4], monkeypatch)
     assert found.bank == NO_BANK
     assert found.members == [0, 3, 4]
-    found = choose(bank_only(sequences), [0, 8])
+    found = choose_bank_of(sequences, [0, 8], monkeypatch)
     assert found.bank in BANK_SETTINGS
     # Two recordings are enough where the gain is large.
-    assert choose(bank_only(sequences[:3]), [0, 8]).bank.adapt
+    assert choose_bank_of(sequences[:3], [0, 8], monkeypatch).bank.adapt
 
 
 def test_the_least_loss_wins():
@@ -165,7 +170,7 @@ def test_a_bank_is_simulated_with_smoothed_weights(monkeypatch):
 
     monkeypatch.setattr(BankSimulation, "errors", errors)
     monkeypatch.setattr(tuning, "bank_weights", bank_weights)
-    choose(bank_only(sequences), [0, 8])
+    choose_bank_of(sequences, [0, 8], monkeypatch)
     assert len(seen) == 3 * len(BANK_SETTINGS)
     for weights in seen:
         np.testing.assert_allclose(weights[:2], [[1.0, 0.0], [0.5, 0.5]], atol=0.01)

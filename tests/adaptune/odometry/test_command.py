@@ -10,6 +10,7 @@ import yaml
 from setups import setup_of
 
 from adaptune.archive import Archive, rows, summarise
+from adaptune.errors import OdometryError
 from adaptune.odometry.program import Template
 from adaptune.odometry.tracker import HealthCheck
 from adaptune.strict import ConfigurationError
@@ -108,6 +109,13 @@ def test_every_layout_of_parameters(tmp_path, name, template, expected):
     # YAML as programs that go by version 1.1 read it.
     read = {".json": json.loads, ".yaml": yaml.safe_load}
     assert read[path.suffix](text) == expected
+
+
+def test_json_that_only_yaml_reads_is_no_template(tmp_path):
+    path = tmp_path / "file.json"
+    path.write_text('{"voxel": 1.0,}')
+    with pytest.raises(OdometryError, match=r"file\.json: .*line 1 column"):
+        Template(path)
 
 
 @pytest.mark.parametrize(("name", "kind"), [("poses/run.csv", "evalio"), ("run.txt", "kitti")])
@@ -344,6 +352,7 @@ def test_the_whole_way(make, caplog):
         ("odometry.settings.template=", "voxel}, and there is no template"),
         ("odometry.settings.command=[slam3000, x]", "there is no program 'slam3000'"),
         ("odometry.settings.command=[sh, '{ouput}']", "{ouput} is nothing; did you mean 'output'?"),
+        ("odometry.settings.output=.", "output: give a path in the program's working folder"),
         ("odometry.settings.output=/x.tum", "output: give a path in the program's working folder"),
         ("odometry.settings.output=a/../../x.tum", "output: give a path in the program's working"),
         ("odometry.settings.inpt=bag", "did you mean 'input'?"),
