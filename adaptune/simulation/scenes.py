@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -29,9 +29,6 @@ from adaptune.simulation.mesh import (
     variants,
 )
 
-if TYPE_CHECKING:
-    from adaptune.simulation.world import Road
-
 # Scenes, and the tiles in which they are built.
 
 
@@ -53,11 +50,24 @@ class Spots:
     d: Floats
 
 
+class Line(Protocol):
+    """What scenes need of a road, see `adaptune.simulation.world.Road`."""
+
+    def heading(self, s: Floats) -> Floats:
+        """Radians from the x axis at each station."""
+
+    def plane(self, s: Floats, d: Floats) -> tuple[Floats, Floats]:
+        """Coordinates x and y of a station and an offset."""
+
+    def ground(self, x: Floats, y: Floats) -> Floats:
+        """Height of the ground."""
+
+
 @dataclass(frozen=True)
 class Tile:
     """A piece of a scene: up to twenty metres of road and its surroundings."""
 
-    road: "Road"
+    road: Line
     index: int  # its number along the road: it begins at station ``index * TILE``
     # Stations of its ends, in metres; a leg may begin or end within it.
     start: float
