@@ -24,18 +24,14 @@ from adaptune.recording.scan import origin
 from adaptune.reference.check import hard_to_track
 from adaptune.report import tables
 from adaptune.space import ParameterSet, ParameterSets, ParameterSpace, in_words
-from adaptune.study.config import SwitchingConfig
+from adaptune.study.config import StudyConfig, SwitchingConfig
 from adaptune.study.references import (
     ensure_references,
     estimates_as_data,
     estimates_in_words,
     estimates_of,
 )
-from adaptune.study.study import (
-    FIXED_SET,
-    OracleErrors,
-    oracle_errors,
-)
+from adaptune.study.study import FIXED_SET, OracleErrors, StudySequences, oracle_errors
 from offline.campaign import (
     Campaign,
     WholeRuns,
@@ -400,7 +396,7 @@ def run_oracle(
     """
     model = study.model()
     study.open()
-    names = _judged(study, progress)
+    names = _judged(study.config, study.sequences, progress)
     numbers = oracle_sets(model, n_sets)
     archive = study.archive("oracle")
     archive.renew(names)
@@ -433,17 +429,16 @@ def oracle_sets(model: ErrorModel, n: int) -> list[int]:
     return list(chosen)[:n]
 
 
-def _judged(study: OfflineStudy, progress: Progress) -> list[str]:
+def _judged(config: StudyConfig, sequences: StudySequences, progress: Progress) -> list[str]:
     """The test sequences that have a reference, or get an estimated one."""
-    refused = ensure_references(
-        study.sequences, study.config.test, study.config.sub_trajectory, progress, required=False
-    )
+    length = config.sub_trajectory
+    refused = ensure_references(sequences, config.test, length, progress, required=False)
     for name, said in refused.items():
         _log.warning("%s; so %s is left out", said, name)
-    recordings = study.sequences.recordings
+    recordings = sequences.recordings
     names = [
         name
-        for name in study.config.test
+        for name in config.test
         if name not in refused
         and (name not in recordings or recordings[name].reference != NO_REFERENCE)
     ]

@@ -410,7 +410,9 @@ def compare(study: Study) -> ComparedReplays:
     obstacle = "" if ADAPTIVE in modes else ReplaySetup.of(study).obstacle(ADAPTIVE, model)
     length, worth = study.config.sub_trajectory, study.config.online.worth
     best = decided(rows, worth)
-    said = wrong[:1] or ([] if best is None else _lost(study, judged, best.mode))
+    said = wrong[:1] or (
+        [] if best is None else _lost(study.odometry.name, study.sequences, judged, best.mode)
+    )
     said += verdict(rows, length, obstacle, worth)
     details = [*wrong, *remarks(rows), *compared.words]
     folder = study.folder / "comparison"
@@ -420,15 +422,17 @@ def compare(study: Study) -> ComparedReplays:
     return ComparedReplays(rows, said, details, advised, compared.unfinished)
 
 
-def _lost(study: Study, judged: Sequence[JudgedModes], best: str) -> list[str]:
+def _lost(
+    odometry: str, sequences: StudySequences, judged: Sequence[JudgedModes], best: str
+) -> list[str]:
     """A sentence where even the best mode has lost its way."""
     every = [row for one in judged for row in one.rows if row.mode == best]
     errors = {row.sequence: row.rte for row in every if row.rte is not None}
     return lost_in_words(
         CALLED[best],
         errors,
-        study.odometry.name,
-        lambda worst: hard_to_track(study.sequences.open(worst)),
+        odometry,
+        lambda worst: hard_to_track(sequences.open(worst)),
     )
 
 
