@@ -533,12 +533,13 @@ def _mean(values: Sequence[float | None]) -> float | None:
 
 
 def select(table: Sequence[Row], sort: str | None = None, top: int | None = None) -> list[Row]:
-    """The first `top` rows, in the order of a column.
+    """The first `top` rows in the order of a column, by default of the mean; else all rows.
 
     With ``-`` before the column, the largest value comes first; unknown values come last.
     """
-    if sort is None:
-        return list(table[:top])
+    if sort is None and top is None:
+        return list(table)
+    sort = sort or "mean"
     name = sort.removeprefix("-")
     column = _COLUMN.get(name, name)
     if table and column not in table[0]:

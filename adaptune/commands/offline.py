@@ -107,7 +107,7 @@ def trials(
         str | None,
         typer.Option(metavar="COLUMN", help="With `-` before it, the largest first."),
     ] = None,
-    top: Annotated[int | None, typer.Option(help="Number of trials to show.", min=1)] = None,
+    top: Annotated[int | None, typer.Option(help="Show so many, the best first.", min=1)] = None,
 ) -> None:
     """List the study's finished trials, also while it runs.
 
