@@ -458,15 +458,16 @@ class Cluster:
             if not future.done() and worker in hosts:
                 continue
             del self._futures[worker]
-            outcomes.append((worker, self._outcome(worker, future)))
+            outcomes.append((worker, self._outcome(worker, future, hosts)))
         return outcomes
 
-    def _outcome(self, worker: str, future: Any) -> Outcome:
+    def _outcome(self, worker: str, future: Any, hosts: Collection[str]) -> Outcome:
         # Dask waits for ever for a result that its worker has taken along.
-        while future.status == "finished" and worker in self._found():
+        while future.status == "finished" and worker in hosts:
             with contextlib.suppress(TimeoutError, self._killed):
                 outcome: Outcome = future.result(timeout=_TIMEOUT)
                 return outcome
+            hosts = self._found()
         if future.status == "error":
             error = future.exception()
             if not isinstance(error, self._killed):

@@ -143,13 +143,13 @@ def test_a_killed_worker_s_trials_run_elsewhere(
     study = load_study(study_file, [], tmp_path / "study")
     pids, read, lost = {}, Cluster._outcome, []
 
-    def kill_first(self, worker, future):
+    def kill_first(self, worker, future, hosts):
         # A worker that dies with a result that nobody has read.
         if not lost and future.status == "finished":
             pids.update(self._client.run(os.getpid))
             lost.append(worker)
             os.kill(pids[worker], signal.SIGKILL)
-        return read(self, worker, future)
+        return read(self, worker, future, hosts)
 
     def kill_at_work(_what, done, *_):
         for worker, pid in pids.items():
