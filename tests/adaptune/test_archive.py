@@ -3,6 +3,7 @@ import math
 
 import numpy as np
 import pytest
+from random_models import assert_same
 
 from adaptune.archive import INDEX, Archive, ArchiveError, Frames, Trial, summarise
 
@@ -36,16 +37,6 @@ def random_frames(seed=0):
     counts = rng.integers(0, 1000, (N, 90)).astype(np.float32)
     elevations = rng.normal(-15.0, 1.0, N).astype(np.float32)
     return Frames(stamps, T_ref_sensor, counts, {"ndt": 90}, elevations)
-
-
-def assert_same(a, b):
-    for field in dataclasses.fields(a):
-        x, y = getattr(a, field.name), getattr(b, field.name)
-        if isinstance(x, np.ndarray):
-            assert x.dtype == y.dtype
-            np.testing.assert_array_equal(x, y)
-        else:
-            assert repr(x) == repr(y)
 
 
 def test_trials_survive(tmp_path):

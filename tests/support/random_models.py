@@ -46,7 +46,8 @@ def random_model():
 
 
 def assert_same(a, b):
-    for field in dataclasses.fields(ErrorModel):
+    """All that two models, trials or frames hold is the same."""
+    for field in dataclasses.fields(a):
         x, y = getattr(a, field.name), getattr(b, field.name)
         if isinstance(x, np.ndarray):
             assert x.dtype == y.dtype
