@@ -194,8 +194,7 @@ class ReplaySetup:
         rate = in_time.rate if in_time is not None and in_time.queue else None
         pace = 1.0 if in_time is None else in_time.rate
         cores = 1 if mode.cost * pace <= ONE_CORE else len(shared_cores())
-        lost = self.config.lost_track
-        return Bank(self.odometry, mode.sets, lost_track=lost, cores=cores, rate=rate)
+        return Bank(self.odometry, mode.sets, WARM_UP, self.config.lost_track, cores, rate)
 
     def identity(
         self, name: str, model: ErrorModel | None = None, digest: str = ""
