@@ -5,7 +5,7 @@ import logging
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,17 +17,13 @@ from adaptune.errors import AdaptuneError, nearest
 from adaptune.files import DAMAGED_NPZ, needing_room, replacing, write_text
 from adaptune.geometry import Poses
 from adaptune.live.hops import Hops
-from adaptune.metrics import cap
-from adaptune.odometry.base import MOST_FAULTS
+from adaptune.metrics import FAILURE, cap
 from adaptune.recording.cache import status_key
 from adaptune.space import ODOMETRY, ParameterSet, in_words
 from adaptune.strict import ConfigurationError
 
 # In `Trial.usage`; the last one in seconds, where the first scan has no pose.
 REGISTER_MS, PREPARE_MS, FIRST_POSE = "register_ms", "prepare_ms", "first_pose"
-MAX_SHARE_WITHOUT_POSE = 0.1
-"""Share of the scans from which an odometry that gives no pose for them has failed."""
-
 _log = logging.getLogger(__name__)
 
 
@@ -48,21 +44,49 @@ class Frames:
     # Direct registrations, one a second at most, see `adaptune.live.hops`.
     hops: Hops = field(default_factory=lambda: Hops.of([]))
     evidence_ms: float = np.nan  # CPU time a scan that these took; NaN if not measured
+    # (k, 3): of each stretch that is driven, the first scan, the first one that counts, and the one
+    # after the last. The scans before the one that counts are warm-up.
+    # By default, there is one: the whole recording.
+    stretches: NDArray[np.intp] = field(default_factory=lambda: np.empty((0, 3), np.intp))
+
+    def __post_init__(self) -> None:
+        if not len(self.stretches):
+            object.__setattr__(self, "stretches", np.array([[0, 0, len(self.stamps)]]))
+
+    @property
+    def uncut(self) -> "Frames":
+        """The same with a single stretch, the whole recording."""
+        return replace(self, stretches=np.array([[0, self.stretches[0, 1], len(self.stamps)]]))
+
+    @property
+    def n_driven(self) -> int:
+        """Scans of all stretches, warm-up included."""
+        return int((self.stretches[:, 2] - self.stretches[:, 0]).sum())
+
+    @property
+    def counted(self) -> Poses:
+        """The reference where scans count, of shape (n, 4, 4); NaN elsewhere."""
+        T_ref_sensor = np.full_like(self.T_ref_sensor, np.nan)
+        for _, begin, end in self.stretches:
+            T_ref_sensor[begin:end] = self.T_ref_sensor[begin:end]
+        return T_ref_sensor
 
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """One parameter set on one sequence."""
+    """The drives of one parameter set on one sequence."""
 
     parameters: ParameterSet
-    T_odom_sensor: Poses  # (n, 4, 4): of the first run, if the trial was run several times
-    # (n,): sub-trajectory RTE in percent; NaN without a sub-trajectory, infinite after a lost
-    # track. Of several runs, the mean of the capped errors.
+    # (n, 4, 4): NaN where nothing is driven; of the first of several repeats
+    T_odom_sensor: Poses
+    # (n,): sub-trajectory RTE in percent; NaN without a sub-trajectory, infinite without poses. Of
+    # several repeats, the mean of the capped errors.
     errors: NDArray[np.float64]
-    restarted: NDArray[np.bool_]  # (n,): where it lost track and restarted at the reference
+    restarted: NDArray[np.bool_]  # (n,): where the health check restarted it
     # (n,): False where the scan had too few points, and before the odometry's first pose.
     registered: NDArray[np.bool_]
     # (n,): computing time of the odometry for each scan, without preparing it.
+    # NaN where it begins, and where nothing is driven.
     seconds: NDArray[np.float64]
     # Reasons why the odometry's process ended or gave no pose, each with its last output.
     faults: tuple[str, ...] = ()
@@ -73,22 +97,25 @@ class Trial:
     usage: dict[str, float] = field(default_factory=dict)
     # RTE and metrics of every run, if the trial was run several times.
     repeats: tuple[dict[str, float], ...] = ()
-    # Faults that the health check would have found in one run, and how often, see
-    # `adaptune.odometry.tracker.Guard.check`. In a whole run, those that it found. Of several
-    # runs, the first one with the most scans without a pose.
+    # Faults that the health check found, and how often, see
+    # `adaptune.odometry.tracker.Guard.check`. Of several repeats, the first one with the most
+    # scans without a pose.
     unhealthy: dict[str, int] = field(default_factory=dict)
-    # Of a whole run, the bounds of the health check that restarted it.
-    health: dict[str, float] = field(default_factory=dict)
+    failure: str = ""  # why the set is never chosen; empty if it may be
 
     def __repr__(self) -> str:
-        lost = int(self.restarted.sum())
-        told = f"{self.mean_error:.3f} %, {lost} lost tracks, {len(self.faults)} faults"
+        n = int(self.restarted.sum())
+        told = f"{self.mean_error:.3f} %, {n} restarts, {len(self.faults)} faults"
         return f"<Trial of {in_words(self.parameters)}: {told}>"
 
     @property
     def mean_error(self) -> float:
-        """Mean capped error in percent over the frames with a sub-trajectory."""
-        return float(np.nanmean(cap(self.errors)))
+        """Mean capped error in percent over the frames with a sub-trajectory.
+
+        It is the cap where no error is known, because the odometry gave no poses.
+        """
+        known = self.errors[~np.isnan(self.errors)]
+        return float(cap(known).mean()) if len(known) else FAILURE
 
 
 @dataclass(frozen=True)
@@ -97,22 +124,13 @@ class Summary:
 
     parameters: ParameterSet
     mean_error: float  # see `Trial.mean_error`
-    lost: int  # how often the odometry lost track
+    restarts: int  # how often the health check restarted the odometry
     faults: int  # how often its process ended or gave no pose
     ms: float  # milliseconds of the odometry for a scan
     others: dict[str, float] = field(default_factory=dict)  # other metrics by name
     repeats: Sequence[dict[str, float]] = ()  # see `Trial`
     unhealthy: dict[str, int] = field(default_factory=dict)  # see `Trial`
-    without_pose: float = 0.0  # share of the scans; unknown in older trials, which gave up instead
-
-    @property
-    def usable(self) -> bool:
-        """Whether the set gave poses, but for a scan now and then. Others are never chosen.
-
-        Where an odometry ends or gives no pose, it takes no time, and may seem to do well.
-        """
-        gave_up = self.faults >= MOST_FAULTS * max(1, len(self.repeats))
-        return not gave_up and self.without_pose < MAX_SHARE_WITHOUT_POSE
+    failure: str = ""  # see `Trial`
 
     @property
     def cost(self) -> float:
@@ -128,17 +146,17 @@ class Summary:
 def summarise(trial: Trial) -> Summary:
     """Summarise a trial. The summary is the same before writing and after reading it."""
     errors = trial.errors.astype(np.float32).astype(np.float64)
-    seconds = trial.seconds[1:].astype(np.float32)  # the first scan starts the odometry
+    seconds = trial.seconds[~np.isnan(trial.seconds)].astype(np.float32)
     return Summary(
         trial.parameters,
-        float(np.nanmean(cap(errors))),
+        replace(trial, errors=errors).mean_error,
         int(trial.restarted.sum()),
         len(trial.faults),
         float(1e3 * seconds.mean(dtype=np.float64)) if len(seconds) else 0.0,
         trial.metrics | trial.usage,
         list(trial.repeats),
         trial.unhealthy,
-        trial.unhealthy.get("no_pose", 0) / len(errors),
+        trial.failure,
     )
 
 
@@ -180,7 +198,7 @@ class Sources(NamedTuple):
 
 INDEX = "index.jsonl"
 _ARRAYS, _SINGLE = ("T_odom_sensor", "restarted", "registered"), ("errors", "seconds")
-_PLAIN = ("parameters", "faults", "metrics", "usage", "repeats", "unhealthy", "health")
+_PLAIN = ("parameters", "faults", "metrics", "usage", "repeats", "unhealthy", "failure")
 """Parts of a trial that are stored as they are, in single precision, and as JSON."""
 _TRIAL = re.compile(r"\d{5,}\.npz")
 
@@ -303,7 +321,8 @@ class Archive:
         return files
 
     def trial_path(self, sequence: str, number: int, whole: bool = False) -> Path:
-        """File of a trial, or of its whole run, which is driven as a replay is."""
+        """File of a trial, or of its drive along the whole recording, if that is another one."""
+        whole = whole and not self.is_uncut(sequence)
         return self.folder / sequence / f"{number:05d}{'-whole' if whole else ''}.npz"
 
     def tidy(self) -> None:
@@ -315,7 +334,7 @@ class Archive:
             write_text(self.folder / INDEX, index)
 
     def finished(self, sequence: str) -> Mapping[int, Summary]:
-        """The finished trials on a sequence by number, without the whole runs.
+        """The finished trials on a sequence by number, without the drives of whole recordings.
 
         It grows as trials are written.
         """
@@ -355,6 +374,15 @@ class Archive:
         except ArchiveError:
             return False
 
+    def is_uncut(self, sequence: str) -> bool:
+        """Whether trials drive the whole recording; False where it is not described yet."""
+        path = self.folder / sequence / "frames.npz"
+        if not path.exists():
+            return False
+        data = _read(path, ["stretches", "stamps"])
+        (first, _, end), *more = data["stretches"].tolist()
+        return not more and end - first == len(data["stamps"])
+
     def write_frames(self, sequence: str, frames: Frames) -> None:
         """Write the data that all trials on a sequence share."""
         self._note(sequence)
@@ -368,6 +396,7 @@ class Archive:
                 blocks=_packed(frames.blocks),
                 elevations=frames.elevations.astype(np.float32),
                 evidence_ms=frames.evidence_ms,
+                stretches=frames.stretches,
                 **{f"hops_{name}": array for name, array in frames.hops._asdict().items()},
             )
 
@@ -384,6 +413,7 @@ class Archive:
                 data["elevations"],
                 Hops(*(data[f"hops_{name}"] for name in Hops._fields)),
                 float(data["evidence_ms"]),
+                data["stretches"].astype(np.intp),
             )
         except (KeyError, ValueError, TypeError) as error:
             raise _damaged(path, error) from error
@@ -397,7 +427,7 @@ class Archive:
         data |= {name: _packed(getattr(trial, name)) for name in _PLAIN}
         with replacing(path) as temporary, temporary.open("wb") as file:
             np.savez(file, **data)
-        if whole:
+        if path != self.trial_path(sequence, number):
             return
         status, summary = path.stat(), summarise(trial)
         line = _line((sequence, number, status.st_size, status.st_mtime_ns), summary)
@@ -498,10 +528,9 @@ def rows(archive: Archive, names: Sequence[str]) -> list[Row]:
     """A row for every trial that is finished on at least one of the sequences.
 
     It has number, parameters, mean error in percent (None before the trial is finished on all
-    sequences), mean error on each sequence, then over all sequences how often it lost track, how
-    often its process ended and how often the health check would have found a fault, its other
-    metrics (None if a sequence is too short for one), and its cost in milliseconds of CPU time a
-    scan (None if it was not measured).
+    sequences), mean error on each sequence, then over all sequences how often the health check
+    restarted it and how often its process ended, its other metrics (None if a sequence is too short
+    for one), and its cost in milliseconds of CPU time a scan (None if it was not measured).
     """
     finished = {name: archive.finished(name) for name in names}
     every = [trial for trials in finished.values() for trial in trials.values()]
@@ -515,8 +544,7 @@ def rows(archive: Archive, names: Sequence[str]) -> list[Row]:
         row: Row = {"trial": number} | {name: there[0].parameters.get(name) for name in parameters}
         errors = {name: t.mean_error if t else None for name, t in trials.items()}
         row |= {"mean": _mean(list(errors.values()))} | errors
-        row |= {"lost": sum(t.lost for t in there), "faults": sum(t.faults for t in there)}
-        row["unhealthy"] = sum(sum(t.unhealthy.values()) for t in there)
+        row |= {"restarts": sum(t.restarts for t in there), "faults": sum(t.faults for t in there)}
         for metric in metrics:
             if metric not in ("rte", REGISTER_MS, PREPARE_MS):
                 without = 0.0 if metric == FIRST_POSE else None

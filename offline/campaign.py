@@ -2,20 +2,21 @@
 
 import logging
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
 
-from adaptune.archive import Archive, ArchiveError, Summary, Trial, summarise
+from adaptune.archive import REGISTER_MS, Archive, ArchiveError, Summary, Trial, summarise
 from adaptune.errors import AdaptuneError
-from adaptune.odometry.tracker import HealthCheck
 from adaptune.progress import Progress, unseen
 from adaptune.space import ParameterSet, PooledSpace
 from adaptune.study.references import contradictions_of
 from offline.config import OfflineConfig, OfflineStudy
-from offline.objective import Verdict, judge, label, mean_value, weighted
+from offline.objective import Verdict, allowed, judge, label, mean_value, weighted
 from offline.search import Clock, Search, rungs
+from offline.trial import SLOW
 from offline.workers import Pool, Task, TaskResult, run
 
 _log = logging.getLogger(__name__)
@@ -37,6 +38,12 @@ class Campaign:
         self._finished = {name: archive.finished(name) for name in self._names}
         space, known = study.odometry.space, archive.sets()
         self._search = Search(self._config, space, self._names, self._finished, known)
+        baselines = range(len(space.baselines))
+        self._most_ms = {
+            name: SLOW * max(drive.others[REGISTER_MS] for drive in drives.values())
+            for name, drives in read_whole_drives(archive, self._names, baselines).items()
+            if drives
+        }
         described = study.config.descriptor
         self._without_frames = [
             name for name in self._names if not archive.has_frames(name, described)
@@ -87,7 +94,8 @@ class Campaign:
     def _tasks(self, missing: Sequence[tuple[str, Mapping[int, ParameterSet]]]) -> list[Task]:
         without_frames, self._without_frames = self._without_frames, []
         n_workers = len(self._workers.workers())
-        return trial_tasks(missing, without_frames, n_workers, self._study.odometry.one_by_one)
+        tasks = trial_tasks(missing, without_frames, n_workers, self._study.odometry.one_by_one)
+        return [task._replace(most_ms=self._most_ms.get(task.sequence, np.inf)) for task in tasks]
 
 
 def trial_tasks(
@@ -135,64 +143,53 @@ def _store(archive: Archive, task: Task, result: TaskResult) -> None:
         archive.write(task.sequence, number, trial, task.whole)
 
 
-WholeRuns = Mapping[str, Mapping[int, Summary]]
-"""By sequence, whole runs by trial number."""
+WholeDrives = Mapping[str, Mapping[int, Summary]]
+"""By sequence, drives of whole recordings by trial number."""
 
 
-def whole_run(archive: Archive, name: str, number: int, health: HealthCheck) -> Trial | None:
-    """The whole run of a trial; None if there is none with this health check."""
-    try:
-        trial = archive.read(name, number, whole=True)
-    except ArchiveError:
-        return None
-    return trial if trial.health == health.model_dump() else None
-
-
-def read_whole_runs(
-    archive: Archive, names: Sequence[str], numbers: Sequence[int], health: HealthCheck
+def read_whole_drives(
+    archive: Archive, names: Sequence[str], numbers: Iterable[int]
 ) -> dict[str, dict[int, Summary]]:
-    """The whole runs of some trials that there are with this health check."""
-    found = {name: {n: whole_run(archive, name, n, health) for n in numbers} for name in names}
-    return {
-        name: {n: summarise(trial) for n, trial in runs.items() if trial is not None}
-        for name, runs in found.items()
-    }
+    """The drives of whole recordings that there are of some trials."""
+    found: dict[str, dict[int, Summary]] = {name: {} for name in names}
+    for name in names:
+        for n in numbers:
+            with suppress(ArchiveError):
+                found[name][n] = summarise(archive.read(name, n, whole=True))
+    return found
 
 
-def run_whole(
+def drive_whole(
     names: Sequence[str],
     sets: Mapping[int, ParameterSet],
-    health: HealthCheck,
     archive: Archive,
     workers: Pool[Any],
     progress: Progress,
 ) -> dict[str, dict[int, Summary]]:
-    """Run sets on the sequences from end to end, unless that was done before."""
-    there = read_whole_runs(archive, names, list(sets), health)
+    """Drive sets along whole recordings, unless that was done before."""
+    there = read_whole_drives(archive, names, sets)
     tasks = [
         Task(name, (n,), (parameters,), whole=True)
         for name in names
         for n, parameters in sets.items()
         if n not in there[name]
     ]
-    watch_tasks(archive, workers, tasks, "whole runs", progress)
-    return read_whole_runs(archive, names, list(sets), health) if tasks else there
+    watch_tasks(archive, workers, tasks, "whole drives", progress)
+    return read_whole_drives(archive, names, sets) if tasks else there
 
 
-def whole_values(config: OfflineConfig, runs: WholeRuns) -> dict[str, dict[int, float]]:
-    """By sequence, the objective in whole runs of every candidate for the fixed set.
+def whole_values(config: OfflineConfig, drives: WholeDrives) -> dict[str, dict[int, float]]:
+    """By sequence, the objective of every candidate for the fixed set over whole recordings.
 
-    Candidates have whole runs on all sequences. The objective of those that are not usable there
-    is infinite.
+    Candidates are driven along all of them. The objective of those that cannot be chosen, see
+    `allowed`, is infinite.
     """
-    numbers = set.intersection(*(set(of_sequence) for of_sequence in runs.values()))
-    verdicts = {n: judge(config, [runs[name][n] for name in runs]) for n in sorted(numbers)}
+    numbers = set.intersection(*map(set, drives.values()))
+    few = {n: judge(config, [of[n] for of in drives.values()]) for n in sorted(numbers)}
+    chosen = allowed({n: np.inf if v.failure else v.restarts for n, v in few.items()})
     return {
-        name: {
-            n: weighted(config.objective, of_sequence[n].metrics) if verdict.usable else np.inf
-            for n, verdict in verdicts.items()
-        }
-        for name, of_sequence in runs.items()
+        name: {n: weighted(config.objective, of[n].metrics) if n in chosen else np.inf for n in few}
+        for name, of in drives.items()
     }
 
 
@@ -209,7 +206,7 @@ class BaselineError(AdaptuneError):
 def run_baseline(
     study: OfflineStudy, archive: Archive, workers: Pool[Any], progress: Progress
 ) -> None:
-    """Run the baseline from end to end on every training sequence, unless that was done before.
+    """Drive the baseline along every training sequence, all of it, unless that was done before.
 
     Of several odometries, the baseline of each. Nothing is stored before all have done well on all
     sequences. Where the reference contradicts the motion of one, scans say which of them is wrong.
@@ -219,7 +216,8 @@ def run_baseline(
     BaselineError
         If one fails on one of them.
     """
-    space, health = study.odometry.space, study.config.health
+    space = study.odometry.space
+    there = read_whole_drives(archive, study.training, range(len(space.baselines)))
     # What the study calls its odometries, in the order of their baselines' trials.
     labels = list(space.spaces) if isinstance(space, PooledSpace) else [study.odometry.name]
     tasks: list[Task] = []
@@ -227,14 +225,15 @@ def run_baseline(
         # The first task of a sequence returns its frames, if they are lacking.
         frames = not archive.has_frames(name, study.config.descriptor)
         for number, parameters in enumerate(space.baselines):
-            if whole_run(archive, name, number, health) is None:
+            if number not in there[name]:
                 tasks.append(Task(name, (number,), (parameters,), True, frames))
                 frames = False
     done = []
     for task, result in run(workers, tasks, "baseline", progress):
         check_baseline(labels[task.numbers[0]], task.sequence, result.trials[0])
         done.append((task, result))
-    for task, result in done:
+    # What all trials share comes first: it says which scans are driven.
+    for task, result in sorted(done, key=lambda pair: pair[1].frames is None):
         _store(archive, task, result)
         name, whole = task.sequence, result.trials[0]
         told = contradictions_of(study.sequences, name, whole.T_odom_sensor, whole.mean_error)
@@ -243,18 +242,17 @@ def run_baseline(
 
 
 def check_baseline(odometry: str, sequence: str, run: Trial) -> None:
-    """Refuse a whole run of the baseline that failed; a fault now and then does no harm.
+    """Refuse a baseline that failed; a fault now and then does no harm.
 
     Raises
     ------
     BaselineError
     """
-    if summarise(run).usable:
+    if not run.failure:
         return
-    n, missing = len(run.errors), run.unhealthy.get("no_pose", 0)
     last = run.faults[-1] if run.faults else "it gave no pose, and no reason"
     raise BaselineError(
-        f"sequences.{sequence}: {odometry} fails with its own parameters, the baseline: no pose "
-        f"for {missing} of {n} scans; {last}; nothing of it is stored: mend the odometry (odometry "
+        f"sequences.{sequence}: {odometry} fails with its own parameters, the baseline: "
+        f"{run.failure}; {last}; nothing of it is stored: mend the odometry (odometry "
         f"in the study), or leave the sequence out, and run the same command again"
     )

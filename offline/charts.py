@@ -109,7 +109,7 @@ def trial_table(
         by_sequence = {name: weighted(objective, run.metrics) for name, run in runs.items()}
         value = verdict.value if len(runs) == len(finished) else np.nan
         cost = float(np.mean([run.cost for run in runs.values()]))
-        about = (number, verdict.parameters, by_sequence, value, verdict.usable, cost)
+        about = (number, verdict.parameters, by_sequence, value, not verdict.failure, cost)
         trials.append(TriedSet(*about))
     named = "RTE [%]" if objective == {"rte": 1.0} else label(objective, units=True)
     chosen = next((trial.number for trial in trials if trial.parameters == fixed), None)

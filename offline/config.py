@@ -11,6 +11,7 @@ from pydantic import BaseModel, BeforeValidator, Field
 
 from adaptune import strict
 from adaptune.errors import AdaptuneError, Finding, in_a_line, nearest
+from adaptune.odometry.registry import PROGRAMS
 from adaptune.recording.config import MOST_VIEWS, ViewConfig
 from adaptune.space import (
     Categorical,
@@ -416,7 +417,9 @@ class OfflineConfig(StrictModel):
     seed: int = Field(0, ge=0, lt=2**32)
     workers: int | None = Field(None, ge=1, le=256)
     objective: Annotated[_Weighted, BeforeValidator(_weighted)] = Field({"rte": 1.0})
-    runs: Literal["restart", "whole"] | None = None  # see `OfflineStudyConfig.runs`
+    # Stretches of all training sequences together that are driven by every set, four of each at
+    # least; where sequences are short, all of them are driven.
+    stretches: Annotated[int, Field(ge=1, le=10_000)] | Literal["all"] = 12
     repeats: int = Field(1, ge=1, le=100)
     baseline_runs: int | None = Field(None, ge=1, le=1000)
     augment: Annotated[tuple[ViewConfig, ...], Field(max_length=MOST_VIEWS)] = ()
@@ -454,7 +457,7 @@ class OfflineConfig(StrictModel):
 
 _SEARCH = (
     *("sampler", "sampler_settings", "initial", "batch", "seed"),
-    *("objective", "runs", "repeats", "baseline_runs", "pruning"),
+    *("objective", "stretches", "repeats", "baseline_runs", "pruning", "health"),
 )
 """Settings by which a search differs from another."""
 
@@ -474,13 +477,15 @@ class OfflineStudyConfig(StudyConfig):
         return views
 
     @property
-    def runs(self) -> Literal["restart", "whole"]:
-        """What a trial does where it loses track: a start in a new container costs too much."""
-        costly = any(
-            one.name == "rustle" and one.settings.get("play") == "lockstep"
-            for one in self.odometries.values()
-        )
-        return self.offline.runs or ("whole" if costly else "restart")
+    def stretches(self) -> int | None:
+        """Stretches of each training sequence that are driven; None for the whole of it.
+
+        A program costs too much to start anew, and some metrics judge whole trajectories.
+        """
+        n, whole = self.offline.stretches, {"kitti", "ape"} & set(self.offline.objective)
+        if n == "all" or whole or any(one.name in PROGRAMS for one in self.odometries.values()):
+            return None
+        return max(4, math.ceil(n / len(self.training)))
 
     def mistakes(self, space: ParameterSpace | None) -> Iterable[Finding]:
         """See `StudyConfig.mistakes`."""
@@ -489,7 +494,7 @@ class OfflineStudyConfig(StudyConfig):
     def resolved(self) -> dict[str, Any]:
         """See `StudyConfig.resolved`."""
         resolved, offline = super().resolved(), self.offline
-        resolved["offline"]["runs"] = self.runs
+        resolved["offline"]["stretches"] = self.stretches or "all"
         if settings := SETTINGS.get(offline.sampler):
             given = settings.model_validate(offline.sampler_settings)
             whole = given.model_dump(mode="json", exclude_none=True)
@@ -499,7 +504,7 @@ class OfflineStudyConfig(StudyConfig):
     @property
     def search_inputs(self) -> dict[str, Any]:
         """What makes the trials of a study those that they are: another search has others."""
-        offline = self.resolved()["offline"]
+        offline = self.resolved()["offline"] | {"health": self.health.model_dump(mode="json")}
         # The sets are shared, as trials of earlier versions have it recorded.
         return {"sets": "shared"} | {k: value for k in _SEARCH if (value := offline.get(k))}
 

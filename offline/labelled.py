@@ -37,10 +37,11 @@ from adaptune.recording.scan import origin, places, stretch_numbers
 from adaptune.space import ParameterSets
 from adaptune.study.config import WORTH
 from adaptune.study.study import MIN_RECORDINGS, PER_STRETCH
-from offline.campaign import mean_values, read_whole_runs, whole_values
+from offline.campaign import mean_values, read_whole_drives, whole_values
 from offline.config import OfflineStudyConfig
 from offline.objective import (
     affordable,
+    allowed,
     best_candidates,
     choose_fixed,
     margin,
@@ -67,7 +68,7 @@ def error_vectors(T_ref_sensor: Poses, trial: Trial, length: float) -> NDArray[n
 
     Returns shape (n_frames, 3).
     """
-    vectors = sub_trajectory_vectors(T_ref_sensor, trial.T_odom_sensor, length, trial.restarted)
+    vectors = sub_trajectory_vectors(T_ref_sensor, trial.T_odom_sensor, length)
     vectors[np.isinf(trial.errors)] = np.inf
     lengths = np.linalg.norm(vectors, axis=1)
     finite = np.isfinite(lengths) & (lengths > 0.0)
@@ -81,6 +82,7 @@ class BankSimulation:
 
     stamps: NDArray[np.int64]  # (n_frames,): nanoseconds
     T_ref_sensor: Poses  # (n_frames, 4, 4)
+    T_ref_counted: Poses  # (n_frames, 4, 4): NaN where nothing is driven, or does not count
     descriptors: NDArray[np.float32]  # (n_frames, n_features): averaged
     period: NDArray[np.int64]  # (n_frames,): whole periods since the first scan
     length: float  # metres of a sub-trajectory
@@ -94,7 +96,7 @@ class BankSimulation:
     @cached_property
     def ends(self) -> NDArray[np.intp]:
         """Last frame of the sub-trajectory from each frame on, of shape (n_frames,)."""
-        return window_ends(self.T_ref_sensor, self.length)
+        return window_ends(self.T_ref_counted, self.length)
 
     def live(self, members: tuple[int, ...]) -> list[LiveSquares | None]:
         """What is measured of members before the first frame of each period."""
@@ -169,7 +171,7 @@ class BankSimulation:
         none = np.asarray(~agreeing.any(axis=1))
         believed = np.where(agreeing[..., None, None], T_previous_current, np.eye(4))
         moved = mean_motion(believed, share(self._of_steps(weights), agreeing | none[:, None]))
-        return cap(sub_trajectory_rte(self.T_ref_sensor, chained(moved), self.length))
+        return cap(sub_trajectory_rte(self.T_ref_counted, chained(moved), self.length))
 
 
 def chained(T_previous_current: Poses) -> Poses:
@@ -184,11 +186,11 @@ def chained(T_previous_current: Poses) -> Poses:
 def recorded_motions(frames: Frames, trials: Sequence[Trial]) -> Poses:
     """Motions over every scan but the first, as the trials recorded them.
 
-    Where a trial lost track, its motion was not recorded, and it started again at the reference. In
-    a bank nobody knows at once: here it stands still for `SECONDS_UNTIL_NOTICED`, as all others do
-    that lose track there, and then goes on.
+    Where the health check restarted a set, it went on as before. A bank does not notice at once:
+    here the member stands still for `SECONDS_UNTIL_NOTICED`, as all others do that are restarted
+    there, and then goes on.
 
-    Returns shape (n_frames - 1, n_trials, 4, 4).
+    Returns shape (n_frames - 1, n_trials, 4, 4), NaN where nothing is driven.
     """
     motions = np.empty((len(frames.stamps) - 1, len(trials), 4, 4))
     begins = frames.stamps[:-1]
@@ -208,16 +210,22 @@ another frame may differ in its last bits, and a sub-trajectory then ends one fr
 def stretches(simulation: BankSimulation, known: NDArray[np.intp]) -> NDArray[np.intp]:
     """Number of each labelled frame's stretch along the reference, of shape (n,).
 
-    `known` has the numbers of these frames. The last piece joins the stretch before if it is
-    shorter than half a stretch.
+    `known` has the numbers of these frames. What is driven without interruption is cut into pieces
+    of `PER_STRETCH` sub-trajectories; the last one joins the one before if it is shorter than half
+    of that.
     """
-    if not len(known):
-        return np.empty(0, np.intp)
-    size = PER_STRETCH * simulation.length
-    distance = travelled(simulation.T_ref_sensor)[known]
-    distance -= distance[0]
-    n_stretches = max(1, int(distance[-1] / size + 0.5))
-    return np.minimum((distance / size).astype(np.intp), n_stretches - 1)
+    number = np.zeros(len(known), np.intp)
+    size, distance = PER_STRETCH * simulation.length, travelled(simulation.T_ref_sensor)
+    counted = np.cumsum(np.isnan(simulation.T_ref_counted[:, 0, 0]))[known]
+    following = 0
+    for drive in np.split(np.arange(len(known)), np.flatnonzero(np.diff(counted)) + 1):
+        if not len(drive):
+            continue
+        metres = distance[known[drive]] - distance[known[drive[0]]]
+        n_pieces = max(1, int(metres[-1] / size + 0.5))
+        number[drive] = following + np.minimum((metres / size).astype(np.intp), n_pieces - 1)
+        following += n_pieces
+    return number
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,10 +249,12 @@ class LabelledSequence:
     repeats: NDArray[np.float64] | None = None
     block: int = 1  # frames of a sub-trajectory
     elevation: float = np.nan  # degrees, see `adaptune.model.descriptor.lowest_elevation`
-    # By trial number, the objective in whole runs of the candidates for the fixed set.
+    # (n_sets,): how often the health check restarted each set, infinite if it failed
+    restarts: NDArray[np.float64] | None = None
+    # By trial number, the objective of the finalists over the whole recording.
     whole: Mapping[int, float] = field(default_factory=dict)
-    # By trial number (n,): errors in these whole runs, where the objective is that of the errors
-    # alone, and so is known on some frames, too; else None.
+    # By trial number (n,): their errors there, where the objective is that of the errors alone,
+    # and so is known on some frames, too; else None.
     whole_errors: Mapping[int, NDArray[np.float64]] | None = None
 
     @cached_property
@@ -324,6 +334,7 @@ class LabelledSequence:
             simulation,
             stamps=simulation.stamps[frames],
             T_ref_sensor=simulation.T_ref_sensor[frames],
+            T_ref_counted=simulation.T_ref_counted[frames],
             descriptors=simulation.descriptors[frames],
             period=simulation.period[frames],
             hops=simulation.hops.part(first, stop),
@@ -338,6 +349,7 @@ class LabelledSequence:
             errors=self.errors[:, columns],
             values=None if self.values is None else self.values[columns],
             repeats=None if self.repeats is None else self.repeats[columns],
+            restarts=None if self.restarts is None else self.restarts[columns],
         )
 
 
@@ -406,7 +418,10 @@ class LabelledData(NamedTuple):
         return stretch_numbers(np.repeat(place, lengths), cuts)
 
     def bounds(self) -> dict[int, float]:
-        """The objective of every set in trials on these sequences, see `Verdict.bound`."""
+        """The objective of every set in trials on these sequences, see `Verdict.bound`.
+
+        It is infinite for sets that may not be chosen, see `offline.objective.allowed`.
+        """
         values = [
             mean_errors(s.errors, np.zeros(len(s.errors), np.intp))
             if s.values is None
@@ -417,10 +432,15 @@ class LabelledData(NamedTuple):
         bounds = mean_value(np.stack(values, axis=-1))
         if len(repeats) == len(values):
             bounds = bounds + np.nan_to_num(margin(np.stack(repeats, axis=-2)))
-        return dict(zip(self.sets, bounds.tolist(), strict=True))
+        restarts = np.zeros(len(self.sets))
+        for s in self.sequences:
+            restarts += 0.0 if s.restarts is None else s.restarts
+        chosen = allowed(dict(zip(self.sets, restarts.tolist(), strict=True)))
+        pairs = zip(self.sets, bounds.tolist(), strict=True)
+        return {n: bound if n in chosen else np.inf for n, bound in pairs}
 
     def whole(self) -> dict[int, float]:
-        """The objective in whole runs on these sequences, of those candidates that have them."""
+        """The objective over whole recordings on these sequences, of finalists that have it."""
         values = mean_values([s.whole for s in self.sequences])
         return {n: value for n, value in values.items() if n in self.sets}
 
@@ -440,26 +460,9 @@ class LabelledData(NamedTuple):
         return affordable(self.costs, trials, budget) if np.isfinite(budget) else trials
 
     def best(self, trials: Collection[int]) -> int:
-        """Trial number of the best of some sets, see `offline.objective.choose_fixed`.
-
-        The candidates are the best by their trials on these sequences. Those of the study were
-        chosen on all sequences: where one is left out, they would owe something to it. A candidate
-        without whole runs counts with its trials if it lost track in none. Where no set but the
-        baseline has whole runs on all these sequences, the trials alone decide.
-        """
+        """Trial number of the best of some sets, see `offline.objective.choose_fixed`."""
         bounds = {n: bound for n, bound in self.bounds().items() if n in trials}
-        whole = {n: value for n, value in self.whole().items() if n in trials}
-        if not set(whole) - {0}:
-            return min(bounds, key=lambda n: bounds[n])
-        best = best_candidates(bounds)
-        columns = {n: self.sets.column(n) for n in best}
-        unlost = {
-            n: bounds[n]
-            for n, c in columns.items()
-            if all(np.isfinite(s.errors[:, c]).all() for s in self.sequences)
-        }
-        known = {n: value for n, value in (unlost | whole).items() if n in best}
-        return choose_fixed(known or whole, bounds)
+        return choose_fixed(bounds, self.whole())
 
     def training_data(self) -> tuple[TrainingData, "ScaledPCA"]:
         """What selection rules are fitted to, and the transformation of descriptors for them."""
@@ -513,7 +516,7 @@ def measured_costs(
             float(np.mean([one.others.get(key, np.nan) for one in runs]))
             for key in (REGISTER_MS, PREPARE_MS)
         )
-        if not all(one.usable for one in runs):
+        if any(one.failure for one in runs):
             register = np.inf
         key = odometry(sets[trial]).preparation
         found[trial] = SetCost(register, prepare, numbers.setdefault(key, len(numbers)))
@@ -551,11 +554,11 @@ def labelled_data(
     eligible = _eligible(list(read.values()), sets)
     bounds = LabelledData(list(read.values()), sets).bounds()
     rivals = [*best_candidates(bounds), *sets.defaults]
-    runs = read_whole_runs(archive, list(run), rivals, config.health)
+    drives = read_whole_drives(archive, list(run), rivals)
     labelled = []
-    for name, whole in whole_values(config.offline, runs).items():
+    for name, whole in whole_values(config.offline, drives).items():
         s = read[name]
-        T_ref_sensor, length = s.simulation.T_ref_sensor, config.sub_trajectory
+        T_ref_sensor, length = s.simulation.T_ref_counted, config.sub_trajectory
         vectors = {
             trial: error_vectors(T_ref_sensor, archive.read(name, trial), length)[s.known]
             for trial in eligible.intersection(run[name])
@@ -592,7 +595,7 @@ def _labelled(
     window: int,
     recording: str,
 ) -> LabelledSequence:
-    """A labelled sequence without error vectors and whole runs."""
+    """A labelled sequence without error vectors and drives of the whole."""
     frames, length = archive.read_frames(name), config.sub_trajectory
     errors = archive.read_errors(name, list(sets))
     # Trials that were run for another budget do not count.
@@ -603,7 +606,8 @@ def _labelled(
     known = np.flatnonzero(~np.isnan(ran).any(axis=1))
     objective, n_repeats = config.offline.objective, config.offline.repeats
     summaries = [archive.finished(name)[trial] if trial in run else None for trial in sets]
-    values = [weighted(objective, s.metrics) if s and s.usable else np.inf for s in summaries]
+    values = [weighted(objective, s.metrics) if s and not s.failure else np.inf for s in summaries]
+    restarts = [np.inf if s is None or s.failure else float(s.restarts) for s in summaries]
     # Of the baseline, there may be more runs.
     repeats = [
         [np.nan] * n_repeats if s is None else repeated(objective, s.repeats)[:n_repeats]
@@ -618,6 +622,7 @@ def _labelled(
     simulation = BankSimulation(
         frames.stamps,
         frames.T_ref_sensor,
+        frames.counted,
         averaged(frames.descriptors, frames.stamps, window, config.online.period),
         ((frames.stamps - frames.stamps[0]) * 1e-9 // config.online.period).astype(np.int64),
         length,
@@ -636,6 +641,7 @@ def _labelled(
         frames.blocks,
         values=np.array(values),
         repeats=np.array(repeats) if n_repeats > 1 else None,
-        block=span(frames.T_ref_sensor, length),
+        block=span(frames.counted, length),
+        restarts=np.array(restarts),
         elevation=float(np.nanmedian(frames.elevations)),
     )

@@ -15,15 +15,14 @@ The first four repeat on the same machine, the last two do not.
 """
 
 from collections.abc import Mapping, Sequence
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune.archive import Frames, Summary
+from adaptune.archive import Summary
 from adaptune.errors import AdaptuneError
-from adaptune.geometry import Poses, invert
+from adaptune.geometry import Poses
 from adaptune.metrics import absolute_error, kitti_error, relative_error
 from adaptune.model.rules import ROUNDING, Costs
 from adaptune.space import ParameterSet
@@ -42,7 +41,7 @@ LARGEST_METRIC = 1e6
 CANDIDATES = 4
 """So many sets, the best by their trials, are candidates for the fixed set beside the baseline."""
 EQUAL_WITHIN = 1.02
-"""Whole runs whose values differ by no larger factor count as equal."""
+"""Drives whose values differ by no larger factor count as equal."""
 PENALTY = 10.0
 """A set that is not usable has so many times the baseline's value at least: samplers keep away."""
 
@@ -71,7 +70,14 @@ class Verdict(NamedTuple):
     # Whether the set was run on all sequences; if not, its value is an estimate.
     complete: bool = True
     sequences: tuple[str, ...] = ()  # the sequences on which it was run
-    usable: bool = True  # see `Summary.usable`; on all sequences
+    failure: str = ""  # why it is never chosen; empty if it may be
+    restarts: float = 0.0  # by the health check, on these sequences
+
+    @property
+    def state(self) -> str:
+        """What became of it: `complete`, `pruned`, or `failed`, and why."""
+        failed = f"failed: {self.failure}" if self.failure else ""
+        return failed or ("complete" if self.complete else "pruned")
 
     @property
     def bound(self) -> float:
@@ -86,11 +92,12 @@ class SamplerResult(NamedTuple):
     value: float  # samplers minimise it
 
 
-def trajectory_metrics(
-    frames: Frames, T_odom_sensor: Poses, lost_steps: Mapping[int, Poses]
-) -> dict[str, float]:
-    """The metrics of a whole trajectory; KITTI's error if it is long enough."""
-    T_ref_sensor, T = frames.T_ref_sensor, joined(T_odom_sensor, lost_steps)
+def trajectory_metrics(T_ref_sensor: Poses, T_odom_sensor: Poses) -> dict[str, float]:
+    """The metrics where the reference is known; KITTI's error if it is long enough."""
+    known = ~np.isnan(T_ref_sensor[:, 0, 0])
+    if not known.any():
+        return {}
+    T = np.where(known[:, None, None], T_odom_sensor, np.eye(4))
     with np.errstate(over="ignore", invalid="ignore"):
         kitti = kitti_error(T_ref_sensor, T)
         found = {
@@ -101,35 +108,22 @@ def trajectory_metrics(
     return {name: float(np.fmin(value, LARGEST_METRIC)) for name, value in found.items()}
 
 
-def joined(T_odom_sensor: Poses, lost_steps: Mapping[int, Poses]) -> Poses:
-    """Undo restarts at the reference, which would hide the errors that led to them.
-
-    `lost_steps` has by frame of a restart the odometry's motion since the frame before, (4, 4).
-
-    Returns shape (n, 4, 4): the trajectory as it would have continued from the wrong pose.
-    """
-    T = T_odom_sensor.copy()
-    for start, end in pairwise([*sorted(lost_steps), len(T)]):
-        T_joined_odom = T[start - 1] @ lost_steps[start] @ invert(T_odom_sensor[start])
-        T[start:end] = T_joined_odom @ T_odom_sensor[start:end]
-    return T
-
-
 def judge(config: OfflineConfig, runs: Sequence[Summary]) -> Verdict:
     """Judge a parameter set by its trials on some sequences."""
     metrics = [run.metrics for run in runs]
     value = float(mean_value(np.array([weighted(config.objective, one) for one in metrics])))
-    usable = all(run.usable for run in runs)
+    failure = next((run.failure for run in runs if run.failure), "")
     above = 0.0
     # Without repeats, nothing is known of the other sets' intervals.
     if config.repeats > 1 and all(run.repeats for run in runs):
         above = float(margin(np.array([repeated(config.objective, r.repeats) for r in runs])))
-    return Verdict(runs[0].parameters, value, above, usable=usable)
+    restarts = float(sum(run.restarts for run in runs))
+    return Verdict(runs[0].parameters, value, above, failure=failure, restarts=restarts)
 
 
 def weighted(weights: Mapping[Metric, float], metrics: Mapping[str, float]) -> float:
-    """A weighted sum of metrics."""
-    return sum(weight * metrics[name] for name, weight in weights.items())
+    """A weighted sum of metrics; one that could not be measured counts as the largest."""
+    return sum(weight * metrics.get(name, LARGEST_METRIC) for name, weight in weights.items())
 
 
 def repeated(weights: Mapping[Metric, float], runs: Sequence[Mapping[str, float]]) -> list[float]:
@@ -162,7 +156,9 @@ def margin(repeats: NDArray[np.float64]) -> NDArray[np.float64]:
 def sampler_results(verdicts: Sequence[Verdict]) -> list[SamplerResult]:
     """The results of trials as samplers receive them; the first one is the baseline's."""
     worst = PENALTY * (verdicts[0].value or 1.0) if verdicts else 0.0
-    return [SamplerResult(v.parameters, max(v.value, 0.0 if v.usable else worst)) for v in verdicts]
+    return [
+        SamplerResult(v.parameters, max(v.value, worst if v.failure else 0.0)) for v in verdicts
+    ]
 
 
 def best_by_trials(verdicts: Mapping[int, Verdict]) -> int:
@@ -171,21 +167,22 @@ def best_by_trials(verdicts: Mapping[int, Verdict]) -> int:
 
 
 def candidates(verdicts: Mapping[int, Verdict]) -> list[int]:
-    """Trial numbers of the candidates for the fixed set, the best by their trials first.
+    """Trial numbers of the finalists, the best by their trials first.
 
-    These are the `CANDIDATES` usable sets with the least objective, and the baseline if it is
-    usable. If trials are repeated, the upper end of the confidence interval counts. Of equal sets,
-    the first one comes first.
+    These are the `CANDIDATES` sets with the least objective of those that may be chosen, see
+    `allowed`, and the baseline if that may be. If trials are repeated, the upper end of the
+    confidence interval counts. Of equal sets, the first one comes first.
 
     Raises
     ------
     NothingUsableError
-        If no set is usable.
+        If no set may be chosen.
     """
-    complete = [n for n, verdict in verdicts.items() if verdict.complete and verdict.usable]
-    if not complete:
+    complete = {n: verdict for n, verdict in verdicts.items() if verdict.complete}
+    chosen = allowed({n: np.inf if v.failure else v.restarts for n, v in complete.items()})
+    if not chosen:
         raise NothingUsableError(UNUSABLE.format(n=len(verdicts)))
-    return best_candidates({n: verdicts[n].bound for n in complete})
+    return best_candidates({n: verdicts[n].bound for n in complete if n in chosen})
 
 
 def best_candidates(bounds: Mapping[int, float]) -> list[int]:
@@ -215,17 +212,28 @@ def affordable(costs: Costs, trials: Sequence[int], budget: float) -> list[int]:
     return few
 
 
-def choose_fixed(whole: Mapping[int, float], trials: Mapping[int, float]) -> int:
-    """Trial number of the fixed set: the candidate with the least value in whole runs.
+def allowed(restarts: Mapping[int, float]) -> set[int]:
+    """The trials that may be chosen, by how often each was restarted; infinite if it failed.
 
-    Of candidates that are nearly as good, the one with the best trials is chosen: the best of a few
-    runs owes something to chance.
-
-    `whole` has by trial number the objective in whole runs, its mean over the sequences, and
-    `trials` the same in trials, see `Verdict.bound`.
+    None of them needs the health check more often than the baseline, which is trial 0, on the same
+    ways: who takes its parameters elsewhere has no health check.
     """
-    most = EQUAL_WITHIN * min(whole.values())
-    return min((n for n, value in whole.items() if value <= most), key=lambda n: trials[n])
+    most = restarts.get(0, np.inf)
+    return {n for n, times in restarts.items() if np.isfinite(times) and times <= most}
+
+
+def choose_fixed(bounds: Mapping[int, float], whole: Mapping[int, float]) -> int:
+    """Trial number of the fixed set, by trials and by drives of whole recordings.
+
+    `bounds` has by trial number the objective in trials, see `Verdict.bound`, and `whole` that over
+    whole recordings, infinite for sets that may not be chosen. The finalists, see
+    `best_candidates`, are compared by the latter; one that has none by its trials. Of finalists
+    that are nearly as good, the one with the best trials is chosen: the best of a few drives owes
+    something to chance.
+    """
+    values = {n: whole.get(n, bounds[n]) for n in best_candidates(bounds)}
+    most = EQUAL_WITHIN * min(values.values())
+    return min((n for n, value in values.items() if value <= most), key=lambda n: bounds[n])
 
 
 def label(weights: Mapping[Metric, float], units: bool = False) -> str:
@@ -238,11 +246,11 @@ def label(weights: Mapping[Metric, float], units: bool = False) -> str:
 
 def failed_in_words(verdicts: Mapping[int, Verdict]) -> list[str]:
     """A sentence about the sets that are not usable, if there are any."""
-    if not (failed := sum(not verdict.usable for verdict in verdicts.values())):
+    if not (failed := sum(bool(verdict.failure) for verdict in verdicts.values())):
         return []
     return [
-        f"{failed} of {len(verdicts)} parameter sets are never chosen: the odometry gave no pose "
-        f"for a tenth of a sequence's scans, or gave up (see faults in `adaptune trials`)."
+        f"{failed} of {len(verdicts)} parameter sets failed and are never chosen (`adaptune "
+        f"trials` says why)."
     ]
 
 

@@ -208,7 +208,7 @@ class Search:
         """Close the batch, whose trials have all finished or stopped."""
         of = (self._config, self.sequences, self._finished)
         self.done |= {n: assess(n, *of) for n in self.numbers}
-        ranks = {n: (not v.complete, not v.usable, v.value) for n, v in self.done.items()}
+        ranks = {n: (not v.complete, bool(v.failure), v.value) for n, v in self.done.items()}
         self.best = min(ranks, key=ranks.__getitem__)
         if len(self.numbers) < self._config.batch and len(self.done) != self._limit:
             self.end = self._sampler.end
@@ -237,7 +237,7 @@ class Search:
         return {
             n: [self._value(run) for run in runs]
             for n, runs in of_numbers.items()
-            if all(run.usable for run in runs)
+            if not any(run.failure for run in runs)
         }
 
     def _value(self, run: Summary) -> float:

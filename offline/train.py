@@ -34,10 +34,10 @@ from adaptune.study.references import (
 from adaptune.study.study import FIXED_SET, OracleErrors, StudySequences, oracle_errors
 from offline.campaign import (
     Campaign,
-    WholeRuns,
+    WholeDrives,
+    drive_whole,
     mean_values,
     run_baseline,
-    run_whole,
     trial_tasks,
     watch_tasks,
     whole_values,
@@ -81,12 +81,12 @@ class Training(NamedTuple):
     def words(self) -> list[str]:
         """What the fixed set is, and what it gains in training."""
         own, of_fixed = (
-            sum(row[f"{mode}, whole run"] for row in self.rows) / len(self.rows)
+            sum(row[f"{mode}, whole"] for row in self.rows) / len(self.rows)
             for mode in ("baseline", "fixed")
         )
         sets, fixed, costs, n = self.model.sets, self.model.fixed, self.model.costs, len(self.rows)
         baseline = f"Parameters of the baseline: {in_words(sets.space.baseline)}"
-        where = f"in whole runs in training ({n} sequence{'s' if n > 1 else ''})"
+        where = f"in training ({n} sequence{'s' if n > 1 else ''})"
         if fixed == 0:
             beaten = f"No set clearly beat the baseline's {own:.3f} % {where}"
             return [*self.said, f"{beaten}; the fixed set is the baseline.", baseline]
@@ -132,7 +132,7 @@ def train(study: OfflineStudy, progress: Progress = unseen, cluster: str | None 
         # Rivals may cost more.
         rivals = {*candidates(verdicts), *every_set.defaults}
         sets = {n: verdicts[n].parameters for n in sorted({0, *best, *rivals})}
-        whole = run_whole(names, sets, study.config.health, archive, workers, progress)
+        whole = drive_whole(names, sets, archive, workers, progress)
     fixed = _fixed(config, verdicts, best, whole)
     model = _fitted(study, archive, every_set, finished, fixed)
     write_fixed(study, verdicts[fixed].parameters)
@@ -144,7 +144,7 @@ def train(study: OfflineStudy, progress: Progress = unseen, cluster: str | None 
     tables.write_rows(study.folder, "training", rows)
     said = lost_in_words(
         f"the fixed set, the best of {len(trials)} parameter sets,",
-        {row["sequence"]: row["fixed, whole run"] for row in rows},
+        {row["sequence"]: row["fixed, whole"] for row in rows},
         study.odometry.name,
         lambda worst: hard_to_track(study.sequences.open(worst)),
     )
@@ -191,14 +191,14 @@ def write_fixed(study: OfflineStudy, fixed: ParameterSet) -> None:
 
 
 def _fixed(
-    config: OfflineConfig, verdicts: Mapping[int, Verdict], best: Sequence[int], whole: WholeRuns
+    config: OfflineConfig, verdicts: Mapping[int, Verdict], best: Sequence[int], whole: WholeDrives
 ) -> int:
     """Trial number of the fixed set, one of the best."""
-    rivals = {name: {n: runs[n] for n in best} for name, runs in whole.items()}
+    rivals = {name: {n: drives[n] for n in best} for name, drives in whole.items()}
     values = mean_values(list(whole_values(config, rivals).values()))
     if np.isinf(min(values.values())):
         raise NothingUsableError(UNUSABLE.format(n=f"the {len(best)} best"))
-    return choose_fixed(values, {n: verdicts[n].bound for n in best})
+    return choose_fixed({n: verdicts[n].bound for n in best}, values)
 
 
 def trial_workers(
@@ -228,7 +228,9 @@ def _fitted(
     if judged := estimates_as_data(estimates, config.sub_trajectory):
         provenance |= {"estimated_references": judged}
     trials = {
-        name: {n: (run.mean_error, run.lost, judge(config.offline, [run])) for n, run in of.items()}
+        name: {
+            n: (run.mean_error, run.restarts, judge(config.offline, [run])) for n, run in of.items()
+        }
         for name, of in finished.items()
     }
     switching = config.online.switching.model_dump(mode="json", include={"size", "sets"})
@@ -268,6 +270,7 @@ def _trial_rows(
     for n, verdict in verdicts.items():
         runs = [finished[name][n] for name in verdict.sequences]
         row: dict[str, Any] = {"trial": n, **space.row(verdict.parameters)}
+        row["state"] = verdict.state
         row[COST] = float(np.mean([run.cost for run in runs]))
         if set(config.objective) != {"rte"}:
             row[label(config.objective)] = verdict.value
@@ -288,7 +291,7 @@ def _training_rows(
     verdicts: Mapping[int, Verdict],
     finished: Finished,
     fixed: int,
-    whole: WholeRuns,
+    whole: WholeDrives,
     reference_errors: Mapping[str, float],
     space: ParameterSpace,
 ) -> list[dict[str, Any]]:
@@ -302,10 +305,10 @@ def _training_rows(
             "baseline": runs[0].mean_error,
             "fixed": runs[fixed].mean_error,
             "own best": runs[best].mean_error,
-            "lost, baseline": runs[0].lost,
-            "lost, fixed": runs[fixed].lost,
-            "baseline, whole run": whole[name][0].mean_error,
-            "fixed, whole run": whole[name][fixed].mean_error,
+            "restarts, baseline": runs[0].restarts,
+            "restarts, fixed": runs[fixed].restarts,
+            "baseline, whole": whole[name][0].mean_error,
+            "fixed, whole": whole[name][fixed].mean_error,
             "_own best trial": best,
             "_reference": "given" if error is None else "estimated",
             "_reference_error": error,

@@ -7,22 +7,15 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import count, islice
-from typing import Any, Literal, Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from adaptune import recording
-from adaptune.archive import (
-    FIRST_POSE,
-    MAX_SHARE_WITHOUT_POSE,
-    PREPARE_MS,
-    REGISTER_MS,
-    Frames,
-    Trial,
-)
+from adaptune.archive import FIRST_POSE, PREPARE_MS, REGISTER_MS, Frames, Trial
 from adaptune.errors import AdaptuneError, UnavailableError, in_a_line
-from adaptune.geometry import Poses, invert, steps
+from adaptune.geometry import Poses, invert, scale
 from adaptune.live.evidence import hops_along
 from adaptune.metrics import KITTI_LENGTHS, cap, sub_trajectory_rte, travelled, window_ends
 from adaptune.model.descriptor import (
@@ -32,12 +25,19 @@ from adaptune.model.descriptor import (
     lowest_elevation,
     speed_and_turn_rate,
 )
-from adaptune.odometry.base import MIN_POINTS, OdometryInstance, Usage, prepared_bytes
+from adaptune.odometry.base import (
+    MAX_SHARE_WITHOUT_POSE,
+    MIN_POINTS,
+    MOST_FAULTS,
+    OdometryInstance,
+    Usage,
+    prepared_bytes,
+)
 from adaptune.odometry.registry import Factory
-from adaptune.odometry.tracker import HealthCheck, Tracker, unhealthy
+from adaptune.odometry.tracker import HealthCheck, Tracker
 from adaptune.processes import apart
 from adaptune.progress import Progress, unseen
-from adaptune.recording.scan import Scan
+from adaptune.recording.scan import Scan, SequenceError
 from adaptune.space import ParameterSet
 from adaptune.study.study import StudySequences
 from adaptune.trajectory import Trajectory
@@ -101,7 +101,12 @@ class SharedScans:
             return kept.scans[i]
         # Also those that a pass makes while it runs: a worker once grew to five times its share.
         with apart():
-            scan, begin = read(), time.process_time()
+            try:
+                scan = read()
+            except OSError as error:
+                what = f"{getattr(self._scans, 'name', 'the recording')}: cannot be read ({error})"
+                raise SequenceError(f"{what}; run the same command again") from error
+            begin = time.process_time()
             prepared = kept.first.prepare(scan)
             kept.seconds += time.process_time() - begin
         kept.n_prepared += 1
@@ -131,53 +136,64 @@ class SharedScans:
         return self.nbytes + size <= self._memory
 
 
-class TrialRun:
-    """A run of an odometry on a sequence, restarted at the reference where it loses track.
+class Drives:
+    """The drives of one parameter set along the stretches of a sequence.
 
-    An exception of the odometry is a fault, after which there is no pose.
+    Each is as a robot drives: from the reference's pose at its begin, with the health check, and
+    without the reference from then on. An exception of the odometry is a fault, after which the
+    drive has no pose. A set that takes more than `most` seconds of CPU time is stopped.
     """
 
     def __init__(
         self,
         make: Callable[[], OdometryInstance],
         frames: Frames,
-        lost_track: float | None,
+        health: HealthCheck,
+        most: float = np.inf,
     ):
         n = len(frames.stamps)
-        self.T_odom_sensor = np.empty((n, 4, 4))
+        self.T_odom_sensor = np.full((n, 4, 4), np.nan)
         self.restarted = np.zeros(n, bool)
-        self.registered = np.ones(n, bool)
-        self.seconds = np.zeros(n)
-        self.lost_steps: dict[int, Poses] = {}
-        self.unhealthy = Counter[str]()  # scans without a pose
-        self._make = make
+        self.registered = np.zeros(n, bool)
+        self.seconds = np.full(n, np.nan)
+        self.unhealthy = Counter[str]()
+        self.too_slow = False
+        self._make, self._frames, self._health, self._most = make, frames, health, most
+        self._stamps = frames.stamps.tolist()
+        self._begins = set(frames.stretches[:, 0].tolist())
         self._odometry: OdometryInstance | None = None
-        self._failure: tuple[str, ...] = ()
-        self._T_ref_sensor = frames.T_ref_sensor
-        self._T_ref_steps = steps(frames.T_ref_sensor)
-        self._bounds = np.diff(frames.stamps) * 1e-9 * (lost_track or np.inf)
+        self._exceptions: dict[str, None] = {}
+        self._failed = False
 
     @property
     def faults(self) -> tuple[str, ...]:
         """See `Trial`."""
-        return (*(() if self._odometry is None else self._odometry.faults), *self._failure)
+        return (*(() if self._odometry is None else self._odometry.faults), *self._exceptions)
 
     def usage(self, scans: SharedScans) -> tuple[Usage, float]:
         """What the odometry used, and the mean CPU time in ms that it took to prepare a scan."""
-        of = self._odometry
-        return (Usage(0.0, None), 0.0) if of is None else (of.usage, scans.milliseconds(of))
+        odometry = self._odometry
+        if odometry is None:
+            return Usage(0.0, None), 0.0
+        return odometry.usage, scans.milliseconds(odometry)
 
     def step(self, i: int, scan: SharedScan) -> None:
-        """Register the scan of frame `i`."""
-        if not self._failure:
-            try:
+        """Register scan `i`, which is one of a stretch."""
+        self._failed &= i not in self._begins
+        try:
+            if not self._failed and not self.too_slow:
                 self._step(i, scan)
-            except UnavailableError:
-                raise
-            except Exception as error:
-                self._failure = (in_a_line(error),)
-        if self._failure:
-            self._step_without_pose(i)
+        except (UnavailableError, SequenceError, MemoryError):
+            raise  # of the machine or the recording, whatever the parameters
+        except Exception as error:
+            self._exceptions[in_a_line(error)] = None
+            self._failed = True
+        if np.isfinite(self.T_odom_sensor[i, 0, 0]):
+            return
+        self.unhealthy["no_pose"] += 1
+        self.T_odom_sensor[i] = (
+            self._start(i)[0] if i in self._begins else self.T_odom_sensor[i - 1]
+        )
 
     def close(self) -> None:
         """End the odometry's processes; what they used stays known."""
@@ -185,73 +201,95 @@ class TrialRun:
             self._odometry.close()
 
     def _step(self, i: int, scan: SharedScan) -> None:
-        if i == 0:
-            T = self._T_ref_sensor[i]
-            T = np.eye(4) if np.isnan(T[0, 0]) else T
+        if self._odometry is None:
             self._odometry = self._make()
-            self._odometry.start(scan(self._odometry), T)
-            self.T_odom_sensor[i], self.registered[i] = T, self._odometry.begun
-            return
-        assert self._odometry is not None
-        odometry = self._odometry
-        prepared, waiting = scan(odometry), not odometry.begun
-        begin = time.perf_counter()
-        T, self.registered[i] = odometry.register(prepared)
-        self.seconds[i] = time.perf_counter() - begin
-        finite = np.isfinite(T).all()
-        if waiting and not odometry.faults:
-            # Nobody knows how it moved until its first pose.
-            self.registered[i] &= odometry.begun and finite
-            self.T_odom_sensor[i] = T if self.registered[i] else self.T_odom_sensor[i - 1]
-            return
-        self.unhealthy.update([] if finite else ["no_pose"])
-        # An odometry without a pose counts as not moved.
-        T_step = invert(self.T_odom_sensor[i - 1]) @ T if finite else np.eye(4)
-        if self._lost(i, T_step if finite else None):
-            self.lost_steps[i] = T_step
-            T = self._T_ref_sensor[i]
-            odometry.start(prepared, T, self._T_ref_steps[i - 1])
-            self.restarted[i] = True
-        elif not finite:
-            # There is no reference at which to restart.
-            T = self.T_odom_sensor[i - 1]
-            odometry.start(prepared, T)
-        self.T_odom_sensor[i] = T
-
-    def _step_without_pose(self, i: int) -> None:
-        self.unhealthy["no_pose"] += 1
-        self.registered[i] = False
-        if self._lost(i, None):
-            self.T_odom_sensor[i], self.restarted[i] = self._T_ref_sensor[i], True
-            self.lost_steps[i] = np.eye(4)
-        else:
-            self.T_odom_sensor[i] = np.eye(4) if i == 0 else self.T_odom_sensor[i - 1]
-
-    def _lost(self, i: int, T_step: Poses | None) -> bool:
-        if i == 0 or np.isnan(self._T_ref_steps[i - 1, 0, 0]) or np.isinf(self._bounds[i - 1]):
-            return False
-        if T_step is None:
-            return True
-        departure = T_step[:3, 3] - self._T_ref_steps[i - 1, :3, 3]
-        return bool(np.linalg.norm(departure) > self._bounds[i - 1])
-
-
-class DrivenRun(TrialRun):
-    """A run from end to end as a replay drives it: with the health check, without reference."""
-
-    def __init__(self, make: Callable[[], OdometryInstance], frames: Frames, health: HealthCheck):
-        super().__init__(make, frames, None)
-        self._stamps, self._health = frames.stamps.tolist(), health
-
-    def _step(self, i: int, scan: SharedScan) -> None:
-        if i == 0:
-            self._odometry = self._make()
-            self._tracker = Tracker(self._odometry, self._health)
-        prepared = scan(self._tracker.odometry)
+        prepared = scan(self._odometry)
+        if i in self._begins:
+            T_odom_start, T_before_start = self._start(i)
+            self._tracker = Tracker(
+                self._odometry,
+                self._health,
+                T_odom_start=T_odom_start,
+                T_before_start=T_before_start,
+            )
         found = self._tracker.register_prepared(self._stamps[i], prepared)
         self.T_odom_sensor[i], self.registered[i] = found.T_odom_sensor, found.registered
-        self.seconds[i] = found.register_seconds if i else 0.0
+        self.restarted[i] = found.unhealthy is not None
         self.unhealthy.update([found.unhealthy] if found.unhealthy else [])
+        if i not in self._begins:
+            self.seconds[i] = found.register_seconds
+        self.too_slow = self._odometry.usage.cpu > self._most
+
+    def _start(self, i: int) -> tuple[Poses, Poses | None]:
+        """Where a drive begins, and the motion that leads there.
+
+        A robot drives already where a recording is entered, and is started at its begin.
+        """
+        T_ref_sensor, stamps = self._frames.T_ref_sensor, self._frames.stamps
+        before = int(np.searchsorted(stamps, stamps[i] - round(RECENT * 1e9)))
+        if not i or before == i or not np.isfinite(T_ref_sensor[[before, i]]).all():
+            return np.eye(4) if not i or np.isnan(T_ref_sensor[i, 0, 0]) else T_ref_sensor[i], None
+        moved = invert(T_ref_sensor[before]) @ T_ref_sensor[i]
+        share = (stamps[i] - stamps[i - 1]) / (stamps[i] - stamps[before])
+        return T_ref_sensor[i], scale(moved, float(share))
+
+
+RECENT = 0.5
+"""Seconds of the reference whose mean motion leads to the begin of a stretch: one step is noisy."""
+SLOW, LEAST_SECONDS = 10.0, 20.0
+"""A set is stopped that takes so many times the CPU time of the baseline, and so many seconds."""
+
+
+# Which stretches of a recording are driven.
+
+
+STRETCH, OVERHANG = 2.0, 1.0
+"""Sub-trajectories that begin along a stretch, and that it is longer than that."""
+WARM_UP = 10.0, 3.0
+"""Metres and seconds that do not count at the begin of a stretch: an odometry has no map yet."""
+MOST_DRIVEN = 0.7
+"""Share of a recording above which all of it is driven."""
+STANDING = 0.5
+"""Metres a second below which a robot stands: where a recording begins so, no warm-up is needed."""
+
+
+def stretches_of(
+    T_ref_sensor: Poses, stamps: NDArray[np.int64], length: float, n: int | None
+) -> NDArray[np.intp]:
+    """Choose `n` stretches, evenly spaced along the reference's path; None for all of it.
+
+    Returns shape (k, 3), see `Frames.stretches`.
+    """
+    metres, seconds = travelled(T_ref_sensor), (stamps - stamps[0]) * 1e-9
+    whole = np.array([[0, _settled(metres, seconds), len(stamps)]], np.intp)
+    size = (STRETCH + OVERHANG) * length
+    if n is None or n * size > metres[-1]:
+        return whole
+
+    def last(of: NDArray[np.float64], until: NDArray[np.float64]) -> NDArray[np.intp]:
+        return np.maximum(np.searchsorted(of, until, side="right") - 1, 0)
+
+    begins = last(metres, np.linspace(0.0, metres[-1] - 1.01 * size, n))
+    ends = last(metres, metres[begins] + size) + 2
+    warm = np.minimum(
+        last(metres, metres[begins] - WARM_UP[0]), last(seconds, seconds[begins] - WARM_UP[1])
+    )
+    firsts = np.maximum(warm, last(metres, metres[begins] - size / 3.0))
+    found = np.stack([firsts, begins, np.minimum(ends, len(stamps))], axis=1)
+    found[0, :2] = whole[0, :2]
+    if (firsts[1:] < ends[:-1]).any() or (ends - firsts).sum() > MOST_DRIVEN * len(stamps):
+        return whole
+    known = window_ends(T_ref_sensor, length) >= 0
+    return found[[bool(known[begin:end].any()) for _, begin, end in found]]
+
+
+def _settled(metres: NDArray[np.float64], seconds: NDArray[np.float64]) -> int:
+    """First scan that counts where a recording may begin in motion."""
+    if metres[np.searchsorted(seconds, 1.0, side="right") - 1] < STANDING:
+        return 0
+    far = np.searchsorted(metres, min(WARM_UP[0], metres[-1] / 5.0))
+    late = np.searchsorted(seconds, min(WARM_UP[1], seconds[-1] / 5.0))
+    return int(min(far, late))
 
 
 def with_measured_hops(
@@ -280,10 +318,9 @@ class TrialSettings:
     """What a trial depends on besides odometry, sequence and parameter set."""
 
     sub_trajectory: float = 25.0
-    lost_track: float = 3.0
     health: HealthCheck = field(default_factory=HealthCheck)
     descriptors: tuple[str, ...] = ("ndt",)
-    runs: Literal["restart", "whole"] = "restart"
+    stretches: int | None = None  # of each sequence; None for all of it
     repeats: int = 1
     baseline_runs: int | None = None  # as many as `repeats`, if not given
     metrics: frozenset[str] = frozenset({"rte"})
@@ -291,10 +328,16 @@ class TrialSettings:
     @classmethod
     def of(cls, config: OfflineStudyConfig) -> Self:
         """The settings of a study."""
-        shared = (config.sub_trajectory, config.lost_track, config.health, config.descriptor)
         offline = config.offline
-        own = (config.runs, offline.repeats, offline.baseline_runs, frozenset(offline.objective))
-        return cls(*shared, *own)
+        return cls(
+            config.sub_trajectory,
+            config.health,
+            config.descriptor,
+            config.stretches,
+            offline.repeats,
+            offline.baseline_runs,
+            frozenset(offline.objective),
+        )
 
 
 class PreparedSequence:
@@ -346,10 +389,10 @@ class PreparedSequence:
         motion = speed_and_turn_rate(at, T_ref_sensor)
         fill_in(described[1:], describe.blocks, motion[:-1])
         elevation = np.array(elevations, np.float32)
-        self.frames = Frames(at, T_ref_sensor, described, describe.blocks, elevation)
-
-    def __iter__(self) -> Iterator[SharedScan]:
-        yield from islice(self.shared, len(self.frames.stamps))
+        stretches = stretches_of(T_ref_sensor, at, settings.sub_trajectory, settings.stretches)
+        self.frames = Frames(
+            at, T_ref_sensor, described, describe.blocks, elevation, stretches=stretches
+        )
 
     def _prepare(self, i: int, scan: recording.Scan) -> bool:
         """Prepare a scan for the baseline; whether there is no room for another."""
@@ -410,7 +453,7 @@ def reference_poses(
 
 @dataclass(frozen=True)
 class TrialSetup:
-    """Everything that a process needs to run trials."""
+    """Everything that a process needs to drive trials."""
 
     settings: TrialSettings
     odometry: Factory
@@ -425,98 +468,113 @@ class TrialSetup:
         scans: PreparedSequence,
         sets: Sequence[ParameterSet],
         whole: bool = False,
+        most_ms: float = np.inf,
         progress: Progress = unseen,
     ) -> list[Trial]:
-        """Run the odometry with several parameter sets on one pass over a sequence.
+        """Drive with several parameter sets on one pass over a sequence, see `Drives`.
 
-        With ``runs: restart``, an odometry that loses track restarts at the reference with that
-        scan. The sub-trajectories across that frame count as failures; later ones are judged on
-        their own. `OfflineConfig` describes other kinds. With `whole`, it is driven from end to end
-        as a replay drives it: without reference, and restarted by the health check.
+        The stretches of the sequence are driven, or with `whole` all of it. Sets that take more
+        than `most_ms` milliseconds of CPU time a scan, see `SLOW`, are stopped.
         """
-        runs = [self._begin(scans, parameters, whole) for parameters in sets]
-        each = [run for of_set in runs for run in of_set]
-        n_frames = len(scans.frames.stamps)
+        frames = scans.frames.uncut if whole else scans.frames
+        most = max(1e-3 * most_ms * frames.n_driven, LEAST_SECONDS)
+        drives = [self._begin(scans, frames, parameters, most) for parameters in sets]
+        each = [one for of_set in drives for one in of_set]
         with ExitStack() as ended:
-            for run in each:
-                ended.callback(run.close)
-            for i, scan in enumerate(_watched(scans, n_frames, "running", progress)):
-                for run in each:
-                    run.step(i, scan)
+            for one in each:
+                ended.callback(one.close)
+            driven = _driven(scans.shared, frames)
+            for i, scan in _watched(driven, frames.n_driven, "running", progress):
+                for one in each:
+                    one.step(i, scan)
         return [
-            _mean(s, [_trial(self.settings, s, scans, run) for run in of_set])
-            for s, of_set in zip(sets, runs, strict=True)
+            _mean(s, [_trial(self.settings, s, frames, scans.shared, one) for one in of_set])
+            for s, of_set in zip(sets, drives, strict=True)
         ]
 
     def _begin(
-        self, scans: PreparedSequence, parameters: ParameterSet, whole: bool
-    ) -> list[TrialRun]:
-        """The runs of a parameter set."""
+        self, scans: PreparedSequence, frames: Frames, parameters: ParameterSet, most: float
+    ) -> list[Drives]:
+        """The drives of a parameter set, once for each repeat."""
         settings, odometry = self.settings, self.odometry
         make = partial(odometry, parameters, scans.name)
         n = settings.repeats
         if settings.baseline_runs is not None and parameters in odometry.space.baselines:
             n = max(n, settings.baseline_runs)
-        if whole:
-            return [DrivenRun(make, scans.frames, settings.health) for _ in range(n)]
-        lost_track = settings.lost_track if settings.runs == "restart" else None
-        return [TrialRun(make, scans.frames, lost_track) for _ in range(n)]
+        return [Drives(make, frames, settings.health, most) for _ in range(n)]
+
+
+def _driven(shared: SharedScans, frames: Frames) -> Iterator[tuple[int, SharedScan]]:
+    """The scans of all stretches, with their numbers."""
+    stop, wanted = int(frames.stretches[:, 2].max()), np.zeros(len(frames.stamps), bool)
+    for first, _, end in frames.stretches:
+        wanted[first:end] = True
+    yield from ((i, scan) for i, scan in enumerate(islice(shared, stop)) if wanted[i])
 
 
 def _trial(
-    settings: TrialSettings, parameters: ParameterSet, scans: PreparedSequence, run: TrialRun
+    settings: TrialSettings,
+    parameters: ParameterSet,
+    frames: Frames,
+    shared: SharedScans,
+    drives: Drives,
 ) -> Trial:
-    """Make a trial of a run."""
-    frames, T_odom_sensor = scans.frames, run.T_odom_sensor
-    T_steps = steps(T_odom_sensor)
-    for i, T_step in run.lost_steps.items():
-        T_steps[i - 1] = T_step
-    n, first = len(frames.stamps), int(np.argmax([*run.registered, True]))
-    # Scans before the first pose are unknown, unless they are so many that the run has failed.
-    begin = 0
-    if (missing := first + run.unhealthy["no_pose"]) >= MAX_SHARE_WITHOUT_POSE * n:
-        run.unhealthy["no_pose"] = min(missing, n)
-    elif begin := first:
-        T_ref_sensor = frames.T_ref_sensor.copy()
-        T_ref_sensor[:first] = np.nan
-        frames = replace(frames, T_ref_sensor=T_ref_sensor)
-    usage, prepare_ms = run.usage(scans.shared)
+    """Make a trial of the drives along all stretches."""
+    T_odom_sensor, T_ref_sensor = drives.T_odom_sensor, frames.counted.copy()
+    n, waiting = frames.n_driven, 0
+    for first, _, end in frames.stretches:
+        without = int(np.argmax([*drives.registered[first:end], True]))
+        # Scans before the first pose are unknown.
+        T_ref_sensor[first : first + without] = np.nan
+        waiting += without
+    missing = waiting + drives.unhealthy["no_pose"]
+    failure = ""
+    if missing >= MAX_SHARE_WITHOUT_POSE * n:
+        drives.unhealthy["no_pose"] = min(missing, n)
+        failure = f"no pose for {min(missing, n)} of {n} scans"
+        T_ref_sensor = frames.counted
+    if len(drives.faults) >= MOST_FAULTS:
+        failure = f"{len(drives.faults)} faults"
+    usage, prepare_ms = drives.usage(shared)
+    if drives.too_slow:
+        done = max(n - drives.unhealthy["no_pose"], 1)
+        failure = f"too slow: {1e3 * usage.cpu / done:.0f} ms a scan"
     if usage.seconds is not None:
-        run.seconds[:] = usage.seconds
+        drives.seconds[~np.isnan(drives.seconds)] = usage.seconds
+    errors = sub_trajectory_rte(T_ref_sensor, T_odom_sensor, settings.sub_trajectory)
+    if np.isnan(errors).all():
+        failure = failure or "no sub-trajectory has poses"
+    seconds = sum(
+        (frames.stamps[end - 1] - frames.stamps[first]) * 1e-9 for first, _, end in frames.stretches
+    )
     used = {
-        "cpu": 100.0 * usage.cpu / ((frames.stamps[-1] - frames.stamps[0]) * 1e-9),
-        REGISTER_MS: 1e3 * usage.cpu / len(frames.stamps),
+        "cpu": 100.0 * usage.cpu / seconds,
+        REGISTER_MS: 1e3 * usage.cpu / n,
         PREPARE_MS: prepare_ms,
     } | ({} if usage.memory is None else {"memory": usage.memory})
-    if 0 < first < n:
-        used[FIRST_POSE] = (frames.stamps[first] - frames.stamps[0]) * 1e-9
-    driven = run if isinstance(run, DrivenRun) else None
+    first, _, end = frames.stretches[0]
+    if 0 < (late := int(np.argmax([*drives.registered[first:end], True]))) < end - first:
+        used[FIRST_POSE] = (frames.stamps[first + late] - frames.stamps[first]) * 1e-9
     return Trial(
         parameters,
         T_odom_sensor,
-        sub_trajectory_rte(
-            frames.T_ref_sensor, T_odom_sensor, settings.sub_trajectory, run.restarted
-        ),
-        run.restarted,
-        run.registered,
-        run.seconds,
-        run.faults,
-        trajectory_metrics(frames, T_odom_sensor, run.lost_steps),
+        errors,
+        drives.restarted,
+        drives.registered,
+        drives.seconds,
+        drives.faults,
+        trajectory_metrics(T_ref_sensor, T_odom_sensor),
         used,
-        unhealthy=dict(run.unhealthy)
-        if driven
-        else unhealthy(
-            settings.health, T_steps[begin:], frames.stamps[begin:], run.registered[begin:]
-        )
-        | dict(run.unhealthy),
-        health=settings.health.model_dump() if driven else {},
+        unhealthy=dict(drives.unhealthy),
+        failure=failure,
     )
 
 
 def _mean(parameters: ParameterSet, repeats: Sequence[Trial]) -> Trial:
-    """One trial of several runs with the same parameters."""
+    """One trial of several with the same parameters."""
     if len(repeats) == 1:
         return repeats[0]
+    metrics = set.intersection(*(set(trial.metrics) for trial in repeats))
     return Trial(
         parameters,
         repeats[0].T_odom_sensor,
@@ -525,12 +583,12 @@ def _mean(parameters: ParameterSet, repeats: Sequence[Trial]) -> Trial:
         np.all([trial.registered for trial in repeats], axis=0),
         np.mean([trial.seconds for trial in repeats], axis=0),
         tuple(fault for trial in repeats for fault in trial.faults),
-        {m: float(np.mean([t.metrics[m] for t in repeats])) for m in repeats[0].metrics},
+        {m: float(np.mean([t.metrics[m] for t in repeats])) for m in sorted(metrics)},
         {
             m: float(np.mean([t.usage.get(m, 0.0) for t in repeats]))
             for m in {m: None for t in repeats for m in t.usage}
         },
         tuple({"rte": trial.mean_error} | trial.metrics for trial in repeats),
         max(repeats, key=lambda trial: trial.unhealthy.get("no_pose", 0)).unhealthy,
-        repeats[0].health,
+        next((trial.failure for trial in repeats if trial.failure), ""),
     )

@@ -17,6 +17,8 @@ from pathlib import Path
 from typing import Any, Generic, NamedTuple, Protocol, Self, TypeVar
 from uuid import uuid4
 
+import numpy as np
+
 from adaptune import __version__
 from adaptune.archive import Frames, Trial
 from adaptune.errors import AdaptuneError, in_a_line
@@ -38,14 +40,15 @@ class WorkerError(AdaptuneError):
 
 
 class Task(NamedTuple):
-    """Trials to run on one pass over a sequence."""
+    """Trials to drive on one pass over a sequence."""
 
     sequence: str
     numbers: tuple[int, ...]  # trial numbers
     sets: tuple[ParameterSet, ...]  # the parameter sets of the trials
-    whole: bool = False  # run them from end to end, without restarts at the reference
+    whole: bool = False  # drive the whole recording, and not its stretches alone
     frames: bool = False  # return the frames, which all trials on the sequence share, too
     apart: bool = False  # run classes of the user in processes of their own, also clean ones
+    most_ms: float = np.inf  # milliseconds of CPU time a scan, above which a set is stopped
 
     @property
     def key(self) -> tuple[str, tuple[int, ...]]:
@@ -223,7 +226,7 @@ class Sequences:
         """Do a task."""
         setup = self._apart if task.apart else self._setup
         sequence = self._prepared(setup, task, progress)
-        trials = setup.run(sequence, task.sets, task.whole, progress)
+        trials = setup.run(sequence, task.sets, task.whole, task.most_ms, progress)
         frames = None
         if task.frames:  # which reads the scans again
             frames = with_measured_hops(sequence.scans, sequence.frames, progress)
@@ -253,6 +256,8 @@ def attempt(
         return sequences.run(task, progress)
     except AdaptuneError as error:
         return error
+    except MemoryError:
+        return WorkerError(f"{task}: the memory is full; lower offline.workers, and run again")
     except Exception:
         return WorkerError(f"{task}:\n{traceback.format_exc()}")
 

@@ -12,10 +12,9 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune.archive import MAX_SHARE_WITHOUT_POSE
 from adaptune.errors import AdaptuneError
 from adaptune.model.rules import BASELINE
-from adaptune.odometry.base import OdometryInstance, Usage
+from adaptune.odometry.base import MAX_SHARE_WITHOUT_POSE, OdometryInstance, Usage
 from adaptune.odometry.tracker import HealthCheck, RegisteredScan, Tracker
 from adaptune.processes import resident_megabytes
 from adaptune.recording.scan import Scan

@@ -261,6 +261,9 @@ class Tracker:
     # `WARM_UP` seconds again. If its motion is still not healthy then, it restarts without a
     # past.
     fall_back: Callable[[int, str], bool] | None = None
+    # The pose of the first scan, and the motion that led there; None if the sensor stood still.
+    T_odom_start: Poses = field(default_factory=lambda: np.eye(4))
+    T_before_start: Poses | None = None
     _last: RegisteredScan | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
@@ -281,8 +284,8 @@ class Tracker:
         begin = time.perf_counter()
         registered, unhealthy = True, None
         if self._last is None:
-            T_odom_sensor, T_previous_current = np.eye(4), None
-            self.odometry.start(prepared, T_odom_sensor)
+            T_odom_sensor, T_previous_current = self.T_odom_start, self.T_before_start
+            self.odometry.start(prepared, T_odom_sensor, T_previous_current)
         elif not self._last.begun:
             T_odom_sensor, T_previous_current = self._last.T_odom_sensor, None
             T, registered = self.odometry.register(prepared)
