@@ -40,7 +40,7 @@ class Campaign:
         self._search = Search(self._config, space, self._names, self._finished, known)
         baselines = range(len(space.baselines))
         self._most_ms = {
-            name: SLOW * max(drive.others[REGISTER_MS] for drive in drives.values())
+            name: SLOW * max(drive.others.get(REGISTER_MS, np.inf) for drive in drives.values())
             for name, drives in read_whole_drives(archive, self._names, baselines).items()
             if drives
         }

@@ -269,14 +269,15 @@ def stretches_of(
     def last(of: NDArray[np.float64], until: NDArray[np.float64]) -> NDArray[np.intp]:
         return np.maximum(np.searchsorted(of, until, side="right") - 1, 0)
 
-    begins = last(metres, np.linspace(0.0, metres[-1] - 1.01 * size, n))
+    # Where the robot stands, the last scan before it moves.
+    begins = last(metres, np.linspace(metres[whole[0, 1]], metres[-1] - 1.01 * size, n))
     ends = last(metres, metres[begins] + size) + 2
     warm = np.minimum(
-        last(metres, metres[begins] - WARM_UP[0]), last(seconds, seconds[begins] - WARM_UP[1])
+        last(metres, np.maximum(metres[begins] - WARM_UP[0], 0.0)),
+        last(seconds, seconds[begins] - WARM_UP[1]),
     )
-    firsts = np.maximum(warm, last(metres, metres[begins] - size / 3.0))
+    firsts = np.maximum(warm, last(metres, np.maximum(metres[begins] - size / 3.0, 0.0)))
     found = np.stack([firsts, begins, np.minimum(ends, len(stamps))], axis=1)
-    found[0, :2] = whole[0, :2]
     if (firsts[1:] < ends[:-1]).any() or (ends - firsts).sum() > MOST_DRIVEN * len(stamps):
         return whole
     known = window_ends(T_ref_sensor, length) >= 0

@@ -53,7 +53,7 @@ def test_a_scatter_has_a_panel_for_each_sequence_and_the_mean():
     assert scatter_chart(table, ["distance"], ["one"]) is None
 
 
-def test_a_trial_that_is_not_usable_is_no_best():
+def test_a_trial_that_failed_is_no_best():
     runs = {
         i: Summary(
             SPACE.baseline | {"points": i + 1},
@@ -61,7 +61,7 @@ def test_a_trial_that_is_not_usable_is_no_best():
             0,
             0,
             1.0,
-            without_pose=0.5 * (i == 2),
+            failure="no pose" * (i == 2),
         )
         for i in range(4)
     }

@@ -32,24 +32,33 @@ def test_the_fixed_set_is_surely_good():
     assert data.training_data()[0].fixed == 5
 
 
-def test_whole_runs_decide_where_there_are_some():
+def test_drives_of_whole_recordings_decide_where_there_are_some():
     data = labelled([[[1.0], [2.0], [3.0]]] * 2)
-    # The baseline alone decides nothing.
     for known, fixed in (
         ([{0: 1.0, 2: 9.0, 5: 3.0}, {0: 9.0, 2: 1.0, 5: 1.0}], 5),
-        ([{0: 1.0, 5: 3.0}, {0: 9.0, 2: 1.0}], 0),
-        ([{0: 9.0, 5: 5.0}, {0: 9.0, 5: 5.0}], 2),  # which lost track in no trial
+        # A finalist that is not driven on all of them counts with its trials.
+        ([{0: 9.0, 5: 3.0}, {0: 9.0, 2: 1.0}], 2),
         ([{2: 1.0}, {5: 1.0}], 0),
+        ([{0: np.inf, 2: 1.0}, {0: 1.0, 2: 1.5}], 2),
     ):
         whole = [replace(s, whole=w) for s, w in zip(data.sequences, known, strict=True)]
-        found = data._replace(sequences=whole)
-        assert found.fixed() == fixed
-        assert found.subset((0, 2)).fixed() == 0
-    # With a sequence left out, the whole runs on the others decide.
+        assert data._replace(sequences=whole).fixed() == fixed
+    # With a sequence left out, the drives on the others decide.
     (_, others), _ = data._replace(
         sequences=[replace(s, whole={0: 3.0, 2: 2.0 + i, 5: 3.0 - i}) for i, s in enumerate(whole)]
     ).folds()
     assert others.fixed() == 5
+
+
+def test_a_set_that_is_restarted_more_often_than_the_baseline_is_not_chosen():
+    data = labelled([[[3.0], [1.0], [2.0]]] * 2)
+    for restarts, fixed in (([1, 3, 1], 5), ([1, 1, 3], 2), ([0, np.inf, 1], 0)):
+        counted = [replace(s, restarts=np.array(restarts, float)) for s in data.sequences]
+        assert data._replace(sequences=counted).fixed() == fixed
+    # The sum over the sequences counts.
+    times = np.array([1.0, 2.0, 0.0]), np.array([1.0, 0.0, 9.0])
+    counted = [replace(s, restarts=r) for s, r in zip(data.sequences, times, strict=True)]
+    assert data._replace(sequences=counted).fixed() == 2
 
 
 def test_a_candidate_of_all_sequences_is_none_where_its_luck_is_left_out():
@@ -65,12 +74,6 @@ def test_a_candidate_of_all_sequences_is_none_where_its_luck_is_left_out():
     assert data.fixed() == luckiest
     of_fixed = [one.errors[0, others.fixed()] for one, others in data.folds()]
     assert np.mean(of_fixed) > errors[:, luckiest].mean() + 0.02
-    # A set that lost track and has no whole runs counts nowhere.
-    lost = sequences[3].errors.copy()
-    others = data.folds()[0][1]
-    lost[1, others.fixed()] = np.inf
-    some = [replace(s, errors=lost if s.name == "s3" else s.errors) for s in others.sequences]
-    assert others._replace(sequences=some).fixed() != others.fixed()
 
 
 def test_one_disaster_outweighs_small_gains():

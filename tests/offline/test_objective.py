@@ -5,12 +5,13 @@ from adaptune.archive import Summary
 from offline.config import OfflineConfig
 from offline.objective import (
     Verdict,
+    allowed,
     baseline_words,
     best_by_trials,
     candidates,
     choose_fixed,
-    joined,
     judge,
+    trajectory_metrics,
 )
 
 
@@ -30,17 +31,25 @@ def test_the_best_few_and_the_baseline_are_candidates():
     verdicts = {n: Verdict({}, float(value)) for n, value in enumerate([9, 7, 5, 3, 4, 6])}
     assert candidates(verdicts) == [3, 4, 2, 5, 0]
     verdicts[3] = verdicts[3]._replace(complete=False)
-    verdicts[0] = verdicts[0]._replace(usable=False)
+    verdicts[0] = verdicts[0]._replace(failure="no pose")
     assert candidates(verdicts) == [4, 2, 5, 1]
 
 
-def test_the_fixed_set_is_the_best_in_whole_runs():
+def test_who_is_restarted_more_often_than_the_baseline_is_no_candidate():
+    verdicts = {n: Verdict({}, float(n), restarts=r) for n, r in enumerate([2, 3, 2, 0])}
+    assert candidates(verdicts) == [0, 2, 3]
+    assert allowed({0: np.inf, 1: 5.0, 2: np.inf}) == {1}
+
+
+def test_the_fixed_set_is_the_best_over_whole_recordings():
     trials = {3: 1.0, 4: 1.1, 0: 2.0}
-    assert choose_fixed({3: 1.0, 4: 1.1, 0: 2.0}, trials) == 3
-    assert choose_fixed({3: 3.0, 4: 1.1, 0: 2.0}, trials) == 4
-    assert choose_fixed({3: 3.0, 4: 2.1, 0: 2.0}, trials) == 0
+    assert choose_fixed(trials, {3: 1.0, 4: 1.1, 0: 2.0}) == 3
+    assert choose_fixed(trials, {3: 3.0, 4: 1.1, 0: 2.0}) == 4
+    assert choose_fixed(trials, {3: 3.0, 4: 2.1, 0: 2.0}) == 0
     # Of those that are nearly equal, the one with the best trials.
-    assert choose_fixed({3: 3.0, 4: 2.03, 0: 2.0}, trials) == 4
+    assert choose_fixed(trials, {3: 3.0, 4: 2.03, 0: 2.0}) == 4
+    # One that was not driven along all of it counts with its trials.
+    assert choose_fixed(trials, {3: 3.0, 0: 2.0}) == 4
 
 
 def test_of_repeated_trials_the_surely_best_is_taken():
@@ -71,14 +80,9 @@ def test_runs_of_the_baseline_alone_give_it_no_margin_but_a_sentence():
     assert baseline_words(config(objective="cpu"), runs) == []
 
 
-def test_new_starts_are_undone():
-    T = np.tile(np.eye(4), (6, 1, 1))
-    T[:, 0, 3] = [0, 1, 2, 10, 11, 12]
-    sideways = np.eye(4)
-    sideways[:3, 3] = [1, 5, 0]
-    whole = joined(T, {3: sideways})
-    np.testing.assert_allclose(whole[:, 0, 3], [0, 1, 2, 3, 4, 5])
-    np.testing.assert_allclose(whole[:, 1, 3], [0, 0, 0, 5, 5, 5])
-    twice = joined(T, {3: sideways, 5: sideways})
-    np.testing.assert_allclose(twice[:, 1, 3], [0, 0, 0, 5, 5, 10])
-    np.testing.assert_array_equal(joined(T, {}), T)
+def test_a_metric_that_cannot_be_measured_counts_as_the_largest():
+    of = config(objective={"rte": 1.0, "kitti": 1.0})
+    runs = [Summary({}, 2.0, 0, 0, 1.0, {"kitti": 1.0}), Summary({}, 2.0, 0, 0, 1.0)]
+    assert judge(of, runs).value == pytest.approx(0.5 * (3.0 + 2.0 + 1e6))
+    poses = np.tile(np.eye(4), (6, 1, 1))
+    assert trajectory_metrics(np.full_like(poses, np.nan), poses) == {}

@@ -62,8 +62,9 @@ def test_offline_shows_scans_and_runs(study_file, tmp_path, workers):
     train(load_study(study_file, overrides, tmp_path), lambda *call: calls.append(call))
     for name in ("one", "two"):
         assert (f"reading {name}", 40, 40, "") in calls
-    # Two sequences; the baseline's whole runs come first.
-    for what, total in (("baseline", 2), ("runs", 8), ("whole runs", 2 * 3)):
+    # Two sequences, which are driven whole by all; the baseline comes first.
+    assert not [call for call in calls if call[0] == "whole drives"]
+    for what, total in (("baseline", 2), ("runs", 8)):
         done = [call[1] for call in calls if call[0] == what]
         assert done[-1] == total
         if workers == 1:

@@ -210,6 +210,7 @@ def simulation_of(trials, weights, lost_track=3.0, hops=NOTHING):
     simulation = BankSimulation(
         f.stamps,
         f.T_ref_sensor,
+        f.T_ref_sensor,
         f.descriptors,
         np.arange(N) // 10,
         SHORT,

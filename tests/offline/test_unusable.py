@@ -14,7 +14,7 @@ from offline.train import train
 from offline.validate import validate
 
 GOOD = Summary({"x": 1}, 2.0, 0, 0, 10.0)
-FAILS = [Summary({"x": 2}, 1.0, 0, 10, 0.01), Summary({"x": 2}, 1.0, 0, 1, 0.01, without_pose=0.1)]
+FAILS = [Summary({"x": 2}, 1.0, 0, 10, 0.01, failure=why) for why in ("10 faults", "too slow")]
 FAST = "offline.objective={rte: 0.001, ms_per_scan: 1.0}"
 
 
@@ -56,14 +56,16 @@ def test_a_set_that_fails_is_never_chosen(study_file, tmp_path, fails, given):
 def test_where_all_others_fail_the_baseline_is_left(study_file, tmp_path):
     _, training = trained(study_file, tmp_path / "study", "but the baseline", FAST)
     assert (training.model.fixed, training.model.bank) == (0, [0])
-    assert any("9 of 10 parameter sets are never chosen" in text for text in training.words)
+    assert any(
+        "9 of 10 parameter sets failed and are never chosen" in text for text in training.words
+    )
 
 
 @pytest.mark.parametrize("fails", FAILS)
 def test_a_set_that_fails_on_one_sequence_is_not_usable(fails):
     of = OfflineConfig(objective="ms_per_scan")
     good, bad = judge(of, [GOOD, GOOD]), judge(of, [GOOD, fails])
-    assert (good.usable, bad.usable) == (True, False)
+    assert (good.state, bad.state) == ("complete", f"failed: {fails.failure}")
     assert candidates({0: good, 1: bad}) == [0]
     assert whole_values(of, {"one": {0: GOOD, 1: fails}}) == {"one": {0: 10.0, 1: np.inf}}
     # Samplers are told that it is bad.
@@ -72,8 +74,3 @@ def test_a_set_that_fails_on_one_sequence_is_not_usable(fails):
     assert 100.0 <= found[1].value < 1e6
     with pytest.raises(AdaptuneError, match=r"none of 1 parameter sets gives poses .*: mend"):
         candidates({1: bad})
-
-
-def test_a_fault_now_and_then_does_no_harm():
-    assert Summary({}, 1.0, 0, 3, 1.0, without_pose=0.09).usable
-    assert Summary({}, 1.0, 0, 12, 1.0, repeats=[{"rte": 1.0}] * 2).usable

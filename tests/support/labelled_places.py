@@ -44,7 +44,7 @@ def simulated(described, motions, T_ref_sensor=None):
     stamps = np.arange(n, dtype=np.int64) * 10**8
     hops = Hops.of([])
     return BankSimulation(
-        stamps, T_ref_sensor, described, np.arange(n) // 10, 10.0, 3.0, hops, motions
+        stamps, T_ref_sensor, T_ref_sensor, described, np.arange(n) // 10, 10.0, 3.0, hops, motions
     )
 
 
