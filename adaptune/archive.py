@@ -83,7 +83,7 @@ class Trial:
     # several repeats, the mean of the capped errors.
     errors: NDArray[np.float64]
     restarted: NDArray[np.bool_]  # (n,): where the health check restarted it
-    # (n,): False where the scan had too few points, and before the odometry's first pose.
+    # (n,): False where the scan had too few points, or the odometry gave no pose.
     registered: NDArray[np.bool_]
     # (n,): computing time of the odometry for each scan, without preparing it.
     # NaN where it begins, and where nothing is driven.

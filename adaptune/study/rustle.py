@@ -435,7 +435,7 @@ def _of_test(
         f"Made of the test {test.name!r} of {file.path.name}: {system.name} on "
         f"{test.dataset_name}, played {speed:g} times as fast as recorded."
     )
-    offline = {"objective": "rpe", "runs": "whole", "trials": 1}
+    offline = {"objective": "rpe", "stretches": "all", "trials": 1}
     offline |= {"baseline_runs": test.iterations, "workers": test.workers}
     settings = system.settings | {"rate": speed}
     data = _study(settings, parameters, test.dataset_name, sequence, offline)
@@ -477,7 +477,7 @@ def _of_tuning(file: _File, algorithms: _File, datasets: _File) -> ImportedStudy
     if not (total := sum(weights.values())):
         raise file.error(("metric_weights",), "give ape or rpe a weight above 0")
     objective = {key: weight / total for key, weight in weights.items() if weight}
-    offline = {"objective": objective, "runs": "whole", "workers": 1} | offline
+    offline = {"objective": objective, "stretches": "all", "workers": 1} | offline
     offline |= {} if tuning.hours is None else {"hours": tuning.hours}
     how = f"{tuning.tuning_algo.replace('_', ' ')} for {system.name} on {tuning.dataset}"
     about = f"Made of the tuning {tuning.name!r}, {file.path.name}: {how}."

@@ -108,7 +108,7 @@ def test_one_set_at_a_time_is_driven_where_a_bank_does_not_pay(own, study_file, 
 def test_a_bank_that_pays_is_weighed(own, study_file):
     """And what is replayed does not end in failure."""
     model = ErrorModel.load(own.folder / "model.safetensors")
-    assert len(model.bank) == 4
+    assert len(model.bank) >= 4
     paying = replace(model, bank_settings=BankSettings(min_fixed_share=0.5))
     path = own.folder / "paying.safetensors"
     paying.save(path)

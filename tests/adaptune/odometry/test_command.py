@@ -9,7 +9,7 @@ import pytest
 import yaml
 from setups import setup_of
 
-from adaptune.archive import Archive, rows, summarise
+from adaptune.archive import Archive, rows
 from adaptune.errors import OdometryError
 from adaptune.odometry.program import Template
 from adaptune.odometry.tracker import HealthCheck
@@ -59,10 +59,10 @@ def make(tmp_path, study_file):
 OTHER = {"registration.voxel": 0.6, "distance": 2.0}
 
 
-def run(study, whole=False):
+def run(study):
     setup = setup_of(study)
     sequence = setup.prepare("one", 1e9)
-    (trial,) = setup.run(sequence, [OTHER], whole)
+    (trial,) = setup.run(sequence, [OTHER])
     return trial, sequence
 
 
@@ -162,17 +162,16 @@ def test_a_program_that_stamps_the_end_of_a_scan(make):
 def test_scans_before_the_first_pose_are_unknown_and_do_not_count(make):
     polite, _ = run(make("polite"))
     study = make("begins after 3")
-    for whole in (False, True):
-        trial, _ = run(study, whole)
-        assert not trial.faults
-        assert not trial.restarted.any()
-        assert trial.registered.tolist() == [False] * 3 + [True] * 37
-        assert np.isnan(trial.errors[:3]).all()
-        np.testing.assert_allclose(trial.errors[3:], polite.errors[3:], atol=1e-4)
-        assert trial.metrics["ape"] < 1e-4
-        assert trial.metrics["rpe"] < 1e-4
-        assert trial.usage["first_pose"] == pytest.approx(0.3)
-        assert trial.unhealthy == {}
+    trial, _ = run(study)
+    assert not trial.faults
+    assert not trial.restarted.any()
+    assert trial.registered.tolist() == [False] * 3 + [True] * 37
+    assert np.isnan(trial.errors[:3]).all()
+    np.testing.assert_allclose(trial.errors[3:], polite.errors[3:], atol=1e-4)
+    assert trial.metrics["ape"] < 1e-4
+    assert trial.metrics["rpe"] < 1e-4
+    assert trial.usage["first_pose"] == pytest.approx(0.3)
+    assert trial.unhealthy == {}
     train(study)
     table = rows(Archive(study.folder / "trials"), ["one"])
     assert [row["first_pose"] for row in table] == pytest.approx([0.3] * 3)
@@ -189,7 +188,7 @@ def test_what_it_takes_is_measured(make):
     study = make("work", f"offline.objective={objective}", once)
     trial, _ = run(study)
     # It computes for half a second with 200 MB, over 40 scans of 3.9 s.
-    assert 12.5 <= 1e3 * np.median(trial.seconds) < 200.0
+    assert 12.5 <= 1e3 * np.nanmedian(trial.seconds) < 200.0
     assert 100 * 0.5 / 3.9 <= trial.usage["cpu"] < 200.0
     assert 200.0 <= trial.usage["memory"] < 1000.0
     assert len(train(study).trials) > 0
@@ -199,7 +198,7 @@ def test_what_it_takes_is_measured(make):
     late = make("hang", "isolation.seconds=0.02")
     trial, _ = run(late)
     assert trial.faults
-    assert 1e3 * np.median(trial.seconds) >= 20.0
+    assert 1e3 * np.nanmedian(trial.seconds) >= 20.0
     assert trial.usage["memory"] > 5.0
 
 
@@ -232,13 +231,8 @@ def test_faults_are_told_with_the_last_lines(make, fault):
     trial, _ = run(study)
     (told,) = trial.faults
     assert re.search(FAULTS[fault], told, re.DOTALL), told
-    if fault == "half":
-        assert np.isfinite(trial.errors[:9]).all()
-    if fault.startswith("begins"):
-        assert not summarise(trial).usable
-        assert trial.mean_error > 1.0
-    else:
-        assert np.isinf(trial.errors[~np.isnan(trial.errors)][-1])
+    assert re.fullmatch(r"no pose for \d+ of 40 scans", trial.failure)
+    assert trial.mean_error > 1.0
 
 
 # As KISS-ICP's program leaves it: a folder with other files, and a link to the latest.
@@ -305,21 +299,13 @@ def test_poses_without_stamps_that_are_too_many_or_not_rigid(make):
         assert told in run(make(fault, *kitti, *more))[0].faults[0]
 
 
-def test_a_lost_track_is_labelled_and_what_comes_after_judged_for_itself(make, monkeypatch):
+def test_after_a_jump_the_health_check_goes_on_with_the_program_s_poses(make, monkeypatch):
     monkeypatch.setattr(HealthCheck, "max_acceleration", 10.0)
-    study = make("jump")
-    trial, sequence = run(study)
-    assert np.flatnonzero(trial.restarted).tolist() == [20]
-    np.testing.assert_allclose(trial.T_odom_sensor, sequence.frames.T_ref_sensor, atol=1e-6)
-    assert np.isinf(trial.errors[10:20]).all()
-    np.testing.assert_allclose(trial.errors[20:25], 0.0, atol=1e-3)
-    # The program has run once, and goes on from where the health check restarts it.
-    whole, _ = run(study, True)
+    trial, _ = run(make("jump"))
     jumped = 0.3 * np.arange(20, 40)
     jumped[:9] += 2.0  # which the odometry might have taken back
-    np.testing.assert_allclose(whole.T_odom_sensor[20:, 0, 3], jumped)
-    assert whole.unhealthy == {"max_acceleration": 1}
-    assert not whole.restarted.any()
+    np.testing.assert_allclose(trial.T_odom_sensor[20:, 0, 3], jumped)
+    assert np.flatnonzero(trial.restarted).tolist() == [29]
 
 
 def test_the_whole_way(make, caplog):
