@@ -232,7 +232,7 @@ def test_faults_are_told_with_the_last_lines(make, fault):
     (told,) = trial.faults
     assert re.search(FAULTS[fault], told, re.DOTALL), told
     assert re.fullmatch(r"no pose for \d+ of 40 scans", trial.failure)
-    assert trial.mean_error > 1.0
+    assert fault.startswith("begins") or trial.mean_error > 1.0
 
 
 # As KISS-ICP's program leaves it: a folder with other files, and a link to the latest.
