@@ -93,8 +93,8 @@ def offline(
     show_table(
         f"RTE [%] over {model.length:g} m in training, {n} parameter sets",
         training.rows,
-        "A trial that loses track restarts at the reference, which counts as 30 %. A whole run is "
-        "driven as `adaptune online` does it; whole runs decide which set is the fixed one.",
+        "Each set is driven as `adaptune online` does it. The drives of the finalists along whole "
+        "recordings decide which set is the fixed one.",
     )
     say_next_of_trained(loaded, bool(model.expected))
 
@@ -133,7 +133,7 @@ def trials(
     if (fixed := loaded.fixed) is not None:
         same = (row["trial"] for row in finished if fixed.items() <= row.items())
         if (number := next(same, None)) is not None:
-            say(f"The fixed set is trial {number}, as whole runs decided.")
+            say(f"The fixed set is trial {number}, as drives along whole recordings decided.")
     if loaded.model_path.exists():
         say_next_of_trained(loaded, len(names) > 1)
     else:

@@ -624,10 +624,7 @@ def always_at_work(switching: SwitchingConfig, model: ErrorModel) -> list[int]:
 
 
 class OracleErrors(NamedTuple):
-    """Errors of several sets on a test sequence, as trials measure them.
-
-    A trial restarts at the reference after a lost track. A replay does not.
-    """
+    """Errors of several sets on a test sequence, as trials measure them."""
 
     trials: tuple[int, ...]  # numbers of the sets, the fixed one's first if it is among them
     # (n_frames, n_sets): sub-trajectory RTE in percent, NaN without a sub-trajectory, infinite

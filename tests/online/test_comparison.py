@@ -123,9 +123,9 @@ def test_a_bank_that_pays_is_weighed(own, study_file):
             assert weights[model.fixed] >= 0.5
             assert sum(weights.values()) == pytest.approx(1.0, abs=0.002)
             assert int(row["trial"]) == model.fixed
-    # The published rule chooses among its members.
+    # The published rule has all sets to choose from.
     with (folder / "paper/selections.csv").open() as file:
-        assert {int(row["trial"]) for row in csv.DictReader(file)} <= set(model.bank)
+        assert {int(row["trial"]) for row in csv.DictReader(file)} <= set(model.sets)
     assert next(row.rte for row in compare(study).rows if row.mode == "adaptive") < 3.0
     more = load_study(study_file, ["online.switching.mechanism=bank"], own.folder)
     with pytest.raises(ModeError, match=r"switching\.size: the model was fitted for another"):
