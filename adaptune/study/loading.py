@@ -24,7 +24,7 @@ from adaptune.recording.config import SequenceConfig
 from adaptune.recording.recording import check_sequence, interval_of, sequence_files
 from adaptune.space import Categorical, Float, Integer, ParameterSpace, PooledSpace
 from adaptune.strict import ConfigurationError, Key, Mistake, validated
-from adaptune.study.config import RULES, OdometryConfig, StudyConfig, settle_roles
+from adaptune.study.config import ROLES, RULES, OdometryConfig, StudyConfig, settle_roles
 from adaptune.study.study import Study, declared_odometry, tuned_space, whole_definition
 
 # Mistakes in the odometries of a study that only the odometries show.
@@ -286,6 +286,11 @@ def read_study(
     cache.cap()
     document = _read(path)
     data: Any = document.data
+    for role in ROLES:  # 00 is a name there
+        named = data.get(role) if isinstance(data.get(role), list) else []
+        for i, name in enumerate(named):
+            if not isinstance(name, str | list | dict):
+                named[i] = document.name((role, i))
     overridden = [_override(data, text) for text in overrides]
     config, mistakes = _check(config_type, data, path.parent.resolve(), needed)
     if mistakes or config is None:
