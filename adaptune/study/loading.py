@@ -1,5 +1,6 @@
 """Reading a study: its YAML, the overrides, and its mistakes with their lines."""
 
+import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import reduce
 from itertools import combinations, product
@@ -127,7 +128,17 @@ def _check_parameters(name: str, space: ParameterSpace | None, tuned: Any) -> li
             mistakes.append(Mistake((parameter,), message))
         elif isinstance(given, dict):
             whole = whole_definition(space, parameter, given)
-            if str(whole.get("type")) in _KINDS:
+            kind = str(whole.get("type"))
+            keys, others = ("low", "high"), ("choices",)
+            if kind == "categorical":
+                keys, others = others, (*keys, "log")
+            if kind in _KINDS and (wrong := [key for key in others if key in given]):
+                own = {} if space is None else space.parameters[parameter].model_dump()
+                usual = ", ".join(f"{key}: {json.dumps(own[key])}" for key in keys if key in own)
+                message = f"takes {' and '.join(keys)}, not {' and '.join(wrong)}"
+                message += f"; its own are {usual}" if usual else ""
+                mistakes.append(Mistake((parameter,), message))
+            elif kind in _KINDS:
                 validated(_KINDS[whole["type"]], whole, (parameter,), mistakes)
             else:
                 mistakes.append(Mistake((parameter,), f"give its type, one of {', '.join(_KINDS)}"))
