@@ -5,7 +5,7 @@ import traceback
 from collections.abc import Iterable
 from functools import cache
 from importlib import import_module
-from typing import Any
+from typing import Any, NamedTuple
 
 
 class AdaptuneError(Exception):
@@ -28,6 +28,31 @@ class UnavailableError(OdometryError):
 
 class NotInstalledError(OdometryError):
     """An odometry whose package is not installed."""
+
+
+Key = tuple[str | int, ...]
+"""Path of a key in a study; of the whole study it is empty."""
+
+
+class Finding(NamedTuple):
+    """One thing that is wrong with what a user gave: a recording, a reference, a setting."""
+
+    where: Key  # a topic, a file, or the path of a key; empty where the text says it
+    what: str  # is wrong, and what follows from it
+    mend: str = ""  # the setting, or the act, that mends it
+    seconds: tuple[float, float] | None = None  # from when to when, since the first scan
+    of: str = ""  # `points`, `reference` or `imu`, where one of these inputs is affected
+    lacks: str = ""  # what is missing because of it: the stages that need it cannot run
+
+    def __str__(self) -> str:
+        when = "" if self.seconds is None else "from {:.1f} to {:.1f} s".format(*self.seconds)
+        what = ", ".join(filter(None, (self.what, when)))
+        said = "; ".join(filter(None, (what, self.mend)))
+        return ": ".join(filter(None, (".".join(map(str, self.where)), said)))
+
+    def below(self, key: Key) -> "Finding":
+        """The same as seen from outside the section at `key`."""
+        return self._replace(where=key + self.where)
 
 
 def in_a_line(error: BaseException) -> str:

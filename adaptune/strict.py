@@ -8,12 +8,12 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from importlib import import_module
 from importlib.metadata import entry_points
-from typing import Annotated, Any, NamedTuple, TypeVar
+from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, ValidationError
 from pydantic_core import CoreSchema, PydanticKnownError, core_schema
 
-from adaptune.errors import AdaptuneError, nearest
+from adaptune.errors import AdaptuneError, Finding, Key, nearest
 
 # Base class of everything that a user sets: its numbers are numbers.
 
@@ -72,9 +72,6 @@ class StrictModel(BaseModel):
 # What pydantic finds wrong, in plain words.
 
 
-Key = tuple[str | int, ...]
-"""Keys and indices that lead to a value."""
-
 UNKNOWN = "unknown key"
 
 _LONGEST = 60
@@ -129,7 +126,7 @@ def in_one_line(error: Exception, data: Any = None) -> str:
     """An error in one line; in plain words where `data`, which may be unknown, are not valid."""
     if not isinstance(error, ValidationError):
         return " ".join(str(error).split())
-    return "; ".join(str(Mistake(*said)) for said in plain_words(error, data).items())
+    return "; ".join(str(Finding(*said)) for said in plain_words(error, data).items())
 
 
 def _path(data: Any, detail: Any) -> Key:
@@ -203,25 +200,11 @@ class ConfigurationError(AdaptuneError):
     """One or more mistakes in a study's YAML, a line each."""
 
 
-class Mistake(NamedTuple):
-    """What is wrong with a value, and what to do; the key of the whole study is empty."""
-
-    key: Key
-    message: str
-
-    def __str__(self) -> str:
-        return ": ".join(filter(None, (".".join(map(str, self.key)), self.message)))
-
-    def below(self, key: Key) -> "Mistake":
-        """The mistake as seen from outside the section at `key`."""
-        return Mistake(key + self.key, self.message)
-
-
 def validated(
     model: type[M],
     data: Any,
     key: Key,
-    mistakes: list[Mistake],
+    mistakes: list[Finding],
     context: dict[str, Any] | None = None,
 ) -> M | None:
     """Validate a section; None if it has mistakes, which are added to `mistakes`."""
@@ -231,7 +214,7 @@ def validated(
         for path, message in plain_words(error, data).items():
             unknown = message == UNKNOWN
             help_ = f"; {nearest(str(path[-1]), _keys(model, path[:-1]))}" if unknown else ""
-            mistakes.append(Mistake(key + path, message + help_))
+            mistakes.append(Finding(key + path, message + help_))
         return None
 
 

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, BeforeValidator, Field
 
 from adaptune import strict
-from adaptune.errors import AdaptuneError, in_a_line, nearest
+from adaptune.errors import AdaptuneError, Finding, in_a_line, nearest
 from adaptune.recording.config import MOST_VIEWS, ViewConfig
 from adaptune.space import (
     Categorical,
@@ -21,7 +21,7 @@ from adaptune.space import (
     Value,
     describe,
 )
-from adaptune.strict import Mistake, StrictModel, validated
+from adaptune.strict import StrictModel, validated
 from adaptune.study.config import StudyConfig
 from adaptune.study.study import Study
 
@@ -264,16 +264,16 @@ def _steps(parameter: Float | Integer, given: Sequence[Value]) -> list[float]:
     return [first + i * step for i in range(int(count))]
 
 
-def _untuned(key: str, names: Iterable[str], space: ParameterSpace) -> Iterable[Mistake]:
+def _untuned(key: str, names: Iterable[str], space: ParameterSpace) -> Iterable[Finding]:
     for name in names:
         if name not in space.names:
             help_ = nearest(name, space.names)
-            yield Mistake((key, name), f"no parameter {name!r} is tuned: {help_}")
+            yield Finding((key, name), f"no parameter {name!r} is tuned: {help_}")
 
 
 def check_grid(
     axes: Mapping[str, Span | Sequence[Value]], space: ParameterSpace
-) -> Iterable[Mistake]:
+) -> Iterable[Finding]:
     """Find mistakes in a grid; their keys begin below the sampler's settings."""
     if untuned := list(_untuned("grid", axes, space)):
         yield from untuned
@@ -283,9 +283,9 @@ def check_grid(
         try:
             size *= len(_axis(parameter, axes.get(name)))
         except ValueError as error:
-            yield Mistake(("grid", name), str(error))
+            yield Finding(("grid", name), str(error))
     if size >= 2**63:  # `random` draws the numbers of points
-        yield Mistake(("grid",), "has more points than can be numbered; give a coarser one")
+        yield Finding(("grid",), "has more points than can be numbered; give a coarser one")
 
 
 def distribution(parameter: Float | Integer | Categorical) -> Any:
@@ -314,7 +314,7 @@ _BOX = ("low", "high")
 
 def check_sampler(
     name: str, settings: Mapping[str, Any], space: ParameterSpace | None
-) -> Iterable[Mistake]:
+) -> Iterable[Finding]:
     """Find mistakes in a sampler's settings; their keys begin below the settings.
 
     Without a `space`, those that only the parameters show are not found.
@@ -341,20 +341,20 @@ def check_sampler(
             yield from check_grid(axes or {}, space)
 
 
-def _check_optuna(name: str, settings: Mapping[str, Any]) -> Iterable[Mistake]:
+def _check_optuna(name: str, settings: Mapping[str, Any]) -> Iterable[Finding]:
     if taken := next((key for key in _NOT_SET if key in settings), None):
-        yield Mistake((taken,), _NOT_SET[taken])
+        yield Finding((taken,), _NOT_SET[taken])
         return
     try:
         optuna_sampler(name, settings, 0)
     except SamplerError as error:
         key, _, rest = str(error).partition(": ")
-        yield Mistake((key,), rest) if key in settings else Mistake((), str(error))
+        yield Finding((key,), rest) if key in settings else Finding((), str(error))
 
 
 def _check_step(
     name: str, parameter: Float | Integer | Categorical, step: Step
-) -> Iterable[Mistake]:
+) -> Iterable[Finding]:
     key, given = ("steps", name), step.model_dump(exclude_none=True)
     allowed: tuple[str, ...] = ("change",)
     if not isinstance(parameter, Categorical):
@@ -364,25 +364,25 @@ def _check_step(
         if setting not in allowed:
             kind = "log " * getattr(parameter, "log", False) + parameter.type
             message = f"steps of a {kind} are set by {', '.join(allowed)} only"
-            yield Mistake((*key, setting), message)
+            yield Finding((*key, setting), message)
     if not isinstance(parameter, Categorical):
         low, high = box = _box(parameter, step)
         if not (low < high and all(map(parameter.contains, box))):
             message = f"the walk's low and high must lie in {describe(parameter)}, low below high"
-            yield Mistake(key, message)
+            yield Finding(key, message)
 
 
 def _check_start(
     name: str, parameter: Float | Integer | Categorical, value: float, step: Step | None
-) -> Iterable[Mistake]:
+) -> Iterable[Finding]:
     if isinstance(parameter, Categorical):
         what = "is a category, which starts at the baseline; leave it out"
-        yield Mistake(("start", name), what)
+        yield Finding(("start", name), what)
         return
     low, high = _box(parameter, step or Step())
     if not (parameter.contains(value) and low <= value <= high):
         what = "a whole number" if isinstance(parameter, Integer) else "a number"
-        yield Mistake(("start", name), f"give {what} from {low:g} to {high:g}, not {value!r}")
+        yield Finding(("start", name), f"give {what} from {low:g} to {high:g}, not {value!r}")
 
 
 def _box(parameter: Float | Integer, step: Step) -> tuple[float, float]:
@@ -427,17 +427,17 @@ class OfflineConfig(StrictModel):
         """Whether the study sets a budget."""
         return any((self.trials, self.hours, self.stagnation))
 
-    def mistakes(self, space: ParameterSpace | None) -> Iterable[Mistake]:
+    def mistakes(self, space: ParameterSpace | None) -> Iterable[Finding]:
         """Find mistakes in the sampler and its settings."""
         key, n = ("sampler_settings",), 1 if space is None else len(space.baselines)
         if n > 1 and (self.sampler not in ("tpe", "random") or "grid" in self.sampler_settings):
             message = "with several odometries, choose tpe or random, without a grid"
-            yield Mistake(("sampler",), message)
+            yield Finding(("sampler",), message)
         if self.trials is not None and self.trials < n:
             message = f"{n} odometries need {n} trials at least, to try the parameters of each"
-            yield Mistake(("trials",), message)
+            yield Finding(("trials",), message)
         if self.sampler in SETTINGS:
-            found: list[Mistake] = []
+            found: list[Finding] = []
             validated(SETTINGS[self.sampler], self.sampler_settings, key, found)
             if found:
                 yield from found
@@ -446,7 +446,7 @@ class OfflineConfig(StrictModel):
             try:
                 optuna_class(self.sampler)
             except SamplerError as error:
-                yield Mistake(("sampler",), str(error))
+                yield Finding(("sampler",), str(error))
                 return
         below = check_sampler(self.sampler, self.sampler_settings, space)
         yield from (mistake.below(key) for mistake in below)
@@ -482,7 +482,7 @@ class OfflineStudyConfig(StudyConfig):
         )
         return self.offline.runs or ("whole" if costly else "restart")
 
-    def mistakes(self, space: ParameterSpace | None) -> Iterable[Mistake]:
+    def mistakes(self, space: ParameterSpace | None) -> Iterable[Finding]:
         """See `StudyConfig.mistakes`."""
         return (mistake.below(("offline",)) for mistake in self.offline.mistakes(space))
 

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, Self
 
 from adaptune import manifest
 from adaptune.bank.bank import WARM_UP, Bank
-from adaptune.errors import AdaptuneError
+from adaptune.errors import AdaptuneError, Finding
 from adaptune.model import ErrorModel
 from adaptune.model.descriptor import DescriptorError
 from adaptune.model.weights import weighted_selection
@@ -387,7 +387,7 @@ def _replay_all(
 
 def _judge(study: Study, name: str, recording: Recording, replayed: Trajectory) -> None:
     """Write the reference of a sequence, and what scans say where a replay disagrees with it."""
-    reference, wrong, sequences = recording.reference(), list[str](), study.sequences
+    reference, wrong, sequences = recording.reference(), list[Finding](), study.sequences
     if reference is not None:
         T_ref_sensor, T_odom_sensor = reference.at(replayed.stamps), replayed.T_world_sensor
         error = mean_difference(T_ref_sensor, T_odom_sensor, study.config.sub_trajectory)

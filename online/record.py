@@ -367,7 +367,7 @@ def write_reference(
     reference: Trajectory | None,
     odometry: Trajectory,
     about: manifest.Inputs,
-    contradictions: Sequence[str] = (),
+    contradictions: Sequence[object] = (),
 ) -> None:
     """Write ``reference.tum``, at the stamps of a replay; remove it if there is none.
 

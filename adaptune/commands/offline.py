@@ -26,11 +26,11 @@ from adaptune.commands.terminal import (
     show_table,
 )
 from adaptune.commands.tune import check_no_study
-from adaptune.errors import AdaptuneError
+from adaptune.errors import AdaptuneError, Finding
 from adaptune.files import write_text
 
 if TYPE_CHECKING:
-    from adaptune.reference.stored import Gap, StoredEstimate
+    from adaptune.reference.stored import StoredEstimate
 
 _log = logging.getLogger(__name__)
 
@@ -209,7 +209,7 @@ def reference(
     say_next("train with it, as with a given one", "offline", "STUDY.yaml", first=first)
 
 
-def _say_estimate(stored: "StoredEstimate", unknown: "list[Gap]", length: float) -> None:
+def _say_estimate(stored: "StoredEstimate", unknown: list[Finding], length: float) -> None:
     """What the estimated reference is worth."""
     say(f"Estimated reference: {stored.metres:.1f} m, {stored.scans:,} scans.")
     error = stored.error(length)
@@ -218,7 +218,7 @@ def _say_estimate(stored: "StoredEstimate", unknown: "list[Gap]", length: float)
     else:
         say(f"It is wrong by about {error:.2g} % over {length:g} m, as its two halves tell.")
     if unknown:
-        where = ", ".join(f"{gap.begin:.1f}-{gap.end:.1f} s ({gap.reason})" for gap in unknown)
+        where = ", ".join(map(str, unknown))
         share = f"{100.0 * stored.unknown_share:.1f} % of the scans"
         say(f"It is unknown for {share}, which have no pose: {where} after the first scan.")
     else:

@@ -111,13 +111,12 @@ def _show_model(file: Path) -> None:
 def _proposed(found: "Inspection", deep: bool, show: Progress) -> tuple[float | None, str, str]:
     """The split to propose, the length of sub-trajectories, and how wrong the reference is.
 
-    Only what can be used to train is measured. What the scans say against it joins the faults.
+    Only what can be used to train is measured. What the scans say against it joins the findings.
     """
     if found.name:
         _undo_motion([found], ["gicp"])
     if found.reference is None or len(found.reference) < 2 or found.missing.get("offline"):
         return None, UNKNOWN_LENGTH, ""
-    from adaptune.recording.inspect import Fault
     from adaptune.recording.recording import open_sequence
     from adaptune.reference import check
     from adaptune.reference.check import diagnose_reference, measured_motions
@@ -133,8 +132,7 @@ def _proposed(found: "Inspection", deep: bool, show: Progress) -> tuple[float | 
         measured = check.measure_reference(scans, reference, partial(show, "registering"))
         motions = measured_motions(scans, len(measured.stamps))
         if (cause := diagnose_reference(reference, measured.stamps, motions)) is not None:
-            what = f"the reference contradicts the scans: {cause}"
-            found.faults.append(Fault(what, "reference"))
+            found.findings.append(cause.below((check.CONTRADICTS,)))
     except AdaptuneError as error:
         return share, str(usual), f"its error cannot be measured: {error}"
     length = check.proposed_sub_trajectory(reference, measured, share)
@@ -364,7 +362,7 @@ def _usable(path: Path, points: str | None, reference: str | None, show: Progres
         )
     recording_config(found, points, reference)
     if reference is None and found.missing["offline"]:
-        why = "; ".join(fault.text for fault in found.faults if fault.of == "reference")
+        why = "; ".join(str(one) for one in found.findings if one.of == "reference")
         say(f"{path}: its reference does not serve ({why}): one is estimated")
         found.given["reference"] = "estimated"
     return found

@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING, Any
 from pydantic import BaseModel, ConfigDict, RootModel
 
 from adaptune import processes, strict
-from adaptune.errors import NotInstalledError, OdometryError
+from adaptune.errors import Finding, NotInstalledError, OdometryError
 from adaptune.odometry.base import Description, InProcess, Odometry, OdometryInstance, OwnFile
 from adaptune.odometry.remote import SERVICE, Guarded, Isolated, Limits
 from adaptune.space import ParameterSet, ParameterSpace, PooledSpace
-from adaptune.strict import Mistake, validated
+from adaptune.strict import validated
 
 if TYPE_CHECKING:
     from adaptune.odometry.program import ProgramInput
@@ -140,7 +140,7 @@ class Declaration:
     """An odometry with given settings."""
 
     settings: Any  # the checked settings; None if they have mistakes
-    mistakes: list[Mistake]
+    mistakes: list[Finding]
     # None if the odometry cannot be described without sound settings
     description: Description | None
 
@@ -166,7 +166,7 @@ def declare(name: str, settings: Any, folder: Path | None = None) -> Declaration
     complete = answer["settings"]
     return Declaration(
         None if complete is None else UserSettings(complete),
-        [Mistake(tuple(key), message) for key, message in answer["mistakes"]],
+        [Finding(tuple(key), message) for key, message in answer["mistakes"]],
         Description(**described | {"space": ParameterSpace.load(answer["space"])}),
     )
 
@@ -174,7 +174,7 @@ def declare(name: str, settings: Any, folder: Path | None = None) -> Declaration
 def declare_here(name: str, settings: Any, folder: Path | None = None) -> Declaration:
     """Do `declare` in this process."""
     cls: Any = odometry_class(name)
-    mistakes: list[Mistake] = []
+    mistakes: list[Finding] = []
     context = None if folder is None else {"folder": folder}
     found: Any = validated(cls.settings_type, settings, (), mistakes, context)
     describes = found is not None or issubclass(cls, Odometry)

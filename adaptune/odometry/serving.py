@@ -30,7 +30,7 @@ def describe(name: str) -> processes.Answer:
             **described._asdict(),
             **wire.about(described),
             "settings": found.settings and found.settings.model_dump(mode="json"),
-            "mistakes": [[list(mistake.key), mistake.message] for mistake in found.mistakes],
+            "mistakes": [[list(mistake.where), mistake.what] for mistake in found.mistakes],
         }
 
     return answer

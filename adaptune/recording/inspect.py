@@ -1,30 +1,33 @@
 """Inspect a recording: what it holds, what is odd about it, and how to name it in a study."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 from rosbags.highlevel import AnyReader
 
 from adaptune import files, geometry
-from adaptune.errors import AdaptuneError
+from adaptune.errors import AdaptuneError, Finding
 from adaptune.progress import Progress, unseen
 from adaptune.recording import Scan, SequenceConfig, SequenceError
 from adaptune.recording.bag import IMU_TYPES, POINTS_TYPES, BagSource, IndexReader
 from adaptune.recording.clouds import FARTHEST, PATH, POSES, Pose, header_of, parse, usable
 from adaptune.recording.config import BAG_SUFFIXES, REFERENCE_FILES, bag_paths
+from adaptune.recording.findings import (
+    Topic,
+    of_clouds,
+    of_overlap,
+    of_reference,
+    of_times,
+    of_topic,
+)
 from adaptune.recording.recording import RecordedSequence
-from adaptune.recording.scan import SOONEST, Reading, doubts
+from adaptune.recording.scan import Reading
 from adaptune.trajectory import Trajectory, is_kitti, read_kitti, read_trajectory
-
-LEAST_POINTS = 20
-"""Valid points that an odometry needs."""
 
 # What each stage uses.
 _INPUTS = {
@@ -32,52 +35,6 @@ _INPUTS = {
     "online": ("points",),
     "motion compensation": ("points", "imu"),
 }
-
-
-@dataclass(frozen=True)
-class Fault:
-    """One thing that is wrong: what it means, and what to do about it."""
-
-    text: str
-    of: str = ""  # `points`, `reference` or `imu`, where one of them is affected
-    lacks: str = ""  # what is missing because of it, where the stages cannot run
-
-
-@dataclass(eq=False)
-class Topic:
-    """What was read of a topic, of the scans of a folder, or of a file of poses."""
-
-    name: str
-    type: str
-    count: int  # messages in the recording
-    stamped: bool = True
-    n_read: int = 0
-    # Nanoseconds of the messages that were read, on the recorder's clock if they have no stamps; a
-    # list for every part of a sample.
-    stamps: list[list[int]] = field(default_factory=list)
-    undecoded: list[tuple[float, str]] = field(default_factory=list)  # seconds, and why
-
-    @property
-    def times(self) -> NDArray[np.int64]:
-        """Nanoseconds of the stamps; of the recording, if messages have none."""
-        return np.array([time for part in self.stamps for time in part], np.int64)
-
-    @property
-    def steps(self) -> NDArray[np.float64]:
-        """Seconds from each message to the next one of its part, where it is later."""
-        steps = [np.diff(np.array(part, np.int64)) * 1e-9 for part in self.stamps]
-        joined = np.concatenate([np.empty(0), *steps])
-        return joined[joined > 0]
-
-    @property
-    def rate(self) -> float | None:
-        """Messages per second."""
-        return float(1.0 / np.median(self.steps)) if len(self.steps) else None
-
-    @property
-    def gap(self) -> float | None:
-        """Longest time between one message and the next, in seconds."""
-        return float(self.steps.max()) if len(self.steps) else None
 
 
 @dataclass(eq=False)
@@ -95,7 +52,7 @@ class Inspection:
     valid: list[int] = field(default_factory=list)  # valid points of each cloud that was read
     readings: list[Reading] = field(default_factory=list)  # of each of them
     reference: Trajectory | None = None  # as far as it was read
-    faults: list[Fault] = field(default_factory=list)
+    findings: list[Finding] = field(default_factory=list)
 
     @property
     def n_messages(self) -> int:
@@ -127,10 +84,10 @@ class Inspection:
         if not self.name:
             return {}
         lacks = {
-            of: [fault.lacks for fault in self.faults if fault.of == of and fault.lacks]
+            of: [one.lacks for one in self.findings if one.of == of and one.lacks]
             for of in ("points", "reference", "imu")
         }
-        if self.scan is None and not any(fault.of == "points" for fault in self.faults):
+        if self.scan is None and not any(one.of == "points" for one in self.findings):
             lacks["points"].append("point clouds that can be read")
         if self.scan is not None and self.scan.times is None:
             lacks["imu"].append("a time for each point")
@@ -159,8 +116,8 @@ def inspect(path: Path, deep: bool = False, show: Progress = unseen) -> Inspecti
     """Read a recording and report what it holds: a sample of it if it is long and not `deep`.
 
     It is a bag, a folder with bags, a KITTI sequence, a folder of scans, or a file of
-    poses. An AdaptuneError says that it cannot be opened at all. What fails later is among the
-    faults.
+    poses. An AdaptuneError says that it cannot be opened at all. What fails later is among
+    its findings.
     """
     if not path.exists():
         raise SequenceError(f"{path}: there is no such file or folder")
@@ -189,7 +146,7 @@ def _inspect_poses(path: Path) -> Inspection:
         topic.type = "poses, one for each scan"
     topic.count = topic.n_read = len(reference)
     found = Inspection(path, {"reference": str(path)}, {topic.name: topic}, reference=reference)
-    found.faults += _reference_faults(reference, complete=True, timed=timed)
+    found.findings += of_reference(reference, complete=True, timed=timed)
     return found
 
 
@@ -214,8 +171,10 @@ def _inspect_scans(path: Path, kind: str, deep: bool, show: Progress) -> Inspect
     try:
         found.reference = source.poses(None, None)
     except AdaptuneError as error:
-        found.faults.append(Fault(str(error), "reference", "a reference trajectory"))
-    _find_faults(found, apart=False, slack=0.0)
+        found.findings.append(
+            Finding((), str(error), of="reference", lacks="a reference trajectory")
+        )
+    _find(found, apart=False, slack=0.0)
     return found
 
 
@@ -224,6 +183,27 @@ def _keep_scan(found: Inspection, scan: Scan) -> None:
         found.valid.append(geometry.count_within(scan.points, 0.0, FARTHEST))
     found.readings.append(scan.reading)
     found.scan = found.scan or scan
+
+
+def _find(found: Inspection, apart: bool, slack: float) -> None:
+    """Add what is wrong with what was read.
+
+    Between bags that are `apart` nothing is missing. Scans and reference may both go on for `slack`
+    seconds beyond what was read.
+    """
+    of = {name: key for key, name in found.used.items()}
+    for topic in found.topics.values():
+        found.findings += of_topic(topic, of.get(topic.name, ""), found.complete, apart)
+    scans = found.topics.get(found.used.get("points", ""))
+    if scans is not None:
+        found.findings += [*of_clouds(scans, found.valid), *of_times(scans, found.readings)]
+    if (reference := found.reference) is None:
+        return
+    poses = found.topics.get(found.used.get("reference", ""))
+    complete = poses is None or found.complete or poses.count == 1
+    found.findings += of_reference(reference, complete)
+    if scans is not None and any(scans.stamps) and (found.complete or len(reference) > 1):
+        found.findings += of_overlap(reference, scans.times, slack)
 
 
 # Reading bags: a sample of their messages, or all of them.
@@ -255,11 +235,11 @@ def _inspect_bags(path: Path, deep: bool, show: Progress) -> Inspection:
         source.topics = {topic.name: topic.type for topic in topics.values()}
         source.points = used.get("points", "")
         apart = _apart(reader, source.paths)
-        found.faults += apart
+        found.findings += apart
         survey = _Survey(source, reader, found)
         survey.read(0 if deep else survey.n_parts(), show)
         found.reference = survey.trajectory()
-    _find_faults(found, bool(apart), survey.slack)
+    _find(found, bool(apart), survey.slack)
     return found
 
 
@@ -282,7 +262,7 @@ def _used(topics: dict[str, Topic]) -> dict[str, str]:
     return used
 
 
-def _apart(reader: AnyReader, paths: tuple[Path, ...]) -> list[Fault]:
+def _apart(reader: AnyReader, paths: tuple[Path, ...]) -> list[Finding]:
     """Whether bags do not follow each other: the two with the longest time between them."""
     readers: Any = reader.readers
     spans = [(r.start_time, r.end_time, p.name) for r, p in zip(readers, paths, strict=True)]
@@ -293,12 +273,12 @@ def _apart(reader: AnyReader, paths: tuple[Path, ...]) -> list[Fault]:
         return []
     longest = int(np.argmax(gaps))
     days = f" ({gaps[longest] / 86400.0:,.0f} days)" if gaps[longest] > 2.0 * 86400.0 else ""
-    text = (
+    what = (
         f"the bags do not follow each other: {gaps[longest]:,.0f} s{days} lie between "
-        f"{spans[longest][2]} and {spans[longest + 1][2]}; inspect each recording by itself, and "
-        f"name each as a sequence of its own"
+        f"{spans[longest][2]} and {spans[longest + 1][2]}"
     )
-    return [Fault(text, "points", "bags that follow each other")]
+    mend = "inspect each recording by itself, and name each as a sequence of its own"
+    return [Finding((), what, mend, of="points", lacks="bags that follow each other")]
 
 
 class _Survey:
@@ -373,9 +353,10 @@ class _Survey:
                     if done % 100 == 0:
                         show("reading", done, found.n_messages)
             except SequenceError as error:
-                fault = Fault(str(error), "points", "a recording that can be read to its end")
-                if fault not in found.faults:
-                    found.faults.append(fault)
+                lacks = "a recording that can be read to its end"
+                damage = Finding((), str(error), of="points", lacks=lacks)
+                if damage not in found.findings:
+                    found.findings.append(damage)
         show("reading", found.n_messages, found.n_messages)
 
     def _take(self, topic: Topic, when: int, data: bytes) -> None:
@@ -409,7 +390,7 @@ class _Survey:
             topic.undecoded.append(((when - self._begin) * 1e-9, why))
 
     def trajectory(self) -> Trajectory | None:
-        """The reference, as far as it was read; its faults are kept."""
+        """The reference, as far as it was read; what is wrong with it is kept."""
         found = self._found
         if self._path:
             topic = found.topics[found.used["reference"]]
@@ -420,168 +401,9 @@ class _Survey:
         if unusable:
             what = f"{unusable} of {len(self._poses)} poses are not finite or have no rotation"
             lacks = "a reference trajectory" if trajectory is None else ""
-            text = f"{found.used['reference']}: {what}: adaptune leaves them out"
-            found.faults.append(Fault(text, "reference", lacks))
+            where, mend = (found.used["reference"],), "adaptune leaves them out"
+            found.findings.append(Finding(where, what, mend, of="reference", lacks=lacks))
         return trajectory
-
-
-# What is wrong with a recording: what it means, and what to do about it.
-
-
-_FASTEST = 100.0  # metres per second
-_STILL = 0.01  # metres
-_MISSED = 0.01  # of the messages of a topic: fewer are not told
-
-_UNDECODED = {
-    "points": (
-        "the stages stop there: set `stop` before it or `start` after it, or repair the bag",
-        "point clouds that decode",
-    ),
-    "reference": (
-        "it cannot be the reference: repair the bag, or name another topic or a file of poses",
-        "a reference that decodes",
-    ),
-    "imu": ("leave `imu` out, or repair the bag", ""),
-}
-_GAPS = {
-    "points": ": odometries lose track there; leave them out with `start`, `stop` or `cut`",
-    "reference": ": scans in gaps beyond `max_gap` (1 s) are not labelled",
-}
-
-
-def _find_faults(found: Inspection, apart: bool, slack: float) -> None:
-    """Add the faults of what was read.
-
-    Between bags that are `apart` nothing is missing. Scans and reference may both go on for `slack`
-    seconds beyond what was read.
-    """
-    of = {name: key for key, name in found.used.items()}
-    for topic in found.topics.values():
-        found.faults += _topic_faults(topic, of.get(topic.name, ""), found.complete, apart)
-    scans = found.topics.get(found.used.get("points", ""))
-    if scans is not None:
-        found.faults += [*_cloud_faults(scans, found.valid), *_time_faults(found, scans)]
-    if (reference := found.reference) is None:
-        return
-    poses = found.topics.get(found.used.get("reference", ""))
-    complete = poses is None or found.complete or poses.count == 1
-    found.faults += _reference_faults(reference, complete)
-    if scans is not None and any(scans.stamps) and (found.complete or len(reference) > 1):
-        found.faults += _overlap_faults(reference, scans.times, slack)
-
-
-def _topic_faults(topic: Topic, of: str, complete: bool, apart: bool) -> Iterator[Fault]:
-    if topic.undecoded:
-        (seconds, why), n = topic.undecoded[0], len(topic.undecoded)
-        help_, lacks = _UNDECODED[of]
-        help_ = "the stages refuse them" if of == "points" and "`" in why else help_
-        many = f"all {n}" if n == topic.n_read else f"{n} of {topic.n_read}"
-        what = f"{many} messages do not decode, the first at {seconds:.1f} s ({why})"
-        yield Fault(f"{topic.name}: {what}; {help_}", of, lacks)
-    if of and topic.count and not topic.n_read and not complete:
-        what = "are not in the sample, `--deep` reads them"
-        yield Fault(f"{topic.name}: its {topic.count} messages {what}", of)
-    if topic.stamped and any(topic.stamps) and not apart:
-        yield from _stamp_faults(topic, of)
-        if not complete and sum(map(len, topic.stamps)) < topic.count:
-            yield from _count_faults(topic, of)
-
-
-def _stamp_faults(topic: Topic, of: str) -> Iterator[Fault]:
-    name, n = topic.name, len(topic.times)
-    if wrong := np.count_nonzero(np.diff(topic.times) <= 0):
-        help_ = ": adaptune leaves such scans out" if of == "points" else ""
-        lacks = "stamps that increase" if wrong == n - 1 and of in ("points", "reference") else ""
-        yield Fault(
-            f"{name}: {wrong} of {n} stamps do not come after the one before{help_}", of, lacks
-        )
-    if len(topic.steps):
-        gap, usual = topic.steps.max(), np.median(topic.steps)
-        if gap > 3.5 * usual and gap > 0.2:
-            lost = np.count_nonzero(topic.steps > 3.5 * usual)
-            what = f"{lost} gaps, the longest of {gap:.2f} s{_GAPS.get(of, '')}"
-            yield Fault(f"{name}: {what}", of)
-
-
-def _count_faults(topic: Topic, of: str) -> Iterator[Fault]:
-    """Messages that are missing between the parts of a sample, by their number in the whole."""
-    usual = np.median(topic.steps) if len(topic.steps) else np.inf
-    steps = topic.steps[np.abs(topic.steps - usual) < 0.2 * usual]
-    # Only what comes regularly has a number to expect.
-    if len(topic.steps) < 5 or len(steps) < 0.9 * len(topic.steps):
-        return
-    expected = 1 + round(int(np.ptp(topic.times)) * 1e-9 / float(steps.mean()))
-    doubt = max(_MISSED, 3.0 * float(steps.std() / steps.mean()) / len(steps) ** 0.5)
-    if topic.count < (1.0 - doubt) * expected:
-        what = f"about {expected - topic.count:,} of {expected:,} messages are missing"
-        yield Fault(f"{topic.name}: {what}: `--deep` looks for the gaps", of)
-
-
-def _cloud_faults(topic: Topic, valid: list[int]) -> Iterator[Fault]:
-    """Faults of clouds; those that were read have `valid` points each."""
-    name = topic.name
-    if topic.count == 1:
-        yield Fault(f"{name}: holds a single cloud: no motion", "points", "more than one cloud")
-    n, few = len(valid), sum(points < LEAST_POINTS for points in valid)
-    rule = f"fewer than {LEAST_POINTS} valid points (finite, not zero, within {FARTHEST:g} m)"
-    if few and few == n:
-        help_ = "an odometry cannot use them: look at the driver, or choose another topic"
-        yield Fault(f"{name}: all {n} clouds hold {rule}; {help_}", "points", "clouds with points")
-    elif few:
-        yield Fault(f"{name}: {few} of {n} clouds hold {rule}{_GAPS['points']}", "points")
-
-
-def _time_faults(found: Inspection, topic: Topic) -> Iterator[Fault]:
-    """Faults of the times of the points."""
-    steps = topic.steps[topic.steps * 1e9 >= SOONEST]
-    for doubt in doubts(found.readings, float(np.median(steps)) if len(steps) else 0.0):
-        yield Fault(f"{topic.name}: {doubt.text}", doubt.of, doubt.lacks)
-
-
-def _reference_faults(reference: Trajectory, complete: bool, timed: bool = True) -> Iterator[Fault]:
-    """Faults of the poses themselves; with `timed` false, the stamps only number them."""
-    of, lacks = "reference", "a reference that moves"
-    if len(reference) < 2:
-        if complete:
-            help_ = "no motion follows from it; name another topic, or a file of poses"
-            yield Fault(f"the reference holds a single pose: {help_}", of, lacks)
-        return
-    positions = reference.T_world_sensor[:, :3, 3]
-    steps = np.linalg.norm(geometry.steps(reference.T_world_sensor)[:, :3, 3], axis=1)
-    if np.linalg.norm(positions - positions[0], axis=1).max() < _STILL:
-        what = f"the reference stands still: all {len(reference)} poses are within 1 cm"
-        help_ = "errors are per metre; drive, or name another topic or a file of poses"
-        yield Fault(f"{what}; {help_}", of, lacks)
-        return
-    seconds = np.diff(reference.stamps) * 1e-9 if timed else np.full(len(steps), 0.1)
-    if jumps := np.count_nonzero(steps > _FASTEST * np.maximum(seconds, 1e-3)):
-        help_ = "errors there are not the odometry's; leave them out with `start`, `stop` or `cut`"
-        yield Fault(f"the reference jumps {jumps} times: {help_}", of)
-    if complete and timed and (gaps := np.count_nonzero(seconds > reference.max_gap)):
-        what = f"the reference has {gaps} gaps beyond {reference.max_gap:g} s"
-        what += f", the longest of {seconds.max():.2f} s: their scans get no label"
-        yield Fault(reference.sparse or what, of)
-
-
-def _overlap_faults(
-    reference: Trajectory, stamps: NDArray[np.int64], slack: float
-) -> Iterator[Fault]:
-    """Scans outside the reference; both may go on for `slack` seconds beyond what was read."""
-    begin, end = int(reference.stamps[0]), int(reference.stamps[-1])
-    scans = int(stamps.min()), int(stamps.max())
-    times = [f"{stamp * 1e-9:.3f}" for stamp in (begin, end, *scans)]
-    spans = f"covers {times[0]} to {times[1]} s, the scans cover {times[2]} to {times[3]} s"
-    if (max(begin, scans[0]) - min(end, scans[1])) * 1e-9 > slack:
-        help_ = "set `clock_offset` to the seconds to add to the reference's stamps"
-        more = "if it is of the same drive; `adaptune offline` proposes them"
-        lacks = "a reference of the same time"
-        yield Fault(f"the reference {spans}: {help_}, {more}", "reference", lacks)
-        return
-    seconds = (scans[1] - scans[0]) * 1e-9
-    outside = [(begin - scans[0]) * 1e-9, (scans[1] - end) * 1e-9]
-    lost = sum(s for s in outside if s > slack + 1.0)
-    if lost > 0.05 * seconds:
-        yield Fault(f"the reference {spans}: the scans outside get no label", "reference")
 
 
 # Show an inspected recording on a terminal.
@@ -600,10 +422,10 @@ def render_inspection(inspection: Inspection, accuracy: str = "") -> RenderableT
         parts.append(Text(f"reference: {text}"))
         if accuracy and inspection.name and not inspection.missing["offline"]:
             parts.append(Text(f"reference: {accuracy}"))
-    elif inspection.scan is not None and not any(f.of == "reference" for f in inspection.faults):
+    elif inspection.scan is not None and not any(f.of == "reference" for f in inspection.findings):
         parts.append(Text("reference: none; adaptune estimates one from the scans"))
     parts.append(Text(_read_text(inspection)))
-    parts += [Text(f"! {f.text}", "red" if f.lacks else "yellow") for f in inspection.faults]
+    parts += [Text(f"! {f}", "red" if f.lacks else "yellow") for f in inspection.findings]
     parts += [_stage_text(inspection, stage) for stage in inspection.missing]
     # Broken lines would not be YAML.
     parts.append(Text("\n" + inspection.entry, no_wrap=True, overflow="ignore"))
@@ -622,7 +444,7 @@ def _read_text(inspection: Inspection) -> str:
 def _stage_text(inspection: Inspection, stage: str) -> Text:
     if lacking := inspection.missing[stage]:
         return Text(f"{stage}: lacks {' and '.join(lacking)}", style="red")
-    if any(fault.of in _INPUTS[stage] for fault in inspection.faults):
+    if any(one.of in _INPUTS[stage] for one in inspection.findings):
         return Text(f"{stage}: can run, but see the lines with ! above", style="yellow")
     limit = "" if inspection.complete else ", as far as the sample shows"
     return Text(f"{stage}: has all it needs{limit}", style="green")

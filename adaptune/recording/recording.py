@@ -289,8 +289,8 @@ class RecordedSequence:
         timing = Timing(self._config.stamp, self._config.time_unit)
         for doubt in doubts([scan.reading for scan in first], period, timing):
             if doubt.of == "points" and doubt.lacks:
-                raise SequenceError(f"{self.name}: {doubt.text}")
-            _warn(self.name, doubt.text)
+                raise SequenceError(f"{self.name}: {doubt}")
+            _warn(self.name, str(doubt))
         yield from chain(first, scans)
 
     def _decode(self, left_out: Counter[str]) -> Iterator[Scan]:

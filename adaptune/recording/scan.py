@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BeforeValidator
 
-from adaptune.errors import AdaptuneError
+from adaptune.errors import AdaptuneError, Finding
 from adaptune.geometry import Poses
 from adaptune.trajectory import Trajectory
 
@@ -360,15 +360,7 @@ SOONEST = 1_000_000
 _POSSIBLE = "possible times of the points"
 
 
-class Doubt(NamedTuple):
-    """What is odd; which input then lacks what: points without it cannot be used."""
-
-    text: str
-    of: str = "points"
-    lacks: str = ""
-
-
-def doubts(readings: Sequence[Reading], period: float, timing: Timing = AUTO) -> Iterator[Doubt]:
+def doubts(readings: Sequence[Reading], period: float, timing: Timing = AUTO) -> Iterator[Finding]:
     """What is odd about scans that come every `period` seconds, and were read with `timing`."""
     timed = [reading for reading in readings if reading.last == reading.last]
     if len(timed) >= 5 and period * 1e9 >= SOONEST:
@@ -377,17 +369,18 @@ def doubts(readings: Sequence[Reading], period: float, timing: Timing = AUTO) ->
         if not (last > first).any():
             help_ = "no motion compensation is possible; `time_unit: none` leaves the times out"
             what = "all points of a scan have the same time"
-            yield Doubt(f"{what}: {help_}", "imu", "a time for each point")
+            yield Finding((), what, help_, of="imu", lacks="a time for each point")
         elif span > 1.5 * period or span < min(0.05 * period, 0.002):
             what = f"the times of the points span {span:.3g} s, scans come every {period:.3g} s"
             help_, known = _mended(span, float(last.max()), timed[0].unit, period)
             sure = timing.unit is None and (known or span > 5.0 * period)
-            text = f"{what}; {help_}, or name their unit if they are right"
-            yield Doubt(text, lacks=_POSSIBLE if sure else "")
+            help_ = f"{help_}, or name their unit if they are right"
+            yield Finding((), what, help_, of="points", lacks=_POSSIBLE if sure else "")
         if late > 1.5 * period:
             what = f"the times of the points begin {late:.3g} s after their scan's stamp"
             help_ = "write `stamp: first_point` to count them from the first point of each scan"
-            yield Doubt(f"{what}; {help_}", lacks=_POSSIBLE if timing.stamp == "auto" else "")
+            lacks = _POSSIBLE if timing.stamp == "auto" else ""
+            yield Finding((), what, help_, of="points", lacks=lacks)
     both = [(reading.stamp, reading.stamp - reading.clock) for reading in timed if reading.clock]
     if len(both) >= 5:
         stamps, late_by = np.array(both).T
@@ -396,7 +389,8 @@ def doubts(readings: Sequence[Reading], period: float, timing: Timing = AUTO) ->
         steps = np.diff(late_by) - drift * np.diff(stamps)
         if (shake := float(np.quantile(np.abs(steps), 0.8)) * 1e-6) > 5.0:
             what = f"the stamps shake by {shake:.0f} ms against the sensor's clock"
-            yield Doubt(f"{what}; write `stamp: sensor_clock`, and `clock_offset` if needed")
+            help_ = "write `stamp: sensor_clock`, and `clock_offset` if needed"
+            yield Finding((), what, help_, of="points")
 
 
 def _mended(span: float, last: float, unit: float, period: float) -> tuple[str, bool]:

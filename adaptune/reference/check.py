@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
+from adaptune.errors import Finding
 from adaptune.geometry import (
     Poses,
     from_quaternions,
@@ -168,25 +169,16 @@ TRUSTED = 0.8
 """Share of the measured motions that are right at least, those that fit best."""
 CLOCK = 30.0
 """Seconds by which clocks may differ to be found."""
+CONTRADICTS = "the reference contradicts the scans"
 SAME_CLOCK = 0.01
 """Seconds by which two clocks may differ and count as the same."""
 
 
-class Cause(NamedTuple):
-    """The likeliest reason why poses contradict the scans."""
-
-    what: str  # completes "the poses look ..."
-    mend: str  # what to do about it
-    before: float  # percent by which the poses differ from what scans show
-    after: float  # and without the cause; NaN if it is not known
-
-    def __str__(self) -> str:
-        """Figures, cause and cure, as they follow a colon."""
-        left = "" if np.isnan(self.after) else f" ({self.after:.3g} % is left without that)"
-        return (
-            f"over some metres they differ by {self.before:.3g} %, by registrations of scans; they "
-            f"look {self.what}{left}; {self.mend}"
-        )
+def _cause(what: str, mend: str, before: float, after: float = np.nan) -> Finding:
+    """What poses look like that differ by `before` percent, and by `after` without that."""
+    left = "" if np.isnan(after) else f" ({after:.3g} % is left without that)"
+    differ = f"over some metres they differ by {before:.3g} %, by registrations of scans"
+    return Finding((), f"{differ}; they look {what}{left}", mend, of="reference")
 
 
 class _Candidate(NamedTuple):
@@ -218,7 +210,7 @@ def _mean(errors: NDArray[np.float64]) -> float:
 
 def diagnose_reference(
     reference: Trajectory, stamps: NDArray[np.int64], hops: Hops, place: Poses | None = None
-) -> Cause | None:
+) -> Finding | None:
     """Why a reference contradicts measured motions; None if it does not, or nobody can tell.
 
     The stamps of the scans are nanoseconds, of shape (n_scans,). `place` is the LiDAR's pose in the
@@ -234,7 +226,7 @@ def diagnose_reference(
     turned = rotation_angle(invert(given[:1]) @ given).max()
     if turned < 1e-6 and rotation_angle(hops.T_start_end).max() > np.radians(2.0):
         mend = "use `reference: estimated`"
-        return Cause("without orientation (all are alike)", mend, before, np.nan)
+        return _cause("without orientation (all are alike)", mend, before)
 
     def at_scans(T_world_given: Poses) -> Poses:
         T = T_world_given @ T_given_sensor
@@ -248,7 +240,7 @@ def diagnose_reference(
     return _likeliest(candidates, hops, errors)
 
 
-def diagnose_odometry(T_odom_sensor: Poses, hops: Hops) -> Cause | None:
+def diagnose_odometry(T_odom_sensor: Poses, hops: Hops) -> Finding | None:
     """Why an odometry's poses, of shape (n_scans, 4, 4), contradict measured motions; else None."""
     errors = mismatch(T_odom_sensor, hops)
     before = _mean(errors)
@@ -270,7 +262,7 @@ def diagnose_odometry(T_odom_sensor: Poses, hops: Hops) -> Cause | None:
 
 def _likeliest(
     candidates: Iterable[_Candidate], hops: Hops, contradicting: NDArray[np.float64]
-) -> Cause | None:
+) -> Finding | None:
     """What leaves nearly as little as the best candidate, if that explains the difference.
 
     On a straight way, two may fit alike. `contradicting` is how far each motion differs.
@@ -293,7 +285,7 @@ def _likeliest(
     fit = fit[:-1] or fit
     what = ", or ".join(candidate.what for candidate, _ in fit[:2])
     mend = ", or ".join(candidate.mend for candidate, _ in fit[:2])
-    return Cause(what, mend, before, fit[0][1])
+    return _cause(what, mend, before, fit[0][1])
 
 
 def _conventions(T: Poses) -> Iterator[_Candidate]:
@@ -416,7 +408,7 @@ def contradictions(
     place: Sequence[Any] | None,
     given: bool,
     seen: Collection[int] | None = None,
-) -> Iterator[str]:
+) -> Iterator[Finding]:
     """What a recording's scans say where its reference and an odometry disagree.
 
     Parameters
@@ -452,16 +444,19 @@ def contradictions(
         cause = diagnose_reference(reference, at, hops, T)
         apart = _mean(mismatch(reference.at(at), hops)), _mean(mismatch(T_odom_sensor, hops))
         if cause is not None:
-            yield f"the reference contradicts the scans: {cause}"
+            yield cause.below((CONTRADICTS,))
         elif apart[0] > max(UNEXPLAINED, 4.0 * apart[1]):
-            yield (
-                f"the reference contradicts the scans: over some metres they differ by "
-                f"{apart[0]:.3g} %, by registrations of scans, and the odometry by {apart[1]:.3g} "
-                f"%; check its file or topic (`reference`), the LiDAR's pose in its frame "
-                f"(`extrinsic`) and its clock (`clock_offset`), or use `reference: estimated`"
+            what = (
+                f"over some metres they differ by {apart[0]:.3g} %, by registrations of scans, and "
+                f"the odometry by {apart[1]:.3g} %"
             )
+            mend = (
+                "check its file or topic (`reference`), the LiDAR's pose in its frame "
+                "(`extrinsic`) and its clock (`clock_offset`), or use `reference: estimated`"
+            )
+            yield Finding((CONTRADICTS,), what, mend, of="reference")
     if (cause := diagnose_odometry(T_odom_sensor, hops)) is not None:
-        yield f"the odometry's poses contradict the scans: {cause}"
+        yield cause.below(("the odometry's poses contradict the scans",))
 
 
 NARROW, RARE = 180.0, 5.0

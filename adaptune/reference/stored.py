@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune.errors import AdaptuneError
+from adaptune.errors import AdaptuneError, Finding
 from adaptune.files import write_text
 from adaptune.geometry import Poses
 from adaptune.metrics import sub_trajectory_rte, travelled
@@ -31,14 +31,6 @@ courses, see docs/research/without-ground-truth.md."""
 
 class EstimateError(AdaptuneError):
     """A recording from which no reference can be estimated."""
-
-
-class Gap(NamedTuple):
-    """Seconds since the first scan between which a reference is unknown, and why."""
-
-    begin: float
-    end: float
-    reason: str
 
 
 class Registrations(NamedTuple):
@@ -75,18 +67,16 @@ class EstimatedReference:
             known[i + 1 : max(int(end), i + 2)] = False
         return known
 
-    def gaps(self) -> list[Gap]:
+    def gaps(self) -> list[Finding]:
         """Where the reference is unknown, and why."""
         seconds = (self.stamps - self.stamps[0]) * 1e-9
         edges = np.flatnonzero(np.diff(self.known.astype(int), prepend=1, append=1))
-        last = len(seconds) - 1
+        begins, ends = np.maximum(edges[::2] - 1, 0), np.minimum(edges[1::2], len(seconds) - 1)
         return [
-            Gap(
-                float(seconds[max(first - 1, 0)]),
-                float(seconds[min(stop, last)]),
-                self._reason(max(first - 1, 0), min(stop, last)),
+            Finding(
+                (), self._reason(begin, end), seconds=(float(seconds[begin]), float(seconds[end]))
             )
-            for first, stop in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)
+            for begin, end in zip(begins.tolist(), ends.tolist(), strict=True)
         ]
 
     def _reason(self, first: int, last: int) -> str:
@@ -205,7 +195,7 @@ def write_estimate(path: Path, found: EstimatedReference, about: dict[str, Any])
     write_tum(path, found.trajectory())
     known = stored._asdict() | {"error_percent": stored.errors}
     known["unknown_seconds"] = [
-        [round(gap.begin, 3), round(gap.end, 3), gap.reason] for gap in found.gaps()
+        [*(round(second, 3) for second in gap.seconds or ()), gap.what] for gap in found.gaps()
     ]
     del known["path"], known["errors"]
     write_text(path.with_suffix(".json"), json.dumps(known, indent=1) + "\n")
@@ -254,7 +244,7 @@ def estimate_chart(title: str, found: EstimatedReference) -> Chart:
         )
         if which.any()
     )
-    gaps = [Spans((gap.begin, gap.end), ("unknown",), "unknown") for gap in found.gaps()]
+    gaps = [Spans(gap.seconds or (), ("unknown",), "unknown") for gap in found.gaps()]
     time = Axis("time [s]", limits=(0.0, max(float(seconds[-1]), 1.0)))
     differ = Axis("differ from the reference by [cm]", log=True)
     of_hops = Panel(time, differ, (*drawn, *gaps), "registrations over 2, 5 and 10 m")

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
-from adaptune.errors import nearest
+from adaptune.errors import Finding, nearest
 from adaptune.odometry.remote import Limits
 from adaptune.odometry.tracker import HealthCheck
 from adaptune.recording.config import SequenceConfig, Transform, ViewConfig
@@ -14,7 +14,7 @@ from adaptune.recording.scan import Fractions, part_name, read_part
 from adaptune.ros.link import SetCommand
 from adaptune.simulation.course import Course
 from adaptune.space import ParameterSpace
-from adaptune.strict import Mistake, StrictModel
+from adaptune.strict import StrictModel
 
 
 def _file_name(name: str) -> str:
@@ -209,7 +209,7 @@ class StudyConfig(StrictModel):
         """Views of every training sequence that are trained on, too, by unique names."""
         return {}
 
-    def mistakes(self, space: ParameterSpace | None) -> "Iterable[Mistake]":  # noqa: ARG002
+    def mistakes(self, space: ParameterSpace | None) -> "Iterable[Finding]":  # noqa: ARG002
         """Find what does not fit the tuned parameters; None where these have mistakes."""
         return ()
 
@@ -238,14 +238,14 @@ class _Named(NamedTuple):
         return self.origin == other.origin and shared > 0.0
 
 
-def settle_roles(data: dict[str, Any]) -> tuple[dict[str, str], list[Mistake]]:
+def settle_roles(data: dict[str, Any]) -> tuple[dict[str, str], list[Finding]]:
     """Make every part that `training` and `test` name a sequence or course of its own.
 
     The study's data are changed in place: ``{hall: 0-60%}`` in a list becomes the name
     ``hall_0-60`` of a new entry. Returns of each new sequence the one that it is a part of, and the
     mistakes in the lists. Entries that are no names at all are left to the models.
     """
-    mistakes: list[Mistake] = []
+    mistakes: list[Finding] = []
     origins: dict[str, str] = {}
     if not all(isinstance(data.get(kind, {}), dict) for kind in _KINDS):
         return origins, mistakes  # the models find it
@@ -261,7 +261,7 @@ def settle_roles(data: dict[str, Any]) -> tuple[dict[str, str], list[Mistake]]:
                 named = _read(data, entry, origins)
                 _check(role, named, found)
             except ValueError as error:
-                mistakes.append(Mistake((role, i), str(error)))
+                mistakes.append(Finding((role, i), str(error)))
                 data[role][i] = str(next(iter(entry), "")) if isinstance(entry, dict) else entry
                 continue
             found[role].append(named)

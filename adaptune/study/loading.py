@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from adaptune import files
-from adaptune.errors import AdaptuneError, NotInstalledError, OdometryError, nearest
+from adaptune.errors import AdaptuneError, Finding, Key, NotInstalledError, OdometryError, nearest
 from adaptune.odometry.base import Description
 from adaptune.odometry.registry import (
     ODOMETRIES,
@@ -24,7 +24,7 @@ from adaptune.recording.cache import MANY, fingerprint
 from adaptune.recording.config import SequenceConfig
 from adaptune.recording.recording import check_sequence, interval_of, sequence_files
 from adaptune.space import Categorical, Float, Integer, ParameterSpace, PooledSpace
-from adaptune.strict import ConfigurationError, Key, Mistake, validated
+from adaptune.strict import ConfigurationError, validated
 from adaptune.study.config import ROLES, RULES, OdometryConfig, StudyConfig, settle_roles
 from adaptune.study.study import Study, declared_odometry, tuned_space, whole_definition
 
@@ -45,7 +45,7 @@ def _entries(given: Any) -> dict[Key, Any]:
     return {("odometry",): given}
 
 
-def _check_together(config: StudyConfig) -> tuple[list[Mistake], ParameterSpace | None]:
+def _check_together(config: StudyConfig) -> tuple[list[Finding], ParameterSpace | None]:
     """Find what does not fit the other odometries, or the rest of the study.
 
     And the parameters that are tuned; None if an odometry cannot be described.
@@ -61,7 +61,7 @@ def _check_together(config: StudyConfig) -> tuple[list[Mistake], ParameterSpace 
         for key, about in described.items():
             if about.whole:
                 message = f"{entries[key].name} runs whole recordings, and must be the only one"
-                mistakes.append(Mistake((*key, "name"), message))
+                mistakes.append(Finding((*key, "name"), message))
     for key, about in described.items():
         if about.needs_imu:
             mistakes += _check_imu(config, entries[key].name)
@@ -72,11 +72,11 @@ def _check_together(config: StudyConfig) -> tuple[list[Mistake], ParameterSpace 
     return mistakes, space
 
 
-def _check_labels(entries: Mapping[Key, OdometryConfig]) -> Iterable[Mistake]:
+def _check_labels(entries: Mapping[Key, OdometryConfig]) -> Iterable[Finding]:
     """Find labels that are given twice."""
     for (first, one), (key, other) in combinations(entries.items(), 2):
         if (one.label or one.name) == (other.label or other.name):
-            yield Mistake(
+            yield Finding(
                 (*key, "label"),
                 f"{one.label or one.name!r} is what odometry.{first[-1]} is called; give one of "
                 f"the two a label of its own",
@@ -84,7 +84,7 @@ def _check_labels(entries: Mapping[Key, OdometryConfig]) -> Iterable[Mistake]:
 
 
 def _check_odometry(
-    data: dict[str, Any], at: Key, mistakes: list[Mistake], folder: Path, needed: bool
+    data: dict[str, Any], at: Key, mistakes: list[Finding], folder: Path, needed: bool
 ) -> None:
     """Check an odometry by itself; make paths in its settings absolute.
 
@@ -112,20 +112,20 @@ def _check_odometry(
             check(declared.settings, dict.fromkeys(tuned, 0))
     except OdometryError as error:
         key = "name" if isinstance(error, NotInstalledError) else at_fault
-        mistakes += [Mistake((*at, key), str(error))] * needed
+        mistakes += [Finding((*at, key), str(error))] * needed
 
 
-def _check_parameters(name: str, space: ParameterSpace | None, tuned: Any) -> list[Mistake]:
-    mistakes: list[Mistake] = []
+def _check_parameters(name: str, space: ParameterSpace | None, tuned: Any) -> list[Finding]:
+    mistakes: list[Finding] = []
     if space is None and not tuned:
-        mistakes.append(Mistake((), f"define the parameters: a {name} does not know its own"))
+        mistakes.append(Finding((), f"define the parameters: a {name} does not know its own"))
     for parameter, given in tuned.items() if isinstance(tuned, dict) else ():
         if space is not None and parameter not in space.names:
             known = nearest(str(parameter), space.names)
             message = f"{name} has no parameter {parameter!r}: {known}"
             if name in ODOMETRIES and parameter in odometry_class(name).space.names:
                 message = f"{parameter} is fixed by settings; leave it out there to tune it"
-            mistakes.append(Mistake((parameter,), message))
+            mistakes.append(Finding((parameter,), message))
         elif isinstance(given, dict):
             whole = whole_definition(space, parameter, given)
             kind = str(whole.get("type"))
@@ -135,40 +135,40 @@ def _check_parameters(name: str, space: ParameterSpace | None, tuned: Any) -> li
             if kind in _KINDS and (wrong := [key for key in others if key in given]):
                 own = {} if space is None else space.parameters[parameter].model_dump()
                 usual = ", ".join(f"{key}: {json.dumps(own[key])}" for key in keys if key in own)
-                message = f"takes {' and '.join(keys)}, not {' and '.join(wrong)}"
-                message += f"; its own are {usual}" if usual else ""
-                mistakes.append(Mistake((parameter,), message))
+                what = f"takes {' and '.join(keys)}, not {' and '.join(wrong)}"
+                help_ = f"its own are {usual}" if usual else ""
+                mistakes.append(Finding((parameter,), what, help_))
             elif kind in _KINDS:
                 validated(_KINDS[whole["type"]], whole, (parameter,), mistakes)
             else:
-                mistakes.append(Mistake((parameter,), f"give its type, one of {', '.join(_KINDS)}"))
+                mistakes.append(Finding((parameter,), f"give its type, one of {', '.join(_KINDS)}"))
     return mistakes
 
 
-def _check_imu(config: StudyConfig, odometry: str) -> Iterable[Mistake]:
+def _check_imu(config: StudyConfig, odometry: str) -> Iterable[Finding]:
     needs = f"{odometry} needs an IMU"
     for name, sequence in config.sequences.items():
         if sequence.imu is None:
             help_ = "name its topic and its place, imu: {topic: ..., extrinsic: ...}"
-            yield Mistake(("sequences", name), f"{needs}; {help_}")
+            yield Finding(("sequences", name), f"{needs}; {help_}")
     for name, course in config.courses.items():
         if course.imu is None:
-            yield Mistake(("courses", name), f"{needs}; simulate one, imu: 200")
+            yield Finding(("courses", name), f"{needs}; simulate one, imu: 200")
 
 
-def _check_switching(config: StudyConfig, described: list[Description]) -> Iterable[Mistake]:
+def _check_switching(config: StudyConfig, described: list[Description]) -> Iterable[Finding]:
     online, names = config.online, ", ".join(config.odometries)
     modes, mechanism = ("online", "modes"), ("online", "switching", "mechanism")
     if any(one.whole for one in described):
         message = f"{names} runs whole recordings and cannot change parameters; leave this out"
         # A study's folder holds the defaults, too.
         if online.rules not in ((), RULES):
-            yield Mistake(modes, message)
+            yield Finding(modes, message)
         if online.switching.mechanism != "auto":
-            yield Mistake(mechanism, message)
+            yield Finding(mechanism, message)
     elif online.switching.mechanism == "live" and not (len(described) == 1 and described[0].live):
         message = f"{names} cannot change parameters between scans; choose auto or bank"
-        yield Mistake(mechanism, message)
+        yield Finding(mechanism, message)
 
 
 # Recordings that a study trains on and tests on under two names.
@@ -178,7 +178,7 @@ _NOTES = (".txt", ".yaml")
 """Files beside scans: two recordings may have the same."""
 
 
-def _overlaps(config: StudyConfig) -> Iterator[Mistake]:
+def _overlaps(config: StudyConfig) -> Iterator[Finding]:
     """Find test sequences that hold scans of a training sequence, by the content of their files."""
     for (i, test), training in product(enumerate(config.test), config.training):
         if test != training and _overlap(config, test, training):
@@ -187,7 +187,7 @@ def _overlaps(config: StudyConfig) -> Iterator[Mistake]:
                 f"nothing here; leave one of them out, or give both a `start` or a `stop` so "
                 f"that they share no scan"
             )
-            yield Mistake(("test", i), message)
+            yield Finding(("test", i), message)
 
 
 def _overlap(config: StudyConfig, one: str, other: str) -> bool:
@@ -305,26 +305,26 @@ def read_study(
     overridden = [_override(data, text) for text in overrides]
     config, mistakes = _check(config_type, data, path.parent.resolve(), needed)
     if mistakes or config is None:
-        mistakes.sort(key=lambda mistake: document.line(mistake.key) or 0)
+        mistakes.sort(key=lambda mistake: document.line(mistake.where) or 0)
         said = dict.fromkeys(_say(_deleted(m, data), path, document, overridden) for m in mistakes)
         raise ConfigurationError("\n".join(said))
     return Study(config, folder or runs / path.stem)
 
 
-def _deleted(mistake: Mistake, data: Any) -> Mistake:
+def _deleted(mistake: Finding, data: Any) -> Finding:
     """A mistake in a key or a value of an earlier version, with what became of it."""
     try:
-        value = reduce(getitem, mistake.key, data)
+        value = reduce(getitem, mistake.where, data)
     except (LookupError, TypeError):
         return mistake
-    parts = [part for part in mistake.key if isinstance(part, str)]
+    parts = [part for part in mistake.where if isinstance(part, str)]
     if parts[:1] in (["sequences"], ["courses"]):
         parts[1:2] = ["*"]
     key = ".".join(parts)
     if key in DELETED:
-        return mistake._replace(message=DELETED[key])
+        return mistake._replace(what=DELETED[key])
     gone = DELETED.get(f"{key}={value}")
-    return mistake if gone is None else mistake._replace(message=f"{value} {gone}")
+    return mistake if gone is None else mistake._replace(what=f"{value} {gone}")
 
 
 def _read(path: Path) -> files.Document:
@@ -358,8 +358,8 @@ def _override(data: dict[str, Any], text: str) -> Key:
     return path
 
 
-def _say(mistake: Mistake, path: Path, document: files.Document, overridden: Sequence[Key]) -> str:
-    key = mistake.key
+def _say(mistake: Finding, path: Path, document: files.Document, overridden: Sequence[Key]) -> str:
+    key = mistake.where
     # The mistake of a whole section may be the mistake of a value in it.
     by_override = any(key[: len(o)] == o[: len(key)] for o in overridden)
     return f"{'-o' if by_override else document.where(path, key)}: {mistake}"
@@ -367,12 +367,12 @@ def _say(mistake: Mistake, path: Path, document: files.Document, overridden: Seq
 
 def _check(
     config_type: type[C], data: dict[str, Any], folder: Path, needed: bool
-) -> tuple[C | None, list[Mistake]]:
+) -> tuple[C | None, list[Finding]]:
     """Validate a study's data, and find the mistakes that the models cannot find.
 
     The configuration is None if the data are not valid.
     """
-    mistakes: list[Mistake] = []
+    mistakes: list[Finding] = []
     for key, one in _entries(data.get("odometry")).items():
         given = {"name": one} if isinstance(one, str) else one
         if isinstance(given, dict):
@@ -381,7 +381,7 @@ def _check(
     mistakes += in_roles
     context = {"folder": folder}
     config = validated(config_type, data, (), mistakes, context)
-    sound = all(mistake.key[:1] != ("odometry",) for mistake in mistakes)
+    sound = all(mistake.where[:1] != ("odometry",) for mistake in mistakes)
     if config is not None:
         space = None
         if sound:
@@ -392,7 +392,7 @@ def _check(
     if not isinstance(sequences, dict) or not isinstance(courses, dict):
         return None, mistakes
     mistakes += [
-        Mistake(("courses", name), "there is a sequence of the same name")
+        Finding(("courses", name), "there is a sequence of the same name")
         for name in sequences
         if name in courses
     ]
@@ -403,19 +403,19 @@ def _check(
     return config, [_at_origin(mistake, origins) for mistake in mistakes]
 
 
-def _at_origin(mistake: Mistake, origins: Mapping[str, str]) -> Mistake:
+def _at_origin(mistake: Finding, origins: Mapping[str, str]) -> Finding:
     """The mistake of a part of a sequence as that of the sequence."""
-    kind, *names = mistake.key or ("",)
+    kind, *names = mistake.where or ("",)
     if kind in ("sequences", "courses") and names and names[0] in origins:
-        return mistake._replace(key=(kind, origins[str(names[0])], *names[1:]))
+        return mistake._replace(where=(kind, origins[str(names[0])], *names[1:]))
     return mistake
 
 
-def _check_recordings(sequences: Mapping[str, Any], context: Any) -> Iterable[Mistake]:
+def _check_recordings(sequences: Mapping[str, Any], context: Any) -> Iterable[Finding]:
     """Open recordings; mistakes in the entries themselves were found with the whole."""
     for name, entry in sequences.items():
         if (config := validated(SequenceConfig, entry, (), [], context)) is not None:
             try:
                 check_sequence(config)
             except AdaptuneError as error:
-                yield Mistake(("sequences", name), str(error))
+                yield Finding(("sequences", name), str(error))

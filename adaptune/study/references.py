@@ -8,6 +8,7 @@ from functools import partial
 from typing import Any
 
 from adaptune import manifest
+from adaptune.errors import Finding
 from adaptune.geometry import Poses
 from adaptune.processes import pin
 from adaptune.recording.recording import RecordedSequence, wants_estimate
@@ -150,7 +151,7 @@ def contradictions_of(
     T_odom_sensor: Poses,
     error: float,
     seen: Collection[int] | None = None,
-) -> list[str]:
+) -> list[Finding]:
     """What the scans of a sequence say where its reference and an odometry disagree.
 
     For the parameters see `adaptune.reference.check.contradictions`. A view has its origin's

@@ -15,9 +15,9 @@ from typing import Annotated, Any, Literal, NamedTuple
 from pydantic import AliasChoices, AliasPath, ConfigDict, Field
 
 from adaptune import files
-from adaptune.errors import AdaptuneError, OdometryError, nearest
+from adaptune.errors import AdaptuneError, Finding, Key, OdometryError, nearest
 from adaptune.odometry.program import Template
-from adaptune.strict import Key, Mistake, StrictModel, validated
+from adaptune.strict import StrictModel, validated
 
 _Number = int | float
 _Some = Field(min_length=1)
@@ -126,13 +126,15 @@ class _File:
 
     def error(self, key: Key, message: str) -> RustleError:
         """An error about the value at a key."""
-        return RustleError(f"{self._document.where(self.path, key)}: {Mistake(key, message)}")
+        return RustleError(f"{self._document.where(self.path, key)}: {Finding(key, message)}")
 
     def check(self, model: type[_Section]) -> Any:
         """The content, or an error that lists the mistakes in it."""
-        mistakes: list[Mistake] = []
+        mistakes: list[Finding] = []
         if (content := validated(model, self.data, (), mistakes)) is None:
-            raise RustleError("\n".join(str(self.error(*mistake)) for mistake in mistakes))
+            raise RustleError(
+                "\n".join(str(self.error(mistake.where, mistake.what)) for mistake in mistakes)
+            )
         return content
 
     def find(self, key: str, name: str, asking: "_File", asked: Key) -> tuple[int, Any]:

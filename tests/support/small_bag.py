@@ -71,4 +71,4 @@ def entry(inspection):
 
 
 def texts(inspection):
-    return [fault.text for fault in inspection.faults]
+    return [str(finding) for finding in inspection.findings]

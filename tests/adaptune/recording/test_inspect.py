@@ -24,7 +24,7 @@ def test_a_sound_bag_has_all_it_needs_and_an_entry_that_opens(tmp_path):
     assert (points.count, points.rate, points.gap) == pytest.approx((10, 10, 0.1))
     assert inspection.fields[3] == "time"
     assert len(inspection.scan) == 195
-    assert inspection.faults == []
+    assert inspection.findings == []
     assert not inspection.missing["offline"]
     assert not inspection.missing["motion compensation"]
     ((name, config),) = entry(inspection).items()
@@ -181,7 +181,7 @@ def test_poses_that_do_not_decode_are_reported(tmp_path):
 def test_a_file_of_a_folder_that_cannot_be_read_is_reported(tmp_path):
     for i in range(100):
         np.save(tmp_path / f"{i}.npy", np.full((30, 3), i + 1.0, np.float32))
-    assert inspect(tmp_path).faults == []
+    assert inspect(tmp_path).findings == []
     assert "sample of 40 of 100" in inspection_text(inspect(tmp_path), width=1000)
     (tmp_path / "99.npy").write_bytes(b"no array")
     np.save(tmp_path / "50.npy", np.zeros((30, 3), np.float32))
@@ -202,7 +202,7 @@ def test_the_poses_of_a_kitti_folder_are_inspected(tmp_path):
     (tmp_path / "calib.txt").write_text("Tr: 1 0 0 0 0 1 0 0 0 0 1 0\n")
     (tmp_path / "poses.txt").write_text(KITTI)
     inspection = inspect(tmp_path)
-    assert inspection.faults == []
+    assert inspection.findings == []
     assert not inspection.missing["offline"]
     ((_, config),) = entry(inspection).items()
     assert config.kitti == str(tmp_path)
@@ -345,7 +345,7 @@ def test_poses_between_the_parts_of_a_sample_are_no_claim(tmp_path):
     messages = [("/points", t, cloud(t)) for t in range(START, START + 40 * 10**9, 10**8)]
     messages += [("/poses", t, pose(t, x)) for t, x in poses]
     inspection = inspect(rec.write_bag(tmp_path / "a.bag", sorted(messages, key=lambda m: m[1])))
-    expected = "/poses: its 400 messages are not in the sample, `--deep` reads them"
+    expected = "/poses: its 400 messages are not in the sample; `--deep` reads them"
     assert texts(inspection) == [expected]
     assert inspection.missing["offline"] == ()
     assert "offline: can run, but see" in inspection_text(inspection)

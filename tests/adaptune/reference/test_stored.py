@@ -218,10 +218,10 @@ def test_gaps_are_where_poses_are_unknown(found):
 
 def test_a_gap_lasts_from_the_last_known_pose_to_the_next():
     found = along(lost=[20, 25])
-    assert found.gaps()[0][:2] == pytest.approx((2.0, 3.6))
+    assert found.gaps()[0].seconds == pytest.approx((2.0, 3.6))
     assert found.unknown_share() == pytest.approx(15 / 101)
-    assert along(lost=[99]).gaps()[0][:2] == pytest.approx((9.9, 10.0))
-    assert along(lost=[0]).gaps()[0][:2] == pytest.approx((0.0, 1.1))
+    assert along(lost=[99]).gaps()[0].seconds == pytest.approx((9.9, 10.0))
+    assert along(lost=[0]).gaps()[0].seconds == pytest.approx((0.0, 1.1))
     assert along().gaps() == []
     assert along().unknown_share() == 0.0
 

@@ -1,0 +1,191 @@
+"""What is wrong with a recording: what it means, and what to do about it."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptune import geometry
+from adaptune.errors import Finding
+from adaptune.recording.clouds import FARTHEST
+from adaptune.recording.scan import SOONEST, Reading, doubts
+from adaptune.trajectory import Trajectory
+
+LEAST_POINTS = 20
+"""Valid points that an odometry needs."""
+
+
+@dataclass(eq=False)
+class Topic:
+    """What was read of a topic, of the scans of a folder, or of a file of poses."""
+
+    name: str
+    type: str
+    count: int  # messages in the recording
+    stamped: bool = True
+    n_read: int = 0
+    # Nanoseconds of the messages that were read, on the recorder's clock if they have no stamps; a
+    # list for every part of a sample.
+    stamps: list[list[int]] = field(default_factory=list)
+    undecoded: list[tuple[float, str]] = field(default_factory=list)  # seconds, and why
+
+    @property
+    def times(self) -> NDArray[np.int64]:
+        """Nanoseconds of the stamps; of the recording, if messages have none."""
+        return np.array([time for part in self.stamps for time in part], np.int64)
+
+    @property
+    def steps(self) -> NDArray[np.float64]:
+        """Seconds from each message to the next one of its part, where it is later."""
+        steps = [np.diff(np.array(part, np.int64)) * 1e-9 for part in self.stamps]
+        joined = np.concatenate([np.empty(0), *steps])
+        return joined[joined > 0]
+
+    @property
+    def rate(self) -> float | None:
+        """Messages per second."""
+        return float(1.0 / np.median(self.steps)) if len(self.steps) else None
+
+    @property
+    def gap(self) -> float | None:
+        """Longest time between one message and the next, in seconds."""
+        return float(self.steps.max()) if len(self.steps) else None
+
+
+_FASTEST = 100.0  # metres per second
+_STILL = 0.01  # metres
+_MISSED = 0.01  # of the messages of a topic: fewer are not told
+
+_UNDECODED = {
+    "points": (
+        "the stages stop there: set `stop` before it or `start` after it, or repair the bag",
+        "point clouds that decode",
+    ),
+    "reference": (
+        "it cannot be the reference: repair the bag, or name another topic or a file of poses",
+        "a reference that decodes",
+    ),
+    "imu": ("leave `imu` out, or repair the bag", ""),
+}
+_GAPS = {
+    "points": "odometries lose track there; leave them out with `start`, `stop` or `cut`",
+    "reference": "scans in gaps beyond `max_gap` (1 s) are not labelled",
+}
+
+
+def of_topic(topic: Topic, of: str, complete: bool, apart: bool) -> Iterator[Finding]:
+    """What is wrong with the messages of a topic, which is used as `of`, and with their stamps."""
+    where = (topic.name,)
+    if topic.undecoded:
+        (seconds, why), n = topic.undecoded[0], len(topic.undecoded)
+        mend, lacks = _UNDECODED[of]
+        mend = "the stages refuse them" if of == "points" and "`" in why else mend
+        many = f"all {n}" if n == topic.n_read else f"{n} of {topic.n_read}"
+        what = f"{many} messages do not decode, the first at {seconds:.1f} s ({why})"
+        yield Finding(where, what, mend, of=of, lacks=lacks)
+    if of and topic.count and not topic.n_read and not complete:
+        what = f"its {topic.count} messages are not in the sample"
+        yield Finding(where, what, "`--deep` reads them", of=of)
+    if topic.stamped and any(topic.stamps) and not apart:
+        yield from _stamps(topic, of)
+        if not complete and sum(map(len, topic.stamps)) < topic.count:
+            yield from _count(topic, of)
+
+
+def _stamps(topic: Topic, of: str) -> Iterator[Finding]:
+    where, n = (topic.name,), len(topic.times)
+    if wrong := np.count_nonzero(np.diff(topic.times) <= 0):
+        mend = "adaptune leaves such scans out" if of == "points" else ""
+        lacks = "stamps that increase" if wrong == n - 1 and of in ("points", "reference") else ""
+        what = f"{wrong} of {n} stamps do not come after the one before"
+        yield Finding(where, what, mend, of=of, lacks=lacks)
+    if len(topic.steps):
+        gap, usual = topic.steps.max(), np.median(topic.steps)
+        if gap > 3.5 * usual and gap > 0.2:
+            lost = np.count_nonzero(topic.steps > 3.5 * usual)
+            what = f"{lost} gaps, the longest of {gap:.2f} s"
+            yield Finding(where, what, _GAPS.get(of, ""), of=of)
+
+
+def _count(topic: Topic, of: str) -> Iterator[Finding]:
+    """Messages that are missing between the parts of a sample, by their number in the whole."""
+    usual = np.median(topic.steps) if len(topic.steps) else np.inf
+    steps = topic.steps[np.abs(topic.steps - usual) < 0.2 * usual]
+    # Only what comes regularly has a number to expect.
+    if len(topic.steps) < 5 or len(steps) < 0.9 * len(topic.steps):
+        return
+    expected = 1 + round(int(np.ptp(topic.times)) * 1e-9 / float(steps.mean()))
+    doubt = max(_MISSED, 3.0 * float(steps.std() / steps.mean()) / len(steps) ** 0.5)
+    if topic.count < (1.0 - doubt) * expected:
+        what = f"about {expected - topic.count:,} of {expected:,} messages are missing"
+        yield Finding((topic.name,), what, "`--deep` looks for the gaps", of=of)
+
+
+def of_clouds(topic: Topic, valid: Sequence[int]) -> Iterator[Finding]:
+    """What is wrong with clouds; those that were read have `valid` points each."""
+    where, of = (topic.name,), "points"
+    if topic.count == 1:
+        what = "holds a single cloud: no motion"
+        yield Finding(where, what, of=of, lacks="more than one cloud")
+    n, few = len(valid), sum(points < LEAST_POINTS for points in valid)
+    rule = f"fewer than {LEAST_POINTS} valid points (finite, not zero, within {FARTHEST:g} m)"
+    if few and few == n:
+        mend = "an odometry cannot use them: look at the driver, or choose another topic"
+        yield Finding(where, f"all {n} clouds hold {rule}", mend, of=of, lacks="clouds with points")
+    elif few:
+        yield Finding(where, f"{few} of {n} clouds hold {rule}", _GAPS[of], of=of)
+
+
+def of_times(topic: Topic, readings: Sequence[Reading]) -> Iterator[Finding]:
+    """What is wrong with the times of the points."""
+    steps = topic.steps[topic.steps * 1e9 >= SOONEST]
+    period = float(np.median(steps)) if len(steps) else 0.0
+    return (doubt.below((topic.name,)) for doubt in doubts(readings, period))
+
+
+def of_reference(reference: Trajectory, complete: bool, timed: bool = True) -> Iterator[Finding]:
+    """What is wrong with the poses; with `timed` false, the stamps only number them."""
+    of, lacks = "reference", "a reference that moves"
+    if len(reference) < 2:
+        if complete:
+            mend = "no motion follows from it; name another topic, or a file of poses"
+            yield Finding((), "the reference holds a single pose", mend, of=of, lacks=lacks)
+        return
+    positions = reference.T_world_sensor[:, :3, 3]
+    steps = np.linalg.norm(geometry.steps(reference.T_world_sensor)[:, :3, 3], axis=1)
+    if np.linalg.norm(positions - positions[0], axis=1).max() < _STILL:
+        what = f"the reference stands still: all {len(reference)} poses are within 1 cm"
+        mend = "errors are per metre; drive, or name another topic or a file of poses"
+        yield Finding((), what, mend, of=of, lacks=lacks)
+        return
+    seconds = np.diff(reference.stamps) * 1e-9 if timed else np.full(len(steps), 0.1)
+    if jumps := np.count_nonzero(steps > _FASTEST * np.maximum(seconds, 1e-3)):
+        mend = "errors there are not the odometry's; leave them out with `start`, `stop` or `cut`"
+        yield Finding((), f"the reference jumps {jumps} times", mend, of=of)
+    if complete and timed and (gaps := np.count_nonzero(seconds > reference.max_gap)):
+        what = f"the reference has {gaps} gaps beyond {reference.max_gap:g} s"
+        what += f", the longest of {seconds.max():.2f} s: their scans get no label"
+        yield Finding((), reference.sparse or what, of=of)
+
+
+def of_overlap(reference: Trajectory, stamps: NDArray[np.int64], slack: float) -> Iterator[Finding]:
+    """Scans outside the reference; both may go on for `slack` seconds beyond what was read."""
+    of = "reference"
+    begin, end = int(reference.stamps[0]), int(reference.stamps[-1])
+    scans = int(stamps.min()), int(stamps.max())
+    times = [f"{stamp * 1e-9:.3f}" for stamp in (begin, end, *scans)]
+    spans = f"covers {times[0]} to {times[1]} s, the scans cover {times[2]} to {times[3]} s"
+    if (max(begin, scans[0]) - min(end, scans[1])) * 1e-9 > slack:
+        mend = (
+            "set `clock_offset` to the seconds to add to the reference's stamps, if it is of the "
+            "same drive; `adaptune offline` proposes them"
+        )
+        lacks = "a reference of the same time"
+        yield Finding((), f"the reference {spans}", mend, of=of, lacks=lacks)
+        return
+    seconds = (scans[1] - scans[0]) * 1e-9
+    outside = [(begin - scans[0]) * 1e-9, (scans[1] - end) * 1e-9]
+    lost = sum(s for s in outside if s > slack + 1.0)
+    if lost > 0.05 * seconds:
+        yield Finding((), f"the reference {spans}: the scans outside get no label", of=of)
