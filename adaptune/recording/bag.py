@@ -34,6 +34,7 @@ from adaptune.recording.clouds import (
     header_of,
     message_stamp,
     of_frame,
+    unstamped,
     usable,
 )
 from adaptune.recording.config import files_of
@@ -100,6 +101,8 @@ class IndexReader(Reader):
         yield from super().messages(connections, start, stop)
 
 
+_LATEST, _LATE = 60 * 10**9, 10**9
+"""Nanoseconds from a bag's begin to its first scan, and by which scans come unevenly."""
 POINTS_TYPES = ("sensor_msgs/msg/PointCloud2", *clouds.LIVOX_TYPES)
 IMU_TYPES = ("sensor_msgs/msg/Imu",)
 
@@ -194,6 +197,21 @@ class BagSource:
             what = f"{self.points} holds clouds of {', '.join(sorted(map(repr, frames)))}"
             raise SequenceError(f"{self.name}: {what}; name one of these frames as `frame`")
 
+    def between(self, begin: int, stop: int) -> list[Frame]:
+        """Scans with stamps from `begin` to before `stop`, found by the bags' index."""
+        with self.open(by_index=True) as reader:
+            load, late, frames = self.loader(reader), None, list[Frame]()
+            first = self.read(reader, self.points, (None, reader.start_time + _LATEST))
+            for _, recorded, data in first:
+                late = recorded - (header_of(data, reader.is2)[0] or 0)
+                break
+            span = (None, None) if late is None else (begin + late - _LATE, stop + late + _LATE)
+            for _, recorded, data in self.read(reader, self.points, span):
+                stamp = header_of(data, reader.is2)[0] or 0
+                if begin <= stamp < stop:
+                    frames.append(Frame(stamp, recorded, partial(load, data, self.name)))
+        return frames
+
     def _begin(self, reader: AnyReader, topic: str) -> int | None:
         """Stamp of the first message, if it has one. Reading the bag reports why it has none."""
         try:
@@ -224,6 +242,8 @@ class BagSource:
             found = of_frame(f"{self.name}: {name}", found, child_frame)
         if not found:
             raise SequenceError(f"{self.name}: no pose on {name}; name another `reference`")
+        if what := unstamped(found):
+            raise SequenceError(f"{self.name}: {name}: {what}; name another `reference`")
         trajectory, unusable = usable(found)
         unfit = f"poses on {name} that are not finite or have no rotation"
         if trajectory is None:

@@ -457,3 +457,11 @@ def usable(poses: Sequence[Pose]) -> tuple[Trajectory | None, int]:
     values = values[good][index]
     T = geometry.from_quaternions(values[:, :3], values[:, 3:])
     return Trajectory(unique, T), int(np.count_nonzero(~good))
+
+
+def unstamped(poses: Sequence[Pose]) -> str:
+    """What is wrong with poses whose stamps were never set; empty for others."""
+    stamps = {stamp for stamp, *_ in poses}
+    if len(poses) < 2 or len(stamps) > 1:
+        return ""
+    return f"all its {len(poses)} poses have the stamp {stamps.pop() * 1e-9:.10g} s"

@@ -15,7 +15,16 @@ from adaptune.errors import AdaptuneError, Finding
 from adaptune.progress import Progress, unseen
 from adaptune.recording import Scan, SequenceConfig, SequenceError
 from adaptune.recording.bag import IMU_TYPES, POINTS_TYPES, BagSource, IndexReader
-from adaptune.recording.clouds import FARTHEST, PATH, POSES, Pose, header_of, parse, usable
+from adaptune.recording.clouds import (
+    FARTHEST,
+    PATH,
+    POSES,
+    Pose,
+    header_of,
+    parse,
+    unstamped,
+    usable,
+)
 from adaptune.recording.config import BAG_SUFFIXES, REFERENCE_FILES, bag_paths
 from adaptune.recording.findings import (
     Topic,
@@ -396,6 +405,12 @@ class _Survey:
             topic = found.topics[found.used["reference"]]
             self._decode(topic, self._reader.end_time, self._path)
         if not self._poses:
+            return None
+        if what := unstamped(self._poses):
+            mend = "name another topic, or a file of poses with stamps"
+            lacks = "a reference with stamps"
+            where = (found.used["reference"],)
+            found.findings.append(Finding(where, what, mend, of="reference", lacks=lacks))
             return None
         trajectory, unusable = usable(self._poses)
         if unusable:
