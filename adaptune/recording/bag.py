@@ -14,6 +14,7 @@ from collections.abc import (
 )
 from contextlib import contextmanager
 from functools import cache, partial
+from itertools import islice
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -34,7 +35,7 @@ from adaptune.recording.clouds import (
     header_of,
     message_stamp,
     of_frame,
-    unstamped,
+    untimed,
     usable,
 )
 from adaptune.recording.config import files_of
@@ -101,7 +102,7 @@ class IndexReader(Reader):
         yield from super().messages(connections, start, stop)
 
 
-_LATEST, _LATE = 60 * 10**9, 10**9
+_LATEST, _LATE = 600 * 10**9, 10**9
 """Nanoseconds from a bag's begin to its first scan, and by which scans come unevenly."""
 POINTS_TYPES = ("sensor_msgs/msg/PointCloud2", *clouds.LIVOX_TYPES)
 IMU_TYPES = ("sensor_msgs/msg/Imu",)
@@ -199,17 +200,16 @@ class BagSource:
 
     def between(self, begin: int, stop: int) -> list[Frame]:
         """Scans with stamps from `begin` to before `stop`, found by the bags' index."""
+        frames = list[Frame]()
         with self.open(by_index=True) as reader:
-            load, late, frames = self.loader(reader), None, list[Frame]()
-            first = self.read(reader, self.points, (None, reader.start_time + _LATEST))
-            for _, recorded, data in first:
+            load, soon = self.loader(reader), (None, reader.start_time + _LATEST)
+            for _, recorded, data in islice(self.read(reader, self.points, soon), 1):
                 late = recorded - (header_of(data, reader.is2)[0] or 0)
-                break
-            span = (None, None) if late is None else (begin + late - _LATE, stop + late + _LATE)
-            for _, recorded, data in self.read(reader, self.points, span):
-                stamp = header_of(data, reader.is2)[0] or 0
-                if begin <= stamp < stop:
-                    frames.append(Frame(stamp, recorded, partial(load, data, self.name)))
+                span = begin + late - _LATE, stop + late + _LATE
+                for _, when, message in self.read(reader, self.points, span):
+                    stamp = header_of(message, reader.is2)[0] or 0
+                    if begin <= stamp < stop:
+                        frames.append(Frame(stamp, when, partial(load, message, self.name)))
         return frames
 
     def _begin(self, reader: AnyReader, topic: str) -> int | None:
@@ -242,7 +242,7 @@ class BagSource:
             found = of_frame(f"{self.name}: {name}", found, child_frame)
         if not found:
             raise SequenceError(f"{self.name}: no pose on {name}; name another `reference`")
-        if what := unstamped(found):
+        if what := untimed(found):
             raise SequenceError(f"{self.name}: {name}: {what}; name another `reference`")
         trajectory, unusable = usable(found)
         unfit = f"poses on {name} that are not finite or have no rotation"

@@ -459,9 +459,7 @@ def usable(poses: Sequence[Pose]) -> tuple[Trajectory | None, int]:
     return Trajectory(unique, T), int(np.count_nonzero(~good))
 
 
-def unstamped(poses: Sequence[Pose]) -> str:
+def untimed(poses: Sequence[Pose]) -> str:
     """What is wrong with poses whose stamps were never set; empty for others."""
-    stamps = {stamp for stamp, *_ in poses}
-    if len(poses) < 2 or len(stamps) > 1:
-        return ""
-    return f"all its {len(poses)} poses have the stamp {stamps.pop() * 1e-9:.10g} s"
+    first, same = poses[0][0], len({stamp for stamp, *_ in poses}) == 1 < len(poses)
+    return f"all its {len(poses)} poses have the stamp {first * 1e-9:.10g} s" if same else ""

@@ -147,8 +147,8 @@ def sequence_files(config: SequenceConfig) -> SequenceFiles:
     return SequenceFiles(source.files, source.pose_files if own is None else own)
 
 
-_LOOK = 10**9
-"""Nanoseconds of a recording that are searched for a scan of another one."""
+_LOOK, _NEVER = 10**9, 1 << 62
+"""Nanoseconds of a recording that are searched for a scan of another one; later than all stamps."""
 _NOTES = (".txt", ".yaml")
 """Files beside scans: two recordings may have the same."""
 
@@ -332,29 +332,27 @@ class RecordedSequence:
                     yield frame
                 number += 1
 
-    @cached_property
-    def _files(self) -> set[Path]:
-        """Files of its scans."""
-        return {file.resolve() for file in self.source.files if file.suffix not in _NOTES}
-
     def shares_scans(self, other: "RecordedSequence") -> bool:
         """Whether both use the same scans, of one file or written again.
 
         Scans of one stamp tell it, those in the middle of the common time first.
         """
-        begins, ends = [], []
+        begin, end, files = 0, _NEVER, list[set[Path]]()
         for one in (self, other):
-            first, last = one.source.span() or (0, -1)
-            begins.append(first + round(1e9 * one.start))
-            ends.append(last + 1 if one.stop is None else first + round(1e9 * one.stop))
-        begin, end = max(begins), min(ends)
-        if begin >= end or self._files & other._files:
+            first, last = one.source.span() or (0, _NEVER)
+            begin = max(begin, first + round(1e9 * one.start))
+            end = min(end, last + 1 if one.stop is None else first + round(1e9 * one.stop))
+            files.append({f.resolve() for f in one.source.files if f.suffix not in _NOTES})
+        if begin >= end or files[0] & files[1]:
             return begin < end
         for at in ((begin + end) // 2, begin, max(begin, end - _LOOK)):
             mine, others = (one.source.between(at, min(at + _LOOK, end)) for one in (self, other))
-            for a, b in product(mine, others):
-                if abs(a.stamp - b.stamp) < SOONEST and len(scan := a.load()):
+            near = [p for p in product(mine, others) if abs(p[0].stamp - p[1].stamp) < SOONEST]
+            for a, b in near:
+                if len(scan := a.load()):
                     return _alike(scan, b.load())
+            if mine and others and not near:
+                return False
         return False
 
     def backward(self) -> Iterator[Scan]:

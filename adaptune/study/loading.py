@@ -129,16 +129,14 @@ def _check_parameters(name: str, space: ParameterSpace | None, tuned: Any) -> li
         elif isinstance(given, dict):
             whole = whole_definition(space, parameter, given)
             kind = str(whole.get("type"))
-            keys: tuple[str, ...] = ("low", "high")
-            others: tuple[str, ...] = ("choices",)
+            keys, others = ["low", "high"], ["choices"]
             if kind == "categorical":
-                keys, others = others, (*keys, "log")
+                keys, others = others, [*keys, "log"]
             if kind in _KINDS and (wrong := [key for key in others if key in given]):
-                own = {} if space is None else space.parameters[parameter].model_dump()
+                own = whole_definition(space, parameter, {})
                 usual = ", ".join(f"{key}: {json.dumps(own[key])}" for key in keys if key in own)
                 what = f"takes {' and '.join(keys)}, not {' and '.join(wrong)}"
-                help_ = f"its own are {usual}" if usual else ""
-                mistakes.append(Finding((parameter,), what, help_))
+                mistakes.append(Finding((parameter,), what, usual and f"its own are {usual}"))
             elif kind in _KINDS:
                 validated(_KINDS[whole["type"]], whole, (parameter,), mistakes)
             else:
@@ -179,15 +177,12 @@ def _overlaps(config: StudyConfig, opened: dict[str, RecordedSequence]) -> Itera
     """Find test sequences that hold scans of a training sequence."""
 
     def same(*names: str) -> bool:
-        if all(name in config.courses for name in names):
-            return len({repr(config.courses[name]) for name in names}) == 1
-        if any(name in config.courses for name in names):
-            return False
-        for name in names:
-            if name not in opened:
-                opened[name] = RecordedSequence(config.sequences[name])
-        # A scan that cannot be read is told of where it is.
-        with suppress(AdaptuneError):
+        if {*names} & config.courses.keys():
+            a, b = map(config.courses.get, names)
+            return a == b
+        for name in {*names} - opened.keys():
+            opened[name] = RecordedSequence(config.sequences[name])
+        with suppress(AdaptuneError):  # training names a scan that cannot be read
             return opened[names[0]].shares_scans(opened[names[1]])
         return False
 
