@@ -63,7 +63,7 @@ def test_a_huge_grid_is_drawn_from_without_making_it():
 def test_a_grid_has_no_more_points_than_can_be_numbered():
     space = ParameterSpace({name: Float(low=0.0, high=1.0, baseline=0.5) for name in "abcd"})
     (mistake,) = check_grid(dict.fromkeys("abcd", Span(low=0.0, high=1.0, count=100_000)), space)
-    assert "coarser" in mistake.message
+    assert "coarser" in mistake.what
 
 
 @given(

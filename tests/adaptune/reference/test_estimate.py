@@ -73,7 +73,8 @@ class TestOfACourse:
         assert not found.trusted[39]
         (gap,) = found.gaps()
         seconds = (found.stamps - found.stamps[0]) * 1e-9
-        assert gap[0] <= seconds[39] < seconds[40] < gap[1]
+        first, stop = gap.seconds
+        assert first <= seconds[39] < seconds[40] < stop
         assert found.unknown_share() < 0.3
 
 

@@ -208,11 +208,12 @@ def test_no_sub_trajectory_crosses_a_motion_that_is_not_trusted(found, length):
 def test_gaps_are_where_poses_are_unknown(found):
     seconds = (found.stamps - found.stamps[0]) * 1e-9
     gaps, inside = found.gaps(), np.zeros(len(seconds), bool)
-    for first, stop, _ in gaps:
+    spans = [gap.seconds for gap in gaps]
+    for first, stop in spans:
         assert first < stop
         inside |= (seconds > first) & (seconds < stop)
-    assert all(stop <= first for (_, stop, _), (first, *_) in pairwise(gaps))
-    inside[-1] |= bool(gaps) and gaps[-1][1] == seconds[-1] and not found.known[-1]
+    assert all(stop <= first for (_, stop), (first, _) in pairwise(spans))
+    inside[-1] |= bool(spans) and spans[-1][1] == seconds[-1] and not found.known[-1]
     np.testing.assert_array_equal(inside, ~found.known)
 
 
