@@ -112,8 +112,9 @@ def write_text(path: Path, text: str) -> None:
 
 def plain_name(path: Path) -> str:
     """Name of a sequence for a recording: letters, digits, _ . and - of the file's."""
-    name = "".join(c if c.isalnum() or c in "_.-" else "_" for c in path.stem)
-    return name.lstrip(".-") or "recording"
+    name = "".join(c if c.isalnum() or c in "_.-" else "_" for c in path.stem).lstrip(".-")
+    # A study's names have 100 bytes at most, those of parts too.
+    return name.encode()[:80].decode(errors="ignore") or "recording"
 
 
 # YAML with the numbers and booleans of YAML 1.2, unique keys, and line numbers.
@@ -129,7 +130,7 @@ _TAGS = ("null", "bool", "int", "float", "str", "seq", "map")
 class _Loader(yaml.SafeLoader):
     """Numbers and booleans of YAML 1.2: 1e3 is a number, 010 is ten, `on` is a string.
 
-    Nothing but plain data is made: no dates, no bytes, no sets.
+    Nothing but plain data is made: no dates, no bytes, no sets. Keys stay as they are written.
     """
 
     yaml_constructors = {  # noqa: RUF012 - that is how PyYAML keeps them
@@ -145,16 +146,17 @@ class _Loader(yaml.SafeLoader):
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
         """Construct a mapping; refuse a key that comes twice."""
-        seen: dict[Any, int] = {}
+        seen: dict[str, int] = {}
         for key_node, _ in node.value:
-            key = self.construct_object(key_node, deep=True)
             line = key_node.start_mark.line + 1
-            if not isinstance(key, str | int | float | bool):
+            if not isinstance(key_node, yaml.ScalarNode):
                 raise YamlError(f"line {line}: a key must be a word or a number")
+            key = _str(self, key_node)
             if key in seen:
                 raise YamlError(f"line {line}: {key!r} was given before, in line {seen[key]}")
             seen[key] = line
-        return super().construct_mapping(node, deep)
+        values = [self.construct_object(value, deep) for _, value in node.value]
+        return dict(zip(seen, values, strict=True))
 
 
 _PREFIX = "tag:yaml.org,2002:"
@@ -262,6 +264,10 @@ class Document:
             return None
         return node.start_mark.index, node.end_mark.index
 
+    def name(self, path: Sequence[str | int]) -> str:
+        """The single value at a path as it is written: a name, also where it is a number."""
+        return str(self._along(path)[-1][1].value)
+
     def line(self, path: Sequence[str | int]) -> int | None:
         """Line of the deepest part of `path` that is there; none for an empty document."""
         found = self._along(path)
@@ -300,13 +306,25 @@ class _Dumper(yaml.SafeDumper):
         """Write everything out."""
         return True
 
+    def represent_str(self, data: str) -> Any:
+        """Quote a text; an AdaptuneError if a study cannot hold it."""
+        if _NO_CHARACTER.search(data):
+            raise AdaptuneError(f"{data!a}: holds what is no character in UTF-8; rename it")
+        # As a plain text, PyYAML folds rarer line breaks, and does not read them back.
+        style = '"' if re.search("[\x85\u2028\u2029]", data) else None
+        return self.represent_scalar(_PREFIX + "str", data, style)
 
+
+_Dumper.add_representer(str, _Dumper.represent_str)
 for _tag, _regexp, _first in (("int", _INT, "-+0123456789"), ("float", _FLOAT, "-+0123456789.")):
     _Dumper.add_implicit_resolver(_PREFIX + _tag, _regexp, list(_first))
 
 
 def dump(data: Any) -> str:
-    """Plain data as YAML, keys in their order."""
+    """Plain data as YAML that is read back as just these, keys in their order.
+
+    An AdaptuneError names a text that YAML cannot hold.
+    """
     text: str = yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=100)
     return text
 

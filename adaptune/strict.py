@@ -267,7 +267,10 @@ def path_of(name: str, kind: str, ours: Mapping[str, str], group: str, sort: str
             help_ = f"{nearest(name, [*ours, *announced])} (a {sort.lower()} of your own is"
             raise PluginError(f"there is no {kind} {name!r}: {help_} module:{sort})")
         path = announced[name]
-    module = path.partition(":")[0]
+    module, _, own = path.partition(":")
+    if module == "__main__":  # of a notebook; trials run in other processes
+        help_ = f"put it into a file, mine.py, and name mine:{own}"
+        raise PluginError(f"{name}: {own} lives in this session only; {help_}")
     if not all(map(str.isidentifier, module.split("."))):
         help_ = f"write it as Python imports it, as in my_package.my_module:{sort}"
         raise PluginError(f"{name}: {module!r} is not the name of a module; {help_}")

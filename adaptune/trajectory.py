@@ -9,6 +9,7 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -83,6 +84,7 @@ class Trajectory:
 Row = tuple[int, list[str]]
 """Number of a line, and its fields."""
 _NUMBER = re.compile(r"[-+.]*\d")
+_DECIMAL = re.compile(r"[-+]?\d+,\d+(?:[eE][-+]?\d+)?")
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str, list[str]]]:
@@ -95,7 +97,21 @@ def _lines(path: Path) -> Iterator[tuple[int, str, list[str]]]:
         raise TrajectoryError(f"{path}: cannot be read as text in UTF-8 ({error})") from error
     for number, line in enumerate(text.splitlines(), start=1):
         if line := line.strip().rstrip(",; "):
-            yield number, line, [] if line[0] == "#" else re.split(r"\s*[,;]\s*|\s+", line)
+            fields = re.split(r"\s*;\s*" if ";" in line else r"\s+", line)
+            commas = [field for field in fields if "," in field]
+            # Where something else parts so many fields, commas are decimal.
+            if commas and len(fields) >= 7 and all(map(_DECIMAL.fullmatch, commas)):
+                _assume(path, "its numbers have decimal commas")
+                fields = [field.replace(",", ".") for field in fields]
+            elif re.search("[,;]", line):
+                fields = re.split(r"\s*[,;]\s*|\s+", line)
+            yield number, line, [] if line[0] == "#" else fields
+
+
+@cache
+def _assume(path: Path, what: str) -> None:
+    """Say once how a file is read."""
+    _log.info("%s: %s", path, what)
 
 
 def _numbers(path: Path, rows: list[Row]) -> NDArray[np.float64]:
@@ -113,29 +129,31 @@ def _numbers(path: Path, rows: list[Row]) -> NDArray[np.float64]:
 _COLUMNS = ("timestamp", "x", "y", "z", "qx", "qy", "qz", "qw")
 # What a header may call them, in lower case and without units; an axis follows the last two.
 _NAMES = {
-    "nanoseconds": r"(.*[._ ])?n(ano)?sec\w*",
-    "timestamp": r"t|.*(time|stamp).*|(.*[._ ])?sec\w*",
-    "q": r"(.*[._ ])?(q|quat|orient|rot)(.*[._ ])?[xyzw]",
-    "": r"(t_?|(.*[._ ])?(p|pos|trans|loc)(.*[._ ])?)?[xyz]",
+    "nanoseconds": r"(.*[._ /])?n(ano)?sec\w*",
+    "timestamp": r"t|.*(time|stamp).*|(.*[._ /])?sec\w*",
+    "q": r"(.*[._ /])?(q|quat|orient|rot)(.*[._ /])?[xyzw]",
+    "": r"(t_?|(.*[._ /])?(p|pos|trans|loc)(.*[._ /])?)?[xyz]",
 }
 
 
-def _named(header: str) -> dict[str, int]:
-    """Where a header has each of `_COLUMNS`, as far as it names them."""
+def _named(header: str) -> dict[str, list[int]]:
+    """Where a header has each of `_COLUMNS`, as far as it names them; the likeliest one first."""
     header = re.sub(r"\[.*?\]|\(.*?\)|[#%\"]", "", header).lower().strip()
-    found: dict[str, int] = {}
-    for i, name in enumerate(
-        re.split(r"\s*[,;]\s*" if re.search("[,;]", header) else r"\s+", header)
-    ):
+    names = re.split(r"\s*[,;]\s*" if re.search("[,;]", header) else r"\s+", header)
+    found: dict[str, list[int]] = {}
+    for i, name in enumerate(names):
         of = next((of for of, known in _NAMES.items() if re.fullmatch(known, name)), None)
         if of is not None:
-            found.setdefault(of if len(of) > 1 else of + name[-1], i)
+            found.setdefault(of if len(of) > 1 else of + name[-1], []).append(i)
+    # A message's own stamp comes before the time at which it was recorded.
+    for times in (found.get("timestamp", []), found.get("nanoseconds", [])):
+        times.sort(key=lambda i: ("header" not in names[i], "stamp" not in names[i]))
     return found
 
 
-def _table(path: Path) -> tuple[dict[str, int], list[Row]]:
+def _table(path: Path) -> tuple[dict[str, list[int]], list[Row]]:
     """Columns that a header, or a comment before the poses, names completely; and the rows."""
-    named: dict[str, int] = {}
+    named: dict[str, list[int]] = {}
     rows: list[Row] = []
     for number, line, fields in _lines(path):
         if fields and (rows or any(map(_NUMBER.match, fields))):
@@ -149,6 +167,12 @@ def _table(path: Path) -> tuple[dict[str, int], list[Row]]:
             named = named if missing else found
     if not rows:
         raise TrajectoryError(f"{path}: holds no pose; give a file of TUM, KITTI or EuRoC")
+    first = rows[0][1]
+    if not named and len(first) >= 10 and not any(map(_NUMBER.match, first[2:3])):
+        _assume(path, "its columns are those of `ros2 topic echo --csv`")
+        x = next((i for i, field in enumerate(first) if i > 2 and _NUMBER.match(field)), 3)
+        columns = [0, *range(x, x + 7)]
+        named = {"nanoseconds": [1]} | {n: [c] for n, c in zip(_COLUMNS, columns, strict=True)}
     return named, rows
 
 
@@ -176,17 +200,47 @@ def _stamps(path: Path, rows: list[Row], columns: Sequence[int]) -> tuple[NDArra
     return np.array(scaled, np.int64), unit == 9
 
 
-def _read(path: Path, csv: bool) -> Trajectory:
-    named, rows = _table(path)
-    need = max([7, *named.values()]) + 1
+@np.errstate(over="ignore", invalid="ignore")
+def _is_matrix(fields: Sequence[str]) -> bool:
+    """Whether fields are the rows of a 3x4 or 4x4 pose."""
+    try:
+        T = np.array(fields, float).reshape(-1, 4)
+        turned = np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-2)
+    except ValueError:
+        return False
+    return turned and len(T) in (3, 4) and bool((T[3:] == [0, 0, 0, 1]).all())
+
+
+def _matrices(path: Path, rows: list[Row]) -> Poses:
+    """Poses of lines that end with the 12 or 16 numbers of the rows of a matrix."""
+    need = len(rows[0][1])
+    for number, fields in rows:
+        if len(fields) != need:
+            what = f"a line of matrices has {need} numbers here, this has {len(fields)}"
+            raise TrajectoryError(f"{path}, line {number}: {what}")
+    values = _numbers(path, [(number, fields[need % 4 :]) for number, fields in rows])
+    T = np.tile(np.eye(4), (len(rows), 1, 1))
+    T[:, :3] = values.reshape(len(rows), -1, 4)[:, :3]
+    return T
+
+
+def _quaternions(
+    path: Path, several: dict[str, list[int]], rows: list[Row], csv: bool
+) -> tuple[NDArray[np.int64], Poses]:
+    """Stamps and poses of lines with a position and a quaternion."""
+    times, named = several.get("timestamp", [0]), {n: c[0] for n, c in several.items()}
+    need = max([7, *times, *named.values()]) + 1
     for number, fields in rows:
         if len(fields) < need or not (named or csv or len(fields) == 8):
             what = f"a {'CSV' if csv else 'TUM'} line has {need} numbers, this has {len(fields)}"
             help_ = f"name other columns in the first line ({' '.join(_COLUMNS)})"
             raise TrajectoryError(f"{path}, line {number}: {what}; {help_}")
-    at = named.get("timestamp", 0)
-    pair = named.get("nanoseconds") == at + 1
-    stamps, nanoseconds = _stamps(path, rows, [at, at + 1] if pair else [at])
+    # A stamp that never changes was never set.
+    at = next((i for i in times if len({fields[i] for _, fields in rows}) > 1), times[0])
+    if len(times) > 1:
+        _assume(path, f"of its columns of times, the stamps are those of column {at + 1}")
+    fractions = [i for i in several.get("nanoseconds", ()) if abs(i - at) == 1]
+    stamps, nanoseconds = _stamps(path, rows, [at, *fractions[:1]])
     quaternion = (5, 6, 7, 4) if csv and nanoseconds else (4, 5, 6, 7)
     order = [named[name] for name in _COLUMNS[1:]] if named else [1, 2, 3, *quaternion]
     values = _numbers(path, [(n, [fields[column] for column in order]) for n, fields in rows])
@@ -195,6 +249,16 @@ def _read(path: Path, csv: bool) -> Trajectory:
         i, columns = int(np.argmax(wrong)), ", ".join(str(column + 1) for column in order[3:])
         what = f"its quaternion has length {np.linalg.norm(values[i, 3:]):.3g}, not 1"
         raise TrajectoryError(f"{path}, line {rows[i][0]}: {what} (columns {columns})")
+    return stamps, geometry.from_quaternions(values[:, :3], values[:, 3:])
+
+
+def _read(path: Path, csv: bool) -> Trajectory:
+    named, rows = _table(path)
+    if not named and _is_matrix(rows[0][1][1:]):
+        _assume(path, "its lines are a stamp and the rows of a matrix")
+        stamps, T = _stamps(path, rows, [0])[0], _matrices(path, rows)
+    else:
+        stamps, T = _quaternions(path, named, rows, csv)
     ahead = np.diff(stamps, prepend=stamps[0] - 1)
     if (back := int(np.argmin(ahead))) and ahead[back] < 0:
         what = "its stamp does not come after the line before; sort the lines by time"
@@ -205,7 +269,7 @@ def _read(path: Path, csv: bool) -> Trajectory:
         if n > 0.1 * len(rows):
             raise TrajectoryError(f"{path}: {what}; write stamps with all their digits")
         _log.warning("%s: %s; they are left out", path, what)
-    return Trajectory(stamps[keep], geometry.from_quaternions(values[keep, :3], values[keep, 3:]))
+    return Trajectory(stamps[keep], T[keep])
 
 
 def read_tum(path: Path) -> Trajectory:
@@ -241,14 +305,10 @@ def tum_lines(stamps: NDArray[np.int64], T_world_sensor: Poses) -> list[str]:
 def read_kitti(path: Path) -> Poses:
     """Read poses, of shape (n, 4, 4), from lines of 12 numbers, the rows of a 3x4 matrix."""
     rows = _table(path)[1]
-    for number, fields in rows:
-        if len(fields) != 12:
-            what = f"a KITTI line has 12 numbers, this has {len(fields)}"
-            raise TrajectoryError(f"{path}, line {number}: {what}")
-    values = _numbers(path, rows)
-    T = np.tile(np.eye(4), (len(values), 1, 1))
-    T[:, :3] = values.reshape(-1, 3, 4)
-    return T
+    if len(fields := rows[0][1]) not in (12, 16):
+        what = f"a KITTI line has 12 numbers, this has {len(fields)}"
+        raise TrajectoryError(f"{path}, line {rows[0][0]}: {what}")
+    return _matrices(path, rows)
 
 
 def write_kitti(path: Path, T_world_sensor: Poses) -> None:
@@ -258,6 +318,7 @@ def write_kitti(path: Path, T_world_sensor: Poses) -> None:
 
 
 def is_kitti(path: Path) -> bool:
-    """Whether a file's first pose has 12 numbers, and no stamp."""
+    """Whether a file's first pose is a matrix of 12 or 16 numbers, and has no stamp."""
     first: list[str] = next((fields for *_, fields in _lines(path) if fields), [])
-    return path.suffix != ".csv" and len(first) == 12 and bool(_NUMBER.match(first[0]))
+    twelve = path.suffix != ".csv" and len(first) == 12 and bool(_NUMBER.match(first[0]))
+    return twelve or _is_matrix(first)

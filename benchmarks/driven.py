@@ -32,9 +32,7 @@ def driven(study: Study, mode: str) -> tuple[list[float], NDArray[np.float64]]:
     errors, told = [], []
     for name in study.config.test:
         folder = study.folder / "replays" / name
-        reference = Reference.read(
-            folder, study.config.sub_trajectory, study.sequences.estimate(name)
-        )
+        reference = Reference.read(study, name)
         replay = StoredReplay.read(folder / mode)
         errors.append(float(np.nanmean(reference.errors(replay.trajectory))))
         at = np.searchsorted(replay.trajectory.stamps, replay.choice_stamps)

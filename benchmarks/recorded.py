@@ -150,9 +150,7 @@ def run(study: OfflineStudy, references: Path) -> list[ComparisonRow]:
         folder = study.folder / "replays" / name
         also = [m for m in study.config.online.also if (folder / m / "replay.json").exists()]
         replays = {mode: StoredReplay.read(folder / mode) for mode in (*MODES, *also)}
-        reference = Reference.read(
-            folder, study.config.sub_trajectory, study.sequences.estimate(name)
-        )
+        reference = Reference.read(study, name)
         rows += compare_modes(name, replays, reference).rows
     return rows
 

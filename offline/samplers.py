@@ -1,7 +1,7 @@
 """Samplers: what proposes the next parameter sets, in batches, and no set twice."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from itertools import islice, zip_longest
 from operator import itemgetter
 from typing import Any
@@ -247,11 +247,7 @@ class AskedSampler(Sampler):
                     return False
             if given is not None:
                 self._study.enqueue_trial(self._encode(given))
-            try:
-                trial = self._study.ask(self._distributions)
-            except Exception as error:
-                what = f"offline.sampler, at trial {number}: {self.config.sampler}"
-                raise SamplerError(f"{what}: {in_a_line(error)}") from error
+            trial = self._call(self._study.ask, self._distributions)
             parameters, given = given or self._decode(trial.params), None
             name = key(parameters)
             if name in self._known:
@@ -277,7 +273,15 @@ class AskedSampler(Sampler):
         self._waiting = {}
 
     def _tell(self, trial: optuna.Trial, result: SamplerResult) -> None:
-        self._study.tell(trial, result.value)
+        self._call(self._study.tell, trial, result.value)
+
+    def _call(self, method: Callable[..., Any], *given: Any) -> Any:
+        """Call a sampler that may be the user's own."""
+        try:
+            return method(*given)
+        except Exception as error:
+            what = f"offline.sampler: {self.config.sampler}"
+            raise SamplerError(f"{what}: {in_a_line(error)}") from error
 
     # For Optuna, as for Python, the choices 1 and True are equal: it receives their index.
 
@@ -389,4 +393,10 @@ def make_sampler(space: ParameterSpace, config: OfflineConfig) -> Sampler:
         return RandomSampler(space, config)
     if config.sampler in ("grid", "random"):
         return GridSampler(space, config)
+    if ":" in config.sampler:
+        # One that cannot sample these parameters says so before anything is run.
+        rehearsal = AskedSampler(space, config.model_copy(update={"initial": 1}))
+        proposed = rehearsal.propose([])
+        if len(proposed) == config.batch:
+            rehearsal.propose([(parameters, 1.0 + i) for i, parameters in enumerate(proposed)])
     return AskedSampler(space, config)

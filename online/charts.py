@@ -169,7 +169,7 @@ def read_replays(study: Study, name: str) -> ReplayedSequence:
         If a file is damaged, or if `compare` refuses all of them.
     """
     folder, length = study.folder / "replays" / name, study.config.sub_trajectory
-    reference = Reference.read(folder, length, study.sequences.estimate(name))
+    reference = Reference.read(study, name)
     current = current_replays(study, [name])
     if current.modes:
         check_reference(folder, study.sequences.reference(name))

@@ -396,8 +396,7 @@ def compare(study: Study) -> ComparedReplays:
     for name in names:
         folder = study.folder / "replays" / name
         replays = {mode: StoredReplay.read(folder / mode) for mode in modes}
-        stored = study.sequences.estimate(name)
-        reference = Reference.read(folder, study.config.sub_trajectory, stored)
+        reference = Reference.read(study, name)
         every = _with_fixed_rivals(replays, model)
         wrong += [f"On {name}, {what}." for what in read_contradictions(folder)]
         of_modes = compare_modes(name, every, reference)

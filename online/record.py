@@ -24,6 +24,10 @@ _TABLES = ("frames.csv", "selections.csv")
 """Files of a replay besides its trajectory."""
 
 
+_INPUTS = {"mode", "parameters", "model", "switching", "real_time"}
+"""What is read of a replay's inputs."""
+
+
 class StoredReplayError(AdaptuneError):
     """A replay that is missing or damaged."""
 
@@ -57,10 +61,15 @@ class ReplaySummary(BaseModel):
                 f"{folder}: there is no replay; run `adaptune online` with this study first"
             )
         try:
-            inputs = manifest.recorded(folder / manifest.FILE)
-            return cls.model_validate_json(path.read_bytes()).model_copy(update={"inputs": inputs})
+            inputs = manifest.recorded(folder / manifest.FILE) or {}
+            found = cls.model_validate_json(path.read_bytes())
         except (OSError, ValidationError, ConfigurationError) as error:
             raise damaged(path, error) from error
+        if not inputs.keys() >= _INPUTS:
+            what = "an older adaptune did not record what this replay was made from"
+            option = " --untrained" if folder.name == "untrained" else ""
+            raise StoredReplayError(f"{folder}: {what}; run `adaptune online{option}` again")
+        return found.model_copy(update={"inputs": inputs})
 
 
 def replay_changes(
@@ -70,8 +79,11 @@ def replay_changes(
     if not all((folder / name).exists() for name in ("replay.json", "trajectory.tum", *_TABLES)):
         return None
     try:
-        return manifest.changes(ReplaySummary.read(folder).inputs, inputs, files)
-    except StoredReplayError:
+        before = manifest.recorded(folder / manifest.FILE)
+        if before is not None and before.keys() >= _INPUTS:
+            ReplaySummary.read(folder)
+        return manifest.changes(before, inputs, files)
+    except (StoredReplayError, ConfigurationError):
         return None
 
 

@@ -99,7 +99,7 @@ def record_replays(study: Study, name: str, progress: Progress = unseen) -> Path
         raise StoredReplayError(refused[0][:-1])
     replays = {mode: StoredReplay.read(folder / mode) for mode in modes}
     check_reference(folder, study.sequences.reference(name))
-    reference = Reference.read(folder, study.config.sub_trajectory)
+    reference = Reference.read(study, name)
     known = reference.trajectory
     paths = {mode: _placed(replay.trajectory, known) for mode, replay in replays.items()}
     placing = next((mode for mode in _PLACING if mode in modes), modes[0])

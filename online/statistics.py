@@ -4,7 +4,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import reduce
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,8 +22,7 @@ from adaptune.metrics import (
     sub_trajectory_rte,
     window_ends,
 )
-from adaptune.reference.stored import StoredEstimate
-from adaptune.study.study import OracleErrors
+from adaptune.study.study import OracleErrors, Study
 from adaptune.trajectory import Trajectory, read_tum
 from online.record import StoredReplay, switched
 
@@ -186,13 +184,17 @@ class Reference(NamedTuple):
     error: float | None = None  # estimated mean RTE of an estimated one, percent
 
     @classmethod
-    def read(cls, folder: Path, length: float, stored: StoredEstimate | None = None) -> "Reference":
-        """Read the reference of a replayed sequence, if it has one, from the folder of its replays.
-
-        `stored` is what is known about an estimated one.
-        """
-        path = folder / "reference.tum"
+    def read(cls, study: Study, name: str) -> "Reference":
+        """Read the reference of a replayed sequence, if it has one, from beside its replays."""
+        path, length = (
+            study.folder / "replays" / name / "reference.tum",
+            study.config.sub_trajectory,
+        )
         trajectory = read_tum(path) if path.exists() else None
+        if trajectory is not None:
+            # Frames in a gap have no label in training, and get none here.
+            trajectory = replace(trajectory, max_gap=study.sequences.config(name).max_gap)
+        stored = study.sequences.estimate(name)
         error = math.nan if stored is None else stored.error(length)
         return cls(trajectory, length, stored is not None, None if math.isnan(error) else error)
 

@@ -4,6 +4,7 @@ import re
 import shlex
 import shutil
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -26,6 +27,7 @@ from adaptune.commands.cli import app
 from adaptune.model import BankSettings, PairedSettings
 from adaptune.odometry.registry import declare_here
 from adaptune.recording import SequenceConfig
+from adaptune.strict import ConfigurationError
 from adaptune.trajectory import read_tum
 from offline.config import OfflineStudyConfig, load_study
 from offline.train import train
@@ -121,10 +123,10 @@ def test_the_tables_of_settings_are_those_of_the_code():
     assert missing == []
 
 
-def blocks(language: str) -> list[tuple[str, str]]:
-    """Code blocks of a language, each with the name of its page."""
+def blocks(language: str, pages: Sequence[Path] = ()) -> list[tuple[str, str]]:
+    """Code blocks of a language, by default those of the guide, each with the name of its page."""
     found = []
-    for page in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))):
+    for page in pages or (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))):
         text = page.read_text("utf-8")
         code = re.findall(rf"^```{language}\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
         if language == "sh":
@@ -133,14 +135,16 @@ def blocks(language: str) -> list[tuple[str, str]]:
     return found
 
 
-def lines() -> list[tuple[str, list[str]]]:
+def lines(pages: Sequence[Path] = ()) -> list[tuple[str, list[str]]]:
     """Every command of adaptune's in the pages, in words, with the name of its page."""
-    return [
-        (page, shlex.split(line.strip(), comments=True))
-        for page, block in blocks("sh")
-        for line in block.splitlines()
-        if line.strip().startswith("adaptune ")
-    ]
+    found = []
+    for page, block in blocks("sh", pages):
+        # A quoted value may go on in the next lines.
+        code = re.sub(r"\s#.*", "", block)
+        whole = re.sub(r"'[^']*'", lambda quoted: " ".join(quoted[0].split()), code)
+        commands = (line.strip() for line in whole.replace("\\\n", " ").splitlines())
+        found += [(page, shlex.split(line)) for line in commands if line.startswith("adaptune ")]
+    return found
 
 
 def written_to(words: list[str]) -> list[str]:
@@ -165,13 +169,33 @@ def folder(tmp_path, monkeypatch):
 def test_commands_are_understood():
     group: Any = get_command(app)
     understood = 0
-    for page, (_, name, *arguments) in lines():
+    for page, (_, name, *arguments) in lines(PAGES):
+        of = group.commands["offline" if name == "$stage" else name]
         try:
-            group.commands[name].make_context(name, written_to(arguments))
+            of.make_context(of.name, written_to(arguments))
         except click.ClickException as error:
             pytest.fail(f"{page}: adaptune {name} {shlex.join(arguments)}: {error.message}")
         understood += 1
-    assert understood > 25
+    assert understood > 45
+
+
+def test_overrides_are_understood(folder):
+    text = "\n".join(page.read_text("utf-8") for page in PAGES)
+    given = re.findall(
+        r"""(?:-o|^[A-Z]+=) ?(?:'([^']+)'|"?([a-z][\w.]*=[^\s`'"]+))""", text, re.MULTILINE
+    )
+    overrides = {" ".join("".join(either).split()) for either in given}
+    overrides = {text for text in overrides if not text.endswith(("=...", "key=value"))}
+    assert len(overrides) > 20
+    # Other studies have other sequences, parameters and samplers.
+    elsewhere = r"there is no sequence|has no parameter|no such setting"
+    for override in sorted(overrides):
+        try:
+            load_study(folder / "my.yaml", [override])
+        except ConfigurationError as error:
+            wrong = [line for line in str(error).splitlines() if line.startswith("-o")]
+            wrong = [line for line in wrong if not re.search(elsewhere, line)]
+            assert wrong == [], override
 
 
 @pytest.mark.usefixtures("folder")

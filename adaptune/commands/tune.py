@@ -158,8 +158,10 @@ def roles(
     Of a single recording, what follows after a `share` of its duration is kept for the test; of
     several, the last one.
     """
+    from adaptune.files import dump
     from adaptune.reference.check import TRAINING
 
+    names = [dump([name]).removeprefix("- ").strip() for name in names]
     if len(names) == 1:
         end = f"{100 * (share or TRAINING):.0f}"
         training, test = f"{names[0]}: 0-{end}%", f"{names[0]}: {end}-100%"
@@ -288,7 +290,9 @@ def _made_by(
     words = [*(str(bag.resolve()) for bag in recordings), "--odometry", odometry]
     words += ["--points", points] if points else []
     words += ["--reference", reference] if reference else []
-    return f"# adaptune tune {shlex.join(words)}\n"
+    # A name may hold the end of a line, or what is no character.
+    plain = (c if c.isprintable() else ascii(c)[1:-1] for c in shlex.join(words))
+    return f"# adaptune tune {''.join(plain)}\n"
 
 
 def _limits(trials: int | None, minutes: float | None) -> dict[str, str]:

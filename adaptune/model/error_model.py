@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, PositiveInt, create_model
 from rich.console import Group, RenderableType
 from rich.text import Text
 from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save_file
+from safetensors.numpy import save
 
 from adaptune import __version__
 from adaptune.archive import compact
@@ -63,9 +63,10 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
         found, version = int(text["format"]), str(text["version"])
         if found != FORMAT:
             raise ModelError(
-                f"{path}: written by adaptune {version}, which is "
-                f"{'newer' if found > FORMAT else 'older'} than this ({__version__}); run "
-                f"`adaptune offline` again, which fits the model to the finished trials"
+                f"{path}: has format {found} (of adaptune {version}), which is "
+                f"{'newer' if found > FORMAT else 'older'} than {FORMAT} (of this one, "
+                f"{__version__}); run `adaptune offline` again, which fits the model to the "
+                f"finished trials"
             )
         arrays = {name: file.get_tensor(name) for name in sorted(file.keys())}
     if digest(text["header"], arrays) != text["digest"]:
@@ -252,7 +253,9 @@ class ErrorModel:
         # The format keeps no order of several entries, and the same model shall have the same
         # bytes.
         with replacing(Path(path)) as temporary:
-            save_file(arrays, temporary, {"adaptune": json.dumps(text | {"header": header})})
+            # The library's own file is for its owner's eyes only.
+            written = save(arrays, {"adaptune": json.dumps(text | {"header": header})})
+            temporary.write_bytes(written)
 
     @classmethod
     def load(cls, path: Path | str) -> Self:

@@ -14,6 +14,7 @@ from collections.abc import (
 )
 from contextlib import contextmanager
 from functools import cache, partial
+from itertools import islice
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -34,6 +35,7 @@ from adaptune.recording.clouds import (
     header_of,
     message_stamp,
     of_frame,
+    untimed,
     usable,
 )
 from adaptune.recording.config import files_of
@@ -100,6 +102,8 @@ class IndexReader(Reader):
         yield from super().messages(connections, start, stop)
 
 
+_LATEST, _LATE = 600 * 10**9, 10**9
+"""Nanoseconds from a bag's begin to its first scan, and by which scans come unevenly."""
 POINTS_TYPES = ("sensor_msgs/msg/PointCloud2", *clouds.LIVOX_TYPES)
 IMU_TYPES = ("sensor_msgs/msg/Imu",)
 
@@ -194,6 +198,20 @@ class BagSource:
             what = f"{self.points} holds clouds of {', '.join(sorted(map(repr, frames)))}"
             raise SequenceError(f"{self.name}: {what}; name one of these frames as `frame`")
 
+    def between(self, begin: int, stop: int) -> list[Frame]:
+        """Scans with stamps from `begin` to before `stop`, found by the bags' index."""
+        frames = list[Frame]()
+        with self.open(by_index=True) as reader:
+            load, soon = self.loader(reader), (None, reader.start_time + _LATEST)
+            for _, recorded, data in islice(self.read(reader, self.points, soon), 1):
+                late = recorded - (header_of(data, reader.is2)[0] or 0)
+                span = begin + late - _LATE, stop + late + _LATE
+                for _, when, message in self.read(reader, self.points, span):
+                    stamp = header_of(message, reader.is2)[0] or 0
+                    if begin <= stamp < stop:
+                        frames.append(Frame(stamp, when, partial(load, message, self.name)))
+        return frames
+
     def _begin(self, reader: AnyReader, topic: str) -> int | None:
         """Stamp of the first message, if it has one. Reading the bag reports why it has none."""
         try:
@@ -224,6 +242,8 @@ class BagSource:
             found = of_frame(f"{self.name}: {name}", found, child_frame)
         if not found:
             raise SequenceError(f"{self.name}: no pose on {name}; name another `reference`")
+        if what := untimed(found):
+            raise SequenceError(f"{self.name}: {name}: {what}; name another `reference`")
         trajectory, unusable = usable(found)
         unfit = f"poses on {name} that are not finite or have no rotation"
         if trajectory is None:

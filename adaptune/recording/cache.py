@@ -9,8 +9,8 @@ import hashlib
 import json
 import logging
 import os
+import secrets
 import shutil
-import tempfile
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, suppress
@@ -143,7 +143,9 @@ class Writer:
         root = folder()
         root.mkdir(parents=True, exist_ok=True)
         _sweep(root)
-        self._temporary = Path(tempfile.mkdtemp(prefix=".writing-", dir=root))
+        # Others may read it as far as the umask lets them.
+        self._temporary = root / f".writing-{secrets.token_hex(4)}"
+        self._temporary.mkdir()
         self._files = {name: (self._temporary / name).open("wb") for name in _ARRAYS}
         self._index: list[list[int]] = []
 

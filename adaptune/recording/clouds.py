@@ -457,3 +457,9 @@ def usable(poses: Sequence[Pose]) -> tuple[Trajectory | None, int]:
     values = values[good][index]
     T = geometry.from_quaternions(values[:, :3], values[:, 3:])
     return Trajectory(unique, T), int(np.count_nonzero(~good))
+
+
+def untimed(poses: Sequence[Pose]) -> str:
+    """What is wrong with poses whose stamps were never set; empty for others."""
+    first, same = poses[0][0], len({stamp for stamp, *_ in poses}) == 1 < len(poses)
+    return f"all its {len(poses)} poses have the stamp {first * 1e-9:.10g} s" if same else ""

@@ -40,12 +40,16 @@ def expand(text: str) -> str:
 
 
 def resolve(path: str, info: ValidationInfo) -> str:
-    """Make a path absolute: `expand`, replace ~, start from the folder of the study's file."""
+    """Make a path absolute: `expand`, replace ~, start from the folder of the study's file.
+
+    What is there under just this name is meant, whatever signs the name holds.
+    """
     folder = (info.context or {}).get("folder", Path())
     if not path.strip():
         raise ValueError("give a path, not an empty text")
     try:
-        whole = (Path(folder) / expand_user(expand(path))).resolve()
+        given = Path(folder, path)
+        whole = (given if given.exists() else folder / expand_user(expand(path))).resolve()
         whole.exists()
     except AdaptuneError as error:
         raise ValueError(str(error)) from error

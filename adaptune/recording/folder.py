@@ -64,6 +64,10 @@ class FileSource:
         for path, stamp in zip(self.scans, self.stamps.tolist(), strict=True):
             yield Frame(stamp, stamp, partial(self._load, path, stamp))
 
+    def between(self, begin: int, stop: int) -> list[Frame]:
+        """Scans with stamps from `begin` to before `stop`."""
+        return [frame for frame in self.frames() if begin <= frame.stamp < stop]
+
     def _load(self, path: Path, stamp: int) -> Scan:
         scan = read_scan(path, stamp, self.timing)
         if not self.elevation:

@@ -15,7 +15,7 @@ from adaptune.errors import AdaptuneError, Finding
 from adaptune.progress import Progress, unseen
 from adaptune.recording import Scan, SequenceConfig, SequenceError
 from adaptune.recording.bag import IMU_TYPES, POINTS_TYPES, BagSource, IndexReader
-from adaptune.recording.clouds import FARTHEST, PATH, POSES, Pose, header_of, parse, usable
+from adaptune.recording.clouds import FARTHEST, PATH, POSES, Pose, header_of, parse, untimed, usable
 from adaptune.recording.config import BAG_SUFFIXES, REFERENCE_FILES, bag_paths
 from adaptune.recording.findings import (
     Topic,
@@ -397,11 +397,17 @@ class _Survey:
             self._decode(topic, self._reader.end_time, self._path)
         if not self._poses:
             return None
-        trajectory, unusable = usable(self._poses)
+        where, (trajectory, unusable) = (found.used["reference"],), usable(self._poses)
+        if what := untimed(self._poses):
+            mend, lacks = "name another topic, or a file of poses", "poses with stamps"
+            found.findings.append(Finding(where, what, mend, of="reference", lacks=lacks))
+            return None
         if unusable:
             what = f"{unusable} of {len(self._poses)} poses are not finite or have no rotation"
-            lacks = "a reference trajectory" if trajectory is None else ""
-            where, mend = (found.used["reference"],), "adaptune leaves them out"
+            lacks, mend = (
+                "a reference trajectory" * (trajectory is None),
+                "adaptune leaves them out",
+            )
             found.findings.append(Finding(where, what, mend, of="reference", lacks=lacks))
         return trajectory
 

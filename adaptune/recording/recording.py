@@ -1,12 +1,11 @@
 """Recordings: what every format offers, and the part of one that a study uses."""
 
 import logging
-import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from functools import cache as once
 from functools import cached_property
-from itertools import chain, islice
+from itertools import chain, islice, product
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -112,13 +111,15 @@ def open_sequence(config: SequenceConfig) -> Recording:
     return sequence
 
 
-def check_sequence(config: SequenceConfig) -> None:
-    """Find what would fail while it is read, without reading its scans.
+def check_sequence(config: SequenceConfig) -> "RecordedSequence":
+    """Open a recording, and find what would fail while it is read, without reading its scans.
 
     A SequenceError says that it cannot be opened as described, ends before its `start`, or that its
     reference is of another time.
     """
-    RecordedSequence(config).check()
+    recorded = RecordedSequence(config)
+    recorded.check()
+    return recorded
 
 
 def wants_estimate(config: SequenceConfig) -> bool:
@@ -146,15 +147,20 @@ def sequence_files(config: SequenceConfig) -> SequenceFiles:
     return SequenceFiles(source.files, source.pose_files if own is None else own)
 
 
-def interval_of(config: SequenceConfig) -> tuple[float, float]:
-    """From which stamp to before which one a sequence uses its recording, in nanoseconds.
+_LOOK, _NEVER = 10**9, 1 << 62
+"""Nanoseconds of a recording that are searched for a scan of another one; later than all stamps."""
+_NOTES = (".txt", ".yaml")
+"""Files beside scans: two recordings may have the same."""
 
-    A SequenceError if it cannot be opened.
-    """
-    recorded = RecordedSequence(config)
-    first, _ = recorded.source.span() or (0, 0)
-    stop = math.inf if recorded.stop is None else first + 1e9 * recorded.stop
-    return first + 1e9 * recorded.start, stop
+
+def _alike(one: Scan, other: Scan) -> bool:
+    """Whether two scans have half of their points in common, to the millimetre."""
+    mine, others = (
+        np.round(scan.points * 1e3).astype(np.int64) @ (1, 1 << 20, 1 << 40)
+        for scan in (one, other)
+    )
+    fewest = min(len(mine), len(others))
+    return fewest > 0 and bool(np.isin(mine, others).sum() >= 0.5 * fewest)
 
 
 def _source(config: SequenceConfig) -> "tuple[Source, str | None]":
@@ -325,6 +331,29 @@ class RecordedSequence:
                 if number % self.stride == 0:
                     yield frame
                 number += 1
+
+    def shares_scans(self, other: "RecordedSequence") -> bool:
+        """Whether both use the same scans, of one file or written again.
+
+        Scans of one stamp tell it, those in the middle of the common time first.
+        """
+        begin, end, files = 0, _NEVER, list[set[Path]]()
+        for one in (self, other):
+            first, last = one.source.span() or (0, _NEVER)
+            begin = max(begin, first + round(1e9 * one.start))
+            end = min(end, last + 1 if one.stop is None else first + round(1e9 * one.stop))
+            files.append({f.resolve() for f in one.source.files if f.suffix not in _NOTES})
+        if begin >= end or files[0] & files[1]:
+            return begin < end
+        for at in ((begin + end) // 2, begin, max(begin, end - _LOOK)):
+            mine, others = (one.source.between(at, min(at + _LOOK, end)) for one in (self, other))
+            near = [p for p in product(mine, others) if abs(p[0].stamp - p[1].stamp) < SOONEST]
+            for a, b in near:
+                if len(scan := a.load()):
+                    return _alike(scan, b.load())
+            if mine and others and not near:
+                return False
+        return False
 
     def backward(self) -> Iterator[Scan]:
         """Read the scans, the last one first. A bag is decoded to the cache before."""

@@ -1,6 +1,8 @@
 """Reading a study: its YAML, the overrides, and its mistakes with their lines."""
 
+import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from functools import reduce
 from itertools import combinations, product
 from operator import getitem
@@ -19,12 +21,11 @@ from adaptune.odometry.registry import (
     where,
 )
 from adaptune.recording import cache
-from adaptune.recording.cache import MANY, fingerprint
 from adaptune.recording.config import SequenceConfig
-from adaptune.recording.recording import check_sequence, interval_of, sequence_files
+from adaptune.recording.recording import RecordedSequence, check_sequence
 from adaptune.space import Categorical, Float, Integer, ParameterSpace, PooledSpace
 from adaptune.strict import ConfigurationError, validated
-from adaptune.study.config import RULES, OdometryConfig, StudyConfig, settle_roles
+from adaptune.study.config import ROLES, RULES, OdometryConfig, StudyConfig, settle_roles
 from adaptune.study.study import Study, declared_odometry, tuned_space, whole_definition
 
 # Mistakes in the odometries of a study that only the odometries show.
@@ -127,7 +128,16 @@ def _check_parameters(name: str, space: ParameterSpace | None, tuned: Any) -> li
             mistakes.append(Finding((parameter,), message))
         elif isinstance(given, dict):
             whole = whole_definition(space, parameter, given)
-            if str(whole.get("type")) in _KINDS:
+            kind = str(whole.get("type"))
+            keys, others = ["low", "high"], ["choices"]
+            if kind == "categorical":
+                keys, others = others, [*keys, "log"]
+            if kind in _KINDS and (wrong := [key for key in others if key in given]):
+                own = whole_definition(space, parameter, {})
+                usual = ", ".join(f"{key}: {json.dumps(own[key])}" for key in keys if key in own)
+                what = f"takes {' and '.join(keys)}, not {' and '.join(wrong)}"
+                mistakes.append(Finding((parameter,), what, usual and f"its own are {usual}"))
+            elif kind in _KINDS:
                 validated(_KINDS[whole["type"]], whole, (parameter,), mistakes)
             else:
                 mistakes.append(Finding((parameter,), f"give its type, one of {', '.join(_KINDS)}"))
@@ -163,46 +173,27 @@ def _check_switching(config: StudyConfig, described: list[Description]) -> Itera
 # Recordings that a study trains on and tests on under two names.
 
 
-_NOTES = (".txt", ".yaml")
-"""Files beside scans: two recordings may have the same."""
+def _overlaps(config: StudyConfig, opened: dict[str, RecordedSequence]) -> Iterator[Finding]:
+    """Find test sequences that hold scans of a training sequence."""
 
+    def same(*names: str) -> bool:
+        if {*names} & config.courses.keys():
+            a, b = map(config.courses.get, names)
+            return a == b
+        for name in {*names} - opened.keys():
+            opened[name] = RecordedSequence(config.sequences[name])
+        with suppress(AdaptuneError):  # training names a scan that cannot be read
+            return opened[names[0]].shares_scans(opened[names[1]])
+        return False
 
-def _overlaps(config: StudyConfig) -> Iterator[Finding]:
-    """Find test sequences that hold scans of a training sequence, by the content of their files."""
     for (i, test), training in product(enumerate(config.test), config.training):
-        if test != training and _overlap(config, test, training):
+        if test != training and same(test, training):
             message = (
                 f"{test!r} is the recording of the training sequence {training!r}, and proves "
                 f"nothing here; leave one of them out, or give both a `start` or a `stop` so "
                 f"that they share no scan"
             )
             yield Finding(("test", i), message)
-
-
-def _overlap(config: StudyConfig, one: str, other: str) -> bool:
-    if one in config.courses and other in config.courses:
-        return config.courses[one] == config.courses[other]
-    a, b = config.sequences.get(one), config.sequences.get(other)
-    if a is None or b is None:
-        return False
-    mine, others = (
-        [file.resolve() for file in sequence_files(of).recording if file.suffix not in _NOTES]
-        for of in (a, b)
-    )
-    if len(mine) >= MANY:
-        mine = [mine[0], mine[len(mine) // 2], mine[-1]]
-    if not set(mine) & set(others):
-        # Files are read only where their sizes agree.
-        sizes = {file.stat().st_size for file in mine} & {file.stat().st_size for file in others}
-        contents, of_others = (
-            {fingerprint(file) for file in files if file.stat().st_size in sizes}
-            for files in (mine, others)
-        )
-        if not contents & of_others:
-            return False
-    # Sections are compared by the stamps of their recordings.
-    (begin, end), (other_begin, other_end) = interval_of(a), interval_of(b)
-    return begin < other_end and other_begin < end
 
 
 # The file.
@@ -286,6 +277,11 @@ def read_study(
     cache.cap()
     document = _read(path)
     data: Any = document.data
+    for role in ROLES:  # 00 is a name there
+        named = data.get(role) if isinstance(data.get(role), list) else []
+        for i, name in enumerate(named):
+            if not isinstance(name, str | list | dict):
+                named[i] = document.name((role, i))
     overridden = [_override(data, text) for text in overrides]
     config, mistakes = _check(config_type, data, path.parent.resolve(), needed)
     if mistakes or config is None:
@@ -381,9 +377,10 @@ def _check(
         if name in courses
     ]
     recorded = {name: entry for name, entry in sequences.items() if name not in origins}
-    mistakes += _check_recordings(recorded, context)
+    opened: dict[str, RecordedSequence] = {}
+    mistakes += _check_recordings(recorded, context, opened)
     if config is not None and not mistakes:
-        mistakes += _overlaps(config)
+        mistakes += _overlaps(config, opened)
     return config, [_at_origin(mistake, origins) for mistake in mistakes]
 
 
@@ -395,11 +392,13 @@ def _at_origin(mistake: Finding, origins: Mapping[str, str]) -> Finding:
     return mistake
 
 
-def _check_recordings(sequences: Mapping[str, Any], context: Any) -> Iterable[Finding]:
+def _check_recordings(
+    sequences: Mapping[str, Any], context: Any, opened: dict[str, RecordedSequence]
+) -> Iterable[Finding]:
     """Open recordings; mistakes in the entries themselves were found with the whole."""
     for name, entry in sequences.items():
         if (config := validated(SequenceConfig, entry, (), [], context)) is not None:
             try:
-                check_sequence(config)
+                opened[name] = check_sequence(config)
             except AdaptuneError as error:
                 yield Finding(("sequences", name), str(error))

@@ -48,6 +48,18 @@ FOREIGN = re.compile(r"pydantic|https://|Input should|validation|Value error|tup
         ("health.max_speed=.nan", "health.max_speed: give a finite number, not NaN"),
         ("health.max_speed=1" + "0" * 400, "health.max_speed: give a number of at most 1"),
         ("descriptor.window=3", "descriptor: give a list, not keys with values"),
+        (
+            "odometry={name: gicp, parameters: {downsampling: {low: 0.2, log: true}}}",
+            "parameters.downsampling: takes choices, not low and log; its own are choices: [0.15,",
+        ),
+        (
+            "odometry.parameters.keyframe_interval={choices: [1, 2]}",
+            "keyframe_interval: takes low and high, not choices; its own are low: 1.0, high: ",
+        ),
+        (
+            "odometry.parameters.keyframe_interval={type: categorical, low: 1, baseline: 1}",
+            "parameters.keyframe_interval: takes choices, not low",
+        ),
         ("online.modes=[paired]", "online.modes.0: paired is now called adaptive"),
         ("offline.objective={rtf: 3}", "offline.objective.rtf: give 'rte', 'kitti', 'rpe', 'ape'"),
         (

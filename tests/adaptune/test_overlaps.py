@@ -1,9 +1,15 @@
 import shutil
 
 import drives
+import numpy as np
 import pytest
+import rec
 
+from adaptune.recording import SequenceConfig
+from adaptune.recording.export import export
+from adaptune.recording.recording import open_sequence
 from adaptune.strict import ConfigurationError
+from adaptune.trajectory import write_tum
 from offline.config import load_study
 
 
@@ -42,12 +48,48 @@ def test_sections_may_not_overlap(load, one, three, overlapping):
         load(*overrides)
 
 
+def write_folder(folder, scans):
+    folder.mkdir(exist_ok=True)
+    for i, points in enumerate(scans):
+        np.column_stack([points, np.zeros(len(points))]).astype("<f4").tofile(folder / f"{i}.bin")
+    (folder / "times.txt").write_text("".join(f"{i}\n" for i in range(len(scans))))
+
+
+def written_again(folder, how):
+    """The bag of `three` as other programs write it."""
+    made = drives.scans(2, 40)
+    if how == "ROS 2":
+        recorded = open_sequence(SequenceConfig(bag=str(folder / "three.bag")))
+        export(recorded, None, folder / "again", "ros2")
+        return folder / "again"
+    if how == "recorded later, compressed":
+        clouds = [("/lidar", s + 10**12, drives.cloud(s, points)) for s, points, _ in made]
+        return rec.write_bag(folder / "again.bag", clouds, "LZ4")
+    if how == "points in another order, a third lost":
+        rng = np.random.default_rng(0)
+        made = [(s, rng.permutation(points)[: 2 * len(points) // 3], T) for s, points, T in made]
+    elif how == "a part":
+        made = made[22:31]
+    elif how == "every third scan":
+        made = made[1::3]
+    elif how == "microseconds":
+        made = [(s // 1000 * 1000, points, T) for s, points, T in made]
+    elif how == "a folder":
+        write_folder(folder / "again", [points for _, points, _ in made])
+        times = (f"{stamp // 10**9}.{stamp % 10**9:09d}\n" for stamp, *_ in made)
+        (folder / "again/times.txt").write_text("".join(times))
+        return folder / "again"
+    elif how == "another sensor of the same drive":
+        made = [(s, points + np.float32(0.3), T) for s, points, T in made]
+    elif how == "another drive at the same time":
+        made = drives.scans(7, 40)
+    return drives.write_bag(folder / "again.bag", made)
+
+
 def test_a_copy_of_a_folder_is_refused(load, tmp_path):
+    scans = [points for _, points, _ in drives.scans(5, 6)]
     for name in ("a", "b"):
-        (tmp_path / name).mkdir()
-        for i in range(3):
-            (tmp_path / name / f"{i}.bin").write_bytes(bytes([i + 1]) * 16 * (i + 1))
-        (tmp_path / name / "times.txt").write_text("0\n1\n2\n")
+        write_folder(tmp_path / name, scans[:3])
     poses = (tmp_path / "poses.tum").absolute()
     poses.write_text("0 0 0 0 0 0 0 1\n2 1 0 0 0 0 0 1\n")
     given = [
@@ -56,9 +98,41 @@ def test_a_copy_of_a_folder_is_refused(load, tmp_path):
     ]
     with pytest.raises(ConfigurationError, match="proves nothing here"):
         load(*given)
-    for i in range(3):
-        (tmp_path / "b" / f"{i}.bin").write_bytes(bytes([i + 7]) * 16 * (i + 1))
+    # Stamps that count from zero are the same by chance.
+    write_folder(tmp_path / "b", scans[3:])
     load(*given)
+
+
+@pytest.mark.parametrize(
+    ("how", "same"),
+    [
+        ("ROS 2", True),
+        ("recorded later, compressed", True),
+        ("points in another order, a third lost", True),
+        ("a part", True),
+        ("every third scan", True),
+        ("microseconds", True),
+        ("a folder", True),
+        ("another sensor of the same drive", False),
+        ("another drive at the same time", False),
+    ],
+)
+def test_the_same_scans_written_again_are_refused(load, tmp_path, how, same):
+    path = written_again(tmp_path, how)
+    poses = tmp_path / "poses.tum"
+    write_tum(poses, load("sequences.three.bag=three.bag").sequences.open("three").reference())
+    key = "folder" if (path / "times.txt").exists() else "bag"
+    given = [f"sequences.four={{{key}: {path}, reference: {poses}}}", "training=[three]"]
+    both = [*given, "sequences.three.bag=three.bag"]
+    if not same:
+        load(*both, "test=[four]")
+        return
+    for roles in (["test=[four]"], ["training=[one, four]", "test=[three]"]):
+        with pytest.raises(ConfigurationError, match="proves nothing here"):
+            load(*both, *roles)
+    apart = ["sequences.three.stop=0.4", "sequences.four.start=3.5"]
+    if how == "ROS 2":
+        load(*both, *apart, "test=[four]")
 
 
 def test_two_names_of_one_course(load):

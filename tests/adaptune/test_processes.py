@@ -62,6 +62,14 @@ def test_what_is_no_module(study_file, kind):
         load_study(study_file, overrides)
 
 
+@pytest.mark.parametrize("kind", NAMED)
+def test_a_class_of_a_notebook_belongs_into_a_file(study_file, kind):
+    overrides = [o.replace("wicked_one:It", "__main__:Mine") for o in NAMED[kind]]
+    words = r"lives in this session only; put it into a file, mine\.py, and name mine:Mine"
+    with pytest.raises(ConfigurationError, match=words):
+        load_study(study_file, overrides)
+
+
 MINE = """
 import os
 from pathlib import Path

@@ -32,6 +32,13 @@ def test_parts_become_sequences_of_their_own(study_file, tmp_path):
     assert recorded_in("one") != recorded_in("two")
 
 
+def test_a_name_may_look_like_a_number(study_file):
+    text = study_file.read_text().replace("one:", "00:").replace("two:", "1e3:")
+    file = study_file.with_name("numbers.yaml")
+    file.write_text(text.replace("[one, two]", "[00: 0-60%, 1e3]"))
+    assert load_study(file).training == ["00_0-60", "1e3"]
+
+
 def test_parts_of_a_course_share_its_recording(study_file, tmp_path):
     overrides = [COURSES, "training=[cave: 0-50%]", "test=[cave: 50-100%]"]
     sequences = load_study(study_file, overrides, tmp_path).sequences

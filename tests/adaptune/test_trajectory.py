@@ -56,6 +56,17 @@ ROS = "%time,field.header.frame_id,field.pose.pose.position.x,field.pose.pose.po
     "field.pose.pose.position.z,field.pose.pose.orientation.x,field.pose.pose.orientation.y,"
     "field.pose.pose.orientation.z,field.pose.pose.orientation.w,field.pose.covariance0\n"
 )
+RECORDED = (
+    "%time,field.header.seq,field.header.stamp,field.header.frame_id," + ROS.partition("id,")[2]
+)
+BAGPY = "Time,header.seq,header.stamp.secs,header.stamp.nsecs,header.frame_id," + (
+    "pose.position.x,pose.position.y,pose.position.z,pose.orientation.x,pose.orientation.y,"
+    "pose.orientation.z,pose.orientation.w\n"
+)
+JUGGLER = "__time,/o/header/stamp/nanosec,/o/header/stamp/sec," + ",".join(
+    f"/o/pose/pose/{of}/{axis}" for of in ("position", "orientation") for axis in "xyzw"
+).replace("/o/pose/pose/position/w,", "")
+TURNED = "0,-1,0,1,1,0,0,2,0,0,1,3"
 S, MS, NS = (("1700000000" + zeros, "1700000001" + zeros) for zeros in ("", "000", "0" * 9))
 
 
@@ -72,14 +83,66 @@ S, MS, NS = (("1700000000" + zeros, "1700000001" + zeros) for zeros in ("", "000
         (ROS, f"{{}},lidar,{AT},{TURN},9\n", NS),
         (f"{EUROC}v_x\n", f"{{}},{AT},.70710678,0,0,.70710678,9,9,9\n", NS),
         (f"{EUROC}q_RS_y [], q_RS_z [], v_x\n", f"{{}},{AT},.70710678,0,0,.70710678,5\n", NS),
+        # Decimal commas.
+        (
+            "t;x;y;z;qx;qy;qz;qw\n",
+            "{};1,0;2;3,0;0;0;0,70710678;0,70710678\n",
+            [f"{s},0" for s in S],
+        ),
+        ("", "{}\t1,0\t2,0\t3,0e0\t0\t0\t0,70710678\t0,70710678\n", [f"{s},0" for s in S]),
+        ("", "{} ;1,0; 2,0;3,0;0;0;0,70710678;0,70710678;\n", S),
+        # Matrices.
+        ("", f"{{}},{TURNED}\n", NS),
+        ("# stamp, r11, r12, ...\n", f"{{}},{TURNED},0,0,0,1\n".replace(",", " "), S),
+        ("", f"{{}};{TURNED.replace(',', ',0;')},0\n", S),
+        # The stamp of a message, not when it was recorded.
+        (RECORDED, f"1{{}},5,{{}},lidar,{AT},{TURN},9\n", NS),
+        (BAGPY, f"1.5,5,{{}},0,lidar,{AT},{TURN}\n", S),
+        (f"{JUGGLER}\n", f"1.5,0,{{}},{AT},{TURN}\n", S),
+        # Or that one, if the message has none.
+        (RECORDED, f"{{}},5,0,lidar,{AT},{TURN},9\n", NS),
+        # ROS 2, without and with a second frame.
+        ("", f"{{}},0,odom,{AT},{TURN}\n", S),
+        ("", f"{{}},0,odom,,{AT},{TURN},0.1,0.1\n", S),
     ],
 )
 def test_poses_are_found_in_columns_of_any_order(tmp_path, header, row, stamps):
-    (tmp_path / "a.csv").write_text(header + "".join(map(row.format, stamps)))
+    text = header + "".join(row.replace("{}", stamp) for stamp in stamps)
+    (tmp_path / "a.csv").write_text(text)
+    assert not is_kitti(tmp_path / "a.csv")
     trajectory = read_trajectory(tmp_path / "a.csv")
     assert trajectory.stamps.tolist() == [17 * 10**17, 1700000001 * 10**9]
     want = [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
     np.testing.assert_allclose(trajectory.T_world_sensor, [want, want], atol=1e-7)
+
+
+@pytest.mark.parametrize("row", [TURNED, f"{TURNED},0,0,0,1"])
+def test_matrices_without_stamps_are_kittis(tmp_path, row):
+    for name, text in (("a.txt", row.replace(",", " ")), ("a.csv", row)):
+        (tmp_path / name).write_text(f"{text}\n" * 2)
+        assert is_kitti(tmp_path / name)
+        assert read_kitti(tmp_path / name)[1, :3, 3].tolist() == [1, 2, 3]
+
+
+def test_what_is_assumed_is_said_once(tmp_path, caplog):
+    caplog.set_level("INFO")
+    rows = {
+        "comma": f"1,5;{AT};{TURN}".replace(",", ";").replace("1;5", "1,5"),
+        "matrix": f"1.5,{TURNED}",
+        "times": f"{RECORDED}1,5,2,a,{AT},{TURN},9",
+        "ros2": f"1,0,odom,{AT},{TURN}",
+    }
+    for name, text in rows.items():
+        (tmp_path / f"{name}.csv").write_text(text)
+        for _ in range(2):
+            read_trajectory(tmp_path / f"{name}.csv")
+    said = [message.partition(".csv: ")[2] for message in caplog.messages]
+    assert said == [
+        "its numbers have decimal commas",
+        "its lines are a stamp and the rows of a matrix",
+        "of its columns of times, the stamps are those of column 3",
+        "its columns are those of `ros2 topic echo --csv`",
+    ]
 
 
 def test_a_clock_of_nanoseconds_may_begin_with_zero(tmp_path):
@@ -112,6 +175,11 @@ TUM_LINE = "1.5 0 0 0 0 0 0 1\n"
         ("a.tum", TUM_LINE + "2 0 0 0 0 0 0 2\n", r"line 2: .* length 2, .*columns 5, 6, 7, 8"),
         ("a.tum", TUM_LINE * 3, "2 of 3 poses repeat .* first on line 2; write .* digits"),
         ("a.csv", "1.5,0,0,0,1,0,0\n", "line 1: a CSV line has 8 numbers, this has 7; name other"),
+        (
+            "a.csv",
+            f"1.5,{TURNED}\n2,0\n",
+            "line 2: a line of matrices has 13 numbers here, this has 2",
+        ),
         ("a.csv", "1e19,0,0,0,1,0,0,0\n", "line 1: '1e19' is not a time"),
         ("a.csv", "t,x,y,z,yaw\n1.5,0,0,0,1\n", "line 1: names no column qx, qy, qz, qw; name"),
         ("a.csv", "w,t,x,y,z,qx,qy,qz,qw\n1,2,3,4,5,6,7,8\n", "line 2: a CSV line has 9 numbers"),

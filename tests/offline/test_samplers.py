@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from adaptune.space import Categorical, Float, Integer, ParameterSpace
-from offline.config import OfflineConfig
+from offline.config import OfflineConfig, SamplerError
 from offline.samplers import make_sampler, sobol_points
 
 SPACE = ParameterSpace(
@@ -143,3 +143,44 @@ def test_ends_when_all_chains_have_stalled():
     assert sampler.end == "all chains have stalled"
     assert make_sampler(SPACE, config).propose(history) == []
     assert len(make_sampler(SPACE, config).propose(history[:-4])) == 4
+
+
+RAISING = """
+import optuna
+
+class Raising(optuna.samplers.RandomSampler):
+    def __init__(self, after):
+        super().__init__(0)
+        self.after = after
+
+    def {hook}(self, study, *given):
+        if len(study.trials) > self.after:
+            raise ValueError("no more")
+        return super().{hook}(study, *given)
+"""
+
+
+@pytest.mark.parametrize(
+    "hook", ["after_trial", "before_trial", "infer_relative_search_space", "sample_independent"]
+)
+def test_a_sampler_that_raises_is_named(tmp_path, monkeypatch, hook):
+    (tmp_path / f"raising_{hook}.py").write_text(RAISING.replace("{hook}", hook))
+    monkeypatch.syspath_prepend(tmp_path)
+
+    def config(after):
+        given = {"after": after}
+        name = f"raising_{hook}:Raising"
+        return OfflineConfig(sampler=name, sampler_settings=given, batch=2, initial=2)
+
+    words = rf"offline\.sampler: raising_{hook}:Raising: ValueError: no more \(.*line"
+    with pytest.raises(SamplerError, match=words):
+        make_sampler(SPACE, config(1))  # before anything is run
+    with pytest.raises(SamplerError, match=words):
+        run(config(8), 8)
+
+
+def test_a_sampler_that_cannot_sample_the_parameters_is_refused_at_once():
+    config = OfflineConfig(sampler="optuna.samplers:BruteForceSampler", batch=2)
+    with pytest.raises(SamplerError, match="step must be given"):
+        make_sampler(SPACE, config)
+    assert len(run(config, 2, FINITE, lambda _: 1.0)) == 4

@@ -11,12 +11,13 @@ from adaptune import manifest
 from adaptune.errors import AdaptuneError
 from adaptune.model import BankSettings, ErrorModel, PairedSettings
 from adaptune.study.study import ModeError, bank_members
-from adaptune.trajectory import read_tum
+from adaptune.trajectory import Trajectory, read_tum, write_tum
 from offline.config import load_study
+from online.charts import read_replays
 from online.compare import compare
 from online.modes import run_replays
 from online.record import StoredReplay, StoredReplayError
-from online.statistics import ComparisonRow
+from online.statistics import ComparisonRow, Reference
 from online.tables import remarks
 
 MODES = ["baseline", "fixed", "adaptive", "paper"]
@@ -155,6 +156,38 @@ def test_a_sequence_without_reference_is_replayed_but_not_judged(trained, study_
 def test_a_written_reference_is_that_of_the_scans(replayed):
     reference = read_tum(replayed.folder / "replays/three/reference.tum")
     np.testing.assert_allclose(reference.T_world_sensor[:, 0, 3], 0.3 * np.arange(40), atol=1e-9)
+
+
+def test_frames_in_a_gap_of_the_reference_have_no_error(own, study_file, tmp_path):
+    truth = own.sequences.open("three").reference()
+    seconds = (truth.stamps - truth.stamps[0]) * 1e-9
+    kept = (seconds < 0.95) | (seconds > 1.65)
+    write_tum(tmp_path / "gap.tum", Trajectory(truth.stamps[kept], truth.T_world_sensor[kept]))
+    for max_gap, unknown in ((0.5, 7), (2.0, 0)):
+        given = [f"reference={tmp_path}/gap.tum", f"max_gap={max_gap}"]
+        study = load_study(study_file, [f"sequences.three.{one}" for one in given], own.folder)
+        run_replays(study, study.model_path)
+        stamps = StoredReplay.read(own.folder / "replays/three/fixed").trajectory.stamps
+        in_training = np.isnan(study.sequences.open("three").reference().at(stamps)[:, 0, 0])
+        assert np.count_nonzero(in_training) == unknown
+        compared = np.isnan(Reference.read(study, "three").trajectory.at(stamps)[:, 0, 0])
+        np.testing.assert_array_equal(compared, in_training)
+
+
+@pytest.mark.parametrize("older", ["nothing", "less"])
+def test_replays_of_an_older_commit_are_made_again(own, older):
+    for path in own.folder.glob("replays/three/*/inputs.json"):
+        inputs = manifest.recorded(path)
+        path.unlink()
+        if older == "less":
+            manifest.record(path, {key: inputs[key] for key in ("mode", "parameters")})
+    what = r"three/\w+: an older adaptune did not record what .*; run `adaptune online` again"
+    for read in (compare, lambda study: read_replays(study, "three")):
+        with pytest.raises(StoredReplayError, match=what):
+            read(own)
+    assert run_replays(own, own.model_path) == len(MODES)
+    assert len(compare(own).rows) == len(MODES)
+    assert len(list(own.folder.glob("earlier/*/replays/three/*/replay.json"))) >= 1
 
 
 def test_rows_over_several_sequences(replayed, study_file, tmp_path):

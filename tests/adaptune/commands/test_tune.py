@@ -69,6 +69,37 @@ def test_one_command_tunes_compares_and_resumes(bag, tmp_path):
 
 
 @pytest.mark.usefixtures("decided")
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("20240501", "001", "1e3", "1.5", "true", "null", "~", "a: b #c", "a\nb: c", "'", "x[1]"),
+        *("a$HOME", "${X}", "n" * 120, "\x85\x01é"),
+    ],
+)
+def test_any_name_is_read_back(bag, name):
+    path = bag.with_name(f"{name}.bag").absolute()
+    shutil.copyfile(bag, path)
+    for command in (["tune", path, "--folder", "out"], ["inspect", path, "--study", "out/x.yaml"]):
+        result = commands.call(*command)
+        assert "out" in result.output
+    for file in ("out/out.yaml", "out/x.yaml"):
+        config = study_in(file).config
+        (_, *parts) = config.sequences.values()
+        assert {part.bag for part in parts} == {str(path)}
+        assert len(parts) == len(config.training + config.test) == 2
+    assert failed(path, "--folder", "out") == "error: out/out.yaml"  # it resumes
+    assert "another `adaptune tune`" in failed(bag, "--folder", "out")
+
+
+@pytest.mark.usefixtures("decided")
+def test_a_name_that_is_no_text_is_refused(bag, tmp_path):
+    path = bag.with_name("a\udcff.bag")
+    shutil.copyfile(bag, path)
+    assert "a\\udcff.bag': holds what is no character in UTF-8; rename it" in failed(path)
+    assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.usefixtures("decided")
 def test_what_it_decides_stands_in_a_study_file(bag, tmp_path):
     assert failed(bag) == "error: runs/one/one.yaml"
     text = (tmp_path / "runs/one/one.yaml").read_text()

@@ -1,5 +1,6 @@
 import dataclasses
 import json
+import os
 import tracemalloc
 
 import numpy as np
@@ -234,3 +235,13 @@ def test_evidence_is_of_stretches():
     # A view shares the stretches of its recording.
     view = dataclasses.replace(cut, sequences=["b", "b+mirrored"])
     np.testing.assert_array_equal(view.training_data(view.pca()).sequence, stretch)
+
+
+@pytest.mark.parametrize(("umask", "mode"), [(0o022, 0o644), (0o027, 0o640), (0o002, 0o664)])
+def test_others_may_read_it_as_far_as_the_umask_lets_them(tmp_path, umask, mode):
+    before = os.umask(umask)
+    try:
+        path = saved(tmp_path)
+    finally:
+        os.umask(before)
+    assert path.stat().st_mode & 0o777 == mode

@@ -8,12 +8,13 @@ import pytest
 import rec
 from rosbags.rosbag1 import Reader, ReaderError
 from rosbags.typesys import get_types_from_msg
-from small_bag import START, cloud, pose
+from small_bag import START, cloud, pose, texts
 
 from adaptune.errors import AdaptuneError
 from adaptune.recording import SequenceConfig, SequenceError
 from adaptune.recording.bag import IndexReader
 from adaptune.recording.clouds import LIVOX_TYPES
+from adaptune.recording.inspect import inspect
 from adaptune.recording.recording import open_sequence
 
 
@@ -247,6 +248,23 @@ def test_poses_come_in_many_types(tmp_path, suffix):
         assert reference.stamps.tolist() == [rec.START, rec.START + 10**9]
         np.testing.assert_allclose(reference.T_world_sensor[1][:3, 3], [1, 2, 3])
         np.testing.assert_allclose(np.diag(reference.T_world_sensor[1]), [-1, -1, 1, 1], atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["Path", "PoseStamped", "TransformStamped"])
+def test_poses_whose_stamps_were_never_set_are_named(tmp_path, kind):
+    poses = poses_of(rec.ROS1)[kind]
+    for each in poses[-1].poses if kind == "Path" else poses:
+        each.header.stamp.sec = each.header.stamp.nanosec = 0
+    messages = [(f"/{kind}", rec.START + i, m) for i, m in enumerate(poses)]
+    messages += [("/points", rec.START + i * 10**8, one_cloud()) for i in range(3)]
+    bag = rec.write_bag(tmp_path / "a.bag", messages)
+    what = "all its 2 poses have the stamp 0 s; name another"
+    with pytest.raises(SequenceError, match=f"a.bag: /{kind}: {what} `reference`"):
+        opened(bag, reference=f"/{kind}").reference()
+    found = inspect(bag)
+    assert f"/{kind}: {what} topic, or a file of poses" in texts(found)
+    assert "poses with stamps" in found.missing["offline"]
+    assert not any("clock_offset" in text for text in texts(found))
 
 
 def test_of_transforms_one_frame_is_taken(tmp_path):

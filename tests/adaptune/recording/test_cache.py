@@ -170,3 +170,12 @@ def test_two_writers_of_the_same_do_not_meet(cache_folder):
     assert len(list(one)) == 3
     assert entries(cache_folder) == ["a"]
     assert json.loads((cache_folder / "a" / "about.json").read_text()) == {"name": "a"}
+
+
+def test_others_may_read_an_entry_as_far_as_the_umask_lets_them(cache_folder):
+    before = os.umask(0o022)
+    try:
+        list(cache.tee(scans_of(1), "a", {"name": "a"}))
+    finally:
+        os.umask(before)
+    assert {path.stat().st_mode & 0o444 for path in cache_folder.rglob("*")} == {0o444}
