@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from adaptune import geometry
 from adaptune.errors import Finding
 from adaptune.recording.clouds import FARTHEST
+from adaptune.recording.poses import FAR_APART, apart, smooth, sound
 from adaptune.recording.scan import SOONEST, Reading, doubts
 from adaptune.trajectory import Trajectory
 
@@ -53,8 +54,8 @@ class Topic:
         return float(self.steps.max()) if len(self.steps) else None
 
 
-_FASTEST = 100.0  # metres per second
 _STILL = 0.01  # metres
+_STRAIGHT = 0.03  # metres, a radian counting as one: less is the noise of a good reference
 _MISSED = 0.01  # of the messages of a topic: fewer are not told
 
 _UNDECODED = {
@@ -144,8 +145,13 @@ def of_times(topic: Topic, readings: Sequence[Reading]) -> Iterator[Finding]:
     return (doubt.below((topic.name,)) for doubt in doubts(readings, period))
 
 
-def of_reference(reference: Trajectory, complete: bool, timed: bool = True) -> Iterator[Finding]:
-    """What is wrong with the poses; with `timed` false, the stamps only number them."""
+def of_reference(
+    reference: Trajectory, complete: bool, timed: bool = True, begin: int | None = None
+) -> Iterator[Finding]:
+    """What is wrong with the poses; with `timed` false, the stamps only number them.
+
+    Seconds count from `begin`, the stamp of the first scan.
+    """
     of, lacks = "reference", "a reference that moves"
     if len(reference) < 2:
         if complete:
@@ -153,16 +159,17 @@ def of_reference(reference: Trajectory, complete: bool, timed: bool = True) -> I
             yield Finding((), "the reference holds a single pose", mend, of=of, lacks=lacks)
         return
     positions = reference.T_world_sensor[:, :3, 3]
-    steps = np.linalg.norm(geometry.steps(reference.T_world_sensor)[:, :3, 3], axis=1)
     if np.linalg.norm(positions - positions[0], axis=1).max() < _STILL:
         what = f"the reference stands still: all {len(reference)} poses are within 1 cm"
         mend = "errors are per metre; drive, or name another topic or a file of poses"
         yield Finding((), what, mend, of=of, lacks=lacks)
         return
-    seconds = np.diff(reference.stamps) * 1e-9 if timed else np.full(len(steps), 0.1)
-    if jumps := np.count_nonzero(steps > _FASTEST * np.maximum(seconds, 1e-3)):
-        mend = "errors there are not the odometry's; leave them out with `start`, `stop` or `cut`"
-        yield Finding((), f"the reference jumps {jumps} times", mend, of=of)
+    seconds = np.diff(reference.stamps) * 1e-9
+    if timed:
+        yield from sound(reference, begin)[1]
+    else:  # ten a second, as most LiDARs measure
+        numbered = Trajectory(reference.stamps * 10**8, reference.T_world_sensor)
+        yield from (one._replace(seconds=None) for one in sound(numbered)[1])
     if complete and timed and (gaps := np.count_nonzero(seconds > reference.max_gap)):
         what = f"the reference has {gaps} gaps beyond {reference.max_gap:g} s"
         what += f", the longest of {seconds.max():.2f} s: their scans get no label"
@@ -184,6 +191,17 @@ def of_overlap(reference: Trajectory, stamps: NDArray[np.int64], slack: float) -
         lacks = "a reference of the same time"
         yield Finding((), f"the reference {spans}", mend, of=of, lacks=lacks)
         return
+    if (seconds := apart(reference)) > FAR_APART and len(reference) > 3 and not slack:
+        straight, curved = reference.at(stamps), smooth(reference, stamps)
+        wrong = np.linalg.norm((straight - curved)[:, :3, 3], axis=1)
+        wrong += geometry.rotation_angle(geometry.invert(straight) @ curved)
+        if (mean := float(np.nan_to_num(wrong).mean())) > _STRAIGHT:
+            what = (
+                f"the reference has a pose every {seconds:.2g} s; scans in between take a straight "
+            )
+            what += f"way, about {mean:.2g} m from a smooth one"
+            mend = "give more poses a second, or use `reference: estimated`"
+            yield Finding((), what, mend, of=of)
     seconds = (scans[1] - scans[0]) * 1e-9
     outside = [(begin - scans[0]) * 1e-9, (scans[1] - end) * 1e-9]
     lost = sum(s for s in outside if s > slack + 1.0)

@@ -27,7 +27,7 @@ def walk(rng, n, step=1.0, turn=0.1):
     for i in range(1, n):
         move = np.eye(4)
         move[:3, :3] = Rotation.from_rotvec(rng.normal(0, turn, 3)).as_matrix()
-        move[:3, 3] = [step * rng.uniform(0, 2), *rng.normal(0, 0.1 * step, 2)]
+        move[:3, 3] = [step * rng.uniform(0.7, 1.3), *rng.normal(0, 0.1 * step, 2)]
         T[i] = T[i - 1] @ move
     return T
 

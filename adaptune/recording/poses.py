@@ -1,0 +1,189 @@
+"""Poses that move as no robot moves: they jump, or one is sent again while the robot moves on."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptune import geometry
+from adaptune.errors import Finding
+from adaptune.trajectory import Trajectory
+
+FASTEST = 100.0
+"""Metres per second. No platform that carries a LiDAR is faster."""
+_JUMP = 0.2
+"""Metres; a radian counts as one. Smaller steps than that are noise."""
+_ACCELERATION = 10.0
+"""Metres per second squared of a robot, or of the hand that holds a sensor."""
+_STAMPS = 0.5, 0.05
+"""Share of a usual step, and seconds, by which stamps may be wrong."""
+_NOISE = 8.0
+"""Times the median difference from neighbours: no noise is as large."""
+_MANY = 0.1
+"""Share of the poses; where more go to and fro, no stretch between is right."""
+_HELD, _AS_FAST = 0.02, 0.6
+"""Metres that a robot moves at least while its pose is repeated, and the share of its usual speed
+at which the next pose makes up for it."""
+_PERIOD = 40_000_000
+"""Nanoseconds. Of poses that follow each other faster, some are enough."""
+_AROUND = 5
+"""Steps before, and after, that say how the robot moves."""
+_SAID = 3
+"""Stretches that are told one by one."""
+
+
+def sound(
+    reference: Trajectory, begin: int | None = None, hole: float = 0.0
+) -> tuple[Trajectory, list[Finding]]:
+    """The poses without those that no robot can have had, and what was wrong with them.
+
+    A pose that is repeated while the robot moves says nothing: it is left out. At a jump a gap of
+    more than `max_gap`, and of `hole` seconds at least, is left: no sub-trajectory crosses it.
+    Seconds of the findings count from `begin`, in nanoseconds, by default from the first pose.
+    """
+    begin = int(reference.stamps[0]) if begin is None else begin
+    kept, held = _without_repeated(reference)
+    what = "the reference repeats a pose while the robot moves"
+    found = _in_words(what, "these poses are left out", held, begin)
+    if apart := _to_and_fro(kept):
+        what = f"the reference goes to and fro by {apart:.2g} m from pose to pose"
+        mend = (
+            "it is noise, or two nodes publish it by turns: name the poses of one of them, or use "
+            "`reference: estimated`"
+        )
+        return kept, [*found, Finding((), what, mend, of="reference")]
+    # A longer `max_gap` than any gap needs would cost more poses than the jump is worth.
+    seconds = np.diff(kept.stamps) * 1e-9
+    gap = min(kept.max_gap, float(seconds[seconds <= kept.max_gap].max(initial=1.0)))
+    jumps, metres, degrees = _jumps(kept)
+    lost, spans = np.zeros(len(kept), bool), list[tuple[int, int]]()
+    for start, end in jumps.tolist():
+        after = max(end, start + round(max(gap, hole) * 1e9) + 1)
+        lost[(kept.stamps > start) & (kept.stamps < after)] = True
+        joined = spans.pop()[0] if spans and start <= spans[-1][1] else start
+        spans.append((joined, after))
+    by = [f"{metres:.3g} m"] * (metres >= _JUMP) + [f"{degrees:.0f} degrees"] * (degrees >= 5.0)
+    what = f"the reference jumps by {' and '.join(by)}{' at most' * (len(spans) > 1)}"
+    then = "its poses there are left out, and no label crosses them"
+    found += _in_words(what, then, np.array(spans, np.int64).reshape(-1, 2), begin)
+    if lost.all() or not lost.any():
+        return kept, found
+    return Trajectory(kept.stamps[~lost], kept.T_world_sensor[~lost], gap), found
+
+
+def _in_words(what: str, then: str, spans: NDArray[np.int64], begin: int) -> list[Finding]:
+    """A finding for each span of time, of shape (n, 2), or one for all where there are many."""
+    if len(spans) > _SAID:
+        what, spans = f"{what} ({len(spans)} times)", np.array([[spans[0, 0], spans[-1, 1]]])
+    seconds = ((spans - begin) * 1e-9).tolist()
+    return [Finding((), what, then, (start, end), of="reference") for start, end in seconds]
+
+
+def _without_repeated(reference: Trajectory) -> tuple[Trajectory, NDArray[np.int64]]:
+    """The poses without those that repeat the one before, and from when to when; of shape (n, 2).
+
+    Where the robot stands, poses that are free of noise repeat, too. Those count as repeated whose
+    next pose lies as far away as if the robot had moved on.
+    """
+    stamps, T = reference.stamps, reference.T_world_sensor
+    again = np.zeros(len(stamps), bool)
+    again[1:] = (T[1:] == T[:-1]).all(axis=(1, 2))
+    first = np.flatnonzero(~again)
+    if not again.any() or len(first) < 3:
+        return reference, np.empty((0, 2), np.int64)
+    at, poses = stamps[first], T[first]
+    start, end = np.arange(len(first) - 1), np.arange(1, len(first))
+
+    def speed(one: NDArray[np.intp], other: NDArray[np.intp]) -> NDArray[np.float64]:
+        motion = geometry.invert(poses[one]) @ poses[other]
+        metres = np.linalg.norm(motion[:, :3, 3], axis=1) + geometry.rotation_angle(motion)
+        return np.asarray(metres / np.maximum((at[other] - at[one]) * 1e-9, 1e-3))
+
+    # Over some poses: the noise of each would count for motion.
+    before = np.minimum(np.searchsorted(at, at[start] - _AROUND * _PERIOD), start - 1).clip(0)
+    after = np.maximum(np.searchsorted(at, at[end] + _AROUND * _PERIOD), end + 1)
+    usual = np.maximum(speed(before, start), speed(end, after.clip(max=len(at) - 1)))
+    seconds = (stamps[first[end] - 1] - at[start]) * 1e-9
+    held = (usual * seconds > _HELD) & (speed(start, end) > _AS_FAST * usual)
+    lost = again & np.append(held, False)[np.cumsum(~again) - 1]
+    spans = np.column_stack([at[start], at[end]])[held]
+    return Trajectory(stamps[~lost], T[~lost], reference.max_gap), spans
+
+
+def _to_and_fro(reference: Trajectory) -> float:
+    """Metres by which poses lie to both sides of the way; 0 if few do."""
+    steps = np.diff(reference.T_world_sensor[:, :3, 3], axis=0)
+    turned = np.linalg.norm(steps[1:] - steps[:-1], axis=1)
+    back = turned > np.maximum(2.0 * _JUMP, np.linalg.norm(steps[1:] + steps[:-1], axis=1))
+    return float(np.median(turned[back])) / 2.0 if len(back) > 3 and back.mean() > _MANY else 0.0
+
+
+def _jumps(reference: Trajectory) -> tuple[NDArray[np.int64], float, float]:
+    """Steps that neither neighbours nor the robot's speed explain.
+
+    Returned are the stamps around each, of shape (n, 2), and how far they lead at most, in metres
+    and in degrees.
+    """
+    from scipy.spatial.transform import Rotation
+
+    _, some = np.unique((reference.stamps - reference.stamps[0]) // _PERIOD, return_index=True)
+    if len(some) < 2:
+        return np.empty((0, 2), np.int64), 0.0, 0.0
+    stamps, T = reference.stamps[some], geometry.steps(reference.T_world_sensor[some])
+    seconds = np.maximum(np.diff(stamps) * 1e-9, 1e-3)
+    turns = Rotation.from_matrix(T[:, :3, :3]).as_rotvec()
+    steps = np.hstack([T[:, :3, 3], turns])
+    around = _around(steps / seconds[:, None])
+    apart = np.linalg.norm(steps - around * seconds[:, None], axis=2).min(axis=0)
+    speed = np.linalg.norm(around, axis=2).max(axis=0)
+    share, late = _STAMPS
+    explained = np.maximum(_ACCELERATION * seconds**2, speed * np.maximum(share * seconds, late))
+    jumps = apart > np.maximum(explained, max(_JUMP, _NOISE * float(np.median(apart))))
+    metres = np.linalg.norm(T[:, :3, 3], axis=1)
+    jumps |= metres > FASTEST * seconds
+    degrees = np.degrees(np.linalg.norm(turns, axis=1))
+    spans = np.column_stack([stamps[:-1], stamps[1:]])[jumps]
+    most = (float(each[jumps].max(initial=0.0)) for each in (metres, degrees))
+    return spans, *most
+
+
+def _around(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Medians of the values, of shape (n, k), before and after each one: (2, n, k).
+
+    At the ends, where there are fewer, the other side stands for both. Few values are their own.
+    """
+    n, k = values.shape
+    if n < _AROUND:
+        return np.stack([values, values])
+    padding = np.full((_AROUND, k), np.nan)
+    padded = np.concatenate([padding, values, padding])
+    windows = np.lib.stride_tricks.sliding_window_view(padded, _AROUND, axis=0)
+    sides = np.stack([windows[:n], windows[_AROUND + 1 :]])
+    few = np.isfinite(sides[..., 0, :]).sum(axis=-1) < 3
+    sides = np.where(few[..., None, None], sides[::-1], sides)
+    return np.asarray(np.nanmedian(sides, axis=-1))
+
+
+# Poses that are far apart.
+
+
+FAR_APART = 0.25
+"""Seconds between poses, from which on the way between them is not straight."""
+
+
+def apart(reference: Trajectory) -> float:
+    """Usual seconds from a pose to the next."""
+    return float(np.median(np.diff(reference.stamps))) * 1e-9 if len(reference) > 1 else 0.0
+
+
+def smooth(reference: Trajectory, stamps: NDArray[np.int64]) -> geometry.Poses:
+    """Poses of shape (m, 4, 4) at m stamps, on a smooth way; NaN where the reference has none."""
+    from scipy.interpolate import CubicSpline
+    from scipy.spatial.transform import Rotation, RotationSpline
+
+    T = reference.at(stamps)
+    known = np.isfinite(T[:, 0, 0])
+    begin = reference.stamps[0]
+    seconds, at = (reference.stamps - begin) * 1e-9, (stamps[known] - begin) * 1e-9
+    rotations = Rotation.from_matrix(reference.T_world_sensor[:, :3, :3])
+    T[known, :3, :3] = RotationSpline(seconds, rotations)(at).as_matrix()
+    T[known, :3, 3] = CubicSpline(seconds, reference.T_world_sensor[:, :3, 3])(at)
+    return T
