@@ -6,10 +6,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune import geometry
 from adaptune.errors import Finding
 from adaptune.recording.clouds import FARTHEST
-from adaptune.recording.poses import FAR_APART, apart, smooth, sound
+from adaptune.recording.poses import sound
 from adaptune.recording.scan import SOONEST, Reading, doubts
 from adaptune.trajectory import Trajectory
 
@@ -55,7 +54,6 @@ class Topic:
 
 
 _STILL = 0.01  # metres
-_STRAIGHT = 0.03  # metres, a radian counting as one: less is the noise of a good reference
 _MISSED = 0.01  # of the messages of a topic: fewer are not told
 
 _UNDECODED = {
@@ -191,17 +189,6 @@ def of_overlap(reference: Trajectory, stamps: NDArray[np.int64], slack: float) -
         lacks = "a reference of the same time"
         yield Finding((), f"the reference {spans}", mend, of=of, lacks=lacks)
         return
-    if (seconds := apart(reference)) > FAR_APART and len(reference) > 3 and not slack:
-        straight, curved = reference.at(stamps), smooth(reference, stamps)
-        wrong = np.linalg.norm((straight - curved)[:, :3, 3], axis=1)
-        wrong += geometry.rotation_angle(geometry.invert(straight) @ curved)
-        if (mean := float(np.nan_to_num(wrong).mean())) > _STRAIGHT:
-            what = (
-                f"the reference has a pose every {seconds:.2g} s; scans in between take a straight "
-            )
-            what += f"way, about {mean:.2g} m from a smooth one"
-            mend = "give more poses a second, or use `reference: estimated`"
-            yield Finding((), what, mend, of=of)
     seconds = (scans[1] - scans[0]) * 1e-9
     outside = [(begin - scans[0]) * 1e-9, (scans[1] - end) * 1e-9]
     lost = sum(s for s in outside if s > slack + 1.0)

@@ -160,30 +160,3 @@ def _around(values: NDArray[np.float64]) -> NDArray[np.float64]:
     few = np.isfinite(sides[..., 0, :]).sum(axis=-1) < 3
     sides = np.where(few[..., None, None], sides[::-1], sides)
     return np.asarray(np.nanmedian(sides, axis=-1))
-
-
-# Poses that are far apart.
-
-
-FAR_APART = 0.25
-"""Seconds between poses, from which on the way between them is not straight."""
-
-
-def apart(reference: Trajectory) -> float:
-    """Usual seconds from a pose to the next."""
-    return float(np.median(np.diff(reference.stamps))) * 1e-9 if len(reference) > 1 else 0.0
-
-
-def smooth(reference: Trajectory, stamps: NDArray[np.int64]) -> geometry.Poses:
-    """Poses of shape (m, 4, 4) at m stamps, on a smooth way; NaN where the reference has none."""
-    from scipy.interpolate import CubicSpline
-    from scipy.spatial.transform import Rotation, RotationSpline
-
-    T = reference.at(stamps)
-    known = np.isfinite(T[:, 0, 0])
-    begin = reference.stamps[0]
-    seconds, at = (reference.stamps - begin) * 1e-9, (stamps[known] - begin) * 1e-9
-    rotations = Rotation.from_matrix(reference.T_world_sensor[:, :3, :3])
-    T[known, :3, :3] = RotationSpline(seconds, rotations)(at).as_matrix()
-    T[known, :3, 3] = CubicSpline(seconds, reference.T_world_sensor[:, :3, 3])(at)
-    return T

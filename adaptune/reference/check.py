@@ -29,7 +29,6 @@ from adaptune.metrics import cap, sub_trajectory_rte, travelled
 from adaptune.recording.compensation import neighbour_motions
 from adaptune.recording.config import SequenceConfig
 from adaptune.recording.inspect import Inspection
-from adaptune.recording.poses import FAR_APART, apart, smooth
 from adaptune.recording.scan import Recording, Scan
 from adaptune.reference.stored import EstimateError, StoredEstimate
 from adaptune.trajectory import Trajectory
@@ -175,6 +174,8 @@ TRUSTED = 0.8
 CLOCK = 30.0
 """Seconds by which clocks may differ to be found."""
 CONTRADICTS = "the reference contradicts the scans"
+FAR_APART = 0.25
+"""Seconds between poses, from which on the way between them is not straight."""
 TURNED = 0.1
 """Radians, the root of their mean square, by which motions must turn a lever arm to show it."""
 SAME_CLOCK = 0.01
@@ -314,10 +315,20 @@ def _conventions(T: Poses) -> Iterator[_Candidate]:
 
 def _far_apart(reference: Trajectory, stamps: NDArray[np.int64]) -> Iterator[_Candidate]:
     """Poses too rare to go straight from one to the next: on a smooth way through them."""
-    if (seconds := apart(reference)) > FAR_APART:
-        what = f"too rare: they are {seconds:.2g} s apart, and scans in between take a straight way"
-        mend = "give more poses a second, or use `reference: estimated`"
-        yield _Candidate(what, mend, smooth(reference, stamps))
+    from scipy.interpolate import CubicSpline
+    from scipy.spatial.transform import RotationSpline
+
+    every = 1e-9 * float(np.median(np.diff(reference.stamps))) if len(reference) > 1 else 0.0
+    if every < FAR_APART:
+        return
+    T = reference.at(stamps)
+    known = np.isfinite(T[:, 0, 0])
+    seconds, at = (1e-9 * (some - stamps[0]) for some in (reference.stamps, stamps[known]))
+    R = Rotation.from_matrix(reference.T_world_sensor[:, :3, :3])
+    T[known, :3, :3] = RotationSpline(seconds, R)(at).as_matrix()
+    T[known, :3, 3] = CubicSpline(seconds, reference.T_world_sensor[:, :3, 3])(at)
+    what = f"too rare: one every {every:.2g} s, and a straight way for the scans in between"
+    yield _Candidate(what, "give more poses a second, or use `reference: estimated`", T)
 
 
 def _clock(reference: Trajectory, stamps: NDArray[np.int64], hops: Hops) -> Iterator[_Candidate]:
@@ -411,7 +422,7 @@ def _lever(T: Poses, measured: Poses, R_body_sensor: NDArray[np.float64]) -> NDA
     # (R - 1) t = R_body_sensor t_measured - t_body
     A = T[:, :3, :3] - np.eye(3)
     b = np.einsum("ij,nj->ni", R_body_sensor, measured[:, :3, 3]) - T[:, :3, 3]
-    # Along an axis about which nearly all turns go, as the vertical one of a car, they show nothing.
+    # Along the axis of nearly all turns, as the vertical one of a car, they show nothing.
     values, axes = np.linalg.eigh(np.einsum("nij,nik->jk", A, A) / len(A))
     A = A @ axes[:, values > TURNED**2]
     weights = np.ones(len(T))
@@ -491,7 +502,7 @@ def _surely_worse(wrong: NDArray[np.float64], others: NDArray[np.float64]) -> bo
     """
     known = np.isfinite(wrong + others)
     more = (wrong - others)[known]
-    if len(more) < FEWEST_HOPS or not _mean(wrong) > max(SUSPICIOUS, 2.0 * _mean(others)):
+    if len(more) < FEWEST_HOPS or not _mean(wrong) > max(NOISY, 2.0 * _mean(others)):
         return False
     return bool(more.mean() > 2.0 * more.std(ddof=1) / len(more) ** 0.5)
 
