@@ -358,24 +358,20 @@ def _replace_noisy(named: "Mapping[str, Inspection]", loaded: "Callable[[], Offl
             measured = measure_reference(scans, reference, partial(show, "registering"))
         if not measured.is_noisy(length) or (error := measured.error(length)) is None:
             continue
-        before = dict(one.given)
-        one.given["reference"] = "estimated"
-        study = loaded()
-        try:
+        before, one.given = one.given, one.given | {"reference": "estimated"}
+        with suppress(AdaptuneError):
+            study = loaded()
             _estimate(study, [name])
             own = study.sequences.estimate(name)
-        except AdaptuneError:
-            own = None
-        if own is not None and own.error(length) < error.low:
-            say(
-                f"{name}: its reference is wrong by {error.mean:.2g} % ({error.low:.2g}-"
-                f"{error.high:.2g}) over {length:g} m, as registrations of scans tell, and an "
-                f"estimated one by {own.error(length):.2g} %: it is judged by that; `--reference "
-                f"{before.get('reference', 'FILE')}` insists on its own"
-            )
-        else:
-            one.given.clear()
-            one.given.update(before)
+            if own is not None and own.error(length) < error.low:
+                say(
+                    f"{name}: its reference is wrong by {error.mean:.2g} % ({error.low:.2g}-"
+                    f"{error.high:.2g}) over {length:g} m, as registrations of scans tell; an "
+                    f"estimated one, by {own.error(length):.2g} %, judges instead. To insist: "
+                    f"`--reference {before.get('reference', 'FILE')}`"
+                )
+                continue
+        one.given = before
 
 
 def _usable(path: Path, points: str | None, reference: str | None, show: Progress) -> "Inspection":

@@ -40,55 +40,59 @@ def sound(
     Seconds of the findings count from `begin`, in nanoseconds, by default from the first pose.
     """
     begin = int(reference.stamps[0]) if begin is None else begin
-    kept, held = _without_repeated(reference)
-    what = "the reference repeats a pose while the robot moves"
-    found = _in_words(what, "these poses are left out", held, begin)
-    if apart := _to_and_fro(kept):
+    lost = _repeated(reference)
+    found = _in_words("repeats a pose while the robot moves", reference, lost, begin)
+    reference = _without(reference, lost)
+    if apart := _to_and_fro(reference):
         what = f"the reference goes to and fro by {apart:.2g} m from pose to pose"
         mend = (
             "it is noise, or two nodes publish it by turns: name the poses of one of them, or use "
             "`reference: estimated`"
         )
-        return kept, [*found, Finding((), what, mend, of="reference")]
+        return reference, [*found, Finding((), what, mend, of="reference")]
     # A longer `max_gap` than any gap needs would cost more poses than the jump is worth.
-    seconds = np.diff(kept.stamps) * 1e-9
-    gap = min(kept.max_gap, float(seconds[seconds <= kept.max_gap].max(initial=1.0)))
-    jumps, metres, degrees = _jumps(kept)
-    lost, spans = np.zeros(len(kept), bool), list[tuple[int, int]]()
+    seconds = np.diff(reference.stamps) * 1e-9
+    gap = min(reference.max_gap, float(seconds[seconds <= reference.max_gap].max(initial=1.0)))
+    jumps, metres = _jumps(reference)
+    lost = np.zeros(len(reference), bool)
     for start, end in jumps.tolist():
         after = max(end, start + round(max(gap, hole) * 1e9) + 1)
-        lost[(kept.stamps > start) & (kept.stamps < after)] = True
-        joined = spans.pop()[0] if spans and start <= spans[-1][1] else start
-        spans.append((joined, after))
-    by = [f"{metres:.3g} m"] * (metres >= _JUMP) + [f"{degrees:.0f} degrees"] * (degrees >= 5.0)
-    what = f"the reference jumps by {' and '.join(by)}{' at most' * (len(spans) > 1)}"
-    then = "its poses there are left out, and no label crosses them"
-    found += _in_words(what, then, np.array(spans, np.int64).reshape(-1, 2), begin)
-    if lost.all() or not lost.any():
-        return kept, found
-    return Trajectory(kept.stamps[~lost], kept.T_world_sensor[~lost], gap), found
+        lost |= (reference.stamps > start) & (reference.stamps < after)
+    found += _in_words(f"jumps by up to {metres:.3g} m (or radians)", reference, lost, begin)
+    return _without(reference, lost, gap if lost.any() else None), found
 
 
-def _in_words(what: str, then: str, spans: NDArray[np.int64], begin: int) -> list[Finding]:
-    """A finding for each span of time, of shape (n, 2), or one for all where there are many."""
+def _without(
+    reference: Trajectory, lost: NDArray[np.bool_], gap: float | None = None
+) -> Trajectory:
+    gap = reference.max_gap if gap is None else gap
+    return Trajectory(reference.stamps[~lost], reference.T_world_sensor[~lost], gap)
+
+
+def _in_words(
+    what: str, reference: Trajectory, lost: NDArray[np.bool_], begin: int
+) -> list[Finding]:
+    """A finding for each run of poses that are lost, or one for all where there are many."""
+    edges = np.flatnonzero(np.diff(lost, prepend=False, append=False)).reshape(-1, 2)
+    spans = reference.stamps[(edges - (1, 0)).clip(max=len(reference) - 1)]
     if len(spans) > _SAID:
         what, spans = f"{what} ({len(spans)} times)", np.array([[spans[0, 0], spans[-1, 1]]])
+    what, mend = f"the reference {what}", "these poses are left out"
     seconds = ((spans - begin) * 1e-9).tolist()
-    return [Finding((), what, then, (start, end), of="reference") for start, end in seconds]
+    return [Finding((), what, mend, (start, end), of="reference") for start, end in seconds]
 
 
-def _without_repeated(reference: Trajectory) -> tuple[Trajectory, NDArray[np.int64]]:
-    """The poses without those that repeat the one before, and from when to when; of shape (n, 2).
+def _repeated(reference: Trajectory) -> NDArray[np.bool_]:
+    """Which poses repeat the one before while the robot moves, of shape (n,).
 
-    Where the robot stands, poses that are free of noise repeat, too. Those count as repeated whose
-    next pose lies as far away as if the robot had moved on.
+    Where it stands, poses that are free of noise repeat, too. Those count whose next pose lies as
+    far away as if the robot had moved on.
     """
     stamps, T = reference.stamps, reference.T_world_sensor
-    again = np.zeros(len(stamps), bool)
-    again[1:] = (T[1:] == T[:-1]).all(axis=(1, 2))
+    again = np.append(False, (T[1:] == T[:-1]).all(axis=(1, 2)))
     first = np.flatnonzero(~again)
     if not again.any() or len(first) < 3:
-        return reference, np.empty((0, 2), np.int64)
+        return np.zeros(len(stamps), bool)
     at, poses = stamps[first], T[first]
     start, end = np.arange(len(first) - 1), np.arange(1, len(first))
 
@@ -103,9 +107,7 @@ def _without_repeated(reference: Trajectory) -> tuple[Trajectory, NDArray[np.int
     usual = np.maximum(speed(before, start), speed(end, after.clip(max=len(at) - 1)))
     seconds = (stamps[first[end] - 1] - at[start]) * 1e-9
     held = (usual * seconds > _HELD) & (speed(start, end) > _AS_FAST * usual)
-    lost = again & np.append(held, False)[np.cumsum(~again) - 1]
-    spans = np.column_stack([at[start], at[end]])[held]
-    return Trajectory(stamps[~lost], T[~lost], reference.max_gap), spans
+    return np.asarray(again & np.append(held, False)[np.cumsum(~again) - 1])
 
 
 def _to_and_fro(reference: Trajectory) -> float:
@@ -116,33 +118,28 @@ def _to_and_fro(reference: Trajectory) -> float:
     return float(np.median(turned[back])) / 2.0 if len(back) > 3 and back.mean() > _MANY else 0.0
 
 
-def _jumps(reference: Trajectory) -> tuple[NDArray[np.int64], float, float]:
+def _jumps(reference: Trajectory) -> tuple[NDArray[np.int64], float]:
     """Steps that neither neighbours nor the robot's speed explain.
 
-    Returned are the stamps around each, of shape (n, 2), and how far they lead at most, in metres
-    and in degrees.
+    Returned are the stamps around each, of shape (n, 2), and how far the farthest leads.
     """
     from scipy.spatial.transform import Rotation
 
     _, some = np.unique((reference.stamps - reference.stamps[0]) // _PERIOD, return_index=True)
     if len(some) < 2:
-        return np.empty((0, 2), np.int64), 0.0, 0.0
+        return np.empty((0, 2), np.int64), 0.0
     stamps, T = reference.stamps[some], geometry.steps(reference.T_world_sensor[some])
     seconds = np.maximum(np.diff(stamps) * 1e-9, 1e-3)
-    turns = Rotation.from_matrix(T[:, :3, :3]).as_rotvec()
-    steps = np.hstack([T[:, :3, 3], turns])
+    steps = np.hstack([T[:, :3, 3], Rotation.from_matrix(T[:, :3, :3]).as_rotvec()])
     around = _around(steps / seconds[:, None])
     apart = np.linalg.norm(steps - around * seconds[:, None], axis=2).min(axis=0)
     speed = np.linalg.norm(around, axis=2).max(axis=0)
     share, late = _STAMPS
     explained = np.maximum(_ACCELERATION * seconds**2, speed * np.maximum(share * seconds, late))
     jumps = apart > np.maximum(explained, max(_JUMP, _NOISE * float(np.median(apart))))
-    metres = np.linalg.norm(T[:, :3, 3], axis=1)
-    jumps |= metres > FASTEST * seconds
-    degrees = np.degrees(np.linalg.norm(turns, axis=1))
-    spans = np.column_stack([stamps[:-1], stamps[1:]])[jumps]
-    most = (float(each[jumps].max(initial=0.0)) for each in (metres, degrees))
-    return spans, *most
+    jumps |= np.linalg.norm(T[:, :3, 3], axis=1) > FASTEST * seconds
+    far = np.linalg.norm(steps[jumps], axis=1).max(initial=0.0)
+    return np.column_stack([stamps[:-1], stamps[1:]])[jumps], float(far)
 
 
 def _around(values: NDArray[np.float64]) -> NDArray[np.float64]:
