@@ -26,19 +26,24 @@ def travelled(T_world_sensor: Poses) -> NDArray[np.float64]:
     """Distance travelled until each pose in metres, of shape (n,).
 
     Poses that are NaN add nothing. Noise adds nothing either: between poses less than `JITTER` from
-    each other, or six times what the poses shake by, the way is straight.
+    each other the way is straight; where most steps are noise, six times as far as the poses shake.
     """
     positions = T_world_sensor[:, :3, 3]
     lengths = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     distance = np.append(0.0, np.cumsum(np.nan_to_num(lengths, nan=0.0)))[: len(positions)]
-    least = max(JITTER, min(6.0 * _shaking(positions), 10.0 * JITTER))
+    shaking = min(6.0 * _shaking(positions), 10.0 * JITTER)
+    known = lengths[np.isfinite(lengths)]
+    least = max(JITTER, shaking if len(known) and np.median(known) < shaking / 2.0 else 0.0)
     if not (lengths < least).any():
         return distance
-    far, last = [0], positions[0].tolist()
+    far, last, before = [0], positions[0].tolist(), positions[0].tolist()
     for i, position in enumerate(positions.tolist()):
         if not math.dist(position, last) < least:  # a distance to NaN is none
+            if not math.dist(position, before) < least:
+                far.append(max(i - 1, 0))  # it leaves where it stood by this step alone
             far.append(i)
             last = position
+        before = position
     ends = [*far, len(positions) - 1]
     ways = np.linalg.norm(np.diff(positions[ends], axis=0), axis=1)
     straight = np.append(0.0, np.cumsum(np.nan_to_num(ways, nan=0.0)))
