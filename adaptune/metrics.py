@@ -47,7 +47,7 @@ def travelled(T_world_sensor: Poses) -> NDArray[np.float64]:
     ends = [*far, len(positions) - 1]
     ways = np.linalg.norm(np.diff(positions[ends], axis=0), axis=1)
     straight = np.append(0.0, np.cumsum(np.nan_to_num(ways, nan=0.0)))
-    return np.interp(distance, distance[ends], straight)
+    return np.asarray(np.interp(distance, distance[ends], straight))
 
 
 def _shaking(positions: NDArray[np.float64]) -> float:
