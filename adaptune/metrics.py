@@ -1,5 +1,6 @@
 """Errors of an odometry: over sub-trajectories, as KITTI's benchmark and as evo define them."""
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
@@ -17,16 +18,49 @@ WORST = 0.1
 KITTI_LENGTHS = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 
 
+JITTER = 0.1
+"""Metres. A robot that stands does not drive by the noise of its poses, where that is less."""
+_AS_STRAIGHT = 0.8
+"""Share of the path that is left without noise, from which noise does not matter."""
+
+
 def travelled(T_world_sensor: Poses) -> NDArray[np.float64]:
     """Distance travelled until each pose in metres, of shape (n,).
 
-    Poses that are NaN add nothing.
+    Poses that are NaN add nothing. Where noise makes a large part of the path, as where a robot
+    stands for long, it adds nothing either: between poses less than `JITTER` from each other the
+    way is straight then; where most steps are noise, six times as far as the poses shake.
     """
-    distance = np.zeros(len(T_world_sensor))
-    if len(T_world_sensor) > 1:
-        lengths = np.linalg.norm(np.diff(T_world_sensor[:, :3, 3], axis=0), axis=1)
-        distance[1:] = np.cumsum(np.nan_to_num(lengths, nan=0.0))
-    return distance
+    positions = T_world_sensor[:, :3, 3]
+    lengths = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    distance = np.append(0.0, np.cumsum(np.nan_to_num(lengths, nan=0.0)))[: len(positions)]
+    shaking = min(6.0 * _shaking(positions), 10.0 * JITTER)
+    known = lengths[np.isfinite(lengths)]
+    least = max(JITTER, shaking if len(known) and np.median(known) < shaking / 2.0 else 0.0)
+    if not (lengths < least).any():
+        return distance
+    far, last, before = [0], positions[0].tolist(), positions[0].tolist()
+    for i, position in enumerate(positions.tolist()):
+        if not math.dist(position, last) < least:  # a distance to NaN is none
+            if not math.dist(position, before) < least:
+                far.append(max(i - 1, 0))  # it leaves where it stood by this step alone
+            far.append(i)
+            last = position
+        before = position
+    ends = [*far, len(positions) - 1]
+    ways = np.linalg.norm(np.diff(positions[ends], axis=0), axis=1)
+    straight = np.append(0.0, np.cumsum(np.nan_to_num(ways, nan=0.0)))
+    if straight[-1] > _AS_STRAIGHT * distance[-1]:
+        return distance
+    return np.asarray(np.interp(distance, distance[ends], straight))
+
+
+def _shaking(positions: NDArray[np.float64]) -> float:
+    """Standard deviation in metres, along an axis, of the noise of positions of shape (n, 3)."""
+    apart = np.linalg.norm(np.diff(positions, n=2, axis=0), axis=1)
+    known = apart[np.isfinite(apart)]
+    # The difference of differences has six times the variance, and its median is 1.54 of it.
+    return float(np.median(known)) / (1.54 * 6.0**0.5) if len(known) else 0.0
 
 
 def window_ends(T_world_sensor: Poses, length: float) -> NDArray[np.intp]:

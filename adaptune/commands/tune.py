@@ -3,7 +3,7 @@
 import re
 import shlex
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from itertools import chain, count
@@ -343,7 +343,39 @@ def _decided(
             "online: {modes: [adaptive]}\n"
         )
 
-    return study(*_split(study("5.0"), list(named), folder))
+    if reference is None:
+        _replace_noisy(named, lambda: _loaded(study("5.0"), folder))
+    return study(*_split(_loaded(study("5.0"), folder), list(named)))
+
+
+def _replace_noisy(named: "Mapping[str, Inspection]", loaded: "Callable[[], OfflineStudy]") -> None:
+    """Let references be estimated that are surely noisier than estimates of them."""
+    from adaptune.recording.recording import open_sequence
+    from adaptune.reference.check import measure_reference, proposed_sub_trajectory
+
+    for name, one in named.items():
+        scans = open_sequence(one.config())
+        if "estimated" in one.given.values() or (reference := scans.reference()) is None:
+            continue
+        length = proposed_sub_trajectory(reference, training=_share(reference))
+        with progress() as show:
+            measured = measure_reference(scans, reference, partial(show, "registering"))
+        if not measured.is_noisy(length) or (error := measured.error(length)) is None:
+            continue
+        before, one.given = one.given, one.given | {"reference": "estimated"}
+        with suppress(AdaptuneError):
+            study = loaded()
+            _estimate(study, [name])
+            own = study.sequences.estimate(name)
+            if own is not None and own.error(length) < error.low:
+                say(
+                    f"{name}: its reference is wrong by {error.mean:.2g} % ({error.low:.2g}-"
+                    f"{error.high:.2g}) over {length:g} m, as registrations of scans tell; an "
+                    f"estimated one, by {own.error(length):.2g} %, judges instead. To insist: "
+                    f"`--reference {before.get('reference', 'FILE')}`"
+                )
+                continue
+        one.given = before
 
 
 def _usable(path: Path, points: str | None, reference: str | None, show: Progress) -> "Inspection":
@@ -390,25 +422,30 @@ def odometries_of(given: str, imu: bool) -> list[str]:
     return there
 
 
-def _split(text: str, whole: Sequence[str], folder: Path) -> tuple[str, float]:
-    """Metres of the sub-trajectories by which a study, whose YAML is given, should judge.
-
-    And the share of a single recording to train on. A reference that is lacking is estimated: it
-    tells how far the robot has moved. `whole` has the names of the recordings.
-    """
-    from adaptune.reference.check import path_after, proposed_sub_trajectory
-    from adaptune.trajectory import read_trajectory
+def _loaded(text: str, folder: Path) -> "OfflineStudy":
+    """A study whose YAML is given and that is in no file yet."""
     from offline.config import load_study
 
     with TemporaryDirectory() as temporary:
         path = Path(temporary) / "study.yaml"
         write_text(path, text)
         try:
-            study = load_study(path, folder=folder)
+            return load_study(path, folder=folder)
         except AdaptuneError as error:
             # The file is nowhere for the user to look.
             told = re.sub(rf"{re.escape(str(path))}(, line \d+)?: ", "", str(error))
             raise AdaptuneError(told.replace(f"{temporary}/", "")) from error
+
+
+def _split(study: "OfflineStudy", whole: Sequence[str]) -> tuple[str, float]:
+    """Metres of the sub-trajectories by which a study should judge.
+
+    And the share of a single recording to train on. A reference that is lacking is estimated: it
+    tells how far the robot has moved. `whole` has the names of the recordings.
+    """
+    from adaptune.reference.check import path_after, proposed_sub_trajectory
+    from adaptune.trajectory import read_trajectory
+
     sequences = study.sequences
     reference = sequences.open(whole[-1]).reference()
     if reference is None:

@@ -244,12 +244,11 @@ class BagSource:
             raise SequenceError(f"{self.name}: no pose on {name}; name another `reference`")
         if what := untimed(found):
             raise SequenceError(f"{self.name}: {name}: {what}; name another `reference`")
-        trajectory, unusable = usable(found)
-        unfit = f"poses on {name} that are not finite or have no rotation"
+        trajectory, left_out = usable(found)
         if trajectory is None:
-            raise SequenceError(f"{self.name}: holds only {unfit}")
-        if unusable:
-            _log.warning("%s: left out %d %s", self.name, unusable, unfit)
+            raise SequenceError(f"{self.name}: {name}: {left_out[-1]}")
+        for what in left_out:
+            _log.warning("%s: %s: %s; they are left out", self.name, name, what)
         return trajectory
 
     def imu(self, name: str | None) -> Imu | None:

@@ -1,6 +1,7 @@
 """sensor_msgs/PointCloud2 to scans."""
 
 import struct
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, lru_cache
@@ -439,11 +440,17 @@ def of_frame(topic: str, poses: Sequence[Pose], frame: str | None) -> list[Pose]
     return [pose for pose in poses if frame in (None, pose[1])]
 
 
-def usable(poses: Sequence[Pose]) -> tuple[Trajectory | None, int]:
-    """Trajectory of the usable poses, each stamp once, and the number of the others.
+def usable(poses: Sequence[Pose]) -> tuple[Trajectory | None, list[str]]:
+    """Trajectory of the usable poses, each stamp once, and what is left out.
 
-    Poses are usable if they are finite and have a rotation. The trajectory is None if none is.
+    Poses are usable if they are finite and have a rotation, and are of the frame that most are of:
+    two nodes may publish on a topic. The trajectory is None if none is usable.
     """
+    (frame, n), *others = Counter(name for _, name, *_ in poses).most_common()
+    left_out = [
+        f"{m} of {n + m} poses are of the frame {name!r}, not {frame!r}" for name, m in others
+    ]
+    poses = [pose for pose in poses if pose[1] == frame]
     stamps = np.array([stamp for stamp, *_ in poses], np.int64)
     values: NDArray[np.float64] = np.array(
         [(p.x, p.y, p.z, q.x, q.y, q.z, q.w) for _, _, p, q in poses]
@@ -451,12 +458,14 @@ def usable(poses: Sequence[Pose]) -> tuple[Trajectory | None, int]:
     with np.errstate(invalid="ignore", over="ignore"):
         norms = np.linalg.norm(values[:, 3:], axis=1)
     good = np.isfinite(values).all(axis=1) & np.isfinite(norms) & (norms > 0.1)
+    if unusable := int(np.count_nonzero(~good)):
+        left_out += [f"{unusable} of {len(poses)} poses are not finite or have no rotation"]
     if not good.any():
-        return None, len(poses)
+        return None, left_out
     unique, index = np.unique(stamps[good], return_index=True)
     values = values[good][index]
     T = geometry.from_quaternions(values[:, :3], values[:, 3:])
-    return Trajectory(unique, T), int(np.count_nonzero(~good))
+    return Trajectory(unique, T), left_out
 
 
 def untimed(poses: Sequence[Pose]) -> str:

@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune import geometry
 from adaptune.errors import Finding
 from adaptune.recording.clouds import FARTHEST
+from adaptune.recording.poses import sound
 from adaptune.recording.scan import SOONEST, Reading, doubts
 from adaptune.trajectory import Trajectory
 
@@ -53,7 +53,6 @@ class Topic:
         return float(self.steps.max()) if len(self.steps) else None
 
 
-_FASTEST = 100.0  # metres per second
 _STILL = 0.01  # metres
 _MISSED = 0.01  # of the messages of a topic: fewer are not told
 
@@ -144,8 +143,13 @@ def of_times(topic: Topic, readings: Sequence[Reading]) -> Iterator[Finding]:
     return (doubt.below((topic.name,)) for doubt in doubts(readings, period))
 
 
-def of_reference(reference: Trajectory, complete: bool, timed: bool = True) -> Iterator[Finding]:
-    """What is wrong with the poses; with `timed` false, the stamps only number them."""
+def of_reference(
+    reference: Trajectory, complete: bool, timed: bool = True, begin: int | None = None
+) -> Iterator[Finding]:
+    """What is wrong with the poses; with `timed` false, the stamps only number them.
+
+    Seconds count from `begin`, the stamp of the first scan.
+    """
     of, lacks = "reference", "a reference that moves"
     if len(reference) < 2:
         if complete:
@@ -153,16 +157,17 @@ def of_reference(reference: Trajectory, complete: bool, timed: bool = True) -> I
             yield Finding((), "the reference holds a single pose", mend, of=of, lacks=lacks)
         return
     positions = reference.T_world_sensor[:, :3, 3]
-    steps = np.linalg.norm(geometry.steps(reference.T_world_sensor)[:, :3, 3], axis=1)
     if np.linalg.norm(positions - positions[0], axis=1).max() < _STILL:
         what = f"the reference stands still: all {len(reference)} poses are within 1 cm"
         mend = "errors are per metre; drive, or name another topic or a file of poses"
         yield Finding((), what, mend, of=of, lacks=lacks)
         return
-    seconds = np.diff(reference.stamps) * 1e-9 if timed else np.full(len(steps), 0.1)
-    if jumps := np.count_nonzero(steps > _FASTEST * np.maximum(seconds, 1e-3)):
-        mend = "errors there are not the odometry's; leave them out with `start`, `stop` or `cut`"
-        yield Finding((), f"the reference jumps {jumps} times", mend, of=of)
+    seconds = np.diff(reference.stamps) * 1e-9
+    if timed:
+        yield from sound(reference, begin)[1]
+    else:  # ten a second, as most LiDARs measure
+        numbered = Trajectory(reference.stamps * 10**8, reference.T_world_sensor)
+        yield from (one._replace(seconds=None) for one in sound(numbered)[1])
     if complete and timed and (gaps := np.count_nonzero(seconds > reference.max_gap)):
         what = f"the reference has {gaps} gaps beyond {reference.max_gap:g} s"
         what += f", the longest of {seconds.max():.2f} s: their scans get no label"

@@ -12,6 +12,7 @@ from rosbags.highlevel import AnyReader
 
 from adaptune import files, geometry
 from adaptune.errors import AdaptuneError, Finding
+from adaptune.metrics import travelled
 from adaptune.progress import Progress, unseen
 from adaptune.recording import Scan, SequenceConfig, SequenceError
 from adaptune.recording.bag import IMU_TYPES, POINTS_TYPES, BagSource, IndexReader
@@ -201,7 +202,8 @@ def _find(found: Inspection, apart: bool, slack: float) -> None:
         return
     poses = found.topics.get(found.used.get("reference", ""))
     complete = poses is None or found.complete or poses.count == 1
-    found.findings += of_reference(reference, complete)
+    begin = int(scans.times.min()) if scans is not None and any(scans.stamps) else None
+    found.findings += of_reference(reference, complete, begin=begin)
     if scans is not None and any(scans.stamps) and (found.complete or len(reference) > 1):
         found.findings += of_overlap(reference, scans.times, slack)
 
@@ -397,18 +399,14 @@ class _Survey:
             self._decode(topic, self._reader.end_time, self._path)
         if not self._poses:
             return None
-        where, (trajectory, unusable) = (found.used["reference"],), usable(self._poses)
+        where = (found.used["reference"],)
         if what := untimed(self._poses):
             mend, lacks = "name another topic, or a file of poses", "poses with stamps"
             found.findings.append(Finding(where, what, mend, of="reference", lacks=lacks))
             return None
-        if unusable:
-            what = f"{unusable} of {len(self._poses)} poses are not finite or have no rotation"
-            lacks, mend = (
-                "a reference trajectory" * (trajectory is None),
-                "adaptune leaves them out",
-            )
-            found.findings.append(Finding(where, what, mend, of="reference", lacks=lacks))
+        trajectory, left_out = usable(self._poses)
+        mend, lacks = "adaptune leaves them out", "a reference trajectory" * (trajectory is None)
+        found.findings += [Finding(where, w, mend, of="reference", lacks=lacks) for w in left_out]
         return trajectory
 
 
@@ -488,7 +486,7 @@ def _scan_text(scan: Scan) -> str:
 
 
 def _reference_text(reference: Trajectory, complete: bool) -> str:
-    length = np.linalg.norm(np.diff(reference.T_world_sensor[:, :3, 3], axis=0), axis=1).sum()
+    length = travelled(reference.T_world_sensor)[-1]
     seconds = (reference.stamps[-1] - reference.stamps[0]) * 1e-9
     words = "poses, " if complete else "poses in the sample, at least "
     # Poses without stamps are numbered by nanoseconds.

@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune import geometry
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import to_pose
 from adaptune.recording import cache, compensation, views
 from adaptune.recording.config import ESTIMATED, NO_REFERENCE, SequenceConfig, files_of
+from adaptune.recording.poses import sound
 from adaptune.recording.scan import (
     FIRST_SCANS,
     SOONEST,
@@ -211,9 +211,6 @@ def _check_topics(source: "Source", config: SequenceConfig) -> None:
 # At most so many scans are registered to find a clock offset.
 _MOST_SCANS = 600
 
-# Metres per second. No platform that carries a LiDAR is faster; only a jump of the reference is.
-_FASTEST = 100.0
-
 
 class RecordedSequence:
     """The scans of a recording as they were recorded, without views and without compensation.
@@ -397,9 +394,7 @@ class RecordedSequence:
         if config.extrinsic is not None:
             T = T @ to_pose(config.extrinsic)
         stamps = trajectory.stamps + round(config.clock_offset * 1e9)
-        trajectory = Trajectory(stamps, T, config.max_gap)
-        self._check(trajectory)
-        return trajectory
+        return self._checked_poses(Trajectory(stamps, T, config.max_gap))
 
     def check(self) -> None:
         """Find early what would fail while reading the scans, without reading them.
@@ -443,14 +438,19 @@ class RecordedSequence:
         order = np.flatnonzero(np.diff(stamps, prepend=stamps[0] - 1) > 0)
         return Trajectory(stamps[order], poses[order])
 
-    def _check(self, trajectory: Trajectory) -> None:
+    def _checked_poses(self, trajectory: Trajectory) -> Trajectory:
+        """The poses that a robot can have had; a SequenceError if they are of another time."""
         span = self.source.span()
         if span is None:
-            return
+            return trajectory
         begin, end = trajectory.stamps[0], trajectory.stamps[-1]
         if begin <= span[1] and end >= span[0]:
-            _warn_of_jumps(self.name, trajectory)
-            return
+            # A gap shorter than the time between two scans would not be noticed.
+            period = self._seconds / max(self.source.n_messages, 1)
+            trajectory, found = sound(trajectory, span[0], 1.5 * period)
+            for finding in found:
+                _warn(self.name, str(finding))
+            return trajectory
         times = [f"{stamp * 1e-9:.3f} s" for stamp in (begin, end, *span)]
         raise SequenceError(
             f"{self.name}: the reference covers {times[0]} to {times[1]}, the scans cover "
@@ -475,13 +475,3 @@ class RecordedSequence:
 @once
 def _warn(name: str, text: str) -> None:
     _log.warning("%s: %s", name, text)
-
-
-def _warn_of_jumps(name: str, trajectory: Trajectory) -> None:
-    steps = geometry.steps(trajectory.T_world_sensor)[:, :3, 3]
-    seconds = np.diff(trajectory.stamps) * 1e-9
-    jumps = np.flatnonzero(np.linalg.norm(steps, axis=1) > _FASTEST * np.maximum(seconds, 1e-3))
-    if len(jumps):
-        first = trajectory.stamps[jumps[0] + 1] * 1e-9
-        message = "%s: the reference jumps %d times, first at %.3f s, faster than %g m/s"
-        _log.warning(message, name, len(jumps), first, _FASTEST)

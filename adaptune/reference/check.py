@@ -1,12 +1,12 @@
 """Who is wrong, and by how much: a reference, or an odometry, by direct registrations of scans."""
 
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import accumulate, islice
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,6 @@ from adaptune.geometry import (
     invert,
     nearest_rotation,
     rotation_angle,
-    to_pose,
     to_quaternions,
 )
 from adaptune.live.evidence import MIN_REACH, Link, OwnError, OwnErrors, hops_along
@@ -48,6 +47,7 @@ class MeasuredReference:
     stamps: NDArray[np.int64]  # (n,): of the scans, in nanoseconds
     T_ref_sensor: Poses  # (n, 4, 4): poses of the reference; NaN where there is none
     hops: Hops  # direct registrations of the same scans
+    doubt: str = ""  # why registrations of these scans prove nothing, see `hard_to_track`
 
     def error(self, length: float) -> OwnError | None:
         """Mean error of the reference, in percent of sub-trajectories of `length` metres.
@@ -83,6 +83,11 @@ class MeasuredReference:
         scale = longer / length
         return None if found is None else OwnError(*(scale * value for value in found))
 
+    def is_noisy(self, length: float) -> bool:
+        """Whether the reference is surely wrong by more than `NOISY`; False if nothing is known."""
+        error = None if self.doubt else self.error(length)
+        return error is not None and error.low > NOISY
+
     @cached_property
     def unseen(self) -> str:
         """Axis of the sensor along which the place does not show motion, though it moves so.
@@ -117,7 +122,7 @@ def measure_reference(
     `advance` is called after every scan.
     """
     stamps, poses = [], []
-    n = scans.n_messages
+    n, doubt = scans.n_messages, hard_to_track(scans)
 
     def with_poses() -> Iterator[tuple[Scan, Poses]]:
         for scan in scans:
@@ -127,7 +132,8 @@ def measure_reference(
 
     hops = hops_along(with_poses(), lambda done: advance(min(done, n), n))
     advance(len(stamps), len(stamps))
-    return MeasuredReference(np.array(stamps, np.int64), np.array(poses).reshape(-1, 4, 4), hops)
+    T_ref_sensor = np.array(poses).reshape(-1, 4, 4)
+    return MeasuredReference(np.array(stamps, np.int64), T_ref_sensor, hops, doubt)
 
 
 def _pose_at(reference: Trajectory, stamp: int) -> Poses:
@@ -159,8 +165,6 @@ def mean_difference(T_one: Poses, T_other: Poses, length: float) -> float:
 
 SUSPICIOUS = 1.5
 """Percent. Poses that differ less from what scans show break no convention."""
-UNEXPLAINED = 5.0
-"""Percent from which a reference is surely wrong, whatever the reason."""
 EXPLAINED = 0.5
 """A cause explains the difference if it leaves less than this share of it."""
 FEWEST_HOPS = 5
@@ -170,6 +174,10 @@ TRUSTED = 0.8
 CLOCK = 30.0
 """Seconds by which clocks may differ to be found."""
 CONTRADICTS = "the reference contradicts the scans"
+FAR_APART = 0.25
+"""Seconds between poses, from which on the way between them is not straight."""
+TURNED = 0.1
+"""Radians, the root of their mean square, by which motions must turn a lever arm to show it."""
 SAME_CLOCK = 0.01
 """Seconds by which two clocks may differ and count as the same."""
 
@@ -234,6 +242,7 @@ def diagnose_reference(
 
     candidates = [
         *(one._replace(T_world_sensor=at_scans(one.T_world_sensor)) for one in _conventions(given)),
+        *_far_apart(reference, stamps),
         *_clock(reference, stamps, hops),
         *_places(at_scans(given) @ invert(T_given_sensor), hops, T_given_sensor),
     ]
@@ -293,12 +302,33 @@ def _conventions(T: Poses) -> Iterator[_Candidate]:
     known = np.isfinite(T[:, 0, 0])
     safe = np.where(np.isfinite(T), T, np.eye(4))
     in_order = from_quaternions(safe[:, :3, 3], to_quaternions(safe)[:, [1, 2, 3, 0]])
+    turned_back = safe.copy()
+    turned_back[:, :3, :3] = np.swapaxes(safe[:, :3, :3], 1, 2)
     for what, mend, T_right in (
         ("as if their quaternions began with w", "write the quaternions as qx qy qz qw", in_order),
         ("inverted", "write the poses of the LiDAR in the world", invert(safe)),
+        ("as if their rotations were transposed", "write a rotation's rows as rows", turned_back),
     ):
         T_right[~known] = np.nan
         yield _Candidate(what, mend, T_right)
+
+
+def _far_apart(reference: Trajectory, stamps: NDArray[np.int64]) -> Iterator[_Candidate]:
+    """Poses too rare to go straight from one to the next: on a smooth way through them."""
+    from scipy.interpolate import CubicSpline
+    from scipy.spatial.transform import RotationSpline
+
+    every = 1e-9 * float(np.median(np.diff(reference.stamps))) if len(reference) > 1 else 0.0
+    if every < FAR_APART:
+        return
+    T = reference.at(stamps)
+    known = np.isfinite(T[:, 0, 0])
+    seconds, at = (1e-9 * (some - stamps[0]) for some in (reference.stamps, stamps[known]))
+    R = Rotation.from_matrix(reference.T_world_sensor[:, :3, :3])
+    T[known, :3, :3] = RotationSpline(seconds, R)(at).as_matrix()
+    T[known, :3, 3] = CubicSpline(seconds, reference.T_world_sensor[:, :3, 3])(at)
+    what = f"too rare: one every {every:.2g} s, and a straight way for the scans in between"
+    yield _Candidate(what, "give more poses a second, or use `reference: estimated`", T)
 
 
 def _clock(reference: Trajectory, stamps: NDArray[np.int64], hops: Hops) -> Iterator[_Candidate]:
@@ -366,6 +396,8 @@ def _places(
     ):
         place = np.eye(4)
         place[:3, :3], place[:3, 3] = R, t
+        if (place == np.eye(4)).all():
+            continue
         numbers = " ".join(
             f"{value + 0.0:.4g}"
             for value in (*t.round(3), *to_quaternions(place[None])[0].round(4))
@@ -390,22 +422,25 @@ def _lever(T: Poses, measured: Poses, R_body_sensor: NDArray[np.float64]) -> NDA
     # (R - 1) t = R_body_sensor t_measured - t_body
     A = T[:, :3, :3] - np.eye(3)
     b = np.einsum("ij,nj->ni", R_body_sensor, measured[:, :3, 3]) - T[:, :3, 3]
+    # Along the axis of nearly all turns, as the vertical one of a car, they show nothing.
+    values, axes = np.linalg.eigh(np.einsum("nij,nik->jk", A, A) / len(A))
+    A = A @ axes[:, values > TURNED**2]
     weights = np.ones(len(T))
-    t = np.zeros(3)
-    for _ in range(10):
+    t = np.zeros(A.shape[2])
+    for _ in range(10 if A.shape[2] else 0):
         t = np.linalg.lstsq(
-            (weights[:, None, None] * A).reshape(-1, 3), (weights[:, None] * b).ravel(), rcond=0.05
+            (weights[:, None, None] * A).reshape(len(b) * 3, -1), (weights[:, None] * b).ravel()
         )[0]
         residuals = np.linalg.norm(A @ t - b, axis=1)
         weights = 1.0 / np.sqrt(np.maximum(residuals, 1e-2 + np.median(residuals)))
-    return np.asarray(t)
+    return np.asarray(axes[:, values > TURNED**2] @ t)
 
 
 def contradictions(
     scans: Recording,
     T_odom_sensor: Poses,
     error: float,
-    place: Sequence[Any] | None,
+    place: Poses | None,
     given: bool,
     seen: Collection[int] | None = None,
 ) -> Iterator[Finding]:
@@ -420,7 +455,7 @@ def contradictions(
     error
         Percent by which the odometry differs from the reference.
     place
-        The LiDAR's pose in the reference's frame as a study states it (`extrinsic`).
+        The LiDAR's pose in the reference's frame, of shape (4, 4), where a study states it.
     given
         Whether the reference came with the recording.
     seen
@@ -440,23 +475,36 @@ def contradictions(
     reference = scans.reference() if given else None
     if reference is not None:
         at = np.array(stamps, np.int64)
-        T = None if place is None else to_pose(list(place))
-        cause = diagnose_reference(reference, at, hops, T)
-        apart = _mean(mismatch(reference.at(at), hops)), _mean(mismatch(T_odom_sensor, hops))
-        if cause is not None:
+        T_ref_sensor = reference.at(at)
+        wrong, others = (mismatch(T, hops) for T in (T_ref_sensor, T_odom_sensor))
+        if (cause := diagnose_reference(reference, at, hops, place)) is not None:
             yield cause.below((CONTRADICTS,))
-        elif apart[0] > max(UNEXPLAINED, 4.0 * apart[1]):
+        elif _surely_worse(wrong, others):
             what = (
-                f"over some metres they differ by {apart[0]:.3g} %, by registrations of scans, and "
-                f"the odometry by {apart[1]:.3g} %"
+                f"over some metres they differ by {_mean(wrong):.3g} %, by registrations of scans, "
+                f"and the odometry by {_mean(others):.3g} %; sets that differ by less cannot be "
+                f"told apart"
             )
             mend = (
-                "check its file or topic (`reference`), the LiDAR's pose in its frame "
-                "(`extrinsic`) and its clock (`clock_offset`), or use `reference: estimated`"
+                "use `reference: estimated` or a longer sub_trajectory, or check its file or topic "
+                "(`reference`), the LiDAR's pose in its frame (`extrinsic`) and its clock "
+                "(`clock_offset`)"
             )
             yield Finding((CONTRADICTS,), what, mend, of="reference")
     if (cause := diagnose_odometry(T_odom_sensor, hops)) is not None:
         yield cause.below(("the odometry's poses contradict the scans",))
+
+
+def _surely_worse(wrong: NDArray[np.float64], others: NDArray[np.float64]) -> bool:
+    """Whether a reference differs from measured motions, of shape (n,), more than an odometry.
+
+    By the 95 % interval of the mean difference: what a registration itself is wrong by, both share.
+    """
+    known = np.isfinite(wrong + others)
+    more = (wrong - others)[known]
+    if len(more) < FEWEST_HOPS or not _mean(wrong) > max(NOISY, 2.0 * _mean(others)):
+        return False
+    return bool(more.mean() > 2.0 * more.std(ddof=1) / len(more) ** 0.5)
 
 
 NARROW, RARE = 180.0, 5.0
@@ -594,18 +642,12 @@ def proposed_sub_trajectory(
     least = min(SECONDS * path / seconds, max(LENGTHS)) if seconds else 0.0
     fit = [usual, *(length for length in LONGER if length > usual and FEWEST * length <= path)]
     usual = next((length for length in fit if length >= least), fit[-1])
-    if measured is None or not is_noisy(measured.error(usual)):
+    if measured is None or not measured.is_noisy(usual):
         return usual
     for length in (length for length in fit if length > usual):
-        error = measured.error(length)
-        if error is not None and not is_noisy(error):
+        if measured.error(length) is not None and not measured.is_noisy(length):
             return length
     return max(length for length in fit if length <= max(LENGTHS))
-
-
-def is_noisy(error: OwnError | None) -> bool:
-    """Whether a reference is surely wrong by more than `NOISY`; False where nothing is known."""
-    return error is not None and error.low > NOISY
 
 
 def accuracy_words(measured: MeasuredReference, *lengths: float) -> str:
@@ -621,16 +663,17 @@ def accuracy_words(measured: MeasuredReference, *lengths: float) -> str:
         return f"its error cannot be measured: the place does not show motion along {axis}"
     if not words:
         return f"its error over {lengths[0]:g} m cannot be measured: too few scans agree"
-    return f"wrong by {', '.join(words)}, as registrations of scans tell"
+    unsure = f", but they prove little: {measured.doubt}" if measured.doubt else ""
+    return f"wrong by {', '.join(words)}, as registrations of scans tell{unsure}"
 
 
 def advice(measured: MeasuredReference, reference: Trajectory, training: float = TRAINING) -> str:
     """What to do about a reference that is too noisy for the usual length; empty if it is not."""
-    if not is_noisy(measured.error(proposed_sub_trajectory(reference, training=training))):
+    if not measured.is_noisy(proposed_sub_trajectory(reference, training=training)):
         return ""
     length = proposed_sub_trajectory(reference, measured, training)
     less = "sets that differ by less cannot be told apart"
-    if is_noisy(measured.error(length)):
+    if measured.is_noisy(length):
         return f"{less}, at no length that fits: use `reference: estimated`"
     return f"{less}: use a sub_trajectory of {length:g} m, or `reference: estimated`"
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from adaptune import manifest
 from adaptune.errors import Finding
-from adaptune.geometry import Poses
+from adaptune.geometry import Poses, to_pose
 from adaptune.processes import pin
 from adaptune.recording.recording import RecordedSequence, wants_estimate
 from adaptune.recording.scan import origin
@@ -162,4 +162,5 @@ def contradictions_of(
         return []
     # Registrations undo the motion within the scans that they need.
     scans, given = RecordedSequence(config), sequences.estimate(name) is None
-    return list(contradictions(scans, T_odom_sensor, error, config.extrinsic, given, seen))
+    place = None if config.extrinsic is None else to_pose(config.extrinsic)
+    return list(contradictions(scans, T_odom_sensor, error, place, given, seen))

@@ -14,6 +14,7 @@ from adaptune.metrics import (
     lost_in_words,
     relative_error,
     sub_trajectory_rte,
+    travelled,
     window_ends,
 )
 
@@ -27,7 +28,7 @@ def walk(rng, n, step=1.0, turn=0.1):
     for i in range(1, n):
         move = np.eye(4)
         move[:3, :3] = Rotation.from_rotvec(rng.normal(0, turn, 3)).as_matrix()
-        move[:3, 3] = [step * rng.uniform(0, 2), *rng.normal(0, 0.1 * step, 2)]
+        move[:3, 3] = [step * rng.uniform(0.3, 1.7), *rng.normal(0, 0.1 * step, 2)]
         T[i] = T[i - 1] @ move
     return T
 
@@ -190,3 +191,17 @@ def test_a_large_error_has_words():
     # The worst sequence tells.
     (words,) = said({"one": 1.0, "two": 10.0}, two="night")
     assert "The likeliest cause: night." in words
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.015, 0.05, 0.1])
+@pytest.mark.parametrize("rate", [1, 10, 20, 100])
+def test_a_robot_that_stands_travels_nothing_by_the_jitter_of_its_poses(rate, noise):
+    x = np.concatenate([np.zeros(180 * rate), np.arange(0.0, 30.0, 1.5 / rate)])
+    T = along_x(x)
+    T[:, :3, 3] += np.random.default_rng(0).normal(0.0, noise, (len(T), 3))
+    metres = travelled(T)
+    assert metres[180 * rate - 1] < 1.0
+    assert metres[-1] == pytest.approx(30.0, rel=0.15 if noise else 0.06)
+    assert (np.diff(metres) >= 0.0).all()
+    T[5:8] = np.nan
+    assert travelled(T)[-1] == pytest.approx(metres[-1], abs=1.0)

@@ -652,11 +652,9 @@ class PlayedBag(WholeRun):
             _log.warning("%s: %s; poses are matched to scans by number", self.name, error)
             stamps = given.stamps
             poses = [(s, *of) for s, (_, *of) in zip(stamps.tolist(), poses, strict=True)]
-        trajectory, unusable = usable(poses)
-        if trajectory is None or unusable:
-            raise OdometryError(
-                f"{unusable} of {len(poses)} poses are no poses (NaN, or no rotation)"
-            )
+        trajectory, left_out = usable(poses)
+        if trajectory is None or left_out:
+            raise OdometryError(left_out[0])
         n, half = len(given.stamps), 0.5 * float(np.median(np.diff(given.stamps)))
         near = np.searchsorted(stamps, given.stamps - half) < np.searchsorted(
             stamps, given.stamps + 2.0 * half

@@ -350,9 +350,25 @@ def test_unusable_poses_are_left_out_and_told(tmp_path, caplog):
     messages.append(("/points", 0, one_cloud()))
     bag = rec.write_bag(tmp_path / "a.bag", messages)
     reference = opened(bag, reference="/poses").reference()
-    assert reference.T_world_sensor[:, 0, 3].tolist() == [0, 3, 900]
-    assert "2 poses on /poses that are not finite or have no rotation" in caplog.text
-    assert "jumps 1 times" in caplog.text
+    assert reference.T_world_sensor[:, 0, 3].tolist() == [0, 3]
+    assert "/poses: 2 of 6 poses are not finite or have no rotation" in caplog.text
+    assert "the reference jumps by up to 897 m" in caplog.text
+
+
+@pytest.mark.parametrize("frames", [("map", "odom"), ("map", "map", "odom"), ("odom", "", "odom")])
+def test_of_two_nodes_on_a_topic_one_counts(tmp_path, caplog, frames):
+    messages = [("/points", 0, one_cloud())]
+    for i in range(30):
+        made = rec.pose(rec.START + i * 10**8, (0.1 * i, 0, 0), (0, 0, 0, 1), rec.ROS1)
+        made.header.frame_id = frames[i % len(frames)]
+        messages.append(("/poses", i, made))
+    bag = rec.write_bag(tmp_path / "a.bag", messages)
+    most = max(frames, key=frames.count)
+    number = 30 * frames.count(most) // len(frames)
+    assert len(opened(bag, reference="/poses").reference()) == number
+    assert f"{30 - number} of 30 poses are of the frame" in caplog.text
+    assert f"not {most!r}" in caplog.text
+    assert "poses are of the frame" in " ".join(map(str, inspect(bag).findings))
 
 
 def truncated(path, share):

@@ -27,6 +27,8 @@ def kitti_odometry(folder, n=4):
         )
     (folder / "times.txt").write_text("".join(f"{i * 0.1:e}\n" for i in range(n)))
     T_camera_sensor, T_world_camera = poses(2)[1], poses(n)
+    T_camera_sensor[:3, 3] *= 0.1
+    T_world_camera[:, :3, 3] *= 0.1
     numbers = " ".join(map(repr, T_camera_sensor[:3].ravel().tolist()))
     (folder / "calib.txt").write_text(f"P0: 1 0 0 0 0 1 0 0 0 0 1 0\nTr: {numbers}\n")
     (folder.parent.parent / "poses").mkdir()

@@ -52,7 +52,7 @@ def test_a_sound_bag_has_all_it_needs_and_an_entry_that_opens(tmp_path):
         ([0, 0.2, 0.1, 0.3], [], "/points: 1 of 4 stamps do not come after the one before"),
         ([0, 0, 0], [], "/points: 2 of 3 stamps do not come after the one before"),
         ([0, 0.1, 0.2, 2.3, 2.4], [], "/points: 1 gaps, the longest of 2.10 s"),
-        ([0, 0.1], [(0, 0), (0.1, 500)], "the reference jumps 1 times"),
+        ([0, 0.1], [(0, 0), (0.1, 500)], "the reference jumps by up to 500 m"),
         ([0, 0.1], [(0, 0), (5, 1)], "1 of 1 gaps of the reference are longer than max_gap = 1 s"),
         ([0, 9], [(0, 0), (4, 60)], "the scans outside get no label"),
         ([0, 0.1], [(0, 0)], "the reference holds a single pose"),

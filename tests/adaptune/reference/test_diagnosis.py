@@ -68,6 +68,12 @@ def turned(T):
     return T @ place
 
 
+def transposed(T):
+    T = T.copy()
+    T[:, :3, :3] = np.swapaxes(T[:, :3, :3], 1, 2)
+    return T
+
+
 def carried(T):
     place = np.eye(4)
     place[:3, 3] = 0.8, 0.3, 0.2
@@ -87,6 +93,7 @@ def percents(found):
         (with_positions(lambda p: 1000.0 * p), "times as long", "metres"),
         (with_positions(lambda p: 1.1 * p), "1.1 times as long", "metres"),
         (invert, "inverted", "LiDAR in the world"),
+        (transposed, "transposed", "rows as rows"),
         (turned, "other axes", "extrinsic: [0, 0, 0, 0, 0, -0.707"),
         (carried, "lever arm", "extrinsic: [-0.79"),
         (lambda T: turned(carried(T)), "other axes", "extrinsic: [-0.29"),
@@ -120,6 +127,57 @@ def test_units_are_found_where_the_study_says_where_the_sensor_is():
     assert "metres" in found.mend
 
 
+@pytest.mark.parametrize("rate", [0.7, 1.0, 1.5])
+def test_poses_that_are_too_rare_are_named(rate):
+    stamps = np.arange(0, 61e9, 1e9 / rate).astype(np.int64)
+    found = diagnose_reference(Trajectory(stamps, poses(stamps), 2.0), SCANS, hops())
+    assert f"too rare: one every {1.0 / rate:.2g} s" in found.what
+    before, after = percents(found)
+    assert after < 0.5 * before
+    # At the scans, nothing lies between.
+    assert (
+        diagnose_reference(Trajectory(SCANS[::10], poses(SCANS[::10])), SCANS[::10], few()) is None
+    )
+
+
+def few():
+    """Registrations of every tenth scan."""
+    T = poses(SCANS[::10])
+    start = np.arange(len(T) - 3)
+    return Hops(
+        start, start + 3, invert(T[start]) @ T[start + 3], np.tile(np.eye(3), (len(start), 1, 1))
+    )
+
+
+def flat(stamps, turning):
+    """The drive of a car, on flat ground."""
+    T = poses(stamps)
+    T[:, 2, 3] = 0.0
+    yaw = Rotation.from_matrix(T[:, :3, :3]).as_euler("ZYX")[:, 0] if turning else np.zeros(len(T))
+    T[:, :3, :3] = Rotation.from_euler("z", yaw[:, None]).as_matrix()
+    if not turning:
+        T[:, :3, 3] = stamps[:, None] * (1.5e-9, 0.0, 0.0)
+    return T
+
+
+@pytest.mark.parametrize("turning", [True, False])
+def test_only_turns_show_a_lever_arm(turning):
+    start = np.arange(0, len(SCANS) - 30, 10)
+    T = flat(SCANS, turning)
+    measured = hops()._replace(T_start_end=invert(T[start]) @ T[start + 27])
+    pitching = np.tile(np.eye(4), (len(POSES), 1, 1))
+    pitch = 0.02 * np.sin(1.3e-9 * POSES)
+    pitching[:, :3, :3] = Rotation.from_euler("y", pitch[:, None]).as_matrix()
+    place = np.eye(4)
+    place[:3, 3] = 0.8, 0.3, 1.6
+    reference = Trajectory(POSES, flat(POSES, turning) @ pitching @ place)
+    found = diagnose_reference(reference, SCANS, measured)
+    assert "lever arm" in found.what if turning else found is None or "lever" not in found.what
+    if turning:
+        numbers = [float(n) for n in re.findall(r"-?[\d.]+", found.mend.split("[")[1])][:3]
+        assert numbers == pytest.approx([-0.8, -0.3, 0.0], abs=0.1)
+
+
 def noisy(T):
     apart = np.random.default_rng(1).normal(0.0, 0.15, (len(T), 3))
     return with_positions(lambda p: p + apart)(T)
@@ -150,6 +208,7 @@ def test_what_the_place_does_not_show_contradicts_nothing():
     [
         (lambda T: np.concatenate([T[:1], invert(T[:-1]) @ T[1:]]), "increments"),
         (invert, "inverted"),
+        (transposed, "transposed"),
         (quaternions([3, 0, 1, 2]), "began with w"),
         (turned, "other axes"),
         (carried, "lever arm"),
@@ -195,6 +254,12 @@ def test_scans_that_were_dropped_do_not_count(monkeypatch):
     wrong = check.contradictions(Recorded(turned(poses(SCANS))), T, 99.0, None, True, set(half))
     (words,) = wrong
     assert str(words).startswith("the reference contradicts the scans: over some metres they")
+    # Without a cause, too, if the odometry is surely the righter one.
+    vague = list(check.contradictions(Recorded(noisy(poses(SCANS))), T, 3.0, None, True, set(half)))
+    assert "and the odometry by" in vague[0].what
+    assert "`reference: estimated`" in vague[0].mend
+    both = check.contradictions(Recorded(noisy(poses(SCANS))), noisy(T), 3.0, None, True, set(half))
+    assert not list(both)
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,12 @@ from rooms import along_x
 
 from adaptune.live.evidence import OwnError
 from adaptune.recording.inspect import inspect
-from adaptune.reference.check import advice, proposed_sub_trajectory, recording_config
+from adaptune.reference.check import (
+    MeasuredReference,
+    advice,
+    proposed_sub_trajectory,
+    recording_config,
+)
 from adaptune.reference.stored import EstimateError
 from adaptune.trajectory import Trajectory
 
@@ -15,11 +20,12 @@ def path(metres, seconds=1000):
     return Trajectory(stamps, along_x(np.linspace(0.0, metres, 101)))
 
 
-class Measured:
+class Measured(MeasuredReference):
     """Errors that are known: metres that do not grow with the length."""
 
-    def __init__(self, metres):
-        self.metres = metres
+    def __init__(self, metres, doubt=""):
+        object.__setattr__(self, "metres", metres)
+        object.__setattr__(self, "doubt", doubt)
 
     def error(self, length):
         mean = 100.0 * self.metres / length
@@ -40,12 +46,14 @@ class Measured:
 def test_a_noisy_reference_needs_longer_sub_trajectories(metres, wrong, length, sentence):
     reference, measured = path(metres), Measured(wrong)
     if metres < 5.0:
-        measured.error = lambda _: None
+        object.__setattr__(measured, "error", lambda _: None)
     proposed = proposed_sub_trajectory(reference, measured)
     assert proposed == {4.0: 1.0}.get(metres, length)
     said = advice(measured, reference)
     assert sentence in said
     assert bool(said) == bool(sentence)
+    # Where registrations prove nothing, they replace nothing.
+    assert advice(Measured(wrong, "the sensor sees 70 degrees only"), reference) == ""
 
 
 @pytest.mark.parametrize(
