@@ -544,8 +544,8 @@ def _trial(
     if usage.seconds is not None:
         drives.seconds[~np.isnan(drives.seconds)] = usage.seconds
     # What goes on without poses may seem to do well.
-    without = ~drives.registered if failure else None
-    errors = sub_trajectory_rte(T_ref_sensor, T_odom_sensor, settings.sub_trajectory, without)
+    unseen = ~drives.registered if failure else None
+    errors = sub_trajectory_rte(T_ref_sensor, T_odom_sensor, settings.sub_trajectory, unseen)
     if np.isnan(errors).all():
         failure = failure or "no sub-trajectory has poses"
     seconds = sum(
