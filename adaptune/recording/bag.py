@@ -27,6 +27,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from adaptune.errors import nearest
 from adaptune.recording import clouds
 from adaptune.recording.clouds import (
+    CLOUDS,
     PATH,
     POSES,
     TRANSFORMS,
@@ -100,7 +101,6 @@ class IndexReader(Reader):
         yield from super().messages(connections, start, stop)
 
 
-POINTS_TYPES = ("sensor_msgs/msg/PointCloud2", *clouds.LIVOX_TYPES)
 IMU_TYPES = ("sensor_msgs/msg/Imu",)
 
 
@@ -145,7 +145,7 @@ class BagSource:
             return
         with self.open() as reader:
             self.topics = {c.topic: c.msgtype for c in reader.connections}
-            self.points = self.topic(points, POINTS_TYPES, "point clouds")
+            self.points = self.topic(points, CLOUDS, "point clouds")
             self.n_messages = sum(c.msgcount for c in reader.connections if c.topic == self.points)
             self._duration = max(reader.end_time - reader.start_time, 0)
             known = [t for t, kind in self.topics.items() if t == self.points or kind in POSES]
@@ -179,7 +179,7 @@ class BagSource:
         with self.open() as reader:
             load, frames, wanted = self.loader(reader), set[str](), (self.frame or "").lstrip("/")
             messages = enumerate(self.read(reader, self.points), start=1)
-            for number, (_, recorded, data) in messages:
+            for number, (connection, recorded, data) in messages:
                 what = f"{self.name}: message {number} on {self.points}"
                 stamp, frame = header_of(data, reader.is2)
                 if stamp is None:
@@ -188,7 +188,7 @@ class BagSource:
                 if not wanted and len(frames) > 1:
                     break
                 if wanted in ("", frame):
-                    yield Frame(stamp, recorded, partial(load, data, what))
+                    yield Frame(stamp, recorded, partial(load, connection.msgtype, data, what))
         wrong = wanted not in frames if wanted else len(frames) > 1
         if frames and wrong:
             what = f"{self.points} holds clouds of {', '.join(sorted(map(repr, frames)))}"
@@ -327,16 +327,16 @@ class BagSource:
                 ) from error
             yield message
 
-    def loader(self, reader: AnyReader) -> Callable[[bytes, str], Scan]:
-        """What decodes a message of the point clouds; its name goes into the SequenceError."""
-        livox = self.topics[self.points] in clouds.LIVOX_TYPES
-        decode = clouds.decode_livox if livox else clouds.decode_cloud
-        return partial(_load, partial(decode, cdr=reader.is2, timing=self.timing))
+    def loader(self, reader: AnyReader) -> Callable[[str, bytes, str], Scan]:
+        """What decodes a message of a type; the message's name goes into the SequenceError."""
+        return partial(_load, reader.is2, self.timing)
 
 
-def _load(decode: Callable[[bytes], Scan], data: bytes, what: str) -> Scan:
+def _load(cdr: bool, timing: Timing, kind: str, data: bytes, what: str) -> Scan:
+    if kind not in CLOUDS:
+        raise SequenceError(f"{what} is {kind}, not a point cloud: another node wrote there")
     try:
-        return decode(data)
+        return CLOUDS[kind](data, cdr, timing)
     except PointCloudError as error:
         raise SequenceError(f"{what}: {error}") from error
     except Exception as error:

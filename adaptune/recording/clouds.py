@@ -390,6 +390,12 @@ def decode_livox(data: bytes | memoryview, cdr: bool, timing: Timing = AUTO) -> 
     return replace(scan, reading=scan.reading._replace(clock=base))
 
 
+CLOUDS: dict[str, Callable[[bytes | memoryview, bool, Timing], Scan]] = {
+    "sensor_msgs/msg/PointCloud2": decode_cloud,
+    **dict.fromkeys(LIVOX_TYPES, decode_livox),
+}
+"""What decodes a serialised message of point clouds, by its type."""
+
 # Poses in ROS messages.
 
 

@@ -1,5 +1,6 @@
 """What is wrong with a recording: what it means, and what to do about it."""
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
@@ -29,6 +30,7 @@ class Topic:
     # list for every part of a sample.
     stamps: list[list[int]] = field(default_factory=list)
     undecoded: list[tuple[float, str]] = field(default_factory=list)  # seconds, and why
+    types: Counter[str] = field(default_factory=Counter)  # how many messages there are of each
 
     @property
     def times(self) -> NDArray[np.int64]:
@@ -77,6 +79,10 @@ _GAPS = {
 def of_topic(topic: Topic, of: str, complete: bool, apart: bool) -> Iterator[Finding]:
     """What is wrong with the messages of a topic, which is used as `of`, and with their stamps."""
     where = (topic.name,)
+    if of and len(topic.types) > 1:
+        many = ", ".join(f"{n} {kind}" for kind, n in topic.types.items())
+        mend = "" if topic.undecoded else "adaptune reads each as what it is"
+        yield Finding(where, f"messages of {len(topic.types)} types ({many})", mend, of=of)
     if topic.undecoded:
         (seconds, why), n = topic.undecoded[0], len(topic.undecoded)
         mend, lacks = _UNDECODED[of]

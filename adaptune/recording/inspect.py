@@ -14,8 +14,18 @@ from adaptune import files, geometry
 from adaptune.errors import AdaptuneError, Finding
 from adaptune.progress import Progress, unseen
 from adaptune.recording import Scan, SequenceConfig, SequenceError
-from adaptune.recording.bag import IMU_TYPES, POINTS_TYPES, BagSource, IndexReader
-from adaptune.recording.clouds import FARTHEST, PATH, POSES, Pose, header_of, parse, usable
+from adaptune.recording.bag import IMU_TYPES, BagSource, IndexReader
+from adaptune.recording.clouds import (
+    CLOUDS,
+    FARTHEST,
+    PATH,
+    POSES,
+    Pose,
+    decode_cloud,
+    header_of,
+    parse,
+    usable,
+)
 from adaptune.recording.config import BAG_SUFFIXES, REFERENCE_FILES, bag_paths
 from adaptune.recording.findings import (
     Topic,
@@ -246,9 +256,11 @@ def _inspect_bags(path: Path, deep: bool, show: Progress) -> Inspection:
 def _topics(reader: AnyReader) -> dict[str, Topic]:
     first = {kind: fields[:1] for kind, (_, fields) in reader.typestore.fielddefs.items()}
     topics: dict[str, Topic] = {}
-    for c in sorted(reader.connections, key=lambda c: c.topic):
+    for c in sorted(reader.connections, key=lambda c: (c.topic, -c.msgcount)):
         stamped = [f[1][1] for f in first.get(c.msgtype, ())] == ["std_msgs/msg/Header"]
-        topics.setdefault(c.topic, Topic(c.topic, c.msgtype, 0, stamped)).count += c.msgcount
+        topic = topics.setdefault(c.topic, Topic(c.topic, c.msgtype, 0, stamped))
+        topic.count += c.msgcount
+        topic.types[c.msgtype] += c.msgcount
     return topics
 
 
@@ -256,7 +268,7 @@ def _used(topics: dict[str, Topic]) -> dict[str, str]:
     """Which topics adaptune would use: of several, the densest; others are parts of it."""
     poses = [kind for kind in POSES if "tf" not in kind]
     used = {}
-    for of, kinds in (("points", POINTS_TYPES), ("reference", poses), ("imu", IMU_TYPES)):
+    for of, kinds in (("points", tuple(CLOUDS)), ("reference", poses), ("imu", IMU_TYPES)):
         if fit := [t for t in topics.values() if t.type in kinds and t.count]:
             used[of] = max(fit, key=lambda t: (t.count, t.name)).name
     return used
@@ -348,7 +360,7 @@ class _Survey:
             try:
                 for connection, when, data in self._source.read(self._reader, name, span):
                     if connection.topic in chosen:
-                        self._take(found.topics[connection.topic], when, data)
+                        self._take(found.topics[connection.topic], connection.msgtype, when, data)
                     done += 1
                     if done % 100 == 0:
                         show("reading", done, found.n_messages)
@@ -359,30 +371,30 @@ class _Survey:
                     found.findings.append(damage)
         show("reading", found.n_messages, found.n_messages)
 
-    def _take(self, topic: Topic, when: int, data: bytes) -> None:
+    def _take(self, topic: Topic, kind: str, when: int, data: bytes) -> None:
         """Keep when a message was made and recorded, and decode it where it is used."""
         topic.n_read += 1
         stamp = header_of(data, self._reader.is2)[0] if topic.stamped else when
         if stamp is not None:
             topic.stamps[-1].append(stamp)
-        if topic.type == PATH and topic.name in self._of:
+        if kind == PATH and topic.name in self._of:
             self._path = data  # each path repeats the one before: the last one will do
         else:
-            self._decode(topic, when, data)
+            self._decode(topic, kind, when, data)
 
-    def _decode(self, topic: Topic, when: int, data: bytes) -> None:
+    def _decode(self, topic: Topic, kind: str, when: int, data: bytes) -> None:
         try:
             match self._of.get(topic.name):
                 case "points":
                     first = self._found.scan is None
-                    _keep_scan(self._found, self._load(data, "message"))
-                    if first and topic.type == POINTS_TYPES[0]:
+                    _keep_scan(self._found, self._load(kind, data, "message"))
+                    if first and CLOUDS[kind] is decode_cloud:
                         fields = parse(data, self._reader.is2).fields
                         self._found.fields = tuple(name for name, *_ in fields)
                 case "reference":
-                    self._poses += POSES[topic.type](self._reader.deserialize(data, topic.type))
+                    self._poses += POSES[kind](self._reader.deserialize(data, kind))
                 case "imu":
-                    message: Any = self._reader.deserialize(data, topic.type)
+                    message: Any = self._reader.deserialize(data, kind)
                     w, a = message.angular_velocity, message.linear_acceleration
                     np.asarray_chkfinite([w.x, w.y, w.z, a.x, a.y, a.z])
         except Exception as error:  # deserializers raise whatever damaged data leads them to
@@ -394,7 +406,7 @@ class _Survey:
         found = self._found
         if self._path:
             topic = found.topics[found.used["reference"]]
-            self._decode(topic, self._reader.end_time, self._path)
+            self._decode(topic, PATH, self._reader.end_time, self._path)
         if not self._poses:
             return None
         trajectory, unusable = usable(self._poses)
