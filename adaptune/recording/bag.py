@@ -24,7 +24,7 @@ from rosbags.rosbag1 import Reader
 from rosbags.rosbag1.reader import Chunk, IndexData, decompressors
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from adaptune.errors import nearest
+from adaptune.errors import Finding, nearest
 from adaptune.recording import clouds
 from adaptune.recording.clouds import (
     CLOUDS,
@@ -126,6 +126,7 @@ class BagSource:
 
     random_access: ClassVar[bool] = False
     pose_files: Sequence[Path] = ()
+    findings: Sequence[Finding] = ()
 
     def __init__(
         self,

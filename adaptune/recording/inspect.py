@@ -35,7 +35,7 @@ from adaptune.recording.findings import (
     of_times,
     of_topic,
 )
-from adaptune.recording.recording import RecordedSequence
+from adaptune.recording.folder import kitti, scan_folder
 from adaptune.recording.scan import Reading
 from adaptune.trajectory import Trajectory, is_kitti, read_kitti, read_trajectory
 
@@ -63,6 +63,7 @@ class Inspection:
     readings: list[Reading] = field(default_factory=list)  # of each of them
     reference: Trajectory | None = None  # as far as it was read
     findings: list[Finding] = field(default_factory=list)
+    stamped_by: str = ""  # what gives the times of scans in files
 
     @property
     def n_messages(self) -> int:
@@ -165,13 +166,15 @@ _FILES = 40
 
 
 def _inspect_scans(path: Path, kind: str, deep: bool, show: Progress) -> Inspection:
-    source = RecordedSequence(SequenceConfig(**{kind: str(path)}, cache=False)).source
+    make = {"kitti": kitti, "folder": scan_folder}[kind]
+    source = make(path)
     frames = list(source.frames())
     number = len(frames) if deep else min(_FILES, len(frames))
     topic = Topic(str(path), "scans", len(frames), n_read=number)
     topic.stamps = [[frame.stamp for frame in frames]]
     found = Inspection(path, {kind: str(path)}, {topic.name: topic}, {"points": topic.name})
     found.complete = number == len(frames)
+    found.stamped_by, found.findings = source.stamped_by, [*source.findings]
     for done, i in enumerate(np.linspace(0, len(frames) - 1, number).astype(int), start=1):
         try:
             _keep_scan(found, frames[i].load())
@@ -429,6 +432,8 @@ def render_inspection(inspection: Inspection, accuracy: str = "") -> RenderableT
         parts.append(Text(f"point: {', '.join(inspection.fields)}"))
     if inspection.scan is not None:
         parts.append(Text(f"first scan: {_scan_text(inspection.scan)}"))
+    if inspection.stamped_by:
+        parts.append(Text(f"times of the scans: {inspection.stamped_by}"))
     if inspection.reference is not None:
         text = _reference_text(inspection.reference, inspection.complete)
         parts.append(Text(f"reference: {text}"))

@@ -268,6 +268,8 @@ class RecordedSequence:
         Scans whose stamps do not come after the one before, or that repeat it, are left out,
         counted, and reported in the log. Times that cannot be are a SequenceError.
         """
+        for finding in self.source.findings:
+            _warn(self.name, str(finding))
         left_out: Counter[str] = Counter()
         kept = None if self.key is None else cache.find(self.key)
         if kept is not None:

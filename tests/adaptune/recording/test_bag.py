@@ -484,7 +484,8 @@ def test_a_topic_of_two_types_is_read_by_both_decoders(tmp_path, name):
         ]
         for i, points in enumerate(clouds):
             stamp, livox = rec.START + i * 10**8, i % 4 > 1
-            made = rec.livox(store, kind, points, stamp) if livox else one_cloud(store, stamp)
+            made = rec.livox(store, kind, points, stamp) if livox else None
+            made = made or rec.cloud(rec.velodyne(points), stamp, store)
             made.header.frame_id = "lidar"
             of = made.__msgtype__
             write = store.serialize_ros1 if store is rec.ROS1 else store.serialize_cdr
