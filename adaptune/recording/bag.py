@@ -285,6 +285,13 @@ class BagSource:
     @contextmanager
     def open(self, by_index: bool = False) -> Iterator[AnyReader]:
         """Open the bags for reading; `by_index`, without a look at their chunks."""
+        for database in (file for file in self.files if file.suffix == ".db3"):
+            for journal in (Path(f"{database}-wal"), Path(f"{database}-journal")):
+                if journal.exists() and journal.stat().st_size:
+                    raise SequenceError(
+                        f"{journal}: holds messages that are not in the bag yet, as its recorder "
+                        f"was killed; add them by `sqlite3 {database} 'pragma wal_checkpoint'`"
+                    )
         try:
             reader = AnyReader(self.paths, default_typestore=_typestore())
             if by_index and not reader.is2:

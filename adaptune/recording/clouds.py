@@ -1,5 +1,6 @@
 """sensor_msgs/PointCloud2 to scans."""
 
+import re
 import struct
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -11,7 +12,15 @@ from numpy.typing import NDArray
 
 from adaptune import geometry
 from adaptune.errors import AdaptuneError, nearest
-from adaptune.recording.scan import AUTO, TIME_FIELDS, Scan, SequenceError, Timing, TimingError
+from adaptune.recording.scan import (
+    AUTO,
+    TIME_FIELDS,
+    Scan,
+    SequenceError,
+    Timing,
+    TimingError,
+    Unit,
+)
 from adaptune.trajectory import Trajectory
 
 # Numbers and texts of serialised ROS messages, where a whole message would take too long.
@@ -211,7 +220,11 @@ def from_fields(raw: NDArray[Any] | Mapping[str, NDArray[Any]], stamp: int, timi
     There is a PointCloudError if these are not single numbers, or if they or the times cannot be.
     """
     names = raw.dtype.names or () if isinstance(raw, np.ndarray) else tuple(raw)
-    time = next((name for name in TIME_FIELDS if name in names), None)
+    time, unread = next((name for name in TIME_FIELDS if name in names), None), ""
+    if time is None and (likely := [name for name in names if _TIMELIKE.search(name.lower())]):
+        sure = [name for name in likely if _is_time(raw[name], name, stamp, timing)]
+        time, unread = (sure[0], "") if sure else (None, likely[0])
+        timing = replace(timing, unit=timing.unit or _unit_in(sure[0])) if sure else timing
     ring = next((name for name in RING_FIELDS if name in names), None)
     # An odd intensity field is ignored: nothing needs it.
     numbers = (n for n in INTENSITY_FIELDS if n in names and raw[n].ndim == 1)
@@ -246,7 +259,32 @@ def from_fields(raw: NDArray[Any] | Mapping[str, NDArray[Any]], stamp: int, timi
     except TimingError as error:
         raise PointCloudError(str(error)) from error
     given_rings, given_lights = rings if ring else None, lights if intensity else None
+    reading = reading._replace(unread=unread)
     return Scan(start, points, seconds, given_rings, None, given_lights, reading)
+
+
+# Names of fields that may hold times, besides those that are known, and the units in them.
+_TIMELIKE = re.compile(r"time|stamp|offset|(^|_)(ts|dt|t)($|_)")
+
+
+def _unit_in(name: str) -> Unit | None:
+    units: dict[str, Unit] = {"ns": "ns", "nsec": "ns", "us": "us", "usec": "us", "ms": "ms"}
+    return units.get(name.lower().rpartition("_")[2])
+
+
+def _is_time(column: NDArray[Any], name: str, stamp: int, timing: Timing) -> bool:
+    """Whether a field holds the times of the points: by its unit, they span about a scan."""
+    if column.ndim != 1 or column.dtype.kind not in "iuf" or column.dtype.itemsize < 4:
+        return False
+    values = column[np.isfinite(column)]
+    if timing.unit is not None or not len(values):
+        return len(values) > 0
+    try:
+        timing = replace(timing, unit=_unit_in(name))
+        reading = timing.resolve(stamp, values, (values.min(), values.max()))[2]
+    except TimingError:
+        return False
+    return 0.01 < reading.last - reading.first < 1.1
 
 
 @np.errstate(over="ignore", invalid="ignore")

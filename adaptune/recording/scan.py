@@ -82,6 +82,7 @@ class Reading(NamedTuple):
     last: float = np.nan
     unit: float = 0.0  # seconds per unit of the points' times
     clock: int | None = None  # nanoseconds of the first point, if the sensor gives its own clock
+    unread: str = ""  # a field whose name says that it holds times, and whose values do not
 
 
 UNREAD = Reading()
@@ -362,6 +363,9 @@ _POSSIBLE = "possible times of the points"
 
 def doubts(readings: Sequence[Reading], period: float, timing: Timing = AUTO) -> Iterator[Finding]:
     """What is odd about scans that come every `period` seconds, and were read with `timing`."""
+    if unread := next((reading.unread for reading in readings if reading.unread), ""):
+        mend = "name their unit if it holds those of the points (`time_unit`), or write `none`"
+        yield Finding((), f"the field {unread!r} looks like times and is not read", mend, of="imu")
     timed = [reading for reading in readings if reading.last == reading.last]
     if len(timed) >= 5 and period * 1e9 >= SOONEST:
         first, last = np.array([reading[1:3] for reading in timed]).T

@@ -498,3 +498,16 @@ def test_a_topic_of_two_types_is_read_by_both_decoders(tmp_path, name):
         f"/points: messages of 2 types (2 sensor_msgs/msg/PointCloud2, 2 {kind}); adaptune reads "
         "each as what it is"
     )
+
+
+@pytest.mark.parametrize("journal", ["-wal", "-journal"])
+def test_a_journal_that_a_recorder_left_is_named(tmp_path, journal):
+    folder = rec.drive(tmp_path / "a.sqlite3")
+    (database,) = folder.glob("*.db3")
+    left = database.with_name(database.name + journal)
+    left.write_bytes(b"")
+    assert len(list(opened(folder))) == 20
+    left.write_bytes(b"messages")
+    for path in (folder, database):
+        with pytest.raises(SequenceError, match=rf"db3{journal}: holds messages .*pragma wal_ch"):
+            list(opened(path))
