@@ -1,6 +1,7 @@
 """Recordings in ROS 1 and ROS 2 bags."""
 
 import logging
+import math
 import re
 from collections import Counter, defaultdict, deque
 from collections.abc import (
@@ -9,11 +10,11 @@ from collections.abc import (
     Generator,
     Iterable,
     Iterator,
-    Mapping,
     Sequence,
 )
 from contextlib import contextmanager
 from functools import cache, partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -38,6 +39,7 @@ from adaptune.recording.clouds import (
     usable,
 )
 from adaptune.recording.config import files_of
+from adaptune.recording.findings import clock_parts, of_clock
 from adaptune.recording.scan import AUTO, Frame, Imu, Scan, SequenceError, Timing
 from adaptune.trajectory import Trajectory
 
@@ -102,6 +104,14 @@ class IndexReader(Reader):
 
 
 IMU_TYPES = ("sensor_msgs/msg/Imu",)
+# Nanoseconds: the end of a bag that is looked at, how late messages are written, and a long pause.
+_LAST, _LATE, _PAUSE = 10 * 10**9, 5 * 10**7, 600 * 10**9
+
+
+def storages(reader: AnyReader) -> list[Any]:
+    """What reads each file of open bags."""
+    readers: Any = (getattr(one, "storage", one) for one in reader.readers)
+    return [file for one in readers for file in getattr(one, "storages", [one])]
 
 
 @cache
@@ -126,7 +136,6 @@ class BagSource:
 
     random_access: ClassVar[bool] = False
     pose_files: Sequence[Path] = ()
-    findings: Sequence[Finding] = ()
 
     def __init__(
         self,
@@ -135,14 +144,21 @@ class BagSource:
         timing: Timing = AUTO,
         frame: str | None = None,
         about: dict[str, Any] | None = None,
+        within: tuple[float, float] = (0.0, math.inf),
     ):
         self.paths, self.timing, self.frame = tuple(paths), timing, frame
+        # Nanoseconds on the recorder's clock of what is used, and seconds before it.
+        self.window: tuple[int | None, int | None] = (None, None)
+        self.skipped, self.findings = 0.0, list[Finding]()
         if about is not None:
             self.topics: dict[str, str] = dict(about["topics"])
             self.points: str = about["points"]
             self.n_messages: int = about["n_messages"]
             self._duration: int = about["duration"]
-            self.begins: Mapping[str, int] = dict(about["begins"])
+            self.begins: dict[str, int] = dict(about["begins"])
+            if "window" in about:
+                self.window, self.skipped = tuple(about["window"]), about["skipped"]
+                self.findings = [Finding((), text, of="points") for text in about["findings"]]
             return
         with self.open() as reader:
             self.topics = {c.topic: c.msgtype for c in reader.connections}
@@ -151,7 +167,8 @@ class BagSource:
             self._duration = max(reader.end_time - reader.start_time, 0)
             known = [t for t, kind in self.topics.items() if t == self.points or kind in POSES]
             begins = {topic: self._begin(reader, topic) for topic in known}
-        self.begins = {topic: stamp for topic, stamp in begins.items() if stamp is not None}
+            self.begins = {topic: stamp for topic, stamp in begins.items() if stamp is not None}
+            self.look_at_clock(reader, within)
 
     def about(self) -> dict[str, Any]:
         """Everything that opening the bags has shown, as plain data."""
@@ -162,7 +179,64 @@ class BagSource:
             "n_messages": self.n_messages,
             "duration": self._duration,
             "begins": self.begins,
+            "window": self.window,
+            "skipped": self.skipped,
+            "findings": [str(finding) for finding in self.findings],
         }
+
+    def look_at_clock(
+        self, reader: AnyReader, within: tuple[float, float] = (0.0, math.inf)
+    ) -> None:
+        """Use the longest part in which the clock goes on, where it leaps.
+
+        `within` says between which seconds it is to lie.
+        """
+        if not self._leaps(reader):
+            return
+        both = (
+            (header_of(data, reader.is2)[0], r) for _, r, data in self.read(reader, self.points)
+        )
+        rows = np.array([row for row in both if row[0] is not None], np.int64).reshape(-1, 2)
+        stamps, recorded = rows.T
+        parts = clock_parts(stamps, recorded)
+        lasts = [min(p.seconds[1], within[1]) - max(p.seconds[0], within[0]) for p in parts]
+        long = [-1.0 if part.twice else last for part, last in zip(parts, lasts, strict=True)]
+        if len(parts) < 2 or max(long) < 0:
+            return
+        used = parts[int(np.argmax(long))]
+        end = int(recorded[used.last]) if used.last < len(rows) else None
+        self.window, self.skipped = (int(recorded[used.first]), end), used.seconds[0]
+        self.begins[self.points] = int(stamps[used.first])
+        self._duration = int(stamps[used.last - 1] - stamps[used.first])
+        self.n_messages = used.last - used.first
+        self.findings = [of_clock(self.points, parts, used)]
+
+    def _leaps(self, reader: AnyReader) -> bool:
+        """Whether a clock may leap: the sensor's against the recorder's, or this in the files."""
+        if not self.points or reader.start_time >= reader.end_time:
+            return False
+        ends = [(None, None), (max(reader.end_time - _LAST, reader.start_time), None)]
+        first, last = (next(self.read(reader, self.points, end), None) for end in ends)
+        if first is None or last is None:
+            return False
+        ahead = [(header_of(m[2], reader.is2)[0] or 0) - m[1] for m in (first, last)]
+        if abs(ahead[1] - ahead[0]) > 1e9 + 1e-3 * reader.duration:
+            return True
+        # Chunks in the order in which they were written, as far as there are any.
+        for file in storages(reader):
+            if (database := getattr(file, "dbconn", None)) is not None:
+                rows = database.execute("SELECT timestamp FROM messages ORDER BY id")
+                spans = [(time, time) for (time,) in rows]
+            elif (chunks := getattr(file, "chunk_infos", None)) is not None:
+                chunks = sorted(chunks, key=lambda c: c.pos)
+                spans = [(c.start_time, c.end_time) for c in chunks]
+            else:
+                chunks = sorted(file.chunks, key=lambda c: c.chunk_start_offset)
+                spans = [(c.message_start_time, c.message_end_time) for c in chunks]
+            steps = [after[0] - before[1] for before, after in pairwise(spans)]
+            if steps and (min(steps) < -_LATE or max(steps) > _PAUSE):
+                return True
+        return False
 
     @property
     def name(self) -> str:
@@ -179,7 +253,7 @@ class BagSource:
         """All scans in the order of their recording."""
         with self.open() as reader:
             load, frames, wanted = self.loader(reader), set[str](), (self.frame or "").lstrip("/")
-            messages = enumerate(self.read(reader, self.points), start=1)
+            messages = enumerate(self.read(reader, self.points, self.window), start=1)
             for number, (connection, recorded, data) in messages:
                 what = f"{self.name}: message {number} on {self.points}"
                 stamp, frame = header_of(data, reader.is2)
@@ -272,7 +346,9 @@ class BagSource:
     def messages(self, topic: str, last: bool = False) -> Iterator[Any]:
         """Deserialised messages of a topic, or its last one only."""
         with self.open() as reader:
-            messages: Iterable[Any] = enumerate(self.read(reader, topic), start=1)
+            there = next(self.read(reader, topic, self.window), None) is not None
+            window = self.window if there else (None, None)
+            messages: Iterable[Any] = enumerate(self.read(reader, topic, window), start=1)
             if last:
                 messages = deque(messages, maxlen=1)
             for number, (connection, _, data) in messages:

@@ -281,7 +281,8 @@ def _is_time(column: NDArray[Any], name: str, stamp: int, timing: Timing) -> boo
         return len(values) > 0
     try:
         timing = replace(timing, unit=_unit_in(name))
-        reading = timing.resolve(stamp, values, (values.min(), values.max()))[2]
+        extent = values.min().item(), values.max().item()
+        reading = timing.resolve(stamp, values, extent)[2]
     except TimingError:
         return False
     return 0.01 < reading.last - reading.first < 1.1

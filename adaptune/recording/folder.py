@@ -49,6 +49,7 @@ class FileSource:
 
     random_access: ClassVar[bool] = True
     begins: ClassVar[Mapping[str, int]] = {}
+    skipped: ClassVar[float] = 0.0
 
     def about(self) -> dict[str, Any]:
         """Its name."""

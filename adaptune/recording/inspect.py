@@ -14,7 +14,7 @@ from adaptune import files, geometry
 from adaptune.errors import AdaptuneError, Finding
 from adaptune.progress import Progress, unseen
 from adaptune.recording import Scan, SequenceConfig, SequenceError
-from adaptune.recording.bag import IMU_TYPES, BagSource, IndexReader
+from adaptune.recording.bag import IMU_TYPES, BagSource, IndexReader, storages
 from adaptune.recording.clouds import (
     CLOUDS,
     FARTHEST,
@@ -166,8 +166,7 @@ _FILES = 40
 
 
 def _inspect_scans(path: Path, kind: str, deep: bool, show: Progress) -> Inspection:
-    make = {"kitti": kitti, "folder": scan_folder}[kind]
-    source = make(path)
+    source = kitti(path) if kind == "kitti" else scan_folder(path)
     frames = list(source.frames())
     number = len(frames) if deep else min(_FILES, len(frames))
     topic = Topic(str(path), "scans", len(frames), n_read=number)
@@ -247,6 +246,8 @@ def _inspect_bags(path: Path, deep: bool, show: Progress) -> Inspection:
         found = Inspection(path, given, topics, used)
         source.topics = {topic.name: topic.type for topic in topics.values()}
         source.points = used.get("points", "")
+        source.look_at_clock(reader)
+        found.findings += source.findings
         apart = _apart(reader, source.paths)
         found.findings += apart
         survey = _Survey(source, reader, found)
@@ -301,8 +302,9 @@ class _Survey:
 
     def __init__(self, source: BagSource, reader: AnyReader, found: Inspection):
         self._source, self._reader, self._found = source, reader, found
-        self._begin = reader.start_time
-        self._length = reader.end_time - reader.start_time
+        begin, end = source.window
+        self._begin = reader.start_time if begin is None else begin
+        self._length = (reader.end_time if end is None else end) - self._begin
         # Number of clouds; where there are none, of messages.
         points = found.topics.get(source.points)
         self._usual = found.n_messages if points is None else points.count
@@ -319,9 +321,8 @@ class _Survey:
         It is if it is short, or a part cannot be read without what is before it: in mcap files
         without chunks.
         """
-        storages = [getattr(r, "storage", None) for r in self._reader.readers]
-        opened = [file for s in storages for file in getattr(s, "storages", [s])]
-        if not all(getattr(file, "chunks", True) for file in opened):
+        is2 = self._reader.is2
+        if is2 and not all(getattr(file, "chunks", True) for file in storages(self._reader)):
             return 0
         size = sum(path.stat().st_size for path in self._source.files)
         try:
@@ -340,7 +341,7 @@ class _Survey:
     def _spans(self, number: int, count: int) -> list[Span]:
         """Parts of the recording in which a topic of so many messages has some each."""
         if not number or number * _EACH >= count:
-            return [(None, None)]
+            return [self._source.window]
         width = _EACH / count
         starts = self._begin + np.linspace(0.0, (1.0 - width) * self._length, number).astype(int)
         return [(start, start + round(width * self._length) + 1) for start in starts.tolist()]
@@ -349,7 +350,7 @@ class _Survey:
         """Read so many parts, or everything if it is 0."""
         found, done = self._found, 0
         spans = self._spans(number, self._usual)
-        found.complete = spans == [(None, None)]
+        found.complete = spans == [self._source.window]
         if not found.complete:
             self.slack = self._length * 1e-9 / (len(spans) - 1)
         # What comes more rarely than the clouds has parts of its own.

@@ -153,6 +153,7 @@ def interval_of(config: SequenceConfig) -> tuple[float, float]:
     """
     recorded = RecordedSequence(config)
     first, _ = recorded.source.span() or (0, 0)
+    first -= round(1e9 * recorded.source.skipped)
     stop = math.inf if recorded.stop is None else first + 1e9 * recorded.stop
     return first + 1e9 * recorded.start, stop
 
@@ -169,8 +170,9 @@ def _source(config: SequenceConfig) -> "tuple[Source, str | None]":
     if config.folder is not None:
         return scan_folder(Path(config.folder), timing), None
     paths = config.bags()
+    within = (config.start, math.inf if config.stop is None else config.stop)
     if not config.cache or not cache.cap():
-        return BagSource(paths, config.points, timing, config.frame), None
+        return BagSource(paths, config.points, timing, config.frame, None, within), None
     try:
         part = (config.start, config.stop, config.stride, config.part)
         key = cache.key(files_of(paths), (config.points, config.frame, timing, *part))
@@ -178,7 +180,7 @@ def _source(config: SequenceConfig) -> "tuple[Source, str | None]":
         raise SequenceError(f"{paths[0]}: cannot be read ({error})") from error
     entry = cache.find(key)
     about = None if entry is None else entry.about
-    return BagSource(paths, config.points, timing, config.frame, about), key
+    return BagSource(paths, config.points, timing, config.frame, about, within), key
 
 
 def _check_topics(source: "Source", config: SequenceConfig) -> None:
@@ -228,8 +230,8 @@ class RecordedSequence:
         if (file := config.poses_file) is not None and not file.is_file():
             raise SequenceError(f"{file}: there is no such file")
         self.source, self.key = _source(config)
-        self.start, self.stop, self.stride = config.start, config.stop, config.stride
-        self._config = config
+        self.start, self.stop = max(config.start, self.source.skipped), config.stop
+        self.stride, self._config = config.stride, config
         _check_topics(self.source, config)
         if config.part is not None and self._seconds:
             begin, end = config.part
@@ -247,9 +249,9 @@ class RecordedSequence:
 
     @cached_property
     def _seconds(self) -> float:
-        """About how long the whole recording lasts."""
+        """About when the recording ends, or the part of it that is used."""
         begin, end = self.source.span() or (0, 0)
-        return (end - begin) * 1e-9
+        return self.source.skipped + (end - begin) * 1e-9
 
     @property
     def _until(self) -> float:
@@ -259,7 +261,8 @@ class RecordedSequence:
     @property
     def n_messages(self) -> int:
         """About how many scans of the recording it uses."""
-        share = max(self._until - self.start, 0.0) / self._seconds if self._seconds > 0.0 else 1.0
+        whole = self._seconds - self.source.skipped
+        share = max(self._until - self.start, 0.0) / whole if whole > 0.0 else 1.0
         return -(-round(self.source.n_messages * share) // self.stride)
 
     def __iter__(self) -> Iterator[Scan]:
@@ -320,7 +323,7 @@ class RecordedSequence:
         first, number = None, 0
         for frame in in_order(self.source.frames(), left_out):
             first = frame.stamp if first is None else first
-            seconds = (frame.stamp - first) * 1e-9
+            seconds = self.source.skipped + (frame.stamp - first) * 1e-9
             if self.stop is not None and seconds >= self.stop:
                 return
             if seconds >= self.start:
