@@ -215,7 +215,7 @@ class BagSource:
         """Whether a clock may leap: the sensor's against the recorder's, or this in the files."""
         if not self.points or reader.start_time >= reader.end_time:
             return False
-        ends = [(None, None), (max(reader.end_time - _LAST, reader.start_time), None)]
+        ends = [(None, None), (reader.end_time - min(_LAST, reader.duration // 4), None)]
         first, last = (next(self.read(reader, self.points, end), None) for end in ends)
         if first is None or last is None:
             return False
@@ -234,7 +234,8 @@ class BagSource:
                 chunks = sorted(file.chunks, key=lambda c: c.chunk_start_offset)
                 spans = [(c.message_start_time, c.message_end_time) for c in chunks]
             steps = [after[0] - before[1] for before, after in pairwise(spans)]
-            if steps and (min(steps) < -_LATE or max(steps) > _PAUSE):
+            longest = max([*steps, *(end - begin for begin, end in spans)], default=0)
+            if min(steps, default=0) < -_LATE or longest > _PAUSE:
                 return True
         return False
 

@@ -154,10 +154,12 @@ def clock_parts(stamps: NDArray[np.int64], recorded: NDArray[np.int64]) -> list[
     cuts = {0: False, n: False}  # whether what begins there comes twice
     away = (steps <= 0) | (steps > _PAUSE) | (steps - passed > _LEAP)
     for i in (np.flatnonzero(away) + 1).tolist():
-        before, after = stamps[max(i - _WINDOW, 0) : i], stamps[i : i + _WINDOW]
-        forward = float(np.median(after - stamps[i - 1]) - np.median(before - stamps[i - 1]))
-        leaps = forward < 0 or min(forward, steps[i - 1]) > _LEAP
-        if leaps and min(len(before), len(after)) > _WINDOW // 2:
+        # As many on both sides, and even: two sensors may take turns.
+        k = min(i, n - i, _WINDOW) // 2 * 2
+        if k <= _WINDOW // 2:
+            continue
+        before, after = (np.median(stamps[j : j + k] - stamps[i]) for j in (i - k, i))
+        if after < before or min(after - before, steps[i - 1]) > _LEAP:
             cuts[i] = False
     two = stamps[2:] - stamps[:-2]
     usual = float(np.median(two)) / 2.0 if len(two) else 0.0
