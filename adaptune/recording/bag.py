@@ -12,9 +12,9 @@ from collections.abc import (
     Iterator,
     Sequence,
 )
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache, partial
-from itertools import pairwise
+from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -104,6 +104,9 @@ class IndexReader(Reader):
 
 
 IMU_TYPES = ("sensor_msgs/msg/Imu",)
+Window = tuple[int | None, int | None]
+"""Nanoseconds on the recorder's clock from which, and up to which, to read."""
+_ALL: Window = (None, None)
 # Nanoseconds: the end of a bag that is looked at, how late messages are written, and a long pause.
 _LAST, _LATE, _PAUSE = 10 * 10**9, 5 * 10**7, 600 * 10**9
 
@@ -148,7 +151,7 @@ class BagSource:
     ):
         self.paths, self.timing, self.frame = tuple(paths), timing, frame
         # Nanoseconds on the recorder's clock of what is used, and seconds before it.
-        self.window: tuple[int | None, int | None] = (None, None)
+        self.window: Window = _ALL
         self.skipped, self.findings = 0.0, list[Finding]()
         if about is not None:
             self.topics: dict[str, str] = dict(about["topics"])
@@ -193,39 +196,41 @@ class BagSource:
         """
         if not self._leaps(reader):
             return
-        both = (
-            (header_of(data, reader.is2)[0], r) for _, r, data in self.read(reader, self.points)
-        )
-        rows = np.array([row for row in both if row[0] is not None], np.int64).reshape(-1, 2)
-        stamps, recorded = rows.T
+        stamps, recorded = np.array(list(self._clocks(reader)), np.int64).reshape(-1, 2).T
         parts = clock_parts(stamps, recorded)
         lasts = [min(p.seconds[1], within[1]) - max(p.seconds[0], within[0]) for p in parts]
         long = [-1.0 if part.twice else last for part, last in zip(parts, lasts, strict=True)]
         if len(parts) < 2 or max(long) < 0:
             return
         used = parts[int(np.argmax(long))]
-        end = int(recorded[used.last]) if used.last < len(rows) else None
+        end = int(recorded[used.last]) if used.last < len(stamps) else None
         self.window, self.skipped = (int(recorded[used.first]), end), used.seconds[0]
         self.begins[self.points] = int(stamps[used.first])
         self._duration = int(stamps[used.last - 1] - stamps[used.first])
         self.n_messages = used.last - used.first
         self.findings = [of_clock(self.points, parts, used)]
 
+    def _clocks(self, reader: AnyReader, span: Window = _ALL) -> Iterator[tuple[int, int]]:
+        """Stamps of the scans, and when they were recorded, up to where the bag is damaged."""
+        with suppress(SequenceError):
+            for _, recorded, data in self.read(reader, self.points, span):
+                stamp = header_of(data, reader.is2)[0]
+                if stamp is not None:
+                    yield stamp, recorded
+
     def _leaps(self, reader: AnyReader) -> bool:
         """Whether a clock may leap: the sensor's against the recorder's, or this in the files."""
         if not self.points or reader.start_time >= reader.end_time:
             return False
-        ends = [(None, None), (reader.end_time - min(_LAST, reader.duration // 4), None)]
-        first, last = (next(self.read(reader, self.points, end), None) for end in ends)
-        if first is None or last is None:
-            return False
-        ahead = [(header_of(m[2], reader.is2)[0] or 0) - m[1] for m in (first, last)]
-        if abs(ahead[1] - ahead[0]) > 1e9 + 1e-3 * reader.duration:
+        tail: Window = (reader.end_time - min(_LAST, reader.duration // 4), None)
+        ends = [end for span in (_ALL, tail) for end in islice(self._clocks(reader, span), 1)]
+        ahead = [stamp - recorded for stamp, recorded in ends]
+        if ends and abs(ahead[-1] - ahead[0]) > 1e9 + 1e-3 * reader.duration:
             return True
         # Chunks in the order in which they were written, as far as there are any.
         for file in storages(reader):
             if (database := getattr(file, "dbconn", None)) is not None:
-                rows = database.execute("SELECT timestamp FROM messages ORDER BY id")
+                rows = database.execute("SELECT timestamp FROM messages ORDER BY rowid")
                 spans = [(time, time) for (time,) in rows]
             elif (chunks := getattr(file, "chunk_infos", None)) is not None:
                 chunks = sorted(chunks, key=lambda c: c.pos)
@@ -347,8 +352,9 @@ class BagSource:
     def messages(self, topic: str, last: bool = False) -> Iterator[Any]:
         """Deserialised messages of a topic, or its last one only."""
         with self.open() as reader:
-            there = next(self.read(reader, topic, self.window), None) is not None
-            window = self.window if there else (None, None)
+            window = self.window
+            if window != _ALL and next(self.read(reader, topic, window), None) is None:
+                window = _ALL  # a reference that was added later
             messages: Iterable[Any] = enumerate(self.read(reader, topic, window), start=1)
             if last:
                 messages = deque(messages, maxlen=1)
@@ -394,7 +400,7 @@ class BagSource:
         self,
         reader: AnyReader,
         topic: str | None = None,
-        span: tuple[int | None, int | None] = (None, None),
+        span: Window = _ALL,
     ) -> Iterator[tuple[Connection, int, bytes]]:
         """Serialised messages of a topic, or of all topics; `span`, those recorded then."""
         chosen = [c for c in reader.connections if topic in (None, c.topic)]

@@ -1,10 +1,10 @@
 """What is wrong with a recording: what it means, and what to do about it."""
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
-from typing import NamedTuple
+from itertools import pairwise, repeat
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from adaptune import geometry
 from adaptune.errors import Finding
 from adaptune.recording.clouds import FARTHEST
-from adaptune.recording.scan import SOONEST, Reading, doubts
+from adaptune.recording.scan import SOONEST, Frame, Reading, doubts, in_order
 from adaptune.trajectory import Trajectory
 
 LEAST_POINTS = 20
@@ -31,6 +31,7 @@ class Topic:
     # Nanoseconds of the messages that were read, on the recorder's clock if they have no stamps; a
     # list for every part of a sample.
     stamps: list[list[int]] = field(default_factory=list)
+    recorded: list[int] = field(default_factory=list)  # of the same messages
     undecoded: list[tuple[float, str]] = field(default_factory=list)  # seconds, and why
     types: Counter[str] = field(default_factory=Counter)  # how many messages there are of each
 
@@ -103,7 +104,12 @@ def of_topic(topic: Topic, of: str, complete: bool, apart: bool) -> Iterator[Fin
 
 def _stamps(topic: Topic, of: str) -> Iterator[Finding]:
     where, n = (topic.name,), len(topic.times)
-    if wrong := np.count_nonzero(np.diff(topic.times) <= 0):
+    wrong = int(np.count_nonzero(np.diff(topic.times) <= 0))
+    if of == "points" and wrong:
+        left, stamps, unread = Counter[str](), topic.times.tolist(), repeat[Any](None)
+        deque(in_order(map(Frame, stamps, topic.recorded or stamps, unread), left), 0)
+        wrong = left.total()
+    if wrong:
         mend = "adaptune leaves such scans out" if of == "points" else ""
         lacks = "stamps that increase" if wrong == n - 1 and of in ("points", "reference") else ""
         what = f"{wrong} of {n} stamps do not come after the one before"

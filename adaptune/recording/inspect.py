@@ -14,7 +14,7 @@ from adaptune import files, geometry
 from adaptune.errors import AdaptuneError, Finding
 from adaptune.progress import Progress, unseen
 from adaptune.recording import Scan, SequenceConfig, SequenceError
-from adaptune.recording.bag import IMU_TYPES, BagSource, IndexReader, storages
+from adaptune.recording.bag import IMU_TYPES, BagSource, IndexReader, Window, storages
 from adaptune.recording.clouds import (
     CLOUDS,
     FARTHEST,
@@ -221,9 +221,6 @@ def _find(found: Inspection, apart: bool, slack: float) -> None:
 # Reading bags: a sample of their messages, or all of them.
 
 
-Span = tuple[int | None, int | None]
-"""Nanoseconds on the recorder's clock from which, and up to which, to read."""
-
 # A recording that takes no longer than this is read completely, and a sample takes about as long.
 SECONDS = 1.0
 # Bytes read in a second, with BZ2 and without; seconds that a message takes to decode.
@@ -338,7 +335,7 @@ class _Survey:
         cost = size * min(_EACH / max(self._usual, 1), 1.0) + min(size, 5e5)
         return int(np.clip(SECONDS * speed / cost, _FEWEST, _MOST))
 
-    def _spans(self, number: int, count: int) -> list[Span]:
+    def _spans(self, number: int, count: int) -> list[Window]:
         """Parts of the recording in which a topic of so many messages has some each."""
         if not number or number * _EACH >= count:
             return [self._source.window]
@@ -355,7 +352,7 @@ class _Survey:
             self.slack = self._length * 1e-9 / (len(spans) - 1)
         # What comes more rarely than the clouds has parts of its own.
         rare = [t for t in self._of if found.topics[t].count < self._usual and not found.complete]
-        jobs: list[tuple[str | None, Span]] = [(None, span) for span in spans]
+        jobs: list[tuple[str | None, Window]] = [(None, span) for span in spans]
         jobs += [(t, span) for t in rare for span in self._spans(number, found.topics[t].count)]
         for name, span in jobs:
             chosen = [name] if name else [t for t in found.topics if t not in rare]
@@ -381,6 +378,7 @@ class _Survey:
         stamp = header_of(data, self._reader.is2)[0] if topic.stamped else when
         if stamp is not None:
             topic.stamps[-1].append(stamp)
+            topic.recorded.append(when)
         if kind == PATH and topic.name in self._of:
             self._path = data  # each path repeats the one before: the last one will do
         else:

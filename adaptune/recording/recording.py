@@ -3,7 +3,7 @@
 import logging
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from functools import cache as once
 from functools import cached_property
 from itertools import chain, islice
@@ -19,6 +19,7 @@ from adaptune.geometry import to_pose
 from adaptune.recording import cache, compensation, views
 from adaptune.recording.config import ESTIMATED, NO_REFERENCE, SequenceConfig, files_of
 from adaptune.recording.scan import (
+    BACKWARD,
     FIRST_SCANS,
     SOONEST,
     Frame,
@@ -28,6 +29,7 @@ from adaptune.recording.scan import (
     SequenceError,
     Timing,
     doubts,
+    in_order,
 )
 from adaptune.trajectory import Trajectory, TrajectoryError, is_kitti, read_kitti, read_trajectory
 
@@ -42,58 +44,13 @@ _log = logging.getLogger(__name__)
 # Which of the scans of a recording are used.
 
 
-BACKWARD = "scans whose stamps do not come after the one before"
-LEAP = "scans whose stamps leap ahead of the recording"
 REPEATED = "scans with the same points as the one before"
 SOON = "scans less than 1 ms after the one before"
-
-
-def in_order(frames: Iterable[Frame], left_out: Counter[str]) -> Iterator[Frame]:
-    """Leave out the fewest frames so that stamps strictly increase.
-
-    If a stamp does not come after the one before it, one of the two is wrong. The one that
-    disagrees more with the recorder's clock is left out. A single stamp in the future thus costs
-    one scan, not all that follow.
-    """
-    last: Frame | None = None
-    doubtful: Frame | None = None
-    for frame in frames:
-        if doubtful is not None:
-            if frame.stamp > doubtful.stamp:
-                yield doubtful
-                last = doubtful
-            elif _leap(last, doubtful) > _leap(last, frame):
-                left_out[LEAP] += 1
-            else:
-                left_out[BACKWARD] += 1
-                continue
-            doubtful = None
-        if last is not None and frame.stamp <= last.stamp:
-            left_out[BACKWARD] += 1
-        elif last is None or _leap(last, frame) > _DOUBT:
-            # The next frame decides. Other frames pass at once: they are decoded while their bytes
-            # are still in the processor's cache.
-            doubtful = frame
-        else:
-            yield frame
-            last = frame
-    if doubtful is not None:
-        yield doubtful
-
-
-# Nanoseconds; a recorder is seldom later than this.
-_DOUBT = 50_000_000
 
 
 def repeats(scan: Scan, last: Scan) -> bool:
     """Whether it holds the same points as the scan before. No sensor measures twice the same."""
     return len(scan) > 0 and np.array_equal(scan.points, last.points)
-
-
-def _leap(last: Frame | None, frame: Frame) -> int:
-    """By how much a stamp has moved against the recorder's clock."""
-    usual = 0 if last is None else last.stamp - last.recorded
-    return abs(frame.stamp - frame.recorded - usual)
 
 
 # Opening recordings, and what they are read from, without reading their scans.

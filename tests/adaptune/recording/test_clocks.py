@@ -91,6 +91,20 @@ def test_the_longest_part_is_used_and_told(tmp_path, caplog, name, kind, said):
     assert half[0].stamp == scans[0].stamp
 
 
+@pytest.mark.parametrize("back", [1, 3])
+def test_inspect_tells_as_many_scans_as_are_left_out(tmp_path, back):
+    times = TIMES[:30] - 0.1 * back * (np.arange(30) > 20)
+    times[10] += 50.0
+    messages = [
+        ("/points", int(rec.START + i * 10**8), rec.cloud(rec.velodyne(cloud), int(s), rec.ROS1))
+        for i, (s, cloud) in enumerate(zip(of_seconds(times), rec.scans(30), strict=True))
+    ]
+    bag = rec.write_bag(tmp_path / "a.bag", messages)
+    left = 30 - len(list(open_sequence(SequenceConfig(bag=str(bag)))))
+    assert left == 1 + back
+    assert f"/points: {left} of 30 stamps do not come after" in "".join(texts(inspect(bag)))
+
+
 def shaken(rng):
     """Host stamps of scans that wait for the recorder now and then."""
     times = np.arange(300) / 10.0
