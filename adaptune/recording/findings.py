@@ -106,7 +106,8 @@ def _stamps(topic: Topic, of: str) -> Iterator[Finding]:
     where, n = (topic.name,), len(topic.times)
     wrong = int(np.count_nonzero(np.diff(topic.times) <= 0))
     if of == "points" and wrong:
-        left, stamps, unread = Counter[str](), topic.times.tolist(), repeat[Any](None)
+        left, stamps = Counter[str](), topic.times.tolist()
+        unread: Any = repeat(None)
         deque(in_order(map(Frame, stamps, topic.recorded or stamps, unread), left), 0)
         wrong = left.total()
     if wrong:
