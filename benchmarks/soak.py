@@ -14,6 +14,7 @@ import logging
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from threading import Semaphore, Thread
 from typing import Any
@@ -27,11 +28,11 @@ from adaptune.recording.scan import Scan
 from adaptune.simulation import Course
 from adaptune.simulation.record import simulate
 from offline.config import load_study
-from online.live import CLOUD
 from online.replay import ReplayRecord
 from online.robot import RobotDrive
 
 RATE = 10.0
+CLOUD = "sensor_msgs/msg/PointCloud2"
 EVERY = 600.0
 """Simulated seconds between two lines."""
 POINTS = 4000
@@ -50,13 +51,19 @@ class Robot:
         self.store = get_typestore(Stores.ROS1_NOETIC)
         text = "geometry_msgs/TransformStamped[] transforms\n"
         self.store.register(get_types_from_msg(text, "tf2_msgs/msg/TFMessage"))
-        self.free, self.alive = Semaphore(2), True
+        self.free, self.alive, self.is2 = Semaphore(2), True, False
         self._clouds = [self._cloud(scan) for scan in scans]
         self._n = n
 
-    def subscribe(self, topic: str, kind: str, take: Callable[[Any], None]) -> None:  # noqa: ARG002
+    def subscribe(
+        self, topic: str, kind: str, take: Callable[[Any], None], raw: bool = True
+    ) -> None:
         """Begin to publish."""
-        Thread(target=self._play, args=[take], daemon=True).start()
+        assert raw, topic
+        write = partial(self.store.serialize_ros1, typename=kind)
+        Thread(
+            target=self._play, args=[lambda cloud: take(bytes(write(cloud)))], daemon=True
+        ).start()
 
     def _play(self, take: Callable[[Any], None]) -> None:
         back_and_forth = [*self._clouds, *self._clouds[-2:0:-1]]

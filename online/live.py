@@ -6,8 +6,9 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from rosbags.typesys.store import Typestore
 
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses, to_quaternions
-from adaptune.recording.clouds import PointCloud2, from_fields, message_stamp, read_points
+from adaptune.recording.clouds import CLOUDS, from_fields, header_of, message_stamp
 from adaptune.recording.config import ImuConfig
 from adaptune.recording.scan import Imu, Scan, Timing
 from adaptune.ros.link import LinkError, RosLink
@@ -29,7 +30,7 @@ IMU_WAIT = 0.1
 """Seconds that a scan waits for the IMU's measurements up to its end."""
 _MAX_IMU = 20_000
 """Measurements that are kept."""
-CLOUD, IMU = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/Imu"
+IMU = "sensor_msgs/msg/Imu"
 
 _log = logging.getLogger(__name__)
 
@@ -81,7 +82,19 @@ class LiveScans:
         self.stopped = False
         if imu is not None and imu.topic is not None:
             link.subscribe(imu.topic, IMU, self._take_imu)
-        link.subscribe(points, CLOUD, self._take)
+        self._kind = ""
+        self._listen(link.topics())
+
+    def _listen(self, topics: Mapping[str, str]) -> None:
+        """Take the messages of the points' topic as what it is, by the `topics` that there are."""
+        kind = topics.get(self._points, self._kind or next(iter(CLOUDS)))
+        if kind not in CLOUDS:
+            can = ", ".join(CLOUDS)
+            raise LinkError(f"{self._points} is {kind}; name a topic of point clouds ({can})")
+        if kind != self._kind:
+            self._kind = kind
+            take = partial(self._take, CLOUDS[kind])
+            self._link.subscribe(self._points, kind, take, raw=True)
 
     def stop(self) -> None:
         """End all iterations."""
@@ -133,22 +146,23 @@ class LiveScans:
         try:
             topics = self._link.topics()
             if self._points not in topics:
-                clouds = sorted(topic for topic, kind in topics.items() if kind == CLOUD)
+                clouds = sorted(topic for topic, kind in topics.items() if kind in CLOUDS)
                 among = f"point clouds come on {', '.join(clouds)}" if clouds else "no point clouds"
                 hint = f"; nobody publishes it ({among})"
+            self._listen(topics)
         except LinkError as error:
             hint = f"; {error}"
         _log.warning("%s: no scan for %.0f s%s", self._points, seconds, hint)
 
-    def _take(self, message: Any) -> None:
+    def _take(self, decode: Callable[..., Scan], data: bytes) -> None:
         came = time.perf_counter()
         try:
-            scan = to_scan(message, self._timing)
+            scan = decode(data, self._link.is2, self._timing)
         except AdaptuneError as error:
             _log.warning("%s: %s; the scan is left out", self._points, error)
             return
         with self._news:
-            self.frame = message.header.frame_id or self.frame
+            self.frame = header_of(data, self._link.is2)[1] or self.frame
             self._waiting.append((scan, came))
             if self._queue and len(self._waiting) > self._queue:
                 self._waiting.popleft()
@@ -184,28 +198,6 @@ class LiveScans:
         values = np.array([values for _, values in taken], np.float64).reshape(-1, 6)
         imu = self._settings.in_si(Imu(stamps, values[:, :3], values[:, 3:]))
         return replace(scan, imu=imu)
-
-
-def to_scan(message: Any, timing: Timing) -> Scan:
-    """The scan of a sensor_msgs/PointCloud2.
-
-    Raises
-    ------
-    AdaptuneError
-        If it holds no points with x, y and z.
-    """
-    fields = tuple((one.name, one.offset, one.datatype, one.count) for one in message.fields)
-    cloud = PointCloud2(
-        message_stamp(message),
-        message.height,
-        message.width,
-        fields,
-        bool(message.is_bigendian),
-        message.point_step,
-        message.row_step,
-        memoryview(message.data),
-    )
-    return from_fields(read_points(cloud), cloud.stamp, timing)
 
 
 # What adaptune publishes while a robot drives.

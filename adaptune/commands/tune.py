@@ -380,13 +380,13 @@ def _replace_noisy(named: "Mapping[str, Inspection]", loaded: "Callable[[], Offl
 
 def _usable(path: Path, points: str | None, reference: str | None, show: Progress) -> "Inspection":
     """Look at a recording; it has scans of one topic, and a reference or is to get one."""
-    from adaptune.recording.bag import POINTS_TYPES
+    from adaptune.recording.clouds import CLOUDS
     from adaptune.recording.inspect import inspect as inspect_file
     from adaptune.reference.check import recording_config
 
     check_no_study(path)
     found = inspect_file(path, False, show)
-    clouds = [topic for topic in found.topics.values() if topic.type in POINTS_TYPES]
+    clouds = [topic for topic in found.topics.values() if topic.type in CLOUDS]
     if len(clouds) > 1 and points is None:
         each = ", ".join(f"{one.name} ({one.count:,} of {one.type})" for one in clouds)
         raise AdaptuneError(

@@ -1,6 +1,7 @@
 """Recordings in ROS 1 and ROS 2 bags."""
 
 import logging
+import math
 import re
 from collections import Counter, defaultdict, deque
 from collections.abc import (
@@ -9,12 +10,11 @@ from collections.abc import (
     Generator,
     Iterable,
     Iterator,
-    Mapping,
     Sequence,
 )
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache, partial
-from itertools import islice
+from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -25,9 +25,10 @@ from rosbags.rosbag1 import Reader
 from rosbags.rosbag1.reader import Chunk, IndexData, decompressors
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from adaptune.errors import nearest
+from adaptune.errors import Finding, nearest
 from adaptune.recording import clouds
 from adaptune.recording.clouds import (
+    CLOUDS,
     PATH,
     POSES,
     TRANSFORMS,
@@ -39,6 +40,7 @@ from adaptune.recording.clouds import (
     usable,
 )
 from adaptune.recording.config import files_of
+from adaptune.recording.findings import clock_parts, of_clock
 from adaptune.recording.scan import AUTO, Frame, Imu, Scan, SequenceError, Timing
 from adaptune.trajectory import Trajectory
 
@@ -102,10 +104,20 @@ class IndexReader(Reader):
         yield from super().messages(connections, start, stop)
 
 
-_LATEST, _LATE = 600 * 10**9, 10**9
+_LATEST, _UNEVEN = 600 * 10**9, 10**9
 """Nanoseconds from a bag's begin to its first scan, and by which scans come unevenly."""
-POINTS_TYPES = ("sensor_msgs/msg/PointCloud2", *clouds.LIVOX_TYPES)
 IMU_TYPES = ("sensor_msgs/msg/Imu",)
+Window = tuple[int | None, int | None]
+"""Nanoseconds on the recorder's clock from which, and up to which, to read."""
+_ALL: Window = (None, None)
+# Nanoseconds: the end of a bag that is looked at, how late messages are written, and a long pause.
+_LAST, _LATE, _PAUSE = 10 * 10**9, 5 * 10**7, 600 * 10**9
+
+
+def storages(reader: AnyReader) -> list[Any]:
+    """What reads each file of open bags."""
+    readers: Any = (getattr(one, "storage", one) for one in reader.readers)
+    return [file for one in readers for file in getattr(one, "storages", [one])]
 
 
 @cache
@@ -138,23 +150,31 @@ class BagSource:
         timing: Timing = AUTO,
         frame: str | None = None,
         about: dict[str, Any] | None = None,
+        within: tuple[float, float] = (0.0, math.inf),
     ):
         self.paths, self.timing, self.frame = tuple(paths), timing, frame
+        # Nanoseconds on the recorder's clock of what is used, and seconds before it.
+        self.window: Window = _ALL
+        self.skipped, self.findings = 0.0, list[Finding]()
         if about is not None:
             self.topics: dict[str, str] = dict(about["topics"])
             self.points: str = about["points"]
             self.n_messages: int = about["n_messages"]
             self._duration: int = about["duration"]
-            self.begins: Mapping[str, int] = dict(about["begins"])
+            self.begins: dict[str, int] = dict(about["begins"])
+            if "window" in about:
+                self.window, self.skipped = tuple(about["window"]), about["skipped"]
+                self.findings = [Finding((), text, of="points") for text in about["findings"]]
             return
         with self.open() as reader:
             self.topics = {c.topic: c.msgtype for c in reader.connections}
-            self.points = self.topic(points, POINTS_TYPES, "point clouds")
+            self.points = self.topic(points, CLOUDS, "point clouds")
             self.n_messages = sum(c.msgcount for c in reader.connections if c.topic == self.points)
             self._duration = max(reader.end_time - reader.start_time, 0)
             known = [t for t, kind in self.topics.items() if t == self.points or kind in POSES]
             begins = {topic: self._begin(reader, topic) for topic in known}
-        self.begins = {topic: stamp for topic, stamp in begins.items() if stamp is not None}
+            self.begins = {topic: stamp for topic, stamp in begins.items() if stamp is not None}
+            self.look_at_clock(reader, within)
 
     def about(self) -> dict[str, Any]:
         """Everything that opening the bags has shown, as plain data."""
@@ -165,7 +185,67 @@ class BagSource:
             "n_messages": self.n_messages,
             "duration": self._duration,
             "begins": self.begins,
+            "window": self.window,
+            "skipped": self.skipped,
+            "findings": [str(finding) for finding in self.findings],
         }
+
+    def look_at_clock(
+        self, reader: AnyReader, within: tuple[float, float] = (0.0, math.inf)
+    ) -> None:
+        """Use the longest part in which the clock goes on, where it leaps.
+
+        `within` says between which seconds it is to lie.
+        """
+        if not self._leaps(reader):
+            return
+        stamps, recorded = np.array(list(self._clocks(reader)), np.int64).reshape(-1, 2).T
+        parts = clock_parts(stamps, recorded)
+        lasts = [min(p.seconds[1], within[1]) - max(p.seconds[0], within[0]) for p in parts]
+        long = [-1.0 if part.twice else last for part, last in zip(parts, lasts, strict=True)]
+        if len(parts) < 2 or max(long) < 0:
+            return
+        used = parts[int(np.argmax(long))]
+        end = int(recorded[used.last]) if used.last < len(stamps) else None
+        self.window, self.skipped = (int(recorded[used.first]), end), used.seconds[0]
+        self.begins[self.points] = int(stamps[used.first])
+        self._duration = int(stamps[used.last - 1] - stamps[used.first])
+        self.n_messages = used.last - used.first
+        self.findings = [of_clock(self.points, parts, used)]
+
+    def _clocks(self, reader: AnyReader, span: Window = _ALL) -> Iterator[tuple[int, int]]:
+        """Stamps of the scans, and when they were recorded, up to where the bag is damaged."""
+        with suppress(SequenceError):
+            for _, recorded, data in self.read(reader, self.points, span):
+                stamp = header_of(data, reader.is2)[0]
+                if stamp is not None:
+                    yield stamp, recorded
+
+    def _leaps(self, reader: AnyReader) -> bool:
+        """Whether a clock may leap: the sensor's against the recorder's, or this in the files."""
+        if not self.points or reader.start_time >= reader.end_time:
+            return False
+        tail: Window = (reader.end_time - min(_LAST, reader.duration // 4), None)
+        ends = [end for span in (_ALL, tail) for end in islice(self._clocks(reader, span), 1)]
+        ahead = [stamp - recorded for stamp, recorded in ends]
+        if ends and abs(ahead[-1] - ahead[0]) > 1e9 + 1e-3 * reader.duration:
+            return True
+        # Chunks in the order in which they were written, as far as there are any.
+        for file in storages(reader):
+            if (database := getattr(file, "dbconn", None)) is not None:
+                rows = database.execute("SELECT timestamp FROM messages ORDER BY rowid")
+                spans = [(time, time) for (time,) in rows]
+            elif (chunks := getattr(file, "chunk_infos", None)) is not None:
+                chunks = sorted(chunks, key=lambda c: c.pos)
+                spans = [(c.start_time, c.end_time) for c in chunks]
+            else:
+                chunks = sorted(file.chunks, key=lambda c: c.chunk_start_offset)
+                spans = [(c.message_start_time, c.message_end_time) for c in chunks]
+            steps = [after[0] - before[1] for before, after in pairwise(spans)]
+            longest = max([*steps, *(end - begin for begin, end in spans)], default=0)
+            if min(steps, default=0) < -_LATE or longest > _PAUSE:
+                return True
+        return False
 
     @property
     def name(self) -> str:
@@ -182,8 +262,8 @@ class BagSource:
         """All scans in the order of their recording."""
         with self.open() as reader:
             load, frames, wanted = self.loader(reader), set[str](), (self.frame or "").lstrip("/")
-            messages = enumerate(self.read(reader, self.points), start=1)
-            for number, (_, recorded, data) in messages:
+            messages = enumerate(self.read(reader, self.points, self.window), start=1)
+            for number, (connection, recorded, data) in messages:
                 what = f"{self.name}: message {number} on {self.points}"
                 stamp, frame = header_of(data, reader.is2)
                 if stamp is None:
@@ -192,7 +272,7 @@ class BagSource:
                 if not wanted and len(frames) > 1:
                     break
                 if wanted in ("", frame):
-                    yield Frame(stamp, recorded, partial(load, data, what))
+                    yield Frame(stamp, recorded, partial(load, connection.msgtype, data, what))
         wrong = wanted not in frames if wanted else len(frames) > 1
         if frames and wrong:
             what = f"{self.points} holds clouds of {', '.join(sorted(map(repr, frames)))}"
@@ -202,14 +282,16 @@ class BagSource:
         """Scans with stamps from `begin` to before `stop`, found by the bags' index."""
         frames = list[Frame]()
         with self.open(by_index=True) as reader:
-            load, soon = self.loader(reader), (None, reader.start_time + _LATEST)
+            load, first = self.loader(reader), self.window[0] or reader.start_time
+            soon = first, first + _LATEST
             for _, recorded, data in islice(self.read(reader, self.points, soon), 1):
                 late = recorded - (header_of(data, reader.is2)[0] or 0)
-                span = begin + late - _LATE, stop + late + _LATE
-                for _, when, message in self.read(reader, self.points, span):
+                span = begin + late - _UNEVEN, stop + late + _UNEVEN
+                for connection, when, message in self.read(reader, self.points, span):
                     stamp = header_of(message, reader.is2)[0] or 0
                     if begin <= stamp < stop:
-                        frames.append(Frame(stamp, when, partial(load, message, self.name)))
+                        kind = connection.msgtype
+                        frames.append(Frame(stamp, when, partial(load, kind, message, self.name)))
         return frames
 
     def _begin(self, reader: AnyReader, topic: str) -> int | None:
@@ -290,7 +372,10 @@ class BagSource:
     def messages(self, topic: str, last: bool = False) -> Iterator[Any]:
         """Deserialised messages of a topic, or its last one only."""
         with self.open() as reader:
-            messages: Iterable[Any] = enumerate(self.read(reader, topic), start=1)
+            window = self.window
+            if window != _ALL and next(self.read(reader, topic, window), None) is None:
+                window = _ALL  # a reference that was added later
+            messages: Iterable[Any] = enumerate(self.read(reader, topic, window), start=1)
             if last:
                 messages = deque(messages, maxlen=1)
             for number, (connection, _, data) in messages:
@@ -303,6 +388,13 @@ class BagSource:
     @contextmanager
     def open(self, by_index: bool = False) -> Iterator[AnyReader]:
         """Open the bags for reading; `by_index`, without a look at their chunks."""
+        for database in (file for file in self.files if file.suffix == ".db3"):
+            for journal in (Path(f"{database}-wal"), Path(f"{database}-journal")):
+                if journal.exists() and journal.stat().st_size:
+                    raise SequenceError(
+                        f"{journal}: holds messages that are not in the bag yet, as its recorder "
+                        f"was killed; add them by `sqlite3 {database} 'pragma wal_checkpoint'`"
+                    )
         try:
             reader = AnyReader(self.paths, default_typestore=_typestore())
             if by_index and not reader.is2:
@@ -328,7 +420,7 @@ class BagSource:
         self,
         reader: AnyReader,
         topic: str | None = None,
-        span: tuple[int | None, int | None] = (None, None),
+        span: Window = _ALL,
     ) -> Iterator[tuple[Connection, int, bytes]]:
         """Serialised messages of a topic, or of all topics; `span`, those recorded then."""
         chosen = [c for c in reader.connections if topic in (None, c.topic)]
@@ -346,16 +438,16 @@ class BagSource:
                 ) from error
             yield message
 
-    def loader(self, reader: AnyReader) -> Callable[[bytes, str], Scan]:
-        """What decodes a message of the point clouds; its name goes into the SequenceError."""
-        livox = self.topics[self.points] in clouds.LIVOX_TYPES
-        decode = clouds.decode_livox if livox else clouds.decode_cloud
-        return partial(_load, partial(decode, cdr=reader.is2, timing=self.timing))
+    def loader(self, reader: AnyReader) -> Callable[[str, bytes, str], Scan]:
+        """What decodes a message of a type; the message's name goes into the SequenceError."""
+        return partial(_load, reader.is2, self.timing)
 
 
-def _load(decode: Callable[[bytes], Scan], data: bytes, what: str) -> Scan:
+def _load(cdr: bool, timing: Timing, kind: str, data: bytes, what: str) -> Scan:
+    if kind not in CLOUDS:
+        raise SequenceError(f"{what} is {kind}, not a point cloud: another node wrote there")
     try:
-        return decode(data)
+        return CLOUDS[kind](data, cdr, timing)
     except PointCloudError as error:
         raise SequenceError(f"{what}: {error}") from error
     except Exception as error:

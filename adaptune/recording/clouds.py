@@ -1,5 +1,6 @@
 """sensor_msgs/PointCloud2 to scans."""
 
+import re
 import struct
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -12,7 +13,15 @@ from numpy.typing import NDArray
 
 from adaptune import geometry
 from adaptune.errors import AdaptuneError, nearest
-from adaptune.recording.scan import AUTO, TIME_FIELDS, Scan, SequenceError, Timing, TimingError
+from adaptune.recording.scan import (
+    AUTO,
+    TIME_FIELDS,
+    Scan,
+    SequenceError,
+    Timing,
+    TimingError,
+    Unit,
+)
 from adaptune.trajectory import Trajectory
 
 # Numbers and texts of serialised ROS messages, where a whole message would take too long.
@@ -212,7 +221,11 @@ def from_fields(raw: NDArray[Any] | Mapping[str, NDArray[Any]], stamp: int, timi
     There is a PointCloudError if these are not single numbers, or if they or the times cannot be.
     """
     names = raw.dtype.names or () if isinstance(raw, np.ndarray) else tuple(raw)
-    time = next((name for name in TIME_FIELDS if name in names), None)
+    time, unread = next((name for name in TIME_FIELDS if name in names), None), ""
+    if time is None and (likely := [name for name in names if _TIMELIKE.search(name.lower())]):
+        sure = [name for name in likely if _is_time(raw[name], name, stamp, timing)]
+        time, unread = (sure[0], "") if sure else (None, likely[0])
+        timing = replace(timing, unit=timing.unit or _unit_in(sure[0])) if sure else timing
     ring = next((name for name in RING_FIELDS if name in names), None)
     # An odd intensity field is ignored: nothing needs it.
     numbers = (n for n in INTENSITY_FIELDS if n in names and raw[n].ndim == 1)
@@ -247,7 +260,33 @@ def from_fields(raw: NDArray[Any] | Mapping[str, NDArray[Any]], stamp: int, timi
     except TimingError as error:
         raise PointCloudError(str(error)) from error
     given_rings, given_lights = rings if ring else None, lights if intensity else None
+    reading = reading._replace(unread=unread)
     return Scan(start, points, seconds, given_rings, None, given_lights, reading)
+
+
+# Names of fields that may hold times, besides those that are known, and the units in them.
+_TIMELIKE = re.compile(r"time|stamp|offset|(^|_)(ts|dt|t)($|_)")
+
+
+def _unit_in(name: str) -> Unit | None:
+    units: dict[str, Unit] = {"ns": "ns", "nsec": "ns", "us": "us", "usec": "us", "ms": "ms"}
+    return units.get(name.lower().rpartition("_")[2])
+
+
+def _is_time(column: NDArray[Any], name: str, stamp: int, timing: Timing) -> bool:
+    """Whether a field holds the times of the points: by its unit, they span about a scan."""
+    if column.ndim != 1 or column.dtype.kind not in "iuf" or column.dtype.itemsize < 4:
+        return False
+    values = column[np.isfinite(column)]
+    if timing.unit is not None or not len(values):
+        return len(values) > 0
+    try:
+        timing = replace(timing, unit=_unit_in(name))
+        extent = values.min().item(), values.max().item()
+        reading = timing.resolve(stamp, values, extent)[2]
+    except TimingError:
+        return False
+    return 0.01 < reading.last - reading.first < 1.1
 
 
 @np.errstate(over="ignore", invalid="ignore")
@@ -390,6 +429,12 @@ def decode_livox(data: bytes | memoryview, cdr: bool, timing: Timing = AUTO) -> 
     scan = from_fields(raw, stamp, timing)
     return replace(scan, reading=scan.reading._replace(clock=base))
 
+
+CLOUDS: dict[str, Callable[[bytes | memoryview, bool, Timing], Scan]] = {
+    "sensor_msgs/msg/PointCloud2": decode_cloud,
+    **dict.fromkeys(LIVOX_TYPES, decode_livox),
+}
+"""What decodes a serialised message of point clouds, by its type."""
 
 # Poses in ROS messages.
 

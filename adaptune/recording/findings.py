@@ -1,7 +1,10 @@
 """What is wrong with a recording: what it means, and what to do about it."""
 
+from collections import Counter, deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise, repeat
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +12,7 @@ from numpy.typing import NDArray
 from adaptune.errors import Finding
 from adaptune.recording.clouds import FARTHEST
 from adaptune.recording.poses import sound
-from adaptune.recording.scan import SOONEST, Reading, doubts
+from adaptune.recording.scan import SOONEST, Frame, Reading, doubts, in_order
 from adaptune.trajectory import Trajectory
 
 LEAST_POINTS = 20
@@ -28,7 +31,9 @@ class Topic:
     # Nanoseconds of the messages that were read, on the recorder's clock if they have no stamps; a
     # list for every part of a sample.
     stamps: list[list[int]] = field(default_factory=list)
+    recorded: list[int] = field(default_factory=list)  # of the same messages
     undecoded: list[tuple[float, str]] = field(default_factory=list)  # seconds, and why
+    types: Counter[str] = field(default_factory=Counter)  # how many messages there are of each
 
     @property
     def times(self) -> NDArray[np.int64]:
@@ -76,6 +81,10 @@ _GAPS = {
 def of_topic(topic: Topic, of: str, complete: bool, apart: bool) -> Iterator[Finding]:
     """What is wrong with the messages of a topic, which is used as `of`, and with their stamps."""
     where = (topic.name,)
+    if of and len(topic.types) > 1:
+        many = ", ".join(f"{n} {kind}" for kind, n in topic.types.items())
+        mend = "" if topic.undecoded else "adaptune reads each as what it is"
+        yield Finding(where, f"messages of {len(topic.types)} types ({many})", mend, of=of)
     if topic.undecoded:
         (seconds, why), n = topic.undecoded[0], len(topic.undecoded)
         mend, lacks = _UNDECODED[of]
@@ -94,7 +103,13 @@ def of_topic(topic: Topic, of: str, complete: bool, apart: bool) -> Iterator[Fin
 
 def _stamps(topic: Topic, of: str) -> Iterator[Finding]:
     where, n = (topic.name,), len(topic.times)
-    if wrong := np.count_nonzero(np.diff(topic.times) <= 0):
+    wrong = int(np.count_nonzero(np.diff(topic.times) <= 0))
+    if of == "points" and wrong:
+        left, stamps = Counter[str](), topic.times.tolist()
+        unread: Any = repeat(None)
+        deque(in_order(map(Frame, stamps, topic.recorded or stamps, unread), left), 0)
+        wrong = left.total()
+    if wrong:
         mend = "adaptune leaves such scans out" if of == "points" else ""
         lacks = "stamps that increase" if wrong == n - 1 and of in ("points", "reference") else ""
         what = f"{wrong} of {n} stamps do not come after the one before"
@@ -119,6 +134,72 @@ def _count(topic: Topic, of: str) -> Iterator[Finding]:
     if topic.count < (1.0 - doubt) * expected:
         what = f"about {expected - topic.count:,} of {expected:,} messages are missing"
         yield Finding((topic.name,), what, "`--deep` looks for the gaps", of=of)
+
+
+class Part(NamedTuple):
+    """Messages, in the order of recording, between two leaps of their clock."""
+
+    first: int  # number of its first message
+    last: int  # of the one after its last message
+    seconds: tuple[float, float]  # since the first one, as if the clock had not leapt
+    twice: bool  # the clock was set back, and messages from before and after lie in between
+    leap: float  # seconds by which the clock leaps at its beginning
+
+
+_WINDOW = 6  # messages that tell a leap from a few wrong stamps
+_LEAP, _PAUSE = 10 * 10**9, 600 * 10**9  # nanoseconds that no clock, and no drive, leaves out
+
+
+def clock_parts(stamps: NDArray[np.int64], recorded: NDArray[np.int64]) -> list[Part]:
+    """Cut messages where their clock leaps for good, by their stamps and the recorder's clock.
+
+    Both are nanoseconds of shape (n,), in the order of recording. Where both clocks were set back,
+    a stretch of time comes twice, and messages come as often again there.
+    """
+    n, steps, passed = len(stamps), np.diff(stamps), np.diff(recorded)
+    cuts = {0: False, n: False}  # whether what begins there comes twice
+    away = (steps <= 0) | (steps > _PAUSE) | (steps - passed > _LEAP)
+    for i in (np.flatnonzero(away) + 1).tolist():
+        # As many on both sides, and even: two sensors may take turns.
+        k = min(i, n - i, _WINDOW) // 2 * 2
+        if k <= _WINDOW // 2:
+            continue
+        before, after = (np.median(stamps[j : j + k] - stamps[i]) for j in (i - k, i))
+        if after < before or min(after - before, steps[i - 1]) > _LEAP:
+            cuts[i] = False
+    two = stamps[2:] - stamps[:-2]
+    usual = float(np.median(two)) / 2.0 if len(two) else 0.0
+    edges = np.flatnonzero(np.diff(np.r_[False, two < 1.5 * usual, False].astype(int)))
+    for begin, end in edges.reshape(-1, 2).tolist():
+        # A recorder that falls behind pauses before as many messages as these.
+        if end - begin >= _WINDOW and begin > 0 and end + 2 < n:
+            regular = (stamps[end + 2] - stamps[begin - 1]) / usual
+            if end + 3 - begin - regular >= _WINDOW // 2:
+                cuts |= {begin: True, end + 2: False}
+    parts, shift, at = [], 0, sorted(cuts)
+    for first, last in pairwise(at):
+        leap = int(steps[first - 1]) if first else 0
+        if first and not 0 <= leap <= _LEAP:
+            goes_on = 0 < passed[first - 1] < _PAUSE
+            shift += leap - int(passed[first - 1] if goes_on else usual)
+        ends = [(int(stamps[i] - stamps[0]) - shift) * 1e-9 for i in (first, last - 1)]
+        parts.append(Part(first, last, (ends[0], ends[1]), cuts[first], leap * 1e-9))
+    return parts
+
+
+def of_clock(name: str, parts: Sequence[Part], used: Part) -> Finding:
+    """What is said of clocks that leap, and of the part that is used."""
+    twice = [part for part in parts if part.twice]
+    leaps = [f"by {p.leap:+,.1f} s at {p.seconds[0]:.1f} s" for p in parts[1:] if not p.twice]
+    leaps = leaps[:3] + ["..."] * (len(leaps) > 3)
+    what = f"the clock of the stamps leaps {', '.join(leaps)}"
+    if twice:
+        what = "the clock was set back: the stamps of {:.2f} to {:.2f} s come twice, and scans and "
+        what = (what + "reference go to and fro there").format(*twice[0].seconds)
+    n, part = parts[-1].last, "{:.1f} to {:.1f} s".format(*used.seconds)
+    what += f"; {n - used.last + used.first} of {n} scans are left out"
+    mend = f"adaptune uses the longest part, {part}; `start` and `stop` choose another"
+    return Finding((name,), what, mend, of="points")
 
 
 def of_clouds(topic: Topic, valid: Sequence[int]) -> Iterator[Finding]:

@@ -17,13 +17,15 @@ from numpy.typing import NDArray
 
 from adaptune import files as open3d
 from adaptune import geometry
-from adaptune.errors import NotInstalledError
+from adaptune.errors import Finding, NotInstalledError
 from adaptune.geometry import Poses
-from adaptune.recording.clouds import PointCloudError, from_fields
+from adaptune.recording.clouds import FARTHEST, PointCloudError, from_fields
 from adaptune.recording.scan import AUTO, Frame, Imu, Scan, SequenceError, Timing
 from adaptune.trajectory import Trajectory, read_kitti
 
 SUFFIXES = (".bin", ".npy", ".pcd", ".ply")
+KITTI = ("x", "y", "z", "intensity")
+"""What KITTI's ``.bin`` files hold of each point."""
 ELEVATION = 0.205
 """Degrees by which KITTI's LiDAR reports its rays too low."""
 
@@ -41,9 +43,13 @@ class FileSource:
     elevation: float = 0.0  # degrees by which every ray is to be turned up
     stamp_files: Sequence[Path] = ()  # hold the stamps, where the files' names do not
     pose_files: Sequence[Path] = ()  # hold the poses
+    stamped_by: str = "times.txt"  # what gives the scans' times
+    columns: Sequence[str] = KITTI  # of a point in a ``.bin`` file
+    findings: Sequence[Finding] = ()  # what is odd about the files
 
     random_access: ClassVar[bool] = True
     begins: ClassVar[Mapping[str, int]] = {}
+    skipped: ClassVar[float] = 0.0
 
     def about(self) -> dict[str, Any]:
         """Its name."""
@@ -69,7 +75,7 @@ class FileSource:
         return [frame for frame in self.frames() if begin <= frame.stamp < stop]
 
     def _load(self, path: Path, stamp: int) -> Scan:
-        scan = read_scan(path, stamp, self.timing)
+        scan = read_scan(path, stamp, self.timing, self.columns)
         if not self.elevation:
             return scan
         return replace(scan, points=turn_up(scan.points, self.elevation))
@@ -86,10 +92,12 @@ class FileSource:
         """Folders hold none."""
 
 
-def read_scan(path: Path, stamp: int, timing: Timing = AUTO) -> Scan:
-    """Read one file: ``.bin`` as KITTI writes them, ``.npy``, ``.pcd`` or ``.ply``."""
+def read_scan(
+    path: Path, stamp: int, timing: Timing = AUTO, columns: Sequence[str] = KITTI
+) -> Scan:
+    """Read one file: ``.npy``, ``.pcd``, ``.ply``, or ``.bin`` with these columns of float32."""
     try:
-        return from_fields(_fields(path), stamp, timing)
+        return from_fields(_fields(path, columns), stamp, timing)
     except FileNotFoundError as error:
         raise SequenceError(f"{path}: there is no such file") from error
     except NotInstalledError as error:
@@ -115,13 +123,15 @@ def turn_up(points: NDArray[np.float32], degrees: float) -> NDArray[np.float32]:
     return turned
 
 
-def _fields(path: Path) -> NDArray[Any] | dict[str, NDArray[Any]]:
+def _fields(path: Path, names: Sequence[str]) -> NDArray[Any] | dict[str, NDArray[Any]]:
     if path.suffix == ".bin":
-        size = path.stat().st_size
-        if size % 16:
-            raise ValueError(f"{size} bytes are not a whole number of points of four float32")
-        array: NDArray[Any] = np.fromfile(path, "<f4").reshape(-1, 4)
-    elif path.suffix == ".npy":
+        size, width = path.stat().st_size, len(names)
+        if size % (4 * width):
+            what = f"{size} bytes are not a whole number of points of {width} float32"
+            raise ValueError(f"{what} ({' '.join(names)})")
+        array: NDArray[Any] = np.fromfile(path, "<f4").reshape(-1, width)
+        return {name: array[:, i] for i, name in enumerate(names)}
+    if path.suffix == ".npy":
         array = np.load(path, allow_pickle=False)
         if array.dtype.names is not None:
             if missing := [axis for axis in "xyz" if axis not in array.dtype.names]:
@@ -132,8 +142,42 @@ def _fields(path: Path) -> NDArray[Any] | dict[str, NDArray[Any]]:
         return _open3d_fields(path)
     if array.ndim != 2 or array.shape[1] < 3:
         raise ValueError(f"an array of shape {array.shape} is not one of points")
-    columns = {axis: array[:, i] for i, axis in enumerate("xyz")}
-    return columns | {"intensity": array[:, 3]} if path.suffix == ".bin" else columns
+    return {axis: array[:, i] for i, axis in enumerate("xyz")}
+
+
+def _columns(files: Sequence[Path]) -> tuple[Sequence[str], list[Finding]]:
+    """Columns of ``.bin`` files, by what they can be, and what is odd about them."""
+    some = [np.fromfile(files[i], "<f4") for i in sorted({0, len(files) // 2, len(files) - 1})]
+    mend = "if they are others, write .npy or .pcd files"
+    for width in range(4, 9):
+        whole = [v.reshape(-1, width) for v in some if len(v) and len(v) % width == 0]
+        if not whole or len(whole) < len(some) or not _can_be_points(np.concatenate(whole)):
+            continue
+        names = [*KITTI, *(_name(column) for column in np.concatenate(whole).T[4:])]
+        # A name that comes again is not known.
+        names = [n if n and n not in names[:i] else f"unknown{i}" for i, n in enumerate(names)]
+        what = f"the .bin files hold {width} numbers a point, read as {' '.join(names)}"
+        return names, [Finding((), what, mend, of="points")] if width > 4 else []
+    if sum(map(len, some)) % 4:
+        return KITTI, []  # reading them says what is wrong
+    what = "many numbers of the .bin files cannot be intensities: they are below zero"
+    return KITTI, [Finding((), f"{what}; read as {' '.join(KITTI)}", mend, of="points")]
+
+
+@np.errstate(over="ignore", invalid="ignore")
+def _can_be_points(points: NDArray[np.float32]) -> bool:
+    """Whether the first four columns are what they should be, but for marks of lost rays."""
+    near = (np.abs(points[:, :3]) < FARTHEST).all(axis=1)
+    return bool(np.mean(near & (points[:, 3] >= 0)) > 0.98)
+
+
+@np.errstate(over="ignore", invalid="ignore")
+def _name(column: NDArray[np.float32]) -> str:
+    """What a column behind the intensities can be."""
+    low, high = float(column.min()), float(column.max())
+    if low >= 0 and high < 256 and not (column % 1).any():
+        return "ring"
+    return "time" if low > -1.0 and 1e-3 < high - low < 1.0 else ""
 
 
 def _open3d_fields(path: Path) -> dict[str, NDArray[Any]]:
@@ -156,23 +200,41 @@ def _open3d_fields(path: Path) -> dict[str, NDArray[Any]]:
 def scan_folder(folder: Path, timing: Timing = AUTO) -> FileSource:
     """Scans of a folder of ``.pcd``, ``.ply``, ``.npy`` or ``.bin`` files.
 
-    Stamps are the lines of ``times.txt`` (seconds) where there is one; else the files' names
-    where these are seconds with a fraction or nanoseconds since 1970; else one `period` a file.
+    They may be in ``data/`` below it, as KITTI's raw recordings are. Stamps are the lines of
+    ``times.txt`` or ``timestamps.txt`` where there is one, there or above ``data/``; else the
+    files' names where these are times; else one `period` a file.
     """
     if not folder.is_dir():
         raise SequenceError(f"{folder}: there is no such folder")
-    for suffix in SUFFIXES:
-        if files := sorted(folder.glob(f"*{suffix}"), key=_natural):
-            break
-    else:
+    places = [folder / below for below in ("", "data", "velodyne_points/data")]
+    found = ((p, sorted(p.glob(f"*{s}"), key=_natural)) for p in places for s in SUFFIXES)
+    place, files = next(((p, files) for p, files in found if files), (folder, []))
+    if not files:
         raise SequenceError(f"{folder}: holds no scan ({', '.join(SUFFIXES)}) and no bag")
-    times = folder / "times.txt"
-    if not times.exists():
-        return FileSource(str(folder), files, _named_stamps(files, timing.period), timing)
+    columns, findings = _columns(files) if files[0].suffix == ".bin" else (KITTI, [])
+    make = partial(FileSource, str(folder), timing=timing, columns=columns, findings=findings)
+    around = [place, place.parent] if place.name == "data" else [place]
+    listed = [p / name for p in around for name in ("times.txt", "timestamps.txt")]
+    times = next((path for path in listed if path.exists()), None)
+    if times is None:
+        named, unit = _named_stamps(files)
+        if named is not None:
+            order = np.argsort(named, kind="stable")
+            make = partial(make, scans=[files[i] for i in order])
+            return make(stamps=named[order], stamped_by=f"the files' names ({unit})")
+        assumed = f"one every {timing.period:g} s, as nothing gives their times"
+        if unit:
+            what = f"the names of the files look like times and are not read ({unit})"
+            mend = "write a times.txt with the seconds of each scan, or set `period`"
+            findings.append(Finding((), f"{what}; {assumed}", mend, of="points"))
+        stamps = np.arange(len(files)) * round(timing.period * 1e9)
+        return make(scans=files, stamps=stamps, stamped_by=assumed)
     stamps = _seconds(times)
+    if len(stamps) > len(files) and all(path.stem.isdigit() for path in files):
+        stamps = _by_number(files, stamps)  # files are missing
     if len(stamps) != len(files):
         raise SequenceError(f"{times}: {len(stamps)} times for {len(files)} scans; give one a scan")
-    return FileSource(str(folder), files, stamps, timing, stamp_files=[times])
+    return make(scans=files, stamps=stamps, stamp_files=[times], stamped_by=times.name)
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:
@@ -180,13 +242,36 @@ def _natural(path: Path) -> list[tuple[int, str]]:
     return [(int(n or 0), text) for text, n in re.findall(r"(\D*)(\d*)", path.stem)]
 
 
-def _named_stamps(files: Sequence[Path], period: float) -> NDArray[np.int64]:
-    stems = [path.stem for path in files]
-    if all(re.fullmatch(r"\d{17,19}", stem) for stem in stems):
-        return np.array([int(stem) for stem in stems], np.int64)
-    if all(re.fullmatch(r"\d{1,10}\.\d+", stem) for stem in stems):
-        return np.array([int(Decimal(stem).scaleb(9)) for stem in stems], np.int64)
-    return np.arange(len(files)) * round(period * 1e9)
+# Times in the names of files: the number, and what may come after it as a part of a second; the
+# power of ten that makes the number nanoseconds. Short ones count from 1970.
+_NAMES = (
+    (r"^(\d{1,10})(\.\d+)$", 9, "seconds"),
+    (r"(?:^|\D)([1-4]\d{9})([._-]\d{1,9})\D*$", 9, "seconds and their parts"),
+    (r"(?:^|\D)(\d{17,19})()\D*$", 0, "nanoseconds"),
+    (r"(?:^|\D)([1-4]\d{15})()\D*$", 3, "microseconds"),
+    (r"(?:^|\D)([1-4]\d{12})()\D*$", 6, "milliseconds"),
+    (r"(?:^|\D)([1-4]\d{9})()\D*$", 9, "seconds"),
+)
+
+
+def _named_stamps(files: Sequence[Path]) -> tuple[NDArray[np.int64] | None, str]:
+    """Nanoseconds that the files' names are, if they are times, and in which unit.
+
+    If they only look like times, the first name is given in place of the unit.
+    """
+    stems = [re.sub(r"(\.(bin|npy|pcd|ply))+$", "", path.name) for path in files]
+    for pattern, power, unit in _NAMES:
+        found = [match.groups() for match in map(re.compile(pattern).search, stems) if match]
+        if len(found) < len(stems):
+            continue
+        # `_5` is five nanoseconds, unless all have the same number of digits: `_000005`.
+        padded = len({len(rest) for _, rest in found}) == 1 or found[0][1].startswith(".")
+        parts = [rest[1:].ljust(9, "0")[:9] if padded else rest[1:] for _, rest in found]
+        times = zip(found, parts, strict=True)
+        return np.array([int(n) * 10**power + int(part) for (n, _), part in times], np.int64), unit
+    numbers = [int(re.sub(r"\D", "", stem) or 0) for stem in stems]
+    look = len(stems) > 1 and numbers[0] > 1e7 and np.median(np.diff(numbers)) > 1
+    return None, files[0].name if look else ""
 
 
 def kitti(folder: Path, elevation: float | None = None) -> FileSource:
@@ -250,9 +335,17 @@ def _by_number(files: Sequence[Path], stamps: NDArray[np.int64]) -> NDArray[np.i
 
 
 def _seconds(path: Path) -> NDArray[np.int64]:
+    """Nanoseconds of the lines of a file: seconds, smaller units since 1970, or dates."""
     try:
-        seconds = [Decimal(line) for line in _text(path).split()]
-        return np.array([int(s.scaleb(9).to_integral_value()) for s in seconds], np.int64)
+        lines = [line for line in _text(path).splitlines() if line.strip()]
+        if lines and re.match(r"\d+-\d+-\d+[ T]\d+:", lines[0]):
+            dates = np.array([line.strip().replace(" ", "T") for line in lines], "datetime64[ns]")
+            return dates.astype(np.int64)
+        times = [Decimal(text) for line in lines for text in line.split()]
+        # Since 1970 there are 1e9 seconds and more.
+        large = max(times, default=Decimal(0))
+        power = next((p for p, most in ((9, 1e11), (6, 1e14), (3, 1e17)) if large < most), 0)
+        return np.array([int(t.scaleb(power).to_integral_value()) for t in times], np.int64)
     except (InvalidOperation, ValueError, OverflowError) as error:
         raise SequenceError(f"{path}: a line is not a time in seconds") from error
 

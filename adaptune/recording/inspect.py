@@ -15,8 +15,19 @@ from adaptune.errors import AdaptuneError, Finding
 from adaptune.metrics import travelled
 from adaptune.progress import Progress, unseen
 from adaptune.recording import Scan, SequenceConfig, SequenceError
-from adaptune.recording.bag import IMU_TYPES, POINTS_TYPES, BagSource, IndexReader
-from adaptune.recording.clouds import FARTHEST, PATH, POSES, Pose, header_of, parse, untimed, usable
+from adaptune.recording.bag import IMU_TYPES, BagSource, IndexReader, Window, storages
+from adaptune.recording.clouds import (
+    CLOUDS,
+    FARTHEST,
+    PATH,
+    POSES,
+    Pose,
+    decode_cloud,
+    header_of,
+    parse,
+    untimed,
+    usable,
+)
 from adaptune.recording.config import BAG_SUFFIXES, REFERENCE_FILES, bag_paths
 from adaptune.recording.findings import (
     Topic,
@@ -26,7 +37,7 @@ from adaptune.recording.findings import (
     of_times,
     of_topic,
 )
-from adaptune.recording.recording import RecordedSequence
+from adaptune.recording.folder import kitti, scan_folder
 from adaptune.recording.scan import Reading
 from adaptune.trajectory import Trajectory, is_kitti, read_kitti, read_trajectory
 
@@ -54,6 +65,7 @@ class Inspection:
     readings: list[Reading] = field(default_factory=list)  # of each of them
     reference: Trajectory | None = None  # as far as it was read
     findings: list[Finding] = field(default_factory=list)
+    stamped_by: str = ""  # what gives the times of scans in files
 
     @property
     def n_messages(self) -> int:
@@ -156,13 +168,14 @@ _FILES = 40
 
 
 def _inspect_scans(path: Path, kind: str, deep: bool, show: Progress) -> Inspection:
-    source = RecordedSequence(SequenceConfig(**{kind: str(path)}, cache=False)).source
+    source = kitti(path) if kind == "kitti" else scan_folder(path)
     frames = list(source.frames())
     number = len(frames) if deep else min(_FILES, len(frames))
     topic = Topic(str(path), "scans", len(frames), n_read=number)
     topic.stamps = [[frame.stamp for frame in frames]]
     found = Inspection(path, {kind: str(path)}, {topic.name: topic}, {"points": topic.name})
     found.complete = number == len(frames)
+    found.stamped_by, found.findings = source.stamped_by, [*source.findings]
     for done, i in enumerate(np.linspace(0, len(frames) - 1, number).astype(int), start=1):
         try:
             _keep_scan(found, frames[i].load())
@@ -211,9 +224,6 @@ def _find(found: Inspection, apart: bool, slack: float) -> None:
 # Reading bags: a sample of their messages, or all of them.
 
 
-Span = tuple[int | None, int | None]
-"""Nanoseconds on the recorder's clock from which, and up to which, to read."""
-
 # A recording that takes no longer than this is read completely, and a sample takes about as long.
 SECONDS = 1.0
 # Bytes read in a second, with BZ2 and without; seconds that a message takes to decode.
@@ -236,6 +246,8 @@ def _inspect_bags(path: Path, deep: bool, show: Progress) -> Inspection:
         found = Inspection(path, given, topics, used)
         source.topics = {topic.name: topic.type for topic in topics.values()}
         source.points = used.get("points", "")
+        source.look_at_clock(reader)
+        found.findings += source.findings
         apart = _apart(reader, source.paths)
         found.findings += apart
         survey = _Survey(source, reader, found)
@@ -248,9 +260,11 @@ def _inspect_bags(path: Path, deep: bool, show: Progress) -> Inspection:
 def _topics(reader: AnyReader) -> dict[str, Topic]:
     first = {kind: fields[:1] for kind, (_, fields) in reader.typestore.fielddefs.items()}
     topics: dict[str, Topic] = {}
-    for c in sorted(reader.connections, key=lambda c: c.topic):
+    for c in sorted(reader.connections, key=lambda c: (c.topic, -c.msgcount)):
         stamped = [f[1][1] for f in first.get(c.msgtype, ())] == ["std_msgs/msg/Header"]
-        topics.setdefault(c.topic, Topic(c.topic, c.msgtype, 0, stamped)).count += c.msgcount
+        topic = topics.setdefault(c.topic, Topic(c.topic, c.msgtype, 0, stamped))
+        topic.count += c.msgcount
+        topic.types[c.msgtype] += c.msgcount
     return topics
 
 
@@ -258,7 +272,7 @@ def _used(topics: dict[str, Topic]) -> dict[str, str]:
     """Which topics adaptune would use: of several, the densest; others are parts of it."""
     poses = [kind for kind in POSES if "tf" not in kind]
     used = {}
-    for of, kinds in (("points", POINTS_TYPES), ("reference", poses), ("imu", IMU_TYPES)):
+    for of, kinds in (("points", tuple(CLOUDS)), ("reference", poses), ("imu", IMU_TYPES)):
         if fit := [t for t in topics.values() if t.type in kinds and t.count]:
             used[of] = max(fit, key=lambda t: (t.count, t.name)).name
     return used
@@ -288,8 +302,9 @@ class _Survey:
 
     def __init__(self, source: BagSource, reader: AnyReader, found: Inspection):
         self._source, self._reader, self._found = source, reader, found
-        self._begin = reader.start_time
-        self._length = reader.end_time - reader.start_time
+        begin, end = source.window
+        self._begin = reader.start_time if begin is None else begin
+        self._length = (reader.end_time if end is None else end) - self._begin
         # Number of clouds; where there are none, of messages.
         points = found.topics.get(source.points)
         self._usual = found.n_messages if points is None else points.count
@@ -306,9 +321,8 @@ class _Survey:
         It is if it is short, or a part cannot be read without what is before it: in mcap files
         without chunks.
         """
-        storages = [getattr(r, "storage", None) for r in self._reader.readers]
-        opened = [file for s in storages for file in getattr(s, "storages", [s])]
-        if not all(getattr(file, "chunks", True) for file in opened):
+        is2 = self._reader.is2
+        if is2 and not all(getattr(file, "chunks", True) for file in storages(self._reader)):
             return 0
         size = sum(path.stat().st_size for path in self._source.files)
         try:
@@ -324,10 +338,10 @@ class _Survey:
         cost = size * min(_EACH / max(self._usual, 1), 1.0) + min(size, 5e5)
         return int(np.clip(SECONDS * speed / cost, _FEWEST, _MOST))
 
-    def _spans(self, number: int, count: int) -> list[Span]:
+    def _spans(self, number: int, count: int) -> list[Window]:
         """Parts of the recording in which a topic of so many messages has some each."""
         if not number or number * _EACH >= count:
-            return [(None, None)]
+            return [self._source.window]
         width = _EACH / count
         starts = self._begin + np.linspace(0.0, (1.0 - width) * self._length, number).astype(int)
         return [(start, start + round(width * self._length) + 1) for start in starts.tolist()]
@@ -336,12 +350,12 @@ class _Survey:
         """Read so many parts, or everything if it is 0."""
         found, done = self._found, 0
         spans = self._spans(number, self._usual)
-        found.complete = spans == [(None, None)]
+        found.complete = spans == [self._source.window]
         if not found.complete:
             self.slack = self._length * 1e-9 / (len(spans) - 1)
         # What comes more rarely than the clouds has parts of its own.
         rare = [t for t in self._of if found.topics[t].count < self._usual and not found.complete]
-        jobs: list[tuple[str | None, Span]] = [(None, span) for span in spans]
+        jobs: list[tuple[str | None, Window]] = [(None, span) for span in spans]
         jobs += [(t, span) for t in rare for span in self._spans(number, found.topics[t].count)]
         for name, span in jobs:
             chosen = [name] if name else [t for t in found.topics if t not in rare]
@@ -350,7 +364,7 @@ class _Survey:
             try:
                 for connection, when, data in self._source.read(self._reader, name, span):
                     if connection.topic in chosen:
-                        self._take(found.topics[connection.topic], when, data)
+                        self._take(found.topics[connection.topic], connection.msgtype, when, data)
                     done += 1
                     if done % 100 == 0:
                         show("reading", done, found.n_messages)
@@ -361,30 +375,31 @@ class _Survey:
                     found.findings.append(damage)
         show("reading", found.n_messages, found.n_messages)
 
-    def _take(self, topic: Topic, when: int, data: bytes) -> None:
+    def _take(self, topic: Topic, kind: str, when: int, data: bytes) -> None:
         """Keep when a message was made and recorded, and decode it where it is used."""
         topic.n_read += 1
         stamp = header_of(data, self._reader.is2)[0] if topic.stamped else when
         if stamp is not None:
             topic.stamps[-1].append(stamp)
-        if topic.type == PATH and topic.name in self._of:
+            topic.recorded.append(when)
+        if kind == PATH and topic.name in self._of:
             self._path = data  # each path repeats the one before: the last one will do
         else:
-            self._decode(topic, when, data)
+            self._decode(topic, kind, when, data)
 
-    def _decode(self, topic: Topic, when: int, data: bytes) -> None:
+    def _decode(self, topic: Topic, kind: str, when: int, data: bytes) -> None:
         try:
             match self._of.get(topic.name):
                 case "points":
                     first = self._found.scan is None
-                    _keep_scan(self._found, self._load(data, "message"))
-                    if first and topic.type == POINTS_TYPES[0]:
+                    _keep_scan(self._found, self._load(kind, data, "message"))
+                    if first and CLOUDS[kind] is decode_cloud:
                         fields = parse(data, self._reader.is2).fields
                         self._found.fields = tuple(name for name, *_ in fields)
                 case "reference":
-                    self._poses += POSES[topic.type](self._reader.deserialize(data, topic.type))
+                    self._poses += POSES[kind](self._reader.deserialize(data, kind))
                 case "imu":
-                    message: Any = self._reader.deserialize(data, topic.type)
+                    message: Any = self._reader.deserialize(data, kind)
                     w, a = message.angular_velocity, message.linear_acceleration
                     np.asarray_chkfinite([w.x, w.y, w.z, a.x, a.y, a.z])
         except Exception as error:  # deserializers raise whatever damaged data leads them to
@@ -396,7 +411,7 @@ class _Survey:
         found = self._found
         if self._path:
             topic = found.topics[found.used["reference"]]
-            self._decode(topic, self._reader.end_time, self._path)
+            self._decode(topic, PATH, self._reader.end_time, self._path)
         if not self._poses:
             return None
         where = (found.used["reference"],)
@@ -421,6 +436,8 @@ def render_inspection(inspection: Inspection, accuracy: str = "") -> RenderableT
         parts.append(Text(f"point: {', '.join(inspection.fields)}"))
     if inspection.scan is not None:
         parts.append(Text(f"first scan: {_scan_text(inspection.scan)}"))
+    if inspection.stamped_by:
+        parts.append(Text(f"times of the scans: {inspection.stamped_by}"))
     if inspection.reference is not None:
         text = _reference_text(inspection.reference, inspection.complete)
         parts.append(Text(f"reference: {text}"))

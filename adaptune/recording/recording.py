@@ -1,8 +1,9 @@
 """Recordings: what every format offers, and the part of one that a study uses."""
 
 import logging
+import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from functools import cache as once
 from functools import cached_property
 from itertools import chain, islice, product
@@ -18,6 +19,7 @@ from adaptune.recording import cache, compensation, views
 from adaptune.recording.config import ESTIMATED, NO_REFERENCE, SequenceConfig, files_of
 from adaptune.recording.poses import sound
 from adaptune.recording.scan import (
+    BACKWARD,
     FIRST_SCANS,
     SOONEST,
     Frame,
@@ -27,6 +29,7 @@ from adaptune.recording.scan import (
     SequenceError,
     Timing,
     doubts,
+    in_order,
 )
 from adaptune.trajectory import Trajectory, TrajectoryError, is_kitti, read_kitti, read_trajectory
 
@@ -41,58 +44,13 @@ _log = logging.getLogger(__name__)
 # Which of the scans of a recording are used.
 
 
-BACKWARD = "scans whose stamps do not come after the one before"
-LEAP = "scans whose stamps leap ahead of the recording"
 REPEATED = "scans with the same points as the one before"
 SOON = "scans less than 1 ms after the one before"
-
-
-def in_order(frames: Iterable[Frame], left_out: Counter[str]) -> Iterator[Frame]:
-    """Leave out the fewest frames so that stamps strictly increase.
-
-    If a stamp does not come after the one before it, one of the two is wrong. The one that
-    disagrees more with the recorder's clock is left out. A single stamp in the future thus costs
-    one scan, not all that follow.
-    """
-    last: Frame | None = None
-    doubtful: Frame | None = None
-    for frame in frames:
-        if doubtful is not None:
-            if frame.stamp > doubtful.stamp:
-                yield doubtful
-                last = doubtful
-            elif _leap(last, doubtful) > _leap(last, frame):
-                left_out[LEAP] += 1
-            else:
-                left_out[BACKWARD] += 1
-                continue
-            doubtful = None
-        if last is not None and frame.stamp <= last.stamp:
-            left_out[BACKWARD] += 1
-        elif last is None or _leap(last, frame) > _DOUBT:
-            # The next frame decides. Other frames pass at once: they are decoded while their bytes
-            # are still in the processor's cache.
-            doubtful = frame
-        else:
-            yield frame
-            last = frame
-    if doubtful is not None:
-        yield doubtful
-
-
-# Nanoseconds; a recorder is seldom later than this.
-_DOUBT = 50_000_000
 
 
 def repeats(scan: Scan, last: Scan) -> bool:
     """Whether it holds the same points as the scan before. No sensor measures twice the same."""
     return len(scan) > 0 and np.array_equal(scan.points, last.points)
-
-
-def _leap(last: Frame | None, frame: Frame) -> int:
-    """By how much a stamp has moved against the recorder's clock."""
-    usual = 0 if last is None else last.stamp - last.recorded
-    return abs(frame.stamp - frame.recorded - usual)
 
 
 # Opening recordings, and what they are read from, without reading their scans.
@@ -175,8 +133,9 @@ def _source(config: SequenceConfig) -> "tuple[Source, str | None]":
     if config.folder is not None:
         return scan_folder(Path(config.folder), timing), None
     paths = config.bags()
+    within = (config.start, math.inf if config.stop is None else config.stop)
     if not config.cache or not cache.cap():
-        return BagSource(paths, config.points, timing, config.frame), None
+        return BagSource(paths, config.points, timing, config.frame, None, within), None
     try:
         part = (config.start, config.stop, config.stride, config.part)
         key = cache.key(files_of(paths), (config.points, config.frame, timing, *part))
@@ -184,7 +143,7 @@ def _source(config: SequenceConfig) -> "tuple[Source, str | None]":
         raise SequenceError(f"{paths[0]}: cannot be read ({error})") from error
     entry = cache.find(key)
     about = None if entry is None else entry.about
-    return BagSource(paths, config.points, timing, config.frame, about), key
+    return BagSource(paths, config.points, timing, config.frame, about, within), key
 
 
 def _check_topics(source: "Source", config: SequenceConfig) -> None:
@@ -231,8 +190,8 @@ class RecordedSequence:
         if (file := config.poses_file) is not None and not file.is_file():
             raise SequenceError(f"{file}: there is no such file")
         self.source, self.key = _source(config)
-        self.start, self.stop, self.stride = config.start, config.stop, config.stride
-        self._config = config
+        self.start, self.stop = max(config.start, self.source.skipped), config.stop
+        self.stride, self._config = config.stride, config
         _check_topics(self.source, config)
         if config.part is not None and self._seconds:
             begin, end = config.part
@@ -250,9 +209,9 @@ class RecordedSequence:
 
     @cached_property
     def _seconds(self) -> float:
-        """About how long the whole recording lasts."""
+        """About when the recording ends, or the part of it that is used."""
         begin, end = self.source.span() or (0, 0)
-        return (end - begin) * 1e-9
+        return self.source.skipped + (end - begin) * 1e-9
 
     @property
     def _until(self) -> float:
@@ -262,7 +221,8 @@ class RecordedSequence:
     @property
     def n_messages(self) -> int:
         """About how many scans of the recording it uses."""
-        share = max(self._until - self.start, 0.0) / self._seconds if self._seconds > 0.0 else 1.0
+        whole = self._seconds - self.source.skipped
+        share = max(self._until - self.start, 0.0) / whole if whole > 0.0 else 1.0
         return -(-round(self.source.n_messages * share) // self.stride)
 
     def __iter__(self) -> Iterator[Scan]:
@@ -271,6 +231,8 @@ class RecordedSequence:
         Scans whose stamps do not come after the one before, or that repeat it, are left out,
         counted, and reported in the log. Times that cannot be are a SequenceError.
         """
+        for finding in self.source.findings:
+            _warn(self.name, str(finding))
         left_out: Counter[str] = Counter()
         kept = None if self.key is None else cache.find(self.key)
         if kept is not None:
@@ -321,7 +283,7 @@ class RecordedSequence:
         first, number = None, 0
         for frame in in_order(self.source.frames(), left_out):
             first = frame.stamp if first is None else first
-            seconds = (frame.stamp - first) * 1e-9
+            seconds = self.source.skipped + (frame.stamp - first) * 1e-9
             if self.stop is not None and seconds >= self.stop:
                 return
             if seconds >= self.start:
@@ -337,6 +299,7 @@ class RecordedSequence:
         begin, end, files = 0, _NEVER, list[set[Path]]()
         for one in (self, other):
             first, last = one.source.span() or (0, _NEVER)
+            first -= round(1e9 * one.source.skipped)
             begin = max(begin, first + round(1e9 * one.start))
             end = min(end, last + 1 if one.stop is None else first + round(1e9 * one.stop))
             files.append({f.resolve() for f in one.source.files if f.suffix not in _NOTES})

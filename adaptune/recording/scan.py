@@ -1,7 +1,8 @@
 """What recordings consist of: scans, measurements of an IMU, and the formats that give them."""
 
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, Literal, NamedTuple, Protocol
 
@@ -82,6 +83,7 @@ class Reading(NamedTuple):
     last: float = np.nan
     unit: float = 0.0  # seconds per unit of the points' times
     clock: int | None = None  # nanoseconds of the first point, if the sensor gives its own clock
+    unread: str = ""  # a field whose name says that it holds times, and whose values do not
 
 
 UNREAD = Reading()
@@ -362,6 +364,9 @@ _POSSIBLE = "possible times of the points"
 
 def doubts(readings: Sequence[Reading], period: float, timing: Timing = AUTO) -> Iterator[Finding]:
     """What is odd about scans that come every `period` seconds, and were read with `timing`."""
+    if unread := next((reading.unread for reading in readings if reading.unread), ""):
+        mend = "name their unit if it holds those of the points (`time_unit`), or write `none`"
+        yield Finding((), f"the field {unread!r} looks like times and is not read", mend, of="imu")
     timed = [reading for reading in readings if reading.last == reading.last]
     if len(timed) >= 5 and period * 1e9 >= SOONEST:
         first, last = np.array([reading[1:3] for reading in timed]).T
@@ -465,3 +470,50 @@ class Frame(NamedTuple):
     stamp: int  # nanoseconds, as recorded
     recorded: int  # nanoseconds on the clock of the recorder; the stamp where there is none
     load: Callable[[], Scan]  # decodes the scan
+
+
+BACKWARD = "scans whose stamps do not come after the one before"
+LEAP = "scans whose stamps leap ahead of the recording"
+
+
+def in_order(frames: Iterable[Frame], left_out: Counter[str]) -> Iterator[Frame]:
+    """Leave out the fewest frames so that stamps strictly increase.
+
+    If a stamp does not come after the one before it, one of the two is wrong. The one that
+    disagrees more with the recorder's clock is left out. A single stamp in the future thus costs
+    one scan, not all that follow.
+    """
+    last: Frame | None = None
+    doubtful: Frame | None = None
+    for frame in frames:
+        if doubtful is not None:
+            if frame.stamp > doubtful.stamp:
+                yield doubtful
+                last = doubtful
+            elif _leap(last, doubtful) > _leap(last, frame):
+                left_out[LEAP] += 1
+            else:
+                left_out[BACKWARD] += 1
+                continue
+            doubtful = None
+        if last is not None and frame.stamp <= last.stamp:
+            left_out[BACKWARD] += 1
+        elif last is None or _leap(last, frame) > _DOUBT:
+            # The next frame decides. Other frames pass at once: they are decoded while their bytes
+            # are still in the processor's cache.
+            doubtful = frame
+        else:
+            yield frame
+            last = frame
+    if doubtful is not None:
+        yield doubtful
+
+
+# Nanoseconds; a recorder is seldom later than this.
+_DOUBT = 50_000_000
+
+
+def _leap(last: Frame | None, frame: Frame) -> int:
+    """By how much a stamp has moved against the recorder's clock."""
+    usual = 0 if last is None else last.stamp - last.recorded
+    return abs(frame.stamp - frame.recorded - usual)

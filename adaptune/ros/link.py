@@ -28,9 +28,15 @@ class RosLink(Protocol):
     """
 
     store: "Typestore"  # the types of all messages
+    is2: bool  # whether messages are serialised as in ROS 2
 
-    def subscribe(self, topic: str, kind: str, take: Callable[[Any], None]) -> None:
-        """Have every message of a topic taken, one after the other, in a thread of its own."""
+    def subscribe(
+        self, topic: str, kind: str, take: Callable[[Any], None], raw: bool = False
+    ) -> None:
+        """Have every message of a topic taken, one after the other, in a thread of its own.
+
+        With `raw`, they are taken as bytes, as they are serialised.
+        """
 
     def advertise(self, topic: str, kind: str) -> Callable[[Any], None]:
         """Announce a topic; what is returned publishes a message on it."""

@@ -10,6 +10,7 @@ import struct
 import subprocess
 import threading
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from queue import Empty, SimpleQueue
 from typing import Any
 
@@ -106,7 +107,11 @@ class Ros1:
             raise LinkError(f"ROS 1: {what}")
         threading.Thread(target=self._receive, daemon=True).start()
 
-    def subscribe(self, topic: str, kind: str, take: Callable[[Any], None]) -> None:
+    is2 = False
+
+    def subscribe(
+        self, topic: str, kind: str, take: Callable[[Any], None], raw: bool = False
+    ) -> None:
         received: SimpleQueue[bytes | None] = SimpleQueue()
         self._waiting.append(received)
         mistaken = set()
@@ -119,7 +124,8 @@ class Ros1:
                 received.put(data)
 
         messages = iter(received.get, None)
-        take_all(topic, messages, lambda data: take(self.store.deserialize_ros1(data, kind)))
+        read = bytes if raw else partial(self.store.deserialize_ros1, typename=kind)
+        take_all(topic, messages, lambda data: take(read(data)))
         self.record(topic, put)
 
     def record(self, topic: str, take: Callable[[str, bytes], None]) -> None:

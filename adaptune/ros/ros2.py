@@ -82,7 +82,11 @@ class Ros2:
         self._kept: list[Any] = [self._session.liveliness().declare_token(token)]
         self._threads: list[threading.Thread] = []
 
-    def subscribe(self, topic: str, kind: str, take: Callable[[Any], None]) -> None:
+    is2 = True
+
+    def subscribe(
+        self, topic: str, kind: str, take: Callable[[Any], None], raw: bool = False
+    ) -> None:
         """See `RosLink.subscribe`; an error in `take` is logged, and the next message is taken.
 
         There is a `LinkError` if the topic is published with another type than this as known here.
@@ -101,8 +105,9 @@ class Ros2:
             self._announce("SUBSCRIPTION", topic, kind)
         self._kept.append(subscriber)
         samples = (sample for sample in subscriber if not self._closed)
-        take_one = lambda sample: take(self._message(sample.payload, kind))  # noqa: E731
-        self._threads.append(take_all(topic, samples, take_one))
+        payloads = (sample.payload for sample in samples)
+        take_one = lambda p: take(p.to_bytes() if raw else self._message(p, kind))  # noqa: E731
+        self._threads.append(take_all(topic, payloads, take_one))
 
     def _message(self, payload: Any, kind: str) -> Any:
         """A message; its arrays are views of the bytes that came."""

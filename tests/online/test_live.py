@@ -5,10 +5,13 @@ import time
 import local_link
 import numpy as np
 import pytest
+import rec
 from rosbags.typesys import Stores, get_typestore
 
+from adaptune.recording.clouds import CLOUDS
 from adaptune.recording.config import ImuConfig
 from adaptune.recording.scan import Timing
+from adaptune.ros.link import LinkError
 from adaptune.space import Selection
 from online import live
 from online.live import UNKNOWN_ERROR, LiveScans, RosMessages, Uncertainty, placed
@@ -73,6 +76,38 @@ def test_the_newest_wait(link):
     play(link, range(5))
     first = next(scans.arrivals())
     assert (round((first.scan.stamp - START) / TENTH), first.dropped) == (3, 3)
+
+
+@pytest.mark.parametrize("kind", [*CLOUDS])
+@pytest.mark.parametrize("late", [False, True])
+def test_every_type_of_clouds_is_read_also_where_its_driver_starts_late(
+    link, monkeypatch, kind, late
+):
+    monkeypatch.setattr(live, "SILENCE", 0.01)
+    link.clouds = kind
+    cloud = local_link.cloud(START, points(0))
+    if "livox" in kind:
+        cloud = rec.livox(link.store, kind, points(0), START)
+    there, nobody, subscribe = link.topics, iter([{}] * late), link.subscribe
+    link.topics = lambda: next(nobody, None) or there()
+
+    def subscribed(topic, of, take, raw):
+        subscribe(topic, of, take, raw)
+        if of == kind:
+            link.play(topic, cloud)
+
+    link.subscribe = subscribed
+    scans = topic(link)
+    scan = next(scans.arrivals()).scan
+    np.testing.assert_array_equal(scan.points, points(0))
+    assert scan.stamp == START
+    assert scans.frame in ("lidar", "x")
+
+
+def test_a_topic_of_another_type_is_refused(link):
+    link.clouds = "sensor_msgs/msg/Image"
+    with pytest.raises(LinkError, match=r"/points is sensor_msgs/msg/Image; name a topic of point"):
+        topic(link)
 
 
 def test_what_is_no_point_cloud_is_left_out(link, caplog):

@@ -7,7 +7,7 @@ import rec
 from drives import cloud
 
 from adaptune.ros.link import LinkError
-from online.live import CLOUD, IMU, RosMessages, placed
+from online.live import IMU, RosMessages, placed
 
 STORE = rec.ROS1
 TYPES = STORE.types
@@ -22,7 +22,7 @@ class LocalLink:
 
     def __init__(self, played=()):
         self._played = played
-        self.alive = True
+        self.alive, self.is2, self.clouds = True, False, "sensor_msgs/msg/PointCloud2"
         self.store = STORE
         self.published = defaultdict(list)
         self.kinds = {}
@@ -30,8 +30,9 @@ class LocalLink:
         self.refuses = ()
         self._takers = defaultdict(list)
 
-    def subscribe(self, topic, _kind, take):
-        self._takers[topic].append(take)
+    def subscribe(self, topic, kind, take, raw=False):
+        read = (lambda m: bytes(self.store.serialize_ros1(m, kind))) if raw else (lambda m: m)
+        self._takers[topic].append(lambda message: take(read(message)))
         if topic == "/points":
             threading.Thread(target=self._play_all, daemon=True).start()
 
@@ -63,7 +64,7 @@ class LocalLink:
         return dict(self.holds)
 
     def topics(self):
-        return {"/points": CLOUD, "/imu": IMU}
+        return {"/points": self.clouds, "/imu": IMU}
 
     def close(self):
         pass

@@ -96,14 +96,9 @@ def imu(stamp, rate, force, store=ROS2):
     )
 
 
-def write_bag(path, messages, compression=None, topics=(), chunk=1 << 20):
-    """Write a ROS 1 bag, or a ROS 2 one where the path says so: ``.sqlite3``, ``.mcap``.
-
-    Messages are made by `store_of(path)`. `topics` are pairs of topic and type without messages;
-    a `chunk` of ROS 1 has at least so many bytes.
-    """
-    store = store_of(path)
-    if store is ROS1:
+def writer_of(path, compression=None, chunk=1 << 20):
+    """Writes a ROS 1 bag, or a ROS 2 one where the path says so."""
+    if store_of(path) is ROS1:
         writer = rosbag1.Writer(path)
         writer.chunk_threshold = chunk
         if compression:
@@ -114,6 +109,16 @@ def write_bag(path, messages, compression=None, topics=(), chunk=1 << 20):
         if compression:
             mode = rosbag2.CompressionMode[compression]
             writer.set_compression(mode, rosbag2.CompressionFormat.ZSTD)
+    return writer
+
+
+def write_bag(path, messages, compression=None, topics=(), chunk=1 << 20):
+    """Write a ROS 1 bag, or a ROS 2 one where the path says so: ``.sqlite3``, ``.mcap``.
+
+    Messages are made by `store_of(path)`. `topics` are pairs of topic and type without messages;
+    a `chunk` of ROS 1 has at least so many bytes.
+    """
+    store, writer = store_of(path), writer_of(path, compression, chunk)
     with writer:
         connections = {t: writer.add_connection(t, kind, typestore=store) for t, kind in topics}
         for topic, recorded, message in messages:

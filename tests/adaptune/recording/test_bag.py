@@ -503,3 +503,44 @@ def test_damaged_messages_give_scans_or_an_error():
 def test_damaged_bags_give_scans_or_an_error(tmp_path):
     counts = fuzz.counted(fuzz.of_bags(tmp_path), 3, range(50))
     assert min(counts["read"], counts["errors"]) > 5
+
+
+@pytest.mark.parametrize("name", ["a.bag", "a.mcap", "a.sqlite3"])
+def test_a_topic_of_two_types_is_read_by_both_decoders(tmp_path, name):
+    path, (kind, _) = tmp_path / name, LIVOX_TYPES
+    store = rec.store_of(path)
+    clouds = rec.scans(4)
+    with rec.writer_of(path) as writer:
+        ids = [
+            writer.add_connection("/points", of, typestore=store)
+            for of in ("sensor_msgs/msg/PointCloud2", kind)
+        ]
+        for i, points in enumerate(clouds):
+            stamp, livox = rec.START + i * 10**8, i % 4 > 1
+            made = rec.livox(store, kind, points, stamp) if livox else None
+            made = made or rec.cloud(rec.velodyne(points), stamp, store)
+            made.header.frame_id = "lidar"
+            of = made.__msgtype__
+            write = store.serialize_ros1 if store is rec.ROS1 else store.serialize_cdr
+            writer.write(ids[livox], stamp, write(made, of))
+    scans = list(opened(path))
+    assert [len(scan) for scan in scans] == [60] * 4
+    np.testing.assert_array_equal(scans[3].points, clouds[3])
+    (said,) = [text for text in map(str, inspect(path).findings) if "types" in text]
+    assert said == (
+        f"/points: messages of 2 types (2 sensor_msgs/msg/PointCloud2, 2 {kind}); adaptune reads "
+        "each as what it is"
+    )
+
+
+@pytest.mark.parametrize("journal", ["-wal", "-journal"])
+def test_a_journal_that_a_recorder_left_is_named(tmp_path, journal):
+    folder = rec.drive(tmp_path / "a.sqlite3")
+    (database,) = folder.glob("*.db3")
+    left = database.with_name(database.name + journal)
+    left.write_bytes(b"")
+    assert len(list(opened(folder))) == 20
+    left.write_bytes(b"messages")
+    for path in (folder, database):
+        with pytest.raises(SequenceError, match=rf"db3{journal}: holds messages .*pragma wal_ch"):
+            list(opened(path))

@@ -9,8 +9,8 @@ from hypothesis.extra import numpy as hnp
 from rosbags.typesys import Stores, get_typestore
 
 from adaptune.recording import clouds
-from adaptune.recording.clouds import PointCloudError
-from adaptune.recording.scan import AUTO, Timing
+from adaptune.recording.clouds import PointCloudError, from_fields
+from adaptune.recording.scan import AUTO, Timing, doubts
 
 _STORE = get_typestore(Stores.ROS2_HUMBLE)
 TYPES = ["f4", "f8", "i2", "u1", "u2", "u4", "i4"]
@@ -363,3 +363,33 @@ def test_any_change_of_a_message_gives_a_scan_or_an_error(data):
     for values in (scan.times, scan.rings):
         assert values is None or len(values) == len(scan)
     assert scan.times is None or (np.isfinite(scan.times).all() and (scan.times >= 0).all())
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "values", "unit", "span"),
+    [
+        ("time_offset_ns", "i4", (0, 1e8), None, 0.1),
+        ("t_us", "u4", (0, 1e5), None, 0.1),
+        ("Point_TimeStamp", "f8", (1.7e9, 1.7e9 + 0.1), None, 0.1),
+        ("relative_time", "f4", (-0.1, 0.0), None, 0.1),
+        ("offset", "u4", (0, 1e5), "us", 0.1),
+        ("time_of_day", "f4", (0, 100.0), None, None),
+        ("t_offset", "u4", (0, 1e5), None, None),
+        ("time_flags", "u1", (0, 1), None, None),
+        ("number_of_times", "i4", (3, 3), None, None),
+        ("distance", "f4", (0, 0.1), None, None),
+    ],
+)
+def test_fields_that_look_like_times_are_read_or_named(name, kind, values, unit, span):
+    n = 50
+    raw = np.zeros(n, [*((axis, "f4") for axis in "xyz"), (name, kind)])
+    raw["x"] = np.arange(1, n + 1)
+    raw[name] = np.linspace(*values, n).astype(kind)
+    scan = from_fields(raw, 1_700_000_000 * 10**9, Timing(unit=unit))
+    if span is None:
+        assert scan.times is None
+        told = [str(doubt) for doubt in doubts([scan.reading] * 10, 0.1)]
+        assert len(told) == (name != "distance")
+        assert not told or f"the field {name!r} looks like times and is not read" in told[0]
+    else:
+        assert np.ptp(scan.times) == pytest.approx(span, rel=1e-5)

@@ -4,11 +4,13 @@ import numpy as np
 import pytest
 import rec
 from scipy.spatial.transform import Rotation
+from small_bag import texts
 
 from adaptune import files, geometry
 from adaptune.errors import import_extra
 from adaptune.recording import SequenceConfig, SequenceError
 from adaptune.recording.folder import read_scan, turn_up
+from adaptune.recording.inspect import inspect
 from adaptune.recording.recording import open_sequence
 from adaptune.trajectory import write_kitti
 
@@ -16,6 +18,9 @@ from adaptune.trajectory import write_kitti
 def poses(n):
     rng = np.random.default_rng(1)
     return geometry.from_quaternions(rng.normal(0, 3, (n, 3)), rng.normal(0, 1, (n, 4)))
+
+
+S = 1_700_000_000 * 10**9
 
 
 def kitti_odometry(folder, n=4):
@@ -146,7 +151,18 @@ def test_cloudcompares_intensities_are_read(tmp_path):
         (["1", "2"], None, [0, 10**8]),
         (["1700000000.1", "1700000000.25"], None, [1700000000_1 * 10**8, 170000000025 * 10**7]),
         (["1700000000100000000", "1700000000250000000"], None, [17000000001 * 10**8] * 1),
+        (["a1_1700000000100000", "a1_1700000000250000"], None, [S + 10**8, S + 25 * 10**7]),
+        (["1700000000100", "1700000000250"], None, [S + 10**8, S + 25 * 10**7]),
+        (["1700000000", "1700000003"], None, [S, S + 3 * 10**9]),
+        (["1700000000_000000005", "1700000001_250000000"], None, [S + 5, S + 125 * 10**7]),
+        (["c-1700000000-000005", "c-1700000001-250000"], None, [S + 5000, S + 125 * 10**7]),
+        (["1700000000_5", "1700000000_250000000"], None, [S + 5, S + 25 * 10**7]),
+        (["1700000000.9.pcd", "1700000000.10.pcd"], None, [S + 10**8, S + 9 * 10**8]),
+        (["0000000000", "0000000001"], None, [0, 10**8]),
         (["1", "2"], "5.000000001\n6\n", [5_000_000_001, 6 * 10**9]),
+        (["1", "2"], "1700000000100\n1700000000250\n", [S + 10**8, S + 25 * 10**7]),
+        (["1", "2"], "1700000000000000005\n1700000001000000000\n", [S + 5, S + 10**9]),
+        (["1", "2"], "2023-11-14 22:13:20.000000005\n2023-11-14 22:13:21\n", [S + 5, S + 10**9]),
     ],
 )
 def test_stamps_of_files(tmp_path, names, times, stamps):
@@ -156,6 +172,69 @@ def test_stamps_of_files(tmp_path, names, times, stamps):
         (tmp_path / "times.txt").write_text(times)
     found = [scan.stamp for scan in open_sequence(SequenceConfig(folder=str(tmp_path)))]
     assert found[: len(stamps)] == stamps
+
+
+def test_names_that_look_like_times_and_are_not_read_are_told(tmp_path):
+    for number in ("20231114_221320_1", "20231114_221320_6"):
+        np.save(tmp_path / f"{number}.npy", rec.scans(1)[0])
+    told = inspect(tmp_path)
+    assert texts(told) == [
+        "the names of the files look like times and are not read (20231114_221320_1.npy); one "
+        "every 0.1 s, as nothing gives their times; write a times.txt with the seconds of each "
+        "scan, or set `period`"
+    ]
+    assert "points" in told.findings[0].of
+
+
+@pytest.mark.parametrize("named", [".", "velodyne_points", "velodyne_points/data"])
+def test_a_raw_recording_of_kittis_has_its_stamps_above_its_data(tmp_path, named):
+    data = tmp_path / "velodyne_points" / "data"
+    data.mkdir(parents=True)
+    for i in (0, 2, 3):  # one is missing
+        np.save(data / f"{i:010d}.npy", rec.scans(1)[0] + i)
+    lines = "".join(f"2011-09-26 13:02:2{i}.951199337\n" for i in range(4))
+    (data.parent / "timestamps.txt").write_text(lines)
+    found = inspect(tmp_path / named)
+    assert found.stamped_by == "timestamps.txt"
+    assert not found.findings[1:]
+    stamps = [scan.stamp for scan in open_sequence(found.config())]
+    assert np.diff(stamps).tolist() == [2 * 10**9, 10**9]
+    assert stamps[0] == 1317042140951199337
+
+
+def columns_of(kind, points):
+    n = len(points)
+    made = {"i": np.full(n, 7.0), "r": np.arange(n) % 16, "t": np.linspace(0, 0.1, n)}
+    made |= {"n": np.linspace(-9.0, 90.0, n), "x": points[:, 0]}
+    return np.column_stack([points, *(made[one] for one in kind)]).astype("<f4")
+
+
+@pytest.mark.parametrize(
+    ("kind", "read"),
+    [
+        ("i", None),
+        ("ir", "x y z intensity ring"),
+        ("it", "x y z intensity time"),
+        ("irt", "x y z intensity ring time"),
+        ("itr", "x y z intensity time ring"),
+        ("irnr", "x y z intensity ring unknown5 unknown6"),
+        ("x", "below zero"),
+    ],
+)
+def test_bin_files_hold_what_their_numbers_can_be(tmp_path, caplog, kind, read):
+    for i, points in enumerate(rec.scans(3, points=240)):
+        columns_of(kind, points).tofile(tmp_path / f"{i}.bin")
+    found = inspect(tmp_path)
+    scans = list(open_sequence(found.config()))
+    for scan, points in zip(scans, rec.scans(3, points=240), strict=True):
+        np.testing.assert_array_equal(scan.points, points)
+        assert (scan.rings is not None) == ("r" in kind)
+        assert (scan.times is not None) == ("t" in kind)
+    said = [text for text in texts(found) if ".bin" in text]
+    assert len(said) == (read is not None)
+    if read is not None:
+        assert read in said[0]
+        assert said[0] in caplog.text
 
 
 def test_a_kitti_pose_file_goes_with_any_recording(tmp_path):
