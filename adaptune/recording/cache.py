@@ -49,7 +49,10 @@ def folder() -> Path:
             return expand_user(given)
         except AdaptuneError as error:
             raise AdaptuneError(f"ADAPTUNE_CACHE: {error}") from error
-    return platformdirs.user_cache_path("adaptune", appauthor=False)
+    try:
+        return platformdirs.user_cache_path("adaptune", appauthor=False)
+    except RuntimeError:  # a user without a home, as in a container
+        return Path(tempfile.gettempdir()) / f"adaptune-cache-{os.getuid()}"
 
 
 def cap() -> int:
