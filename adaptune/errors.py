@@ -1,6 +1,7 @@
 """Errors that a user is meant to read."""
 
 import difflib
+import errno
 import traceback
 from collections.abc import Iterable
 from functools import cache
@@ -53,6 +54,38 @@ class Finding(NamedTuple):
     def below(self, key: Key) -> "Finding":
         """The same as seen from outside the section at `key`."""
         return self._replace(where=key + self.where)
+
+
+OUT_OF_MEMORY = "out of memory; end other programs, or lower offline.workers"
+
+
+class MachineError(AdaptuneError):
+    """What a machine lacks, whatever the data and the odometry are."""
+
+
+def blame_machine(what: str, error: BaseException) -> None:
+    """Raise a MachineError where an error, or what led to it, says what the machine lacks."""
+    if said := lacking(error):
+        raise MachineError(f"{what}: {said}") from error
+
+
+def lacking(error: BaseException | None) -> str:
+    """What the machine lacks, where the system says so in what led to an error; else nothing.
+
+    A MemoryError says nothing: damaged data may ask for any size.
+    """
+    while error is not None:
+        if isinstance(error, OSError) and error.errno in _LACKING:
+            return _LACKING[error.errno]
+        error = error.__cause__ or error.__context__
+    return ""
+
+
+_LACKING = {
+    **dict.fromkeys((errno.EMFILE, errno.ENFILE), "too many open files; raise `ulimit -n`"),
+    **dict.fromkeys((errno.ENOSPC, errno.EDQUOT), "the disk is full; make room"),
+    errno.ENOMEM: OUT_OF_MEMORY,
+}
 
 
 def in_a_line(error: BaseException) -> str:

@@ -2,6 +2,8 @@
 
 import ctypes
 import errno
+import fcntl
+import logging
 import os
 import re
 import secrets
@@ -10,15 +12,17 @@ import tempfile
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
-from typing import Any, Self
+from typing import IO, Any, Self, TypeVar
 
 import yaml
 
 from adaptune.errors import AdaptuneError, import_extra
+
+_log = logging.getLogger(__name__)
 
 DAMAGED_NPZ = (
     *(OSError, ValueError, TypeError, EOFError, RuntimeError, OverflowError),
@@ -108,6 +112,21 @@ def write_text(path: Path, text: str) -> None:
     """Write `text` to `path` in UTF-8, whole or not at all."""
     with replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+def locked(file: IO[str], wait: bool = True) -> bool:
+    """Lock an open file; False where another process holds it, and nobody is to wait for that.
+
+    Some network disks have no locks: a warning says so, and the file counts as locked.
+    """
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+    except OSError as error:
+        if error.errno in (errno.EAGAIN, errno.EACCES):
+            return False
+        what = "%s: this disk has no file locks (%s); run one adaptune at a time in this folder"
+        _log.warning(what, Path(file.name).parent, error.strerror)
+    return True
 
 
 def plain_name(path: Path) -> str:
@@ -329,7 +348,7 @@ def dump(data: Any) -> str:
     return text
 
 
-# Open3D, imported where it is used and on machines without libusb.
+# Open3D and numba, imported where they are used, and on machines that lack what they look for.
 
 
 @cache
@@ -344,3 +363,20 @@ def load() -> Any:
     (open3d,) = import_extra("open3d", "open3d")
     open3d.utility.set_verbosity_level(open3d.utility.VerbosityLevel.Error)
     return open3d
+
+
+_Loop = TypeVar("_Loop", bound=Callable[..., Any])
+
+
+def compiled(loop: _Loop, signature: Any = None) -> _Loop:
+    """Compile a loop with numba; with a signature at once, and to run beside other threads.
+
+    It is kept for later processes where there is a folder that can be written to.
+    """
+    import numba
+
+    compiler: Any = partial(numba.njit, signature, nogil=signature is not None)
+    try:
+        return compiler(cache=True)(loop)  # type: ignore[no-any-return]
+    except RuntimeError:  # numba's "no locator available"
+        return compiler()(loop)  # type: ignore[no-any-return]

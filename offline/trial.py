@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from adaptune import recording
 from adaptune.archive import FIRST_POSE, PREPARE_MS, REGISTER_MS, Frames, Trial
-from adaptune.errors import AdaptuneError, UnavailableError, in_a_line
+from adaptune.errors import AdaptuneError, MachineError, UnavailableError, in_a_line
 from adaptune.geometry import Poses, invert, scale
 from adaptune.live.evidence import hops_along
 from adaptune.metrics import KITTI_LENGTHS, cap, sub_trajectory_rte, travelled, window_ends
@@ -183,7 +183,7 @@ class Drives:
         try:
             if not self._failed and not self.too_slow:
                 self._step(i, scan)
-        except (UnavailableError, SequenceError, MemoryError):
+        except (UnavailableError, SequenceError, MachineError, MemoryError):
             raise  # of the machine or the recording, whatever the parameters
         except Exception as error:
             self._exceptions[in_a_line(error)] = None

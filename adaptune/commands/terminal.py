@@ -15,7 +15,7 @@ import typer
 from rich.console import Console
 from typer.core import TyperGroup
 
-from adaptune.errors import AdaptuneError
+from adaptune.errors import OUT_OF_MEMORY, AdaptuneError
 from adaptune.progress import Progress
 
 if TYPE_CHECKING:
@@ -39,10 +39,10 @@ class Commands(TyperGroup):
         """Run a command."""
         try:
             return super().invoke(ctx)
-        except (AdaptuneError, OSError) as error:
+        except (AdaptuneError, OSError, MemoryError) as error:
             if isinstance(error, BrokenPipeError):
                 raise  # nobody reads the output any more
-            errors.print(f"error: {error}", style="red", soft_wrap=True)
+            errors.print(f"error: {str(error) or OUT_OF_MEMORY}", style="red", soft_wrap=True)
             raise typer.Exit(getattr(error, "exit_code", 2)) from error
         except KeyboardInterrupt as error:
             errors.print("interrupted; run the same command again to resume", style="yellow")

@@ -3,11 +3,11 @@
 from collections.abc import Iterable
 from typing import Self
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from sklearn.decomposition import PCA
 
+from adaptune.files import compiled
 from adaptune.metrics import FAILURE
 from adaptune.model.rules import Rule, TrainingData
 from adaptune.space import Selection
@@ -151,7 +151,7 @@ def _nearest_sets(
     return near_squared, near_sets
 
 
-@numba.njit(cache=True)
+@compiled
 def _nearest_of_groups(
     X: NDArray[np.float64], bounds: NDArray[np.intp], x: NDArray[np.float64], k: int
 ) -> tuple[NDArray[np.float64], NDArray[np.intp], NDArray[np.intp]]:
@@ -191,7 +191,7 @@ def _nearest_of_groups(
     return squared, rows, group
 
 
-@numba.njit(cache=True)
+@compiled
 def _mean_of_nearest(
     squared: NDArray[np.float64],
     frames: NDArray[np.intp],

@@ -5,10 +5,10 @@ data using the normal distributions transform*, ICRA 2009, and Koide et al., IRO
 leave the constants open; they are set here.
 """
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from adaptune.files import compiled
 from adaptune.recording.scan import Scan
 
 CELL_SIZE = 1.0
@@ -28,7 +28,7 @@ Z_LIMIT = 1_000_000
 """Metres and cells; beyond it the number of a cell would overflow."""
 
 
-@numba.njit(cache=True)
+@compiled
 def _eigenvalues(c: NDArray[np.float64]) -> tuple[float, float, float]:
     """Eigenvalues, falling, of a symmetric matrix given as xx, yy, zz, xy, xz, yz."""
     q = ((c[0] + c[1]) + c[2]) / 3.0
@@ -50,7 +50,7 @@ def _eigenvalues(c: NDArray[np.float64]) -> tuple[float, float, float]:
     return l1, 3.0 * q - l1 - l3, l3
 
 
-@numba.njit(cache=True)
+@compiled
 def _tilt(c: NDArray[np.float64], value: float) -> float:
     """Absolute z of the unit eigenvector to a simple eigenvalue."""
     # The rows of c - value * I span the plane across the eigenvector: the longest of their cross
@@ -69,7 +69,7 @@ def _tilt(c: NDArray[np.float64], value: float) -> float:
     return tilt
 
 
-@numba.njit(cache=True)
+@compiled
 def _accumulate(points: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Sum up the points of every cell.
 
@@ -128,7 +128,7 @@ def _accumulate(points: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArr
     return sums[:cells], keys[:cells]
 
 
-@numba.njit(cache=True)
+@compiled
 def _histogram(points: NDArray[np.float32]) -> NDArray[np.float64]:
     counts = np.zeros(N_FEATURES)
     sums, keys = _accumulate(points)

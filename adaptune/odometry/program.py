@@ -1,7 +1,6 @@
 """Odometries in programs that read a recording and a parameter file and write a trajectory."""
 
 import copy
-import fcntl
 import json
 import logging
 import os
@@ -23,7 +22,7 @@ from pydantic import AfterValidator
 
 from adaptune import files, processes
 from adaptune.errors import OdometryError, UnavailableError, nearest
-from adaptune.files import replacing_folder, temporary_folder
+from adaptune.files import locked, replacing_folder, temporary_folder
 from adaptune.geometry import Poses, invert, nearest_rotation, rotation_angle, to_pose
 from adaptune.metrics import window_ends
 from adaptune.odometry.base import (
@@ -229,7 +228,7 @@ def program_input(
     own = _own_bag(config, layout)
     name = {"bag": "input.bag", "ros2": "input", "kitti": "input"}[layout]
     with (folder.parent / f".{folder.name}.lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
+        locked(lock)
         if _about(folder) != about:
             stamps: list[int] = []
             with replacing_folder(folder) as temporary:

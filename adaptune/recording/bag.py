@@ -1,8 +1,10 @@
 """Recordings in ROS 1 and ROS 2 bags."""
 
+import errno
 import logging
 import math
 import re
+import resource
 from collections import Counter, defaultdict, deque
 from collections.abc import (
     Callable,
@@ -25,7 +27,7 @@ from rosbags.rosbag1 import Reader
 from rosbags.rosbag1.reader import Chunk, IndexData, decompressors
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from adaptune.errors import Finding, nearest
+from adaptune.errors import Finding, blame_machine, nearest
 from adaptune.recording import clouds
 from adaptune.recording.clouds import (
     CLOUDS,
@@ -404,6 +406,10 @@ class BagSource:
                 raise TypeError("metadata.yaml counts in no numbers")  # noqa: TRY301
         except Exception as error:
             # The readers raise what their formats and decompressors raise.
+            # SQLite does not say why it cannot open a file.
+            most = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
+            full = 0 < most < len(files_of(self.paths)) + 32
+            blame_machine(self.name, OSError(errno.EMFILE, "") if full else error)
             if re.search("File magic is|not a database", str(error)):
                 what = "is no bag, whatever its name says; give the recording itself"
                 raise SequenceError(f"{self.name}: {what}") from error
@@ -432,6 +438,7 @@ class BagSource:
             except StopIteration:
                 return
             except Exception as error:
+                blame_machine(self.name, error)
                 help_ = "the bag is damaged, `stop` before the damage or repair it"
                 raise SequenceError(
                     f"{self.name}: the rest cannot be read ({_say(error)}); {help_}"
@@ -451,6 +458,7 @@ def _load(cdr: bool, timing: Timing, kind: str, data: bytes, what: str) -> Scan:
     except PointCloudError as error:
         raise SequenceError(f"{what}: {error}") from error
     except Exception as error:
+        blame_machine(what, error)
         raise SequenceError(f"{what}: damaged ({_say(error)})") from error
 
 

@@ -11,6 +11,7 @@ import logging
 import os
 import secrets
 import shutil
+import tempfile
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, suppress
@@ -49,7 +50,10 @@ def folder() -> Path:
             return expand_user(given)
         except AdaptuneError as error:
             raise AdaptuneError(f"ADAPTUNE_CACHE: {error}") from error
-    return platformdirs.user_cache_path("adaptune", appauthor=False)
+    try:
+        return platformdirs.user_cache_path("adaptune", appauthor=False)
+    except RuntimeError:  # a user without a home, as in a container
+        return Path(tempfile.gettempdir()) / f"adaptune-cache-{os.getuid()}"
 
 
 def cap() -> int:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from adaptune import geometry
 from adaptune.errors import AdaptuneError, nearest
+from adaptune.files import compiled
 from adaptune.recording.scan import (
     AUTO,
     TIME_FIELDS,
@@ -375,8 +376,7 @@ def _kernel(kind: str) -> Callable[..., Any]:
     signature = types.Tuple((numba.int64, numba.int64, time, time))(
         *3 * (column(real),), given, scan
     )
-    compiled: Callable[..., Any] = numba.njit(signature, nogil=True, cache=True)(_gather)
-    return compiled
+    return compiled(_gather, signature)
 
 
 # livox_ros_driver/CustomMsg to scans.

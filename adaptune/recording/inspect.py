@@ -11,7 +11,7 @@ from rich.text import Text
 from rosbags.highlevel import AnyReader
 
 from adaptune import files, geometry
-from adaptune.errors import AdaptuneError, Finding
+from adaptune.errors import AdaptuneError, Finding, MachineError
 from adaptune.metrics import travelled
 from adaptune.progress import Progress, unseen
 from adaptune.recording import Scan, SequenceConfig, SequenceError
@@ -402,6 +402,8 @@ class _Survey:
                     message: Any = self._reader.deserialize(data, kind)
                     w, a = message.angular_velocity, message.linear_acceleration
                     np.asarray_chkfinite([w.x, w.y, w.z, a.x, a.y, a.z])
+        except MachineError:
+            raise
         except Exception as error:  # deserializers raise whatever damaged data leads them to
             why = str(error) or type(error).__name__
             topic.undecoded.append(((when - self._begin) * 1e-9, why))

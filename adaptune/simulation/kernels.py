@@ -2,15 +2,16 @@
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from adaptune.files import compiled
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
 
-@numba.njit(cache=True)
+@compiled
 def _corner(i: int, j: int, k: int, seed: int) -> float:
     """Give a lattice point its value in -1..1, by an integer hash."""
     h = np.uint32(i) * np.uint32(0x9E3779B1) ^ np.uint32(j) * np.uint32(0x85EBCA77)
@@ -21,7 +22,7 @@ def _corner(i: int, j: int, k: int, seed: int) -> float:
     return h / 2147483647.5 - 1.0
 
 
-@numba.njit(cache=True)
+@compiled
 def _value(x: float, y: float, z: float, seed: int) -> float:
     """Interpolate the lattice, with a quintic fade so that slopes are continuous."""
     i, j, k = int(np.floor(x)), int(np.floor(y)), int(np.floor(z))
@@ -38,7 +39,7 @@ def _value(x: float, y: float, z: float, seed: int) -> float:
     return total
 
 
-@numba.njit(cache=True)
+@compiled
 def fractal(points: F64, wavelength: float, octaves: int, seed: int) -> NDArray[np.float64]:
     """See `adaptune.simulation.mesh.fractal`."""
     values = np.zeros(len(points))
@@ -71,7 +72,7 @@ class Receiver(NamedTuple):
     dropout: float
 
 
-@numba.njit(cache=True)
+@compiled
 def aim(directions: F32, T_world_sensor: F64, origin: F64) -> F32:
     """Send every ray from its own column's pose: (n_columns * n_rings, 6), origin and direction.
 
@@ -94,7 +95,7 @@ def aim(directions: F32, T_world_sensor: F64, origin: F64) -> F32:
     return rays
 
 
-@numba.njit(cache=True)
+@compiled
 def receive(
     directions: F32,
     cast: Cast,

@@ -1,7 +1,6 @@
 """A study: a checked configuration, and what is made of it."""
 
 import contextlib
-import fcntl
 import json
 import logging
 import math
@@ -18,7 +17,7 @@ from typing_extensions import TypeVar
 from adaptune import files, manifest
 from adaptune.archive import Archive, Sources
 from adaptune.errors import AdaptuneError, OdometryError
-from adaptune.files import write_text
+from adaptune.files import locked, write_text
 from adaptune.manifest import merged
 from adaptune.model import ErrorModel
 from adaptune.model.descriptor import descriptor_content
@@ -417,14 +416,12 @@ class Study(Generic[C_co]):
             ) from error
         if str(folder) not in _locks:
             lock = (folder / ".lock").open("w")
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError as error:
+            if not locked(lock, wait=False):
                 lock.close()
                 raise ConfigurationError(
                     f"{folder}: another adaptune is at work here; wait for it, or give this study "
                     f"another folder (--folder)"
-                ) from error
+                )
             _locks[str(folder)] = lock
         with contextlib.suppress(OdometryError):  # one that is not here, and not needed now
             write_text(folder / CONFIGURATION, files.dump(self._resolved()))

@@ -1,3 +1,4 @@
+import errno
 import math
 import os
 
@@ -5,8 +6,17 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from adaptune.errors import AdaptuneError
-from adaptune.files import Document, YamlError, dump, replacing, scalar, write_text
+from adaptune.errors import AdaptuneError, lacking
+from adaptune.files import (
+    Document,
+    YamlError,
+    compiled,
+    dump,
+    locked,
+    replacing,
+    scalar,
+    write_text,
+)
 
 
 def test_a_file_appears_when_all_went_well(tmp_path):
@@ -188,3 +198,49 @@ def test_what_cannot_be_read_back_is_not_written(text):
     for data in ({text: 1}, [{"bag": text}]):
         with pytest.raises(AdaptuneError, match=r"no character in UTF-8; rename it"):
             dump(data)
+
+
+@pytest.mark.parametrize("number", [errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EIO])
+def test_a_disk_without_locks_is_told_and_used(tmp_path, monkeypatch, caplog, number):
+    def flock(*_):
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr("fcntl.flock", flock)
+    with (tmp_path / ".lock").open("w") as file:
+        assert locked(file, wait=False)
+    (record,) = caplog.records
+    assert f"{tmp_path}: this disk has no file locks" in record.getMessage()
+
+
+def test_what_another_holds_is_not_locked(tmp_path, caplog):
+    with (tmp_path / ".lock").open("w") as one, (tmp_path / ".lock").open("w") as other:
+        assert locked(one, wait=False)
+        assert not locked(other, wait=False)
+    assert not caplog.records
+
+
+@pytest.mark.parametrize("signature", [None, "float64(float64)"])
+def test_loops_are_compiled_where_nothing_can_be_kept(monkeypatch, signature):
+    monkeypatch.setattr("numba.core.config.CACHE_DIR", "/proc/none")
+    half = compiled(lambda x: 0.5 * x, signature)
+    assert half(3.0) == 1.5
+    assert len(half.signatures) == 1
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (OSError(errno.EMFILE, "Too many open files"), "raise `ulimit -n`"),
+        (OSError(errno.EDQUOT, "Disk quota exceeded"), "the disk is full"),
+        (OSError(errno.ENOMEM, "Cannot allocate memory"), "out of memory"),
+        (MemoryError(), ""),
+        (OSError(errno.ENOENT, "No such file"), ""),
+        (ValueError("odd"), ""),
+    ],
+)
+def test_what_a_machine_lacks_is_found_in_what_led_to_an_error(error, words):
+    later = RuntimeError("cannot be read")
+    later.__cause__ = error
+    for seen in (error, later):
+        assert words in lacking(seen)
+        assert bool(lacking(seen)) == bool(words)

@@ -1,4 +1,6 @@
+import errno
 import re
+import resource
 import sqlite3
 from contextlib import closing
 
@@ -10,10 +12,10 @@ from rosbags.rosbag1 import Reader, ReaderError
 from rosbags.typesys import get_types_from_msg
 from small_bag import START, cloud, pose, texts
 
-from adaptune.errors import AdaptuneError
+from adaptune.errors import AdaptuneError, MachineError
 from adaptune.recording import SequenceConfig, SequenceError
 from adaptune.recording.bag import IndexReader
-from adaptune.recording.clouds import LIVOX_TYPES
+from adaptune.recording.clouds import CLOUDS, LIVOX_TYPES
 from adaptune.recording.inspect import inspect
 from adaptune.recording.recording import open_sequence
 
@@ -544,3 +546,29 @@ def test_a_journal_that_a_recorder_left_is_named(tmp_path, journal):
     for path in (folder, database):
         with pytest.raises(SequenceError, match=rf"db3{journal}: holds messages .*pragma wal_ch"):
             list(opened(path))
+
+
+@pytest.mark.parametrize("suffix", [".bag", ".sqlite3", ".mcap"])
+def test_more_parts_than_a_process_may_open_are_no_damage(tmp_path, suffix):
+    n = 60
+    parts = [rec.drive(tmp_path / f"part{i:02}{suffix}", 2) for i in range(n)]
+    before = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (n, before[1]))
+    try:
+        with pytest.raises(MachineError, match="too many open files; raise `ulimit -n`"):
+            opened(parts)
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, before)
+
+
+def test_a_machine_without_room_is_not_taken_for_a_damaged_scan(tmp_path, monkeypatch):
+    path = rec.drive(tmp_path / "a.bag", 2)
+
+    def full(*_, **__):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setitem(CLOUDS, "sensor_msgs/msg/PointCloud2", full)
+    with pytest.raises(MachineError, match="the disk is full"):
+        list(opened(path))
+    with pytest.raises(MachineError, match="the disk is full"):
+        inspect(path)
