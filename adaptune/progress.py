@@ -12,12 +12,3 @@ class Progress(Protocol):
 
 def unseen(text: str, done: float, of: int, remark: str = "", /) -> None:
     """Take no note."""
-
-
-def part(progress: Progress, name: str) -> Progress:
-    """Note a part of a task: what is done gets a name before it."""
-
-    def noted(text: str, done: float, of: int, remark: str = "", /) -> None:
-        progress(f"{name}, {text}", done, of, remark)
-
-    return noted

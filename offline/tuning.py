@@ -266,13 +266,9 @@ def _choosers(bank: int, spending: Spending | None) -> list[Chooser]:
     ways = (cancelling_members, complementary_members)
     if spending is None:
         return [partial(way, size=bank) for way in ways]
-    # A budget may be spent on more members, on dearer ones, or on those that gain most for it.
+    # A budget may be spent on more members, or on dearer ones.
     sizes = dict.fromkeys((bank, MOST_MEMBERS))
-    thrifty = spending._replace(thrifty=True)
-    return [
-        *(partial(way, size=size, spending=spending) for way in ways for size in sizes),
-        partial(cancelling_members, size=MOST_MEMBERS, spending=thrifty),
-    ]
+    return [partial(way, size=size, spending=spending) for way in ways for size in sizes]
 
 
 def _logs(

@@ -176,7 +176,6 @@ class Spending(NamedTuple):
 
     costs: Costs
     budget: float = np.inf  # milliseconds of CPU time a scan, with all members and live evidence
-    thrifty: bool = False  # whether the next member is the one that gains most for its cost
 
     @classmethod
     def of(cls, costs: Costs | None, budget: float | None) -> Self | None:
@@ -186,11 +185,6 @@ class Spending(NamedTuple):
     def allows(self, members: Sequence[int]) -> bool:
         """Whether a bank of these trials stays within the budget; of unknown cost, none does."""
         return self.costs.adaptive(members) <= self.budget + ROUNDING
-
-    def price(self, members: Sequence[int], more: int) -> float:
-        """What another member adds to the cost of a bank, one microsecond at least."""
-        together = self.costs.adaptive([*members, more]) - self.costs.adaptive(members)
-        return max(together, 1e-3)
 
 
 def allowed_sets(

@@ -320,7 +320,7 @@ def _next_member(
     chosen: Sequence[int],
     spending: Spending | None,
 ) -> int | None:
-    """The set that most lowers the error of those chosen, or most for its cost; None if none may.
+    """The set that most lowers the error of those chosen; None if none may.
 
     It is a place in `pool`, as those in `chosen` are.
     """
@@ -329,9 +329,6 @@ def _next_member(
     if spending is not None:
         rest = [j for j in rest if spending.allows([*members, pool[j]])]
     lowered = {j: _root_mean_square(squares, [*chosen, j]) for j in rest}
-    if spending is not None and spending.thrifty:
-        now = _root_mean_square(squares, list(chosen))
-        lowered = {j: (rms - now) / spending.price(members, pool[j]) for j, rms in lowered.items()}
     return min(rest, key=lowered.__getitem__, default=None)
 
 

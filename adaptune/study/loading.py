@@ -3,9 +3,7 @@
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from functools import reduce
 from itertools import combinations, product
-from operator import getitem
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -199,60 +197,6 @@ def _overlaps(config: StudyConfig, opened: dict[str, RecordedSequence]) -> Itera
 # The file.
 
 
-_HAND_OVER = ("beside", "catch_up_scans", "full_rate", "stride")
-DELETED = {
-    "offline.search": "is gone: a search is always for single sets; leave it out",
-    "online.also": "is gone: name these modes in online.modes, too",
-    "online.repeats": "is gone: replay again into another folder (--folder, --model)",
-    "online.rules": "is gone: name these modes in online.modes",
-    "online.dwell": "is gone: selections do not wait; leave it out",
-    "online.pin": "is gone: fix a parameter by its range (odometry.parameters), or leave it out",
-    **{
-        f"online.switching.{key}": "is gone with the hand-over, which gained nothing; leave it out"
-        for key in _HAND_OVER
-    },
-    "online.switching.cores": "is gone: a bank shares all cores that adaptune may use",
-    "online.switching.sets": "is gone: training chooses the bank; give its size",
-    "online.switching.memory": "is gone: auto spends 16 GB; give mechanism: bank for more",
-    "online.switching.warm_up": "is gone: it is always 12 s; leave it out",
-    "online.switching.mechanism=hand_over": "is gone (it gained nothing); give auto, live or bank",
-    "online.modes=paired": "is now called adaptive",
-    **{
-        f"online.modes={mode}": "is gone: a mode that served research; leave it out"
-        for mode in ("one_set", "bank", "bank_learned", "random")
-    },
-    **{
-        f"health.max_{what}": "is gone: its bound is fixed; leave it out"
-        for what in ("acceleration", "freeze", "turn_rate", "unregistered")
-    },
-    "odometry.settings.drain": "is gone: adaptune waits until the system rests; leave it out",
-    "offline.limits": "is gone: give online.budget, the CPU time of a scan, or weigh costs in "
-    "offline.objective",
-    "offline.sets": "is gone: all training sequences share their sets; leave it out",
-    "offline.runs=episodes": "is gone; give restart, or whole",
-    "offline.pruning=halving": "is gone; give wilcoxon, which saved more",
-    "offline.pruning=hyperband": "is gone; give wilcoxon, which saved more",
-    "offline.memory": "is gone: each worker keeps 1.5 GB of prepared scans at most",
-    **{
-        f"offline.sampler={old}": "is gone; give one of optuna.samplers, with its own settings"
-        for old in ("cmaes", "gp", "nsga2", "qmc", "sobol")
-    },
-    "offline.preset": "is gone; for the paper's, give trials: 256, runs: whole",
-    "offline.target": "is gone; give trials, hours or stagnation",
-    "offline.storage": "is gone: the trials are files in the study's folder, and in trials.csv",
-    "offline.max_frames": "is gone: the error model keeps all frames; leave it out",
-    "sequences.*.position_prior": "is gone: it changed nothing over 50 m; leave it out",
-    "sequences.*.evalio": "is gone: give the data set's files, as `bag`, `kitti` or `folder`",
-    "sequences.*.compensate=gyro": "is gone; give constant_velocity, which needs no IMU",
-    "courses.*.compensate=gyro": "is gone; give constant_velocity, which needs no IMU",
-    "courses.*.moving_objects": "is gone: nothing moves in simulated places; leave it out",
-    "courses.*.stand": "is gone: a course drives off at once; leave it out",
-    "courses.*.weather": "is gone: the air is always clear; leave it out",
-    "courses.*.sensor=avia": "is gone; choose a sensor that turns",
-}
-"""Keys, and values of keys, of earlier versions that are gone, and what became of them; a star
-stands for any name."""
-
 _MOST_BYTES = 10**6
 
 C = TypeVar("C", bound=StudyConfig)
@@ -286,25 +230,9 @@ def read_study(
     config, mistakes = _check(config_type, data, path.parent.resolve(), needed)
     if mistakes or config is None:
         mistakes.sort(key=lambda mistake: document.line(mistake.where) or 0)
-        said = dict.fromkeys(_say(_deleted(m, data), path, document, overridden) for m in mistakes)
+        said = dict.fromkeys(_say(m, path, document, overridden) for m in mistakes)
         raise ConfigurationError("\n".join(said))
     return Study(config, folder or runs / path.stem)
-
-
-def _deleted(mistake: Finding, data: Any) -> Finding:
-    """A mistake in a key or a value of an earlier version, with what became of it."""
-    try:
-        value = reduce(getitem, mistake.where, data)
-    except (LookupError, TypeError):
-        return mistake
-    parts = [part for part in mistake.where if isinstance(part, str)]
-    if parts[:1] in (["sequences"], ["courses"]):
-        parts[1:2] = ["*"]
-    key = ".".join(parts)
-    if key in DELETED:
-        return mistake._replace(what=DELETED[key])
-    gone = DELETED.get(f"{key}={value}")
-    return mistake if gone is None else mistake._replace(what=f"{value} {gone}")
 
 
 def _read(path: Path) -> files.Document:

@@ -6,7 +6,6 @@ from setups import failure
 
 from adaptune.errors import import_extra
 from adaptune.strict import ConfigurationError
-from adaptune.study.loading import DELETED
 from offline.config import load_study
 
 STIFF = ["odometry.name=mad_icp", "odometry.parameters=", "odometry.settings={}"]
@@ -126,20 +125,6 @@ def test_names_mistakes_in_sampler_settings_with_their_lines(study_file, offline
     assert f"line {line}: offline.sampler_settings" in message
     assert words in message
     assert len(message.splitlines()) == 1
-
-
-@pytest.mark.parametrize(("old", "words"), DELETED.items())
-def test_what_is_gone_is_told_what_became_of_it(study_file, old, words):
-    key, _, value = old.partition("=")
-    kind, star, last = key.partition(".*.")
-    if star:
-        needed = {"courses": "scenes: [cave]", "sequences": "folder: nowhere"}[kind]
-        given = f"{kind}.new={{{needed}, {last}: {value or 1}}}"
-    else:
-        given = f"{key}=[{value}]" if key == "online.modes" else f"{key}={value or 3}"
-    where = key.replace("*", "new") + ".0" * (key == "online.modes")
-    told = f"{value} {words}" if value else words
-    assert f"-o: {where}: {told}" in failure(study_file, given).splitlines()
 
 
 def test_a_folder_that_cannot_be_made(study_file, tmp_path):

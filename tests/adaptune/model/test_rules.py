@@ -79,12 +79,6 @@ def test_members_stay_within_a_budget():
     assert members(Spending(costs(1.0, 9.0, 9.0, 9.0), 5.0)) == [0]
 
 
-def test_thrifty_members_gain_most_for_their_cost():
-    dear = costs(1.0, 0.1, 50.0, 40.0)
-    assert members(Spending(dear), 2) == [0, 2]
-    assert members(Spending(dear, thrifty=True), 2) == [0, 1]
-
-
 def test_complementary_sets_stay_within_a_budget():
     errors = np.array([[2.0, 1.0, 1.2], [2.0, 3.0, 3.0]], np.float32)
     data = TrainingData(np.empty((2, 0)), np.zeros(2, np.intp), errors, sets(3), 0)
