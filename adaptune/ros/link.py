@@ -44,6 +44,9 @@ class RosLink(Protocol):
     def topics(self) -> Mapping[str, str]:
         """The topics that somebody publishes now, and their types."""
 
+    def why_unheard(self, topic: str) -> str:
+        """Why others may get no messages of a topic, in words; empty where nothing is known."""
+
     @property
     def alive(self) -> bool:
         """Whether messages still pass."""

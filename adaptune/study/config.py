@@ -133,7 +133,7 @@ class RosConfig(StrictModel):
     odometry: RosName = "adaptune/odometry"
     tf: bool = False
     steer: SteerConfig | None = None
-    router: str = "127.0.0.1:7447"
+    router: str | None = None  # of Zenoh; ROS 2 over DDS if left out
 
 
 RULES = ("adaptive", "paper")

@@ -227,7 +227,7 @@ def node(link, monkeypatch):
     monkeypatch.setattr(robot, "PATIENCE", 0.01)
 
     def make(**settings):
-        return SteeredNode(link, SteerConfig(node="/node", odometry="/odom", **settings))
+        return SteeredNode(link, SteerConfig(node="/node", odometry="/odom", **settings), "/points")
 
     return make
 
@@ -280,7 +280,7 @@ def test_a_topic_without_poses_is_named_once(node, caplog):
     for i in range(1, 30):
         odometry.register(scan(i * TENTH))
     assert caplog.messages == [
-        "/odom: no pose of /node for 10 scans; is it the topic, and does the node run?"
+        "/odom: no pose of /node for 10 of 10 scans; is it the topic, and does the node run?"
     ]
 
 

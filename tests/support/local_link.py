@@ -28,6 +28,7 @@ class LocalLink:
         self.kinds = {}
         self.holds = {}
         self.refuses = ()
+        self.deaf = ""
         self._takers = defaultdict(list)
 
     def subscribe(self, topic, _kind, take):
@@ -64,6 +65,9 @@ class LocalLink:
 
     def topics(self):
         return {"/points": CLOUD, "/imu": IMU}
+
+    def why_unheard(self, topic):
+        return self.deaf if topic == "/points" else ""
 
     def close(self):
         pass

@@ -1,0 +1,400 @@
+"""A robot whose ROS 2 runs on DDS, as it does by default, reached without an installation of it.
+
+Messages pass as bytes: `rosbags` serialises them, and Cyclone DDS carries them.
+"""
+
+import contextlib
+import itertools
+import logging
+import os
+import random
+import socket
+import struct
+import threading
+import time
+import types
+from collections.abc import Callable, Iterator, Mapping
+from functools import cache
+from typing import Any, NamedTuple
+from weakref import WeakValueDictionary
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+from cyclonedds.builtin import (
+    BuiltinDataReader,
+    BuiltinTopicDcpsPublication,
+    BuiltinTopicDcpsSubscription,
+)
+from cyclonedds.core import (
+    DDSException,
+    DDSStatus,
+    GuardCondition,
+    InstanceState,
+    ReadCondition,
+    SampleState,
+    ViewState,
+    WaitSet,
+)
+from cyclonedds.domain import Domain, DomainParticipant
+from cyclonedds.idl import IdlStruct
+from cyclonedds.pub import DataWriter
+from cyclonedds.qos import Policy, Qos
+from cyclonedds.sub import DataReader
+from cyclonedds.topic import Topic
+from cyclonedds.util import duration
+
+from adaptune.errors import in_a_line
+from adaptune.recording.clouds import LIVOX_TYPES
+from adaptune.ros.link import LinkError, take_all
+from adaptune.ros.ros2 import NODE, Ros2Link, Service, full
+
+_DISCOVERY = 1.5
+"""Seconds in which other nodes are found."""
+_AGAIN = 0.5
+"""Seconds after which a service is called again: its answer may have had no way back yet."""
+_DEPTH = 1000
+"""Messages of a topic that may wait; then the oldest are dropped."""
+_BUFFER = 1 << 22
+"""Bytes of a receive buffer that hold some clouds."""
+_CYCLONE, _FAST_DDS = b"\x01\x10", b"\x01\x0f"
+"""The vendors of DDS in ROS 2, as they begin the keys of their participants."""
+_INFO = "rmw_dds_common/msg/ParticipantEntitiesInfo"
+_TRANSFORMS = "tf2_msgs/msg/TFMessage"
+_CLOUDS = ("sensor_msgs/msg/PointCloud2", *LIVOX_TYPES)
+_ALL = ViewState.Any | SampleState.Any
+_DURABILITIES = tuple(
+    getattr(Policy.Durability, name)
+    for name in ("Volatile", "TransientLocal", "Transient", "Persistent")
+)
+
+_log = logging.getLogger(__name__)
+
+_domains: WeakValueDictionary[int, Domain] = WeakValueDictionary()
+"""Those of this process, which has one of each."""
+_joining = threading.Lock()
+
+
+class Endpoint(NamedTuple):
+    """What publishes a topic, or subscribes to it."""
+
+    topic: str
+    kind: str
+    node: str
+    vendor: bytes
+    qos: Qos
+
+
+class DdsLink(Ros2Link):
+    """A `RosLink` to a robot whose ROS 2 runs on DDS.
+
+    Other nodes are found as in ROS 2 (``ROS_AUTOMATIC_DISCOVERY_RANGE``, ``ROS_STATIC_PEERS``);
+    ``CYCLONEDDS_URI`` has the last word. There is a `LinkError` if the network does not allow it.
+    """
+
+    _discovery = _DISCOVERY
+
+    def __init__(self, domain: int | None = None):
+        super().__init__(domain)
+        where = f"ROS domain {self.domain}: DDS does not start; see CYCLONEDDS_URI and the network"
+        with self._naming(where), _joining:
+            joined = _domains.get(self.domain) or Domain(self.domain, _configuration())
+            _domains[self.domain] = joined
+            me = DomainParticipant(self.domain, Qos(Policy.Userdata(b"enclave=/;")))
+            self._participant, self._closing = me, GuardCondition(me)
+            pair = (BuiltinTopicDcpsPublication, BuiltinTopicDcpsSubscription)
+            found = [BuiltinDataReader(me, topic) for topic in pair]
+            self._found = [(r, ReadCondition(r, _ALL | InstanceState.Alive)) for r in found]
+            self._kept: list[Any] = [joined]
+            self._writers: dict[str, DataWriter] = {}
+            self._clients: dict[str, tuple[DataWriter, DataReader]] = {}
+            self._numbers, self._id = itertools.count(1), random.getrandbits(64)
+            self._gids: dict[type, list[Any]] = {DataReader: [], DataWriter: []}
+            self._nodes: dict[bytes, str] = {}
+            self._announcing = threading.Lock()
+            self._info = self._end(DataWriter, "ros_discovery_info", _INFO, latched=1)
+            self._infos = self._end(DataReader, "ros_discovery_info", _INFO, latched=_DEPTH)
+            self._announce()
+
+    def subscribe(
+        self, topic: str, kind: str, take: Callable[[Any], None], raw: bool = False
+    ) -> None:
+        """See `RosLink.subscribe`; an error in `take` is logged, and the next message is taken.
+
+        It is reliable where all who publish are. There is a `LinkError` if the topic is published
+        with another type, as far as that is known by now.
+        """
+        there = [e for e in self._endpoints(0) if e.topic == full(topic)]
+        if there and kind not in {e.kind for e in there}:
+            raise LinkError(f"{topic} is published as {there[0].kind}, not as {kind}")
+        if kind in _CLOUDS and (size := _receive_buffer()) < _BUFFER:
+            _log.warning(
+                "%s: clouds may be lost on their way: the receive buffer of this machine has %d "
+                "kB; run `sudo sysctl -w net.core.rmem_max=%d` and start again",
+                topic,
+                size // 1000,
+                _BUFFER,
+            )
+        reader = self._topic_end(DataReader, topic, kind)
+        messages = self._received(topic, kind, reader)
+        self._threads.append(take_all(topic, messages, take if raw else self._reading(kind, take)))
+
+    def _received(self, topic: str, kind: str, reader: DataReader) -> Iterator[bytes]:
+        """The bytes of messages as they come, until the link is closed."""
+        before: list[int] = []
+        for sample in self._taken(topic, kind, reader):
+            handle = sample.sample_info.publication_handle
+            # A node that starts again is another one, and the first is not heard again.
+            if handle in before[:-1] and kind != _TRANSFORMS:
+                names = sorted({e.node for e in self._endpoints(0) if e.topic == full(topic)})
+                what = "%s is published by two (%s), whose messages mix; end one of them"
+                _log.warning(what, topic, " and ".join(names))
+                kind = _TRANSFORMS  # once
+            if handle not in before:
+                before.append(handle)
+            yield sample.data
+
+    def _taken(self, topic: str, kind: str, reader: DataReader) -> Iterator[Any]:
+        """Samples as they come, until the link is closed."""
+        while not self._closed:
+            yield from self._waited(reader)
+            if not self._closed:
+                # Who publishes is not reliable.
+                reader = self._topic_end(DataReader, topic, kind, reliable=False)
+
+    def _waited(self, reader: DataReader, seconds: float | None = None) -> Iterator[Any]:
+        """Samples as they come, until that takes too long, or somebody offers another QoS."""
+        ready = WaitSet(self._participant)
+        for condition in (reader, self._closing, ReadCondition(reader, _ALL | InstanceState.Any)):
+            ready.attach(condition)
+        limit = duration(weeks=9999) if seconds is None else duration(seconds=seconds)
+        while ready.wait(limit) and not self._closed:
+            yield from (one for one in reader.take(N=_DEPTH) if one.sample_info.valid_data)
+            if reader.get_requested_incompatible_qos_status().total_count:
+                return
+
+    def advertise(self, topic: str, kind: str) -> Callable[[Any], None]:
+        self._writers[topic] = self._topic_end(DataWriter, topic, kind)
+
+        def publish(message: Any) -> None:
+            data = bytes(self.store.serialize_cdr(message, kind))
+            try:
+                with self._naming(topic):
+                    writer = self._writers[topic]
+                    writer.write(writer.data_type(data))
+            except KeyError as error:
+                raise LinkError(f"{topic}: the link was closed") from error
+
+        return publish
+
+    def topics(self) -> Mapping[str, str]:
+        """See `RosLink.topics`; a link that is new waits until it can know."""
+        time.sleep(max(0.0, self._joined + _DISCOVERY - time.monotonic()))
+        return {e.topic: e.kind for e in self._endpoints(0)}
+
+    def why_unheard(self, topic: str) -> str:
+        topic = full(topic)
+        offered = [e for e in self._endpoints(0, own=True) if e.topic == topic]
+        wanted = [e for e in self._endpoints(1) if e.topic == topic]
+        if not wanted:
+            return f"nobody else subscribes to {topic}"
+        for one in wanted:
+            fitting = [e for e in offered if e.kind == one.kind]
+            if offered and not fitting:
+                return f"{one.node} subscribes to {topic} as {one.kind}, not {offered[0].kind}"
+            lacks = [_lack(e.qos, one.qos) for e in fitting]
+            if lacks and all(lacks):
+                return f"{one.node} wants {topic} {lacks[0]}, and it is not published so"
+        if fast := sorted({e.node for e in wanted if e.vendor == _FAST_DDS}):
+            return (
+                f"{' and '.join(fast)} on Fast DDS loses clouds that do not fit in the receive "
+                f"buffer: run `sudo sysctl -w net.core.rmem_default={_BUFFER}` on its machine and "
+                "start it again"
+            )
+        return ""
+
+    def _endpoints(self, which: int, *, own: bool = False) -> list[Endpoint]:
+        """Who publishes topics (0), or subscribes to them (1), this link left out or not."""
+        there = [e for e in self._others(which, own=own) if e.topic_name.startswith("rt/")]
+        self._learn_names()
+        return [
+            Endpoint(
+                e.topic_name[2:],
+                e.type_name.replace("::dds_::", "/").replace("::", "/").removesuffix("_"),
+                self._nodes.get(e.key.bytes, "a node"),
+                e.participant_key.bytes[:2],
+                e.qos,
+            )
+            for e in there
+        ]
+
+    def _others(self, which: int, *, own: bool = False) -> list[Any]:
+        """All writers (0) or readers (1) that are there now."""
+        with self._naming("ROS 2"):
+            if self._closed:
+                raise LinkError("ROS 2: the link was closed")
+            (reader, alive), me = self._found[which], self._participant.guid
+            found = reader.read(N=10_000, condition=alive)
+            return [e for e in found if own or e.participant_key != me]
+
+    def _learn_names(self) -> None:
+        for sample in self._infos.take(N=_DEPTH):
+            if sample.sample_info.valid_data:
+                with contextlib.suppress(Exception):  # that of another ROS 2 is longer
+                    info: Any = self.store.deserialize_cdr(sample.data, _INFO)
+                    for node in info.node_entities_info_seq:
+                        name = full(f"{node.node_namespace.rstrip('/')}/{node.node_name}")
+                        for gid in (*node.reader_gid_seq, *node.writer_gid_seq):
+                            self._nodes[bytes(gid.data)] = name
+
+    def _ask(self, place: str, service: Service, request: bytes, seconds: float) -> Iterator[Any]:
+        with self._naming(place):
+            if self._closed:
+                raise LinkError("ROS 2: the link was closed")
+            if place not in self._clients:
+                request_end = self._end(DataWriter, f"rq{place}Request", service.request)
+                reply_end = self._end(DataReader, f"rr{place}Reply", service.response)
+                self._clients[place] = request_end, reply_end
+            writer, reader = self._clients[place]
+            servers = writer.get_matched_subscriptions()
+            if not servers or not reader.get_matched_publications():
+                return
+            server = writer.get_matched_subscription_data(servers[0])
+            # Cyclone begins with who asked and which request it was; others do not let us see it.
+            cyclone = server is not None and server.participant_key.bytes[:2] == _CYCLONE
+            head = struct.pack("<Qq", self._id, next(self._numbers)) if cyclone else b""
+            reader.take(N=_DEPTH)
+            writer.write(writer.data_type(request[:4] + head + request[4:]))
+            for sample in self._waited(reader, min(seconds, _AGAIN)):
+                if sample.data[4 : 4 + len(head)] == head:
+                    yield sample.data[:4] + sample.data[4 + len(head) :]
+
+    def _places(self) -> list[str]:
+        names = {e.topic_name for e in self._others(1)}
+        return sorted(n[2:-7] for n in names if n.startswith("rq/"))
+
+    def _leave(self) -> None:
+        self._closing.set(True)
+        self._writers.clear()
+        self._clients.clear()
+        # What is no longer kept takes leave of the others, once its threads have ended.
+        self._kept, self._found = self._kept[:1], []
+
+    def _topic_end(self, kind_of_end: type, topic: str, kind: str, *, reliable: bool = True) -> Any:
+        static = {"latched": _DEPTH} if full(topic) == "/tf_static" else {}
+        with self._naming(topic):
+            end = self._end(kind_of_end, f"rt{full(topic)}", kind, reliable=reliable, **static)
+            self._announce()
+        return end
+
+    def _end(
+        self,
+        kind_of_end: type,
+        name: str,
+        kind: str,
+        *,
+        reliable: bool = True,
+        latched: int = 0,
+    ) -> Any:
+        """Make a reader or a writer; `latched` is how many messages are for who comes later."""
+        if kind not in self.store.types:
+            raise LinkError(f"{name[2:]}: the message type {kind} is not known")
+        of = Policy.Reliability
+        qos = Qos(
+            of.Reliable(duration(milliseconds=100)) if reliable else of.BestEffort,
+            _DURABILITIES[bool(latched)],
+            Policy.History.KeepLast(latched or _DEPTH),
+            Policy.Userdata(f"typehash={self.store.hash_rihs01(kind)};".encode()),
+        )
+        end = kind_of_end(self._participant, Topic(self._participant, name, _carrier(kind)), qos)
+        if kind_of_end is DataReader:
+            end.set_status_mask(DDSStatus.RequestedIncompatibleQos)
+        self._kept.append(end)
+        if not name.startswith("ros_"):
+            self._gids[kind_of_end].append(self._gid(end))
+        return end
+
+    def _gid(self, entity: Any) -> Any:
+        return self.store.types["rmw_dds_common/msg/Gid"](np.frombuffer(entity.guid.bytes, "u1"))
+
+    def _announce(self) -> None:
+        """Let tools of ROS 2 see this node and what it publishes and subscribes to."""
+        with self._announcing:
+            node = self.store.types["rmw_dds_common/msg/NodeEntitiesInfo"](
+                "/", NODE, self._gids[DataReader], self._gids[DataWriter]
+            )
+            info = self.store.types[_INFO](self._gid(self._participant), [node])
+            data = bytes(self.store.serialize_cdr(info, _INFO))
+            self._info.write(self._info.data_type(data))
+
+    @contextlib.contextmanager
+    def _naming(self, what: str) -> Iterator[None]:
+        """Say what DDS cannot do, and why."""
+        try:
+            yield
+        except (DDSException, UnicodeError) as error:
+            raise LinkError(f"{what}: {in_a_line(error)}") from error
+
+
+@cache
+def _carrier(kind: str) -> Any:
+    """What DDS takes for a message of a type: its bytes."""
+
+    def hold(self: Any, data: bytes) -> None:
+        self.data = data
+
+    methods = {
+        "__init__": hold,
+        "serialize": lambda self, **_: self.data,
+        "deserialize": classmethod(lambda cls, data, **_: cls(data)),
+        "deserialize_key": classmethod(lambda cls, data, **_: cls(data)),
+    }
+    # rosbags puts services among the messages.
+    package, space, name = kind.replace("/srv/msg/", "/srv/").split("/")
+    given = {"typename": f"{package}.{space}.dds_.{name}_"}
+    return types.new_class(name, (IdlStruct,), given, lambda names: names.update(methods))
+
+
+def _lack(offered: Qos, wanted: Qos) -> str:
+    """In words, what a subscriber wants and a publisher does not offer; empty if they match."""
+    reliable = Policy.Reliability.Reliable
+    if isinstance(wanted[Policy.Reliability], reliable) and not isinstance(
+        offered[Policy.Reliability], reliable
+    ):
+        return "reliable"
+    durability = [_DURABILITIES.index(qos[Policy.Durability]) for qos in (offered, wanted)]
+    if durability[0] < durability[1]:
+        return "transient local, with what was published before it came"
+    if offered[Policy.Deadline].deadline > wanted[Policy.Deadline].deadline:
+        return "with a deadline"
+    return ""
+
+
+def _configuration() -> str:
+    """What Cyclone DDS is told, by what ROS 2 is told of discovery."""
+    name = "ROS_AUTOMATIC_DISCOVERY_RANGE"
+    reach = os.environ.get(name, "").strip().upper() or "SUBNET"
+    peers = ["localhost", *filter(None, os.environ.get("ROS_STATIC_PEERS", "").split(";"))]
+    if os.environ.get("ROS_LOCALHOST_ONLY") == "1":
+        reach, peers = "LOCALHOST", peers[:1]
+    if reach not in ("SUBNET", "LOCALHOST", "OFF", "SYSTEM_DEFAULT"):
+        raise LinkError(f"{name} is {reach}; it is SUBNET, LOCALHOST, OFF or SYSTEM_DEFAULT")
+    alone = f"<Tag>adaptune {os.getpid()}</Tag>" if reach == "OFF" else ""
+    known = "".join(f"<Peer address={quoteattr(peer.strip())}/>" for peer in peers)
+    parts = [f'<Internal><SocketReceiveBufferSize max="{_BUFFER} B"/></Internal>']
+    if reach in ("LOCALHOST", "OFF"):
+        parts.append("<General><AllowMulticast>false</AllowMulticast></General>")
+    if reach != "SYSTEM_DEFAULT":
+        parts.append(
+            "<Discovery><ParticipantIndex>auto</ParticipantIndex>"
+            "<MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>"
+            f"{alone}<Peers>{known}</Peers></Discovery>"
+        )
+    own = f"<CycloneDDS><Domain>{''.join(parts)}</Domain></CycloneDDS>"
+    return ",".join(filter(None, (own, os.environ.get("CYCLONEDDS_URI"))))
+
+
+def _receive_buffer() -> int:
+    """Bytes that the kernel lets a socket receive ahead."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
+        return probe.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2
