@@ -20,11 +20,7 @@ from weakref import WeakValueDictionary
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
-from cyclonedds.builtin import (
-    BuiltinDataReader,
-    BuiltinTopicDcpsPublication,
-    BuiltinTopicDcpsSubscription,
-)
+from cyclonedds import builtin
 from cyclonedds.core import (
     DDSException,
     DDSStatus,
@@ -101,18 +97,17 @@ class DdsLink(Ros2Link):
             _domains[self.domain] = joined
             me = DomainParticipant(self.domain, Qos(Policy.Userdata(b"enclave=/;")))
             self._participant, self._closing = me, GuardCondition(me)
-            pair = (BuiltinTopicDcpsPublication, BuiltinTopicDcpsSubscription)
-            found = [BuiltinDataReader(me, topic) for topic in pair]
+            pair = builtin.BuiltinTopicDcpsPublication, builtin.BuiltinTopicDcpsSubscription
+            found = [builtin.BuiltinDataReader(me, topic) for topic in pair]
             self._found = [(r, ReadCondition(r, _ALL | InstanceState.Alive)) for r in found]
             self._kept: list[Any] = [joined]
-            self._writers: dict[str, DataWriter] = {}
             self._clients: dict[str, tuple[DataWriter, DataReader]] = {}
             self._numbers, self._id = itertools.count(1), random.getrandbits(64)
             self._gids: dict[type, list[Any]] = {DataReader: [], DataWriter: []}
             self._nodes: dict[bytes, str] = {}
             self._announcing = threading.Lock()
-            self._info = self._end(DataWriter, "ros_discovery_info", _INFO, latched=1)
-            self._infos = self._end(DataReader, "ros_discovery_info", _INFO, latched=_DEPTH)
+            self._info = self._end(DataWriter, "ros_discovery_info", _INFO)
+            self._infos = self._end(DataReader, "ros_discovery_info", _INFO)
             self._announce()
 
     def subscribe(
@@ -127,39 +122,31 @@ class DdsLink(Ros2Link):
         if there and kind not in {e.kind for e in there}:
             raise LinkError(f"{topic} is published as {there[0].kind}, not as {kind}")
         if kind in _CLOUDS and (size := _receive_buffer()) < _BUFFER:
-            _log.warning(
-                "%s: clouds may be lost on their way: the receive buffer of this machine has %d "
-                "kB; run `sudo sysctl -w net.core.rmem_max=%d` and start again",
-                topic,
-                size // 1000,
-                _BUFFER,
-            )
-        reader = self._topic_end(DataReader, topic, kind)
-        messages = self._received(topic, kind, reader)
+            what = "%s: clouds may be lost, as this machine receives %d kB ahead; run `sudo sysctl "
+            what += "-w net.core.rmem_max=%d` and start again"
+            _log.warning(what, topic, size // 1000, _BUFFER)
+        messages = self._taken(topic, kind, self._end(DataReader, f"rt{full(topic)}", kind))
         self._threads.append(take_all(topic, messages, take if raw else self._reading(kind, take)))
 
-    def _received(self, topic: str, kind: str, reader: DataReader) -> Iterator[bytes]:
+    def _taken(self, topic: str, kind: str, reader: DataReader) -> Iterator[bytes]:
         """The bytes of messages as they come, until the link is closed."""
-        before: list[int] = []
-        for sample in self._taken(topic, kind, reader):
-            handle = sample.sample_info.publication_handle
-            # A node that starts again is another one, and the first is not heard again.
-            if handle in before[:-1] and kind != _TRANSFORMS:
-                names = sorted({e.node for e in self._endpoints(0) if e.topic == full(topic)})
-                what = "%s is published by two (%s), whose messages mix; end one of them"
-                _log.warning(what, topic, " and ".join(names))
-                kind = _TRANSFORMS  # once
-            if handle not in before:
-                before.append(handle)
-            yield sample.data
-
-    def _taken(self, topic: str, kind: str, reader: DataReader) -> Iterator[Any]:
-        """Samples as they come, until the link is closed."""
+        senders: list[int] = []
+        mixed = kind == _TRANSFORMS  # as is usual
         while not self._closed:
-            yield from self._waited(reader)
+            for sample in self._waited(reader):
+                sender = sample.sample_info.publication_handle
+                # A node that starts again is another one, and the first is not heard again.
+                if sender in senders[:-1] and not mixed:
+                    mixed = True
+                    names = sorted({e.node for e in self._endpoints(0) if e.topic == full(topic)})
+                    what = "%s is published by two (%s), whose messages mix; end one of them"
+                    _log.warning(what, topic, " and ".join(names))
+                if sender not in senders:
+                    senders.append(sender)
+                yield sample.data
             if not self._closed:
                 # Who publishes is not reliable.
-                reader = self._topic_end(DataReader, topic, kind, reliable=False)
+                reader = self._end(DataReader, f"rt{full(topic)}", kind, reliable=False)
 
     def _waited(self, reader: DataReader, seconds: float | None = None) -> Iterator[Any]:
         """Samples as they come, until that takes too long, or somebody offers another QoS."""
@@ -173,16 +160,12 @@ class DdsLink(Ros2Link):
                 return
 
     def advertise(self, topic: str, kind: str) -> Callable[[Any], None]:
-        self._writers[topic] = self._topic_end(DataWriter, topic, kind)
+        writer = self._end(DataWriter, f"rt{full(topic)}", kind)
 
         def publish(message: Any) -> None:
             data = bytes(self.store.serialize_cdr(message, kind))
-            try:
-                with self._naming(topic):
-                    writer = self._writers[topic]
-                    writer.write(writer.data_type(data))
-            except KeyError as error:
-                raise LinkError(f"{topic}: the link was closed") from error
+            with self._naming(topic):
+                writer.write(writer.data_type(data))
 
         return publish
 
@@ -230,8 +213,6 @@ class DdsLink(Ros2Link):
     def _others(self, which: int, *, own: bool = False) -> list[Any]:
         """All writers (0) or readers (1) that are there now."""
         with self._naming("ROS 2"):
-            if self._closed:
-                raise LinkError("ROS 2: the link was closed")
             (reader, alive), me = self._found[which], self._participant.guid
             found = reader.read(N=10_000, condition=alive)
             return [e for e in found if own or e.participant_key != me]
@@ -248,8 +229,6 @@ class DdsLink(Ros2Link):
 
     def _ask(self, place: str, service: Service, request: bytes, seconds: float) -> Iterator[Any]:
         with self._naming(place):
-            if self._closed:
-                raise LinkError("ROS 2: the link was closed")
             if place not in self._clients:
                 request_end = self._end(DataWriter, f"rq{place}Request", service.request)
                 reply_end = self._end(DataReader, f"rr{place}Reply", service.response)
@@ -274,43 +253,29 @@ class DdsLink(Ros2Link):
 
     def _leave(self) -> None:
         self._closing.set(True)
-        self._writers.clear()
-        self._clients.clear()
         # What is no longer kept takes leave of the others, once its threads have ended.
-        self._kept, self._found = self._kept[:1], []
+        self._kept, self._found, self._clients = self._kept[:1], [], {}
 
-    def _topic_end(self, kind_of_end: type, topic: str, kind: str, *, reliable: bool = True) -> Any:
-        static = {"latched": _DEPTH} if full(topic) == "/tf_static" else {}
-        with self._naming(topic):
-            end = self._end(kind_of_end, f"rt{full(topic)}", kind, reliable=reliable, **static)
-            self._announce()
-        return end
-
-    def _end(
-        self,
-        kind_of_end: type,
-        name: str,
-        kind: str,
-        *,
-        reliable: bool = True,
-        latched: int = 0,
-    ) -> Any:
-        """Make a reader or a writer; `latched` is how many messages are for who comes later."""
+    def _end(self, of: type, name: str, kind: str, *, reliable: bool = True) -> Any:
+        """Make a reader or a writer of a topic, as DDS names it, and announce it."""
         if kind not in self.store.types:
             raise LinkError(f"{name[2:]}: the message type {kind} is not known")
-        of = Policy.Reliability
+        info, policy = name == "ros_discovery_info", Policy.Reliability
         qos = Qos(
-            of.Reliable(duration(milliseconds=100)) if reliable else of.BestEffort,
-            _DURABILITIES[bool(latched)],
-            Policy.History.KeepLast(latched or _DEPTH),
+            policy.Reliable(duration(milliseconds=100)) if reliable else policy.BestEffort,
+            # What is published once is for those who come later, too.
+            _DURABILITIES[info or name == "rt/tf_static"],
+            Policy.History.KeepLast(1 if info and of is DataWriter else _DEPTH),
             Policy.Userdata(f"typehash={self.store.hash_rihs01(kind)};".encode()),
         )
-        end = kind_of_end(self._participant, Topic(self._participant, name, _carrier(kind)), qos)
-        if kind_of_end is DataReader:
-            end.set_status_mask(DDSStatus.RequestedIncompatibleQos)
-        self._kept.append(end)
-        if not name.startswith("ros_"):
-            self._gids[kind_of_end].append(self._gid(end))
+        with self._naming(name[2:]), self._announcing:
+            end = of(self._participant, Topic(self._participant, name, _carrier(kind)), qos)
+            self._kept.append(end)
+            if of is DataReader:
+                end.set_status_mask(DDSStatus.RequestedIncompatibleQos)
+            if not info:
+                self._gids[of].append(self._gid(end))
+                self._announce()
         return end
 
     def _gid(self, entity: Any) -> Any:
@@ -318,17 +283,17 @@ class DdsLink(Ros2Link):
 
     def _announce(self) -> None:
         """Let tools of ROS 2 see this node and what it publishes and subscribes to."""
-        with self._announcing:
-            node = self.store.types["rmw_dds_common/msg/NodeEntitiesInfo"](
-                "/", NODE, self._gids[DataReader], self._gids[DataWriter]
-            )
-            info = self.store.types[_INFO](self._gid(self._participant), [node])
-            data = bytes(self.store.serialize_cdr(info, _INFO))
-            self._info.write(self._info.data_type(data))
+        node = self.store.types["rmw_dds_common/msg/NodeEntitiesInfo"](
+            "/", NODE, self._gids[DataReader], self._gids[DataWriter]
+        )
+        info = self.store.types[_INFO](self._gid(self._participant), [node])
+        self._info.write(self._info.data_type(bytes(self.store.serialize_cdr(info, _INFO))))
 
     @contextlib.contextmanager
     def _naming(self, what: str) -> Iterator[None]:
         """Say what DDS cannot do, and why."""
+        if self._closed:
+            raise LinkError(f"{what}: the link was closed")
         try:
             yield
         except (DDSException, UnicodeError) as error:

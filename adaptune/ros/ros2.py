@@ -35,12 +35,6 @@ DEFINITIONS = {
     ),
 }
 """Requests and responses of services, which are not among the types of rosbags."""
-PLACES = {
-    "SetParameters": "set_parameters",
-    "GetParameters": "get_parameters",
-    "ListParameters": "list_parameters",
-}
-"""Where a node serves them, below its name."""
 _FIELDS = {bool: "bool_value", int: "integer_value", float: "double_value", str: "string_value"}
 """Where a parameter's value is, in the order of rcl_interfaces/msg/ParameterType, from 1 on."""
 _ARRAYS = {"byte": np.uint8, "bool": np.bool_, "integer": np.int64, "double": np.float64}
@@ -150,7 +144,7 @@ class Ros2Link(RosLink, ABC):
         Who calls may get the answer to another caller, which has as many values only by chance.
         """
         service = self._services[name]
-        place = f"{node}/{PLACES[name]}"
+        place = f"{node}/{name.removesuffix('Parameters').lower()}_parameters"
         request = self.store.types[service.request](**fields)
         raw = bytes(self.store.serialize_cdr(request, service.request))
         response = None
