@@ -160,14 +160,14 @@ def _drive(
 ) -> None:
     """Drive on a robot until Ctrl-C."""
     from adaptune.ros.ros1 import local_ros1
-    from adaptune.ros.ros2 import ros2_link
+    from adaptune.ros.ros2 import local_ros2
     from online.modes import UNTRAINED, WITHOUT_MODEL
     from online.robot import RobotDrive
 
     mode = UNTRAINED if untrained else mode or next(iter(loaded.config.online.rules), "adaptive")
     path = None if mode in WITHOUT_MODEL else model or loaded.model_path
     drive = RobotDrive(loaded, mode, path)
-    link = ros2_link(loaded.config.online.ros.router) if ros2 else local_ros1()
+    link = local_ros2() if ros2 else local_ros1()
     with closing(link), _alone(loaded), progress() as show:
         log.info("drive, %s: Ctrl-C ends it", mode)
         driven = drive.run(link, lambda of: show("drive", of.done, of.done, now(of)))

@@ -1,7 +1,4 @@
-"""A robot whose ROS 2 runs on DDS, as it does by default, reached without an installation of it.
-
-Messages pass as bytes: `rosbags` serialises them, and Cyclone DDS carries them.
-"""
+"""A robot's ROS 2 over DDS, as it runs by default, reached without an installation of it."""
 
 import contextlib
 import itertools
@@ -13,10 +10,9 @@ import struct
 import threading
 import time
 import types
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import cache
 from typing import Any, NamedTuple
-from weakref import WeakValueDictionary
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
@@ -39,17 +35,31 @@ from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
-from adaptune.errors import in_a_line
+from adaptune.errors import nearest
 from adaptune.recording.clouds import LIVOX_TYPES
 from adaptune.ros.link import LinkError, take_all
-from adaptune.ros.ros2 import NODE, Ros2Link, Service, full
+from adaptune.ros.ros2 import (
+    FIELDS,
+    PLACES,
+    Service,
+    full,
+    message_types,
+    parameter_message,
+    register_service,
+    ros_domain,
+)
 
+_NODE = "adaptune"
+_ANSWER = 2.0
+"""Seconds in which a service must answer."""
 _DISCOVERY = 1.5
 """Seconds in which other nodes are found."""
 _AGAIN = 0.5
 """Seconds after which a service is called again: its answer may have had no way back yet."""
 _DEPTH = 1000
 """Messages of a topic that may wait; then the oldest are dropped."""
+_PAUSE = 0.02
+"""Seconds between calls of a service that is not there, or not yet."""
 _BUFFER = 1 << 22
 """Bytes of a receive buffer that hold some clouds."""
 _CYCLONE, _FAST_DDS = b"\x01\x10", b"\x01\x0f"
@@ -65,8 +75,8 @@ _DURABILITIES = tuple(
 
 _log = logging.getLogger(__name__)
 
-_domains: WeakValueDictionary[int, Domain] = WeakValueDictionary()
-"""Those of this process, which has one of each."""
+_domains: dict[int, Domain] = {}
+"""Those of this process, which joins each once: other threads would not survive its end."""
 _joining = threading.Lock()
 
 
@@ -80,27 +90,33 @@ class Endpoint(NamedTuple):
     qos: Qos
 
 
-class DdsLink(Ros2Link):
+class DdsLink:
     """A `RosLink` to a robot whose ROS 2 runs on DDS.
 
     Other nodes are found as in ROS 2 (``ROS_AUTOMATIC_DISCOVERY_RANGE``, ``ROS_STATIC_PEERS``);
     ``CYCLONEDDS_URI`` has the last word. There is a `LinkError` if the network does not allow it.
     """
 
-    _discovery = _DISCOVERY
+    is2 = True
 
     def __init__(self, domain: int | None = None):
-        super().__init__(domain)
+        self.domain = ros_domain(domain)
+        self.store = message_types()
+        self._services = {name: register_service(self.store, name) for name in PLACES}
+        self._calling, self._closed = threading.Lock(), False
+        self._threads: list[threading.Thread] = []
+        self._joined = time.monotonic()
         where = f"ROS domain {self.domain}: DDS does not start; see CYCLONEDDS_URI and the network"
         with self._naming(where), _joining:
-            joined = _domains.get(self.domain) or Domain(self.domain, _configuration())
-            _domains[self.domain] = joined
+            if self.domain not in _domains:
+                _domains[self.domain] = Domain(self.domain, _configuration())
             me = DomainParticipant(self.domain, Qos(Policy.Userdata(b"enclave=/;")))
             self._participant, self._closing = me, GuardCondition(me)
             pair = builtin.BuiltinTopicDcpsPublication, builtin.BuiltinTopicDcpsSubscription
             found = [builtin.BuiltinDataReader(me, topic) for topic in pair]
             self._found = [(r, ReadCondition(r, _ALL | InstanceState.Alive)) for r in found]
-            self._kept: list[Any] = [joined]
+            self._kept: list[Any] = []
+            self._writers: dict[str, DataWriter] = {}
             self._clients: dict[str, tuple[DataWriter, DataReader]] = {}
             self._numbers, self._id = itertools.count(1), random.getrandbits(64)
             self._gids: dict[type, list[Any]] = {DataReader: [], DataWriter: []}
@@ -125,14 +141,14 @@ class DdsLink(Ros2Link):
             what = "%s: clouds may be lost, as this machine receives %d kB ahead; run `sudo sysctl "
             what += "-w net.core.rmem_max=%d` and start again"
             _log.warning(what, topic, size // 1000, _BUFFER)
-        messages = self._taken(topic, kind, self._end(DataReader, f"rt{full(topic)}", kind))
+        messages = self._taken(topic, kind, self._topic_end(DataReader, topic, kind))
         self._threads.append(take_all(topic, messages, take if raw else self._reading(kind, take)))
 
     def _taken(self, topic: str, kind: str, reader: DataReader) -> Iterator[bytes]:
         """The bytes of messages as they come, until the link is closed."""
         senders: list[int] = []
         mixed = kind == _TRANSFORMS  # as is usual
-        while not self._closed:
+        for reliable in (True, False):
             for sample in self._waited(reader):
                 sender = sample.sample_info.publication_handle
                 # A node that starts again is another one, and the first is not heard again.
@@ -144,9 +160,10 @@ class DdsLink(Ros2Link):
                 if sender not in senders:
                     senders.append(sender)
                 yield sample.data
-            if not self._closed:
+            if reliable and not self._closed:
                 # Who publishes is not reliable.
-                reader = self._end(DataReader, f"rt{full(topic)}", kind, reliable=False)
+                self._kept.remove(reader)
+                reader = self._topic_end(DataReader, topic, kind, reliable=False)
 
     def _waited(self, reader: DataReader, seconds: float | None = None) -> Iterator[Any]:
         """Samples as they come, until that takes too long, or somebody offers another QoS."""
@@ -159,20 +176,51 @@ class DdsLink(Ros2Link):
             if reader.get_requested_incompatible_qos_status().total_count:
                 return
 
-    def advertise(self, topic: str, kind: str) -> Callable[[Any], None]:
-        writer = self._end(DataWriter, f"rt{full(topic)}", kind)
+    def advertise(self, topic: str, kind: str, *, raw: bool = False) -> Callable[[Any], None]:
+        """See `RosLink.advertise`; with `raw`, messages are given as bytes."""
+        self._writers[topic] = self._topic_end(DataWriter, topic, kind)
 
         def publish(message: Any) -> None:
-            data = bytes(self.store.serialize_cdr(message, kind))
+            data = message if raw else bytes(self.store.serialize_cdr(message, kind))
             with self._naming(topic):
+                writer = self._writers[topic]
                 writer.write(writer.data_type(data))
 
         return publish
+
+    def hearers(self, topic: str) -> int:
+        """How many subscribers hear what this link publishes on a topic."""
+        with self._naming(topic):
+            return len(self._writers[topic].get_matched_subscriptions())
 
     def topics(self) -> Mapping[str, str]:
         """See `RosLink.topics`; a link that is new waits until it can know."""
         time.sleep(max(0.0, self._joined + _DISCOVERY - time.monotonic()))
         return {e.topic: e.kind for e in self._endpoints(0)}
+
+    @property
+    def alive(self) -> bool:
+        """See `RosLink.alive`; whoever has gone may come back."""
+        return not self._closed
+
+    def close(self) -> None:
+        """Leave; messages that wait to be taken are dropped."""
+        if self._closed:
+            return
+        self._closed = True
+        self._closing.set(True)
+        for thread in self._threads:
+            if thread is not threading.current_thread():
+                thread.join(_ANSWER)
+        with self._calling:
+            # What nobody holds any more takes leave of the others.
+            self._kept, self._found, self._threads = [], [], []
+            self._writers, self._clients = {}, {}
+            del self._participant, self._closing, self._info, self._infos
+
+    def _reading(self, kind: str, take: Callable[[Any], None]) -> Callable[[bytes], None]:
+        """Take messages of a type by their bytes; arrays are views of them."""
+        return lambda data: take(self.store.deserialize_cdr(memoryview(data), kind))
 
     def why_unheard(self, topic: str) -> str:
         topic = full(topic)
@@ -189,11 +237,79 @@ class DdsLink(Ros2Link):
                 return f"{one.node} wants {topic} {lacks[0]}, and it is not published so"
         if fast := sorted({e.node for e in wanted if e.vendor == _FAST_DDS}):
             return (
-                f"{' and '.join(fast)} on Fast DDS loses clouds that do not fit in the receive "
-                f"buffer: run `sudo sysctl -w net.core.rmem_default={_BUFFER}` on its machine and "
-                "start it again"
+                f"{' and '.join(fast)} runs on Fast DDS, which loses clouds that do not fit in the "
+                f"receive buffer: run `sudo sysctl -w net.core.rmem_default={_BUFFER}` on its "
+                "machine, and start it again"
             )
         return ""
+
+    def set_parameters(self, node: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
+        """See `RosLink.set_parameters`; what the node does not tell is as given.
+
+        If it refuses a value, it may hold the other values then.
+        """
+        node = full(node)
+        given = [parameter_message(self.store, name, value) for name, value in values.items()]
+        results = self._call(node, "SetParameters", len(given), parameters=given).results
+        if refused := [
+            f"{name} = {value!r} ({result.reason or 'without a reason'})"
+            for (name, value), result in zip(values.items(), results, strict=False)
+            if not result.successful
+        ]:
+            raise LinkError(f"{node} refuses {', '.join(refused)}{self._lacking(node, values)}")
+        return dict(values) | self._held(node, list(values))
+
+    def parameters(self, node: str) -> Mapping[str, Any]:
+        """The parameters that a node declares, and what it holds; arrays and empty ones left out.
+
+        There is a LinkError if the node is not there or does not answer.
+        """
+        return self._held(full(node), self._declared(full(node)))
+
+    def _declared(self, node: str) -> list[str]:
+        names = self._call(node, "ListParameters", None, prefixes=[], depth=0).result.names
+        return sorted(names)
+
+    def _held(self, node: str, names: list[str]) -> dict[str, Any]:
+        told = self._call(node, "GetParameters", len(names), names=names).values
+        fields = dict(enumerate(FIELDS.values(), 1))
+        held = zip(names, told, strict=False)  # none, where a node does not tell
+        return {n: getattr(value, fields[value.type]) for n, value in held if value.type in fields}
+
+    def _lacking(self, node: str, names: Iterable[str]) -> str:
+        """In words, which parameters a node does not declare, as far as it tells."""
+        with contextlib.suppress(LinkError):
+            declared = self._declared(node)
+            if lacking := [name for name in names if declared and name not in declared]:
+                return f"; it declares no {lacking[0]}: {nearest(lacking[0], declared)}"
+        return ""
+
+    def _call(self, node: str, name: str, n: int | None, **fields: Any) -> Any:
+        """Call a service of a node, as soon as there is such a one; `n` values are expected.
+
+        Who calls may get the answer to another caller, which has as many values only by chance.
+        """
+        asked = self._services[name]
+        place = f"{node}/{PLACES[name]}"
+        request = self.store.types[asked.request](**fields)
+        raw = bytes(self.store.serialize_cdr(request, asked.request))
+        response = None
+        with self._calling:
+            end = max(time.monotonic(), self._joined + _DISCOVERY) + _ANSWER
+            while (left := end - time.monotonic()) > 0:
+                for reply in self._ask(place, asked, raw, left):
+                    with contextlib.suppress(Exception):  # it answers another request
+                        response = self.store.deserialize_cdr(reply, asked.response)
+                        if n is None or len(next(iter(vars(response).values()))) == n:
+                            return response
+                time.sleep(_PAUSE)
+        if response is not None:
+            return response
+        services = self._places()
+        raise LinkError(
+            f"{node} does not answer: {place} in ROS domain {self.domain}; the services there are "
+            f"{', '.join(services) or 'none'}"
+        )
 
     def _endpoints(self, which: int, *, own: bool = False) -> list[Endpoint]:
         """Who publishes topics (0), or subscribes to them (1), this link left out or not."""
@@ -251,10 +367,8 @@ class DdsLink(Ros2Link):
         names = {e.topic_name for e in self._others(1)}
         return sorted(n[2:-7] for n in names if n.startswith("rq/"))
 
-    def _leave(self) -> None:
-        self._closing.set(True)
-        # What is no longer kept takes leave of the others, once its threads have ended.
-        self._kept, self._found, self._clients = self._kept[:1], [], {}
+    def _topic_end(self, of: type, topic: str, kind: str, *, reliable: bool = True) -> Any:
+        return self._end(of, f"rt{full(topic)}", kind, reliable=reliable)
 
     def _end(self, of: type, name: str, kind: str, *, reliable: bool = True) -> Any:
         """Make a reader or a writer of a topic, as DDS names it, and announce it."""
@@ -262,9 +376,9 @@ class DdsLink(Ros2Link):
             raise LinkError(f"{name[2:]}: the message type {kind} is not known")
         info, policy = name == "ros_discovery_info", Policy.Reliability
         qos = Qos(
-            policy.Reliable(duration(milliseconds=100)) if reliable else policy.BestEffort,
+            policy.Reliable(duration(seconds=_ANSWER)) if reliable else policy.BestEffort,
             # What is published once is for those who come later, too.
-            _DURABILITIES[info or name == "rt/tf_static"],
+            _DURABILITIES[info or (name == "rt/tf_static" and reliable)],
             Policy.History.KeepLast(1 if info and of is DataWriter else _DEPTH),
             Policy.Userdata(f"typehash={self.store.hash_rihs01(kind)};".encode()),
         )
@@ -284,7 +398,7 @@ class DdsLink(Ros2Link):
     def _announce(self) -> None:
         """Let tools of ROS 2 see this node and what it publishes and subscribes to."""
         node = self.store.types["rmw_dds_common/msg/NodeEntitiesInfo"](
-            "/", NODE, self._gids[DataReader], self._gids[DataWriter]
+            "/", _NODE, self._gids[DataReader], self._gids[DataWriter]
         )
         info = self.store.types[_INFO](self._gid(self._participant), [node])
         self._info.write(self._info.data_type(bytes(self.store.serialize_cdr(info, _INFO))))
@@ -297,7 +411,7 @@ class DdsLink(Ros2Link):
         try:
             yield
         except (DDSException, UnicodeError) as error:
-            raise LinkError(f"{what}: {in_a_line(error)}") from error
+            raise LinkError(f"{what}: {error}") from error
 
 
 @cache
@@ -338,13 +452,18 @@ def _configuration() -> str:
     """What Cyclone DDS is told, by what ROS 2 is told of discovery."""
     name = "ROS_AUTOMATIC_DISCOVERY_RANGE"
     reach = os.environ.get(name, "").strip().upper() or "SUBNET"
-    peers = ["localhost", *filter(None, os.environ.get("ROS_STATIC_PEERS", "").split(";"))]
+    peers = ["localhost", *os.environ.get("ROS_STATIC_PEERS", "").replace(";", " ").split()]
     if os.environ.get("ROS_LOCALHOST_ONLY") == "1":
         reach, peers = "LOCALHOST", peers[:1]
     if reach not in ("SUBNET", "LOCALHOST", "OFF", "SYSTEM_DEFAULT"):
         raise LinkError(f"{name} is {reach}; it is SUBNET, LOCALHOST, OFF or SYSTEM_DEFAULT")
+    for peer in peers:
+        try:
+            socket.getaddrinfo(peer, None)
+        except OSError as error:  # Cyclone DDS would end the process
+            raise LinkError(f"ROS_STATIC_PEERS: {peer}: {error.strerror}") from error
     alone = f"<Tag>adaptune {os.getpid()}</Tag>" if reach == "OFF" else ""
-    known = "".join(f"<Peer address={quoteattr(peer.strip())}/>" for peer in peers)
+    known = "".join(f"<Peer address={quoteattr(peer)}/>" for peer in peers)
     parts = [f'<Internal><SocketReceiveBufferSize max="{_BUFFER} B"/></Internal>']
     if reach in ("LOCALHOST", "OFF"):
         parts.append("<General><AllowMulticast>false</AllowMulticast></General>")

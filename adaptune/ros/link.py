@@ -113,6 +113,7 @@ class Steering:
         self._node, self._set_parameters = node, set_parameters
         self._command, self._run = command, run
         self._told: set[str] = set()
+        self._holds = False
 
     def apply(self, parameters: ParameterSet) -> None:
         """Set the parameters, and make sure that the node holds them where it tells.
@@ -130,6 +131,10 @@ class Steering:
                 self._warn(name)
             elif not equal_values(value, held[name]):
                 raise OdometryError(f"{self._node} holds {name} = {held[name]}")
+        if held and not self._holds:
+            self._holds = True
+            what = "%s holds what is set; a node that reads it only at its start does not tell"
+            _log.info(what, self._node)
 
     def _warn(self, name: str) -> None:
         if name not in self._told:

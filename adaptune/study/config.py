@@ -133,7 +133,6 @@ class RosConfig(StrictModel):
     odometry: RosName = "adaptune/odometry"
     tf: bool = False
     steer: SteerConfig | None = None
-    router: str | None = None  # of Zenoh; ROS 2 over DDS if left out
 
 
 RULES = ("adaptive", "paper")

@@ -284,6 +284,23 @@ def test_a_topic_without_poses_is_named_once(node, caplog):
     ]
 
 
+def test_a_node_that_answers_now_and_then_may_not_hear(link, node, caplog):
+    odometry, link.deaf = node(), "/node runs on Fast DDS"
+    odometry.start(odometry.prepare(scan(0)), np.eye(4))
+    for i in range(1, 60):
+        if i % 8 == 0:
+            play(link, i * TENTH)
+        odometry.register(scan(i * TENTH))
+    assert caplog.messages == ["/odom: no pose of /node for 9 of 10 scans; /node runs on Fast DDS"]
+    # Half of them may be its habit.
+    caplog.clear()
+    for i in range(60, 90):
+        if i % 2 == 0:
+            play(link, i * TENTH)
+        odometry.register(scan(i * TENTH))
+    assert not caplog.messages
+
+
 def test_poses_of_another_frame_become_those_of_the_sensor(link, node):
     turned = (0.0, 0.0, 1.0, 0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5))
     odometry = node(extrinsic=turned)

@@ -1,4 +1,4 @@
-"""A robot's node on DDS or on Zenoh, which runs on, made of what others have for nodes.
+"""A robot's node on DDS, which runs on, written without what adaptune has for it.
 
 It publishes point clouds, says the odometry that it gets again on another topic, and has
 parameters: it accepts all but `rings`. It ends when its input does.
@@ -28,7 +28,6 @@ SERVICES = {
     GET: ("string[] names", "rcl_interfaces/ParameterValue[] values"),
     LIST: ("string[] prefixes\nuint64 depth", "rcl_interfaces/ListParametersResult result"),
 }
-USED = ("ListParametersResult", "Parameter", "SetParametersResult")
 _held = []
 
 
@@ -54,10 +53,10 @@ def cloud(store, n):
 
 
 class Parameters:
-    """Answers services; `type_named` gives the type of a request or a response."""
+    """Answers a node's services."""
 
-    def __init__(self, store, type_named):
-        self.store, self.type_named, self.held = store, type_named, {}
+    def __init__(self, node):
+        self.store, self.type_named, self.held = node.store, node.type_named, {}
 
     def set(self, request):
         results = []
@@ -92,7 +91,7 @@ class DdsNode:
         with contextlib.suppress(DDSException):  # this process has joined it
             self.domain = Domain(domain, config)
         self.participant, self.bare = DomainParticipant(domain), bare
-        self.store, self.kept = get_typestore(Stores.ROS2_JAZZY), []
+        self.store = get_typestore(Stores.ROS2_JAZZY)
         for kind, texts in SERVICES.items():
             for part, text in zip(("Request", "Response"), texts, strict=True):
                 self.store.register(get_types_from_msg(text, f"{kind}_{part}"))
@@ -120,24 +119,27 @@ class DdsNode:
         serialise = self.store.serialize_cdr
         return lambda message: writer.write(writer.data_type(bytes(serialise(message, kind))))
 
-    def subscribe(self, topic, kind, take):
+    def subscribe(self, topic, kind, take, latched=False):
         from cyclonedds.sub import DataReader
 
-        reader = self.end(DataReader, f"rt{topic}", kind)
+        reader = self.end(DataReader, topic if latched else f"rt{topic}", kind, latched=latched)
         self._taking(reader, lambda data: take(self.store.deserialize_cdr(data, kind)))
 
-    def serve(self, place, kind, answer=None):
+    def serve(self, place, kind, answer=None, before=None):
+        """Answer a service's requests; `before` is an answer to somebody else."""
         from cyclonedds.pub import DataWriter
         from cyclonedds.sub import DataReader
 
         request, response = f"{kind}_Request", f"{kind}_Response"
         writer = self.end(DataWriter, f"rr{place}Reply", response)
         names = self.type_named(request).__msgtype__, self.type_named(response).__msgtype__
-        head = 0 if self.bare else 16
+        head, serialise = 0 if self.bare else 16, self.store.serialize_cdr
 
         def reply(data):
+            if before is not None:
+                writer.write(writer.data_type(bytes(serialise(before, names[1]))))
             asked = self.store.deserialize_cdr(data[:4] + data[4 + head :], names[0])
-            raw = bytes(self.store.serialize_cdr(answer(asked), names[1]))
+            raw = bytes(serialise(answer(asked), names[1]))
             writer.write(writer.data_type(raw[:4] + data[4 : 4 + head] + raw[4:]))
 
         reader = self.end(DataReader, f"rq{place}Request", request)
@@ -166,66 +168,15 @@ def carrier(kind):
     return types.new_class(name, (IdlStruct,), given, body)
 
 
-class ZenohNode:
-    """A node on Zenoh, by the package itself; `folder` is for files with definitions."""
-
-    def __init__(self, port, folder):
-        from zenoh_ros2_sdk import ZenohSession, get_registry
-
-        used = [f"rcl_interfaces/msg/{name}" for name in USED]
-        write_definitions(Path(folder), POINTS, ODOMETRY, *used)
-        self.session = ZenohSession.get_instance("127.0.0.1", int(port))
-        self.store, self.kept = self.session.store, []
-        registry = get_registry(str(folder))
-        for name in used:
-            registry.load_message_type(name)
-
-    def type_named(self, name):
-        return self.store.types[self.session._registered_types[name]]
-
-    def publisher(self, topic, kind):
-        from zenoh_ros2_sdk import ROS2Publisher
-
-        self.kept.append(publisher := ROS2Publisher(topic, kind))
-        return lambda message: publisher.publish(**vars(message))
-
-    def subscribe(self, topic, kind, take):
-        from zenoh_ros2_sdk import ROS2Subscriber
-
-        self.kept.append(ROS2Subscriber(topic, kind, take))
-
-    def serve(self, place, kind, answer=None):
-        from zenoh_ros2_sdk import ROS2ServiceServer
-
-        mode = "callback" if answer else "queue"
-        # With the definitions it looks for no file, and so downloads none.
-        self.kept.append(ROS2ServiceServer(place, kind, answer, *SERVICES[kind], mode=mode))
-
-
-def write_definitions(folder, *messages):
-    """Write definitions as files, so that none is downloaded."""
-    store = get_typestore(Stores.ROS2_JAZZY)
-    for message in messages:
-        head, *others = store.generate_msgdef(message, ros_version=2)[0].split("=" * 80 + "\n")
-        texts = {message: head}
-        for other in others:
-            name, _, text = other.removeprefix("MSG: ").partition("\n")
-            texts[name.replace("/", "/msg/")] = text
-        for name, text in texts.items():
-            file = folder / f"{name}.msg"
-            file.parent.mkdir(parents=True, exist_ok=True)
-            file.write_text(text)
-
-
-def main(transport, where, *more):
-    node = DdsNode(int(where)) if transport == "dds" else ZenohNode(where, *more)
-    parameters = Parameters(node.store, node.type_named)
-    points, echo = node.publisher("/points", POINTS), node.publisher("/robot/echo", ODOMETRY)
-    node.subscribe("/odometry", ODOMETRY, echo)
+def main(domain):
+    node = DdsNode(int(domain))
+    parameters = Parameters(node)
+    # As LiDARs do.
+    points = node.publisher("/points", POINTS, reliable=False)
+    node.subscribe("/odometry", ODOMETRY, node.publisher("/robot/echo", ODOMETRY))
     node.serve("/robot/slam/set_parameters", SET, parameters.set)
     node.serve("/robot/slam/get_parameters", GET, parameters.get)
     node.serve("/robot/slam/list_parameters", LIST, parameters.list)
-    node.serve("/robot/slam/set_parameters_atomically", SET)
     node.serve("/deaf/set_parameters", SET)
     ended = threading.Event()
     threading.Thread(target=lambda: (sys.stdin.read(), ended.set()), daemon=True).start()
@@ -233,10 +184,6 @@ def main(transport, where, *more):
     while not ended.wait(1.0 / HZ):
         points(cloud(node.store, n))
         n += 1
-    if transport == "zenoh":
-        for each in node.kept:
-            each.close()
-        node.session.close()
 
 
 if __name__ == "__main__":
