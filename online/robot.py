@@ -24,7 +24,7 @@ from adaptune.odometry.tracker import RegisteredScan
 from adaptune.recording.clouds import POSES
 from adaptune.recording.config import ImuConfig, SequenceConfig
 from adaptune.recording.scan import Scan, Timing
-from adaptune.ros.link import RosLink, Steering
+from adaptune.ros.link import LinkError, RosLink, Steering
 from adaptune.selector import BACK, Selector
 from adaptune.space import Selection
 from adaptune.strict import in_one_line
@@ -121,7 +121,7 @@ ODOMETRY = "nav_msgs/msg/Odometry"
 PATIENCE = 0.3
 """Seconds after a scan in which the node's pose must be there."""
 SILENT = 10
-"""Scans in a row without a pose after which the log says so."""
+"""Scans of which most have no pose; then the log says so."""
 _COMMAND = 5.0
 """Seconds for a command that sets a parameter."""
 _KEPT = 1000
@@ -136,8 +136,8 @@ class SteeredNode(OdometryInstance):
     faults = ()
     rewinds = False
 
-    def __init__(self, link: RosLink, settings: SteerConfig):
-        self._settings = settings
+    def __init__(self, link: RosLink, settings: SteerConfig, points: str):
+        self._settings, self._link, self._points = settings, link, points
         extrinsic = settings.extrinsic
         self._T_base_sensor = np.eye(4) if extrinsic is None else to_pose(extrinsic)
         self._news = threading.Condition()
@@ -150,7 +150,8 @@ class SteeredNode(OdometryInstance):
             settings.command,
             _run,
         )
-        self._silent = 0
+        self._silent: deque[bool] = deque(maxlen=SILENT)
+        self._told = False
         link.subscribe(settings.odometry, ODOMETRY, self._take)
 
     def start(
@@ -167,10 +168,8 @@ class SteeredNode(OdometryInstance):
         T_node = self._pose(self._submitted, PATIENCE)
         T_odom_sensor = np.full((4, 4), np.nan)
         known = bool(np.isfinite(T_node).all())
-        self._silent = 0 if known else self._silent + 1
-        if self._silent == SILENT:
-            what = "%s: no pose of %s for %d scans; is it the topic, and does the node run?"
-            _log.warning(what, self._settings.odometry, self._settings.node, SILENT)
+        self._silent.append(not known)
+        self._tell_of_silence()
         if known:
             if self._T_odom_node is None:
                 assert self._begun is not None
@@ -181,6 +180,21 @@ class SteeredNode(OdometryInstance):
             T_odom_sensor = self._T_odom_node @ T_node
         self._last_motion.move(T_odom_sensor)
         return Registration(T_odom_sensor, known)
+
+    def _tell_of_silence(self) -> None:
+        n = sum(self._silent)
+        self._told &= n > 0
+        # A node that loses clouds answers now and then.
+        if n < SILENT - 2 or len(self._silent) < SILENT or self._told:
+            return
+        self._told, settings = True, self._settings
+        try:
+            why = self._link.why_unheard(self._points)
+        except LinkError as error:
+            why = str(error)
+        what = "%s: no pose of %s for %d of %d scans; %s"
+        usual = "is it the topic, and does the node run?"
+        _log.warning(what, settings.odometry, settings.node, n, SILENT, why or usual)
 
     def apply(self, selection: Selection) -> None:
         """Set the parameters, see `adaptune.ros.link.Steering.apply`."""
@@ -265,6 +279,7 @@ class RobotDrive:
         self._study, self._setup, self._settings = study, setup, real_time
         self._ros = config.online.ros
         self._like = _like(config, study.sequences)
+        self._points = _named(self._ros.points or self._like.points, "online.ros.points")
         self._scans: LiveScans | None = None
         self._stopped = False
         model = None if model_path is None else study.model(model_path)
@@ -300,7 +315,9 @@ class RobotDrive:
         """
         done = 0
         with ExitStack() as stack:
-            steered = None if self._ros.steer is None else SteeredNode(link, self._ros.steer)
+            steered = None
+            if self._ros.steer is not None:
+                steered = SteeredNode(link, self._ros.steer, self._points)
             selector = None
             if self._mode.selector is not None:
                 period = self._study.config.online.period
@@ -329,8 +346,7 @@ class RobotDrive:
         if self._study.odometry.description.needs_imu and self._ros.steer is None:
             imu = like.imu or ImuConfig()
             imu = imu.model_copy(update={"topic": _named(imu.topic, "imu.topic")})
-        points = _named(self._ros.points or like.points, "online.ros.points")
-        return LiveScans(link, points, timing, self._settings.queue, imu)
+        return LiveScans(link, self._points, timing, self._settings.queue, imu)
 
     def _part(
         self,

@@ -56,7 +56,7 @@ Model = Annotated[
 Untrained = Annotated[
     bool, typer.Option("--untrained", help="Only the baseline, and a bank that needs no model.")
 ]
-Ros2 = Annotated[bool, typer.Option("--ros2", help="Drive on a robot with ROS 2 over Zenoh.")]
+Ros2 = Annotated[bool, typer.Option("--ros2", help="Drive on a robot with ROS 2.")]
 Details = Annotated[bool, typer.Option("--details", help="Print all sentences and tables.")]
 Oracle = Annotated[
     bool, typer.Option("--oracle", help="Run sets as trials: what was there to gain?")
@@ -160,14 +160,14 @@ def _drive(
 ) -> None:
     """Drive on a robot until Ctrl-C."""
     from adaptune.ros.ros1 import local_ros1
-    from adaptune.ros.ros2 import Ros2
+    from adaptune.ros.ros2 import local_ros2
     from online.modes import UNTRAINED, WITHOUT_MODEL
     from online.robot import RobotDrive
 
     mode = UNTRAINED if untrained else mode or next(iter(loaded.config.online.rules), "adaptive")
     path = None if mode in WITHOUT_MODEL else model or loaded.model_path
     drive = RobotDrive(loaded, mode, path)
-    link = Ros2(loaded.config.online.ros.router) if ros2 else local_ros1()
+    link = local_ros2() if ros2 else local_ros1()
     with closing(link), _alone(loaded), progress() as show:
         log.info("drive, %s: Ctrl-C ends it", mode)
         driven = drive.run(link, lambda of: show("drive", of.done, of.done, now(of)))

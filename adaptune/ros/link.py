@@ -50,6 +50,9 @@ class RosLink(Protocol):
     def topics(self) -> Mapping[str, str]:
         """The topics that somebody publishes now, and their types."""
 
+    def why_unheard(self, topic: str) -> str:
+        """Why others may get no messages of a topic, in words; empty where nothing is known."""
+
     @property
     def alive(self) -> bool:
         """Whether messages still pass."""
@@ -116,6 +119,7 @@ class Steering:
         self._node, self._set_parameters = node, set_parameters
         self._command, self._run = command, run
         self._told: set[str] = set()
+        self._holds = False
 
     def apply(self, parameters: ParameterSet) -> None:
         """Set the parameters, and make sure that the node holds them where it tells.
@@ -133,6 +137,10 @@ class Steering:
                 self._warn(name)
             elif not equal_values(value, held[name]):
                 raise OdometryError(f"{self._node} holds {name} = {held[name]}")
+        if held and not self._holds:
+            self._holds = True
+            what = "%s holds what is set; a node that reads it only at its start does not tell"
+            _log.info(what, self._node)
 
     def _warn(self, name: str) -> None:
         if name not in self._told:

@@ -171,6 +171,9 @@ class Ros1:
             raise LinkError(f"ROS 1: the roscore does not answer ({error})") from error
         return {topic: kind.replace("/", "/msg/") for topic, kind in found.items()}
 
+    def why_unheard(self, topic: str) -> str:  # noqa: ARG002
+        return ""
+
     def ask(self, kind: str, **given: Any) -> Any:
         """What the node answers, see `adaptune.ros.ros1_node`; a `LinkError` if it refuses."""
         number = next(self._numbers)

@@ -133,7 +133,6 @@ class RosConfig(StrictModel):
     odometry: RosName = "adaptune/odometry"
     tf: bool = False
     steer: SteerConfig | None = None
-    router: str = "127.0.0.1:7447"
 
 
 RULES = ("adaptive", "paper")

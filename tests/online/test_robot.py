@@ -227,7 +227,7 @@ def node(link, monkeypatch):
     monkeypatch.setattr(robot, "PATIENCE", 0.01)
 
     def make(**settings):
-        return SteeredNode(link, SteerConfig(node="/node", odometry="/odom", **settings))
+        return SteeredNode(link, SteerConfig(node="/node", odometry="/odom", **settings), "/points")
 
     return make
 
@@ -280,8 +280,25 @@ def test_a_topic_without_poses_is_named_once(node, caplog):
     for i in range(1, 30):
         odometry.register(scan(i * TENTH))
     assert caplog.messages == [
-        "/odom: no pose of /node for 10 scans; is it the topic, and does the node run?"
+        "/odom: no pose of /node for 10 of 10 scans; is it the topic, and does the node run?"
     ]
+
+
+def test_a_node_that_answers_now_and_then_may_not_hear(link, node, caplog):
+    odometry, link.deaf = node(), "/node runs on Fast DDS"
+    odometry.start(odometry.prepare(scan(0)), np.eye(4))
+    for i in range(1, 60):
+        if i % 8 == 0:
+            play(link, i * TENTH)
+        odometry.register(scan(i * TENTH))
+    assert caplog.messages == ["/odom: no pose of /node for 9 of 10 scans; /node runs on Fast DDS"]
+    # Half of them may be its habit.
+    caplog.clear()
+    for i in range(60, 90):
+        if i % 2 == 0:
+            play(link, i * TENTH)
+        odometry.register(scan(i * TENTH))
+    assert not caplog.messages
 
 
 def test_poses_of_another_frame_become_those_of_the_sensor(link, node):

@@ -28,6 +28,7 @@ class LocalLink:
         self.kinds = {}
         self.holds = {}
         self.refuses = ()
+        self.deaf = ""
         self._takers = defaultdict(list)
 
     def subscribe(self, topic, kind, take, raw=False):
@@ -65,6 +66,9 @@ class LocalLink:
 
     def topics(self):
         return {"/points": self.clouds, "/imu": IMU}
+
+    def why_unheard(self, topic):
+        return self.deaf if topic == "/points" else ""
 
     def close(self):
         pass

@@ -1,7 +1,7 @@
-import os
+import contextlib
 import queue
+import re
 import shutil
-import socket
 import subprocess
 import sys
 import threading
@@ -13,9 +13,10 @@ import needs
 import numpy as np
 import pytest
 import ros2_node
+from commands import refused
 
 from adaptune.ros.link import LinkError
-from adaptune.ros.ros2 import Ros2, message_types
+from adaptune.ros.ros2 import local_ros2, message_types
 from adaptune.trajectory import read_tum
 from offline.config import load_study
 from online.live import RosMessages
@@ -24,63 +25,32 @@ from online.robot import RobotDrive
 pytestmark = pytest.mark.services
 
 STORE = message_types()
-HASHES = {  # as ROS 2 Jazzy has them
-    "SetParameters": "RIHS01_56eed9a67e169f9cb6c1f987bc88f868c14a8fc9f743a263bc734c154015d7e0",
-    "GetParameters": "RIHS01_bf9803d5c74cf989a5de3e0c2e99444599a627c7ff75f97b8c05b01003675cbc",
-    "PointCloud2": "RIHS01_9198cabf7da3796ae6fe19c4cb3bdd3525492988c70522628af5daa124bae2b5",
-}
+HASH = "RIHS01_9198cabf7da3796ae6fe19c4cb3bdd3525492988c70522628af5daa124bae2b5"
+"""That of point clouds, as ROS 2 Jazzy has it."""
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _installed():
-    needs.needs("zenoh_ros2_sdk", "ros2")
+def domain():
+    """A ROS domain in which no test needs multicast, nor hears another."""
+    needs.needs("cyclonedds", "ros2")
+    with pytest.MonkeyPatch.context() as patch:
+        domain = ros2_node.free_domain()
+        patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        patch.setenv("ROS_DOMAIN_ID", str(domain))
+        yield domain
 
 
 @pytest.fixture(scope="module")
-def port():
-    return free_port()
-
-
-def free_port():
-    with socket.socket() as bound:
-        bound.bind(("127.0.0.1", 0))
-        return bound.getsockname()[1]
-
-
-@pytest.fixture(scope="module")
-def router(port):
-    import zenoh
-
-    config = zenoh.Config()
-    config.insert_json5("mode", '"router"')
-    config.insert_json5("listen/endpoints", f'["tcp/127.0.0.1:{port}"]')
-    config.insert_json5("scouting/multicast/enabled", "false")
-    config.insert_json5("transport/shared_memory/enabled", "false")
-    with zenoh.open(config) as session:
-        yield session
-
-
-@pytest.fixture(scope="module")
-def robot(router, port, tmp_path_factory):
-    """Where the router of a robot listens whose node, in a process of its own, can be seen."""
-    command = [sys.executable, ros2_node.__file__, str(port)]
-    folder = tmp_path_factory.mktemp("definitions")
-    # Nothing is downloaded; an attempt would leave the first of these folders.
-    aside = {"ZENOH_ROS2_SDK_CACHE": str(folder / "cache"), "GIT_ALLOW_PROTOCOL": "none"}
-    aside["ZENOH_CONFIG_OVERRIDE"] = "transport/shared_memory/enabled=false"
-    aside["GIT_CONFIG_GLOBAL"] = str(folder / "gitconfig")
-    process = subprocess.Popen(
-        [*command, str(folder)], stdin=subprocess.PIPE, env=os.environ | aside
-    )
+def link(domain):
+    """A link that sees the node of a robot, which is in a process of its own."""
+    command = [sys.executable, ros2_node.__file__, str(domain)]
+    process = subprocess.Popen(command, stdin=subprocess.PIPE)
+    made = local_ros2()
     try:
-        end = time.monotonic() + 20.0
-        while not tokens(router, "SS", "deaf%"):
-            assert process.poll() is None
-            assert time.monotonic() < end
-            time.sleep(0.02)
-        assert not (folder / "cache").exists()
-        yield f"127.0.0.1:{port}"
+        until(lambda: process.poll() is None and "/deaf/set_parameters" in made._places())
+        yield made
     finally:
+        made.close()
         process.stdin.close()
         try:
             process.wait(5.0)
@@ -89,16 +59,33 @@ def robot(router, port, tmp_path_factory):
             process.wait()
 
 
-def tokens(session, kind, name):
-    keys = [str(r.ok.key_expr) for r in session.liveliness().get("@ros2_lv/0/**", timeout=2.0)]
-    return [key for key in keys if f"/{kind}/" in key and f"%{name}" in key]
+@pytest.fixture
+def dds():
+    from adaptune.ros import dds
+
+    return dds
 
 
-@pytest.fixture(scope="module")
-def link(robot):
-    made = Ros2(robot, 0)
-    yield made
-    made.close()
+@pytest.fixture
+def alone(dds, monkeypatch):
+    """Make links in a domain of their own."""
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(ros2_node.free_domain()))
+    made = []
+
+    def make():
+        made.append(dds.DdsLink())
+        return made[-1]
+
+    yield make
+    for each in made:
+        each.close()
+
+
+def until(condition, seconds=20.0):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.02)
 
 
 def taken(link, topic, kind, n):
@@ -129,19 +116,19 @@ def odometry(n):
     )
 
 
-def test_the_robot_gets_what_is_published(link, router):
+def test_the_robot_gets_what_is_published(link):
     echoed = queue.SimpleQueue()
     link.subscribe("robot/echo", ros2_node.ODOMETRY, echoed.put)
     publish = link.advertise("odometry", ros2_node.ODOMETRY)
-    assert link.topics()["/odometry"] == ros2_node.ODOMETRY
     for n in range(5):
-        publish(odometry(n))
-        back = echoed.get(timeout=5.0)
+        back = None
+        while back is None:  # until the robot has found the topic
+            publish(odometry(n))
+            with contextlib.suppress(queue.Empty):
+                back = echoed.get(timeout=0.2 if n == 0 else 5.0)
         assert STORE.serialize_cdr(back, ros2_node.ODOMETRY) == STORE.serialize_cdr(
             odometry(n), ros2_node.ODOMETRY
         )
-    (token,) = tokens(router, "MP", "odometry")
-    assert "/%/%/adaptune/%odometry/nav_msgs::msg::dds_::Odometry_/" in token
 
 
 def test_parameters_are_set_and_read_back(link):
@@ -163,14 +150,15 @@ def test_parameters_are_set_and_read_back(link):
 def test_a_refusal_gives_the_reason(link):
     with pytest.raises(LinkError) as refused:
         link.set_parameters("/robot/slam", {"voxel_size": 1.0, "rings": 64})
-    assert str(refused.value) == f"/robot/slam refuses rings = 64 ({ros2_node.REASON})"
+    said = str(refused.value)
+    assert said.startswith(f"/robot/slam refuses rings = 64 ({ros2_node.REASON}); it declares no r")
     with pytest.raises(LinkError, match="bounds = \\[1\\] is not a boolean, a number or a text"):
         link.set_parameters("/robot/slam", {"bounds": [1]})
 
 
 @pytest.mark.parametrize("node", ["/other", "/deaf"])
-def test_a_node_that_is_not_there_or_does_not_answer_is_named(link, node):
-    words = "in ROS domain 0; the services there are /deaf/.*, /robot/slam/"
+def test_a_node_that_is_not_there_or_does_not_answer_is_named(link, node, domain):
+    words = f"in ROS domain {domain}; the services there are /deaf/.*, /robot/slam/"
     with pytest.raises(LinkError, match=f"{node} does not answer: .* {words}"):
         link.set_parameters(node, {"voxel_size": 1.0})
 
@@ -190,16 +178,155 @@ def test_an_error_while_a_message_is_taken_is_logged_and_the_next_one_comes(link
     assert "RuntimeError: a mistake" in caplog.text
 
 
-@pytest.mark.usefixtures("robot")
-def test_type_hashes_are_those_of_ros(router):
-    for service in ("Set", "Get"):
-        name = f"{service}Parameters"
-        # The service is called by this key above.
-        (token,) = tokens(router, "SS", f"robot%slam%{service.lower()}_parameters/")
-        assert f"/rcl_interfaces::srv::dds_::{name}_/{HASHES[name]}/" in token
-    (token,) = tokens(router, "MP", "points")
-    assert HASHES["PointCloud2"] == STORE.hash_rihs01(ros2_node.POINTS)
-    assert f"/{HASHES['PointCloud2']}/" in token
+def test_type_hashes_are_those_of_ros(alone):
+    from cyclonedds.qos import Policy
+
+    link, other = alone(), alone()
+    link.advertise("/clouds", ros2_node.POINTS)
+    until(lambda: [e.topic for e in other._endpoints(0)] == ["/clouds"])
+    (found,) = other._endpoints(0)
+    assert found.qos[Policy.Userdata].data == f"typehash={HASH};".encode()
+
+
+def test_it_is_seen_as_ros_sees_nodes_until_it_leaves(alone):
+    link, other = alone(), alone()
+    node, told = ros2_node.DdsNode(link.domain), queue.SimpleQueue()
+    info = "rmw_dds_common/msg/ParticipantEntitiesInfo"
+    node.subscribe("ros_discovery_info", info, told.put, latched=True)
+    publish = link.advertise("/a", "std_msgs/msg/String")
+    link.subscribe("/b", "std_msgs/msg/String", print)
+    seen = None
+    while seen is None or seen.gid.data.tobytes() != link._participant.guid.bytes:
+        (seen,) = (message := told.get(timeout=5.0)).node_entities_info_seq or [None]
+        seen = message if seen and seen.reader_gid_seq and seen.writer_gid_seq else None
+    (named,) = seen.node_entities_info_seq
+    assert (named.node_namespace, named.node_name) == ("/", "adaptune")
+    until(lambda: other.why_unheard("/b") == "" and "/a" in other.topics())
+    (end,) = (e for e in other._endpoints(0) if e.topic == "/a")
+    assert end.node == "/adaptune"
+    link.close()
+    until(lambda: other.why_unheard("/b") and "/a" not in other.topics())
+    with pytest.raises(LinkError, match="/a: the link was closed"):
+        publish(STORE.types["std_msgs/msg/String"]("late"))
+
+
+@pytest.mark.parametrize("foreign", [False, True])
+def test_services_of_other_vendors_have_no_header(alone, dds, monkeypatch, foreign):
+    monkeypatch.setattr(dds, "_CYCLONE", b"\x01\x12")  # the node is of Cyclone, then
+    link = alone()
+    node = ros2_node.DdsNode(link.domain, bare=True)
+    parameters = ros2_node.Parameters(node)
+    parameters.held["other"] = None
+    for name, kind in (("set", ros2_node.SET), ("get", ros2_node.GET), ("list", ros2_node.LIST)):
+        answer = getattr(parameters, name)
+        # Somebody else asked, too, and is answered before.
+        empty = node.type_named(f"{kind}_Response")([]) if foreign and name != "list" else None
+        node.serve(f"/slam/{name}_parameters", kind, answer, empty)
+    given = {"voxel_size": 0.5, "threads": 4}
+    assert link.set_parameters("slam", given) == given
+    del parameters.held["other"]
+    assert link.parameters("slam") == given
+
+
+def test_two_that_publish_a_topic_are_named_once(alone, caplog):
+    link, other = alone(), alone()
+    node, came = ros2_node.DdsNode(link.domain), queue.SimpleQueue()
+    kind = "std_msgs/msg/String"
+    link.subscribe("/odom", kind, came.put)
+    senders = [other.advertise("/odom", kind), node.publisher("/odom", kind)]
+    for sender in (*senders, *senders, *senders):
+        message = STORE.types[kind]("a")
+        while True:  # until they have found each other
+            sender(message)
+            with contextlib.suppress(queue.Empty):
+                came.get(timeout=0.5)
+                break
+    said = "/odom is published by two (/adaptune and a node), whose messages mix; end one of them"
+    assert caplog.messages == [said]
+
+
+def test_it_says_why_nobody_hears(alone, dds, monkeypatch):
+    link = alone()
+    node = ros2_node.DdsNode(link.domain)
+    publish = link.advertise("/points", ros2_node.POINTS)
+    assert link.why_unheard("/points") == "nobody else subscribes to /points"
+    node.subscribe("/points", ros2_node.POINTS, print)
+    until(lambda: link.why_unheard("/points") == "")
+    assert link.hearers("/points") == 1
+    monkeypatch.setattr(dds, "_FAST_DDS", dds._CYCLONE)
+    words = "a node runs on Fast DDS, which loses clouds .* -w net.core.rmem_default=4194304` on it"
+    assert re.match(words, link.why_unheard("/points"))
+    node.subscribe("/points", ros2_node.ODOMETRY, print)
+    words = f"a node subscribes to /points as {ros2_node.ODOMETRY}, not {ros2_node.POINTS}"
+    until(lambda: link.why_unheard("points") == words)
+    del publish
+
+
+def test_a_subscriber_that_wants_another_qos_is_named(alone):
+    link = alone()
+    node = ros2_node.DdsNode(link.domain)
+    link.advertise("/points", ros2_node.POINTS)
+    node.subscribe("rt/points", ros2_node.POINTS, print, latched=True)
+    words = "a node wants /points transient local, with what was published before it came"
+    until(lambda: link.why_unheard("/points").startswith(words))
+    link.advertise("/tf_static", "tf2_msgs/msg/TFMessage")
+    node.subscribe("rt/tf_static", "tf2_msgs/msg/TFMessage", print, latched=True)
+    until(lambda: link.hearers("/tf_static") == 1)
+
+
+def test_a_small_receive_buffer_is_told(alone, dds, monkeypatch, caplog):
+    monkeypatch.setattr(dds, "_receive_buffer", lambda: 212_992)
+    link = alone()
+    link.subscribe("/odom", ros2_node.ODOMETRY, print)
+    assert not caplog.messages
+    link.subscribe("/points", ros2_node.POINTS, print)
+    assert "/points: clouds may be lost, as this machine receives 212 kB ahead" in caplog.text
+    assert "sudo sysctl -w net.core.rmem_max=4194304" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("given", "there", "lacking"),
+    [
+        ({}, ['address="localhost"', "<ParticipantIndex>auto"], ["AllowMulticast"]),
+        ({"RANGE": "localhost"}, ["<AllowMulticast>false", 'address="localhost"'], ["<Tag>"]),
+        ({"RANGE": "OFF"}, ["<AllowMulticast>false", "<Tag>"], []),
+        ({"RANGE": "SYSTEM_DEFAULT"}, [], ["Discovery", "AllowMulticast"]),
+        ({"PEERS": "10.0.0.1; 10.0.0.2"}, ['address="10.0.0.1"', 'address="10.0.0.2"'], []),
+        ({"ONLY": "1", "PEERS": "10.0.0.1"}, ["<AllowMulticast>false"], ["10.0.0.1"]),
+        ({"URI": "<CycloneDDS/>"}, ["</CycloneDDS>,<CycloneDDS/>"], []),
+    ],
+)
+def test_others_are_found_as_ros_is_told(dds, monkeypatch, given, there, lacking):
+    names = {
+        "RANGE": "ROS_AUTOMATIC_DISCOVERY_RANGE",
+        "PEERS": "ROS_STATIC_PEERS",
+        "ONLY": "ROS_LOCALHOST_ONLY",
+        "URI": "CYCLONEDDS_URI",
+    }
+    for key, name in names.items():
+        monkeypatch.delenv(name, raising=False)
+        if key in given:
+            monkeypatch.setenv(name, given[key])
+    found = dds._configuration()
+    assert all(word in found for word in there)
+    assert not any(word in found for word in lacking)
+    dds.DdsLink(ros2_node.free_domain()).close()  # Cyclone takes it
+
+
+def test_what_ros_does_not_know_is_refused(dds, monkeypatch):
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "WORLD")
+    words = "ROS_AUTOMATIC_DISCOVERY_RANGE is WORLD; it is SUBNET, LOCALHOST, OFF or SYSTEM_DEFAULT"
+    with pytest.raises(LinkError, match=words):
+        dds.DdsLink(ros2_node.free_domain())
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    monkeypatch.setenv("ROS_STATIC_PEERS", "127.0.0.1;no.such.host.invalid")
+    with pytest.raises(LinkError, match=r"ROS_STATIC_PEERS: no\.such\.host\.invalid: "):
+        dds.DdsLink(ros2_node.free_domain())
+    monkeypatch.delenv("ROS_STATIC_PEERS")
+    monkeypatch.setenv("CYCLONEDDS_URI", "<CycloneDDS><Nonsense")
+    domain = ros2_node.free_domain()
+    with pytest.raises(LinkError, match=f"ROS domain {domain}: DDS does not start; see CYC"):
+        dds.DdsLink(domain)
 
 
 def test_an_unknown_type_is_refused(link):
@@ -210,14 +337,15 @@ def test_an_unknown_type_is_refused(link):
 
 
 def test_another_type_than_what_is_published_is_refused(link):
-    told = "/points is published as sensor_msgs/msg/PointCloud2 with the type hash RIHS01_9198c"
-    with pytest.raises(LinkError, match=f"^{told}.*, not as nav_msgs/msg/Odometry with RIHS01_"):
+    told = "/points is published as sensor_msgs/msg/PointCloud2.*, not as nav_msgs/msg/Odometry"
+    with pytest.raises(LinkError, match=f"^{told}"):
         link.subscribe("/points", ros2_node.ODOMETRY, print)
 
 
-def test_no_messages_come_after_it_is_closed(robot):
+@pytest.mark.usefixtures("link")
+def test_no_messages_come_after_it_is_closed():
     threads = threading.active_count()
-    link, came = Ros2(robot, 0), queue.SimpleQueue()
+    link, came = local_ros2(), queue.SimpleQueue()
     link.subscribe("/points", ros2_node.POINTS, came.put)
     came.get(timeout=5.0)
     link.close()
@@ -227,30 +355,24 @@ def test_no_messages_come_after_it_is_closed(robot):
     assert came.qsize() == n
     assert threading.active_count() == threads
     for use in (link.topics, lambda: link.set_parameters("/robot/slam", {"voxel_size": 1.0})):
-        with pytest.raises(LinkError, match="session closed"):
+        with pytest.raises(LinkError, match="closed"):
             use()
 
 
-def test_another_domain_is_another_world(robot, monkeypatch):
-    monkeypatch.setenv("ROS_DOMAIN_ID", "7")
-    link = Ros2(robot)
-    assert not link.topics()
-    link.close()
-    monkeypatch.setenv("ROS_DOMAIN_ID", "seven")
-    with pytest.raises(LinkError, match="the ROS domain: Invalid ROS_DOMAIN_ID value: 'seven'"):
-        Ros2(robot)
+@pytest.mark.usefixtures("link")
+def test_another_domain_is_another_world(alone, dds, monkeypatch, study_file, tmp_path):
+    assert not alone().topics()
+    for name in ("seven", "-1", "233"):
+        monkeypatch.setenv("ROS_DOMAIN_ID", name)
+        with pytest.raises(LinkError, match=f"ROS_DOMAIN_ID is {name}; it is a number from 0 to"):
+            local_ros2()
+    command = "online", study_file, "--folder", tmp_path / "run", "--ros2", "--untrained"
+    assert "ROS_DOMAIN_ID is 233; it is a number from 0 to 232" in refused(*command)
+    with pytest.raises(LinkError, match="the ROS domain is 300; it is a number from 0 to 232"):
+        dds.DdsLink(300)
 
 
-def test_a_router_must_answer():
-    for router in (f"127.0.0.1:{free_port()}", ""):
-        with pytest.raises(
-            LinkError, match=r"no Zenoh router answers at .*rmw_zenohd.*7447"
-        ) as told:
-            Ros2(router)
-        assert ".rs:" not in str(told.value)
-
-
-def test_it_drives_over_zenoh(link, robot, study_file, trained_folder, tmp_path):
+def test_it_drives(link, study_file, trained_folder, tmp_path):
     folder = shutil.copytree(trained_folder, tmp_path / "run")
     patient = ["online.real_time={deadline: 60, queue: 0}", "online.ros.points=/velodyne"]
     study = load_study(study_file, patient, folder)
@@ -258,7 +380,7 @@ def test_it_drives_over_zenoh(link, robot, study_file, trained_folder, tmp_path)
     scans, poses = drives.scans(2, 15), []
     cloud = link.advertise("/velodyne", "sensor_msgs/msg/PointCloud2")
     link.subscribe("/adaptune/odometry", "nav_msgs/msg/Odometry", poses.append)
-    other = Ros2(robot, 0)
+    other = local_ros2()
 
     def play():
         end = time.monotonic() + 30.0

@@ -1,0 +1,484 @@
+"""A robot's ROS 2 over DDS, as it runs by default, reached without an installation of it."""
+
+import contextlib
+import itertools
+import logging
+import os
+import random
+import socket
+import struct
+import threading
+import time
+import types
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from functools import cache
+from typing import Any, NamedTuple
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+from cyclonedds import builtin
+from cyclonedds.core import (
+    DDSException,
+    DDSStatus,
+    GuardCondition,
+    InstanceState,
+    ReadCondition,
+    SampleState,
+    ViewState,
+    WaitSet,
+)
+from cyclonedds.domain import Domain, DomainParticipant
+from cyclonedds.idl import IdlStruct
+from cyclonedds.pub import DataWriter
+from cyclonedds.qos import Policy, Qos
+from cyclonedds.sub import DataReader
+from cyclonedds.topic import Topic
+from cyclonedds.util import duration
+
+from adaptune.errors import nearest
+from adaptune.recording.clouds import LIVOX_TYPES
+from adaptune.ros.link import LinkError, take_all
+from adaptune.ros.ros2 import (
+    FIELDS,
+    PLACES,
+    Service,
+    full,
+    message_types,
+    parameter_message,
+    register_service,
+    ros_domain,
+)
+
+_NODE = "adaptune"
+_ANSWER = 2.0
+"""Seconds in which a service must answer."""
+_DISCOVERY = 1.5
+"""Seconds in which other nodes are found."""
+_AGAIN = 0.5
+"""Seconds after which a service is called again: its answer may have had no way back yet."""
+_DEPTH = 1000
+"""Messages of a topic that may wait; then the oldest are dropped."""
+_PAUSE = 0.02
+"""Seconds between calls of a service that is not there, or not yet."""
+_BUFFER = 1 << 22
+"""Bytes of a receive buffer that hold some clouds."""
+_CYCLONE, _FAST_DDS = b"\x01\x10", b"\x01\x0f"
+"""The vendors of DDS in ROS 2, as they begin the keys of their participants."""
+_INFO = "rmw_dds_common/msg/ParticipantEntitiesInfo"
+_TRANSFORMS = "tf2_msgs/msg/TFMessage"
+_CLOUDS = ("sensor_msgs/msg/PointCloud2", *LIVOX_TYPES)
+_ALL = ViewState.Any | SampleState.Any
+_DURABILITIES = tuple(
+    getattr(Policy.Durability, name)
+    for name in ("Volatile", "TransientLocal", "Transient", "Persistent")
+)
+
+_log = logging.getLogger(__name__)
+
+_domains: dict[int, Domain] = {}
+"""Those of this process, which joins each once: other threads would not survive its end."""
+_joining = threading.Lock()
+
+
+class Endpoint(NamedTuple):
+    """What publishes a topic, or subscribes to it."""
+
+    topic: str
+    kind: str
+    node: str
+    vendor: bytes
+    qos: Qos
+
+
+class DdsLink:
+    """A `RosLink` to a robot whose ROS 2 runs on DDS.
+
+    Other nodes are found as in ROS 2 (``ROS_AUTOMATIC_DISCOVERY_RANGE``, ``ROS_STATIC_PEERS``);
+    ``CYCLONEDDS_URI`` has the last word. There is a `LinkError` if the network does not allow it.
+    """
+
+    is2 = True
+
+    def __init__(self, domain: int | None = None):
+        self.domain = ros_domain(domain)
+        self.store = message_types()
+        self._services = {name: register_service(self.store, name) for name in PLACES}
+        self._calling, self._closed = threading.Lock(), False
+        self._threads: list[threading.Thread] = []
+        self._joined = time.monotonic()
+        where = f"ROS domain {self.domain}: DDS does not start; see CYCLONEDDS_URI and the network"
+        with self._naming(where), _joining:
+            if self.domain not in _domains:
+                _domains[self.domain] = Domain(self.domain, _configuration())
+            me = DomainParticipant(self.domain, Qos(Policy.Userdata(b"enclave=/;")))
+            self._participant, self._closing = me, GuardCondition(me)
+            pair = builtin.BuiltinTopicDcpsPublication, builtin.BuiltinTopicDcpsSubscription
+            found = [builtin.BuiltinDataReader(me, topic) for topic in pair]
+            self._found = [(r, ReadCondition(r, _ALL | InstanceState.Alive)) for r in found]
+            self._kept: list[Any] = []
+            self._writers: dict[str, DataWriter] = {}
+            self._clients: dict[str, tuple[DataWriter, DataReader]] = {}
+            self._numbers, self._id = itertools.count(1), random.getrandbits(64)
+            self._gids: dict[type, list[Any]] = {DataReader: [], DataWriter: []}
+            self._nodes: dict[bytes, str] = {}
+            self._announcing = threading.Lock()
+            self._info = self._end(DataWriter, "ros_discovery_info", _INFO)
+            self._infos = self._end(DataReader, "ros_discovery_info", _INFO)
+            self._announce()
+
+    def subscribe(
+        self, topic: str, kind: str, take: Callable[[Any], None], raw: bool = False
+    ) -> None:
+        """See `RosLink.subscribe`; an error in `take` is logged, and the next message is taken.
+
+        It is reliable where all who publish are. There is a `LinkError` if the topic is published
+        with another type, as far as that is known by now.
+        """
+        there = [e for e in self._endpoints(0) if e.topic == full(topic)]
+        if there and kind not in {e.kind for e in there}:
+            raise LinkError(f"{topic} is published as {there[0].kind}, not as {kind}")
+        if kind in _CLOUDS and (size := _receive_buffer()) < _BUFFER:
+            what = "%s: clouds may be lost, as this machine receives %d kB ahead; run `sudo sysctl "
+            what += "-w net.core.rmem_max=%d` and start again"
+            _log.warning(what, topic, size // 1000, _BUFFER)
+        messages = self._taken(topic, kind, self._topic_end(DataReader, topic, kind))
+        self._threads.append(take_all(topic, messages, take if raw else self._reading(kind, take)))
+
+    def _taken(self, topic: str, kind: str, reader: DataReader) -> Iterator[bytes]:
+        """The bytes of messages as they come, until the link is closed."""
+        senders: list[int] = []
+        mixed = kind == _TRANSFORMS  # as is usual
+        for reliable in (True, False):
+            for sample in self._waited(reader):
+                sender = sample.sample_info.publication_handle
+                # A node that starts again is another one, and the first is not heard again.
+                if sender in senders[:-1] and not mixed:
+                    mixed = True
+                    names = sorted({e.node for e in self._endpoints(0) if e.topic == full(topic)})
+                    what = "%s is published by two (%s), whose messages mix; end one of them"
+                    _log.warning(what, topic, " and ".join(names))
+                if sender not in senders:
+                    senders.append(sender)
+                yield sample.data
+            if reliable and not self._closed:
+                # Who publishes is not reliable.
+                self._kept.remove(reader)
+                reader = self._topic_end(DataReader, topic, kind, reliable=False)
+
+    def _waited(self, reader: DataReader, seconds: float | None = None) -> Iterator[Any]:
+        """Samples as they come, until that takes too long, or somebody offers another QoS."""
+        ready = WaitSet(self._participant)
+        for condition in (reader, self._closing, ReadCondition(reader, _ALL | InstanceState.Any)):
+            ready.attach(condition)
+        limit = duration(weeks=9999) if seconds is None else duration(seconds=seconds)
+        while ready.wait(limit) and not self._closed:
+            yield from (one for one in reader.take(N=_DEPTH) if one.sample_info.valid_data)
+            if reader.get_requested_incompatible_qos_status().total_count:
+                return
+
+    def advertise(self, topic: str, kind: str, *, raw: bool = False) -> Callable[[Any], None]:
+        """See `RosLink.advertise`; with `raw`, messages are given as bytes."""
+        self._writers[topic] = self._topic_end(DataWriter, topic, kind)
+
+        def publish(message: Any) -> None:
+            data = message if raw else bytes(self.store.serialize_cdr(message, kind))
+            with self._naming(topic):
+                writer = self._writers[topic]
+                writer.write(writer.data_type(data))
+
+        return publish
+
+    def hearers(self, topic: str) -> int:
+        """How many subscribers hear what this link publishes on a topic."""
+        with self._naming(topic):
+            return len(self._writers[topic].get_matched_subscriptions())
+
+    def topics(self) -> Mapping[str, str]:
+        """See `RosLink.topics`; a link that is new waits until it can know."""
+        time.sleep(max(0.0, self._joined + _DISCOVERY - time.monotonic()))
+        return {e.topic: e.kind for e in self._endpoints(0)}
+
+    @property
+    def alive(self) -> bool:
+        """See `RosLink.alive`; whoever has gone may come back."""
+        return not self._closed
+
+    def close(self) -> None:
+        """Leave; messages that wait to be taken are dropped."""
+        if self._closed:
+            return
+        self._closed = True
+        self._closing.set(True)
+        for thread in self._threads:
+            if thread is not threading.current_thread():
+                thread.join(_ANSWER)
+        with self._calling:
+            # What nobody holds any more takes leave of the others.
+            self._kept, self._found, self._threads = [], [], []
+            self._writers, self._clients = {}, {}
+            del self._participant, self._closing, self._info, self._infos
+
+    def _reading(self, kind: str, take: Callable[[Any], None]) -> Callable[[bytes], None]:
+        """Take messages of a type by their bytes; arrays are views of them."""
+        return lambda data: take(self.store.deserialize_cdr(memoryview(data), kind))
+
+    def why_unheard(self, topic: str) -> str:
+        topic = full(topic)
+        offered = [e for e in self._endpoints(0, own=True) if e.topic == topic]
+        wanted = [e for e in self._endpoints(1) if e.topic == topic]
+        if not wanted:
+            return f"nobody else subscribes to {topic}"
+        for one in wanted:
+            fitting = [e for e in offered if e.kind == one.kind]
+            if offered and not fitting:
+                return f"{one.node} subscribes to {topic} as {one.kind}, not {offered[0].kind}"
+            lacks = [_lack(e.qos, one.qos) for e in fitting]
+            if lacks and all(lacks):
+                return f"{one.node} wants {topic} {lacks[0]}, and it is not published so"
+        if fast := sorted({e.node for e in wanted if e.vendor == _FAST_DDS}):
+            return (
+                f"{' and '.join(fast)} runs on Fast DDS, which loses clouds that do not fit in the "
+                f"receive buffer: run `sudo sysctl -w net.core.rmem_default={_BUFFER}` on its "
+                "machine, and start it again"
+            )
+        return ""
+
+    def set_parameters(self, node: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
+        """See `RosLink.set_parameters`; what the node does not tell is as given.
+
+        If it refuses a value, it may hold the other values then.
+        """
+        node = full(node)
+        given = [parameter_message(self.store, name, value) for name, value in values.items()]
+        results = self._call(node, "SetParameters", len(given), parameters=given).results
+        if refused := [
+            f"{name} = {value!r} ({result.reason or 'without a reason'})"
+            for (name, value), result in zip(values.items(), results, strict=False)
+            if not result.successful
+        ]:
+            raise LinkError(f"{node} refuses {', '.join(refused)}{self._lacking(node, values)}")
+        return dict(values) | self._held(node, list(values))
+
+    def parameters(self, node: str) -> Mapping[str, Any]:
+        """The parameters that a node declares, and what it holds; arrays and empty ones left out.
+
+        There is a LinkError if the node is not there or does not answer.
+        """
+        return self._held(full(node), self._declared(full(node)))
+
+    def _declared(self, node: str) -> list[str]:
+        names = self._call(node, "ListParameters", None, prefixes=[], depth=0).result.names
+        return sorted(names)
+
+    def _held(self, node: str, names: list[str]) -> dict[str, Any]:
+        told = self._call(node, "GetParameters", len(names), names=names).values
+        fields = dict(enumerate(FIELDS.values(), 1))
+        held = zip(names, told, strict=False)  # none, where a node does not tell
+        return {n: getattr(value, fields[value.type]) for n, value in held if value.type in fields}
+
+    def _lacking(self, node: str, names: Iterable[str]) -> str:
+        """In words, which parameters a node does not declare, as far as it tells."""
+        with contextlib.suppress(LinkError):
+            declared = self._declared(node)
+            if lacking := [name for name in names if declared and name not in declared]:
+                return f"; it declares no {lacking[0]}: {nearest(lacking[0], declared)}"
+        return ""
+
+    def _call(self, node: str, name: str, n: int | None, **fields: Any) -> Any:
+        """Call a service of a node, as soon as there is such a one; `n` values are expected.
+
+        Who calls may get the answer to another caller, which has as many values only by chance.
+        """
+        asked = self._services[name]
+        place = f"{node}/{PLACES[name]}"
+        request = self.store.types[asked.request](**fields)
+        raw = bytes(self.store.serialize_cdr(request, asked.request))
+        response = None
+        with self._calling:
+            end = max(time.monotonic(), self._joined + _DISCOVERY) + _ANSWER
+            while (left := end - time.monotonic()) > 0:
+                for reply in self._ask(place, asked, raw, left):
+                    with contextlib.suppress(Exception):  # it answers another request
+                        response = self.store.deserialize_cdr(reply, asked.response)
+                        if n is None or len(next(iter(vars(response).values()))) == n:
+                            return response
+                time.sleep(_PAUSE)
+        if response is not None:
+            return response
+        services = self._places()
+        raise LinkError(
+            f"{node} does not answer: {place} in ROS domain {self.domain}; the services there are "
+            f"{', '.join(services) or 'none'}"
+        )
+
+    def _endpoints(self, which: int, *, own: bool = False) -> list[Endpoint]:
+        """Who publishes topics (0), or subscribes to them (1), this link left out or not."""
+        there = [e for e in self._others(which, own=own) if e.topic_name.startswith("rt/")]
+        self._learn_names()
+        return [
+            Endpoint(
+                e.topic_name[2:],
+                e.type_name.replace("::dds_::", "/").replace("::", "/").removesuffix("_"),
+                self._nodes.get(e.key.bytes, "a node"),
+                e.participant_key.bytes[:2],
+                e.qos,
+            )
+            for e in there
+        ]
+
+    def _others(self, which: int, *, own: bool = False) -> list[Any]:
+        """All writers (0) or readers (1) that are there now."""
+        with self._naming("ROS 2"):
+            (reader, alive), me = self._found[which], self._participant.guid
+            found = reader.read(N=10_000, condition=alive)
+            return [e for e in found if own or e.participant_key != me]
+
+    def _learn_names(self) -> None:
+        for sample in self._infos.take(N=_DEPTH):
+            if sample.sample_info.valid_data:
+                with contextlib.suppress(Exception):  # that of another ROS 2 is longer
+                    info: Any = self.store.deserialize_cdr(sample.data, _INFO)
+                    for node in info.node_entities_info_seq:
+                        name = full(f"{node.node_namespace.rstrip('/')}/{node.node_name}")
+                        for gid in (*node.reader_gid_seq, *node.writer_gid_seq):
+                            self._nodes[bytes(gid.data)] = name
+
+    def _ask(self, place: str, service: Service, request: bytes, seconds: float) -> Iterator[Any]:
+        with self._naming(place):
+            if place not in self._clients:
+                request_end = self._end(DataWriter, f"rq{place}Request", service.request)
+                reply_end = self._end(DataReader, f"rr{place}Reply", service.response)
+                self._clients[place] = request_end, reply_end
+            writer, reader = self._clients[place]
+            servers = writer.get_matched_subscriptions()
+            if not servers or not reader.get_matched_publications():
+                return
+            server = writer.get_matched_subscription_data(servers[0])
+            # Cyclone begins with who asked and which request it was; others do not let us see it.
+            cyclone = server is not None and server.participant_key.bytes[:2] == _CYCLONE
+            head = struct.pack("<Qq", self._id, next(self._numbers)) if cyclone else b""
+            reader.take(N=_DEPTH)
+            writer.write(writer.data_type(request[:4] + head + request[4:]))
+            for sample in self._waited(reader, min(seconds, _AGAIN)):
+                if sample.data[4 : 4 + len(head)] == head:
+                    yield sample.data[:4] + sample.data[4 + len(head) :]
+
+    def _places(self) -> list[str]:
+        names = {e.topic_name for e in self._others(1)}
+        return sorted(n[2:-7] for n in names if n.startswith("rq/"))
+
+    def _topic_end(self, of: type, topic: str, kind: str, *, reliable: bool = True) -> Any:
+        return self._end(of, f"rt{full(topic)}", kind, reliable=reliable)
+
+    def _end(self, of: type, name: str, kind: str, *, reliable: bool = True) -> Any:
+        """Make a reader or a writer of a topic, as DDS names it, and announce it."""
+        if kind not in self.store.types:
+            raise LinkError(f"{name[2:]}: the message type {kind} is not known")
+        info, policy = name == "ros_discovery_info", Policy.Reliability
+        qos = Qos(
+            policy.Reliable(duration(seconds=_ANSWER)) if reliable else policy.BestEffort,
+            # What is published once is for those who come later, too.
+            _DURABILITIES[info or (name == "rt/tf_static" and reliable)],
+            Policy.History.KeepLast(1 if info and of is DataWriter else _DEPTH),
+            Policy.Userdata(f"typehash={self.store.hash_rihs01(kind)};".encode()),
+        )
+        with self._naming(name[2:]), self._announcing:
+            end = of(self._participant, Topic(self._participant, name, _carrier(kind)), qos)
+            self._kept.append(end)
+            if of is DataReader:
+                end.set_status_mask(DDSStatus.RequestedIncompatibleQos)
+            if not info:
+                self._gids[of].append(self._gid(end))
+                self._announce()
+        return end
+
+    def _gid(self, entity: Any) -> Any:
+        return self.store.types["rmw_dds_common/msg/Gid"](np.frombuffer(entity.guid.bytes, "u1"))
+
+    def _announce(self) -> None:
+        """Let tools of ROS 2 see this node and what it publishes and subscribes to."""
+        node = self.store.types["rmw_dds_common/msg/NodeEntitiesInfo"](
+            "/", _NODE, self._gids[DataReader], self._gids[DataWriter]
+        )
+        info = self.store.types[_INFO](self._gid(self._participant), [node])
+        self._info.write(self._info.data_type(bytes(self.store.serialize_cdr(info, _INFO))))
+
+    @contextlib.contextmanager
+    def _naming(self, what: str) -> Iterator[None]:
+        """Say what DDS cannot do, and why."""
+        if self._closed:
+            raise LinkError(f"{what}: the link was closed")
+        try:
+            yield
+        except (DDSException, UnicodeError) as error:
+            raise LinkError(f"{what}: {error}") from error
+
+
+@cache
+def _carrier(kind: str) -> Any:
+    """What DDS takes for a message of a type: its bytes."""
+
+    def hold(self: Any, data: bytes) -> None:
+        self.data = data
+
+    methods = {
+        "__init__": hold,
+        "serialize": lambda self, **_: self.data,
+        "deserialize": classmethod(lambda cls, data, **_: cls(data)),
+        "deserialize_key": classmethod(lambda cls, data, **_: cls(data)),
+    }
+    # rosbags puts services among the messages.
+    package, space, name = kind.replace("/srv/msg/", "/srv/").split("/")
+    given = {"typename": f"{package}.{space}.dds_.{name}_"}
+    return types.new_class(name, (IdlStruct,), given, lambda names: names.update(methods))
+
+
+def _lack(offered: Qos, wanted: Qos) -> str:
+    """In words, what a subscriber wants and a publisher does not offer; empty if they match."""
+    reliable = Policy.Reliability.Reliable
+    if isinstance(wanted[Policy.Reliability], reliable) and not isinstance(
+        offered[Policy.Reliability], reliable
+    ):
+        return "reliable"
+    durability = [_DURABILITIES.index(qos[Policy.Durability]) for qos in (offered, wanted)]
+    if durability[0] < durability[1]:
+        return "transient local, with what was published before it came"
+    if offered[Policy.Deadline].deadline > wanted[Policy.Deadline].deadline:
+        return "with a deadline"
+    return ""
+
+
+def _configuration() -> str:
+    """What Cyclone DDS is told, by what ROS 2 is told of discovery."""
+    name = "ROS_AUTOMATIC_DISCOVERY_RANGE"
+    reach = os.environ.get(name, "").strip().upper() or "SUBNET"
+    peers = ["localhost", *os.environ.get("ROS_STATIC_PEERS", "").replace(";", " ").split()]
+    if os.environ.get("ROS_LOCALHOST_ONLY") == "1":
+        reach, peers = "LOCALHOST", peers[:1]
+    if reach not in ("SUBNET", "LOCALHOST", "OFF", "SYSTEM_DEFAULT"):
+        raise LinkError(f"{name} is {reach}; it is SUBNET, LOCALHOST, OFF or SYSTEM_DEFAULT")
+    for peer in peers:
+        try:
+            socket.getaddrinfo(peer, None)
+        except OSError as error:  # Cyclone DDS would end the process
+            raise LinkError(f"ROS_STATIC_PEERS: {peer}: {error.strerror}") from error
+    alone = f"<Tag>adaptune {os.getpid()}</Tag>" if reach == "OFF" else ""
+    known = "".join(f"<Peer address={quoteattr(peer)}/>" for peer in peers)
+    parts = [f'<Internal><SocketReceiveBufferSize max="{_BUFFER} B"/></Internal>']
+    if reach in ("LOCALHOST", "OFF"):
+        parts.append("<General><AllowMulticast>false</AllowMulticast></General>")
+    if reach != "SYSTEM_DEFAULT":
+        parts.append(
+            "<Discovery><ParticipantIndex>auto</ParticipantIndex>"
+            "<MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>"
+            f"{alone}<Peers>{known}</Peers></Discovery>"
+        )
+    own = f"<CycloneDDS><Domain>{''.join(parts)}</Domain></CycloneDDS>"
+    return ",".join(filter(None, (own, os.environ.get("CYCLONEDDS_URI"))))
+
+
+def _receive_buffer() -> int:
+    """Bytes that the kernel lets a socket receive ahead."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
+        return probe.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2
