@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from adaptune.archive import Archive, Summary
 from adaptune.errors import AdaptuneError
-from adaptune.recording.scan import OF_VIEW
 from adaptune.report.charts import (
     Axis,
     Band,
@@ -356,7 +355,6 @@ def charts_of_trials(study: OfflineStudy) -> Charts:
 
 
 def _of_trials(table: TrialTable) -> Iterator[Chart | str | None]:
-    names = [name for name in table.names if OF_VIEW not in name]
     found = {name: importances(of) for name, of in table.odometries().items()}
     yield iteration_chart(table)
     yield importance_chart(found) or (
@@ -364,7 +362,7 @@ def _of_trials(table: TrialTable) -> Iterator[Chart | str | None]:
     )
     for odometry, of in table.odometries().items():
         pair = most_important(of, found.get(odometry, {}))
-        chart = scatter_chart(of, pair, names)
+        chart = scatter_chart(of, pair, table.names)
         if chart is not None and odometry:
             key, title = f"{chart.key}-{odometry}", f"{odometry}: {chart.title}"
             chart = replace(chart, key=key, title=title)

@@ -12,7 +12,6 @@ from pydantic import BaseModel, BeforeValidator, Field
 from adaptune import strict
 from adaptune.errors import AdaptuneError, Finding, in_a_line, nearest
 from adaptune.odometry.registry import PROGRAMS
-from adaptune.recording.config import MOST_VIEWS, ViewConfig
 from adaptune.space import (
     Categorical,
     Float,
@@ -422,7 +421,6 @@ class OfflineConfig(StrictModel):
     stretches: Annotated[int, Field(ge=1, le=10_000)] | Literal["all"] = 12
     repeats: int = Field(1, ge=1, le=100)
     baseline_runs: int | None = Field(None, ge=1, le=1000)
-    augment: Annotated[tuple[ViewConfig, ...], Field(max_length=MOST_VIEWS)] = ()
     pruning: Literal["none", "wilcoxon"] = "none"
 
     @property
@@ -466,15 +464,6 @@ class OfflineStudyConfig(StudyConfig):
     """The whole YAML of a study."""
 
     offline: OfflineConfig = OfflineConfig()
-
-    @property
-    def views(self) -> Mapping[str, ViewConfig]:
-        """See `StudyConfig.views`."""
-        views: dict[str, ViewConfig] = {}
-        for view in self.offline.augment:
-            same = sum(other.name == view.name for other in views.values())
-            views[f"{view.name}{same + 1}" if same else view.name] = view
-        return views
 
     @property
     def stretches(self) -> int | None:

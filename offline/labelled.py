@@ -33,7 +33,7 @@ from adaptune.model.rules import (
 )
 from adaptune.model.weights import MEMBER_POOL_SIZE, MemberWeights
 from adaptune.odometry.registry import Factory
-from adaptune.recording.scan import origin, places, stretch_numbers
+from adaptune.recording.scan import stretch_numbers
 from adaptune.space import ParameterSets
 from adaptune.study.config import WORTH
 from adaptune.study.study import MIN_RECORDINGS, PER_STRETCH
@@ -233,10 +233,10 @@ class LabelledSequence:
     """The frames of a sequence that have a sub-trajectory, and the errors of sets there."""
 
     name: str
-    recording: str  # that it is, or is a part or a view of
+    recording: str  # that it is, or is a part of
     simulation: BankSimulation  # of all frames
     known: NDArray[np.intp]  # (n,): numbers of the labelled ones
-    stretch: NDArray[np.intp]  # (n,): number of each frame's stretch, the same in a view
+    stretch: NDArray[np.intp]  # (n,): number of each frame's stretch
     # (n, n_sets): percent, infinite where the track was lost, NaN where a set was not run.
     errors: NDArray[np.float32]
     baseline: NDArray[np.float64]  # (n,): errors of the baseline
@@ -291,20 +291,10 @@ class LabelledSequence:
             before = self.ends < left_out.known.min()
             found = near | ~(before | (self.known > left_out.ends.max()))
         else:
-            # A view counts frames in another way, and may be played backwards.
+            # Another part of it counts frames in another way, or plays them backwards.
             at_ends = self.simulation.T_ref_sensor[self.ends, :3, 3]
             found = near | (path.query(at_ends)[0] <= length)
         return np.asarray(found)
-
-    def cut_as(self, recording: "LabelledSequence") -> "LabelledSequence":
-        """A view, cut into the stretches of the recording's nearest frames.
-
-        It shares the recording's reference.
-        """
-        from scipy.spatial import cKDTree
-
-        nearest = cKDTree(recording.positions).query(self.positions)[1]
-        return replace(self, stretch=recording.stretch[nearest])
 
     def frames(self, kept: NDArray[np.bool_]) -> "LabelledSequence":
         """The same with some of the frames."""
@@ -378,16 +368,15 @@ class LabelledData(NamedTuple):
 
     @property
     def recordings(self) -> list[str]:
-        """The recordings; parts of one, and its views, are none."""
+        """The recordings; parts of one are none."""
         return list(dict.fromkeys(s.recording for s in self.sequences))
 
     def folds(
         self, by_recording: bool | None = None
     ) -> list[tuple[LabelledSequence, "LabelledData"]]:
-        """Leave each recording out, or, where there are few, each stretch, with all its views.
+        """Leave each recording out, or, where there are few, each stretch.
 
-        Views themselves are not left out: they add nothing about the place that they show. A
-        stretch is not left out if nothing far enough from it remains.
+        A stretch is not left out if nothing far enough from it remains.
 
         Recordings are left out where `by_recording`; by default if there are `MIN_RECORDINGS`.
         """
@@ -395,8 +384,6 @@ class LabelledData(NamedTuple):
             by_recording = len(self.recordings) >= MIN_RECORDINGS
         folds = []
         for one in self.sequences:
-            if origin(one.name) != one.name:
-                continue
             elsewhere = [s for s in self.sequences if s.recording != one.recording]
             if by_recording:
                 folds.append((one, elsewhere))
@@ -411,11 +398,10 @@ class LabelledData(NamedTuple):
         return [(left, self._replace(sequences=others)) for left, others in folds if others]
 
     def stretches(self) -> NDArray[np.intp]:
-        """Number of every frame's stretch, of shape (n_frames,); views share their numbers."""
-        place = places([s.name for s in self.sequences])
+        """Number of every frame's stretch, of shape (n_frames,)."""
         lengths = [len(s.errors) for s in self.sequences]
         cuts = np.concatenate([s.stretch for s in self.sequences])
-        return stretch_numbers(np.repeat(place, lengths), cuts)
+        return stretch_numbers(np.repeat(np.arange(len(lengths)), lengths), cuts)
 
     def bounds(self) -> dict[int, float]:
         """The objective of every set in trials on these sequences, see `Verdict.bound`.
@@ -550,7 +536,7 @@ def labelled_data(
                 f"fitted to; run `adaptune offline` again"
             )
         one = _labelled(archive, name, set(counted), sets, config, window, recorded_in(name))
-        read[name] = one.cut_as(read[origin(name)]) if origin(name) in read else one
+        read[name] = one
     eligible = _eligible(list(read.values()), sets)
     bounds = LabelledData(list(read.values()), sets).bounds()
     rivals = [*best_candidates(bounds), *sets.defaults]

@@ -19,7 +19,6 @@ from adaptune.odometry.registry import ODOMETRIES, PROGRAMS
 from adaptune.processes import available
 from adaptune.progress import Progress, unseen
 from adaptune.recording.config import NO_REFERENCE
-from adaptune.recording.scan import origin
 from adaptune.reference.check import hard_to_track
 from adaptune.report import tables
 from adaptune.space import ParameterSet, ParameterSets, ParameterSpace, in_words
@@ -297,7 +296,7 @@ def _training_rows(
     rows = []
     for name, runs in finished.items():
         best = best_by_trials({n: judge(config, [run]) for n, run in runs.items()})
-        error = reference_errors.get(origin(name))
+        error = reference_errors.get(name)
         row = {
             "sequence": name,
             "baseline": runs[0].mean_error,

@@ -182,7 +182,7 @@ class Validation:
 def leave_one_out(
     data: LabelledData, progress: Progress = unseen, bank: int = BANK_SIZE
 ) -> Validation:
-    """Leave each recording or stretch out in turn, with all views of it.
+    """Leave each recording or stretch out in turn.
 
     What is driven is chosen anew on the rest, by the loss with which a study chooses it. So the
     figures are those of the choice, and not of what was best in hindsight.

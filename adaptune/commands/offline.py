@@ -55,7 +55,7 @@ def simulate(
         raise AdaptuneError(f"{study}: courses: there is none to simulate; {help_}")
     loaded.open()
     # Without what the odometry says of them: it may not be installed.
-    sequences = StudySequences({}, loaded.config.courses, {}, loaded.folder)
+    sequences = StudySequences({}, loaded.config.courses, loaded.folder)
     with progress() as show:
         courses = {name: c for name, c in loaded.config.courses.items() if c.of is None}
         due = [n for n in courses if overwrite or not sequences.recording(n).exists()]

@@ -29,7 +29,7 @@ from adaptune.model.rules import (
     mean_errors,
 )
 from adaptune.model.weights import BankSettings
-from adaptune.recording.scan import places, stretch_numbers
+from adaptune.recording.scan import stretch_numbers
 from adaptune.report import tables
 from adaptune.space import ParameterSets, SpaceError, in_words, load_space
 from adaptune.strict import in_one_line
@@ -162,7 +162,7 @@ class ErrorModel:
 
     def stretches(self) -> NDArray[np.intp]:
         """Number of every frame's stretch among all of the model, of shape (n_frames,)."""
-        return stretch_numbers(places(self.sequences)[self.sequence], self.stretch)
+        return stretch_numbers(self.sequence, self.stretch)
 
     def training_data(self, pca: "ScaledPCA", members: Sequence[int] | None = None) -> TrainingData:
         """What selection rules are fitted to; `pca` is what `pca` returned.

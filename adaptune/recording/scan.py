@@ -407,26 +407,11 @@ def _mended(span: float, last: float, unit: float, period: float) -> tuple[str, 
     return LEAVE_OUT if right is None else f"write `time_unit: {right}`", right is not None
 
 
-# Names of views of sequences.
-
-
-OF_VIEW = "+"
-"""Joins the name of a sequence and the name of a view of it. No name of a user contains it."""
-
-
-def origin(name: str) -> str:
-    """Name of the sequence that a training sequence is, or is a view of."""
-    return name.partition(OF_VIEW)[0]
-
-
-def places(names: Sequence[str]) -> NDArray[np.intp]:
-    """Number the places of sequences, of shape (n,): a view has the place of its origin."""
-    number = {place: i for i, place in enumerate(dict.fromkeys(map(origin, names)))}
-    return np.array([number[origin(name)] for name in names], np.intp)
+# Stretches of several recordings.
 
 
 def stretch_numbers(place: NDArray[np.intp], stretch: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Number stretches of all places from 0 on.
+    """Number stretches of all recordings from 0 on.
 
     All of shape (n_frames,): each frame's number, that of its place, and of its stretch there.
     """

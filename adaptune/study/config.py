@@ -1,7 +1,7 @@
 """The configuration of a study: the settings that both stages share."""
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
@@ -9,7 +9,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 from adaptune.errors import Finding, nearest
 from adaptune.odometry.remote import Limits
 from adaptune.odometry.tracker import HealthCheck
-from adaptune.recording.config import SequenceConfig, Transform, ViewConfig
+from adaptune.recording.config import SequenceConfig, Transform
 from adaptune.recording.scan import Fractions, part_name, read_part
 from adaptune.ros.link import SetCommand
 from adaptune.simulation.course import Course
@@ -202,11 +202,6 @@ class StudyConfig(StrictModel):
         return {one.label or one.name: one for one in given}
 
     # What a stage that adds settings of its own overrides.
-
-    @property
-    def views(self) -> Mapping[str, ViewConfig]:
-        """Views of every training sequence that are trained on, too, by unique names."""
-        return {}
 
     def mistakes(self, space: ParameterSpace | None) -> "Iterable[Finding]":  # noqa: ARG002
         """Find what does not fit the tuned parameters; None where these have mistakes."""

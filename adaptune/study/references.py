@@ -12,7 +12,6 @@ from adaptune.errors import Finding
 from adaptune.geometry import Poses, to_pose
 from adaptune.processes import pin
 from adaptune.recording.recording import RecordedSequence, wants_estimate
-from adaptune.recording.scan import origin
 from adaptune.reference import estimate
 from adaptune.reference.check import SUSPICIOUS, contradictions
 from adaptune.reference.stored import (
@@ -33,11 +32,14 @@ _log = logging.getLogger(__name__)
 def to_estimate(sequences: StudySequences, names: Iterable[str]) -> list[str]:
     """Those of the sequences whose reference is to be estimated: none is given, or it is asked for.
 
-    Views count as the sequence that they are of. A course has a reference of its own.
+    A course has a reference of its own.
     """
     recordings = sequences.recordings
-    each = dict.fromkeys(map(origin, names))
-    return [name for name in each if name in recordings and wants_estimate(recordings[name])]
+    return [
+        name
+        for name in dict.fromkeys(names)
+        if name in recordings and wants_estimate(recordings[name])
+    ]
 
 
 def ensure_references(
@@ -49,7 +51,7 @@ def ensure_references(
 ) -> dict[str, str]:
     """Estimate the references that are to be estimated and are not yet, or of something else.
 
-    An estimate is made from the scans as they were recorded, so the views of a sequence share it.
+    An estimate is made from the scans as they were recorded, without the views of a sequence.
     It knows nothing of the study's odometry: what judges a bank is not built from its members.
     One that was refused is not tried again before something has changed. The study's folder keeps
     them as ``references/<sequence>.tum``. Their accuracy is told over `length` metres.
@@ -124,7 +126,7 @@ def _accuracy(stored: StoredEstimate, length: float) -> str:
 
 def estimates_of(sequences: StudySequences, names: Iterable[str]) -> dict[str, StoredEstimate]:
     """The estimated references of those of the sequences that have one, by their names."""
-    found = {name: sequences.estimate(name) for name in dict.fromkeys(map(origin, names))}
+    found = {name: sequences.estimate(name) for name in dict.fromkeys(names)}
     return {name: stored for name, stored in found.items() if stored is not None}
 
 

@@ -26,7 +26,7 @@ from adaptune.odometry.program import ProgramInput, program_input
 from adaptune.odometry.registry import Factory, OdometryFactory, OdometryPool, declare
 from adaptune.processes import available
 from adaptune.recording.cache import fingerprints
-from adaptune.recording.config import REFERENCE_FILES, SequenceConfig, ViewConfig
+from adaptune.recording.config import REFERENCE_FILES, SequenceConfig
 from adaptune.recording.export import Layout
 from adaptune.recording.recording import (
     SequenceFiles,
@@ -34,7 +34,7 @@ from adaptune.recording.recording import (
     sequence_files,
     wants_estimate,
 )
-from adaptune.recording.scan import OF_VIEW, Recording, origin, part_name
+from adaptune.recording.scan import Recording, part_name
 from adaptune.recording.views import with_imu
 from adaptune.reference.stored import BREAK, EstimateError, StoredEstimate
 from adaptune.simulation.course import Course
@@ -48,7 +48,7 @@ from adaptune.study.config import (
     SwitchingConfig,
 )
 
-# The sequences of a study by name: recordings, simulated courses, and views of them.
+# The sequences of a study by name: recordings and simulated courses.
 
 
 _PATHS = ("bag", "kitti", "folder")
@@ -71,7 +71,6 @@ class StudySequences:
 
     recordings: Mapping[str, SequenceConfig]
     courses: Mapping[str, Course]
-    views: Mapping[str, ViewConfig]  # views that may be had of every sequence
     # The study's folder: it keeps recorded courses, estimated references and what programs read.
     folder: Path
     with_imu: bool = False  # whether scans bring along the IMU's measurements
@@ -82,14 +81,12 @@ class StudySequences:
         return self.folder / "recordings" / f"{self.courses[course].of or course}.bag"
 
     def config(self, name: str) -> SequenceConfig:
-        """Configuration of a sequence, a course, or a view."""
-        whole, *views = name.split(OF_VIEW)
-        config = self.unseen(whole)
-        if self._is_made(whole):
-            reference = str(self.estimate_path(whole).absolute())
+        """Configuration of a sequence or a course."""
+        config = self.unseen(name)
+        if self._is_made(name):
+            reference = str(self.estimate_path(name).absolute())
             config = config.model_copy(update=_AS_ESTIMATED | {"reference": reference})
-        more = [self.views[view] for view in views]
-        return config.model_copy(update={"views": (*config.views, *more)}) if more else config
+        return config
 
     def unseen(self, name: str) -> SequenceConfig:
         """Configuration of a sequence, or a course, without an estimate that was made of it."""
@@ -100,21 +97,21 @@ class StudySequences:
         return as_sequence(self.courses[name], self.recording(name))
 
     def estimate_path(self, name: str) -> Path:
-        """The TUM file of an estimated reference; the views of a sequence share it."""
-        return self.folder / "references" / f"{origin(name)}.tum"
+        """The TUM file of an estimated reference."""
+        return self.folder / "references" / f"{name}.tum"
 
     def _is_made(self, name: str) -> bool:
-        """Whether an estimated reference of a sequence, or a view, is in the study's folder."""
-        given, path = self.recordings.get(origin(name)), self.estimate_path(name)
+        """Whether an estimated reference of a sequence is in the study's folder."""
+        given, path = self.recordings.get(name), self.estimate_path(name)
         # The file beside it is written last.
         there = given is not None and path.exists() and path.with_suffix(".json").exists()
-        return there and wants_estimate(self.recordings[origin(name)])
+        return there and wants_estimate(self.recordings[name])
 
     def estimate(self, name: str) -> StoredEstimate | None:
         """What is known about an estimated reference, also a file's; None if it is not one."""
         if self._is_made(name):
             return StoredEstimate.read(self.estimate_path(name))
-        given = self.recordings.get(origin(name))
+        given = self.recordings.get(name)
         if given is None or not (given.reference or "").endswith(REFERENCE_FILES):
             return None
         # The user's own file of poses may have any file beside it.
@@ -124,7 +121,6 @@ class StudySequences:
 
     def key(self, name: str) -> str:
         """The key under which the user finds a sequence: a part has none of its own."""
-        name = origin(name)
         part = self.config(name).part
         whole = name if part is None else name.removesuffix(part_name("", part))
         if part is None or whole == name:
@@ -132,12 +128,12 @@ class StudySequences:
         return f"[{whole}: {100.0 * part[0]:.10g}-{100.0 * part[1]:.10g}%]"
 
     def recorded_in(self, name: str) -> str:
-        """What a sequence was recorded in: parts of a recording, and views, share it."""
-        config = self.config(origin(name))
+        """What a sequence was recorded in: parts of a recording share it."""
+        config = self.config(name)
         return str(next(path for key in _PATHS if (path := getattr(config, key)) is not None))
 
     def open(self, name: str) -> Recording:
-        """Open a sequence, a recorded course, or a view.
+        """Open a sequence, or a recorded course.
 
         A SequenceError says that it cannot be opened, a ConfigurationError that the course has not
         been recorded.
@@ -147,10 +143,9 @@ class StudySequences:
         return with_imu(sequence) if self.with_imu else sequence
 
     def _check_recorded(self, name: str) -> None:
-        course = origin(name)
-        if course in self.courses and not self.recording(course).exists():
+        if name in self.courses and not self.recording(name).exists():
             raise ConfigurationError(
-                f"{self.recording(course)}: the course {course} is not recorded yet; run "
+                f"{self.recording(name)}: the course {name} is not recorded yet; run "
                 f"`adaptune simulate` with this study first"
             )
 
@@ -168,7 +163,7 @@ class StudySequences:
 
         A recording is known by its content, not by its path.
         """
-        course = self.courses.get(origin(name))
+        course = self.courses.get(name)
         others = {*_PATHS, *_AS_ESTIMATED, "cache"}
         config = self.config(name).model_dump(mode="json", exclude=others)
         config |= {} if course is None else course.model_dump(mode="json")
@@ -184,7 +179,7 @@ class StudySequences:
         return {self._kind(name): {name: config}, "reference": {name: fingerprints(files)}}
 
     def _kind(self, name: str) -> str:
-        return "courses" if origin(name) in self.courses else "sequences"
+        return "courses" if name in self.courses else "sequences"
 
     def sources(self, name: str) -> dict[str, Sequence[Path]]:
         """The files of a sequence, by the keys of their digests in `inputs`."""
@@ -265,7 +260,7 @@ class Study(Generic[C_co]):
             if described.whole:
                 layout = getattr(settings, "input", layout)
         needs_imu = any(described.needs_imu for _, described in declared)
-        of_study = (config.sequences, config.courses, config.views, self.folder)
+        of_study = (config.sequences, config.courses, self.folder)
         return StudySequences(*of_study, needs_imu, layout)
 
     @cached_property
@@ -300,9 +295,8 @@ class Study(Generic[C_co]):
 
     @property
     def training(self) -> list[str]:
-        """Names of the training sequences, each followed by its views."""
-        suffixes = ("", *(f"{OF_VIEW}{view}" for view in self.config.views))
-        return [name + suffix for name in self.config.training for suffix in suffixes]
+        """Names of the training sequences."""
+        return list(self.config.training)
 
     @property
     def rules(self) -> tuple[str, ...]:

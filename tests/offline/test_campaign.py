@@ -125,26 +125,6 @@ def test_a_task_that_kills_every_worker_is_told(study_file, tmp_path, monkeypatc
         train(study)
 
 
-def test_views_are_trained_on_beside_their_origin(study_file, tmp_path):
-    overrides = [
-        "offline.augment=[{noise: 0.02}, {reverse: true}, {noise: 0.1}]",
-        "offline.trials=2",
-        "training=[one]",
-        "odometry.name=gicp",
-    ]
-    study = load_study(study_file, overrides, tmp_path / "study")
-    names = ["one", "one+noise", "one+reverse", "one+noise2"]
-    training = train(study)
-    assert training.model.sequences == names
-    assert [row["sequence"] for row in training.rows] == names
-    archive = Archive(study.folder / "trials")
-    frames = [archive.read_frames(name).T_ref_sensor for name in names]
-    np.testing.assert_array_equal(frames[0], frames[1])
-    np.testing.assert_allclose(frames[0], frames[2][::-1], atol=1e-9)
-    errors = [training.trials[0][name] for name in names]
-    assert len(set(errors)) == 4
-
-
 FEW = ["offline.trials=3", "offline.initial=3", "offline.workers=1"]
 
 

@@ -79,24 +79,6 @@ def test_a_selection_holds_for_its_second(monkeypatch):
     )
 
 
-def test_a_sequence_is_left_out_with_its_views(monkeypatch):
-    sequences = two_kinds(np.random.default_rng(4))[:3]
-    seen = [
-        replace(s, name=f"{s.name}+noise", errors=s.errors + np.float32(100 + i))
-        for i, s in enumerate(sequences)
-    ]
-    monkeypatch.setattr(validation, "NearestNeighbours", Cheat)
-    Cheat.fitted = ()
-    found = leave_one_out(labelled([*sequences, *seen]), bank=0)
-    assert [s.name for s in found.left_out] == [s.name for s in sequences]
-    for i, data in enumerate(Cheat.fitted):
-        fitted = {e.tobytes() for e in data.errors}
-        assert not fitted & {e.tobytes() for e in (*sequences[i].errors, *seen[i].errors)}
-        assert len(fitted) == 4 * 80
-    with pytest.raises(ValidationError, match="one stretch"):
-        leave_one_out(labelled([sequences[0], seen[0]]), bank=0)
-
-
 def test_the_fixed_set_is_chosen_by_what_the_study_judges_by():
     sequences = two_kinds(np.random.default_rng(5))
     for value, expected in (([5, 4, 3, 2, 1], 4), ([np.inf, 1, 2, 3, 4], 1)):

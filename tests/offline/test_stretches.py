@@ -90,24 +90,6 @@ def test_nothing_that_is_known_comes_near_to_what_is_left_out(T, which):
     assert (overlaps | (apart <= LENGTH)).all()
 
 
-def test_a_view_that_is_played_backwards_is_cut_as_its_recording():
-    T = poses(np.full(400, 0.5), np.zeros(400))
-    recording = along(T)
-    view = along(T[::-1], "one+reverse").cut_as(recording)
-    at = np.linspace(11.0, 189.0, 30)
-    for x in at:
-        frame = np.abs(recording.positions[:, 0] - x).argmin()
-        same = np.abs(view.positions[:, 0] - x).argmin()
-        assert view.stretch[same] == recording.stretch[frame]
-    left = recording.frames(recording.stretch == 2)
-    kept = view.frames(~view.near(left))
-    first, last = left.positions[:, 0].min(), T[left.ends, 0, 3].max()
-    # It goes from its start back to its end.
-    end_positions = T[::-1][kept.ends, 0, 3]
-    assert ((kept.positions[:, 0] < first) | (end_positions > last - LENGTH)).all()
-    assert len(kept.known)
-
-
 def test_with_six_recordings_whole_ones_are_left_out():
     rng = np.random.default_rng(3)
     sequences = [with_motions(f"s{i}", rng, 500) for i in range(6)]

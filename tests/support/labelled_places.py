@@ -8,7 +8,6 @@ from tables import table
 
 from adaptune.live.hops import Hops
 from adaptune.metrics import sub_trajectory_vectors
-from adaptune.recording.scan import origin
 from offline.labelled import BankSimulation, LabelledData, LabelledSequence, stretches
 
 TRIALS = (0, 3, 4, 7, 8)
@@ -51,7 +50,7 @@ def simulated(described, motions, T_ref_sensor=None):
 def in_place(name, simulation, known, errors, **more):
     """A sequence with errors on its known frames."""
     frames = np.flatnonzero(known)
-    place = (name, origin(name), simulation, frames, stretches(simulation, frames))
+    place = (name, name, simulation, frames, stretches(simulation, frames))
     return LabelledSequence(*place, errors, errors[:, 0], {"ndt": 90}, **more)
 
 
