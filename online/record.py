@@ -24,10 +24,6 @@ _TABLES = ("frames.csv", "selections.csv")
 """Files of a replay besides its trajectory."""
 
 
-_INPUTS = {"mode", "parameters", "model", "switching", "real_time"}
-"""What is read of a replay's inputs."""
-
-
 class StoredReplayError(AdaptuneError):
     """A replay that is missing or damaged."""
 
@@ -61,11 +57,11 @@ class ReplaySummary(BaseModel):
                 f"{folder}: there is no replay; run `adaptune online` with this study first"
             )
         try:
-            inputs = manifest.recorded(folder / manifest.FILE) or {}
+            inputs = manifest.recorded(folder / manifest.FILE)
             found = cls.model_validate_json(path.read_bytes())
         except (OSError, ValidationError, ConfigurationError) as error:
             raise damaged(path, error) from error
-        if not inputs.keys() >= _INPUTS:
+        if inputs is None:
             what = "an older adaptune did not record what this replay was made from"
             option = " --untrained" if folder.name == "untrained" else ""
             raise StoredReplayError(f"{folder}: {what}; run `adaptune online{option}` again")
@@ -80,7 +76,7 @@ def replay_changes(
         return None
     try:
         before = manifest.recorded(folder / manifest.FILE)
-        if before is not None and before.keys() >= _INPUTS:
+        if before is not None:
             ReplaySummary.read(folder)
         return manifest.changes(before, inputs, files)
     except (StoredReplayError, ConfigurationError):
