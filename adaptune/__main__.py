@@ -1,8 +1,11 @@
 """Start the command line; Ctrl-C ends it at once until a command begins its work."""
 
 import os
+import resource
 import signal
 import sys
+
+_FILES = 1 << 16
 
 
 def _leave(*_: object) -> None:
@@ -12,9 +15,16 @@ def _leave(*_: object) -> None:
 
 
 def main() -> None:
-    """Run the command line."""
+    """Run the command line; a user's classes are found in the working folder, after all others."""
+    here = os.getcwd()  # noqa: PTH109 - what this imports may not have the name of a file here
+    sys.path[:] = [*(folder for folder in sys.path if folder not in ("", here)), here]
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _leave)
+    # A recording may have more parts than the 1024 files that most systems begin with.
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    most = _FILES if hard < 0 else min(hard, _FILES)
+    if 0 <= soft < most:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
     from adaptune.commands import cli
 
     cli.main()

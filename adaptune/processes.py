@@ -22,11 +22,13 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
-from multiprocessing import get_context
+from multiprocessing import forkserver, get_context
 from multiprocessing.connection import wait
+from multiprocessing.context import ForkServerContext
+from multiprocessing.util import get_temp_dir
 from pathlib import Path
 from types import ModuleType
-from typing import Any, BinaryIO, NamedTuple, NoReturn, Protocol
+from typing import Any, BinaryIO, NamedTuple, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,13 +39,6 @@ from adaptune.keeper import Ended, adopt_orphans, keep
 
 _LENGTH = struct.Struct("<I")
 _LONGEST_HEADER = 1 << 24
-
-
-class Readable(Protocol):
-    """A stream of messages."""
-
-    def read(self, size: int, /) -> bytes:
-        """Read so many bytes; fewer only at the end."""
 
 
 class SocketStream:
@@ -84,6 +79,16 @@ class SocketStream:
             self._socket.shutdown(socket.SHUT_RDWR)
 
 
+@contextmanager
+def socket_name(path: Path) -> Iterator[str]:
+    """A name for a socket's file for the block: the system takes no names above 107 bytes."""
+    folder = os.open(path.parent, os.O_PATH | os.O_DIRECTORY)
+    try:
+        yield f"/proc/self/fd/{folder}/{path.name}"
+    finally:
+        os.close(folder)
+
+
 class WireError(AdaptuneError):
     """A stream without messages of this version."""
 
@@ -107,7 +112,7 @@ def send(
     stream.flush()
 
 
-def receive(stream: Readable) -> Message | None:
+def receive(stream: "BinaryIO | SocketStream | _Timed") -> Message | None:
     """Read a message, or None where the stream has ended; else there is a `WireError`."""
     first = stream.read(_LENGTH.size)
     if not first:
@@ -126,7 +131,7 @@ def receive(stream: Readable) -> Message | None:
     return Message(header, arrays)
 
 
-def _exactly(stream: Readable, size: int) -> bytes:
+def _exactly(stream: "BinaryIO | SocketStream | _Timed", size: int) -> bytes:
     data = stream.read(size)
     if len(data) < size:
         raise WireError("the stream ends in the middle of a message")
@@ -252,13 +257,20 @@ class Server(NamedTuple):
     control: socket.socket
 
 
-@cache
+servers: dict[tuple[str, str], Server] = {}
+"""By service and name; each ends with this process, or where it is dropped."""
+
+
 def server(service: str, name: str) -> Server:
-    """Server of a piece of user code, started at the first call.
+    """Server of a piece of user code, started at the first call, and again where it has ended.
 
     The service is a module. Its function ``load(name)`` imports the user code, and others make an
     `Answer` from the name. If it is not imported, a `HostError` has the last lines that it wrote.
     """
+    if known := servers.get((service, name)):
+        if known.process.poll() is None:
+            return known
+        known.control.close()
     here, there = socket.socketpair(type=socket.SOCK_SEQPACKET)
     path = os.pathsep.join(folder or str(Path.cwd()) for folder in sys.path)
     arguments = [str(there.fileno()), str(IMPORT_SECONDS), service, name]
@@ -283,7 +295,8 @@ def server(service: str, name: str) -> Server:
         if wrong is not None:
             here.close()
             raise HostError(f"{name}: {quoting(wrong, last_lines(output))}")
-    return Server(process, here)
+    started = servers[service, name] = Server(process, here)
+    return started
 
 
 def _wait_for_import(process: subprocess.Popen[bytes], control: socket.socket) -> str | None:
@@ -333,8 +346,6 @@ class Forked(Transport):
 
     def connect(self) -> SocketStream:
         """Fork it; a `HostError` if the user code cannot be imported."""
-        if server(self.service, self.name).process.poll() is not None:
-            server.cache_clear()
         here, there = socket.socketpair()
         with there:
             request = json.dumps([self.do, self.bounds]).encode()
@@ -435,7 +446,7 @@ Answer = Callable[[Message], Mapping[str, Any] | None]
 """Gives what the answer to a message holds, arrays as such; None if there is no answer."""
 
 
-def answer_all(reader: Readable, writer: BinaryIO, answer: Answer) -> None:
+def answer_all(reader: "BinaryIO | _Timed", writer: BinaryIO, answer: Answer) -> None:
     """Answer messages until the stream ends; what an `AdaptuneError` says is refused."""
     while (message := receive(reader)) is not None:
         try:
@@ -448,10 +459,7 @@ def answer_all(reader: Readable, writer: BinaryIO, answer: Answer) -> None:
             send(writer, {"type": "done", **rest}, **arrays)
 
 
-# Forks processes in which user code lives, see `adaptune.processes`.
-#
-# Run with the number of a socket, the time for the import, the module of a service and the name of
-# the user code. For every socket that it receives it forks a watcher, which forks the process and
+# The server. For every socket that it receives it forks a watcher, which forks the process and
 # reports how that ended.
 
 _LONGER = 5
@@ -650,6 +658,33 @@ def other_core(number: int) -> int:
     return others[number % len(others)]
 
 
+# Processes of adaptune's own modules, forked by one server that has imported these.
+
+
+def fork_server(*preload: str) -> ForkServerContext:
+    """What forks processes that have imported some modules; it is started if there is none."""
+    # A process forked from one with threads may deadlock.
+    context = get_context("forkserver")
+    context.set_forkserver_preload(list(preload))
+    _name_sockets()
+    # A fresh Python looks for modules where it begins, before it looks among its own. Processes
+    # have the folder and the path of this one again.
+    with contextlib.chdir("/"):
+        forkserver.ensure_running()
+    return context
+
+
+@cache
+def _name_sockets() -> None:
+    """Let multiprocessing give its sockets short names, however long TMPDIR is: `socket_name`."""
+    folder = tempfile.gettempdir()
+    tempfile.tempdir = f"/proc/{os.getpid()}/fd/{os.open(folder, os.O_PATH)}"  # stays open
+    try:
+        get_temp_dir()
+    finally:
+        tempfile.tempdir = folder
+
+
 @contextmanager
 def processes(most: int, preload: Sequence[str] = ()) -> Iterator[Executor]:
     """At most so many processes to compute in, one a core; tasks that wait end with the block.
@@ -657,10 +692,8 @@ def processes(most: int, preload: Sequence[str] = ()) -> Iterator[Executor]:
     All of them need the modules to preload, which are imported once. There is an `AdaptuneError`
     if a process ends before its time.
     """
-    # A process forked from one with threads may deadlock.
-    context = get_context("forkserver")
-    context.set_forkserver_preload(list(preload))
     n = max(1, min(most, available()))
+    context = fork_server(*preload)
     # Ctrl-C reaches all processes; the first of them decides what happens.
     pool = ProcessPoolExecutor(n, context, signal.signal, (signal.SIGINT, signal.SIG_IGN))
     try:

@@ -2,7 +2,6 @@
 
 import contextlib
 import logging
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -60,7 +59,7 @@ from offline.objective import (
 from offline.search import BUDGETS, Finished
 from offline.trial import TrialSettings, TrialSetup
 from offline.tuning import DO_NOT_ADAPT, NO_BANK, choose, driven_cost, reserve, rivals
-from offline.workers import Cluster, Workers
+from offline.workers import Cluster, Workers, spare_memory
 
 COST = "cost [ms]"
 """Column of CPU time a scan, preparation included."""
@@ -211,8 +210,7 @@ def trial_workers(
     _log.info("trials run on %s; each sequence is prepared before its first one", where)
     odometry = study.odometry.changed(user_code=True)
     setup = TrialSetup(TrialSettings.of(study.config), odometry, study.sequences)
-    memory = 0.25 * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    return Cluster(setup, names, memory, cluster) if cluster else Workers(setup, n, memory)
+    return Cluster(setup, names, cluster) if cluster else Workers(setup, n, spare_memory())
 
 
 def _fitted(

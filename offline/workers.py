@@ -2,7 +2,6 @@
 
 import contextlib
 import logging
-import multiprocessing as mp
 import os
 import signal
 import threading
@@ -19,8 +18,8 @@ from uuid import uuid4
 
 from adaptune import __version__
 from adaptune.archive import Frames, Trial
-from adaptune.errors import AdaptuneError, in_a_line
-from adaptune.processes import apart, how_it_ended, pin
+from adaptune.errors import OUT_OF_MEMORY, AdaptuneError, MachineError, in_a_line, lacking
+from adaptune.processes import apart, fork_server, how_it_ended, pin
 from adaptune.progress import Progress, unseen
 from adaptune.recording.cache import fingerprints
 from adaptune.space import ParameterSet
@@ -193,9 +192,10 @@ class _Queue(Generic[W]):
         self.waiting.insert(0, task)
         self._deaths[task.key] += 1
         if self._deaths[task.key] == MOST_DEATHS:
+            help_ = "; if they were out of memory, lower offline.workers" * ("KILL" in death.cause)
             self.failure = WorkerError(
                 f"{MOST_DEATHS} workers died ({death.cause}) on {task}; what they wrote above may "
-                f"say why; if they were out of memory, lower offline.workers"
+                f"say why{help_}"
             )
 
 
@@ -208,6 +208,11 @@ def _pick(waiting: list[Task], near: dict[W, set[str]], worker: W) -> Task:
 
 MOST_PREPARED = 1.5e9
 """Bytes of prepared scans that a worker keeps; others are prepared again for each batch."""
+
+
+def spare_memory() -> float:
+    """Bytes of this machine that all its workers together may take for prepared scans."""
+    return 0.25 * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
 
 
 class Sequences:
@@ -253,7 +258,9 @@ def attempt(
         return sequences.run(task, progress)
     except AdaptuneError as error:
         return error
-    except Exception:
+    except Exception as error:
+        if said := OUT_OF_MEMORY if isinstance(error, MemoryError) else lacking(error):
+            return MachineError(f"{task}: {said}")
         return WorkerError(f"{task}:\n{traceback.format_exc()}")
 
 
@@ -267,10 +274,6 @@ class Workers:
         self.setup = setup
         self.n = n
         self.memory = memory
-        # A process forked from one with threads may deadlock. A small server that has imported
-        # what workers need forks them in milliseconds.
-        self._context = mp.get_context("forkserver")
-        self._context.set_forkserver_preload(["offline.trial", "adaptune.model.descriptor"])
         self._workers: dict[int, tuple[ForkServerProcess, Connection]] = {}
         self._busy: set[int] = set()
 
@@ -313,9 +316,10 @@ class Workers:
         return outcomes
 
     def _spawn(self, w: int) -> tuple[ForkServerProcess, Connection]:
-        here, there = self._context.Pipe()
+        context = fork_server("offline.trial", "adaptune.model.descriptor")
+        here, there = context.Pipe()
         given = (there, os.getpid() + w, self.memory / self.n)
-        process = self._context.Process(target=_serve, args=given, daemon=True)
+        process = context.Process(target=_serve, args=given, daemon=True)
         process.start()
         there.close()
         with contextlib.suppress(BrokenPipeError):  # `wait` notices it
@@ -368,8 +372,7 @@ class Cluster:
 
     A worker reads the recordings, which must be under the same path there.
 
-    Its workers share `memory` bytes, or less, for prepared scans. Use it as a context: leaving it
-    cancels the tasks that are not done.
+    Use it as a context: leaving it cancels the tasks that are not done.
 
     Raises
     ------
@@ -377,13 +380,12 @@ class Cluster:
         If it cannot be reached, has no workers, or workers of another version.
     """
 
-    def __init__(self, setup: TrialSetup, names: Iterable[str], memory: float, address: str):
+    def __init__(self, setup: TrialSetup, names: Iterable[str], address: str):
         try:
             import distributed
         except ImportError as error:
             raise ClusterError("--cluster needs Dask: pip install 'adaptune[dask]'") from error
         self._killed = distributed.KilledWorker
-        self._memory = memory
         self._address = address
         self._setup = _elsewhere(setup)
         self._files = {name: contents(self._setup.sequences, name) for name in names}
@@ -399,16 +401,12 @@ class Cluster:
                 f"--cluster {address}: cannot be reached ({error}); start a scheduler there "
                 f"(`dask scheduler`), or leave --cluster out"
             ) from error
-        try:
-            found = self.workers()
-        except ClusterError:
-            self._client.close()
-            raise
-        if not found:
-            self._client.close()
-            raise ClusterError(
-                f"--cluster {address}: has no workers; start some with `dask worker {address}`"
-            )
+        with contextlib.ExitStack() as undo:
+            undo.callback(self._client.close)
+            if not self.workers():
+                help_ = f"start some with `dask worker {address}`"
+                raise ClusterError(f"--cluster {address}: has no workers; {help_}")
+            undo.pop_all()
 
     def __enter__(self) -> Self:
         return self
@@ -439,7 +437,7 @@ class Cluster:
             self._files[task.sequence],
             task,
             of_host.index(worker),
-            self._memory / len(self._hosts),
+            1 / len(of_host),
             workers=[worker],
             allow_other_workers=False,
             pure=False,
@@ -553,13 +551,16 @@ _held: tuple[str, Sequences] | None = None
 
 
 def perform(
-    token: str, setup: TrialSetup, files: Mapping[Path, str], task: Task, core: int, memory: float
+    token: str, setup: TrialSetup, files: Mapping[Path, str], task: Task, core: int, share: float
 ) -> Outcome:
-    """Do a task, with the sequences that earlier tasks of the same campaign have prepared."""
+    """Do a task, with the sequences that earlier tasks of the same campaign have prepared.
+
+    They take this `share` of the machine's memory for them.
+    """
     global _held  # noqa: PLW0603 (a Dask worker keeps nothing else from task to task)
     check_files(setup.sequences, task.sequence, files)
     with _lock:
         pin(core)
         if _held is None or _held[0] != token:
-            _held = token, Sequences(setup, memory)
+            _held = token, Sequences(setup, share * spare_memory())
         return attempt(_held[1], task)

@@ -1,8 +1,6 @@
 """The command line."""
 
 import logging
-import sys
-from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -69,8 +67,7 @@ def _main(
 
 
 def main() -> None:
-    """Run the command line; a user's classes are also found in the working folder."""
-    sys.path.append(str(Path.cwd()))
+    """Run the command line."""
     app(prog_name="adaptune")
 
 

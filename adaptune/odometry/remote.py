@@ -10,8 +10,9 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Hashable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import cache
+from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
@@ -292,7 +293,9 @@ def _reached(address: str) -> socket.socket:
     family, where = parse_address(address)
     connection = socket.socket(family)
     try:
-        connection.connect(where)
+        is_file = family == socket.AF_UNIX
+        with processes.socket_name(Path(where)) if is_file else nullcontext(where) as name:
+            connection.connect(name)
     except OSError as error:
         connection.close()
         what = f"nothing listens at {address} ({error.strerror})"

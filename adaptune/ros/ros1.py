@@ -39,7 +39,9 @@ def ros_python() -> str:
     """
     found = [shutil.which("python3", path=folder) for folder in os.get_exec_path()]
     for python in dict.fromkeys([*filter(None, found), "/usr/bin/python3"]):
-        done = subprocess.run([python, "-c", "import rospy"], capture_output=True, check=False)
+        # Not what lies in the working folder under a name of Python's.
+        code = "import sys; sys.path[:] = filter(None, sys.path); import rospy"
+        done = subprocess.run([python, "-c", code], capture_output=True, check=False)
         if done.returncode == 0:
             return python
     raise LinkError(

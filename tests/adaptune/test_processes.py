@@ -1,5 +1,6 @@
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -33,7 +34,7 @@ NAMED = {
 def mine(tmp_path, monkeypatch):
     """Write modules that a study can name."""
     monkeypatch.syspath_prepend(str(tmp_path))
-    processes.server.cache_clear()
+    processes.servers.clear()
 
     def write(name, text):
         (tmp_path / f"{name}.py").write_text(text)
@@ -117,7 +118,7 @@ def test_the_driver_imports_no_code_of_the_user_s(mine, study_file, tmp_path, ca
 
     # Another study does not name the descriptor: nothing of it is used.
     (tmp_path / "imported").unlink()
-    processes.server.cache_clear()
+    processes.servers.clear()
     with pytest.raises(ModelError, match="the model: uses the descriptor 'users_own:described'"):
         Selector(model)
     assert Selector(model, descriptors=["users_own:described"]).fixed == model.fixed
@@ -361,3 +362,70 @@ def test_large_arrays_among_small_ones_leave_no_holes():
 
     assert kept("as ever") > 50.0
     assert kept("apart") < 10.0
+
+
+ODD = """
+import os, sys
+from pathlib import Path
+from adaptune.processes import processes
+
+def seen():
+    import offline, random
+    return [os.getcwd(), offline.__file__, random.__file__]
+
+if __name__ == "__main__":
+    with processes(1, ["offline", "random", "statistics"]) as pool:
+        import offline, random
+        assert pool.submit(seen).result() == [os.getcwd(), offline.__file__, random.__file__]
+    print("well")
+"""
+
+
+def test_processes_begin_whatever_the_folder_holds_and_however_long_its_name_is(tmp_path):
+    (tmp_path / "odd.py").write_text(ODD)
+    here = tmp_path / ("x" * 100)
+    here.mkdir()
+    # Modules of Python's, of multiprocessing's, and of adaptune's.
+    for name in ("random", "statistics", "selectors", "queue", "offline"):
+        (here / f"{name}.py").write_text("import os; os.abort()")
+    done = subprocess.run(
+        [sys.executable, "-P", tmp_path / "odd.py"],
+        cwd=here,
+        env=os.environ | {"TMPDIR": str(here)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.stdout, done.stderr) == ("well\n", "")
+    assert not list(here.glob("pymp-*"))
+
+
+SCRIPT = "import sys; from adaptune.__main__ import main; sys.exit(main())"
+
+
+@pytest.mark.parametrize("how", [("-m", "adaptune"), ("-c", SCRIPT)])
+def test_the_command_takes_modules_of_the_working_folder_last(tmp_path, how):
+    for name in ("random", "typing", "offline"):
+        (tmp_path / f"{name}.py").write_text("import os; os.abort()")
+    path = os.pathsep.join(["", *sys.path])
+    done = subprocess.run(
+        [sys.executable, *how, "--version"],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.stdout.startswith("adaptune "), done.stderr
+
+
+def test_sockets_have_short_names(tmp_path):
+    folder = tmp_path / ("x" * 120)
+    folder.mkdir()
+    with socket.socket(socket.AF_UNIX) as server, socket.socket(socket.AF_UNIX) as client:
+        with processes.socket_name(folder / "odometry.sock") as name:
+            server.bind(name)
+        server.listen()
+        assert (folder / "odometry.sock").is_socket()
+        with processes.socket_name(folder / "odometry.sock") as name:
+            client.connect(name)

@@ -83,7 +83,7 @@ def local(trained_folder):
 
 
 def cluster_of(study, address):
-    return Cluster(setup_of(study), study.training, 1e9, address)
+    return Cluster(setup_of(study), study.training, address)
 
 
 def test_a_cluster_without_workers_is_told(study_file, tmp_path, scheduler, monkeypatch):
@@ -131,7 +131,7 @@ def test_a_class_of_the_user_that_hangs_is_ended(study_file, tmp_path, scheduler
         limits=Limits(seconds=1.0),
         user_code=True,
     )
-    with Cluster(setup_of(study, hangs), ["one"], 1e9, scheduler[0]) as pool:
+    with Cluster(setup_of(study, hangs), ["one"], scheduler[0]) as pool:
         ((_, result),) = run(pool, [Task("one", (0,), ({"x": 0.5},))])
     assert "a scan took longer than" in result.trials[0].faults[0]
 

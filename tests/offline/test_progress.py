@@ -1,4 +1,6 @@
+import errno
 from importlib import import_module
+from types import SimpleNamespace
 
 import pytest
 
@@ -69,3 +71,24 @@ def test_offline_shows_scans_and_runs(study_file, tmp_path, workers):
         if workers == 1:
             assert done == sorted(done)
         assert {call[2] for call in calls if call[0] == what} == {total}
+
+
+@pytest.mark.parametrize(("cause", "memory"), [("SIGKILL", True), ("ended with code 1", False)])
+def test_only_a_worker_that_was_killed_may_have_lacked_memory(cause, memory):
+    pool = TwoWords()
+    pool.said = [Death(cause)] * workers.MOST_DEATHS
+    with pytest.raises(workers.WorkerError) as caught:
+        list(run(pool, [Task("one", (0, 1), ({}, {}))]))
+    assert ("out of memory" in str(caught.value)) == memory
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [(MemoryError(), "out of memory"), (OSError(errno.ENOSPC, "full"), "the disk is full")],
+)
+def test_what_the_machine_lacks_is_told_in_a_sentence(error, words):
+    def lacking(*_):
+        raise error
+
+    failure = workers.attempt(SimpleNamespace(run=lacking), Task("one", (0, 1), ({}, {})))
+    assert str(failure).startswith(f"one, trials 0, 1: {words}; ")

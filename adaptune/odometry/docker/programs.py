@@ -161,7 +161,8 @@ class ContainerTransport(processes.Transport):
         while time.monotonic() - begin < FIRST_ANSWER:
             connection = socket.socket(socket.AF_UNIX)
             with contextlib.suppress(OSError):
-                connection.connect(str(folder / "odometry.sock"))
+                with processes.socket_name(folder / "odometry.sock") as name:
+                    connection.connect(name)
                 connection.settimeout(max(self.bounds.seconds, FIRST_ANSWER))
                 return processes.SocketStream(connection)
             connection.close()

@@ -129,7 +129,8 @@ class RosSystem:
             self._environment["HOME"] = _FOLDER
         with contextlib.ExitStack() as undo:
             with socket.socket(socket.AF_UNIX) as server:
-                server.bind(str(self.folder / "link"))
+                with processes.socket_name(self.folder / "link") as name:
+                    server.bind(name)
                 (self.folder / "link").chmod(0o777)
                 server.listen()
                 self._container = self._start(memory, mounts)

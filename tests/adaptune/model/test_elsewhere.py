@@ -53,7 +53,7 @@ SAID = {
 
 @pytest.fixture(autouse=True)
 def mine(tmp_path, monkeypatch):
-    hosting.server.cache_clear()
+    hosting.servers.clear()
     (tmp_path / "descriptors_elsewhere.py").write_text(MINE)
     monkeypatch.syspath_prepend(str(tmp_path))
 

@@ -134,11 +134,13 @@ def test_settings_are_checked_in_another_process():
 def test_a_server_that_was_killed_is_replaced():
     odometry = isolated("none")
     odometry.start(scan(0), np.eye(4))
+    other = processes.server(SERVICE, "faulty:Faulty")
     processes.server(SERVICE, "faulty:Clean").process.kill()
-    processes.server(SERVICE, "faulty:Clean").process.wait()
-    # Those it has forked live on.
+    processes.servers[SERVICE, "faulty:Clean"].process.wait()
+    # Those it has forked live on, and so do other servers.
     assert odometry.register(scan(1)).T_odom_sensor[0, 3] == pytest.approx(0.1)
     odometry.start(scan(2), np.eye(4))
+    assert processes.server(SERVICE, "faulty:Faulty") is other
     assert odometry.register(scan(3)).T_odom_sensor[0, 3] == pytest.approx(0.1)
     assert not odometry.faults
 
