@@ -2,7 +2,6 @@
 
 import contextlib
 import logging
-import multiprocessing
 import os
 import threading
 import time
@@ -22,9 +21,9 @@ from adaptune.bank.bank import CLOCK, Bank, Clock
 from adaptune.errors import AdaptuneError
 from adaptune.odometry.base import Motions, OdometryInstance
 from adaptune.odometry.tracker import HealthCheck, RegisteredScan
-from adaptune.processes import shared_cores
+from adaptune.processes import fork_server, shared_cores
 from adaptune.recording.scan import Imu, Scan, joined
-from adaptune.selector import AnySelector, Schedule, TimedSelector
+from adaptune.selector import BACK, AnySelector, Schedule, TimedSelector
 from adaptune.space import Selection
 from adaptune.study.config import RealTimeConfig
 from online.replay import Driver, ReplayRecord, Watch
@@ -85,8 +84,8 @@ class SelectorProcess:
         self.period, self.unseen, self.cpu, self.alive = period, 0, 0.0, True
         self._owed = 0  # answers
         self._moved: Motions | None = None  # over the scans that were not shown
-        context = multiprocessing.get_context("forkserver")
-        context.set_forkserver_preload([__name__])
+        self._stamp = 0  # of the last scan, shown or not
+        context = fork_server(__name__)
         self._here, there = context.Pipe()
         given = there, make, period, sorted(shared_cores())
         self._process = context.Process(target=_run, args=given, daemon=True)
@@ -109,7 +108,10 @@ class SelectorProcess:
 
         It waits at most so many seconds for the process to take another scan.
         """
-        moved = motions if self._moved is None else _one_after_the_other(self._moved, motions)
+        # Where the clock goes back, another drive begins, see `TimedSelector`.
+        before = None if self._stamp - stamp > BACK else self._moved
+        self._stamp = stamp
+        moved = motions if before is None else _one_after_the_other(before, motions)
         self._take_answers()
         if self._owed == SLOTS:
             self._take_answers(seconds)
@@ -178,8 +180,7 @@ def _one_after_the_other(first: Motions, second: Motions) -> Motions:
 
 def _run(connection: Connection, make: Make, period: float, cores: list[int]) -> None:
     """Be the other process."""
-    if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, cores)
+    os.sched_setaffinity(0, cores)
     with contextlib.suppress(EOFError, OSError, KeyboardInterrupt):
         try:
             selector = make()
@@ -199,7 +200,7 @@ def _run(connection: Connection, make: Make, period: float, cores: list[int]) ->
 
 
 def _lower_priority() -> None:
-    with contextlib.suppress(OSError, AttributeError):
+    with contextlib.suppress(OSError):
         os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
 
 

@@ -340,6 +340,7 @@ class Bank(OdometryInstance):
             for trial, of in sets.items()
         ]
         self._told: set[int] = set()
+        self._known_faults = [0] * len(sets)  # of each member, when it last worked
         self.late = Lateness(self._members, self._names, rate, clock)
         self._rate = rate
         # In real time, there is no time for scans of the past.
@@ -508,10 +509,13 @@ class Bank(OdometryInstance):
         for i, (name, member) in enumerate(zip(self._names, self._members, strict=True)):
             if self.late.resting[i]:
                 continue
-            if member.ended and i not in self._told:
+            # One that has not begun yet, or that waits for its turn, has not failed.
+            new = member.faults[self._known_faults[i] :]
+            if member.ended and new and i not in self._told:
                 self._told.add(i)
-                why = member.faults[-1] if member.faults else "it was closed"
-                _log.warning("%s ended: %s; the bank goes on without it", name, why)
-            elif not member.ended and i in self._told:
-                self._told.remove(i)
-                _log.warning("%s is back", name)
+                _log.warning("%s ended: %s; the bank goes on without it", name, new[-1])
+            elif not member.ended:
+                self._known_faults[i] = len(member.faults)
+                if i in self._told:
+                    self._told.remove(i)
+                    _log.warning("%s is back", name)

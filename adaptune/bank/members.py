@@ -47,7 +47,7 @@ class SentScan(NamedTuple):
 
 
 class MemberProcess:
-    """A process with members, which the first start of one begins.
+    """A process with members, which the first start of one begins, and the last close ends.
 
     `name` is an odometry that is imported before the process is forked.
     """
@@ -58,6 +58,7 @@ class MemberProcess:
         self.conversation = processes.Conversation(
             processes.Forked(SERVICE, name, "members", bounds)
         )
+        self.users = set[int]()  # numbers of the members that are not closed
         self._numbers = itertools.count()
         self._held: OrderedDict[int, None] = OrderedDict()
         self._answers: dict[int, deque[processes.Message]] = {}
@@ -128,6 +129,7 @@ class _Channel(processes.Conversation):
     def __init__(self, process: MemberProcess, number: int):
         self._process, self._number = process, number
         self._generation: int | None = None
+        process.users.add(number)
 
     @property
     def alive(self) -> bool:
@@ -141,6 +143,7 @@ class _Channel(processes.Conversation):
 
     def open(self) -> None:
         self._process.open()
+        self._process.users.add(self._number)
         self._generation = self._process.generation
 
     def send(self, header: Mapping[str, Any], **arrays: Any) -> None:
@@ -157,11 +160,9 @@ class _Channel(processes.Conversation):
 
     def close(self) -> None:
         self._generation = None
-        if self._number == 0:
+        self._process.users.discard(self._number)
+        if not self._process.users:
             self._process.close()
-
-    def __del__(self) -> None:
-        pass  # the process ends with its last member
 
 
 class Member(Isolated):

@@ -1,9 +1,11 @@
 """What every odometry offers, and the base class of adapters."""
 
 import logging
+import sys
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Hashable, Iterable, Mapping, Sequence
+from dataclasses import fields, is_dataclass
 from functools import cached_property
 from typing import Any, ClassVar, NamedTuple
 
@@ -332,15 +334,20 @@ class Odometry(ABC):
 
 
 def prepared_bytes(prepared: Any) -> int:
-    """Memory that a prepared scan takes, roughly, in bytes."""
-    if isinstance(prepared, Scan):
-        prepared = tuple(vars(prepared).values())
-    size = getattr(prepared, "nbytes", None)
-    if size is not None:
+    """Memory that a prepared scan takes, roughly, in bytes.
+
+    That of a compiled object, such as a cloud with its tree, is not known: it counts a megabyte.
+    """
+    if (size := getattr(prepared, "nbytes", None)) is not None:
         return int(size)
-    if isinstance(prepared, tuple):
+    if is_dataclass(prepared):
+        prepared = [getattr(prepared, each.name) for each in fields(prepared)]
+    if isinstance(prepared, Mapping):
+        prepared = [*prepared.values()]
+    if isinstance(prepared, tuple | list):
         return sum(map(prepared_bytes, prepared))
-    return 0 if prepared is None or isinstance(prepared, int) else 1_000_000
+    plain = prepared is None or isinstance(prepared, int | float | str | bytes)
+    return sys.getsizeof(prepared) if plain else 1_000_000
 
 
 # Prepared scans that several instances share.

@@ -279,6 +279,16 @@ def test_it_never_waits_and_the_motion_of_what_was_not_shown_is_not_lost(started
     assert set(told["member"].values()) == {1.0}
 
 
+def test_where_the_clock_goes_back_no_motion_of_before_counts(started, tmp_path):
+    process, scan = started(partial(Noting, tmp_path / "gate"), 1e-9), drive(1)[0]
+    for stamp in range(SLOTS + 3):
+        process.show(10 * SECOND + stamp, scan, moved(0.25))
+    (tmp_path / "gate").touch()
+    assert process.answer_to(10 * SECOND + SLOTS - 1, 60.0)
+    assert process.show(0, scan, moved(0.0))
+    assert process.answer_to(0, 60.0).selection.parameters["metres"] == 0.0
+
+
 def test_an_answer_that_is_late_is_dropped(started, tmp_path):
     process, scan = started(partial(Noting, tmp_path / "gate"), 1e-9), drive(1)[0]
     process.show(1, scan, moved(0.1))

@@ -175,7 +175,8 @@ def _telling(image: str) -> Iterator[None]:
     try:
         yield
     except APIError as error:
-        raise OdometryError(f"image {image!r}: {error.explanation or error}") from error
+        kind = EngineError if error.is_server_error() else OdometryError
+        raise kind(f"image {image!r}: {error.explanation or error}") from error
     except OSError as error:
         raise EngineError(f"the Docker engine does not answer any more ({error})") from error
 
@@ -270,13 +271,13 @@ class Container:
 
     def ended(self) -> int | None:
         """Exit code, or minus the signal's number; None while it runs."""
-        from docker.errors import APIError
+        from docker.errors import NotFound
 
         with _telling(self.image):
             try:
                 state = engine().api.inspect_container(self.id)["State"]
-            except APIError:
-                return -9
+            except NotFound:  # somebody has removed it
+                return -signal.SIGKILL
         self.out_of_memory = bool(state["OOMKilled"])
         if state["Running"]:
             return None
@@ -323,13 +324,13 @@ class Container:
 
     def finished(self, name: str) -> int | None:
         """Exit code of a command that `run` began; None while it runs."""
-        from docker.errors import APIError
+        from docker.errors import NotFound
 
         with _telling(self.image):
             try:
                 state = engine().api.exec_inspect(name)
-            except APIError:
-                return -9  # with its container
+            except NotFound:
+                return -signal.SIGKILL  # with its container
         return None if state["Running"] else int(state["ExitCode"] or 0)
 
     def last_lines(self) -> str:

@@ -190,6 +190,18 @@ def test_a_member_that_a_fault_has_ended_is_told_once_and_starts_again(caplog):
     bank.close()
 
 
+def test_a_member_that_has_rested_since_the_start_has_not_ended(caplog):
+    bank = with_faulty("none")
+    bank.apply(Selection(7, {}, {7: 1.0}, resting=frozenset({3})))
+    np.testing.assert_allclose(steps_of(bank, 5), 0.1)
+    bank.apply(Selection(7, {}, {7: 0.5, 3: 0.5}))
+    assert all(member.ended for member in bank._members if member.apart)
+    np.testing.assert_allclose(np.diff(x_on(bank, range(5, 9))), 0.1)
+    assert not any(member.ended for member in bank._members)
+    assert not [r for r in caplog.records if r.name == "adaptune.bank.bank"]
+    bank.close()
+
+
 def test_one_that_cannot_start_is_out_for_good(caplog):
     bank = with_faulty("never begins")
     with caplog.at_level(logging.WARNING, "adaptune.bank.bank"):

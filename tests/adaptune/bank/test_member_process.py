@@ -124,3 +124,18 @@ def test_usage_counts_the_process_once(scans):
     used = odometry.usage
     assert 0.0 < used.other_cpu < used.cpu
     assert 20.0 < used.memory < 5_000.0
+
+
+def test_a_process_ends_with_the_last_of_its_members(scans):
+    made = spread(POOL, [POOL.space.complete(one) for one in SETS], 2)
+    members = [one for one in reversed(made) if isinstance(one, Member)]
+    process = members[0].preparation
+    for member in members:
+        member.start(member.prepare(scans[0]), np.eye(4))
+    for i, member in enumerate(members):
+        assert process.conversation.alive
+        member.close()
+        for other in members[i + 1 :]:
+            assert np.isfinite(other.register(other.prepare(scans[1])).T_odom_sensor).all()
+            assert not other.faults
+    assert not process.conversation.alive

@@ -8,6 +8,7 @@ import os
 import subprocess
 import sys
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -214,6 +215,28 @@ def test_prepared_scans_say_what_they_take(name):
     cloud = getattr(prepared, "cloud", prepared).points
     held = np.asarray(cloud() if callable(cloud) else cloud).nbytes
     assert prepared_bytes(prepared) >= 0.9 * held > 1e5
+
+
+class Mine(NamedTuple):
+    ranges: np.ndarray
+    rings: list
+    gain: float = 0.5
+    frame: str = "lidar"
+    stamp: int = 1_700_000_000_000_000_000
+
+
+@pytest.mark.parametrize(
+    ("prepared", "at_least", "at_most"),
+    [
+        (Mine(np.zeros(300), [np.zeros(10), 2]), 2480, 3000),
+        ({"ranges": np.zeros(300), "note": b"none"}, 2400, 2600),
+        (np.zeros(300), 2400, 2400),
+        ((1, 2.0, "three", None), 4, 500),
+        (object(), 1e6, 1e6),
+    ],
+)
+def test_plain_values_count_little_in_prepared_scans(prepared, at_least, at_most):
+    assert at_least <= prepared_bytes(prepared) <= at_most
 
 
 def parameter_cases():
