@@ -678,7 +678,7 @@ def fork_server(*preload: str) -> ForkServerContext:
 def _name_sockets() -> None:
     """Let multiprocessing give its sockets short names, however long TMPDIR is: `socket_name`."""
     folder = tempfile.gettempdir()
-    tempfile.tempdir = f"/proc/self/fd/{os.open(folder, os.O_PATH)}"  # which stays open
+    tempfile.tempdir = f"/proc/{os.getpid()}/fd/{os.open(folder, os.O_PATH)}"  # stays open
     try:
         get_temp_dir()
     finally:
