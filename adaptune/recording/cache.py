@@ -28,7 +28,7 @@ from adaptune.recording.scan import Scan
 _log = logging.getLogger(__name__)
 _NOT_KEPT = "%s: not kept in the cache (%s)"
 
-_VERSION = 7
+_VERSION = 8
 _CAP_GB, _MOST_GB = 50.0, 1e9
 # Seconds. A writer that has not written for this long is dead.
 _DEAD = 3600.0

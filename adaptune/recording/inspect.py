@@ -10,13 +10,14 @@ from rich.table import Table
 from rich.text import Text
 from rosbags.highlevel import AnyReader
 
-from adaptune import files, geometry
+from adaptune import files
 from adaptune.errors import AdaptuneError, Finding
 from adaptune.progress import Progress, unseen
 from adaptune.recording import Scan, SequenceConfig, SequenceError
 from adaptune.recording.bag import IMU_TYPES, POINTS_TYPES, BagSource, IndexReader
-from adaptune.recording.clouds import FARTHEST, PATH, POSES, Pose, header_of, parse, usable
+from adaptune.recording.clouds import PATH, POSES, Pose, header_of, parse, usable
 from adaptune.recording.config import BAG_SUFFIXES, REFERENCE_FILES, bag_paths
+from adaptune.recording.content import Content
 from adaptune.recording.findings import (
     Topic,
     of_clouds,
@@ -26,7 +27,6 @@ from adaptune.recording.findings import (
     of_topic,
 )
 from adaptune.recording.recording import RecordedSequence
-from adaptune.recording.scan import Reading
 from adaptune.trajectory import Trajectory, is_kitti, read_kitti, read_trajectory
 
 # What each stage uses.
@@ -49,10 +49,14 @@ class Inspection:
     complete: bool = True  # whether it was read to its end or damage, and not only a sample of it
     scan: Scan | None = None  # the first one; none where no scan could be read
     fields: tuple[str, ...] = ()  # names of those of a point, in a PointCloud2
-    valid: list[int] = field(default_factory=list)  # valid points of each cloud that was read
-    readings: list[Reading] = field(default_factory=list)  # of each of them
+    content: Content = field(default_factory=Content)  # of each cloud that was read
     reference: Trajectory | None = None  # as far as it was read
     findings: list[Finding] = field(default_factory=list)
+
+    def keep(self, scan: Scan) -> None:
+        """Look at a scan that was read."""
+        self.content.see(scan)
+        self.scan = self.scan or scan
 
     @property
     def n_messages(self) -> int:
@@ -62,7 +66,7 @@ class Inspection:
     @property
     def n_read(self) -> tuple[int, int]:
         """How many of them were read, and clouds among them that could be decoded."""
-        return sum(topic.n_read for topic in self.topics.values()), len(self.valid)
+        return sum(topic.n_read for topic in self.topics.values()), len(self.content.looks)
 
     @property
     def name(self) -> str:
@@ -164,7 +168,7 @@ def _inspect_scans(path: Path, kind: str, deep: bool, show: Progress) -> Inspect
     found.complete = number == len(frames)
     for done, i in enumerate(np.linspace(0, len(frames) - 1, number).astype(int), start=1):
         try:
-            _keep_scan(found, frames[i].load())
+            found.keep(frames[i].load())
         except AdaptuneError as error:
             topic.undecoded.append(((frames[i].stamp - frames[0].stamp) * 1e-9, str(error)))
         show("reading", done, number)
@@ -178,13 +182,6 @@ def _inspect_scans(path: Path, kind: str, deep: bool, show: Progress) -> Inspect
     return found
 
 
-def _keep_scan(found: Inspection, scan: Scan) -> None:
-    with np.errstate(over="ignore"):
-        found.valid.append(geometry.count_within(scan.points, 0.0, FARTHEST))
-    found.readings.append(scan.reading)
-    found.scan = found.scan or scan
-
-
 def _find(found: Inspection, apart: bool, slack: float) -> None:
     """Add what is wrong with what was read.
 
@@ -196,7 +193,7 @@ def _find(found: Inspection, apart: bool, slack: float) -> None:
         found.findings += of_topic(topic, of.get(topic.name, ""), found.complete, apart)
     scans = found.topics.get(found.used.get("points", ""))
     if scans is not None:
-        found.findings += [*of_clouds(scans, found.valid), *of_times(scans, found.readings)]
+        found.findings += [*of_clouds(scans, found.content), *of_times(scans, found.content)]
     if (reference := found.reference) is None:
         return
     poses = found.topics.get(found.used.get("reference", ""))
@@ -204,6 +201,8 @@ def _find(found: Inspection, apart: bool, slack: float) -> None:
     found.findings += of_reference(reference, complete)
     if scans is not None and any(scans.stamps) and (found.complete or len(reference) > 1):
         found.findings += of_overlap(reference, scans.times, slack)
+        in_map = poses is not None and scans.frames == poses.frames
+        found.findings += found.content.of_place(reference, in_map, (scans.name,))
 
 
 # Reading bags: a sample of their messages, or all of them.
@@ -362,9 +361,10 @@ class _Survey:
     def _take(self, topic: Topic, when: int, data: bytes) -> None:
         """Keep when a message was made and recorded, and decode it where it is used."""
         topic.n_read += 1
-        stamp = header_of(data, self._reader.is2)[0] if topic.stamped else when
+        stamp, frame = header_of(data, self._reader.is2) if topic.stamped else (when, "")
         if stamp is not None:
             topic.stamps[-1].append(stamp)
+            topic.frames.add(frame)
         if topic.type == PATH and topic.name in self._of:
             self._path = data  # each path repeats the one before: the last one will do
         else:
@@ -375,7 +375,7 @@ class _Survey:
             match self._of.get(topic.name):
                 case "points":
                     first = self._found.scan is None
-                    _keep_scan(self._found, self._load(data, "message"))
+                    self._found.keep(self._load(data, "message"))
                     if first and topic.type == POINTS_TYPES[0]:
                         fields = parse(data, self._reader.is2).fields
                         self._found.fields = tuple(name for name, *_ in fields)

@@ -82,6 +82,7 @@ class Reading(NamedTuple):
     last: float = np.nan
     unit: float = 0.0  # seconds per unit of the points' times
     clock: int | None = None  # nanoseconds of the first point, if the sensor gives its own clock
+    marks: float = 0.0  # share of the points that mark rays that did not come back, far away
 
 
 UNREAD = Reading()
