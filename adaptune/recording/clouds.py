@@ -247,10 +247,12 @@ def from_fields(raw: NDArray[Any] | Mapping[str, NDArray[Any]], stamp: int, timi
     made = (np.empty((n, 3), np.float32), *(np.empty(len(v), v.dtype) for v in given))
     gather = _kernel(given[0].dtype.str)
     valid, far, low, high = gather(x, y, z, given, made)
+    marks = 0.0
     if far or not valid:
         marked = _marks([columns[axis] for axis in "xyz"])
         x = np.where(marked, np.float32(np.nan), x)
         valid, _, low, high = gather(x, y, z, given, made)
+        marks = np.count_nonzero(marked) / max(n, 1)
     if valid < n:
         # A copy, so that the other points are not kept in memory with them.
         made = tuple(values[:valid].copy() for values in made)
@@ -260,6 +262,7 @@ def from_fields(raw: NDArray[Any] | Mapping[str, NDArray[Any]], stamp: int, timi
         start, seconds, reading = timing.resolve(stamp, timed, (low, high))
     except TimingError as error:
         raise PointCloudError(str(error)) from error
+    reading = reading._replace(marks=marks)
     given_rings, given_lights = rings if ring else None, lights if intensity else None
     reading = reading._replace(unread=unread)
     return Scan(start, points, seconds, given_rings, None, given_lights, reading)

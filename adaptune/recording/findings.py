@@ -10,13 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptune.errors import Finding
-from adaptune.recording.clouds import FARTHEST
+from adaptune.recording.content import Content, of_looks
 from adaptune.recording.poses import sound
-from adaptune.recording.scan import SOONEST, Frame, Reading, doubts, in_order
+from adaptune.recording.scan import SOONEST, Frame, doubts, in_order
 from adaptune.trajectory import Trajectory
-
-LEAST_POINTS = 20
-"""Valid points that an odometry needs."""
 
 
 @dataclass(eq=False)
@@ -34,6 +31,7 @@ class Topic:
     recorded: list[int] = field(default_factory=list)  # of the same messages
     undecoded: list[tuple[float, str]] = field(default_factory=list)  # seconds, and why
     types: Counter[str] = field(default_factory=Counter)  # how many messages there are of each
+    frames: set[str] = field(default_factory=set)  # of the messages that were read
 
     @property
     def times(self) -> NDArray[np.int64]:
@@ -202,25 +200,25 @@ def of_clock(name: str, parts: Sequence[Part], used: Part) -> Finding:
     return Finding((name,), what, mend, of="points")
 
 
-def of_clouds(topic: Topic, valid: Sequence[int]) -> Iterator[Finding]:
-    """What is wrong with clouds; those that were read have `valid` points each."""
+def of_clouds(topic: Topic, content: Content) -> Iterator[Finding]:
+    """What is wrong with the clouds that were read."""
     where, of = (topic.name,), "points"
     if topic.count == 1:
         what = "holds a single cloud: no motion"
         yield Finding(where, what, of=of, lacks="more than one cloud")
-    n, few = len(valid), sum(points < LEAST_POINTS for points in valid)
-    rule = f"fewer than {LEAST_POINTS} valid points (finite, not zero, within {FARTHEST:g} m)"
-    if few and few == n:
-        mend = "an odometry cannot use them: look at the driver, or choose another topic"
-        yield Finding(where, f"all {n} clouds hold {rule}", mend, of=of, lacks="clouds with points")
-    elif few:
-        yield Finding(where, f"{few} of {n} clouds hold {rule}", _GAPS[of], of=of)
+    if len(topic.frames) > 1:
+        what = f"holds clouds of {', '.join(sorted(map(repr, topic.frames)))}"
+        mend = "name one of these frames as `frame`"
+        yield Finding(where, what, mend, of=of, lacks="clouds of one frame")
+    else:
+        yield from of_looks(content.looks, where)
 
 
-def of_times(topic: Topic, readings: Sequence[Reading]) -> Iterator[Finding]:
+def of_times(topic: Topic, content: Content) -> Iterator[Finding]:
     """What is wrong with the times of the points."""
     steps = topic.steps[topic.steps * 1e9 >= SOONEST]
     period = float(np.median(steps)) if len(steps) else 0.0
+    readings = [look.reading for look in content.looks]
     return (doubt.below((topic.name,)) for doubt in doubts(readings, period))
 
 

@@ -10,7 +10,7 @@ from rich.table import Table
 from rich.text import Text
 from rosbags.highlevel import AnyReader
 
-from adaptune import files, geometry
+from adaptune import files
 from adaptune.errors import AdaptuneError, Finding, MachineError
 from adaptune.metrics import travelled
 from adaptune.progress import Progress, unseen
@@ -18,7 +18,6 @@ from adaptune.recording import Scan, SequenceConfig, SequenceError
 from adaptune.recording.bag import IMU_TYPES, BagSource, IndexReader, Window, storages
 from adaptune.recording.clouds import (
     CLOUDS,
-    FARTHEST,
     PATH,
     POSES,
     Pose,
@@ -29,6 +28,7 @@ from adaptune.recording.clouds import (
     usable,
 )
 from adaptune.recording.config import BAG_SUFFIXES, REFERENCE_FILES, bag_paths
+from adaptune.recording.content import Content
 from adaptune.recording.findings import (
     Topic,
     of_clouds,
@@ -38,7 +38,6 @@ from adaptune.recording.findings import (
     of_topic,
 )
 from adaptune.recording.folder import kitti, scan_folder
-from adaptune.recording.scan import Reading
 from adaptune.trajectory import Trajectory, is_kitti, read_kitti, read_trajectory
 
 # What each stage uses.
@@ -61,11 +60,15 @@ class Inspection:
     complete: bool = True  # whether it was read to its end or damage, and not only a sample of it
     scan: Scan | None = None  # the first one; none where no scan could be read
     fields: tuple[str, ...] = ()  # names of those of a point, in a PointCloud2
-    valid: list[int] = field(default_factory=list)  # valid points of each cloud that was read
-    readings: list[Reading] = field(default_factory=list)  # of each of them
+    content: Content = field(default_factory=Content)  # of each cloud that was read
     reference: Trajectory | None = None  # as far as it was read
     findings: list[Finding] = field(default_factory=list)
     stamped_by: str = ""  # what gives the times of scans in files
+
+    def keep(self, scan: Scan) -> None:
+        """Look at a scan that was read."""
+        self.content.see(scan)
+        self.scan = self.scan or scan
 
     @property
     def n_messages(self) -> int:
@@ -75,7 +78,7 @@ class Inspection:
     @property
     def n_read(self) -> tuple[int, int]:
         """How many of them were read, and clouds among them that could be decoded."""
-        return sum(topic.n_read for topic in self.topics.values()), len(self.valid)
+        return sum(topic.n_read for topic in self.topics.values()), len(self.content.looks)
 
     @property
     def name(self) -> str:
@@ -178,7 +181,7 @@ def _inspect_scans(path: Path, kind: str, deep: bool, show: Progress) -> Inspect
     found.stamped_by, found.findings = source.stamped_by, [*source.findings]
     for done, i in enumerate(np.linspace(0, len(frames) - 1, number).astype(int), start=1):
         try:
-            _keep_scan(found, frames[i].load())
+            found.keep(frames[i].load())
         except AdaptuneError as error:
             topic.undecoded.append(((frames[i].stamp - frames[0].stamp) * 1e-9, str(error)))
         show("reading", done, number)
@@ -192,13 +195,6 @@ def _inspect_scans(path: Path, kind: str, deep: bool, show: Progress) -> Inspect
     return found
 
 
-def _keep_scan(found: Inspection, scan: Scan) -> None:
-    with np.errstate(over="ignore"):
-        found.valid.append(geometry.count_within(scan.points, 0.0, FARTHEST))
-    found.readings.append(scan.reading)
-    found.scan = found.scan or scan
-
-
 def _find(found: Inspection, apart: bool, slack: float) -> None:
     """Add what is wrong with what was read.
 
@@ -210,7 +206,7 @@ def _find(found: Inspection, apart: bool, slack: float) -> None:
         found.findings += of_topic(topic, of.get(topic.name, ""), found.complete, apart)
     scans = found.topics.get(found.used.get("points", ""))
     if scans is not None:
-        found.findings += [*of_clouds(scans, found.valid), *of_times(scans, found.readings)]
+        found.findings += [*of_clouds(scans, found.content), *of_times(scans, found.content)]
     if (reference := found.reference) is None:
         return
     poses = found.topics.get(found.used.get("reference", ""))
@@ -219,6 +215,8 @@ def _find(found: Inspection, apart: bool, slack: float) -> None:
     found.findings += of_reference(reference, complete, begin=begin)
     if scans is not None and any(scans.stamps) and (found.complete or len(reference) > 1):
         found.findings += of_overlap(reference, scans.times, slack)
+        in_map = poses is not None and scans.frames == poses.frames
+        found.findings += found.content.of_place(reference, in_map, (scans.name,))
 
 
 # Reading bags: a sample of their messages, or all of them.
@@ -378,10 +376,11 @@ class _Survey:
     def _take(self, topic: Topic, kind: str, when: int, data: bytes) -> None:
         """Keep when a message was made and recorded, and decode it where it is used."""
         topic.n_read += 1
-        stamp = header_of(data, self._reader.is2)[0] if topic.stamped else when
+        stamp, frame = header_of(data, self._reader.is2) if topic.stamped else (when, "")
         if stamp is not None:
             topic.stamps[-1].append(stamp)
             topic.recorded.append(when)
+            topic.frames.add(frame)
         if kind == PATH and topic.name in self._of:
             self._path = data  # each path repeats the one before: the last one will do
         else:
@@ -392,7 +391,7 @@ class _Survey:
             match self._of.get(topic.name):
                 case "points":
                     first = self._found.scan is None
-                    _keep_scan(self._found, self._load(kind, data, "message"))
+                    self._found.keep(self._load(kind, data, "message"))
                     if first and CLOUDS[kind] is decode_cloud:
                         fields = parse(data, self._reader.is2).fields
                         self._found.fields = tuple(name for name, *_ in fields)

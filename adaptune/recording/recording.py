@@ -17,6 +17,7 @@ from adaptune.errors import AdaptuneError
 from adaptune.geometry import to_pose
 from adaptune.recording import cache, compensation, views
 from adaptune.recording.config import ESTIMATED, NO_REFERENCE, SequenceConfig, files_of
+from adaptune.recording.content import Content, of_looks
 from adaptune.recording.poses import sound
 from adaptune.recording.scan import (
     BACKWARD,
@@ -42,15 +43,6 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 # Which of the scans of a recording are used.
-
-
-REPEATED = "scans with the same points as the one before"
-SOON = "scans less than 1 ms after the one before"
-
-
-def repeats(scan: Scan, last: Scan) -> bool:
-    """Whether it holds the same points as the scan before. No sensor measures twice the same."""
-    return len(scan) > 0 and np.array_equal(scan.points, last.points)
 
 
 # Opening recordings, and what they are read from, without reading their scans.
@@ -228,26 +220,33 @@ class RecordedSequence:
     def __iter__(self) -> Iterator[Scan]:
         """Read the scans one after the other.
 
-        Scans whose stamps do not come after the one before, or that repeat it, are left out,
-        counted, and reported in the log. Times that cannot be are a SequenceError.
+        Scans whose stamps do not come after the one before, or that repeat it, are left out. That,
+        and what else is odd about the scans, is reported in the log. Times that cannot be are a
+        SequenceError.
         """
         for finding in self.source.findings:
             _warn(self.name, str(finding))
         left_out: Counter[str] = Counter()
+        odd: list[str] = []
         kept = None if self.key is None else cache.find(self.key)
         if kept is not None:
             yield from kept
             left_out.update(kept.about["left_out"])
+            odd = kept.about["odd"]
         else:
-            about = self.source.about() | {"left_out": left_out}
-            decoded = self._checked(self._decode(left_out))
+            about = self.source.about() | {"left_out": left_out, "odd": odd}
+            decoded = self._checked(left_out, odd)
             yield from decoded if self.key is None else cache.tee(decoded, self.key, about)
         if left_out:
             what = ", ".join(f"{n} {reason}" for reason, n in left_out.items())
             _log.warning("%s: left out %s", self.name, what)
+        for text in odd:
+            _warn(self.name, text)
 
-    def _checked(self, scans: Iterator[Scan]) -> Iterator[Scan]:
-        """The scans, unless the first ones have times that cannot be."""
+    def _checked(self, left_out: Counter[str], odd: list[str]) -> Iterator[Scan]:
+        """The scans, unless the first ones have times that cannot be; what is odd about them."""
+        content = Content()
+        scans = self._decode(left_out, content)
         first = list(islice(scans, FIRST_SCANS))
         steps = np.diff([scan.stamp for scan in first]) * 1e-9 / self.stride
         period = float(np.median(steps)) if len(steps) else 0.0
@@ -255,20 +254,20 @@ class RecordedSequence:
         for doubt in doubts([scan.reading for scan in first], period, timing):
             if doubt.of == "points" and doubt.lacks:
                 raise SequenceError(f"{self.name}: {doubt}")
-            _warn(self.name, str(doubt))
+            odd.append(str(doubt))
+            _warn(self.name, odd[-1])
         yield from chain(first, scans)
+        odd += map(str, of_looks(content.looks, start=self.start))
 
-    def _decode(self, left_out: Counter[str]) -> Iterator[Scan]:
+    def _decode(self, left_out: Counter[str], content: Content) -> Iterator[Scan]:
         last: Scan | None = None
         for frame in self._frames(left_out):
             scan = frame.load()
             if last is not None and scan.stamp <= last.stamp:
                 left_out[BACKWARD] += 1
-            elif last is not None and repeats(scan, last):
-                left_out[REPEATED] += 1
-            elif last is not None and scan.stamp - last.stamp < SOONEST:
-                left_out[SOON] += 1
-            else:
+                continue
+            look = content.see(scan)
+            if not look.repeats and not look.soon:
                 last = scan
                 yield scan
         if last is None:
@@ -425,7 +424,7 @@ class RecordedSequence:
         """The offset found from how the scans turn."""
         _log.info("%s: comparing how its scans turn with the reference", self.name)
         try:
-            turns = compensation.turning_of(islice(self._decode(Counter()), _MOST_SCANS))
+            turns = compensation.turning_of(islice(self._decode(Counter(), Content()), _MOST_SCANS))
         except AdaptuneError:
             return ""
         if (offset := compensation.clock_offset(trajectory, *turns)) is None:

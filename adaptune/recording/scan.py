@@ -84,6 +84,7 @@ class Reading(NamedTuple):
     unit: float = 0.0  # seconds per unit of the points' times
     clock: int | None = None  # nanoseconds of the first point, if the sensor gives its own clock
     unread: str = ""  # a field whose name says that it holds times, and whose values do not
+    marks: float = 0.0  # share of the points that mark rays that did not come back, far away
 
 
 UNREAD = Reading()

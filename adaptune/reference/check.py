@@ -28,6 +28,7 @@ from adaptune.live.hops import Hop, HopCloud, Hops, register
 from adaptune.metrics import cap, sub_trajectory_rte, travelled
 from adaptune.recording.compensation import neighbour_motions
 from adaptune.recording.config import SequenceConfig
+from adaptune.recording.content import Content
 from adaptune.recording.inspect import Inspection
 from adaptune.recording.scan import Recording, Scan
 from adaptune.reference.stored import EstimateError, StoredEstimate
@@ -464,16 +465,19 @@ def contradictions(
     if not error > SUSPICIOUS:
         return
     stamps: list[int] = []
+    content = Content()
 
     def read() -> Iterator[Scan]:
         for scan in scans:
             if seen is None or scan.stamp in seen:
                 stamps.append(scan.stamp)
+                content.see(scan)
                 yield scan
 
     hops = measured_motions(read(), len(T_odom_sensor))
     reference = scans.reference() if given else None
     if reference is not None:
+        yield from content.of_place(reference, not len(hops.start))
         at = np.array(stamps, np.int64)
         T_ref_sensor = reference.at(at)
         wrong, others = (mismatch(T, hops) for T in (T_ref_sensor, T_odom_sensor))

@@ -94,7 +94,8 @@ def _check(name: str, found: Pass) -> None:
         raise EstimateError(
             f"{name}: by its scans, the robot comes {way:.1f} m far, and a reference needs "
             f"{SHORTEST:g} m: name another part, or record a longer drive, in a place that does "
-            f"not look the same all along"
+            f"not look the same all along; where the clouds are in the frame of a map, name the "
+            f"topic of the sensor's driver"
         )
 
 

@@ -155,9 +155,9 @@ def clouds_at(path, stamps, clouds, frames=("lidar",)):
 @pytest.mark.parametrize(
     ("later", "same", "what"),
     [
-        (5 * 10**7, True, "3 scans with the same points as the one before"),
-        (1000, True, "3 scans with the same points as the one before"),
-        (1000, False, "3 scans less than 1 ms after the one before"),
+        (5 * 10**7, True, "3 of 6 clouds repeat the points of the one before"),
+        (1000, True, "3 of 6 clouds repeat the points of the one before"),
+        (1000, False, "3 of 6 clouds come less than 1 ms after the one before"),
     ],
 )
 def test_scans_that_repeat_the_one_before_are_left_out(tmp_path, caplog, later, same, what):

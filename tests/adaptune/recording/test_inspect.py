@@ -11,6 +11,7 @@ from small_bag import START, bad_cloud, cloud, drive, entry, inspection_text, po
 from adaptune import files
 from adaptune.recording import SequenceConfig, SequenceError
 from adaptune.recording import inspect as module
+from adaptune.recording import recording as module_recording
 from adaptune.recording.inspect import inspect
 from adaptune.recording.recording import open_sequence
 from offline.config import load_study
@@ -82,6 +83,55 @@ def test_clouds_without_valid_points_are_reported(tmp_path, of):
     assert "1 of 5 clouds hold fewer than 20 valid points" in " ".join(texts(inspection))
     assert inspection.missing["online"] == ()
     assert "online: can run, but see" in inspection_text(inspection)
+
+
+@pytest.mark.usefixtures("cache_folder")
+def test_every_command_tells_what_a_look_at_the_clouds_shows(tmp_path, caplog):
+    times, messages = [START + i * 10**8 for i in range(40)], []
+    for i, when in enumerate(times):
+        raw = cloud(when).data.view("<f4").reshape(-1, 4).copy()
+        raw[5:85, :3] = 1e5 if i else raw[5:85, :3]
+        raw[:, :3] *= 0.01 if 10 <= i < 20 else 1.0
+        messages += [("/points", t, rec.cloud(raw.view(cloud_dtype(raw)).ravel(), t, rec.ROS1))
+                     for t in (when, when + 1000)[: 1 + i % 2]]  # fmt: skip
+    inspection = inspect(rec.write_bag(tmp_path / "a.bag", messages))
+    shown = [text.removeprefix("/points: ") for text in texts(inspection)]
+    marks, repeated, covered = [text for text in shown if "stamps" not in text]
+    assert marks.startswith("40% of the points mark rays that did not come back")
+    assert repeated.startswith("20 of 60 clouds repeat the points of the one before")
+    assert covered.startswith("10 of 60 clouds lie within 1 m")
+    ((_, config),) = entry(inspection).items()
+    for _ in range(2):  # from the bag, and from the cache
+        module_recording._warn.cache_clear()
+        caplog.clear()
+        assert len(list(open_sequence(config))) == 40
+        assert [text in caplog.text for text in (marks, repeated, covered)] == 3 * [True]
+
+
+def cloud_dtype(raw):
+    return np.dtype([(name, raw.dtype) for name in ("x", "y", "z", "time")])
+
+
+def framed(message, frame):
+    message.header.frame_id = frame
+    return message
+
+
+def test_clouds_of_two_frames_or_of_a_map_are_named(tmp_path):
+    times = [START + i * 10**8 for i in range(20)]
+    two = [("/points", t, framed(cloud(t), "ab"[i % 2])) for i, t in enumerate(times)]
+    inspection = inspect(rec.write_bag(tmp_path / "two.bag", two))
+    assert "holds clouds of 'a', 'b'; name one of these frames as `frame`" in texts(inspection)[0]
+    assert inspection.missing["offline"] == ("clouds of one frame",)
+    for frame, moves in (("lidar", False), ("map", True), ("map", False)):
+        messages = []
+        for i, t in enumerate(times):
+            message = framed(cloud(t), frame)
+            message.data.view("<f4").reshape(-1, 4)[:, 0] += 2.0 * i * moves
+            messages += [("/points", t, message), ("/poses", t, pose(t, 2.0 * i))]
+        inspection = inspect(rec.write_bag(tmp_path / f"{frame}_{moves}.bag", messages))
+        lacks = moves * ("clouds in the sensor's frame",)
+        assert inspection.missing["offline"] == lacks, texts(inspection)
 
 
 def test_messages_that_do_not_decode_are_reported(tmp_path):
