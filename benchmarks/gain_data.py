@@ -1,8 +1,7 @@
 """The courses of `gain.py`, and what odometries do on them with several parameter sets."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from functools import partial
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +28,7 @@ from offline.labelled import (
     recorded_motions,
 )
 from offline.samplers import make_sampler
-from offline.trial import SharedScan, SharedScans, TrialSettings, TrialSetup, with_measured_hops
+from offline.trial import SharedScans, TrialSettings, TrialSetup, with_measured_hops
 
 MEMORY = 3e9
 """Bytes of prepared scans."""
@@ -41,7 +40,8 @@ WINDOW = 3
 """Selections whose descriptors are averaged."""
 PERIOD = 10
 """Scans from one selection to the next."""
-NO_SEQUENCES = StudySequences({}, {}, {}, Path())
+LOST_TRACK = 3.0  # metres a second by which members of a bank may differ
+NO_SEQUENCES = StudySequences({}, {}, Path())
 """Of a study: the courses are in no study."""
 
 
@@ -79,9 +79,6 @@ class SharedCourse:
     def __init__(self, name: str, scans: Iterable[Any], frames: Frames):
         self.name, self.frames = name, frames
         self.shared = SharedScans(scans, MEMORY)
-
-    def __iter__(self) -> Iterator[SharedScan]:
-        return islice(self.shared, len(self.frames.stamps))
 
 
 def run(path: Path, course: Course, odometry: str, seed: int) -> None:
@@ -159,10 +156,11 @@ def labelled_sequence(name: str, found: Any) -> LabelledSequence:
     simulation = BankSimulation(
         stamps,
         found["T_world_sensor"],
+        found["T_world_sensor"],
         described,
         period,
         settings.sub_trajectory,
-        settings.lost_track,
+        LOST_TRACK,
         Hops(*(found[f"hops_{name}"] for name in Hops._fields)),
         partial(np.take, motions, axis=1),
     )

@@ -7,7 +7,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from gain_data import NO_SEQUENCES, PERIOD, WINDOW, SharedCourse, in_place, training_courses
+from gain_data import (
+    LOST_TRACK,
+    NO_SEQUENCES,
+    PERIOD,
+    WINDOW,
+    SharedCourse,
+    in_place,
+    training_courses,
+)
 from numpy.typing import NDArray
 
 from adaptune.archive import PREPARE_MS, REGISTER_MS, Frames
@@ -162,10 +170,11 @@ def _labelled(name: str, found: list[dict[str, NDArray[Any]]]) -> LabelledSequen
     simulation = BankSimulation(
         stamps,
         first["T_world_sensor"],
+        first["T_world_sensor"],
         described,
         period,
         settings.sub_trajectory,
-        settings.lost_track,
+        LOST_TRACK,
         Hops(*(first[f"hops_{key}"] for key in Hops._fields)),
         partial(np.take, motions, axis=1),
     )

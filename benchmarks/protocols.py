@@ -219,7 +219,7 @@ PROTOCOLS = MappingProxyType(
         ),
         "docker": Protocol(
             "garden_docker",
-            overrides=("offline.objective=rpe", "offline.runs=whole"),
+            overrides=("offline.objective=rpe", "offline.stretches=all"),
             variants=samplers(DOCKER_GRID),
             simulated=True,
             sets=19,

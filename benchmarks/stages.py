@@ -12,6 +12,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -89,7 +90,8 @@ def trial(study: OfflineStudy) -> None:
     sequence = setup.prepare("hall_begin", 8e9)
     parameters: ParameterSet = {"max_correspondence_distance": 2.0, "keyframe_interval": 1.0}
     instance = study.odometry(parameters)
-    prepared = [(scan.cloud, scan.tree) for scan in (load(instance) for load in sequence)]
+    scans = islice(sequence.shared, len(sequence.frames.stamps))
+    prepared = [(scan.cloud, scan.tree) for scan in (load(instance) for load in scans)]
     iterations = study.odometry.settings.iterations
     compare(
         f"trial, {len(prepared)} scans",

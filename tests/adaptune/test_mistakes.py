@@ -60,7 +60,10 @@ FOREIGN = re.compile(r"pydantic|https://|Input should|validation|Value error|tup
             "odometry.parameters.keyframe_interval={type: categorical, low: 1, baseline: 1}",
             "parameters.keyframe_interval: takes choices, not low",
         ),
-        ("online.modes=[paired]", "online.modes.0: paired is now called adaptive"),
+        (
+            "online.modes=[paired]",
+            "online.modes.0: give 'adaptive', 'paper', 'even' or 'untrained'",
+        ),
         ("offline.objective={rtf: 3}", "offline.objective.rtf: give 'rte', 'kitti', 'rpe', 'ape'"),
         (
             "offline={sampler: grid, sampler_settings: {grid: {keyframe_interval: 3}}}",

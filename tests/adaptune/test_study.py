@@ -80,7 +80,7 @@ def test_reads_a_study(study_file, tmp_path):
             ["grid.max_correspondence_distance", "grid.keyframe_interval"],
         ),
         ("offline.trial=3", ["offline.trial", "did you mean 'trials'?"]),
-        ("online.switching.mechanism=hand_over", ["hand_over is gone", "give auto, live or bank"]),
+        ("online.switching.mechanism=hand_over", ["give 'auto', 'live' or 'bank', not"]),
         ("test=[three, three]", ["test.1", "named twice"]),
         ("sequences.one.bag=four.bag", ["sequences.one", "four.bag", "no such bag"]),
         ("sequences.one.bag=${NO_SUCH_VARIABLE}/a.bag", ["NO_SUCH_VARIABLE"]),

@@ -55,8 +55,6 @@ def test_costs_are_of_all_that_is_driven():
     assert Spending(COSTS, 14.5).allows([0, 4])
     assert not Spending(COSTS, 14.4).allows([0, 4])
     assert not Spending(COSTS).allows([0, 5])  # of unknown cost
-    assert Spending(COSTS).price([0], 4) == 4.0
-    assert Spending(COSTS).price([0], 7) == 30.0
 
 
 def members(spending, size=3):
