@@ -134,7 +134,7 @@ def of_looks(looks: Sequence[Look], where: Key = (), start: float = 0.0) -> Iter
     if (marks := float(np.median([reading.marks for reading in readings]))) > 0.01:
         what = f"{marks:.0%} of the points mark rays that did not come back, far away"
         yield Finding(where, what, _LEFT_OUT, of=of)
-    if grow := np.mean(more >= 0) > 0.95 and sum(more > 0) > _ROW and n[-1] > 3 * n[0]:
+    if grow := sum(more > 0) > _ROW and np.mean(more >= 0) > 0.95 and n[-1] > 3 * n[0]:
         what = f"the clouds grow from {n[0]:,} to {n[-1]:,} points: they are a map"
         yield Finding(where, what, _DRIVER, of=of)
     kinds = (

@@ -177,11 +177,13 @@ def spun(radians, axes=(0, 1), first=0, last=N):
     return of
 
 
+@pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize(
     ("clouds", "step"),
     [
         (drive(), 10**8),
         (drive()[:9], 10**8),
+        (drive()[:1], 10**8),
         (drive(view=70.0), 10**8),
         (drive(room=AISLE), 10**8),
         ([CELL[0] * 0.0 + seen(0, rays(), CELL) + 1e-3 * i for i in range(N)], 10**8),
