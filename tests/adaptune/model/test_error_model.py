@@ -22,16 +22,14 @@ def test_knows_the_sensors_of_its_training():
     assert not model.is_foreign(0.0)  # where nothing is known, nothing is said
 
 
-def test_views_are_of_one_place():
-    model = dataclasses.replace(random_model(), sequences=["b", "b+mirrored"])
+def test_members_of_a_bank_are_the_candidates():
+    model = random_model()
     data = model.training_data(model.pca())
-    assert not data.sequence.any()
+    assert data.sequence.tolist() == model.sequence.tolist()
     assert (data.fixed, data.candidates) == (4, None)
     data = model.training_data(model.pca(), [10, 4])
     assert (data.fixed, data.candidates) == (10, (10, 4))
     np.testing.assert_array_equal(data.vectors, model.vectors[:, ::-1])
-    apart = random_model()
-    assert apart.training_data(apart.pca()).sequence.tolist() == apart.sequence.tolist()
 
 
 def several_odometries():
@@ -232,9 +230,6 @@ def test_evidence_is_of_stretches():
     cut = dataclasses.replace(model, stretch=stretch)
     number = cut.training_data(cut.pca()).sequence
     np.testing.assert_array_equal(number, 2 * model.sequence + stretch)
-    # A view shares the stretches of its recording.
-    view = dataclasses.replace(cut, sequences=["b", "b+mirrored"])
-    np.testing.assert_array_equal(view.training_data(view.pca()).sequence, stretch)
 
 
 @pytest.mark.parametrize(("umask", "mode"), [(0o022, 0o644), (0o027, 0o640), (0o002, 0o664)])

@@ -77,7 +77,7 @@ def test_the_longest_part_is_used_and_told(tmp_path, caplog, name, kind, said):
             assert told in caplog.text
             assert f"; {N - len(scans)} of {N} scans are left out" in told
     assert opened().n_messages == len(scans)
-    assert len(found.valid) == len(scans)
+    assert len(found.content.looks) == len(scans)
     # Poses are those of the part, and go one way.
     x = opened().reference().T_world_sensor[:, 0, 3]
     np.testing.assert_allclose(np.diff(x), 0.1, atol=1e-6)

@@ -175,8 +175,8 @@ def test_stamps_of_files(tmp_path, names, times, stamps):
 
 
 def test_names_that_look_like_times_and_are_not_read_are_told(tmp_path):
-    for number in ("20231114_221320_1", "20231114_221320_6"):
-        np.save(tmp_path / f"{number}.npy", rec.scans(1)[0])
+    for i, number in enumerate(("20231114_221320_1", "20231114_221320_6")):
+        np.save(tmp_path / f"{number}.npy", rec.scans(2)[i])
     told = inspect(tmp_path)
     assert texts(told) == [
         "the names of the files look like times and are not read (20231114_221320_1.npy); one "
