@@ -459,6 +459,10 @@ _SEARCH = (
 """Settings by which a search differs from another."""
 
 
+_COSTLY = (("rustle", "lockstep"), ("ros2", "lockstep"), ("ros2", None))
+"""Odometries, and their `play`, whose start takes seconds."""
+
+
 class OfflineStudyConfig(StudyConfig):
     """The whole YAML of a study."""
 
@@ -477,8 +481,7 @@ class OfflineStudyConfig(StudyConfig):
     def runs(self) -> Literal["restart", "whole"]:
         """What a trial does where it loses track: a start in a new container costs too much."""
         costly = any(
-            one.name == "rustle" and one.settings.get("play") == "lockstep"
-            for one in self.odometries.values()
+            (one.name, one.settings.get("play")) in _COSTLY for one in self.odometries.values()
         )
         return self.offline.runs or ("whole" if costly else "restart")
 

@@ -4,7 +4,6 @@ import contextlib
 import logging
 import multiprocessing as mp
 import os
-import signal
 import threading
 import time
 import traceback
@@ -20,7 +19,7 @@ from uuid import uuid4
 from adaptune import __version__
 from adaptune.archive import Frames, Trial
 from adaptune.errors import AdaptuneError, in_a_line
-from adaptune.processes import apart, how_it_ended, pin
+from adaptune.processes import apart, end_with_parent, how_it_ended, pin
 from adaptune.progress import Progress, unseen
 from adaptune.recording.cache import fingerprints
 from adaptune.space import ParameterSet
@@ -324,8 +323,7 @@ class Workers:
 
 
 def _serve(connection: Connection, core: int, memory: float) -> None:
-    # Ctrl-C reaches all processes; the driver decides what happens.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    end_with_parent()
     os.setsid()  # user code may end its process group
     pin(core)
     try:

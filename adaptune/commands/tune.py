@@ -6,10 +6,10 @@ import shutil
 from collections.abc import Sequence
 from contextlib import suppress
 from functools import partial
-from itertools import chain, count
+from itertools import chain, count, takewhile
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -59,6 +59,8 @@ def inspect(
     if file.suffix == ".safetensors" or (file / "model.safetensors").exists():
         _show_model(file)
         return
+    if file.suffix in (".yaml", ".yml") and _look(file):
+        return
     check_no_study(file)
     if study is not None and study.exists():
         raise AdaptuneError(f"{study}: exists; name another file with --study, or move it away")
@@ -84,6 +86,29 @@ def inspect(
     if study is not None:
         write_text(study, f"{found.entry}\n{rest}")
     say_next("train on a part of it", "offline", path, first=first)
+
+
+_ROS = ("ros2", "rustle")
+_LOOK = 20.0
+"""Seconds of a recording on which a ROS system is looked at."""
+
+
+def _look(path: Path) -> bool:
+    """Show what the ROS system of a study does; False if it has none."""
+    loaded = load(path, [], None)
+    factory: Any = loaded.odometry
+    if loaded.config.odometries.keys().isdisjoint(_ROS) or len(loaded.config.odometries) > 1:
+        return False
+    from adaptune.odometry.docker.probe import look
+
+    name = loaded.config.training[0]
+    scans = loaded.sequences.open(name)
+    first = next(iter(scans)).stamp
+    some = takewhile(lambda scan: scan.stamp < first + _LOOK * 1e9, scans)
+    say(f"{factory.name} on the first {_LOOK:g} s of {name}, with the baseline's parameters:")
+    found = look(factory.settings, factory.space.baseline, factory.limits, some)
+    show_table("What it does", [{"": key, "found": value} for key, value in found.items()])
+    return True
 
 
 def check_no_study(path: Path) -> None:
