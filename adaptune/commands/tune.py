@@ -1,5 +1,6 @@
 """Commands that begin with recordings: look at one, or tune an odometry on them."""
 
+import json
 import re
 import shlex
 import shutil
@@ -238,7 +239,8 @@ def tune(
         str,
         typer.Option(
             metavar="NAME",
-            help="gicp, kiss_icp, my_module:MyClass, ...; several with commas, or `all`.",
+            help="gicp, kiss_icp, my_module:MyClass, ...; several with commas, or `all`. Of a "
+            "ROS system, its image or launch command: that writes its study.",
         ),
     ] = "gicp",
     points: Points = None,
@@ -262,6 +264,9 @@ def tune(
     """
     if reference is not None and Path(reference).is_file():
         reference = str(Path(reference).resolve())
+    if (system := _system(odometry)) is not None:
+        _propose(recordings, system, points, reference)
+        return
     folder = folder or Path("runs") / _study_name(recordings, odometry)
     path = folder / f"{folder.resolve().name}.yaml"
     made_by = _made_by(recordings, odometry, points, reference)
@@ -387,6 +392,66 @@ def _usable(path: Path, points: str | None, reference: str | None, show: Progres
         say(f"{path}: its reference does not serve ({why}): one is estimated")
         found.given["reference"] = "estimated"
     return found
+
+
+_SYSTEM = """\
+odometry:
+  name: ros2    # or rustle, for a ROS 1 system, see docs/docker.md
+  settings:
+    {image}command: {command}
+    template: {lacking}    # the parameter file that you use now
+    odometry: /{lacking}    # the topic of its poses
+    points: /points    # the topics that it hears
+    {imu}
+  parameters:
+    {lacking}: {{type: float, low: 0.1, high: 2.0, baseline: 0.5}}    # what to tune
+"""
+_LACKING = "FILL_IN"
+
+
+def _system(given: str) -> dict[str, str] | None:
+    """What is known of a ROS system, by its image or its launch command; None if it is none."""
+    words = shlex.split(given)
+    if words[:1] == ["ros2"]:
+        if not any("{parameters}" in word for word in words):
+            words.append("FILL_IN:={parameters}")
+        return {"image": "", "command": json.dumps(words)}
+    if not re.fullmatch(r"[a-z0-9][\w./-]*(:[\w.-]+)?", given):
+        return None
+    from adaptune.odometry import registry
+    from adaptune.odometry.docker.engine import EngineError, image_digest
+
+    if given in registry.ODOMETRIES or given in registry.PROGRAMS or given == "all":
+        return None
+    try:
+        image_digest(given)
+    except (EngineError, NotInstalledError):
+        if "/" in given:  # no name of an odometry
+            raise
+        return None
+    launch = ["ros2", "launch", _LACKING, f"{_LACKING}.launch.py", f"{_LACKING}:={{parameters}}"]
+    return {"image": f"image: {given}\n    ", "command": json.dumps(launch)}
+
+
+def _propose(
+    recordings: Sequence[Path], system: dict[str, str], points: str | None, reference: str | None
+) -> None:
+    """Write a study of a ROS system to fill in."""
+    path = Path(f"{plain_name(recordings[0].resolve())}_ros2.yaml")
+    if path.exists():
+        raise AdaptuneError(f"{path}: exists; fill it in, or move it away")
+    with progress() as show:
+        found = [_usable(one, points, reference, show) for one in recordings]
+    rest = roles([one.name for one in found], UNKNOWN_LENGTH, ["ros2"]).partition("odometry:")[0]
+    imu = "imu: /imu" if all("imu" in one.given for one in found) else "# imu: /imu"
+    block = _SYSTEM.format(lacking=_LACKING, imu=imu, **system)
+    entries = "\n".join(one.entry.removeprefix("sequences:\n") for one in found)
+    write_text(path, f"sequences:\n{entries}\n{rest}{block}")
+    say(
+        f"{path}: is a study of this system. Fill in what stands there as {_LACKING}, as "
+        f"docs/docker.md#a-ros-2-system says. Then look at what the system does:"
+    )
+    say(f"  adaptune inspect {path}")
 
 
 def odometries_of(given: str, imu: bool) -> list[str]:
