@@ -255,7 +255,7 @@ DELETED = {
     "sequences.*.compensate=gyro": "is gone; give constant_velocity, which needs no IMU",
     "courses.*.compensate=gyro": "is gone; give constant_velocity, which needs no IMU",
     "courses.*.moving_objects": "is gone: nothing moves in simulated places; leave it out",
-    "courses.*.stand": "is gone: a course drives off at once; leave it out",
+    "courses.*.stand": "is gone: give standstill, the seconds before it drives off",
     "courses.*.weather": "is gone: the air is always clear; leave it out",
     "courses.*.sensor=avia": "is gone; choose a sensor that turns",
 }
