@@ -239,8 +239,7 @@ def tune(
         str,
         typer.Option(
             metavar="NAME",
-            help="gicp, kiss_icp, my_module:MyClass, ...; several with commas, or `all`. Of a "
-            "ROS system, its image or launch command: that writes its study.",
+            help="gicp, my_module:MyClass, ..., several with commas, or `all`; or an image.",
         ),
     ] = "gicp",
     points: Points = None,
@@ -256,16 +255,14 @@ def tune(
     """Tune an odometry on recordings, and say what to drive.
 
     It keeps the last 40 % of one recording (of its path, where the robot stands for long), or the
-    last one of several, for the test. It tries parameter sets on the rest, replays the test with
-    the odometry's own parameters, the best set, and adapting, and compares.
+    last of several, for the test. It tries sets on the rest, replays the test, and compares.
 
-    What it decides is written to a study file in its folder, with which all other commands work.
-    Run the same command again to resume.
+    What it decides is written to a study file in its folder; run the same command to resume.
+    Of a ROS 2 system (an image, or `ros2 launch ...`), it writes a study to fill in.
     """
     if reference is not None and Path(reference).is_file():
         reference = str(Path(reference).resolve())
-    if (system := _system(odometry)) is not None:
-        _propose(recordings, system, points, reference)
+    if _propose(recordings, odometry, points, reference):
         return
     folder = folder or Path("runs") / _study_name(recordings, odometry)
     path = folder / f"{folder.resolve().name}.yaml"
@@ -280,8 +277,7 @@ def tune(
             f"to resume it, or another --folder"
         )
     else:
-        limits = _limits(trials, minutes)
-        overrides = [f"offline.{key}={value}" for key, value in limits.items()]
+        overrides = [f"offline.{key}={value}" for key, value in _limits(trials, minutes).items()]
     from offline.train import train
 
     loaded = load(path, overrides, folder, runs=True)
@@ -434,9 +430,11 @@ def _system(given: str) -> dict[str, str] | None:
 
 
 def _propose(
-    recordings: Sequence[Path], system: dict[str, str], points: str | None, reference: str | None
-) -> None:
-    """Write a study of a ROS system to fill in."""
+    recordings: Sequence[Path], odometry: str, points: str | None, reference: str | None
+) -> bool:
+    """Write a study of a ROS system to fill in; False if the odometry is none."""
+    if (system := _system(odometry)) is None:
+        return False
     path = Path(f"{plain_name(recordings[0].resolve())}_ros2.yaml")
     if path.exists():
         raise AdaptuneError(f"{path}: exists; fill it in, or move it away")
@@ -452,6 +450,7 @@ def _propose(
         f"docs/docker.md#a-ros-2-system says. Then look at what the system does:"
     )
     say(f"  adaptune inspect {path}")
+    return True
 
 
 def odometries_of(given: str, imu: bool) -> list[str]:

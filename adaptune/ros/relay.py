@@ -204,4 +204,4 @@ class Ros2Relay(Relay):
         return self.store.deserialize_cdr(memoryview(data), kind)
 
     def why_unheard(self, topic: str) -> str:
-        return str(self.ask("state", topics=[topic])["unheard"][topic])
+        return str(self.ask("state", topics=[topic], own=[])["unheard"][topic])

@@ -41,9 +41,13 @@ class _Link(DdsLink):
         found: tuple[dict[str, list[str]], dict[str, list[str]]] = {}, {}
         for which, kinds in enumerate(found):
             for end in self._endpoints(which):
-                if end.topic not in _QUIET:
+                if not which or end.topic not in _QUIET:
                     kinds[end.topic] = sorted({end.kind, *kinds.get(end.topic, ())})
         return found
+
+    def senders(self, topic: str) -> list[str]:
+        """The nodes that publish a topic."""
+        return [end.node for end in self._endpoints(0) if end.topic == topic]
 
     def hearers(self, topic: str) -> int:
         """How many subscribers hear what is published here."""
@@ -102,6 +106,7 @@ class _Node:
             "published": published,
             "subscribed": subscribed,
             "sending": {topic: self._link.hearers(topic) for topic in self._publish},
+            "senders": {topic: self._link.senders(topic) for topic in header["own"]},
             "unheard": {topic: self._link.why_unheard(topic) for topic in header["topics"]},
         }
 

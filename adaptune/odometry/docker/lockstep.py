@@ -19,7 +19,7 @@ from adaptune.files import temporary_prefix
 from adaptune.geometry import Poses, invert, rectify, to_pose
 from adaptune.odometry.base import LOST, Faulting, Registration, Usage, pose_fault
 from adaptune.odometry.docker.played_bag import MAX_SCATTER, OWN_CLOCK
-from adaptune.odometry.docker.ros_system import RosSystem, filled, read_poses
+from adaptune.odometry.docker.ros_system import QUIET, RosSystem, filled, read_poses
 from adaptune.odometry.remote import Limits
 from adaptune.recording.clouds import LIVOX_TYPES
 from adaptune.recording.export import IMU, POINTS, Messages, structured
@@ -305,7 +305,7 @@ class Lockstep(Faulting):
             help_ = "if it knows no points but the bag's own, set odometry.settings.play: bag"
             raise OdometryError(f"{error} before its first pose; {help_}") from error
         if self._silent >= _MOST_SILENT:
-            published = system.link.topics().keys() - {"/clock", "/rosout", *self._topics}
+            published = system.link.topics().keys() - {*QUIET, *self._topics}
             needs = "" if self._settings.imu else "an IMU (odometry.settings.imu), or "
             why = system.link.why_unheard(self._topics[0]) or (
                 f"does it need {needs}all that the bag holds (play: bag)?"

@@ -12,7 +12,7 @@ from rosbags.highlevel import AnyReader
 
 from adaptune.errors import AdaptuneError, OdometryError
 from adaptune.odometry.docker.engine import kept_log
-from adaptune.odometry.docker.ros_system import RosSystem, filled, read_poses
+from adaptune.odometry.docker.ros_system import QUIET, RosSystem, filled, read_poses
 from adaptune.odometry.program import ProgramInput, WholeRun, when_known
 from adaptune.recording.clouds import PATH, POSES, Pose, usable
 from adaptune.ros.relay import Relay
@@ -173,7 +173,7 @@ class PlayedBag(WholeRun):
     def _check_published(self, system: RosSystem, recorder: PoseRecorder) -> None:
         if recorder.received:
             return
-        topics = ", ".join(sorted(system.link.topics().keys() - {"/clock", "/rosout"}))
+        topics = ", ".join(sorted(system.link.topics().keys() - QUIET))
         raise OdometryError(
             f"nothing was published on {self.settings.odometry} until the system had rested for "
             f"{_FIRST:g} s after the bag; nodes announce {topics or 'no topics'}. If it is there, "

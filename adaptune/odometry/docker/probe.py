@@ -10,13 +10,11 @@ import numpy as np
 from adaptune.errors import OdometryError
 from adaptune.odometry.docker.lockstep import Lockstep
 from adaptune.odometry.docker.played_bag import MAX_SCATTER
+from adaptune.odometry.docker.ros_system import QUIET
 from adaptune.odometry.remote import Limits
 from adaptune.recording.scan import Scan
 from adaptune.ros.link import LinkError
 from adaptune.space import ParameterSet
-
-_QUIET = ("/clock", "/rosout", "/rosout_agg", "/parameter_events")
-"""Topics of every node."""
 
 
 class _Watched(Lockstep):
@@ -72,8 +70,8 @@ def _topics(system: Any) -> dict[str, str]:
         return {}
     heard = state["subscribed"].keys()
     return {
-        "subscribed topics": ", ".join(sorted(heard - set(_QUIET))),
-        "published topics": ", ".join(sorted(published - set(_QUIET))),
+        "subscribed topics": ", ".join(sorted(heard - QUIET)),
+        "published topics": ", ".join(sorted(published - QUIET)),
     }
 
 

@@ -34,7 +34,7 @@ from adaptune.odometry.docker.engine import (
 from adaptune.odometry.docker.ros_system import RosSettings, RosSystem, SimClock, image_user
 from adaptune.odometry.docker.rustle import Rustle
 from adaptune.odometry.program import Template, check_names, placeholders, replace
-from adaptune.recording.clouds import LIVOX_TYPES
+from adaptune.recording.clouds import LIVOX_TYPES, POSES, TRANSFORMS
 from adaptune.recording.config import Transform
 from adaptune.ros.link import LinkError, equal_values
 from adaptune.ros.relay import Ros2Relay
@@ -178,7 +178,15 @@ class Ros2System(RosSystem):
                 raise OdometryError(f"node {name} died: {processes.how_it_ended(code)}")
         if (ended := self._ended()) is not None:
             raise ended
-        found: dict[str, Any] = self.link.ask("state", topics=self._topics[1:])
+        topic = self._settings.odometry
+        found: dict[str, Any] = self.link.ask("state", topics=self._topics[1:], own=[topic])
+        if (kinds := found["published"].get(topic)) and kinds[0] not in POSES:
+            raise OdometryError(
+                f"{topic} is {kinds[0]}; odometry.settings.odometry must name poses"
+            )
+        if len(senders := found["senders"][topic]) > 1 and kinds[0] not in TRANSFORMS:
+            names = " and ".join(senders)
+            raise OdometryError(f"{topic} is published by two ({names}), whose poses would mix")
         return found
 
     def cloud_type(self, topic: str) -> str:

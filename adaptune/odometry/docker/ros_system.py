@@ -39,6 +39,8 @@ from adaptune.ros.link import LinkError, Run, Steering
 from adaptune.ros.relay import Relay
 from adaptune.space import ParameterSet
 
+QUIET = {"/clock", "/rosout", "/rosout_agg", "/parameter_events"}
+"""Topics of every node."""
 CLOCK = "rosgraph_msgs/msg/Clock"
 _BETWEEN_LOOKS = 0.05
 _TAIL = 1 << 14

@@ -102,6 +102,11 @@ def test_on_this_machine_it_needs_no_container(make):
             {"points": "/velodyne", "ready": 3},
             r"no node subscribed to the clouds' topic /points .*: /velodyne\)",
         ),
+        (
+            VALUES,
+            {"odometry": "/parameter_events"},
+            "/parameter_events is rcl_interfaces/msg/ParameterEvent; .*must name poses",
+        ),
         (VALUES, {"command": ("/no-such", "{parameters}")}, "its process ended with code 127: "),
     ],
 )
