@@ -55,18 +55,19 @@ done
 """
 """As a workspace is sourced, wherever the image has one."""
 _RUN = 'exec > "$ADAPTUNE_LOG" 2>&1; exec "$@"'
-_PROBE = """
+_PROBE = r"""
 command -v "$1" >/dev/null || exit 1
+case "$1 $3" in ros2\ */*) [ -r "$3" ]; exit;; esac
 [ "$1" != ros2 ] || for prefix in ${AMENT_PREFIX_PATH//:/ }; do
     [ ! -e "$prefix/share/$3/package.xml" ] || exit 0
 done
 [ "$1" != ros2 ]
 """
-_DIED = re.compile(
+DIED = re.compile(
     rb"\[ERROR\] \[([\w./-]+?)(?:-\d+)?\]: process has died \[pid \d+, exit code (-?\d+)"
 )
 """What `ros2 launch` writes, which may go on."""
-_NOISE = re.compile(
+NOISE = re.compile(
     rb"\[INFO\] \[(launch|[\w.-]+)\]: (All log files|Default logging|process started).*"
 )
 _TRANSFORMS = "tf2_msgs/msg/TFMessage"
@@ -93,7 +94,7 @@ class Ros2System(RosSystem):
 
     ros = 2
     link: Ros2Relay
-    _log_name, _noise, _inside = "output.log", _NOISE, _FOLDER
+    _log_name, _noise, _inside = "output.log", NOISE, _FOLDER
     _used = Usage(0.0, 0.0)
     _at_begin = 0.0
     _node: Any = None
@@ -173,7 +174,7 @@ class Ros2System(RosSystem):
             used = self._container.used()
             cpu = max(used.cpu - self._at_begin, self.usage.cpu)
             self.usage = Usage(cpu, max(used.memory, self.usage.memory or 0.0))
-            if died := _DIED.search(self._tail(self._log_name)):
+            if died := DIED.search(self._tail(self._log_name)):
                 name, code = died[1].decode(), int(died[2])
                 raise OdometryError(f"node {name} died: {processes.how_it_ended(code)}")
         if (ended := self._ended()) is not None:
@@ -212,7 +213,9 @@ class Ros2System(RosSystem):
         wanted = {self.whole_name(template, name): value for name, value in parameters.items()}
         end = time.monotonic() + _UNDECLARED
         while True:
-            nodes: dict[str, Any] = self.link.ask("parameters")
+            nodes: dict[str, Any] = {}
+            with contextlib.suppress(LinkError):  # nodes that are busy do not answer
+                nodes = self.link.ask("parameters")
             held = [(n, k, v) for n, all_ in nodes.items() for k, v in all_.items() if k in wanted]
             lacking = wanted.keys() - {name for _, name, _ in held}
             if not lacking or time.monotonic() > end:

@@ -193,7 +193,7 @@ def test_scans_without_a_pose_continue_the_motion(make, monkeypatch):
     assert not odometry.faults
     assert np.isnan(on(odometry, 3, 5)[-1].T_odom_sensor).all()
     (fault,) = odometry.faults
-    words = "no pose on /Odometry for 4 scans in a row; topics that are published.*play: bag"
+    words = "no pose yet on /Odometry for 4 scans in a row; topics that are published.*play: bag"
     assert re.match(words, fault), fault
 
 

@@ -5,7 +5,7 @@ import yaml
 from pydantic import ValidationError
 
 from adaptune.odometry import OdometryError
-from adaptune.odometry.docker.ros2_system import Ros2Settings, Ros2System
+from adaptune.odometry.docker.ros2_system import DIED, NOISE, Ros2Settings, Ros2System
 from adaptune.odometry.docker.ros_container import server_keys, warn_of_unread
 from adaptune.odometry.program import Template
 
@@ -146,3 +146,10 @@ def test_a_number_that_ros_1_takes_for_a_text_is_told(tmp_path, caplog):
 def test_a_command_must_name_the_file(command, words):
     with pytest.raises(ValidationError, match=re.escape(words)):
         Ros2Settings(command=command, template="p.yaml", odometry="/odometry")
+
+
+def test_a_node_that_dies_under_ros2_launch_is_known_by_what_that_writes():
+    line = b"[ERROR] [kiss_icp_node-1]: process has died [pid 53, exit code -11, cmd '/opt/x --y']."
+    found = DIED.search(b"[INFO] [launch]: All log files can be found below /x\n" + line)
+    assert (found[1], found[2]) == (b"kiss_icp_node", b"-11")
+    assert NOISE.fullmatch(b"[INFO] [kiss_icp_node-1]: process started with pid [53]")
