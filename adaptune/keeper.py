@@ -100,6 +100,13 @@ def _resident(process: int) -> float:
     return 1e-6 * int(fields[1]) * resource.getpagesize() if fields else 0.0
 
 
+def used(process: int) -> tuple[float, float]:
+    """CPU seconds of a process and of its children that have ended, and megabytes; 0 if it has."""
+    fields = _read(f"/proc/{process}/stat").rpartition(b")")[2].split()
+    ticks = sum(map(int, fields[11:15]))
+    return ticks / os.sysconf("SC_CLK_TCK"), _resident(process)
+
+
 def _read(path: str) -> bytes:
     """A file's content; nothing if the process has ended."""
     with contextlib.suppress(OSError), open(path, "rb") as file:  # noqa: PTH123

@@ -15,6 +15,7 @@ import struct
 import subprocess
 import sys
 import tempfile
+import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -22,7 +23,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
-from multiprocessing import forkserver, get_context
+from multiprocessing import forkserver, get_context, parent_process
 from multiprocessing.connection import wait
 from multiprocessing.context import ForkServerContext
 from multiprocessing.util import get_temp_dir
@@ -227,6 +228,12 @@ class Program:
         except (OSError, ValueError):  # the keeper itself was killed
             return Ended(-signal.SIGKILL, 0.0, 0.0)
         return Ended(int(code), float(cpu), float(memory))
+
+    def used(self) -> Ended:
+        """CPU seconds and megabytes of what runs now."""
+        running = keeper.descendants(self._keeper.pid)
+        used = [keeper.used(process) for process in running]
+        return Ended(0, sum(cpu for cpu, _ in used), sum(memory for _, memory in used))
 
     def end(self) -> Ended | None:
         """End it with all that it has started, and say what it has used."""
@@ -658,6 +665,21 @@ def other_core(number: int) -> int:
     return others[number % len(others)]
 
 
+def end_with_parent() -> None:
+    """End this process where the one that it computes for has ended, whatever it does by then."""
+    # Ctrl-C reaches all processes; the first of them decides what happens.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = parent_process()
+    if parent is None:
+        return
+
+    def watch() -> None:
+        parent.join()
+        os._exit(1)  # its containers and programs end with it
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
 # Processes of adaptune's own modules, forked by one server that has imported these.
 
 
@@ -694,8 +716,7 @@ def processes(most: int, preload: Sequence[str] = ()) -> Iterator[Executor]:
     """
     n = max(1, min(most, available()))
     context = fork_server(*preload)
-    # Ctrl-C reaches all processes; the first of them decides what happens.
-    pool = ProcessPoolExecutor(n, context, signal.signal, (signal.SIGINT, signal.SIG_IGN))
+    pool = ProcessPoolExecutor(n, context, end_with_parent)
     try:
         yield pool
     except BrokenProcessPool as error:

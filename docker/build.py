@@ -1,4 +1,4 @@
-"""Build the project's images: `python docker/build.py reference` or `adaptune`.
+"""Build the project's images: `python docker/build.py reference`, `reference-ros2` or `adaptune`.
 
 A build downloads nothing through pip: wheels for the Python of Debian 12 come from a folder that
 is filled here first. adaptune's own wheel comes last, so that a change of it builds one layer.
@@ -28,11 +28,16 @@ PYTHON = "3.11"
 """Of the base."""
 GLIBC = 36
 """Of the base: 2.36."""
-FOLDERS = {"reference": ROOT / "docker/reference", "adaptune": ROOT / "docker"}
+ROS2 = "reference-ros2"
+FOLDERS = {name: ROOT / "docker" / name for name in ("reference", ROS2)}
+FOLDERS["adaptune"] = ROOT / "docker"
 """Where an image's Dockerfile is."""
-FILES = {"reference": ["rustle-ros"], "adaptune": []}
-"""Folders beside it that go into the image."""
-TAGS = {"reference": "adaptune-reference", "adaptune": "adaptune"}
+FILES = {"reference": ["rustle-ros"], ROS2: ["params.yaml"], "adaptune": []}
+"""Files and folders beside it that go into the image."""
+TAGS = {"reference": "adaptune-reference", ROS2: "adaptune-reference-ros2", "adaptune": "adaptune"}
+NODE = FOLDERS[ROS2] / "node"
+"""A program in Rust, which is built here: that of Debian 12 is too old for what it needs."""
+RUST = "1.88"
 REFERENCE_NEEDS = ("numpy", "pydantic", "scipy", "small_gicp", "typing-extensions")
 """What `adaptune.odometry.keyframe` and `adaptune.odometry.serving` import, sooner or later."""
 SOURCES = ("adaptune", "offline", "online", "pyproject.toml", "README.md", "LICENSE")
@@ -120,14 +125,33 @@ def _context(name: str) -> Path:
     context = ROOT / "build/docker" / name
     context.mkdir(parents=True, exist_ok=True)
     shutil.copy(FOLDERS[name] / "Dockerfile", context)
-    for folder in FILES[name]:
-        shutil.rmtree(context / folder, ignore_errors=True)
-        _copy(FOLDERS[name] / folder, context / folder)
+    for file in FILES[name]:
+        shutil.rmtree(context / file, ignore_errors=True)
+        _copy(FOLDERS[name] / file, context / file)
+    if name == ROS2:
+        (context / "bin").mkdir(exist_ok=True)
+        shutil.copy(build_node(), context / "bin")
+        return context
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
     needed = REFERENCE_NEEDS if name == "reference" else project["dependencies"]
     _download(context / "wheels", needed)
     _own_wheel(context / "adaptune")
     return context
+
+
+def build_node() -> Path:
+    """Build the ROS 2 node, and return the program; a `LackingError` if there is no Rust.
+
+    What it is made of is kept for other copies of the project: the first time takes five minutes.
+    """
+    if shutil.which("cargo") is None:
+        raise LackingError(f"there is no cargo: install Rust {RUST} or newer by https://rustup.rs")
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    target = cache / "adaptune-reference-ros2"
+    manifest = f"--manifest-path={NODE / 'Cargo.toml'}"
+    _log.info("building %s", NODE)
+    _run("cargo", "build", "--release", "--locked", "--quiet", manifest, f"--target-dir={target}")
+    return target / "release/adaptune-reference-ros2"
 
 
 def _download(folder: Path, requirements: Iterable[str]) -> None:

@@ -3,7 +3,6 @@
 import contextlib
 import logging
 import os
-import signal
 import threading
 import time
 import traceback
@@ -21,7 +20,7 @@ import numpy as np
 from adaptune import __version__
 from adaptune.archive import Frames, Trial
 from adaptune.errors import OUT_OF_MEMORY, AdaptuneError, MachineError, in_a_line, lacking
-from adaptune.processes import apart, fork_server, how_it_ended, pin
+from adaptune.processes import apart, end_with_parent, fork_server, how_it_ended, pin
 from adaptune.progress import Progress, unseen
 from adaptune.recording.cache import fingerprints
 from adaptune.space import ParameterSet
@@ -331,8 +330,7 @@ class Workers:
 
 
 def _serve(connection: Connection, core: int, memory: float) -> None:
-    # Ctrl-C reaches all processes; the driver decides what happens.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    end_with_parent()
     os.setsid()  # user code may end its process group
     pin(core)
     try:

@@ -1,15 +1,16 @@
 """Commands that begin with recordings: look at one, or tune an odometry on them."""
 
+import json
 import re
 import shlex
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
-from itertools import chain, count
+from itertools import chain, count, takewhile
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -59,6 +60,8 @@ def inspect(
     if file.suffix == ".safetensors" or (file / "model.safetensors").exists():
         _show_model(file)
         return
+    if file.suffix in (".yaml", ".yml") and _look(file):
+        return
     check_no_study(file)
     if study is not None and study.exists():
         raise AdaptuneError(f"{study}: exists; name another file with --study, or move it away")
@@ -84,6 +87,29 @@ def inspect(
     if study is not None:
         write_text(study, f"{found.entry}\n{rest}")
     say_next("train on a part of it", "offline", path, first=first)
+
+
+_ROS = ("ros2", "rustle")
+_LOOK = 20.0
+"""Seconds of a recording on which a ROS system is looked at."""
+
+
+def _look(path: Path) -> bool:
+    """Show what the ROS system of a study does; False if it has none."""
+    loaded = load(path, [], None)
+    factory: Any = loaded.odometry
+    if loaded.config.odometries.keys().isdisjoint(_ROS) or len(loaded.config.odometries) > 1:
+        return False
+    from adaptune.odometry.docker.probe import look
+
+    name = loaded.config.training[0]
+    scans = loaded.sequences.open(name)
+    first = next(iter(scans)).stamp
+    some = takewhile(lambda scan: scan.stamp < first + _LOOK * 1e9, scans)
+    say(f"{factory.name} on the first {_LOOK:g} s of {name}, with the baseline's parameters:")
+    found = look(factory.settings, factory.space.baseline, factory.limits, some)
+    show_table("What it does", [{"": key, "found": value} for key, value in found.items()])
+    return True
 
 
 def check_no_study(path: Path) -> None:
@@ -215,7 +241,7 @@ def tune(
         str,
         typer.Option(
             metavar="NAME",
-            help="gicp, kiss_icp, my_module:MyClass, ...; several with commas, or `all`.",
+            help="gicp, my_module:MyClass, ..., several with commas, or `all`; or an image.",
         ),
     ] = "gicp",
     points: Points = None,
@@ -231,14 +257,15 @@ def tune(
     """Tune an odometry on recordings, and say what to drive.
 
     It keeps the last 40 % of one recording (of its path, where the robot stands for long), or the
-    last one of several, for the test. It tries parameter sets on the rest, replays the test with
-    the odometry's own parameters, the best set, and adapting, and compares.
+    last of several, for the test. It tries sets on the rest, replays the test, and compares.
 
-    What it decides is written to a study file in its folder, with which all other commands work.
-    Run the same command again to resume.
+    What it decides is written to a study file in its folder; run the same command to resume.
+    Of a ROS 2 system (an image, or `ros2 launch ...`), it writes a study to fill in.
     """
     if reference is not None and Path(reference).is_file():
         reference = str(Path(reference).resolve())
+    if _propose(recordings, odometry, points, reference):
+        return
     folder = folder or Path("runs") / _study_name(recordings, odometry)
     path = folder / f"{folder.resolve().name}.yaml"
     made_by = _made_by(recordings, odometry, points, reference)
@@ -252,8 +279,7 @@ def tune(
             f"to resume it, or another --folder"
         )
     else:
-        limits = _limits(trials, minutes)
-        overrides = [f"offline.{key}={value}" for key, value in limits.items()]
+        overrides = [f"offline.{key}={value}" for key, value in _limits(trials, minutes).items()]
     from offline.train import train
 
     loaded = load(path, overrides, folder, runs=True)
@@ -398,6 +424,69 @@ def _usable(path: Path, points: str | None, reference: str | None, show: Progres
         say(f"{path}: its reference does not serve ({why}): one is estimated")
         found.given["reference"] = "estimated"
     return found
+
+
+_SYSTEM = """\
+odometry:
+  name: ros2    # or rustle, for a ROS 1 system, see docs/docker.md
+  settings:
+    {image}command: {command}
+    template: {lacking}    # the parameter file that you use now
+    odometry: /{lacking}    # the topic of its poses
+    points: /points    # the topics that it hears
+    {imu}
+  parameters:
+    {lacking}: {{type: float, low: 0.1, high: 2.0, baseline: 0.5}}    # what to tune
+"""
+_LACKING = "FILL_IN"
+
+
+def _system(given: str) -> dict[str, str] | None:
+    """What is known of a ROS system, by its image or its launch command; None if it is none."""
+    words = shlex.split(given)
+    if words[:1] == ["ros2"]:
+        if not any("{parameters}" in word for word in words):
+            words.append("FILL_IN:={parameters}")
+        return {"image": "", "command": json.dumps(words)}
+    if not re.fullmatch(r"[a-z0-9][\w./-]*(:[\w.-]+)?", given):
+        return None
+    from adaptune.odometry import registry
+    from adaptune.odometry.docker.engine import EngineError, image_digest
+
+    if given in registry.ODOMETRIES or given in registry.PROGRAMS or given == "all":
+        return None
+    try:
+        image_digest(given)
+    except (EngineError, NotInstalledError):
+        if "/" in given:  # no name of an odometry
+            raise
+        return None
+    launch = ["ros2", "launch", _LACKING, f"{_LACKING}.launch.py", f"{_LACKING}:={{parameters}}"]
+    return {"image": f"image: {given}\n    ", "command": json.dumps(launch)}
+
+
+def _propose(
+    recordings: Sequence[Path], odometry: str, points: str | None, reference: str | None
+) -> bool:
+    """Write a study of a ROS system to fill in; False if the odometry is none."""
+    if (system := _system(odometry)) is None:
+        return False
+    path = Path(f"{plain_name(recordings[0].resolve())}_ros2.yaml")
+    if path.exists():
+        raise AdaptuneError(f"{path}: exists; fill it in, or move it away")
+    with progress() as show:
+        found = [_usable(one, points, reference, show) for one in recordings]
+    rest = roles([one.name for one in found], UNKNOWN_LENGTH, ["ros2"]).partition("odometry:")[0]
+    imu = "imu: /imu" if all("imu" in one.given for one in found) else "# imu: /imu"
+    block = _SYSTEM.format(lacking=_LACKING, imu=imu, **system)
+    entries = "\n".join(one.entry.removeprefix("sequences:\n") for one in found)
+    write_text(path, f"sequences:\n{entries}\n{rest}{block}")
+    say(
+        f"{path}: is a study of this system. Fill in what stands there as {_LACKING}, as "
+        f"docs/docker.md#a-ros-2-system says. Then look at what the system does:"
+    )
+    say(f"  adaptune inspect {path}")
+    return True
 
 
 def odometries_of(given: str, imu: bool) -> list[str]:

@@ -90,6 +90,7 @@ class OwnFile(NamedTuple):
     suffix: str  # of the file's name
     text: str
     use: str  # what to do with it: a command, where FILE stands for its path, or words
+    name: str = ""  # whose it is, where that is not the odometry
 
 
 class LastMotion:

@@ -11,7 +11,7 @@ import time
 from abc import abstractmethod
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
-from functools import reduce
+from functools import cache, reduce
 from operator import getitem
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, Self
@@ -59,7 +59,7 @@ class Template:
 
     A parameter's name is its keys from the outermost on, with points or slashes between them.
     Leading keys may be left out if the rest names one value only. Points and slashes within a key,
-    as in ROS, separate keys too; ROS 2's ``ros__parameters`` does not count. There is an
+    as in ROS, separate keys too; ROS 2's ``/**`` and ``ros__parameters`` do not count. There is an
     `OdometryError` if the file cannot be read.
     """
 
@@ -90,6 +90,26 @@ class Template:
         """Keys of a value, from the outermost on; none if there is no such, an error if several."""
         place = self._find(name)
         return () if place is None else place[0]
+
+    def ros2_name(self, name: str) -> str:
+        """Name of a value as ROS 2 has it: its keys below the node, with points between them."""
+        place = self._find(name)
+        keys = [] if place is None else [str(key) for key in place[-1]]
+        return ".".join(keys[keys.index(_ROS2) + 1 if _ROS2 in keys else 0 :])
+
+    @property
+    def ros2(self) -> bool:
+        """Whether the file is laid out as ROS 2 wants it."""
+        return any(_ROS2 in place[-1] for place in self._places)
+
+    def warn_of_texts(self) -> None:
+        """Log numbers that ROS 1 reads as texts: those with an exponent and without a point."""
+        for path, held_in, key, keys in self._places:
+            value = held_in[key]
+            if isinstance(value, str) and _EXPONENT.fullmatch(value):
+                begin, end = self._document.span(keys) or (0, 0)
+                if self._text[begin:end] == value:
+                    _warn_of_text(self.path, self._document.line(keys), ".".join(path), value)
 
     @property
     def names(self) -> list[str]:
@@ -159,11 +179,20 @@ def _places(data: Any, path: tuple[str, ...] = (), keys: tuple[Any, ...] = ()) -
     """Every value that is neither a mapping nor a list of them."""
     items = data.items() if isinstance(data, dict) else enumerate(data)
     for key, value in items:
-        below = path if key == _ROS2 else path + _parts(key)
+        below = path if key in (_ROS2, "/**") else path + _parts(key)
         if isinstance(value, dict | list) and value:
             yield from _places(value, below, (*keys, key))
         else:
             yield below, data, key, (*keys, key)
+
+
+@cache
+def _warn_of_text(path: Path, line: int | None, name: str, value: str) -> None:
+    _log.warning(
+        "%s:%s: ROS 1 takes %s: %s for a text, and many systems go back to their default then; "
+        "write %s",
+        *(path, line, name, value, float(value)),
+    )
 
 
 _EXPONENT = re.compile(r"[-+]?[.\d]+[eE][-+]?\d+")
@@ -205,6 +234,10 @@ def check_names(
 # The recording that a program reads: the sequence's own bag, or one that is written for it.
 
 
+Either = Literal["either"]
+"""A bag of ROS 1 or of ROS 2, as it is."""
+
+
 class ProgramInput(NamedTuple):
     """A recording as a program reads it, the topics in it, and what is known of its n scans."""
 
@@ -217,7 +250,7 @@ class ProgramInput(NamedTuple):
 
 
 def program_input(
-    sequence: Recording, config: SequenceConfig, about: Any, folder: Path, layout: Layout
+    sequence: Recording, config: SequenceConfig, about: Any, folder: Path, layout: Layout | Either
 ) -> ProgramInput:
     """Find or write the recording of a sequence for a program that reads `layout`.
 
@@ -226,7 +259,7 @@ def program_input(
     """
     folder.parent.mkdir(parents=True, exist_ok=True)
     own = _own_bag(config, layout)
-    name = {"bag": "input.bag", "ros2": "input", "kitti": "input"}[layout]
+    name = "input" if layout in ("ros2", "kitti") else "input.bag"
     with (folder.parent / f".{folder.name}.lock").open("w") as lock:
         locked(lock)
         if _about(folder) != about:
@@ -257,7 +290,7 @@ def _note_stamps(sequence: Recording, stamps: list[int]) -> Iterator[Scan]:
         yield scan
 
 
-def _own_bag(config: SequenceConfig, layout: Layout) -> Path | None:
+def _own_bag(config: SequenceConfig, layout: str) -> Path | None:
     """The sequence's bag, if it is a single one, used as it is, and of the right kind."""
     if not isinstance(config.bag, str) or layout == "kitti":
         return None
@@ -266,9 +299,8 @@ def _own_bag(config: SequenceConfig, layout: Layout) -> Path | None:
     if any(getattr(config, key) != getattr(plain, key) for key in changes):
         return None
     path = Path(config.bag)
-    right = path.is_file() and path.suffix == ".bag"
-    if layout == "ros2":
-        right = (path / "metadata.yaml").exists()
+    is_ros1, is_ros2 = path.is_file() and path.suffix == ".bag", (path / "metadata.yaml").exists()
+    right = {"bag": is_ros1, "ros2": is_ros2}.get(layout, is_ros1 or is_ros2)
     return path if right else None
 
 

@@ -49,12 +49,13 @@ PROGRAMS = {
     "docker_command": "adaptune.odometry.docker.programs:DockerCommand",
     "docker_process": "adaptune.odometry.docker.programs:DockerProcess",
     "process": "adaptune.odometry.remote:Process",
+    "ros2": "adaptune.odometry.docker.ros2_system:Ros2",
     "rustle": "adaptune.odometry.docker.rustle:Rustle",
 }
 """Programs of the user."""
 
-CONTAINERS = ("docker_command", "docker_process", "rustle")
-"""Those of them that run in containers."""
+CONTAINERS = ("docker_command", "docker_process", "ros2", "rustle")
+"""Those of them that run in containers, or may."""
 
 PACKAGES = {"gicp": "small_gicp", "kiss_icp": "kiss-icp", "ndt": "open3d", "vgicp": "small_gicp"}
 """Packages that our odometries run on, where they are not named as the adapter's module is."""

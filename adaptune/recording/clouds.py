@@ -439,6 +439,25 @@ CLOUDS: dict[str, Callable[[bytes | memoryview, bool, Timing], Scan]] = {
 }
 """What decodes a serialised message of point clouds, by its type."""
 
+
+def livox_points(scan: Scan) -> bytes:
+    """The points of a scan as a Livox driver for ROS 2 serialises them, their number first."""
+    raw = np.zeros(len(scan), np.dtype(list(_LIVOX_POINT), align=True))
+    for axis, values in zip("xyz", scan.points.T, strict=True):
+        raw[axis] = values
+    raw["tag"] = 0x10  # a good return
+    for name, given, factor in (
+        ("offset_time", scan.times, 1e9),
+        ("reflectivity", scan.intensities, 1.0),
+        ("line", scan.rings, 1),
+    ):
+        if given is not None:
+            most = np.iinfo(raw.dtype[name]).max
+            raw[name] = (np.asarray(given, np.float64) * factor).clip(0, most).round()
+    behind = raw.dtype.itemsize - _LIVOX_SIZE
+    return struct.pack("<I", len(scan)) + raw.tobytes()[: -behind if len(scan) else None]
+
+
 # Poses in ROS messages.
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptune.files import write_text
+from adaptune.recording.clouds import livox_points
 from adaptune.recording.scan import Imu, Scan
 
 Message = tuple[str, int, Any]
@@ -66,6 +67,13 @@ class Messages:
             is_dense=True,
         )
 
+    def livox(self, header: Any, scan: Scan) -> bytes:
+        """A scan as a Livox driver for ROS 2 sends it, serialised."""
+        stamp = scan.stamp.to_bytes(8, "little")
+        head = bytes(self.typestore.serialize_cdr(header, "std_msgs/msg/Header"))
+        head += bytes(-(len(head) - 4) % 8)  # behind the four bytes of the encoding
+        return head + stamp + len(scan).to_bytes(4, "little") + bytes(4) + livox_points(scan)
+
     def imu(self, header: Any, gyro: NDArray[np.float64], accel: NDArray[np.float64]) -> Any:
         """A measurement without an orientation."""
         vector, unknown = self.types["geometry_msgs/msg/Vector3"], np.zeros(9)
@@ -106,7 +114,7 @@ class Messages:
                 bag.write(topics[topic], stamp, serialize(message, types[topic]))
 
 
-def export(scans: Iterable[Scan], imu: Imu | None, path: Path, layout: Layout) -> None:
+def export(scans: Iterable[Scan], imu: Imu | None, path: Path, layout: str) -> None:
     """Write scans, and an IMU's measurements where there are any, for another program.
 
     Bags hold `POINTS` (x, y, z, intensity, which is 0 where the scans have none, and ring and time
@@ -116,7 +124,7 @@ def export(scans: Iterable[Scan], imu: Imu | None, path: Path, layout: Layout) -
     if layout == "kitti":
         write_kitti_sequence(scans, path)
         return
-    messages = Messages(1 if layout == "bag" else 2)
+    messages = Messages(2 if layout == "ros2" else 1)
     types = {POINTS: "sensor_msgs/msg/PointCloud2"}
     streams = [_clouds(messages, scans)]
     if imu is not None:

@@ -36,7 +36,7 @@ from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
 from adaptune.errors import nearest
-from adaptune.recording.clouds import LIVOX_TYPES
+from adaptune.recording.clouds import CLOUDS
 from adaptune.ros.link import LinkError, take_all
 from adaptune.ros.ros2 import (
     FIELDS,
@@ -66,7 +66,6 @@ _CYCLONE, _FAST_DDS = b"\x01\x10", b"\x01\x0f"
 """The vendors of DDS in ROS 2, as they begin the keys of their participants."""
 _INFO = "rmw_dds_common/msg/ParticipantEntitiesInfo"
 _TRANSFORMS = "tf2_msgs/msg/TFMessage"
-_CLOUDS = ("sensor_msgs/msg/PointCloud2", *LIVOX_TYPES)
 _ALL = ViewState.Any | SampleState.Any
 _DURABILITIES = tuple(
     getattr(Policy.Durability, name)
@@ -137,7 +136,7 @@ class DdsLink:
         there = [e for e in self._endpoints(0) if e.topic == full(topic)]
         if there and kind not in {e.kind for e in there}:
             raise LinkError(f"{topic} is published as {there[0].kind}, not as {kind}")
-        if kind in _CLOUDS and (size := _receive_buffer()) < _BUFFER:
+        if kind in CLOUDS and (size := _receive_buffer()) < _BUFFER:
             what = "%s: clouds may be lost, as this machine receives %d kB ahead; run `sudo sysctl "
             what += "-w net.core.rmem_max=%d` and start again"
             _log.warning(what, topic, size // 1000, _BUFFER)

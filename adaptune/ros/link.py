@@ -114,7 +114,7 @@ class Steering:
         node: str,
         set_parameters: Callable[[ParameterSet], Mapping[str, Any]],
         command: Sequence[str] | None,
-        run: Run,
+        run: Run | None,
     ):
         self._node, self._set_parameters = node, set_parameters
         self._command, self._run = command, run
@@ -155,6 +155,7 @@ class Steering:
             for key, text in values.items():
                 argument = argument.replace(key, text)  # noqa: PLW2901
             arguments.append(argument)
+        assert self._run is not None
         code, written = self._run(arguments)
         if code:
             words = " | ".join(written.split("\n")[-4:]).strip(" |")

@@ -1,36 +1,16 @@
 """A link to ROS 1, by a node that the Python of a ROS installation runs."""
 
-import contextlib
-import itertools
-import logging
 import os
 import shutil
 import socket
-import struct
 import subprocess
-import threading
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
-from queue import Empty, SimpleQueue
 from typing import Any
 
-import numpy as np
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from adaptune import processes
 from adaptune.ros import ros1_node
-from adaptune.ros.link import LinkError, take_all, telling
-
-_START = 20.0
-"""Seconds in which the node must be ready."""
-_WAITING = 1000
-"""Messages of a topic that may wait; more are dropped."""
-_ANSWER = 5.0
-"""Seconds in which it must answer; it waits less for others."""
-_DEAF = 30.0
-"""Seconds in which it must read what is sent."""
-
-_log = logging.getLogger(__name__)
+from adaptune.ros.link import LinkError
+from adaptune.ros.relay import Relay
 
 
 def ros_python() -> str:
@@ -78,150 +58,23 @@ def local_ros1() -> "Ros1":
         raise LinkError(f"{error}; start `roscore`, and source your ROS's setup") from error
 
 
-class Ros1:
-    """A node in a running ROS 1, see `adaptune.ros.link.RosLink`.
+class Ros1(Relay):
+    """A node in a running ROS 1: the Python of any ROS will do."""
 
-    A process of its own imports ROS, so any Python that ROS was built for will do. Messages pass
-    through it as bytes. `running` says whether it runs, `end` waits for it or ends it. There is a
-    `LinkError` with its reason if the node does not start.
-    """
+    version = 1
 
-    def __init__(
-        self, connection: socket.socket, running: Callable[[], bool], end: Callable[[], None]
-    ):
+    def __init__(self, *given: Any):
         self.store = get_typestore(Stores.ROS1_NOETIC)
         text = "geometry_msgs/TransformStamped[] transforms\n"
         self.store.register(get_types_from_msg(text, "tf2_msgs/msg/TFMessage"))
-        self._running, self._end = running, end
-        # For sending alone: a thread may wait for messages as long as it likes.
-        limit = struct.pack("ll", int(_DEAF), int(_DEAF % 1 * 1e6))
-        connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, limit)
-        self._stream = processes.SocketStream(connection)
-        self._sending = threading.Lock()
-        self._numbers = itertools.count()
-        self._answers: dict[int, SimpleQueue[dict[str, Any]]] = {}
-        self._takes: dict[str, Callable[[str, bytes], None]] = {}
-        self._waiting: list[SimpleQueue[bytes | None]] = []
-        ready = processes.receive(self._stream) if self._stream.ready(_START) else None
-        if ready is None or ready.header["type"] == "failed":
-            self.close()
-            what = "its node did not start" if ready is None else ready.header["message"]
-            raise LinkError(f"ROS 1: {what}")
-        threading.Thread(target=self._receive, daemon=True).start()
+        super().__init__(*given)
 
-    is2 = False
+    def encode(self, message: Any, kind: str) -> Any:
+        return self.store.serialize_ros1(message, kind)
 
-    def subscribe(
-        self, topic: str, kind: str, take: Callable[[Any], None], raw: bool = False
-    ) -> None:
-        received: SimpleQueue[bytes | None] = SimpleQueue()
-        self._waiting.append(received)
-        mistaken = set()
+    def decode(self, data: bytes, kind: str) -> Any:
+        return self.store.deserialize_ros1(data, kind)
 
-        def put(of: str, data: bytes) -> None:
-            if of != kind and of not in mistaken:
-                mistaken.add(of)
-                _log.warning("%s is %s, not %s: its messages are ignored", topic, of, kind)
-            elif of == kind and received.qsize() < _WAITING:
-                received.put(data)
-
-        messages = iter(received.get, None)
-        read = bytes if raw else partial(self.store.deserialize_ros1, typename=kind)
-        take_all(topic, messages, lambda data: take(read(data)))
-        self.record(topic, put)
-
-    def record(self, topic: str, take: Callable[[str, bytes], None]) -> None:
-        """Have every message of a topic taken as it comes, as its type and its bytes."""
-        self._takes[topic] = take
-        self._send({"type": "subscribe", "topic": topic})
-
-    def advertise(self, topic: str, kind: str) -> Callable[[Any], None]:
+    def _names(self, kind: str) -> dict[str, str]:
         text, md5 = self.store.generate_msgdef(kind, ros_version=1)
-        names = {"kind": kind.replace("/msg/", "/"), "text": text, "md5": md5}
-        self._send({"type": "advertise", "topic": topic, **names})
-
-        def publish(message: Any) -> None:
-            data = np.frombuffer(self.store.serialize_ros1(message, kind), np.uint8)
-            self._send({"type": "publish", "topic": topic}, data)
-
-        return publish
-
-    def set_parameters(
-        self,
-        node: str,
-        values: Mapping[str, Any],
-        keys: Mapping[str, Sequence[str]] | None = None,
-    ) -> Mapping[str, Any]:
-        """See `RosLink.set_parameters`; `keys` name others at the parameter server than the node's.
-
-        They are set by dynamic_reconfigure where the node has it. The others are set at the
-        parameter server: nobody tells what the node makes of them, so they are not returned.
-        """
-        asked = {"node": node, "values": dict(values), "keys": dict(keys or {})}
-        try:
-            held: dict[str, Any] = self.ask("set_parameters", **asked)
-        except LinkError as error:
-            raise LinkError(f"{node}: {error}") from error
-        return held
-
-    def topics(self) -> Mapping[str, str]:
-        try:
-            found: dict[str, str] = self.ask("topics")
-        except LinkError as error:
-            raise LinkError(f"ROS 1: the roscore does not answer ({error})") from error
-        return {topic: kind.replace("/", "/msg/") for topic, kind in found.items()}
-
-    def why_unheard(self, topic: str) -> str:  # noqa: ARG002
-        return ""
-
-    def ask(self, kind: str, **given: Any) -> Any:
-        """What the node answers, see `adaptune.ros.ros1_node`; a `LinkError` if it refuses."""
-        number = next(self._numbers)
-        waiting = self._answers[number] = SimpleQueue()
-        try:
-            self._send({**given, "type": kind, "number": number})
-            answer = waiting.get(timeout=_ANSWER)
-        except Empty as error:
-            raise LinkError(f"no answer in {_ANSWER:g} s") from error
-        finally:
-            del self._answers[number]
-        if "refused" in answer:
-            raise LinkError(str(answer["refused"]))
-        return answer["found"]
-
-    @property
-    def alive(self) -> bool:
-        return self._running()
-
-    def close(self) -> None:
-        for received in self._waiting:
-            received.put(None)
-        # A thread reads; without it the node would not notice.
-        self._stream.end()
-        with contextlib.suppress(OSError):
-            self._stream.close()
-        self._end()
-
-    def _send(self, header: dict[str, Any], data: Any = None) -> None:
-        try:
-            with self._sending:
-                processes.send(self._stream, header, data=data)
-        except BlockingIOError as error:
-            raise LinkError(f"ROS 1: adaptune's node has read nothing for {_DEAF:g} s") from error
-        except (OSError, ValueError) as error:
-            raise LinkError("ROS 1: adaptune's node has ended") from error
-
-    def _receive(self) -> None:
-        """Pass on what the node sends, until it ends."""
-        try:
-            while (message := processes.receive(self._stream)) is not None:
-                header = message.header
-                if header["type"] == "answer":
-                    if (waiting := self._answers.get(header["number"])) is not None:
-                        waiting.put(header)
-                    continue
-                kind, data = header["kind"].replace("/", "/msg/"), message.arrays["data"].tobytes()
-                with telling(header["topic"]):
-                    self._takes[header["topic"]](kind, data)
-        except (OSError, processes.WireError):
-            pass  # it was closed
+        return {"text": text, "md5": md5}

@@ -153,6 +153,8 @@ class Course(StrictModel):
     rate: float | None = Field(default=None, gt=0.0, le=100.0)
     # Firings in a turn; the sensor's own if not given.
     columns: int | None = Field(default=None, ge=16, le=8192)
+    # Seconds at rest before it drives off, which LiDAR-inertial systems need to begin.
+    standstill: float = Field(default=0.0, ge=0.0, le=60.0)
     # Hz of the inertial measurements; none are made if not given.
     imu: Literal[200, 400] | None = None
     # How motion within a scan is undone, as for a recorded sequence.

@@ -60,7 +60,8 @@ class Drive:
     def __init__(self, course: Course) -> None:
         self.course = course
         self.road = Road([(SCENES[name], length) for name, length in course.legs], course.seed)
-        self.ride = Ride(self.road, MOTIONS[course.motion], course.seed)
+        motion = MOTIONS[course.motion]
+        self.ride = Ride(self.road, motion, course.seed, course.standstill)
 
     def __len__(self) -> int:
         """Whole scans in the drive."""

@@ -225,17 +225,21 @@ _KNOTS = 50.0
 """Knots of the trajectory's spline in a second; nothing in it moves faster than a tenth of it."""
 
 
+_START = 2.0
+"""Seconds in which a vehicle that stood reaches its speed."""
+
+
 class Ride:
     """The sensor's trajectory in continuous time, with its derivatives.
 
     One spline of fifth order through positions and roll, pitch and yaw contains the ground, the
     vehicle and its shake. Poses, velocities and accelerations thus match exactly. The seed is that
-    of its straying, its speed and its shake.
+    of its straying, its speed and its shake. It stands for some seconds first.
 
     Its `duration` is seconds until the end of the road's drive.
     """
 
-    def __init__(self, road: Road, motion: Motion, seed: int) -> None:
+    def __init__(self, road: Road, motion: Motion, seed: int, standstill: float = 0.0) -> None:
         rng = np.random.default_rng([seed, 2])
         s = np.arange(-10.0, road.length + 10.0, _STEP)
         lane = _lane(road, motion, s, rng)
@@ -244,13 +248,23 @@ class Ride:
         self.duration = float(np.interp(road.length, s, times))
         knots = np.arange(np.ceil(times[0] * _KNOTS), np.floor(times[-1] * _KNOTS)) / _KNOTS
         # Smoothed over a third of a second: no vehicle changes its acceleration at once.
-        along = gaussian_filter1d(np.interp(knots, times, s), 0.15 * _KNOTS, mode="reflect")
+        moves = np.ones_like(knots)
+        if standstill:
+            self.duration += standstill + _START / 2.0
+            knots = np.arange(-_KNOTS, np.floor((self.duration + 1.0) * _KNOTS)) / _KNOTS
+            since = np.maximum(knots - standstill, 0.0)
+            moves = np.minimum(since / _START, 1.0)
+            knots_of_drive = since - _START * (moves - 0.5 * moves**2)
+            along = np.interp(knots_of_drive, times, s)
+        else:
+            along = np.interp(knots, times, s)
+        along = gaussian_filter1d(along, 0.15 * _KNOTS, mode="reflect")
         values = np.stack([np.interp(along, s, column) for column in lane.T], axis=1)
         values = gaussian_filter1d(values, 0.1 * _KNOTS, axis=0, mode="nearest")
         roughness = np.zeros_like(along)
         for leg, share in road.shares(along):
             roughness += share * leg.scene.shake
-        shake = _shake(motion, knots, rng) * roughness[:, None]
+        shake = _shake(motion, knots, rng) * (roughness * moves)[:, None]
         # The mount shakes about its own axes; yaw turns what shakes along and across.
         yaw = values[:, 5]
         values[:, 0] += np.cos(yaw) * shake[:, 0] - np.sin(yaw) * shake[:, 1]

@@ -291,7 +291,7 @@ class Study(Generic[C_co]):
         factory, parameters = self.odometry.alone(fixed)
         if (own := factory.own_file(parameters)) is None:
             return None
-        return self.folder / f"fixed_{factory.name}{own.suffix}", own
+        return self.folder / f"fixed_{own.name or factory.name}{own.suffix}", own
 
     @property
     def training(self) -> list[str]:

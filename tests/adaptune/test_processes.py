@@ -343,6 +343,29 @@ def test_a_process_that_is_killed_is_told():
         pool.submit(os._exit, 1).result()
 
 
+OWNER = """
+import os, sys, time
+from adaptune import processes
+with processes.processes(1) as pool:
+    print(pool.submit(os.getpid).result(), flush=True)
+    pool.submit(time.sleep, 600).result()
+"""
+
+
+def test_a_process_ends_with_the_one_that_it_computes_for():
+    owner = subprocess.Popen(
+        [sys.executable, "-c", OWNER],
+        stdout=subprocess.PIPE,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+        text=True,
+    )
+    with owner:
+        worker = owner.stdout.readline().strip()
+        assert not gone(worker)
+        owner.kill()
+    wait_until_gone([worker])
+
+
 HOLES = """
 import contextlib, sys
 import numpy as np

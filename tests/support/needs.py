@@ -48,10 +48,10 @@ def module_of(file: str) -> Any:
 
 
 @cache
-def reference_image() -> str:
-    """Build the reference image, once in a run of pytest; skip where none can. Returns its tag."""
+def reference_image(name: str = "reference", service: str = "docker") -> str:
+    """Build a reference image, once in a run of pytest; skip where none can. Returns its tag."""
     builder = module_of("docker/build.py")
-    lock = ROOT / "build/docker.lock"
+    lock = ROOT / f"build/docker-{name}.lock"
     lock.parent.mkdir(exist_ok=True)
     run = os.environ.get("PYTEST_XDIST_TESTRUNUID", "")
     with lock.open("a+") as held:
@@ -59,11 +59,17 @@ def reference_image() -> str:
         held.seek(0)
         # Another process of this run may have built it.
         if run and held.read() == run:
-            return str(builder.TAGS["reference"])
+            return str(builder.TAGS[name])
         try:
-            tag: str = builder.build("reference")
+            tag: str = builder.build(name)
         except builder.LackingError as error:
-            lacking("docker", str(error))
+            lacking(service, str(error))
         held.truncate(0)
         held.write(run)
     return tag
+
+
+def ros2_image() -> str:
+    """Build the image of the ROS 2 reference; skip where there is no Rust, no Docker, no DDS."""
+    needs("cyclonedds", "ros2")
+    return reference_image("reference-ros2", "ros2")

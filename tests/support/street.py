@@ -13,6 +13,7 @@ import drives
 import numpy as np
 import program
 from needs import reference_image
+from ros2_reference import ros2
 
 from adaptune.odometry.base import InProcess
 from adaptune.odometry.keyframe import KeyframeGicp
@@ -43,7 +44,7 @@ gicp: {max_correspondence_distance: 1.0, keyframe_interval: 1.0, downsampling: 0
 """
 
 
-FILED = ("command", "docker_command", "rustle", LOCKSTEP)
+FILED = ("command", "docker_command", "rustle", LOCKSTEP, "ros2")
 """Programs that read all parameters in a file."""
 
 
@@ -93,6 +94,8 @@ def _settings(name):
     given[LOCKSTEP] = given["rustle"] | {"play": "lockstep", "node": "/gicp", "patience": 60.0}
     if name == "process":
         return served()
+    if name == "ros2":
+        return ros2(Path(_folder.name) / "icp.yaml", node="/icp", patience=60.0)
     own = {} if name == "command" else {"image": reference_image()}
     return _kind(name).settings_type(**given[name], **own)
 
@@ -110,6 +113,8 @@ def space_of(name):
                 "registration.distance": Float(low=0.5, high=4.0, baseline=2.0, log=True),
             }
         )
+    if name == "ros2":
+        return ParameterSpace({"voxel_size": Float(low=0.3, high=1.5, baseline=0.5)})
     if name in FILED:
         tuned = ("max_correspondence_distance", "keyframe_interval")
         return ParameterSpace({key: KeyframeGicp.space.parameters[key] for key in tuned})

@@ -2,6 +2,7 @@
 
 import contextlib
 import hashlib
+import io
 import json
 import logging
 import os
@@ -10,6 +11,7 @@ import signal
 import stat
 import subprocess
 import sys
+import tarfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -201,12 +203,12 @@ def _home(user: str) -> dict[str, str]:
 class Container:
     """A running container.
 
-    It has no network, no privileges and no new ones, and sees nothing of the host but its mounts.
-    There is an `OdometryError` if it cannot be started.
+    It has no network, or that of another container, no privileges and no new ones, and sees nothing
+    of the host but its mounts. There is an `OdometryError` if it cannot be started.
 
     Memory is in gigabytes. The command is the image's own if it is empty; a bare one takes the
-    place of the image's entry point, too. A hurried container may use all cores until
-    `hold_to_cores`.
+    place of the image's entry point, too. A bare one, and one beside another, may use all cores
+    until `hold_to_cores`.
     """
 
     def __init__(
@@ -219,7 +221,7 @@ class Container:
         user: str,
         environment: Mapping[str, str] | None = None,
         bare: bool = False,
-        hurried: bool = False,
+        beside: "Container | None" = None,
     ):
         from docker.types import LogConfig, Ulimit
         from docker.types import Mount as Bind
@@ -233,11 +235,11 @@ class Container:
         limit = int(memory * 1e9)
         host = client.api.create_host_config(
             mounts=binds,
-            network_mode="none",
+            network_mode="none" if beside is None else f"container:{beside.id}",
             mem_limit=limit,
             memswap_limit=limit,
             cpu_period=_PERIOD,
-            cpu_quota=-1 if hurried else int(settings.cpus * _PERIOD),
+            cpu_quota=-1 if bare or beside else int(settings.cpus * _PERIOD),
             cpu_shares=min(max(int(settings.cpus * _WEIGHT), 2), 262_144),
             pids_limit=settings.pids,
             cap_drop=["ALL"],
@@ -351,6 +353,47 @@ class Container:
             _remove(engine(), self.id)
 
 
+# Programs of this machine in a container, which reach no more than what runs beside them.
+
+_EMPTY = "adaptune-empty:latest"
+"""An image without a file."""
+
+
+def own_container(
+    command: Sequence[str], folder: Path, environment: Mapping[str, str]
+) -> Container:
+    """Run a Python program of adaptune's in a container, which sees this machine's Python.
+
+    It may write to the folder.
+    """
+    with _telling(_EMPTY):
+        if not engine().api.images(_EMPTY, quiet=True):
+            nothing = io.BytesIO()
+            tarfile.open(fileobj=nothing, mode="w").close()
+            engine().api.import_image_from_data(
+                nothing.getvalue(), repository="adaptune-empty", tag="latest"
+            )
+    # Links lead to places outside of an environment.
+    pythons = [sys.prefix, sys.base_prefix, str(Path(sys.executable).resolve().parents[1])]
+    own = [str(Path(__file__).parents[3]), "/usr", "/lib", "/lib64", "/bin", "/etc/ld.so.cache"]
+    paths = sorted(path for path in {*own, *pythons, *filter(None, sys.path)} if _is_there(path))
+    mounts = [Mount(Path(path), path) for path in paths]
+    return Container(
+        ContainerSettings(image=_EMPTY),
+        1.0,
+        [sys.executable, *command],
+        [*mounts, Mount(folder, str(folder), writable=True)],
+        user=f"{os.getuid()}:{os.getgid()}",
+        environment={"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
+        | dict(environment),
+        bare=True,
+    )
+
+
+def _is_there(path: str) -> bool:
+    return path.strip("/") != "" and path[0] == "/" and os.path.exists(path)  # noqa: PTH110
+
+
 # Folders that containers write to. Nothing that is in them is trusted.
 
 _SECONDS = 20.0
@@ -434,8 +477,9 @@ def kept_log(run: Any, logs: Path | None, fault: str | None, **about: Any) -> It
     name = hashlib.blake2b(whole.encode(), digest_size=4).hexdigest()
     with replacing_folder(logs / name) as temporary:
         temporary.mkdir()
-        digest = image_digest(settings.image)
-        note = {"image": settings.image, "digest": digest, "parameters": parameters, **about}
+        note = {"parameters": parameters, **about}
+        if settings.image is not None:
+            note = {"image": settings.image, "digest": image_digest(settings.image)} | note
         note |= {"cpu": round(usage.cpu, 3), "memory": round(usage.memory or 0.0, 1)}
         if fault:
             note["fault"] = fault

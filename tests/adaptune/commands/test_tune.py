@@ -168,6 +168,24 @@ def test_several_odometries_share_a_study(bag):
     assert "evalio_kiss_icp" not in every
 
 
+def test_of_a_launch_command_a_study_is_written_to_fill_in(bag):
+    given = ("tune", bag, "--points", "/points", "--odometry")
+    done = commands.succeeded(*given, "ros2 launch kiss_icp odometry.launch.py topic:=/points")
+    assert "adaptune inspect one_ros2.yaml" in done.output
+    text = Path("one_ros2.yaml").read_text()
+    assert '"kiss_icp", "odometry.launch.py", "topic:=/points", "FILL_IN:={parameters}"' in text
+    # Once it is filled in, it is a study.
+    Path("p.yaml").write_text("voxel: 1.0\n")
+    Path("one_ros2.yaml").write_text(
+        text.replace("template: FILL_IN", "template: p.yaml").replace("FILL_IN:", "voxel:")
+    )
+    config = load_study(Path("one_ros2.yaml"), [], None, needed=False).config
+    assert config.odometries["ros2"].settings["points"] == "/points"
+    assert "one_ros2.yaml: exists" in failed(*given[1:], "ros2 launch a b")
+    refused = failed(*given[1:], "my/kiss-icp:jazzy")
+    assert "there is no image 'my/kiss-icp:jazzy'" in refused or "no Docker engine" in refused
+
+
 @pytest.mark.usefixtures("decided")
 def test_a_drive_too_short_to_split_is_refused(tmp_path):
     short = drives.write_bag(tmp_path / "short.bag", drives.scans(n_scans=12))

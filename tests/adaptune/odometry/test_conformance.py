@@ -43,9 +43,10 @@ CLEAN = [name for name in ODOMETRIES if odometry_class(name).clean]
 programs = [
     pytest.param(name, marks=pytest.mark.services) if name in CONTAINERS else name
     for name in PROGRAMS
+    if name != "ros2"
 ]
-in_lockstep = pytest.param(LOCKSTEP, marks=pytest.mark.services)
-every_odometry = pytest.mark.parametrize("name", [*CLEAN, *programs, in_lockstep])
+in_lockstep = [pytest.param(name, marks=pytest.mark.services) for name in (LOCKSTEP, "ros2")]
+every_odometry = pytest.mark.parametrize("name", [*CLEAN, *programs, *in_lockstep])
 
 # A node's clock does not go back; test_lockstep.py holds more of it.
 but_lockstep = pytest.mark.parametrize("name", [*CLEAN, *programs])
@@ -314,7 +315,7 @@ def test_preparing_leaves_the_scan_and_serves_all_instances(name):
 
 @every_odometry
 def test_parameters_that_do_not_exist_are_refused(name):
-    words = "voxl: (no argument holds|params.yaml has no)|has no parameter 'voxl'"
+    words = "voxl: (no argument holds|(params|icp).yaml has no)|has no parameter 'voxl'"
     with pytest.raises(OdometryError, match=words):  # noqa: PT012 - a program is asked at its start
         odometry = make(name, space_of(name).baseline | {"voxl": 1.0})
         odometry.start(prepared_drive(name)[0], np.eye(4))

@@ -3,8 +3,10 @@ import pytest
 import turns
 
 from adaptune.recording import Imu, Scan, SequenceConfig
-from adaptune.recording.export import export
+from adaptune.recording.clouds import decode_livox
+from adaptune.recording.export import Messages, export
 from adaptune.recording.recording import open_sequence
+from adaptune.ros.ros2 import message_types
 
 FIRST = 1_700_000_000_123_456_000
 
@@ -47,3 +49,25 @@ def test_a_kitti_folder(tmp_path):
         assert there.stamp == pytest.approx(i * 10**8, abs=1000)
         np.testing.assert_array_equal(there.points, scan.points)
         np.testing.assert_array_equal(there.intensities, scan.intensities)
+
+
+@pytest.mark.parametrize("n", [0, 1, 500])
+@pytest.mark.parametrize("frame", ["", "lidar", "livox_frame"])
+def test_a_scan_as_a_livox_message_is_that_scan(n, frame):
+    rng = np.random.default_rng(n)
+    points = rng.normal(size=(n, 3)).astype(np.float32)
+    times = np.sort(rng.uniform(0, 0.1, n)).astype(np.float32)
+    rings, light = (rng.integers(0, 200, n) for _ in range(2))
+    scan = Scan(FIRST, points, times, rings.astype(np.uint16), intensities=light.astype("f4"))
+    messages = Messages(2)
+    data = messages.livox(messages.header("/livox", FIRST, frame), scan)
+    store = message_types()
+    read = store.deserialize_cdr(data, "livox_ros_driver2/msg/CustomMsg")
+    assert (read.point_num, read.timebase, read.header.frame_id) == (n, FIRST, frame)
+    assert len(read.points) == n
+    found = decode_livox(data, cdr=True)
+    np.testing.assert_array_equal(found.points, points)
+    if n:
+        assert [point.line for point in read.points] == rings.tolist()
+        np.testing.assert_allclose(found.times, times, atol=1e-8)
+        np.testing.assert_array_equal(found.intensities, light)

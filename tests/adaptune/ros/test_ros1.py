@@ -16,7 +16,7 @@ from needs import needs_program
 
 from adaptune import processes
 from adaptune.keeper import descendants
-from adaptune.ros import ros1
+from adaptune.ros import relay
 from adaptune.ros.link import LinkError
 from adaptune.ros.ros1 import Ros1, local_ros1, ros_python
 from adaptune.trajectory import read_tum
@@ -152,7 +152,7 @@ def test_a_node_that_is_killed_is_noticed(link):
 
 
 def test_a_node_that_reads_nothing_any_more_is_an_error(monkeypatch):
-    monkeypatch.setattr(ros1, "_DEAF", 0.2)
+    monkeypatch.setattr(relay, "_DEAF", 0.2)
     here, there = socket.socketpair()
     processes.send(processes.SocketStream(there), {"type": "ready"})
     link = Ros1(here, lambda: True, there.close)

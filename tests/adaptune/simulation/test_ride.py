@@ -43,3 +43,27 @@ def test_vehicle_keeps_to_its_limits_and_the_road(ride):
     # It looks where it goes.
     ahead = np.einsum("ni,ni->n", T[:-1, :3, 0], np.diff(T[:, :3, 3], axis=0)) / 0.02 / speed
     assert ahead.min() > 0.9
+
+
+@pytest.mark.parametrize("name", MOTIONS)
+@pytest.mark.parametrize("standstill", [1.0, 4.0])
+def test_it_stands_first_and_then_takes_the_same_road(name, standstill):
+    road, motion = Road([(SCENES["street"], 60.0)], seed=1), MOTIONS[name]
+    drives, stands = Ride(road, motion, 1), Ride(road, motion, 1, standstill)
+    at_rest = np.linspace(0.0, standstill - 0.7, 50)
+    T = stands.poses(at_rest)
+    np.testing.assert_allclose(T, np.broadcast_to(T[0], T.shape), atol=2e-3)
+    for found in (*stands.velocities(at_rest), *stands.accelerations(at_rest)):
+        assert np.abs(found).max() < 0.02
+    assert stands.duration > drives.duration + standstill
+    moving = np.linspace(standstill, stands.duration, 400)
+    acceleration, _ = stands.accelerations(moving)
+    assert (
+        np.linalg.norm(acceleration, axis=1).max()
+        < 2.0 * motion.speed
+        + np.linalg.norm(
+            drives.accelerations(np.linspace(0.0, drives.duration, 400))[0], axis=1
+        ).max()
+    )
+    ends = [ride.poses(np.array([ride.duration]))[0, :3, 3] for ride in (drives, stands)]
+    np.testing.assert_allclose(*ends, atol=0.3)

@@ -271,7 +271,7 @@ def test_a_process_that_is_killed_leaves_no_container(settings):
 
 
 def test_one_that_is_hurried_is_held_to_its_cores_later(settings):
-    with closing(started(settings, "sleep", "60", hurried=True)) as container:
+    with closing(started(settings, "sleep", "60", bare=True)) as container:
 
         def quota():
             found = engine_module.engine().api.inspect_container(container.id)

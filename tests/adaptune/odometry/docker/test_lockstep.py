@@ -21,10 +21,10 @@ from rooms import moved
 
 from adaptune.odometry import OdometryError
 from adaptune.odometry.base import InProcess
-from adaptune.odometry.docker import rustle as lockstep
+from adaptune.odometry.docker import lockstep
 from adaptune.odometry.docker.engine import engine
-from adaptune.odometry.docker.ros_container import RosSystem
-from adaptune.odometry.docker.rustle import Rustle
+from adaptune.odometry.docker.ros_container import Ros1System
+from adaptune.odometry.docker.rustle import Rustle, RustleSettings
 from adaptune.odometry.keyframe import KeyframeGicp
 from adaptune.space import Selection
 
@@ -49,12 +49,12 @@ def _image():
 def systems(monkeypatch):
     started = []
 
-    class Noted(RosSystem):
+    class Noted(Ros1System):
         def __init__(self, *given):
             super().__init__(*given)
             started.append(self)
 
-    monkeypatch.setattr(lockstep, "RosSystem", Noted)
+    monkeypatch.setattr(RustleSettings, "system", Noted)
     return started
 
 
@@ -193,7 +193,7 @@ def test_scans_without_a_pose_continue_the_motion(make, monkeypatch):
     assert not odometry.faults
     assert np.isnan(on(odometry, 3, 5)[-1].T_odom_sensor).all()
     (fault,) = odometry.faults
-    words = "no pose on /Odometry for 4 scans in a row; topics that are published.*play: bag"
+    words = "no pose yet on /Odometry for 4 scans in a row; topics that are published.*play: bag"
     assert re.match(words, fault), fault
 
 

@@ -23,9 +23,10 @@ from contained import (
 from needs import reference_image
 
 from adaptune.odometry import OdometryError
-from adaptune.odometry.docker import rustle as rustle_system
+from adaptune.odometry.docker import played_bag
 from adaptune.odometry.docker.engine import image_digest
-from adaptune.odometry.docker.rustle import PlayedBag, Rustle
+from adaptune.odometry.docker.played_bag import PlayedBag
+from adaptune.odometry.docker.rustle import Rustle
 from adaptune.odometry.remote import Limits
 
 pytestmark = [
@@ -80,7 +81,7 @@ def folder(tmp_path_factory):
 def ran(folder):
     reference_image()
     with pytest.MonkeyPatch.context() as patch, ThreadPoolExecutor(SIDE_BY_SIDE) as pool:
-        patch.setattr(rustle_system, "_FIRST", 2.0)
+        patch.setattr(played_bag, "_FIRST", 2.0)
         trials = {name: pool.submit(run, folder / name, **given) for name, given in TRIALS.items()}
         yield lambda name: trials[name].result()
         for trial in trials.values():

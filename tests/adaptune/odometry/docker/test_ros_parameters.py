@@ -1,6 +1,11 @@
+import re
+
 import pytest
+import yaml
+from pydantic import ValidationError
 
 from adaptune.odometry import OdometryError
+from adaptune.odometry.docker.ros2_system import DIED, NOISE, Ros2Settings, Ros2System
 from adaptune.odometry.docker.ros_container import server_keys, warn_of_unread
 from adaptune.odometry.program import Template
 
@@ -95,3 +100,56 @@ def test_parameters_that_no_node_reads_are_named_once(asked, warned, caplog, req
         warn_of_unread(Asked(**asked), request.node.name, {"voxel": ["/gicp/voxel"]})
     assert len(caplog.messages) == warned
     assert all("no node has read the parameter voxel" in message for message in caplog.messages)
+
+
+@pytest.mark.parametrize(
+    ("text", "name", "known", "line"),
+    [
+        ("a: {b: 1.0}\n", "b", "a.b", "    a: {b: 2.0}"),
+        ("%YAML 1.2\n---\na.b: 1.0\n", "a.b", "a.b", "    a.b: 2.0"),
+        ("/**:\n  ros__parameters:\n    a: {b: 1.0}\n", "a.b", "a.b", "    a: {b: 2.0}"),
+        ("icp:\n  ros__parameters:\n    a.b: 1.0\n", "icp.a.b", "a.b", "    a.b: 2.0"),
+    ],
+)
+def test_a_file_is_laid_out_as_ros_2_reads_it(tmp_path, text, name, known, line):
+    path = tmp_path / "params.yaml"
+    path.write_text(text)
+    held = Template(path)
+    assert held.ros2_name(name) == known
+    filled = Ros2System.laid_out(held, held.fill({name: 2}))
+    assert line in filled.splitlines()
+    data = yaml.safe_load(filled)
+    (inside,) = data.values()
+    assert set(data) <= {"/**", "icp"}
+    assert inside["ros__parameters"] in ({"a": {"b": 2.0}}, {"a.b": 2.0})
+
+
+def test_a_number_that_ros_1_takes_for_a_text_is_told(tmp_path, caplog):
+    path = tmp_path / "params.yaml"
+    path.write_text("a:\n  scale: 1e3\n  sound: 1.0e+3\n  word: '1e3'\n  small: -2e-4\n")
+    Template(path).warn_of_texts()
+    said = [record.getMessage() for record in caplog.records]
+    assert [words.split(" for a text")[0] for words in said] == [
+        f"{path}:2: ROS 1 takes a.scale: 1e3",
+        f"{path}:5: ROS 1 takes a.small: -2e-4",
+    ]
+    assert "write 1000.0" in said[0]
+
+
+@pytest.mark.parametrize(
+    ("command", "words"),
+    [
+        (("ros2", "launch"), "no argument holds {parameters}"),
+        (("ros2", "{parameter}"), "{parameter} is nothing; did you mean 'parameters'"),
+    ],
+)
+def test_a_command_must_name_the_file(command, words):
+    with pytest.raises(ValidationError, match=re.escape(words)):
+        Ros2Settings(command=command, template="p.yaml", odometry="/odometry")
+
+
+def test_a_node_that_dies_under_ros2_launch_is_known_by_what_that_writes():
+    line = b"[ERROR] [kiss_icp_node-1]: process has died [pid 53, exit code -11, cmd '/opt/x --y']."
+    found = DIED.search(b"[INFO] [launch]: All log files can be found below /x\n" + line)
+    assert (found[1], found[2]) == (b"kiss_icp_node", b"-11")
+    assert NOISE.fullmatch(b"[INFO] [kiss_icp_node-1]: process started with pid [53]")

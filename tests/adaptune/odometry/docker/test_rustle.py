@@ -15,14 +15,8 @@ from rooms import moved
 
 from adaptune.odometry import OdometryError
 from adaptune.odometry.docker.engine import EngineError
-from adaptune.odometry.docker.rustle import (
-    Drain,
-    PlayedBag,
-    PoseRecorder,
-    Rustle,
-    RustleSettings,
-    check_stamps,
-)
+from adaptune.odometry.docker.played_bag import Drain, PlayedBag, PoseRecorder, check_stamps
+from adaptune.odometry.docker.rustle import Rustle, RustleSettings
 from adaptune.odometry.program import ProgramInput
 from adaptune.recording.clouds import usable
 
@@ -77,14 +71,14 @@ def test_nothing_is_said_of_no_poses_and_of_one():
 class Recorded:
     """Stands for a link whose node publishes messages of one type."""
 
-    store = local_link.STORE
+    decode = staticmethod(local_link.STORE.deserialize_ros1)
 
     def record(self, topic, take):
         self.topic, self.take = topic, take
 
     def publish(self, message):
         kind = message.__msgtype__
-        self.take(kind, bytes(self.store.serialize_ros1(message, kind)))
+        self.take(kind, bytes(local_link.STORE.serialize_ros1(message, kind)))
 
 
 def odometry(i, x=0.0):

@@ -1,0 +1,366 @@
+"""A ROS system that receives scan after scan, and can change its parameters."""
+
+import contextlib
+import logging
+import shutil
+import tempfile
+import threading
+import time
+import weakref
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from adaptune import processes
+from adaptune.errors import AdaptuneError, OdometryError, UnavailableError
+from adaptune.files import temporary_prefix
+from adaptune.geometry import Poses, invert, rectify, to_pose
+from adaptune.odometry.base import LOST, Faulting, Registration, Usage, pose_fault
+from adaptune.odometry.docker.played_bag import MAX_SCATTER, OWN_CLOCK
+from adaptune.odometry.docker.ros_system import QUIET, RosSystem, filled, read_poses
+from adaptune.odometry.remote import Limits
+from adaptune.recording.clouds import LIVOX_TYPES
+from adaptune.recording.export import IMU, POINTS, Messages, structured
+from adaptune.recording.scan import Scan
+from adaptune.ros.link import LinkError
+from adaptune.space import ParameterSet, Selection
+from adaptune.trajectory import Trajectory
+
+_IMU = "sensor_msgs/msg/Imu"
+_log = logging.getLogger(__name__)
+
+_MOST_SILENT = 30
+"""Scans in a row without a pose that are a fault."""
+_LEAST_ANSWERED = 0.75
+"""Least share of scans with a pose, of so many or more since the first one."""
+_BETWEEN_LOOKS = 1.0
+"""Seconds between looks at what the system has used."""
+_MOST_PATIENT = 3
+"""Scans in a row for which it waits in full before the first pose; then it waits `_IMPATIENCE`."""
+_IMPATIENCE = 0.5
+"""Seconds."""
+_BACKGROUND, _BUSY = 0.5, 0.2
+"""Seconds after the last pose, and cores, at which a system works on."""
+_EARLY = 1_000_000
+"""Nanoseconds by which a pose's stamp may be before the scan's."""
+
+
+_SEEN: set[str] = set()
+"""Systems of which it is known whether they work on after their last pose."""
+
+
+@cache
+def _warn_once(what: str) -> None:
+    _log.warning("%s", what)
+
+
+class Lockstep(Faulting):
+    """A ROS system that hears a scan, and then waits for the next one until its pose is there.
+
+    It begins anew with each start. Where a scan gets no pose, the last motion goes on. With a
+    `rate`, a scan waits until as much time has passed since the one before as in the recording.
+    """
+
+    apart = True
+
+    def __init__(self, parameters: ParameterSet, settings: Any, limits: Limits):
+        super().__init__(settings.image or settings.command[0], parameters)
+        self._settings, self._limits = settings, limits
+        self._system: RosSystem | None = None
+        self._used = self._used_before = Usage(0.0, 0.0)
+        extrinsic = settings.extrinsic
+        self._T_base_sensor = np.eye(4) if extrinsic is None else to_pose(extrinsic)
+        self._news = threading.Condition()
+        self._poses: list[tuple[int, Poses]] = []
+        self._waiting = self._has_run = False
+        self._shown = (0, -np.inf)  # stamp of the last scan, and when it was published
+        self._looked = -np.inf
+        self._patience = min(settings.patience, limits.seconds)
+
+    @property
+    def ended(self) -> bool:
+        return self._system is None
+
+    @property
+    def begun(self) -> bool:
+        return self._has_run or bool(self.faults)
+
+    @property
+    def usage(self) -> Usage:
+        if self._system is not None and time.monotonic() - self._looked > _BETWEEN_LOOKS:
+            self._look(self._system)
+        cpu = self._used_before.cpu + self._used.cpu
+        memory = max(self._used_before.memory or 0.0, self._used.memory or 0.0)
+        return Usage(cpu, memory, other_cpu=cpu)
+
+    def start(
+        self, prepared: Scan, T_odom_sensor: Poses, T_previous_current: Poses | None = None
+    ) -> None:
+        self._last_motion.start(T_odom_sensor, T_previous_current)
+        self.close()
+        if self.given_up:
+            return
+        self._T_odom_sensor = np.array(T_odom_sensor)
+        self._T_step = np.eye(4) if T_previous_current is None else np.array(T_previous_current)
+        self._T_odom_own: Poses | None = None
+        self._silent, self._stamp, self._poses = 0, prepared.stamp, []
+        self._n_shown = self._n_answered = 0  # since its first pose
+        self._shown = (prepared.stamp, -np.inf)
+        self._late: int | None = None
+        self._steady = True  # whether all poses are as late as the first one
+        self._before: tuple[int, Poses] | None = None
+        try:
+            self._begin(prepared)
+            self._show(prepared)
+            self._correct()
+        except (OdometryError, LinkError) as error:
+            told = self._told(error)
+            # One that has run can be gone for good.
+            if not self._has_run:
+                self.close()
+                raise OdometryError(f"{self.name}: {told}") from error
+            self.note_fault(told)
+
+    def submit(self, prepared: Scan) -> None:
+        self._stamp, self._waiting = prepared.stamp, True
+        if self._system is not None:
+            try:
+                self._show(prepared)
+            except (OdometryError, LinkError) as error:
+                self.note_fault(self._told(error))
+
+    def collect(self) -> Registration:
+        self._waiting = False
+        registration = LOST
+        if self._system is not None:
+            try:
+                registration = self._registration()
+            except (OdometryError, LinkError) as error:
+                registration = self.note_fault(self._told(error))
+        self._last_motion.move(registration.T_odom_sensor)
+        return registration
+
+    def _registration(self) -> Registration:
+        T_before = self._T_odom_sensor
+        self._T_odom_sensor = T_before @ self._T_step
+        registered = self._correct()
+        if registered:
+            self._T_step = rectify(invert(T_before) @ self._T_odom_sensor)
+        return Registration(self._T_odom_sensor.copy(), registered)
+
+    def ready(self, seconds: float) -> bool:
+        return self._system is None or self._pose(seconds) is not None
+
+    @property
+    def busy(self) -> bool:
+        return self._waiting
+
+    def apply(self, selection: Selection) -> None:
+        """Set the node's parameters, see `adaptune.ros.link.Steering.apply`."""
+        if unknown := selection.parameters.keys() - self.parameters.keys():
+            raise OdometryError(f"{self.name} has no parameter {min(unknown)!r}")
+        self.parameters |= selection.parameters
+        if self._system is not None and self._steering is not None:
+            named = {
+                self._system.whole_name(self._template, n): v
+                for n, v in selection.parameters.items()
+            }
+            try:
+                self._steering.apply(named)
+            except LinkError as error:
+                raise OdometryError(str(error)) from error
+
+    def close(self) -> None:
+        if self._system is not None:
+            self._look(self._system)
+            self._warn_of_background(self._system)
+            if self._has_run:
+                with contextlib.suppress(OdometryError, LinkError):
+                    self._system.warn_of_unread()
+            self._system.close()
+            shutil.rmtree(self._folder, ignore_errors=True)
+            self._system = None
+            self._used_before = Usage(self.usage.cpu, self.usage.memory)
+            self._used = Usage(0.0, 0.0)
+
+    def _warn_of_background(self, system: RosSystem) -> None:
+        """Log, once, where the system works on after its last pose, though nothing waits for it."""
+        if self._settings.rate or not self._n_answered or self.name in _SEEN:
+            return
+        _SEEN.add(self.name)
+        before = self._used.cpu
+        time.sleep(_BACKGROUND)
+        self._look(system)
+        if self._used.cpu - before > _BUSY * _BACKGROUND:
+            _warn_once(
+                f"{self.name}: it works on after its last pose, as systems that map in the "
+                f"background do; at rate: 0, it has less time for that than on a robot, so its "
+                f"poses are worse: set odometry.settings.rate: 1"
+            )
+
+    def __del__(self) -> None:
+        self.close()
+
+    def _look(self, system: RosSystem) -> None:
+        """See what the system has used."""
+        self._looked = time.monotonic()
+        with contextlib.suppress(OdometryError, LinkError):
+            system.state()
+        self._used = system.usage
+
+    def _begin(self, scan: Scan) -> None:
+        """Start the system, and wait until it listens."""
+        self._template, text = filled(self._settings, self.parameters)
+        self._folder = Path(tempfile.mkdtemp(prefix=temporary_prefix()))
+        try:
+            system = self._settings.system(self._settings, self._limits.memory, text, self._folder)
+        except AdaptuneError:
+            shutil.rmtree(self._folder, ignore_errors=True)
+            raise
+        self._system = system
+        link, topics = system.link, (self._settings.points or POINTS, self._settings.imu or IMU)
+        self._messages = Messages(link.version)
+        take = weakref.WeakMethod(self._take)  # the link must not keep this alive
+        link.record(self._settings.odometry, lambda *given: (do := take()) and do(*given))
+        self._clock = system.run_clock(scan.stamp, self._settings.rate or 1.0)
+        self._kind = system.cloud_type(topics[0])
+        self._send_cloud = link.advertise_bytes(topics[0], self._kind)
+        self._send_imu = link.advertise(topics[1], _IMU) if self._settings.imu else None
+        self._topics = topics
+        system.wait(topics[0], topics if self._settings.imu else topics[:1])
+        system.check(self._template, self.parameters)
+        self._steering = system.steering()
+
+    def _show(self, scan: Scan) -> None:
+        """Publish what the system hears until the end of a scan."""
+        stamp, at = self._shown
+        if rate := self._settings.rate:
+            time.sleep(max(0.0, at + 1e-9 * (scan.stamp - stamp) / rate - time.monotonic()))
+        self._shown = scan.stamp, time.monotonic()
+        with self._news:
+            self._poses = []
+        assert self._system is not None
+        messages, (points, imu_topic) = self._messages, self._topics
+        if scan.imu is not None and self._send_imu is not None:
+            imu = scan.imu
+            measured = zip(imu.stamps.tolist(), imu.angular_velocity, imu.acceleration, strict=True)
+            for stamp, gyro, acceleration in measured:
+                self._clock.reach(stamp)
+                header = messages.header(imu_topic, stamp, "imu")
+                self._send_imu(messages.imu(header, gyro, acceleration))
+        self._clock.reach(scan.stamp + max(scan.span, 0))
+        header = messages.header(points, scan.stamp, self._settings.frame)
+        if self._kind in LIVOX_TYPES:
+            self._send_cloud(messages.livox(header, scan))
+        else:
+            cloud = messages.cloud(header, structured(scan))
+            self._send_cloud(self._system.link.encode(cloud, self._kind))
+
+    def _correct(self) -> bool:
+        """Correct the predicted pose; False if the system gave none."""
+        waits = bool(self._n_answered) or self._silent < _MOST_PATIENT
+        found = self._pose(self._patience if waits else min(self._patience, _IMPATIENCE))
+        if found is not None and self._late is None and self._silent:
+            # It may be of an earlier scan; then others follow, though nothing more was sent.
+            time.sleep(self._patience)
+            found = self._pose(0.0)
+        assert self._system is not None
+        if self._n_answered or found is not None:
+            self._n_shown += 1
+        if found is None:
+            self._silent += 1
+            self._check_silent(self._system)
+            return False
+        stamp, T_own = found
+        self._silent, self._has_run = 0, True
+        self._n_answered += 1
+        if wrong := pose_fault(T_own):
+            raise OdometryError(f"it gave a pose {wrong}")
+        if self._late is None:
+            self._late = stamp - self._stamp
+        if abs(stamp - self._stamp - self._late) >= MAX_SCATTER:
+            self._steady = False
+            _warn_once(f"{self.name}: {OWN_CLOCK}; poses are matched to scans by their order")
+            if silent := self._n_shown - self._n_answered:
+                raise OdometryError(
+                    f"{OWN_CLOCK}, and {silent} scans had no pose after {self._patience:g} s, so "
+                    f"a late pose cannot be told from the next one; raise "
+                    f"odometry.settings.patience and isolation.seconds"
+                )
+        T_own = self._at_scan(stamp, T_own @ self._T_base_sensor)
+        if self._T_odom_own is None:
+            self._T_odom_own = self._T_odom_sensor @ invert(T_own)
+        self._T_odom_sensor = self._T_odom_own @ T_own
+        return True
+
+    def _check_silent(self, system: RosSystem) -> None:
+        """Raise an `OdometryError` where a scan without a pose is one too many."""
+        try:
+            system.state()
+        except OdometryError as error:
+            if self._n_answered:
+                raise
+            help_ = "if it knows no points but the bag's own, set odometry.settings.play: bag"
+            raise OdometryError(f"{error} before its first pose; {help_}") from error
+        if self._silent >= _MOST_SILENT:
+            published = system.link.topics().keys() - {*QUIET, *self._topics}
+            needs = "" if self._settings.imu else "an IMU (odometry.settings.imu), or "
+            why = system.link.why_unheard(self._topics[0]) or (
+                f"does it need {needs}all that the bag holds (play: bag)?"
+            )
+            raise OdometryError(
+                f"no pose {'' if self._n_answered else 'yet '}on {self._settings.odometry} for "
+                f"{_MOST_SILENT} scans in a row; topics that are published: "
+                f"{', '.join(sorted(published)) or 'none'}; {why}"
+            )
+        n, answered = self._n_shown, self._n_answered
+        if n >= _MOST_SILENT and answered < _LEAST_ANSWERED * n:
+            raise OdometryError(
+                f"it gave poses for {answered} of {n} scans, and lockstep needs one for each; set "
+                f"odometry.settings.play: bag"
+            )
+
+    def _at_scan(self, stamp: int, T_own_sensor: Poses) -> Poses:
+        """The pose at the scan's stamp, if the system gives that at the scan's end."""
+        before, self._before = self._before, (stamp, T_own_sensor)
+        # Stamps of a clock say nothing.
+        if before is None or not before[0] <= self._stamp < stamp or not self._steady:
+            return T_own_sensor
+        both = Trajectory(np.array([before[0], stamp]), np.stack([before[1], T_own_sensor]))
+        T: Poses = both.at(np.array([self._stamp], np.int64), 1e9)[0]
+        return T
+
+    def _pose(self, seconds: float) -> tuple[int, Poses] | None:
+        """The system's pose of the scan that was published last; None if it does not come.
+
+        It comes after the scan was published. Its stamp is as late as that of the first pose was:
+        a system gives it at the scan's begin, or at its end, where the next scan begins.
+        """
+        earliest = self._stamp - _EARLY + (0 if self._late is None else self._late // 2)
+
+        def there() -> bool:
+            return bool(self._poses) and self._poses[-1][0] >= earliest
+
+        with self._news:
+            return self._poses[-1] if self._news.wait_for(there, seconds) else None
+
+    def _take(self, kind: str, data: bytes) -> None:
+        if self._system is None:
+            return
+        for stamp, _, p, q in read_poses(self._system.link, kind, data)[-1:]:
+            try:
+                T = to_pose((p.x, p.y, p.z, q.x, q.y, q.z, q.w))
+            except ValueError:
+                T = np.full((4, 4), np.nan)
+            with self._news:
+                self._poses = [(stamp, T)]
+                self._news.notify_all()
+
+    def _told(self, error: Exception) -> str:
+        """An error, and the last lines that the system wrote; no engine is no fault of a trial."""
+        if isinstance(error, UnavailableError):
+            raise error
+        words = "" if self._system is None else self._system.words()
+        return processes.quoting(str(error), words)

@@ -1,0 +1,446 @@
+"""A ROS 2 system in a container, or on this machine, and adaptune's node in its network."""
+
+import contextlib
+import fcntl
+import logging
+import re
+import socket
+import subprocess
+import sys
+import tempfile
+import textwrap
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar, Literal, NamedTuple
+
+from pydantic import Field, field_validator
+from rosbags.highlevel import AnyReader
+from rosbags.typesys.store import Typestore
+
+from adaptune import processes
+from adaptune.errors import OdometryError, import_extra, in_a_line, nearest
+from adaptune.geometry import to_pose, to_quaternions
+from adaptune.keeper import Ended
+from adaptune.odometry.base import Usage
+from adaptune.odometry.docker.engine import (
+    Container,
+    Mount,
+    image_digest,
+    own_container,
+    remove_shared,
+)
+from adaptune.odometry.docker.ros_system import RosSettings, RosSystem, SimClock, image_user
+from adaptune.odometry.docker.rustle import Rustle
+from adaptune.odometry.program import Template, check_names, placeholders, replace
+from adaptune.recording.clouds import LIVOX_TYPES, POSES, TRANSFORMS
+from adaptune.recording.config import Transform
+from adaptune.ros.link import LinkError, equal_values
+from adaptune.ros.relay import Ros2Relay
+from adaptune.space import ParameterSet
+
+_FOLDER, _PARAMETERS = "/adaptune", "/adaptune-parameters/params.yaml"
+_MODULE = "adaptune.ros.ros2_node"
+_FIND = """\
+command -v ros2 >/dev/null || for file in /opt/ros/*/setup.bash; do
+    [ ! -r "$file" ] || . "$file"
+done
+"""
+_SETUP = """\
+for file in ./install/setup.bash /*/install/setup.bash /root/*/install/setup.bash \
+        /home/*/*/install/setup.bash; do
+    [ ! -r "$file" ] || . "$file"
+done
+"""
+"""As a workspace is sourced, wherever the image has one."""
+_RUN = 'exec > "$ADAPTUNE_LOG" 2>&1; exec "$@"'
+_PROBE = r"""
+command -v "$1" >/dev/null || exit 1
+case "$1 $3" in ros2\ */*) [ -r "$3" ]; exit;; esac
+[ "$1" != ros2 ] || for prefix in ${AMENT_PREFIX_PATH//:/ }; do
+    [ ! -e "$prefix/share/$3/package.xml" ] || exit 0
+done
+[ "$1" != ros2 ]
+"""
+DIED = re.compile(
+    rb"\[ERROR\] \[([\w./-]+?)(?:-\d+)?\]: process has died \[pid \d+, exit code (-?\d+)"
+)
+"""What `ros2 launch` writes, which may go on."""
+NOISE = re.compile(
+    rb"\[INFO\] \[(launch|[\w.-]+)\]: (All log files|Default logging|process started).*"
+)
+_TRANSFORMS = "tf2_msgs/msg/TFMessage"
+_BETWEEN_LOOKS, _BETWEEN_STATES = 0.3, 0.05
+"""Seconds."""
+_UNDECLARED = 3.0
+"""Seconds in which a node that subscribes declares its parameters."""
+_MATCHED = 3.0
+"""Seconds in which nodes find what is published."""
+_LEAD = 300_000_000
+"""Nanoseconds between the begin of the clock and of the recording."""
+_DOMAINS = range(60, 101)
+"""Of systems on this machine; ports of higher ones are given to other programs."""
+
+_log = logging.getLogger(__name__)
+
+
+class Ros2System(RosSystem):
+    """A ROS 2 system as it is started by hand, in an image or on this machine.
+
+    A container has no network but its own, which adaptune's node shares. On this machine, a domain
+    of its own keeps it apart from others.
+    """
+
+    ros = 2
+    link: Ros2Relay
+    _log_name, _noise, _inside = "output.log", NOISE, _FOLDER
+    _used = Usage(0.0, 0.0)
+    _at_begin = 0.0
+    _node: Any = None
+    _player: "_Player | None" = None
+    _looked = -float("inf")
+
+    def _begin(self) -> None:
+        settings = self._settings
+        common = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "PYTHONUNBUFFERED": "1"}
+        if settings.image is None:
+            self._inside = str(self.folder)
+            self._domain = _free_domain()
+            common["ROS_DOMAIN_ID"] = str(self._domain.number)
+            self._node = Here([sys.executable, "-m", _MODULE, f"{self.folder}/link"], common, 1.0)
+            parameters = str(self._parameters)
+        else:
+            common["ROS_DOMAIN_ID"] = "0"
+            user = self._user = image_user(settings, _FIND + _SETUP + _PROBE, *settings.command[:3])
+            self._node = own_container(["-m", _MODULE, f"{self.folder}/link"], self.folder, common)
+            self._parameters.chmod(0o644)
+            self._given.chmod(0o755)
+            parameters = _PARAMETERS
+        logs = f"{self._inside}/ros"
+        environment = common | {
+            "ADAPTUNE_LOG": f"{self._inside}/{self._log_name}",
+            "ROS_HOME": logs,
+            "ROS_LOG_DIR": f"{logs}/log",
+        }
+        values = {"points": settings.points, "imu": settings.imu, "parameters": parameters}
+        command = [replace(argument, values) for argument in settings.command]
+        setup = _FIND if settings.image is None else _FIND + _SETUP
+        shell = ["/bin/bash", "-l", "-c", setup + _RUN, "bash", *command]
+        if settings.image is None:
+            self._container = Here(shell, environment, self._memory)
+            return
+        if user.partition(":")[0] not in ("0", "root"):
+            environment["HOME"] = _FOLDER
+        mounts = [
+            Mount(self.folder, _FOLDER, writable=True),
+            Mount(self._given, str(Path(_PARAMETERS).parent)),
+        ]
+        self._container = Container(
+            settings,
+            self._memory,
+            shell,
+            mounts,
+            user=user,
+            environment=environment,
+            beside=self._node,
+        )
+
+    def _linked(self, connection: socket.socket) -> Ros2Relay:
+        link = Ros2Relay(connection, lambda: self._node.ended() is None, self._node.close)
+        if transforms := self._settings.transforms:
+            types = link.store.types
+            stamped = [_stamped(types, child, *given) for child, given in transforms.items()]
+            link.advertise("/tf_static", _TRANSFORMS)(types[_TRANSFORMS](stamped))
+        return link
+
+    def _lacking(self) -> OdometryError | None:
+        if self._node.ended() is not None:
+            return OdometryError(f"adaptune's node ended: {self._node.last_lines()}")
+        ended = self._ended()
+        return ended and OdometryError(processes.quoting(str(ended), self.words()))
+
+    def _ended(self) -> OdometryError | None:
+        if (code := self._container.ended()) is not None:
+            return OdometryError(
+                f"{' '.join(self._settings.command[:4])}: {processes.how_it_ended(code)}"
+            )
+        return None
+
+    def state(self) -> dict[str, Any]:
+        now = time.monotonic()
+        if now - self._looked > _BETWEEN_LOOKS:
+            self._looked = now
+            used = self._container.used()
+            cpu = max(used.cpu - self._at_begin, self.usage.cpu)
+            self.usage = Usage(cpu, max(used.memory, self.usage.memory or 0.0))
+            if died := DIED.search(self._tail(self._log_name)):
+                name, code = died[1].decode(), int(died[2])
+                raise OdometryError(f"node {name} died: {processes.how_it_ended(code)}")
+        if (ended := self._ended()) is not None:
+            raise ended
+        topic = self._settings.odometry
+        found: dict[str, Any] = self.link.ask("state", topics=self._topics[1:], own=[topic])
+        if (kinds := found["published"].get(topic)) and kinds[0] not in POSES:
+            raise OdometryError(
+                f"{topic} is {kinds[0]}; odometry.settings.odometry must name poses"
+            )
+        if len(senders := found["senders"][topic]) > 1 and kinds[0] not in TRANSFORMS:
+            names = " and ".join(senders)
+            raise OdometryError(f"{topic} is published by two ({names}), whose poses would mix")
+        return found
+
+    def cloud_type(self, topic: str) -> str:
+        while time.monotonic() - self._begun < self._settings.ready:
+            if kinds := self.state()["subscribed"].get(topic):
+                livox = [kind for kind in kinds if kind in LIVOX_TYPES]
+                return str(livox[0]) if livox else super().cloud_type(topic)
+            time.sleep(_BETWEEN_STATES)
+        return super().cloud_type(topic)  # what waits for it says what is wrong
+
+    @staticmethod
+    def laid_out(template: Template, text: str) -> str:
+        if template.ros2:
+            return text
+        text = re.sub(r"(?m)^(---|%).*$", "", text)
+        return "/**:\n  ros__parameters:\n" + textwrap.indent(text, "    ")
+
+    def whole_name(self, template: Template, name: str) -> str:
+        return template.ros2_name(name)
+
+    def check(self, template: Template, parameters: ParameterSet) -> None:
+        """Raise an `OdometryError` if no node declares a parameter, or one holds another value."""
+        wanted = {self.whole_name(template, name): value for name, value in parameters.items()}
+        end = time.monotonic() + _UNDECLARED
+        while True:
+            nodes: dict[str, Any] = {}
+            with contextlib.suppress(LinkError):  # nodes that are busy do not answer
+                nodes = self.link.ask("parameters")
+            held = [(n, k, v) for n, all_ in nodes.items() for k, v in all_.items() if k in wanted]
+            lacking = wanted.keys() - {name for _, name, _ in held}
+            if not lacking or time.monotonic() > end:
+                break
+            time.sleep(0.1)
+        if lacking and nodes:
+            name, declared = min(lacking), sorted({k for all_ in nodes.values() for k in all_})
+            raise OdometryError(
+                f"no node declares the parameter {name}, so its value changes nothing; "
+                f"{nearest(name, declared)}"
+            )
+        for node, name, value in held:
+            if not equal_values(wanted[name], value):
+                raise OdometryError(
+                    f"{node} holds {name} = {value!r}, not {wanted[name]!r}: does it read the file "
+                    f"{{parameters}}, and has the launch file another value?"
+                )
+
+    def warn_of_unread(self) -> None:
+        """Nobody tells which parameters a node of ROS 2 has read."""
+
+    def set_parameters(self, values: Mapping[str, Any]) -> Mapping[str, Any]:
+        return self.link.set_parameters(self._settings.node, values)
+
+    def play(self, rate: float, renamed: Mapping[str, str]) -> None:
+        assert self._recording is not None
+        clock = self.run_clock(int(self._recording.stamps[0]) - _LEAD, rate)
+        heard = self.state()["subscribed"]
+        publish, store = {}, self.link.store
+        with AnyReader([self._recording.path]) as reader:
+            for connection in reader.connections:
+                topic, kind = connection.topic, connection.msgtype
+                kinds = heard.get(renamed.get(topic, topic), ())
+                # The two drivers of Livox have the same messages.
+                kind = next((k for k in kinds if {k, kind} <= set(LIVOX_TYPES)), kind)
+                if kind in kinds and kind in store.types:
+                    sent = renamed.get(topic, topic)
+                    publish[topic] = kind, self.link.advertise_bytes(sent, kind)
+        end = time.monotonic() + _MATCHED
+        while not all(self.state()["sending"].values()) and time.monotonic() < end:
+            time.sleep(_BETWEEN_STATES)
+        self._player = _Player(self._recording.path, rate, clock, store, publish)
+
+    def played(self) -> bool:
+        assert self._player is not None
+        if (error := self._player.error) is not None:
+            raise OdometryError(f"the recording cannot be played: {in_a_line(error)}")
+        return not self._player.is_alive()
+
+    def stop(self) -> None:
+        if self._player is not None:
+            self._player.ended.set()
+            self._player.join()
+            self._player = None
+        super().stop()
+        if self._node is not None:
+            self._node.close()
+
+    def close(self) -> None:
+        super().close()
+        if self._settings.image is None:
+            self._domain.close()
+        else:
+            remove_shared(self.folder, self._settings.image, self._user)
+
+
+def _stamped(types: Mapping[str, Any], child: str, parent: str, given: Any) -> Any:
+    """A frame's pose in another one, as a message."""
+    T = to_pose(given)
+    return types["geometry_msgs/msg/TransformStamped"](
+        types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](0, 0), parent),
+        child,
+        types["geometry_msgs/msg/Transform"](
+            types["geometry_msgs/msg/Vector3"](*T[:3, 3].tolist()),
+            types["geometry_msgs/msg/Quaternion"](*to_quaternions(T[None])[0].tolist()),
+        ),
+    )
+
+
+class _Player(threading.Thread):
+    """Publishes the messages of a recording that a system hears, each when it is due."""
+
+    error: Exception | None = None
+
+    def __init__(
+        self,
+        path: Path,
+        rate: float,
+        clock: SimClock,
+        store: Typestore,
+        publish: Mapping[str, tuple[str, Callable[[Any], None]]],
+    ):
+        super().__init__(daemon=True)
+        self._path, self._rate, self._clock = path, rate, clock
+        self._store, self._publish = store, publish
+        self.ended = threading.Event()
+        self.start()
+
+    def run(self) -> None:
+        try:
+            with AnyReader([self._path]) as reader:
+                self._play(reader)
+        except LinkError:
+            pass  # whoever asks for the system's state learns why
+        except Exception as error:
+            self.error = error
+
+    def _play(self, reader: AnyReader) -> None:
+        chosen = [c for c in reader.connections if c.topic in self._publish]
+        begin, first = time.monotonic(), None
+        for connection, stamp, raw in reader.messages(connections=chosen):
+            first = stamp if first is None else first
+            due = begin + 1e-9 * (stamp - first) / self._rate
+            if self.ended.wait(max(0.0, due - time.monotonic())):
+                return
+            self._clock.reach(stamp)
+            kind, publish = self._publish[connection.topic]
+            publish(raw if reader.is2 else self._store.ros1_to_cdr(raw, kind))
+
+
+class Here:
+    """A program on this machine, with what a `Container` says and does."""
+
+    out_of_memory = False
+
+    def __init__(self, command: Sequence[str], environment: Mapping[str, str], memory: float):
+        self._output = tempfile.TemporaryFile()  # noqa: SIM115
+        variables = [f"{name}={value}" for name, value in environment.items()]
+        self._program = processes.Program(
+            ["env", *variables, *command],
+            memory,
+            stdin=subprocess.DEVNULL,
+            stdout=self._output,
+            stderr=subprocess.STDOUT,
+        )
+        self._how: Ended | None = None
+
+    def ended(self) -> int | None:
+        self._how = self._how or self._program.wait(1e-3)
+        return None if self._how is None else self._how.code
+
+    def used(self) -> Ended:
+        return self._how or self._program.used()
+
+    def last_lines(self) -> str:
+        return processes.last_lines(self._output)
+
+    def hold_to_cores(self) -> None:
+        """There is no limit on this machine."""
+
+    def close(self) -> None:
+        self._program.close()
+
+
+def _free_domain() -> Any:
+    """An open file that holds a ROS domain which no other process of adaptune's has."""
+    for number in _DOMAINS:
+        path = Path(tempfile.gettempdir()) / f"adaptune-ros-domain-{number}.lock"
+        with contextlib.suppress(OSError):
+            file = path.open("a")
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                file.close()
+            else:
+                return _Domain(number, file)
+    raise OdometryError("all ROS domains of adaptune's are in use on this machine")
+
+
+class _Domain(NamedTuple):
+    number: int
+    file: Any
+
+    def close(self) -> None:
+        self.file.close()
+
+
+class Ros2Settings(RosSettings):
+    """A ROS 2 system as it is started by hand; without an image, that of this machine."""
+
+    system: ClassVar[type[RosSystem]] = Ros2System
+    input: ClassVar[str] = "either"
+
+    image: str | None = Field(None, min_length=1)  # type: ignore[assignment]
+    command: tuple[str, ...] = Field(min_length=1)
+    # Poses of frames in others, by their names, as in imu_link: [lidar, [0, 0, 0.1, 0, 0, 0, 1]].
+    transforms: dict[str, tuple[str, Transform]] = Field(default_factory=dict)
+    play: Literal["bag", "lockstep"] = "lockstep"
+
+    @field_validator("command")
+    @classmethod
+    def _names_file(cls, command: tuple[str, ...]) -> tuple[str, ...]:
+        known = ("parameters", "points", "imu")
+        names = [name for argument in command for name in placeholders(argument)]
+        for name in names:
+            if name not in known:
+                raise ValueError(f"{{{name}}} is nothing; {nearest(name, known)}")
+        if "parameters" not in names:
+            raise ValueError(
+                "no argument holds {parameters}, which stands for the parameter file; give it as "
+                "the launch file takes it, as in params_file:={parameters}"
+            )
+        return command
+
+
+class Ros2(Rustle):
+    """A ROS 2 system, run on a recording that is played, or scan by scan."""
+
+    settings_type = Ros2Settings
+
+    @staticmethod
+    def check(settings: Any, parameters: ParameterSet) -> None:
+        """Raise an `OdometryError` if the system is not here, or a parameter is not in its file."""
+        template = Template(Path(settings.template))
+        if template.path.suffix not in (".yaml", ".yml"):
+            raise OdometryError(f"template: {template.path} is not YAML, as ROS 2 reads it")
+        check_names(parameters, template, ())
+        import_extra("ros2", "cyclonedds")
+        if settings.image is not None:
+            image_digest(settings.image)
+            return
+        program = settings.command[0]
+        find = ["/bin/bash", "-l", "-c", _FIND + 'command -v "$1"', "bash", program]
+        if subprocess.run(find, capture_output=True, check=False).returncode:
+            raise OdometryError(
+                f"command: a login shell of this machine finds no {program!r}; source your ROS 2 "
+                f"in ~/.bash_profile, or name an image"
+            )

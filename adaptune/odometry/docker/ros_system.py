@@ -1,0 +1,351 @@
+"""A ROS system under adaptune's eyes: its nodes, and adaptune's node beside them."""
+
+import contextlib
+import logging
+import os
+import re
+import shutil
+import socket
+import struct
+import threading
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from collections.abc import Set as AbstractSet
+from functools import cache
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal, Self
+
+from pydantic import AfterValidator, Field, model_validator
+from rosbags.serde import SerdeError
+
+from adaptune import processes
+from adaptune.errors import OdometryError
+from adaptune.odometry.base import Usage
+from adaptune.odometry.docker.engine import (
+    Container,
+    ContainerSettings,
+    copy_regular,
+    default_user,
+    image_digest,
+    make_shared,
+    opened,
+    regular_files,
+)
+from adaptune.odometry.program import ProgramInput, Template, WholeSettings
+from adaptune.recording.clouds import POSES, Pose
+from adaptune.recording.config import resolve
+from adaptune.ros.link import LinkError, Run, Steering
+from adaptune.ros.relay import Relay
+from adaptune.space import ParameterSet
+
+QUIET = {"/clock", "/rosout", "/rosout_agg", "/parameter_events"}
+"""Topics of every node."""
+CLOCK = "rosgraph_msgs/msg/Clock"
+_BETWEEN_LOOKS = 0.05
+_TAIL = 1 << 14
+"""Bytes of a log in which its last lines are."""
+_TICK = 0.01
+"""Seconds."""
+_log = logging.getLogger(__name__)
+
+START = 30.0
+"""Seconds in which adaptune's node must be there."""
+
+
+def _topic(name: str) -> str:
+    if not re.fullmatch(r"/[A-Za-z][\w/]*", name):
+        raise ValueError(f"{name!r} is no name in ROS; it begins with a slash, as /Odometry")
+    return name
+
+
+Topic = Annotated[str, AfterValidator(_topic)]
+
+
+class RosSettings(ContainerSettings, WholeSettings):
+    """What ROS systems may set; ``docs/docker.md`` describes it and its defaults."""
+
+    template: Annotated[str, AfterValidator(resolve)]
+    odometry: Topic
+    frame: str = "lidar"
+    points: Topic | None = None
+    imu: Topic | None = None
+    play: Literal["bag", "lockstep"] = "bag"
+    rate: float = Field(1.0, ge=0, le=100)
+    ready: float = Field(60.0, gt=0, le=3600)
+    patience: float = Field(2.0, gt=0, le=3600)
+    node: Topic | None = None
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.play == "bag" and not self.rate:
+            raise ValueError("rate: 0 is for play: lockstep; a bag plays at 1, or at another rate")
+        if self.node is not None and self.play == "bag":
+            raise ValueError("node: parameters change only with play: lockstep")
+        return self
+
+
+class RosSystem(ABC):
+    """The nodes of a system, and a node of adaptune's, which `link` reaches.
+
+    There is an `OdometryError` if it does not begin. The settings are `RosSettings`, the memory in
+    gigabytes, the parameters the text of a file. The caller removes the folder, which is empty.
+    A recording is given if it is to be played.
+    """
+
+    ros: ClassVar[Literal[1, 2]] = 1
+    link: Relay
+    _log_name: ClassVar[str]
+    """Of the log of the nodes."""
+    _noise: ClassVar[re.Pattern[bytes]]
+    """Lines of it that say nothing."""
+    _container: Any = None
+
+    def __init__(
+        self,
+        settings: Any,
+        memory: float,
+        parameters: str,
+        folder: Path,
+        recording: ProgramInput | None = None,
+    ):
+        self._settings, self._topics = settings, [settings.odometry]
+        self.usage, self._memory, self._recording = Usage(0.0, 0.0), memory, recording
+        self._clock: SimClock | None = None
+        self.folder, self._given = make_shared(folder / "shared"), folder / "given"
+        self._given.mkdir()
+        self._parameters = self._given / "params.yaml"
+        self._parameters.write_text(parameters, encoding="utf-8")
+        with contextlib.ExitStack() as undo:
+            with socket.socket(socket.AF_UNIX) as server:
+                with processes.socket_name(self.folder / "link") as name:
+                    server.bind(name)
+                (self.folder / "link").chmod(0o777)
+                server.listen()
+                undo.callback(self.stop)
+                self._begin()
+                connection = self._accept(server)
+            self.link, self._begun = self._linked(connection), time.monotonic()
+            undo.pop_all()
+
+    @abstractmethod
+    def _begin(self) -> None:
+        """Begin the system, and adaptune's node, which connects to the socket ``link``."""
+
+    @abstractmethod
+    def _linked(self, connection: socket.socket) -> Relay:
+        """The link, by the connection of adaptune's node."""
+
+    @abstractmethod
+    def _lacking(self) -> OdometryError | None:
+        """Why there is no node of adaptune's, and will be none; None while it may come."""
+
+    @abstractmethod
+    def state(self) -> dict[str, Any]:
+        """What adaptune's node sees; an `OdometryError` where the system has ended."""
+
+    @abstractmethod
+    def check(self, template: Template, parameters: ParameterSet) -> None:
+        """Raise an `OdometryError` if the nodes hold other parameters."""
+
+    @abstractmethod
+    def warn_of_unread(self) -> None:
+        """Log which of the parameters that were checked no node has read."""
+
+    @abstractmethod
+    def set_parameters(self, values: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Set parameters of the settings' node, by whole names; what it then holds."""
+
+    def cloud_type(self, topic: str) -> str:  # noqa: ARG002
+        """The type of the messages with points that the system hears."""
+        return "sensor_msgs/msg/PointCloud2"
+
+    @staticmethod
+    def laid_out(template: Template, text: str) -> str:  # noqa: ARG004
+        """A parameter file's text as the nodes read it."""
+        return text
+
+    @abstractmethod
+    def whole_name(self, template: Template, name: str) -> str:
+        """The name that a parameter has in this ROS."""
+
+    @abstractmethod
+    def play(self, rate: float, renamed: Mapping[str, str]) -> None:
+        """Begin to play the recording, with some topics renamed."""
+
+    @abstractmethod
+    def played(self) -> bool:
+        """Whether it has been played to its end; an error if that went wrong."""
+
+    def stop(self) -> None:
+        """End the system."""
+        if self._clock is not None:
+            self._clock.close()
+            self._clock = None
+        if self._container is not None:
+            self._container.close()
+
+    def _accept(self, server: socket.socket) -> socket.socket:
+        server.settimeout(_BETWEEN_LOOKS)
+        begin = time.monotonic()
+        while time.monotonic() - begin < START:
+            with contextlib.suppress(TimeoutError):
+                return server.accept()[0]
+            if (failure := self._lacking()) is not None:
+                raise failure
+        raise OdometryError(f"adaptune's node did not begin in {START:g} s: {self.words()}")
+
+    def wait(self, topic: str, sent: Sequence[str] = ()) -> None:
+        """Wait until a node subscribes to the clouds' topic, and hears what adaptune sends.
+
+        An `OdometryError` names the topics to which nodes subscribe if none does in time.
+        """
+        self._topics.append(topic)
+        before: AbstractSet[str] = set()
+        late = False
+        while not late:
+            late = time.monotonic() - self._begun > self._settings.ready
+            state = self.state()
+            heard = state["subscribed"].keys() - {"/clock"}
+            # A node subscribes to one after the other.
+            if heard != before:
+                before = heard
+            elif topic in heard and all(state["sending"].get(t, 0) for t in sent if t in heard):
+                self._container.hold_to_cores()
+                return
+            time.sleep(_BETWEEN_LOOKS)
+        if topic in before and (why := self.link.why_unheard(topic)):
+            raise OdometryError(why)
+        others = ", ".join(sorted(before)) or "none"
+        raise OdometryError(
+            f"no node subscribed to the clouds' topic {topic} in {self._settings.ready:g} s "
+            f"(topics with subscribers: {others}); name the topic that the system hears as "
+            f"odometry.settings.points, or change it in the template"
+        )
+
+    def run_clock(self, stamp: int, rate: float = 1.0) -> "SimClock":
+        """Publish a clock from now on, until this is closed."""
+        if self._clock is None:
+            self._clock = SimClock(self.link, stamp, rate)
+        return self._clock
+
+    def steering(self) -> Steering | None:
+        """What sets parameters of the settings' node while it runs, if that is named."""
+        node = self._settings.node
+        return None if node is None else Steering(node, self.set_parameters, *self._command())
+
+    def _command(self) -> tuple[Sequence[str] | None, Run | None]:
+        """What sets a parameter in place of ROS, and what runs it, if anything."""
+        return None, None
+
+    def words(self) -> str:
+        """The last lines that the system wrote."""
+        with contextlib.suppress(OdometryError):
+            self._container.ended()
+        if self._container.out_of_memory:
+            return "out of isolation.memory"
+        return self._last_lines(self._log_name)
+
+    def _last_lines(self, name: str) -> str:
+        tail = self._tail(name).splitlines()
+        lines = [line for line in tail if not self._noise.fullmatch(line)]
+        return processes.plain_lines(re.sub(rb"={10,}", b"", b"\n".join(lines)))
+
+    def _tail(self, name: str) -> bytes:
+        with opened(self.folder / name, self.folder) as file:
+            if file is None:
+                return b""
+            file.seek(max(file.seek(0, os.SEEK_END) - _TAIL, 0))
+            return file.read()
+
+    def keep(self, folder: Path) -> None:
+        """Copy what was written, and what was given, to a folder."""
+        shutil.copy(self._parameters, folder)
+        for name in (self._log_name, "rosbag.log"):
+            copy_regular(self.folder / name, self.folder, folder / name)
+        logs = self.folder / "ros" / "log"
+        for path in regular_files(logs):
+            copy_regular(path, self.folder, folder / "ros" / path.relative_to(logs))
+
+    def close(self) -> None:
+        """End the system, and remove what it has written."""
+        self.stop()
+        self.link.close()
+
+
+class SimClock:
+    """Publishes ``/clock``, and goes on by itself, so that nodes that sleep by it wake up.
+
+    It begins at a stamp in nanoseconds; `rate` is seconds of it in a second.
+    """
+
+    def __init__(self, link: Relay, stamp: int, rate: float):
+        self._types, self._publish = link.store.types, link.advertise("/clock", CLOCK)
+        self._rate, self._lock = rate, threading.Lock()
+        self._begin, self._stamp = time.monotonic(), stamp
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._tick, daemon=True)
+        self._thread.start()
+
+    @property
+    def now(self) -> int:
+        """Its time, in nanoseconds."""
+        return self._stamp + int(1e9 * self._rate * (time.monotonic() - self._begin))
+
+    def reach(self, stamp: int) -> None:
+        """Go to a time at once; it never goes back."""
+        with self._lock:
+            if stamp > self.now:
+                self._begin, self._stamp = time.monotonic(), stamp
+            self._send()
+
+    def close(self) -> None:
+        """Stop."""
+        self._ended.set()
+        self._thread.join()
+
+    def _tick(self) -> None:
+        with contextlib.suppress(LinkError):
+            while not self._ended.wait(_TICK):
+                with self._lock:
+                    self._send()
+
+    def _send(self) -> None:
+        seconds, nanoseconds = divmod(self.now, 10**9)
+        time_ = self._types["builtin_interfaces/msg/Time"](sec=seconds, nanosec=nanoseconds)
+        self._publish(self._types[CLOCK](clock=time_))
+
+
+def filled(settings: Any, parameters: ParameterSet) -> tuple[Template, str]:
+    """The template, and its text with the parameters."""
+    template = Template(Path(settings.template))
+    return template, settings.system.laid_out(template, template.fill(parameters))
+
+
+def image_user(settings: Any, script: str, *words: str) -> str:
+    """User who runs ROS in an image: root only where a script succeeds for nobody else."""
+    user = default_user(settings)
+    if settings.user is not None:
+        return user
+    return _probed(image_digest(settings.image), user, script, words)
+
+
+@cache
+def _probed(image: str, user: str, script: str, words: tuple[str, ...]) -> str:
+    command = ["/bin/bash", "-l", "-c", script, "bash", *words]
+    settings, home = ContainerSettings(image=image), {"HOME": "/"}
+    container = Container(settings, 1.0, command, user=user, environment=home, bare=True)
+    with contextlib.closing(container):
+        code = container.wait(START)
+    if code != 0:
+        _log.info("only root finds %s in the image, so root runs it", " ".join(words))
+        return "0"
+    return user
+
+
+def read_poses(link: Relay, kind: str, data: bytes) -> list[Pose]:
+    """The poses in a message; none if it is of another type."""
+    try:
+        return POSES[kind](link.decode(data, kind)) if kind in POSES else []
+    except (SerdeError, struct.error, ValueError, IndexError) as error:
+        raise OdometryError(f"it publishes a {kind} that cannot be read ({error})") from error

@@ -1,0 +1,169 @@
+"""A ROS 2 node in a process of its own, beside a system that no other network reaches."""
+
+import contextlib
+import socket
+import sys
+import threading
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from cyclonedds.pub import DataWriter
+from cyclonedds.sub import DataReader
+
+from adaptune import processes
+from adaptune.ros.dds import DdsLink
+from adaptune.ros.link import LinkError
+from adaptune.ros.ros2 import full
+
+_QUIET = ("/parameter_events", "/rosout", "/clock")
+"""Topics of every node."""
+
+
+class _Link(DdsLink):
+    """What `DdsLink` is, for bytes, and what it sees."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._writers: dict[str, Any] = {}
+
+    def advertise_bytes(self, topic: str, kind: str) -> Callable[[bytes], None]:
+        self._writers[topic] = writer = self._end(DataWriter, f"rt{full(topic)}", kind)
+
+        def publish(data: bytes) -> None:
+            with self._naming(topic):
+                writer.write(writer.data_type(data))
+
+        return publish
+
+    def seen(self) -> tuple[dict[str, list[str]], dict[str, list[str]]]:
+        """The topics that others publish now, and subscribe to, with their types."""
+        found: tuple[dict[str, list[str]], dict[str, list[str]]] = {}, {}
+        for which, kinds in enumerate(found):
+            for end in self._endpoints(which):
+                if not which or end.topic not in _QUIET:
+                    kinds[end.topic] = sorted({end.kind, *kinds.get(end.topic, ())})
+        return found
+
+    def senders(self, topic: str) -> list[str]:
+        """The nodes that publish a topic."""
+        return [end.node for end in self._endpoints(0) if end.topic == topic]
+
+    def hearers(self, topic: str) -> int:
+        """How many subscribers hear what is published here."""
+        with self._naming(topic):
+            return len(self._writers[topic].get_matched_subscriptions())
+
+    def nodes(self) -> list[str]:
+        """The nodes that serve their parameters."""
+        last = "/list_parameters"
+        return [place.removesuffix(last) for place in self._places() if place.endswith(last)]
+
+    def meet(self) -> None:
+        """Let nodes find who will ask for their parameters, which takes a while."""
+        for node in self.nodes():
+            for name, service in self._services.items():
+                place = f"{node}/{name.removesuffix('Parameters').lower()}_parameters"
+                if place not in self._clients:
+                    asks = self._end(DataWriter, f"rq{place}Request", service.request)
+                    hears = self._end(DataReader, f"rr{place}Reply", service.response)
+                    self._clients[place] = asks, hears
+
+
+class _Node:
+    def __init__(self, link: _Link, stream: processes.SocketStream):
+        self._link, self._stream, self._lock = link, stream, threading.Lock()
+        self._publish: dict[str, Callable[[bytes], None]] = {}
+        self._awaited: list[str] = []
+
+    def send(self, header: Mapping[str, Any], data: Any = None) -> None:
+        with self._lock, contextlib.suppress(OSError, ValueError):  # the other side may have gone
+            arrays = {} if data is None else {"data": data}
+            processes.send(self._stream, header, **arrays)
+
+    def subscribe(self, header: Mapping[str, Any], _: bytes) -> None:
+        """Subscribe as soon as somebody publishes, of whatever type."""
+        self._awaited.append(full(header["topic"]))
+
+    def advertise(self, header: Mapping[str, Any], _: bytes) -> None:
+        kind = header["kind"].replace("/", "/msg/")
+        self._publish[header["topic"]] = self._link.advertise_bytes(header["topic"], kind)
+
+    def publish(self, header: Mapping[str, Any], data: bytes) -> None:
+        self._publish[header["topic"]](data)
+
+    def state(self, header: Mapping[str, Any]) -> dict[str, Any]:
+        """Who publishes which topics, and who subscribes; to whom this node is connected.
+
+        And why those do not hear the topics of this node that subscribe to them.
+        """
+        published, subscribed = self._link.seen()
+        for topic in [topic for topic in self._awaited if topic in published]:
+            self._awaited.remove(topic)
+            self._record(topic, published[topic][0])
+        self._link.meet()
+        return {
+            "published": published,
+            "subscribed": subscribed,
+            "sending": {topic: self._link.hearers(topic) for topic in self._publish},
+            "senders": {topic: self._link.senders(topic) for topic in header["own"]},
+            "unheard": {topic: self._link.why_unheard(topic) for topic in header["topics"]},
+        }
+
+    def _record(self, topic: str, kind: str) -> None:
+        head = {"type": "message", "topic": topic, "kind": kind.replace("/msg/", "/")}
+        take = lambda data: self.send(head, np.frombuffer(data, np.uint8))  # noqa: E731
+        with contextlib.suppress(LinkError):  # of a type that nobody knows
+            self._link.subscribe(topic, kind, take, raw=True)
+
+    def topics(self, _: Mapping[str, Any]) -> dict[str, str]:
+        return {t: kinds[0].replace("/msg/", "/") for t, kinds in self._link.seen()[0].items()}
+
+    def set_parameters(self, header: Mapping[str, Any]) -> Mapping[str, Any]:
+        held: Mapping[str, Any] = self._link.set_parameters(header["node"], header["values"])
+        return held
+
+    def parameters(self, _: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
+        """What every node that serves its parameters holds."""
+        found = {}
+        for node in self._link.nodes():
+            with contextlib.suppress(LinkError):
+                found[node] = self._link.parameters(node)
+        return found
+
+    def answer(self, header: Mapping[str, Any], about: Callable[[Any], Any]) -> None:
+        try:
+            found = {"found": about(header)}
+        except Exception as error:
+            found = {"refused": str(error) or type(error).__name__}
+        self.send({**found, "type": "answer", "number": header["number"]})
+
+
+_ASKED = ("state", "topics", "set_parameters", "parameters")
+
+
+def main(path: str) -> None:
+    """Be a node, and pass messages on through a socket, until its other side has gone."""
+    connection = socket.socket(socket.AF_UNIX)
+    connection.connect(path)
+    stream = processes.SocketStream(connection)
+    try:
+        link = _Link()
+    except LinkError as error:
+        processes.send(stream, {"type": "failed", "message": str(error)})
+        return
+    node = _Node(link, stream)
+    node.send({"type": "ready"})
+    while (message := processes.receive(stream)) is not None:
+        kind = message.header["type"]
+        if kind in _ASKED:
+            given = (message.header, getattr(node, kind))
+            threading.Thread(target=node.answer, args=given, daemon=True).start()
+        else:
+            data = message.arrays.get("data")
+            getattr(node, kind)(message.header, b"" if data is None else data.tobytes())
+    link.close()
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

@@ -1,0 +1,193 @@
+"""The ROS 2 reference in its image and on this machine, scan by scan and by a bag that is played.
+
+Its node is RustDDS, which shares no code with what carries adaptune's messages.
+"""
+
+import re
+
+import numpy as np
+import pytest
+from contained import LIMITS, N_SCANS, containers, drive, recording, scans, truth
+from needs import module_of, ros2_image
+from ros2_reference import ros2
+
+from adaptune.odometry import OdometryError
+from adaptune.odometry.docker import lockstep, played_bag, ros2_system
+from adaptune.odometry.docker.probe import look
+from adaptune.odometry.docker.ros2_system import Ros2, Ros2System
+from adaptune.recording import Imu, Scan
+from adaptune.space import Selection
+
+pytestmark = [
+    pytest.mark.services,
+    pytest.mark.filterwarnings("error::pytest.PytestUnhandledThreadExceptionWarning"),
+]
+
+VALUES = {"voxel_size": 0.5, "icp.max_iterations": 30}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _image():
+    ros2_image()
+
+
+@pytest.fixture
+def make(tmp_path):
+    odometries = []
+
+    def begin(parameters=VALUES, given=None, **settings):
+        chosen = ros2(tmp_path / "icp.yaml", **({"patience": 60.0} | settings))
+        odometries.append(Ros2.instance(parameters, chosen, LIMITS, given and (lambda: given)))
+        return odometries[-1]
+
+    yield begin
+    for odometry in odometries:
+        odometry.close()
+    assert not containers()
+
+
+def test_parameters_get_there_and_change_while_it_runs(make, monkeypatch):
+    systems = []
+
+    class Noted(Ros2System):
+        def __init__(self, *given):
+            super().__init__(*given)
+            systems.append(self)
+
+    monkeypatch.setattr(ros2_system.Ros2Settings, "system", Noted)
+    odometry = make(node="/icp")
+    poses = drive(odometry)
+    np.testing.assert_allclose(poses[:, :3, 3], truth()[:, :3, 3], atol=0.08)
+    assert not odometry.faults
+    assert 0.0 < odometry.usage.cpu < 100.0
+    assert 0.0 < odometry.usage.memory < 1000.0
+    # The system, and adaptune's node in its network.
+    assert len(containers()) == 2
+    (system,) = systems
+    held = system.link.ask("parameters")["/icp"]
+    assert held["voxel_size"] == 0.5
+    assert held["icp.max_iterations"] == 30
+    assert held["icp.max_correspondence_distance"] == 1.5
+    odometry.apply(Selection(0, {"icp.max_iterations": 1}))
+    assert system.link.ask("parameters")["/icp"]["icp.max_iterations"] == 1
+    with pytest.raises(OdometryError, match=r"/icp refuses icp\.max_iterations = 'many'"):
+        odometry.apply(Selection(0, {"icp.max_iterations": "many"}))
+
+
+def test_on_this_machine_it_needs_no_container(make):
+    node = module_of("docker/build.py").build_node()
+    command = (str(node), "--params-file", "{parameters}")
+    odometry = make(image=None, command=command)
+    Ros2.check(odometry._settings, VALUES)
+    poses = drive(odometry)
+    np.testing.assert_allclose(poses[:, :3, 3], truth()[:, :3, 3], atol=0.08)
+    assert odometry.usage.cpu > 0.0
+    assert not containers()
+    with pytest.raises(OdometryError, match="a login shell of this machine finds no 'ros3'"):
+        Ros2.check(odometry._settings.model_copy(update={"command": ("ros3",)}), VALUES)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "settings", "words"),
+    [
+        ({"other": 2}, {}, "no node declares the parameter other, .*; there is 'icp"),
+        (
+            {"icp.max_iterations": 2.5},
+            {},
+            r"adaptune-reference-ros2 .*: its process ended with code 1: icp: parameter "
+            r"icp\.max_iterations has invalid type",
+        ),
+        (
+            VALUES,
+            {"points": "/velodyne", "ready": 3},
+            r"no node subscribed to the clouds' topic /points .*: /velodyne\)",
+        ),
+        (
+            VALUES,
+            {"odometry": "/parameter_events"},
+            "/parameter_events is rcl_interfaces/msg/ParameterEvent; .*must name poses",
+        ),
+        (VALUES, {"command": ("/no-such", "{parameters}")}, "its process ended with code 127: "),
+    ],
+)
+def test_one_that_cannot_begin_says_why(make, parameters, settings, words):
+    odometry = make(parameters, **settings)
+    with pytest.raises(OdometryError, match=words):
+        odometry.start(scans()[0], np.eye(4))
+    assert odometry.ended
+    assert not containers()
+
+
+def test_its_manners_are_those_of_ros_1(make, monkeypatch):
+    monkeypatch.setattr(lockstep, "_MOST_SILENT", 4)
+    late = make(imitate={"late": 2}, patience=0.5)
+    drive(late)
+    assert not late.faults
+    dies = make(imitate={"die_at": 4}, patience=3.0)
+    poses = drive(dies)
+    assert np.isfinite(poses[:4]).all()
+    assert np.isnan(poses[-1]).all()
+    assert "its process ended with code 3: " in dies.faults[0]
+    assert "icp: terminating after 4 scans: the map is corrupt" in dies.faults[0]
+    silent = make(imitate={"silent": True}, patience=0.2)
+    drive(silent)
+    assert re.match(r"no pose yet on /odometry for 4 scans in a row", silent.faults[0])
+
+
+def test_one_that_works_on_or_stamps_by_a_clock_is_told(make, caplog):
+    lockstep._warn_once.cache_clear()
+    lockstep._SEEN.clear()
+    busy = make(imitate={"background": 0.8})
+    on = [busy.prepare(scan) for scan in scans()[:2]]
+    busy.start(on[0], np.eye(4))
+    busy.register(on[1])
+    busy.close()
+    assert "it works on after its last pose" in caplog.text
+    assert "by its own clock" not in caplog.text
+    clocked = make(imitate={"own_clock": 0.0})
+    clocked.start(on[0], np.eye(4))
+    for scan in scans()[1:4]:
+        clocked.register(scan)
+    assert "by its own clock, not by the scans; poses are matched to scans" in caplog.text
+
+
+def test_what_it_does_is_told_before_it_is_tuned(tmp_path):
+    given = ros2(tmp_path / "icp.yaml", imitate={"late": 2, "stamp_later": 0.05}, patience=0.3)
+    found = look(given, VALUES, LIMITS, scans()[:12])
+    assert found["subscribed topics"] == "/points"
+    assert found["published topics"] == "/odometry"
+    assert found["first pose"].startswith("after 3 scans")
+    assert found["stamps"] == "of the scans, 50 ms after their begin"
+    assert found["lockstep"] == "yes"
+    every_second = ros2(tmp_path / "icp.yaml", imitate={"one_of": 2}, patience=0.2)
+    found = look(every_second, VALUES, LIMITS, scans()[:8])
+    assert found["lockstep"] == "no: set odometry.settings.play: bag"
+    assert not containers()
+
+
+def test_an_imu_is_heard_until_the_end_of_a_scan(make):
+    odometry = make(imitate={"imu": True}, imu="/imu", patience=10.0)
+    given = []
+    for scan in scans()[:10]:
+        times = np.linspace(0, 0.1, len(scan), dtype=np.float32)
+        stamps = scan.stamp + np.arange(0, 110_000_000, 10_000_000)
+        imu = Imu(stamps, np.zeros((11, 3)), np.tile([0.0, 0.0, 9.81], (11, 1)))
+        given.append(Scan(scan.stamp, scan.points, times, imu=imu))
+    odometry.start(given[0], np.eye(4))
+    assert all(odometry.register(scan).registered for scan in given[1:])
+
+
+def test_a_ros_1_bag_is_played_as_it_was_recorded(make, tmp_path, monkeypatch):
+    monkeypatch.setattr(played_bag, "_FIRST", 2.0)
+    logs = tmp_path / "logs"
+    logs.mkdir()
+    given = recording(tmp_path / "bag", logs)
+    odometry = make(given=given, play="bag", rate=4.0)
+    poses = drive(odometry)
+    np.testing.assert_allclose(poses[:, :3, 3], truth()[:, :3, 3], atol=0.08)
+    assert not odometry.faults
+    (kept,) = logs.iterdir()
+    assert "max_iterations: 30" in (kept / "params.yaml").read_text()
+    assert "ready for /points" in (kept / "output.log").read_text()
+    assert "digest" in (kept / "trial.yaml").read_text()
+    assert len(poses) == N_SCANS

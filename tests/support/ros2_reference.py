@@ -1,0 +1,25 @@
+"""Settings of the ROS 2 reference in its image."""
+
+import json
+
+from needs import ros2_image
+
+from adaptune.odometry.docker.ros2_system import Ros2Settings
+
+TEMPLATE = """\
+/**:
+  ros__parameters:
+    points_topic: {points}
+    voxel_size: 0.9
+    icp: {{max_correspondence_distance: 1.5, max_iterations: 25}}
+    other: 1
+    imitate: {imitate}
+"""
+
+
+def ros2(file, points="/points", imitate=(), **settings):
+    """Settings of the ROS 2 reference, in its image."""
+    file.write_text(TEMPLATE.format(points=points, imitate=json.dumps(dict(imitate))))
+    command = ("adaptune-reference-ros2", "--params-file", "{parameters}")
+    given = {"image": ros2_image(), "command": command, "odometry": "/odometry", "rate": 0.0}
+    return Ros2Settings(template=str(file), **(given | settings))
