@@ -14,7 +14,7 @@ help:
 	@echo "make docs    build the documentation as a site, build/site"
 	@echo "make test-services  test with Docker, ROS, a browser, a cluster, kills and benchmarks"
 	@echo "make services  install what pip cannot bring: ROS 1, Docker, Chromium (Debian 12); it needs"
-	@echo "               Rust 1.88 or newer (https://rustup.rs) for the ROS 2 odometry that tests run"
+	@echo "               Rust 1.88 or newer (by rustup) for the ROS 2 odometry that tests run"
 	@echo "make reference-image  build the image of a ROS 1 odometry that tests run"
 	@echo "make reference-ros2-image  build that of a ROS 2 odometry; the first time takes five minutes"
 	@echo "make format  format the code"
@@ -55,7 +55,7 @@ services:
 		|| $(SUDO) sh -c 'setsid dockerd >/var/log/docker.log 2>&1 </dev/null &'
 	$(SUDO) sh -c 'for i in $$(seq 30); do docker info >/dev/null 2>&1 && exit; sleep 1; done; \
 		echo "the Docker engine does not answer: see /var/log/docker.log" >&2; exit 1'
-	@command -v cargo >/dev/null || echo "tests of ROS 2 need Rust: see https://rustup.rs" >&2
+	@command -v cargo >/dev/null || echo "tests of ROS 2 need Rust: install it by rustup" >&2
 
 reference-image: $(VENV)/.installed
 	$(BIN)/python docker/build.py reference

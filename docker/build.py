@@ -145,7 +145,7 @@ def build_node() -> Path:
     What it is made of is kept for other copies of the project: the first time takes five minutes.
     """
     if shutil.which("cargo") is None:
-        raise LackingError(f"there is no cargo: install Rust {RUST} or newer by https://rustup.rs")
+        raise LackingError(f"there is no cargo: install Rust {RUST} or newer by rustup")
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     target = cache / "adaptune-reference-ros2"
     manifest = f"--manifest-path={NODE / 'Cargo.toml'}"
