@@ -58,7 +58,7 @@ def unbounded(schema, definitions, path=""):
             below[key] = schema[key]
     below |= {f"item {i}": item for i, item in enumerate(schema.get("prefixItems", ()))}
     for key, value in below.items():
-        if key not in ("extrinsic", "part", "transform"):  # have a check of their own
+        if key not in ("extrinsic", "part", "transform", "transforms"):  # have a check of their own
             yield from unbounded(value, definitions, f"{path}.{key}")
 
 
