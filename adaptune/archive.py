@@ -82,7 +82,8 @@ class Trial:
     # (n,): sub-trajectory RTE in percent; NaN without a sub-trajectory, infinite without poses. Of
     # several repeats, the mean of the capped errors.
     errors: NDArray[np.float64]
-    restarted: NDArray[np.bool_]  # (n,): where the health check restarted it
+    # (n,): where the health check restarted it; of several repeats, how often in the mean
+    restarted: NDArray[np.floating] | NDArray[np.bool_]
     # (n,): False where the scan had too few points, or the odometry gave no pose.
     registered: NDArray[np.bool_]
     # (n,): computing time of the odometry for each scan, without preparing it.
@@ -104,8 +105,8 @@ class Trial:
     failure: str = ""  # why the set is never chosen; empty if it may be
 
     def __repr__(self) -> str:
-        n = int(self.restarted.sum())
-        told = f"{self.mean_error:.3f} %, {n} restarts, {len(self.faults)} faults"
+        n = self.restarted.sum()
+        told = f"{self.mean_error:.3f} %, {n:g} restarts, {len(self.faults)} faults"
         return f"<Trial of {in_words(self.parameters)}: {told}>"
 
     @property
@@ -124,7 +125,7 @@ class Summary:
 
     parameters: ParameterSet
     mean_error: float  # see `Trial.mean_error`
-    restarts: int  # how often the health check restarted the odometry
+    restarts: float  # how often the health check restarted the odometry
     faults: int  # how often its process ended or gave no pose
     ms: float  # milliseconds of the odometry for a scan
     others: dict[str, float] = field(default_factory=dict)  # other metrics by name
@@ -150,7 +151,7 @@ def summarise(trial: Trial) -> Summary:
     return Summary(
         trial.parameters,
         replace(trial, errors=errors).mean_error,
-        int(trial.restarted.sum()),
+        float(trial.restarted.sum()),
         len(trial.faults),
         float(1e3 * seconds.mean(dtype=np.float64)) if len(seconds) else 0.0,
         trial.metrics | trial.usage,
@@ -293,7 +294,10 @@ class Archive:
         if partly and "descriptors" in differing:
             files += folder.glob("frames.npz")
         if partly and "limits" in differing:
-            faulty = [n for n, run in self.finished(name).items() if run.faults]
+            # A limit may have ended a drive of the whole recording alone.
+            faulty = {n for n, run in self.finished(name).items() if run.faults}
+            whole = [int(file.name[:5]) for file in folder.glob("*-whole.npz")]
+            faulty |= {n for n in whole if self.read(name, n, whole=True).faults}
             files += (file for n in faulty for file in folder.glob(f"{n:05d}*.npz"))
         manifest.set_aside(study, folder, before, files)
         # The record changes last: until then, it is known what these depend on.

@@ -93,14 +93,15 @@ def sub_trajectory_rte(
     T_ref_sensor: Poses,
     T_odom_sensor: Poses,
     length: float,
-    restarted: NDArray[np.bool_] | None = None,
+    lost: NDArray[np.bool_] | None = None,
+    ends: NDArray[np.intp] | None = None,
 ) -> NDArray[np.float64]:
     """Relative translation error of the sub-trajectory that starts at every frame, of shape (n,).
 
     After Koide et al., *Adaptive Hyperparameter Tuning for Black-box LiDAR Odometry*, IROS 2021.
     In percent of the length: the lengths of `sub_trajectory_vectors`.
     """
-    vectors = sub_trajectory_vectors(T_ref_sensor, T_odom_sensor, length, restarted)
+    vectors = sub_trajectory_vectors(T_ref_sensor, T_odom_sensor, length, lost, ends)
     return np.asarray(np.linalg.norm(vectors, axis=1))
 
 
@@ -108,17 +109,17 @@ def sub_trajectory_vectors(
     T_ref_sensor: Poses,
     T_odom_sensor: Poses,
     length: float,
-    restarted: NDArray[np.bool_] | None = None,
+    lost: NDArray[np.bool_] | None = None,
+    ends: NDArray[np.intp] | None = None,
 ) -> NDArray[np.float64]:
     """Error vector at the end of the sub-trajectory that starts at every frame, of shape (n, 3).
 
     In percent of `length`, which is in metres, in the frame of the sub-trajectory's start: NaN for
-    frames without a full sub-trajectory, infinity for those whose sub-trajectory contains a lost
-    track or poses that are not finite. Poses are of shape (n, 4, 4), those of the reference NaN
-    where there is none. `restarted`, of shape (n,), are the frames at which the odometry lost track
-    and restarted at the reference.
+    frames without a full sub-trajectory, infinity for those whose sub-trajectory contains a scan
+    that is `lost`, of shape (n,), or poses that are not finite. Poses are of shape (n, 4, 4), those
+    of the reference NaN where there is none. `ends` are those of `window_ends`, if they are known.
     """
-    ends = window_ends(T_ref_sensor, length)
+    ends = window_ends(T_ref_sensor, length) if ends is None else ends
     starts = np.flatnonzero(ends >= 0)
     ends = ends[starts]
     vectors = np.full((len(T_ref_sensor), 3), np.nan)
@@ -127,9 +128,9 @@ def sub_trajectory_vectors(
         vectors[starts] = 100.0 / length * (d_est - d_gt)[:, :3, 3]
     # Only the reference may be unknown. An odometry whose poses are not finite has lost track.
     vectors[starts[~np.isfinite(vectors[starts]).all(axis=1)]] = np.inf
-    if restarted is not None:
+    if lost is not None:
         # The step that failed ends at its frame: a window that starts there is sound.
-        failures = np.cumsum(restarted)
+        failures = np.cumsum(lost)
         vectors[starts[failures[ends] > failures[starts]]] = np.inf
     return vectors
 

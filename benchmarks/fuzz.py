@@ -39,7 +39,7 @@ from adaptune.archive import Archive, Frames, Trial, rows
 from adaptune.model import ErrorModel
 from adaptune.model.error_model import render
 from adaptune.odometry import wire
-from adaptune.odometry.docker.rustle import PoseRecorder
+from adaptune.odometry.docker.played_bag import PoseRecorder
 from adaptune.odometry.program import CommandSettings, Template, read_output
 from adaptune.recording import Scan, SequenceConfig
 from adaptune.recording.folder import read_scan

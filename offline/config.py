@@ -455,7 +455,7 @@ class OfflineConfig(StrictModel):
 
 _SEARCH = (
     *("sampler", "sampler_settings", "initial", "batch", "seed"),
-    *("objective", "stretches", "repeats", "baseline_runs", "pruning", "health"),
+    *("objective", "stretches", "repeats", "baseline_runs", "pruning"),
 )
 """Settings by which a search differs from another."""
 
@@ -493,7 +493,7 @@ class OfflineStudyConfig(StudyConfig):
     @property
     def search_inputs(self) -> dict[str, Any]:
         """What makes the trials of a study those that they are: another search has others."""
-        offline = self.resolved()["offline"] | {"health": self.health.model_dump(mode="json")}
+        offline = self.resolved()["offline"]
         # The sets are shared, as trials of earlier versions have it recorded.
         return {"sets": "shared"} | {k: value for k in _SEARCH if (value := offline.get(k))}
 

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, lru_cache, partial
+from itertools import chain
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -91,11 +92,14 @@ class BankSimulation:
     # The motions of some sets, by trial numbers, over every scan but the first, of shape (n_frames
     # - 1, n_sets, 4, 4), see `recorded_motions`.
     motions: Callable[[tuple[int, ...]], Poses]
+    ends_of_whole: NDArray[np.intp] | None = None  # `ends`, where it is a part of a simulation
     _live: dict[tuple[int, ...], list[LiveSquares | None]] = field(default_factory=dict, init=False)
 
     @cached_property
     def ends(self) -> NDArray[np.intp]:
-        """Last frame of the sub-trajectory from each frame on, of shape (n_frames,)."""
+        """Last frame of the sub-trajectory from each frame on, of shape (n_frames,); -1: none."""
+        if self.ends_of_whole is not None:
+            return self.ends_of_whole
         return window_ends(self.T_ref_counted, self.length)
 
     def live(self, members: tuple[int, ...]) -> list[LiveSquares | None]:
@@ -171,7 +175,8 @@ class BankSimulation:
         none = np.asarray(~agreeing.any(axis=1))
         believed = np.where(agreeing[..., None, None], T_previous_current, np.eye(4))
         moved = mean_motion(believed, share(self._of_steps(weights), agreeing | none[:, None]))
-        return cap(sub_trajectory_rte(self.T_ref_counted, chained(moved), self.length))
+        T_ref, T_odom = self.T_ref_counted, chained(moved)
+        return cap(sub_trajectory_rte(T_ref, T_odom, self.length, ends=self.ends))
 
 
 def chained(T_previous_current: Poses) -> Poses:
@@ -196,7 +201,7 @@ def recorded_motions(frames: Frames, trials: Sequence[Trial]) -> Poses:
     begins = frames.stamps[:-1]
     for k, trial in enumerate(trials):
         motions[:, k] = steps(trial.T_odom_sensor)
-        lost = np.where(trial.restarted[1:], begins, np.iinfo(np.int64).min // 2)
+        lost = np.where(trial.restarted[1:] > 0, begins, np.iinfo(np.int64).min // 2)
         since = begins - np.maximum.accumulate(lost)  # the last step that was lost began
         motions[since < SECONDS_UNTIL_NOTICED * 1e9, k] = np.eye(4)
     return motions
@@ -320,11 +325,15 @@ class LabelledSequence:
         simulation, first = self.simulation, int(self.known.min())
         stop = min(int(self.ends.max()) + 1 + MARGIN_FRAMES, len(simulation.stamps))
         frames = slice(first, stop)
+        ends = simulation.ends[frames] - first
+        ends[(simulation.ends[frames] < 0) | (ends >= stop - first)] = -1
         part = replace(
             simulation,
             stamps=simulation.stamps[frames],
             T_ref_sensor=simulation.T_ref_sensor[frames],
             T_ref_counted=simulation.T_ref_counted[frames],
+            # Noise counts by the whole path: of a part, windows might end elsewhere.
+            ends_of_whole=ends,
             descriptors=simulation.descriptors[frames],
             period=simulation.period[frames],
             hops=simulation.hops.part(first, stop),
@@ -538,8 +547,12 @@ def labelled_data(
         one = _labelled(archive, name, set(counted), sets, config, window, recorded_in(name))
         read[name] = one
     eligible = _eligible(list(read.values()), sets)
-    bounds = LabelledData(list(read.values()), sets).bounds()
-    rivals = [*best_candidates(bounds), *sets.defaults]
+    costs, budget = measured_costs(archive, run, sets, odometry), config.online.budget
+    of_trials = LabelledData(list(read.values()), sets, costs)
+    bounds = of_trials.bounds()
+    cheap = of_trials.within(np.inf if budget is None else budget)
+    finalists = best_candidates(bounds), best_candidates({n: bounds[n] for n in cheap})
+    rivals = list(dict.fromkeys([*chain(*finalists), *sets.defaults]))
     drives = read_whole_drives(archive, list(run), rivals)
     labelled = []
     for name, whole in whole_values(config.offline, drives).items():
@@ -555,7 +568,6 @@ def labelled_data(
         if by_frames:
             errors_of = {n: archive.read(name, n, whole=True).errors[s.known] for n in whole}
         labelled.append(replace(s, vectors=vectors, whole=whole, whole_errors=errors_of))
-    costs = measured_costs(archive, run, sets, odometry)
     online, live = config.online, odometry.description.live
     return LabelledData(labelled, sets, costs, online.budget, online.worth, live)
 

@@ -14,7 +14,7 @@ Metrics of one parameter set on one sequence:
 The first four repeat on the same machine, the last two do not.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -166,8 +166,10 @@ def best_by_trials(verdicts: Mapping[int, Verdict]) -> int:
     return candidates(verdicts)[0]
 
 
-def candidates(verdicts: Mapping[int, Verdict]) -> list[int]:
-    """Trial numbers of the finalists, the best by their trials first.
+def candidates(
+    verdicts: Mapping[int, Verdict], affordable: Collection[int] | None = None
+) -> list[int]:
+    """Trial numbers of the finalists, the best by their trials first; of those that are affordable.
 
     These are the `CANDIDATES` sets with the least objective of those that may be chosen, see
     `allowed`, and the baseline if that may be. If trials are repeated, the upper end of the
@@ -180,6 +182,7 @@ def candidates(verdicts: Mapping[int, Verdict]) -> list[int]:
     """
     complete = {n: verdict for n, verdict in verdicts.items() if verdict.complete}
     chosen = allowed({n: np.inf if v.failure else v.restarts for n, v in complete.items()})
+    chosen &= chosen if affordable is None else set(affordable)
     if not chosen:
         raise NothingUsableError(UNUSABLE.format(n=len(verdicts)))
     return best_candidates({n: verdicts[n].bound for n in complete if n in chosen})

@@ -122,11 +122,11 @@ def train(study: OfflineStudy, progress: Progress = unseen, cluster: str | None 
             for name in names
         }
         tried = tuple(verdict.parameters for verdict in verdicts.values())
-        every_set, affordable_ones = ParameterSets(space, tuple(verdicts), tried), verdicts
+        every_set, affordable_ones = ParameterSets(space, tuple(verdicts), tried), list(verdicts)
         if (budget := study.config.online.budget) is not None:
             costs = measured_costs(archive, finished, every_set, study.odometry)
-            affordable_ones = {n: verdicts[n] for n in affordable(costs, list(verdicts), budget)}
-        best = candidates(affordable_ones)
+            affordable_ones = affordable(costs, affordable_ones, budget)
+        best = candidates(verdicts, affordable_ones)
         # Rivals may cost more.
         rivals = {*candidates(verdicts), *every_set.defaults}
         sets = {n: verdicts[n].parameters for n in sorted({0, *best, *rivals})}
@@ -192,9 +192,8 @@ def _fixed(
     config: OfflineConfig, verdicts: Mapping[int, Verdict], best: Sequence[int], whole: WholeDrives
 ) -> int:
     """Trial number of the fixed set, one of the best."""
-    rivals = {name: {n: drives[n] for n in best} for name, drives in whole.items()}
-    values = mean_values(list(whole_values(config, rivals).values()))
-    if np.isinf(min(values.values())):
+    values = mean_values(list(whole_values(config, whole).values()))
+    if np.isinf(min(values[n] for n in best)):
         raise NothingUsableError(UNUSABLE.format(n=f"the {len(best)} best"))
     return choose_fixed({n: verdicts[n].bound for n in best}, values)
 

@@ -155,6 +155,8 @@ class Drives:
         self.T_odom_sensor = np.full((n, 4, 4), np.nan)
         self.restarted = np.zeros(n, bool)
         self.registered = np.zeros(n, bool)
+        self.tried = np.zeros(n, bool)  # scans that the odometry was given
+        self.without_pose = np.zeros(n, bool)
         self.seconds = np.full(n, np.nan)
         self.unhealthy = Counter[str]()
         self.too_slow = False
@@ -190,7 +192,7 @@ class Drives:
             self._failed = True
         if np.isfinite(self.T_odom_sensor[i, 0, 0]):
             return
-        self.unhealthy["no_pose"] += 1
+        self.without_pose[i] = True
         self.T_odom_sensor[i] = (
             self._start(i)[0] if i in self._begins else self.T_odom_sensor[i - 1]
         )
@@ -213,10 +215,12 @@ class Drives:
                 T_before_start=T_before_start,
             )
         found = self._tracker.register_prepared(self._stamps[i], prepared)
-        self.T_odom_sensor[i] = found.T_odom_sensor
-        self.registered[i] = found.registered and found.unhealthy != "no_pose"
+        self.T_odom_sensor[i], self.tried[i] = found.T_odom_sensor, True
+        self.without_pose[i] = found.unhealthy == "no_pose"
+        self.registered[i] = found.registered and not self.without_pose[i]
         self.restarted[i] = found.unhealthy is not None
-        self.unhealthy.update([found.unhealthy] if found.unhealthy else [])
+        if found.unhealthy not in (None, "no_pose"):
+            self.unhealthy[found.unhealthy] += 1
         if i not in self._begins:
             self.seconds[i] = found.register_seconds
         self.too_slow = self._odometry.usage.cpu > self._most
@@ -522,29 +526,29 @@ def _trial(
     drives: Drives,
 ) -> Trial:
     """Make a trial of the drives along all stretches."""
-    T_odom_sensor, T_ref_sensor = drives.T_odom_sensor, frames.counted.copy()
-    n, waiting = frames.n_driven, 0
+    T_odom_sensor, T_ref_sensor = drives.T_odom_sensor, frames.counted
+    n, waiting = frames.n_driven, np.zeros(len(frames.stamps), bool)
     for first, _, end in frames.stretches:
         without = int(np.argmax([*drives.registered[first:end], True]))
-        # Scans before the first pose are unknown.
-        T_ref_sensor[first : first + without] = np.nan
-        waiting += without
-    missing = waiting + drives.unhealthy["no_pose"]
-    failure = ""
+        # Scans before a first pose that comes are unknown.
+        waiting[first : first + without] = first + without < end
+    missing = int((waiting | drives.without_pose).sum())
+    failure, lost = "", int(drives.without_pose.sum())
     if missing >= MAX_SHARE_WITHOUT_POSE * n:
-        drives.unhealthy["no_pose"] = min(missing, n)
-        failure = f"no pose for {min(missing, n)} of {n} scans"
-        T_ref_sensor = frames.counted
+        failure, lost = f"no pose for {missing} of {n} scans", missing
+    else:
+        T_ref_sensor[waiting & ~drives.without_pose] = np.nan
+    unhealthy = dict(drives.unhealthy) | ({"no_pose": lost} if lost else {})
     if len(drives.faults) >= MOST_FAULTS:
         failure = f"{len(drives.faults)} faults"
     usage, prepare_ms = drives.usage(shared)
+    tried = max(int(drives.tried.sum()), 1)
     if drives.too_slow:
-        done = max(n - drives.unhealthy["no_pose"], 1)
-        failure = f"too slow: {1e3 * usage.cpu / done:.0f} ms a scan"
+        failure = f"too slow: {1e3 * usage.cpu / tried:.0f} ms a scan"
     if usage.seconds is not None:
         drives.seconds[~np.isnan(drives.seconds)] = usage.seconds
     # What goes on without poses may seem to do well.
-    unseen = ~drives.registered if failure else None
+    unseen = ~drives.tried | ((drives.without_pose | waiting) & bool(failure))
     errors = sub_trajectory_rte(T_ref_sensor, T_odom_sensor, settings.sub_trajectory, unseen)
     if np.isnan(errors).all():
         failure = failure or "no sub-trajectory has poses"
@@ -553,7 +557,7 @@ def _trial(
     )
     used = {
         "cpu": 100.0 * usage.cpu / seconds,
-        REGISTER_MS: 1e3 * usage.cpu / n,
+        REGISTER_MS: 1e3 * usage.cpu / tried,
         PREPARE_MS: prepare_ms,
     } | ({} if usage.memory is None else {"memory": usage.memory})
     first, _, end = frames.stretches[0]
@@ -569,7 +573,7 @@ def _trial(
         drives.faults,
         trajectory_metrics(T_ref_sensor, T_odom_sensor),
         used,
-        unhealthy=dict(drives.unhealthy),
+        unhealthy=unhealthy,
         failure=failure,
     )
 
@@ -583,7 +587,7 @@ def _mean(parameters: ParameterSet, repeats: Sequence[Trial]) -> Trial:
         parameters,
         repeats[0].T_odom_sensor,
         np.mean([cap(trial.errors) for trial in repeats], axis=0),
-        np.any([trial.restarted for trial in repeats], axis=0),
+        np.mean([trial.restarted for trial in repeats], axis=0),
         np.all([trial.registered for trial in repeats], axis=0),
         np.mean([trial.seconds for trial in repeats], axis=0),
         tuple(fault for trial in repeats for fault in trial.faults),

@@ -192,8 +192,10 @@ class Reference(NamedTuple):
         )
         trajectory = read_tum(path) if path.exists() else None
         if trajectory is not None:
-            # Frames in a gap have no label in training, and get none here.
-            trajectory = replace(trajectory, max_gap=study.sequences.config(name).max_gap)
+            # Frames in a gap, and across a jump, have no label in training, and get none here.
+            known = study.sequences.open(name).reference()
+            gap = trajectory.max_gap if known is None else known.max_gap
+            trajectory = replace(trajectory, max_gap=gap)
         stored = study.sequences.estimate(name)
         error = math.nan if stored is None else stored.error(length)
         return cls(trajectory, length, stored is not None, None if math.isnan(error) else error)
@@ -430,6 +432,6 @@ def oracle_row(judged: JudgedModes, oracle: OracleErrors, fixed: int) -> Compari
     if rte is None or fixed not in oracle.trials or not known.any():
         return None
     means = errors[known].mean(axis=0)
-    # Trials restart at the reference, and replays do not: only the ratio carries over.
+    # Replays of the fixed set are made again, and trials count without warm-up.
     ratio = float(means.min()) / max(float(means[oracle.trials.index(fixed)]), 1e-12)
     return ComparisonRow(judged.name, ORACLE, rte * ratio, ratio, yardstick=yardstick)

@@ -48,6 +48,9 @@ from adaptune.study.config import (
     SwitchingConfig,
 )
 
+_READER = 2
+"""Changes where the same files give other scans or poses than before."""
+
 # The sequences of a study by name: recordings and simulated courses.
 
 
@@ -168,7 +171,8 @@ class StudySequences:
         config = self.config(name).model_dump(mode="json", exclude=others)
         config |= {} if course is None else course.model_dump(mode="json")
         recording = fingerprints(self.files(name).recording)
-        return {self._kind(name): {name: config}, "recording": {name: recording}}
+        about = {self._kind(name): {name: config}, "recording": {name: recording}}
+        return about | {"reader": _READER}
 
     def reference(self, name: str) -> dict[str, Any]:
         """Everything that the reference of a sequence depends on besides its scans."""
@@ -351,6 +355,7 @@ class Study(Generic[C_co]):
         shared = self.odometry_inputs | {
             "sub_trajectory": config.sub_trajectory,
             "lost_track": config.lost_track,
+            "drives": {"health": config.health.model_dump(mode="json")},
             "descriptors": descriptor_content(config.descriptor),
             **(more or {}),
         }

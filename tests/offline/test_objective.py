@@ -39,6 +39,8 @@ def test_who_is_restarted_more_often_than_the_baseline_is_no_candidate():
     verdicts = {n: Verdict({}, float(n), restarts=r) for n, r in enumerate([2, 3, 2, 0])}
     assert candidates(verdicts) == [0, 2, 3]
     assert allowed({0: np.inf, 1: 5.0, 2: np.inf}) == {1}
+    # The baseline's restarts count also where it costs too much.
+    assert candidates(verdicts, [1, 2]) == [2]
 
 
 def test_the_fixed_set_is_the_best_over_whole_recordings():

@@ -126,6 +126,30 @@ def test_each_stretch_begins_at_the_reference_and_in_motion(study):
     assert np.count_nonzero(~np.isnan(whole.errors)) > np.count_nonzero(~np.isnan(trial.errors))
 
 
+class FailsOnce(KeyframeGicp):
+    """Cannot begin on its second stretch."""
+
+    n_starts = 0
+
+    def start(self, *args):
+        self.n_starts += 1
+        if self.n_starts == 2:
+            raise ValueError("seven planes")
+        super().start(*args)
+
+
+def test_a_drive_that_fails_at_its_first_scan_counts_as_lost(study):
+    setup = setup_of(study, made_of(FailsOnce, study), sub_trajectory=0.5, stretches=3)
+    sequence = setup.prepare("one", 1e9)
+    (trial,) = setup.run(sequence, [GOOD])
+    for i, (_, begin, end) in enumerate(sequence.frames.stretches):
+        known = trial.errors[begin:end][~np.isnan(trial.errors[begin:end])]
+        assert len(known)
+        assert np.isinf(known).all() == (i == 1)
+    assert "seven planes" in trial.faults[0]
+    assert trial.failure.startswith("no pose for ")
+
+
 @pytest.mark.parametrize(
     ("metres", "n", "many"), [(400.0, 12, 12), (120.0, 12, 1), (400.0, None, 1)]
 )
@@ -169,7 +193,9 @@ def test_a_set_that_is_too_slow_is_stopped(study, monkeypatch):
         patch.setattr("offline.trial.LEAST_SECONDS", 0.0)
         (slow,) = setup.run(sequence, [GOOD], most_ms=0.0)
         (good,) = setup.run(sequence, [GOOD], most_ms=1e6)
-    assert re.fullmatch(r"too slow: \d+ ms a scan", slow.failure)
+    (ms,) = re.findall(r"too slow: (\d+) ms a scan", slow.failure)
+    assert int(ms) == round(slow.usage["register_ms"])
+    assert int(ms) < 1e3  # of the one scan that it was given
     assert not slow.registered[2:].any()
     assert not good.failure
 

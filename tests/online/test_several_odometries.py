@@ -47,7 +47,7 @@ def test_the_trials_range_over_both(trained):
     assert {s[ODOMETRY] for s in sets.parameters} == {"gicp", "vgicp"}
     archive = Archive(study.folder / "trials")
     for name in study.training:
-        # The baselines of both have whole runs.
+        # The baselines of both are driven whole.
         for trial in (0, 1):
             assert archive.read(name, trial, whole=True).parameters == sets[trial]
             assert archive.finished(name)[trial].cost > 0.0

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from adaptune import processes
-from adaptune.errors import OdometryError, UnavailableError
+from adaptune.errors import OdometryError
 from adaptune.odometry.base import Usage
 from adaptune.odometry.docker.engine import (
     Container,
@@ -119,9 +119,7 @@ class Ros1System(RosSystem):
         command = _LAUNCH.format(packages=" ".join(settings.packages), launch=launch)
         try:
             self._launch = self._container.run(command, self._environment)
-        except UnavailableError:
-            raise
-        except OdometryError as error:
+        except OdometryError as error:  # also an engine's, of a container that has ended
             time.sleep(_UNTIL_NOTED)
             raise self._lacking() or error from error
 

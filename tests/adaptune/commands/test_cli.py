@@ -60,7 +60,7 @@ def test_one_bag_is_enough_and_every_command_names_the_next(adaptune, study_file
         there = "The parameters: my study[v2]/fixed.yaml." in done.stdout
         assert (command == "online") != there
         assert (command == "online") == ("4 replays made: my study[v2]/replays/" in done.stdout)
-        trained = "% in whole runs in training (1 sequence)"
+        trained = "% in training (1 sequence)"
         assert (command == "offline") == (trained in done.stdout)
     assert done.stdout.startswith(("Drive ", "Keep "))
     words = "baseline", "fixed", "adaptive", "paper", "one_60-100"

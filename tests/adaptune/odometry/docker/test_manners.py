@@ -44,7 +44,7 @@ def trial(study_file, folder, imitate, way, patience=60.0):
         settings += f", odometry: /Odometry, rate: {rate}, play: {way}, patience: {patience}"
     given = [f"odometry.name={name}", f"odometry.settings={{{settings}}}", PARAMETERS]
     given.append("isolation.seconds=60")
-    setup = setup_of(load_study(study_file, given, folder / "run"), runs="whole")
+    setup = setup_of(load_study(study_file, given, folder / "run"))
     (found,) = setup.run(setup.prepare("one", 1e9), [VALUES])
     return found
 
@@ -72,7 +72,7 @@ def trials(study_file, tmp_path_factory):
 def polite(study_file, tmp_path_factory):
     given = ["odometry.name=gicp", "odometry.settings={}", "odometry.parameters=null"]
     study = load_study(study_file, given, tmp_path_factory.mktemp("polite") / "run")
-    setup = setup_of(study, runs="whole")
+    setup = setup_of(study)
     (found,) = setup.run(setup.prepare("one", 1e9), [VALUES | FIXED])
     return found.mean_error
 
