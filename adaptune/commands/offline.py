@@ -112,8 +112,8 @@ def trials(
     """List the study's finished trials, also while it runs.
 
     The columns are the trial number, the parameters, the `mean` RTE in percent over all training
-    sequences and the RTE on each of them, the number of lost tracks, of ended processes and of
-    steps that the health check rejects, and the other metrics.
+    sequences and the RTE on each of them, the number of restarts by the health check and of ended
+    processes, and the other metrics.
     """
     loaded = load(study, override, folder)
     from adaptune import archive as table

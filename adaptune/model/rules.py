@@ -203,8 +203,7 @@ class TrainingData:
     """Errors of parameter sets on the frames of several sequences."""
 
     features: NDArray[np.float64]  # (n_frames, n_features): descriptors, scaled
-    # (n_frames,): number of each frame's sequence. Views of a sequence share its number, for they
-    # show the same place.
+    # (n_frames,): number of each frame's stretch.
     sequence: NDArray[np.intp]
     # (n_frames, n_sets): sub-trajectory RTE in percent, infinite where the track was lost, NaN
     # where the set was not run (usually on all frames of a sequence, or on none). Every frame has a

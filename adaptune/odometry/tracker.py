@@ -1,14 +1,13 @@
 """Register scan after scan, and restart the odometry where its motion is not healthy."""
 
 import time
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field
 from statistics import median
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from adaptune.geometry import Poses, invert, rectify, rotation_angle, scale
@@ -206,22 +205,6 @@ class Guard:
 
 def _velocity(T_previous_current: Poses, seconds: float) -> Poses:
     return T_previous_current[:3, 3] / seconds
-
-
-def unhealthy(
-    check: HealthCheck,
-    T_previous_current: Poses,
-    stamps: NDArray[np.int64],
-    registered: NDArray[np.bool_],
-) -> dict[str, int]:
-    """How often a `Guard` finds each fault in a trajectory of n poses.
-
-    Motions are of shape (n - 1, 4, 4), stamps (nanoseconds) and registered of shape (n,).
-    """
-    guard = Guard(check)
-    elapsed = (np.diff(stamps) * 1e-9).tolist()
-    found = map(guard.check, T_previous_current, elapsed, registered[1:].tolist())
-    return dict(Counter(what for what in found if what is not None))
 
 
 WARM_UP = 2.0

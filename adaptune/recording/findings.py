@@ -72,7 +72,7 @@ _UNDECODED = {
 }
 _GAPS = {
     "points": "odometries lose track there; leave them out with `start`, `stop` or `cut`",
-    "reference": "scans in gaps beyond `max_gap` (1 s) are not labelled",
+    "reference": "scans in gaps beyond `max_gap` are not labelled",
 }
 
 

@@ -1,10 +1,12 @@
+from collections import Counter
+
 import numpy as np
 import pytest
 from pydantic import ValidationError
 from rooms import moved
 
 from adaptune.odometry import tracker
-from adaptune.odometry.tracker import Guard, HealthCheck, unhealthy
+from adaptune.odometry.tracker import Guard, HealthCheck
 
 
 class Cautious(HealthCheck):
@@ -12,6 +14,13 @@ class Cautious(HealthCheck):
 
 
 CHECK = Cautious(max_speed=10.0)
+
+
+def unhealthy(check, motions, stamps, registered):
+    """How often a guard finds each fault in a trajectory."""
+    guard, elapsed = Guard(check), (np.diff(stamps) * 1e-9).tolist()
+    found = map(guard.check, motions, elapsed, registered[1:].tolist())
+    return dict(Counter(what for what in found if what is not None))
 
 
 @pytest.mark.parametrize(
