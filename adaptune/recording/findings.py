@@ -242,9 +242,9 @@ def of_reference(
         yield Finding((), what, mend, of=of, lacks=lacks)
         return
     seconds = np.diff(reference.stamps) * 1e-9
-    if timed:
+    if timed and complete:  # between the parts of a sample, all may happen
         yield from sound(reference, begin)[1]
-    else:  # ten a second, as most LiDARs measure
+    elif not timed:  # ten a second, as most LiDARs measure
         numbered = Trajectory(reference.stamps * 10**8, reference.T_world_sensor)
         yield from (one._replace(seconds=None) for one in sound(numbered)[1])
     if complete and timed and (gaps := np.count_nonzero(seconds > reference.max_gap)):

@@ -402,6 +402,17 @@ def test_poses_between_the_parts_of_a_sample_are_no_claim(tmp_path):
 
 
 @pytest.mark.usefixtures("sampled")
+def test_a_robot_may_turn_back_between_the_parts_of_a_sample(tmp_path):
+    messages = []
+    for i in range(400):
+        t = START + i * 10**8
+        messages += [("/points", t, cloud(t)), ("/poses", t, pose(t, 10.0 * np.sin(0.08 * i)))]
+    inspection = inspect(rec.write_bag(tmp_path / "a.bag", messages))
+    assert inspection.n_read[0] < 200
+    assert texts(inspection) == []
+
+
+@pytest.mark.usefixtures("sampled")
 def test_bags_of_every_format_are_sampled(tmp_path):
     for bag in fuzz.bags(tmp_path, scans=60):
         inspection = inspect(bag)
