@@ -28,7 +28,7 @@ REFUSED = {
     ("one of two", "lockstep"): r"it gave poses for 1\d of \d\d scans, and .*\.play: bag: ",
 }
 TABLE = [(m, w) for m in MANNERS for w in WAYS if (m, w) != ("background", "command")]
-PATIENCE = {"late": 2.0, "own layout": 2.0, "one of two": 0.3}
+PATIENCE = {"late": 2.0, "own layout": 2.0, "one of two": 1.0}
 RANGES = [f"{name}: {{type: float, low: 1, high: 9, baseline: {v}}}" for name, v in VALUES.items()]
 PARAMETERS = f"odometry.parameters={{{', '.join(RANGES)}}}"
 
@@ -85,5 +85,6 @@ def test_a_manner(trials, polite, manner, way):
         assert re.match(words, found.faults[0]), found.faults
         return
     assert not found.faults
-    assert found.mean_error == pytest.approx(polite, rel=0.1)
+    # Who is late makes the first keyframe two scans later, in a recording of forty.
+    assert found.mean_error == pytest.approx(polite, rel=0.15 if manner == "late" else 0.1)
     assert manner != "late" or "first_pose" in found.usage
