@@ -548,7 +548,10 @@ def rows(archive: Archive, names: Sequence[str]) -> list[Row]:
         row: Row = {"trial": number} | {name: there[0].parameters.get(name) for name in parameters}
         errors = {name: t.mean_error if t else None for name, t in trials.items()}
         row |= {"mean": _mean(list(errors.values()))} | errors
-        row |= {"restarts": round(sum(t.restarts for t in there)), "faults": sum(t.faults for t in there)}
+        row |= {
+            "restarts": round(sum(t.restarts for t in there)),
+            "faults": sum(t.faults for t in there),
+        }
         for metric in metrics:
             if metric not in ("rte", REGISTER_MS, PREPARE_MS):
                 without = 0.0 if metric == FIRST_POSE else None
