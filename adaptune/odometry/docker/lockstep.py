@@ -78,6 +78,8 @@ class Lockstep(Faulting):
         self._shown = (0, -np.inf)  # stamp of the last scan, and when it was published
         self._looked = -np.inf
         self._patience = min(settings.patience, limits.seconds)
+        # Scans since the first pose after each start, and those that got a pose.
+        self._n_shown = self._n_answered = 0
 
     @property
     def ended(self) -> bool:
@@ -106,7 +108,6 @@ class Lockstep(Faulting):
         self._T_step = np.eye(4) if T_previous_current is None else np.array(T_previous_current)
         self._T_odom_own: Poses | None = None
         self._silent, self._stamp, self._poses = 0, prepared.stamp, []
-        self._n_shown = self._n_answered = 0  # since its first pose
         self._shown = (prepared.stamp, -np.inf)
         self._late: int | None = None
         self._steady = True  # whether all poses are as late as the first one
@@ -267,7 +268,7 @@ class Lockstep(Faulting):
             time.sleep(self._patience)
             found = self._pose(0.0)
         assert self._system is not None
-        if self._n_answered or found is not None:
+        if self._late is not None or found is not None:
             self._n_shown += 1
         if found is None:
             self._silent += 1
