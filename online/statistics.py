@@ -432,6 +432,6 @@ def oracle_row(judged: JudgedModes, oracle: OracleErrors, fixed: int) -> Compari
     if rte is None or fixed not in oracle.trials or not known.any():
         return None
     means = errors[known].mean(axis=0)
-    # Replays of the fixed set are made again, and trials count without warm-up.
+    # A trial leaves its warm-up out, and a replay does not: only the ratio carries over.
     ratio = float(means.min()) / max(float(means[oracle.trials.index(fixed)]), 1e-12)
     return ComparisonRow(judged.name, ORACLE, rte * ratio, ratio, yardstick=yardstick)
