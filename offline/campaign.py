@@ -13,8 +13,8 @@ from adaptune.errors import AdaptuneError
 from adaptune.progress import Progress, unseen
 from adaptune.space import ParameterSet, PooledSpace
 from adaptune.study.references import contradictions_of
-from offline.config import OfflineConfig, OfflineStudy
-from offline.objective import Verdict, allowed, judge, label, mean_value, weighted
+from offline.config import OfflineStudy
+from offline.objective import Verdict, label
 from offline.search import Clock, Search, rungs
 from offline.trial import SLOW
 from offline.workers import Pool, Task, TaskResult, run
@@ -176,27 +176,6 @@ def drive_whole(
     ]
     watch_tasks(archive, workers, tasks, "whole drives", progress)
     return read_whole_drives(archive, names, sets) if tasks else there
-
-
-def whole_values(config: OfflineConfig, drives: WholeDrives) -> dict[str, dict[int, float]]:
-    """By sequence, the objective of every candidate for the fixed set over whole recordings.
-
-    Candidates are driven along all of them. The objective of those that cannot be chosen, see
-    `allowed`, is infinite.
-    """
-    numbers = set.intersection(*map(set, drives.values()))
-    few = {n: judge(config, [of[n] for of in drives.values()]) for n in sorted(numbers)}
-    chosen = allowed({n: np.inf if v.failure else v.restarts for n, v in few.items()})
-    return {
-        name: {n: weighted(config.objective, of[n].metrics) if n in chosen else np.inf for n in few}
-        for name, of in drives.items()
-    }
-
-
-def mean_values(values: Sequence[Mapping[int, float]]) -> dict[int, float]:
-    """Mean over the sequences of the values of those trials that have one on each."""
-    numbers = set.intersection(*map(set, values)) if values else set()
-    return {n: float(mean_value(np.array([of[n] for of in values]))) for n in sorted(numbers)}
 
 
 class BaselineError(AdaptuneError):

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, lru_cache, partial
-from itertools import chain
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -38,18 +37,10 @@ from adaptune.recording.scan import stretch_numbers
 from adaptune.space import ParameterSets
 from adaptune.study.config import WORTH
 from adaptune.study.study import MIN_RECORDINGS, PER_STRETCH
-from offline.campaign import mean_values, read_whole_drives, whole_values
+from offline.campaign import read_whole_drives
+from offline.choice import PER_BLOCK, BlockErrors, choose, finalists
 from offline.config import OfflineStudyConfig
-from offline.objective import (
-    affordable,
-    allowed,
-    best_candidates,
-    choose_fixed,
-    margin,
-    mean_value,
-    repeated,
-    weighted,
-)
+from offline.objective import weighted
 
 if TYPE_CHECKING:
     from adaptune.model.knn import ScaledPCA
@@ -212,15 +203,16 @@ MARGIN_FRAMES = 2
 another frame may differ in its last bits, and a sub-trajectory then ends one frame later."""
 
 
-def stretches(simulation: BankSimulation, known: NDArray[np.intp]) -> NDArray[np.intp]:
+def stretches(
+    simulation: BankSimulation, known: NDArray[np.intp], n: float = PER_STRETCH
+) -> NDArray[np.intp]:
     """Number of each labelled frame's stretch along the reference, of shape (n,).
 
     `known` has the numbers of these frames. What is driven without interruption is cut into pieces
-    of `PER_STRETCH` sub-trajectories; the last one joins the one before if it is shorter than half
-    of that.
+    of `n` sub-trajectories; the last one joins the one before if it is shorter than half of that.
     """
     number = np.zeros(len(known), np.intp)
-    size, distance = PER_STRETCH * simulation.length, travelled(simulation.T_ref_sensor)
+    size, distance = n * simulation.length, travelled(simulation.T_ref_sensor)
     counted = np.cumsum(np.isnan(simulation.T_ref_counted[:, 0, 0]))[known]
     following = 0
     for drive in np.split(np.arange(len(known)), np.flatnonzero(np.diff(counted)) + 1):
@@ -231,6 +223,13 @@ def stretches(simulation: BankSimulation, known: NDArray[np.intp]) -> NDArray[np
         number[drive] = following + np.minimum((metres / size).astype(np.intp), n_pieces - 1)
         following += n_pieces
     return number
+
+
+def block_means(errors: NDArray[np.floating], block: NDArray[np.intp]) -> NDArray[np.float64]:
+    """Mean capped errors of shape (n_blocks, n_sets) from those at frames, by their blocks."""
+    _, first = np.unique(block, return_index=True)
+    sums = np.add.reduceat(cap(errors), first)
+    return np.asarray(sums / np.diff([*first, len(errors)])[:, None])
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,19 +247,20 @@ class LabelledSequence:
     blocks: Mapping[str, int]  # by name, in order, the lengths of the descriptors
     # By trial number (n, 3): errors of the best sets as vectors, see `adaptune.model.TrainingData`.
     vectors: Mapping[int, NDArray[np.float32]] = field(default_factory=dict)
-    # (n_sets,): the objective that chooses the fixed set; the mean capped error when left out.
+    # (n,): number of each frame's block, see `offline.choice`
+    blocks_of: NDArray[np.intp] = field(default_factory=lambda: np.empty(0, np.intp))
+    # (n_sets,): the objective that chooses the fixed set, unless it is the errors' mean.
     values: NDArray[np.float64] | None = None
-    # (n_sets, n_repeats): where trials are repeated, the objective of every run.
-    repeats: NDArray[np.float64] | None = None
     block: int = 1  # frames of a sub-trajectory
     elevation: float = np.nan  # degrees, see `adaptune.model.descriptor.lowest_elevation`
     # (n_sets,): how often the health check restarted each set, infinite if it failed
     restarts: NDArray[np.float64] | None = None
-    # By trial number, the objective of the finalists over the whole recording.
-    whole: Mapping[int, float] = field(default_factory=dict)
-    # By trial number (n,): their errors there, where the objective is that of the errors alone,
-    # and so is known on some frames, too; else None.
-    whole_errors: Mapping[int, NDArray[np.float64]] | None = None
+    # Of finalists by trial number, in drives of the whole recording: (n,), their errors;
+    whole: Mapping[int, NDArray[np.float64]] = field(default_factory=dict)
+    # (n_blocks,), their mean capped errors in blocks of all frames, or (1,), another objective; and
+    # how often each was restarted. None where some frames are left out.
+    whole_means: Mapping[int, NDArray[np.float64]] | None = None
+    whole_restarts: Mapping[int, float] = field(default_factory=dict)
 
     @cached_property
     def period(self) -> NDArray[np.int64]:
@@ -312,13 +312,24 @@ class LabelledSequence:
             errors=self.errors[kept],
             baseline=self.baseline[kept],
             vectors={trial: vectors[kept] for trial, vectors in self.vectors.items()},
+            blocks_of=self.blocks_of[kept],
         )
-        if self.whole_errors is None or not kept.any():
+        if self.values is not None:  # of some frames, it is not known
             return some
-        few = {n: errors[kept] for n, errors in self.whole_errors.items()}
-        whole = {n: float(np.nanmean(cap(errors))) for n, errors in few.items()}
-        # The objective is that of the frames that are left.
-        return replace(some, values=None, repeats=None, whole=whole, whole_errors=few)
+        few = {n: errors[kept] for n, errors in self.whole.items()}
+        return replace(some, whole=few, whole_means=None)
+
+    def in_blocks(self, whole: Sequence[int] = ()) -> NDArray[np.float64]:
+        """Mean capped errors in blocks, of shape (n_blocks, n_sets), or the objective, (1, n_sets).
+
+        Of all sets in their trials; or of those with the numbers `whole` in drives of all of it.
+        """
+        if whole and self.whole_means is not None:
+            return np.stack([self.whole_means[n] for n in whole], axis=1)
+        if self.values is not None:
+            return self.values[None]
+        errors = np.stack([self.whole[n] for n in whole], axis=1) if whole else self.errors
+        return block_means(errors, self.blocks_of)
 
     def part(self) -> "LabelledSequence":
         """The same with the part of the simulation that its frames take."""
@@ -347,7 +358,6 @@ class LabelledSequence:
             self,
             errors=self.errors[:, columns],
             values=None if self.values is None else self.values[columns],
-            repeats=None if self.repeats is None else self.repeats[columns],
             restarts=None if self.restarts is None else self.restarts[columns],
         )
 
@@ -412,52 +422,38 @@ class LabelledData(NamedTuple):
         cuts = np.concatenate([s.stretch for s in self.sequences])
         return stretch_numbers(np.repeat(np.arange(len(lengths)), lengths), cuts)
 
-    def bounds(self) -> dict[int, float]:
-        """The objective of every set in trials on these sequences, see `Verdict.bound`.
+    def blocks(self) -> BlockErrors:
+        """What the trials of all sets say."""
+        none = np.zeros(len(self.sets))
+        restarts = [none if s.restarts is None else s.restarts for s in self.sequences]
+        costs = np.array([self.costs.alone(trial) for trial in self.sets])
+        errors = [s.in_blocks() for s in self.sequences]
+        number = np.repeat(np.arange(len(errors)), [len(of) for of in errors])
+        of_all = np.concatenate(errors), number, costs, np.sum(restarts, axis=0)
+        return BlockErrors(list(self.sets), *of_all)
 
-        It is infinite for sets that may not be chosen, see `offline.objective.allowed`.
+    def whole_blocks(self, trials: Collection[int]) -> BlockErrors:
+        """What drives of whole recordings say, of those of some sets that have made them."""
+        known = [n for n in self.sets if n in trials and all(n in s.whole for s in self.sequences)]
+        if not known:
+            return self.blocks().some(list(trials))
+        errors = [s.in_blocks(known) for s in self.sequences]
+        number = np.repeat(np.arange(len(errors)), [len(of) for of in errors])
+        restarts = np.sum([[s.whole_restarts[n] for n in known] for s in self.sequences], axis=0)
+        of_known = np.array([self.costs.alone(n) for n in known]), restarts
+        return BlockErrors(known, np.concatenate(errors), number, *of_known)
+
+    def finalists(self) -> list[int]:
+        """Trials whose sets drive whole recordings, see `offline.choice.finalists`."""
+        return finalists(self.blocks(), self.budget)
+
+    def fixed(self, budget: float | None = None) -> int:
+        """Trial number of the fixed set within a budget, the study's by default.
+
+        It is chosen among the finalists, by their drives of whole recordings.
         """
-        values = [
-            mean_errors(s.errors, np.zeros(len(s.errors), np.intp))
-            if s.values is None
-            else s.values
-            for s in self.sequences
-        ]
-        repeats = [s.repeats for s in self.sequences if s.repeats is not None]
-        bounds = mean_value(np.stack(values, axis=-1))
-        if len(repeats) == len(values):
-            bounds = bounds + np.nan_to_num(margin(np.stack(repeats, axis=-2)))
-        restarts = np.zeros(len(self.sets))
-        for s in self.sequences:
-            restarts += 0.0 if s.restarts is None else s.restarts
-        chosen = allowed(dict(zip(self.sets, restarts.tolist(), strict=True)))
-        pairs = zip(self.sets, bounds.tolist(), strict=True)
-        return {n: bound if n in chosen else np.inf for n, bound in pairs}
-
-    def whole(self) -> dict[int, float]:
-        """The objective over whole recordings on these sequences, of finalists that have it."""
-        values = mean_values([s.whole for s in self.sequences])
-        return {n: value for n, value in values.items() if n in self.sets}
-
-    def fixed(self) -> int:
-        """Trial number of the fixed set: the best within the budget, see `best`."""
-        return self.best(self.within(np.inf if self.budget is None else self.budget))
-
-    def within(self, budget: float) -> list[int]:
-        """Trial numbers of the sets that alone cost no more milliseconds a scan; all if infinite.
-
-        Raises
-        ------
-        AdaptuneError
-            If there is none.
-        """
-        trials = list(self.sets)
-        return affordable(self.costs, trials, budget) if np.isfinite(budget) else trials
-
-    def best(self, trials: Collection[int]) -> int:
-        """Trial number of the best of some sets, see `offline.objective.choose_fixed`."""
-        bounds = {n: bound for n, bound in self.bounds().items() if n in trials}
-        return choose_fixed(bounds, self.whole())
+        budget = self.budget if budget is None else budget
+        return choose(self.whole_blocks(finalists(self.blocks(), budget)), budget)
 
     def training_data(self) -> tuple[TrainingData, "ScaledPCA"]:
         """What selection rules are fitted to, and the transformation of descriptors for them."""
@@ -546,30 +542,53 @@ def labelled_data(
             )
         one = _labelled(archive, name, set(counted), sets, config, window, recorded_in(name))
         read[name] = one
-    eligible = _eligible(list(read.values()), sets)
-    costs, budget = measured_costs(archive, run, sets, odometry), config.online.budget
-    of_trials = LabelledData(list(read.values()), sets, costs)
-    bounds = of_trials.bounds()
-    cheap = of_trials.within(np.inf if budget is None else budget)
-    finalists = best_candidates(bounds), best_candidates({n: bounds[n] for n in cheap})
-    rivals = list(dict.fromkeys([*chain(*finalists), *sets.defaults]))
-    drives = read_whole_drives(archive, list(run), rivals)
-    labelled = []
-    for name, whole in whole_values(config.offline, drives).items():
-        s = read[name]
-        T_ref_sensor, length = s.simulation.T_ref_counted, config.sub_trajectory
+    costs, online = measured_costs(archive, run, sets, odometry), config.online
+    live = odometry.description.live
+    return LabelledData(list(read.values()), sets, costs, online.budget, online.worth, live)
+
+
+def with_whole_drives(
+    data: LabelledData, archive: Archive, config: OfflineStudyConfig
+) -> LabelledData:
+    """The same with the drives of whole recordings that there are of finalists."""
+    names = [s.name for s in data.sequences]
+    drives = read_whole_drives(archive, names, [*data.finalists(), *data.sets.defaults])
+    known = set.intersection(*map(set, drives.values()))
+    sequences = []
+    for s in data.sequences:
+        trials = {n: archive.read(s.name, n, whole=True) for n in sorted(known)}
+        errors = np.stack([trial.errors for trial in trials.values()], axis=1)
+        if s.values is None:
+            frames = np.flatnonzero(~np.isnan(errors).any(axis=1))
+            everywhere = replace(s.simulation, T_ref_counted=s.simulation.T_ref_sensor)
+            means = block_means(errors[frames], stretches(everywhere, frames, PER_BLOCK))
+        else:
+            weights = config.offline.objective
+            means = np.array([[weighted(weights, drives[s.name][n].metrics) for n in trials]])
+        restarts = {n: drives[s.name][n].restarts for n in trials}
+        failed = {n: np.inf for n in trials if drives[s.name][n].failure}
+        sequences.append(
+            replace(
+                s,
+                whole=dict(zip(trials, errors[s.known].T, strict=True)),
+                whole_means=dict(zip(trials, means.T, strict=True)),
+                whole_restarts=restarts | failed,
+            )
+        )
+    return data._replace(sequences=sequences)
+
+
+def with_vectors(data: LabelledData, archive: Archive) -> LabelledData:
+    """The same with error vectors of the sets that may be members of a bank."""
+    eligible, sequences = _eligible(data.sequences, data.sets), []
+    for s in data.sequences:
+        T_ref_sensor, length = s.simulation.T_ref_counted, s.simulation.length
         vectors = {
-            trial: error_vectors(T_ref_sensor, archive.read(name, trial), length)[s.known]
-            for trial in eligible.intersection(run[name])
+            trial: error_vectors(T_ref_sensor, archive.read(s.name, trial), length)[s.known]
+            for trial in eligible.intersection(archive.finished(s.name))
         }
-        # Whether the objective on some frames follows from the errors there.
-        by_frames = set(config.offline.objective) == {"rte"}
-        errors_of = None
-        if by_frames:
-            errors_of = {n: archive.read(name, n, whole=True).errors[s.known] for n in whole}
-        labelled.append(replace(s, vectors=vectors, whole=whole, whole_errors=errors_of))
-    online, live = config.online, odometry.description.live
-    return LabelledData(labelled, sets, costs, online.budget, online.worth, live)
+        sequences.append(replace(s, vectors=vectors))
+    return data._replace(sequences=sequences)
 
 
 def _eligible(sequences: Sequence[LabelledSequence], sets: ParameterSets) -> set[int]:
@@ -602,15 +621,10 @@ def _labelled(
     # All trials know the same frames, but for those before an odometry's first pose.
     ran = np.column_stack([errors[:, ~np.isnan(errors).all(axis=0)], baseline])
     known = np.flatnonzero(~np.isnan(ran).any(axis=1))
-    objective, n_repeats = config.offline.objective, config.offline.repeats
+    objective = config.offline.objective
     summaries = [archive.finished(name)[trial] if trial in run else None for trial in sets]
     values = [weighted(objective, s.metrics) if s and not s.failure else np.inf for s in summaries]
     restarts = [np.inf if s is None or s.failure else float(s.restarts) for s in summaries]
-    # Of the baseline, there may be more runs.
-    repeats = [
-        [np.nan] * n_repeats if s is None else repeated(objective, s.repeats)[:n_repeats]
-        for s in summaries
-    ]
     read = cache(partial(archive.read, name))
 
     @lru_cache(maxsize=1)  # one bank after the other is asked for, each many times
@@ -637,8 +651,8 @@ def _labelled(
         errors[known],
         baseline[known],
         frames.blocks,
-        values=np.array(values),
-        repeats=np.array(repeats) if n_repeats > 1 else None,
+        blocks_of=stretches(simulation, known, PER_BLOCK),
+        values=None if set(objective) == {"rte"} else np.array(values),
         block=span(frames.counted, length),
         restarts=np.array(restarts),
         elevation=float(np.nanmedian(frames.elevations)),

@@ -14,17 +14,15 @@ Metrics of one parameter set on one sequence:
 The first four repeat on the same machine, the last two do not.
 """
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from adaptune.archive import Summary
-from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses
 from adaptune.metrics import absolute_error, kitti_error, relative_error
-from adaptune.model.rules import ROUNDING, Costs
 from adaptune.space import ParameterSet
 from offline.config import TIMED, Metric, OfflineConfig
 
@@ -38,25 +36,8 @@ UNITS: dict[Metric, str] = {
 }
 LARGEST_METRIC = 1e6
 """The largest value of a metric, also where it cannot be computed: sums stay finite."""
-CANDIDATES = 4
-"""So many sets, the best by their trials, are candidates for the fixed set beside the baseline."""
-EQUAL_WITHIN = 1.02
-"""Drives whose values differ by no larger factor count as equal."""
 PENALTY = 10.0
 """A set that is not usable has so many times the baseline's value at least: samplers keep away."""
-
-
-class NothingUsableError(AdaptuneError):
-    """No parameter set gives poses."""
-
-    exit_code = 1
-
-
-UNUSABLE = (
-    "odometry: none of {n} parameter sets gives poses for nearly all scans of every training "
-    "sequence, so none can be chosen (`adaptune trials` lists their faults): mend the odometry, or "
-    "narrow the ranges of the parameters (odometry.parameters)"
-)
 
 
 class Verdict(NamedTuple):
@@ -159,84 +140,6 @@ def sampler_results(verdicts: Sequence[Verdict]) -> list[SamplerResult]:
     return [
         SamplerResult(v.parameters, max(v.value, worst if v.failure else 0.0)) for v in verdicts
     ]
-
-
-def best_by_trials(verdicts: Mapping[int, Verdict]) -> int:
-    """Trial number of the first of `candidates`."""
-    return candidates(verdicts)[0]
-
-
-def candidates(
-    verdicts: Mapping[int, Verdict], affordable: Collection[int] | None = None
-) -> list[int]:
-    """Trial numbers of the finalists, the best by their trials first; of those that are affordable.
-
-    These are the `CANDIDATES` sets with the least objective of those that may be chosen, see
-    `allowed`, and the baseline if that may be. If trials are repeated, the upper end of the
-    confidence interval counts. Of equal sets, the first one comes first.
-
-    Raises
-    ------
-    NothingUsableError
-        If no set may be chosen.
-    """
-    complete = {n: verdict for n, verdict in verdicts.items() if verdict.complete}
-    chosen = allowed({n: np.inf if v.failure else v.restarts for n, v in complete.items()})
-    chosen &= chosen if affordable is None else set(affordable)
-    if not chosen:
-        raise NothingUsableError(UNUSABLE.format(n=len(verdicts)))
-    return best_candidates({n: verdicts[n].bound for n in complete if n in chosen})
-
-
-def best_candidates(bounds: Mapping[int, float]) -> list[int]:
-    """The `CANDIDATES` trials with the least values, the least first, and the baseline."""
-    finite = [n for n, bound in bounds.items() if np.isfinite(bound)]
-    best = sorted(finite, key=lambda n: bounds[n])[:CANDIDATES]
-    return best if 0 in best or 0 not in bounds else [*best, 0]
-
-
-def affordable(costs: Costs, trials: Sequence[int], budget: float) -> list[int]:
-    """The trials whose sets alone cost no more milliseconds of CPU time a scan.
-
-    Raises
-    ------
-    AdaptuneError
-        If there is none.
-    """
-    few = [n for n in trials if costs.alone(n) <= budget + ROUNDING]
-    if not few:
-        cheapest = min(trials, key=costs.alone)
-        raise AdaptuneError(
-            f"online.budget: {budget:g} ms of CPU time a scan is less than the cheapest of "
-            f"{len(trials)} parameter sets takes, {costs.alone(cheapest):.1f} ms (trial "
-            f"{cheapest}); allow more, or add cheaper sets (a coarser downsampling, fewer "
-            f"iterations, another odometry)"
-        )
-    return few
-
-
-def allowed(restarts: Mapping[int, float]) -> set[int]:
-    """The trials that may be chosen, by how often each was restarted; infinite if it failed.
-
-    None of them needs the health check more often than the baseline, which is trial 0, on the same
-    ways: who takes its parameters elsewhere has no health check.
-    """
-    most = restarts.get(0, np.inf)
-    return {n for n, times in restarts.items() if np.isfinite(times) and times <= most}
-
-
-def choose_fixed(bounds: Mapping[int, float], whole: Mapping[int, float]) -> int:
-    """Trial number of the fixed set, by trials and by drives of whole recordings.
-
-    `bounds` has by trial number the objective in trials, see `Verdict.bound`, and `whole` that over
-    whole recordings, infinite for sets that may not be chosen. The finalists, see
-    `best_candidates`, are compared by the latter; one that has none by its trials. Of finalists
-    that are nearly as good, the one with the best trials is chosen: the best of a few drives owes
-    something to chance.
-    """
-    values = {n: whole.get(n, bounds[n]) for n in best_candidates(bounds)}
-    most = EQUAL_WITHIN * min(values.values())
-    return min((n for n, value in values.items() if value <= most), key=lambda n: bounds[n])
 
 
 def label(weights: Mapping[Metric, float], units: bool = False) -> str:

@@ -14,7 +14,7 @@ from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
 from adaptune.metrics import cap, lost_in_words
 from adaptune.model import ErrorModel, ModelError
-from adaptune.model.rules import complementary, mean_errors
+from adaptune.model.rules import BASELINE, complementary, mean_errors
 from adaptune.odometry.registry import ODOMETRIES, PROGRAMS
 from adaptune.processes import available
 from adaptune.progress import Progress, unseen
@@ -29,28 +29,22 @@ from adaptune.study.references import (
     estimates_in_words,
     estimates_of,
 )
-from adaptune.study.study import FIXED_SET, OracleErrors, StudySequences, oracle_errors
+from adaptune.study.study import BANK, FIXED_SET, OracleErrors, StudySequences, oracle_errors
 from offline.campaign import (
     Campaign,
     WholeDrives,
     drive_whole,
-    mean_values,
     run_baseline,
     trial_tasks,
     watch_tasks,
-    whole_values,
 )
+from offline.choice import BlockErrors, front, left_out_ratio, mean_and_error, ratio_to_baseline
+from offline.choice import choose as choose_fixed
 from offline.config import OfflineConfig, OfflineStudy
-from offline.labelled import LabelledData, labelled_data, measured_costs
+from offline.labelled import LabelledData, labelled_data, with_vectors, with_whole_drives
 from offline.objective import (
-    UNUSABLE,
-    NothingUsableError,
     Verdict,
-    affordable,
     baseline_words,
-    best_by_trials,
-    candidates,
-    choose_fixed,
     failed_in_words,
     judge,
     label,
@@ -75,25 +69,29 @@ class Training(NamedTuple):
     rows: list[dict[str, Any]]
     said: Sequence[str] = ()  # further sentences
 
+    # What error costs, a row for each choice, that which is recommended first.
+    front: Sequence[dict[str, Any]] = ()
+
     @property
     def words(self) -> list[str]:
         """What the fixed set is, and what it gains in training."""
+        sets, fixed, n = self.model.sets, self.model.fixed, len(self.rows)
         own, of_fixed = (
-            sum(row[f"{mode}, whole"] for row in self.rows) / len(self.rows)
-            for mode in ("baseline", "fixed")
+            sum(row[f"{mode}, whole"] for row in self.rows) / n for mode in ("baseline", "fixed")
         )
-        sets, fixed, costs, n = self.model.sets, self.model.fixed, self.model.costs, len(self.rows)
+        costs, where = self.model.costs, f"in training ({n} sequence{'s' if n > 1 else ''})"
+        at_own, at = (
+            "" if costs is None else f" at {costs.alone(trial):.1f} ms of CPU time a scan"
+            for trial in (0, fixed)
+        )
         baseline = f"Parameters of the baseline: {in_words(sets.space.baseline)}"
-        where = f"in training ({n} sequence{'s' if n > 1 else ''})"
         if fixed == 0:
-            beaten = f"No set clearly beat the baseline's {own:.3f} % {where}"
-            return [*self.said, f"{beaten}; the fixed set is the baseline.", baseline]
-        ms = np.nan if costs is None else costs.alone(fixed)
-        cost = f"; it costs {ms:.1f} ms of CPU time a scan" if np.isfinite(ms) else ""
+            least = f"No set that costs no more surely beat the baseline's {own:.3f} %{at_own} "
+            return [f"{least}{where}; the fixed set is the baseline.", *self.said, baseline]
         return [
+            f"Fixed: {of_fixed:.3f} %{at} against the baseline's {own:.3f} %{at_own} {where}.",
             *self.said,
-            f"Fixed: {of_fixed:.3f} % against the baseline's {own:.3f} % {where}.",
-            f"Parameters of the fixed set: {in_words(sets[fixed])}{cost}",
+            f"Parameters of the fixed set: {in_words(sets[fixed])}",
             baseline,
         ]
 
@@ -122,17 +120,22 @@ def train(study: OfflineStudy, progress: Progress = unseen, cluster: str | None 
             for name in names
         }
         tried = tuple(verdict.parameters for verdict in verdicts.values())
-        every_set, affordable_ones = ParameterSets(space, tuple(verdicts), tried), list(verdicts)
-        if (budget := study.config.online.budget) is not None:
-            costs = measured_costs(archive, finished, every_set, study.odometry)
-            affordable_ones = affordable(costs, affordable_ones, budget)
-        best = candidates(verdicts, affordable_ones)
-        # Rivals may cost more.
-        rivals = {*candidates(verdicts), *every_set.defaults}
-        sets = {n: verdicts[n].parameters for n in sorted({0, *best, *rivals})}
-        whole = drive_whole(names, sets, archive, workers, progress)
-    fixed = _fixed(config, verdicts, best, whole)
-    model = _fitted(study, archive, every_set, finished, fixed)
+        every_set = ParameterSets(space, tuple(verdicts), tried)
+        data = labelled_data(
+            archive,
+            finished,
+            every_set,
+            study.config,
+            study.window,
+            study.sequences.recorded_in,
+            study.odometry,
+        )
+        of_all = data.complete()
+        sets = {n: verdicts[n].parameters for n in {*of_all.finalists(), *every_set.defaults}}
+        whole = drive_whole(names, dict(sorted(sets.items())), archive, workers, progress)
+    of_all = with_whole_drives(of_all, archive, study.config)
+    fixed = of_all.fixed()
+    model = _fitted(study, data, with_vectors(of_all, archive), finished, fixed)
     write_fixed(study, verdicts[fixed].parameters)
     trials = _trial_rows(config, space, verdicts, finished)
     tables.write_rows(study.folder, "trials", trials)
@@ -147,9 +150,69 @@ def train(study: OfflineStudy, progress: Progress = unseen, cluster: str | None 
         lambda worst: hard_to_track(study.sequences.open(worst)),
     )
     said += estimates_in_words(estimates, model.length)
+    said += left_out_in_words(of_all)
     said += failed_in_words(verdicts)
     said += baseline_words(config, [runs[0] for runs in finished.values()])
-    return Training(model, trials, rows, said)
+    rows_of_front = front_rows(of_all, model)
+    tables.write_rows(study.folder, "front", rows_of_front)
+    return Training(model, trials, rows, said, rows_of_front)
+
+
+MOST_ROWS = 5
+"""Rows of the front, the baseline's included."""
+
+
+def front_rows(data: LabelledData, model: ErrorModel) -> list[dict[str, Any]]:
+    """Error over cost: the fixed set, the baseline, what costs more and errs less, and the bank.
+
+    Errors are those of drives of whole recordings in training, with intervals of 95 % of their
+    ratio to the baseline's.
+    """
+    blocks = data.whole_blocks(data.finalists())
+    rows = []
+    others = [trial for trial in front(blocks) if trial not in (model.fixed, BASELINE)]
+    for trial in list(dict.fromkeys([model.fixed, BASELINE, *others]))[: MOST_ROWS - 1]:
+        what = "baseline" if trial == BASELINE else f"trial {trial}"
+        ratio = ratio_to_baseline(blocks, trial)
+        rows.append(_front_row(what, data.costs.alone(trial), blocks, ratio))
+        rows[-1]["parameters"] = in_words(data.sets[trial])
+    if of_bank := model.expected.get(BANK):
+        members = [trial for trial in model.bank if trial not in model.reserve]
+        by = (of_bank["geometric"], of_bank["low"], of_bank["high"])
+        value, low, high = np.multiply(ratio_to_baseline(blocks, model.fixed), by).tolist()
+        what, cost = f"bank of {len(members)}", data.costs.adaptive(members)
+        rows.append(_front_row(what, cost, blocks, (value, low, high)))
+        rows[-1]["parameters"] = f"trials {', '.join(map(str, members))}"
+    rows[0]["recommended"] = True
+    return [rows[0], *sorted(rows[1:], key=lambda row: row[COST])]
+
+
+def _front_row(
+    what: str, cost: float, blocks: BlockErrors, ratio: tuple[float, float, float]
+) -> dict[str, Any]:
+    base = float(mean_and_error(blocks.errors, blocks.sequence)[0][blocks.baseline])
+    value, low, high = ratio
+    return {
+        "what": what,
+        COST: cost,
+        "error [%]": base * value,
+        "vs baseline": value,
+        "low": low,
+        "high": high,
+        "recommended": False,
+    }
+
+
+def left_out_in_words(data: LabelledData) -> list[str]:
+    """What to expect elsewhere of a set that is chosen as the fixed one is."""
+    found = left_out_ratio(data.blocks(), lambda blocks: choose_fixed(blocks, data.budget))
+    if found is None:
+        return ["There is too little to tell how the fixed set does where it was not chosen."]
+    ratio, low, high = found
+    return [
+        f"Where they were not chosen, sets chosen so have {ratio:.2f} times the baseline's error "
+        f"in these recordings (95 % interval {low:.2f}-{high:.2f})."
+    ]
 
 
 def _ready_archive(study: OfflineStudy, progress: Progress) -> Archive:
@@ -188,16 +251,6 @@ def write_fixed(study: OfflineStudy, fixed: ParameterSet) -> None:
         write_text(own[0], own[1].text)
 
 
-def _fixed(
-    config: OfflineConfig, verdicts: Mapping[int, Verdict], best: Sequence[int], whole: WholeDrives
-) -> int:
-    """Trial number of the fixed set, one of the best."""
-    values = mean_values(list(whole_values(config, whole).values()))
-    if np.isinf(min(values[n] for n in best)):
-        raise NothingUsableError(UNUSABLE.format(n=f"the {len(best)} best"))
-    return choose_fixed({n: verdicts[n].bound for n in best}, values)
-
-
 def trial_workers(
     study: OfflineStudy, names: Sequence[str], cluster: str | None
 ) -> Cluster | Workers:
@@ -212,7 +265,7 @@ def trial_workers(
 
 
 def _fitted(
-    study: OfflineStudy, archive: Archive, sets: ParameterSets, finished: Finished, fixed: int
+    study: OfflineStudy, data: LabelledData, complete: LabelledData, finished: Finished, fixed: int
 ) -> ErrorModel:
     """The study's error model: the one before, if that was fitted to just this, or fitted now."""
     config, inputs = study.config, study.model_inputs
@@ -238,18 +291,9 @@ def _fitted(
     if before is not None and before.provenance == provenance:
         manifest.record(study.model_inputs_path, inputs)
         return before
-    data = labelled_data(
-        archive,
-        finished,
-        sets,
-        config,
-        study.window,
-        study.sequences.recorded_in,
-        study.odometry,
-    )
     identity, length = study.odometry.identity, config.sub_trajectory
     model = fit(data, fixed, identity, length, study.window, provenance)
-    model = tuned(model, data, config.online.switching)
+    model = tuned(model, complete, config.online.switching)
     model.save(study.model_path)
     manifest.record(study.model_inputs_path, inputs)
     return model
@@ -291,10 +335,11 @@ def _training_rows(
     reference_errors: Mapping[str, float],
     space: ParameterSpace,
 ) -> list[dict[str, Any]]:
-    """A row for every training sequence; its own best set is found as the fixed one is."""
+    """A row for every training sequence, with the set that has the least error there."""
     rows = []
     for name, runs in finished.items():
-        best = best_by_trials({n: judge(config, [run]) for n, run in runs.items()})
+        usable = {n: v.value for n, run in runs.items() if not (v := judge(config, [run])).failure}
+        best = min(usable, key=usable.__getitem__)
         error = reference_errors.get(name)
         row = {
             "sequence": name,
@@ -349,9 +394,8 @@ def fit(
     )
 
 
-def tuned(model: ErrorModel, data: LabelledData, switching: SwitchingConfig) -> ErrorModel:
+def tuned(model: ErrorModel, complete: LabelledData, switching: SwitchingConfig) -> ErrorModel:
     """Choose what is driven: the rule's settings, the bank and those of its weights."""
-    complete = data.complete()
     chosen = choose(complete, switching.size, fixed=model.fixed)
     members = chosen.members or [model.fixed]
     besides = reserve(members, complete)

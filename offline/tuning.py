@@ -22,7 +22,6 @@ from adaptune.model.weights import (
     choose_members,
     smooth_weights,
 )
-from adaptune.study.config import MOST_MEMBERS
 from adaptune.study.study import (
     BANK,
     BEST_DEFAULT,
@@ -31,6 +30,7 @@ from adaptune.study.study import (
     ONE_SET,
     is_worth,
 )
+from offline.choice import choose as choose_fixed
 from offline.labelled import LabelledData, LabelledSequence, periods
 
 if TYPE_CHECKING:
@@ -235,10 +235,13 @@ def least_loss(
 ) -> Policy:
     """The settings with the least loss, of one set at a time and of a bank.
 
-    `logs` is of shape (n_stretches, n_single + len(banks) * len(BANK_SETTINGS)); its first
-    `n_single` columns are about one set at a time. `banks` has the members of each, `worth` the
-    share of the error that a bank has to spare.
+    `logs` is of shape (n_stretches, n_single + len(banks) * (len(BANK_SETTINGS) + 1)); its first
+    `n_single` columns are about one set at a time, its last ones about the best set at the cost of
+    each bank. `banks` has the members of each, `worth` the share of the error that a bank has to
+    spare of what such a set has.
     """
+    n_rivals = len(banks)
+    logs, of_rivals = logs[:, : logs.shape[1] - n_rivals], logs[:, logs.shape[1] - n_rivals :]
     losses = np.array([expected_loss(column, recordings) for column in logs.T])
     losses[~(np.abs(losses) > ROUNDING)] = 0.0
     expected: dict[str, Figures] = {}
@@ -253,7 +256,9 @@ def least_loss(
         expected[BANK] = figures(logs[:, best], recordings)
         way, which = divmod(best - n_single, len(BANK_SETTINGS))
         members = banks[way]
-        spares = is_worth(expected[BANK].geometric, expected[BANK].high, worth)
+        rival = figures(logs[:, best] - of_rivals[:, way], recordings)
+        of_both = rival, expected[BANK]
+        spares = all(is_worth(one.geometric, one.high, worth) for one in of_both)
         if spares and losses[best] < min(0.0, losses[:n_single].min(initial=0.0)):
             bank = BANK_SETTINGS[which]
     return Policy(one_set, bank, members, expected)
@@ -264,11 +269,7 @@ def _choosers(bank: int, spending: Spending | None) -> list[Chooser]:
     if bank < 2:
         return []
     ways = (cancelling_members, complementary_members)
-    if spending is None:
-        return [partial(way, size=bank) for way in ways]
-    # A budget may be spent on more members, or on dearer ones.
-    sizes = dict.fromkeys((bank, MOST_MEMBERS))
-    return [partial(way, size=size, spending=spending) for way in ways for size in sizes]
+    return [partial(way, size=bank, spending=spending) for way in ways]
 
 
 def _logs(
@@ -280,7 +281,8 @@ def _logs(
     """Logarithms of ratios to the fixed set's error, on a fold.
 
     Returns shape (n_stretches, n_ways): first those of one set at a time with each of
-    `PAIRED_SETTINGS`, then those of each bank with each of `BANK_SETTINGS`.
+    `PAIRED_SETTINGS`, then those of each bank with each of `BANK_SETTINGS`, then those of the best
+    set that costs no more than each bank.
     """
     fitted = data, pca = others.training_data()
     fixed = cap(left_out.errors[:, data.sets.column(data.fixed)])
@@ -288,8 +290,12 @@ def _logs(
     if one_set:
         columns += list(_paired_errors(left_out, data, pca))
     known: dict[tuple[int, ...], list[NDArray[np.float64]]] = {}
+    of_rivals = []
     for make in choosers:
         found = make(others, data.fixed)
+        cost = others.costs.adaptive(found)
+        rival = others.fixed(cost) if np.isfinite(cost) else data.fixed
+        of_rivals.append(cap(left_out.errors[:, data.sets.column(rival)]))
         # Whatever the order of the others is, they are the same bank.
         members = (*found[:1], *sorted(found[1:]))
         if members not in known and len(members) < 2:
@@ -300,6 +306,7 @@ def _logs(
         columns += known[members]
     if not columns:
         return np.empty((len(np.unique(left_out.stretch)), 0))
+    columns += of_rivals
     return np.stack([log_ratios(e, fixed, left_out.stretch) for e in columns], axis=1)
 
 
@@ -428,10 +435,8 @@ def rivals(data: LabelledData, cost: float) -> dict[str, int]:
     `cost` is in milliseconds of CPU time a scan of what is driven; NaN if it is unknown.
     """
     found = {}
-    bounds = data.bounds()
-    defaults = [trial for trial in data.sets.defaults if np.isfinite(bounds[trial])]
-    if len(data.sets.space.baselines) > 1 and defaults:
-        found[BEST_DEFAULT] = data.best(defaults)
+    if len(data.sets.space.baselines) > 1:
+        found[BEST_DEFAULT] = choose_fixed(data.whole_blocks(data.sets.defaults), np.inf)
     if np.isfinite(cost):
-        found[EQUAL_COST] = data.best(data.within(cost))
+        found[EQUAL_COST] = data.fixed(cost)
     return found

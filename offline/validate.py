@@ -33,7 +33,14 @@ from adaptune.study.study import (
 )
 from offline.charts import stretch_chart
 from offline.config import OfflineStudy
-from offline.labelled import LabelledData, LabelledSequence, labelled_data, periods
+from offline.labelled import (
+    LabelledData,
+    LabelledSequence,
+    labelled_data,
+    periods,
+    with_vectors,
+    with_whole_drives,
+)
 from offline.tuning import (
     MOST_FOLDS,
     Figures,
@@ -343,15 +350,12 @@ def _labelled(study: OfflineStudy, model: ErrorModel) -> LabelledData:
     """The labelled data set of the sets that were run on all training sequences."""
     complete = np.flatnonzero(~np.isnan(model.errors).any(axis=0))
     sets = model.sets.subset([model.sets.trials[column] for column in complete])
-    return labelled_data(
-        Archive(study.folder / "trials"),
-        {name: list(sets) for name in model.sequences},
-        sets,
-        study.config,
-        study.window,
-        study.sequences.recorded_in,
-        study.odometry,
+    archive = Archive(study.folder / "trials")
+    run, recorded_in = {name: list(sets) for name in model.sequences}, study.sequences.recorded_in
+    data = labelled_data(
+        archive, run, sets, study.config, study.window, recorded_in, study.odometry
     ).complete()
+    return with_vectors(with_whole_drives(data, archive, study.config), archive)
 
 
 def _rows(validation: Validation) -> list[dict[str, Any]]:

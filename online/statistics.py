@@ -206,11 +206,11 @@ class Reference(NamedTuple):
         return 1 if self.trajectory is None else span(self.trajectory.T_world_sensor, self.length)
 
     def errors(self, odometry: Trajectory) -> NDArray[np.float64]:
-        """Sub-trajectory RTE at every frame in percent, NaN where it is unknown."""
+        """Capped sub-trajectory RTE at every frame in percent, NaN where it is unknown."""
         if self.trajectory is None:
             return np.full(len(odometry), np.nan)
         T_ref_sensor = self.trajectory.at(odometry.stamps)
-        return sub_trajectory_rte(T_ref_sensor, odometry.T_world_sensor, self.length)
+        return cap(sub_trajectory_rte(T_ref_sensor, odometry.T_world_sensor, self.length))
 
     def errors_around(self, odometry: Trajectory) -> NDArray[np.float64]:
         """Mean RTE in percent of the sub-trajectories through each pose; NaN without any."""

@@ -159,22 +159,32 @@ def _judged(rows: Sequence[ComparisonRow]) -> dict[str, ComparisonRow]:
 
 
 def decided(rows: Sequence[ComparisonRow], worth: float = WORTH) -> ComparisonRow | None:
-    """What to drive: the one set with the least error, or what is worth its cost.
+    """What to drive: the fixed set, unless another one is surely better, or what is worth its cost.
 
-    The rows over all sequences come last. None if no test sequence has a reference. `worth` is the
-    share of the error that adapting has to spare.
+    Adapting has to spare the share `worth` of the error, and to beat the best set that costs as
+    much. The rows over all sequences come last. None if no test sequence has a reference.
     """
     last = _judged(rows)
     if not last:
         return None
-    one = min((last[m] for m in _ONE_SET if m in last), key=lambda row: _ratio(row).value)
+    one = next(last[mode] for mode in ("fixed", "baseline") if mode in last)
+    for mode in _ONE_SET:
+        if mode in last and _surely_better(last[mode], one):
+            one = last[mode]
     candidates = [one]
-    for mode in ("adaptive", "untrained", EQUAL_COST):
+    for mode in ("adaptive", "untrained"):
         if (row := last.get(mode)) is not None:
-            ratio = _to(row, one)
-            if ratio.interval is not None and is_worth(ratio.value, ratio.interval[1], worth):
-                candidates.append(row)
+            ratio, rival = _to(row, one), last.get(EQUAL_COST)
+            beats = rival is None or _surely_better(row, rival)
+            spares = ratio.interval is not None and is_worth(ratio.value, ratio.interval[1], worth)
+            candidates += [row] if spares and beats else []
     return min(candidates, key=lambda row: _ratio(row).value)
+
+
+def _surely_better(row: ComparisonRow, other: ComparisonRow) -> bool:
+    """Whether a mode has less error, by more than chance where that is known."""
+    ratio = _to(row, other)
+    return ratio.value < 1.0 and (ratio.interval is None or ratio.interval[1] < 1.0)
 
 
 def _to(row: ComparisonRow, one: ComparisonRow) -> Ratio:

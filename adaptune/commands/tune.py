@@ -212,6 +212,8 @@ DISTORTED = {"gicp", "vgicp", "ndt"}
 UNEVEN = 0.2
 """By how much the share of the path may differ from that of the duration, before the split goes by
 the path."""
+LEAST_SPEED = 2.0
+"""Metres a second below which no step is called impossible."""
 LEAST_PATH = 2.0
 """Metres that the part for the test has to hold."""
 Trials = Annotated[
@@ -219,6 +221,14 @@ Trials = Annotated[
 ]
 Minutes = Annotated[
     float | None, typer.Option(help="Time for trying them; without, all are tried.", min=0.01)
+]
+Budget = Annotated[
+    float | None,
+    typer.Option(
+        help="Milliseconds of CPU time a scan that may be spent.",
+        min=1e-3,
+        show_default="what the odometry's own parameters take",
+    ),
 ]
 Given = Annotated[
     str | None,
@@ -248,6 +258,7 @@ def tune(
     reference: Given = None,
     trials: Trials = None,
     minutes: Minutes = None,
+    budget: Budget = None,
     folder: Annotated[
         Path | None,
         typer.Option(help="The study's folder.", show_default="the first bag's name, under runs/"),
@@ -271,7 +282,8 @@ def tune(
     made_by = _made_by(recordings, odometry, points, reference)
     overrides: list[str] = []
     if not path.exists():
-        text = _decided(recordings, odometry, (points, reference), (trials, minutes), folder)
+        limits = _limits(trials, minutes), budget
+        text = _decided(recordings, odometry, (points, reference), limits, folder)
         _write(path, made_by + text)
     elif not path.read_text("utf-8").startswith(made_by):
         raise AdaptuneError(
@@ -280,6 +292,7 @@ def tune(
         )
     else:
         overrides = [f"offline.{key}={value}" for key, value in _limits(trials, minutes).items()]
+        overrides += [] if budget is None else [f"online.budget={budget:g}"]
     from offline.train import train
 
     loaded = load(path, overrides, folder, runs=True)
@@ -288,6 +301,7 @@ def tune(
         training = train(loaded, show)
     replay_missing(loaded)
     compared(loaded, details=details)
+    show_front(training)
     say_odometries(loaded, training)
     say_next("replays to look at in Foxglove", "record", folder)
 
@@ -331,7 +345,7 @@ def _decided(
     recordings: Sequence[Path],
     odometry: str,
     topics: tuple[str | None, str | None],
-    budget: tuple[int | None, float | None],
+    limits: tuple[dict[str, str], float | None],
     folder: Path,
 ) -> str:
     """The study of some recordings as YAML, with comments; nothing is written but references."""
@@ -352,21 +366,21 @@ def _decided(
         named[next(name for name in names if name not in named)] = one
     odometries = odometries_of(odometry, all("imu" in one.given for one in found))
     _undo_motion(found, odometries)
-    trials, minutes = budget
-    if trials is None and minutes is None:
-        trials = max(TRIALS, EACH * len(odometries))
-    limits = ", ".join(f"{key}: {value}" for key, value in _limits(trials, minutes).items())
+    search, budget = limits
+    search = search or {"trials": str(max(TRIALS, EACH * len(odometries)))}
+    tried = ", ".join(f"{key}: {value}" for key, value in search.items())
+    spent = "" if budget is None else f", budget: {budget:g}"
 
-    def study(length: str, share: float | None = None) -> str:
+    def study(length: str, share: float | None = None, health: str = "") -> str:
         from adaptune import files
 
         recorded = files.dump({"sequences": {name: one.given for name, one in named.items()}})
         return (
             f"# Every command works with this file; change what you like.\n\n{recorded}\n"
             f"# The part for the test is not trained on.\n"
-            f"{roles(list(named), length, odometries, share)}"
-            f"offline: {{{limits}}}    # parameter sets to try, or the time for it\n"
-            "online: {modes: [adaptive]}\n"
+            f"{roles(list(named), length, odometries, share)}{health}"
+            f"offline: {{{tried}}}    # parameter sets to try, or the time for it\n"
+            f"online: {{modes: [adaptive]{spent}}}\n"
         )
 
     if reference is None:
@@ -526,16 +540,18 @@ def _loaded(text: str, folder: Path) -> "OfflineStudy":
             raise AdaptuneError(told.replace(f"{temporary}/", "")) from error
 
 
-def _split(study: "OfflineStudy", whole: Sequence[str]) -> tuple[str, float]:
+def _split(study: "OfflineStudy", whole: Sequence[str]) -> tuple[str, float, str]:
     """Metres of the sub-trajectories by which a study should judge.
 
-    And the share of a single recording to train on. A reference that is lacking is estimated: it
-    tells how far the robot has moved. `whole` has the names of the recordings.
+    And the share of a single recording to train on, and what the health check is to know. A
+    reference that is lacking is estimated: it tells how far the robot has moved. `whole` has the
+    names of the recordings.
     """
-    from adaptune.reference.check import path_after, proposed_sub_trajectory
+    from adaptune.reference.check import greatest_speed, path_after, proposed_sub_trajectory
     from adaptune.trajectory import read_trajectory
 
     sequences = study.sequences
+    known = [one for name in whole if (one := sequences.open(name).reference()) is not None]
     reference = sequences.open(whole[-1]).reference()
     if reference is None:
         _estimate(study, whole[-1:])
@@ -550,7 +566,9 @@ def _split(study: "OfflineStudy", whole: Sequence[str]) -> tuple[str, float]:
         )
     length = proposed_sub_trajectory(reference, training=share)
     words = f"{length}    # metres over which errors are measured; the test moves {metres:.0f} m"
-    return words, share
+    speed = max(LEAST_SPEED, 2.0 * max(map(greatest_speed, [*known, reference])))
+    health = f"health: {{max_speed: {speed:.0f}}}    # m/s: twice the speed of the fastest second\n"
+    return words, share, health
 
 
 def _share(reference: "Trajectory") -> float:
@@ -581,6 +599,27 @@ def _estimate(study: "OfflineStudy", names: Sequence[str]) -> None:
         if not there:
             shutil.rmtree(study.folder)
         raise AdaptuneError(f"{error}; or give a --reference") from error
+
+
+def show_front(training: "Training") -> None:
+    """What CPU time buys: the table of the front."""
+    rows = [
+        {
+            "": ("-> " if row["recommended"] else "") + row["what"],
+            "cost [ms]": row["cost [ms]"],
+            "RTE [%]": row["error [%]"],
+            "vs baseline": row["vs baseline"],
+            "95 %": None if row["low"] != row["low"] else f"{row['low']:.2f}-{row['high']:.2f}",
+            "parameters": row["parameters"],
+        }
+        for row in training.front
+    ]
+    show_table(
+        "What CPU time buys, in training",
+        rows,
+        "The arrow marks what is recommended: the best of what costs no more than the baseline, or "
+        "than `--budget`, in milliseconds of CPU time a scan.",
+    )
 
 
 def say_odometries(study: "OfflineStudy", training: "Training") -> None:

@@ -629,6 +629,13 @@ def path_after(reference: Trajectory, training: float) -> tuple[float, float]:
     return float(travelled(reference.T_world_sensor[after])[-1]), seconds
 
 
+def greatest_speed(reference: Trajectory) -> float:
+    """Metres that a reference moves in its fastest second."""
+    stamps = np.arange(reference.stamps[0], reference.stamps[-1], 10**9)
+    metres = np.linalg.norm(np.diff(reference.at(stamps)[:, :3, 3], axis=0), axis=1)
+    return float(np.nan_to_num(metres).max(initial=0.0))
+
+
 def proposed_sub_trajectory(
     reference: Trajectory, measured: MeasuredReference | None = None, training: float = TRAINING
 ) -> float:

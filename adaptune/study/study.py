@@ -41,7 +41,6 @@ from adaptune.simulation.course import Course
 from adaptune.space import ODOMETRY, ParameterSet, ParameterSpace
 from adaptune.strict import ConfigurationError
 from adaptune.study.config import (
-    MOST_MEMBERS,
     OdometryConfig,
     OnlineConfig,
     StudyConfig,
@@ -320,8 +319,7 @@ class Study(Generic[C_co]):
             return None
         if switching.mechanism != "auto":
             return switching.mechanism
-        instances = switching.size if self.config.online.budget is None else MOST_MEMBERS
-        if available() > 1 and instances * self.config.isolation.memory <= BANK_MEMORY:
+        if available() > 1 and switching.size * self.config.isolation.memory <= BANK_MEMORY:
             return "bank"
         return "live" if described.live else None
 
