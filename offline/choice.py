@@ -78,7 +78,8 @@ def mean_and_error(
     mean, n = weights @ values, len(values)
     if n < 2:
         return mean, np.full(values.shape[1], np.inf)
-    squares = weights[:, None] ** 2 * (values - mean) ** 2
+    with np.errstate(invalid="ignore"):  # a set that failed may have an infinite objective
+        squares = weights[:, None] ** 2 * (values - mean) ** 2
     return mean, np.sqrt(squares.sum(axis=0) * n / (n - 1))
 
 
@@ -89,7 +90,8 @@ def surely_worse(blocks: BlockErrors) -> NDArray[np.bool_]:
     """
     from scipy import stats  # slow to import
 
-    more = blocks.errors - blocks.errors[:, [blocks.baseline]]
+    with np.errstate(invalid="ignore"):
+        more = blocks.errors - blocks.errors[:, [blocks.baseline]]
     worse = np.zeros(len(blocks.trials), bool)
     every = np.ones(len(more), bool)
     for of in [every, *(blocks.sequence == s for s in np.unique(blocks.sequence))]:
@@ -187,8 +189,10 @@ def finalists(blocks: BlockErrors, budget: float | None = None) -> list[int]:
     order = [k for k in np.argsort(bound, kind="stable") if np.isfinite(bound[k])]
     best = [blocks.trials[k] for k in order[:FINALISTS]]
     allowed = dict(zip(blocks.trials, few, strict=True))
-    dearer = [trial for trial in front(blocks) if not allowed[trial]]
-    return list(dict.fromkeys([BASELINE, *best, *dearer[:DEARER]]))
+    cheaper, dearer = (
+        [trial for trial in front(blocks) if allowed[trial] == within] for within in (True, False)
+    )
+    return list(dict.fromkeys([BASELINE, *best, *cheaper[-2:], *dearer[:DEARER]]))
 
 
 def ratio_to_baseline(blocks: BlockErrors, trial: int) -> tuple[float, float, float]:

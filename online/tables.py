@@ -167,7 +167,10 @@ def decided(rows: Sequence[ComparisonRow], worth: float = WORTH) -> ComparisonRo
     last = _judged(rows)
     if not last:
         return None
-    one = next(last[mode] for mode in ("fixed", "baseline") if mode in last)
+    one = next(last[mode] for mode in _ONE_SET if mode in last)
+    if "fixed" in last:
+        same = "baseline" in last and abs(_ratio(last["baseline"]).value - 1.0) < ROUNDING
+        one = last["baseline" if same else "fixed"]
     for mode in _ONE_SET:
         if mode in last and _surely_better(last[mode], one):
             one = last[mode]
@@ -236,7 +239,19 @@ def verdict(
         has = f"It has {best.ratio:.2f} times the {_YARDSTICKS[best.yardstick]}'s error"
         cost = _for_cost(best, last[best.yardstick])
         return [f"{said}.", f"{has} ({_interval(_ratio(best))}){cost}."]
-    return [f"{said}{_doubt(best, last)}.", *_why_not(main, best, rows, obstacle, worth)]
+    said = f"{said}{_doubt(best, last)}."
+    return [said, *_dearer(best, last), *_why_not(main, best, rows, obstacle, worth)]
+
+
+def _dearer(best: ComparisonRow, last: Mapping[str, ComparisonRow]) -> list[str]:
+    """That a single set which costs more does better, where it surely does."""
+    row = last.get(EQUAL_COST)
+    if row is None or row.ratio is None or not _surely_better(row, best):
+        return []
+    ratio, cost = _to(row, best), _for_cost(row, best)
+    has = f"{ratio.value:.2f} times its error ({_interval(ratio)}){cost}"
+    budget = "" if row.cpu_ms is None else f": `--budget {row.cpu_ms:.0f}` allows it"
+    return [f"A single set that costs more has {has}{budget}."]
 
 
 def _doubt(best: ComparisonRow, last: Mapping[str, ComparisonRow]) -> str:

@@ -10,70 +10,49 @@ from offline.labelled import LabelledData
 from offline.tuning import expected_loss, interval_of, log_ratios, standard_error, worst_tenth
 
 
-def labelled(runs):
-    """Sequences on which each of three sets had these values in repeated runs."""
+def labelled(*of_sequences):
+    """Sequences of five blocks on which three sets have these errors, the baseline's first."""
     sequences = [
-        of_errors(
-            f"s{i}",
-            np.tile(np.mean(of_sets, axis=1).astype(np.float32), (4, 1)),
-            values=np.mean(of_sets, axis=1),
-            repeats=np.array(of_sets),
-        )
-        for i, of_sets in enumerate(runs)
+        of_errors(f"s{i}", np.tile(np.array(means, np.float32), (300, 1)))
+        for i, means in enumerate(of_sequences)
     ]
     return LabelledData(sequences, table(np.eye(3), (0, 2, 5)))
 
 
-def test_the_fixed_set_is_surely_good():
-    # The second set has the least mean by luck; the third is surely better than the first.
-    runs = [[[1.0, 1.0, 1.1], [0.1, 0.2, 2.3], [0.9, 0.91, 0.92]]] * 2
-    data = labelled(runs)
-    assert data.fixed() == 5
-    assert data.training_data()[0].fixed == 5
+def in_whole(data, *of_sequences):
+    """The same with mean errors of finalists in drives of whole recordings."""
+    sequences = [
+        replace(
+            s,
+            whole={n: np.full(len(s.errors), value) for n, value in means.items()},
+            whole_means={n: np.full(5, value) for n, value in means.items()},
+            whole_restarts=dict.fromkeys(means, 0.0),
+        )
+        for s, means in zip(data.sequences, of_sequences, strict=True)
+    ]
+    return data._replace(sequences=sequences)
 
 
 def test_drives_of_whole_recordings_decide_where_there_are_some():
-    data = labelled([[[1.0], [2.0], [3.0]]] * 2)
-    for known, fixed in (
-        ([{0: 1.0, 2: 9.0, 5: 3.0}, {0: 9.0, 2: 1.0, 5: 1.0}], 5),
-        # A finalist that is not driven on all of them counts with its trials.
-        ([{0: 9.0, 5: 3.0}, {0: 9.0, 2: 1.0}], 2),
-        ([{2: 1.0}, {5: 1.0}], 0),
-        ([{0: np.inf, 2: 1.0}, {0: 1.0, 2: 1.5}], 2),
-    ):
-        whole = [replace(s, whole=w) for s, w in zip(data.sequences, known, strict=True)]
-        assert data._replace(sequences=whole).fixed() == fixed
+    data = labelled([3.0, 2.0, 1.0], [3.0, 2.0, 1.0])
+    assert data.fixed() == data.training_data()[0].fixed == 5
+    assert in_whole(data, {0: 3.0, 2: 1.0, 5: 3.0}, {0: 3.0, 2: 1.0, 5: 2.0}).fixed() == 2
+    # Those that are not driven on all of them are not chosen.
+    assert in_whole(data, {0: 3.0, 5: 1.0}, {0: 3.0, 2: 1.0}).fixed() == 0
     # With a sequence left out, the drives on the others decide.
-    (_, others), _ = data._replace(
-        sequences=[replace(s, whole={0: 3.0, 2: 2.0 + i, 5: 3.0 - i}) for i, s in enumerate(whole)]
-    ).folds()
-    assert others.fixed() == 5
+    both = in_whole(data, {0: 3.0, 2: 1.0, 5: 3.0}, {0: 3.0, 2: 2.0, 5: 1.0})
+    (_, without_first), (_, without_second) = both.folds(by_recording=True)
+    assert (without_first.fixed(), without_second.fixed()) == (5, 2)
 
 
-def test_a_set_that_is_restarted_more_often_than_the_baseline_is_not_chosen():
-    data = labelled([[[3.0], [1.0], [2.0]]] * 2)
+def test_restarts_of_all_sequences_count():
+    data = labelled([3.0, 1.0, 2.0], [3.0, 1.0, 2.0])
     for restarts, fixed in (([1, 3, 1], 5), ([1, 1, 3], 2), ([0, np.inf, 1], 0)):
         counted = [replace(s, restarts=np.array(restarts, float)) for s in data.sequences]
         assert data._replace(sequences=counted).fixed() == fixed
-    # The sum over the sequences counts.
     times = np.array([1.0, 2.0, 0.0]), np.array([1.0, 0.0, 9.0])
     counted = [replace(s, restarts=r) for s, r in zip(data.sequences, times, strict=True)]
     assert data._replace(sequences=counted).fixed() == 2
-
-
-def test_a_candidate_of_all_sequences_is_none_where_its_luck_is_left_out():
-    rng = np.random.default_rng(0)
-    errors = rng.uniform(0.9, 1.1, (8, 256))  # all sets are equally good
-    luckiest = int(errors.mean(axis=0).argmin())
-    whole = {0: 5.0, luckiest: 0.9}
-    sequences = [
-        of_errors(f"s{i}", np.tile(of, (4, 1)), whole=whole)
-        for i, of in enumerate(errors.astype(np.float32))
-    ]
-    data = LabelledData(sequences, table(np.linspace(0, 1, 256)[:, None], tuple(range(256))))
-    assert data.fixed() == luckiest
-    of_fixed = [one.errors[0, others.fixed()] for one, others in data.folds()]
-    assert np.mean(of_fixed) > errors[:, luckiest].mean() + 0.02
 
 
 def test_one_disaster_outweighs_small_gains():

@@ -4,12 +4,7 @@ import pytest
 from adaptune.archive import Summary
 from offline.config import OfflineConfig
 from offline.objective import (
-    Verdict,
-    allowed,
     baseline_words,
-    best_by_trials,
-    candidates,
-    choose_fixed,
     judge,
     trajectory_metrics,
 )
@@ -27,33 +22,6 @@ def test_a_sum_is_a_mean_over_sequences():
     assert verdict.value == pytest.approx(0.5 * (1.0 + 1.0) + 0.5 * (3.0 + 3.0))
 
 
-def test_the_best_few_and_the_baseline_are_candidates():
-    verdicts = {n: Verdict({}, float(value)) for n, value in enumerate([9, 7, 5, 3, 4, 6])}
-    assert candidates(verdicts) == [3, 4, 2, 5, 0]
-    verdicts[3] = verdicts[3]._replace(complete=False)
-    verdicts[0] = verdicts[0]._replace(failure="no pose")
-    assert candidates(verdicts) == [4, 2, 5, 1]
-
-
-def test_who_is_restarted_more_often_than_the_baseline_is_no_candidate():
-    verdicts = {n: Verdict({}, float(n), restarts=r) for n, r in enumerate([2, 3, 2, 0])}
-    assert candidates(verdicts) == [0, 2, 3]
-    assert allowed({0: np.inf, 1: 5.0, 2: np.inf}) == {1}
-    # The baseline's restarts count also where it costs too much.
-    assert candidates(verdicts, [1, 2]) == [2]
-
-
-def test_the_fixed_set_is_the_best_over_whole_recordings():
-    trials = {3: 1.0, 4: 1.1, 0: 2.0}
-    assert choose_fixed(trials, {3: 1.0, 4: 1.1, 0: 2.0}) == 3
-    assert choose_fixed(trials, {3: 3.0, 4: 1.1, 0: 2.0}) == 4
-    assert choose_fixed(trials, {3: 3.0, 4: 2.1, 0: 2.0}) == 0
-    # Of those that are nearly equal, the one with the best trials.
-    assert choose_fixed(trials, {3: 3.0, 4: 2.03, 0: 2.0}) == 4
-    # One that was not driven along all of it counts with its trials.
-    assert choose_fixed(trials, {3: 3.0, 0: 2.0}) == 4
-
-
 def test_of_repeated_trials_the_surely_best_is_taken():
     def summary(*errors):
         repeats = [{"rte": e} for e in errors]
@@ -66,7 +34,7 @@ def test_of_repeated_trials_the_surely_best_is_taken():
     error = np.sqrt(np.var([0.2, 0.9, 1.9], ddof=1) / 3) / 2
     assert verdicts[1].margin == pytest.approx(2.1318 * error, rel=1e-4)
     assert verdicts[1].value < verdicts[0].value
-    assert best_by_trials(dict(enumerate(verdicts))) == 0
+    assert verdicts[0].bound < verdicts[1].bound
     assert judge(config(), [Summary({}, 1.0, 0, 0, 1.0)]).margin == 0.0
 
 

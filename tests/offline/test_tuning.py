@@ -93,7 +93,7 @@ def test_a_bank_that_gains_nothing_does_not_adapt(monkeypatch):
 
 
 def test_the_least_loss_wins():
-    logs = np.zeros((8, len(PAIRED_SETTINGS) + 2 * len(BANK_SETTINGS)))
+    logs = np.zeros((8, len(PAIRED_SETTINGS) + 2 * len(BANK_SETTINGS) + 2))
     names = [str(i) for i in range(8)]
     banks = [[0, 1], [0, 2]]
 
@@ -128,6 +128,12 @@ def test_the_least_loss_wins():
         assert found.bank.adapt == adapts, (gain, spread, n, worth)
         if n > 1:
             assert found.expected["bank"].loss == expected_loss(logs[:n, second + 3], names[:n])
+    # A set that costs as much does as well.
+    logs[:] = 0.0
+    logs[:, second + 3] = -0.3
+    assert best().bank.adapt
+    logs[:, -1] = -0.25
+    assert not best().bank.adapt
     # What rounding gains is no gain.
     logs[:] = 0.0
     logs[:, second + 3] = -1e-9

@@ -80,7 +80,8 @@ def test_own_parameters_are_kept_where_they_do_best():
 @pytest.mark.parametrize(
     ("ratios", "start"),
     [
-        ({"equal_cost": 0.6, "adaptive": 0.8}, "Drive the best set that costs no more: 0.600 %"),
+        ({"equal_cost": 0.6, "adaptive": 0.8}, "Drive the fixed set: 1.000 %"),
+        ({"equal_cost": 0.8, "adaptive": 0.6}, "Drive adaptive: 0.600 %"),
         ({"equal_cost": 0.95}, "Drive the fixed set: 1.000 %"),
         ({"best_default": 0.9, "baseline": 1.1}, "Drive the best odometry with its own param"),
         ({"even": 0.5, "adaptive": 0.8}, "Drive adaptive: 0.800 %"),
