@@ -17,8 +17,6 @@ PER_BLOCK = 2.0
 """Sub-trajectories in a block: errors of neighbouring frames share most of theirs."""
 SURE = 0.95
 """Confidence, on one side, with which a set is worse than the baseline."""
-STANDARD_ERRORS = 2.0
-"""Above the mean error lies the bound by which sets are compared."""
 COST_CLASS = 1.1
 """Costs that differ by no larger factor, about, are the same: the machine's load makes as much."""
 AS_GOOD = 1.03
@@ -104,12 +102,16 @@ def surely_worse(blocks: BlockErrors) -> NDArray[np.bool_]:
 def bounds(blocks: BlockErrors) -> NDArray[np.float64]:
     """Upper bound of the mean error of each set in percent, of shape (n_trials,).
 
+    It is the baseline's mean error, plus the mean difference from it and a standard error of that.
     It is infinite for sets that are not admissible: they failed, were restarted more often than the
     baseline (whoever takes its parameters elsewhere has no health check), or are surely worse.
     """
-    mean, error = mean_and_error(blocks.errors, blocks.sequence)
-    bound = mean + STANDARD_ERRORS * np.where(np.isfinite(error), error, 0.0)
-    usable = np.isfinite(blocks.restarts)
+    base = blocks.errors[:, [blocks.baseline]]
+    with np.errstate(invalid="ignore"):
+        more, error = mean_and_error(blocks.errors - base, blocks.sequence)
+    (mean,), _ = mean_and_error(base, blocks.sequence)
+    bound = mean + more + np.where(np.isfinite(error), error, 0.0)
+    usable = np.isfinite(blocks.restarts) & np.isfinite(bound)
     usable &= blocks.restarts <= blocks.restarts[blocks.baseline]
     return np.where(usable & ~surely_worse(blocks), bound, np.inf)
 

@@ -35,8 +35,8 @@ def places():
 
 def test_the_best_default_is_the_best_of_the_odometries_baselines(places):
     found = rivals(data(places), 100.0)
-    # Both have the same mean error, and the second is surer.
-    assert found[BEST_DEFAULT] == TRIALS[1]
+    # Both have the same mean error: nothing shows that the second is better.
+    assert found[BEST_DEFAULT] == TRIALS[0]
     # One odometry's is the baseline.
     assert BEST_DEFAULT not in rivals(labelled(places)._replace(costs=COSTS), 100.0)
 
