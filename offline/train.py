@@ -32,12 +32,11 @@ from adaptune.study.references import (
 from adaptune.study.study import FIXED_SET, OracleErrors, StudySequences, oracle_errors
 from offline.campaign import (
     Campaign,
+    Schedule,
     WholeDrives,
     drive_whole,
     mean_values,
     run_baseline,
-    trial_tasks,
-    watch_tasks,
     whole_values,
 )
 from offline.config import OfflineConfig, OfflineStudy
@@ -117,10 +116,7 @@ def train(study: OfflineStudy, progress: Progress = unseen, cluster: str | None 
     with trial_workers(study, names, cluster) as workers:
         run_baseline(study, archive, workers, progress)
         verdicts = Campaign(study, archive, workers, progress).run()
-        finished = {
-            name: {n: archive.finished(name)[n] for n, v in verdicts.items() if name in v.sequences}
-            for name in names
-        }
+        finished = {name: {n: archive.finished(name)[n] for n in verdicts} for name in names}
         tried = tuple(verdict.parameters for verdict in verdicts.values())
         every_set, affordable_ones = ParameterSets(space, tuple(verdicts), tried), list(verdicts)
         if (budget := study.config.online.budget) is not None:
@@ -130,7 +126,7 @@ def train(study: OfflineStudy, progress: Progress = unseen, cluster: str | None 
         # Rivals may cost more.
         rivals = {*candidates(verdicts), *every_set.defaults}
         sets = {n: verdicts[n].parameters for n in sorted({0, *best, *rivals})}
-        whole = drive_whole(names, sets, archive, workers, progress)
+        whole = drive_whole(study, sets, archive, workers, progress)
     fixed = _fixed(config, verdicts, best, whole)
     model = _fitted(study, archive, every_set, finished, fixed)
     write_fixed(study, verdicts[fixed].parameters)
@@ -264,9 +260,9 @@ def _trial_rows(
     """A row for every trial: its parameters, how it was judged, its mean errors in percent."""
     rows = []
     for n, verdict in verdicts.items():
-        runs = [finished[name][n] for name in verdict.sequences]
+        runs = [of[n] for of in finished.values()]
         row: dict[str, Any] = {"trial": n, **space.row(verdict.parameters)}
-        row["state"] = verdict.state
+        row |= {"state": verdict.state, "proposed by": runs[0].source}
         row[COST] = float(np.mean([run.cost for run in runs]))
         if set(config.objective) != {"rte"}:
             row[label(config.objective)] = verdict.value
@@ -274,10 +270,8 @@ def _trial_rows(
                 row[metric] = float(np.mean([run.metrics[metric] for run in runs]))
         if config.repeats > 1:
             row["margin"] = verdict.margin
-        mean = float(np.mean([run.mean_error for run in runs])) if verdict.complete else None
-        row["mean"] = mean
-        for name, trials in finished.items():
-            row[name] = trials[n].mean_error if n in trials else None
+        row["mean"] = float(np.mean([run.mean_error for run in runs]))
+        row |= {name: of[n].mean_error for name, of in finished.items()}
         rows.append(row)
     return rows
 
@@ -402,15 +396,17 @@ def run_oracle(
     for name in names:
         _remove_other_sets(archive, name, model)
     archive.tidy()
-    due = {name: [n for n in numbers if n not in archive.finished(name)] for name in names}
-    described = study.config.descriptor
-    without_frames = [name for name in names if not archive.has_frames(name, described)]
-    if any(due.values()) or without_frames:
-        missing = [(name, {n: model.sets[n] for n in trials}) for name, trials in due.items()]
-        with trial_workers(study, list(due), cluster) as workers:
-            at_once, one_by_one = len(workers.workers()), study.odometry.one_by_one
-            tasks = trial_tasks(missing, without_frames, at_once, one_by_one)
-            watch_tasks(archive, workers, tasks, "runs on test sequences", progress)
+    schedule = Schedule(study, archive, "runs on test sequences", progress, measure=False)
+    for name in names:
+        schedule.need(name)
+        for n in numbers:
+            if n not in archive.finished(name):
+                schedule.add(name, n, model.sets[n])
+    if schedule.waits():
+        with trial_workers(study, names, cluster) as workers:
+            for done in schedule.run(workers):
+                schedule.store(*done)
+        schedule.close()
     found = {name: oracle_errors(archive, name, model) for name in names}
     return [_row(name, errors) for name, errors in found.items() if errors is not None]
 

@@ -10,7 +10,7 @@ from rooms import along_x
 from adaptune.archive import Archive, Frames, Summary, Trial
 from offline.charts import trial_table
 from offline.config import OfflineConfig
-from offline.workers import TaskResult
+from offline.workers import Task
 
 N_FRAMES = 40
 
