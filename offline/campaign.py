@@ -2,7 +2,7 @@
 
 import logging
 import math
-from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -166,7 +166,8 @@ class Schedule:
             due.left += 1
 
     def _driven(self, task: Task, result: Result) -> Iterator[tuple[str, int, Trial]]:
-        assert task.stretch is not None and not isinstance(result, Frames)
+        assert task.stretch is not None
+        assert not isinstance(result, Frames)
         name = task.sequence
         self._partly.pop(task.key, None)
         for number, drives in result.items():
