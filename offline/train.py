@@ -120,7 +120,7 @@ def train(study: OfflineStudy, progress: Progress = unseen, cluster: str | None 
         tried = tuple(verdict.parameters for verdict in verdicts.values())
         every_set, affordable_ones = ParameterSets(space, tuple(verdicts), tried), list(verdicts)
         if (budget := study.config.online.budget) is not None:
-            costs = measured_costs(archive, finished, every_set, study.odometry)
+            costs = measured_costs(archive, names, every_set, study.odometry)
             affordable_ones = affordable(costs, affordable_ones, budget)
         best = candidates(verdicts, affordable_ones)
         # Rivals may cost more.
@@ -236,7 +236,7 @@ def _fitted(
         return before
     data = labelled_data(
         archive,
-        finished,
+        study.training,
         sets,
         config,
         study.window,
@@ -316,10 +316,7 @@ def fit(
     window: int,
     provenance: dict[str, Any],
 ) -> ErrorModel:
-    """Make the error model, which does not adapt yet.
-
-    Sets have no errors (NaN) on the sequences that they were not run on.
-    """
+    """Make the error model, which does not adapt yet."""
     sequences = data.sequences
     return ErrorModel(
         odometry=odometry,
@@ -345,23 +342,23 @@ def fit(
 
 def tuned(model: ErrorModel, data: LabelledData, switching: SwitchingConfig) -> ErrorModel:
     """Choose what is driven: the rule's settings, the bank and those of its weights."""
-    complete = data.complete()
-    chosen = choose(complete, switching.size, fixed=model.fixed)
+    usable = data.usable()
+    chosen = choose(usable, switching.size, fixed=model.fixed)
     members = chosen.members or [model.fixed]
-    besides = reserve(members, complete)
+    besides = reserve(members, usable)
     members = [*members, *besides]
     return replace(
         model,
         paired=chosen.one_set,
         bank=members,
-        vectors=complete.vectors(members),
+        vectors=usable.vectors(members),
         bank_settings=chosen.bank.model_copy(update={"reserve": len(besides)}),
         # As they are read back, so that the same model is the same file.
         expected={
             way: {key: float(value) for key, value in figures._asdict().items()}
             for way, figures in chosen.expected.items()
         },
-        rivals=rivals(complete, driven_cost(complete, chosen, model.fixed)),
+        rivals=rivals(usable, driven_cost(usable, chosen, model.fixed)),
     )
 
 

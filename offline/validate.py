@@ -340,18 +340,16 @@ def baseline_in_words(validation: Validation) -> str:
 
 
 def _labelled(study: OfflineStudy, model: ErrorModel) -> LabelledData:
-    """The labelled data set of the sets that were run on all training sequences."""
-    complete = np.flatnonzero(~np.isnan(model.errors).any(axis=0))
-    sets = model.sets.subset([model.sets.trials[column] for column in complete])
+    """The labelled data set of the sets that did not fail."""
     return labelled_data(
         Archive(study.folder / "trials"),
-        {name: list(sets) for name in model.sequences},
-        sets,
+        model.sequences,
+        model.sets,
         study.config,
         study.window,
         study.sequences.recorded_in,
         study.odometry,
-    ).complete()
+    ).usable()
 
 
 def _rows(validation: Validation) -> list[dict[str, Any]]:

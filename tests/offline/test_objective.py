@@ -30,9 +30,8 @@ def test_a_sum_is_a_mean_over_sequences():
 def test_the_best_few_and_the_baseline_are_candidates():
     verdicts = {n: Verdict({}, float(value)) for n, value in enumerate([9, 7, 5, 3, 4, 6])}
     assert candidates(verdicts) == [3, 4, 2, 5, 0]
-    verdicts[3] = verdicts[3]._replace(complete=False)
     verdicts[0] = verdicts[0]._replace(failure="no pose")
-    assert candidates(verdicts) == [4, 2, 5, 1]
+    assert candidates(verdicts) == [3, 4, 2, 5]
 
 
 def test_who_is_restarted_more_often_than_the_baseline_is_no_candidate():

@@ -9,7 +9,7 @@ from adaptune.errors import AdaptuneError
 from adaptune.model.knn import NearestNeighbours
 from offline.campaign import whole_values
 from offline.config import OfflineConfig, load_study
-from offline.objective import candidates, judge, sampler_results
+from offline.objective import candidates, judge, told
 from offline.train import train
 from offline.validate import validate
 
@@ -69,8 +69,8 @@ def test_a_set_that_fails_on_one_sequence_is_not_usable(fails):
     assert candidates({0: good, 1: bad}) == [0]
     assert whole_values(of, {"one": {0: GOOD, 1: fails}}) == {"one": {0: 10.0, 1: np.inf}}
     # Samplers are told that it is bad.
-    found = sampler_results([good, bad])
-    assert found[0].value == 10.0
-    assert 100.0 <= found[1].value < 1e6
+    (_, own), (_, worse) = told([good, bad])
+    assert own == 10.0
+    assert 100.0 <= worse < 1e6
     with pytest.raises(AdaptuneError, match=r"none of 1 parameter sets gives poses .*: mend"):
         candidates({1: bad})
