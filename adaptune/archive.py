@@ -103,6 +103,7 @@ class Trial:
     # scans without a pose.
     unhealthy: dict[str, int] = field(default_factory=dict)
     failure: str = ""  # why the set is never chosen; empty if it may be
+    source: str = ""  # what proposed the set, see `offline.samplers.Proposal`
 
     def __repr__(self) -> str:
         n = self.restarted.sum()
@@ -132,6 +133,7 @@ class Summary:
     repeats: Sequence[dict[str, float]] = ()  # see `Trial`
     unhealthy: dict[str, int] = field(default_factory=dict)  # see `Trial`
     failure: str = ""  # see `Trial`
+    source: str = ""  # see `Trial`
 
     @property
     def cost(self) -> float:
@@ -158,6 +160,7 @@ def summarise(trial: Trial) -> Summary:
         list(trial.repeats),
         trial.unhealthy,
         trial.failure,
+        trial.source,
     )
 
 
@@ -199,7 +202,7 @@ class Sources(NamedTuple):
 
 INDEX = "index.jsonl"
 _ARRAYS, _SINGLE = ("T_odom_sensor", "restarted", "registered"), ("errors", "seconds")
-_PLAIN = ("parameters", "faults", "metrics", "usage", "repeats", "unhealthy", "failure")
+_PLAIN = ("parameters", "faults", "metrics", "usage", "repeats", "unhealthy", "failure", "source")
 """Parts of a trial that are stored as they are, in single precision, and as JSON."""
 _TRIAL = re.compile(r"\d{5,}\.npz")
 
@@ -351,10 +354,13 @@ class Archive:
                 self._finished.setdefault(sequence, {})[number] = summary
         return self._finished
 
+    def known(self) -> dict[int, Summary]:
+        """All finished trials, also on sequences that are no more used; of each, on one of them."""
+        return {number: run for trials in self._all().values() for number, run in trials.items()}
+
     def sets(self) -> dict[int, ParameterSet]:
-        """The parameter sets of all finished trials, also on sequences that are no more used."""
-        every = self._all().values()
-        return {number: run.parameters for trials in every for number, run in trials.items()}
+        """Their parameter sets."""
+        return {number: run.parameters for number, run in self.known().items()}
 
     def _entries(self) -> Iterator[tuple[_Key, Summary]]:
         """Entries that the index should have."""
@@ -549,6 +555,7 @@ def rows(archive: Archive, names: Sequence[str]) -> list[Row]:
         errors = {name: t.mean_error if t else None for name, t in trials.items()}
         row |= {"mean": _mean(list(errors.values()))} | errors
         row |= {
+            "proposed by": there[0].source,
             "restarts": round(sum(t.restarts for t in there)),
             "faults": sum(t.faults for t in there),
         }

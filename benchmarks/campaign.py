@@ -28,7 +28,6 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -41,21 +40,20 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "tests" / "support"))
 import drives
 
 from adaptune import files
-from adaptune.archive import Archive, Frames, Trial
+from adaptune.archive import Archive, Frames
 from adaptune.odometry.keyframe import crop
-from adaptune.odometry.tracker import HealthCheck
 from adaptune.simulation.record import record
 from offline import train as training
 from offline import trial, workers
 from offline.config import OfflineStudy, load_study
-from offline.trial import TrialSettings, TrialSetup
-from offline.workers import Task, TaskResult
+from offline.trial import Drive, Stretch, TrialSettings, TrialSetup, stretches_along
+from offline.workers import Result, Task
 
 STUDY = """\
 odometry: {{name: gicp, settings: {{downsampling: 0.5, iterations: 20}}}}
 courses: {{cave: {{scenes: [cave], length: {length:.0f}, sensor: hdl32e, seed: 1}}}}
 training: [cave]
-offline: {{initial: {trials}, trials: {trials}}}
+offline: {{trials: {trials}}}
 """
 N_FRAMES = 600
 
@@ -135,13 +133,17 @@ def rounds(study: OfflineStudy, n: int, as_it_is: bool) -> tuple[float, float]:
     if not as_it_is:
         workers.apart = trial.apart = contextlib.nullcontext  # type: ignore[assignment]
     setup = TrialSetup(TrialSettings.of(study.config), study.odometry, study.sequences)
-    sequences = workers.Sequences(setup, 0.4e9)
+    bench = workers.Bench(setup, 0.4e9)
+    stretches = {
+        name: stretches_along(name, setup.describe(name).uncut)[0] for name in study.training
+    }
     before, begin = _memory(), time.process_time()
     # All but the baseline's clouds are prepared while trials run.
     sets = [study.odometry.space.baseline | {"downsampling": d} for d in (0.25, 0.35, 0.7)]
     for i, name in enumerate(n * study.training):
-        sequences.run(Task(name, (0,), (sets[i % len(sets)],)), lambda *_: None)
-    kept = 1e-6 * sum(one.shared.nbytes for one in sequences._ready.values())
+        task = Task(name, stretch=stretches[name], sets={0: sets[i % len(sets)]})
+        bench.run(task, lambda *_: None)
+    kept = 1e-6 * sum(shared.nbytes for shared in bench._shared.values())
     return (_memory() - before) / kept, time.process_time() - begin
 
 
@@ -186,33 +188,30 @@ class Drawn:
         self.asked = self.asked or time.monotonic()
         self._task = task
 
-    def wait(self) -> list[tuple[int, TaskResult]]:
-        """Draw its trials."""
+    def wait(self) -> list[tuple[int, Result]]:
+        """Draw its drives."""
         assert self._task is not None
-        health = HealthCheck().model_dump() if self._task.whole else {}
-        drawn = map(_drawn, self._task.numbers, self._task.sets)
-        trials = [replace(trial, health=health) for trial in drawn]
+        stretch = self._task.stretch
+        if stretch is not None:
+            return [(0, {number: [_drawn(number, stretch)] for number in self._task.sets})]
         frames = Frames(
             np.arange(N_FRAMES) * 10**8,
             np.tile(np.eye(4), (N_FRAMES, 1, 1)),
             np.random.default_rng(0).integers(0, 99, (N_FRAMES, 90)).astype(np.float32),
             {"ndt": 90},
             np.zeros(N_FRAMES, np.float32),
+            evidence_ms=0.0,
         )
-        return [(0, TaskResult(trials, frames if self._task.frames else None))]
+        return [(0, frames)]
 
 
-def _drawn(number: int, parameters: dict[str, Any]) -> Trial:
-    rng = np.random.default_rng(number)
-    nothing = np.zeros(N_FRAMES, bool)
-    return Trial(
-        parameters,
-        rng.normal(size=(N_FRAMES, 4, 4)),
-        rng.gamma(1.0, size=N_FRAMES),
-        nothing,
-        ~nothing,
-        rng.gamma(1.0, size=N_FRAMES),
-    )
+def _drawn(number: int, stretch: Stretch) -> Drive:
+    rng, drive = np.random.default_rng(number), Drive.lost(stretch)
+    drive.T_odom_sensor[:, :3, 3] += rng.normal(size=(len(stretch.stamps), 3))
+    drive.registered[:] = drive.tried[:] = True
+    drive.without_pose[:] = False
+    drive.seconds[1:] = rng.gamma(1.0, size=len(stretch.stamps) - 1)
+    return drive
 
 
 def _memory() -> float:

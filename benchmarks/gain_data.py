@@ -1,12 +1,17 @@
 """The courses of `gain.py`, and what odometries do on them with several parameter sets."""
 
-from collections.abc import Iterable
+import sys
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "tests" / "support"))
+
+from made_drives import trials_of
 
 from adaptune.archive import Frames
 from adaptune.files import replacing
@@ -15,11 +20,11 @@ from adaptune.model.descriptor import averaged, lowest_elevation
 from adaptune.model.ndt import N_FEATURES, ndt_histogram
 from adaptune.odometry.registry import OdometryFactory, odometry_class
 from adaptune.odometry.remote import Limits
+from adaptune.recording.scan import Scan
 from adaptune.simulation import Course
 from adaptune.simulation.record import simulate
 from adaptune.space import ParameterSets, ParameterSpace
 from adaptune.study.study import StudySequences
-from offline.config import OfflineConfig
 from offline.labelled import (
     BankSimulation,
     LabelledData,
@@ -27,8 +32,8 @@ from offline.labelled import (
     error_vectors,
     recorded_motions,
 )
-from offline.samplers import make_sampler
-from offline.trial import SharedScans, TrialSettings, TrialSetup, with_measured_hops
+from offline.samplers import sobol_points
+from offline.trial import TrialSettings, TrialSetup, with_measured_hops
 
 MEMORY = 3e9
 """Bytes of prepared scans."""
@@ -73,12 +78,15 @@ def factory_of(name: str) -> OdometryFactory:
     return OdometryFactory(name, settings, cls.describe(settings).space, Limits())
 
 
-class SharedCourse:
-    """Scans of a course, in place of `offline.trial.PreparedSequence`."""
+class Simulated:
+    """The scans of a course, in place of a recording."""
 
-    def __init__(self, name: str, scans: Iterable[Any], frames: Frames):
-        self.name, self.frames = name, frames
-        self.shared = SharedScans(scans, MEMORY)
+    def __init__(self, name: str, scans: Sequence[Scan]):
+        self.name, self.scans = name, scans
+
+    def since(self, _stamp: int) -> Iterator[Scan]:
+        """All of them."""
+        return iter(self.scans)
 
 
 def run(path: Path, course: Course, odometry: str, seed: int) -> None:
@@ -92,11 +100,10 @@ def run(path: Path, course: Course, odometry: str, seed: int) -> None:
         np.array([lowest_elevation(scan) for scan in scans], np.float32),
     )
     factory, settings = factory_of(odometry), TrialSettings()
-    config = OfflineConfig(initial=N_SETS, batch=N_SETS, seed=seed)
-    sets = make_sampler(factory.space, config).propose([])
-    frames = with_measured_hops(scans, frames)
-    course_scans: Any = SharedCourse(path.stem, scans, frames)
-    trials = TrialSetup(settings, factory, NO_SEQUENCES).run(course_scans, sets)
+    sets = [factory.space.baseline, *sobol_points(factory.space, seed, range(1, N_SETS))]
+    frames, read = with_measured_hops(scans, frames), Simulated(path.stem, scans)
+    setup = TrialSetup(settings, factory, NO_SEQUENCES)
+    trials = trials_of(setup, sets, path.stem, frames, read, memory=MEMORY)
     length = settings.sub_trajectory
     vectors = [error_vectors(frames.T_ref_sensor, trial, length) for trial in trials]
     motions = recorded_motions(frames, trials)[..., :3, :]

@@ -9,12 +9,14 @@ from typing import Any
 import numpy as np
 from gain_data import (
     LOST_TRACK,
+    MEMORY,
     NO_SEQUENCES,
     PERIOD,
     WINDOW,
-    SharedCourse,
+    Simulated,
     in_place,
     training_courses,
+    trials_of,
 )
 from numpy.typing import NDArray
 
@@ -95,7 +97,7 @@ def run_course(folder: Path, seed: int, name: str) -> None:
     frames = with_measured_hops(scans, frames)
     for odometry, path in due.items():
         sets = sets_of(odometry, seed, more)
-        _write(path, odometry, sets, SharedCourse(name, scans, frames))
+        _write(path, odometry, sets, frames, Simulated(name, scans))
 
 
 def _n_sets(path: Path) -> int:
@@ -105,12 +107,13 @@ def _n_sets(path: Path) -> int:
         return len(json.loads(str(found["parameters"])))
 
 
-def _write(path: Path, odometry: str, sets: list[ParameterSet], course: SharedCourse) -> None:
+def _write(
+    path: Path, odometry: str, sets: list[ParameterSet], frames: Frames, read: Simulated
+) -> None:
     """Run sets of an odometry, and keep their errors, motions and costs."""
-    settings, frames = TrialSettings(), course.frames
-    scans: Any = course
+    settings = TrialSettings()
     setup = TrialSetup(settings, pool().factories[odometry], NO_SEQUENCES)
-    trials = setup.run(scans, sets)
+    trials = trials_of(setup, sets, read.name, frames, read, memory=MEMORY)
     T_ref_sensor, length = frames.T_ref_sensor, settings.sub_trajectory
     vectors = [error_vectors(T_ref_sensor, trial, length) for trial in trials]
     motions = recorded_motions(frames, trials)[..., :3, :]

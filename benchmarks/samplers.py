@@ -28,15 +28,20 @@ from numpy.typing import NDArray
 from rich.console import Console
 from scipy.stats import wilcoxon
 
+sys.path.insert(0, str(Path(__file__).parent.parent / "tests" / "support"))
+
+from made_drives import trials_of
+
 from adaptune import processes
+from adaptune.archive import Frames
 from adaptune.report import tables
 from adaptune.report.charts import Axis, Band, Chart, Drawn, Line, Panel
 from adaptune.report.drawing import draw_chart
 from adaptune.simulation.record import record
 from adaptune.space import Categorical, Float, ParameterSet, ParameterSpace
 from offline.config import OfflineConfig, load_study
-from offline.samplers import make_sampler
-from offline.trial import PreparedSequence, TrialSettings, TrialSetup
+from offline.samplers import Sampler, make_sampler
+from offline.trial import TrialSettings, TrialSetup
 
 TRIALS = 96
 SEEDS = range(20)
@@ -101,10 +106,21 @@ def best_so_far(
     """Best error after every trial of one search."""
     config = OfflineConfig(sampler=sampler, seed=seed)
     search = make_sampler(space, config)
-    history: list[tuple[ParameterSet, float]] = []
-    while len(history) < TRIALS:
-        history += [(s, error(s)) for s in search.propose(history)]
-    return np.minimum.accumulate([value for _, value in history[:TRIALS]])
+    return np.minimum.accumulate([error(one) for one in proposed(search, error, TRIALS)])
+
+
+def proposed(search: Sampler, error: Error, n: int) -> list[ParameterSet]:
+    """The sets of a search, each with the results of all trials but the last ones before it."""
+    sets: list[ParameterSet] = []
+    values: list[float] = []
+    while len(sets) < n:
+        seen = max(0, len(sets) - search.config.batch + 1)
+        found = search.propose(list(zip(sets, values, strict=True))[:seen], sets[seen:])
+        if found is None:
+            break
+        sets.append(found.parameters)
+        values.append(error(found.parameters))
+    return sets
 
 
 def against_random(
@@ -150,7 +166,7 @@ sub_trajectory: 10.0
 """
 
 
-def prepare(folder: Path, *overrides: str) -> tuple[TrialSetup, PreparedSequence]:
+def prepare(folder: Path, *overrides: str) -> tuple[TrialSetup, Frames]:
     """Simulate the course, if it is not there yet, and prepare it for an odometry."""
     file = folder / "samplers.yaml"
     file.write_text(STUDY)
@@ -158,16 +174,16 @@ def prepare(folder: Path, *overrides: str) -> tuple[TrialSetup, PreparedSequence
     if not study.sequences.recording("course").exists():
         record(study.config.courses["course"], study.sequences.recording("course"))
     setup = TrialSetup(TrialSettings.of(study.config), study.odometry, study.sequences)
-    return setup, setup.prepare("course", 8e9)
+    return setup, setup.describe("course")
 
 
 def table(folder: Path) -> None:
     """Compare on recorded trials of GICP."""
-    setup, sequence = prepare(folder)
+    setup, frames = prepare(folder)
     space = setup.odometry.space
     unit = (np.arange(SIDE) + 0.5) / SIDE
     points = np.stack(np.meshgrid(*[unit] * len(space), indexing="ij"), -1).reshape(-1, len(space))
-    trials = setup.run(sequence, space.from_unit(points))
+    trials = trials_of(setup, space.from_unit(points), "course", frames, memory=8e9)
     errors = np.array([trial.mean_error for trial in trials])
     print(f"table: {len(errors)} trials, {errors.min():.3f} to {errors.max():.3f} %", flush=True)
 
@@ -180,12 +196,12 @@ def table(folder: Path) -> None:
 
 def searches(folder: Path, name: str) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     """Rows of the thesis's table for an odometry, and the curves of each sampler."""
-    setup, sequence = prepare(folder, f"odometry.name={name}", *THESIS[name])
+    setup, frames = prepare(folder, f"odometry.name={name}", *THESIS[name])
     known: dict[str, tuple[float, float]] = {}
 
     def measures(s: ParameterSet) -> tuple[float, float]:
         if repr(s) not in known:
-            (trial,) = setup.run(sequence, [s])
+            (trial,) = trials_of(setup, [s], "course", frames, memory=8e9)
             known[repr(s)] = trial.mean_error, trial.metrics["rpe"]
         return known[repr(s)]
 
@@ -212,10 +228,8 @@ def searches(folder: Path, name: str) -> tuple[list[dict[str, Any]], dict[str, A
                     batch=2,
                 ),
             )
-            history: list[tuple[ParameterSet, float]] = []
-            while len(history) < THESIS_TRIALS and (sets := search.propose(history)):
-                history += [(s, measures(s)[0]) for s in sets]
-            best.append([measures(s) for s, _ in history[:THESIS_TRIALS]])
+            sets = proposed(search, lambda s: measures(s)[0], THESIS_TRIALS)
+            best.append([measures(s) for s in sets])
             print(f"{name}: {sampler}, seed {seed}", file=sys.stderr, flush=True)
         curves[sampler] = np.minimum.accumulate(np.array(best), axis=1)
         rte, rpe = np.median(curves[sampler][:, -1], axis=0)

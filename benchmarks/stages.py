@@ -12,7 +12,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +32,7 @@ from adaptune.space import ParameterSet, Selection
 from adaptune.trajectory import read_kitti
 from offline.config import OfflineStudy, load_study
 from offline.train import train
-from offline.trial import TrialSettings, TrialSetup
+from offline.trial import SharedScans, TrialSettings, TrialSetup, stretches_along, trial_of
 from online.replay import ReplayRecord, replay
 
 REPETITIONS = 5
@@ -87,15 +86,22 @@ def bare_gicp(
 def trial(study: OfflineStudy) -> None:
     """One trial over prepared scans."""
     setup = TrialSetup(TrialSettings.of(study.config), study.odometry, study.sequences)
-    sequence = setup.prepare("hall_begin", 8e9)
+    frames = setup.describe("hall_begin").uncut
+    (stretch,) = stretches_along("hall_begin", frames)
+    shared, read = SharedScans(8e9), study.sequences.open("hall_begin")
     parameters: ParameterSet = {"max_correspondence_distance": 2.0, "keyframe_interval": 1.0}
     instance = study.odometry(parameters)
-    scans = islice(sequence.shared, len(sequence.frames.stamps))
-    prepared = [(scan.cloud, scan.tree) for scan in (load(instance) for load in scans)]
+    scans = (load(instance) for load in shared.along(stretch, read))
+    prepared = [(scan.cloud, scan.tree) for scan in scans]
     iterations = study.odometry.settings.iterations
+
+    def ours() -> None:
+        (drives,) = setup.drive(shared, read, stretch, [parameters])
+        trial_of(setup.settings, parameters, frames, {0: drives})
+
     compare(
         f"trial, {len(prepared)} scans",
-        lambda: setup.run(sequence, [parameters], whole=True),
+        ours,
         lambda: bare_gicp(prepared, 2.0, 1.0, iterations),
     )
 

@@ -1,25 +1,210 @@
-"""The campaign: run the trials of the search, batch by batch."""
+"""The campaign: drive the parameter sets of the search, and store the trials."""
 
 import logging
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
-from adaptune.archive import REGISTER_MS, Archive, ArchiveError, Summary, Trial, summarise
+from adaptune.archive import REGISTER_MS, Archive, ArchiveError, Frames, Summary, Trial, summarise
 from adaptune.errors import AdaptuneError
 from adaptune.progress import Progress, unseen
 from adaptune.space import ParameterSet, PooledSpace
 from adaptune.study.references import contradictions_of
 from offline.config import OfflineStudy
 from offline.objective import Verdict, label
-from offline.search import Clock, Search, rungs
-from offline.trial import SLOW
-from offline.workers import Pool, Task, TaskResult, run
+from offline.search import Clock, Search
+from offline.trial import Drive, Stretch, TrialSettings, stretches_along, trial_of
+from offline.workers import Pool, Result, Task, TaskProgress, run
 
 _log = logging.getLogger(__name__)
+
+SLOW, LEAST_SECONDS = 10.0, 20.0
+"""A set is stopped that takes so many times the CPU time of the baseline, and so many seconds."""
+
+
+@dataclass
+class _Due:
+    """A trial that is being driven on a sequence."""
+
+    parameters: ParameterSet
+    left: int = 0  # stretches that are not driven yet
+    share: float = 0.0  # of its scans that are
+    drives: dict[int, Sequence[Drive]] = field(default_factory=dict)  # by first scan
+
+
+class Schedule:
+    """Trials on sequences, each driven stretch by stretch, by whoever holds the prepared scans.
+
+    A sequence that is not described yet is described first, and the hops along it are measured
+    when there is nothing else to do. With `whole`, whole recordings are driven.
+    """
+
+    def __init__(
+        self,
+        study: OfflineStudy,
+        archive: Archive,
+        what: str,
+        progress: Progress = unseen,
+        whole: bool = False,
+        measure: bool = True,
+    ):
+        self.most_ms: Mapping[str, float] = {}  # of CPU time a scan, above which a set is stopped
+        self.done = 0  # trials on sequences
+        self._archive, self._what, self._progress = archive, what, progress
+        self._whole, self._measure = whole, measure
+        self._settings = TrialSettings.of(study.config)
+        self._one_by_one = study.odometry.one_by_one
+        self._described: dict[str, Frames] = {}
+        self._frames: dict[str, Frames] = {}  # the same, with the stretches that are driven
+        self._unread: list[str] = []
+        self._unmeasured: list[str] = []
+        self._unsaved: set[str] = set()  # whose frames the archive does not have
+        self._due: dict[str, dict[int, _Due]] = {}
+        self._stretches: dict[Hashable, Stretch] = {}
+        # By stretch, the sets that are still to be driven there.
+        self._waiting: dict[Hashable, dict[int, ParameterSet]] = {}
+        self._partly: dict[Hashable, float] = {}  # by task, how much of it is done
+
+    def need(self, name: str) -> None:
+        """Describe a sequence, unless that was done before."""
+        if name in self._due:
+            return
+        self._due[name] = {}
+        if self._archive.has_frames(name, self._settings.descriptors):
+            self._know(name, self._archive.read_frames(name))
+        else:
+            self._unread.append(name)
+
+    def add(self, name: str, number: int, parameters: ParameterSet) -> None:
+        """Drive a set."""
+        self.need(name)
+        self._due[name][number] = _Due(parameters)
+        if name in self._frames:
+            self._open(name, number)
+
+    @property
+    def total(self) -> int:
+        """Trials that are done, or due."""
+        return self.done + sum(map(len, self._due.values()))
+
+    def run(self, workers: Pool[Any]) -> Iterator[tuple[str, int, Trial]]:
+        """Yield each trial with its sequence and its number; more may be added meanwhile."""
+        for task, result in run(workers, self):
+            if isinstance(result, Frames):
+                self._unsaved.add(task.sequence)
+                self._know(task.sequence, result)
+            else:
+                yield from self._driven(task, result)
+
+    def store(self, name: str, number: int, trial: Trial) -> None:
+        """Store a trial, and before it what all on the sequence share: which scans are driven."""
+        self._save(name)
+        self._archive.write(name, number, trial, self._whole)
+
+    def close(self) -> None:
+        """Store the frames that no trial was stored with."""
+        for name in sorted(self._unsaved):
+            self._save(name)
+
+    def waits(self) -> bool:
+        """See `offline.workers.Work`."""
+        return bool(self._unread or self._waiting or self._unmeasured)
+
+    def take(self, held: Collection[Hashable], others: Collection[Hashable], n: int) -> Task:
+        """See `offline.workers.Work`."""
+        if self._unread:
+            return Task(self._unread.pop(0))
+        if not self._waiting:
+            name = self._unmeasured.pop(0)
+            return Task(name, self._described[name])
+
+        def rank(key: Hashable) -> tuple[bool, bool, int]:
+            return key not in held, key not in held and key in others, min(self._waiting[key])
+
+        key = min(self._waiting, key=rank)
+        waiting, stretch = self._waiting[key], self._stretches[key]
+        # Some are left for others, and for the time when the next sets wait.
+        size = math.ceil(len(waiting) / max(2, n / len(self._waiting)))
+        numbers = sorted(waiting)[: 1 if self._one_by_one else size]
+        sets = {number: waiting.pop(number) for number in numbers}
+        if not waiting:
+            del self._waiting[key]
+        name, n_scans = stretch.sequence, len(stretch.stamps)
+        most_ms, share = self.most_ms.get(name, np.inf), self._share(stretch)
+        most = max(1e-3 * most_ms * n_scans, LEAST_SECONDS * share)
+        return Task(name, stretch=stretch, sets=sets, most=most)
+
+    def note(self, task: Task, progress: TaskProgress) -> None:
+        """See `offline.workers.Work`."""
+        stage, scans, of = progress
+        if task.stretch is None:
+            self._progress(f"{stage} {task.sequence}", scans, of)
+            return
+        share = self._share(task.stretch) * scans / max(of, 1)
+        self._partly[task.key] = share * len(task.sets)
+        self._show()
+
+    def _know(self, name: str, frames: Frames) -> None:
+        measured, self._described[name] = name in self._described, frames
+        if measured:
+            return
+        self._frames[name] = frames.uncut if self._whole else frames
+        if self._measure and np.isnan(frames.evidence_ms):
+            self._unmeasured.append(name)
+        for number in self._due[name]:
+            self._open(name, number)
+
+    def _open(self, name: str, number: int) -> None:
+        due = self._due[name][number]
+        for stretch in stretches_along(name, self._frames[name]):
+            self._stretches[stretch.key] = stretch
+            self._waiting.setdefault(stretch.key, {})[number] = due.parameters
+            due.left += 1
+
+    def _driven(self, task: Task, result: Result) -> Iterator[tuple[str, int, Trial]]:
+        assert task.stretch is not None
+        assert not isinstance(result, Frames)
+        name = task.sequence
+        self._partly.pop(task.key, None)
+        for number, drives in result.items():
+            due = self._due[name][number]
+            due.drives[task.stretch.first] = drives
+            due.share += self._share(task.stretch)
+            due.left -= 1
+            if any(drive.too_slow for drive in drives):
+                due.left -= self._stop(name, number)
+            if not due.left:
+                del self._due[name][number]
+                self.done += 1
+                of = (due.parameters, self._frames[name], due.drives)
+                yield name, number, trial_of(self._settings, *of)
+        self._show()
+
+    def _stop(self, name: str, number: int) -> int:
+        """Drive a set no more on a sequence; returns along how many stretches it is not driven."""
+        stopped = 0
+        for key in [key for key in self._waiting if self._stretches[key].sequence == name]:
+            stopped += self._waiting[key].pop(number, None) is not None
+            if not self._waiting[key]:
+                del self._waiting[key]
+        return stopped
+
+    def _share(self, stretch: Stretch) -> float:
+        return len(stretch.stamps) / self._frames[stretch.sequence].n_driven
+
+    def _save(self, name: str) -> None:
+        if name in self._unsaved:
+            self._archive.write_frames(name, self._described[name])
+            self._unsaved.remove(name)
+
+    def _show(self) -> None:
+        due = sum(due.share for of in self._due.values() for due in of.values())
+        done = round(self.done + due + sum(self._partly.values()), 6)
+        self._progress(self._what, done, self.total)
 
 
 class Campaign:
@@ -32,115 +217,50 @@ class Campaign:
         workers: Pool[Any],
         progress: Progress = unseen,
     ):
-        self._study, self._archive, self._workers = study, archive, workers
-        self._progress = progress
+        self._archive, self._workers, self._progress = archive, workers, progress
         self._config, self._names = study.config.offline, study.training
+        self._clock = Clock(study.folder / "elapsed.json")
         self._finished = {name: archive.finished(name) for name in self._names}
-        space, known = study.odometry.space, archive.sets()
-        self._search = Search(self._config, space, self._names, self._finished, known)
+        space, known = study.odometry.space, archive.known()
+        self._search = Search(self._config, space, self._finished, known)
+        self._schedule = Schedule(study, archive, "runs", self._show)
         baselines = range(len(space.baselines))
-        self._most_ms = {
+        self._schedule.most_ms = {
             name: SLOW * max(drive.others.get(REGISTER_MS, np.inf) for drive in drives.values())
             for name, drives in read_whole_drives(archive, self._names, baselines).items()
             if drives
         }
-        described = study.config.descriptor
-        self._without_frames = [
-            name for name in self._names if not archive.has_frames(name, described)
-        ]
 
     def run(self) -> dict[int, Verdict]:
         """Run all trials that are not in the archive yet, and judge all of them by number."""
-        clock = Clock(self._study.folder / "elapsed.json")
-        batch, search = 0, self._search
-        while search.begin(clock.hours(batch)):
-            for m in rungs(self._config.pruning == "wilcoxon", batch, len(self._names)):
-                if tasks := self._tasks(search.missing(m)):
-                    with clock.running(batch):
-                        self._run_tasks(tasks)
-                search.prune(m)
-            search.close()
-            self._show(self._n_done())
-            batch += 1
+        search = self._search
+        self._begin()
+        for name, number, trial in self._schedule.run(self._workers):
+            self._schedule.store(name, number, replace(trial, source=search.sources[number]))
+            self._clock.save()
+            self._begin()
+        self._schedule.close()
         _log.info("the search ends: %s", search.end)
-        self._show(self._n_done())
+        self._show("runs", search.total * len(self._names), 0)
         return dict(sorted(search.done.items()))
 
-    def _run_tasks(self, tasks: list[Task]) -> None:
-        before = self._n_done()
+    def _begin(self) -> None:
+        """Begin as many trials as can begin now."""
+        while (number := self._search.begin(self._clock.hours)) is not None:
+            for name in self._names:
+                if number in self._finished[name]:
+                    self._schedule.done += 1
+                else:
+                    self._schedule.add(name, number, self._search.sets[number])
 
-        def show(what: str, done: float, of: int, remark: str = "", /) -> None:
-            if what == "runs":
-                self._show(before + done)
-            else:
-                self._progress(what, done, of, remark)
-
-        for task, result in run(self._workers, tasks, "runs", show):
-            _store(self._archive, task, result)
-
-    def _n_done(self) -> int:
-        """Runs that are done, with those that will not be run."""
-        search, finished = self._search, self._finished.values()
-        closed = len(search.done) * len(self._names)
-        return closed + sum(number in of for of in finished for number in search.numbers)
-
-    def _show(self, done: float) -> None:
-        search, remark = self._search, ""
-        if verdict := search.done.get(search.best):
-            what = f"best {label(self._config.objective)} {verdict.value:.3f}"
-            remark = f"{what} (trial {search.best})"
-        self._progress("runs", done, search.total(), remark)
-
-    def _tasks(self, missing: Sequence[tuple[str, Mapping[int, ParameterSet]]]) -> list[Task]:
-        without_frames, self._without_frames = self._without_frames, []
-        n_workers = len(self._workers.workers())
-        tasks = trial_tasks(missing, without_frames, n_workers, self._study.odometry.one_by_one)
-        return [task._replace(most_ms=self._most_ms.get(task.sequence, np.inf)) for task in tasks]
-
-
-def trial_tasks(
-    missing: Sequence[tuple[str, Mapping[int, ParameterSet]]],
-    without_frames: Sequence[str],
-    n_workers: int,
-    one_by_one: bool = False,
-) -> list[Task]:
-    """Split the trials that are missing on sequences, sets by number, between the workers.
-
-    Those of the last sequence are split into ever smaller pieces, so that all workers end together.
-    A sequence whose frames are missing, but no trial, is a task of its own. If trials run
-    `one_by_one`, so is every trial.
-    """
-    lacking = [(name, list(sets.items())) for name, sets in missing if sets]
-    to_read = [name for name in without_frames if name not in dict(lacking)]
-    tasks = [Task(name, (), (), frames=True) for name in to_read]
-    n_workers = max(1, n_workers)  # those of a cluster may all be on their way back
-    for last, (name, sets_of) in enumerate(lacking, 1 - len(lacking)):
-        left = sets_of
-        # The first task of a sequence returns what all trials on it share.
-        first = left[0] if name in without_frames else None
-        while left:
-            size = 1 if one_by_one else math.ceil(len(left) / n_workers / (1 if last else 2))
-            for share in range(n_workers):
-                if some := left[share * size : (share + 1) * size]:
-                    numbers, sets = zip(*some, strict=True)
-                    tasks.append(Task(name, numbers, sets, frames=some[0] is first))
-            left = left[n_workers * size :]
-    return tasks
-
-
-def watch_tasks(
-    archive: Archive, workers: Pool[Any], tasks: list[Task], what: str, progress: Progress
-) -> None:
-    """Run tasks and store their results, see `offline.workers.run`."""
-    for task, result in run(workers, tasks, what, progress):
-        _store(archive, task, result)
-
-
-def _store(archive: Archive, task: Task, result: TaskResult) -> None:
-    if result.frames is not None:
-        archive.write_frames(task.sequence, result.frames)
-    for number, trial in zip(task.numbers, result.trials, strict=True):
-        archive.write(task.sequence, number, trial, task.whole)
+    def _show(self, what: str, done: float, of: int, remark: str = "", /) -> None:
+        search = self._search
+        if what == "runs":
+            of = search.total * len(self._names)
+            if search.done:
+                value = search.done[search.best].value
+                remark = f"best {label(self._config.objective)} {value:.3f} (trial {search.best})"
+        self._progress(what, done, of, remark)
 
 
 WholeDrives = Mapping[str, Mapping[int, Summary]]
@@ -160,22 +280,23 @@ def read_whole_drives(
 
 
 def drive_whole(
-    names: Sequence[str],
+    study: OfflineStudy,
     sets: Mapping[int, ParameterSet],
     archive: Archive,
     workers: Pool[Any],
     progress: Progress,
 ) -> dict[str, dict[int, Summary]]:
-    """Drive sets along whole recordings, unless that was done before."""
+    """Drive sets along whole training sequences, unless that was done before."""
+    names = study.training
     there = read_whole_drives(archive, names, sets)
-    tasks = [
-        Task(name, (n,), (parameters,), whole=True)
-        for name in names
-        for n, parameters in sets.items()
-        if n not in there[name]
-    ]
-    watch_tasks(archive, workers, tasks, "whole drives", progress)
-    return read_whole_drives(archive, names, sets) if tasks else there
+    schedule = Schedule(study, archive, "whole drives", progress, whole=True)
+    for name in names:
+        for n, parameters in sets.items():
+            if n not in there[name]:
+                schedule.add(name, n, parameters)
+    for done in schedule.run(workers):
+        schedule.store(*done)
+    return read_whole_drives(archive, names, sets) if schedule.done else there
 
 
 class BaselineError(AdaptuneError):
@@ -199,25 +320,22 @@ def run_baseline(
     there = read_whole_drives(archive, study.training, range(len(space.baselines)))
     # What the study calls its odometries, in the order of their baselines' trials.
     labels = list(space.spaces) if isinstance(space, PooledSpace) else [study.odometry.name]
-    tasks: list[Task] = []
+    schedule = Schedule(study, archive, "baseline", progress, whole=True)
     for name in study.training:
-        # The first task of a sequence returns its frames, if they are lacking.
-        frames = not archive.has_frames(name, study.config.descriptor)
+        schedule.need(name)
         for number, parameters in enumerate(space.baselines):
             if number not in there[name]:
-                tasks.append(Task(name, (number,), (parameters,), True, frames))
-                frames = False
+                schedule.add(name, number, parameters)
     done = []
-    for task, result in run(workers, tasks, "baseline", progress):
-        check_baseline(labels[task.numbers[0]], task.sequence, result.trials[0])
-        done.append((task, result))
-    # What all trials share comes first: it says which scans are driven.
-    for task, result in sorted(done, key=lambda pair: pair[1].frames is None):
-        _store(archive, task, result)
-        name, whole = task.sequence, result.trials[0]
-        told = contradictions_of(study.sequences, name, whole.T_odom_sensor, whole.mean_error)
+    for name, number, trial in schedule.run(workers):
+        check_baseline(labels[number], name, trial)
+        done.append((name, number, trial))
+    for name, number, trial in done:
+        schedule.store(name, number, replace(trial, source="baseline"))
+        told = contradictions_of(study.sequences, name, trial.T_odom_sensor, trial.mean_error)
         for what in told:
-            _log.warning("sequences.%s, %s: %s", name, labels[task.numbers[0]], what)
+            _log.warning("sequences.%s, %s: %s", name, labels[number], what)
+    schedule.close()
 
 
 def check_baseline(odometry: str, sequence: str, run: Trial) -> None:

@@ -403,6 +403,10 @@ def _weighted(given: Any) -> Any:
     return {given: 1.0} if isinstance(given, str) else given
 
 
+TRIALS, INITIAL = 64, 0.25
+"""Trials of a search without a budget, and the share of all that are not proposed by results."""
+
+
 class OfflineConfig(StrictModel):
     """How to search for parameter sets; ``docs/reference-study.md`` describes every key."""
 
@@ -411,8 +415,8 @@ class OfflineConfig(StrictModel):
     trials: int | None = Field(None, ge=1, le=10**6)
     hours: float | None = Field(None, gt=0, le=1e5)
     stagnation: int | None = Field(None, ge=1, le=10**6)
-    initial: int = Field(32, ge=1, le=10_000)
-    batch: int = Field(16, ge=1, le=1000)
+    initial: int | None = Field(None, ge=1, le=10_000)
+    batch: int = Field(8, ge=1, le=1000)
     seed: int = Field(0, ge=0, lt=2**32)
     workers: int | None = Field(None, ge=1, le=256)
     objective: Annotated[_Weighted, BeforeValidator(_weighted)] = Field({"rte": 1.0})
@@ -421,12 +425,19 @@ class OfflineConfig(StrictModel):
     stretches: Annotated[int, Field(ge=1, le=10_000)] | Literal["all"] = 12
     repeats: int = Field(1, ge=1, le=100)
     baseline_runs: int | None = Field(None, ge=1, le=1000)
-    pruning: Literal["none", "wilcoxon"] = "none"
 
     @property
-    def budgeted(self) -> bool:
-        """Whether the study sets a budget."""
-        return any((self.trials, self.hours, self.stagnation))
+    def most_trials(self) -> int | None:
+        """Number of trials after which the search stops; None if another budget stops it."""
+        if self.trials or self.hours or self.stagnation or self.sampler == "grid":
+            return self.trials
+        return TRIALS
+
+    @property
+    def n_initial(self) -> int:
+        """Trials with which a sampler that learns begins: a share of all, if not set."""
+        share = round(INITIAL * (self.most_trials or TRIALS))
+        return self.initial or max(self.batch, share)
 
     def mistakes(self, space: ParameterSpace | None) -> Iterable[Finding]:
         """Find mistakes in the sampler and its settings."""
@@ -455,7 +466,7 @@ class OfflineConfig(StrictModel):
 
 _SEARCH = (
     *("sampler", "sampler_settings", "initial", "batch", "seed"),
-    *("objective", "stretches", "repeats", "baseline_runs", "pruning"),
+    *("objective", "stretches", "repeats", "baseline_runs"),
 )
 """Settings by which a search differs from another."""
 

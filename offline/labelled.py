@@ -1,6 +1,6 @@
 """The labelled data set: what the archive holds about every training sequence."""
 
-from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, lru_cache, partial
 from typing import TYPE_CHECKING, NamedTuple
@@ -241,7 +241,7 @@ class LabelledSequence:
     simulation: BankSimulation  # of all frames
     known: NDArray[np.intp]  # (n,): numbers of the labelled ones
     stretch: NDArray[np.intp]  # (n,): number of each frame's stretch
-    # (n, n_sets): percent, infinite where the track was lost, NaN where a set was not run.
+    # (n, n_sets): percent, infinite where the track was lost, NaN where a set never gave a pose.
     errors: NDArray[np.float32]
     baseline: NDArray[np.float64]  # (n,): errors of the baseline
     blocks: Mapping[str, int]  # by name, in order, the lengths of the descriptors
@@ -379,11 +379,9 @@ class LabelledData(NamedTuple):
         few = [s.subset(columns) for s in self.sequences]
         return self._replace(sequences=few, sets=self.sets.subset(trials))
 
-    def complete(self) -> "LabelledData":
-        """The same with the usable sets that were run on all sequences, on every frame."""
-        missing = np.array([np.isnan(s.errors).any(axis=0) for s in self.sequences])
-        everywhere = [self.sets.trials[c] for c in np.flatnonzero(~missing.any(axis=0))]
-        return self.subset([n for n in everywhere if self.costs.usable(n)])
+    def usable(self) -> "LabelledData":
+        """The same with the sets that did not fail."""
+        return self.subset([n for n in self.sets if self.costs.usable(n)])
 
     @property
     def recordings(self) -> list[str]:
@@ -493,16 +491,13 @@ def periods(period: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArray[np.int
 
 
 def measured_costs(
-    archive: Archive, run: Mapping[str, Iterable[int]], sets: ParameterSets, odometry: Factory
+    archive: Archive, names: Sequence[str], sets: ParameterSets, odometry: Factory
 ) -> Costs:
-    """Mean costs of sets over the sequences on which they were run.
-
-    `run` has for each sequence the trials that count there.
-    """
+    """Mean costs of sets over sequences."""
     numbers: dict[Hashable, int] = {}
     found: dict[int, SetCost] = {}
     for trial in sets:
-        runs = [archive.finished(name)[trial] for name, trials in run.items() if trial in trials]
+        runs = [archive.finished(name)[trial] for name in names]
         register, prepare = (
             float(np.mean([one.others.get(key, np.nan) for one in runs]))
             for key in (REGISTER_MS, PREPARE_MS)
@@ -511,12 +506,12 @@ def measured_costs(
             register = np.inf
         key = odometry(sets[trial]).preparation
         found[trial] = SetCost(register, prepare, numbers.setdefault(key, len(numbers)))
-    return Costs(found, float(np.mean([archive.read_frames(name).evidence_ms for name in run])))
+    return Costs(found, float(np.mean([archive.read_frames(name).evidence_ms for name in names])))
 
 
 def labelled_data(
     archive: Archive,
-    run: Mapping[str, Collection[int]],
+    names: Sequence[str],
     sets: ParameterSets,
     config: OfflineStudyConfig,
     window: int,
@@ -525,8 +520,8 @@ def labelled_data(
 ) -> LabelledData:
     """Read the labelled data set of a study.
 
-    `run` has for each training sequence the trials that count there, `window` the number of
-    descriptors that are averaged, `recorded_in` the recording of a sequence.
+    `window` is the number of descriptors that are averaged, `recorded_in` tells the recording of a
+    sequence.
 
     Raises
     ------
@@ -534,15 +529,14 @@ def labelled_data(
         If a trial is missing.
     """
     read: dict[str, LabelledSequence] = {}
-    for name, counted in run.items():
-        if missing := set(counted) - set(archive.finished(name)):
+    for name in names:
+        if missing := set(sets) - set(archive.finished(name)):
             raise ModelError(
                 f"{archive.folder}: lacks trial {min(missing)} on {name}, which the model was "
                 f"fitted to; run `adaptune offline` again"
             )
-        one = _labelled(archive, name, set(counted), sets, config, window, recorded_in(name))
-        read[name] = one
-    costs, online = measured_costs(archive, run, sets, odometry), config.online
+        read[name] = _labelled(archive, name, sets, config, window, recorded_in(name))
+    costs, online = measured_costs(archive, names, sets, odometry), config.online
     live = odometry.description.live
     return LabelledData(list(read.values()), sets, costs, online.budget, online.worth, live)
 
@@ -585,7 +579,7 @@ def with_vectors(data: LabelledData, archive: Archive) -> LabelledData:
         T_ref_sensor, length = s.simulation.T_ref_counted, s.simulation.length
         vectors = {
             trial: error_vectors(T_ref_sensor, archive.read(s.name, trial), length)[s.known]
-            for trial in eligible.intersection(archive.finished(s.name))
+            for trial in eligible
         }
         sequences.append(replace(s, vectors=vectors))
     return data._replace(sequences=sequences)
@@ -606,7 +600,6 @@ def _eligible(sequences: Sequence[LabelledSequence], sets: ParameterSets) -> set
 def _labelled(
     archive: Archive,
     name: str,
-    run: Collection[int],
     sets: ParameterSets,
     config: OfflineStudyConfig,
     window: int,
@@ -615,16 +608,14 @@ def _labelled(
     """A labelled sequence without error vectors and drives of the whole."""
     frames, length = archive.read_frames(name), config.sub_trajectory
     errors = archive.read_errors(name, list(sets))
-    # Trials that were run for another budget do not count.
-    errors[:, [trial not in run for trial in sets]] = np.nan
     baseline = archive.read(name, 0).errors
     # All trials know the same frames, but for those before an odometry's first pose.
     ran = np.column_stack([errors[:, ~np.isnan(errors).all(axis=0)], baseline])
     known = np.flatnonzero(~np.isnan(ran).any(axis=1))
     objective = config.offline.objective
-    summaries = [archive.finished(name)[trial] if trial in run else None for trial in sets]
-    values = [weighted(objective, s.metrics) if s and not s.failure else np.inf for s in summaries]
-    restarts = [np.inf if s is None or s.failure else float(s.restarts) for s in summaries]
+    summaries = [archive.finished(name)[trial] for trial in sets]
+    values = [np.inf if s.failure else weighted(objective, s.metrics) for s in summaries]
+    restarts = [np.inf if s.failure else float(s.restarts) for s in summaries]
     read = cache(partial(archive.read, name))
 
     @lru_cache(maxsize=1)  # one bank after the other is asked for, each many times

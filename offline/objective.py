@@ -41,36 +41,25 @@ PENALTY = 10.0
 
 
 class Verdict(NamedTuple):
-    """How a parameter set did on the sequences on which it was run."""
+    """How a parameter set did on some sequences."""
 
     parameters: ParameterSet
     value: float  # mean of the objective over the sequences
     # Distance from the value to the upper end of its one-sided 95 % confidence interval; 0
     # unless trials are repeated.
     margin: float = 0.0
-    # Whether the set was run on all sequences; if not, its value is an estimate.
-    complete: bool = True
-    sequences: tuple[str, ...] = ()  # the sequences on which it was run
     failure: str = ""  # why it is never chosen; empty if it may be
     restarts: float = 0.0  # by the health check, on these sequences
 
     @property
     def state(self) -> str:
-        """What became of it: `complete`, `pruned`, or `failed`, and why."""
-        failed = f"failed: {self.failure}" if self.failure else ""
-        return failed or ("complete" if self.complete else "pruned")
+        """What became of it: `complete`, or `failed`, and why."""
+        return f"failed: {self.failure}" if self.failure else "complete"
 
     @property
     def bound(self) -> float:
         """What the value surely is below: the upper end of its interval."""
         return self.value + self.margin
-
-
-class SamplerResult(NamedTuple):
-    """The result of a trial as samplers receive it."""
-
-    parameters: ParameterSet
-    value: float  # samplers minimise it
 
 
 def trajectory_metrics(T_ref_sensor: Poses, T_odom_sensor: Poses) -> dict[str, float]:
@@ -134,12 +123,10 @@ def margin(repeats: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(stats.t.ppf(0.95, n_sequences * (n_repeats - 1)) * error)
 
 
-def sampler_results(verdicts: Sequence[Verdict]) -> list[SamplerResult]:
-    """The results of trials as samplers receive them; the first one is the baseline's."""
+def told(verdicts: Sequence[Verdict]) -> list[tuple[ParameterSet, float]]:
+    """Parameters and values of trials as samplers are told; the first one is the baseline's."""
     worst = PENALTY * (verdicts[0].value or 1.0) if verdicts else 0.0
-    return [
-        SamplerResult(v.parameters, max(v.value, worst if v.failure else 0.0)) for v in verdicts
-    ]
+    return [(v.parameters, max(v.value, worst if v.failure else 0.0)) for v in verdicts]
 
 
 def label(weights: Mapping[Metric, float], units: bool = False) -> str:

@@ -1,10 +1,11 @@
-"""Samplers: what proposes the next parameter sets, in batches, and no set twice."""
+"""Samplers: what proposes the next parameter set, and no set twice."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from itertools import islice, zip_longest
-from operator import itemgetter
-from typing import Any
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from functools import partial
+from itertools import islice
+from typing import Any, NamedTuple
 
 import numpy as np
 import optuna
@@ -31,47 +32,43 @@ from offline.config import (
     make_grid,
     optuna_sampler,
 )
-from offline.objective import SamplerResult
 
 _ENUMERABLE = 4096
 _DRAWS = 1000
 
 
-class Sampler(ABC):
-    """Proposes trials in batches.
+class Proposal(NamedTuple):
+    """A parameter set to try."""
 
-    Proposals depend on the seed and on the results of the batches before, and on nothing else: not
-    on the number of trials, nor on who runs them. Trial 0 is the baseline, and no set is proposed
-    twice.
+    parameters: ParameterSet
+    source: str  # `baseline`, `sobol` (initial points), `random`, or the sampler's name
+
+
+History = Sequence[tuple[ParameterSet, float]]
+"""Sets that were tried and their values, which samplers minimise."""
+
+
+class Sampler(ABC):
+    """Proposes trials one after the other.
+
+    Proposals depend on the seed and on the results that are given, and on nothing else: not on the
+    number of trials, nor on who runs them. Trial 0 is the baseline, and no set is proposed twice.
     """
 
     end = "there is nothing else to try"
-    """Why the search ends when the sampler proposes fewer sets than a batch."""
+    """Why the search ends when the sampler proposes nothing."""
 
     def __init__(self, space: ParameterSpace, config: OfflineConfig):
         self.space = space
         self.config = config
 
-    def propose(self, history: Sequence[tuple[Any, ...]]) -> list[ParameterSet]:
-        """Propose the parameter sets of the next batch.
-
-        The history has the results of all trials of the batches before, in their order:
-        `SamplerResult`, or tuples of a set and its value.
-
-        Returns
-        -------
-        list of dict
-            ``config.batch`` parameter sets; fewer where nothing is left to try, which ends the
-            search.
-        """
-        first = len(history)
-        if first % self.config.batch:
-            raise ValueError(f"batches have {self.config.batch} trials; {first} is not a multiple")
-        results = [SamplerResult(*result) for result in history]
-        return self._propose(range(first, first + self.config.batch), results)
-
     @abstractmethod
-    def _propose(self, numbers: range, history: Sequence[SamplerResult]) -> list[ParameterSet]: ...
+    def propose(self, history: History, running: Sequence[ParameterSet] = ()) -> Proposal | None:
+        """Propose the set of the next trial; None if nothing is left to try.
+
+        `history` has the results of the first trials in their order, `running` the sets of those
+        that follow and have none yet.
+        """
 
 
 def untried(
@@ -90,9 +87,22 @@ def untried(
     return None
 
 
+def another(
+    space: ParameterSpace, tried: Collection[str], rng: np.random.Generator
+) -> Proposal | None:
+    """Propose a set that was not tried, see `untried`."""
+    drawn = untried(space, tried, rng)
+    return None if drawn is None else Proposal(drawn, "random")
+
+
 def key(parameters: ParameterSet) -> str:
     """Text that identifies a set: True is not 1."""
     return repr(sorted(parameters.items()))
+
+
+def keys(history: History, running: Iterable[ParameterSet]) -> set[str]:
+    """Texts that identify all sets that were tried, or are being tried."""
+    return {key(parameters) for parameters in (*(tried for tried, _ in history), *running)}
 
 
 _SHUFFLED = 1 << 20
@@ -105,36 +115,41 @@ class RandomSampler(Sampler):
     Each set follows from the number of its trial. One that was tried before is drawn again.
     """
 
-    def _propose(self, numbers: range, history: Sequence[SamplerResult]) -> list[ParameterSet]:
-        tried = {key(result.parameters) for result in history}
-        sets: list[ParameterSet] = []
-        for number in numbers:
-            drawn = self.space.baseline
-            if number:
-                rng = np.random.default_rng((self.config.seed, number))
-                (drawn,) = self.space.from_unit(rng.random((1, len(self.space))))
-            again = np.random.default_rng((self.config.seed, number, 1))
-            point = untried(self.space, tried, again) if key(drawn) in tried else drawn
-            if point is None:
-                break
-            tried.add(key(point))
-            sets.append(point)
-        return sets
+    def propose(self, history: History, running: Sequence[ParameterSet] = ()) -> Proposal | None:
+        """See `Sampler`."""
+        if not history and not running:
+            return Proposal(self.space.baseline, "baseline")
+        number = len(history) + len(running)
+        (drawn,) = self.space.from_unit(self._rng(number).random((1, len(self.space))))
+        if key(drawn) not in (tried := keys(history, running)):
+            return Proposal(drawn, "random")
+        return another(self.space, tried, self._rng(number, 1))
+
+    def _rng(self, *words: int) -> np.random.Generator:
+        return np.random.default_rng((self.config.seed, *words))
 
 
 class GridSampler(Sampler):
     """The baseline, then the other points of a grid, in row-major or in random order."""
 
-    def _propose(self, numbers: range, history: Sequence[SamplerResult]) -> list[ParameterSet]:  # noqa: ARG002
-        settings = GridSettings.model_validate(self.config.sampler_settings)
-        grid = make_grid(self.space, settings.grid or {})
-        order: Iterable[int] = range(grid.size)
-        if self.config.sampler == "random":
-            order = _shuffled(grid.size, self.config.seed, numbers.stop)
-        baseline = self.space.baseline
-        known = grid.index(baseline)
-        rest = islice((i for i in order if i != known), max(numbers.start - 1, 0), numbers.stop - 1)
-        return [baseline] * (numbers.start == 0) + [grid[i] for i in rest]
+    def __init__(self, space: ParameterSpace, config: OfflineConfig):
+        super().__init__(space, config)
+        settings = GridSettings.model_validate(config.sampler_settings)
+        self._grid = make_grid(space, settings.grid or {})
+        self._order: list[int] = []
+
+    def propose(self, history: History, running: Sequence[ParameterSet] = ()) -> Proposal | None:
+        """See `Sampler`."""
+        number, name, grid = len(history) + len(running), self.config.sampler, self._grid
+        if not number:
+            return Proposal(self.space.baseline, "baseline")
+        if number > len(self._order):
+            order: Iterable[int] = range(grid.size)
+            if name == "random":
+                order = _shuffled(grid.size, self.config.seed, 2 * number)
+            known = grid.index(self.space.baseline)
+            self._order = list(islice((i for i in order if i != known), 2 * number))
+        return Proposal(grid[self._order[number - 1]], name) if number <= len(self._order) else None
 
 
 def _shuffled(size: int, seed: int, n: int) -> Iterator[int]:
@@ -169,8 +184,8 @@ class AskedSampler(Sampler):
 
     Many Optuna samplers keep notes on the trials that they proposed. A resumed search therefore
     asks again for the earlier proposals, and answers from the history. Samplers without notes
-    receive the history instead, and begin every batch with a seed of its own; so do those that no
-    longer propose what they did, because sequences were added, or another version is installed.
+    receive the history instead, with a seed of its own for every trial; so do those that no longer
+    propose what they did, because sequences were added, or another version is installed.
 
     If the sampler proposes a set that was tried before, it receives the known value at once and is
     asked again. After many attempts, a random set is taken.
@@ -184,96 +199,88 @@ class AskedSampler(Sampler):
             else distribution(p)
             for name, p in space.parameters.items()
         }
-        self._forgetful = config.sampler == "tpe"
-        self._begin(0, ())
+        self._forgetful = config.sampler in ("tpe", "annealing")
+        self._begin(0, (), ())
 
-    def _begin(self, seed: int, history: Sequence[SamplerResult]) -> None:
-        self._study = optuna.create_study(sampler=self._sampler(seed))
-        self._study.add_trials(
-            optuna.trial.create_trial(
-                params=self._encode(result.parameters),
-                distributions=self._distributions,
-                value=result.value,
-            )
-            for result in history
-        )
-        self._history = list(history)
-        self._known = {key(result.parameters): result for result in history}
-        self._waiting: dict[str, tuple[ParameterSet, list[Any]]] = {}
-
-    def _sampler(self, batch: int) -> Any:
-        config = self.config
-        if config.sampler == "annealing":
-            settings = AnnealingSettings.model_validate(config.sampler_settings)
-            return AnnealingSampler(settings, n_startup_trials=config.initial, seed=config.seed)
-        # The initial points are the start-up; TPE needs no random points of its own.
-        usual = {"n_startup_trials": 1} if config.sampler == "tpe" else {}
-        seed = int(np.random.SeedSequence((config.seed, batch)).generate_state(1)[0])
-        return optuna_sampler(config.sampler, usual | config.sampler_settings, seed)
-
-    def _propose(self, numbers: range, history: Sequence[SamplerResult]) -> list[ParameterSet]:
-        if self._history != list(history[: len(self._history)]):
-            self._begin(0, ())
-        while len(self._history) < numbers.start and not self._forgetful:
-            first = len(self._history)
-            batch = range(first, first + self.config.batch)
-            self._ask(batch)
-            self._answer(history[batch.start : batch.stop])
+    def propose(self, history: History, running: Sequence[ParameterSet] = ()) -> Proposal | None:
+        """See `Sampler`."""
+        number = len(history) + len(running)
+        if not self._forgetful:
+            self._replay([parameters for parameters, _ in history] + list(running), history)
         if self._forgetful:
-            self._begin(numbers.start // self.config.batch, history)
-        return self._ask(numbers)
-
-    def _ask(self, numbers: range) -> list[ParameterSet]:
-        """Sets of the next batch; the same sets until they are answered."""
+            self._begin(number, history, running)
         sampler = self._study.sampler
         if isinstance(sampler, AnnealingSampler) and sampler.stalled(self._study):
             self.end = "all chains have stalled"
-        elif not self._waiting:
-            tried = {key(result.parameters) for result in self._history}
-            given = [self.space.baseline][numbers.start :]
-            rest = range(numbers.start + len(given), min(numbers.stop, self.config.initial))
-            given += sobol_points(self.space, self.config.seed, rest)
-            for number, first in zip_longest(numbers, given):
-                if not self._ask_once(number, first, tried):
-                    break
-        return [parameters for parameters, _ in self._waiting.values()]
+            return None
+        return self._ask(number)
 
-    def _ask_once(self, number: int, given: ParameterSet | None, tried: set[str]) -> bool:
+    def _begin(self, number: int, history: History, running: Sequence[ParameterSet]) -> None:
+        """Begin anew, with these trials; the next one has this number."""
+        self._study = optuna.create_study(sampler=self._sampler(number))
+        self._asked: list[ParameterSet] = []
+        self._waiting: dict[str, list[Any]] = {}  # trials without a value
+        self._values = {key(parameters): value for parameters, value in history}
+        make = partial(optuna.trial.create_trial, distributions=self._distributions)
+        state = optuna.trial.TrialState.RUNNING
+        self._study.add_trials(
+            [make(params=self._encode(parameters), value=value) for parameters, value in history]
+            + [make(params=self._encode(parameters), state=state) for parameters in running]
+        )
+        self._tried = keys(history, running)
+
+    def _replay(self, sets: Sequence[ParameterSet], history: History) -> None:
+        """Ask for all sets that were proposed so far, and answer as it was done then."""
+        if self._asked != list(sets[: len(self._asked)]):
+            self._begin(0, (), ())
+        for number in range(len(self._asked), len(sets) + 1):
+            for parameters, value in history[: max(0, number - self.config.batch + 1)]:
+                self._values[name := key(parameters)] = value
+                for trial in self._waiting.pop(name, ()):
+                    self._call(self._study.tell, trial, value)
+            if number < len(sets):
+                proposed = self._ask(number)
+                if proposed is None or proposed.parameters != sets[number]:
+                    self._forgetful = True
+                    return
+
+    def _sampler(self, number: int) -> Any:
+        config = self.config
+        if config.sampler == "annealing":
+            settings = AnnealingSettings.model_validate(config.sampler_settings)
+            return AnnealingSampler(settings, n_startup_trials=config.n_initial, seed=config.seed)
+        # The initial points are the start-up; TPE needs no random points of its own.
+        usual = {"n_startup_trials": 1} if config.sampler == "tpe" else {}
+        seed = int(np.random.SeedSequence((config.seed, number)).generate_state(1)[0])
+        return optuna_sampler(config.sampler, usual | config.sampler_settings, seed)
+
+    def _ask(self, number: int) -> Proposal | None:
+        """Ask for the set of a trial."""
+        given: Proposal | None = None
+        if not number:
+            given = Proposal(self.space.baseline, "baseline")
+        elif number < self.config.n_initial:
+            (point,) = sobol_points(self.space, self.config.seed, range(number, number + 1))
+            given = Proposal(point, "sobol")
         for attempt in range(_ATTEMPTS):
             if attempt == _ATTEMPTS - 1:
                 rng = np.random.default_rng((self.config.seed, number, 1))
-                given = untried(self.space, tried, rng)
-                if given is None:
-                    return False
+                if (given := another(self.space, self._tried, rng)) is None:
+                    return None
             if given is not None:
-                self._study.enqueue_trial(self._encode(given))
+                self._study.enqueue_trial(self._encode(given.parameters))
             trial = self._call(self._study.ask, self._distributions)
-            parameters, given = given or self._decode(trial.params), None
-            name = key(parameters)
-            if name in self._known:
-                self._tell(trial, self._known[name])
-            elif name in self._waiting:
-                self._waiting[name][1].append(trial)
-            else:
-                self._waiting[name] = (parameters, [trial])
-                tried.add(name)
-                return True
+            found, given = given or Proposal(self._decode(trial.params), self.config.sampler), None
+            name = key(found.parameters)
+            if name in self._values:
+                self._call(self._study.tell, trial, self._values[name])
+                continue
+            self._waiting.setdefault(name, []).append(trial)
+            if name not in self._tried:
+                self._tried.add(name)
+                self._asked.append(found.parameters)
+                return found
         raise AssertionError
-
-    def _answer(self, results: Sequence[SamplerResult]) -> None:
-        asked = [parameters for parameters, _ in self._waiting.values()]
-        if asked != [result.parameters for result in results]:
-            self._forgetful = True
-            return
-        for (_, trials), result in zip(self._waiting.values(), results, strict=True):
-            for trial in trials:
-                self._tell(trial, result)
-            self._known[key(result.parameters)] = result
-        self._history += results
-        self._waiting = {}
-
-    def _tell(self, trial: optuna.Trial, result: SamplerResult) -> None:
-        self._call(self._study.tell, trial, result.value)
 
     def _call(self, method: Callable[..., Any], *given: Any) -> Any:
         """Call a sampler that may be the user's own."""
@@ -307,9 +314,8 @@ class PooledSampler(Sampler):
     """A sampler for each odometry, over its own parameters and with the results of its own sets.
 
     The first trials are the baselines of all odometries. Then the odometries take turns until
-    ``config.initial`` trials. After that each batch is split: an odometry whose best value so far
-    is the k-th best of all gets a share in proportion to 1 / k. It gets one set at least where the
-    batch has enough.
+    ``config.n_initial`` trials. After that the odometry whose best value so far is the k-th best of
+    all gets a share in proportion to 1 / k (Sainte-Lague's method).
     """
 
     space: PooledSpace
@@ -317,7 +323,7 @@ class PooledSampler(Sampler):
     def __init__(self, space: PooledSpace, config: OfflineConfig):
         super().__init__(space, config)
         n = len(space.spaces)
-        self._n_initial = max(config.initial, n)
+        self._n_initial = max(config.n_initial, n)
         turns = [len(range(i, self._n_initial, n)) for i in range(n)]
         seeds = np.random.SeedSequence((config.seed, 1)).generate_state(n).tolist()
         of_each = zip(space.spaces.items(), turns, seeds, strict=True)
@@ -326,63 +332,35 @@ class PooledSampler(Sampler):
             for (label, own), initial, seed in of_each
         }
 
-    def _propose(self, numbers: range, history: Sequence[SamplerResult]) -> list[ParameterSet]:
-        of = {label: self._own(label, history) for label in self._samplers}
-        sets: dict[str, list[ParameterSet]] = {label: [] for label in of}
-        able = list(of)
-        while (n := sum(map(len, sets.values()))) < len(numbers) and able:
-            for label, more in self._split(range(numbers.start + n, numbers.stop), of, able):
-                wanted, first = len(sets[label]) + more, len(of[label])
-                # Asked for more, a sampler proposes the same sets first.
-                own = self._samplers[label]._propose(range(first, first + wanted), of[label])
-                sets[label] = [{ODOMETRY: label, **parameters} for parameters in own]
-                if len(own) < wanted:
-                    able.remove(label)
-        return _spread(sets, numbers.start)
+    def propose(self, history: History, running: Sequence[ParameterSet] = ()) -> Proposal | None:
+        """See `Sampler`."""
+        tried: dict[str, list[tuple[ParameterSet, float]]] = {one: [] for one in self._samplers}
+        tries: dict[str, list[ParameterSet]] = {one: [] for one in self._samplers}
+        labels = []  # whose turn it was
+        for parameters, value in history:
+            label, own = self.space.split(parameters)
+            tried[label].append((own, value))
+            labels.append(label)
+        for parameters in running:
+            label, own = self.space.split(parameters)
+            tries[label].append(own)
+            labels.append(label)
+        for label in self._order(labels, tried):
+            if (found := self._samplers[label].propose(tried[label], tries[label])) is not None:
+                return found._replace(parameters={ODOMETRY: label, **found.parameters})
+        return None
 
-    def _own(self, label: str, history: Sequence[SamplerResult]) -> list[SamplerResult]:
-        """The results of the sets of one odometry, as its sampler takes them."""
-        own = []
-        for result in history:
-            of, parameters = self.space.split(result.parameters)
-            if of == label:
-                own.append(result._replace(parameters=parameters))
-        return own
-
-    def _split(
-        self, numbers: range, of: dict[str, list[SamplerResult]], labels: Sequence[str]
-    ) -> list[tuple[str, int]]:
-        """How many of the next trials each odometry gets; those that get none are left out."""
-        initial = range(numbers.start, max(numbers.start, min(numbers.stop, self._n_initial)))
-        counts = dict.fromkeys(labels, 0)
-        for number in initial:
-            counts[labels[number % len(labels)]] += 1
-        rest = len(numbers) - len(initial)
-        ranked = sorted(labels, key=lambda label: _best(of[label]))
-        shares = 1.0 / np.arange(1, len(ranked) + 1)
-        ideal = rest * shares / shares.sum()
-        whole = np.floor(ideal).astype(int)
-        whole[np.argsort(whole - ideal, kind="stable")[: rest - whole.sum()]] += 1
-        while rest >= len(whole) and not whole.all():
-            # Nobody is given up for a bad beginning.
-            whole[whole.argmax()] -= 1
-            whole[whole.argmin()] += 1
-        for label, n in zip(ranked, whole.tolist(), strict=True):
-            counts[label] += n
-        return [(label, n) for label, n in counts.items() if n]
-
-
-def _best(history: Sequence[SamplerResult]) -> float:
-    """The least value."""
-    return min((result.value for result in history), default=np.inf)
-
-
-def _spread(sets: dict[str, list[ParameterSet]], first: int) -> list[ParameterSet]:
-    """The sets of a batch, those of each odometry evenly; trial `first` says who begins."""
-    labels = list(sets)
-    order = [*labels[first % len(labels) :], *labels[: first % len(labels)]]
-    placed = [(k / len(sets[label]), own) for label in order for k, own in enumerate(sets[label])]
-    return [own for _, own in sorted(placed, key=itemgetter(0))]
+    def _order(
+        self, labels: Sequence[str], tried: Mapping[str, Sequence[tuple[ParameterSet, float]]]
+    ) -> list[str]:
+        """The odometries, the one whose turn it is first."""
+        every, number = list(tried), len(labels)
+        if number < self._n_initial:
+            first = number % len(every)
+            return every[first:] + every[:first]
+        ranked = sorted(every, key=lambda label: min((v for _, v in tried[label]), default=np.inf))
+        had = Counter(labels[self._n_initial :])
+        return sorted(every, key=lambda one: (1 + ranked.index(one)) * (2 * had[one] + 1))
 
 
 def make_sampler(space: ParameterSpace, config: OfflineConfig) -> Sampler:
@@ -395,8 +373,8 @@ def make_sampler(space: ParameterSpace, config: OfflineConfig) -> Sampler:
         return GridSampler(space, config)
     if ":" in config.sampler:
         # One that cannot sample these parameters says so before anything is run.
-        rehearsal = AskedSampler(space, config.model_copy(update={"initial": 1}))
-        proposed = rehearsal.propose([])
-        if len(proposed) == config.batch:
-            rehearsal.propose([(parameters, 1.0 + i) for i, parameters in enumerate(proposed)])
+        rehearsal = AskedSampler(space, config.model_copy(update={"initial": 1, "batch": 1}))
+        history: list[tuple[ParameterSet, float]] = []
+        while len(history) < 3 and (proposed := rehearsal.propose(history)) is not None:
+            history.append((proposed.parameters, 1.0 + len(history)))
     return AskedSampler(space, config)

@@ -32,11 +32,10 @@ from adaptune.study.references import (
 from adaptune.study.study import BANK, FIXED_SET, OracleErrors, StudySequences, oracle_errors
 from offline.campaign import (
     Campaign,
+    Schedule,
     WholeDrives,
     drive_whole,
     run_baseline,
-    trial_tasks,
-    watch_tasks,
 )
 from offline.choice import BlockErrors, front, left_out_ratio, mean_and_error, ratio_to_baseline
 from offline.choice import choose as choose_fixed
@@ -115,27 +114,18 @@ def train(study: OfflineStudy, progress: Progress = unseen, cluster: str | None 
     with trial_workers(study, names, cluster) as workers:
         run_baseline(study, archive, workers, progress)
         verdicts = Campaign(study, archive, workers, progress).run()
-        finished = {
-            name: {n: archive.finished(name)[n] for n, v in verdicts.items() if name in v.sequences}
-            for name in names
-        }
+        finished = {name: {n: archive.finished(name)[n] for n in verdicts} for name in names}
         tried = tuple(verdict.parameters for verdict in verdicts.values())
         every_set = ParameterSets(space, tuple(verdicts), tried)
-        data = labelled_data(
-            archive,
-            finished,
-            every_set,
-            study.config,
-            study.window,
-            study.sequences.recorded_in,
-            study.odometry,
-        )
-        of_all = data.complete()
-        sets = {n: verdicts[n].parameters for n in {*of_all.finalists(), *every_set.defaults}}
-        whole = drive_whole(names, dict(sorted(sets.items())), archive, workers, progress)
-    of_all = with_whole_drives(of_all, archive, study.config)
-    fixed = of_all.fixed()
-    model = _fitted(study, data, with_vectors(of_all, archive), finished, fixed)
+        recorded_in = study.sequences.recorded_in
+        about = (names, every_set, study.config, study.window, recorded_in, study.odometry)
+        data = labelled_data(archive, *about)
+        usable = data.usable()
+        sets = {n: verdicts[n].parameters for n in {*usable.finalists(), *every_set.defaults}}
+        whole = drive_whole(study, dict(sorted(sets.items())), archive, workers, progress)
+    usable = with_whole_drives(usable, archive, study.config)
+    fixed = usable.fixed()
+    model = _fitted(study, data, with_vectors(usable, archive), finished, fixed)
     write_fixed(study, verdicts[fixed].parameters)
     trials = _trial_rows(config, space, verdicts, finished)
     tables.write_rows(study.folder, "trials", trials)
@@ -150,10 +140,10 @@ def train(study: OfflineStudy, progress: Progress = unseen, cluster: str | None 
         lambda worst: hard_to_track(study.sequences.open(worst)),
     )
     said += estimates_in_words(estimates, model.length)
-    said += left_out_in_words(of_all)
+    said += left_out_in_words(usable)
     said += failed_in_words(verdicts)
     said += baseline_words(config, [runs[0] for runs in finished.values()])
-    rows_of_front = front_rows(of_all, model)
+    rows_of_front = front_rows(usable, model)
     tables.write_rows(study.folder, "front", rows_of_front)
     return Training(model, trials, rows, said, rows_of_front)
 
@@ -265,7 +255,7 @@ def trial_workers(
 
 
 def _fitted(
-    study: OfflineStudy, data: LabelledData, complete: LabelledData, finished: Finished, fixed: int
+    study: OfflineStudy, data: LabelledData, usable: LabelledData, finished: Finished, fixed: int
 ) -> ErrorModel:
     """The study's error model: the one before, if that was fitted to just this, or fitted now."""
     config, inputs = study.config, study.model_inputs
@@ -293,7 +283,7 @@ def _fitted(
         return before
     identity, length = study.odometry.identity, config.sub_trajectory
     model = fit(data, fixed, identity, length, study.window, provenance)
-    model = tuned(model, complete, config.online.switching)
+    model = tuned(model, usable, config.online.switching)
     model.save(study.model_path)
     manifest.record(study.model_inputs_path, inputs)
     return model
@@ -308,9 +298,9 @@ def _trial_rows(
     """A row for every trial: its parameters, how it was judged, its mean errors in percent."""
     rows = []
     for n, verdict in verdicts.items():
-        runs = [finished[name][n] for name in verdict.sequences]
+        runs = [of[n] for of in finished.values()]
         row: dict[str, Any] = {"trial": n, **space.row(verdict.parameters)}
-        row["state"] = verdict.state
+        row |= {"state": verdict.state, "proposed by": runs[0].source}
         row[COST] = float(np.mean([run.cost for run in runs]))
         if set(config.objective) != {"rte"}:
             row[label(config.objective)] = verdict.value
@@ -318,10 +308,8 @@ def _trial_rows(
                 row[metric] = float(np.mean([run.metrics[metric] for run in runs]))
         if config.repeats > 1:
             row["margin"] = verdict.margin
-        mean = float(np.mean([run.mean_error for run in runs])) if verdict.complete else None
-        row["mean"] = mean
-        for name, trials in finished.items():
-            row[name] = trials[n].mean_error if n in trials else None
+        row["mean"] = float(np.mean([run.mean_error for run in runs]))
+        row |= {name: of[n].mean_error for name, of in finished.items()}
         rows.append(row)
     return rows
 
@@ -367,10 +355,7 @@ def fit(
     window: int,
     provenance: dict[str, Any],
 ) -> ErrorModel:
-    """Make the error model, which does not adapt yet.
-
-    Sets have no errors (NaN) on the sequences that they were not run on.
-    """
+    """Make the error model, which does not adapt yet."""
     sequences = data.sequences
     return ErrorModel(
         odometry=odometry,
@@ -394,24 +379,24 @@ def fit(
     )
 
 
-def tuned(model: ErrorModel, complete: LabelledData, switching: SwitchingConfig) -> ErrorModel:
+def tuned(model: ErrorModel, usable: LabelledData, switching: SwitchingConfig) -> ErrorModel:
     """Choose what is driven: the rule's settings, the bank and those of its weights."""
-    chosen = choose(complete, switching.size, fixed=model.fixed)
+    chosen = choose(usable, switching.size, fixed=model.fixed)
     members = chosen.members or [model.fixed]
-    besides = reserve(members, complete)
+    besides = reserve(members, usable)
     members = [*members, *besides]
     return replace(
         model,
         paired=chosen.one_set,
         bank=members,
-        vectors=complete.vectors(members),
+        vectors=usable.vectors(members),
         bank_settings=chosen.bank.model_copy(update={"reserve": len(besides)}),
         # As they are read back, so that the same model is the same file.
         expected={
             way: {key: float(value) for key, value in figures._asdict().items()}
             for way, figures in chosen.expected.items()
         },
-        rivals=rivals(complete, driven_cost(complete, chosen, model.fixed)),
+        rivals=rivals(usable, driven_cost(usable, chosen, model.fixed)),
     )
 
 
@@ -446,15 +431,17 @@ def run_oracle(
     for name in names:
         _remove_other_sets(archive, name, model)
     archive.tidy()
-    due = {name: [n for n in numbers if n not in archive.finished(name)] for name in names}
-    described = study.config.descriptor
-    without_frames = [name for name in names if not archive.has_frames(name, described)]
-    if any(due.values()) or without_frames:
-        missing = [(name, {n: model.sets[n] for n in trials}) for name, trials in due.items()]
-        with trial_workers(study, list(due), cluster) as workers:
-            at_once, one_by_one = len(workers.workers()), study.odometry.one_by_one
-            tasks = trial_tasks(missing, without_frames, at_once, one_by_one)
-            watch_tasks(archive, workers, tasks, "runs on test sequences", progress)
+    schedule = Schedule(study, archive, "runs on test sequences", progress, measure=False)
+    for name in names:
+        schedule.need(name)
+        for n in numbers:
+            if n not in archive.finished(name):
+                schedule.add(name, n, model.sets[n])
+    if schedule.waits():
+        with trial_workers(study, names, cluster) as workers:
+            for done in schedule.run(workers):
+                schedule.store(*done)
+        schedule.close()
     found = {name: oracle_errors(archive, name, model) for name in names}
     return [_row(name, errors) for name, errors in found.items() if errors is not None]
 

@@ -1,18 +1,16 @@
-"""One parameter set on one sequence, or several at once on one pass over it."""
+"""Drives of parameter sets along the stretches of a recording, and the trials that they make."""
 
 import time
 from collections import Counter
-from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import count, islice
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune import recording
 from adaptune.archive import FIRST_POSE, PREPARE_MS, REGISTER_MS, Frames, Trial
 from adaptune.errors import AdaptuneError, MachineError, UnavailableError, in_a_line
 from adaptune.geometry import Poses, invert, scale
@@ -37,7 +35,7 @@ from adaptune.odometry.registry import Factory
 from adaptune.odometry.tracker import HealthCheck, Tracker
 from adaptune.processes import apart
 from adaptune.progress import Progress, unseen
-from adaptune.recording.scan import Scan, SequenceError
+from adaptune.recording.scan import Recording, Scan, SequenceError
 from adaptune.space import ParameterSet
 from adaptune.study.study import StudySequences
 from adaptune.trajectory import Trajectory
@@ -45,204 +43,254 @@ from offline.config import OfflineStudyConfig
 from offline.objective import trajectory_metrics
 
 
+class Stretch(NamedTuple):
+    """A stretch of a recording, as it is driven."""
+
+    sequence: str
+    first: int  # number of its first scan
+    stamps: NDArray[np.int64]  # (n,): nanoseconds of its scans
+    T_odom_start: Poses  # (4, 4): where a drive begins
+    # (4, 4): the motion that leads there. A robot drives already where a recording is entered, and
+    # is started at its begin.
+    T_before_start: Poses | None
+
+    @property
+    def key(self) -> tuple[str, int, int]:
+        """Identifies it among all of a study."""
+        return self.sequence, self.first, len(self.stamps)
+
+
+RECENT = 0.5
+"""Seconds of the reference whose mean motion leads to the begin of a stretch: one step is noisy."""
+
+
+def stretches_along(name: str, frames: Frames) -> list[Stretch]:
+    """The stretches of a sequence that are driven."""
+    T_ref_sensor, stamps = frames.T_ref_sensor, frames.stamps
+    found = []
+    for first, _, end in frames.stretches.tolist():
+        before = int(np.searchsorted(stamps, stamps[first] - round(RECENT * 1e9)))
+        known = not np.isnan(T_ref_sensor[first, 0, 0])
+        T_odom_start = T_ref_sensor[first] if first and known else np.eye(4)
+        T_before_start = None
+        if before < first and known and np.isfinite(T_ref_sensor[before]).all():
+            moved = invert(T_ref_sensor[before]) @ T_ref_sensor[first]
+            share = (stamps[first] - stamps[first - 1]) / (stamps[first] - stamps[before])
+            T_before_start = scale(moved, float(share))
+        found.append(Stretch(name, first, stamps[first:end], T_odom_start, T_before_start))
+    return found
+
+
 @dataclass
 class _Kept:
-    """What a sequence was prepared to in one way."""
+    """What a stretch was prepared to in one way."""
 
-    first: OdometryInstance  # prepares for all with the same preparation
     scans: dict[int, Any] = field(default_factory=dict)  # by number
     nbytes: int = 0
     seconds: float = 0.0  # of CPU time for `n_prepared` scans
     n_prepared: int = 0
+    used: int = 0  # number of the pass
 
 
 SharedScan = Callable[[OdometryInstance], Any]
 """Gives a scan as an instance takes it."""
+STALE = 64
+"""Passes after which prepared scans that are not used make room for others."""
 
 
 class SharedScans:
-    """The scans of a sequence, each prepared once for all instances with the same preparation.
+    """The scans of stretches, each prepared once for all instances with the same preparation.
 
-    Iterating yields a `SharedScan` for every scan, and does not end. Prepared scans that exceed
-    `memory` bytes are read and prepared again on every pass. Of several preparations, those that a
-    pass does not use make room.
+    Prepared scans that exceed `memory` bytes are read and prepared again on every pass, once for
+    all that share it.
     """
 
-    def __init__(self, scans: Iterable[Scan], memory: float):
-        self._scans, self._memory = scans, memory
-        self._kept: dict[Hashable, _Kept] = {}
-        self._used: set[Hashable] = set()  # in the present pass
+    def __init__(self, memory: float):
+        self.nbytes = 0  # that the prepared scans take
+        self._memory = memory
+        self._kept: dict[tuple[Hashable, ...], _Kept] = {}
+        self._n_passes = 0
 
-    @property
-    def nbytes(self) -> int:
-        """Bytes that the prepared scans take."""
-        return sum(kept.nbytes for kept in self._kept.values())
-
-    def __iter__(self) -> Iterator[SharedScan]:
-        self._used = set()
-        numbered = enumerate(self._scans)
+    def along(self, stretch: Stretch, scans: Recording) -> Iterator[SharedScan]:
+        """Pass along a stretch of a recording; scans are read where they are asked for."""
+        self._n_passes += 1
+        numbered = enumerate(_scans_of(stretch, scans))
         last: tuple[int, Any] = -1, None
 
-        def read(i: int) -> Any:  # only what is asked for, in order
+        def read(i: int) -> Any:
             nonlocal last
             while last[0] < i:
                 last = next(numbered)
             return last[1]
 
-        for i in count():
-            yield partial(self.prepared, i, partial(read, i))
+        for i in range(len(stretch.stamps)):
+            yield partial(self._prepared, stretch.key, i, partial(read, i), {})
 
-    def prepared(self, i: int, read: Callable[[], Scan], instance: OdometryInstance) -> Any:
-        """Scan `i`, which `read` returns, as an instance takes it."""
-        key = instance.preparation
-        self._used.add(key)
-        kept = self._kept.setdefault(key, _Kept(instance))
+    def _prepared(
+        self,
+        key: tuple[Hashable, ...],
+        i: int,
+        read: Callable[[], Scan],
+        fresh: dict[Hashable, Any],
+        instance: OdometryInstance,
+    ) -> Any:
+        """Scan `i` as an instance takes it; `fresh` has what there is no room for."""
+        preparation = instance.preparation
+        kept = self._kept.setdefault((*key, preparation), _Kept())
+        kept.used = self._n_passes
         if i in kept.scans:
             return kept.scans[i]
+        if preparation in fresh:
+            return fresh[preparation]
         # Also those that a pass makes while it runs: a worker once grew to five times its share.
         with apart():
-            try:
-                scan = read()
-            except OSError as error:
-                what = f"{getattr(self._scans, 'name', 'the recording')}: cannot be read ({error})"
-                raise SequenceError(f"{what}; run the same command again") from error
+            scan = read()
             begin = time.process_time()
-            prepared = kept.first.prepare(scan)
+            prepared = instance.prepare(scan)
             kept.seconds += time.process_time() - begin
         kept.n_prepared += 1
-        if self._has_room(size := prepared_bytes(prepared), i):
+        if self._has_room(size := prepared_bytes(prepared)):
             kept.scans[i] = prepared
             kept.nbytes += size
+            self.nbytes += size
+        else:
+            fresh[preparation] = prepared
         return prepared
 
-    def n_kept(self, instance: OdometryInstance) -> int:
-        """How many scans are kept as such an instance takes them."""
-        kept = self._kept.get(instance.preparation)
-        return 0 if kept is None else len(kept.scans)
-
-    def milliseconds(self, instance: OdometryInstance) -> float:
-        """Mean CPU time that it took to prepare a scan for such an instance."""
-        kept = self._kept.get(instance.preparation)
+    def milliseconds(self, stretch: Stretch, instance: OdometryInstance) -> float:
+        """Mean CPU time that it took to prepare a scan of a stretch for such an instance."""
+        kept = self._kept.get((*stretch.key, instance.preparation))
         return 1e3 * kept.seconds / kept.n_prepared if kept and kept.n_prepared else 0.0
 
-    def _has_room(self, size: int, i: int) -> bool:
-        """Whether so many bytes more are allowed at scan `i`; where they are not, make room."""
-        # Which preparations a pass uses is known after its first scan.
-        for key in [key for key in self._kept if i and key not in self._used]:
+    def _has_room(self, size: int) -> bool:
+        """Whether so many bytes more are allowed; where they are not, make room."""
+        for kept in self._kept.values():
             if self.nbytes + size <= self._memory:
                 break
-            self._kept[key].scans.clear()
-            self._kept[key].nbytes = 0
+            if self._n_passes - kept.used > STALE:
+                self.nbytes -= kept.nbytes
+                kept.scans, kept.nbytes = {}, 0
         return self.nbytes + size <= self._memory
 
 
-class Drives:
-    """The drives of one parameter set along the stretches of a sequence.
+def _scans_of(stretch: Stretch, scans: Recording) -> Iterator[Scan]:
+    """Read the scans of a stretch.
 
-    Each is as a robot drives: from the reference's pose at its begin, with the health check, and
-    without the reference from then on. An exception of the odometry is a fault, after which the
-    drive has no pose. A set that takes more than `most` seconds of CPU time is stopped.
+    Raises
+    ------
+    SequenceError
+        If they cannot be read, or are others than before.
+    """
+    again = "run the same command again"
+    try:
+        read = scans.since(int(stretch.stamps[0]))
+        for stamp in stretch.stamps.tolist():
+            scan = next((one for one in read if one.stamp >= stamp), None)
+            if scan is None or scan.stamp != stamp:
+                raise SequenceError(f"{scans.name}: has other scans than before; {again}")
+            yield scan
+    except OSError as error:
+        raise SequenceError(f"{scans.name}: cannot be read ({error}); {again}") from error
+
+
+_UNUSED = Usage(0.0, None)
+
+
+@dataclass(eq=False)
+class Drive:
+    """What one parameter set did along one stretch; it is lost where it was not driven.
+
+    It begins at the reference's pose, as a robot does, with the health check, and without the
+    reference from then on.
+    """
+
+    T_odom_sensor: Poses  # (n, 4, 4)
+    restarted: NDArray[np.bool_]  # (n,): by the health check
+    registered: NDArray[np.bool_]  # (n,)
+    tried: NDArray[np.bool_]  # (n,): scans that the odometry was given
+    without_pose: NDArray[np.bool_]  # (n,)
+    seconds: NDArray[np.float64]  # (n,): NaN where it begins
+    unhealthy: Counter[str] = field(default_factory=Counter)
+    faults: tuple[str, ...] = ()  # of the odometry
+    exception: str = ""  # after which the drive has no pose
+    usage: Usage = _UNUSED
+    prepare_ms: float = 0.0  # mean CPU time that it took to prepare a scan
+    too_slow: bool = False
+
+    @classmethod
+    def lost(cls, stretch: Stretch) -> Self:
+        """A drive before it begins."""
+        n = len(stretch.stamps)
+        T_odom_sensor = np.tile(stretch.T_odom_start, (n, 1, 1))
+        nothing = (np.zeros(n, bool) for _ in range(3))
+        return cls(T_odom_sensor, *nothing, np.ones(n, bool), np.full(n, np.nan))
+
+
+class _Driver:
+    """Drives one parameter set along one stretch.
+
+    An exception of the odometry is a fault, after which the drive has no pose. A set that takes
+    more than `most` seconds of CPU time is stopped.
     """
 
     def __init__(
         self,
         make: Callable[[], OdometryInstance],
-        frames: Frames,
+        stretch: Stretch,
         health: HealthCheck,
-        most: float = np.inf,
+        most: float,
     ):
-        n = len(frames.stamps)
-        self.T_odom_sensor = np.full((n, 4, 4), np.nan)
-        self.restarted = np.zeros(n, bool)
-        self.registered = np.zeros(n, bool)
-        self.tried = np.zeros(n, bool)  # scans that the odometry was given
-        self.without_pose = np.zeros(n, bool)
-        self.seconds = np.full(n, np.nan)
-        self.unhealthy = Counter[str]()
-        self.too_slow = False
-        self._make, self._frames, self._health, self._most = make, frames, health, most
-        self._stamps = frames.stamps.tolist()
-        self._begins = set(frames.stretches[:, 0].tolist())
+        self.drive = Drive.lost(stretch)
+        self._make, self._stretch, self._health, self._most = make, stretch, health, most
+        self._stamps = stretch.stamps.tolist()
         self._odometry: OdometryInstance | None = None
-        self._exceptions: dict[str, None] = {}
-        self._failed = False
-
-    @property
-    def faults(self) -> tuple[str, ...]:
-        """See `Trial`."""
-        return (*(() if self._odometry is None else self._odometry.faults), *self._exceptions)
-
-    def usage(self, scans: SharedScans) -> tuple[Usage, float]:
-        """What the odometry used, and the mean CPU time in ms that it took to prepare a scan."""
-        odometry = self._odometry
-        if odometry is None:
-            return Usage(0.0, None), 0.0
-        return odometry.usage, scans.milliseconds(odometry)
 
     def step(self, i: int, scan: SharedScan) -> None:
-        """Register scan `i`, which is one of a stretch."""
-        self._failed &= i not in self._begins
+        """Register scan `i`."""
+        drive = self.drive
         try:
-            if not self._failed and not self.too_slow:
-                self._step(i, scan)
+            if not drive.exception and not drive.too_slow:
+                self._step(drive, i, scan)
         except (UnavailableError, SequenceError, MachineError, MemoryError):
             raise  # of the machine or the recording, whatever the parameters
         except Exception as error:
-            self._exceptions[in_a_line(error)] = None
-            self._failed = True
-        if np.isfinite(self.T_odom_sensor[i, 0, 0]):
+            drive.exception = in_a_line(error)
+        if not (drive.tried[i] and np.isfinite(drive.T_odom_sensor[i, 0, 0])):
+            drive.without_pose[i] = True
+            drive.T_odom_sensor[i] = drive.T_odom_sensor[i - 1] if i else self._stretch.T_odom_start
+
+    def close(self, scans: SharedScans) -> None:
+        """End the odometry's processes, and note what they used."""
+        if self._odometry is None:
             return
-        self.without_pose[i] = True
-        self.T_odom_sensor[i] = (
-            self._start(i)[0] if i in self._begins else self.T_odom_sensor[i - 1]
-        )
+        self._odometry.close()
+        drive, usage = self.drive, self._odometry.usage
+        drive.faults, drive.usage = tuple(self._odometry.faults), usage
+        drive.prepare_ms = scans.milliseconds(self._stretch, self._odometry)
+        if usage.seconds is not None:
+            drive.seconds[~np.isnan(drive.seconds)] = usage.seconds
 
-    def close(self) -> None:
-        """End the odometry's processes; what they used stays known."""
-        if self._odometry is not None:
-            self._odometry.close()
-
-    def _step(self, i: int, scan: SharedScan) -> None:
+    def _step(self, drive: Drive, i: int, scan: SharedScan) -> None:
         if self._odometry is None:
             self._odometry = self._make()
         prepared = scan(self._odometry)
-        if i in self._begins:
-            T_odom_start, T_before_start = self._start(i)
+        if not i:
             self._tracker = Tracker(
                 self._odometry,
                 self._health,
-                T_odom_start=T_odom_start,
-                T_before_start=T_before_start,
+                T_odom_start=self._stretch.T_odom_start,
+                T_before_start=self._stretch.T_before_start,
             )
         found = self._tracker.register_prepared(self._stamps[i], prepared)
-        self.T_odom_sensor[i], self.tried[i] = found.T_odom_sensor, True
-        self.without_pose[i] = found.unhealthy == "no_pose"
-        self.registered[i] = found.registered and not self.without_pose[i]
-        self.restarted[i] = found.unhealthy is not None
+        drive.T_odom_sensor[i], drive.tried[i] = found.T_odom_sensor, True
+        drive.without_pose[i] = found.unhealthy == "no_pose"
+        drive.registered[i] = found.registered and not drive.without_pose[i]
+        drive.restarted[i] = found.unhealthy is not None
         if found.unhealthy not in (None, "no_pose"):
-            self.unhealthy[found.unhealthy] += 1
-        if i not in self._begins:
-            self.seconds[i] = found.register_seconds
-        self.too_slow = self._odometry.usage.cpu > self._most
-
-    def _start(self, i: int) -> tuple[Poses, Poses | None]:
-        """Where a drive begins, and the motion that leads there.
-
-        A robot drives already where a recording is entered, and is started at its begin.
-        """
-        T_ref_sensor, stamps = self._frames.T_ref_sensor, self._frames.stamps
-        before = int(np.searchsorted(stamps, stamps[i] - round(RECENT * 1e9)))
-        if not i or before == i or not np.isfinite(T_ref_sensor[[before, i]]).all():
-            return np.eye(4) if not i or np.isnan(T_ref_sensor[i, 0, 0]) else T_ref_sensor[i], None
-        moved = invert(T_ref_sensor[before]) @ T_ref_sensor[i]
-        share = (stamps[i] - stamps[i - 1]) / (stamps[i] - stamps[before])
-        return T_ref_sensor[i], scale(moved, float(share))
-
-
-RECENT = 0.5
-"""Seconds of the reference whose mean motion leads to the begin of a stretch: one step is noisy."""
-SLOW, LEAST_SECONDS = 10.0, 20.0
-"""A set is stopped that takes so many times the CPU time of the baseline, and so many seconds."""
+            drive.unhealthy[found.unhealthy] += 1
+        if i:
+            drive.seconds[i] = found.register_seconds
+        drive.too_slow = self._odometry.usage.cpu > self._most
 
 
 # Which stretches of a recording are driven.
@@ -346,83 +394,6 @@ class TrialSettings:
         )
 
 
-class PreparedSequence:
-    """A sequence that is read, prepared and described once, for all trials of a worker.
-
-    Attributes
-    ----------
-    name : str
-    scans : Recording
-    frames : Frames
-    shared : SharedScans
-        The prepared scans, which take `memory` bytes at most.
-
-    Raises
-    ------
-    AdaptuneError
-        If the sequence cannot be read, or no error can be measured on it.
-    """
-
-    def __init__(self, setup: "TrialSetup", name: str, memory: float, progress: Progress):
-        settings, key = setup.settings, setup.sequences.key(name)
-        self.name, self._setup = name, setup
-        self.scans = scans = setup.sequences.open(name)
-        self.shared = SharedScans(scans, memory)
-        self._odometry: OdometryInstance | None = None
-        reference = scans.reference()
-        if reference is None:
-            raise AdaptuneError(f"{key}: training needs a reference trajectory")
-        stamps, descriptors, elevations, full, enough = [], [], [], False, False
-        try:
-            describe = Describer(settings.descriptors)
-            for scan in _watched(scans, scans.n_messages, "reading", progress):
-                enough = enough or len(scan) >= MIN_POINTS
-                stamps.append(scan.stamp)
-                descriptors.append(describe(scan))
-                elevations.append(lowest_elevation(scan))
-                full = full or self._prepare(len(stamps) - 1, scan)
-        except DescriptorError as error:
-            raise AdaptuneError(f"sequences.{name}: {error}") from error
-        if not enough:
-            raise AdaptuneError(
-                f"sequences.{name}: none of its {len(stamps)} scans has {MIN_POINTS} points; check "
-                f"`points` and what the sensor recorded"
-            )
-        at = np.array(stamps, np.int64)
-        T_ref_sensor = reference_poses(key, reference, at, settings)
-        described = np.array(descriptors)
-        # When a scan is described online, the pose of the scan before is known.
-        motion = speed_and_turn_rate(at, T_ref_sensor)
-        fill_in(described[1:], describe.blocks, motion[:-1])
-        elevation = np.array(elevations, np.float32)
-        stretches = stretches_of(T_ref_sensor, at, settings.sub_trajectory, settings.stretches)
-        self.frames = Frames(
-            at, T_ref_sensor, described, describe.blocks, elevation, stretches=stretches
-        )
-
-    def _prepare(self, i: int, scan: recording.Scan) -> bool:
-        """Prepare a scan for the baseline; whether there is no room for another."""
-        try:
-            if self._odometry is None:
-                self._odometry = self._setup.odometry()
-            self.shared.prepared(i, lambda: scan, self._odometry)
-        except Exception as error:
-            raise AdaptuneError(
-                f"sequences.{self.name}: the odometry fails with its own parameters, the baseline, "
-                f"when it is to prepare a scan: {in_a_line(error)}; mend the odometry "
-                f"(odometry in the study), and run the same command again"
-            ) from error
-        return self.shared.n_kept(self._odometry) <= i
-
-
-def _watched(scans: Iterable[Any], n: int, what: str, progress: Progress) -> Iterator[Any]:
-    done = 0
-    for done, scan in enumerate(scans, start=1):
-        yield scan
-        progress(what, min(done, n), n)
-    progress(what, done, done)
-
-
 def reference_poses(
     key: str, reference: Trajectory, stamps: NDArray[np.int64], settings: TrialSettings
 ) -> Poses:
@@ -459,132 +430,194 @@ def reference_poses(
 
 @dataclass(frozen=True)
 class TrialSetup:
-    """Everything that a process needs to drive trials."""
+    """Everything that a process needs to describe recordings, and to drive along them."""
 
     settings: TrialSettings
     odometry: Factory
     sequences: StudySequences
 
-    def prepare(self, name: str, memory: float, progress: Progress = unseen) -> PreparedSequence:
-        """Read and prepare a sequence, see `PreparedSequence`."""
-        return PreparedSequence(self, name, memory, progress)
+    def describe(self, name: str, progress: Progress = unseen) -> Frames:
+        """Read a whole sequence, and describe its scans.
 
-    def run(
-        self,
-        scans: PreparedSequence,
-        sets: Sequence[ParameterSet],
-        whole: bool = False,
-        most_ms: float = np.inf,
-        progress: Progress = unseen,
-    ) -> list[Trial]:
-        """Drive with several parameter sets on one pass over a sequence, see `Drives`.
-
-        The stretches of the sequence are driven, or with `whole` all of it. Sets that take more
-        than `most_ms` milliseconds of CPU time a scan, see `SLOW`, are stopped.
+        Raises
+        ------
+        AdaptuneError
+            If the sequence cannot be read, or no error can be measured on it.
         """
-        frames = scans.frames.uncut if whole else scans.frames
-        most = max(1e-3 * most_ms * frames.n_driven, LEAST_SECONDS)
-        drives = [self._begin(scans, frames, parameters, most) for parameters in sets]
-        each = [one for of_set in drives for one in of_set]
-        with ExitStack() as ended:
-            for one in each:
-                ended.callback(one.close)
-            driven = _driven(scans.shared, frames)
-            for i, scan in _watched(driven, frames.n_driven, "running", progress):
-                for one in each:
-                    one.step(i, scan)
-        return [
-            _mean(s, [_trial(self.settings, s, frames, scans.shared, one) for one in of_set])
-            for s, of_set in zip(sets, drives, strict=True)
+        settings, key = self.settings, self.sequences.key(name)
+        scans = self.sequences.open(name)
+        reference = scans.reference()
+        if reference is None:
+            raise AdaptuneError(f"{key}: training needs a reference trajectory")
+        stamps, descriptors, elevations, enough = [], [], [], False
+        try:
+            describe = Describer(settings.descriptors)
+            for scan in _watched(scans, scans.n_messages, "reading", progress):
+                enough = enough or len(scan) >= MIN_POINTS
+                stamps.append(scan.stamp)
+                descriptors.append(describe(scan))
+                elevations.append(lowest_elevation(scan))
+        except DescriptorError as error:
+            raise AdaptuneError(f"sequences.{name}: {error}") from error
+        if not enough:
+            raise AdaptuneError(
+                f"sequences.{name}: none of its {len(stamps)} scans has {MIN_POINTS} points; check "
+                f"`points` and what the sensor recorded"
+            )
+        at = np.array(stamps, np.int64)
+        T_ref_sensor = reference_poses(key, reference, at, settings)
+        described = np.array(descriptors)
+        # When a scan is described online, the pose of the scan before is known.
+        motion = speed_and_turn_rate(at, T_ref_sensor)
+        fill_in(described[1:], describe.blocks, motion[:-1])
+        elevation = np.array(elevations, np.float32)
+        stretches = stretches_of(T_ref_sensor, at, settings.sub_trajectory, settings.stretches)
+        return Frames(at, T_ref_sensor, described, describe.blocks, elevation, stretches=stretches)
+
+    def drive(
+        self,
+        shared: SharedScans,
+        scans: Recording,
+        stretch: Stretch,
+        sets: Iterable[ParameterSet],
+        most: float = np.inf,
+        progress: Progress = unseen,
+    ) -> list[list[Drive]]:
+        """Drive with several parameter sets on one pass along a stretch; each for every repeat.
+
+        Sets that take more than `most` seconds of CPU time are stopped.
+        """
+        health, n = self.settings.health, len(stretch.stamps)
+        drivers = [
+            [
+                _Driver(partial(self.odometry, one, stretch.sequence), stretch, health, most)
+                for _ in range(self._n_repeats(one))
+            ]
+            for one in sets
         ]
+        with ExitStack() as ended:
+            each = [driver for of_set in drivers for driver in of_set]
+            for driver in each:
+                ended.callback(driver.close, shared)
+            along = _watched(shared.along(stretch, scans), n, "running", progress)
+            for i, scan in enumerate(along):
+                for driver in each:
+                    driver.step(i, scan)
+        return [[driver.drive for driver in of_set] for of_set in drivers]
 
-    def _begin(
-        self, scans: PreparedSequence, frames: Frames, parameters: ParameterSet, most: float
-    ) -> list[Drives]:
-        """The drives of a parameter set, once for each repeat."""
-        settings, odometry = self.settings, self.odometry
-        make = partial(odometry, parameters, scans.name)
-        n = settings.repeats
-        if settings.baseline_runs is not None and parameters in odometry.space.baselines:
-            n = max(n, settings.baseline_runs)
-        return [Drives(make, frames, settings.health, most) for _ in range(n)]
-
-
-def _driven(shared: SharedScans, frames: Frames) -> Iterator[tuple[int, SharedScan]]:
-    """The scans of all stretches, with their numbers."""
-    stop, wanted = int(frames.stretches[:, 2].max()), np.zeros(len(frames.stamps), bool)
-    for first, _, end in frames.stretches:
-        wanted[first:end] = True
-    yield from ((i, scan) for i, scan in enumerate(islice(shared, stop)) if wanted[i])
+    def _n_repeats(self, parameters: ParameterSet) -> int:
+        settings = self.settings
+        if settings.baseline_runs is None or parameters not in self.odometry.space.baselines:
+            return settings.repeats
+        return max(settings.repeats, settings.baseline_runs)
 
 
-def _trial(
+def _watched(scans: Iterable[Any], n: int, what: str, progress: Progress) -> Iterator[Any]:
+    done = 0
+    for done, scan in enumerate(scans, start=1):
+        yield scan
+        progress(what, min(done, n), n)
+    progress(what, done, done)
+
+
+# A trial of its drives.
+
+
+def trial_of(
     settings: TrialSettings,
     parameters: ParameterSet,
     frames: Frames,
-    shared: SharedScans,
-    drives: Drives,
+    drives: Mapping[int, Sequence[Drive]],
 ) -> Trial:
-    """Make a trial of the drives along all stretches."""
-    T_odom_sensor, T_ref_sensor = drives.T_odom_sensor, frames.counted
-    n, waiting = frames.n_driven, np.zeros(len(frames.stamps), bool)
-    for first, _, end in frames.stretches:
-        without = int(np.argmax([*drives.registered[first:end], True]))
-        # Scans before a first pose that comes are unknown.
-        waiting[first : first + without] = first + without < end
-    missing = int((waiting | drives.without_pose).sum())
-    failure, lost = "", int(drives.without_pose.sum())
-    if missing >= MAX_SHARE_WITHOUT_POSE * n:
-        failure, lost = f"no pose for {missing} of {n} scans", missing
+    """Make a trial of the drives along all stretches of a sequence, by the first scan of each.
+
+    There is one for every repeat. Stretches along which a set was not driven count as lost.
+    """
+    lost = {stretch.first: Drive.lost(stretch) for stretch in stretches_along("", frames)}
+    repeats = [
+        [drives[first][i] if first in drives else none for first, none in lost.items()]
+        for i in range(min(map(len, drives.values())))
+    ]
+    return _mean([_trial(settings, parameters, frames, of_repeat) for of_repeat in repeats])
+
+
+def _trial(
+    settings: TrialSettings, parameters: ParameterSet, frames: Frames, drives: Sequence[Drive]
+) -> Trial:
+    at = np.concatenate([np.arange(first, end) for first, _, end in frames.stretches])
+    late, seconds = [], 0.0
+    for drive, (first, _, end) in zip(drives, frames.stretches, strict=True):
+        late.append(int(np.argmax([*drive.registered, True])))
+        seconds += (frames.stamps[end - 1] - frames.stamps[first]) * 1e-9
+
+    def joined(parts: Iterable[NDArray[Any]], elsewhere: float) -> NDArray[Any]:
+        driven = np.concatenate(list(parts))
+        whole = np.full((len(frames.stamps), *driven.shape[1:]), elsewhere, driven.dtype)
+        whole[at] = driven
+        return whole
+
+    T_odom_sensor = joined((drive.T_odom_sensor for drive in drives), np.nan)
+    registered = joined((drive.registered for drive in drives), 0)
+    tried = joined((drive.tried for drive in drives), 0)
+    without_pose = joined((drive.without_pose for drive in drives), 0)
+    # Scans before a first pose that comes are unknown.
+    before = (np.arange(n := len(d.tried)) < k % n for d, k in zip(drives, late, strict=True))
+    waiting = joined(before, 0)
+    T_ref_sensor, failure, lost = frames.counted, "", int(without_pose.sum())
+    missing = int((waiting | without_pose).sum())
+    if missing >= MAX_SHARE_WITHOUT_POSE * frames.n_driven:
+        failure, lost = f"no pose for {missing} of {frames.n_driven} scans", missing
     else:
-        T_ref_sensor[waiting & ~drives.without_pose] = np.nan
-    unhealthy = dict(drives.unhealthy) | ({"no_pose": lost} if lost else {})
-    if len(drives.faults) >= MOST_FAULTS:
-        failure = f"{len(drives.faults)} faults"
-    usage, prepare_ms = drives.usage(shared)
-    tried = max(int(drives.tried.sum()), 1)
-    if drives.too_slow:
-        failure = f"too slow: {1e3 * usage.cpu / tried:.0f} ms a scan"
-    if usage.seconds is not None:
-        drives.seconds[~np.isnan(drives.seconds)] = usage.seconds
+        T_ref_sensor[waiting & ~without_pose] = np.nan
+    unhealthy = dict(sum((drive.unhealthy for drive in drives), Counter[str]()))
+    faults = [fault for drive in drives for fault in drive.faults]
+    faults += dict.fromkeys(drive.exception for drive in drives if drive.exception)
+    if len(faults) >= MOST_FAULTS:
+        failure = f"{len(faults)} faults"
+    used = _used(drives, seconds)
+    if any(drive.too_slow for drive in drives):
+        failure = f"too slow: {used[REGISTER_MS]:.0f} ms a scan"
     # What goes on without poses may seem to do well.
-    unseen = ~drives.tried | ((drives.without_pose | waiting) & bool(failure))
+    unseen = ~tried | ((without_pose | waiting) & bool(failure))
     errors = sub_trajectory_rte(T_ref_sensor, T_odom_sensor, settings.sub_trajectory, unseen)
     if np.isnan(errors).all():
         failure = failure or "no sub-trajectory has poses"
-    seconds = sum(
-        (frames.stamps[end - 1] - frames.stamps[first]) * 1e-9 for first, _, end in frames.stretches
-    )
-    used = {
-        "cpu": 100.0 * usage.cpu / seconds,
-        REGISTER_MS: 1e3 * usage.cpu / tried,
-        PREPARE_MS: prepare_ms,
-    } | ({} if usage.memory is None else {"memory": usage.memory})
-    first, _, end = frames.stretches[0]
-    if 0 < (late := int(np.argmax([*drives.registered[first:end], True]))) < end - first:
-        used[FIRST_POSE] = (frames.stamps[first + late] - frames.stamps[first]) * 1e-9
+    if 0 < late[0] < len(drives[0].tried):
+        stamps = frames.stamps[frames.stretches[0, 0] :]
+        used[FIRST_POSE] = float(stamps[late[0]] - stamps[0]) * 1e-9
     return Trial(
         parameters,
         T_odom_sensor,
         errors,
-        drives.restarted,
-        drives.registered,
-        drives.seconds,
-        drives.faults,
+        joined((drive.restarted for drive in drives), 0),
+        registered,
+        joined((drive.seconds for drive in drives), np.nan),
+        tuple(faults),
         trajectory_metrics(T_ref_sensor, T_odom_sensor),
         used,
-        unhealthy=unhealthy,
+        unhealthy=unhealthy | ({"no_pose": lost} if lost else {}),
         failure=failure,
     )
 
 
-def _mean(parameters: ParameterSet, repeats: Sequence[Trial]) -> Trial:
+def _used(drives: Sequence[Drive], seconds: float) -> dict[str, float]:
+    """CPU time and memory of drives along so many seconds, see `Trial.usage`."""
+    cpu = sum(drive.usage.cpu for drive in drives)
+    n_tried = [int(drive.tried.sum()) for drive in drives]
+    prepare_ms = sum(drive.prepare_ms * n for drive, n in zip(drives, n_tried, strict=True))
+    n = max(sum(n_tried), 1)
+    used = {"cpu": 100.0 * cpu / seconds, REGISTER_MS: 1e3 * cpu / n, PREPARE_MS: prepare_ms / n}
+    memory = [drive.usage.memory for drive in drives if drive.usage.memory is not None]
+    return used | ({"memory": max(memory)} if memory else {})
+
+
+def _mean(repeats: Sequence[Trial]) -> Trial:
     """One trial of several with the same parameters."""
     if len(repeats) == 1:
         return repeats[0]
     metrics = set.intersection(*(set(trial.metrics) for trial in repeats))
     return Trial(
-        parameters,
+        repeats[0].parameters,
         repeats[0].T_odom_sensor,
         np.mean([cap(trial.errors) for trial in repeats], axis=0),
         np.mean([trial.restarted for trial in repeats], axis=0),

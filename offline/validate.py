@@ -347,14 +347,10 @@ def baseline_in_words(validation: Validation) -> str:
 
 
 def _labelled(study: OfflineStudy, model: ErrorModel) -> LabelledData:
-    """The labelled data set of the sets that were run on all training sequences."""
-    complete = np.flatnonzero(~np.isnan(model.errors).any(axis=0))
-    sets = model.sets.subset([model.sets.trials[column] for column in complete])
-    archive = Archive(study.folder / "trials")
-    run, recorded_in = {name: list(sets) for name in model.sequences}, study.sequences.recorded_in
-    data = labelled_data(
-        archive, run, sets, study.config, study.window, recorded_in, study.odometry
-    ).complete()
+    """The labelled data set of the sets that did not fail."""
+    archive, of = Archive(study.folder / "trials"), study.sequences.recorded_in
+    about = (model.sequences, model.sets, study.config, study.window, of, study.odometry)
+    data = labelled_data(archive, *about).usable()
     return with_vectors(with_whole_drives(data, archive, study.config), archive)
 
 

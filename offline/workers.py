@@ -1,4 +1,4 @@
-"""Processes that run trials, and keep the sequences that they have prepared."""
+"""Processes that drive, and keep the scans that they have prepared."""
 
 import contextlib
 import logging
@@ -18,14 +18,15 @@ from uuid import uuid4
 import numpy as np
 
 from adaptune import __version__
-from adaptune.archive import Frames, Trial
+from adaptune.archive import Frames
 from adaptune.errors import OUT_OF_MEMORY, AdaptuneError, MachineError, in_a_line, lacking
-from adaptune.processes import apart, end_with_parent, fork_server, how_it_ended, pin
+from adaptune.processes import end_with_parent, fork_server, how_it_ended, pin
 from adaptune.progress import Progress, unseen
 from adaptune.recording.cache import fingerprints
+from adaptune.recording.scan import Recording
 from adaptune.space import ParameterSet
 from adaptune.study.study import StudySequences
-from offline.trial import PreparedSequence, TrialSetup, with_measured_hops
+from offline.trial import Drive, SharedScans, Stretch, TrialSetup, with_measured_hops
 
 MOST_DEATHS = 3
 """A task fails after so many workers have died at it."""
@@ -38,31 +39,27 @@ class WorkerError(AdaptuneError):
 
 
 class Task(NamedTuple):
-    """Trials to drive on one pass over a sequence."""
+    """Work on a sequence: describe it; or measure the hops along its frames; or drive."""
 
     sequence: str
-    numbers: tuple[int, ...]  # trial numbers
-    sets: tuple[ParameterSet, ...]  # the parameter sets of the trials
-    whole: bool = False  # drive the whole recording, and not its stretches alone
-    frames: bool = False  # return the frames, which all trials on the sequence share, too
+    frames: Frames | None = None  # whose hops are measured
+    stretch: Stretch | None = None  # along which sets are driven
+    sets: Mapping[int, ParameterSet] = {}  # by trial number, what is driven on one pass
+    most: float = np.inf  # seconds of CPU time above which a set is stopped
     apart: bool = False  # run classes of the user in processes of their own, also clean ones
-    most_ms: float = np.inf  # milliseconds of CPU time a scan, above which a set is stopped
 
     @property
-    def key(self) -> tuple[str, tuple[int, ...]]:
+    def key(self) -> Hashable:
         """Identifies it among the tasks of a run, also when it is run again."""
-        return self.sequence, self.numbers
+        return self.sequence, None if self.stretch is None else self.stretch.key, *self.sets
 
     def __str__(self) -> str:
-        trials = f"trials {', '.join(map(str, self.numbers))}" if self.numbers else "its scans"
+        trials = f"trials {', '.join(map(str, self.sets))}" if self.sets else "its scans"
         return f"{self.sequence}, {trials}"
 
 
-class TaskResult(NamedTuple):
-    """The result of a task; the frames are there if the task asks for them."""
-
-    trials: list[Trial]
-    frames: Frames | None
+Result = Frames | Mapping[int, Sequence[Drive]]
+"""Of a task: the frames, or by trial number the drives, one for every repeat."""
 
 
 class Death(NamedTuple):
@@ -79,7 +76,7 @@ class TaskProgress(NamedTuple):
     total: int
 
 
-Outcome = TaskResult | AdaptuneError | Death
+Outcome = Result | AdaptuneError | Death
 
 W = TypeVar("W", bound=Hashable)
 """Identifies a worker of a pool."""
@@ -104,15 +101,29 @@ class Pool(Protocol[W]):
         ...
 
 
-def run(
-    pool: Pool[W], tasks: Sequence[Task], what: str = "runs", progress: Progress = unseen
-) -> Iterator[tuple[Task, TaskResult]]:
-    """Run tasks, and yield each as it is done, with its result.
+class Work(Protocol):
+    """Gives out tasks; results may bring more of them."""
 
-    A task goes to a worker that has prepared its sequence, if there is one. If a worker dies,
-    another one runs its task again. `progress` is called with `what` and the number of runs that
-    are done. It is also called about scans that are read: several workers may read the same
-    sequence.
+    def waits(self) -> bool:
+        """Whether there is a task now."""
+        ...
+
+    def take(self, held: Collection[Hashable], others: Collection[Hashable], n: int) -> Task:
+        """Take a task for one of `n` workers, which holds the scans of stretches of these keys.
+
+        The other workers hold `others`.
+        """
+        ...
+
+    def note(self, task: Task, progress: TaskProgress) -> None:
+        """Note how far a task is."""
+        ...
+
+
+def run(pool: Pool[W], work: Work) -> Iterator[tuple[Task, Result]]:
+    """Run tasks, and yield each as it is done, with its result, until there are no more.
+
+    If a worker dies, its task is run again.
 
     Raises
     ------
@@ -121,95 +132,83 @@ def run(
     WorkerError
         If several workers died at the same task.
     """
-    queue = _Queue(pool, tasks, what, progress)
-    while queue.open:
-        queue.start()
-        finished, queue.finished = queue.finished, []
+    crew = _Crew(pool, work)
+    while True:
+        crew.start()
+        finished, crew.finished = crew.finished, []
         yield from finished  # the workers work while their results are written
-        if queue.failure is not None:
-            raise queue.failure
-        queue.wait()
+        if crew.failure is not None:
+            raise crew.failure
+        if not finished:
+            if not crew.busy:
+                return
+            crew.wait()
 
 
-class _Queue(Generic[W]):
-    """Tasks that wait, run, and are finished."""
+class _Crew(Generic[W]):
+    """The workers of a pool, and what each does."""
 
-    def __init__(self, pool: Pool[W], tasks: Sequence[Task], what: str, progress: Progress):
-        self.waiting = list(tasks)
-        self.running: dict[W, Task] = {}
-        self.finished: list[tuple[Task, TaskResult]] = []
+    def __init__(self, pool: Pool[W], work: Work):
+        self.finished: list[tuple[Task, Result]] = []
         self.failure: AdaptuneError | None = None
-        self._pool, self._what, self._progress = pool, what, progress
-        self._deaths = Counter[tuple[str, tuple[int, ...]]]()
-        self._near: dict[W, set[str]] = {}
-        self._total = sum(len(task.numbers) for task in tasks)
-        # Runs by task, also in part, and scans that were read by what for.
-        self._done: dict[tuple[str, tuple[int, ...]], float] = {}
-        self._read: dict[str, float] = {}
+        self._pool, self._work = pool, work
+        self._running: dict[W, Task] = {}
+        self._held: dict[W, set[Hashable]] = {}  # keys of the stretches that each has prepared
+        self._again: list[Task] = []
+        self._deaths = Counter[Hashable]()
+        self._suspects: set[int] = set()  # trials at which a worker died
 
     @property
-    def open(self) -> bool:
-        # A failure is raised even if nothing runs any more.
-        return bool(self.waiting or self.running or self.finished or self.failure)
+    def busy(self) -> bool:
+        """Whether there is anything to do, or to wait for."""
+        return bool(self._running or self._again or self._work.waits())
 
     def start(self) -> None:
-        """Give waiting tasks to idle workers."""
-        for worker in self._pool.workers() if self.waiting and self.failure is None else ():
-            if self.waiting and worker not in self.running:
-                task = _pick(self.waiting, self._near, worker)
-                self.waiting.remove(task)
-                self._near.setdefault(worker, set()).add(task.sequence)
-                self.running[worker] = task
-                self._pool.start(worker, task)
+        """Give tasks to idle workers."""
+        workers = self._pool.workers() if self.failure is None else ()
+        for worker in [worker for worker in workers if worker not in self._running]:
+            if not self._again and not self._work.waits():
+                return
+            held = self._held.setdefault(worker, set())
+            others = set().union(*(keys for w, keys in self._held.items() if w != worker))
+            task = self._again.pop() if self._again else self._work.take(held, others, len(workers))
+            # A class that is not as clean as it says then costs its own trials only.
+            task = task._replace(apart=not self._suspects.isdisjoint(task.sets))
+            if task.stretch is not None:
+                held.add(task.stretch.key)
+            self._running[worker] = task
+            self._pool.start(worker, task)
 
     def wait(self) -> None:
         """Wait for some of the tasks."""
-        for worker, outcome in self._pool.wait() if self.waiting or self.running else ():
+        for worker, outcome in self._pool.wait():
             if isinstance(outcome, TaskProgress):
-                self._report(self.running[worker], outcome)
+                self._work.note(self._running[worker], outcome)
                 continue
-            task = self.running.pop(worker)
-            if isinstance(outcome, TaskResult):
-                self.finished.append((task, outcome))
-                self._report(task, TaskProgress("running", 1, 1))
-            elif isinstance(outcome, AdaptuneError):
+            task = self._running.pop(worker)
+            if isinstance(outcome, AdaptuneError):
                 self.failure = outcome
+            elif isinstance(outcome, Death):
+                del self._held[worker]
+                self._try_again(task, outcome.cause)
             else:
-                self._near.pop(worker, None)
-                self._again(task, outcome)
+                self.finished.append((task, outcome))
 
-    def _report(self, task: Task, of_task: TaskProgress) -> None:
-        stage, scans, of = of_task
-        if stage == "running":
-            self._done[task.key] = len(task.numbers) * scans / max(of, 1)
-        else:
-            reading = f"{stage} {task.sequence}"
-            self._read[reading] = max(scans, self._read.get(reading, 0))
-            self._progress(reading, self._read[reading], of, "")
-        self._progress(self._what, sum(self._done.values()), self._total, "")
-
-    def _again(self, task: Task, death: Death) -> None:
-        # A class that is not as clean as it says then costs its own trial only.
-        task = task._replace(apart=True)
-        self.waiting.insert(0, task)
+    def _try_again(self, task: Task, cause: str) -> None:
+        self._work.note(task, TaskProgress("running", 0, 1))
+        self._again.append(task)
+        self._suspects |= set(task.sets)
         self._deaths[task.key] += 1
         if self._deaths[task.key] == MOST_DEATHS:
-            help_ = "; if they were out of memory, lower offline.workers" * ("KILL" in death.cause)
+            help_ = "; if they were out of memory, lower offline.workers" * ("KILL" in cause)
             self.failure = WorkerError(
-                f"{MOST_DEATHS} workers died ({death.cause}) on {task}; what they wrote above may "
-                f"say why{help_}"
+                f"{MOST_DEATHS} workers died ({cause}) on {task}; what they wrote above may say "
+                f"why{help_}"
             )
 
 
-def _pick(waiting: list[Task], near: dict[W, set[str]], worker: W) -> Task:
-    """Prefer a task whose sequence this worker has prepared, then one that nobody has."""
-    here = near.get(worker, set())
-    elsewhere = set().union(*near.values()) - here
-    return min(waiting, key=lambda t: (t.sequence not in here, t.sequence in elsewhere))
-
-
 MOST_PREPARED = 1.5e9
-"""Bytes of prepared scans that a worker keeps; others are prepared again for each batch."""
+"""Bytes of prepared scans that a worker keeps; others are prepared again on each pass."""
 
 
 def spare_memory() -> float:
@@ -217,47 +216,37 @@ def spare_memory() -> float:
     return 0.25 * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
 
 
-class Sequences:
-    """The sequences that a worker has prepared, as many as its memory holds."""
+class Bench:
+    """What a worker works with: recordings that it has opened, and scans that it has prepared."""
 
     def __init__(self, setup: TrialSetup, memory: float):
         self._setup = setup
         self._apart = replace(setup, odometry=setup.odometry.changed(user_code=False))
         self._memory = min(memory, MOST_PREPARED)
-        self._ready: dict[tuple[str, bool], PreparedSequence] = {}
+        self._recordings: dict[str, Recording] = {}
+        self._shared: dict[bool, SharedScans] = {}
 
-    def run(self, task: Task, progress: Progress) -> TaskResult:
+    def run(self, task: Task, progress: Progress) -> Result:
         """Do a task."""
+        if task.stretch is None and task.frames is None:
+            return self._setup.describe(task.sequence, progress)
+        if task.sequence not in self._recordings:
+            self._recordings[task.sequence] = self._setup.sequences.open(task.sequence)
+        scans = self._recordings[task.sequence]
+        if task.stretch is None:
+            return with_measured_hops(scans, task.frames, progress)
         setup = self._apart if task.apart else self._setup
-        sequence = self._prepared(setup, task, progress)
-        trials = setup.run(sequence, task.sets, task.whole, task.most_ms, progress)
-        frames = None
-        if task.frames:  # which reads the scans again
-            frames = with_measured_hops(sequence.scans, sequence.frames, progress)
-        return TaskResult(trials, frames)
-
-    def _prepared(self, setup: TrialSetup, task: Task, progress: Progress) -> PreparedSequence:
-        key = task.sequence, setup is self._setup
-        sequence = self._ready.pop(key, None)
-        if sequence is None:
-            # Make room: drop the sequences that were not used for longest.
-            while self._ready and self._used() > self._memory / 2:
-                del self._ready[next(iter(self._ready))]
-            with apart():
-                sequence = setup.prepare(task.sequence, self._memory - self._used(), progress)
-        self._ready[key] = sequence
-        return sequence
-
-    def _used(self) -> int:
-        return sum(sequence.shared.nbytes for sequence in self._ready.values())
+        if task.apart not in self._shared:  # other instances take scans in another way
+            self._shared = {task.apart: SharedScans(self._memory)}
+        shared, sets = self._shared[task.apart], task.sets
+        drives = setup.drive(shared, scans, task.stretch, sets.values(), task.most, progress)
+        return dict(zip(sets, drives, strict=True))
 
 
-def attempt(
-    sequences: Sequences, task: Task, progress: Progress = unseen
-) -> TaskResult | AdaptuneError:
+def attempt(bench: Bench, task: Task, progress: Progress = unseen) -> Result | AdaptuneError:
     """Do a task; return an exception instead of raising it."""
     try:
-        return sequences.run(task, progress)
+        return bench.run(task, progress)
     except AdaptuneError as error:
         return error
     except Exception as error:
@@ -334,14 +323,14 @@ def _serve(connection: Connection, core: int, memory: float) -> None:
     os.setsid()  # user code may end its process group
     pin(core)
     try:
-        sequences = Sequences(connection.recv(), memory)
+        bench = Bench(connection.recv(), memory)
     except Exception as error:
         connection.send(WorkerError(f"a worker cannot import what it needs: {in_a_line(error)}"))
         return
     progress = now_and_then(connection.send)
     with contextlib.suppress(EOFError, BrokenPipeError):
         while True:
-            connection.send(attempt(sequences, connection.recv(), progress))
+            connection.send(attempt(bench, connection.recv(), progress))
 
 
 def now_and_then(send: Callable[[TaskProgress], None]) -> Progress:
@@ -548,13 +537,13 @@ def check_files(sequences: StudySequences, name: str, there: Mapping[Path, str])
 
 
 _lock = threading.Lock()
-_held: tuple[str, Sequences] | None = None
+_held: tuple[str, Bench] | None = None
 
 
 def perform(
     token: str, setup: TrialSetup, files: Mapping[Path, str], task: Task, core: int, share: float
 ) -> Outcome:
-    """Do a task, with the sequences that earlier tasks of the same campaign have prepared.
+    """Do a task, with the scans that earlier tasks of the same campaign have prepared.
 
     They take this `share` of the machine's memory for them.
     """
@@ -563,5 +552,5 @@ def perform(
     with _lock:
         pin(core)
         if _held is None or _held[0] != token:
-            _held = token, Sequences(setup, share * spare_memory())
+            _held = token, Bench(setup, share * spare_memory())
         return attempt(_held[1], task)

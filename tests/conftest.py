@@ -15,7 +15,7 @@ from adaptune.odometry.registry import ODOMETRIES
 from offline import train as training
 from offline.config import load_study
 from offline.train import train
-from offline.workers import Sequences, TaskProgress, Workers, attempt
+from offline.workers import Bench, TaskProgress, Workers, attempt
 
 hypothesis.settings.register_profile("untimed", deadline=None)
 hypothesis.settings.load_profile("untimed")
@@ -51,7 +51,7 @@ class InProcess:
 
     def __init__(self, setup, n, memory):
         self.setup, self.n, self.memory = setup, n, memory
-        self._sequences = [Sequences(setup, memory / n) for _ in range(n)]
+        self._benches = [Bench(setup, memory / n) for _ in range(n)]
         self._tasks = {}
 
     def __enter__(self):
@@ -69,7 +69,7 @@ class InProcess:
     def wait(self):
         worker, said = next(iter(self._tasks)), []
         outcome = attempt(
-            self._sequences[worker],
+            self._benches[worker],
             self._tasks.pop(worker),
             lambda *now: said.append((worker, TaskProgress(*now))),
         )

@@ -18,6 +18,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from commands import call
+from made_drives import trials_of
 from needs import module_of
 from setups import setup_of
 from typer.main import get_command
@@ -310,6 +311,6 @@ def test_the_example_of_a_program_follows_a_drive(study_file, tmp_path, monkeypa
     (tmp_path / "kiss_icp.yaml").write_text(template)
     (tmp_path / "study.yaml").write_text(drives.study_with(example, study_file.parent))
     setup = setup_of(load_study(tmp_path / "study.yaml", runs=tmp_path / "runs"))
-    (trial,) = setup.run(setup.prepare("one", 1e9), [{"mapping.voxel_size": 0.5}])
+    (trial,) = trials_of(setup, [{"mapping.voxel_size": 0.5}])
     assert not trial.faults
     assert np.nanmean(trial.errors) < 5.0

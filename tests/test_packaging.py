@@ -12,6 +12,7 @@ import drives
 import numpy as np
 import pytest
 import yaml
+from made_drives import trials_of
 from setups import setup_of
 
 from adaptune.model.descriptor import Describer
@@ -80,8 +81,7 @@ def test_a_package_of_others_adds_an_odometry_and_a_descriptor(tmp_path, monkeyp
     text = "odometry: {name: scan_to_scan}\ndescriptor: [range_deciles]\n"
     study.write_text(drives.study_with(text, tmp_path))
     setup = setup_of(load_study(study))
-    scans = setup.prepare("one", 1e9)
-    (trial,) = setup.run(scans, [{"voxel": 0.4}])
+    (trial,) = trials_of(setup, [{"voxel": 0.4}])
     assert np.nanmean(trial.errors) < 5.0
     assert Describer(["range_deciles"]).blocks == {"range_deciles": 9}
     assert setup.odometry.content["version of adaptune-example"] == "1.2.3"

@@ -111,6 +111,11 @@ class CachedScans:
     def __iter__(self) -> Iterator[Scan]:
         return (self[i] for i in range(len(self)))
 
+    def since(self, stamp: int) -> Iterator[Scan]:
+        """Read the scans from `stamp` on."""
+        first = int(np.searchsorted(self._index[:, 0], stamp))
+        return (self[i] for i in range(first, len(self)))
+
     def _map(self, name: str, length: int) -> Any:
         kind, columns = _ARRAYS[name]
         shape = (length, columns)[: 2 if columns > 1 else 1]

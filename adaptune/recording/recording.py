@@ -159,6 +159,9 @@ def _check_topics(source: "Source", config: SequenceConfig) -> None:
 # Which part of a recording is used, and its reference and IMU.
 
 
+_BEFORE = 3.0
+"""Seconds by which reading from a stamp on begins earlier: that of a message may mark the end of a
+scan, and what is seen of a scan may depend on those before."""
 # At most so many scans are registered to find a clock offset.
 _MOST_SCANS = 600
 
@@ -259,9 +262,13 @@ class RecordedSequence:
         yield from chain(first, scans)
         odd += map(str, of_looks(content.looks, start=self.start))
 
-    def _decode(self, left_out: Counter[str], content: Content) -> Iterator[Scan]:
+    def _decode(
+        self, left_out: Counter[str], content: Content, begin: float = -math.inf
+    ) -> Iterator[Scan]:
         last: Scan | None = None
         for frame in self._frames(left_out):
+            if frame.stamp < begin:
+                continue
             scan = frame.load()
             if last is not None and scan.stamp <= last.stamp:
                 left_out[BACKWARD] += 1
@@ -313,6 +320,15 @@ class RecordedSequence:
             if mine and others and not near:
                 return False
         return False
+
+    def since(self, stamp: int) -> Iterator[Scan]:
+        """Read the scans from a little before `stamp` on, without a word about what is odd."""
+        begin = stamp - round(_BEFORE * 1e9)
+        kept = None if self.key is None else cache.find(self.key)
+        if kept is not None:
+            yield from kept.since(begin)
+        else:
+            yield from self._decode(Counter(), Content(), begin)
 
     def backward(self) -> Iterator[Scan]:
         """Read the scans, the last one first. A bag is decoded to the cache before."""

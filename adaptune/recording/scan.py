@@ -170,6 +170,9 @@ class Recording(Protocol):
     def __iter__(self) -> Iterator[Scan]:
         """Read the scans; their stamps strictly increase."""
 
+    def since(self, stamp: int) -> Iterator[Scan]:
+        """Read the scans from `stamp` on, or from some before: views need those, too."""
+
     def backward(self) -> Iterator[Scan]:
         """Read the scans, the last one first."""
 

@@ -48,6 +48,10 @@ class View:
         """Read the scans; a SequenceError if the view leaves none."""
         return self._seen(self.inner.backward() if self.reverse else iter(self.inner))
 
+    def since(self, stamp: int) -> Iterator[Scan]:
+        """Read the scans from about `stamp` on; played backwards, all of them."""
+        return iter(self) if self.reverse else self._seen(self.inner.since(stamp))
+
     def backward(self) -> Iterator[Scan]:
         """Read the scans, the last one first."""
         return self._seen(iter(self.inner) if self.reverse else self.inner.backward())

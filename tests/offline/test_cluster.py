@@ -9,13 +9,14 @@ import drives
 import faulty
 import kills
 import pytest
+from made_drives import Tasks, task_of
 from setups import setup_of
 
 from adaptune.odometry.remote import Limits
 from offline import workers as cluster
 from offline.config import load_study
 from offline.train import train
-from offline.workers import Cluster, ClusterError, Task, run
+from offline.workers import Cluster, ClusterError, run
 
 pytestmark = pytest.mark.services
 
@@ -131,9 +132,11 @@ def test_a_class_of_the_user_that_hangs_is_ended(study_file, tmp_path, scheduler
         limits=Limits(seconds=1.0),
         user_code=True,
     )
-    with Cluster(setup_of(study, hangs), ["one"], scheduler[0]) as pool:
-        ((_, result),) = run(pool, [Task("one", (0,), ({"x": 0.5},))])
-    assert "a scan took longer than" in result.trials[0].faults[0]
+    setup = setup_of(study, hangs)
+    tasks = Tasks(task_of(setup, "one", {0: {"x": 0.5}}))
+    with Cluster(setup, ["one"], scheduler[0]) as pool:
+        ((_, result),) = run(pool, tasks)
+    assert "a scan took longer than" in result[0][0].faults[0]
 
 
 def test_a_killed_worker_s_trials_run_elsewhere(

@@ -19,13 +19,10 @@ SPACE = ParameterSpace(
 
 def walk(name, grid, trials, batch=5, space=SPACE, seed=0):
     config = OfflineConfig(sampler=name, sampler_settings={"grid": grid}, batch=batch, seed=seed)
-    sampler, history = make_sampler(space, config), []
-    while len(history) < trials:
-        sets = sampler.propose(history)
-        history += [(s, 1.0) for s in sets]
-        if len(sets) < batch:
-            break
-    return [tuple(s.values()) for s, _ in history[:trials]]
+    sampler, sets = make_sampler(space, config), []
+    while len(sets) < trials and (proposed := sampler.propose([], sets)) is not None:
+        sets.append(proposed.parameters)
+    return [tuple(s.values()) for s in sets]
 
 
 def test_a_grid_is_walked_in_row_major_order():

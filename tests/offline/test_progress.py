@@ -3,18 +3,21 @@ from importlib import import_module
 from types import SimpleNamespace
 
 import pytest
+from made_drives import Tasks
 
 from offline import workers
 from offline.config import load_study
 from offline.train import train
-from offline.workers import Death, Task, TaskProgress, TaskResult, Workers, now_and_then, run
+from offline.workers import Death, Task, TaskProgress, Workers, now_and_then, run
+
+TASK = Task("one", sets={0: {}, 1: {}})
 
 
 class TwoWords:
     """A pool of one worker that tells how far it is before it is done."""
 
-    def __init__(self):
-        self.said = [TaskProgress("reading", 5, 10), TaskProgress("running", 2, 10)]
+    def __init__(self, *said):
+        self.said = list(said)
 
     def workers(self):
         return [0]
@@ -23,15 +26,13 @@ class TwoWords:
         pass
 
     def wait(self):
-        return [(0, self.said.pop(0) if self.said else TaskResult([], None))]
+        return [(0, self.said.pop(0) if self.said else {})]
 
 
 def test_what_a_dead_worker_had_done_does_not_count():
-    pool, calls = TwoWords(), []
-    half = TaskProgress("running", 8, 10)
-    pool.said = [half, Death("it was killed"), half]
-    list(run(pool, [Task("one", (0, 1), ({}, {}))], "runs", lambda *call: calls.append(call)))
-    assert [done for _, done, *_ in calls] == [1.6, 1.6, 2]
+    half, work = TaskProgress("running", 8, 10), Tasks(TASK)
+    list(run(TwoWords(half, Death("it was killed"), half), work))
+    assert [progress.done for progress in work.noted] == [8, 0, 8]
 
 
 class Elsewhere:
@@ -43,7 +44,7 @@ class Elsewhere:
 
 def test_a_worker_that_cannot_import_tells_why():
     with Workers(Elsewhere(), 1, 1e9) as pool, pytest.raises(workers.WorkerError) as caught:
-        list(run(pool, [Task("one", (0, 1), ({}, {}))]))
+        list(run(pool, Tasks(TASK)))
     assert "No module named 'no_module_of_the_worker_s'" in str(caught.value)
 
 
@@ -76,10 +77,9 @@ def test_offline_shows_scans_and_runs(study_file, tmp_path, workers):
 
 @pytest.mark.parametrize(("cause", "memory"), [("SIGKILL", True), ("ended with code 1", False)])
 def test_only_a_worker_that_was_killed_may_have_lacked_memory(cause, memory):
-    pool = TwoWords()
-    pool.said = [Death(cause)] * workers.MOST_DEATHS
+    pool = TwoWords(*[Death(cause)] * workers.MOST_DEATHS)
     with pytest.raises(workers.WorkerError) as caught:
-        list(run(pool, [Task("one", (0, 1), ({}, {}))]))
+        list(run(pool, Tasks(TASK)))
     assert ("out of memory" in str(caught.value)) == memory
 
 
@@ -91,5 +91,5 @@ def test_what_the_machine_lacks_is_told_in_a_sentence(error, words):
     def lacking(*_):
         raise error
 
-    failure = workers.attempt(SimpleNamespace(run=lacking), Task("one", (0, 1), ({}, {})))
+    failure = workers.attempt(SimpleNamespace(run=lacking), TASK)
     assert str(failure).startswith(f"one, trials 0, 1: {words}; ")

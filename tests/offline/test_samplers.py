@@ -60,16 +60,19 @@ def config(request):
     return OfflineConfig(sampler=name, sampler_settings=settings, batch=8, initial=12, seed=5)
 
 
-def run(config, n_batches, space=SPACE, error=bowl):
-    sampler = make_sampler(space, config)
-    history = []
-    for _ in range(n_batches):
-        history += [(s, error(s)) for s in sampler.propose(history)]
-    return history
+def run(config, n, space=SPACE, error=bowl, sampler=None):
+    """Sets and values of `n` trials, or of as many as there are."""
+    sampler, sets, history = sampler or make_sampler(space, config), [], []
+    while len(sets) < n:
+        history = [(s, error(s)) for s in sets[: max(0, len(sets) - config.batch + 1)]]
+        if (proposed := sampler.propose(history, sets[len(history) :])) is None:
+            break
+        sets.append(proposed.parameters)
+    return [(s, error(s)) for s in sets]
 
 
 def test_sets_are_of_the_space_and_differ(config):
-    history = run(config, 8)
+    history = run(config, 64)
     assert len({repr(parameters) for parameters, _ in history}) == len(history) == 64
     for parameters, _ in history:
         SPACE.check(parameters)
@@ -78,20 +81,19 @@ def test_sets_are_of_the_space_and_differ(config):
         assert list(parameters) == list(SPACE.names)
 
 
-@pytest.mark.parametrize("known", [0, 1, 3, 4])
+@pytest.mark.parametrize("known", [0, 1, 11, 13, 32])
 def test_resumes_exactly(config, known):
-    history = run(config, 6)
-    resumed = make_sampler(SPACE, config)
-    for batch in range(known, 6):
-        assert resumed.propose(history[: 8 * batch]) == [
-            s for s, _ in history[8 * batch : 8 * batch + 8]
-        ]
+    history = run(config, 40)
+    sets, resumed = [s for s, _ in history], make_sampler(SPACE, config)
+    for n in range(known, 40):
+        seen = max(0, n - config.batch + 1)
+        assert resumed.propose(history[:seen], sets[seen:n]).parameters == sets[n]
 
 
 @pytest.mark.parametrize("config", [name for name in SAMPLERS if name != "grid"], indirect=True)
 def test_heeds_the_log_scale(config):
     config = config.model_copy(update={"initial": 48})
-    sets = [s for s, _ in run(config, 12, error=lambda _: 1.0)]
+    sets = [s for s, _ in run(config, 96, error=lambda _: 1.0)]
     assert 0.2 < np.mean([s["distance"] < 1.0 for s in sets]) < 0.8
     assert 0.2 < np.mean([s["rings"] < 8 for s in sets]) < 0.8
 
@@ -102,12 +104,7 @@ def test_tries_all_there_is_and_ends(config):
         config = config.model_copy(update={"sampler_settings": settings})
     if "steps" in config.sampler_settings:
         config = config.model_copy(update={"sampler_settings": {}})
-    sampler = make_sampler(FINITE, config)
-    history = []
-    while sets := sampler.propose(history):
-        history += [(s, s["passes"] / 6 + (s["kernel"] == "none")) for s in sets]
-        if len(sets) < config.batch:
-            break
+    history = run(config, 30, FINITE, lambda s: s["passes"] / 6 + (s["kernel"] == "none"))
     assert len(history) == 18
     assert max(collections.Counter(repr(s) for s, _ in history).values()) == 1
 
@@ -118,14 +115,14 @@ LEARNING = ["tpe", "annealing", "optuna.samplers:CmaEsSampler"]
 @pytest.mark.parametrize("name", LEARNING)
 def test_learns(name):
     config = OfflineConfig(sampler=name, batch=8, initial=16, seed=5)
-    errors = [error for _, error in run(config, 14)]
+    errors = [error for _, error in run(config, 112)]
     assert np.mean(errors[64:]) < 0.7 * np.mean(errors[1:16])
 
 
 @pytest.mark.parametrize("name", LEARNING)
 def test_begins_with_points_that_spread_evenly_in_ratio(name):
     config = OfflineConfig(sampler=name, batch=64, initial=64, seed=1)
-    sets = [s for s, _ in run(config, 1)]
+    sets = [s for s, _ in run(config, 64)]
     assert sets[1:] == sobol_points(SPACE, 1, range(1, 64))
     counts, _ = np.histogram(np.log10([s["distance"] for s in sets[1:]]), bins=4, range=(-2, 2))
     assert counts.min() >= 14
@@ -136,13 +133,14 @@ def test_ends_when_all_chains_have_stalled():
     config = OfflineConfig(
         sampler="annealing", sampler_settings=settings, batch=4, initial=4, seed=5
     )
-    sampler, history = make_sampler(SPACE, config), []
-    while sets := sampler.propose(history):
-        history += [(s, float(len(history) + i)) for i, s in enumerate(sets)]
-        assert len(history) < 500
+    sampler, errors = make_sampler(SPACE, config), {}
+    history = run(
+        config, 500, error=lambda s: errors.setdefault(repr(s), float(len(errors))), sampler=sampler
+    )
+    assert len(history) < 500
     assert sampler.end == "all chains have stalled"
-    assert make_sampler(SPACE, config).propose(history) == []
-    assert len(make_sampler(SPACE, config).propose(history[:-4])) == 4
+    assert make_sampler(SPACE, config).propose(history) is None
+    assert make_sampler(SPACE, config).propose(history[:-8]) is not None
 
 
 RAISING = """
@@ -176,11 +174,11 @@ def test_a_sampler_that_raises_is_named(tmp_path, monkeypatch, hook):
     with pytest.raises(SamplerError, match=words):
         make_sampler(SPACE, config(1))  # before anything is run
     with pytest.raises(SamplerError, match=words):
-        run(config(8), 8)
+        run(config(8), 16)
 
 
 def test_a_sampler_that_cannot_sample_the_parameters_is_refused_at_once():
     config = OfflineConfig(sampler="optuna.samplers:BruteForceSampler", batch=2)
     with pytest.raises(SamplerError, match="step must be given"):
         make_sampler(SPACE, config)
-    assert len(run(config, 2, FINITE, lambda _: 1.0)) == 4
+    assert len(run(config, 4, FINITE, lambda _: 1.0)) == 4

@@ -6,6 +6,7 @@ from typing import ClassVar
 import drives
 import numpy as np
 import pytest
+from made_drives import trials_of
 from setups import made_of, setup_of
 
 from adaptune.errors import AdaptuneError
@@ -18,7 +19,7 @@ from adaptune.recording import SequenceConfig
 from adaptune.recording.scan import Scan, SequenceError
 from adaptune.trajectory import Trajectory
 from offline.config import OfflineConfig, load_study
-from offline.trial import SharedScans, TrialSettings, reference_poses, stretches_of
+from offline.trial import STALE, SharedScans, Stretch, TrialSettings, reference_poses, stretches_of
 from online.replay import replay
 
 GOOD = {"max_correspondence_distance": 2.0, "keyframe_interval": 1.0}
@@ -30,8 +31,8 @@ def study(study_file, tmp_path_factory):
 
 
 def test_a_good_trial(study):
-    sequence = setup_of(study).prepare("one", 1e9)
-    (trial,) = setup_of(study).run(sequence, [GOOD])
+    frames = setup_of(study).describe("one")
+    (trial,) = trials_of(setup_of(study), [GOOD], frames=frames)
     assert trial.parameters == GOOD
     assert not trial.restarted.any()
     assert trial.registered.all()
@@ -39,13 +40,13 @@ def test_a_good_trial(study):
     # 39 steps of 0.3 m: sub-trajectories of more than 3 m start at the first 29 frames. It begins
     # in motion: a fifth of it is warm-up.
     assert np.flatnonzero(~np.isnan(trial.errors)).tolist() == list(range(8, 29))
-    expected = sub_trajectory_rte(sequence.frames.counted, trial.T_odom_sensor, 3.0)
+    expected = sub_trajectory_rte(frames.counted, trial.T_odom_sensor, 3.0)
     np.testing.assert_array_equal(trial.errors, expected)
 
 
 def test_motion_is_described_by_the_reference_before_each_scan(study_file, tmp_path):
     study = load_study(study_file, ["descriptor=[ndt, motion]"], tmp_path)
-    frames = setup_of(study).prepare("one", 1e9).frames
+    frames = setup_of(study).describe("one")
     assert frames.blocks == {"ndt": 90, "motion": 2}
     np.testing.assert_allclose(frames.descriptors[:2, 90], 0.0)
     # 0.3 m a scan, ten scans a second.
@@ -54,11 +55,10 @@ def test_motion_is_described_by_the_reference_before_each_scan(study_file, tmp_p
 
 
 def test_trials_side_by_side_are_those_one_by_one(study):
-    sequence = setup_of(study).prepare("one", 1e9)
     sets = [GOOD, GOOD | {"keyframe_interval": 5.0}, GOOD | {"max_correspondence_distance": 0.2}]
-    together = setup_of(study).run(sequence, sets)
+    together = trials_of(setup_of(study), sets)
     for parameters, trial in zip(sets, together, strict=True):
-        (alone,) = setup_of(study).run(sequence, [parameters])
+        (alone,) = trials_of(setup_of(study), [parameters])
         np.testing.assert_array_equal(trial.T_odom_sensor, alone.T_odom_sensor)
     assert not np.array_equal(together[0].T_odom_sensor, together[1].T_odom_sensor)
 
@@ -91,26 +91,26 @@ class Lost(Slipping):
 
 def test_a_trial_is_a_drive_with_the_health_check(study):
     setup = setup_of(study, made_of(Lost, study))
-    sequence = setup.prepare("one", 1e9)
-    (trial,) = setup.run(sequence, [GOOD])
+    frames = setup.describe("one")
+    (trial,) = trials_of(setup, [GOOD], frames=frames)
     scans = study.sequences.open("one")
     replayed = replay(scans, made_of(Lost, study)(GOOD), study.config.health)
     assert trial.unhealthy == replayed.unhealthy == {"max_speed": 1}
     np.testing.assert_array_equal(trial.T_odom_sensor, replayed.trajectory.T_world_sensor)
     assert np.flatnonzero(trial.restarted).tolist() == [10]
     assert np.isfinite(trial.errors[8:29]).all()
-    (whole,) = setup.run(sequence, [GOOD], whole=True)
+    (whole,) = trials_of(setup, [GOOD], frames=frames.uncut)
     np.testing.assert_array_equal(whole.T_odom_sensor, trial.T_odom_sensor)
 
 
 def test_each_stretch_begins_at_the_reference_and_in_motion(study):
     instances = []
     setup = setup_of(study, made_of(Slipping, study, instances), sub_trajectory=0.5, stretches=3)
-    sequence = setup.prepare("one", 1e9)
-    (trial,) = setup.run(sequence, [GOOD])
-    stretches = sequence.frames.stretches
+    frames = setup.describe("one")
+    (trial,) = trials_of(setup, [GOOD], frames=frames)
+    stretches = frames.stretches
     assert len(stretches) == 3
-    T_ref_sensor, starts = sequence.frames.T_ref_sensor, instances[-1].starts
+    T_ref_sensor, starts = frames.T_ref_sensor, [one.starts[0] for one in instances]
     assert len(starts) == 3
     for (first, begin, end), (_, T, motion) in zip(stretches[1:], starts[1:], strict=True):
         np.testing.assert_array_equal(T, T_ref_sensor[first])
@@ -121,7 +121,7 @@ def test_each_stretch_begins_at_the_reference_and_in_motion(study):
         known = ~np.isnan(trial.errors[first:end])
         assert not known[: begin - first].any()
         assert known[begin - first :].any()
-    (whole,) = setup.run(sequence, [GOOD], whole=True)
+    (whole,) = trials_of(setup, [GOOD], frames=frames.uncut)
     assert np.isfinite(whole.T_odom_sensor).all()
     assert np.count_nonzero(~np.isnan(whole.errors)) > np.count_nonzero(~np.isnan(trial.errors))
 
@@ -129,20 +129,20 @@ def test_each_stretch_begins_at_the_reference_and_in_motion(study):
 class FailsOnce(KeyframeGicp):
     """Cannot begin on its second stretch."""
 
-    n_starts = 0
+    made: ClassVar = []
 
     def start(self, *args):
-        self.n_starts += 1
-        if self.n_starts == 2:
+        self.made.append(self)
+        if len(self.made) == 2:
             raise ValueError("seven planes")
         super().start(*args)
 
 
 def test_a_drive_that_fails_at_its_first_scan_counts_as_lost(study):
     setup = setup_of(study, made_of(FailsOnce, study), sub_trajectory=0.5, stretches=3)
-    sequence = setup.prepare("one", 1e9)
-    (trial,) = setup.run(sequence, [GOOD])
-    for i, (_, begin, end) in enumerate(sequence.frames.stretches):
+    frames = setup.describe("one")
+    (trial,) = trials_of(setup, [GOOD], frames=frames)
+    for i, (_, begin, end) in enumerate(frames.stretches):
         known = trial.errors[begin:end][~np.isnan(trial.errors[begin:end])]
         assert len(known)
         assert np.isinf(known).all() == (i == 1)
@@ -186,13 +186,10 @@ class Slow(KeyframeGicp):
     """Takes ten seconds of CPU time a scan, as far as it says."""
 
 
-def test_a_set_that_is_too_slow_is_stopped(study, monkeypatch):
+def test_a_set_that_is_too_slow_is_stopped(study):
     setup = setup_of(study, made_of(Slow, study))
-    sequence = setup.prepare("one", 1e9)
-    with monkeypatch.context() as patch:
-        patch.setattr("offline.trial.LEAST_SECONDS", 0.0)
-        (slow,) = setup.run(sequence, [GOOD], most_ms=0.0)
-        (good,) = setup.run(sequence, [GOOD], most_ms=1e6)
+    (slow,) = trials_of(setup, [GOOD], most=0.0)
+    (good,) = trials_of(setup, [GOOD], most=1e6)
     (ms,) = re.findall(r"too slow: (\d+) ms a scan", slow.failure)
     assert int(ms) == round(slow.usage["register_ms"])
     assert int(ms) < 1e3  # of the one scan that it was given
@@ -202,18 +199,16 @@ def test_a_set_that_is_too_slow_is_stopped(study, monkeypatch):
 
 def test_a_scan_that_cannot_be_read_is_no_fault_of_the_odometry(study):
     setup = setup_of(study)
-    sequence = setup.prepare("one", 0.0)  # scans are read again
 
     class Gone:
         name = "one.bag"
 
-        def __iter__(self):
-            yield from islice(iter(study.sequences.open("one")), 20)
+        def since(self, stamp):
+            yield from islice(study.sequences.open("one").since(stamp), 20)
             raise OSError("the disk is gone")
 
-    sequence.shared = SharedScans(Gone(), 0.0)
     with pytest.raises(SequenceError, match=r"one\.bag: cannot be read .*the disk is gone.*again"):
-        setup.run(sequence, [GOOD])
+        trials_of(setup, [GOOD], scans=Gone())
 
 
 class Unable(KeyframeGicp):
@@ -245,9 +240,9 @@ class Unable(KeyframeGicp):
 def test_an_exception_is_a_fault_of_its_trial(study, where):
     unable = type("Unable", (Unable,), {"where": where})
     setup = setup_of(study, made_of(unable, study))
-    sequence = setup.prepare("one", 1e9)
+    frames = setup.describe("one")
     sets = [GOOD | {"keyframe_interval": 7.0}, GOOD]
-    bad, good = setup.run(sequence, sets)
+    bad, good = trials_of(setup, sets, frames=frames)
     (fault,) = bad.faults
     assert "ValueError: seven planes" in fault
     assert not good.faults
@@ -268,19 +263,18 @@ def test_repeats_are_averaged_and_kept(study):
             super().__init__(*args)
             made.append(self)
             drift, loss = dict.fromkeys(range(40), 0.01), {10: 5.0, 11: -5.0}
-            self.slips = {3: drift, 4: loss}.get(len(made), {})
+            self.slips = {2: drift, 3: loss}.get(len(made), {})
 
     wavering = made_of(Wavering, study)
-    sequence = setup_of(study, wavering).prepare("one", 1e9)
-    (trial,) = setup_of(study, wavering, repeats=3).run(sequence, [GOOD])
-    assert len(made) == 4
+    (trial,) = trials_of(setup_of(study, wavering, repeats=3), [GOOD])
+    assert len(made) == 3
     errors = [of_run["rte"] for of_run in trial.repeats]
     assert errors[1] > max(errors[0], errors[2]) + 1.0
     assert errors[0] != errors[2]
     assert trial.mean_error == pytest.approx(np.mean(errors))
     assert np.flatnonzero(trial.restarted).tolist() == [10]
     assert trial.metrics["ape"] == pytest.approx(np.mean([r["ape"] for r in trial.repeats]))
-    (alone,) = setup_of(study, wavering).run(sequence, [GOOD])
+    (alone,) = trials_of(setup_of(study, wavering), [GOOD])
     np.testing.assert_array_equal(trial.T_odom_sensor, alone.T_odom_sensor)
 
 
@@ -294,7 +288,7 @@ def test_a_path_that_is_too_short_is_told(study, tmp_path, part):
     setup = dataclasses.replace(setup_of(study), sequences=sequences, settings=settings)
     key = r"sequences\.hall" if part is None else r"\[hall: 0-30%\]"
     with pytest.raises(AdaptuneError, match=rf"^{key}: its path of .* holds no sub-trajectory"):
-        setup.prepare(name, 1e9)
+        setup.describe(name)
 
 
 def test_a_reference_with_too_few_poses_names_max_gap():
@@ -331,52 +325,66 @@ class Preparer(OdometryInstance):
 class Read:
     """Scans that count how often they are read."""
 
-    count = 0
+    name, count = "read", 0
 
-    def __iter__(self):
-        for stamp in range(N):
+    def since(self, stamp):
+        for at in range(stamp, N):
             self.count += 1
-            yield Scan(stamp, np.zeros((1, 3), np.float32))
+            yield Scan(at, np.zeros((1, 3), np.float32))
 
 
-def passes(shared, *instances):
+def along(first=0):
+    return Stretch("one", first, np.arange(first, N), np.eye(4), None)
+
+
+def passes(shared, read, *instances, stretch=None):
     """What each instance gets on a pass."""
-    return [[int(scan(one)[0]) for one in instances] for scan in islice(shared, N)]
+    stretch = stretch or along()
+    return [[int(scan(one)[0]) for one in instances] for scan in shared.along(stretch, read)]
 
 
 def test_each_scan_is_prepared_once_for_all_that_are_alike():
-    read = Read()
-    shared = SharedScans(read, 1e6)
+    read, shared = Read(), SharedScans(1e6)
     one, alike, other = Preparer("a"), Preparer("a"), Preparer("b")
-    assert passes(shared, one, alike, other) == [[i, i, i] for i in range(N)]
+    assert passes(shared, read, one, alike, other) == [[i, i, i] for i in range(N)]
     assert (one.count, alike.count, other.count) == (N, 0, N)
     assert read.count == N
     # Nothing is read or prepared again.
-    assert passes(shared, alike, other) == [[i, i] for i in range(N)]
+    assert passes(shared, read, alike, other) == [[i, i] for i in range(N)]
     assert (one.count, other.count, read.count) == (N, N, N)
     assert shared.nbytes == 2 * N * SIZE
+    # Only the scans of a stretch are read.
+    assert passes(shared, read, one, stretch=along(3)) == [[3], [4]]
+    assert read.count == N + 2
 
 
-def test_what_memory_does_not_hold_is_read_again():
-    read = Read()
-    shared = SharedScans(read, 2.5 * SIZE)
-    one = Preparer("a")
-    assert passes(shared, one) == passes(shared, one) == [[i] for i in range(N)]
+def test_what_memory_does_not_hold_is_read_again_once_for_all():
+    read, shared = Read(), SharedScans(2.5 * SIZE)
+    one, alike = Preparer("a"), Preparer("a")
+    for _ in range(2):
+        assert passes(shared, read, one, alike) == [[i, i] for i in range(N)]
     assert shared.nbytes == 2 * SIZE
-    assert one.count == N + (N - 2)
+    assert (one.count, alike.count) == (N + (N - 2), 0)
     assert read.count == 2 * N
 
 
-def test_preparations_that_a_pass_does_not_use_make_room():
-    shared = SharedScans(Read(), N * SIZE)
+def test_what_has_not_been_used_for_long_makes_room():
+    read, shared = Read(), SharedScans(N * SIZE)
     one, other = Preparer("a"), Preparer("b")
-    passes(shared, one)
-    passes(shared, other)
-    # The first scan found no room.
-    assert (shared.n_kept(one), shared.n_kept(other)) == (0, N - 1)
-    # Of two that are used, none makes room for the other.
-    passes(shared, one, other)
-    assert (shared.n_kept(one), shared.n_kept(other)) == (1, N - 1)
+    passes(shared, read, one)
+    for _ in range(STALE):
+        passes(shared, read, other)
+    assert other.count == STALE * N
+    passes(shared, read, other)
+    assert shared.nbytes == N * SIZE
+    passes(shared, read, other)
+    assert other.count == (STALE + 1) * N
+
+
+def test_scans_that_are_others_than_before_are_refused():
+    stretch = along()._replace(stamps=np.array([0, 1, 3, 9]))
+    with pytest.raises(SequenceError, match="read: has other scans than before; run the same"):
+        passes(SharedScans(1e6), Read(), Preparer("a"), stretch=stretch)
 
 
 @pytest.mark.parametrize(

@@ -45,12 +45,12 @@ def make(name):
     return make_sampler(SPACE, OfflineConfig(sampler=name, initial=2, batch=2, seed=3))
 
 
-def propose_all(sampler, batches=4):
-    history = []
-    for _ in range(batches):
-        sets = sampler.propose(history)
-        history += [(s, s["voxel"] + (s["kernel"] is True)) for s in sets]
-    return [parameters for parameters, _ in history]
+def propose_all(sampler):
+    sets = []
+    for n in range(8):
+        history = [(s, s["voxel"] + (s["kernel"] is True)) for s in sets[: max(0, n - 1)]]
+        sets.append(sampler.propose(history, sets[len(history) :]).parameters)
+    return sets
 
 
 def test_it_proposes_as_optuna_s_own_would():

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 import turns
+from made_drives import Tasks
 from setups import setup_of
 
 from adaptune import processes as hosting
@@ -95,4 +96,4 @@ def test_a_campaign_names_the_descriptor_and_the_sequence(study_file, tmp_path):
     study = load_study(study_file, overrides, tmp_path / "study")
     words = r"sequences\.one: descriptors_elsewhere:crashes: its process was ended by SIGSEGV"
     with Workers(setup_of(study), 1, 1e9) as workers, pytest.raises(AdaptuneError, match=words):
-        list(run(workers, [Task("one", (), (), frames=True)]))
+        list(run(workers, Tasks(Task("one"))))

@@ -7,6 +7,7 @@ import numpy as np
 import program
 import pytest
 import yaml
+from made_drives import trials_of
 from setups import setup_of
 
 from adaptune.archive import Archive, rows
@@ -61,18 +62,18 @@ OTHER = {"registration.voxel": 0.6, "distance": 2.0}
 
 def run(study):
     setup = setup_of(study)
-    sequence = setup.prepare("one", 1e9)
-    (trial,) = setup.run(sequence, [OTHER])
-    return trial, sequence
+    frames = setup.describe("one")
+    (trial,) = trials_of(setup, [OTHER], frames=frames)
+    return trial, frames
 
 
 def test_the_poses_are_the_program_s(make):
     study = make()
-    trial, sequence = run(study)
+    trial, frames = run(study)
     assert not trial.faults
     assert not trial.restarted.any()
     np.testing.assert_allclose(
-        trial.T_odom_sensor[:, :3, 3], sequence.frames.T_ref_sensor[:, :3, 3], atol=0.1
+        trial.T_odom_sensor[:, :3, 3], frames.T_ref_sensor[:, :3, 3], atol=0.1
     )
     # It is what the program finds with these values.
     output, file = study.folder / "alone.tum", study.folder / "alone.json"
@@ -121,9 +122,9 @@ def test_json_that_only_yaml_reads_is_no_template(tmp_path):
 @pytest.mark.parametrize(("name", "kind"), [("poses/run.csv", "evalio"), ("run.txt", "kitti")])
 def test_every_format_of_trajectories(make, name, kind):
     settings = [f"odometry.settings.output={name}", f"odometry.settings.format={kind}"]
-    trial, sequence = run(make("pretend", *settings))
+    trial, frames = run(make("pretend", *settings))
     assert not trial.faults
-    np.testing.assert_allclose(trial.T_odom_sensor, sequence.frames.T_ref_sensor, atol=1e-6)
+    np.testing.assert_allclose(trial.T_odom_sensor, frames.T_ref_sensor, atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -140,11 +141,11 @@ def test_a_view_is_written_once_for_the_program(make, kind, points):
         f"odometry.settings.output=run.{'txt' if kind == 'kitti' else 'tum'}",
         "sequences.one.views=[{cut: [[0.0, 1.5], [2.0, 9.0]]}]",
     )
-    trial, sequence = run(study)
+    trial, frames = run(study)
     assert not trial.faults
-    assert len(trial.T_odom_sensor) == len(sequence.frames.stamps) == 35
+    assert len(trial.T_odom_sensor) == len(frames.stamps) == 35
     np.testing.assert_allclose(
-        trial.T_odom_sensor[:, :3, 3], sequence.frames.T_ref_sensor[:, :3, 3], atol=0.15
+        trial.T_odom_sensor[:, :3, 3], frames.T_ref_sensor[:, :3, 3], atol=0.15
     )
     (written,) = (study.folder / "inputs" / "one").glob("input*")
     before = written.stat().st_mtime_ns
@@ -206,8 +207,8 @@ def test_another_frame(make):
     (fault,) = run(make("camera"))[0].faults
     assert re.search(r"another frame: turned by 120 degrees.*extrinsic.*: read", fault)
     lidar = "[[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]]"
-    trial, sequence = run(make("camera", f"odometry.settings.extrinsic={lidar}"))
-    np.testing.assert_allclose(trial.T_odom_sensor, sequence.frames.T_ref_sensor, atol=1e-6)
+    trial, frames = run(make("camera", f"odometry.settings.extrinsic={lidar}"))
+    np.testing.assert_allclose(trial.T_odom_sensor, frames.T_ref_sensor, atol=1e-6)
 
 
 FAULTS = {
@@ -264,10 +265,10 @@ def test_one_file_that_fits_is_the_trajectory(make, output, told):
         f"odometry.settings.output='{output}'",
         "odometry.settings.template=",
     )
-    trial, sequence = run(study)
+    trial, frames = run(study)
     if told is None:
         assert not trial.faults
-        np.testing.assert_allclose(trial.T_odom_sensor, sequence.frames.T_ref_sensor, atol=1e-6)
+        np.testing.assert_allclose(trial.T_odom_sensor, frames.T_ref_sensor, atol=1e-6)
     else:
         told = told.format("results/now/config.yml, results/now/one_poses.tum")
         (fault,) = trial.faults

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import server
 import turns
+from made_drives import Tasks, task_of, trials_of
 from rooms import moved
 from setups import setup_of
 from street import served
@@ -30,7 +31,7 @@ from adaptune.recording.scan import ImuNoise
 from adaptune.space import Selection
 from adaptune.strict import ConfigurationError
 from offline.config import load_study
-from offline.workers import Task, Workers, run
+from offline.workers import Workers, run
 from online.replay import replay
 
 TOLD = {
@@ -153,8 +154,7 @@ def test_a_trial_keeps_its_faults_and_goes_on(study_file, tmp_path):
         "isolation={seconds: 60, memory: 1}",
     ]
     setup = setup_of(load_study(study_file, overrides, tmp_path / "study"))
-    sequence = setup.prepare("one", 1e9)
-    (trial,) = setup.run(sequence, [{"x": 0.5}])
+    (trial,) = trials_of(setup, [{"x": 0.5}])
     assert np.flatnonzero(trial.restarted).tolist() == [12]
     assert "SIGABRT" in trial.faults[0]
     assert trial.unhealthy == {"no_pose": 1}
@@ -163,10 +163,10 @@ def test_a_trial_keeps_its_faults_and_goes_on(study_file, tmp_path):
     archive.write("one", 0, trial)
     assert archive.read("one", 0).faults == trial.faults
     # And the campaign goes on.
-    tasks = [Task("one", (n,), ({"x": 0.5},)) for n in range(2)]
+    tasks = [task_of(setup, "one", {n: {"x": 0.5}}) for n in range(2)]
     with Workers(setup, 1, 1e9) as workers:
-        results = [result for _, result in run(workers, tasks)]
-    assert ["SIGABRT" in result.trials[0].faults[0] for result in results] == [True, True]
+        found = [drive for _, of in run(workers, Tasks(*tasks)) for (drive,) in of.values()]
+    assert ["SIGABRT" in drive.faults[0] for drive in found] == [True, True]
 
 
 @pytest.mark.parametrize(
@@ -176,13 +176,15 @@ def test_a_trial_keeps_its_faults_and_goes_on(study_file, tmp_path):
 def test_a_class_that_ends_the_worker_then_runs_apart(study_file, tmp_path, fault, words):
     overrides = ["odometry.name=faulty:Clean", "odometry.parameters=", "odometry.settings="]
     study = load_study(study_file, overrides, tmp_path / "study")
-    with Workers(setup_of(study, factory(fault, here=True)), 1, 1e9) as workers:
-        ((_, result),) = run(workers, [Task("one", (0,), ({"x": 0.5},), frames=True)])
+    setup = setup_of(study, factory(fault, here=True))
+    tasks = Tasks(task_of(setup, "one", {0: {"x": 0.5}}))
+    with Workers(setup, 1, 1e9) as workers:
+        ((_, result),) = run(workers, tasks)
         ((process, _),) = workers._workers.values()
         # It may end its process group.
         assert os.getpgid(process.pid) == process.pid
-    assert result.frames is not None
-    assert words in result.trials[0].faults[0]
+    (drive,) = result[0]
+    assert words in " ".join([*drive.faults, drive.exception])
 
 
 def test_a_replay_goes_on_at_the_last_healthy_motion():

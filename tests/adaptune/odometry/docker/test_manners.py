@@ -8,6 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 from contained import FIXED, VALUES, containers, template
+from made_drives import trials_of
 from needs import reference_image
 from setups import setup_of
 
@@ -45,7 +46,7 @@ def trial(study_file, folder, imitate, way, patience=60.0):
     given = [f"odometry.name={name}", f"odometry.settings={{{settings}}}", PARAMETERS]
     given.append("isolation.seconds=60")
     setup = setup_of(load_study(study_file, given, folder / "run"))
-    (found,) = setup.run(setup.prepare("one", 1e9), [VALUES])
+    (found,) = trials_of(setup, [VALUES])
     return found
 
 
@@ -73,7 +74,7 @@ def polite(study_file, tmp_path_factory):
     given = ["odometry.name=gicp", "odometry.settings={}", "odometry.parameters=null"]
     study = load_study(study_file, given, tmp_path_factory.mktemp("polite") / "run")
     setup = setup_of(study)
-    (found,) = setup.run(setup.prepare("one", 1e9), [VALUES | FIXED])
+    (found,) = trials_of(setup, [VALUES | FIXED])
     return found.mean_error
 
 

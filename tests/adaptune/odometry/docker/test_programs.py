@@ -17,6 +17,7 @@ from contained import (
     template,
     truth,
 )
+from made_drives import trials_of
 from needs import reference_image
 from rooms import moved
 from setups import setup_of
@@ -108,10 +109,8 @@ def test_a_trial_of_a_study(tmp_path, study_file):
     overrides = study_overrides(tmp_path)
     study = load_study(study_file, overrides, tmp_path / "run")
     assert study.odometry.one_by_one
-    setup = setup_of(study)
-    sequence = setup.prepare("one", 1e9)
     parameters = {"max_correspondence_distance": 2.0, "gicp.keyframe_interval": 1.5}
-    (trial,) = setup.run(sequence, [parameters])
+    (trial,) = trials_of(setup_of(study), [parameters])
     assert not trial.faults
     np.testing.assert_allclose(trial.T_odom_sensor, host_poses(), atol=1e-6)
     content = study.odometry.content
@@ -202,10 +201,10 @@ def test_an_engine_that_goes_away_is_no_trial(tmp_path, study_file, monkeypatch)
         raise EngineError("the Docker engine does not answer any more")
 
     setup = setup_of(load_study(study_file, study_overrides(tmp_path), tmp_path / "run"))
-    sequence = setup.prepare("one", 1e9)
+    frames = setup.describe("one")
     monkeypatch.setattr(Container, "ended", gone)
     with pytest.raises(EngineError, match="does not answer"):
-        setup.run(sequence, [{"max_correspondence_distance": 2.0}])
+        trials_of(setup, [{"max_correspondence_distance": 2.0}], frames=frames)
 
 
 SERVE = ("odometry-serve", "{socket}")
