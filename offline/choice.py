@@ -19,6 +19,8 @@ SURE = 0.95
 """Confidence, on one side, with which a set is worse than the baseline."""
 COST_CLASS = 1.1
 """Costs that differ by no larger factor, about, are the same: the machine's load makes as much."""
+LEAST_COST = 1.0
+"""Milliseconds of CPU time a scan; less is nothing, and mostly noise."""
 AS_GOOD = 1.03
 """Sets whose bounds differ by no larger factor are as good as each other."""
 FINALISTS = 4
@@ -118,10 +120,8 @@ def bounds(blocks: BlockErrors) -> NDArray[np.float64]:
 
 def cost_classes(blocks: BlockErrors) -> NDArray[np.float64]:
     """Classes of costs, of shape (n_trials,): 0 for the baseline's; unknown costs count so."""
-    base = max(float(blocks.costs[blocks.baseline]), 1e-9)
-    with np.errstate(divide="ignore"):
-        classes = np.round(np.log(blocks.costs / base) / np.log(COST_CLASS))
-    return np.asarray(np.nan_to_num(classes, nan=0.0))
+    classes = np.log(np.maximum(blocks.costs, LEAST_COST)) / np.log(COST_CLASS)
+    return np.asarray(np.nan_to_num(np.round(classes - classes[blocks.baseline]), nan=0.0))
 
 
 def choose(blocks: BlockErrors, budget: float | None = None) -> int:
@@ -161,7 +161,7 @@ def affordable(blocks: BlockErrors, budget: float | None) -> NDArray[np.bool_]:
     """
     if budget is None:
         return cost_classes(blocks) <= 0.0
-    few = ~(blocks.costs > budget + ROUNDING)
+    few = ~(blocks.costs > max(budget + ROUNDING, LEAST_COST))
     if not few.any():
         cheapest = int(np.argmin(blocks.costs))
         raise AdaptuneError(

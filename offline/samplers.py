@@ -95,6 +95,10 @@ def another(
     return None if drawn is None else Proposal(drawn, "random")
 
 
+KEPT = 0.5
+"""Chance of a value to be the baseline's."""
+
+
 def key(parameters: ParameterSet) -> str:
     """Text that identifies a set: True is not 1."""
     return repr(sorted(parameters.items()))
@@ -261,7 +265,7 @@ class AskedSampler(Sampler):
             given = Proposal(self.space.baseline, "baseline")
         elif number < self.config.n_initial:
             (point,) = sobol_points(self.space, self.config.seed, range(number, number + 1))
-            given = Proposal(point, "sobol")
+            given = self._crossed(Proposal(point, "sobol"), number)
         for attempt in range(_ATTEMPTS):
             if attempt == _ATTEMPTS - 1:
                 rng = np.random.default_rng((self.config.seed, number, 1))
@@ -270,8 +274,10 @@ class AskedSampler(Sampler):
             if given is not None:
                 self._study.enqueue_trial(self._encode(given.parameters))
             trial = self._call(self._study.ask, self._distributions)
-            found, given = given or Proposal(self._decode(trial.params), self.config.sampler), None
-            name = key(found.parameters)
+            found = given or Proposal(self._decode(trial.params), self.config.sampler)
+            if given is None and not attempt:
+                found = self._crossed(found, number)
+            name, given = key(found.parameters), None
             if name in self._values:
                 self._call(self._study.tell, trial, self._values[name])
                 continue
@@ -281,6 +287,18 @@ class AskedSampler(Sampler):
                 self._asked.append(found.parameters)
                 return found
         raise AssertionError
+
+    def _crossed(self, found: Proposal, number: int) -> Proposal:
+        """Of TPE, give every second set about half of the baseline's values.
+
+        So some sets cost about as much as the baseline, whatever it is that costs, and what errs
+        less is tried at that cost, too.
+        """
+        if number % 2 or self.config.sampler != "tpe":
+            return found
+        rng, base = np.random.default_rng((self.config.seed, number, 2)), self.space.baseline
+        kept = zip(found.parameters.items(), rng.random(len(base)) < KEPT, strict=True)
+        return found._replace(parameters={k: base[k] if keep else v for (k, v), keep in kept})
 
     def _call(self, method: Callable[..., Any], *given: Any) -> Any:
         """Call a sampler that may be the user's own."""
