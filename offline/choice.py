@@ -17,6 +17,8 @@ PER_BLOCK = 2.0
 """Sub-trajectories in a block: errors of neighbouring frames share most of theirs."""
 SURE = 0.95
 """Confidence, on one side, with which a set is worse than the baseline."""
+STANDARD_ERRORS = 2.0
+"""Of the difference from the baseline, by which a set has to be better."""
 COST_CLASS = 1.1
 """Costs that differ by no larger factor, about, are the same: the machine's load makes as much."""
 LEAST_COST = 1.0
@@ -101,18 +103,18 @@ def surely_worse(blocks: BlockErrors) -> NDArray[np.bool_]:
     return worse
 
 
-def bounds(blocks: BlockErrors) -> NDArray[np.float64]:
+def bounds(blocks: BlockErrors, n_errors: float = STANDARD_ERRORS) -> NDArray[np.float64]:
     """Upper bound of the mean error of each set in percent, of shape (n_trials,).
 
-    It is the baseline's mean error, plus the mean difference from it and a standard error of that.
-    It is infinite for sets that are not admissible: they failed, were restarted more often than the
+    It is the mean error plus `n_errors` standard errors of the difference from the baseline's. It
+    is infinite for sets that are not admissible: they failed, were restarted more often than the
     baseline (whoever takes its parameters elsewhere has no health check), or are surely worse.
     """
-    base = blocks.errors[:, [blocks.baseline]]
+    mean, _ = mean_and_error(blocks.errors, blocks.sequence)
     with np.errstate(invalid="ignore"):
-        more, error = mean_and_error(blocks.errors - base, blocks.sequence)
-    (mean,), _ = mean_and_error(base, blocks.sequence)
-    bound = mean + more + np.where(np.isfinite(error), error, 0.0)
+        more = blocks.errors - blocks.errors[:, [blocks.baseline]]
+        _, error = mean_and_error(more, blocks.sequence)
+    bound = mean + n_errors * np.where(np.isfinite(error), error, 0.0)
     usable = np.isfinite(blocks.restarts) & np.isfinite(bound)
     usable &= blocks.restarts <= blocks.restarts[blocks.baseline]
     return np.where(usable & ~surely_worse(blocks), bound, np.inf)
@@ -124,7 +126,9 @@ def cost_classes(blocks: BlockErrors) -> NDArray[np.float64]:
     return np.asarray(np.nan_to_num(np.round(classes - classes[blocks.baseline]), nan=0.0))
 
 
-def choose(blocks: BlockErrors, budget: float | None = None) -> int:
+def choose(
+    blocks: BlockErrors, budget: float | None = None, n_errors: float = STANDARD_ERRORS
+) -> int:
     """Trial number of the fixed set.
 
     Of the admissible sets that cost no more than the baseline, or than a `budget` in milliseconds
@@ -137,7 +141,7 @@ def choose(blocks: BlockErrors, budget: float | None = None) -> int:
     NothingUsableError
         If no set can be chosen.
     """
-    bound = np.where(affordable(blocks, budget), bounds(blocks), np.inf)
+    bound = np.where(affordable(blocks, budget), bounds(blocks, n_errors), np.inf)
     if not np.isfinite(bound).any():
         raise NothingUsableError(UNUSABLE.format(n=len(blocks.trials)))
     good, classes = np.flatnonzero(bound <= AS_GOOD * bound.min()), cost_classes(blocks)
@@ -174,8 +178,8 @@ def affordable(blocks: BlockErrors, budget: float | None) -> NDArray[np.bool_]:
 
 
 def front(blocks: BlockErrors) -> list[int]:
-    """Trials by rising cost, each with a clearly lower bound than all that cost less."""
-    bound, classes = bounds(blocks), cost_classes(blocks)
+    """Trials by rising cost, each with clearly less error than all that cost less."""
+    bound, classes = bounds(blocks, 0.0), cost_classes(blocks)
     found, least = [], np.inf
     for k in sorted(range(len(bound)), key=lambda k: (classes[k], bound[k])):
         if np.isfinite(bound[k]) and bound[k] * AS_GOOD < least:

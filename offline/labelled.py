@@ -453,6 +453,10 @@ class LabelledData(NamedTuple):
         budget = self.budget if budget is None else budget
         return choose(self.whole_blocks(finalists(self.blocks(), budget)), budget)
 
+    def rival(self, cost: float) -> int:
+        """Trial number of the set with the least error that costs no more milliseconds a scan."""
+        return choose(self.whole_blocks(finalists(self.blocks(), cost)), cost, n_errors=0.0)
+
     def training_data(self) -> tuple[TrainingData, "ScaledPCA"]:
         """What selection rules are fitted to, and the transformation of descriptors for them."""
         from adaptune.model.knn import ScaledPCA  # takes long to import

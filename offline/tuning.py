@@ -294,7 +294,7 @@ def _logs(
     for make in choosers:
         found = make(others, data.fixed)
         cost = others.costs.adaptive(found)
-        rival = others.fixed(cost) if np.isfinite(cost) else data.fixed
+        rival = others.rival(cost) if np.isfinite(cost) else data.fixed
         of_rivals.append(cap(left_out.errors[:, data.sets.column(rival)]))
         # Whatever the order of the others is, they are the same bank.
         members = (*found[:1], *sorted(found[1:]))
@@ -436,7 +436,7 @@ def rivals(data: LabelledData, cost: float) -> dict[str, int]:
     """
     found = {}
     if len(data.sets.space.baselines) > 1:
-        found[BEST_DEFAULT] = choose_fixed(data.whole_blocks(data.sets.defaults), np.inf)
+        found[BEST_DEFAULT] = choose_fixed(data.whole_blocks(data.sets.defaults), np.inf, 0.0)
     if np.isfinite(cost):
-        found[EQUAL_COST] = data.fixed(cost)
+        found[EQUAL_COST] = data.rival(cost)
     return found

@@ -41,7 +41,7 @@ def test_rules_gain_where_places_tell_the_sets_apart():
         said = validation.verdict(rule)
         assert said.startswith(f"`{rule}`: expected gain 5")
         assert "in other recordings (8 stretches of 8 recordings), adapting 100 %" in said
-    np.testing.assert_allclose(validation.ratios["baseline"], [0.5] * 4 + [3.0] * 4, rtol=0.05)
+    np.testing.assert_allclose(validation.ratios["baseline"], [1.5] * 4 + [2.0] * 4, rtol=0.05)
 
 
 class Cheat(Rule):

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from labelled_places import TRIALS, labelled, two_kinds, with_motions
+from labelled_places import TRIALS, labelled, sequence, two_kinds, with_motions
 
 from adaptune.errors import AdaptuneError
 from adaptune.model import BankSettings, PairedSettings
@@ -60,7 +60,9 @@ def test_what_is_driven_costs_what_all_of_it_costs(places):
     assert np.isnan(driven_cost(labelled(places), bank, TRIALS[2]))
 
 
-def test_a_budget_bounds_the_fixed_set_and_what_is_selected(places):
+def test_a_budget_bounds_the_fixed_set_and_what_is_selected():
+    rng = np.random.default_rng(0)
+    places = [sequence(f"s{i}", [2.0, 1.9, 1.0, 1.5, 3.0], 0, rng) for i in range(8)]
     assert data(places).fixed() == TRIALS[0]  # all others cost more
     assert data(places, budget=100.0).fixed() == TRIALS[2]
     cheap = data(places, budget=15.0)
