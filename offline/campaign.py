@@ -142,7 +142,7 @@ class Schedule:
         """See `offline.workers.Work`."""
         stage, scans, of = progress
         if task.stretch is None:
-            self._progress(f"{stage} {task.sequence}", scans, of)
+            self._progress(f"{stage} {task.sequence}", scans, of, "")
             return
         share = self._share(task.stretch) * scans / max(of, 1)
         self._partly[task.key] = share * len(task.sets)
@@ -204,7 +204,7 @@ class Schedule:
     def _show(self) -> None:
         due = sum(due.share for of in self._due.values() for due in of.values())
         done = round(self.done + due + sum(self._partly.values()), 6)
-        self._progress(self._what, done, self.total)
+        self._progress(self._what, done, self.total, "")
 
 
 class Campaign:

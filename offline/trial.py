@@ -222,8 +222,10 @@ class Drive:
         """A drive before it begins."""
         n = len(stretch.stamps)
         T_odom_sensor = np.tile(stretch.T_odom_start, (n, 1, 1))
-        nothing = (np.zeros(n, bool) for _ in range(3))
-        return cls(T_odom_sensor, *nothing, np.ones(n, bool), np.full(n, np.nan))
+        restarted, registered, tried = np.zeros((3, n), bool)
+        return cls(
+            T_odom_sensor, restarted, registered, tried, np.ones(n, bool), np.full(n, np.nan)
+        )
 
 
 class _Driver:

@@ -228,18 +228,19 @@ class Bench:
 
     def run(self, task: Task, progress: Progress) -> Result:
         """Do a task."""
-        if task.stretch is None and task.frames is None:
+        if (stretch := task.stretch) is None and task.frames is None:
             return self._setup.describe(task.sequence, progress)
         if task.sequence not in self._recordings:
             self._recordings[task.sequence] = self._setup.sequences.open(task.sequence)
         scans = self._recordings[task.sequence]
-        if task.stretch is None:
+        if task.frames is not None:
             return with_measured_hops(scans, task.frames, progress)
         setup = self._apart if task.apart else self._setup
         if task.apart not in self._shared:  # other instances take scans in another way
             self._shared = {task.apart: SharedScans(self._memory)}
         shared, sets = self._shared[task.apart], task.sets
-        drives = setup.drive(shared, scans, task.stretch, sets.values(), task.most, progress)
+        assert stretch is not None
+        drives = setup.drive(shared, scans, stretch, sets.values(), task.most, progress)
         return dict(zip(sets, drives, strict=True))
 
 

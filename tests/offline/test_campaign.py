@@ -84,6 +84,16 @@ def test_number_of_workers_changes_nothing(trained, study_file, tmp_path):
     assert contents(alone.folder) == contents(study.folder)
 
 
+def test_nor_does_it_where_stretches_are_driven(study_file, tmp_path):
+    found = []
+    for workers in (1, 3):
+        given = [*LONG, f"offline.workers={workers}"]
+        study = load_study(study_file, given, tmp_path / f"{workers}" / "study")
+        train(study)
+        found.append(contents(study.folder))
+    assert found[0] == found[1]
+
+
 @pytest.mark.services
 @pytest.mark.usefixtures("processes")
 def test_a_killed_worker_is_replaced(trained, study_file, tmp_path, monkeypatch):

@@ -79,7 +79,7 @@ class Drawn:
     def _drive(self, task, parameters):
         """A drive that is too long by the error."""
         drive, factor = Drive.lost(task.stretch), 1.0 + 0.01 * self.error(task.sequence, parameters)
-        drive.T_odom_sensor = along_x(0.3 * factor * np.arange(N_FRAMES))
+        drive.T_odom_sensor = along_x(0.3 * factor * np.arange(len(drive.tried)))
         drive.registered[:] = drive.tried[:] = True
         drive.without_pose[:] = False
         drive.seconds[1:] = 1e-3

@@ -151,3 +151,26 @@ def test_an_imu_that_is_not_there_or_of_another_time():
     for begin in (-9.0, 20.0):
         with pytest.raises(SequenceError, match="record both on the same clock, or leave"):
             hundredths(begin, begin + 5.0)
+
+
+@pytest.mark.parametrize(
+    ("view", "cache"),
+    [
+        (None, False),
+        (None, True),
+        ({"noise": 0.1}, True),
+        ({"drop": 0.3}, False),
+        ({"cut": [[0.2, 1.8]]}, True),
+        ({"reverse": True}, True),
+    ],
+)
+def test_reading_from_a_scan_on_gives_the_same_scans(bag, monkeypatch, cache, view):
+    monkeypatch.setattr("adaptune.recording.recording._BEFORE", 0.25)
+    sequence = seen(bag, *([view] if view else []), cache=cache)
+    scans = list(sequence)  # into the cache
+    last = scans[-5:]
+    some = list(sequence.since(last[0].stamp))
+    assert 5 <= len(some) < (len(scans) if view is None else 21)
+    for one, other in zip(last, some[-5:], strict=True):
+        assert one.stamp == other.stamp
+        assert np.array_equal(one.points, other.points)
