@@ -22,6 +22,7 @@ from adaptune.report.charts import (
     Line,
     Panel,
     Points,
+    Words,
     charts_of,
 )
 from adaptune.space import ODOMETRY, Categorical, Float, Integer, ParameterSet, ParameterSpace
@@ -196,29 +197,67 @@ def iteration_chart(table: TrialTable) -> Chart | None:
     )
 
 
-def cost_chart(table: TrialTable) -> Chart | None:
-    """Error over CPU time of all trials, with their Pareto front."""
-    table = table.some(np.isfinite(trial.value + trial.cost) for trial in table.trials)
-    if len(table) < 2:
+MARKED = ("recommended", "bank", "baseline")
+"""What is marked and named on the front: what is recommended, and what is called so."""
+
+
+def front_chart(rows: Sequence[Mapping[str, Any]], label: str = "error [%]") -> Chart | None:
+    """Error over CPU time of all that was tried, and the front: less error only at more cost.
+
+    Rows have ``what`` (a name), ``cost [ms]``, ``error [%]``, its interval as ``low`` and ``high``,
+    which may be None, and ``recommended``. See `MARKED`; `label` is that of the errors.
+    """
+    keys = "cost [ms]", "error [%]", "low", "high"
+    values = np.array([[row[key] for key in keys] for row in rows], float).reshape(-1, 4)
+    kept = (values[:, :2] > 0.0).all(axis=1) & np.isfinite(values[:, :2]).all(axis=1)
+    if kept.sum() < 2:
         return None
-    costs = np.array([trial.cost for trial in table.trials])
-    order = np.lexsort((table.values, costs))
-    least = np.minimum.accumulate(table.values[order])
+    rows, values = [rows[i] for i in np.flatnonzero(kept)], values[kept]
+    costs, errors, low, high = values.T
+    order = np.lexsort((errors, costs))
+    least = np.minimum.accumulate(errors[order])
     front = order[np.diff(least, prepend=np.inf) < 0.0]
-    drawn = (
-        Points(costs, table.values, "trial", texts=[f"trial {n}" for n in table.numbers]),
-        Line(costs[front], table.values[front], "Pareto front", steps=True),
-        *_marked(table, costs, table.values),
-    )
-    log = bool((table.values > 0.0).all())
-    x, y = Axis("CPU time a scan [ms]", log=True), Axis(table.objective, log)
+    kinds = [
+        "recommended" if row["recommended"] else str(row["what"]).partition(" ")[0] for row in rows
+    ]
+    marked = {kind: np.flatnonzero([k == kind for k in kinds]) for kind in MARKED}
+    named = np.concatenate([*marked.values()])
+    texts = np.array([str(row["what"]) for row in rows], object)
+    drawn: list[Drawn] = [
+        Points(costs, errors, "tried", texts=texts, faint=True),
+        Line(costs[front], errors[front], "front", steps=True),
+    ]
+    if np.isfinite([low[named], high[named]]).any():
+        ends = np.column_stack([low, high, np.full(len(rows), np.nan)])[named]
+        drawn.append(Line(np.repeat(costs[named], 3), ends.ravel(), "95 % interval"))
+    for kind, at in marked.items():
+        drawn += [Points(costs[at], errors[at], kind, texts=texts[at])] if len(at) else []
+    drawn.append(Words(costs[named], errors[named], texts[named]))
+    x, y = Axis("CPU time a scan [ms]", log=True), Axis(label, log=True)
     return Chart(
-        "cost",
-        "Error over cost of the trials",
-        (Panel(x, y, drawn),),
-        "Each point is a trial, in the mean over the training sequences. No trial has less of both "
-        "than those on the Pareto front.",
+        "front",
+        "Error over cost of all that was tried",
+        (Panel(x, y, tuple(drawn), height=1.3),),
+        "Nothing that was tried has both less error and less cost than what lies on the front. "
+        "Right of where the front is flat, CPU time buys nothing.",
     )
+
+
+def front_rows(table: TrialTable) -> list[dict[str, Any]]:
+    """The rows of `front_chart` for the trials that may be chosen, in the mean over sequences."""
+    names = {table.fixed: "fixed", 0: "baseline"}
+    return [
+        {
+            "what": names.get(trial.number, f"trial {trial.number}"),
+            "cost [ms]": trial.cost,
+            "error [%]": trial.value,
+            "recommended": trial.number == table.fixed,
+            "low": None,
+            "high": None,
+        }
+        for trial in table.trials
+        if trial.usable
+    ]
 
 
 Parameter = Float | Integer | Categorical
@@ -367,7 +406,7 @@ def _of_trials(table: TrialTable) -> Iterator[Chart | str | None]:
             key, title = f"{chart.key}-{odometry}", f"{odometry}: {chart.title}"
             chart = replace(chart, key=key, title=title)
         yield chart
-    yield cost_chart(table)
+    yield front_chart(front_rows(table), table.objective)
 
 
 def most_important(table: TrialTable, shares: Mapping[str, float]) -> list[str]:

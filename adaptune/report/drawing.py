@@ -54,6 +54,8 @@ MODES = {
     "even": Look("#117733", (3, 3), "triangle-right"),
     "paper": Look("#000000", (4, 4), "triangle-up"),
     "oracle, sequence": Look("#009e73", shape="diamond"),
+    "bank": Look("#e69f00", shape="diamond"),
+    "recommended": Look("#0072b2", shape=_STAR),
 }
 """Looks of the modes; the lines of the first lie lowest."""
 _COLOURS = ("#d55e00", "#56b4e9", "#009e73", "#cc79a7", "#888888", "#b8a800")
@@ -498,10 +500,17 @@ class _Drawing:
         rule: Spec = {"type": "rule", "color": _DARK, "strokeDash": (5, 3), "clip": True}
         yield {"data": _table(x=[mark.at]), "mark": rule, "encoding": {"x": self._x}}
 
+    def _pixels(self, which: Literal["x", "y"], values: NDArray[np.float64]) -> NDArray[np.float64]:
+        axis = self._panel.x if which == "x" else self._panel.y
+        size = self._width if which == "x" else self._height
+        ends = np.array(self._extent[which])
+        if axis.log:
+            ends, values = np.log(ends), np.log(values)
+        return np.asarray((values - ends[0]) / (ends[1] - ends[0]) * size)
+
     def _words(self, words: Words) -> Iterator[Spec]:
         x, y = numbers(words.x, self._panel.x), numbers(words.y, self._panel.y)
-        right, up = x * self._width, y * self._height
-        right, up = right / np.ptp(self._extent["x"]), up / np.ptp(self._extent["y"])
+        right, up = self._pixels("x", x), self._pixels("y", y)
         shown: list[int] = []
         for i, text in enumerate(words.words):
             wide = [_LETTER * (0.5 * len(text + words.words[k]) + 1.0) for k in shown]

@@ -168,3 +168,11 @@ def test_within_a_decade_a_logarithmic_axis_names_ticks_on_both_sides_of_1(tmp_p
     assert {"0.8", "1.2", "0.1", "10"} <= set(
         drawn(chart_of(points, x=ratios, y=errors), tmp_path)[0]
     )
+
+
+def test_names_that_are_apart_on_a_logarithmic_axis_are_all_read(tmp_path):
+    x = [1.0, 3.0, 1000.0, 1010.0]
+    names = Words(x, [1.0] * 4, ["one", "two", "three", "four"])
+    chart = chart_of(Points(x, [1.0] * 4, "fixed"), names, x=Axis("x", log=True))
+    texts = drawn(chart, tmp_path)[0]
+    assert [name for name in names.words if name in texts] == ["one", "two", "three"]
