@@ -34,8 +34,8 @@ import fuzz
 import local_link
 from random_models import random_model
 
-from adaptune import files, processes
-from adaptune.archive import Archive, Frames, Trial, rows
+from adaptune import processes, yaml12
+from adaptune.archive import Archive, Frames, Trial
 from adaptune.model import ErrorModel
 from adaptune.model.error_model import render
 from adaptune.odometry import wire
@@ -47,6 +47,7 @@ from adaptune.recording.recording import open_sequence
 from adaptune.reference.stored import StoredEstimate
 from adaptune.selector import Selector
 from adaptune.trajectory import Trajectory, read_trajectory, write_kitti, write_tum
+from adaptune.trial_rows import rows
 
 BYTES = 3 << 30
 ODOMETRY = "nav_msgs/msg/Odometry"
@@ -174,7 +175,7 @@ def estimate(folder: Path) -> fuzz.Case:
 def templates(folder: Path) -> fuzz.Case:
     """Parameter files of programs."""
     data = {"mapping": {"voxel": 1.0, "names": ["a", "b"]}, "rate": 10, "on": True}
-    (folder / "a.yaml").write_text(files.dump(data))
+    (folder / "a.yaml").write_text(yaml12.dump(data))
     (folder / "b.json").write_text(json.dumps(data))
 
     def read(path: Path) -> object:

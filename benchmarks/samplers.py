@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from scipy.stats import wilcoxon
 
-from adaptune import processes
+from adaptune import machine
 from adaptune.report import tables
 from adaptune.report.charts import Axis, Band, Chart, Drawn, Line, Panel
 from adaptune.report.drawing import draw_chart
@@ -251,7 +251,7 @@ def thesis(folder: Path, png: Path, names: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    processes.pin(0)
+    machine.pin(0)
     what, *more = sys.argv[1:] or [""]
     with tempfile.TemporaryDirectory() as made:
         if what == "functions":

@@ -212,7 +212,7 @@ def front_chart(rows: Sequence[Mapping[str, Any]], label: str = "error [%]") -> 
     kept = (values[:, :2] > 0.0).all(axis=1) & np.isfinite(values[:, :2]).all(axis=1)
     if kept.sum() < 2:
         return None
-    rows, values = [rows[i] for i in np.flatnonzero(kept)], values[kept]
+    rows, values = [rows[i] for i in np.flatnonzero(kept).tolist()], values[kept]
     costs, errors, low, high = values.T
     order = np.lexsort((errors, costs))
     least = np.minimum.accumulate(errors[order])

@@ -136,7 +136,7 @@ def _oracle(loaded: "OfflineStudy", cluster: str | None) -> None:
 
 def _alone(study: "OfflineStudy") -> ExitStack:
     """Bind this process to one core, and leave the others to what it starts."""
-    from adaptune.processes import pin
+    from adaptune.machine import pin
 
     # Ask for the number of cores before.
     _ = study.mechanism
@@ -308,21 +308,21 @@ def _comparison(
 
 
 def _search(study: "OfflineStudy") -> "PageSection":
-    from adaptune import archive
+    from adaptune import trial_rows
     from adaptune.archive import Archive
     from adaptune.report.tables import Listing
     from offline.charts import charts_of_trials
 
     section = _of_charts("What was tried", partial(charts_of_trials, study))
     try:
-        finished = archive.rows(Archive(study.folder / "trials"), study.training)
+        finished = trial_rows.rows(Archive(study.folder / "trials"), study.training)
     except AdaptuneError as error:
         return replace(section, notes=(*section.notes, f"{error}."))
     if not finished:
         return section
-    best = archive.select([row for row in finished if row["mean"] is not None], "mean", _BEST)
+    best = trial_rows.select([row for row in finished if row["mean"] is not None], "mean", _BEST)
     title = f"The best {len(best)} of {len(finished)} trials, in training"
-    listed = archive.with_units(best, study.training, study.odometry.space.labels)
+    listed = trial_rows.with_units(best, study.training, study.odometry.space.labels)
     return replace(section, tables=(Listing(title, listed),))
 
 

@@ -12,17 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from adaptune.errors import OdometryError, import_extra, nearest
 from adaptune.geometry import Poses, invert, squared_ranges
-from adaptune.odometry.base import (
-    END,
-    MIDDLE,
-    MIN_POINTS,
-    NO_IMU,
-    BaseSettings,
-    Description,
-    OwnFrameOdometry,
-    RangeSettings,
-    duration_of,
-)
+from adaptune.odometry.base import MIN_POINTS, BaseSettings, Description, RangeSettings
+from adaptune.odometry.own_frame import END, MIDDLE, NO_IMU, OwnFrameOdometry, duration_of
 from adaptune.recording.scan import Imu, Scan
 from adaptune.space import Float, Integer, ParameterSet, ParameterSpace, Value
 

@@ -10,9 +10,9 @@ import small_gicp
 from pydantic import Field
 
 from adaptune.errors import import_extra
-from adaptune.files import load
 from adaptune.geometry import Poses, invert, rectify, scale, squared_ranges
 from adaptune.odometry.base import MIN_POINTS, BaseSettings, Description, Odometry, Registration
+from adaptune.open3d import load
 from adaptune.recording.scan import Scan
 from adaptune.space import Categorical, Float, Integer, ParameterSet, ParameterSpace
 

@@ -20,20 +20,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator
 
-from adaptune import files, processes
+from adaptune import processes, yaml12
 from adaptune.errors import OdometryError, UnavailableError, nearest
 from adaptune.files import locked, replacing_folder, temporary_folder
 from adaptune.geometry import Poses, invert, nearest_rotation, rotation_angle, to_pose
 from adaptune.metrics import window_ends
-from adaptune.odometry.base import (
-    BaseSettings,
-    Description,
-    Faulting,
-    OwnFile,
-    Registration,
-    Usage,
-    pose_fault,
-)
+from adaptune.odometry.base import BaseSettings, Description, OwnFile, Registration, Usage
+from adaptune.odometry.faults import Faulting, pose_fault
 from adaptune.odometry.remote import Arguments, Limits
 from adaptune.recording.config import SequenceConfig, Transform, resolve
 from adaptune.recording.export import IMU, POINTS, Layout, export
@@ -73,18 +66,18 @@ class Template:
             self._document = self._parsed(self._text)
         except FileNotFoundError as error:
             raise OdometryError(f"{path}: there is no such file") from error
-        except (OSError, ValueError, files.YamlError) as error:
+        except (OSError, ValueError, yaml12.YamlError) as error:
             raise OdometryError(f"{path}: {error}") from error
         self._data: Any = self._document.data
         held = isinstance(self._data, dict | list)
         self._places = list(_places(self._data)) if held else []
 
-    def _parsed(self, text: str) -> files.Document:
+    def _parsed(self, text: str) -> yaml12.Document:
         if self.path.suffix == ".json":
             json.loads(text)
             # JSON is YAML but for tabs, which it has between values only.
             text = text.replace("\t", " ")
-        return files.Document(text, foreign=True)
+        return yaml12.Document(text, foreign=True)
 
     def path_of(self, name: str) -> tuple[str, ...]:
         """Keys of a value, from the outermost on; none if there is no such, an error if several."""
@@ -144,13 +137,13 @@ class Template:
         text, spans = self._text, []
         for keys, value in changed.items():
             begin, end = self._document.span(keys) or (0, 0)
-            new = files.dump([value]).removeprefix("- ").strip()
+            new = yaml12.dump([value]).removeprefix("- ").strip()
             if self.path.suffix == ".json" and isinstance(value, str):
                 new = json.dumps(value)
             spans.append((begin, end, new if begin < end else f" {new}"))
         for begin, end, new in sorted(spans, reverse=True):
             text = text[:begin] + new + text[end:]
-        with suppress(files.YamlError):
+        with suppress(yaml12.YamlError):
             # Where nan is nan.
             if repr(self._parsed(text).data) == repr(data):
                 return text

@@ -21,18 +21,10 @@ from pydantic import AfterValidator, BaseModel, Field, ValidationInfo, model_val
 from adaptune import processes
 from adaptune.errors import AdaptuneError, OdometryError, UnavailableError, in_a_line
 from adaptune.geometry import Poses
+from adaptune.machine import available, next_core
 from adaptune.odometry import wire
-from adaptune.odometry.base import (
-    LOST,
-    BaseSettings,
-    Description,
-    Faulting,
-    Odometry,
-    Registration,
-    Usage,
-    pose_fault,
-)
-from adaptune.processes import available, next_core
+from adaptune.odometry.base import BaseSettings, Description, Odometry, Registration, Usage
+from adaptune.odometry.faults import LOST, Faulting, pose_fault
 from adaptune.recording.scan import Scan
 from adaptune.space import ParameterSet, Selection
 from adaptune.strict import StrictModel

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptune import geometry
+from adaptune.compiled import compiled
 from adaptune.errors import AdaptuneError, nearest
-from adaptune.files import compiled
 from adaptune.recording.scan import (
     AUTO,
     TIME_FIELDS,

@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from adaptune.compiled import compiled
 from adaptune.errors import Finding, Key
-from adaptune.files import compiled
 from adaptune.geometry import nearest_rotation
 from adaptune.recording.scan import SOONEST, Reading, Scan
 from adaptune.trajectory import Trajectory

@@ -10,7 +10,7 @@ from rich.table import Table
 from rich.text import Text
 from rosbags.highlevel import AnyReader
 
-from adaptune import files
+from adaptune import files, yaml12
 from adaptune.errors import AdaptuneError, Finding, MachineError
 from adaptune.metrics import travelled
 from adaptune.progress import Progress, unseen
@@ -116,8 +116,8 @@ class Inspection:
     def entry(self) -> str:
         """YAML for a study."""
         if not self.name:
-            return files.dump(self.given)
-        text = files.dump({"sequences": {self.name: self.given}})
+            return yaml12.dump(self.given)
+        text = yaml12.dump({"sequences": {self.name: self.given}})
         if "bag" not in self.given:
             return text
         hint = "    # reference: a topic, or a TUM, KITTI or EuRoC file; estimated if left out\n"

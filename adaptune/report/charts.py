@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Values = NDArray[Any] | Sequence[Any]
-"""Numbers, or names where an axis has names."""
+"""Numbers, or names: along an axis with names, or of points."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Points:
     colour: Values | None = None  # a number for every point, shown on a colour bar
     colour_label: str = ""
     log_colour: bool = False
-    texts: Sequence[str] | None = None  # what is told of each point in a browser
+    texts: Values | None = None  # what is told of each point in a browser
     faint: bool = False
     shape: str | None = None  # of the markers, see `adaptune.report.drawing.Look`
 
@@ -98,7 +98,7 @@ class Words:
 
     x: Values
     y: Values
-    words: Sequence[str]
+    words: Values
 
 
 Drawn = Line | Points | Band | Bars | Shares | Spans | Mark | Words

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune import files, geometry
+from adaptune import geometry, open3d
 from adaptune.files import replacing
 from adaptune.geometry import Poses, invert
 from adaptune.progress import Progress, unseen
@@ -134,7 +134,7 @@ class _Caster:
 
     def _build(self, mesh: Mesh, origin: NDArray[np.float64]) -> None:
         """Build what rays are cast at, relative to an origin."""
-        o3d: Any = files.load()
+        o3d: Any = open3d.load()
         self._tensor, self._origin = o3d.core.Tensor.from_numpy, origin
         self._scene = o3d.t.geometry.RaycastingScene()
         vertices = np.ascontiguousarray(mesh.vertices - origin, np.float32)

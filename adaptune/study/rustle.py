@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import AliasChoices, AliasPath, ConfigDict, Field
 
-from adaptune import files
+from adaptune import yaml12
 from adaptune.errors import AdaptuneError, Finding, Key, OdometryError, nearest
 from adaptune.odometry.program import Template
 from adaptune.strict import StrictModel, validated
@@ -119,8 +119,8 @@ class _File:
     def __init__(self, path: Path):
         self.path = path
         try:
-            self._document = files.Document.of_file(path)
-        except files.YamlError as error:
+            self._document = yaml12.Document.of_file(path)
+        except yaml12.YamlError as error:
             raise RustleError(str(error)) from error
         self.data: Any = self._document.data
 
@@ -296,7 +296,7 @@ class ImportedStudy(NamedTuple):
         if self.notes:
             lines.append("# Not taken over, or to be looked at:")
         lines += [fill(n, initial_indent="# - ", subsequent_indent="#   ") for n in self.notes]
-        sections = [files.dump({key: value}) for key, value in self.data.items()]
+        sections = [yaml12.dump({key: value}) for key, value in self.data.items()]
         return "\n".join([*lines, "", *sections])
 
 

@@ -6,17 +6,10 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from adaptune.compiled import compiled
 from adaptune.errors import AdaptuneError, lacking
-from adaptune.files import (
-    Document,
-    YamlError,
-    compiled,
-    dump,
-    locked,
-    replacing,
-    scalar,
-    write_text,
-)
+from adaptune.files import locked, replacing, write_text
+from adaptune.yaml12 import Document, YamlError, dump, scalar
 
 
 def test_a_file_appears_when_all_went_well(tmp_path):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from wicked import IMPORTS, gone
 
-from adaptune import processes
+from adaptune import forking, machine, processes
 from adaptune.commands.tune import inspect
 from adaptune.errors import AdaptuneError
 from adaptune.model import ModelError
@@ -300,53 +300,53 @@ def allowed(monkeypatch):
 
 
 def test_a_process_is_kept_on_one_core_until_that_is_undone(allowed):
-    with processes.pin(6):
+    with machine.pin(6):
         assert allowed == {5}
-        assert processes.available() == 1
+        assert machine.available() == 1
     assert allowed == {2, 3, 5, 7}
 
 
 def test_others_get_the_rest_only_where_this_process_is_alone(allowed):
-    with processes.pin(1, alone=True):
-        assert {processes.next_core() for _ in range(4)} == {2, 3, 5, 7}
-    with processes.pin(1):
-        assert {processes.next_core() for _ in range(4)} == allowed == {3}
+    with machine.pin(1, alone=True):
+        assert {machine.next_core() for _ in range(4)} == {2, 3, 5, 7}
+    with machine.pin(1):
+        assert {machine.next_core() for _ in range(4)} == allowed == {3}
 
 
 def test_those_that_work_for_this_process_get_other_cores(allowed):
-    assert [processes.other_core(i) for i in range(4)] == [3, 5, 7, 3]
-    with processes.pin(1, alone=True):
-        assert processes.shared_cores() == {2, 3, 5, 7}
-        assert [processes.other_core(i) for i in range(4)] == [2, 5, 7, 2]
+    assert [machine.other_core(i) for i in range(4)] == [3, 5, 7, 3]
+    with machine.pin(1, alone=True):
+        assert machine.shared_cores() == {2, 3, 5, 7}
+        assert [machine.other_core(i) for i in range(4)] == [2, 5, 7, 2]
     allowed.clear()
     allowed.add(7)
-    assert [processes.other_core(i) for i in range(2)] == [7, 7]
-    assert processes.shared_cores() == {7}
+    assert [machine.other_core(i) for i in range(2)] == [7, 7]
+    assert machine.shared_cores() == {7}
 
 
 def test_mapped_files_are_no_memory_of_the_process(tmp_path):
     path = tmp_path / "mapped"
     np.zeros(50_000_000, np.uint8).tofile(path)
     mapped = np.memmap(path, np.uint8, "r")
-    before = processes.resident_megabytes()
+    before = machine.resident_megabytes()
     assert mapped.sum() == 0  # now all of it is there
-    assert processes.resident_megabytes() < before + 20.0
+    assert machine.resident_megabytes() < before + 20.0
     held = np.ones(50_000_000, np.uint8)
-    assert processes.resident_megabytes() > before + 40.0
+    assert machine.resident_megabytes() > before + 40.0
     del held
-    processes.release_memory()
-    assert processes.resident_megabytes() < before + 20.0
+    machine.release_memory()
+    assert machine.resident_megabytes() < before + 20.0
 
 
 def test_a_process_that_is_killed_is_told():
-    with pytest.raises(AdaptuneError, match="was the memory full"), processes.processes(1) as pool:
+    with pytest.raises(AdaptuneError, match="was the memory full"), forking.processes(1) as pool:
         pool.submit(os._exit, 1).result()
 
 
 OWNER = """
 import os, sys, time
-from adaptune import processes
-with processes.processes(1) as pool:
+from adaptune import forking
+with forking.processes(1) as pool:
     print(pool.submit(os.getpid).result(), flush=True)
     pool.submit(time.sleep, 600).result()
 """
@@ -369,19 +369,19 @@ def test_a_process_ends_with_the_one_that_it_computes_for():
 HOLES = """
 import contextlib, sys
 import numpy as np
-from adaptune import processes as cores
-before = cores.resident_megabytes()
+from adaptune import machine
+before = machine.resident_megabytes()
 np.ones(2**21)  # once it is free, the C library keeps arrays of this size
 large, small = [], []
-with cores.apart() if sys.argv[1] == "apart" else contextlib.nullcontext():
+with machine.apart() if sys.argv[1] == "apart" else contextlib.nullcontext():
     if sys.argv[1] == "apart":
-        with cores.apart():
+        with machine.apart():
             pass  # the outer block goes on
     for _ in range(50):
         large.append(np.ones(2**18))
         small.append(np.ones(2**10))
 large.clear()
-print(cores.resident_megabytes() - before)
+print(machine.resident_megabytes() - before)
 """
 
 
@@ -398,7 +398,7 @@ def test_large_arrays_among_small_ones_leave_no_holes():
 ODD = """
 import os, sys
 from pathlib import Path
-from adaptune.processes import processes
+from adaptune.forking import processes
 
 def seen():
     import offline, random

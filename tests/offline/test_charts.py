@@ -6,7 +6,7 @@ import pytest
 from made_trials import made_table, write_trials
 from random_models import SPACE
 
-from adaptune import files
+from adaptune import yaml12
 from adaptune.archive import Summary
 from adaptune.errors import AdaptuneError
 from adaptune.report.charts import Band, Line, Points, Words
@@ -126,7 +126,7 @@ def test_a_study_is_read(study_file, tmp_path):
     intervals = table.column("keyframe_interval")
     np.testing.assert_allclose(table.values, intervals, rtol=1e-6)
     assert table.fixed is None
-    (study.folder / "fixed.yaml").write_text(files.dump(table.trials[2].parameters), "utf-8")
+    (study.folder / "fixed.yaml").write_text(yaml12.dump(table.trials[2].parameters), "utf-8")
     assert read_trials(study).fixed == 2
 
 

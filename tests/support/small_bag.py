@@ -7,7 +7,7 @@ import rec
 from pydantic import TypeAdapter
 from rich.console import Console
 
-from adaptune import files
+from adaptune import yaml12
 from adaptune.recording import SequenceConfig
 from adaptune.recording.inspect import render_inspection
 
@@ -66,7 +66,7 @@ def inspection_text(inspection, width=100):
 
 def entry(inspection):
     """The proposed entry, read back as a study would."""
-    data = files.Document(inspection.entry).data["sequences"]
+    data = yaml12.Document(inspection.entry).data["sequences"]
     return TypeAdapter(dict[str, SequenceConfig]).validate_python(data)
 
 

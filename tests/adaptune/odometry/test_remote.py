@@ -20,7 +20,8 @@ from street import served
 from adaptune import processes
 from adaptune.archive import Archive
 from adaptune.odometry import OdometryError, wire
-from adaptune.odometry.base import MOST_FAULTS, InProcess
+from adaptune.odometry.base import InProcess
+from adaptune.odometry.faults import MOST_FAULTS
 from adaptune.odometry.keyframe import KeyframeGicp
 from adaptune.odometry.registry import OdometryFactory, make_here
 from adaptune.odometry.remote import SERVICE, Guarded, Isolated, Limits, Process, ProcessSettings

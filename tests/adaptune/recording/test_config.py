@@ -4,7 +4,7 @@ import rec
 from pydantic import ValidationError
 from rooms import along_x
 
-from adaptune import files
+from adaptune import yaml12
 from adaptune.geometry import to_pose
 from adaptune.odometry.program import program_input
 from adaptune.recording import SequenceConfig
@@ -80,7 +80,7 @@ def test_what_would_fail_later_is_found_at_once(tmp_path):
                 "sequences": {"yard": {"bag": str(bag)} | entry},
                 "training": ["yard"],
             }
-            study.write_text(files.dump(data))
+            study.write_text(yaml12.dump(data))
             with pytest.raises(ConfigurationError, match=rf"line \d+: sequences\.yard: .*{told}"):
                 load_study(study)
             list(open_sequence(SequenceConfig(bag=str(bag))))
