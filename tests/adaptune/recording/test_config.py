@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import rec
 from pydantic import ValidationError
-from rooms import along_x
+from rooms import along_x, write_kitti
 
 from adaptune import yaml12
 from adaptune.geometry import to_pose
@@ -11,7 +11,7 @@ from adaptune.recording import SequenceConfig
 from adaptune.recording.recording import check_sequence, open_sequence
 from adaptune.recording.scan import part_name, read_part
 from adaptune.strict import ConfigurationError
-from adaptune.trajectory import Trajectory, write_kitti, write_tum
+from adaptune.trajectory import Trajectory, write_tum
 from offline.config import load_study
 
 

@@ -3,6 +3,7 @@ import sys
 import numpy as np
 import pytest
 import rec
+from rooms import write_kitti
 from scipy.spatial.transform import Rotation
 from small_bag import texts
 
@@ -12,7 +13,6 @@ from adaptune.recording import SequenceConfig, SequenceError
 from adaptune.recording.folder import read_scan, turn_up
 from adaptune.recording.inspect import inspect
 from adaptune.recording.recording import open_sequence
-from adaptune.trajectory import write_kitti
 
 
 def poses(n):
