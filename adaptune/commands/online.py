@@ -31,9 +31,9 @@ if TYPE_CHECKING:
     from adaptune.report.charts import Charts
     from adaptune.report.page import PageSection
     from offline.config import OfflineStudy, OfflineStudyConfig
-    from online.charts import ReplayedSequence
     from online.compare import ComparedReplays
     from online.replay import ReplayRecord
+    from online.replayed import ReplayedSequence
 
 
 log = logging.getLogger(__name__)
@@ -262,8 +262,9 @@ def _write_page(study: "OfflineStudy", found: "ComparedReplays | str") -> Path:
     """Write all that is known of a study as one page; `found` may be why nothing is compared."""
     from adaptune.report.page import Page, write_page
     from offline.charts import charts_of_validation
-    from online.charts import charts_of_replays, read_replays
+    from online.charts import charts_of_replays
     from online.modes import sequences_without_model
+    from online.replayed import read_replays
 
     read = cache(partial(read_replays, study))
 

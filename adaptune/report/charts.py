@@ -46,7 +46,7 @@ class Points:
     log_colour: bool = False
     texts: Values | None = None  # what is told of each point in a browser
     faint: bool = False
-    shape: str | None = None  # of the markers, see `adaptune.report.drawing.Look`
+    shape: str | None = None  # of the markers, see `adaptune.report.looks.Look`
 
 
 @dataclass(frozen=True)

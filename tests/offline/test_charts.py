@@ -15,14 +15,12 @@ from offline.charts import (
     charts_of_validation,
     front_chart,
     front_rows,
-    importances,
     iteration_chart,
-    read_trials,
     scatter_chart,
     stretch_chart,
-    trial_table,
 )
 from offline.config import OfflineConfig, load_study
+from offline.trial_table import importances, read_trials, trial_table
 from offline.tuning import figures
 
 
@@ -113,9 +111,8 @@ def test_trials_that_may_be_chosen_are_on_the_front():
     assert [row["what"] for row in rows[:5]] == [
         *("baseline", "trial 1", "trial 2", "fixed", "trial 4")
     ]
-    assert [row["what"] for row in rows if row["recommended"]] == ["fixed"]
     (panel,) = front_chart(rows).panels
-    assert len(of_kind(panel, Points, "recommended")) == 1
+    assert len(of_kind(panel, Points, "fixed")) == 1
 
 
 def test_a_study_is_read(study_file, tmp_path):

@@ -3,12 +3,8 @@ from made_replays import SCENES, SECONDS, bank, kept, replay, sequence
 
 from adaptune.report.charts import Band, Line, Mark, Points, Shares, Spans
 from offline.config import load_study
-from online.charts import (
-    charts_of_replays,
-    choice_chart,
-    error_chart,
-    read_replays,
-)
+from online.charts import charts_of_replays, choice_chart, error_chart
+from online.replayed import read_replays
 
 
 def of_kind(panel, kind):

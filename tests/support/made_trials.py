@@ -8,8 +8,8 @@ from random_models import SPACE
 from rooms import along_x
 
 from adaptune.archive import Archive, Frames, Summary, Trial
-from offline.charts import trial_table
 from offline.config import OfflineConfig
+from offline.trial_table import trial_table
 from offline.workers import TaskResult
 
 N_FRAMES = 40

@@ -19,7 +19,8 @@ from adaptune.report.charts import (
     Spans,
     Words,
 )
-from adaptune.report.drawing import MODES, draw_chart, looks, spec, thinned
+from adaptune.report.drawing import draw_chart, spec, thinned
+from adaptune.report.looks import MODES, looks
 
 
 def drawn(chart, folder):
