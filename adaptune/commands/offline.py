@@ -170,9 +170,6 @@ def validate(
     say_next_online(loaded)
 
 
-# The command that estimates references.
-
-
 def reference(
     recording: Annotated[
         Path, typer.Argument(metavar="BAG", help="A bag, or a folder.", show_default=False)

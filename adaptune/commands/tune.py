@@ -58,7 +58,7 @@ def inspect(
     if study is not None and study.exists():
         raise AdaptuneError(f"{study}: exists; name another file with --study, or move it away")
     from adaptune.recording.inspect import inspect as inspect_file
-    from adaptune.recording.inspect import render_inspection
+    from adaptune.recording.rendering import render_inspection
 
     with progress() as show:
         found = inspect_file(file, deep, show)

@@ -294,9 +294,6 @@ class GridPipeline(RingedPipeline):
         return points if len(scan) < MIN_POINTS else image(scan, points, *shape), shape
 
 
-# The pipelines of evalio that need a LiDAR only.
-
-
 class KissIcp(Pipeline):
     """KISS-ICP (Vizzo et al., RA-L 2023), compiled."""
 
@@ -400,8 +397,6 @@ class Form(GridPipeline):
         max_num_rematches=Integer(low=3, high=30, baseline=30, log=True),
     )
 
-
-# The pipelines of evalio that need a LiDAR and an IMU.
 
 _BEHIND = 2
 """Scans that LIO-SAM waits for before it registers one."""

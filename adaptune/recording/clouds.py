@@ -25,9 +25,6 @@ from adaptune.recording.scan import (
 )
 from adaptune.trajectory import Trajectory
 
-# Numbers and texts of serialised ROS messages, where a whole message would take too long.
-
-
 _WORD = {order: struct.Struct(f"{order}I").unpack_from for order in "<>"}
 
 

@@ -108,9 +108,6 @@ def _kernel() -> Callable[[NDArray[np.float32]], tuple[float, ...]]:
     return compiled(_glance)  # when a scan is read: it takes time
 
 
-# What is wrong with clouds that follow each other.
-
-
 # Of what is usual, below which a cloud is a part of one, or has lost nearly all.
 _PART, _LITTLE = 0.6, 0.15
 # Clouds in a row before and after a change that lasts; seconds between neighbours that see the

@@ -42,8 +42,6 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-# Which of the scans of a recording are used.
-
 
 # Opening recordings, and what they are read from, without reading their scans.
 
@@ -154,9 +152,6 @@ def _check_topics(source: "Source", config: SequenceConfig) -> None:
             f"{source.name}: has no topics; leave `child_frame` and `imu.topic` out, and let "
             f"`reference` be a file of poses, or leave it out"
         )
-
-
-# Which part of a recording is used, and its reference and IMU.
 
 
 # At most so many scans are registered to find a clock offset.

@@ -18,8 +18,6 @@ from adaptune.recording.scan import ImuNoise, Part
 from adaptune.simulation.scenes import SCENES
 from adaptune.strict import StrictModel
 
-# LiDARs: their rays, rates and noise.
-
 
 @dataclass(frozen=True, eq=False)
 class Sensor:
@@ -76,9 +74,6 @@ def directions(name: str, columns: int) -> NDArray[np.float32]:
     looks = np.stack([x, y, z], axis=-1).astype(np.float32)
     looks.setflags(write=False)
     return looks
-
-
-# Ways of carrying a sensor.
 
 
 @dataclass(frozen=True)
@@ -184,9 +179,6 @@ class Course(StrictModel):
     def turns(self) -> float:
         """Scans a second."""
         return SENSORS[self.sensor].rate if self.rate is None else self.rate
-
-
-# The sensors of a simulated recording: their topics, and the mounting of the IMU.
 
 
 POINTS, POSES, IMU = "/velodyne_points", "/gt_poses", "/imu/data"

@@ -31,12 +31,10 @@ from adaptune.simulation.course import (
     directions,
 )
 from adaptune.simulation.mesh import REFLECTIVITY, Mesh
-from adaptune.simulation.scenes import SCENES, TILE
+from adaptune.simulation.scenes import SCENES
+from adaptune.simulation.tiles import TILE
 from adaptune.simulation.world import Ride, Road, World
 from adaptune.trajectory import Trajectory, write_tum
-
-# Drive through a world and scan it.
-
 
 EPOCH = 1_600_000_000_000_000_000
 """Nanoseconds at which every recording starts."""
@@ -147,9 +145,6 @@ class _Caster:
 def simulate(course: Course) -> Iterator[SimulatedScan]:
     """Drive a course and scan it, one scan at a time; stamps always mark a scan's start."""
     return Drive(course).scans()
-
-
-# Simulated measurements of an inertial measurement unit.
 
 
 GRAVITY = 9.80665

@@ -212,9 +212,6 @@ class StudyConfig(StrictModel):
         return self.model_dump(mode="json")
 
 
-# The sequences that a study names for training and test, and parts of them.
-
-
 ROLES = ("training", "test")
 _KINDS = ("sequences", "courses")
 _WHOLE = (0.0, 1.0)

@@ -26,9 +26,6 @@ from adaptune.strict import ConfigurationError, validated
 from adaptune.study.config import ROLES, RULES, OdometryConfig, StudyConfig, settle_roles
 from adaptune.study.study import Study, declared_odometry, tuned_space, whole_definition
 
-# Mistakes in the odometries of a study that only the odometries show.
-
-
 _KINDS: dict[str, type[Float | Integer | Categorical]] = {
     "float": Float,
     "integer": Integer,
@@ -168,9 +165,6 @@ def _check_switching(config: StudyConfig, described: list[Description]) -> Itera
         yield Finding(mechanism, message)
 
 
-# Recordings that a study trains on and tests on under two names.
-
-
 def _overlaps(config: StudyConfig, opened: dict[str, RecordedSequence]) -> Iterator[Finding]:
     """Find test sequences that hold scans of a training sequence."""
 
@@ -192,9 +186,6 @@ def _overlaps(config: StudyConfig, opened: dict[str, RecordedSequence]) -> Itera
                 f"that they share no scan"
             )
             yield Finding(("test", i), message)
-
-
-# The file.
 
 
 _MOST_BYTES = 10**6

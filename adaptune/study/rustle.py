@@ -16,7 +16,7 @@ from pydantic import AliasChoices, AliasPath, ConfigDict, Field
 
 from adaptune import yaml12
 from adaptune.errors import AdaptuneError, Finding, Key, OdometryError, nearest
-from adaptune.odometry.program import Template
+from adaptune.odometry.template import Template
 from adaptune.strict import StrictModel, validated
 
 _Number = int | float
@@ -147,9 +147,6 @@ class _File:
         return names.index(name), entries[names.index(name)]
 
 
-# Searches for parameters in RUSTLE's tunings, as settings of the offline stage.
-
-
 _MOST_TRIALS = 10**6
 """Of a random search over a grid."""
 _ALPHA = 0.95
@@ -268,9 +265,6 @@ def _annealing(
     if given.max_iterations is not None:
         offline["trials"] = given.max_iterations + 1  # and the baseline
     return parameters, offline
-
-
-# Studies made of RUSTLE's tests and tunings.
 
 
 _TOPICS = {

@@ -9,7 +9,7 @@ from rich.console import Console
 
 from adaptune import yaml12
 from adaptune.recording import SequenceConfig
-from adaptune.recording.inspect import render_inspection
+from adaptune.recording.rendering import render_inspection
 
 START = 1_700_000_000_000_000_000
 
