@@ -57,7 +57,7 @@ def scatter_chart(
         log = bool((of[kept] > 0.0).all())
         # The worst would take nearly all colours.
         colour = np.minimum(of[kept], _COLOURED * of[kept].min()) if log else of[kept]
-        drawn: list[Drawn] = [Points(x, y, "trial", colour, label, log_colour=log)]
+        drawn: list[Drawn] = [Points(x, y, "trial", colour, label)]
         best = int(of[kept].argmin())
         drawn.append(Points(x[[best]], y[[best]], "best trial here", shape="diamond"))
         drawn += _marked(table, xy[0], xy[1])

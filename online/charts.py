@@ -17,10 +17,10 @@ from adaptune.report.charts import (
     Mark,
     Panel,
     Points,
-    Shares,
     Spans,
     Words,
     charts_of,
+    shares,
 )
 from adaptune.report.drawing import plain
 from online.modes import ADAPTIVE, BASELINE, FIXED, WITHOUT_MODEL
@@ -191,14 +191,14 @@ def _place(value: Any, names: tuple[str, ...] | None) -> float:
 
 def _weights(replayed: ReplayedSequence) -> Iterator[Panel]:
     for mode, track in replayed.modes.items():
-        shares = 100.0 * np.array(list(track.weights.values()))
-        if len(shares) < 2 or not np.ptp(shares, axis=1).any():
+        parts = 100.0 * np.array(list(track.weights.values()))
+        if len(parts) < 2 or not np.ptp(parts, axis=1).any():
             continue  # they never change
-        shares = np.column_stack([shares, shares[:, -1]])
+        parts = np.column_stack([parts, parts[:, -1]])
         # Shares hide what is shaded.
         ends = [] if replayed.scenes is None else replayed.scenes.edges[1:-1]
         edges = (Mark(float(edge)) for edge in ends)
-        drawn = (*_scenes(replayed), Shares(track.span, shares, tuple(track.weights)), *edges)
+        drawn = (*_scenes(replayed), *shares(track.span, parts, track.weights), *edges)
         y = Axis("weight [%]", limits=(0.0, 100.0))
         yield Panel(TIME, y, drawn, f"{mode} applies a bank: weights of its members")
 

@@ -22,12 +22,11 @@ from adaptune.report.charts import (
     Mark,
     Panel,
     Points,
-    Shares,
     Spans,
     Values,
     Words,
 )
-from adaptune.report.looks import Look, legend_names, looks
+from adaptune.report.looks import Look, looks
 
 _MAP = ("#440154", "#472d7b", "#3b528b", "#2c728e", "#21918c", "#28ae80", "#5ec962", "#9bd93c")
 """A colour map whose lightness rises, without colours too light for a white ground."""
@@ -35,11 +34,11 @@ _TINT = 0.15
 """Opacity of what is shaded."""
 _UNKNOWN = "#bbbbbb"
 """Colour of points without a number where colours say numbers."""
-_MOST, _MOST_FAINT = 1500, 500
+_MOST = 1500
 """Most points of a line that are drawn."""
 _MANY, _OUTLINED = 1000, 150
 """Points from which on they are small, and up to which they have outlines."""
-_LAYERS = (Spans, Shares, Bars, Band, Line, Points, Mark, Words)
+_LAYERS = (Spans, Bars, Band, Line, Points, Mark, Words)
 
 
 def _layer(item: Drawn) -> float:
@@ -67,16 +66,16 @@ def numbers(values: Values, axis: Axis) -> NDArray[np.float64]:
     return made
 
 
-def thinned(*columns: NDArray[np.float64], most: int = _MOST) -> NDArray[np.intp]:
+def thinned(*columns: NDArray[np.float64]) -> NDArray[np.intp]:
     """Indices of the points of a line to draw where it has many.
 
     Of each stretch the lowest and the highest of every column stay, and a gap stays a gap.
     """
     n = len(columns[0])
-    if n <= most:
+    if n <= _MOST:
         return np.arange(n)
     kept = [0, n - 1]
-    for some in np.array_split(np.arange(n), most // (2 * len(columns) + 2)):
+    for some in np.array_split(np.arange(n), _MOST // (2 * len(columns) + 2)):
         missing = np.isnan([column[some] for column in columns]).any(axis=0)
         kept += [some[0], some[missing.argmax()]]
         there = some[~missing]
@@ -199,9 +198,6 @@ def _coordinates(panel: Panel) -> Iterator[tuple[NDArray[np.float64], NDArray[np
             case Bars():
                 values = numbers(item.values, panel.x)
                 yield np.r_[0.0 * values, values], np.tile(np.arange(len(values)), 2)
-            case Shares():
-                x = numbers(item.x, panel.x)
-                yield np.tile(x, 2), np.r_[0.0 * x, np.sum(item.shares, axis=0)]
 
 
 def _is_empty(panel: Panel) -> bool:
@@ -288,7 +284,6 @@ class _Drawing:
             Points: self._points,
             Band: self._band,
             Bars: self._bars,
-            Shares: self._shares,
             Spans: self._spans,
             Mark: self._mark,
             Words: self._words,
@@ -335,43 +330,43 @@ class _Drawing:
 
     def _line(self, line: Line) -> Iterator[Spec]:
         x, y = numbers(line.x, self._panel.x), numbers(line.y, self._panel.y)
-        kept = thinned(x, y, most=_MOST_FAINT if line.faint else _MOST)
-        look = self._look(line.name)
-        width, opacity = (1.2, 0.4) if line.faint else (line.width, 1.0)
-        mark: Spec = {"type": "line", "strokeJoin": "round", "tooltip": line.name}
-        mark |= {"interpolate": "step-after" if line.steps else "linear", "color": look.colour}
-        mark |= {"strokeWidth": width, "opacity": opacity}
-        mark |= {"strokeDash": (5, 3) if line.dashed else look.dash}
+        kept, look = thinned(x, y), self._look(line.name)
+        mark = {
+            "type": "line",
+            "strokeJoin": "round",
+            "tooltip": line.name,
+            "interpolate": "step-after" if line.steps else "linear",
+            "color": look.colour,
+            "strokeWidth": 1.2 if line.faint else line.width,
+            "opacity": 0.4 if line.faint else 1.0,
+            "strokeDash": (5, 3) if line.dashed else look.dash,
+        }
         # Drawn in the order of the points, and not from left to right.
-        data, order = {"x": x[kept], "y": y[kept]}, {"value": None}
-        yield self._drawn(mark, data, order=order)
+        yield self._drawn(mark, {"x": x[kept], "y": y[kept]}, order={"value": None})
 
     def _points(self, points: Points) -> Iterator[Spec]:
-        panel = self._panel
+        panel, look, many = self._panel, self._look(points.name), len(points.x) > _MANY
         columns: dict[str, Any] = {"x": numbers(points.x, panel.x), "y": numbers(points.y, panel.y)}
-        look = self._look(points.name)
         shape = points.shape or look.shape
         mark: Spec = {"type": "point", "filled": True, "shape": shape, "color": look.colour}
-        mark |= {"size": 60 if shape.startswith("M") else 45, "opacity": 1.0}
-        if len(points.x) > _MANY:
-            mark |= {"size": 12, "opacity": 0.7}
-        if points.faint:
-            mark |= {"opacity": 0.35}
-        elif len(points.x) <= _OUTLINED:
+        mark["size"] = 12 if many else 60 if shape.startswith("M") else 45
+        mark["opacity"] = 0.35 if points.faint else 0.7 if many else 1.0
+        if not points.faint and len(points.x) <= _OUTLINED:
             mark |= _OUTLINE
-        tips: list[Spec] = [
-            {"field": "x", "title": panel.x.label or "x", "format": ".4~g"},
-            {"field": "y", "title": panel.y.label or "y", "format": ".4~g"},
+        tips = [
+            {"field": which, "title": axis.label or which, "format": ".4~g"}
+            for which, axis in (("x", panel.x), ("y", panel.y))
         ]
         if points.texts is not None:
             columns["text"] = points.texts
             tips.insert(0, {"field": "text", "title": points.name or "point"})
         encoding: Spec = {"tooltip": tips}
         if points.colour is not None:
-            columns["c"] = numbers(points.colour, Axis("", log=points.log_colour))
+            columns["c"] = numbers(points.colour, Axis(""))
             mark |= {"color": _UNKNOWN}
-            if np.isfinite(columns["c"]).any():
-                encoding["color"] = self._colour_bar(points.colour_label, points.log_colour)
+            if (known := np.isfinite(columns["c"])).any():
+                log = bool((columns["c"][known] > 0.0).all())
+                encoding["color"] = self._colour_bar(points.colour_label, log)
         yield self._drawn(mark, columns, **encoding)
 
     def _colour_bar(self, words: str, log: bool) -> Spec:
@@ -380,8 +375,8 @@ class _Drawing:
         if self._panel.equal:
             legend |= {"title": words, "orient": "bottom", "titleOrient": "left"}
             legend |= {"gradientLength": 0.5 * self._width, "gradientThickness": 10}
-        scale: Spec = {"type": "log" if log else "linear", "range": _MAP, "nice": False}
-        scale |= {} if log else {"zero": False}
+        scale: Spec = {"type": "log"} if log else {"type": "linear", "zero": False}
+        scale |= {"range": _MAP, "nice": False}
         legend |= {"format": "~r"} if log else {}
         return {"field": "c", "type": "quantitative", "scale": scale, "legend": legend}
 
@@ -393,7 +388,10 @@ class _Drawing:
             low = np.where(np.isfinite(high) & np.isnan(low), self._extent["y"][0], low)
         kept = thinned(x, low, high)
         mark: Spec = {"type": "area", "tooltip": band.name, "color": look.colour}
-        mark |= {"fillOpacity": 0.25, "stroke": look.colour, "strokeOpacity": 0.6}
+        if band.share:
+            mark |= {"interpolate": "step-after", "stroke": "white", "strokeWidth": 0.5}
+        else:
+            mark |= {"fillOpacity": 0.25, "stroke": look.colour, "strokeOpacity": 0.6}
         yield self._drawn(mark, {"x": x[kept], "y": low[kept], "y2": high[kept]})
 
     def _bars(self, bars: Bars) -> Iterator[Spec]:
@@ -404,15 +402,6 @@ class _Drawing:
         mark = {"type": "rect", "color": self._look(bars.name).colour} | _OUTLINE
         data = {name: column[there] for name, column in columns.items()}
         yield self._drawn(mark, data, tooltip=[tip])
-
-    def _shares(self, shares: Shares) -> Iterator[Spec]:
-        x = numbers(shares.x, self._panel.x)
-        made = np.nan_to_num(np.array(shares.shares, np.float64).reshape(len(shares.names), -1))
-        ends = np.vstack([np.zeros(len(x)), np.cumsum(made, axis=0)])
-        for name, low, high in zip(shares.names, ends[:-1], ends[1:], strict=True):
-            mark: Spec = {"type": "area", "color": self._looks[name].colour, "tooltip": name}
-            mark |= {"interpolate": "step-after", "stroke": "white", "strokeWidth": 0.5}
-            yield self._drawn(mark, {"x": x, "y": low, "y2": high})
 
     def _spans(self, spans: Spans) -> Iterator[Spec]:
         for begin, end, name in _shaded(spans):
@@ -479,8 +468,9 @@ def _legend(chart: Chart, every: dict[str, Look]) -> list[Spec]:
     written = {word for item in items if isinstance(item, Words) for word in item.words}
     symbols: dict[str, tuple[str, str, tuple[float, ...]]] = {}
     for item in sorted(items, key=_layer):
-        if not (isinstance(item, Line | Points) and not len(item.x)):
-            symbols |= {name: _symbol(item, every[name]) for name in legend_names(item)}
+        name = getattr(item, "name", "")
+        if name and not (isinstance(item, Line | Points) and not len(item.x)):
+            symbols[name] = _symbol(item, every[name])
     names = [name for name in every if name in symbols and name not in written]
     if not names or all(map(_is_empty, chart.panels)):
         return []

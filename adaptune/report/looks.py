@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from itertools import cycle
 
-from adaptune.report.charts import Chart, Drawn, Shares, Spans
+from adaptune.report.charts import Band, Chart, Spans
 
 
 @dataclass(frozen=True)
@@ -48,18 +48,12 @@ def looks(chart: Chart) -> dict[str, Look]:
     items = [item for panel in chart.panels for item in panel.drawn]
     spans = (item for item in items if isinstance(item, Spans) and not item.name)
     places = dict.fromkeys(name for item in spans for name in item.names if name)
-    shares = dict.fromkeys(n for item in items if isinstance(item, Shares) for n in item.names)
+    shares = dict.fromkeys(b.name for b in items if isinstance(b, Band) and b.share)
     known = dict(zip(shares, map(Look, cycle(_SHARES)), strict=False)) | MODES
     known |= dict(zip(places, map(Look, cycle(_PLACES)), strict=False))
     known |= {item.name: Look(_SHADE) for item in items if isinstance(item, Spans) and item.name}
-    names = dict.fromkeys(name for item in items for name in legend_names(item)) | places
+    names = dict.fromkeys(name for item in items if (name := getattr(item, "name", ""))) | places
     taken = {known[name].colour for name in names if name in known}
     colours = cycle([colour for colour in _COLOURS if colour not in taken])
     made = map(Look, colours, cycle(_DASHES), cycle(_SHAPES))
     return {name: known[name] if name in known else next(made) for name in names}
-
-
-def legend_names(item: Drawn) -> tuple[str, ...]:
-    """The names of an item in the legend."""
-    named = (getattr(item, "name", ""),)
-    return tuple(filter(None, item.names if isinstance(item, Shares) else named))

@@ -46,7 +46,6 @@ def test_a_scatter_has_a_panel_for_each_sequence_and_the_mean():
         (fixed,) = of_kind(panel, Points, "fixed")
         assert list(fixed.x) == [table.column("distance")[3]]
         (trials,) = of_kind(panel, Points, "trial")
-        assert trials.log_colour
         assert min(trials.colour) == values.min()
     assert scatter_chart(table, ["distance"], ["one"]) is None
 

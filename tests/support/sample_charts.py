@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from adaptune.report.charts import Axis, Band, Bars, Chart, Line, Mark, Panel, Points, Shares, Spans
+from adaptune.report.charts import Axis, Band, Bars, Chart, Line, Mark, Panel, Points, Spans, shares
 from adaptune.report.page import Page, PageSection
 from adaptune.report.tables import Listing
 
@@ -28,14 +28,16 @@ def over_time() -> Chart:
         Line(t, error, "fixed", faint=True),
     )
     weights = rng.dirichlet(np.ones(3), len(k)).T
-    members = Shares(k, weights, ("trial 3", "trial 17", "trial 242"))
+    members = shares(k, weights, ("trial 3", "trial 17", "trial 242"))
     return Chart(
         "over-time",
         "Errors and selections over time",
         (
             Panel(TIME, RTE, lines, "error of the replays", height=1.6),
             Panel(TIME, Axis("RTE, last 30 s [%]"), estimate, "its error as estimated"),
-            Panel(TIME, Axis("weight [-]", limits=(0.0, 1.0)), (members,), "members of the bank"),
+            Panel(
+                TIME, Axis("weight [-]", limits=(0.0, 1.0)), tuple(members), "members of the bank"
+            ),
         ),
         "The adaptive mode lost its reference for ten seconds.",
         shared_x=True,
@@ -48,7 +50,7 @@ def trials(n: int = 2000) -> Chart:
     cost, error = rng.lognormal(2.0, 0.5, n), rng.lognormal(0.0, 0.7, n)
     size = np.where(rng.random(n) < 0.1, np.nan, rng.lognormal(-1.0, 1.0, n))
     texts = [f"trial {i}: voxel_size {size[i]:.3g}" for i in range(n)]
-    points = Points(cost, error, "trials", size, "voxel size [m]", log_colour=True, texts=texts)
+    points = Points(cost, error, "trials", size, "voxel size [m]", texts=texts)
     kinds = Axis("registration", names=("point to point", "point to plane", "GICP"))
     named = Points([kinds.names[i % 3] for i in range(60)], error[:60], "trials")
     return Chart(
@@ -95,10 +97,10 @@ def from_above() -> Chart:
 def empty() -> Chart:
     drawn = (
         Line([], [], "fixed"),
-        Points([1.0], [np.nan], "trials", [np.nan], "size [m]", log_colour=True),
+        Points([1.0], [np.nan], "trials", [np.nan], "size [m]"),
         Bars([], "bars"),
         Band([], [], [], "band"),
-        Shares([], np.zeros((2, 0)), ("a", "b")),
+        *shares([], np.zeros((2, 0)), ("a", "b")),
         Mark(1.0),
     )
     panel = Panel(Axis("x [-]", log=True), Axis("y [-]", log=True), drawn)

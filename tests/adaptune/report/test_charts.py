@@ -15,9 +15,9 @@ from adaptune.report.charts import (
     Mark,
     Panel,
     Points,
-    Shares,
     Spans,
     Words,
+    shares,
 )
 from adaptune.report.drawing import draw_chart, spec, thinned
 from adaptune.report.looks import MODES, looks
@@ -44,7 +44,7 @@ def chart_of(*items, **panel):
         Points([0, 1], [1, 2], "fixed", texts=["a", "b"]),
         Band([0, 1], [1, 2], [2, 3], "fixed"),
         Bars([1, 2], "fixed"),
-        Shares([0, 1, 2], np.full((2, 3), 50.0), ("fixed", "b")),
+        shares([0, 1, 2], np.full((2, 3), 50.0), ("fixed", "b"))[0],
     ],
     ids=lambda item: type(item).__name__,
 )
@@ -55,7 +55,7 @@ def test_an_item_has_its_colour_in_the_panel_and_in_the_legend(tmp_path, item):
 
 
 def test_colours_of_points_are_on_a_bar_and_unknown_ones_are_grey(tmp_path):
-    points = Points([0, 1, 2], [1, 2, 3], "trial", [0.1, 1.0, np.nan], "size [m]", log_colour=True)
+    points = Points([0, 1, 2], [1, 2, 3], "trial", [0.1, 1.0, np.nan], "size [m]")
     texts, svg = drawn(chart_of(points), tmp_path)
     assert {"size [m]", "0.2", "0.5", "trial"} <= set(texts)
     assert svg.count("#bbbbbb") == 1
