@@ -13,7 +13,6 @@ from adaptune.errors import AdaptuneError
 from adaptune.report.charts import (
     Axis,
     Band,
-    Bars,
     Chart,
     Charts,
     Drawn,
@@ -193,9 +192,10 @@ def importance_chart(by_odometry: Mapping[str, Mapping[str, float]]) -> Chart | 
     for odometry, shares in by_odometry.items():
         if not shares:
             continue
-        names = tuple(reversed(list(shares)))
-        percent = [100.0 * shares[name] for name in names]
-        bars = Bars(percent, "")
+        rising = list(shares.items())[::-1]
+        names = tuple(f"{name} ({100.0 * share:.0f}\u00a0%)" for name, share in rising)
+        ends = [(0.0, 100.0 * share, np.nan) for _, share in rising]
+        bars = Line(np.ravel(ends), np.repeat(range(len(names)), 3), "", width=24.0)
         x = Axis("share of the error's variance [%]", limits=(0.0, 100.0))
         panels.append(Panel(x, Axis("", names=names), (bars,), odometry))
     if not panels:

@@ -14,7 +14,6 @@ from adaptune.report.charts import (
     Charts,
     Drawn,
     Line,
-    Mark,
     Panel,
     Points,
     Spans,
@@ -48,7 +47,7 @@ def comparison_chart(rows: Sequence[ComparisonRow]) -> Chart | None:
         texts = [f"{row.mode}, {row.sequence}" for row in some]
         return Points(ratios, places, name, texts=texts, **look)
 
-    drawn: list[Drawn] = [Mark(1.0)]
+    drawn: list[Drawn] = [Line([1.0, 1.0], [-0.6, len(modes) - 0.4], "", dashed=True, width=1.0)]
     ends = [(*row.ratio_interval, i) for i, row in enumerate(last) if row.ratio_interval]
     if ends:
         x = [value for low, high, _ in ends for value in (low, high, np.nan)]
@@ -197,7 +196,7 @@ def _weights(replayed: ReplayedSequence) -> Iterator[Panel]:
         parts = np.column_stack([parts, parts[:, -1]])
         # Shares hide what is shaded.
         ends = [] if replayed.scenes is None else replayed.scenes.edges[1:-1]
-        edges = (Mark(float(edge)) for edge in ends)
+        edges = (Line([edge] * 2, [0.0, 100.0], "", dashed=True, width=1.0) for edge in ends)
         drawn = (*_scenes(replayed), *shares(track.span, parts, track.weights), *edges)
         y = Axis("weight [%]", limits=(0.0, 100.0))
         yield Panel(TIME, y, drawn, f"{mode} applies a bank: weights of its members")

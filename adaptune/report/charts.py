@@ -60,27 +60,12 @@ class Band:
 
 
 @dataclass(frozen=True)
-class Bars:
-    """Bars from zero along x, one for each name of the y axis."""
-
-    values: Values
-    name: str
-
-
-@dataclass(frozen=True)
 class Spans:
     """Stretches along x that are shaded and named, such as the scenes of a course."""
 
     edges: Values  # of shape (n + 1,)
     names: tuple[str, ...]  # of shape (n,); an empty name is not shaded
     name: str = ""  # in the legend, if any
-
-
-@dataclass(frozen=True)
-class Mark:
-    """A dashed line across the panel, at a value of x."""
-
-    at: float
 
 
 @dataclass(frozen=True)
@@ -92,7 +77,7 @@ class Words:
     words: Values
 
 
-Drawn = Line | Points | Band | Bars | Spans | Mark | Words
+Drawn = Line | Points | Band | Spans | Words
 
 
 @dataclass(frozen=True)

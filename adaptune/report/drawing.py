@@ -15,11 +15,9 @@ from adaptune.files import replacing
 from adaptune.report.charts import (
     Axis,
     Band,
-    Bars,
     Chart,
     Drawn,
     Line,
-    Mark,
     Panel,
     Points,
     Spans,
@@ -38,7 +36,7 @@ _MOST = 1500
 """Most points of a line that are drawn."""
 _MANY, _OUTLINED = 1000, 150
 """Points from which on they are small, and up to which they have outlines."""
-_LAYERS = (Spans, Bars, Band, Line, Points, Mark, Words)
+_LAYERS = (Spans, Band, Line, Points, Words)
 
 
 def _layer(item: Drawn) -> float:
@@ -195,9 +193,6 @@ def _coordinates(panel: Panel) -> Iterator[tuple[NDArray[np.float64], NDArray[np
             case Band():
                 x = numbers(item.x, panel.x)
                 yield np.tile(x, 2), np.r_[numbers(item.low, panel.y), numbers(item.high, panel.y)]
-            case Bars():
-                values = numbers(item.values, panel.x)
-                yield np.r_[0.0 * values, values], np.tile(np.arange(len(values)), 2)
 
 
 def _is_empty(panel: Panel) -> bool:
@@ -211,9 +206,7 @@ def _extent(panel: Panel, which: Literal["x", "y"]) -> tuple[float, float]:
         return axis.limits
     if axis.names is not None:
         return -0.6, len(axis.names) - 0.4
-    marks = [item.at for item in panel.drawn if isinstance(item, Mark) and which == "x"]
-    found = [pair[which == "y"] for pair in _coordinates(panel)]
-    values = np.concatenate([*found, marks])
+    values = np.concatenate([[], *(pair[which == "y"] for pair in _coordinates(panel))])
     values = values[np.isfinite(values)]
     if not len(values):
         return 1.0, 10.0
@@ -283,9 +276,7 @@ class _Drawing:
             Line: self._line,
             Points: self._points,
             Band: self._band,
-            Bars: self._bars,
             Spans: self._spans,
-            Mark: self._mark,
             Words: self._words,
         }
         items = sorted(panel.drawn, key=_layer)
@@ -394,15 +385,6 @@ class _Drawing:
             mark |= {"fillOpacity": 0.25, "stroke": look.colour, "strokeOpacity": 0.6}
         yield self._drawn(mark, {"x": x[kept], "y": low[kept], "y2": high[kept]})
 
-    def _bars(self, bars: Bars) -> Iterator[Spec]:
-        ends = numbers(bars.values, self._panel.x)
-        place, there = np.arange(len(ends)), np.isfinite(ends)
-        columns = {"x": 0.0 * ends, "x2": ends, "y": place - 0.4, "y2": place + 0.4}
-        tip = {"field": "x2", "title": self._panel.x.label, "format": ".4~g"}
-        mark = {"type": "rect", "color": self._look(bars.name).colour} | _OUTLINE
-        data = {name: column[there] for name, column in columns.items()}
-        yield self._drawn(mark, data, tooltip=[tip])
-
     def _spans(self, spans: Spans) -> Iterator[Spec]:
         for begin, end, name in _shaded(spans):
             mark: Spec = {"type": "rect", "stroke": "white", "tooltip": None, "clip": True}
@@ -421,10 +403,6 @@ class _Drawing:
             if needed > pixels:
                 words |= {"y": 4, "angle": -90, "align": "right", "baseline": "middle"}
             yield from _read_anywhere(words, _table(x=[0.5 * (begin + end)]), {"x": self._x})
-
-    def _mark(self, mark: Mark) -> Iterator[Spec]:
-        rule: Spec = {"type": "rule", "color": _DARK, "strokeDash": (5, 3), "clip": True}
-        yield {"data": _table(x=[mark.at]), "mark": rule, "encoding": {"x": self._x}}
 
     def _pixels(self, which: Literal["x", "y"], values: NDArray[np.float64]) -> NDArray[np.float64]:
         axis = self._panel.x if which == "x" else self._panel.y

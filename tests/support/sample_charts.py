@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from adaptune.report.charts import Axis, Band, Bars, Chart, Line, Mark, Panel, Points, Spans, shares
+from adaptune.report.charts import Axis, Band, Chart, Line, Panel, Points, Spans, shares
 from adaptune.report.page import Page, PageSection
 from adaptune.report.tables import Listing
 
@@ -20,7 +20,6 @@ def over_time() -> Chart:
         scenes,
         Line(t, error, "fixed"),
         Line(t, np.where((t > 60.0) & (t < 70.0), np.nan, 0.8 * error), "adaptive"),
-        Mark(120.0),
     )
     k = np.arange(0.0, 241.0, 20.0)
     estimate = (
@@ -75,7 +74,7 @@ def comparison() -> Chart:
             Panel(
                 Axis("error over the fixed set's [-]"),
                 Axis("parameter", names=("voxel_size", "max_range", "iterations")),
-                (Bars([1.4, 0.8, 1.05], "fixed"), Mark(1.0)),
+                (Line([0.0, 1.4, np.nan, 0.0, 0.8], [0, 0, 0, 1, 1], "fixed", width=20.0),),
             ),
         ),
         columns=2,
@@ -98,10 +97,8 @@ def empty() -> Chart:
     drawn = (
         Line([], [], "fixed"),
         Points([1.0], [np.nan], "trials", [np.nan], "size [m]"),
-        Bars([], "bars"),
         Band([], [], [], "band"),
         *shares([], np.zeros((2, 0)), ("a", "b")),
-        Mark(1.0),
     )
     panel = Panel(Axis("x [-]", log=True), Axis("y [-]", log=True), drawn)
     return Chart("empty", "Nothing was measured", (panel,))
