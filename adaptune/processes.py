@@ -1,4 +1,9 @@
-"""Messages between processes: a JSON header, and arrays as raw bytes."""
+"""User code in processes of its own, where it ends nothing else, and messages to it.
+
+Python code is imported once, by a server. For every socket that this receives it forks a watcher,
+which forks a fresh process and reports how that ended. Programs run under a keeper. All of them end
+with this process. A message is a JSON header, and arrays as raw bytes.
+"""
 
 import contextlib
 import json
@@ -128,11 +133,6 @@ def _exactly(stream: "BinaryIO | SocketStream | _Timed", size: int) -> bytes:
         raise WireError("the stream ends in the middle of a message")
     return data
 
-
-# User code in processes of its own: whatever it does there ends that process and nothing else.
-#
-# Python code is imported once, by a server that then forks a fresh process for each use of it.
-# Programs run under a keeper. Both end with this process, and so does all that they have started.
 
 IMPORT_SECONDS = 60.0
 """An import of user code may take so long."""
@@ -455,9 +455,6 @@ def answer_all(reader: "BinaryIO | _Timed", writer: BinaryIO, answer: Answer) ->
             rest = {key: value for key, value in found.items() if key not in arrays}
             send(writer, {"type": "done", **rest}, **arrays)
 
-
-# The server. For every socket that it receives it forks a watcher, which forks the process and
-# reports how that ended.
 
 _LONGER = 5
 """Seconds by which the limit on the import is longer here: it is for servers left behind."""

@@ -31,8 +31,9 @@ from adaptune.recording.compensation import compensate
 from adaptune.recording.config import SequenceConfig
 from adaptune.recording.export import write_kitti_sequence
 from adaptune.recording.folder import ELEVATION, turn_up
+from adaptune.recording.parts import read_part
 from adaptune.recording.recording import open_sequence
-from adaptune.recording.scan import Scan, read_part
+from adaptune.recording.scan import Scan
 from adaptune.simulation import Course
 from adaptune.simulation.record import Drive, SimulatedScan, record
 

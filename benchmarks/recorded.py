@@ -37,7 +37,7 @@ from adaptune import machine, yaml12
 from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
 from adaptune.recording.config import ESTIMATED
-from adaptune.recording.scan import part_name, read_part
+from adaptune.recording.parts import part_name, read_part
 from adaptune.report import tables
 from adaptune.study.config import ALSO
 from offline.config import OfflineStudy, load_study

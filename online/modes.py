@@ -19,7 +19,8 @@ from adaptune.model.weights import weighted_selection
 from adaptune.odometry.base import Motions, OdometryInstance
 from adaptune.odometry.registry import Factory
 from adaptune.progress import Progress, unseen
-from adaptune.recording.scan import Recording, Scan, part_name
+from adaptune.recording.parts import part_name
+from adaptune.recording.scan import Recording, Scan
 from adaptune.reference.check import mean_difference
 from adaptune.selector import AnySelector, Selector, UntrainedSelector, untrained_sets
 from adaptune.space import ParameterSet, ParameterSets, Selection

@@ -14,15 +14,8 @@ from numpy.typing import NDArray
 from adaptune import geometry
 from adaptune.compiled import compiled
 from adaptune.errors import AdaptuneError, nearest
-from adaptune.recording.scan import (
-    AUTO,
-    TIME_FIELDS,
-    Scan,
-    SequenceError,
-    Timing,
-    TimingError,
-    Unit,
-)
+from adaptune.recording.scan import Scan, SequenceError
+from adaptune.recording.timing import AUTO, TIME_FIELDS, Timing, TimingError, Unit
 from adaptune.trajectory import Trajectory
 
 _WORD = {order: struct.Struct(f"{order}I").unpack_from for order in "<>"}

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from adaptune.compiled import compiled
 from adaptune.errors import Finding, Key
 from adaptune.geometry import nearest_rotation
-from adaptune.recording.scan import SOONEST, Reading, Scan
+from adaptune.recording.scan import Reading, Scan
+from adaptune.recording.timing import SOONEST
 from adaptune.trajectory import Trajectory
 
 LEAST_POINTS = 20

@@ -20,7 +20,8 @@ from adaptune.errors import Finding, NotInstalledError
 from adaptune.files import DAMAGED_NPZ
 from adaptune.geometry import Poses
 from adaptune.recording.clouds import FARTHEST, PointCloudError, from_fields
-from adaptune.recording.scan import AUTO, Frame, Imu, Scan, SequenceError, Timing
+from adaptune.recording.scan import Frame, Imu, Scan, SequenceError
+from adaptune.recording.timing import AUTO, Timing
 from adaptune.trajectory import Trajectory, read_kitti
 
 SUFFIXES = (".bin", ".npy", ".pcd", ".ply")

@@ -19,19 +19,8 @@ from adaptune.recording import cache, compensation, views
 from adaptune.recording.config import ESTIMATED, NO_REFERENCE, SequenceConfig, files_of
 from adaptune.recording.content import Content, of_looks
 from adaptune.recording.poses import sound
-from adaptune.recording.scan import (
-    BACKWARD,
-    FIRST_SCANS,
-    SOONEST,
-    Frame,
-    Imu,
-    Recording,
-    Scan,
-    SequenceError,
-    Timing,
-    doubts,
-    in_order,
-)
+from adaptune.recording.scan import BACKWARD, Frame, Imu, Recording, Scan, SequenceError, in_order
+from adaptune.recording.timing import FIRST_SCANS, SOONEST, Timing, doubts
 from adaptune.trajectory import Trajectory, TrajectoryError, is_kitti, read_kitti, read_trajectory
 
 if TYPE_CHECKING:

@@ -317,7 +317,7 @@ class _Drawing:
         return {"data": _table(**data), "mark": {"clip": True} | mark, "encoding": every}
 
     def _look(self, name: str) -> Look:
-        return self._looks.get(name, Look("#666666"))
+        return self._looks.get(name, Look(_DARK))
 
     def _line(self, line: Line) -> Iterator[Spec]:
         x, y = numbers(line.x, self._panel.x), numbers(line.y, self._panel.y)

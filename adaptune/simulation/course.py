@@ -14,7 +14,8 @@ from adaptune import geometry
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses
 from adaptune.recording.config import Compensation, SequenceConfig
-from adaptune.recording.scan import ImuNoise, Part
+from adaptune.recording.parts import Part
+from adaptune.recording.scan import ImuNoise
 from adaptune.simulation.scenes import SCENES
 from adaptune.strict import StrictModel
 

@@ -28,13 +28,14 @@ from adaptune.odometry.registry import Factory, OdometryFactory, OdometryPool, d
 from adaptune.recording.cache import fingerprints
 from adaptune.recording.config import REFERENCE_FILES, SequenceConfig
 from adaptune.recording.export import Layout
+from adaptune.recording.parts import part_name
 from adaptune.recording.recording import (
     SequenceFiles,
     open_sequence,
     sequence_files,
     wants_estimate,
 )
-from adaptune.recording.scan import Recording, part_name
+from adaptune.recording.scan import Recording
 from adaptune.recording.views import with_imu
 from adaptune.reference.stored import BREAK, EstimateError, StoredEstimate
 from adaptune.simulation.course import Course

@@ -8,8 +8,8 @@ from adaptune import yaml12
 from adaptune.geometry import to_pose
 from adaptune.odometry.program import program_input
 from adaptune.recording import SequenceConfig
+from adaptune.recording.parts import part_name, read_part
 from adaptune.recording.recording import check_sequence, open_sequence
-from adaptune.recording.scan import part_name, read_part
 from adaptune.strict import ConfigurationError
 from adaptune.trajectory import Trajectory, write_tum
 from offline.config import load_study
