@@ -13,13 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptune import manifest
-from adaptune.errors import AdaptuneError, nearest
+from adaptune.errors import AdaptuneError
 from adaptune.files import DAMAGED_NPZ, needing_room, replacing, write_text
 from adaptune.geometry import Poses
 from adaptune.live.hops import Hops
 from adaptune.metrics import FAILURE, cap
 from adaptune.recording.cache import status_key
-from adaptune.space import ODOMETRY, ParameterSet, in_words
+from adaptune.space import ParameterSet, in_words
 from adaptune.strict import ConfigurationError
 
 # In `Trial.usage`; the last one in seconds, where the first scan has no pose.
@@ -511,103 +511,3 @@ def _read(path: Path, names: Sequence[str] | None = None) -> dict[str, NDArray[A
         raise ArchiveError(f"{path}: there is no such file; run `adaptune offline`") from error
     except (KeyError, *DAMAGED_NPZ) as error:
         raise _damaged(path, error) from error
-
-
-# The table of the trials in a study's archive: sort it.
-
-
-Row = dict[str, Any]
-
-_COLUMN = {"rte": "mean"}
-"""Columns that have another name in a study's objectives."""
-_HEADINGS = {
-    "mean": "mean RTE [%]",
-    "rpe": "RPE [m]",
-    "ape": "APE [m]",
-    "kitti": "KITTI [%]",
-    "ms_per_scan": "odometry [ms]",
-    "cpu": "cpu [%]",
-    "memory": "memory [MB]",
-    "cost": "cost [ms]",
-    FIRST_POSE: "first pose after [s]",
-}
-"""Columns as a table for reading names them."""
-
-
-def rows(archive: Archive, names: Sequence[str]) -> list[Row]:
-    """A row for every trial that is finished on at least one of the sequences.
-
-    It has number, parameters, mean error in percent (None before the trial is finished on all
-    sequences), mean error on each sequence, then over all sequences how often the health check
-    restarted it and how often its process ended, its other metrics (None if a sequence is too short
-    for one), and its cost in milliseconds of CPU time a scan (None if it was not measured).
-    """
-    finished = {name: archive.finished(name) for name in names}
-    every = [trial for trials in finished.values() for trial in trials.values()]
-    # Dictionaries keep the order of metrics, and of parameters: several odometries have others.
-    metrics = dict.fromkeys(metric for trial in every for metric in trial.metrics)
-    parameters = dict.fromkeys(name for trial in every for name in trial.parameters)
-    found = []
-    for number in sorted(set().union(*finished.values())):
-        trials = {name: finished[name].get(number) for name in names}
-        there = [trial for trial in trials.values() if trial is not None]
-        row: Row = {"trial": number} | {name: there[0].parameters.get(name) for name in parameters}
-        errors = {name: t.mean_error if t else None for name, t in trials.items()}
-        row |= {"mean": _mean(list(errors.values()))} | errors
-        row |= {
-            "proposed by": there[0].source,
-            "restarts": round(sum(t.restarts for t in there)),
-            "faults": sum(t.faults for t in there),
-        }
-        for metric in metrics:
-            if metric not in ("rte", REGISTER_MS, PREPARE_MS):
-                without = 0.0 if metric == FIRST_POSE else None
-                row[metric] = _mean([t.metrics.get(metric, without) for t in there])
-        cost = float(np.mean([t.cost for t in there]))
-        found.append(row | {"cost": None if np.isnan(cost) else cost})
-    return found
-
-
-def _mean(values: Sequence[float | None]) -> float | None:
-    """Mean of values; None if one is unknown."""
-    known = [value for value in values if value is not None]
-    return float(np.mean(known)) if len(known) == len(values) else None
-
-
-def select(table: Sequence[Row], sort: str | None = None, top: int | None = None) -> list[Row]:
-    """The first `top` rows in the order of a column, by default of the mean; else all rows.
-
-    With ``-`` before the column, the largest value comes first; unknown values come last.
-    """
-    if sort is None and top is None:
-        return list(table)
-    sort = sort or "mean"
-    name = sort.removeprefix("-")
-    column = _COLUMN.get(name, name)
-    if table and column not in table[0]:
-        known = nearest(column, table[0])
-        raise AdaptuneError(f"--sort {sort}: there is no column {column!r}: {known}")
-    chosen = [row for row in table if row[column] is not None]
-    chosen.sort(key=lambda row: row[column], reverse=sort.startswith("-"))
-    return [*chosen, *(row for row in table if row[column] is None)][:top]
-
-
-def with_units(table: Sequence[Row], names: Sequence[str], labels: Mapping[str, str]) -> list[Row]:
-    """Rows for reading: headings say what is measured on the sequences, and units.
-
-    `labels` are those of the parameters, see `ParameterSpace.labels`.
-    """
-    headings = {**labels, **_HEADINGS} | {name: f"RTE [%] {name}" for name in names}
-    if table and ODOMETRY in table[0]:
-        table = [_short(row) for row in table]
-    return [{headings.get(key, key): value for key, value in row.items()} for row in table]
-
-
-def _short(row: Row) -> Row:
-    """The row with all parameters in a single column: those of several odometries are many."""
-    keys = list(row)
-    last = keys.index("mean")
-    parameters = {key: row[key] for key in keys[1:last] if row[key] is not None}
-    short = {"trial": row["trial"], ODOMETRY: parameters.pop(ODOMETRY)}
-    short["parameters"] = in_words(parameters)
-    return short | {key: row[key] for key in keys[last:]}

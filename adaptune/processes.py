@@ -1,9 +1,11 @@
-"""Messages between processes: a JSON header, and arrays as raw bytes."""
+"""User code in processes of its own, where it ends nothing else, and messages to it.
+
+Python code is imported once, by a server. For every socket that this receives it forks a watcher,
+which forks a fresh process and reports how that ended. Programs run under a keeper. All of them end
+with this process. A message is a JSON header, and arrays as raw bytes.
+"""
 
 import contextlib
-import ctypes
-import gc
-import itertools
 import json
 import math
 import os
@@ -15,18 +17,11 @@ import struct
 import subprocess
 import sys
 import tempfile
-import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache
 from importlib import import_module
-from multiprocessing import forkserver, get_context, parent_process
 from multiprocessing.connection import wait
-from multiprocessing.context import ForkServerContext
-from multiprocessing.util import get_temp_dir
 from pathlib import Path
 from types import ModuleType
 from typing import Any, BinaryIO, NamedTuple, NoReturn
@@ -138,11 +133,6 @@ def _exactly(stream: "BinaryIO | SocketStream | _Timed", size: int) -> bytes:
         raise WireError("the stream ends in the middle of a message")
     return data
 
-
-# User code in processes of its own: whatever it does there ends that process and nothing else.
-#
-# Python code is imported once, by a server that then forks a fresh process for each use of it.
-# Programs run under a keeper. Both end with this process, and so does all that they have started.
 
 IMPORT_SECONDS = 60.0
 """An import of user code may take so long."""
@@ -466,9 +456,6 @@ def answer_all(reader: "BinaryIO | _Timed", writer: BinaryIO, answer: Answer) ->
             send(writer, {"type": "done", **rest}, **arrays)
 
 
-# The server. For every socket that it receives it forks a watcher, which forks the process and
-# reports how that ended.
-
 _LONGER = 5
 """Seconds by which the limit on the import is longer here: it is for servers left behind."""
 
@@ -563,166 +550,6 @@ class _Timed:
         data = self._stream.read(size)
         signal.setitimer(signal.ITIMER_REAL, self._seconds)
         return data
-
-
-# Which cores a process may use.
-
-
-def resident_megabytes() -> float:
-    """Memory that this process takes at present, without the files that it maps."""
-    _, resident, shared, *_ = Path("/proc/self/statm").read_text(encoding="ascii").split()
-    return 1e-6 * (int(resident) - int(shared)) * os.sysconf("SC_PAGE_SIZE")
-
-
-def release_memory() -> None:
-    """Give memory that is free back to the system, so that what comes next is measured alone.
-
-    Threads that prepare scans leave hundreds of megabytes to the C library, which keeps them.
-    """
-    gc.collect()
-    ctypes.CDLL(None).malloc_trim(0)
-
-
-@contextmanager
-def apart() -> Iterator[None]:
-    """Let large arrays that are made meanwhile go back to the system as soon as they are free.
-
-    By default, the C library keeps them among small ones. Where a process holds many arrays of
-    different sizes and replaces them time after time, as prepared scans, the holes between them
-    then take several times what they hold. It costs some time for each array.
-    """
-    global _apart  # noqa: PLW0603 - the setting is that of the process
-    mallopt = ctypes.CDLL(None).mallopt
-    _apart += 1
-    mallopt(_M_MMAP_THRESHOLD, _LARGE)
-    try:
-        yield
-    finally:
-        _apart -= 1
-        if not _apart:
-            mallopt(_M_MMAP_THRESHOLD, _LARGEST)
-
-
-_M_MMAP_THRESHOLD, _LARGE, _LARGEST = -3, 256 * 1024, 32 * 1024**2
-"""The number of the setting in malloc.h; bytes of arrays that are kept apart, and to what glibc
-raises that by itself as such arrays become free."""
-_apart = 0
-"""In how many blocks of `apart` this process is."""
-_before: set[int] | None = None
-"""Cores that this process had before it was pinned alone."""
-_numbers = itertools.count(1)
-
-
-def available() -> int:
-    """Number of cores that this process may use."""
-    return len(os.sched_getaffinity(0))
-
-
-def shared_cores() -> set[int]:
-    """The cores of this process and of those that work beside it, see `pin`."""
-    return os.sched_getaffinity(0) if _before is None else _before
-
-
-def pin(core: int, alone: bool = False) -> ExitStack:
-    """Keep this process on one core until what it returns is closed.
-
-    Open3D sums in an order that depends on its threads. Only on one core do its results repeat bit
-    by bit. Running threads keep their cores: call this before the first use of Open3D. Numbers
-    beyond the last core restart at the first. `alone` says that this process is the only one at
-    work: then `next_core` gives others the rest.
-    """
-    global _before  # noqa: PLW0603 - the cores are those of the process
-    pinned = ExitStack()
-    cores = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, {sorted(cores)[core % len(cores)]})
-    _before = cores if alone else None
-
-    def unpin() -> None:
-        global _before  # noqa: PLW0603
-        os.sched_setaffinity(0, cores)
-        _before = None
-
-    pinned.callback(unpin)
-    return pinned
-
-
-def next_core() -> int:
-    """Core for another process that works beside this one.
-
-    Each call gives the next core, after the one that `pin` gives to the number of this process.
-    """
-    cores = sorted(shared_cores())
-    return cores[(os.getpid() + next(_numbers)) % len(cores)]
-
-
-def other_core(number: int) -> int:
-    """Core for the process of this number, from 0, of those that work for this one; see `pin`.
-
-    They get the cores that this process does not use, as far as there are any.
-    """
-    cores = sorted(shared_cores())
-    others = sorted(set(cores) - os.sched_getaffinity(0)) or cores[1:] or cores
-    return others[number % len(others)]
-
-
-def end_with_parent() -> None:
-    """End this process where the one that it computes for has ended, whatever it does by then."""
-    # Ctrl-C reaches all processes; the first of them decides what happens.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    parent = parent_process()
-    if parent is None:
-        return
-
-    def watch() -> None:
-        parent.join()
-        os._exit(1)  # its containers and programs end with it
-
-    threading.Thread(target=watch, daemon=True).start()
-
-
-# Processes of adaptune's own modules, forked by one server that has imported these.
-
-
-def fork_server(*preload: str) -> ForkServerContext:
-    """What forks processes that have imported some modules; it is started if there is none."""
-    # A process forked from one with threads may deadlock.
-    context = get_context("forkserver")
-    context.set_forkserver_preload(list(preload))
-    _name_sockets()
-    # A fresh Python looks for modules where it begins, before it looks among its own. Processes
-    # have the folder and the path of this one again.
-    with contextlib.chdir("/"):
-        forkserver.ensure_running()
-    return context
-
-
-@cache
-def _name_sockets() -> None:
-    """Let multiprocessing give its sockets short names, however long TMPDIR is: `socket_name`."""
-    folder = tempfile.gettempdir()
-    tempfile.tempdir = f"/proc/{os.getpid()}/fd/{os.open(folder, os.O_PATH)}"  # stays open
-    try:
-        get_temp_dir()
-    finally:
-        tempfile.tempdir = folder
-
-
-@contextmanager
-def processes(most: int, preload: Sequence[str] = ()) -> Iterator[Executor]:
-    """At most so many processes to compute in, one a core; tasks that wait end with the block.
-
-    All of them need the modules to preload, which are imported once. There is an `AdaptuneError`
-    if a process ends before its time.
-    """
-    n = max(1, min(most, available()))
-    context = fork_server(*preload)
-    pool = ProcessPoolExecutor(n, context, end_with_parent)
-    try:
-        yield pool
-    except BrokenProcessPool as error:
-        raise AdaptuneError("a process was ended from outside; was the memory full?") from error
-    finally:
-        pool.shutdown(cancel_futures=True)
 
 
 if __name__ == "__main__":

@@ -261,9 +261,6 @@ def describe(parameter: Float | Integer | Categorical) -> str:
     return f"[{parameter.low:g}, {parameter.high:g}]"
 
 
-# The parameter sets of a study: the one table that numbers them.
-
-
 @dataclass(frozen=True, eq=False)
 class ParameterSets:
     """Parameter sets by the numbers of their trials.
@@ -465,9 +462,6 @@ def load_space(data: Mapping[str, Any]) -> ParameterSpace:
     if data and pooled:
         return PooledSpace({label: ParameterSpace.load(of) for label, of in data.items()})
     return ParameterSpace.load(data)
-
-
-# What is chosen for a scan, and what an odometry or a bank applies.
 
 
 class Selection(NamedTuple):

@@ -311,12 +311,6 @@ def read_kitti(path: Path) -> Poses:
     return _matrices(path, rows)
 
 
-def write_kitti(path: Path, T_world_sensor: Poses) -> None:
-    """Write poses of shape (n, 4, 4) as 12 numbers a line, the rows of a 3x4 matrix."""
-    rows = T_world_sensor[:, :3].reshape(-1, 12)
-    write_text(path, "".join(" ".join(f"{v:.9e}" for v in row) + "\n" for row in rows))
-
-
 def is_kitti(path: Path) -> bool:
     """Whether a file's first pose is a matrix of 12 or 16 numbers, and has no stamp."""
     first: list[str] = next((fields for *_, fields in _lines(path) if fields), [])

@@ -11,7 +11,7 @@ the bare loop's time with one worker, 1.8 times faster with two, where two bare 
 
 *memory* lets a worker, which may keep 0.4 GB of prepared scans, run a trial on each of four caves,
 ROUNDS (4) times. Each cave makes room for the next one. It prints the worker's memory at the end,
-as a ratio to what it keeps, and its CPU time: as it is, and without `adaptune.processes.apart`.
+as a ratio to what it keeps, and its CPU time: as it is, and without `adaptune.machine.apart`.
 Limit: 2 times what it keeps.
 
 *size* runs a campaign of TRIALS (10,000) whose trials of 600 scans are random numbers, and prints
@@ -39,7 +39,7 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "tests" / "support"))
 
 import drives
 
-from adaptune import files
+from adaptune import yaml12
 from adaptune.archive import Archive, Frames
 from adaptune.odometry.keyframe import crop
 from adaptune.simulation.record import record
@@ -154,7 +154,7 @@ def memory(n: int) -> None:
         caves = {f"cave_{i}": {"scenes": ["cave"], "length": 40, "seed": i} for i in range(4)}
         odometry = {"name": "gicp"}
         study = {"odometry": odometry, "courses": caves, "training": list(caves)}
-        file.write_text(files.dump(study))
+        file.write_text(yaml12.dump(study))
         loaded = load_study(file, [], Path(temporary) / "caves")
         for name in caves:
             loaded.sequences.recording(name).parent.mkdir(parents=True, exist_ok=True)

@@ -30,7 +30,7 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "tests" / "support"))
 import kills
 import needs
 
-from adaptune import files
+from adaptune import yaml12
 from adaptune.odometry.docker.engine import OWNER, engine, is_orphan
 from adaptune.simulation import Course
 from adaptune.simulation.record import record
@@ -67,8 +67,8 @@ def study_file() -> Iterator[Path]:
             "common": {"points_topic": "/velodyne_points"},
             "gicp": {"max_correspondence_distance": 4.0, "downsampling": 0.5},
         }
-        (folder / "params.yaml").write_text(files.dump(template))
-        (folder / "study.yaml").write_text(files.dump(given))
+        (folder / "params.yaml").write_text(yaml12.dump(template))
+        (folder / "study.yaml").write_text(yaml12.dump(given))
         yield folder / "study.yaml"
 
 

@@ -34,19 +34,21 @@ import fuzz
 import local_link
 from random_models import random_model
 
-from adaptune import files, processes
-from adaptune.archive import Archive, Frames, Trial, rows
+from adaptune import processes, yaml12
+from adaptune.archive import Archive, Frames, Trial
 from adaptune.model import ErrorModel
 from adaptune.model.error_model import render
 from adaptune.odometry import wire
 from adaptune.odometry.docker.played_bag import PoseRecorder
-from adaptune.odometry.program import CommandSettings, Template, read_output
+from adaptune.odometry.program import CommandSettings, read_output
+from adaptune.odometry.template import Template
 from adaptune.recording import Scan, SequenceConfig
 from adaptune.recording.folder import read_scan
 from adaptune.recording.recording import open_sequence
 from adaptune.reference.stored import StoredEstimate
 from adaptune.selector import Selector
-from adaptune.trajectory import Trajectory, read_trajectory, write_kitti, write_tum
+from adaptune.trajectory import Trajectory, read_trajectory, write_tum
+from adaptune.trial_rows import rows
 
 BYTES = 3 << 30
 ODOMETRY = "nav_msgs/msg/Odometry"
@@ -82,7 +84,7 @@ def poses(n: int = len(STAMPS)) -> np.ndarray:
 def trajectories(folder: Path) -> fuzz.Case:
     """Files of poses: a reference, or what a program leaves."""
     write_tum(folder / "a.tum", Trajectory(STAMPS, poses()))
-    write_kitti(folder / "b.txt", poses())
+    np.savetxt(folder / "b.txt", poses()[:, :3].reshape(-1, 12))
     lines = ["#timestamp [ns],x,y,z,qw,qx,qy,qz"]
     lines += [f"{s},{x},0,0,1,0,0,0" for s, x in zip(STAMPS, poses()[:, 0, 3], strict=True)]
     (folder / "c.csv").write_text("\n".join(lines))
@@ -174,7 +176,7 @@ def estimate(folder: Path) -> fuzz.Case:
 def templates(folder: Path) -> fuzz.Case:
     """Parameter files of programs."""
     data = {"mapping": {"voxel": 1.0, "names": ["a", "b"]}, "rate": 10, "on": True}
-    (folder / "a.yaml").write_text(files.dump(data))
+    (folder / "a.yaml").write_text(yaml12.dump(data))
     (folder / "b.json").write_text(json.dumps(data))
 
     def read(path: Path) -> object:

@@ -26,7 +26,7 @@ from pathlib import Path
 import numpy as np
 from reading import cloud, write
 
-from adaptune import files, processes
+from adaptune import machine, yaml12
 from adaptune.bank.bank import Bank
 from adaptune.odometry.registry import OdometryFactory, odometry_class
 from adaptune.odometry.remote import Limits
@@ -80,7 +80,7 @@ def campaign(folder: Path, scans: int, points: int) -> float:
         "sub_trajectory": 5.0,
         "offline": {"trials": 2, "initial": 2, "batch": 2, "workers": 2},
     }
-    (folder / "study.yaml").write_text(files.dump(study))
+    (folder / "study.yaml").write_text(yaml12.dump(study))
     cache = folder / "cache"
     environment = os.environ | {"ADAPTUNE_CACHE": str(cache)}
     command = [sys.executable, "-m", "adaptune", "offline", "study.yaml"]
@@ -115,7 +115,7 @@ def length(sizes: list[int], points: int, scratch: Path | None) -> None:
 
 def members(scans: int) -> None:
     """Print what banks of several sizes take."""
-    processes.pin(0)
+    machine.pin(0)
     street = list(islice(simulate(Course(scenes=("street",), length=100.0, seed=1)), scans))
     space = odometry_class("gicp").space
     factory = OdometryFactory("gicp", {}, space, Limits())

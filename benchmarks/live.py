@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from adaptune import processes
+from adaptune import machine
 from adaptune.live.evidence import LiveEvidence
 from adaptune.odometry.base import InProcess
 from adaptune.odometry.keyframe import KeyframeGicp
@@ -56,7 +56,7 @@ def measure(name: str, scans: Iterable[Scan]) -> None:
 
 def main() -> None:
     """Measure on recorded and on simulated scans."""
-    processes.pin(1)
+    machine.pin(1)
     bag = Path(os.environ["ADAPTUNE_TEST_DATA"]) / "town.bag"
     measure("town.bag", open_sequence(SequenceConfig(bag=str(bag), points="/velodyne_points")))
     for scene in ("cave", "street"):

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import small_gicp
 
-from adaptune import files, processes
+from adaptune import machine, open3d
 from adaptune.geometry import Poses
 from adaptune.metrics import sub_trajectory_rte
 from adaptune.odometry.base import InProcess, OdometryInstance
@@ -106,9 +106,9 @@ def own_time(name: str, scans: list[Scan]) -> tuple[Poses, float, float]:
     odometry: Any = odometry_class(name)()
     odometry.start(odometry.prepare(scans[0]), np.eye(4))
     originals = small_gicp.align, small_gicp.preprocess_points
-    registration = files.load().pipelines.registration
+    registration = open3d.load().pipelines.registration
     ndt = registration.registration_ndt
-    cloud = files.load().geometry.PointCloud
+    cloud = open3d.load().geometry.PointCloud
     downsample = cloud.voxel_down_sample
     small_gicp.align, small_gicp.preprocess_points = map(clock.wrap, originals)
     registration.registration_ndt = clock.wrap(ndt)
@@ -155,7 +155,7 @@ def adapters(path: Path, length: float) -> None:
 
 
 if __name__ == "__main__":
-    processes.pin(1)
+    machine.pin(1)
     if len(sys.argv) in (3, 4) and sys.argv[1] == "adapters":
         adapters(Path(sys.argv[2]), float(sys.argv[3]) if len(sys.argv) == 4 else LENGTH)
     else:

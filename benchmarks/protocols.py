@@ -31,11 +31,11 @@ from adaptune.recording.compensation import compensate
 from adaptune.recording.config import SequenceConfig
 from adaptune.recording.export import write_kitti_sequence
 from adaptune.recording.folder import ELEVATION, turn_up
+from adaptune.recording.parts import read_part
 from adaptune.recording.recording import open_sequence
-from adaptune.recording.scan import Scan, read_part
+from adaptune.recording.scan import Scan
 from adaptune.simulation import Course
 from adaptune.simulation.record import Drive, SimulatedScan, record
-from adaptune.trajectory import write_kitti
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 
@@ -142,9 +142,9 @@ def write_sequence(root: Path, name: str, scans: Iterable[tuple[Scan, Poses]]) -
     with tempfile.TemporaryDirectory(prefix=".making.", dir=root) as made:
         new = Path(made)
         write_kitti_sequence(seen(), new, name)
-        write_kitti(
-            new / "poses" / f"{name}.txt", invert(T_world_lidar[0]) @ np.array(T_world_lidar)
-        )
+        T = invert(T_world_lidar[0]) @ np.array(T_world_lidar)
+        (new / "poses").mkdir()
+        np.savetxt(new / "poses" / f"{name}.txt", T[:, :3].reshape(-1, 12), fmt="%.9e")
         # The scans last: a sequence that is there has its poses.
         for file in (f"poses/{name}.txt", f"sequences/{name}"):
             (new / file).rename(root / file)

@@ -26,7 +26,7 @@ from pathlib import Path
 
 import numpy as np
 
-from adaptune import processes
+from adaptune import machine
 from adaptune.bank.bank import Bank
 from adaptune.model import ErrorModel
 from adaptune.model.descriptor import lowest_elevation
@@ -147,7 +147,7 @@ def main() -> None:
     )
     parser.add_argument("--seconds", type=float, default=60.0, help="of the replay in real time")
     seconds = parser.parse_args().seconds
-    pinned = processes.pin(0, alone=True)
+    pinned = machine.pin(0, alone=True)
     lockstep(Path(os.environ["ADAPTUNE_TEST_DATA"]) / "street.bag")
     spread_bank(list(simulate(Course(scenes=("street",), length=40.0, seed=1))))
     in_real_time(

@@ -33,11 +33,11 @@ from pathlib import Path
 
 import numpy as np
 
-from adaptune import files, processes
+from adaptune import machine, yaml12
 from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
 from adaptune.recording.config import ESTIMATED
-from adaptune.recording.scan import part_name, read_part
+from adaptune.recording.parts import part_name, read_part
 from adaptune.report import tables
 from adaptune.study.config import ALSO
 from offline.config import OfflineStudy, load_study
@@ -214,7 +214,7 @@ def main() -> None:
     given = parser.parse_args()
     if "ADAPTUNE_TEST_DATA" not in os.environ:
         sys.exit("ADAPTUNE_TEST_DATA does not name the folder of the recordings")
-    processes.pin(os.getpid())
+    machine.pin(os.getpid())
     given.folder.mkdir(parents=True, exist_ok=True)
     for odometry in given.odometries:
         ratios: dict[str, list[float]] = {mode: [] for mode in (*MODES, *given.also)}
@@ -239,7 +239,7 @@ def directed(given: argparse.Namespace, odometry: str, name: str) -> list[Compar
         no_reference=given.no_reference,
         also=given.also,
     )
-    write_text(path, files.dump(defined))
+    write_text(path, yaml12.dump(defined))
     begin = time.perf_counter()
     try:
         rows = run(load_study(path, folder=folder), given.folder / "references")

@@ -32,7 +32,7 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "tests" / "support"))
 
 from made_drives import trials_of
 
-from adaptune import processes
+from adaptune import machine
 from adaptune.archive import Frames
 from adaptune.report import tables
 from adaptune.report.charts import Axis, Band, Chart, Drawn, Line, Panel
@@ -265,7 +265,7 @@ def thesis(folder: Path, png: Path, names: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    processes.pin(0)
+    machine.pin(0)
     what, *more = sys.argv[1:] or [""]
     with tempfile.TemporaryDirectory() as made:
         if what == "functions":

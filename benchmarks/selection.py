@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from sklearn.neighbors import KNeighborsRegressor
 from threadpoolctl import threadpool_limits
 
-from adaptune import processes
+from adaptune import machine
 from adaptune.model import (
     BankRule,
     BankSettings,
@@ -227,7 +227,7 @@ def draw_growth(path: Path, n_sets: int = 64, n_sequences: int = 16) -> None:
 
 def main(png: Path | None) -> None:
     """Measure everything."""
-    processes.pin(1)
+    machine.pin(1)
     threadpool_limits(1)
     with tempfile.TemporaryDirectory() as folder:
         print(f"256 sets a sequence, {len(LENGTHS)} sequences")

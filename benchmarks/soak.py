@@ -22,8 +22,8 @@ from typing import Any
 import numpy as np
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from adaptune import files
-from adaptune.processes import resident_megabytes
+from adaptune import yaml12
+from adaptune.machine import resident_megabytes
 from adaptune.recording.scan import Scan
 from adaptune.simulation import Course
 from adaptune.simulation.record import simulate
@@ -131,7 +131,7 @@ def main(folder: Path, hours: float) -> None:
     logging.disable(logging.WARNING)
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / "soak.yaml"
-    path.write_text(files.dump(STUDY))
+    path.write_text(yaml12.dump(STUDY))
     study = load_study(path, folder=folder / "run")
     course = Course(scenes=("street",), length=60.0, seed=3, rate=RATE)
     scans = [thinned(scan) for scan in simulate(course)]

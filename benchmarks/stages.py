@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import small_gicp
 
-from adaptune import processes
+from adaptune import machine
 from adaptune.geometry import Poses
 from adaptune.metrics import sub_trajectory_rte
 from adaptune.model import ErrorModel
@@ -157,7 +157,7 @@ def adaptive_replay(study: OfflineStudy, model: ErrorModel) -> None:
 
 def main(folder: Path) -> None:
     """Measure everything."""
-    processes.pin(0)
+    machine.pin(0)
     bag = str(folder / "hilti_2022_scan.bag")
     points = next(iter(open_sequence(SequenceConfig(bag=bag)))).points
     rng = np.random.default_rng(0)

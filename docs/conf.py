@@ -38,7 +38,7 @@ LINK = re.compile(r"\]\(([\w/-]+)\.md[#)]")
 OBJECTS = """
 adaptune.recording: Scan Imu SequenceConfig
 adaptune.recording.recording: open_sequence
-adaptune.trajectory: Trajectory read_trajectory read_tum write_tum read_kitti write_kitti
+adaptune.trajectory: Trajectory read_trajectory read_tum write_tum read_kitti
 adaptune.metrics: sub_trajectory_rte kitti_error absolute_error relative_error
 adaptune.space: Float Integer Categorical ParameterSpace ParameterSets Selection
 adaptune.odometry: Odometry Registration InProcess

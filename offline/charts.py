@@ -1,122 +1,33 @@
 """Charts of the offline stage: of trials, and of what was left out."""
 
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune.archive import Archive, Summary
 from adaptune.errors import AdaptuneError
 from adaptune.report.charts import (
     Axis,
     Band,
-    Bars,
     Chart,
     Charts,
     Drawn,
     Line,
     Panel,
     Points,
+    Words,
     charts_of,
 )
-from adaptune.space import ODOMETRY, Categorical, Float, Integer, ParameterSet, ParameterSpace
+from adaptune.space import Categorical, Float, Integer
 from adaptune.space import label as parameter_label
-from offline.config import OfflineConfig, OfflineStudy, distribution
-from offline.objective import judge, label, weighted
+from offline.config import OfflineStudy
+from offline.trial_table import FEW, TrialTable, importances, read_trials
 from offline.tuning import figures
 
-
-class TriedSet(NamedTuple):
-    """A parameter set, and how it did in its trials."""
-
-    number: int
-    parameters: ParameterSet
-    by_sequence: Mapping[str, float]  # the objective on the sequences on which it was run
-    value: float  # its mean over all training sequences, NaN if not run on all
-    usable: bool  # whether it may be chosen
-    cost: float  # milliseconds of CPU time a scan, NaN if unknown
-
-
-@dataclass(frozen=True, eq=False)
-class TrialTable:
-    """Trials, in the order of their numbers."""
-
-    space: ParameterSpace
-    names: Sequence[str]  # of the training sequences
-    trials: Sequence[TriedSet]
-    objective: str = "RTE [%]"  # name of the objective, with its unit
-    fixed: int | None = None  # trial number of the fixed set, once it is chosen
-
-    def __len__(self) -> int:
-        return len(self.trials)
-
-    @cached_property
-    def numbers(self) -> NDArray[np.int64]:
-        """Their numbers, of shape (n,)."""
-        return np.array([trial.number for trial in self.trials], int)
-
-    @cached_property
-    def values(self) -> NDArray[np.float64]:
-        """See `TriedSet`, of shape (n,)."""
-        return np.array([trial.value for trial in self.trials])
-
-    def on(self, name: str) -> NDArray[np.float64]:
-        """The objective on a sequence, of shape (n,); NaN where a trial was not run."""
-        return np.array([trial.by_sequence.get(name, np.nan) for trial in self.trials])
-
-    def column(self, name: str) -> list[Any]:
-        """Values of one of `space.parameters`; None where a set has none."""
-        return [self.space.flat(trial.parameters).get(name) for trial in self.trials]
-
-    def some(self, kept: Iterable[bool | np.bool_]) -> "TrialTable":
-        """The same of some of the trials."""
-        few = [trial for trial, its in zip(self.trials, kept, strict=True) if its]
-        return replace(self, trials=few)
-
-    def odometries(self) -> dict[str, "TrialTable"]:
-        """By the name of an odometry its trials; of the only one by no name."""
-        names = [str(trial.parameters.get(ODOMETRY, "")) for trial in self.trials]
-        return {name: self.some(own == name for own in names) for name in dict.fromkeys(names)}
-
-
-def read_trials(study: OfflineStudy) -> TrialTable:
-    """Read the finished trials of a study on its training sequences; there may be none."""
-    archive = Archive(study.folder / "trials")
-    finished = {name: archive.finished(name) for name in study.training}
-    return trial_table(study.config.offline, study.odometry.space, finished, study.fixed)
-
-
-def trial_table(
-    config: OfflineConfig,
-    space: ParameterSpace,
-    finished: Mapping[str, Mapping[int, Summary]],
-    fixed: ParameterSet | None = None,
-) -> TrialTable:
-    """Finished trials as columns: by training sequence, `finished` has them by their numbers.
-
-    Of `config`, the objective counts; `fixed` is the fixed set, once chosen.
-    """
-    objective, trials = config.objective, []
-    for number in sorted({number for of_sequence in finished.values() for number in of_sequence}):
-        runs = {name: of[number] for name, of in finished.items() if number in of}
-        verdict = judge(config, list(runs.values()))
-        by_sequence = {name: weighted(objective, run.metrics) for name, run in runs.items()}
-        value = verdict.value if len(runs) == len(finished) else np.nan
-        cost = float(np.mean([run.cost for run in runs.values()]))
-        about = (number, verdict.parameters, by_sequence, value, not verdict.failure, cost)
-        trials.append(TriedSet(*about))
-    named = "RTE [%]" if objective == {"rte": 1.0} else label(objective, units=True)
-    chosen = next((trial.number for trial in trials if trial.parameters == fixed), None)
-    return TrialTable(space, list(finished), trials, named, chosen)
-
-
-FEW = 8
-"""With fewer trials, importances mean nothing."""
 MOST_PANELS = 12
 """Panels of a chart; further sequences are not shown."""
 _COLOURED = 4.0
@@ -145,7 +56,7 @@ def scatter_chart(
         log = bool((of[kept] > 0.0).all())
         # The worst would take nearly all colours.
         colour = np.minimum(of[kept], _COLOURED * of[kept].min()) if log else of[kept]
-        drawn: list[Drawn] = [Points(x, y, "trial", colour, label, log_colour=log)]
+        drawn: list[Drawn] = [Points(x, y, "trial", colour, label)]
         best = int(of[kept].argmin())
         drawn.append(Points(x[[best]], y[[best]], "best trial here", shape="diamond"))
         drawn += _marked(table, xy[0], xy[1])
@@ -196,29 +107,67 @@ def iteration_chart(table: TrialTable) -> Chart | None:
     )
 
 
-def cost_chart(table: TrialTable) -> Chart | None:
-    """Error over CPU time of all trials, with their Pareto front."""
-    table = table.some(np.isfinite(trial.value + trial.cost) for trial in table.trials)
-    if len(table) < 2:
+MARKED = ("recommended", "bank", "fixed", "baseline")
+"""What is marked and named on the front: what is recommended, and what is called so."""
+
+
+def front_chart(rows: Sequence[Mapping[str, Any]], label: str = "error [%]") -> Chart | None:
+    """Error over CPU time of all that was tried, and the front: less error only at more cost.
+
+    Rows have ``what`` (a name), ``cost [ms]``, ``error [%]``, its interval as ``low`` and ``high``,
+    which may be None, and ``recommended``. See `MARKED`; `label` is that of the errors.
+    """
+    keys = "cost [ms]", "error [%]", "low", "high"
+    values = np.array([[row[key] for key in keys] for row in rows], float).reshape(-1, 4)
+    kept = (values[:, :2] > 0.0).all(axis=1) & np.isfinite(values[:, :2]).all(axis=1)
+    if kept.sum() < 2:
         return None
-    costs = np.array([trial.cost for trial in table.trials])
-    order = np.lexsort((table.values, costs))
-    least = np.minimum.accumulate(table.values[order])
+    rows, values = [rows[i] for i in np.flatnonzero(kept).tolist()], values[kept]
+    costs, errors, low, high = values.T
+    order = np.lexsort((errors, costs))
+    least = np.minimum.accumulate(errors[order])
     front = order[np.diff(least, prepend=np.inf) < 0.0]
-    drawn = (
-        Points(costs, table.values, "trial", texts=[f"trial {n}" for n in table.numbers]),
-        Line(costs[front], table.values[front], "Pareto front", steps=True),
-        *_marked(table, costs, table.values),
-    )
-    log = bool((table.values > 0.0).all())
-    x, y = Axis("CPU time a scan [ms]", log=True), Axis(table.objective, log)
+    kinds = [
+        "recommended" if row["recommended"] else str(row["what"]).partition(" ")[0] for row in rows
+    ]
+    marked = {kind: np.flatnonzero([k == kind for k in kinds]) for kind in MARKED}
+    named = np.concatenate([*marked.values()])
+    texts = np.array([str(row["what"]) for row in rows], object)
+    drawn: list[Drawn] = [
+        Points(costs, errors, "tried", texts=texts, faint=True),
+        Line(costs[front], errors[front], "front", steps=True),
+    ]
+    if np.isfinite([low[named], high[named]]).any():
+        ends = np.column_stack([low, high, np.full(len(rows), np.nan)])[named]
+        drawn.append(Line(np.repeat(costs[named], 3), ends.ravel(), "95 % interval"))
+    for kind, at in marked.items():
+        drawn += [Points(costs[at], errors[at], kind, texts=texts[at])] if len(at) else []
+    drawn.append(Words(costs[named], errors[named], texts[named]))
+    x, y = Axis("CPU time a scan [ms]", log=True), Axis(label, log=True)
     return Chart(
-        "cost",
-        "Error over cost of the trials",
-        (Panel(x, y, drawn),),
-        "Each point is a trial, in the mean over the training sequences. No trial has less of both "
-        "than those on the Pareto front.",
+        "front",
+        "Error over cost of all that was tried",
+        (Panel(x, y, tuple(drawn), height=1.3),),
+        "Nothing that was tried has both less error and less cost than what lies on the front. "
+        "Right of where the front is flat, CPU time buys nothing.",
     )
+
+
+def front_rows(table: TrialTable) -> list[dict[str, Any]]:
+    """The rows of `front_chart` for the trials that may be chosen, in the mean over sequences."""
+    names = {table.fixed: "fixed", 0: "baseline"}
+    return [
+        {
+            "what": names.get(trial.number, f"trial {trial.number}"),
+            "cost [ms]": trial.cost,
+            "error [%]": trial.value,
+            "recommended": False,
+            "low": None,
+            "high": None,
+        }
+        for trial in table.trials
+        if trial.usable
+    ]
 
 
 Parameter = Float | Integer | Categorical
@@ -237,55 +186,16 @@ def on_axis(values: Sequence[Any], parameter: Parameter) -> NDArray[np.float64]:
     return np.array([np.nan if value is None else at(value) for value in values], np.float64)
 
 
-FOREST: Any = {"n_trees": 16, "max_depth": 8, "seed": 0}
-"""Size of the forest, which bounds the time that it takes."""
-
-
-def importances(table: TrialTable) -> dict[str, float]:
-    """Share of each parameter in the variance of the error's logarithm, by falling share.
-
-    It is functional ANOVA, Optuna's default, on a small forest: Optuna's own takes minutes for some
-    thousand trials, and gives the same shares. The trials are of one odometry. There is none with
-    fewer than `FEW` finished trials, one parameter, or equal errors.
-    """
-    known = table.some(np.isfinite(table.values) & (table.values > 0.0))
-    parameters = {
-        name: p
-        for name, p in table.space.parameters.items()
-        if all(value is not None for value in known.column(name))
-        and len(set(map(repr, known.column(name)))) > 1
-    }
-    logs = np.log(known.values)
-    if len(known) < FEW or len(parameters) < 2 or np.ptp(logs) < 1e-9:
-        return {}
-    import optuna
-
-    optuna.logging.set_verbosity(optuna.logging.WARNING)
-    distributions = {name: distribution(p) for name, p in parameters.items()}
-    columns = {name: known.column(name) for name in parameters}
-    study = optuna.create_study()
-    study.add_trials(
-        optuna.trial.create_trial(
-            params={name: column[i] for name, column in columns.items()},
-            distributions=distributions,
-            value=float(log),
-        )
-        for i, log in enumerate(logs)
-    )
-    evaluator = optuna.importance.FanovaImportanceEvaluator(**FOREST)
-    found = optuna.importance.get_param_importances(study, evaluator=evaluator)
-    return {name: float(share) for name, share in found.items()}
-
-
 def importance_chart(by_odometry: Mapping[str, Mapping[str, float]]) -> Chart | None:
     """What `importances` found, a panel for each odometry; "" if there is only one."""
     panels = []
     for odometry, shares in by_odometry.items():
         if not shares:
             continue
-        names = tuple(reversed(list(shares)))
-        percent = [100.0 * shares[name] for name in names]
-        bars = Bars(percent, "")
+        rising = list(shares.items())[::-1]
+        names = tuple(f"{name} ({100.0 * share:.0f}\u00a0%)" for name, share in rising)
+        ends = [(0.0, 100.0 * share, np.nan) for _, share in rising]
+        bars = Line(np.ravel(ends), np.repeat(range(len(names)), 3), "", width=24.0)
         x = Axis("share of the error's variance [%]", limits=(0.0, 100.0))
         panels.append(Panel(x, Axis("", names=names), (bars,), odometry))
     if not panels:
@@ -367,7 +277,7 @@ def _of_trials(table: TrialTable) -> Iterator[Chart | str | None]:
             key, title = f"{chart.key}-{odometry}", f"{odometry}: {chart.title}"
             chart = replace(chart, key=key, title=title)
         yield chart
-    yield cost_chart(table)
+    yield front_chart(front_rows(table), table.objective)
 
 
 def most_important(table: TrialTable, shares: Mapping[str, float]) -> list[str]:

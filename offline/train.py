@@ -8,15 +8,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from adaptune import __version__, files, manifest
+from adaptune import __version__, manifest, yaml12
 from adaptune.archive import Archive
 from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
+from adaptune.machine import available
 from adaptune.metrics import cap, lost_in_words
 from adaptune.model import ErrorModel, ModelError
 from adaptune.model.rules import BASELINE, complementary, mean_errors
 from adaptune.odometry.registry import ODOMETRIES, PROGRAMS
-from adaptune.processes import available
 from adaptune.progress import Progress, unseen
 from adaptune.recording.config import NO_REFERENCE
 from adaptune.reference.check import hard_to_track
@@ -236,7 +236,7 @@ def write_fixed(study: OfflineStudy, fixed: ParameterSet) -> None:
     for path in study.folder.glob("fixed_*"):
         if path.stem in ours and (own is None or path != own[0]):
             path.unlink()
-    write_text(study.folder / FIXED_SET, files.dump(fixed))
+    write_text(study.folder / FIXED_SET, yaml12.dump(fixed))
     if own is not None:
         write_text(own[0], own[1].text)
 

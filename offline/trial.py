@@ -15,6 +15,7 @@ from adaptune.archive import FIRST_POSE, PREPARE_MS, REGISTER_MS, Frames, Trial
 from adaptune.errors import AdaptuneError, MachineError, UnavailableError, in_a_line
 from adaptune.geometry import Poses, invert, scale
 from adaptune.live.evidence import hops_along
+from adaptune.machine import apart
 from adaptune.metrics import KITTI_LENGTHS, cap, sub_trajectory_rte, travelled, window_ends
 from adaptune.model.descriptor import (
     Describer,
@@ -23,17 +24,11 @@ from adaptune.model.descriptor import (
     lowest_elevation,
     speed_and_turn_rate,
 )
-from adaptune.odometry.base import (
-    MAX_SHARE_WITHOUT_POSE,
-    MIN_POINTS,
-    MOST_FAULTS,
-    OdometryInstance,
-    Usage,
-    prepared_bytes,
-)
+from adaptune.odometry.base import MIN_POINTS, OdometryInstance, Usage
+from adaptune.odometry.faults import MAX_SHARE_WITHOUT_POSE, MOST_FAULTS
+from adaptune.odometry.prepared import prepared_bytes
 from adaptune.odometry.registry import Factory
 from adaptune.odometry.tracker import HealthCheck, Tracker
-from adaptune.processes import apart
 from adaptune.progress import Progress, unseen
 from adaptune.recording.scan import Recording, Scan, SequenceError
 from adaptune.space import ParameterSet

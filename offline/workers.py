@@ -20,7 +20,9 @@ import numpy as np
 from adaptune import __version__
 from adaptune.archive import Frames
 from adaptune.errors import OUT_OF_MEMORY, AdaptuneError, MachineError, in_a_line, lacking
-from adaptune.processes import end_with_parent, fork_server, how_it_ended, pin
+from adaptune.forking import end_with_parent, fork_server
+from adaptune.machine import pin
+from adaptune.processes import how_it_ended
 from adaptune.progress import Progress, unseen
 from adaptune.recording.cache import fingerprints
 from adaptune.recording.scan import Recording

@@ -1,15 +1,12 @@
 """Charts of the online stage: of a comparison, and of the replays of a sequence."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune.geometry import invert
-from adaptune.metrics import travelled
-from adaptune.model import ErrorModel
 from adaptune.report.charts import (
     Axis,
     Band,
@@ -17,25 +14,18 @@ from adaptune.report.charts import (
     Charts,
     Drawn,
     Line,
-    Mark,
     Panel,
     Points,
-    Shares,
     Spans,
     Words,
     charts_of,
+    shares,
 )
 from adaptune.report.drawing import plain
-from adaptune.space import ParameterSpace
-from adaptune.study.study import Study, StudySequences, named
-from adaptune.trajectory import Trajectory, read_tum
-from online.compare import current_replays
-from online.modes import ADAPTIVE, BASELINE, FIXED, UNTRAINED, WITHOUT_MODEL
-from online.record import StoredReplay, check_reference, switched
-from online.statistics import ALL, ComparisonRow, Reference
-
-# The chart of a comparison: the ratio of each mode's error, over all sequences and on each.
-
+from online.modes import ADAPTIVE, BASELINE, FIXED, WITHOUT_MODEL
+from online.record import switched
+from online.replayed import ModeReplay, ReplayedSequence
+from online.statistics import ALL, ComparisonRow
 
 _LINE, _BELOW = 0.12, 0.3
 """Height of a mode's line, and by which share of it the ratios on each sequence lie lower."""
@@ -57,7 +47,7 @@ def comparison_chart(rows: Sequence[ComparisonRow]) -> Chart | None:
         texts = [f"{row.mode}, {row.sequence}" for row in some]
         return Points(ratios, places, name, texts=texts, **look)
 
-    drawn: list[Drawn] = [Mark(1.0)]
+    drawn: list[Drawn] = [Line([1.0, 1.0], [-0.6, len(modes) - 0.4], "", dashed=True, width=1.0)]
     ends = [(*row.ratio_interval, i) for i, row in enumerate(last) if row.ratio_interval]
     if ends:
         x = [value for low, high, _ in ends for value in (low, high, np.nan)]
@@ -78,164 +68,6 @@ def comparison_chart(rows: Sequence[ComparisonRow]) -> Chart | None:
         f"error is at the top. Intervals are shown where the recordings are long enough, or many "
         f"enough." + (" Below each mean are the ratios on each sequence." if several else ""),
     )
-
-
-# Where on a recording of a simulated course which scene is.
-
-
-def scene_spans(
-    legs: Sequence[tuple[str, float]], driven: Trajectory, stamps: NDArray[np.int64]
-) -> Spans:
-    """The scenes of a drive, as stretches of its time.
-
-    Metres of the road become time by the path that was driven. It is a little longer than the road,
-    because the vehicle strays and shakes: it is scaled to the road's length.
-
-    Parameters
-    ----------
-    legs
-        Name and metres of each scene, in driving order.
-    driven
-        True poses of the whole drive.
-    stamps
-        Of the scans that are shown, nanoseconds: they may be a part of the drive. Edges are seconds
-        since the first of them.
-    """
-    along = travelled(driven.T_world_sensor)
-    names, metres = zip(*legs, strict=True)
-    ends = np.cumsum([0.0, *metres])
-    path = along / max(float(along[-1]), 1e-9) * ends[-1]
-    seconds = (driven.stamps - stamps[0]) * 1e-9
-    edges = np.interp(ends, path, seconds)
-    edges[-1] = max(edges[-1], seconds[-1])
-    begin, end = 0.0, float(stamps[-1] - stamps[0]) * 1e-9
-    shown = [i for i in range(len(names)) if edges[i] < end and edges[i + 1] > begin]
-    kept = np.clip(edges[[*shown, shown[-1] + 1]], begin, end)
-    return Spans(kept, tuple(names[i] for i in shown))
-
-
-# The replays of a sequence in all modes that there are, as charts need them.
-
-
-class ModeReplay(NamedTuple):
-    """Errors and selections of one mode along a sequence: n scans, m selections."""
-
-    seconds: NDArray[np.float64]  # since the first scan, of shape (n,)
-    errors: NDArray[np.float64]  # sub-trajectory RTE in percent, of shape (n,)
-    errors_around: NDArray[np.float64]  # the mean of those through each place
-    errors_behind: NDArray[np.float64]  # the mean of those that ended in the last 30 s
-    restarted: NDArray[np.bool_]  # of shape (n,)
-    choice_seconds: NDArray[np.float64]  # of shape (m,)
-    choices: Mapping[str, Sequence[Any]]  # for every parameter its values, of shape (m,)
-    weights: Mapping[str, Sequence[float]]  # in a bank by member instead, of shape (m,)
-    # Of shape (m, 3): percent, the error that was estimated while driving, and the ends of its
-    # interval; NaN where there is none.
-    estimated: NDArray[np.float64]
-    lost: NDArray[np.bool_]  # of shape (m,): whether the bank was lost
-    places: NDArray[np.float64]  # (n, 2): metres, by the reference where there is one
-
-    @property
-    def span(self) -> NDArray[np.float64]:
-        """When each choice was made, and the end, until which the last one holds."""
-        return np.append(self.choice_seconds, self.seconds[-1])
-
-    @property
-    def adapts(self) -> bool:
-        """Whether anything was selected along the way."""
-        return len(self.choice_seconds) > 1
-
-
-@dataclass(frozen=True, eq=False)
-class ReplayedSequence:
-    """The replays of a sequence."""
-
-    name: str
-    length: float  # metres of a sub-trajectory
-    modes: Mapping[str, ModeReplay]  # in the order in which lines lie on each other
-    space: ParameterSpace
-    scenes: Spans | None = None  # of a simulated course
-    estimated: bool = False  # whether the reference was computed from the recording
-    refused: Sequence[str] = ()  # sentences about replays that are not among them
-
-
-def read_replays(study: Study, name: str) -> ReplayedSequence:
-    """Read the replays of a sequence that are finished and drawn; there may be none.
-
-    Those that `compare` refuses are not, see `online.compare.current_replays`.
-
-    Raises
-    ------
-    AdaptuneError
-        If a file is damaged, or if `compare` refuses all of them.
-    """
-    folder, length = study.folder / "replays" / name, study.config.sub_trajectory
-    reference = Reference.read(study, name)
-    current = current_replays(study, [name])
-    if current.modes:
-        check_reference(folder, study.sequences.reference(name))
-    replays = {mode: StoredReplay.read(folder / mode) for mode in current.modes}
-    modes = {mode: _read_mode(replay, reference, current.model) for mode, replay in replays.items()}
-    scenes = None
-    if replays:
-        stamps = next(iter(replays.values())).trajectory.stamps
-        scenes = scenes_along(study.sequences, name, stamps)
-    return ReplayedSequence(
-        name,
-        length,
-        modes,
-        study.odometry.space,
-        scenes,
-        reference.estimated,
-        current.refused,
-    )
-
-
-def scenes_along(sequences: StudySequences, name: str, stamps: NDArray[np.int64]) -> Spans | None:
-    """The scenes of a simulated course at scans of these stamps; None of another recording."""
-    course = sequences.courses.get(name)
-    if course is None:
-        return None
-    path = sequences.recording(name).with_suffix(".tum")
-    return scene_spans(course.legs, read_tum(path), stamps) if path.exists() else None
-
-
-def _read_mode(replay: StoredReplay, reference: Reference, model: ErrorModel | None) -> ModeReplay:
-    """Read a replay; `model` names the members of a bank."""
-    stamps, truth = replay.trajectory.stamps, reference.trajectory
-    places = _seen_from(replay.trajectory)
-    if truth is not None and len(known := np.flatnonzero(np.isin(stamps, truth.stamps))):
-        places = np.full((len(stamps), 2), np.nan)
-        places[known] = _seen_from(truth)[np.searchsorted(truth.stamps, stamps[known])]
-    return ModeReplay(
-        (stamps - stamps[0]) * 1e-9,
-        reference.errors(replay.trajectory),
-        reference.errors_around(replay.trajectory),
-        reference.errors_behind(replay.trajectory),
-        replay.restarted,
-        np.asarray((replay.choice_stamps - stamps[0]) * 1e-9),
-        replay.choices,
-        {_member(replay, model, number): of for number, of in replay.weights.items()},
-        replay.estimated,
-        replay.lost,
-        places,
-    )
-
-
-def _member(replay: StoredReplay, model: ErrorModel | None, number: int) -> str:
-    """What a member of a bank is called. Those of a bank without a model are no trials."""
-    if replay.summary.inputs["mode"] == UNTRAINED:
-        return f"untrained set {number}" if number else BASELINE
-    if model is None or number not in model.sets:
-        return f"trial {number}"
-    if number == model.fixed:
-        return FIXED
-    return BASELINE if (name := named(model, number)) == "0" else f"trial {name}"
-
-
-def _seen_from(trajectory: Trajectory) -> NDArray[np.float64]:
-    """Positions in the plane of the sensor at the first pose: x forward, y to the left."""
-    T = trajectory.T_world_sensor
-    return np.asarray((invert(T[0]) @ T)[:, :2, 3])
 
 
 TIME = Axis("time [s]")
@@ -358,23 +190,20 @@ def _place(value: Any, names: tuple[str, ...] | None) -> float:
 
 def _weights(replayed: ReplayedSequence) -> Iterator[Panel]:
     for mode, track in replayed.modes.items():
-        shares = 100.0 * np.array(list(track.weights.values()))
-        if len(shares) < 2 or not np.ptp(shares, axis=1).any():
+        parts = 100.0 * np.array(list(track.weights.values()))
+        if len(parts) < 2 or not np.ptp(parts, axis=1).any():
             continue  # they never change
-        shares = np.column_stack([shares, shares[:, -1]])
+        parts = np.column_stack([parts, parts[:, -1]])
         # Shares hide what is shaded.
         ends = [] if replayed.scenes is None else replayed.scenes.edges[1:-1]
-        edges = (Mark(float(edge)) for edge in ends)
-        drawn = (*_scenes(replayed), Shares(track.span, shares, tuple(track.weights)), *edges)
+        edges = (Line([edge] * 2, [0.0, 100.0], "", dashed=True, width=1.0) for edge in ends)
+        drawn = (*_scenes(replayed), *shares(track.span, parts, track.weights), *edges)
         y = Axis("weight [%]", limits=(0.0, 100.0))
         yield Panel(TIME, y, drawn, f"{mode} applies a bank: weights of its members")
 
 
 def _scenes(replayed: ReplayedSequence) -> list[Drawn]:
     return [] if replayed.scenes is None else [replayed.scenes]
-
-
-# The picture of a comparison: a sequence at a glance.
 
 
 def charts_of_comparison(

@@ -18,7 +18,8 @@ from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses, to_quaternions
 from adaptune.recording.clouds import CLOUDS, from_fields, header_of, message_stamp
 from adaptune.recording.config import ImuConfig
-from adaptune.recording.scan import Imu, Scan, Timing
+from adaptune.recording.scan import Imu, Scan
+from adaptune.recording.timing import Timing
 from adaptune.ros.link import LinkError, RosLink
 from adaptune.selector import BACK
 from adaptune.space import Selection

@@ -12,14 +12,15 @@ from typing import Any, NamedTuple, Self
 from adaptune import manifest
 from adaptune.bank.bank import WARM_UP, Bank
 from adaptune.errors import AdaptuneError, Finding
+from adaptune.machine import release_memory, shared_cores
 from adaptune.model import ErrorModel
 from adaptune.model.descriptor import DescriptorError
 from adaptune.model.weights import weighted_selection
 from adaptune.odometry.base import Motions, OdometryInstance
 from adaptune.odometry.registry import Factory
-from adaptune.processes import release_memory, shared_cores
 from adaptune.progress import Progress, unseen
-from adaptune.recording.scan import Recording, Scan, part_name
+from adaptune.recording.parts import part_name
+from adaptune.recording.scan import Recording, Scan
 from adaptune.reference.check import mean_difference
 from adaptune.selector import AnySelector, Selector, UntrainedSelector, untrained_sets
 from adaptune.space import ParameterSet, ParameterSets, Selection

@@ -19,9 +19,10 @@ from numpy.typing import NDArray
 
 from adaptune.bank.bank import CLOCK, Bank, Clock
 from adaptune.errors import AdaptuneError
+from adaptune.forking import fork_server
+from adaptune.machine import shared_cores
 from adaptune.odometry.base import Motions, OdometryInstance
 from adaptune.odometry.tracker import HealthCheck, RegisteredScan
-from adaptune.processes import fork_server, shared_cores
 from adaptune.recording.scan import Imu, Scan, joined
 from adaptune.selector import BACK, AnySelector, Schedule, TimedSelector
 from adaptune.space import Selection

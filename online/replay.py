@@ -13,10 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptune.errors import AdaptuneError
+from adaptune.machine import resident_megabytes
 from adaptune.model.rules import BASELINE
-from adaptune.odometry.base import MAX_SHARE_WITHOUT_POSE, OdometryInstance, Usage
+from adaptune.odometry.base import OdometryInstance, Usage
+from adaptune.odometry.faults import MAX_SHARE_WITHOUT_POSE
 from adaptune.odometry.tracker import HealthCheck, RegisteredScan, Tracker
-from adaptune.processes import resident_megabytes
 from adaptune.recording.scan import Scan
 from adaptune.selector import REMEMBERED, SETTLING, AnySelector, Schedule, used_instead
 from adaptune.space import Selection

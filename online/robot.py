@@ -23,7 +23,8 @@ from adaptune.odometry.base import OdometryInstance, Registration
 from adaptune.odometry.tracker import RegisteredScan
 from adaptune.recording.clouds import POSES
 from adaptune.recording.config import ImuConfig, SequenceConfig
-from adaptune.recording.scan import Scan, Timing
+from adaptune.recording.scan import Scan
+from adaptune.recording.timing import Timing
 from adaptune.ros.link import LinkError, RosLink, Steering
 from adaptune.selector import BACK, Selector
 from adaptune.space import Selection

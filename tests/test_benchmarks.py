@@ -8,7 +8,7 @@ import pytest
 from needs import module_of
 from setups import failure
 
-from adaptune import files
+from adaptune import yaml12
 from adaptune.geometry import invert
 from adaptune.odometry.docker import rustle
 from adaptune.recording.config import SequenceConfig
@@ -37,7 +37,7 @@ def test_directions_of_recorded_data_are_studies(recorded, tmp_path, monkeypatch
     roles = {"training": set(), "test": set()}
     for name, direction in module.DIRECTIONS.items():
         path = tmp_path / f"{name}.yaml"
-        path.write_text(files.dump(module.definition(direction, "gicp", 3, 0)))
+        path.write_text(yaml12.dump(module.definition(direction, "gicp", 3, 0)))
         config = load_study(path, folder=tmp_path / name).config
         for role, names in roles.items():
             names.update(getattr(config, role))

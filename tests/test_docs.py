@@ -23,7 +23,7 @@ from needs import module_of
 from setups import setup_of
 from typer.main import get_command
 
-from adaptune import files
+from adaptune import yaml12
 from adaptune.commands.cli import app
 from adaptune.model import BankSettings, PairedSettings
 from adaptune.odometry.registry import declare_here
@@ -271,7 +271,7 @@ def test_yaml_is_valid(page, block, tmp_path, monkeypatch):
         monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=":")
         monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setenv("RECORDINGS", "/data")
-    data = files.Document(dedent(block)).data
+    data = yaml12.Document(dedent(block)).data
     study = {"odometry": "gicp", "training": ["a"]}
     recording = {"bag": "a.bag"}
     fields = OfflineStudyConfig.model_fields

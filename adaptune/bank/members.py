@@ -18,11 +18,12 @@ from numpy.typing import NDArray
 from adaptune import processes
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses, invert, mean_motion
+from adaptune.machine import other_core
 from adaptune.odometry import wire
-from adaptune.odometry.base import InProcess, OdometryInstance, PreparedScan, Usage
+from adaptune.odometry.base import InProcess, OdometryInstance, Usage
+from adaptune.odometry.prepared import PreparedScan
 from adaptune.odometry.registry import Factory, OdometryFactory, make_here, odometry_class
 from adaptune.odometry.remote import Isolated
-from adaptune.processes import other_core
 from adaptune.recording.scan import Scan
 from adaptune.space import ParameterSet
 

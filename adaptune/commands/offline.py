@@ -117,17 +117,17 @@ def trials(
     processes, and the other metrics.
     """
     loaded = load(study, override, folder)
-    from adaptune import archive as table
+    from adaptune import trial_rows
     from adaptune.archive import Archive
 
     names, archive = loaded.training, Archive(loaded.folder / "trials")
-    finished = table.rows(archive, names)
+    finished = trial_rows.rows(archive, names)
     if not finished:
         raise AdaptuneError(f"{archive.folder}: no trial is finished yet; run `adaptune offline`")
-    chosen = table.select(finished, sort, top)
+    chosen = trial_rows.select(finished, sort, top)
     labels = loaded.odometry.space.labels
     title = f"{len(chosen)} of {len(finished)} trials"
-    show_table(title, table.with_units(chosen, names, labels))
+    show_table(title, trial_rows.with_units(chosen, names, labels))
     if judged := [row for row in finished if row["mean"] is not None]:
         best = min(judged, key=lambda row: row["mean"])
         say(f"Best mean: {best['mean']:.3f} %, of trial {best['trial']}.")
@@ -171,9 +171,6 @@ def validate(
     say_next_online(loaded)
 
 
-# The command that estimates references.
-
-
 def reference(
     recording: Annotated[
         Path, typer.Argument(metavar="BAG", help="A bag, or a folder.", show_default=False)
@@ -188,23 +185,23 @@ def reference(
     It writes the poses (TUM), what is known of their error (JSON), and a picture. Of a study,
     `adaptune offline` and `online` estimate the references that are lacking.
     """
-    from adaptune.processes import pin
+    from adaptune.machine import pin
     from adaptune.recording.inspect import inspect
     from adaptune.recording.recording import open_sequence
-    from adaptune.reference import check, estimate
-    from adaptune.reference.stored import write_estimate
+    from adaptune.reference import estimate, stored
+    from adaptune.reference.check import proposed_sub_trajectory
 
     check_no_study(recording)
-    config = check.recording_config(inspect(recording), points)
+    config = estimate.recording_config(inspect(recording), points)
     path = out / f"{recording.resolve().stem}_reference.tum"
     # What can fail is found before the estimate, which takes minutes.
-    check.check_writable(path)
+    stored.check_writable(path)
     # Only on one core do results repeat bit by bit.
     with pin(os.getpid()), progress() as show:
         found = estimate.estimate_reference(open_sequence(config), partial(show, "estimating"))
         about = {"recording": str(recording.resolve()), "points": config.points}
-        stored = write_estimate(path, found, about)
-    _say_estimate(stored, found.gaps(), check.proposed_sub_trajectory(found.trajectory()))
+        written = stored.write_estimate(path, found, about)
+    _say_estimate(written, found.gaps(), proposed_sub_trajectory(found.trajectory()))
     say(f"Files: {path}, {path.with_suffix('.json').name}, {path.with_suffix('.png').name}")
     first = f"write `reference: {path}` under this sequence in a study; then "
     say_next("train with it, as with a given one", "offline", "STUDY.yaml", first=first)

@@ -3,10 +3,7 @@
 import logging
 import math
 import os
-from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
-from dataclasses import replace
-from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -28,13 +25,9 @@ from adaptune.commands.terminal import (
 from adaptune.errors import AdaptuneError
 
 if TYPE_CHECKING:
-    from adaptune.report.charts import Charts
-    from adaptune.report.page import PageSection
-    from offline.config import OfflineStudy, OfflineStudyConfig
-    from online.charts import ReplayedSequence
+    from offline.config import OfflineStudy
     from online.compare import ComparedReplays
     from online.replay import ReplayRecord
-
 
 log = logging.getLogger(__name__)
 
@@ -136,7 +129,7 @@ def _oracle(loaded: "OfflineStudy", cluster: str | None) -> None:
 
 def _alone(study: "OfflineStudy") -> ExitStack:
     """Bind this process to one core, and leave the others to what it starts."""
-    from adaptune.processes import pin
+    from adaptune.machine import pin
 
     # Ask for the number of cores before.
     _ = study.mechanism
@@ -225,6 +218,7 @@ def compared(loaded: "OfflineStudy", *, details: bool = False) -> "ComparedRepla
 
     With `details`, print all sentences and tables of the page, too.
     """
+    from adaptune.commands.page import write_study_page
     from online.compare import compare as compare_replays
     from online.modes import ADAPTIVE, BASELINE, FIXED
     from online.tables import decision_table, tables
@@ -235,9 +229,9 @@ def compared(loaded: "OfflineStudy", *, details: bool = False) -> "ComparedRepla
     except AdaptuneError as error:
         # A study that still runs has a page, too.
         if (loaded.folder / "study.yaml").exists():
-            say(f"Page: {_write_page(loaded, f'No comparison: {error}.')}")
+            say(f"Page: {write_study_page(loaded, f'No comparison: {error}.')}")
         raise
-    page, length = _write_page(loaded, found), loaded.config.sub_trajectory
+    page, length = write_study_page(loaded, found), loaded.config.sub_trajectory
     say(" ".join(found.verdict))
     if found.rows[0].yardstick == "fixed":
         same = (BASELINE,) if loaded.fixed == loaded.odometry.space.baseline else ()
@@ -249,108 +243,6 @@ def compared(loaded: "OfflineStudy", *, details: bool = False) -> "ComparedRepla
     for made in shown:
         show_table(*made)
     return found
-
-
-# The page of a study.
-
-
-_BEST = 50
-"""Trials of the page's table: the best ones."""
-
-
-def _write_page(study: "OfflineStudy", found: "ComparedReplays | str") -> Path:
-    """Write all that is known of a study as one page; `found` may be why nothing is compared."""
-    from adaptune.report.page import Page, write_page
-    from offline.charts import charts_of_validation
-    from online.charts import charts_of_replays, read_replays
-    from online.modes import sequences_without_model
-
-    read = cache(partial(read_replays, study))
-
-    def along(name: str) -> "Charts":
-        return charts_of_replays(read(name))
-
-    config = study.config
-    # Without a test, some may have been replayed without a model.
-    others = sequences_without_model(config)
-    replayed = [name for name in others if (study.folder / "replays" / name).exists()]
-    sections = [_comparison(found, config.sub_trajectory, read)]
-    names = config.test or replayed
-    sections += [_of_charts(f"Along {name}", partial(along, name)) for name in names]
-    sections.append(_search(study))
-    validation = partial(charts_of_validation, study.folder)
-    sections += [_of_charts("With recordings left out", validation), _settings(config)]
-    n = len(config.training)
-    subtitle = (
-        f"{', '.join(config.odometries)}: trained on {n} sequence{'s' * (n != 1)}, tested on "
-        f"{len(config.test)}, errors over {config.sub_trajectory:g} m, seed {config.offline.seed}"
-    )
-    words = () if isinstance(found, str) else tuple(found.verdict)
-    path = study.folder / "report" / "report.html"
-    write_page(path, Page(study.name, subtitle, words, tuple(sections)))
-    return path
-
-
-def _comparison(
-    found: "ComparedReplays | str", length: float, read: "Callable[[str], ReplayedSequence]"
-) -> "PageSection":
-    from adaptune.report.page import PageSection
-    from online.charts import charts_of_comparison
-    from online.tables import modes_in_words, tables
-
-    title = "What adapting gained"
-    if isinstance(found, str):
-        return PageSection(title, notes=(found,))
-    made = *tables(found.rows, length), modes_in_words(found.rows)
-    charts = partial(charts_of_comparison, found.rows, read)
-    section = _of_charts(title, charts)
-    return replace(section, notes=(*section.notes, *found.details), tables=made)
-
-
-def _search(study: "OfflineStudy") -> "PageSection":
-    from adaptune import archive
-    from adaptune.archive import Archive
-    from adaptune.report.tables import Listing
-    from offline.charts import charts_of_trials
-
-    section = _of_charts("What was tried", partial(charts_of_trials, study))
-    try:
-        finished = archive.rows(Archive(study.folder / "trials"), study.training)
-    except AdaptuneError as error:
-        return replace(section, notes=(*section.notes, f"{error}."))
-    if not finished:
-        return section
-    best = archive.select([row for row in finished if row["mean"] is not None], "mean", _BEST)
-    title = f"The best {len(best)} of {len(finished)} trials, in training"
-    listed = archive.with_units(best, study.training, study.odometry.space.labels)
-    return replace(section, tables=(Listing(title, listed),))
-
-
-def _settings(config: "OfflineStudyConfig") -> "PageSection":
-    """The study's settings, a row each."""
-    from adaptune.report.page import PageSection
-    from adaptune.report.tables import Listing
-
-    def leaves(value: object, key: str) -> Iterator[tuple[str, object]]:
-        if isinstance(value, dict) and value:
-            for name, inner in value.items():
-                yield from leaves(inner, f"{key}.{name}" if key else str(name))
-        elif value is not None:
-            yield key, value
-
-    rows = [{"key": key, "value": str(v)} for key, v in leaves(config.resolved(), "")]
-    return PageSection("Settings", tables=(Listing("The study's YAML, with its defaults", rows),))
-
-
-def _of_charts(title: str, make: "Callable[[], Charts]") -> "PageSection":
-    """A section of charts; an error is told in their place."""
-    from adaptune.report.page import PageSection
-
-    try:
-        charts, notes = make()
-    except AdaptuneError as error:
-        return PageSection(title, notes=(f"{error}.",))
-    return PageSection(title, notes=tuple(notes), charts=tuple(charts))
 
 
 def record(

@@ -139,9 +139,6 @@ def say_fixed(study: "OfflineStudy", advised: bool = True) -> None:
     say(f"{what}: {study.folder / FIXED_SET}{more}.")
 
 
-# The command to run next, which every command names at its end.
-
-
 def say_next(why: str, *words: object, first: str = "") -> None:
     """Print a command, ready to copy, what it is for, and what to do first."""
     say(f"Next: {first}{shlex.join(['adaptune', *map(str, words)])}    # {why}")
@@ -169,9 +166,6 @@ def say_next_of_trained(study: "OfflineStudy", enough: bool) -> None:
         say_next_of_study("what does adapting gain elsewhere?", "validate")
     else:
         say_next_online(study)
-
-
-# Arguments that all commands on a study share.
 
 
 StudyFile = Annotated[

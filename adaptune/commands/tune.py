@@ -15,15 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from adaptune.commands.online import Details, compared, replay_missing
-from adaptune.commands.terminal import (
-    Points,
-    console,
-    load,
-    progress,
-    say,
-    say_next,
-    show_table,
-)
+from adaptune.commands.terminal import Points, console, load, progress, say, say_next, show_table
 from adaptune.errors import AdaptuneError, NotInstalledError
 from adaptune.files import plain_name, write_text
 from adaptune.progress import Progress
@@ -66,7 +58,7 @@ def inspect(
     if study is not None and study.exists():
         raise AdaptuneError(f"{study}: exists; name another file with --study, or move it away")
     from adaptune.recording.inspect import inspect as inspect_file
-    from adaptune.recording.inspect import render_inspection
+    from adaptune.recording.rendering import render_inspection
 
     with progress() as show:
         found = inspect_file(file, deep, show)
@@ -145,7 +137,8 @@ def _proposed(found: "Inspection", deep: bool, show: Progress) -> tuple[float | 
         return None, UNKNOWN_LENGTH, ""
     from adaptune.recording.recording import open_sequence
     from adaptune.reference import check
-    from adaptune.reference.check import diagnose_reference, measured_motions
+    from adaptune.reference.diagnosis import diagnose_reference
+    from adaptune.reference.motions import measured_motions
 
     share = _share(found.reference)
     usual = check.proposed_sub_trajectory(found.reference, training=share)
@@ -184,8 +177,8 @@ def roles(
     Of a single recording, what follows after a `share` of its duration is kept for the test; of
     several, the last one.
     """
-    from adaptune.files import dump
     from adaptune.reference.check import TRAINING
+    from adaptune.yaml12 import dump
 
     names = [dump([name]).removeprefix("- ").strip() for name in names]
     if len(names) == 1:
@@ -372,9 +365,9 @@ def _decided(
     spent = "" if budget is None else f", budget: {budget:g}"
 
     def study(length: str, share: float | None = None, health: str = "") -> str:
-        from adaptune import files
+        from adaptune import yaml12
 
-        recorded = files.dump({"sequences": {name: one.given for name, one in named.items()}})
+        recorded = yaml12.dump({"sequences": {name: one.given for name, one in named.items()}})
         return (
             f"# Every command works with this file; change what you like.\n\n{recorded}\n"
             f"# The part for the test is not trained on.\n"
@@ -422,7 +415,7 @@ def _usable(path: Path, points: str | None, reference: str | None, show: Progres
     """Look at a recording; it has scans of one topic, and a reference or is to get one."""
     from adaptune.recording.clouds import CLOUDS
     from adaptune.recording.inspect import inspect as inspect_file
-    from adaptune.reference.check import recording_config
+    from adaptune.reference.estimate import recording_config
 
     check_no_study(path)
     found = inspect_file(path, False, show)

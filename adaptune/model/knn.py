@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sklearn.decomposition import PCA
 
-from adaptune.files import compiled
+from adaptune.compiled import compiled
 from adaptune.metrics import FAILURE
 from adaptune.model.rules import Rule, TrainingData
 from adaptune.space import Selection

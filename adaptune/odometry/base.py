@@ -1,11 +1,8 @@
 """What every odometry offers, and the base class of adapters."""
 
-import logging
-import sys
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Hashable, Iterable, Mapping, Sequence
-from dataclasses import fields, is_dataclass
 from functools import cached_property
 from typing import Any, ClassVar, NamedTuple
 
@@ -13,12 +10,10 @@ import numpy as np
 from pydantic import Field
 
 from adaptune.errors import OdometryError, nearest
-from adaptune.geometry import Poses, invert, rectify, scale
+from adaptune.geometry import Poses, invert
 from adaptune.recording.scan import Scan
 from adaptune.space import ParameterSet, ParameterSpace, Selection
 from adaptune.strict import StrictModel
-
-_log = logging.getLogger(__name__)
 
 MIN_POINTS = 20
 """An adapter does not register scans with fewer points in range."""
@@ -334,53 +329,6 @@ class Odometry(ABC):
         return parameters
 
 
-def prepared_bytes(prepared: Any) -> int:
-    """Memory that a prepared scan takes, roughly, in bytes.
-
-    That of a compiled object, such as a cloud with its tree, is not known: it counts a megabyte.
-    """
-    if (size := getattr(prepared, "nbytes", None)) is not None:
-        return int(size)
-    if is_dataclass(prepared):
-        prepared = [getattr(prepared, each.name) for each in fields(prepared)]
-    if isinstance(prepared, Mapping):
-        prepared = [*prepared.values()]
-    if isinstance(prepared, tuple | list):
-        return sum(map(prepared_bytes, prepared))
-    plain = prepared is None or isinstance(prepared, int | float | str | bytes)
-    return sys.getsizeof(prepared) if plain else 1_000_000
-
-
-# Prepared scans that several instances share.
-
-
-class PreparedScan:
-    """A scan that is prepared for several instances, once for all with the same preparation.
-
-    `first` is shared by the scans: the first instance with each preparation, which prepares for all
-    of them. They share what it learned from the first scan's layout.
-    """
-
-    def __init__(self, scan: Scan, first: dict[Hashable, Any]):
-        self.scan, self._first = scan, first
-        self._prepared: dict[Hashable, Any] = {}
-
-    @property
-    def stamp(self) -> int:
-        """Nanoseconds."""
-        return self.scan.stamp
-
-    def by(self, instance: OdometryInstance) -> Any:
-        """The scan as an instance takes it; it is prepared where nobody has asked before."""
-        if (key := instance.preparation) not in self._prepared:
-            first = self._first.setdefault(key, instance)
-            self._prepared[key] = first.prepare(self.scan)
-        return self._prepared[key]
-
-
-# An odometry in this process, as an instance that can be driven.
-
-
 class InProcess(OdometryInstance):
     """Runs an adapter, which nothing else may use, in this process, and notes what it takes."""
 
@@ -417,187 +365,3 @@ class InProcess(OdometryInstance):
 
     def apply(self, selection: Selection) -> None:
         self.odometry.configure(selection.parameters)
-
-
-# An odometry that may go wrong.
-
-MOST_FAULTS = 10
-"""An instance with so many faults does not start again: the rest of its sequence is lost."""
-MAX_SHARE_WITHOUT_POSE = 0.1
-"""Share of the scans from which an odometry that gives no pose for them has failed."""
-
-_TOLERANCE = 1e-3
-"""By how much a rotation times its transpose may differ from the identity."""
-
-
-LOST = Registration(np.full((4, 4), np.nan), registered=False)
-"""What an odometry gives where there is no pose."""
-LOST.T_odom_sensor.setflags(write=False)
-
-
-class Faulting(OdometryInstance):
-    """An instance that may go wrong, and notes it."""
-
-    faults: Sequence[str] = ()
-
-    def __init__(self, name: str, parameters: ParameterSet):
-        self.name = name
-        self.parameters = dict(parameters)
-
-    @property
-    def given_up(self) -> bool:
-        """Whether it had so many faults that it does not start again."""
-        return len(self.faults) >= MOST_FAULTS
-
-    def note_fault(self, what: str) -> Registration:
-        """Note a fault and end; the pose of a scan with a fault."""
-        self.close()
-        if what not in self.faults:
-            _log.warning("%s with %s: %s", self.name, self.parameters, what)
-        self.faults = [*self.faults, what]
-        if self.given_up:
-            _log.warning("%s: fault number %d, it does not start again", self.name, MOST_FAULTS)
-        return LOST
-
-
-def pose_fault(T_odom_sensor: Poses) -> str | None:
-    """What is wrong with a pose, if anything."""
-    if T_odom_sensor.shape != (4, 4):
-        return f"of shape {T_odom_sensor.shape}"
-    if not np.isfinite(T_odom_sensor).all():
-        return "that is not finite"
-    R = T_odom_sensor[:3, :3]
-    if np.abs(R @ R.T - np.eye(3)).max() > _TOLERANCE or np.linalg.det(R) < 0:
-        return "that is not rigid"
-    return None
-
-
-# The moment of a scan to which an odometry's pose belongs.
-#
-# A scan takes a while. adaptune's poses belong to its stamp, the start. An odometry that deskews
-# gives the pose at the end, where its newest point was measured. One that takes a scan as it is
-# gives, about, the pose at its middle. While the sensor gets faster or slower, motions between
-# those are not the motions between stamps.
-
-
-START, MIDDLE, END = 0.0, 0.5, 1.0
-"""Shares of a scan's duration."""
-
-
-def duration_of(scan: Scan) -> int:
-    """Nanoseconds from a scan's stamp to its last point; 0 if the points' times do not differ."""
-    if scan.times is None or not len(scan) or not np.ptp(scan.times):
-        return 0
-    return scan.span
-
-
-class AtStamp:
-    """Carries an odometry's poses back to the stamps of scans.
-
-    Between two poses of the odometry, the velocity is taken as constant. A pose belongs to the
-    moment after this share of a scan's duration.
-    """
-
-    def __init__(self, share: float):
-        self._share = share
-        self._before: tuple[float, Poses] = 0.0, np.eye(4)
-        self._begun_at: int | None = None
-        self._T_odom_begun = np.eye(4)
-
-    def begin(
-        self, stamp: int, duration: int, T_odom_sensor: Poses, T_previous_current: Poses | None
-    ) -> Poses:
-        """Begin with a scan, and return where the odometry has to believe it is.
-
-        Stamp and duration are in nanoseconds. The motion from the scan before goes on; if it is
-        None, the first motion that the odometry finds is taken for that during the first scan.
-        """
-        then, T_odom_then = stamp + self._share * duration, T_odom_sensor
-        self._T_odom_begun = np.eye(4)
-        self._begun_at = stamp if T_previous_current is None else None
-        if T_previous_current is not None and then > stamp:
-            T_odom_then = T_odom_sensor @ scale(T_previous_current, self._share)
-        self._before = then, T_odom_then
-        return T_odom_then
-
-    def __call__(self, stamp: int, duration: int, T_odom_then: Poses) -> Poses:
-        """The pose at a scan's stamp, from the odometry's; a faulty pose is left as it is."""
-        if pose_fault(T_odom_then):
-            return T_odom_then
-        before, T_odom_before = self._before
-        then = stamp + self._share * duration
-        if self._begun_at is not None:
-            if before < then:
-                moved = invert(T_odom_before) @ T_odom_then
-                missing = scale(moved, (before - self._begun_at) / (then - before))
-                self._T_odom_begun = T_odom_before @ missing @ invert(T_odom_before)
-                T_odom_before = T_odom_before @ missing
-            self._begun_at = None
-        T_odom_then = self._T_odom_begun @ T_odom_then
-        self._before = then, T_odom_then
-        if then == stamp or then <= before:
-            return T_odom_then
-        moved = invert(T_odom_before) @ T_odom_then
-        return np.asarray(T_odom_before @ scale(moved, (stamp - before) / (then - before)))
-
-
-# Odometries that begin at rest in a frame of their own.
-
-NO_IMU = "{} needs an IMU, and the scans do not bring along what one measured"
-
-
-class OwnFrameOdometry(Odometry):
-    """An odometry that can begin only at rest, in its own frame, and with a usable scan.
-
-    The first pose that it returns places its frame. Where it returns none, the last motion goes
-    on. What `prepare` returns is `usable` or not, and has the scan's `stamp` and `duration` in
-    nanoseconds. Poses that belong to a later moment of a scan are carried back to its stamp.
-    """
-
-    _share = START
-    """Of a scan's duration, after which its pose belongs; it may be set until `_begin` returns."""
-
-    @abstractmethod
-    def _begin(self, prepared: Any) -> None:
-        """Make a new one for a usable scan, which `_process` receives next."""
-
-    @abstractmethod
-    def _process(self, prepared: Any) -> Poses | None:
-        """Process a scan, usable or not, and return ``T_own_sensor`` if there is a pose."""
-
-    def start(
-        self, prepared: Any, T_odom_sensor: Poses, T_previous_current: Poses | None = None
-    ) -> None:
-        self._T_odom_sensor = T_odom_sensor
-        self._T_previous_current = np.eye(4) if T_previous_current is None else T_previous_current
-        self._T_known = T_previous_current
-        self._T_odom_own: Poses | None = None
-        self._begun = False
-        self._correct(prepared)
-
-    def register(self, prepared: Any) -> Registration:
-        T_odom_previous = self._T_odom_sensor
-        self._T_odom_sensor = T_odom_previous @ self._T_previous_current
-        registered = self._correct(prepared)
-        if registered:
-            self._T_previous_current = rectify(invert(T_odom_previous) @ self._T_odom_sensor)
-        return Registration(self._T_odom_sensor, registered)
-
-    def _correct(self, prepared: Any) -> bool:
-        """Correct the predicted pose; False if the odometry returned none."""
-        if not self._begun:
-            if not prepared.usable:
-                return False
-            self._begin(prepared)
-            self._at_stamp = AtStamp(self._share)
-            self._begun = True
-        T_own_sensor = self._process(prepared)
-        if T_own_sensor is None:
-            return False
-        taken = prepared.stamp, prepared.duration
-        if self._T_odom_own is None:
-            T_odom_then = self._at_stamp.begin(*taken, self._T_odom_sensor, self._T_known)
-            self._T_odom_own = T_odom_then @ invert(T_own_sensor)
-            return True
-        self._T_odom_sensor = self._at_stamp(*taken, self._T_odom_own @ T_own_sensor)
-        return True

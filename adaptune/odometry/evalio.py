@@ -12,17 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from adaptune.errors import OdometryError, import_extra, nearest
 from adaptune.geometry import Poses, invert, squared_ranges
-from adaptune.odometry.base import (
-    END,
-    MIDDLE,
-    MIN_POINTS,
-    NO_IMU,
-    BaseSettings,
-    Description,
-    OwnFrameOdometry,
-    RangeSettings,
-    duration_of,
-)
+from adaptune.odometry.base import MIN_POINTS, BaseSettings, Description, RangeSettings
+from adaptune.odometry.own_frame import END, MIDDLE, NO_IMU, OwnFrameOdometry, duration_of
 from adaptune.recording.scan import Imu, Scan
 from adaptune.space import Float, Integer, ParameterSet, ParameterSpace, Value
 
@@ -303,9 +294,6 @@ class GridPipeline(RingedPipeline):
         return points if len(scan) < MIN_POINTS else image(scan, points, *shape), shape
 
 
-# The pipelines of evalio that need a LiDAR only.
-
-
 class KissIcp(Pipeline):
     """KISS-ICP (Vizzo et al., RA-L 2023), compiled."""
 
@@ -409,8 +397,6 @@ class Form(GridPipeline):
         max_num_rematches=Integer(low=3, high=30, baseline=30, log=True),
     )
 
-
-# The pipelines of evalio that need a LiDAR and an IMU.
 
 _BEHIND = 2
 """Scans that LIO-SAM waits for before it registers one."""

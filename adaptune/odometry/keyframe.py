@@ -10,9 +10,9 @@ import small_gicp
 from pydantic import Field
 
 from adaptune.errors import import_extra
-from adaptune.files import load
 from adaptune.geometry import Poses, invert, rectify, scale, squared_ranges
 from adaptune.odometry.base import MIN_POINTS, BaseSettings, Description, Odometry, Registration
+from adaptune.open3d import load
 from adaptune.recording.scan import Scan
 from adaptune.space import Categorical, Float, Integer, ParameterSet, ParameterSpace
 
@@ -137,9 +137,6 @@ def crop(scan: Scan, min_range: float) -> Any:
     return points if kept.all() else points.take(np.flatnonzero(kept), axis=0)
 
 
-# Keyframe GICP and VGICP on small_gicp.
-
-
 class _SmallGicp(KeyframeOdometry):
     """A keyframe odometry on small_gicp."""
 
@@ -208,9 +205,6 @@ class KeyframeVgicp(_SmallGicp):
             self._cells = target, resolution, cells
         # A point is matched to the cell that contains it, however far the cell's mean is.
         return (self._cells[2], source.cloud), np.inf
-
-
-# Keyframe NDT on Open3D.
 
 
 class KeyframeNdt(KeyframeOdometry):

@@ -11,19 +11,10 @@ from kiss_icp.registration import get_registration
 from kiss_icp.threshold import get_threshold_estimator
 from numpy.typing import NDArray
 
-from adaptune import files
+from adaptune import yaml12
 from adaptune.geometry import Poses, count_within
-from adaptune.odometry.base import (
-    END,
-    MIDDLE,
-    MIN_POINTS,
-    AtStamp,
-    Odometry,
-    OwnFile,
-    RangeSettings,
-    Registration,
-    duration_of,
-)
+from adaptune.odometry.base import MIN_POINTS, Odometry, OwnFile, RangeSettings, Registration
+from adaptune.odometry.own_frame import END, MIDDLE, AtStamp, duration_of
 from adaptune.recording.scan import Scan
 from adaptune.space import Float, Integer, ParameterSet, ParameterSpace
 
@@ -77,7 +68,7 @@ class Kiss(Odometry):
     def own_file(cls, parameters: ParameterSet, settings: Any) -> OwnFile:
         # Where results go stays open: KISS-ICP has an environment variable for it.
         data = cls(parameters, settings)._config().model_dump(exclude={"out_dir"})
-        return OwnFile(".yaml", files.dump(data), "kiss_icp_pipeline --config FILE DATA")
+        return OwnFile(".yaml", yaml12.dump(data), "kiss_icp_pipeline --config FILE DATA")
 
     def configure(self, parameters: ParameterSet) -> None:
         # The adaptive threshold restarts at a new `initial_threshold`; with a new `min_motion_th`

@@ -17,7 +17,8 @@ from pydantic import BaseModel, ConfigDict, RootModel
 from adaptune import processes, strict
 from adaptune.errors import Finding, NotInstalledError, OdometryError
 from adaptune.odometry.base import Description, InProcess, Odometry, OdometryInstance, OwnFile
-from adaptune.odometry.remote import SERVICE, Guarded, Isolated, Limits
+from adaptune.odometry.guarded import Guarded
+from adaptune.odometry.remote import SERVICE, Isolated, Limits
 from adaptune.space import ParameterSet, ParameterSpace, PooledSpace
 from adaptune.strict import validated
 
@@ -125,9 +126,6 @@ def make_here(name: str, parameters: ParameterSet, settings: Any) -> tuple[Any, 
     """Make an odometry in this process."""
     checked, described = declare_here(name, settings).sound(name)
     return odometry_class(name)(parameters, checked), described
-
-
-# What an odometry says of itself. A class of the user is asked in a process of its own.
 
 
 class UserSettings(RootModel[dict[str, Any]]):
@@ -362,9 +360,6 @@ class OdometryFactory:
             return Guarded(self.name, odometry_class, given, self.settings, self.limits.seconds)
         cls: Any = odometry_class(self.name)
         return InProcess(cls(given, self.settings))
-
-
-# Several odometries in one study: a parameter set says which of them it is for.
 
 
 @dataclass(frozen=True)

@@ -14,15 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from adaptune.errors import OdometryError, import_extra
 from adaptune.geometry import Poses, count_within
-from adaptune.odometry.base import (
-    END,
-    MIDDLE,
-    MIN_POINTS,
-    NO_IMU,
-    Description,
-    OwnFrameOdometry,
-    RangeSettings,
-)
+from adaptune.odometry.base import MIN_POINTS, Description, RangeSettings
+from adaptune.odometry.own_frame import END, MIDDLE, NO_IMU, OwnFrameOdometry
 from adaptune.recording.scan import Imu, Scan
 from adaptune.space import Float, ParameterSet, ParameterSpace
 

@@ -6,14 +6,7 @@ import math
 import re
 import resource
 from collections import Counter, defaultdict, deque
-from collections.abc import (
-    Callable,
-    Collection,
-    Generator,
-    Iterable,
-    Iterator,
-    Sequence,
-)
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import cache, partial
 from itertools import islice, pairwise
@@ -43,7 +36,8 @@ from adaptune.recording.clouds import (
 )
 from adaptune.recording.config import files_of
 from adaptune.recording.findings import clock_parts, of_clock
-from adaptune.recording.scan import AUTO, Frame, Imu, Scan, SequenceError, Timing
+from adaptune.recording.scan import Frame, Imu, Scan, SequenceError
+from adaptune.recording.timing import AUTO, Timing
 from adaptune.trajectory import Trajectory
 
 _log = logging.getLogger(__name__)

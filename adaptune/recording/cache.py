@@ -250,9 +250,6 @@ def _size(path: Path) -> int:
     return sum(p.stat().st_size for p in path.iterdir() if p.is_file())
 
 
-# Hashes of the content of files, remembered on disk.
-
-
 SMALL = 1 << 24
 """Bytes of files below which their content is read every time."""
 FILE = "fingerprints.txt"

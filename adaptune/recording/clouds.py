@@ -12,21 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptune import geometry
+from adaptune.compiled import compiled
 from adaptune.errors import AdaptuneError, nearest
-from adaptune.files import compiled
-from adaptune.recording.scan import (
-    AUTO,
-    TIME_FIELDS,
-    Scan,
-    SequenceError,
-    Timing,
-    TimingError,
-    Unit,
-)
+from adaptune.recording.scan import Scan, SequenceError
+from adaptune.recording.timing import AUTO, TIME_FIELDS, Timing, TimingError, Unit
 from adaptune.trajectory import Trajectory
-
-# Numbers and texts of serialised ROS messages, where a whole message would take too long.
-
 
 _WORD = {order: struct.Struct(f"{order}I").unpack_from for order in "<>"}
 

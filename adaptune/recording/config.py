@@ -7,18 +7,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import (
-    AfterValidator,
-    BeforeValidator,
-    Field,
-    ValidationInfo,
-    model_validator,
-)
+from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, model_validator
 
 from adaptune import geometry
 from adaptune.errors import AdaptuneError
 from adaptune.files import expand_user
-from adaptune.recording.scan import USUAL, Imu, ImuNoise, Mark, Part, SequenceError, Unit
+from adaptune.recording.parts import Part
+from adaptune.recording.scan import USUAL, Imu, ImuNoise, SequenceError
+from adaptune.recording.timing import Mark, Unit
 from adaptune.strict import StrictModel
 
 Compensation = Literal["constant_velocity"] | None

@@ -7,10 +7,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from adaptune.compiled import compiled
 from adaptune.errors import Finding, Key
-from adaptune.files import compiled
 from adaptune.geometry import nearest_rotation
-from adaptune.recording.scan import SOONEST, Reading, Scan
+from adaptune.recording.scan import Reading, Scan
+from adaptune.recording.timing import SOONEST
 from adaptune.trajectory import Trajectory
 
 LEAST_POINTS = 20
@@ -106,9 +107,6 @@ def _glance(points: NDArray[np.float32]) -> tuple[float, ...]:
 @cache
 def _kernel() -> Callable[[NDArray[np.float32]], tuple[float, ...]]:
     return compiled(_glance)  # when a scan is read: it takes time
-
-
-# What is wrong with clouds that follow each other.
 
 
 # Of what is usual, below which a cloud is a part of one, or has lost nearly all.

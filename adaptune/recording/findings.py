@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from adaptune.errors import Finding
 from adaptune.recording.content import Content, of_looks
 from adaptune.recording.poses import sound
-from adaptune.recording.scan import SOONEST, Frame, doubts, in_order
+from adaptune.recording.scan import Frame, in_order
+from adaptune.recording.timing import SOONEST, doubts
 from adaptune.trajectory import Trajectory
 
 

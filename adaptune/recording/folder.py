@@ -15,12 +15,13 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune import files as open3d
-from adaptune import geometry
+from adaptune import geometry, open3d
 from adaptune.errors import Finding, NotInstalledError
+from adaptune.files import DAMAGED_NPZ
 from adaptune.geometry import Poses
 from adaptune.recording.clouds import FARTHEST, PointCloudError, from_fields
-from adaptune.recording.scan import AUTO, Frame, Imu, Scan, SequenceError, Timing
+from adaptune.recording.scan import Frame, Imu, Scan, SequenceError
+from adaptune.recording.timing import AUTO, Timing
 from adaptune.trajectory import Trajectory, read_kitti
 
 SUFFIXES = (".bin", ".npy", ".pcd", ".ply")
@@ -102,7 +103,7 @@ def read_scan(
         raise SequenceError(f"{path}: there is no such file") from error
     except NotInstalledError as error:
         raise SequenceError(f"{path}: {error}") from error
-    except (KeyError, PointCloudError, *open3d.DAMAGED_NPZ) as error:
+    except (KeyError, PointCloudError, *DAMAGED_NPZ) as error:
         raise SequenceError(f"{path}: cannot be read as a scan ({error})") from error
 
 

@@ -19,19 +19,8 @@ from adaptune.recording import cache, compensation, views
 from adaptune.recording.config import ESTIMATED, NO_REFERENCE, SequenceConfig, files_of
 from adaptune.recording.content import Content, of_looks
 from adaptune.recording.poses import sound
-from adaptune.recording.scan import (
-    BACKWARD,
-    FIRST_SCANS,
-    SOONEST,
-    Frame,
-    Imu,
-    Recording,
-    Scan,
-    SequenceError,
-    Timing,
-    doubts,
-    in_order,
-)
+from adaptune.recording.scan import BACKWARD, Frame, Imu, Recording, Scan, SequenceError, in_order
+from adaptune.recording.timing import FIRST_SCANS, SOONEST, Timing, doubts
 from adaptune.trajectory import Trajectory, TrajectoryError, is_kitti, read_kitti, read_trajectory
 
 if TYPE_CHECKING:
@@ -41,8 +30,6 @@ if TYPE_CHECKING:
     Source = BagSource | FileSource
 
 _log = logging.getLogger(__name__)
-
-# Which of the scans of a recording are used.
 
 
 # Opening recordings, and what they are read from, without reading their scans.
@@ -154,9 +141,6 @@ def _check_topics(source: "Source", config: SequenceConfig) -> None:
             f"{source.name}: has no topics; leave `child_frame` and `imu.topic` out, and let "
             f"`reference` be a file of poses, or leave it out"
         )
-
-
-# Which part of a recording is used, and its reference and IMU.
 
 
 _BEFORE = 3.0

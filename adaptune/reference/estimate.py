@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from adaptune.bank.members import LEVER
 from adaptune.geometry import Poses, invert, mean_motion, rectify, rotation_angle, steps
+from adaptune.recording.config import SequenceConfig
+from adaptune.recording.inspect import Inspection
 from adaptune.recording.scan import Recording, Scan
 from adaptune.reference.graph import (
     HALVES,
@@ -239,3 +241,20 @@ def _steps_of(found: Pass, T_world_sensor: Poses, members: Sequence[int]) -> Pos
     near |= ~near.any(axis=1, keepdims=True)
     theirs = np.where(np.isfinite(apart)[..., None, None], theirs, whole)
     return mean_motion(theirs, near.astype(np.float64))
+
+
+def recording_config(
+    found: Inspection, points: str | None = None, reference: str | None = None
+) -> SequenceConfig:
+    """The sequence that an inspected recording is, with what the user chose written to `found`.
+
+    `points` and `reference` are topics in place of those that were found; the reference may be a
+    file, too. There is an `EstimateError` if there are no scans.
+    """
+    if not found.name:
+        raise EstimateError(f"{found.path}: is a file of poses; give a recording of scans")
+    if points is None and (lacking := found.missing["online"]):
+        raise EstimateError(f"{found.path}: lacks {' and '.join(lacking)}; see `adaptune inspect`")
+    chosen = {"points": points, "reference": reference}
+    found.given |= {key: value for key, value in chosen.items() if value is not None}
+    return found.config()

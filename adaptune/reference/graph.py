@@ -21,9 +21,6 @@ from adaptune.odometry.tracker import HealthCheck, Tracker
 from adaptune.recording.scan import Scan
 from adaptune.space import ParameterSet, Selection
 
-# One pass over a recording: the consensus, and registrations of scans to scans before them.
-
-
 # The consensus: several odometries side by side, and the motion on which they agree.
 
 POOL: tuple[tuple[str, Mapping[str, float]], ...] = (
@@ -346,8 +343,6 @@ def _robust(noise: Any, bounded: bool = True) -> Any:
     kernel = of.Cauchy(1.0) if bounded else of.Huber(1.345)
     return gtsam.noiseModel.Robust.Create(kernel, noise)
 
-
-# Registrations where the path comes by again.
 
 LATER = 30.0
 """Metres driven until a place counts as one that the path comes by again."""

@@ -4,6 +4,7 @@ import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -200,6 +201,28 @@ def write_estimate(path: Path, found: EstimatedReference, about: dict[str, Any])
     del known["path"], known["errors"]
     write_text(path.with_suffix(".json"), json.dumps(known, indent=1) + "\n")
     return stored
+
+
+def check_writable(path: Path) -> None:
+    """Make the folder of an estimate; an `EstimateError` if that cannot be written to.
+
+    There is one, too, if a file there is no estimate.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with TemporaryFile(dir=path.parent):
+            pass
+    except OSError as error:
+        raise EstimateError(
+            f"{path.parent}: cannot be written to ({error.strerror}); write elsewhere with --out"
+        ) from error
+    if StoredEstimate.read(path) is None:
+        files = (path.with_suffix(suffix) for suffix in (".tum", ".json", ".png"))
+        if there := [file for file in files if file.exists()]:
+            raise EstimateError(
+                f"{there[0]}: is there, and is not of an estimate that is complete; move it away, "
+                f"or write elsewhere with --out"
+            )
 
 
 class Refusal(NamedTuple):

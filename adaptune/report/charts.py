@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Values = NDArray[Any] | Sequence[Any]
-"""Numbers, or names where an axis has names."""
+"""Numbers, or names: along an axis with names, or of points."""
 
 
 @dataclass(frozen=True)
@@ -41,12 +41,11 @@ class Points:
     x: Values
     y: Values
     name: str  # in the legend; of a mode, the mode's, whose colour and marker they then have
-    colour: Values | None = None  # a number for every point, shown on a colour bar
+    colour: Values | None = None  # a number for every point, on a colour bar; by logarithm if > 0
     colour_label: str = ""
-    log_colour: bool = False
-    texts: Sequence[str] | None = None  # what is told of each point in a browser
+    texts: Values | None = None  # what is told of each point in a browser
     faint: bool = False
-    shape: str | None = None  # of the markers, see `adaptune.report.drawing.Look`
+    shape: str | None = None  # of the markers, see `adaptune.report.looks.Look`
 
 
 @dataclass(frozen=True)
@@ -57,23 +56,7 @@ class Band:
     low: Values
     high: Values
     name: str
-
-
-@dataclass(frozen=True)
-class Bars:
-    """Bars from zero along x, one for each name of the y axis."""
-
-    values: Values
-    name: str
-
-
-@dataclass(frozen=True)
-class Shares:
-    """Shares of a whole over time, stacked, each lasting until the next point."""
-
-    x: Values  # of shape (n,), the last being the end
-    shares: NDArray[np.float64]  # of shape (k, n)
-    names: tuple[str, ...]
+    share: bool = False  # of a whole: one of several on each other, in steps, see `shares`
 
 
 @dataclass(frozen=True)
@@ -86,22 +69,15 @@ class Spans:
 
 
 @dataclass(frozen=True)
-class Mark:
-    """A dashed line across the panel, at a value of x."""
-
-    at: float
-
-
-@dataclass(frozen=True)
 class Words:
     """Names at points; one that would lie on another is left out."""
 
     x: Values
     y: Values
-    words: Sequence[str]
+    words: Values
 
 
-Drawn = Line | Points | Band | Bars | Shares | Spans | Mark | Words
+Drawn = Line | Points | Band | Spans | Words
 
 
 @dataclass(frozen=True)
@@ -126,6 +102,12 @@ class Chart:
     caption: str = ""  # what it shows, in a sentence or two
     columns: int = 1
     shared_x: bool = False  # panels below each other have the same x axis, unless they are `equal`
+
+
+def shares(x: Values, parts: NDArray[np.float64], names: Iterable[str]) -> list[Band]:
+    """Shares of a whole, of shape (k, n), stacked; each lasts until the next of n points."""
+    ends = np.vstack([np.zeros(len(x)), np.cumsum(np.nan_to_num(parts), axis=0)])
+    return [Band(x, ends[i], ends[i + 1], name, share=True) for i, name in enumerate(names)]
 
 
 class Charts(NamedTuple):

@@ -4,8 +4,7 @@ import json
 import re
 import textwrap
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from itertools import chain, cycle
+from itertools import chain
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,88 +15,28 @@ from adaptune.files import replacing
 from adaptune.report.charts import (
     Axis,
     Band,
-    Bars,
     Chart,
     Drawn,
     Line,
-    Mark,
     Panel,
     Points,
-    Shares,
     Spans,
     Values,
     Words,
 )
+from adaptune.report.looks import Look, looks
 
-# How a chart looks.
-
-
-@dataclass(frozen=True)
-class Look:
-    """How whatever has one name is drawn."""
-
-    colour: str
-    dash: tuple[float, ...] = ()  # strokes and gaps in pixels; none if it is solid
-    shape: str = "circle"  # of a marker, as Vega names it, or an SVG path
-
-
-_STAR = "M0,-1.2 L.3,-.4 L1.1,-.4 L.5,.1 L.7,.95 L0,.5 L-.7,.95 L-.5,.1 L-1.1,-.4 L-.3,-.4 Z"
-_TIMES = "M-1,-.7 L-.7,-1 L0,-.3 L.7,-1 L1,-.7 L.3,0 L1,.7 L.7,1 L0,.3 L-.7,1 L-1,.7 L-.3,0 Z"
-# Colours that the colour-blind tell apart, most of them Okabe and Ito's.
-MODES = {
-    "baseline": Look("#999999", shape="square"),
-    "best_default": Look("#882255", shape="triangle-down"),
-    "equal_cost": Look("#56c8a0", shape="cross"),
-    "fixed": Look("#0072b2", shape=_STAR),
-    "adaptive": Look("#e69f00"),
-    "untrained": Look("#7b3294", shape="triangle-left"),
-    "even": Look("#117733", (3, 3), "triangle-right"),
-    "paper": Look("#000000", (4, 4), "triangle-up"),
-    "oracle, sequence": Look("#009e73", shape="diamond"),
-}
-"""Looks of the modes; the lines of the first lie lowest."""
-_COLOURS = ("#d55e00", "#56b4e9", "#009e73", "#cc79a7", "#888888", "#b8a800")
-_DASHES: tuple[tuple[float, ...], ...] = ((), (8, 3), (2, 3), (8, 3, 2, 3))
-_SHAPES = ("circle", "square", "triangle-up", "diamond", "triangle-down", _TIMES, "cross")
-_PLACES = ("#8c510a", "#35a79c", "#c51b7d", "#7fbc41", "#555555", "#b8a800")
-"""Colours of places; no mode has them."""
 _MAP = ("#440154", "#472d7b", "#3b528b", "#2c728e", "#21918c", "#28ae80", "#5ec962", "#9bd93c")
 """A colour map whose lightness rises, without colours too light for a white ground."""
-_SHADE, _TINT = "#555555", 0.15
-"""Colour of stretches that are no places, and opacity of what is shaded."""
-_SHARES = ("#c97f00", "#f0b84d", "#8f5a00", "#f8dba5", "#b0885a")
-"""Colours of shares that have no look of their own."""
+_TINT = 0.15
+"""Opacity of what is shaded."""
 _UNKNOWN = "#bbbbbb"
 """Colour of points without a number where colours say numbers."""
-_MOST, _MOST_FAINT = 1500, 500
+_MOST = 1500
 """Most points of a line that are drawn."""
 _MANY, _OUTLINED = 1000, 150
 """Points from which on they are small, and up to which they have outlines."""
-
-
-def looks(chart: Chart) -> dict[str, Look]:
-    """The look of each name in a chart, in the order in which they appear; modes have theirs."""
-    items = [item for panel in chart.panels for item in panel.drawn]
-    spans = (item for item in items if isinstance(item, Spans) and not item.name)
-    places = dict.fromkeys(name for item in spans for name in item.names if name)
-    shares = dict.fromkeys(n for item in items if isinstance(item, Shares) for n in item.names)
-    known = dict(zip(shares, map(Look, cycle(_SHARES)), strict=False)) | MODES
-    known |= dict(zip(places, map(Look, cycle(_PLACES)), strict=False))
-    known |= {item.name: Look(_SHADE) for item in items if isinstance(item, Spans) and item.name}
-    names = dict.fromkeys(name for item in items for name in _names(item)) | places
-    taken = {known[name].colour for name in names if name in known}
-    colours = cycle([colour for colour in _COLOURS if colour not in taken])
-    made = map(Look, colours, cycle(_DASHES), cycle(_SHAPES))
-    return {name: known[name] if name in known else next(made) for name in names}
-
-
-def _names(item: Drawn) -> tuple[str, ...]:
-    """The names of an item in the legend."""
-    named = (getattr(item, "name", ""),)
-    return tuple(filter(None, item.names if isinstance(item, Shares) else named))
-
-
-_LAYERS = (Spans, Shares, Bars, Band, Line, Points, Mark, Words)
+_LAYERS = (Spans, Band, Line, Points, Words)
 
 
 def _layer(item: Drawn) -> float:
@@ -125,16 +64,16 @@ def numbers(values: Values, axis: Axis) -> NDArray[np.float64]:
     return made
 
 
-def thinned(*columns: NDArray[np.float64], most: int = _MOST) -> NDArray[np.intp]:
+def thinned(*columns: NDArray[np.float64]) -> NDArray[np.intp]:
     """Indices of the points of a line to draw where it has many.
 
     Of each stretch the lowest and the highest of every column stay, and a gap stays a gap.
     """
     n = len(columns[0])
-    if n <= most:
+    if n <= _MOST:
         return np.arange(n)
     kept = [0, n - 1]
-    for some in np.array_split(np.arange(n), most // (2 * len(columns) + 2)):
+    for some in np.array_split(np.arange(n), _MOST // (2 * len(columns) + 2)):
         missing = np.isnan([column[some] for column in columns]).any(axis=0)
         kept += [some[0], some[missing.argmax()]]
         there = some[~missing]
@@ -147,9 +86,6 @@ def wrapped(words: str, letters: float) -> list[str]:
     """Words on lines of at most so many letters, where they can be broken."""
     width = max(int(letters), 8)
     return [part for line in words.splitlines() for part in textwrap.wrap(line, width)] or [""]
-
-
-# The drawing, as a specification of Vega-Lite.
 
 
 Spec = dict[str, Any]
@@ -257,12 +193,6 @@ def _coordinates(panel: Panel) -> Iterator[tuple[NDArray[np.float64], NDArray[np
             case Band():
                 x = numbers(item.x, panel.x)
                 yield np.tile(x, 2), np.r_[numbers(item.low, panel.y), numbers(item.high, panel.y)]
-            case Bars():
-                values = numbers(item.values, panel.x)
-                yield np.r_[0.0 * values, values], np.tile(np.arange(len(values)), 2)
-            case Shares():
-                x = numbers(item.x, panel.x)
-                yield np.tile(x, 2), np.r_[0.0 * x, np.sum(item.shares, axis=0)]
 
 
 def _is_empty(panel: Panel) -> bool:
@@ -276,9 +206,7 @@ def _extent(panel: Panel, which: Literal["x", "y"]) -> tuple[float, float]:
         return axis.limits
     if axis.names is not None:
         return -0.6, len(axis.names) - 0.4
-    marks = [item.at for item in panel.drawn if isinstance(item, Mark) and which == "x"]
-    found = [pair[which == "y"] for pair in _coordinates(panel)]
-    values = np.concatenate([*found, marks])
+    values = np.concatenate([[], *(pair[which == "y"] for pair in _coordinates(panel))])
     values = values[np.isfinite(values)]
     if not len(values):
         return 1.0, 10.0
@@ -348,10 +276,7 @@ class _Drawing:
             Line: self._line,
             Points: self._points,
             Band: self._band,
-            Bars: self._bars,
-            Shares: self._shares,
             Spans: self._spans,
-            Mark: self._mark,
             Words: self._words,
         }
         items = sorted(panel.drawn, key=_layer)
@@ -392,47 +317,47 @@ class _Drawing:
         return {"data": _table(**data), "mark": {"clip": True} | mark, "encoding": every}
 
     def _look(self, name: str) -> Look:
-        return self._looks.get(name, Look("#666666"))
+        return self._looks.get(name, Look(_DARK))
 
     def _line(self, line: Line) -> Iterator[Spec]:
         x, y = numbers(line.x, self._panel.x), numbers(line.y, self._panel.y)
-        kept = thinned(x, y, most=_MOST_FAINT if line.faint else _MOST)
-        look = self._look(line.name)
-        width, opacity = (1.2, 0.4) if line.faint else (line.width, 1.0)
-        mark: Spec = {"type": "line", "strokeJoin": "round", "tooltip": line.name}
-        mark |= {"interpolate": "step-after" if line.steps else "linear", "color": look.colour}
-        mark |= {"strokeWidth": width, "opacity": opacity}
-        mark |= {"strokeDash": (5, 3) if line.dashed else look.dash}
+        kept, look = thinned(x, y), self._look(line.name)
+        mark = {
+            "type": "line",
+            "strokeJoin": "round",
+            "tooltip": line.name,
+            "interpolate": "step-after" if line.steps else "linear",
+            "color": look.colour,
+            "strokeWidth": 1.2 if line.faint else line.width,
+            "opacity": 0.4 if line.faint else 1.0,
+            "strokeDash": (5, 3) if line.dashed else look.dash,
+        }
         # Drawn in the order of the points, and not from left to right.
-        data, order = {"x": x[kept], "y": y[kept]}, {"value": None}
-        yield self._drawn(mark, data, order=order)
+        yield self._drawn(mark, {"x": x[kept], "y": y[kept]}, order={"value": None})
 
     def _points(self, points: Points) -> Iterator[Spec]:
-        panel = self._panel
+        panel, look, many = self._panel, self._look(points.name), len(points.x) > _MANY
         columns: dict[str, Any] = {"x": numbers(points.x, panel.x), "y": numbers(points.y, panel.y)}
-        look = self._look(points.name)
         shape = points.shape or look.shape
         mark: Spec = {"type": "point", "filled": True, "shape": shape, "color": look.colour}
-        mark |= {"size": 60 if shape.startswith("M") else 45, "opacity": 1.0}
-        if len(points.x) > _MANY:
-            mark |= {"size": 12, "opacity": 0.7}
-        if points.faint:
-            mark |= {"opacity": 0.35}
-        elif len(points.x) <= _OUTLINED:
+        mark["size"] = 12 if many else 60 if shape.startswith("M") else 45
+        mark["opacity"] = 0.35 if points.faint else 0.7 if many else 1.0
+        if not points.faint and len(points.x) <= _OUTLINED:
             mark |= _OUTLINE
-        tips: list[Spec] = [
-            {"field": "x", "title": panel.x.label or "x", "format": ".4~g"},
-            {"field": "y", "title": panel.y.label or "y", "format": ".4~g"},
+        tips = [
+            {"field": which, "title": axis.label or which, "format": ".4~g"}
+            for which, axis in (("x", panel.x), ("y", panel.y))
         ]
         if points.texts is not None:
             columns["text"] = points.texts
             tips.insert(0, {"field": "text", "title": points.name or "point"})
         encoding: Spec = {"tooltip": tips}
         if points.colour is not None:
-            columns["c"] = numbers(points.colour, Axis("", log=points.log_colour))
+            columns["c"] = numbers(points.colour, Axis(""))
             mark |= {"color": _UNKNOWN}
-            if np.isfinite(columns["c"]).any():
-                encoding["color"] = self._colour_bar(points.colour_label, points.log_colour)
+            if (known := np.isfinite(columns["c"])).any():
+                log = bool((columns["c"][known] > 0.0).all())
+                encoding["color"] = self._colour_bar(points.colour_label, log)
         yield self._drawn(mark, columns, **encoding)
 
     def _colour_bar(self, words: str, log: bool) -> Spec:
@@ -441,8 +366,8 @@ class _Drawing:
         if self._panel.equal:
             legend |= {"title": words, "orient": "bottom", "titleOrient": "left"}
             legend |= {"gradientLength": 0.5 * self._width, "gradientThickness": 10}
-        scale: Spec = {"type": "log" if log else "linear", "range": _MAP, "nice": False}
-        scale |= {} if log else {"zero": False}
+        scale: Spec = {"type": "log"} if log else {"type": "linear", "zero": False}
+        scale |= {"range": _MAP, "nice": False}
         legend |= {"format": "~r"} if log else {}
         return {"field": "c", "type": "quantitative", "scale": scale, "legend": legend}
 
@@ -454,26 +379,11 @@ class _Drawing:
             low = np.where(np.isfinite(high) & np.isnan(low), self._extent["y"][0], low)
         kept = thinned(x, low, high)
         mark: Spec = {"type": "area", "tooltip": band.name, "color": look.colour}
-        mark |= {"fillOpacity": 0.25, "stroke": look.colour, "strokeOpacity": 0.6}
-        yield self._drawn(mark, {"x": x[kept], "y": low[kept], "y2": high[kept]})
-
-    def _bars(self, bars: Bars) -> Iterator[Spec]:
-        ends = numbers(bars.values, self._panel.x)
-        place, there = np.arange(len(ends)), np.isfinite(ends)
-        columns = {"x": 0.0 * ends, "x2": ends, "y": place - 0.4, "y2": place + 0.4}
-        tip = {"field": "x2", "title": self._panel.x.label, "format": ".4~g"}
-        mark = {"type": "rect", "color": self._look(bars.name).colour} | _OUTLINE
-        data = {name: column[there] for name, column in columns.items()}
-        yield self._drawn(mark, data, tooltip=[tip])
-
-    def _shares(self, shares: Shares) -> Iterator[Spec]:
-        x = numbers(shares.x, self._panel.x)
-        made = np.nan_to_num(np.array(shares.shares, np.float64).reshape(len(shares.names), -1))
-        ends = np.vstack([np.zeros(len(x)), np.cumsum(made, axis=0)])
-        for name, low, high in zip(shares.names, ends[:-1], ends[1:], strict=True):
-            mark: Spec = {"type": "area", "color": self._looks[name].colour, "tooltip": name}
+        if band.share:
             mark |= {"interpolate": "step-after", "stroke": "white", "strokeWidth": 0.5}
-            yield self._drawn(mark, {"x": x, "y": low, "y2": high})
+        else:
+            mark |= {"fillOpacity": 0.25, "stroke": look.colour, "strokeOpacity": 0.6}
+        yield self._drawn(mark, {"x": x[kept], "y": low[kept], "y2": high[kept]})
 
     def _spans(self, spans: Spans) -> Iterator[Spec]:
         for begin, end, name in _shaded(spans):
@@ -494,14 +404,17 @@ class _Drawing:
                 words |= {"y": 4, "angle": -90, "align": "right", "baseline": "middle"}
             yield from _read_anywhere(words, _table(x=[0.5 * (begin + end)]), {"x": self._x})
 
-    def _mark(self, mark: Mark) -> Iterator[Spec]:
-        rule: Spec = {"type": "rule", "color": _DARK, "strokeDash": (5, 3), "clip": True}
-        yield {"data": _table(x=[mark.at]), "mark": rule, "encoding": {"x": self._x}}
+    def _pixels(self, which: Literal["x", "y"], values: NDArray[np.float64]) -> NDArray[np.float64]:
+        axis = self._panel.x if which == "x" else self._panel.y
+        size = self._width if which == "x" else self._height
+        ends = np.array(self._extent[which])
+        if axis.log:
+            ends, values = np.log(ends), np.log(values)
+        return np.asarray((values - ends[0]) / (ends[1] - ends[0]) * size)
 
     def _words(self, words: Words) -> Iterator[Spec]:
         x, y = numbers(words.x, self._panel.x), numbers(words.y, self._panel.y)
-        right, up = x * self._width, y * self._height
-        right, up = right / np.ptp(self._extent["x"]), up / np.ptp(self._extent["y"])
+        right, up = self._pixels("x", x), self._pixels("y", y)
         shown: list[int] = []
         for i, text in enumerate(words.words):
             wide = [_LETTER * (0.5 * len(text + words.words[k]) + 1.0) for k in shown]
@@ -533,8 +446,9 @@ def _legend(chart: Chart, every: dict[str, Look]) -> list[Spec]:
     written = {word for item in items if isinstance(item, Words) for word in item.words}
     symbols: dict[str, tuple[str, str, tuple[float, ...]]] = {}
     for item in sorted(items, key=_layer):
-        if not (isinstance(item, Line | Points) and not len(item.x)):
-            symbols |= {name: _symbol(item, every[name]) for name in _names(item)}
+        name = getattr(item, "name", "")
+        if name and not (isinstance(item, Line | Points) and not len(item.x)):
+            symbols[name] = _symbol(item, every[name])
     names = [name for name in every if name in symbols and name not in written]
     if not names or all(map(_is_empty, chart.panels)):
         return []

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from adaptune.files import write_text
-from adaptune.processes import processes
+from adaptune.forking import processes
 from adaptune.report.charts import Chart
 from adaptune.report.drawing import draw_chart, spec
 from adaptune.report.tables import Listing, cell_text

@@ -14,11 +14,10 @@ from adaptune import geometry
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses
 from adaptune.recording.config import Compensation, SequenceConfig
-from adaptune.recording.scan import ImuNoise, Part
+from adaptune.recording.parts import Part
+from adaptune.recording.scan import ImuNoise
 from adaptune.simulation.scenes import SCENES
 from adaptune.strict import StrictModel
-
-# LiDARs: their rays, rates and noise.
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,9 +75,6 @@ def directions(name: str, columns: int) -> NDArray[np.float32]:
     looks = np.stack([x, y, z], axis=-1).astype(np.float32)
     looks.setflags(write=False)
     return looks
-
-
-# Ways of carrying a sensor.
 
 
 @dataclass(frozen=True)
@@ -184,9 +180,6 @@ class Course(StrictModel):
     def turns(self) -> float:
         """Scans a second."""
         return SENSORS[self.sensor].rate if self.rate is None else self.rate
-
-
-# The sensors of a simulated recording: their topics, and the mounting of the IMU.
 
 
 POINTS, POSES, IMU = "/velodyne_points", "/gt_poses", "/imu/data"

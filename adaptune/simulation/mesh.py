@@ -180,9 +180,6 @@ def foliage(centres: NDArray[np.float64], radii: ArrayLike, leaf: float, seed: i
     return mesh(vertices.reshape(-1, 3), np.arange(3 * n), Material.LEAVES)
 
 
-# Objects of several scenes, each with its origin on the ground.
-
-
 VARIANTS = 4
 """How many different trees, bushes and boulders there are."""
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune import files, geometry
+from adaptune import geometry, open3d
 from adaptune.files import replacing
 from adaptune.geometry import Poses, invert
 from adaptune.progress import Progress, unseen
@@ -31,12 +31,10 @@ from adaptune.simulation.course import (
     directions,
 )
 from adaptune.simulation.mesh import REFLECTIVITY, Mesh
-from adaptune.simulation.scenes import SCENES, TILE
+from adaptune.simulation.scenes import SCENES
+from adaptune.simulation.tiles import TILE
 from adaptune.simulation.world import Ride, Road, World
 from adaptune.trajectory import Trajectory, write_tum
-
-# Drive through a world and scan it.
-
 
 EPOCH = 1_600_000_000_000_000_000
 """Nanoseconds at which every recording starts."""
@@ -134,7 +132,7 @@ class _Caster:
 
     def _build(self, mesh: Mesh, origin: NDArray[np.float64]) -> None:
         """Build what rays are cast at, relative to an origin."""
-        o3d: Any = files.load()
+        o3d: Any = open3d.load()
         self._tensor, self._origin = o3d.core.Tensor.from_numpy, origin
         self._scene = o3d.t.geometry.RaycastingScene()
         vertices = np.ascontiguousarray(mesh.vertices - origin, np.float32)
@@ -147,9 +145,6 @@ class _Caster:
 def simulate(course: Course) -> Iterator[SimulatedScan]:
     """Drive a course and scan it, one scan at a time; stamps always mark a scan's start."""
     return Drive(course).scans()
-
-
-# Simulated measurements of an inertial measurement unit.
 
 
 GRAVITY = 9.80665

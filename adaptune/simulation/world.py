@@ -11,10 +11,7 @@ from scipy.ndimage import gaussian_filter1d
 from adaptune.geometry import Poses
 from adaptune.simulation.course import Motion
 from adaptune.simulation.mesh import Mesh, grid, merge
-from adaptune.simulation.scenes import TILE, Scene, Spots, Tile, smooth
-
-# The line that a course follows over the ground.
-
+from adaptune.simulation.tiles import TILE, Scene, Spots, Tile, smooth
 
 APRON = 40.0
 """Metres of world before the start and after the end of the drive."""
@@ -216,9 +213,6 @@ class World:
             inside = (cells >= leg.start) & (cells <= leg.stop)
             materials[inside] = leg.scene.surface(d[inside])
         return grid(vertices, materials)
-
-
-# The sensor's true trajectory in continuous time.
 
 
 _KNOTS = 50.0

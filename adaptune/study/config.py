@@ -10,7 +10,7 @@ from adaptune.errors import Finding, nearest
 from adaptune.odometry.remote import Limits
 from adaptune.odometry.tracker import HealthCheck
 from adaptune.recording.config import SequenceConfig, Transform
-from adaptune.recording.scan import Fractions, part_name, read_part
+from adaptune.recording.parts import Fractions, part_name, read_part
 from adaptune.ros.link import SetCommand
 from adaptune.simulation.course import Course
 from adaptune.space import ParameterSpace
@@ -210,9 +210,6 @@ class StudyConfig(StrictModel):
     def resolved(self) -> dict[str, Any]:
         """The configuration as plain data, with nothing left to defaults."""
         return self.model_dump(mode="json")
-
-
-# The sequences that a study names for training and test, and parts of them.
 
 
 ROLES = ("training", "test")

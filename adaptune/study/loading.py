@@ -7,7 +7,7 @@ from itertools import combinations, product
 from pathlib import Path
 from typing import Any, TypeVar
 
-from adaptune import files
+from adaptune import yaml12
 from adaptune.errors import AdaptuneError, Finding, Key, NotInstalledError, OdometryError, nearest
 from adaptune.odometry.base import Description
 from adaptune.odometry.registry import (
@@ -25,9 +25,6 @@ from adaptune.space import Categorical, Float, Integer, ParameterSpace, PooledSp
 from adaptune.strict import ConfigurationError, validated
 from adaptune.study.config import ROLES, RULES, OdometryConfig, StudyConfig, settle_roles
 from adaptune.study.study import Study, declared_odometry, tuned_space, whole_definition
-
-# Mistakes in the odometries of a study that only the odometries show.
-
 
 _KINDS: dict[str, type[Float | Integer | Categorical]] = {
     "float": Float,
@@ -168,9 +165,6 @@ def _check_switching(config: StudyConfig, described: list[Description]) -> Itera
         yield Finding(mechanism, message)
 
 
-# Recordings that a study trains on and tests on under two names.
-
-
 def _overlaps(config: StudyConfig, opened: dict[str, RecordedSequence]) -> Iterator[Finding]:
     """Find test sequences that hold scans of a training sequence."""
 
@@ -192,9 +186,6 @@ def _overlaps(config: StudyConfig, opened: dict[str, RecordedSequence]) -> Itera
                 f"that they share no scan"
             )
             yield Finding(("test", i), message)
-
-
-# The file.
 
 
 _MOST_BYTES = 10**6
@@ -235,12 +226,12 @@ def read_study(
     return Study(config, folder or runs / path.stem)
 
 
-def _read(path: Path) -> files.Document:
+def _read(path: Path) -> yaml12.Document:
     if path.exists() and not (path.is_file() and path.stat().st_size <= _MOST_BYTES):
         raise ConfigurationError(f"{path}: a study is a file of YAML, of 1 MB at most")
     try:
-        document = files.Document.of_file(path)
-    except files.YamlError as error:
+        document = yaml12.Document.of_file(path)
+    except yaml12.YamlError as error:
         raise ConfigurationError(str(error)) from error
     if not isinstance(document.data, dict):
         raise ConfigurationError(f"{path}: a study is a mapping of keys, see `adaptune --help`")
@@ -260,13 +251,13 @@ def _override(data: dict[str, Any], text: str) -> Key:
         if not isinstance(data, dict):
             raise ConfigurationError(f"-o {text}: {part} has no keys below it")
     try:
-        data[last] = files.scalar(value)
-    except files.YamlError as error:
+        data[last] = yaml12.scalar(value)
+    except yaml12.YamlError as error:
         raise ConfigurationError(f"-o {text}: {error}") from error
     return path
 
 
-def _say(mistake: Finding, path: Path, document: files.Document, overridden: Sequence[Key]) -> str:
+def _say(mistake: Finding, path: Path, document: yaml12.Document, overridden: Sequence[Key]) -> str:
     key = mistake.where
     # The mistake of a whole section may be the mistake of a value in it.
     by_override = any(key[: len(o)] == o[: len(key)] for o in overridden)

@@ -10,10 +10,10 @@ from typing import Any
 from adaptune import manifest
 from adaptune.errors import Finding
 from adaptune.geometry import Poses, to_pose
-from adaptune.processes import pin
+from adaptune.machine import pin
 from adaptune.recording.recording import RecordedSequence, wants_estimate
 from adaptune.reference import estimate
-from adaptune.reference.check import SUSPICIOUS, contradictions
+from adaptune.reference.diagnosis import SUSPICIOUS, contradictions
 from adaptune.reference.stored import (
     EstimatedReference,
     EstimateError,
@@ -156,7 +156,7 @@ def contradictions_of(
 ) -> list[Finding]:
     """What the scans of a sequence say where its reference and an odometry disagree.
 
-    For the parameters see `adaptune.reference.check.contradictions`. A view has its origin's
+    For the parameters see `adaptune.reference.diagnosis.contradictions`. A view has its origin's
     reference, seen otherwise: nothing is said of it.
     """
     config = sequences.config(name)

@@ -14,9 +14,9 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import AliasChoices, AliasPath, ConfigDict, Field
 
-from adaptune import files
+from adaptune import yaml12
 from adaptune.errors import AdaptuneError, Finding, Key, OdometryError, nearest
-from adaptune.odometry.program import Template
+from adaptune.odometry.template import Template
 from adaptune.strict import StrictModel, validated
 
 _Number = int | float
@@ -119,8 +119,8 @@ class _File:
     def __init__(self, path: Path):
         self.path = path
         try:
-            self._document = files.Document.of_file(path)
-        except files.YamlError as error:
+            self._document = yaml12.Document.of_file(path)
+        except yaml12.YamlError as error:
             raise RustleError(str(error)) from error
         self.data: Any = self._document.data
 
@@ -145,9 +145,6 @@ class _File:
             what = f"{self.path.name} has no {name!r} in {key}: {nearest(name, names)}"
             raise asking.error(asked, what)
         return names.index(name), entries[names.index(name)]
-
-
-# Searches for parameters in RUSTLE's tunings, as settings of the offline stage.
 
 
 _MOST_TRIALS = 10**6
@@ -270,9 +267,6 @@ def _annealing(
     return parameters, offline
 
 
-# Studies made of RUSTLE's tests and tunings.
-
-
 _TOPICS = {
     "points": ("lid_topic", "lidar_topic", "pointCloudTopic", "points_topic", "cloud_topic"),
     "imu": ("imu_topic", "imuTopic"),
@@ -296,7 +290,7 @@ class ImportedStudy(NamedTuple):
         if self.notes:
             lines.append("# Not taken over, or to be looked at:")
         lines += [fill(n, initial_indent="# - ", subsequent_indent="#   ") for n in self.notes]
-        sections = [files.dump({key: value}) for key, value in self.data.items()]
+        sections = [yaml12.dump({key: value}) for key, value in self.data.items()]
         return "\n".join([*lines, "", *sections])
 
 

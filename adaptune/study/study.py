@@ -14,27 +14,28 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import TypeVar
 
-from adaptune import files, manifest
+from adaptune import manifest, yaml12
 from adaptune.archive import Archive, Sources
 from adaptune.errors import AdaptuneError, OdometryError
 from adaptune.files import locked, write_text
+from adaptune.machine import available
 from adaptune.manifest import merged
 from adaptune.model import ErrorModel
 from adaptune.model.descriptor import descriptor_content
 from adaptune.odometry.base import Description, OwnFile
 from adaptune.odometry.program import ProgramInput, program_input
 from adaptune.odometry.registry import Factory, OdometryFactory, OdometryPool, declare
-from adaptune.processes import available
 from adaptune.recording.cache import fingerprints
 from adaptune.recording.config import REFERENCE_FILES, SequenceConfig
 from adaptune.recording.export import Layout
+from adaptune.recording.parts import part_name
 from adaptune.recording.recording import (
     SequenceFiles,
     open_sequence,
     sequence_files,
     wants_estimate,
 )
-from adaptune.recording.scan import Recording, part_name
+from adaptune.recording.scan import Recording
 from adaptune.recording.views import with_imu
 from adaptune.reference.stored import BREAK, EstimateError, StoredEstimate
 from adaptune.simulation.course import Course
@@ -287,7 +288,7 @@ class Study(Generic[C_co]):
     def fixed(self) -> ParameterSet | None:
         """The fixed set, once training has chosen it."""
         path = self.folder / FIXED_SET
-        return files.Document.of_file(path).data if path.exists() else None
+        return yaml12.Document.of_file(path).data if path.exists() else None
 
     def own_file(self, fixed: ParameterSet) -> tuple[Path, OwnFile] | None:
         """The fixed set as its odometry's own tool reads it, and where; None if it has none."""
@@ -421,7 +422,7 @@ class Study(Generic[C_co]):
                 )
             _locks[str(folder)] = lock
         with contextlib.suppress(OdometryError):  # one that is not here, and not needed now
-            write_text(folder / CONFIGURATION, files.dump(self._resolved()))
+            write_text(folder / CONFIGURATION, yaml12.dump(self._resolved()))
 
     def _resolved(self) -> dict[str, Any]:
         """The configuration with nothing left to defaults."""

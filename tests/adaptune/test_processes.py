@@ -7,11 +7,10 @@ import time
 
 import numpy as np
 import pytest
-from wicked import IMPORTS, gone
+from wicked import IMPORTS, gone, wait_until_gone
 
 from adaptune import processes
 from adaptune.commands.tune import inspect
-from adaptune.errors import AdaptuneError
 from adaptune.model import ModelError
 from adaptune.model.error_model import ErrorModel
 from adaptune.odometry.registry import OdometryFactory
@@ -152,14 +151,6 @@ def test_mistakes_in_the_settings_of_a_user_s_class(mine, study_file):
             load_study(study_file, [*base, given])
 
 
-def wait_until_gone(pids, seconds=10.0):
-    end = time.monotonic() + seconds
-    while not all(map(gone, pids)) and time.monotonic() < end:
-        time.sleep(0.02)
-    assert [process for process in pids if not gone(process)] == []
-
-
-# A child in the program's own session, and one that leaves it.
 LEAVES = "sleep 1000 & echo $!; setsid sleep 1000 & echo $!; echo $$; "
 
 
@@ -280,155 +271,6 @@ def test_a_program_is_measured_with_all_that_it_starts():
     assert code == 0
     assert 0.6 <= cpu < 3.0
     assert 200.0 <= memory < 400.0
-
-
-# Which cores a process may use, and its memory.
-
-
-@pytest.fixture
-def allowed(monkeypatch):
-    """Cores of this process, of which a test may have as many as it likes."""
-    now = {2, 3, 5, 7}
-
-    def keep(_, some):
-        now.clear()
-        now.update(some)
-
-    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(now), raising=False)
-    monkeypatch.setattr(os, "sched_setaffinity", keep, raising=False)
-    return now
-
-
-def test_a_process_is_kept_on_one_core_until_that_is_undone(allowed):
-    with processes.pin(6):
-        assert allowed == {5}
-        assert processes.available() == 1
-    assert allowed == {2, 3, 5, 7}
-
-
-def test_others_get_the_rest_only_where_this_process_is_alone(allowed):
-    with processes.pin(1, alone=True):
-        assert {processes.next_core() for _ in range(4)} == {2, 3, 5, 7}
-    with processes.pin(1):
-        assert {processes.next_core() for _ in range(4)} == allowed == {3}
-
-
-def test_those_that_work_for_this_process_get_other_cores(allowed):
-    assert [processes.other_core(i) for i in range(4)] == [3, 5, 7, 3]
-    with processes.pin(1, alone=True):
-        assert processes.shared_cores() == {2, 3, 5, 7}
-        assert [processes.other_core(i) for i in range(4)] == [2, 5, 7, 2]
-    allowed.clear()
-    allowed.add(7)
-    assert [processes.other_core(i) for i in range(2)] == [7, 7]
-    assert processes.shared_cores() == {7}
-
-
-def test_mapped_files_are_no_memory_of_the_process(tmp_path):
-    path = tmp_path / "mapped"
-    np.zeros(50_000_000, np.uint8).tofile(path)
-    mapped = np.memmap(path, np.uint8, "r")
-    before = processes.resident_megabytes()
-    assert mapped.sum() == 0  # now all of it is there
-    assert processes.resident_megabytes() < before + 20.0
-    held = np.ones(50_000_000, np.uint8)
-    assert processes.resident_megabytes() > before + 40.0
-    del held
-    processes.release_memory()
-    assert processes.resident_megabytes() < before + 20.0
-
-
-def test_a_process_that_is_killed_is_told():
-    with pytest.raises(AdaptuneError, match="was the memory full"), processes.processes(1) as pool:
-        pool.submit(os._exit, 1).result()
-
-
-OWNER = """
-import os, sys, time
-from adaptune import processes
-with processes.processes(1) as pool:
-    print(pool.submit(os.getpid).result(), flush=True)
-    pool.submit(time.sleep, 600).result()
-"""
-
-
-def test_a_process_ends_with_the_one_that_it_computes_for():
-    owner = subprocess.Popen(
-        [sys.executable, "-c", OWNER],
-        stdout=subprocess.PIPE,
-        env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
-        text=True,
-    )
-    with owner:
-        worker = owner.stdout.readline().strip()
-        assert not gone(worker)
-        owner.kill()
-    wait_until_gone([worker])
-
-
-HOLES = """
-import contextlib, sys
-import numpy as np
-from adaptune import processes as cores
-before = cores.resident_megabytes()
-np.ones(2**21)  # once it is free, the C library keeps arrays of this size
-large, small = [], []
-with cores.apart() if sys.argv[1] == "apart" else contextlib.nullcontext():
-    if sys.argv[1] == "apart":
-        with cores.apart():
-            pass  # the outer block goes on
-    for _ in range(50):
-        large.append(np.ones(2**18))
-        small.append(np.ones(2**10))
-large.clear()
-print(cores.resident_megabytes() - before)
-"""
-
-
-def test_large_arrays_among_small_ones_leave_no_holes():
-    def kept(what):
-        """Megabytes that a process keeps of 105 that are free."""
-        command = [sys.executable, "-c", HOLES, what]
-        return float(subprocess.run(command, capture_output=True, check=True, text=True).stdout)
-
-    assert kept("as ever") > 50.0
-    assert kept("apart") < 10.0
-
-
-ODD = """
-import os, sys
-from pathlib import Path
-from adaptune.processes import processes
-
-def seen():
-    import offline, random
-    return [os.getcwd(), offline.__file__, random.__file__]
-
-if __name__ == "__main__":
-    with processes(1, ["offline", "random", "statistics"]) as pool:
-        import offline, random
-        assert pool.submit(seen).result() == [os.getcwd(), offline.__file__, random.__file__]
-    print("well")
-"""
-
-
-def test_processes_begin_whatever_the_folder_holds_and_however_long_its_name_is(tmp_path):
-    (tmp_path / "odd.py").write_text(ODD)
-    here = tmp_path / ("x" * 100)
-    here.mkdir()
-    # Modules of Python's, of multiprocessing's, and of adaptune's.
-    for name in ("random", "statistics", "selectors", "queue", "offline"):
-        (here / f"{name}.py").write_text("import os; os.abort()")
-    done = subprocess.run(
-        [sys.executable, "-P", tmp_path / "odd.py"],
-        cwd=here,
-        env=os.environ | {"TMPDIR": str(here)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert (done.stdout, done.stderr) == ("well\n", "")
-    assert not list(here.glob("pymp-*"))
 
 
 SCRIPT = "import sys; from adaptune.__main__ import main; sys.exit(main())"

@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 from needs import needs_evalio
 
-from adaptune import files
+from adaptune import yaml12
 from adaptune.odometry.docker import rustle
-from adaptune.odometry.program import Template
+from adaptune.odometry.template import Template
 from adaptune.strict import ConfigurationError
 from offline.config import load_study
 
@@ -32,11 +32,11 @@ def test_shipped_studies_lack_nothing_but_their_data(name, monkeypatch, tmp_path
 
 @pytest.mark.parametrize("name", IMAGES)
 def test_templates_hold_the_baseline(name):
-    odometry = files.Document((CONFIGS / f"{name}.yaml").read_text()).data["odometry"]
+    odometry = yaml12.Document((CONFIGS / f"{name}.yaml").read_text()).data["odometry"]
     template = CONFIGS / odometry["settings"]["template"]
     baseline = {key: p["baseline"] for key, p in odometry["parameters"].items()}
-    unchanged = files.Document(Template(template).fill({})).data
-    assert files.Document(Template(template).fill(baseline)).data == unchanged
+    unchanged = yaml12.Document(Template(template).fill({})).data
+    assert yaml12.Document(Template(template).fill(baseline)).data == unchanged
 
 
 def test_studies_of_third_party_odometries_differ_in_their_odometry_only():

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 from tables import table
 
-from adaptune import files
+from adaptune import yaml12
 from adaptune.space import (
     ODOMETRY,
     Categorical,
@@ -141,7 +141,7 @@ def test_space_survives_its_dump():
     space = ParameterSpace(
         dict(SPACE.parameters) | {"mixed": Categorical(choices=(1, "1", 2.5, True), baseline=2.5)}
     )
-    for write, read in [(json.dumps, json.loads), (files.dump, files.scalar)]:
+    for write, read in [(json.dumps, json.loads), (yaml12.dump, yaml12.scalar)]:
         back = ParameterSpace.load(read(write(space.dump())))
         assert back == space
         assert list(map(type, back.parameters["mixed"].choices)) == [int, str, float, bool]

@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from rooms import write_kitti
 
 from adaptune import geometry
 from adaptune.trajectory import (
@@ -14,7 +15,6 @@ from adaptune.trajectory import (
     read_kitti,
     read_trajectory,
     read_tum,
-    write_kitti,
     write_tum,
 )
 

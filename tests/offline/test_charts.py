@@ -1,28 +1,26 @@
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from made_trials import made_table, write_trials
 from random_models import SPACE
 
-from adaptune import files
+from adaptune import yaml12
 from adaptune.archive import Summary
 from adaptune.errors import AdaptuneError
-from adaptune.report.charts import Band, Line, Points
+from adaptune.report.charts import Band, Line, Points, Words
 from offline.charts import (
-    TrialTable,
-    TriedSet,
     charts_of_trials,
     charts_of_validation,
-    cost_chart,
-    importances,
+    front_chart,
+    front_rows,
     iteration_chart,
-    read_trials,
     scatter_chart,
     stretch_chart,
-    trial_table,
 )
 from offline.config import OfflineConfig, load_study
+from offline.trial_table import importances, read_trials, trial_table
 from offline.tuning import figures
 
 
@@ -48,7 +46,6 @@ def test_a_scatter_has_a_panel_for_each_sequence_and_the_mean():
         (fixed,) = of_kind(panel, Points, "fixed")
         assert list(fixed.x) == [table.column("distance")[3]]
         (trials,) = of_kind(panel, Points, "trial")
-        assert trials.log_colour
         assert min(trials.colour) == values.min()
     assert scatter_chart(table, ["distance"], ["one"]) is None
 
@@ -69,20 +66,52 @@ def test_a_trial_that_failed_is_no_best():
     np.testing.assert_allclose(of_kind(panel, Line)[0].y, [1.0, 0.9, 0.9, 0.7])
 
 
+def tried(what, cost, error, low=None, high=None, recommended=False):
+    row = {"what": what, "cost [ms]": cost, "error [%]": error, "recommended": recommended}
+    return row | {"low": low, "high": high}
+
+
 def test_the_front_has_less_error_for_more_time():
-    table = TrialTable(
-        SPACE,
-        ["one"],
-        [
-            TriedSet(n, SPACE.baseline, {"one": error}, error, True, cost)
-            for n, (cost, error) in enumerate(
-                [(5.0, 3.0), (1.0, 9.0), (1.0, 8.0), (7.0, 3.0), (9.0, 1.0), (np.nan, 0.1)]
-            )
-        ],
-    )
-    (panel,) = cost_chart(table).panels
-    (front,) = of_kind(panel, Line)
-    assert list(zip(front.x, front.y, strict=True)) == [(1.0, 8.0), (5.0, 3.0), (9.0, 1.0)]
+    rows = [
+        tried("bank of 4", 9.0, 1.0, 0.8, 1.3),
+        tried("baseline", 5.0, 3.0),
+        tried("trial 1", 1.0, 9.0),
+        tried("trial 2", 1.0, 8.0),
+        tried("trial 3", 4.0, 4.0, 3.0, 5.0, recommended=True),
+        tried("trial 4", 7.0, 3.0),
+        tried("trial 5", np.nan, 0.1),
+        tried("trial 6", 0.1, None),
+    ]
+    (panel,) = front_chart(rows).panels
+    (front,) = of_kind(panel, Line, "front")
+    assert [*zip(front.x, front.y, strict=True)] == [(1.0, 8.0), (4.0, 4.0), (5.0, 3.0), (9.0, 1.0)]
+    points = {d.name: list(d.x) for d in of_kind(panel, Points)}
+    assert len(points.pop("tried")) == 6
+    assert points == {"recommended": [4.0], "bank": [9.0], "baseline": [5.0]}
+    # The baseline has none.
+    (intervals,) = of_kind(panel, Line, "95 % interval")
+    assert [y for y in intervals.y if np.isfinite(y)] == [3.0, 5.0, 0.8, 1.3]
+    (words,) = of_kind(panel, Words)
+    assert list(words.words) == ["trial 3", "bank of 4", "baseline"]
+    assert (list(words.x), list(words.y)) == ([4.0, 9.0, 5.0], [4.0, 1.0, 3.0])
+
+
+@pytest.mark.parametrize("row", [None, tried("trial 3", np.nan, 2.0), tried("trial 3", 1.0, 0.0)])
+def test_one_known_point_is_no_front(row):
+    assert front_chart([tried("baseline", 5.0, 3.0), *([row] if row else [])]) is None
+
+
+def test_trials_that_may_be_chosen_are_on_the_front():
+    table = made_table(error, fixed=3)
+    failed = table.trials[5]._replace(usable=False)
+    table = replace(table, trials=[*table.trials[:5], failed, *table.trials[6:]])
+    rows = front_rows(table)
+    assert len(rows) == len(table) - 1
+    assert [row["what"] for row in rows[:5]] == [
+        *("baseline", "trial 1", "trial 2", "fixed", "trial 4")
+    ]
+    (panel,) = front_chart(rows).panels
+    assert len(of_kind(panel, Points, "fixed")) == 1
 
 
 def test_a_study_is_read(study_file, tmp_path):
@@ -93,7 +122,7 @@ def test_a_study_is_read(study_file, tmp_path):
     intervals = table.column("keyframe_interval")
     np.testing.assert_allclose(table.values, intervals, rtol=1e-6)
     assert table.fixed is None
-    (study.folder / "fixed.yaml").write_text(files.dump(table.trials[2].parameters), "utf-8")
+    (study.folder / "fixed.yaml").write_text(yaml12.dump(table.trials[2].parameters), "utf-8")
     assert read_trials(study).fixed == 2
 
 

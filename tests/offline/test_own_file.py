@@ -1,7 +1,7 @@
 import pytest
 from drives import study_with
 
-from adaptune import files
+from adaptune import yaml12
 from adaptune.commands import terminal
 from adaptune.space import ODOMETRY
 from offline.config import load_study
@@ -20,7 +20,7 @@ def study(study_file, tmp_path):
 def write(study, label, **parameters):
     fixed = study.odometry.space.complete({ODOMETRY: label, **parameters})
     write_fixed(study, fixed)
-    assert files.Document.of_file(study.folder / "fixed.yaml").data == fixed
+    assert yaml12.Document.of_file(study.folder / "fixed.yaml").data == fixed
 
 
 def said(study, capsys, **options):
@@ -33,7 +33,7 @@ def test_the_fixed_set_s_odometry_decides(study, capsys):
     own, users = study.folder / "fixed_kiss_icp.yaml", study.folder / "fixed_mine.yaml"
     write(study, "kiss_icp", voxel_size=0.7)
     users.touch()
-    assert files.Document.of_file(own).data["mapping"]["voxel_size"] == 0.7
+    assert yaml12.Document.of_file(own).data["mapping"]["voxel_size"] == 0.7
     alone = f"The parameters: {study.folder}/fixed.yaml"
     for_tool = f"for the odometry's own tool: {own} (kiss_icp_pipeline --config FILE DATA)"
     assert said(study, capsys) == f"{alone}; {for_tool}."

@@ -13,10 +13,10 @@ from adaptune.model import BankSettings, ErrorModel, PairedSettings
 from adaptune.study.study import ModeError, bank_members
 from adaptune.trajectory import Trajectory, read_tum, write_tum
 from offline.config import load_study
-from online.charts import read_replays
 from online.compare import compare
 from online.modes import run_replays
 from online.record import StoredReplay, StoredReplayError
+from online.replayed import read_replays
 from online.statistics import ComparisonRow, Reference
 from online.tables import remarks
 

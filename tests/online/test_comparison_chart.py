@@ -38,7 +38,8 @@ def test_modes_stand_below_each_other_from_the_least_error():
     assert list(points) == ["geometric mean over all sequences", "each sequence"]
     means = points["geometric mean over all sequences"]
     assert list(zip(means.x, means.y, strict=True)) == [(1.3, 0.0), (0.85, 1.0), (0.6, 2.0)]
-    (interval,) = drawn(ROWS, Line).values()
+    mark, interval = drawn(ROWS, Line).values()
+    assert (list(mark.x), list(mark.y)) == ([1.0, 1.0], [-0.6, 2.6])
     np.testing.assert_array_equal(interval.x, [0.8, 0.95, np.nan])
     assert list(interval.y) == [1.0] * 3
     # What lies lower still belongs to the line.
@@ -53,7 +54,7 @@ def test_of_one_sequence_there_is_nothing_below():
     rows = [row("one", "fixed", 1.0), row("one", "adaptive", 0.8), row("one", "paper", 2.0)]
     (points,) = drawn(rows, Points).values()
     assert (points.name, list(points.x)) == ("one", [2.0, 0.8])
-    assert not drawn(rows, Line)
+    assert list(drawn(rows, Line)) == [""]
     assert "Below each mean" not in comparison_chart(rows).caption
 
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from adaptune.trajectory import Trajectory
-from online.charts import scene_spans
+from online.replayed import scene_spans
 
 LEGS = [("cave", 20.0), ("open", 30.0), ("street", 10.0)]
 START = 1_600_000_000_000_000_000

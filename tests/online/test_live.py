@@ -10,7 +10,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from adaptune.recording.clouds import CLOUDS
 from adaptune.recording.config import ImuConfig
-from adaptune.recording.scan import Timing
+from adaptune.recording.timing import Timing
 from adaptune.ros.link import LinkError
 from adaptune.space import Selection
 from online import live

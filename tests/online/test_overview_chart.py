@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from made_replays import SCENES, SECONDS, bank, kept, replay, sequence
 
-from adaptune.report.charts import Line, Mark, Points, Shares, Spans, Words
+from adaptune.report.charts import Band, Line, Points, Spans, Words
 from online.charts import charts_of_comparison, overview_chart
 from online.statistics import ComparisonRow
 
@@ -44,7 +44,8 @@ def test_the_sequence_is_shown_on_which_the_main_modes_differ_most():
     assert of_kind(path, Words)[0].words == ["start", "cave", "open"]
     assert [line.name for line in of_kind(errors, Line)] == ["baseline", "fixed", "adaptive"]
     assert of_kind(errors, Spans) == of_kind(chosen, Spans) == [SCENES]
-    assert len(of_kind(chosen, Shares)) == len(of_kind(chosen, Mark)) == 1
+    assert len(of_kind(chosen, Band)) == 3
+    assert len(of_kind(chosen, Line)) == 1
 
 
 def test_the_path_lies_along_x():

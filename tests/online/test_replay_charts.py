@@ -1,14 +1,10 @@
 import numpy as np
 from made_replays import SCENES, SECONDS, bank, kept, replay, sequence
 
-from adaptune.report.charts import Band, Line, Mark, Points, Shares, Spans
+from adaptune.report.charts import Band, Line, Points, Spans
 from offline.config import load_study
-from online.charts import (
-    charts_of_replays,
-    choice_chart,
-    error_chart,
-    read_replays,
-)
+from online.charts import charts_of_replays, choice_chart, error_chart
+from online.replayed import read_replays
 
 
 def of_kind(panel, kind):
@@ -61,12 +57,12 @@ def test_choices_last_until_the_next_one():
     assert distance.y.log
     assert kernel.y.names == ("huber", "none")
     assert list(of_kind(kernel, Line)[1].y) == [1.0, 1.0, 0.0, 0.0]
-    (shares,) = of_kind(weights, Shares)
-    np.testing.assert_allclose(shares.shares.sum(axis=0), 100.0)
-    np.testing.assert_allclose(shares.shares[:, -1], [60.0, 10.0, 30.0])
-    assert shares.names == ("trial 4", "trial 17", "trial 2")
+    shares = of_kind(weights, Band)
+    np.testing.assert_allclose(shares[-1].high, 100.0)
+    np.testing.assert_allclose([one.high[-1] - one.low[-1] for one in shares], [60.0, 10.0, 30.0])
+    assert [one.name for one in shares] == ["trial 4", "trial 17", "trial 2"]
     # Shares hide what is shaded: a line shows where a scene ends.
-    assert [mark.at for mark in of_kind(weights, Mark)] == [8.0]
+    assert [line.x for line in of_kind(weights, Line)] == [[8.0, 8.0]]
 
 
 def test_weights_that_never_change_are_not_drawn():

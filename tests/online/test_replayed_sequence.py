@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from offline.config import load_study
-from online.charts import charts_of_replays, read_replays, scenes_along
+from online.charts import charts_of_replays
 from online.modes import run_replays
+from online.replayed import read_replays, scenes_along
 
 COURSE = """\
 odometry: {name: gicp}

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 from drives import study_with
 
-from adaptune import files
+from adaptune import yaml12
 from adaptune.archive import Archive
 from adaptune.model import ErrorModel
 from adaptune.space import ODOMETRY, PooledSpace
@@ -55,7 +55,7 @@ def test_the_trials_range_over_both(trained):
     rows = list(csv.DictReader((study.folder / "trials.csv").open()))
     assert all((row["resolution"] == "") == (row[ODOMETRY] == "gicp") for row in rows)
     assert all(float(row["cost [ms]"]) > 0.0 for row in rows)
-    fixed = files.Document((study.folder / "fixed.yaml").read_text()).data
+    fixed = yaml12.Document((study.folder / "fixed.yaml").read_text()).data
     assert fixed == sets[training.model.fixed]
 
 

@@ -15,10 +15,11 @@ from adaptune.trajectory import Trajectory, write_tum
 from offline.config import load_study
 from offline.train import train
 from offline.validate import validate
-from online.charts import charts_of_replays, read_replays
+from online.charts import charts_of_replays
 from online.compare import compare, current_replays
 from online.modes import run_replays
 from online.record import StoredReplayError, check_reference
+from online.replayed import read_replays
 
 
 @pytest.fixture(scope="module")

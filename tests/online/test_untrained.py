@@ -11,10 +11,10 @@ from adaptune import manifest
 from adaptune.selector import UntrainedSelector, untrained_sets
 from adaptune.study.study import ModeError
 from offline.config import load_study
-from online.charts import read_replays
 from online.compare import compare
 from online.modes import ReplaySetup, run_untrained, sequences_without_model
 from online.record import StoredReplay, StoredReplayError
+from online.replayed import read_replays
 from online.tables import remarks, tables
 
 MODES = ["baseline", "untrained"]

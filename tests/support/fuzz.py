@@ -21,8 +21,9 @@ import rec
 
 from adaptune.errors import AdaptuneError
 from adaptune.recording import Scan, SequenceConfig, clouds
-from adaptune.recording.inspect import inspect, render_inspection
+from adaptune.recording.inspect import inspect
 from adaptune.recording.recording import open_sequence
+from adaptune.recording.rendering import render_inspection
 from offline.config import load_study
 
 SECONDS = 10

@@ -4,7 +4,7 @@ import numpy as np
 
 from adaptune.report.charts import Spans
 from adaptune.space import Categorical, Float, ParameterSpace
-from online.charts import ModeReplay, ReplayedSequence
+from online.replayed import ModeReplay, ReplayedSequence
 
 SECONDS = np.arange(0.0, 20.0, 0.1)
 XY = np.column_stack([SECONDS, np.sin(SECONDS)])

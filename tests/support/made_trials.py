@@ -8,9 +8,9 @@ from random_models import SPACE
 from rooms import along_x
 
 from adaptune.archive import Archive, Frames, Summary, Trial
-from offline.charts import trial_table
 from offline.config import OfflineConfig
 from offline.trial import Drive
+from offline.trial_table import trial_table
 
 N_FRAMES = 40
 

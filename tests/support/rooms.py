@@ -50,3 +50,8 @@ def along_x(x):
     T = np.tile(np.eye(4), (len(x), 1, 1))
     T[:, 0, 3] = x
     return T
+
+
+def write_kitti(path, T):
+    """Write poses as KITTI has them, 12 numbers a line."""
+    np.savetxt(path, T[:, :3].reshape(-1, 12), fmt="%.9e")

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from adaptune.report.charts import Axis, Band, Bars, Chart, Line, Mark, Panel, Points, Shares, Spans
+from adaptune.report.charts import Axis, Band, Chart, Line, Panel, Points, Spans, shares
 from adaptune.report.page import Page, PageSection
 from adaptune.report.tables import Listing
 
@@ -20,7 +20,6 @@ def over_time() -> Chart:
         scenes,
         Line(t, error, "fixed"),
         Line(t, np.where((t > 60.0) & (t < 70.0), np.nan, 0.8 * error), "adaptive"),
-        Mark(120.0),
     )
     k = np.arange(0.0, 241.0, 20.0)
     estimate = (
@@ -28,14 +27,16 @@ def over_time() -> Chart:
         Line(t, error, "fixed", faint=True),
     )
     weights = rng.dirichlet(np.ones(3), len(k)).T
-    members = Shares(k, weights, ("trial 3", "trial 17", "trial 242"))
+    members = shares(k, weights, ("trial 3", "trial 17", "trial 242"))
     return Chart(
         "over-time",
         "Errors and selections over time",
         (
             Panel(TIME, RTE, lines, "error of the replays", height=1.6),
             Panel(TIME, Axis("RTE, last 30 s [%]"), estimate, "its error as estimated"),
-            Panel(TIME, Axis("weight [-]", limits=(0.0, 1.0)), (members,), "members of the bank"),
+            Panel(
+                TIME, Axis("weight [-]", limits=(0.0, 1.0)), tuple(members), "members of the bank"
+            ),
         ),
         "The adaptive mode lost its reference for ten seconds.",
         shared_x=True,
@@ -48,7 +49,7 @@ def trials(n: int = 2000) -> Chart:
     cost, error = rng.lognormal(2.0, 0.5, n), rng.lognormal(0.0, 0.7, n)
     size = np.where(rng.random(n) < 0.1, np.nan, rng.lognormal(-1.0, 1.0, n))
     texts = [f"trial {i}: voxel_size {size[i]:.3g}" for i in range(n)]
-    points = Points(cost, error, "trials", size, "voxel size [m]", log_colour=True, texts=texts)
+    points = Points(cost, error, "trials", size, "voxel size [m]", texts=texts)
     kinds = Axis("registration", names=("point to point", "point to plane", "GICP"))
     named = Points([kinds.names[i % 3] for i in range(60)], error[:60], "trials")
     return Chart(
@@ -73,7 +74,7 @@ def comparison() -> Chart:
             Panel(
                 Axis("error over the fixed set's [-]"),
                 Axis("parameter", names=("voxel_size", "max_range", "iterations")),
-                (Bars([1.4, 0.8, 1.05], "fixed"), Mark(1.0)),
+                (Line([0.0, 1.4, np.nan, 0.0, 0.8], [0, 0, 0, 1, 1], "fixed", width=20.0),),
             ),
         ),
         columns=2,
@@ -95,11 +96,9 @@ def from_above() -> Chart:
 def empty() -> Chart:
     drawn = (
         Line([], [], "fixed"),
-        Points([1.0], [np.nan], "trials", [np.nan], "size [m]", log_colour=True),
-        Bars([], "bars"),
+        Points([1.0], [np.nan], "trials", [np.nan], "size [m]"),
         Band([], [], [], "band"),
-        Shares([], np.zeros((2, 0)), ("a", "b")),
-        Mark(1.0),
+        *shares([], np.zeros((2, 0)), ("a", "b")),
     )
     panel = Panel(Axis("x [-]", log=True), Axis("y [-]", log=True), drawn)
     return Chart("empty", "Nothing was measured", (panel,))

@@ -7,9 +7,9 @@ import rec
 from pydantic import TypeAdapter
 from rich.console import Console
 
-from adaptune import files
+from adaptune import yaml12
 from adaptune.recording import SequenceConfig
-from adaptune.recording.inspect import render_inspection
+from adaptune.recording.rendering import render_inspection
 
 START = 1_700_000_000_000_000_000
 
@@ -66,7 +66,7 @@ def inspection_text(inspection, width=100):
 
 def entry(inspection):
     """The proposed entry, read back as a study would."""
-    data = files.Document(inspection.entry).data["sequences"]
+    data = yaml12.Document(inspection.entry).data["sequences"]
     return TypeAdapter(dict[str, SequenceConfig]).validate_python(data)
 
 

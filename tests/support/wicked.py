@@ -3,6 +3,7 @@
 import contextlib
 import os
 import signal
+import time
 from pathlib import Path
 
 from adaptune.processes import server
@@ -24,6 +25,16 @@ def gone(process):
         return stat.rpartition(")")[2].split()[0] == "Z"
     except OSError:
         return True
+
+
+def wait_until_gone(pids, seconds=10.0):
+    end = time.monotonic() + seconds
+    while not all(map(gone, pids)) and time.monotonic() < end:
+        time.sleep(0.02)
+    assert [process for process in pids if not gone(process)] == []
+
+
+# A child in the program's own session, and one that leaves it.
 
 
 def children(process):

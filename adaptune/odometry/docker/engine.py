@@ -21,7 +21,7 @@ from typing import Any, BinaryIO, Literal, NamedTuple
 
 from pydantic import Field
 
-from adaptune import files, processes
+from adaptune import processes, yaml12
 from adaptune.errors import NotInstalledError, OdometryError, UnavailableError
 from adaptune.files import replacing_folder, temporary_prefix
 from adaptune.keeper import Ended
@@ -483,5 +483,5 @@ def kept_log(run: Any, logs: Path | None, fault: str | None, **about: Any) -> It
         note |= {"cpu": round(usage.cpu, 3), "memory": round(usage.memory or 0.0, 1)}
         if fault:
             note["fault"] = fault
-        (temporary / "trial.yaml").write_text(files.dump(note), encoding="utf-8")
+        (temporary / "trial.yaml").write_text(yaml12.dump(note), encoding="utf-8")
         yield temporary

@@ -1,7 +1,7 @@
 import pytest
 from commands import refused, succeeded
 
-from adaptune import files as yaml
+from adaptune import yaml12
 from adaptune.odometry.docker import rustle as docker_rustle
 from adaptune.space import ParameterSpace
 from adaptune.strict import ConfigurationError
@@ -107,7 +107,7 @@ def rustle(tmp_path, monkeypatch):
 
 
 def read(path):
-    return yaml.Document(path.read_text(encoding="utf-8")).data
+    return yaml12.Document(path.read_text(encoding="utf-8")).data
 
 
 def check(path):

@@ -10,11 +10,12 @@ import yaml
 from made_drives import trials_of
 from setups import setup_of
 
-from adaptune.archive import Archive, rows
+from adaptune.archive import Archive
 from adaptune.errors import OdometryError
-from adaptune.odometry.program import Template
+from adaptune.odometry.template import Template
 from adaptune.odometry.tracker import HealthCheck
 from adaptune.strict import ConfigurationError
+from adaptune.trial_rows import rows
 from offline.campaign import BaselineError
 from offline.config import load_study
 from offline.train import train

@@ -28,10 +28,10 @@ from street import (
     usual_drive,
 )
 
-from adaptune import processes
+from adaptune import machine
 from adaptune.geometry import invert
 from adaptune.odometry import OdometryError
-from adaptune.odometry.base import prepared_bytes
+from adaptune.odometry.prepared import prepared_bytes
 from adaptune.odometry.registry import CONTAINERS, ODOMETRIES, PROGRAMS, odometry_class
 from adaptune.recording import Scan
 from adaptune.space import Selection
@@ -106,7 +106,7 @@ def test_the_same_scans_give_the_same_bytes_on_one_core(name):
 
 
 def print_digests():
-    processes.pin(0)
+    machine.pin(0)
     for name in CLEAN:
         poses = [drive(make(name), prepared_drive(name)) for _ in range(2)]
         found = (hashlib.sha256(of_one.tobytes()).hexdigest() for of_one in poses)

@@ -21,10 +21,12 @@ from street import served
 from adaptune import processes
 from adaptune.archive import Archive
 from adaptune.odometry import OdometryError, wire
-from adaptune.odometry.base import MOST_FAULTS, InProcess
+from adaptune.odometry.base import InProcess
+from adaptune.odometry.faults import MOST_FAULTS
+from adaptune.odometry.guarded import Guarded
 from adaptune.odometry.keyframe import KeyframeGicp
 from adaptune.odometry.registry import OdometryFactory, make_here
-from adaptune.odometry.remote import SERVICE, Guarded, Isolated, Limits, Process, ProcessSettings
+from adaptune.odometry.remote import SERVICE, Isolated, Limits, Process, ProcessSettings
 from adaptune.odometry.tracker import HealthCheck
 from adaptune.recording import Imu, Scan
 from adaptune.recording.scan import ImuNoise

@@ -10,7 +10,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from adaptune.recording import clouds
 from adaptune.recording.clouds import PointCloudError, from_fields
-from adaptune.recording.scan import AUTO, Timing, doubts
+from adaptune.recording.timing import AUTO, Timing, doubts
 
 _STORE = get_typestore(Stores.ROS2_HUMBLE)
 TYPES = ["f4", "f8", "i2", "u1", "u2", "u4", "i4"]

@@ -2,16 +2,16 @@ import numpy as np
 import pytest
 import rec
 from pydantic import ValidationError
-from rooms import along_x
+from rooms import along_x, write_kitti
 
-from adaptune import files
+from adaptune import yaml12
 from adaptune.geometry import to_pose
 from adaptune.odometry.program import program_input
 from adaptune.recording import SequenceConfig
+from adaptune.recording.parts import part_name, read_part
 from adaptune.recording.recording import check_sequence, open_sequence
-from adaptune.recording.scan import part_name, read_part
 from adaptune.strict import ConfigurationError
-from adaptune.trajectory import Trajectory, write_kitti, write_tum
+from adaptune.trajectory import Trajectory, write_tum
 from offline.config import load_study
 
 
@@ -80,7 +80,7 @@ def test_what_would_fail_later_is_found_at_once(tmp_path):
                 "sequences": {"yard": {"bag": str(bag)} | entry},
                 "training": ["yard"],
             }
-            study.write_text(files.dump(data))
+            study.write_text(yaml12.dump(data))
             with pytest.raises(ConfigurationError, match=rf"line \d+: sequences\.yard: .*{told}"):
                 load_study(study)
             list(open_sequence(SequenceConfig(bag=str(bag))))

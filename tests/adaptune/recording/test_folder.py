@@ -3,16 +3,16 @@ import sys
 import numpy as np
 import pytest
 import rec
+from rooms import write_kitti
 from scipy.spatial.transform import Rotation
 from small_bag import texts
 
-from adaptune import files, geometry
+from adaptune import geometry, open3d
 from adaptune.errors import import_extra
 from adaptune.recording import SequenceConfig, SequenceError
 from adaptune.recording.folder import read_scan, turn_up
 from adaptune.recording.inspect import inspect
 from adaptune.recording.recording import open_sequence
-from adaptune.trajectory import write_kitti
 
 
 def poses(n):
@@ -81,7 +81,7 @@ def test_kittis_rays_are_corrected_unless_told_otherwise(tmp_path, elevation, de
 
 def test_clouds_that_only_open3d_reads_say_how_to_install_it(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "libusb_package", None)
-    for cached in (import_extra, files.load):
+    for cached in (import_extra, open3d.load):
         cached.cache_clear()
     (tmp_path / "1.ply").write_text("ply\n")
     what = r"1\.ply: open3d cannot be imported .*pip install 'adaptune\[open3d\]'"
@@ -100,7 +100,7 @@ def test_folders_of_files(tmp_path, suffix):
         elif suffix == "structured":
             np.save(tmp_path / f"scan_{i}.npy", rec.velodyne(points))
         else:
-            o3d = files.load()
+            o3d = open3d.load()
             cloud = o3d.t.geometry.PointCloud(o3d.core.Tensor(points))
             cloud.point["time"] = o3d.core.Tensor(rec.velodyne(points)["time"][:, None].copy())
             o3d.t.io.write_point_cloud(str(path), cloud)

@@ -8,7 +8,7 @@ import rec
 from rosbags.highlevel import AnyReader
 from small_bag import START, bad_cloud, cloud, drive, entry, inspection_text, pose, texts
 
-from adaptune import files
+from adaptune import yaml12
 from adaptune.recording import SequenceConfig, SequenceError
 from adaptune.recording import inspect as module
 from adaptune.recording import recording as module_recording
@@ -295,7 +295,7 @@ def test_files_of_poses_are_inspected(tmp_path, name, content, timed):
     length = "reference: 20 poses, 57.0 m" + (" in 1.9 s" if timed else "\n")
     assert length in inspection_text(inspection, width=1000)
     bag = drive(tmp_path / "a.bag", [s for s, _ in POSES], [])
-    given = files.Document(inspection.entry).data
+    given = yaml12.Document(inspection.entry).data
     config = SequenceConfig(bag=str(bag), clock_offset=START * 1e-9 if timed else 0.0, **given)
     assert open_sequence(config).reference() is not None
 

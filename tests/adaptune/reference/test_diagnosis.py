@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 from adaptune.geometry import from_quaternions, invert, to_quaternions
 from adaptune.live.hops import Hops
 from adaptune.recording.scan import Scan
-from adaptune.reference import check
-from adaptune.reference.check import diagnose_odometry, diagnose_reference
+from adaptune.reference import diagnosis, motions
+from adaptune.reference.diagnosis import diagnose_odometry, diagnose_reference
 from adaptune.trajectory import Trajectory
 
 SCANS = np.arange(0, 60_000_000_000, 100_000_000)
@@ -247,18 +247,24 @@ def test_scans_that_were_dropped_do_not_count(monkeypatch):
     T = poses(half)
     start, end = hops().start // 2, (hops().end + 1) // 2
     measured = hops()._replace(start=start, end=end, T_start_end=invert(T[start]) @ T[end])
-    monkeypatch.setattr(check, "measured_motions", lambda scans, _: [*scans] and measured)
-    found = check.contradictions(Recorded(poses(SCANS)), T, 10.0, None, True, set(half.tolist()))
+    monkeypatch.setattr(diagnosis, "measured_motions", lambda scans, _: [*scans] and measured)
+    found = diagnosis.contradictions(
+        Recorded(poses(SCANS)), T, 10.0, None, True, set(half.tolist())
+    )
     assert not list(found)
-    assert not list(check.contradictions(Recorded(poses(SCANS)), T, 1.0, None, True))
-    wrong = check.contradictions(Recorded(turned(poses(SCANS))), T, 99.0, None, True, set(half))
+    assert not list(diagnosis.contradictions(Recorded(poses(SCANS)), T, 1.0, None, True))
+    wrong = diagnosis.contradictions(Recorded(turned(poses(SCANS))), T, 99.0, None, True, set(half))
     (words,) = wrong
     assert str(words).startswith("the reference contradicts the scans: over some metres they")
     # Without a cause, too, if the odometry is surely the righter one.
-    vague = list(check.contradictions(Recorded(noisy(poses(SCANS))), T, 3.0, None, True, set(half)))
+    vague = list(
+        diagnosis.contradictions(Recorded(noisy(poses(SCANS))), T, 3.0, None, True, set(half))
+    )
     assert "and the odometry by" in vague[0].what
     assert "`reference: estimated`" in vague[0].mend
-    both = check.contradictions(Recorded(noisy(poses(SCANS))), noisy(T), 3.0, None, True, set(half))
+    both = diagnosis.contradictions(
+        Recorded(noisy(poses(SCANS))), noisy(T), 3.0, None, True, set(half)
+    )
     assert not list(both)
 
 
@@ -275,14 +281,14 @@ def test_of_slow_scans_some_are_enough(monkeypatch, metres, seconds, used):
         for i, at in enumerate(T)
     ]
     read = []
-    of_neighbours = check.neighbour_motions
+    of_neighbours = motions.neighbour_motions
     monkeypatch.setattr(
-        check,
+        motions,
         "neighbour_motions",
         lambda some: of_neighbours(read.append(s.stamp) or s for s in some),
     )
-    found = check.measured_motions(scans, len(scans))
-    assert len(found.start) >= check.FEWEST_HOPS
-    assert check.mismatch(T, found).max() < 1.0
+    found = motions.measured_motions(scans, len(scans))
+    assert len(found.start) >= diagnosis.FEWEST_HOPS
+    assert diagnosis.mismatch(T, found).max() < 1.0
     between = np.diff(np.unique(np.array(read))[2:]) / (seconds * 1e9)
     assert np.median(between) == used

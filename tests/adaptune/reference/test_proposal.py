@@ -4,12 +4,8 @@ from rooms import along_x
 
 from adaptune.live.evidence import OwnError
 from adaptune.recording.inspect import inspect
-from adaptune.reference.check import (
-    MeasuredReference,
-    advice,
-    proposed_sub_trajectory,
-    recording_config,
-)
+from adaptune.reference.check import MeasuredReference, advice, proposed_sub_trajectory
+from adaptune.reference.estimate import recording_config
 from adaptune.reference.stored import EstimateError
 from adaptune.trajectory import Trajectory
 

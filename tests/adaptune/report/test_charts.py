@@ -6,20 +6,9 @@ import numpy as np
 import pytest
 from sample_charts import comparison, empty, from_above, over_time, samples, trials
 
-from adaptune.report.charts import (
-    Axis,
-    Band,
-    Bars,
-    Chart,
-    Line,
-    Mark,
-    Panel,
-    Points,
-    Shares,
-    Spans,
-    Words,
-)
-from adaptune.report.drawing import MODES, draw_chart, looks, spec, thinned
+from adaptune.report.charts import Axis, Band, Chart, Line, Panel, Points, Spans, Words, shares
+from adaptune.report.drawing import draw_chart, spec, thinned
+from adaptune.report.looks import MODES, looks
 
 
 def drawn(chart, folder):
@@ -35,6 +24,10 @@ def chart_of(*items, **panel):
     return Chart("one", "A chart", (Panel(drawn=items, **axes),))
 
 
+def mark(at):
+    return Line([at, at], [1, 2], "", dashed=True)
+
+
 @pytest.mark.parametrize(
     "item",
     [
@@ -42,8 +35,7 @@ def chart_of(*items, **panel):
         Line([0, 1], [1, 2], "fixed", steps=True, dashed=True),
         Points([0, 1], [1, 2], "fixed", texts=["a", "b"]),
         Band([0, 1], [1, 2], [2, 3], "fixed"),
-        Bars([1, 2], "fixed"),
-        Shares([0, 1, 2], np.full((2, 3), 50.0), ("fixed", "b")),
+        shares([0, 1, 2], np.full((2, 3), 50.0), ("fixed", "b"))[0],
     ],
     ids=lambda item: type(item).__name__,
 )
@@ -54,7 +46,7 @@ def test_an_item_has_its_colour_in_the_panel_and_in_the_legend(tmp_path, item):
 
 
 def test_colours_of_points_are_on_a_bar_and_unknown_ones_are_grey(tmp_path):
-    points = Points([0, 1, 2], [1, 2, 3], "trial", [0.1, 1.0, np.nan], "size [m]", log_colour=True)
+    points = Points([0, 1, 2], [1, 2, 3], "trial", [0.1, 1.0, np.nan], "size [m]")
     texts, svg = drawn(chart_of(points), tmp_path)
     assert {"size [m]", "0.2", "0.5", "trial"} <= set(texts)
     assert svg.count("#bbbbbb") == 1
@@ -62,11 +54,11 @@ def test_colours_of_points_are_on_a_bar_and_unknown_ones_are_grey(tmp_path):
 
 def test_spans_are_named_above_and_marks_widen_the_axis(tmp_path):
     spans = Spans([0, 10, 11, 50, 100], ("cave", "street", "", "garden"))
-    items = spans, Line([0, 100], [1, 2], "fixed"), Mark(60.0)
+    items = spans, Line([0, 100], [1, 2], "fixed"), mark(60.0)
     texts, svg = drawn(chart_of(*items), tmp_path)
     assert {"cave", "garden"} <= set(texts)
     assert texts.count("street") == 0  # too short for its name
-    texts, wider = drawn(chart_of(*items, Mark(190.0)), tmp_path)
+    texts, wider = drawn(chart_of(*items, mark(190.0)), tmp_path)
     assert "180" in texts
     assert wider.count("stroke-dasharray") == svg.count("stroke-dasharray") + 1
 
@@ -81,7 +73,9 @@ def test_names_stand_along_an_axis_also_long_ones(tmp_path):
     texts, svg = drawn(chart_of(points, x=Axis("", names=narrow)), tmp_path)
     assert set(narrow) <= set(texts)
     assert svg.count("rotate(325") >= 20
-    texts, _ = drawn(chart_of(Bars(np.ones(12), ""), y=Axis("", names=names)), tmp_path)
+    texts, _ = drawn(
+        chart_of(Points(np.ones(12), np.arange(12.0), ""), y=Axis("", names=names)), tmp_path
+    )
     assert set(names) <= {text.replace(" ", "") for text in texts}
 
 
@@ -168,3 +162,11 @@ def test_within_a_decade_a_logarithmic_axis_names_ticks_on_both_sides_of_1(tmp_p
     assert {"0.8", "1.2", "0.1", "10"} <= set(
         drawn(chart_of(points, x=ratios, y=errors), tmp_path)[0]
     )
+
+
+def test_names_that_are_apart_on_a_logarithmic_axis_are_all_read(tmp_path):
+    x = [1.0, 3.0, 1000.0, 1010.0]
+    names = Words(x, [1.0] * 4, ["one", "two", "three", "four"])
+    chart = chart_of(Points(x, [1.0] * 4, "fixed"), names, x=Axis("x", log=True))
+    texts = drawn(chart, tmp_path)[0]
+    assert [name for name in names.words if name in texts] == ["one", "two", "three"]

@@ -124,10 +124,10 @@ def test_charts_are_drawn_and_say_what_a_point_is(opened):
     assert opened.evaluate(
         "[...document.querySelectorAll('.drawing')].every(d => d.scrollWidth <= d.clientWidth)"
     )
-    opened.locator("#comparison .mark-rect path").first.hover()
+    opened.locator("#comparison .mark-symbol.role-mark path").first.hover()
     tip = opened.locator("#vg-tooltip-element.visible")
     tip.wait_for()
-    assert re.search(r"error over the fixed set's \[-\]\s*1.4", tip.inner_text())
+    assert re.search(r"mean RTE \[%\]\s*1$", tip.inner_text())
 
 
 def column(page, i):

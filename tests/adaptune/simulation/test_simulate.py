@@ -3,7 +3,7 @@ import itertools
 import numpy as np
 import pytest
 
-from adaptune import files
+from adaptune import open3d
 from adaptune.metrics import sub_trajectory_rte
 from adaptune.odometry.registry import odometry_class
 from adaptune.simulation import SCENES, SENSORS, Course
@@ -23,7 +23,7 @@ def some(course, n):
 
 def surface(drive, station, reach):
     """Scene in which the distance to the world's surface can be asked for."""
-    o3d = files.load()
+    o3d = open3d.load()
     mesh = World(drive.road).around(station, reach)
     scene = o3d.t.geometry.RaycastingScene()
     tensor = o3d.core.Tensor.from_numpy

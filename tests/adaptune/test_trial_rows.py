@@ -4,8 +4,9 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from adaptune.archive import Archive, Trial, rows, select, with_units
+from adaptune.archive import Archive, Trial
 from adaptune.errors import AdaptuneError
+from adaptune.trial_rows import rows, select, with_units
 from offline.config import Metric
 
 STAMPS = 1_700_000_000_123_456_789 + np.arange(20) * 100_000_000

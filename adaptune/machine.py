@@ -1,0 +1,107 @@
+"""What this process uses of the machine: its cores and its memory."""
+
+import ctypes
+import gc
+import itertools
+import os
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+_before: set[int] | None = None
+"""Cores that this process had before it was pinned alone."""
+_numbers = itertools.count(1)
+
+
+def available() -> int:
+    """Number of cores that this process may use."""
+    return len(os.sched_getaffinity(0))
+
+
+def shared_cores() -> set[int]:
+    """The cores of this process and of those that work beside it, see `pin`."""
+    return os.sched_getaffinity(0) if _before is None else _before
+
+
+def pin(core: int, alone: bool = False) -> ExitStack:
+    """Keep this process on one core until what it returns is closed.
+
+    Open3D sums in an order that depends on its threads. Only on one core do its results repeat bit
+    by bit. Running threads keep their cores: call this before the first use of Open3D. Numbers
+    beyond the last core restart at the first. `alone` says that this process is the only one at
+    work: then `next_core` gives others the rest.
+    """
+    global _before  # noqa: PLW0603 - the cores are those of the process
+    pinned = ExitStack()
+    cores = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {sorted(cores)[core % len(cores)]})
+    _before = cores if alone else None
+
+    def unpin() -> None:
+        global _before  # noqa: PLW0603
+        os.sched_setaffinity(0, cores)
+        _before = None
+
+    pinned.callback(unpin)
+    return pinned
+
+
+def next_core() -> int:
+    """Core for another process that works beside this one.
+
+    Each call gives the next core, after the one that `pin` gives to the number of this process.
+    """
+    cores = sorted(shared_cores())
+    return cores[(os.getpid() + next(_numbers)) % len(cores)]
+
+
+def other_core(number: int) -> int:
+    """Core for the process of this number, from 0, of those that work for this one; see `pin`.
+
+    They get the cores that this process does not use, as far as there are any.
+    """
+    cores = sorted(shared_cores())
+    others = sorted(set(cores) - os.sched_getaffinity(0)) or cores[1:] or cores
+    return others[number % len(others)]
+
+
+def resident_megabytes() -> float:
+    """Memory that this process takes at present, without the files that it maps."""
+    _, resident, shared, *_ = Path("/proc/self/statm").read_text(encoding="ascii").split()
+    return 1e-6 * (int(resident) - int(shared)) * os.sysconf("SC_PAGE_SIZE")
+
+
+def release_memory() -> None:
+    """Give memory that is free back to the system, so that what comes next is measured alone.
+
+    Threads that prepare scans leave hundreds of megabytes to the C library, which keeps them.
+    """
+    gc.collect()
+    ctypes.CDLL(None).malloc_trim(0)
+
+
+@contextmanager
+def apart() -> Iterator[None]:
+    """Let large arrays that are made meanwhile go back to the system as soon as they are free.
+
+    By default, the C library keeps them among small ones. Where a process holds many arrays of
+    different sizes and replaces them time after time, as prepared scans, the holes between them
+    then take several times what they hold. It costs some time for each array.
+    """
+    global _apart  # noqa: PLW0603 - the setting is that of the process
+    mallopt = ctypes.CDLL(None).mallopt
+    _apart += 1
+    mallopt(_M_MMAP_THRESHOLD, _LARGE)
+    try:
+        yield
+    finally:
+        _apart -= 1
+        if not _apart:
+            mallopt(_M_MMAP_THRESHOLD, _LARGEST)
+
+
+_M_MMAP_THRESHOLD, _LARGE, _LARGEST = -3, 256 * 1024, 32 * 1024**2
+"""The number of the setting in malloc.h; bytes of arrays that are kept apart, and to what glibc
+raises that by itself as such arrays become free."""
+_apart = 0
+"""In how many blocks of `apart` this process is."""

@@ -1,0 +1,376 @@
+"""The likeliest cause where poses contradict the scans, and what mends it.
+
+Poses that do not show the motions that registrations of scans have measured break a convention:
+another order of numbers, another frame, another clock. Each convention predicts the poses as they
+would be without it; the one that fits the measured motions is the likeliest.
+"""
+
+from collections.abc import Collection, Iterable, Iterator
+from itertools import accumulate
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
+from scipy.spatial.transform import Rotation
+
+from adaptune.errors import Finding
+from adaptune.geometry import (
+    Poses,
+    from_quaternions,
+    invert,
+    nearest_rotation,
+    rotation_angle,
+    to_quaternions,
+)
+from adaptune.live.hops import Hops
+from adaptune.recording.content import Content
+from adaptune.recording.scan import Recording, Scan
+from adaptune.reference.check import CONTRADICTS, NOISY
+from adaptune.reference.motions import measured_motions
+from adaptune.trajectory import Trajectory
+
+SUSPICIOUS = 1.5
+"""Percent. Poses that differ less from what scans show break no convention."""
+EXPLAINED = 0.5
+"""A cause explains the difference if it leaves less than this share of it."""
+FEWEST_HOPS = 5
+"""Measured motions that a verdict needs."""
+TRUSTED = 0.8
+"""Share of the measured motions that are right at least, those that fit best."""
+CLOCK = 30.0
+"""Seconds by which clocks may differ to be found."""
+FAR_APART = 0.25
+"""Seconds between poses, from which on the way between them is not straight."""
+TURNED = 0.1
+"""Radians, the root of their mean square, by which motions must turn a lever arm to show it."""
+SAME_CLOCK = 0.01
+"""Seconds by which two clocks may differ and count as the same."""
+
+
+def _cause(what: str, mend: str, before: float, after: float = np.nan) -> Finding:
+    """What poses look like that differ by `before` percent, and by `after` without that."""
+    left = "" if np.isnan(after) else f" ({after:.3g} % is left without that)"
+    differ = f"over some metres they differ by {before:.3g} %, by registrations of scans"
+    return Finding((), f"{differ}; they look {what}{left}", mend, of="reference")
+
+
+class _Candidate(NamedTuple):
+    what: str
+    mend: str
+    T_world_sensor: Poses  # (n, 4, 4): at the scans
+
+
+def mismatch(T_world_sensor: Poses, hops: Hops) -> NDArray[np.float64]:
+    """How far motions differ from measured ones, in percent of each, at most 100, of shape (n,).
+
+    The poses are of shape (n_scans, 4, 4). Both translation and rotation (in radians) count, along
+    the directions that the place shows; NaN where a pose is unknown.
+    """
+    T = invert(T_world_sensor[hops.start]) @ T_world_sensor[hops.end]
+    apart = invert(hops.T_start_end) @ T
+    metres = np.linalg.norm(hops.T_start_end[:, :3, 3], axis=1)
+    shift = np.einsum("nij,nj->ni", hops.projection, T[:, :3, 3] - hops.T_start_end[:, :3, 3])
+    share = np.linalg.norm(shift, axis=1) / np.maximum(metres, 1e-9)
+    return np.asarray(100.0 * np.minimum(np.hypot(share, rotation_angle(apart)), 1.0))
+
+
+def _mean(errors: NDArray[np.float64]) -> float:
+    """Mean of most of the errors: registrations fail, too, now and then; NaN if there are few."""
+    known = np.sort(errors[np.isfinite(errors)])
+    most = known[: round(TRUSTED * len(known))]
+    return float(most.mean()) if len(known) >= FEWEST_HOPS else np.nan
+
+
+def diagnose_reference(
+    reference: Trajectory, stamps: NDArray[np.int64], hops: Hops, place: Poses | None = None
+) -> Finding | None:
+    """Why a reference contradicts measured motions; None if it does not, or nobody can tell.
+
+    The stamps of the scans are nanoseconds, of shape (n_scans,). `place` is the LiDAR's pose in the
+    frame of the poses that were given, of shape (4, 4), as the study states it; by default they are
+    the LiDAR's own.
+    """
+    errors = mismatch(reference.at(stamps), hops)
+    before = _mean(errors)
+    if np.isnan(before) or before < SUSPICIOUS:
+        return None
+    T_given_sensor = np.eye(4) if place is None else place
+    given = reference.T_world_sensor @ invert(T_given_sensor)
+    turned = rotation_angle(invert(given[:1]) @ given).max()
+    if turned < 1e-6 and rotation_angle(hops.T_start_end).max() > np.radians(2.0):
+        mend = "use `reference: estimated`"
+        return _cause("without orientation (all are alike)", mend, before)
+
+    def at_scans(T_world_given: Poses) -> Poses:
+        T = T_world_given @ T_given_sensor
+        return Trajectory(reference.stamps, T, reference.max_gap).at(stamps)
+
+    candidates = [
+        *(one._replace(T_world_sensor=at_scans(one.T_world_sensor)) for one in _conventions(given)),
+        *_far_apart(reference, stamps),
+        *_clock(reference, stamps, hops),
+        *_places(at_scans(given) @ invert(T_given_sensor), hops, T_given_sensor),
+    ]
+    return _likeliest(candidates, hops, errors)
+
+
+def diagnose_odometry(T_odom_sensor: Poses, hops: Hops) -> Finding | None:
+    """Why an odometry's poses, of shape (n_scans, 4, 4), contradict measured motions; else None."""
+    errors = mismatch(T_odom_sensor, hops)
+    before = _mean(errors)
+    if np.isnan(before) or before < SUSPICIOUS:
+        return None
+    known = np.isfinite(T_odom_sensor).all(axis=(1, 2), keepdims=True)
+    steps = np.where(known, T_odom_sensor, np.eye(4))
+    candidates = [
+        _Candidate(
+            "like increments from scan to scan",
+            "let the odometry return the pose of each scan in the frame of the first one",
+            np.array([*accumulate(steps, np.matmul)]),
+        ),
+        *_conventions(T_odom_sensor),
+        *_places(T_odom_sensor, hops, np.eye(4), of_odometry=True),
+    ]
+    return _likeliest(candidates, hops, errors)
+
+
+def _likeliest(
+    candidates: Iterable[_Candidate], hops: Hops, contradicting: NDArray[np.float64]
+) -> Finding | None:
+    """What leaves nearly as little as the best candidate, if that explains the difference.
+
+    On a straight way, two may fit alike. `contradicting` is how far each motion differs.
+    """
+    before = _mean(contradicting)
+
+    def after(errors: NDArray[np.float64]) -> float:
+        # Where a candidate knows no pose, it explains nothing: the same motions are compared.
+        same = _mean(np.where(np.isnan(errors), np.nan, contradicting))
+        return _mean(errors) * before / max(same, 1e-9)
+
+    left = [(c, after(mismatch(c.T_world_sensor, hops))) for c in candidates]
+    left = [(c, rest) for c, rest in left if np.isfinite(rest)]
+    least = min((rest for _, rest in left), default=np.inf)
+    if least > EXPLAINED * before:
+        return None
+    # The last one, with the most freedom, fits whatever others fit, and noise, too.
+    most = max(1.25 * least, 0.1 * before)
+    fit = [(c, rest) for c, rest in left if rest <= most]
+    fit = fit[:-1] or fit
+    what = ", or ".join(candidate.what for candidate, _ in fit[:2])
+    mend = ", or ".join(candidate.mend for candidate, _ in fit[:2])
+    return _cause(what, mend, before, fit[0][1])
+
+
+def _conventions(T: Poses) -> Iterator[_Candidate]:
+    """Poses as they would be if the file, or the odometry, wrote them by another convention."""
+    known = np.isfinite(T[:, 0, 0])
+    safe = np.where(np.isfinite(T), T, np.eye(4))
+    in_order = from_quaternions(safe[:, :3, 3], to_quaternions(safe)[:, [1, 2, 3, 0]])
+    turned_back = safe.copy()
+    turned_back[:, :3, :3] = np.swapaxes(safe[:, :3, :3], 1, 2)
+    for what, mend, T_right in (
+        ("as if their quaternions began with w", "write the quaternions as qx qy qz qw", in_order),
+        ("inverted", "write the poses of the LiDAR in the world", invert(safe)),
+        ("as if their rotations were transposed", "write a rotation's rows as rows", turned_back),
+    ):
+        T_right[~known] = np.nan
+        yield _Candidate(what, mend, T_right)
+
+
+def _far_apart(reference: Trajectory, stamps: NDArray[np.int64]) -> Iterator[_Candidate]:
+    """Poses too rare to go straight from one to the next: on a smooth way through them."""
+    from scipy.interpolate import CubicSpline
+    from scipy.spatial.transform import RotationSpline
+
+    every = 1e-9 * float(np.median(np.diff(reference.stamps))) if len(reference) > 1 else 0.0
+    if every < FAR_APART:
+        return
+    T = reference.at(stamps)
+    known = np.isfinite(T[:, 0, 0])
+    seconds, at = (1e-9 * (some - stamps[0]) for some in (reference.stamps, stamps[known]))
+    R = Rotation.from_matrix(reference.T_world_sensor[:, :3, :3])
+    T[known, :3, :3] = RotationSpline(seconds, R)(at).as_matrix()
+    T[known, :3, 3] = CubicSpline(seconds, reference.T_world_sensor[:, :3, 3])(at)
+    what = f"too rare: one every {every:.2g} s, and a straight way for the scans in between"
+    yield _Candidate(what, "give more poses a second, or use `reference: estimated`", T)
+
+
+def _clock(reference: Trajectory, stamps: NDArray[np.int64], hops: Hops) -> Iterator[_Candidate]:
+    """The reference by another clock, found by how fast both turn and move."""
+    turned, moved = _turned_moved(hops.T_start_end)
+    seconds = 1e-9 * (stamps[hops.end] - stamps[hops.start])
+    ends = np.concatenate([stamps[hops.start], stamps[hops.end]])
+
+    def shifted(offset: float, at: NDArray[np.int64]) -> Poses:
+        return reference.at(at - round(offset * 1e9))
+
+    def unlike(offset: float) -> float:
+        start, end = np.split(shifted(offset, ends), 2)
+        other_turned, other_moved = _turned_moved(invert(start) @ end)
+        apart = np.hypot(other_turned - turned, (other_moved - moved) / np.maximum(moved, 1e-9))
+        known = np.isfinite(apart)
+        # Where half of it is unknown, an offset explains nothing.
+        return float(np.minimum(apart[known], 1.0).mean()) if known.mean() > 0.5 else np.inf
+
+    step = float(np.clip(0.2 * np.median(seconds), 0.05, 0.5))
+    offsets = np.arange(-CLOCK, CLOCK + step / 2, step)
+    costs = np.array([unlike(offset) for offset in offsets])
+    if not np.isfinite(costs).any():
+        return
+
+    def left(offset: float) -> float:
+        error = _mean(mismatch(shifted(offset, stamps), hops))
+        return 100.0 if np.isnan(error) else error
+
+    rough = float(offsets[costs.argmin()])
+    bounds, options = (rough - step, rough + step), {"xatol": 1e-3}
+    best = float(minimize_scalar(left, bounds=bounds, method="bounded", options=options).x)
+    if abs(best) < SAME_CLOCK:
+        return
+    mend = f"add {best:.3f} to `clock_offset`"
+    yield _Candidate("like those of another clock", mend, shifted(best, stamps))
+
+
+def _turned_moved(T: Poses) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Radians and metres of motions, which no frame changes much."""
+    return rotation_angle(T), np.linalg.norm(T[:, :3, 3], axis=1)
+
+
+def _places(
+    T_world_body: Poses, hops: Hops, T_body_sensor: Poses, of_odometry: bool = False
+) -> Iterator[_Candidate]:
+    """The poses of another body of the same platform, or in other units."""
+    T = invert(T_world_body[hops.start]) @ T_world_body[hops.end]
+    known = np.isfinite(T).all(axis=(1, 2))
+    T, measured = T[known], hops.T_start_end[known]
+    if len(T) < FEWEST_HOPS:
+        return
+    scale = float(np.median(_turned_moved(T)[1] / np.maximum(_turned_moved(measured)[1], 1e-9)))
+    if scale > 0.0:
+        scaled = T_world_body.copy()
+        scaled[:, :3, 3] /= scale
+        what = f"{scale:.4g} times as long as the way of the scans"
+        yield _Candidate(what, "write the positions in metres", scaled @ T_body_sensor)
+    turned, lever = _rotation(T, measured), _lever(T, measured, np.eye(3))
+    both = _lever(T, measured, turned)
+    for R, t, what in (
+        (np.eye(3), lever, "like those of another body, a lever arm away"),
+        (turned, np.zeros(3), "like those of other axes"),
+        (turned, both, "like those of another body, with other axes"),
+    ):
+        place = np.eye(4)
+        place[:3, :3], place[:3, 3] = R, t
+        if (place == np.eye(4)).all():
+            continue
+        numbers = " ".join(
+            f"{value + 0.0:.4g}"
+            for value in (*t.round(3), *to_quaternions(place[None])[0].round(4))
+        )
+        mend = f"set `extrinsic: [{numbers.replace(' ', ', ')}]`, the LiDAR's pose in their frame"
+        if of_odometry:
+            mend = f"return the LiDAR's poses: multiply by its place in the body, {numbers}"
+        yield _Candidate(what, mend, T_world_body @ place)
+
+
+def _rotation(T: Poses, measured: Poses) -> NDArray[np.float64]:
+    """Rotation of shape (3, 3) from the measured frame to that of the poses, by all motions."""
+    vectors = []
+    for motions in (T, measured):
+        turns = Rotation.from_matrix(motions[:, :3, :3]).as_rotvec()
+        vectors.append(np.concatenate([motions[:, :3, 3], 10.0 * turns]))
+    return nearest_rotation(vectors[1], vectors[0])
+
+
+def _lever(T: Poses, measured: Poses, R_body_sensor: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Position of shape (3,) of the sensor in the body, as far as turns show it."""
+    # (R - 1) t = R_body_sensor t_measured - t_body
+    A = T[:, :3, :3] - np.eye(3)
+    b = np.einsum("ij,nj->ni", R_body_sensor, measured[:, :3, 3]) - T[:, :3, 3]
+    # Along the axis of nearly all turns, as the vertical one of a car, they show nothing.
+    values, axes = np.linalg.eigh(np.einsum("nij,nik->jk", A, A) / len(A))
+    A = A @ axes[:, values > TURNED**2]
+    weights = np.ones(len(T))
+    t = np.zeros(A.shape[2])
+    for _ in range(10 if A.shape[2] else 0):
+        t = np.linalg.lstsq(
+            (weights[:, None, None] * A).reshape(len(b) * 3, -1), (weights[:, None] * b).ravel()
+        )[0]
+        residuals = np.linalg.norm(A @ t - b, axis=1)
+        weights = 1.0 / np.sqrt(np.maximum(residuals, 1e-2 + np.median(residuals)))
+    return np.asarray(axes[:, values > TURNED**2] @ t)
+
+
+def contradictions(
+    scans: Recording,
+    T_odom_sensor: Poses,
+    error: float,
+    place: Poses | None,
+    given: bool,
+    seen: Collection[int] | None = None,
+) -> Iterator[Finding]:
+    """What a recording's scans say where its reference and an odometry disagree.
+
+    Parameters
+    ----------
+    scans
+        Read once more, as far as needed, where `error` is large.
+    T_odom_sensor
+        The odometry's poses, of shape (n_scans, 4, 4), which owe nothing to the reference.
+    error
+        Percent by which the odometry differs from the reference.
+    place
+        The LiDAR's pose in the reference's frame, of shape (4, 4), where a study states it.
+    given
+        Whether the reference came with the recording.
+    seen
+        Stamps of the scans that the odometry was given, if they are not all.
+    """
+    if not error > SUSPICIOUS:
+        return
+    stamps: list[int] = []
+    content = Content()
+
+    def read() -> Iterator[Scan]:
+        for scan in scans:
+            if seen is None or scan.stamp in seen:
+                stamps.append(scan.stamp)
+                content.see(scan)
+                yield scan
+
+    hops = measured_motions(read(), len(T_odom_sensor))
+    reference = scans.reference() if given else None
+    if reference is not None:
+        yield from content.of_place(reference, not len(hops.start))
+        at = np.array(stamps, np.int64)
+        T_ref_sensor = reference.at(at)
+        wrong, others = (mismatch(T, hops) for T in (T_ref_sensor, T_odom_sensor))
+        if (cause := diagnose_reference(reference, at, hops, place)) is not None:
+            yield cause.below((CONTRADICTS,))
+        elif _surely_worse(wrong, others):
+            what = (
+                f"over some metres they differ by {_mean(wrong):.3g} %, by registrations of scans, "
+                f"and the odometry by {_mean(others):.3g} %; sets that differ by less cannot be "
+                f"told apart"
+            )
+            mend = (
+                "use `reference: estimated` or a longer sub_trajectory, or check its file or topic "
+                "(`reference`), the LiDAR's pose in its frame (`extrinsic`) and its clock "
+                "(`clock_offset`)"
+            )
+            yield Finding((CONTRADICTS,), what, mend, of="reference")
+    if (cause := diagnose_odometry(T_odom_sensor, hops)) is not None:
+        yield cause.below(("the odometry's poses contradict the scans",))
+
+
+def _surely_worse(wrong: NDArray[np.float64], others: NDArray[np.float64]) -> bool:
+    """Whether a reference differs from measured motions, of shape (n,), more than an odometry.
+
+    By the 95 % interval of the mean difference: what a registration itself is wrong by, both share.
+    """
+    known = np.isfinite(wrong + others)
+    more = (wrong - others)[known]
+    if len(more) < FEWEST_HOPS or not _mean(wrong) > max(NOISY, 2.0 * _mean(others)):
+        return False
+    return bool(more.mean() > 2.0 * more.std(ddof=1) / len(more) ** 0.5)

@@ -1,0 +1,219 @@
+"""YAML with the numbers and booleans of YAML 1.2, unique keys, and line numbers."""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Self
+
+import yaml
+
+from adaptune.errors import AdaptuneError
+
+
+class YamlError(AdaptuneError):
+    """Text that is not YAML, or gives a key twice."""
+
+
+_TAGS = ("null", "bool", "int", "float", "str", "seq", "map")
+
+
+class _Loader(yaml.SafeLoader):
+    """Numbers and booleans of YAML 1.2: 1e3 is a number, 010 is ten, `on` is a string.
+
+    Nothing but plain data is made: no dates, no bytes, no sets. Keys stay as they are written.
+    """
+
+    yaml_constructors = {  # noqa: RUF012 - that is how PyYAML keeps them
+        tag: constructor
+        for tag, constructor in yaml.SafeLoader.yaml_constructors.items()
+        if tag is None or tag.rpartition(":")[2] in _TAGS
+    }
+
+    yaml_implicit_resolvers = {  # noqa: RUF012 - that is how PyYAML keeps them
+        first: [(tag, regexp) for tag, regexp in resolvers if tag.rpartition(":")[2] == "null"]
+        for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
+    }
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
+        """Construct a mapping; refuse a key that comes twice."""
+        seen: dict[str, int] = {}
+        for key_node, _ in node.value:
+            line = key_node.start_mark.line + 1
+            if not isinstance(key_node, yaml.ScalarNode):
+                raise YamlError(f"line {line}: a key must be a word or a number")
+            key = _str(self, key_node)
+            if key in seen:
+                raise YamlError(f"line {line}: {key!r} was given before, in line {seen[key]}")
+            seen[key] = line
+        values = [self.construct_object(value, deep) for _, value in node.value]
+        return dict(zip(seen, values, strict=True))
+
+
+_PREFIX = "tag:yaml.org,2002:"
+_INT = re.compile(r"^[-+]?[0-9]+$")
+_FLOAT = re.compile(
+    r"^(?:[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?"
+    r"|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$"
+)
+_BOOL = re.compile(r"^(?:true|True|TRUE|false|False|FALSE)$")
+_Loader.add_implicit_resolver(_PREFIX + "int", _INT, list("-+0123456789"))
+_Loader.add_implicit_resolver(_PREFIX + "float", _FLOAT, list("-+0123456789."))
+_Loader.add_implicit_resolver(_PREFIX + "bool", _BOOL, list("tTfF"))
+
+
+_NO_CHARACTER = re.compile("[\0\ud800-\udfff]")
+_MOST = 100_000
+"""Values in a document. Aliases of aliases make more out of a few lines than fit in memory."""
+
+
+def _int(loader: Any, node: Any) -> int:
+    return int(loader.construct_scalar(node))  # PyYAML takes 010 for eight
+
+
+def _str(loader: Any, node: Any) -> str:
+    text: str = loader.construct_scalar(node)
+    if _NO_CHARACTER.search(text):
+        line = node.start_mark.line + 1
+        raise YamlError(f"line {line}: a text holds a null character or half of one; remove it")
+    return text
+
+
+_Loader.add_constructor(_PREFIX + "int", _int)
+_Loader.add_constructor(_PREFIX + "str", _str)
+
+
+def _count(node: Any, counted: dict[int, int]) -> int:
+    """Number of values in a node, with those that aliases repeat."""
+    if isinstance(node, yaml.ScalarNode):
+        return 1
+    if id(node) not in counted:
+        counted[id(node)] = _MOST  # if met again in itself
+        parts = node.value
+        if isinstance(node, yaml.MappingNode):
+            parts = [part for pair in parts for part in pair]
+        counted[id(node)] = 1 + sum(_count(part, counted) for part in parts)
+    return counted[id(node)]
+
+
+class _Foreign(yaml.SafeLoader):
+    """What ROS 1 reads: YAML 1.1, where 1e3 is a text; of a key that comes twice, the last counts.
+
+    Keys stay as they are written.
+    """
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
+        """Construct a mapping."""
+        self.flatten_mapping(node)
+        return {str(key.value): self.construct_object(value, deep) for key, value in node.value}
+
+
+class Document:
+    """A YAML text as plain data (`data`), and where in the text each part of it stands.
+
+    A YamlError names the line that is wrong.
+    """
+
+    def __init__(self, text: str, foreign: bool = False):
+        try:
+            loader = _Foreign(text) if foreign else _Loader(text)
+            self._node = loader.get_single_node()
+            if self._node is not None and _count(self._node, {}) > _MOST:
+                raise YamlError(f"holds more than {_MOST:,} values, or an alias of itself")
+            self.data = None if self._node is None else loader.construct_document(self._node)
+        except yaml.MarkedYAMLError as error:
+            mark = error.problem_mark or error.context_mark
+            where = f"line {mark.line + 1}: " if mark else ""
+            what = ", ".join(part for part in (error.context, error.problem) if part)
+            raise YamlError(f"{where}{what}") from error
+        except RecursionError as error:
+            raise YamlError("is nested too deeply") from error
+        except yaml.YAMLError as error:
+            raise YamlError(" ".join(str(error).split())) from error
+        except (ValueError, LookupError, AttributeError) as error:
+            # PyYAML's constructors raise these.
+            what = "a tag (!!...) does not fit its value, or a number has thousands of digits"
+            raise YamlError(f"{what}; leave tags out, and give a smaller one") from error
+
+    @classmethod
+    def of_file(cls, path: Path) -> Self:
+        """Read a file; a YamlError that names it if it cannot be read."""
+        try:
+            return cls(path.read_text(encoding="utf-8"))
+        except FileNotFoundError as error:
+            raise YamlError(f"{path}: there is no such file") from error
+        except (OSError, UnicodeDecodeError) as error:
+            raise YamlError(f"{path}: cannot be read as text ({error})") from error
+        except YamlError as error:
+            raise YamlError(f"{path}: {error}") from error
+
+    def span(self, path: Sequence[str | int]) -> tuple[int, int] | None:
+        """Where in the text a single value begins and ends; None if there is none."""
+        found = self._along(path)
+        node = found[-1][1] if found else self._node
+        if len(found) < len(path) or not isinstance(node, yaml.ScalarNode):
+            return None
+        return node.start_mark.index, node.end_mark.index
+
+    def name(self, path: Sequence[str | int]) -> str:
+        """The single value at a path as it is written: a name, also where it is a number."""
+        return str(self._along(path)[-1][1].value)
+
+    def line(self, path: Sequence[str | int]) -> int | None:
+        """Line of the deepest part of `path` that is there; none for an empty document."""
+        found = self._along(path)
+        return found[-1][0].start_mark.line + 1 if found else None
+
+    def _along(self, path: Sequence[str | int]) -> list[tuple[Any, Any]]:
+        """The nodes of the keys on a path, as far as they are there, and of their values."""
+        node, found = self._node, list[tuple[Any, Any]]()
+        for part in path:
+            entries: list[tuple[Any, Any]] = []
+            if isinstance(node, yaml.MappingNode):
+                entries = [entry for entry in node.value if entry[0].value == str(part)]
+            elif isinstance(node, yaml.SequenceNode) and isinstance(part, int):
+                entries = [(value, value) for value in node.value[part : part + 1]]
+            if not entries:
+                break
+            found.append(entries[-1])
+            node = entries[-1][1]
+        return found
+
+    def where(self, file: Path, path: Sequence[str | int]) -> str:
+        """The file of this text, and the line of `path` in it."""
+        line = self.line(path)
+        return f"{file}, line {line}" if line else str(file)
+
+
+def scalar(text: str) -> Any:
+    """Value of one line of YAML from the command line."""
+    return Document(text).data
+
+
+class _Dumper(yaml.SafeDumper):
+    """Quotes what YAML 1.1 or 1.2 does not read back as a string, and repeats lists."""
+
+    def ignore_aliases(self, data: Any) -> bool:  # noqa: ARG002
+        """Write everything out."""
+        return True
+
+    def represent_str(self, data: str) -> Any:
+        """Quote a text; an AdaptuneError if a study cannot hold it."""
+        if _NO_CHARACTER.search(data):
+            raise AdaptuneError(f"{data!a}: holds what is no character in UTF-8; rename it")
+        # As a plain text, PyYAML folds rarer line breaks, and does not read them back.
+        style = '"' if re.search("[\x85\u2028\u2029]", data) else None
+        return self.represent_scalar(_PREFIX + "str", data, style)
+
+
+_Dumper.add_representer(str, _Dumper.represent_str)
+for _tag, _regexp, _first in (("int", _INT, "-+0123456789"), ("float", _FLOAT, "-+0123456789.")):
+    _Dumper.add_implicit_resolver(_PREFIX + _tag, _regexp, list(_first))
+
+
+def dump(data: Any) -> str:
+    """Plain data as YAML that is read back as just these, keys in their order.
+
+    An AdaptuneError names a text that YAML cannot hold.
+    """
+    text: str = yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=100)
+    return text

@@ -1,0 +1,73 @@
+import os
+import subprocess
+import sys
+
+import pytest
+from wicked import gone, wait_until_gone
+
+from adaptune import forking
+from adaptune.errors import AdaptuneError
+
+
+def test_a_process_that_is_killed_is_told():
+    with pytest.raises(AdaptuneError, match="was the memory full"), forking.processes(1) as pool:
+        pool.submit(os._exit, 1).result()
+
+
+OWNER = """
+import os, sys, time
+from adaptune import forking
+with forking.processes(1) as pool:
+    print(pool.submit(os.getpid).result(), flush=True)
+    pool.submit(time.sleep, 600).result()
+"""
+
+
+def test_a_process_ends_with_the_one_that_it_computes_for():
+    owner = subprocess.Popen(
+        [sys.executable, "-c", OWNER],
+        stdout=subprocess.PIPE,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+        text=True,
+    )
+    with owner:
+        worker = owner.stdout.readline().strip()
+        assert not gone(worker)
+        owner.kill()
+    wait_until_gone([worker])
+
+
+ODD = """
+import os, sys
+from pathlib import Path
+from adaptune.forking import processes
+
+def seen():
+    import offline, random
+    return [os.getcwd(), offline.__file__, random.__file__]
+
+if __name__ == "__main__":
+    with processes(1, ["offline", "random", "statistics"]) as pool:
+        import offline, random
+        assert pool.submit(seen).result() == [os.getcwd(), offline.__file__, random.__file__]
+    print("well")
+"""
+
+
+def test_processes_begin_whatever_the_folder_holds_and_however_long_its_name_is(tmp_path):
+    (tmp_path / "odd.py").write_text(ODD)
+    here = tmp_path / ("x" * 100)
+    here.mkdir()
+    # Modules of Python's, of multiprocessing's, and of adaptune's.
+    for name in ("random", "statistics", "selectors", "queue", "offline"):
+        (here / f"{name}.py").write_text("import os; os.abort()")
+    done = subprocess.run(
+        [sys.executable, "-P", tmp_path / "odd.py"],
+        cwd=here,
+        env=os.environ | {"TMPDIR": str(here)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.stdout, done.stderr) == ("well\n", "")
+    assert not list(here.glob("pymp-*"))
