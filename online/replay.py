@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from adaptune.errors import AdaptuneError
 from adaptune.model.rules import BASELINE
-from adaptune.odometry.base import MAX_SHARE_WITHOUT_POSE, OdometryInstance, Usage
+from adaptune.odometry.base import MAX_SHARE_WITHOUT_POSE, Motions, OdometryInstance, Usage
 from adaptune.odometry.tracker import HealthCheck, RegisteredScan, Tracker
 from adaptune.processes import resident_megabytes
 from adaptune.recording.scan import Scan
@@ -92,6 +92,11 @@ class Driver:
             self._since = stamp
         self._applied = selection
         self._note(choice)
+
+    @property
+    def motions(self) -> Motions:
+        """Over the last scan, see `Tracker.motions`."""
+        return self._tracker.motions
 
     def register(
         self, scan: Scan, prepared: Any = None, seconds: float | None = None
@@ -290,7 +295,7 @@ def replay(
     for scan in scans:
         record.begin()
         if selector is not None:
-            selector.observe(scan.stamp, scan, odometry.motions)
+            selector.observe(scan.stamp, scan, driver.motions)
             if schedule.due(scan.stamp):
                 t = time.perf_counter()
                 selection = selector.select()

@@ -22,11 +22,11 @@ MIN_INLIERS = 0.35
 """Least share of points near a point of the other scan; a registration with fewer is rejected."""
 DEGENERATE = 0.002
 """A direction is unknown if its information is less than this share of the best direction's."""
-_CELL, _NEIGHBOURS, _MIN_RANGE = 0.25, 20, 1.0
+_CELL, _NEIGHBOURS, _MIN_RANGE = float(__import__("os").environ.get("EV_CELL", "0.25")), 20, 1.0
 _MIN_POINTS = 100
 """Points; small_gicp crashes on an empty target, and three points always converge."""
-_REACHES = (2.0, 0.5)
-"""Metres of the greatest distance of correspondences, one registration after the other."""
+_REACH = float(__import__("os").environ.get("EV_REACH", "1.0"))
+"""Metres of the greatest distance of correspondences."""
 _ITERATIONS = 20
 _OF_A_PLANE = 0.5
 """Information that small_gicp ascribes to a pair of points along their plane; there is none."""
@@ -84,6 +84,11 @@ class HopCloud:
         self._motion = T_current_next, seconds
 
     @property
+    def is_prepared(self) -> bool:
+        """Whether `prepared` costs nothing."""
+        return self._scan is None
+
+    @property
     def prepared(self) -> Any:
         """Cloud with covariances, and its tree; None if there are too few points."""
         if self._scan is not None:
@@ -119,15 +124,13 @@ def register(
 
     (target, tree), (source, _) = start.prepared, end.prepared
     for T_start_end in guesses:
-        for reach in _REACHES:
-            result = small_gicp.align(
-                *(target, source, tree),
-                init_T_target_source=T_start_end,
-                max_correspondence_distance=reach,
-                max_iterations=_ITERATIONS,
-                num_threads=1,
-            )
-            T_start_end = result.T_target_source  # noqa: PLW2901
+        result = small_gicp.align(
+            *(target, source, tree),
+            init_T_target_source=T_start_end,
+            max_correspondence_distance=_REACH,
+            max_iterations=_ITERATIONS,
+            num_threads=1,
+        )
         T = rectify(result.T_target_source)
         if np.isfinite(T).all() and result.num_inliers >= min_inliers * source.size():
             return Hop(T, T[:3, :3] @ _known_directions(result) @ T[:3, :3].T)
@@ -151,7 +154,7 @@ def _known_directions(result: Any) -> NDArray[np.float64]:
 # How wrong the members of a bank were over the last hops, and what that says of their weights.
 
 
-SECONDS, METRES = 30.0, 30.0
+SECONDS, METRES = float(__import__("os").environ.get("EV_SECONDS", "30")), 30.0
 """A hop counts as long as it is no older, or no farther behind, than this."""
 CLIP = 5.0
 """Percent of a hop by which a member may differ from the best one, for weights: beyond that it is
