@@ -43,7 +43,7 @@ MAX_TIMES_PREDICTED = 2.0
 REMEMBERED = 60.0
 """Seconds for which a failure, or what was measured of that set, counts, and not what is predicted;
 and for which members of a bank keep working that would otherwise rest."""
-UNUSUAL = float(__import__("os").environ.get("EV_UNUSUAL", "0.9"))
+UNUSUAL = 0.9
 """Quantile of the members' spread in training that counts as usual."""
 SETTLING = 2 * 10**9
 """Nanoseconds after a selection for which a failure says nothing of the set."""
@@ -334,12 +334,8 @@ class Selector(_Measuring):
         error = self._live.own_error()
         is_worse = error is not None and error.low > MAX_TIMES_PREDICTED * predicted
         # What was not worth its cost in training is not, either, where a place is new alone.
-        if (
-            (self._is_new() and self._model.bank_adapts)
-            or is_worse
-            or self._failed
-            or self._live.lost
-        ):
+        is_new = self._model.bank_adapts and self._is_new()
+        if is_new or is_worse or self._failed or self._live.lost:
             self._at_work = seconds + REMEMBERED
         # Somebody has to go on.
         present = self._live.present()[np.isin(self.members, self._always)]

@@ -472,6 +472,7 @@ class LabelledData(NamedTuple):
             self.sets,
             fixed := self.fixed(),
             allowed=allowed_sets(self.costs, self.budget, self.sets, fixed),
+            costs=self.costs,
         )
         return data, pca
 

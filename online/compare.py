@@ -32,10 +32,10 @@ from online.modes import (
     ADAPTIVE,
     BASELINE,
     EVEN,
-    MODES,
     UNTRAINED,
     WITHOUT_MODEL,
     ReplaySetup,
+    in_order,
     replayed_modes,
     sequences_without_model,
 )
@@ -467,4 +467,4 @@ def _with_fixed_rivals(
         of_fixed = [mode for mode in RIVALS if model.rivals.get(mode) == model.fixed]
         same |= dict.fromkeys(of_fixed, replays["fixed"])
     every = {**same, **replays}
-    return {mode: every[mode] for mode in MODES if mode in every}
+    return {mode: every[mode] for mode in in_order(every)}

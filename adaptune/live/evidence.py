@@ -32,6 +32,8 @@ from adaptune.space import Selection
 # few metres are much like the registration's. So hops that follow each other are chained, until
 # they reach over a sub-trajectory, where the odometry's errors are several times the chain's.
 
+OWN_SECONDS = 60.0
+"""A chain counts as long as it is no older, or its start is among the last metres."""
 MIN_COVERED = 0.5
 """Least share of a chain that its hops cover; in between, the odometry's own motion is taken."""
 MIN_REACH = 0.8
@@ -43,7 +45,7 @@ LOG_DEVIATION = 0.3
 scaled to e times the metres of its chains."""
 HOP_ERROR = 0.05
 """Metres by which a hop itself is wrong where registrations are worst, as among plants."""
-HIDDEN = 0.01
+HIDDEN = 0.0075
 """Metres of an odometry's error that a hop may have, too, and so hide."""
 
 
@@ -95,7 +97,7 @@ class OwnErrors:
         self._chains.append(_chain(self._links, self._length))
         if self._whole:
             return
-        until, behind = link.seconds - SECONDS, link.end - max(METRES, self._length)
+        until, behind = link.seconds - OWN_SECONDS, link.end - max(METRES, self._length)
         while self._chains[0].seconds < until and self._chains[0].start < behind:
             self._chains.popleft()
 

@@ -22,10 +22,10 @@ MIN_INLIERS = 0.35
 """Least share of points near a point of the other scan; a registration with fewer is rejected."""
 DEGENERATE = 0.002
 """A direction is unknown if its information is less than this share of the best direction's."""
-_CELL, _NEIGHBOURS, _MIN_RANGE = float(__import__("os").environ.get("EV_CELL", "0.25")), 20, 1.0
+_CELL, _NEIGHBOURS, _MIN_RANGE = 0.25, 20, 1.0
 _MIN_POINTS = 100
 """Points; small_gicp crashes on an empty target, and three points always converge."""
-_REACH = float(__import__("os").environ.get("EV_REACH", "1.0"))
+_REACH = 1.0
 """Metres of the greatest distance of correspondences."""
 _ITERATIONS = 20
 _OF_A_PLANE = 0.5
@@ -154,7 +154,7 @@ def _known_directions(result: Any) -> NDArray[np.float64]:
 # How wrong the members of a bank were over the last hops, and what that says of their weights.
 
 
-SECONDS, METRES = float(__import__("os").environ.get("EV_SECONDS", "30")), 30.0
+SECONDS, METRES = 30.0, 30.0
 """A hop counts as long as it is no older, or no farther behind, than this."""
 CLIP = 5.0
 """Percent of a hop by which a member may differ from the best one, for weights: beyond that it is

@@ -33,8 +33,3 @@ def rule_class(name: str) -> type[Rule]:
     if not (isinstance(found, type) and issubclass(found, Rule)):
         raise RuleError(f"{name}: is not a class derived from adaptune.model.Rule")
     return found
-
-
-def sentence_of(name: str) -> str:
-    """What the rule of a name selects, in a sentence."""
-    return rule_class(name).sentence

@@ -365,9 +365,8 @@ def test_a_bank_measures_where_members_differ_by_more_than_in_training(monkeypat
     monkeypatch.setattr(LiveEvidence, "due", lambda _, in_doubt: in_doubt)
     model = of_two_caves()
     # In training, half of them lie 2 % apart: each 1 % from the middle.
-    model = replace(
-        model, vectors=np.tile(np.float32([[2, 0, 0], [0, 0, 0]]), (len(model.errors), 1, 1))
-    )
+    apart = np.float32([[2.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    model = replace(model, vectors=np.tile(apart, (len(model.errors), 1, 1)))
     scan = drive_cave("hdl32e", 1)[0]
 
     def measures(*speeds):
