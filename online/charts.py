@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from adaptune.geometry import invert
 from adaptune.metrics import travelled
 from adaptune.model import ErrorModel
+from adaptune.model.registry import ADAPTIVE
 from adaptune.report.charts import (
     Axis,
     Band,
@@ -30,7 +31,7 @@ from adaptune.space import ParameterSpace
 from adaptune.study.study import Study, StudySequences, named
 from adaptune.trajectory import Trajectory, read_tum
 from online.compare import current_replays
-from online.modes import ADAPTIVE, BASELINE, FIXED, UNTRAINED, WITHOUT_MODEL
+from online.modes import BASELINE, FIXED, UNTRAINED, WITHOUT_MODEL
 from online.record import StoredReplay, check_reference, switched
 from online.statistics import ALL, ComparisonRow, Reference
 

@@ -17,6 +17,7 @@ from adaptune.metrics import (
     worst_tenth,
 )
 from adaptune.model import ErrorModel
+from adaptune.model.registry import ADAPTIVE
 from adaptune.reference.check import hard_to_track
 from adaptune.report import tables as report
 from adaptune.study.config import ALSO
@@ -29,7 +30,6 @@ from adaptune.study.study import (
     oracle_errors,
 )
 from online.modes import (
-    ADAPTIVE,
     BASELINE,
     EVEN,
     UNTRAINED,

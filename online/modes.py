@@ -200,7 +200,8 @@ class ReplaySetup:
         self, name: str, model: ErrorModel | None = None, digest: str = ""
     ) -> dict[str, Any]:
         """What a mode depends on, as plain data; `digest` is the model's."""
-        about = {"mode": name, "parameters": None, "model": None, "switching": None}
+        about: dict[str, Any] = dict.fromkeys(("parameters", "model", "switching"))
+        about["mode"] = name
         if name in (BASELINE, FIXED, *RIVALS):
             mode = self.mode(name, model)
             return about | {"parameters": mode.sets[mode.fixed]}

@@ -176,6 +176,8 @@ DOUBTFUL = 5.0
 SELDOM = 50
 """Scans from one measurement to the next where nothing is in doubt: five seconds of most sensors.
 The odometry costs as much a scan, whatever the sensor's rate."""
+USUAL_SHARE = 0.4
+"""About the share of the seconds in which a bank measures."""
 HOPS_TO_BE_LOST = 2
 """Hops in a row that must be rejected, or disagree, before an odometry counts as lost."""
 _APART = 0.3
@@ -427,7 +429,7 @@ class LiveEvidence:
         errors = found.errors()
         errors[end.no_pose > start.no_pose] = np.nan
         ends = start.metres, end.metres, end.stamp * 1e-9
-        measured = np.isfinite(errors).all(axis=1)
+        measured = np.asarray(np.isfinite(errors).all(axis=1))
         if start.metres >= self._restarted:
             self._compare(errors, measured, ends)
         if measured[0]:
