@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from adaptune.bank.members import share
 from adaptune.geometry import Poses
-from adaptune.live.evidence import LiveEvidence
+from adaptune.live.evidence import LiveEvidence, spread_of
 from adaptune.metrics import FAILURE
-from adaptune.model import RULES, BankRule, ErrorModel, Rule
+from adaptune.model import ErrorModel
 from adaptune.model.descriptor import (
     MOTION,
     SECOND,
@@ -23,7 +23,8 @@ from adaptune.model.descriptor import (
     lowest_elevation,
     speed_and_turn_rate,
 )
-from adaptune.model.rules import NOVEL_FAMILIARITY, PairedExpectedRatio
+from adaptune.model.registry import ADAPTIVE, rule_class
+from adaptune.model.rules import NOVEL_FAMILIARITY, Live
 from adaptune.model.weights import (
     SMOOTHED_SELECTIONS,
     measured_weights,
@@ -42,6 +43,8 @@ MAX_TIMES_PREDICTED = 2.0
 REMEMBERED = 60.0
 """Seconds for which a failure, or what was measured of that set, counts, and not what is predicted;
 and for which members of a bank keep working that would otherwise rest."""
+UNUSUAL = 0.9
+"""Quantile of the members' spread in training that counts as usual."""
 SETTLING = 2 * 10**9
 """Nanoseconds after a selection for which a failure says nothing of the set."""
 SELECTIONS_TO_JUDGE_PLACE = 5
@@ -89,6 +92,7 @@ class _Measuring:
         self.fixed, self.members = fixed, tuple(members)
         self._sets, self._weighs = sets, weighs
         self._always: Sequence[int] = self.members  # those that never rest
+        self._usual_spread = -1.0  # of the members in training; any is more where nobody knows it
         self._live = LiveEvidence(self.members, length)
 
     def reset(self) -> None:
@@ -102,10 +106,20 @@ class _Measuring:
     def measure(self) -> None:
         """Measure how wrong the odometry, or each member of the bank, was over the last metres.
 
-        It takes some tens of milliseconds. Nothing depends on when it is called after `select`,
-        and without it only the training counts.
+        It takes some tens of milliseconds, and is done where something is in doubt, else seldom,
+        see `LiveEvidence.due`. Nothing depends on when it is called after `select`, and without it
+        only the training counts.
         """
-        self._live.measure()
+        if self._live.due(self._in_doubt()):
+            self._live.measure()
+
+    def _in_doubt(self) -> bool:
+        """Whether there is a reason to measure now."""
+        return self._differ()
+
+    def _differ(self) -> bool:
+        """Whether the members differ by more than they do in training."""
+        return self._live.spread() > self._usual_spread
 
     def fall_back(self) -> Selection:
         """What to apply where nothing can be chosen: the fixed set, or what most of a bank do.
@@ -153,7 +167,7 @@ class Selector(_Measuring):
     model
         Fitted offline.
     rule
-        One of `adaptune.model.RULES`.
+        Its name, see `adaptune.model.registry`.
     members
         Trial numbers of the members of the bank that runs, the fixed set first: the paired rule
         weighs them, others choose among them. None takes the model's bank for the paired rule if
@@ -179,30 +193,30 @@ class Selector(_Measuring):
     def __init__(
         self,
         model: ErrorModel,
-        rule: str = RULES[0],
+        rule: str = ADAPTIVE,
         members: Sequence[int] | None = None,
         descriptors: Collection[str] = (),
     ):
         model.check_descriptors(descriptors)
+        cls = rule_class(rule)
         if members is None:
-            drives_bank = rule == "adaptive" and (model.bank_adapts or model.bank_rests)
+            drives_bank = cls.weighs and (model.bank_adapts or model.bank_rests)
             members = model.bank if drives_bank else ()
-        weighs = bool(members) and rule == "adaptive"
+        weighs = bool(members) and cls.weighs
         fixed = members[0] if members else model.fixed
         super().__init__(model.sets, fixed, members, model.length, weighs)
         self._model = model
         self._pca = model.pca()
         self._reserve = frozenset(model.reserve if weighs else ()).intersection(self.members)
         self._always = [member for member in self.members if member not in self._reserve]
-        fitted: Rule = PairedExpectedRatio(model.paired)
         if weighs:
-            # A bank that need not always work weighs its members where it does.
-            fitted = BankRule(model.bank_settings.model_copy(update={"adapt": True}))
-        elif rule == "paper":
-            from adaptune.model.knn import NearestNeighbours  # compiled code, which few need
-
-            fitted = NearestNeighbours()
-        self._rule = fitted.fit(model.training_data(self._pca, self.members or None))
+            at = [model.bank.index(member) for member in self._always]
+            spreads = spread_of(
+                np.nan_to_num(model.vectors[:, at], posinf=FAILURE, neginf=-FAILURE)
+            )
+            self._usual_spread = float(np.quantile(spreads, UNUSUAL))
+        data = model.training_data(self._pca, self.members or None)
+        self._rule = cls.of(model, weighs).fit(data)
         self._describe = Describer(model.blocks)
         if self._describe.blocks != model.blocks:
             raise DescriptorError(
@@ -273,8 +287,6 @@ class Selector(_Measuring):
         mean = np.stack(self._descriptors).mean(axis=0, dtype=np.float64, keepdims=True)
         feature = self._pca.transform(mean.astype(np.float32))[0]
         is_foreign = self._rule.gated and self._is_foreign(self._scan)
-        if self._failed and self.members:
-            self._live.forget()  # hops over a restart say nothing of any member
         selection = self._choose(feature, is_foreign)
         self._failed = False
         # Where the fixed set does worse than predicted, training's guess is better than none.
@@ -292,27 +304,37 @@ class Selector(_Measuring):
         return self._live.estimated(selection)
 
     def _choose(self, feature: NDArray[np.float64], is_foreign: bool) -> Selection:
-        if isinstance(self._rule, BankRule):
-            near = self._rule.near(feature[None])
-            familiarity = 0.0 if is_foreign else float(near.evidence.familiarity[0])
-            if self._reserve and self._is_enough(familiarity, self._rule.predicted_fixed(near)):
-                found = self._rule.weigh(near.of(self._always), self._live.squares(self._always))
-                return found._replace(resting=self._reserve)
-            return self._rule.weigh(near, self._live.squares())
-        if isinstance(self._rule, PairedExpectedRatio):
-            return self._rule.select(feature, self._worse_than_predicted())
-        return self._rule.select(feature)
+        resting: frozenset[int] = frozenset()
 
-    def _is_enough(self, familiarity: float, predicted: float) -> bool:
+        def at_work(members: Sequence[int], familiarity: float, predicted: float) -> Sequence[int]:
+            nonlocal resting
+            self._familiar.append(0.0 if is_foreign else familiarity)
+            if self._reserve and self._is_enough(predicted):
+                resting = self._reserve
+            return [member for member in members if member not in resting]
+
+        live = Live(self._worse_than_predicted, self._live.squares, at_work)
+        return self._rule.select(feature, live)._replace(resting=resting)
+
+    def _is_new(self) -> bool:
+        """Whether training does not know the place."""
+        return bool(self._familiar) and float(np.median(self._familiar)) < NOVEL_FAMILIARITY
+
+    def _in_doubt(self) -> bool:
+        """Whether a bank at work is in a new place, or differs by more than in training."""
+        at_work = self._weighs and self._resting != frozenset(self.members[1:])
+        return at_work and (self._is_new() or self._differ())
+
+    def _is_enough(self, predicted: float) -> bool:
         """Whether the members that always work are enough.
 
         Training knows the place, they do as predicted, and have not failed in the last minute.
         """
         seconds = self._stamp * 1e-9
-        self._familiar.append(familiarity)
         error = self._live.own_error()
         is_worse = error is not None and error.low > MAX_TIMES_PREDICTED * predicted
-        is_new = float(np.median(self._familiar)) < NOVEL_FAMILIARITY
+        # What was not worth its cost in training is not, either, where a place is new alone.
+        is_new = self._model.bank_adapts and self._is_new()
         if is_new or is_worse or self._failed or self._live.lost:
             self._at_work = seconds + REMEMBERED
         # Somebody has to go on.

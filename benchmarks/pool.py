@@ -31,6 +31,7 @@ from replays import ORDERS, mean_error
 
 from adaptune.bank.bank import Bank
 from adaptune.model import ErrorModel
+from adaptune.model.registry import ADAPTIVE
 from adaptune.odometry.remote import SERVICE
 from adaptune.odometry.tracker import HealthCheck
 from adaptune.processes import server
@@ -43,7 +44,7 @@ from adaptune.study.study import BEST_DEFAULT, EQUAL_COST, RIVALS, named
 from offline.labelled import LabelledData
 from offline.train import fit, tuned
 from offline.tuning import figures
-from offline.validate import PAIRED, Validation, leave_one_out
+from offline.validate import Validation, leave_one_out
 from online.replay import ReplayRecord, replay
 
 DRIVEN_LENGTH = 40.0
@@ -59,7 +60,7 @@ def left_out(data: LabelledData) -> None:
         # The fixed set without a budget.
         free = leave_one_out(fixed_set, bank=0)
         pairs = zip(validation.left_out, free.left_out, strict=True)
-        ratio = np.array([a.errors[PAIRED].mean() / b.errors["fixed"].mean() for a, b in pairs])
+        ratio = np.array([a.errors[ADAPTIVE].mean() / b.errors["fixed"].mean() for a, b in pairs])
         print(f"within the budget, adaptive / fixed without it: {_words(ratio)}")
 
 
@@ -67,13 +68,13 @@ def print_left_out(validation: Validation) -> None:
     """Print ratios to the rivals and the fixed set, over all courses and by their kind."""
     means = {
         mode: np.array([one.errors[mode].mean() for one in validation.left_out])
-        for mode in ("baseline", *RIVALS, "fixed", PAIRED)
+        for mode in ("baseline", *RIVALS, "fixed", ADAPTIVE)
     }
     for mode, of in means.items():
         print(f"{mode:14} {np.exp(np.log(of).mean()):.3f} % at {validation.cost(mode):6.1f} ms")
     kinds = [one.name.rstrip("0123456789") for one in validation.left_out]
     for rival in (BEST_DEFAULT, EQUAL_COST, "fixed"):
-        ratio = means[PAIRED] / means[rival]
+        ratio = means[ADAPTIVE] / means[rival]
         found = figures(np.log(ratio), kinds and [one.name for one in validation.left_out])
         by_kind = {
             kind: np.exp(np.log(ratio[[k == kind for k in kinds]]).mean())
@@ -83,7 +84,7 @@ def print_left_out(validation: Validation) -> None:
             f"adaptive / {rival:13} {_words(ratio)}, 95 % {found.low:.2f}-{found.high:.2f}; "
             + ", ".join(f"{kind} {value:.2f}" for kind, value in by_kind.items())
         )
-    each = zip(validation.left_out, means[PAIRED] / means[BEST_DEFAULT], strict=True)
+    each = zip(validation.left_out, means[ADAPTIVE] / means[BEST_DEFAULT], strict=True)
     print("each / best_default: " + ", ".join(f"{one.name} {ratio:.2f}" for one, ratio in each))
     print(flush=True)
 
@@ -103,8 +104,8 @@ def drive(model: ErrorModel, course: Course) -> dict[str, tuple[float, ReplayRec
     scans, make = list(simulate(course)), pool()
     trials = {"baseline": 0, **model.rivals, "fixed": model.fixed}
     found = {}
-    for mode in [*trials, PAIRED]:
-        if mode == PAIRED:
+    for mode in [*trials, ADAPTIVE]:
+        if mode == ADAPTIVE:
             result = drive_bank(model, scans)
         else:
             alone = make(model.sets[trials[mode]])
@@ -118,7 +119,7 @@ def drive_bank(model: ErrorModel, scans: Iterable[Scan]) -> ReplayRecord:
     """Replay scans with the model's bank."""
     sets = {trial: model.sets[trial] for trial in model.bank}
     bank = Bank(pool(), sets)
-    result = replay(scans, bank, HealthCheck(), Selector(model, PAIRED, list(sets)))
+    result = replay(scans, bank, HealthCheck(), Selector(model, ADAPTIVE, list(sets)))
     bank.close()
     return result
 

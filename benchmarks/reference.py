@@ -25,6 +25,7 @@ from scipy.stats import spearmanr
 
 from adaptune.files import replacing
 from adaptune.metrics import cap, sub_trajectory_rte, sub_trajectory_vectors
+from adaptune.model.registry import ADAPTIVE
 from adaptune.reference.estimate import VERSION, estimated
 from adaptune.reference.graph import pass_over
 from adaptune.reference.stored import EstimateError
@@ -33,7 +34,7 @@ from adaptune.simulation.record import simulate
 from offline import validate as validation
 from offline.labelled import LabelledData, chained
 from offline.tuning import choose
-from offline.validate import PAIRED, LeftOut, Validation
+from offline.validate import LeftOut, Validation
 
 LENGTH = 25.0
 
@@ -164,10 +165,10 @@ def trained(data: LabelledData, estimates: LabelledData, size: int) -> None:
         ("circular", "trained without truth, judged by the estimate"),
     ):
         print(f"bank {what}: ", end="")
-        print_summary(Validation(found[name]), [PAIRED])
+        print_summary(Validation(found[name]), [ADAPTIVE])
     tuned = np.array([left.errors["fixed"].mean() for left in found["truth"]])
-    without_truth = np.array([left.errors[PAIRED].mean() for left in found["estimate"]])
-    gain = Validation(found["truth"]).summary(PAIRED)["geometric"]
+    without_truth = np.array([left.errors[ADAPTIVE].mean() for left in found["estimate"]])
+    gain = Validation(found["truth"]).summary(ADAPTIVE)["geometric"]
     ratios = without_truth / tuned
     kept = float(np.exp(np.log(ratios).mean()))
     print(

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from adaptune.archive import PREPARE_MS, REGISTER_MS, Archive, Frames, Trial
 from adaptune.bank.members import LEVER, Agreement, share
 from adaptune.geometry import Poses, invert, mean_motion, rectify, rotation_angle, steps
-from adaptune.live.evidence import SPACING
+from adaptune.live.evidence import SPACING, USUAL_SHARE
 from adaptune.live.hops import HopErrors, Hops, LiveSquares, live_squares
 from adaptune.metrics import (
     cap,
@@ -470,6 +470,7 @@ class LabelledData(NamedTuple):
             self.sets,
             fixed := self.fixed(),
             allowed=allowed_sets(self.costs, self.budget, self.sets, fixed),
+            costs=self.costs,
         )
         return data, pca
 
@@ -510,7 +511,8 @@ def measured_costs(
             register = np.inf
         key = odometry(sets[trial]).preparation
         found[trial] = SetCost(register, prepare, numbers.setdefault(key, len(numbers)))
-    return Costs(found, float(np.mean([archive.read_frames(name).evidence_ms for name in names])))
+    every_second = float(np.mean([archive.read_frames(name).evidence_ms for name in names]))
+    return Costs(found, USUAL_SHARE * every_second)
 
 
 def labelled_data(

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from adaptune.archive import Archive
 from adaptune.errors import AdaptuneError
 from adaptune.metrics import bootstrap, cap
-from adaptune.model import RULES, ErrorModel, ModelError, PairedExpectedRatio, Rule
-from adaptune.model.knn import NearestNeighbours
+from adaptune.model import ErrorModel, ModelError, PairedExpectedRatio
+from adaptune.model.registry import ADAPTIVE, RULES, rule_class
 from adaptune.model.rules import ERROR_FLOOR
 from adaptune.progress import Progress, unseen
 from adaptune.report import tables
@@ -52,8 +52,6 @@ from offline.tuning import (
     rivals,
 )
 
-PAIRED = RULES[0]
-"""The mode that `adaptune online` drives: what has the least expected loss."""
 BANK_SIZE = 4
 """Its members, unless the study says otherwise."""
 
@@ -138,8 +136,9 @@ class Validation:
 
     @property
     def modes(self) -> list[str]:
-        """`PAIRED`, and what it is compared with."""
-        return [mode for mode in dict.fromkeys((PAIRED, ONE_SET, *RULES)) if mode in self.ratios]
+        """`ADAPTIVE`, and the other rules."""
+        others = [mode for mode in self.left_out[0].adapted if mode != ADAPTIVE]
+        return [mode for mode in (ADAPTIVE, *others) if mode in self.ratios]
 
     def figures(self, mode: str, other: str = "fixed") -> Figures:
         """What is expected of a mode elsewhere, compared with another one."""
@@ -161,7 +160,7 @@ class Validation:
     def verdict(self, rule: str) -> str:
         """What to expect of a rule, in a sentence."""
         # One set at a time is a mode of its own where a bank was simulated.
-        bank = rule == PAIRED and ONE_SET in self.ratios
+        bank = rule == ADAPTIVE and ONE_SET in self.ratios
         what = f"`{rule}`, with the bank where that is best" if bank else f"`{rule}`"
         expected = expected_in_words(self.figures(rule)._asdict())
         share = 100 * np.mean([left_out.adapted.get(rule, 0.0) for left_out in self.left_out])
@@ -175,19 +174,22 @@ class Validation:
         return f"{what}: {expected}, adapting {share:.0f} % of the time."
 
     def against_rivals(self) -> list[str]:
-        """How `PAIRED` compares with its rivals, a sentence for each."""
+        """How `ADAPTIVE` compares with its rivals, a sentence for each."""
         return [
-            f"Compared with {RIVAL_WORDS[rival]}, `{PAIRED}` has {f.geometric:.2f} times its error "
-            f"(95 % interval {f.low:.2f}-{f.high:.2f}), at {self.cost(PAIRED):.1f} ms of CPU time "
-            f"a scan against {self.cost(rival):.1f}."
+            f"Compared with {RIVAL_WORDS[rival]}, `{ADAPTIVE}` has {f.geometric:.2f} times its "
+            f"error (95 % interval {f.low:.2f}-{f.high:.2f}), at {self.cost(ADAPTIVE):.1f} ms of "
+            f"CPU time a scan against {self.cost(rival):.1f}."
             for rival in RIVALS
-            if rival in self.logs and PAIRED in self.logs
-            for f in [self.figures(PAIRED, rival)]
+            if rival in self.logs and ADAPTIVE in self.logs
+            for f in [self.figures(ADAPTIVE, rival)]
         ]
 
 
 def leave_one_out(
-    data: LabelledData, progress: Progress = unseen, bank: int = BANK_SIZE
+    data: LabelledData,
+    progress: Progress = unseen,
+    bank: int = BANK_SIZE,
+    rules: Sequence[str] = tuple(RULES),
 ) -> Validation:
     """Leave each recording or stretch out in turn.
 
@@ -202,6 +204,8 @@ def leave_one_out(
         Called about every fold.
     bank
         Number of a bank's members. No bank is simulated with 0.
+    rules
+        Names of the selection rules, see `adaptune.model.registry`.
 
     Raises
     ------
@@ -222,7 +226,7 @@ def leave_one_out(
     parts: dict[str, list[LeftOut]] = {}
     for i, (left_out, others) in enumerate(folds):
         progress("parts left out", i, len(folds))
-        found = leave_out(left_out, others, bank, by_recording)
+        found = leave_out(left_out, others, bank, by_recording, rules)
         parts.setdefault(found.name, []).append(found)
     progress("parts left out", len(folds), len(folds))
     return Validation([joined(of) for of in parts.values()])
@@ -233,6 +237,7 @@ def leave_out(
     others: LabelledData,
     bank: int,
     by_recording: bool,
+    rules: Sequence[str] = tuple(RULES),
 ) -> LeftOut:
     """Fit on the others, and look up what happens on what is left out."""
     fitted = data, pca = others.training_data()
@@ -243,26 +248,26 @@ def leave_out(
     frames = np.arange(len(capped))
     errors, adapted = {"baseline": cap(sequence.baseline), "fixed": fixed}, {}
     chosen = choose(others, bank, by_recording, MOST_FOLDS)
-    one_set, paper = PairedExpectedRatio(chosen.one_set), NearestNeighbours()
-    rules: dict[str, Rule] = {PAIRED: one_set, "paper": paper}
-    if bank:
-        rules = {"paper": paper, ONE_SET: one_set}
-    for name, rule in rules.items():
+    alone, costs = others.costs.alone, dict[str, float]()
+    one_at_a_time = {name: rule_class(name)() for name in rules if name != ADAPTIVE}
+    for name, rule in ({ONE_SET: PairedExpectedRatio(chosen.one_set)} | one_at_a_time).items():
         rule.fit(data)
-        selections = [rule.select(features[i]) for i in first]
-        selected = data.sets.columns([selection.trial for selection in selections])
-        errors[name] = capped[frames, selected[period]]
-        adapted[name] = float(np.mean([selection.trial != data.fixed for selection in selections]))
-    if bank:
-        # Where a bank does not have the least loss, one set at a time is driven, or the fixed one.
-        errors[PAIRED], adapted[PAIRED] = errors[ONE_SET], adapted[ONE_SET]
+        trials = [rule.select(features[i]).trial for i in first]
+        errors[name] = capped[frames, data.sets.columns(trials)[period]]
+        adapted[name] = float(np.mean([trial != data.fixed for trial in trials]))
+        costs[name] = float(np.mean([alone(trial) for trial in trials]))
+    # Where a bank does not have the least loss, one set at a time is driven, or the fixed one.
+    errors[ADAPTIVE], adapted[ADAPTIVE] = errors[ONE_SET], adapted[ONE_SET]
+    if not bank:
+        for of in (errors, adapted, costs):
+            del of[ONE_SET]
     if bank and chosen.bank.adapt:
         simulated = bank_errors(sequence, others, fitted, chosen.members, [chosen.bank])
-        errors[PAIRED], weights = next(simulated)
-        adapted[PAIRED] = float(1.0 - weights.weights[:, 0].mean())
-    driven, alone = driven_cost(others, chosen, data.fixed), others.costs.alone
+        errors[ADAPTIVE], weights = next(simulated)
+        adapted[ADAPTIVE] = float(1.0 - weights.weights[:, 0].mean())
+    driven = driven_cost(others, chosen, data.fixed)
     of_rivals = rivals(others, driven)
-    costs = {"baseline": alone(0), "fixed": alone(data.fixed), PAIRED: driven}
+    costs |= {"baseline": alone(0), "fixed": alone(data.fixed), ADAPTIVE: driven}
     costs |= {name: alone(trial) for name, trial in of_rivals.items()}
     errors |= {name: capped[:, data.sets.column(trial)] for name, trial in of_rivals.items()}
     # The best set in hindsight.
@@ -303,10 +308,10 @@ def validate(study: OfflineStudy, progress: Progress = unseen) -> Validated:
     data = _labelled(study, model)
     online = driven(model, study.config.online, study.odometry, study.mechanism)
     bank = 0
-    if study.mechanism == "bank" and PAIRED in study.rules:
+    if study.mechanism == "bank" and ADAPTIVE in study.rules:
         bank = study.config.online.switching.size
     try:
-        validation = leave_one_out(data, progress, bank)
+        validation = leave_one_out(data, progress, bank, study.rules)
     except ValidationError as error:
         raise ValidationError(f"{error}. {online}") from error
     rows = _rows(validation)
@@ -324,15 +329,14 @@ def validate(study: OfflineStudy, progress: Progress = unseen) -> Validated:
 def _verdicts(rules: Collection[str], bank: bool, validation: Validation) -> list[str]:
     """The estimate for what `adaptune online` will drive, then for what else it drives."""
     said = []
-    if PAIRED in rules:
-        said += [validation.verdict(PAIRED), *validation.against_rivals()]
+    if ADAPTIVE in rules:
+        said += [validation.verdict(ADAPTIVE), *validation.against_rivals()]
     said.append(baseline_in_words(validation))
-    if "paper" not in rules:
-        return said
-    if bank:
+    others = [name for name in rules if name != ADAPTIVE]
+    if bank and others:
         why = "`online` lets it choose among the bank's members, here it chooses among all sets"
-        return [*said, f"`paper` has no verdict: {why}."]
-    return [*said, validation.verdict("paper")]
+        return [*said, *(f"`{name}` has no verdict: {why}." for name in others)]
+    return [*said, *map(validation.verdict, others)]
 
 
 def baseline_in_words(validation: Validation) -> str:
@@ -356,7 +360,7 @@ def _labelled(study: OfflineStudy, model: ErrorModel) -> LabelledData:
 
 def _rows(validation: Validation) -> list[dict[str, Any]]:
     """Ratios to the fixed set's error, intervals of the default rule's, and costs."""
-    default = (*validation.modes, PAIRED)[0]
+    default = (*validation.modes, ADAPTIVE)[0]
     modes = [mode for mode in validation.ratios if mode != "fixed"]
     rows: list[dict[str, Any]] = []
 

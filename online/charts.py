@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from adaptune.model.registry import ADAPTIVE
 from adaptune.report.charts import (
     Axis,
     Band,
@@ -22,7 +23,7 @@ from adaptune.report.charts import (
     shares,
 )
 from adaptune.report.drawing import plain
-from online.modes import ADAPTIVE, BASELINE, FIXED, WITHOUT_MODEL
+from online.modes import BASELINE, FIXED, WITHOUT_MODEL
 from online.record import switched
 from online.replayed import ModeReplay, ReplayedSequence
 from online.statistics import ALL, ComparisonRow

@@ -17,6 +17,7 @@ from adaptune.metrics import (
     worst_tenth,
 )
 from adaptune.model import ErrorModel
+from adaptune.model.registry import ADAPTIVE
 from adaptune.reference.check import hard_to_track
 from adaptune.report import tables as report
 from adaptune.study.config import ALSO
@@ -29,13 +30,12 @@ from adaptune.study.study import (
     oracle_errors,
 )
 from online.modes import (
-    ADAPTIVE,
     BASELINE,
     EVEN,
-    MODES,
     UNTRAINED,
     WITHOUT_MODEL,
     ReplaySetup,
+    in_order,
     replayed_modes,
     sequences_without_model,
 )
@@ -467,4 +467,4 @@ def _with_fixed_rivals(
         of_fixed = [mode for mode in RIVALS if model.rivals.get(mode) == model.fixed]
         same |= dict.fromkeys(of_fixed, replays["fixed"])
     every = {**same, **replays}
-    return {mode: every[mode] for mode in MODES if mode in every}
+    return {mode: every[mode] for mode in in_order(every)}

@@ -15,9 +15,10 @@ from adaptune.errors import AdaptuneError, Finding
 from adaptune.machine import release_memory, shared_cores
 from adaptune.model import ErrorModel
 from adaptune.model.descriptor import DescriptorError
+from adaptune.model.registry import ADAPTIVE, ENTRY_POINTS, RULES
 from adaptune.model.weights import weighted_selection
 from adaptune.odometry.base import Motions, OdometryInstance
-from adaptune.odometry.registry import Factory
+from adaptune.odometry.registry import Factory, python_content
 from adaptune.progress import Progress, unseen
 from adaptune.recording.parts import part_name
 from adaptune.recording.scan import Recording, Scan
@@ -46,10 +47,9 @@ from online.record import (
 )
 from online.replay import ReplayRecord, replay
 
-BASELINE, FIXED, ADAPTIVE, PAPER = "baseline", "fixed", "adaptive", "paper"
-EVEN, UNTRAINED = "even", "untrained"
-MODES = (BASELINE, *RIVALS, FIXED, ADAPTIVE, UNTRAINED, EVEN, PAPER)
-"""All modes, in the order of tables and of lines that lie on each other."""
+BASELINE, FIXED, EVEN, UNTRAINED = "baseline", "fixed", "even", "untrained"
+MODES = tuple(dict.fromkeys((BASELINE, *RIVALS, FIXED, ADAPTIVE, UNTRAINED, EVEN, *RULES)))
+"""All modes but rules of the user's, in the order of tables and of lines that lie on each other."""
 WITHOUT_MODEL: tuple[str, ...] = (BASELINE, UNTRAINED)
 """The modes that need neither trials nor a model."""
 
@@ -176,7 +176,7 @@ class ReplaySetup:
         modes = {BASELINE, *RIVALS, FIXED, *self.rules, *self.also}
         if model is not None:
             modes -= {r for r in RIVALS if model.rivals.get(r, model.fixed) == model.fixed}
-        return tuple(name for name in MODES if name in modes and not self.obstacle(name, model))
+        return in_order(name for name in modes if not self.obstacle(name, model))
 
     def instance(self, mode: Mode, sequence: str | None = None) -> OdometryInstance:
         """Make the odometry of a mode, or the bank.
@@ -201,7 +201,8 @@ class ReplaySetup:
         self, name: str, model: ErrorModel | None = None, digest: str = ""
     ) -> dict[str, Any]:
         """What a mode depends on, as plain data; `digest` is the model's."""
-        about = {"mode": name, "parameters": None, "model": None, "switching": None}
+        about: dict[str, Any] = dict.fromkeys(("parameters", "model", "switching"))
+        about["mode"] = name
         if name in (BASELINE, FIXED, *RIVALS):
             mode = self.mode(name, model)
             return about | {"parameters": mode.sets[mode.fixed]}
@@ -209,6 +210,8 @@ class ReplaySetup:
         if name == UNTRAINED:
             members = list(self._untrained_sets().parameters)
             return about | {"switching": switching | {"members": members}}
+        if name not in MODES:
+            about |= {"rule": python_content(name, ENTRY_POINTS)}
         if name != EVEN and self._mechanism(name, needed(name, model)) != "bank":
             return about | {"model": digest, "switching": {"mechanism": "live"}}
         named = self.config.online.switching.model_dump(mode="json", include={"size", "sets"})
@@ -263,9 +266,15 @@ def needed(name: str, model: ErrorModel | None) -> ErrorModel:
     return model
 
 
+def in_order(names: Iterable[str]) -> tuple[str, ...]:
+    """Names of modes in the order of `MODES`, and then those of the user's."""
+    there = sorted(names)
+    return tuple(dict.fromkeys((*(mode for mode in MODES if mode in there), *there)))
+
+
 def replayed_modes(folder: Path) -> tuple[str, ...]:
-    """The modes in which a sequence was replayed, in the order of `MODES`, from their folder."""
-    return tuple(mode for mode in MODES if (folder / mode / "replay.json").exists())
+    """The modes in which a sequence was replayed, see `in_order`, from their folder."""
+    return in_order(path.parent.name for path in folder.glob("*/replay.json"))
 
 
 def sequences_without_model(config: StudyConfig) -> tuple[str, ...]:

@@ -369,7 +369,7 @@ class RealTimeDrive:
             return odometry.prepare(scan)
         wanted = self._schedule.due(scan.stamp)
         wait = self._left(due) if wanted else 0.0
-        shown = selector.show(scan.stamp, scan, odometry.motions, wait)
+        shown = selector.show(scan.stamp, scan, self._driver.motions, wait)
         if not wanted:
             return odometry.prepare(scan)
         begin = self._clock.now()

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from adaptune.errors import AdaptuneError
 from adaptune.machine import resident_megabytes
 from adaptune.model.rules import BASELINE
-from adaptune.odometry.base import OdometryInstance, Usage
+from adaptune.odometry.base import Motions, OdometryInstance, Usage
 from adaptune.odometry.faults import MAX_SHARE_WITHOUT_POSE
 from adaptune.odometry.tracker import HealthCheck, RegisteredScan, Tracker
 from adaptune.recording.scan import Scan
@@ -93,6 +93,11 @@ class Driver:
             self._since = stamp
         self._applied = selection
         self._note(choice)
+
+    @property
+    def motions(self) -> Motions:
+        """Over the last scan, see `Tracker.motions`."""
+        return self._tracker.motions
 
     def register(
         self, scan: Scan, prepared: Any = None, seconds: float | None = None
@@ -291,7 +296,7 @@ def replay(
     for scan in scans:
         record.begin()
         if selector is not None:
-            selector.observe(scan.stamp, scan, odometry.motions)
+            selector.observe(scan.stamp, scan, driver.motions)
             if schedule.due(scan.stamp):
                 t = time.perf_counter()
                 selection = selector.select()

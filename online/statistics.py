@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune.live.hops import SECONDS
+from adaptune.live.evidence import OWN_SECONDS
 from adaptune.metrics import (
     KittiError,
     absolute_error,
@@ -219,12 +219,12 @@ class Reference(NamedTuple):
         return _means(errors, np.searchsorted(ends, poses), np.searchsorted(starts, poses, "right"))
 
     def errors_behind(self, odometry: Trajectory) -> NDArray[np.float64]:
-        """Mean RTE in percent of the sub-trajectories that ended in the last `SECONDS`.
+        """Mean RTE in percent of the sub-trajectories that ended in the last `OWN_SECONDS`.
 
         It is what an odometry estimates while it drives. NaN where none ended.
         """
         _, ends, errors = self._known(odometry)
-        oldest = np.searchsorted(odometry.stamps, odometry.stamps - int(SECONDS * 1e9))
+        oldest = np.searchsorted(odometry.stamps, odometry.stamps - int(OWN_SECONDS * 1e9))
         newest = np.searchsorted(ends, np.arange(len(odometry)), "right")
         return _means(errors, np.searchsorted(ends, oldest), newest)
 

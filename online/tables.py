@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from adaptune.model.registry import rule_class
 from adaptune.report.tables import Listing
 from adaptune.study.config import WORTH
 from adaptune.study.study import EQUAL_COST, MIN_RECORDINGS, RIVAL_WORDS, RIVALS, is_worth
@@ -46,19 +47,20 @@ _DRIVEN = {
     "best_default": "of several odometries, the one that does best with its own parameters",
     "equal_cost": "the best set in training that costs no more than what is driven",
     "fixed": "the one set that is best in training",
-    "adaptive": "what adapts with the least expected loss in training, or the fixed set",
     "untrained": "a bank without a model: sets around the baseline, weighed while driving",
     "even": "the bank with even weights: a control, which chooses nothing",
-    "paper": "the set with the least expected error, as Koide et al. (IROS 2021) choose it",
     ORACLE: "the best set of each sequence, known in hindsight only",
 }
-"""What each mode drives."""
+"""What each mode drives that is no selection rule."""
 
 
 def modes_in_words(rows: Sequence[ComparisonRow]) -> Listing:
     """What each mode of the tables drives, for readers without the guide."""
     modes = dict.fromkeys(row.mode for row in rows)
-    cells = [{"mode": mode, "what it drives": _DRIVEN[mode]} for mode in modes]
+    cells = [
+        {"mode": mode, "what it drives": _DRIVEN.get(mode) or rule_class(mode).sentence}
+        for mode in modes
+    ]
     return Listing("What the modes are", cells)
 
 

@@ -219,8 +219,9 @@ def compared(loaded: "OfflineStudy", *, details: bool = False) -> "ComparedRepla
     With `details`, print all sentences and tables of the page, too.
     """
     from adaptune.commands.page import write_study_page
+    from adaptune.model.registry import ADAPTIVE
     from online.compare import compare as compare_replays
-    from online.modes import ADAPTIVE, BASELINE, FIXED
+    from online.modes import BASELINE, FIXED
     from online.tables import decision_table, tables
 
     begin_work()

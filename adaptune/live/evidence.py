@@ -32,6 +32,8 @@ from adaptune.space import Selection
 # few metres are much like the registration's. So hops that follow each other are chained, until
 # they reach over a sub-trajectory, where the odometry's errors are several times the chain's.
 
+OWN_SECONDS = 60.0
+"""A chain counts as long as it is no older, or its start is among the last metres."""
 MIN_COVERED = 0.5
 """Least share of a chain that its hops cover; in between, the odometry's own motion is taken."""
 MIN_REACH = 0.8
@@ -43,6 +45,8 @@ LOG_DEVIATION = 0.3
 scaled to e times the metres of its chains."""
 HOP_ERROR = 0.05
 """Metres by which a hop itself is wrong where registrations are worst, as among plants."""
+HIDDEN = 0.0075
+"""Metres of an odometry's error that a hop may have, too, and so hide."""
 
 
 class OwnError(NamedTuple):
@@ -93,13 +97,19 @@ class OwnErrors:
         self._chains.append(_chain(self._links, self._length))
         if self._whole:
             return
-        until, behind = link.seconds - SECONDS, link.end - max(METRES, self._length)
+        until, behind = link.seconds - OWN_SECONDS, link.end - max(METRES, self._length)
         while self._chains[0].seconds < until and self._chains[0].start < behind:
             self._chains.popleft()
 
     def interrupt(self) -> None:
         """Let no later chain begin at a hop so far: in between, the poses are unknown."""
         self._links.clear()
+
+    @property
+    def complete(self) -> bool:
+        """Whether the newest chain reaches over a sub-trajectory."""
+        newest = self._chains[-1] if self._chains else None
+        return newest is not None and newest.end - newest.start >= MIN_REACH * self._length
 
     @property
     def begin(self) -> float:
@@ -121,9 +131,9 @@ class OwnErrors:
         deviation = LOG_DEVIATION * np.sqrt(1.0 / windows(start, end) + np.log(times) ** 2)
         factor = float(np.exp(1.96 * deviation))
         # Some of it, or all, may be what the hops are wrong by.
-        of_hops = times**GROWTH * float((100.0 * HOP_ERROR * np.sqrt(hops) / reach).mean())
-        low = float(np.sqrt(max(0.0, mean**2 - of_hops**2))) / factor
-        return OwnError(mean, low, mean * factor)
+        of_a_metre = times**GROWTH * float((100.0 * np.sqrt(hops) / reach).mean())
+        low = float(np.sqrt(max(0.0, mean**2 - (HOP_ERROR * of_a_metre) ** 2))) / factor
+        return OwnError(mean, low, float(np.hypot(mean * factor, HIDDEN * of_a_metre)))
 
 
 def _chain(links: deque[Link], length: float) -> _Chain:
@@ -163,6 +173,11 @@ LOST = 10.0
 """Percent of a hop. An odometry that is more wrong has lost track."""
 DOUBTFUL = 5.0
 """Percent of a hop. One that differs so much from the odometry must be confirmed by another."""
+SELDOM = 50
+"""Scans from one measurement to the next where nothing is in doubt: five seconds of most sensors.
+The odometry costs as much a scan, whatever the sensor's rate."""
+USUAL_SHARE = 0.4
+"""About the share of the seconds in which a bank measures."""
 HOPS_TO_BE_LOST = 2
 """Hops in a row that must be rejected, or disagree, before an odometry counts as lost."""
 _APART = 0.3
@@ -170,6 +185,8 @@ _APART = 0.3
 _GUESSES = 3
 _TRY_AGAIN = 5
 """After so many shorter hops, a long one is tried again."""
+SHARED = 1.25
+"""A hop may be this many times as long if it starts at a cloud that was prepared before."""
 _MIN_DIRECTIONS = 1.5
 """A hop must tell the motion in two directions at least."""
 _FULL_TURN = 10.0
@@ -227,7 +244,8 @@ class LiveEvidence:
         self._without = np.full(1 + len(self.members), -np.inf)
         self._metres = 0.0
         self._newest: _Anchor | None = None
-        self._short = 0
+        self._short = self._since = self._n_starts = 0
+        self._restarted = 0.0  # metres driven until the last restart
         self._begin()
 
     def _begin(self) -> None:
@@ -245,11 +263,33 @@ class LiveEvidence:
         """Whether the last hops say that the odometry, or the bank, has lost track."""
         return bool(max(self._rejected, self._wrong[0]) >= HOPS_TO_BE_LOST)
 
+    def due(self, in_doubt: bool) -> bool:
+        """Whether to measure now, if the caller is `in_doubt` or not.
+
+        It is where there is no hop yet, where the last one was rejected or disagreed, where hops
+        have yet to reach over a sub-trajectory, and after `SELDOM` scans.
+        """
+        unknown = not len(self._hops.errors) or self._rejected or self._wrong.any()
+        if in_doubt or unknown or self._since >= SELDOM:
+            return True
+        behind = 0.0 if self._newest is None else self._newest.metres - self._measured
+        return not self._own.complete and behind >= LENGTHS[0]
+
+    def spread(self) -> float:
+        """How far the members came apart over the last metres, see `spread_of`; 0 if unknown."""
+        start, end = self._anchors[0] if self._anchors else None, self._newest
+        if start is None or end is None or end.metres - start.metres < LENGTHS[-1]:
+            return 0.0
+        moved = (invert(start.T_odom_sensor) @ end.T_odom_sensor)[1:, :3, 3]
+        with_poses = moved[(end.no_pose == start.no_pose)[1:]]
+        return float(spread_of(100.0 / (end.metres - start.metres) * with_poses))
+
     def observe(self, stamp: int, scan: Scan, motions: Motions) -> None:
         """See a scan, before it is registered; see `adaptune.selector.Selector.observe`."""
         if self._last is not None:
             self._move(*self._last, motions)
         self._last = stamp, scan
+        self._since += 1
 
     def _move(self, before: int, scan: Scan, motions: Motions) -> None:
         """Take note of the motion that ended at the scan before."""
@@ -261,6 +301,10 @@ class LiveEvidence:
         self._without[~finite] = before * 1e-9
         # Without a pose, the health check lets the odometry go on; so does this.
         T[~finite] = T[0] if finite[0] else np.eye(4)
+        restarted = self._newest is not None and motions.starts > self._n_starts
+        self._n_starts = motions.starts
+        if restarted:
+            self._restart()
         # The first scan is where the odometry starts, whatever motion it was given.
         if self._newest is None:
             T[:] = np.eye(4)
@@ -271,13 +315,13 @@ class LiveEvidence:
             way = invert(last.T_odom_sensor[0]) @ self._T_odom_sensor[0]
             self._metres = last.metres + float(np.linalg.norm(way[:3, 3]))
         seconds = 0.0 if self._newest is None else (before - self._newest.stamp) * 1e-9
-        if self._newest is not None and finite[0]:
+        if self._newest is not None and finite[0] and not restarted:
             # This, not the motion before it, is how the sensor moved while it took the last scan.
             self._newest.cloud.moved(T[0], seconds)
         self._newest = _Anchor(
             before,
             self._metres,
-            HopCloud(scan, T[0], seconds),
+            HopCloud(scan, T[0], 0.0 if restarted else seconds),
             self._T_odom_sensor,
             self._no_pose,
         )
@@ -286,6 +330,14 @@ class LiveEvidence:
             # Before the start of the longest hop, one more is kept, to confirm it.
             while len(self._anchors) > 2 and self._metres - self._anchors[2].metres >= LENGTHS[0]:
                 self._anchors.popleft()
+
+    def _restart(self) -> None:
+        """Take note that the odometry, or all members of a bank, have begun anew."""
+        own, anchors, measured = self._own, self._anchors, self._measured
+        self._begin()
+        # What a member did before says nothing of it now, but the drive has the jump.
+        self._own, self._anchors, self._measured = own, anchors, measured
+        self._restarted = self._metres
 
     def measure(self) -> Measured | None:
         """Register the newest scan whose motion is known to one some metres before.
@@ -301,28 +353,34 @@ class LiveEvidence:
         starts = self._starts(end)
         if not starts:
             return None
-        self._measured = end.metres
+        self._measured, self._since = end.metres, 0
+        if end is not self._anchors[-1]:
+            self._anchors.append(end)
         found = self._register(starts, end)
         # On an open plain only height can be told; that is no loss of track.
         if found is not None and np.trace(found.hop.projection) < _MIN_DIRECTIONS:
             return None
         if found is None or not self._is_confirmed(found):
-            self._rejected += 1
+            self._rejected += starts[-1].metres >= self._restarted
             return None
         self._take(found)
         return found
 
     def _starts(self, end: _Anchor) -> list[_Anchor]:
         """Where a hop may start, in the order in which that is tried."""
-        long, short = (
-            next((a for a in reversed(self._anchors) if end.metres - a.metres >= length), None)
-            for length in LENGTHS
-        )
+        long, short = (self._start(end, length) for length in LENGTHS)
         first, second = long, short
         if long is not None and 0 < self._short < _TRY_AGAIN:
             self._short += 1
             first, second = short, long
         return [a for a in (first, second) if a is not None and a.stamp < end.stamp]
+
+    def _start(self, end: _Anchor, length: float) -> _Anchor | None:
+        """The last anchor before so many metres, or one a little before it that is prepared."""
+        before = [a for a in reversed(self._anchors) if end.metres - a.metres >= length]
+        most = SHARED * length
+        near = (a for a in before if a.cloud.is_prepared and end.metres - a.metres <= most)
+        return next(near, before[0] if before else None)
 
     def _register(self, starts: Sequence[_Anchor], end: _Anchor) -> Measured | None:
         """The first registration that is accepted.
@@ -371,14 +429,27 @@ class LiveEvidence:
         errors = found.errors()
         errors[end.no_pose > start.no_pose] = np.nan
         ends = start.metres, end.metres, end.stamp * 1e-9
-        measured = np.isfinite(errors).all(axis=1)
+        measured = np.asarray(np.isfinite(errors).all(axis=1))
+        if start.metres >= self._restarted:
+            self._compare(errors, measured, ends)
+        if measured[0]:
+            self._own.add(Link(*ends, start.T_odom_sensor[0], end.T_odom_sensor[0], hop))
+        self._rejected = 0
+
+    def _compare(
+        self,
+        errors: NDArray[np.float64],
+        measured: NDArray[np.bool_],
+        ends: tuple[float, float, float],
+    ) -> None:
+        """Take note of a hop's errors, of shape (1 + n_members, 3); over a restart there are none.
+
+        `measured` says which of them are known, `ends` where the hop starts and ends, and when.
+        """
         # Those that are back count as measured, not as lost.
         self._hops = self._hops.filled(measured & np.isfinite(self._without))
         self._hops = self._hops.with_hop(errors, *ends)
         self._without[measured] = -np.inf
-        if np.isfinite(errors[0]).all():
-            self._own.add(Link(*ends, start.T_odom_sensor[0], end.T_odom_sensor[0], hop))
-        self._rejected = 0
         # A scan without a pose says nothing of the rest of the hop.
         with np.errstate(invalid="ignore"):
             wrong = np.linalg.norm(errors, axis=1) > LOST
@@ -432,6 +503,14 @@ class LiveEvidence:
         return selection._replace(
             estimated_error=error.mean, estimated_low=error.low, estimated_high=error.high
         )
+
+
+def spread_of(vectors: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Root mean square distance from their mean of vectors of shape (..., n, 3); 0 of none."""
+    if not vectors.shape[-2]:
+        return np.zeros(vectors.shape[:-2])
+    apart = vectors - vectors.mean(axis=-2, keepdims=True)
+    return np.asarray(np.sqrt((apart**2).sum(axis=-1).mean(axis=-1)))
 
 
 def _alike(error: NDArray[np.float64], other: NDArray[np.float64]) -> bool:

@@ -25,8 +25,8 @@ DEGENERATE = 0.002
 _CELL, _NEIGHBOURS, _MIN_RANGE = 0.25, 20, 1.0
 _MIN_POINTS = 100
 """Points; small_gicp crashes on an empty target, and three points always converge."""
-_REACHES = (2.0, 0.5)
-"""Metres of the greatest distance of correspondences, one registration after the other."""
+_REACH = 1.0
+"""Metres of the greatest distance of correspondences."""
 _ITERATIONS = 20
 _OF_A_PLANE = 0.5
 """Information that small_gicp ascribes to a pair of points along their plane; there is none."""
@@ -84,6 +84,11 @@ class HopCloud:
         self._motion = T_current_next, seconds
 
     @property
+    def is_prepared(self) -> bool:
+        """Whether `prepared` costs nothing."""
+        return self._scan is None
+
+    @property
     def prepared(self) -> Any:
         """Cloud with covariances, and its tree; None if there are too few points."""
         if self._scan is not None:
@@ -119,15 +124,13 @@ def register(
 
     (target, tree), (source, _) = start.prepared, end.prepared
     for T_start_end in guesses:
-        for reach in _REACHES:
-            result = small_gicp.align(
-                *(target, source, tree),
-                init_T_target_source=T_start_end,
-                max_correspondence_distance=reach,
-                max_iterations=_ITERATIONS,
-                num_threads=1,
-            )
-            T_start_end = result.T_target_source  # noqa: PLW2901
+        result = small_gicp.align(
+            *(target, source, tree),
+            init_T_target_source=T_start_end,
+            max_correspondence_distance=_REACH,
+            max_iterations=_ITERATIONS,
+            num_threads=1,
+        )
         T = rectify(result.T_target_source)
         if np.isfinite(T).all() and result.num_inliers >= min_inliers * source.size():
             return Hop(T, T[:3, :3] @ _known_directions(result) @ T[:3, :3].T)

@@ -4,11 +4,7 @@ from adaptune.model.error_model import ErrorModel, ModelError
 from adaptune.model.rules import PairedExpectedRatio, PairedSettings, Rule, TrainingData
 from adaptune.model.weights import BankRule, BankSettings
 
-RULES = ("adaptive", "paper")
-"""Names of the selection rules; the first is the default."""
-
 __all__ = [
-    "RULES",
     "BankRule",
     "BankSettings",
     "ErrorModel",

@@ -177,6 +177,7 @@ class ErrorModel:
             self.sets,
             self.fixed,
             allowed=self.allowed(),
+            costs=self.costs,
         )
         if members is None:
             return data

@@ -9,7 +9,7 @@ from sklearn.decomposition import PCA
 
 from adaptune.compiled import compiled
 from adaptune.metrics import FAILURE
-from adaptune.model.rules import Rule, TrainingData
+from adaptune.model.rules import NOTHING, Live, Rule, TrainingData
 from adaptune.space import Selection
 
 N_COMPONENTS = 10
@@ -75,6 +75,8 @@ class NearestNeighbours(Rule):
     earlier frame, then that with the earlier set. Of fewer than k pairs, all are averaged.
     """
 
+    sentence = "the set with the least expected error, as Koide et al. (IROS 2021) choose it"
+
     def __init__(self, k: int = 5):
         self.k = k
 
@@ -118,7 +120,7 @@ class NearestNeighbours(Rule):
         )
         return np.where(self._allowed, predicted, np.inf)
 
-    def select(self, feature: NDArray[np.float64]) -> Selection:
+    def select(self, feature: NDArray[np.float64], live: Live = NOTHING) -> Selection:  # noqa: ARG002
         """See `Rule.select`."""
         sets = self.data_.sets
         predicted = self.predict(feature)

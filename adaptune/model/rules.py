@@ -1,14 +1,15 @@
 """What selection rules learn from, and what they have in common."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, NamedTuple, Self
+from typing import Annotated, Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, NonNegativeFloat, PositiveInt
 
+from adaptune.live.hops import LiveSquares
 from adaptune.metrics import FAILURE, cap
 from adaptune.space import ParameterSets, Selection
 
@@ -219,6 +220,7 @@ class TrainingData:
     vectors: NDArray[np.float32] | None = None
     # Trial numbers of the usable sets that a budget allows, the fixed one included; all if None.
     allowed: tuple[int, ...] | None = None
+    costs: Costs | None = None  # what the sets cost; None if it was not measured
 
     def allows(self) -> NDArray[np.bool_]:
         """Which sets may be chosen, of shape (n_sets,)."""
@@ -282,18 +284,43 @@ def complementary(data: TrainingData, size: int, spending: Spending | None = Non
     return chosen
 
 
-class Rule(ABC):
-    """A way to choose a parameter set for a scan."""
+class Live(NamedTuple):
+    """What the drive has told so far."""
 
+    # By trial, what was measured of sets that have done worse than predicted, in percent.
+    worse: Callable[[], Mapping[int, float]] = dict
+    # What was measured of some members of a bank, by trial.
+    squares: Callable[[Collection[int]], LiveSquares | None] = lambda _: None
+    # Of a bank's members, those that work where a place is so familiar, and so much is predicted of
+    # the fixed set, in percent.
+    at_work: Callable[[Sequence[int], float, float], Sequence[int]] = lambda members, *_: members
+
+
+NOTHING = Live()
+"""Before a drive, or without one."""
+
+
+class Rule(ABC):
+    """A way to choose a parameter set for a scan; see `adaptune.model.registry`."""
+
+    # What it selects, in a sentence.
+    sentence: ClassVar[str] = "what a rule of the user's selects"
     # Whether the fixed set is kept for scans of another sensor than in training.
     gated: ClassVar[bool] = False
+    # Whether it weighs the members of a bank where one runs; others choose among them.
+    weighs: ClassVar[bool] = False
+
+    @classmethod
+    def of(cls, model: Any, weighs: bool) -> "Rule":  # noqa: ARG003 - for those that need them
+        """Make the rule for an error model, and for a bank that it `weighs` or one set."""
+        return cls()
 
     @abstractmethod
     def fit(self, data: TrainingData) -> Self:
         """Learn, and compute whatever does not depend on the scan."""
 
     @abstractmethod
-    def select(self, feature: NDArray[np.float64]) -> Selection:
+    def select(self, feature: NDArray[np.float64], live: Live = NOTHING) -> Selection:
         """Choose a set, or weights, for one scan's scaled descriptor of shape (n_features,)."""
 
 
@@ -416,10 +443,10 @@ class PairedExpectedRatio(Rule):
     def select(
         self,
         feature: NDArray[np.float64],
-        measured: Mapping[int, float] | None = None,
+        live: Live = NOTHING,
     ) -> Selection:
-        """See `Rule.select`; `measured` has errors in percent of sets worse than predicted."""
-        measured = measured or {}
+        """See `Rule.select`."""
+        measured = live.worse()
         near = self.near(feature[None])
         (expected,), (cautious,), (weights,) = self._ratios(near, self.settings.sharpness)
         (best,) = self._best(cautious[None])

@@ -1,7 +1,7 @@
 """Weights of the members of a bank, whose motions are averaged."""
 
 from collections.abc import Collection, Mapping, Sequence
-from typing import Annotated, NamedTuple, Self
+from typing import Annotated, Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,8 +19,11 @@ from adaptune.live.hops import LiveSquares, blend
 from adaptune.metrics import FAILURE
 from adaptune.model.rules import (
     ERROR_FLOOR,
+    NOTHING,
     Evidence,
+    Live,
     NearestFrames,
+    PairedExpectedRatio,
     Rule,
     Spending,
     TrainingData,
@@ -102,7 +105,16 @@ class BankRule(Rule):
     applies the mean over a few selections, see `smooth_weights`.
     """
 
-    gated = True
+    sentence = "what adapts with the least expected loss in training, or the fixed set"
+    gated = weighs = True
+
+    @classmethod
+    def of(cls, model: Any, weighs: bool) -> Rule:
+        """See `Rule.of`: what the training chose for one set where no bank runs."""
+        if not weighs:
+            return PairedExpectedRatio(model.paired)
+        # A bank that need not always work weighs its members where it does.
+        return cls(model.bank_settings.model_copy(update={"adapt": True}))
 
     def __init__(self, settings: BankSettings | None = None):
         self.settings = settings or BankSettings()
@@ -137,9 +149,12 @@ class BankRule(Rule):
         products, fixed = evidence.means(self.products_), evidence.means(self.fixed_squares_)
         return NearProducts(self.members_, evidence, products, fixed)
 
-    def select(self, feature: NDArray[np.float64]) -> Selection:
-        """See `Rule.select`; by the training alone."""
-        return self.weigh(self.near(feature[None]), None)
+    def select(self, feature: NDArray[np.float64], live: Live = NOTHING) -> Selection:
+        """See `Rule.select`."""
+        near = self.near(feature[None])
+        familiarity = float(near.evidence.familiarity[0])
+        members = live.at_work(self.members_, familiarity, self.predicted_fixed(near))
+        return self.weigh(near.of(members), live.squares(members))
 
     def predicted_fixed(self, near: NearProducts) -> float:
         """Root mean square of the fixed set's error that is expected for one scan, in percent."""

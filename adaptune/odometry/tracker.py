@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Field
 
 from adaptune.geometry import Poses, invert, rectify, rotation_angle, scale
-from adaptune.odometry.base import OdometryInstance
+from adaptune.odometry.base import Motions, OdometryInstance
 from adaptune.recording.scan import Scan
 from adaptune.strict import StrictModel
 
@@ -248,10 +248,23 @@ class Tracker:
     T_odom_start: Poses = field(default_factory=lambda: np.eye(4))
     T_before_start: Poses | None = None
     _last: RegisteredScan | None = field(default=None, init=False)
+    # From the pose of the scan before to that of the last one, where the odometry restarted.
+    _T_jumped: Poses | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
         self._guard = Guard(self.health)
         self._seen: deque[_Seen] = deque()
+
+    @property
+    def motions(self) -> Motions:
+        """The odometry's over the last scan; where it restarted, from the pose that it had before.
+
+        A restart takes back a jump of the scans before, and may itself be wrong.
+        """
+        found = self.odometry.motions
+        if self._T_jumped is None:
+            return found
+        return found._replace(T_previous_current=self._T_jumped)
 
     def register(self, scan: Scan) -> RegisteredScan:
         """Find the pose of the next scan."""
@@ -265,7 +278,7 @@ class Tracker:
     ) -> RegisteredScan:
         """Find the pose of the next prepared scan; a warm-up needs the scan, too."""
         begin = time.perf_counter()
-        registered, unhealthy = True, None
+        registered, unhealthy, self._T_jumped = True, None, None
         if self._last is None:
             T_odom_sensor, T_previous_current = self.T_odom_start, self.T_before_start
             self.odometry.start(prepared, T_odom_sensor, T_previous_current)
@@ -294,6 +307,7 @@ class Tracker:
                     self.odometry.start(prepared, T_odom_sensor, T_healthy)
                 else:
                     T_odom_sensor = T_warm
+                self._T_jumped = invert(T_odom_previous) @ T_odom_sensor
         if self.fall_back is not None and scan is not None and self.odometry.rewinds:
             self._remember(scan, prepared, T_odom_sensor, T_previous_current)
         seconds, begun = time.perf_counter() - begin, self.odometry.begun

@@ -135,15 +135,25 @@ class RosConfig(StrictModel):
     steer: SteerConfig | None = None
 
 
-RULES = ("adaptive", "paper")
-"""Modes that select parameters with the error model."""
 ALSO = ("even", "untrained")
-"""Modes that are replayed only on demand, to compare with."""
-Mode = Literal["adaptive", "paper", "even", "untrained"]
+"""Modes that are replayed only on demand, to compare with; the others are selection rules."""
 
 
 def _modes(given: Any) -> Any:
+    from adaptune.model.registry import RULES
+
     return (*RULES, *ALSO) if given == "all" else given
+
+
+def _known_mode(name: str) -> str:
+    from adaptune.model.registry import RULES, RuleError, rule_class
+
+    try:
+        if name not in (*RULES, *ALSO):
+            rule_class(name)
+    except RuleError as error:
+        raise ValueError(str(error)) from error
+    return name
 
 
 class OnlineConfig(StrictModel):
@@ -156,10 +166,11 @@ class OnlineConfig(StrictModel):
     """
 
     period: float = Field(1.0, ge=0.01, le=3600)
-    modes: Annotated[tuple[Mode, ...], BeforeValidator(_modes), AfterValidator(_once)] = (
-        "adaptive",
-        "paper",
-    )
+    modes: Annotated[
+        tuple[Annotated[str, AfterValidator(_known_mode)], ...],
+        BeforeValidator(_modes),
+        AfterValidator(_once),
+    ] = ("adaptive", "paper")
     switching: SwitchingConfig = SwitchingConfig()
     budget: float | None = Field(None, gt=0, le=1e6)
     worth: float = Field(WORTH, ge=0, le=1)
@@ -169,7 +180,7 @@ class OnlineConfig(StrictModel):
     @property
     def rules(self) -> tuple[str, ...]:
         """The modes that select parameters with the error model."""
-        return tuple(mode for mode in self.modes if mode in RULES)
+        return tuple(mode for mode in self.modes if mode not in ALSO)
 
     @property
     def also(self) -> tuple[str, ...]:

@@ -23,7 +23,13 @@ from adaptune.recording.config import SequenceConfig
 from adaptune.recording.recording import RecordedSequence, check_sequence
 from adaptune.space import Categorical, Float, Integer, ParameterSpace, PooledSpace
 from adaptune.strict import ConfigurationError, validated
-from adaptune.study.config import ROLES, RULES, OdometryConfig, StudyConfig, settle_roles
+from adaptune.study.config import (
+    ROLES,
+    OdometryConfig,
+    OnlineConfig,
+    StudyConfig,
+    settle_roles,
+)
 from adaptune.study.study import Study, declared_odometry, tuned_space, whole_definition
 
 _KINDS: dict[str, type[Float | Integer | Categorical]] = {
@@ -156,7 +162,7 @@ def _check_switching(config: StudyConfig, described: list[Description]) -> Itera
     if any(one.whole for one in described):
         message = f"{names} runs whole recordings and cannot change parameters; leave this out"
         # A study's folder holds the defaults, too.
-        if online.rules not in ((), RULES):
+        if online.rules not in ((), OnlineConfig().rules):
             yield Finding(modes, message)
         if online.switching.mechanism != "auto":
             yield Finding(mechanism, message)

@@ -22,6 +22,7 @@ from adaptune.machine import available
 from adaptune.manifest import merged
 from adaptune.model import ErrorModel
 from adaptune.model.descriptor import descriptor_content
+from adaptune.model.registry import ADAPTIVE
 from adaptune.odometry.base import Description, OwnFile
 from adaptune.odometry.program import ProgramInput, program_input
 from adaptune.odometry.registry import Factory, OdometryFactory, OdometryPool, declare
@@ -506,9 +507,9 @@ def driven(
         return f"{fixed} only, because {cannot_adapt(odometry, None)}."
     if not online.rules:
         return f"{fixed} only, because no rule is named (online.modes)."
-    if "adaptive" not in online.rules:
-        return "`online` will drive `paper`, and not `adaptive` (online.modes)."
-    how = mechanism_of("adaptive", model, mechanism, odometry.description.live)
+    if ADAPTIVE not in online.rules:
+        return f"`online` will drive `{online.rules[0]}`, and not `{ADAPTIVE}` (online.modes)."
+    how = mechanism_of(ADAPTIVE, model, mechanism, odometry.description.live)
     why = (
         f"there is too little to compare ways to adapt, which takes "
         f"{2 * PER_STRETCH * model.length:g} m of recordings, or a smaller sub_trajectory"
@@ -583,8 +584,8 @@ def mechanism_of(
     The `mechanism` is the study's; `live`: whether the odometry changes its parameters between
     scans. A bank with more expected loss than one set at a time would only cost.
     """
-    # `paper` was published with one instance, and all sets to choose from.
-    bank = model.bank_adapts or model.bank_rests if mode == "adaptive" else not live
+    # A rule that chooses one set has all sets to choose from where it can.
+    bank = model.bank_adapts or model.bank_rests if mode == ADAPTIVE else not live
     if mechanism == "bank" and bank:
         return "bank"
     return "live" if live else None

@@ -7,7 +7,7 @@ from labelled_places import SETS, TRIALS, labelled, two_kinds, with_motions
 
 from adaptune.errors import AdaptuneError
 from adaptune.model import ErrorModel, ModelError
-from adaptune.model.rules import Rule
+from adaptune.model.rules import NOTHING, Rule
 from adaptune.space import Selection
 from adaptune.strict import ConfigurationError
 from adaptune.study.config import SwitchingConfig
@@ -57,7 +57,7 @@ class Cheat(Rule):
     def predict(self, feature):
         raise NotImplementedError
 
-    def select(self, _feature):
+    def select(self, feature, live=NOTHING):  # noqa: ARG002
         return Selection(0, {})
 
 
@@ -65,12 +65,12 @@ def test_a_selection_holds_for_its_second(monkeypatch):
     asked = []
 
     class Remember(Cheat):
-        def select(self, feature):
+        def select(self, feature, live=NOTHING):  # noqa: ARG002
             asked.append(feature)
             return Selection(TRIALS[len(asked) % 2], {})
 
     sequences = two_kinds(np.random.default_rng(2))[:2]
-    monkeypatch.setattr(validation, "NearestNeighbours", Remember)
+    monkeypatch.setattr(validation, "rule_class", lambda _: Remember)
     found = leave_one_out(labelled(sequences), bank=0)
     assert len(asked) == 2 * 8
     expected = np.where(np.arange(80) // 10 % 2 == 0, 1, 0)

@@ -4,11 +4,12 @@ from labelled_places import TRIALS, labelled, sequence, two_kinds, with_motions
 
 from adaptune.errors import AdaptuneError
 from adaptune.model import BankSettings, PairedSettings
+from adaptune.model.registry import ADAPTIVE
 from adaptune.model.rules import Costs, SetCost, allowed_sets
 from adaptune.space import ODOMETRY, Float, ParameterSets, ParameterSpace, PooledSpace
 from adaptune.study.study import BEST_DEFAULT, EQUAL_COST
 from offline.tuning import NO_BANK, Policy, driven_cost, rivals
-from offline.validate import PAIRED, leave_one_out
+from offline.validate import leave_one_out
 
 ONE = ParameterSpace({"x": Float(low=0.0, high=9.0, baseline=1.0)})
 POOL = PooledSpace({"gicp": ONE, "ndt": ONE})
@@ -82,10 +83,10 @@ def validation():
 
 def test_rivals_are_left_out_too(validation):
     _, found = validation
-    assert {BEST_DEFAULT, EQUAL_COST, PAIRED} <= set(found.ratios)
+    assert {BEST_DEFAULT, EQUAL_COST, ADAPTIVE} <= set(found.ratios)
     assert found.cost("baseline") == 2.0
-    assert found.cost(PAIRED) > found.cost("fixed")
-    assert found.cost(EQUAL_COST) <= found.cost(PAIRED)
+    assert found.cost(ADAPTIVE) > found.cost("fixed")
+    assert found.cost(EQUAL_COST) <= found.cost(ADAPTIVE)
     said = found.against_rivals()
     assert len(said) == 2
     assert "of CPU time a scan against" in said[0]
@@ -98,4 +99,4 @@ def test_a_bank_stays_within_the_budget():
     fixed = rich.costs.alone(rich.fixed())
     for budget in (fixed, 40.0, 200.0):
         found = leave_one_out(rich._replace(budget=budget), bank=2)
-        assert found.cost(PAIRED) <= budget + 1e-6
+        assert found.cost(ADAPTIVE) <= budget + 1e-6

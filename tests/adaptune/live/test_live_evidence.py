@@ -5,7 +5,7 @@ import pytest
 from rooms import moved, scan_at, street
 
 from adaptune.live import evidence
-from adaptune.live.evidence import LOST, LiveEvidence
+from adaptune.live.evidence import LOST, SELDOM, LiveEvidence, spread_of
 from adaptune.live.hops import Hop
 from adaptune.model.weights import measured_weights
 from adaptune.odometry.base import Motions
@@ -36,6 +36,8 @@ def smeared(i):
 
 
 class Numbered:
+    is_prepared = False
+
     def __init__(self, scan, T_previous_current, seconds):  # noqa: ARG002 - as `HopCloud`
         self.number = scan.stamp // 10**8
 
@@ -202,6 +204,59 @@ def test_it_forgets_the_hops_of_another_set(exactly):  # noqa: ARG001
     assert found
     assert min(one.start.stamp for one in found) >= 59 * 10**8
     assert live.own_error().mean < 0.01
+
+
+def test_after_a_restart_the_own_error_has_the_jump_and_the_members_are_as_new(exactly):  # noqa: ARG001
+    live, jump = LiveEvidence((0, 1), length=10.0), 40
+
+    def restarting(i):
+        found = bank(1.0, 1.02)(i)
+        T = moved(STEP - 0.5) if i == jump else found.T_previous_current
+        return found._replace(T_previous_current=T, starts=int(i >= jump))
+
+    drive(live, jump + 1, restarting)
+    assert live.squares().products[1, 1] == pytest.approx(4.0, rel=0.01)
+    assert live.own_error().mean == pytest.approx(0.0, abs=1e-6)
+    drive(live, 10, restarting, first=jump + 1)
+    assert live.squares() is None  # over the restart
+    assert live.due(in_doubt=False)
+    assert not live.lost
+    drive(live, 10, restarting, first=jump + 11)
+    assert live.squares().products[1, 1] == pytest.approx(4.0, rel=0.01)
+    # One of six sub-trajectories lost half a metre of ten.
+    error = live.own_error()
+    assert error.low < 5.0 / 6.0 < error.high
+
+
+def test_where_nothing_is_in_doubt_it_is_seldom_due(exactly):
+    live, due = LiveEvidence((0, 1), length=10.0), []
+
+    def show(n):
+        for _ in range(n):
+            i = len(due)
+            stamp = i * 10**8
+            live.observe(stamp, Scan(stamp, NOTHING.points), bank(1.0, 1.01)(i))
+            due.append(live.due(in_doubt=False))
+            if due[-1]:
+                live.measure()
+
+    show(20)
+    # Until there is a hop, and one over a sub-trajectory.
+    assert np.flatnonzero(due).tolist() == [*range(7), 16]
+    show(SELDOM)
+    assert np.flatnonzero(due[17:]).tolist() == [SELDOM - 1]
+    assert live.due(in_doubt=True)
+    exactly(lambda *_: None)
+    show(SELDOM + 1)
+    assert due[-1]  # the last one was rejected
+
+
+def test_its_spread_is_how_far_the_members_came_apart(exactly):  # noqa: ARG001
+    live = LiveEvidence((0, 1))
+    assert live.spread() == 0.0
+    drive(live, 12, bank(1.0, 1.04))
+    assert live.spread() == pytest.approx(2.0, rel=1e-3)
+    assert spread_of(np.zeros((4, 0, 3))).tolist() == [0.0] * 4
 
 
 def test_the_own_error_is_the_odometrys_over_the_length(exactly):  # noqa: ARG001

@@ -1,0 +1,35 @@
+"""The selection rules by name: adaptune's own, and the user's."""
+
+from adaptune import strict
+from adaptune.errors import AdaptuneError
+from adaptune.model.rules import Rule
+
+RULES = {
+    "adaptive": "adaptune.model.weights:BankRule",
+    "paper": "adaptune.model.knn:NearestNeighbours",
+}
+"""Where the classes are, as ``module:Class``; the first is the default."""
+ADAPTIVE = next(iter(RULES))
+ENTRY_POINTS = "adaptune.rules"
+"""Group in which other packages announce their rules, each by its name."""
+
+
+class RuleError(AdaptuneError):
+    """A selection rule that does not exist, or is none."""
+
+
+def rule_class(name: str) -> type[Rule]:
+    """Class of a selection rule: one of `RULES`, an announced one, or ``module:Class``.
+
+    A `RuleError` says why there is none.
+    """
+    try:
+        path = strict.path_of(name, "mode", RULES, ENTRY_POINTS, "Class")
+        found = strict.load(name, path, "class")
+    except strict.PluginError as error:
+        raise RuleError(str(error)) from error
+    except Exception as error:  # of a module of the user
+        raise RuleError(f"{name}: cannot be imported: {strict.in_one_line(error)}") from error
+    if not (isinstance(found, type) and issubclass(found, Rule)):
+        raise RuleError(f"{name}: is not a class derived from adaptune.model.Rule")
+    return found

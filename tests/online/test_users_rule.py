@@ -1,0 +1,94 @@
+"""A selection rule of the user's own, from his working folder, in every command."""
+
+import re
+import shutil
+
+import numpy as np
+import pytest
+
+from adaptune import manifest
+from adaptune.commands.online import compared
+from adaptune.model import ErrorModel
+from adaptune.model.registry import RuleError, rule_class
+from adaptune.selector import Selector
+from adaptune.strict import ConfigurationError
+from offline.config import load_study
+from offline.validate import validate
+from online.modes import run_replays
+from online.record import StoredReplay
+
+RULE = """
+from adaptune.model import Rule
+from adaptune.model.rules import NOTHING
+from adaptune.space import Selection
+
+
+class Cheapest(Rule):
+    sentence = "the set that costs least, wherever it is"
+
+    def fit(self, data):
+        self.sets, costs = data.sets, data.costs
+        self.best = min(data.sets, key=costs.alone)
+        return self
+
+    def select(self, feature, live=NOTHING):
+        return Selection(self.best, self.sets[self.best], predicted_error=1.0)
+
+
+class Other:
+    pass
+"""
+
+
+@pytest.fixture
+def study(study_file, trained_folder, tmp_path, monkeypatch):
+    (tmp_path / "my_rules.py").write_text(RULE)
+    monkeypatch.syspath_prepend(tmp_path)
+    folder = shutil.copytree(trained_folder, tmp_path / "study")
+    return load_study(study_file, ["online.modes=[my_rules:Cheapest, adaptive]"], folder)
+
+
+def test_it_is_validated_replayed_compared_and_shown(study, study_file, tmp_path):
+    mode = "my_rules:Cheapest"
+    found = validate(study)
+    assert mode in found.validation.modes
+    costs = ErrorModel.load(study.model_path).costs
+    least = min(costs.sets, key=costs.alone)
+    assert found.validation.cost(mode) == pytest.approx(costs.alone(least))
+    assert found.verdicts[-1].startswith(f"`{mode}`")
+
+    run_replays(study, study.model_path)
+    replay = StoredReplay.read(study.folder / "replays/three" / mode)
+    assert np.unique(replay.selections["trial"]).tolist() == [least]
+    assert run_replays(study, study.model_path) == 0
+
+    rows = compared(study).rows
+    assert [row.mode for row in rows] == ["baseline", "fixed", "adaptive", mode]
+    page = (study.folder / "report/report.html").read_text()
+    assert "the set that costs least, wherever it is" in page
+
+    # Another rule under the same name is another replay.
+    with (tmp_path / "my_rules.py").open("a") as file:
+        file.write("# changed\n")
+    again = load_study(study_file, ["online.modes=[my_rules:Cheapest]"], study.folder)
+    assert run_replays(again, again.model_path) == 1
+    about = manifest.recorded(study.folder / "replays/three" / mode / manifest.FILE)
+    assert about["rule"]
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("adaptiv", "there is no mode 'adaptiv': did you mean 'adaptive'?"),
+        ("my_rules:Nothing", "my_rules:Nothing: my_rules has no Nothing"),
+        ("nowhere:Rule", "nowhere:Rule: cannot import nowhere"),
+        ("my_rules:Other", "my_rules:Other: is not a class derived from adaptune.model.Rule"),
+    ],
+)
+def test_an_unknown_rule_is_one_clear_error(study, study_file, name, words):
+    with pytest.raises(ConfigurationError, match=f"online.modes.*{re.escape(words)}"):
+        load_study(study_file, [f"online.modes=[{name}]"], study.folder)
+    with pytest.raises(RuleError, match=re.escape(words)):
+        rule_class(name)
+    with pytest.raises(RuleError, match=re.escape(words)):
+        Selector(ErrorModel.load(study.model_path), name)
