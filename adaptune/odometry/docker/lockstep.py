@@ -318,9 +318,9 @@ class Lockstep(Faulting):
             )
         n, answered = self._n_shown, self._n_answered
         if n >= _MOST_SILENT and answered < _LEAST_ANSWERED * n:
+            why = system.link.why_unheard(self._topics[0]) or "set odometry.settings.play: bag"
             raise OdometryError(
-                f"it gave poses for {answered} of {n} scans, and lockstep needs one for each; set "
-                f"odometry.settings.play: bag"
+                f"it gave poses for {answered} of {n} scans, and lockstep needs one for each; {why}"
             )
 
     def _at_scan(self, stamp: int, T_own_sensor: Poses) -> Poses:
