@@ -65,7 +65,7 @@ _PAUSE = 0.02
 _CYCLONE, _FAST_DDS = b"\x01\x10", b"\x01\x0f"
 """The vendors of DDS in ROS 2, as they begin the keys of their participants."""
 _INFO = "rmw_dds_common/msg/ParticipantEntitiesInfo"
-_TRANSFORMS = "tf2_msgs/msg/TFMessage"
+TRANSFORMS = "tf2_msgs/msg/TFMessage"
 _ALL = ViewState.Any | SampleState.Any
 _DURABILITIES = tuple(
     getattr(Policy.Durability, name)
@@ -146,7 +146,7 @@ class DdsLink:
     def _taken(self, topic: str, kind: str, reader: DataReader) -> Iterator[bytes]:
         """The bytes of messages as they come, until the link is closed."""
         senders: list[int] = []
-        mixed = kind == _TRANSFORMS  # as is usual
+        mixed = kind == TRANSFORMS  # as is usual
         for reliable in (True, False):
             for sample in self._waited(reader):
                 sender = sample.sample_info.publication_handle

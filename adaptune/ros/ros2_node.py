@@ -12,7 +12,7 @@ from cyclonedds.pub import DataWriter
 from cyclonedds.sub import DataReader
 
 from adaptune import processes
-from adaptune.ros.dds import DdsLink
+from adaptune.ros.dds import TRANSFORMS, DdsLink
 from adaptune.ros.link import LinkError
 from adaptune.ros.ros2 import full
 
@@ -83,7 +83,11 @@ class _Node:
 
     def subscribe(self, header: Mapping[str, Any], _: bytes) -> None:
         """Subscribe as soon as somebody publishes, of whatever type."""
-        self._awaited.append(full(header["topic"]))
+        topic = full(header["topic"])
+        if topic.endswith("/tf_static"):  # this node may publish it
+            self._record(topic, TRANSFORMS)
+        else:
+            self._awaited.append(topic)
 
     def advertise(self, header: Mapping[str, Any], _: bytes) -> None:
         kind = header["kind"].replace("/", "/msg/")

@@ -19,7 +19,8 @@ from adaptune.files import temporary_prefix
 from adaptune.geometry import Poses, invert, rectify, to_pose
 from adaptune.odometry.base import LOST, Faulting, Registration, Usage, pose_fault
 from adaptune.odometry.docker.played_bag import MAX_SCATTER, OWN_CLOCK
-from adaptune.odometry.docker.ros_system import QUIET, RosSystem, filled, read_poses
+from adaptune.odometry.docker.poses import matrix
+from adaptune.odometry.docker.ros_system import QUIET, RosSystem, filled
 from adaptune.odometry.remote import Limits
 from adaptune.recording.clouds import LIVOX_TYPES
 from adaptune.recording.export import IMU, POINTS, Messages, structured
@@ -224,7 +225,8 @@ class Lockstep(Faulting):
         link, topics = system.link, (self._settings.points or POINTS, self._settings.imu or IMU)
         self._messages = Messages(link.version)
         take = weakref.WeakMethod(self._take)  # the link must not keep this alive
-        link.record(self._settings.odometry, lambda *given: (do := take()) and do(*given))
+        self._reader = system.reader()
+        self._reader.hear(lambda *given: (do := take()) and do(*given))
         self._clock = system.run_clock(scan.stamp, self._settings.rate or 1.0)
         self._kind = system.cloud_type(topics[0])
         self._send_cloud = link.advertise_bytes(topics[0], self._kind)
@@ -308,8 +310,10 @@ class Lockstep(Faulting):
         if self._silent >= _MOST_SILENT:
             published = system.link.topics().keys() - {*QUIET, *self._topics}
             needs = "" if self._settings.imu else "an IMU (odometry.settings.imu), or "
-            why = system.link.why_unheard(self._topics[0]) or (
-                f"does it need {needs}all that the bag holds (play: bag)?"
+            why = (
+                self._reader.lacking
+                or system.link.why_unheard(self._topics[0])
+                or (f"does it need {needs}all that the bag holds (play: bag)?")
             )
             raise OdometryError(
                 f"no pose {'' if self._n_answered else 'yet '}on {self._settings.odometry} for "
@@ -342,22 +346,22 @@ class Lockstep(Faulting):
         earliest = self._stamp - _EARLY + (0 if self._late is None else self._late // 2)
 
         def there() -> bool:
-            return bool(self._poses) and self._poses[-1][0] >= earliest
+            found = bool(self._poses) and self._poses[-1][0] >= earliest
+            return found or bool(self._reader.fault)
 
         with self._news:
-            return self._poses[-1] if self._news.wait_for(there, seconds) else None
+            came = self._news.wait_for(there, seconds)
+            if self._reader.fault:
+                raise OdometryError(self._reader.fault)
+            return self._poses[-1] if came else None
 
     def _take(self, kind: str, data: bytes) -> None:
         if self._system is None:
             return
-        for stamp, _, p, q in read_poses(self._system.link, kind, data)[-1:]:
-            try:
-                T = to_pose((p.x, p.y, p.z, q.x, q.y, q.z, q.w))
-            except ValueError:
-                T = np.full((4, 4), np.nan)
-            with self._news:
-                self._poses = [(stamp, T)]
-                self._news.notify_all()
+        poses = [] if self._reader.fault else self._reader.read(kind, data)[-1:]
+        with self._news:
+            self._poses = [(stamp, matrix(p, q)) for stamp, _, p, q in poses] or self._poses
+            self._news.notify_all()
 
     def _told(self, error: Exception) -> str:
         """An error, and the last lines that the system wrote; no engine is no fault of a trial."""

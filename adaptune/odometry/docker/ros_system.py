@@ -6,7 +6,6 @@ import os
 import re
 import shutil
 import socket
-import struct
 import threading
 import time
 from abc import ABC, abstractmethod
@@ -17,7 +16,6 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import AfterValidator, Field, model_validator
-from rosbags.serde import SerdeError
 
 from adaptune import processes
 from adaptune.errors import OdometryError
@@ -32,8 +30,8 @@ from adaptune.odometry.docker.engine import (
     opened,
     regular_files,
 )
+from adaptune.odometry.docker.poses import PoseReader
 from adaptune.odometry.program import ProgramInput, Template, WholeSettings
-from adaptune.recording.clouds import POSES, Pose
 from adaptune.recording.config import resolve
 from adaptune.ros.link import LinkError, Run, Steering
 from adaptune.ros.relay import Relay
@@ -223,6 +221,12 @@ class RosSystem(ABC):
             f"odometry.settings.points, or change it in the template"
         )
 
+    def reader(self) -> PoseReader:
+        """What reads the system's poses."""
+        given = self._settings
+        fixed = getattr(given, "transforms", None)
+        return PoseReader(self.link, given.odometry, given.frame, fixed)
+
     def run_clock(self, stamp: int, rate: float = 1.0) -> "SimClock":
         """Publish a clock from now on, until this is closed."""
         if self._clock is None:
@@ -341,11 +345,3 @@ def _probed(image: str, user: str, script: str, words: tuple[str, ...]) -> str:
         _log.info("only root finds %s in the image, so root runs it", " ".join(words))
         return "0"
     return user
-
-
-def read_poses(link: Relay, kind: str, data: bytes) -> list[Pose]:
-    """The poses in a message; none if it is of another type."""
-    try:
-        return POSES[kind](link.decode(data, kind)) if kind in POSES else []
-    except (SerdeError, struct.error, ValueError, IndexError) as error:
-        raise OdometryError(f"it publishes a {kind} that cannot be read ({error})") from error

@@ -191,3 +191,45 @@ def test_a_ros_1_bag_is_played_as_it_was_recorded(make, tmp_path, monkeypatch):
     assert "ready for /points" in (kept / "output.log").read_text()
     assert "digest" in (kept / "trial.yaml").read_text()
     assert len(poses) == N_SCANS
+
+
+def mounted():
+    """The reference's LiDAR on its base."""
+    T = np.eye(4)
+    T[:2, :2] = [[np.cos(0.7), -np.sin(0.7)], [np.sin(0.7), np.cos(0.7)]]
+    T[:3, 3] = 1.0, 0.5, 0.3
+    return T
+
+
+@pytest.mark.parametrize("play", ["lockstep", "bag"])
+def test_poses_may_come_as_transforms(make, tmp_path, play):
+    given = recording(tmp_path / "bag") if play == "bag" else None
+    odometry = make(imitate={"tf": True}, odometry="/tf", given=given, play=play, rate=4.0)
+    poses = drive(odometry)
+    assert not odometry.faults
+    # In the frame of the LiDAR, by way of the base, and not of the wheel.
+    np.testing.assert_allclose(poses[:, :3, 3], truth()[:, :3, 3], atol=0.08)
+
+
+def test_a_frame_that_is_not_there_is_told(make, monkeypatch):
+    monkeypatch.setattr(lockstep, "_MOST_SILENT", 4)
+    odometry = make(imitate={"tf": True}, odometry="/tf", frame="laser", patience=0.3)
+    drive(odometry)
+    words = "/tf moves base, wheel, and does not say where laser is; name the sensor's frame"
+    assert words in odometry.faults[0]
+
+
+@pytest.mark.parametrize(
+    ("imitate", "words"),
+    [
+        ({"twice": True}, "/odometry is published by two (/icp and /icp), whose poses would mix"),
+        ({"times": 3000}, "it publishes more than 2000 messages a second on /odometry"),
+        ({"wants_old": True}, "/icp wants /points transient local, with what was published before"),
+    ],
+)
+def test_what_a_node_does_that_no_odometry_may_is_told(make, imitate, words):
+    odometry = make(imitate=imitate, ready=6)
+    with pytest.raises(OdometryError, match=re.escape(words)):
+        drive(odometry)
+        raise OdometryError(odometry.faults[0])
+    assert odometry.ended
