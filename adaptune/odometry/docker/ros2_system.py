@@ -11,7 +11,7 @@ import tempfile
 import textwrap
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Literal, NamedTuple
 
@@ -81,6 +81,8 @@ _LEAD = 300_000_000
 """Nanoseconds between the begin of the clock and of the recording."""
 _DOMAINS = range(60, 101)
 """Of systems on this machine; ports of higher ones are given to other programs."""
+_PORT, _PORTS = 7400, 250
+"""The first port of the first domain, and how many each has."""
 
 _log = logging.getLogger(__name__)
 
@@ -371,7 +373,8 @@ class Here:
 
 
 def _free_domain() -> Any:
-    """An open file that holds a ROS domain which no other process of adaptune's has."""
+    """An open file that holds a ROS domain in which nobody is on this machine."""
+    taken = {(port - _PORT) // _PORTS for port in _ports()}
     for number in _DOMAINS:
         path = Path(tempfile.gettempdir()) / f"adaptune-ros-domain-{number}.lock"
         with contextlib.suppress(OSError):
@@ -380,9 +383,20 @@ def _free_domain() -> Any:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError:
                 file.close()
-            else:
+                continue
+            if number not in taken:
                 return _Domain(number, file)
-    raise OdometryError("all ROS domains of adaptune's are in use on this machine")
+            file.close()
+    which = f"from {_DOMAINS[0]} to {_DOMAINS[-1]}"
+    raise OdometryError(f"all ROS domains {which} are in use on this machine; end what runs there")
+
+
+def _ports() -> Iterator[int]:
+    """UDP ports that programs of this machine hold."""
+    for name in ("udp", "udp6"):
+        with contextlib.suppress(OSError):
+            for line in Path("/proc/net", name).read_text().splitlines()[1:]:
+                yield int(line.split()[1].rpartition(":")[2], 16)
 
 
 class _Domain(NamedTuple):

@@ -3,7 +3,9 @@
 Its node is RustDDS, which shares no code with what carries adaptune's messages.
 """
 
+import contextlib
 import re
+import socket
 
 import numpy as np
 import pytest
@@ -229,7 +231,24 @@ def test_a_frame_that_is_not_there_is_told(make, monkeypatch):
 )
 def test_what_a_node_does_that_no_odometry_may_is_told(make, imitate, words):
     odometry = make(imitate=imitate, ready=6)
-    with pytest.raises(OdometryError, match=re.escape(words)):
+
+    def fault():
         drive(odometry)
         raise OdometryError(odometry.faults[0])
+
+    with pytest.raises(OdometryError, match=re.escape(words)):
+        fault()
     assert odometry.ended
+
+
+def test_a_domain_that_others_use_is_left_to_them(monkeypatch):
+    free = ros2_system._free_domain()
+    free.close()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("", 7400 + 250 * free.number + 11))
+        with contextlib.closing(ros2_system._free_domain()) as chosen:
+            assert chosen.number != free.number
+        monkeypatch.setattr(ros2_system, "_DOMAINS", range(free.number, free.number + 1))
+        words = f"all ROS domains from {free.number} to {free.number} are in use on this machine"
+        with pytest.raises(OdometryError, match=words):
+            ros2_system._free_domain()
