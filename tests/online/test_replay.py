@@ -476,7 +476,7 @@ class LateToPose(InProcess):
 
 def test_a_late_first_pose_is_told_and_what_was_before_is_left_out(tmp_path, caplog):
     caplog.set_level("INFO")
-    late = replay(scans(np.arange(20.0)), LateToPose(Scripted()), HEALTH)
+    late = replay(scans(np.arange(40.0)), LateToPose(Scripted()), HEALTH)
     assert late.first_pose == 3.0
     folder = tmp_path / "hall" / "fixed"
     folder.mkdir(parents=True)
@@ -484,5 +484,5 @@ def test_a_late_first_pose_is_told_and_what_was_before_is_left_out(tmp_path, cap
     assert caplog.messages == ["hall, fixed: the odometry gave its first pose after 3.0 s"]
     stored = StoredReplay.read(folder)
     assert stored.summary.first_pose == 3.0
-    assert stored.summary.scans == len(stored.trajectory) == 17
-    assert replay(scans(np.arange(20.0)), InProcess(Scripted()), HEALTH).first_pose == 0.0
+    assert stored.summary.scans == len(stored.trajectory) == 37
+    assert replay(scans(np.arange(40.0)), InProcess(Scripted()), HEALTH).first_pose == 0.0
