@@ -167,6 +167,24 @@ def test_what_it_does_is_told_before_it_is_tuned(tmp_path):
     assert not containers()
 
 
+def test_parameters_that_are_accepted_in_vain_are_told(tmp_path):
+    given = ros2(tmp_path / "icp.yaml", node="/icp", patience=9.0)
+    values = VALUES | {"max_range": 60.0}
+    others = {"voxel_size": 2.0, "max_range": 3.0, "icp.max_iterations": "many"}
+    found = look(given, values, LIMITS, scans()[:16], others)
+    assert found["takes effect while it runs"] == "voxel_size"
+    vain = found["has no effect while it runs"]
+    assert re.match(r"max_range, icp\.max_iterations is refused \(.*\): do not switch live", vain)
+
+
+def test_one_that_works_on_is_driven_without_waiting_too(tmp_path):
+    given = ros2(tmp_path / "icp.yaml", imitate={"background": 0.8}, patience=9.0)
+    found = look(given, VALUES, LIMITS, scans()[:5])
+    words = r"yes: at rate: 0 its path is up to 0\.00 m off that at rate: 1, on 1\.\d m; keep"
+    assert re.match(words, found["works on after a pose"])
+    assert "takes effect while it runs" not in found
+
+
 def test_an_imu_is_heard_until_the_end_of_a_scan(make):
     odometry = make(imitate={"imu": True}, imu="/imu", patience=10.0)
     given = []
