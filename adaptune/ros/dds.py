@@ -343,11 +343,7 @@ class DdsLink:
 
     def _ask(self, place: str, service: Service, request: bytes, seconds: float) -> Iterator[Any]:
         with self._naming(place):
-            if place not in self._clients:
-                request_end = self._end(DataWriter, f"rq{place}Request", service.request)
-                reply_end = self._end(DataReader, f"rr{place}Reply", service.response)
-                self._clients[place] = request_end, reply_end
-            writer, reader = self._clients[place]
+            writer, reader = self._client(place, service)
             servers = writer.get_matched_subscriptions()
             if not servers or not reader.get_matched_publications():
                 return
@@ -360,6 +356,12 @@ class DdsLink:
             for sample in self._waited(reader, min(seconds, _AGAIN)):
                 if sample.data[4 : 4 + len(head)] == head:
                     yield sample.data[:4] + sample.data[4 + len(head) :]
+
+    def _client(self, place: str, service: Service) -> tuple[DataWriter, DataReader]:
+        if place not in self._clients:
+            asks = self._end(DataWriter, f"rq{place}Request", service.request)
+            self._clients[place] = asks, self._end(DataReader, f"rr{place}Reply", service.response)
+        return self._clients[place]
 
     def _places(self) -> list[str]:
         names = {e.topic_name for e in self._others(1)}

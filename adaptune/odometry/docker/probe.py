@@ -65,9 +65,9 @@ def look(
             if system.ended:
                 break
             shown.append((system._shown[1], scan.stamp))
-        if not system.ended:
-            found |= _topics(system._system)
-            works_on = system._works_on(system._system)
+        if (inside := system._system) is not None:
+            found |= _topics(inside)
+            works_on = system._works_on(inside)
     seconds = max(1e-9 * (shown[-1][1] - shown[0][1]), 0.1)
     found["time of a start"] = f"{took:.1f} s"
     found |= _poses(system.came, shown)
@@ -127,7 +127,8 @@ def _effects(
     fast = settings.model_copy(update={"play": "lockstep", "rate": 0.0})
     path, again = (_driven(fast, parameters, limits, scans) for _ in range(2))
     chance = 3.0 * _furthest(path, again) + 1e-6
-    live, vain = [], []
+    live: list[str] = []
+    vain: list[str] = []
     for name, value in others.items():
         try:
             changed = _driven(fast, parameters, limits, scans, {name: value})

@@ -110,6 +110,7 @@ class RosSystem(ABC):
         self._settings, self._topics = settings, [settings.odometry]
         self.usage, self._memory, self._recording = Usage(0.0, 0.0), memory, recording
         self._clock: SimClock | None = None
+        self._keys: Mapping[str, Sequence[str]] = {}  # of a parameter server
         self.folder, self._given = make_shared(folder / "shared"), folder / "given"
         self._given.mkdir()
         self._parameters = self._given / "params.yaml"
@@ -146,13 +147,8 @@ class RosSystem(ABC):
     def check(self, template: Template, parameters: ParameterSet) -> None:
         """Raise an `OdometryError` if the nodes hold other parameters."""
 
-    @abstractmethod
-    def warn_of_unread(self) -> None:
-        """Log which of the parameters that were checked no node has read."""
-
-    @abstractmethod
-    def set_parameters(self, values: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Set parameters of the settings' node, by whole names; what it then holds."""
+    def warn_of_unread(self) -> None:  # noqa: B027
+        """Log which of the parameters that were checked no node has read, where that is known."""
 
     def cloud_type(self, topic: str) -> str:  # noqa: ARG002
         """The type of the messages with points that the system hears."""
@@ -235,8 +231,10 @@ class RosSystem(ABC):
 
     def steering(self) -> Steering | None:
         """What sets parameters of the settings' node while it runs, if that is named."""
-        node = self._settings.node
-        return None if node is None else Steering(node, self.set_parameters, *self._command())
+        if (node := self._settings.node) is None:
+            return None
+        set_them = lambda values: self.link.set_parameters(node, values, self._keys)  # noqa: E731
+        return Steering(node, set_them, *self._command())
 
     def _command(self) -> tuple[Sequence[str] | None, Run | None]:
         """What sets a parameter in place of ROS, and what runs it, if anything."""

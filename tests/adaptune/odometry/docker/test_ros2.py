@@ -3,7 +3,6 @@
 Its node is RustDDS, which shares no code with what carries adaptune's messages.
 """
 
-import contextlib
 import re
 import socket
 
@@ -260,13 +259,14 @@ def test_what_a_node_does_that_no_odometry_may_is_told(make, imitate, words):
 
 
 def test_a_domain_that_others_use_is_left_to_them(monkeypatch):
-    free = ros2_system._free_domain()
-    free.close()
+    free, held = ros2_system._free_domain()
+    held.close()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
-        other.bind(("", 7400 + 250 * free.number + 11))
-        with contextlib.closing(ros2_system._free_domain()) as chosen:
-            assert chosen.number != free.number
-        monkeypatch.setattr(ros2_system, "_DOMAINS", range(free.number, free.number + 1))
-        words = f"all ROS domains from {free.number} to {free.number} are in use on this machine"
+        other.bind(("", 7400 + 250 * free + 11))
+        chosen, held = ros2_system._free_domain()
+        held.close()
+        assert chosen != free
+        monkeypatch.setattr(ros2_system, "_DOMAINS", range(free, free + 1))
+        words = f"all ROS domains from {free} to {free} are in use on this machine"
         with pytest.raises(OdometryError, match=words):
             ros2_system._free_domain()
