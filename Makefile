@@ -13,7 +13,7 @@ help:
 	@echo "make test    run linters, type checker, import contract and all tests that need no service"
 	@echo "make docs    build the documentation as a site, build/site"
 	@echo "make test-services  test with Docker, ROS, a browser, a cluster, kills and benchmarks"
-	@echo "make services  install what pip cannot bring: ROS 1, Docker, Chromium (Debian 12); it needs"
+	@echo "make services  install what pip cannot bring: ROS 1, Docker, Chromium, Fast DDS (Debian 12); it needs"
 	@echo "               Rust 1.88 or newer (by rustup) for the ROS 2 odometry that tests run"
 	@echo "make reference-image  build the image of a ROS 1 odometry that tests run"
 	@echo "make reference-ros2-image  build that of a ROS 2 odometry; the first time takes five minutes"
@@ -49,7 +49,7 @@ pytest: $(VENV)/.installed
 services:
 	$(SUDO) apt-get update
 	DEBIAN_FRONTEND=noninteractive $(SUDO) apt-get install --yes --no-install-recommends \
-		ros-core python3-rospy python3-dynamic-reconfigure debootstrap chromium \
+		ros-core python3-rospy python3-dynamic-reconfigure debootstrap chromium g++ libfastrtps-dev \
 		$(if $(shell command -v dockerd),,docker.io)
 	$(SUDO) docker info >/dev/null 2>&1 || $(SUDO) service docker start \
 		|| $(SUDO) sh -c 'setsid dockerd >/var/log/docker.log 2>&1 </dev/null &'

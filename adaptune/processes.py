@@ -46,12 +46,14 @@ class SocketStream:
         self.write, self.writelines = self._writer.write, self._writer.writelines
         self.flush = self._writer.flush
 
-    def read(self, size: int, /) -> bytes:
+    def read(self, size: int, /) -> bytearray:
         """Read so many bytes; fewer only at the end."""
-        data = bytearray()
-        while len(data) < size and (more := self._socket.recv(size - len(data))):
-            data += more
-        return bytes(data)
+        data, n = bytearray(size), 0
+        with memoryview(data) as room:
+            while n < size and (more := self._socket.recv_into(room[n:])):
+                n += more
+        del data[n:]
+        return data
 
     def ready(self, seconds: float) -> bool:
         """Whether a message, or the end, is there, or comes in so many seconds."""
@@ -127,7 +129,7 @@ def receive(stream: "BinaryIO | SocketStream | _Timed") -> Message | None:
     return Message(header, arrays)
 
 
-def _exactly(stream: "BinaryIO | SocketStream | _Timed", size: int) -> bytes:
+def _exactly(stream: "BinaryIO | SocketStream | _Timed", size: int) -> bytes | bytearray:
     data = stream.read(size)
     if len(data) < size:
         raise WireError("the stream ends in the middle of a message")

@@ -3,15 +3,19 @@
     python benchmarks/containers.py cost [TRIALS]
     python benchmarks/containers.py parallel [TRIALS]
     python benchmarks/containers.py kills [KILLS] [SEED]
+    python benchmarks/containers.py ros2 [SCANS]
 
 It builds the reference image if needed, and records a garden of 20 s. `cost` runs trials one after
 the other: their time less that of the bag. `parallel` runs as many one after the other, and then
 two at a time. `kills` sends SIGKILL to a campaign with two workers, or to one of its workers, at a
 random moment, and counts what the engine holds: 5 s later, and when the next campaign has begun.
+`ros2` drives the ROS 2 reference in lockstep by clouds of 29,000 points: CPU time of what carries
+them, and the trial's time next to the node's own.
 """
 
 import logging
 import os
+import re
 import signal
 import sys
 import tempfile
@@ -29,9 +33,13 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "tests" / "support"))
 
 import kills
 import needs
+import ros2_reference
 
 from adaptune import yaml12
 from adaptune.odometry.docker.engine import OWNER, engine, is_orphan
+from adaptune.odometry.docker.ros2_system import Ros2
+from adaptune.odometry.remote import Limits
+from adaptune.recording import Scan
 from adaptune.simulation import Course
 from adaptune.simulation.record import record
 from offline.config import load_study
@@ -166,9 +174,54 @@ def kill(path: Path, n: int, seed: int) -> None:
     )
 
 
+def ros2(n: int) -> None:
+    """What lockstep costs besides the node's own time, which the node prints."""
+    rng = np.random.default_rng(0)
+    walls = rng.uniform(-20.0, 20.0, (29_000, 3)).astype(np.float32)
+    walls[np.arange(29_000), rng.integers(0, 2, 29_000)] = 20.0
+    scans = [Scan(10**9 + i * 10**8, walls) for i in range(n)]
+    program = ("adaptune-reference-ros2", "--params-file", "{parameters}")
+    with tempfile.TemporaryDirectory() as name:
+        given = ros2_reference.ros2(
+            Path(name) / "p.yaml", command=("env", "ADAPTUNE_TIMES=1", *program), patience=60.0
+        )
+        odometry = Ros2.instance({}, given, Limits(seconds=60.0, memory=2.0), None)
+        odometry.start(scans[0], np.eye(4))
+        system: Any = odometry._system
+        time.sleep(2.0)  # until its node has learnt all of the other
+        idle = _idle(system)
+        begin, cpu, carrier = time.monotonic(), time.process_time(), system._node.used().cpu
+        node = system._container.used().cpu
+        for scan in scans[1:]:
+            odometry.register(scan)
+        took, cpu = time.monotonic() - begin, time.process_time() - cpu
+        carrier, node = system._node.used().cpu - carrier, system._container.used().cpu - node
+        log = (system.folder / "output.log").read_text()
+        own = sum(float(ms) for ms in re.findall(r"scan (?!1:)\d+: (\S+) ms", log)) * 1e-3
+        odometry.close()
+    used = zip((cpu, carrier), idle, strict=True)
+    mine, its = (1e3 * (busy - took * rest) / (n - 1) for busy, rest in used)
+    print(f"{n - 1} clouds: CPU of a cloud {mine:.2f} ms here, {its:.2f} ms in adaptune's node,")
+    print(f"  {1e3 * node / (n - 1):.2f} ms in the system")
+    print(f"  {took:.2f} s in lockstep, {own:.2f} s in the node: {took / own:.2f}x")
+
+
+def _idle(system: Any) -> tuple[float, float]:
+    """Cores that this process and adaptune's node use while nothing is sent but the clock."""
+    begin, cpu, carrier = time.monotonic(), time.process_time(), system._node.used().cpu
+    time.sleep(3.0)
+    took = time.monotonic() - begin
+    found = (time.process_time() - cpu) / took, (system._node.used().cpu - carrier) / took
+    print(f"the clock alone: {1e2 * found[0]:.1f} and {1e2 * found[1]:.1f} % of a core")
+    return found
+
+
 def main(what: str, n: int, seed: int) -> None:
-    """Measure one of the three."""
+    """Measure one of the four."""
     logging.basicConfig(format="%(message)s")
+    if what == "ros2":
+        ros2(n)
+        return
     logging.getLogger("adaptune.odometry.docker.rustle").setLevel(logging.INFO)
     with study_file() as path:
         if what == "cost":

@@ -40,6 +40,7 @@ from adaptune.model import ErrorModel
 from adaptune.model.error_model import render
 from adaptune.odometry import wire
 from adaptune.odometry.docker.played_bag import PoseRecorder
+from adaptune.odometry.docker.poses import PoseReader
 from adaptune.odometry.program import CommandSettings, read_output
 from adaptune.odometry.template import Template
 from adaptune.recording import Scan, SequenceConfig
@@ -213,7 +214,7 @@ def containers(_: Path) -> fuzz.Case:
     """Messages of poses that a system in a container publishes."""
     link: Any = local_link.LocalLink()
     link.record = lambda *_: None  # the messages are put there
-    recorder = PoseRecorder(link, "/odometry")
+    recorder = PoseRecorder(PoseReader(link, "/odometry"))
     made = [local_link.odometry(int(stamp), T) for stamp, T in zip(STAMPS, poses(5), strict=False)]
     sound = [bytes(link.store.serialize_ros1(each, ODOMETRY)) for each in made]
 

@@ -2,6 +2,7 @@
 
 import csv
 import itertools
+import logging
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -28,6 +29,9 @@ class StoredReplayError(AdaptuneError):
     """A replay that is missing or damaged."""
 
 
+_log = logging.getLogger(__name__)
+
+
 class ReplaySummary(BaseModel):
     """The content of ``replay.json``."""
 
@@ -40,6 +44,7 @@ class ReplaySummary(BaseModel):
     cpu_ms: float | None = None  # milliseconds of CPU time a scan, without reading it
     memory_mb: float | None = None  # most megabytes of all processes
     real_time: dict[str, float] | None = None  # how it kept up, see `kept_up`
+    first_pose: float = 0.0  # seconds from the first scan; what was before is left out
     model_file: str | None  # of the model that it was made with; None if it needed none
     inputs: dict[str, Any] = Field({}, exclude=True)  # see `adaptune.manifest`
 
@@ -188,8 +193,12 @@ def write_replay(
         cpu_ms=round(replay.cpu_ms, 3),
         memory_mb=round(replay.memory, 1),
         real_time=kept_up(replay),
+        first_pose=round(replay.first_pose, 3),
         model_file=None if model_file is None else str(model_file.resolve()),
     )
+    if replay.first_pose:
+        what = "%s, %s: the odometry gave its first pose after %.1f s"
+        _log.info(what, folder.parent.name, folder.name, replay.first_pose)
     manifest.record(folder / manifest.FILE, inputs)
     write_text(folder / "replay.json", summary.model_dump_json(indent=2) + "\n")
 

@@ -175,6 +175,7 @@ class ReplayRecord:
     newest: Choice | None = None  # applied or not
     cpu_ms: float = math.nan  # milliseconds of CPU time a scan, in all processes, without reading
     memory: float = 0.0  # most megabytes of all processes
+    first_pose: float = 0.0  # seconds from the first scan to the odometry's first pose
     # In real time:
     dropped: int = 0  # scans that the odometry did not get
     missed: int = 0  # selections that were not there at their deadline
@@ -249,6 +250,8 @@ class ReplayRecord:
         # Scans before the first pose are unknown, unless they are so many that it has failed.
         waiting = sum(1 for _ in takewhile(lambda step: not step.begun, self.steps))
         if 0 < waiting < MAX_SHARE_WITHOUT_POSE * self._n:
+            stamps = self.steps[waiting].stamp, self.steps[0].stamp
+            self.first_pose = 1e-9 * (stamps[0] - stamps[1])
             del self.steps[:waiting], self.late[:waiting]
         self.cpu_ms = 1e3 * (self._cpu + usage.other_cpu + other_cpu) / self._n
         self.memory += usage.memory or 0.0

@@ -96,6 +96,7 @@ class ComparisonRow:
     cpu_ms: float | None = None  # milliseconds of CPU time a scan
     memory_mb: float | None = None  # most megabytes of all processes
     real_time: Mapping[str, float] | None = None  # see `ReplaySummary`
+    first_pose: float = 0.0  # seconds from the first scan
     # Over all sequences: geometric mean of the ratios over the worst tenth of the stretches, and on
     # how many sequences the mode has less and more error by what counts.
     worst_tenth: float | None = None
@@ -332,6 +333,7 @@ def _measured(
         cpu_ms=summary.cpu_ms,
         memory_mb=summary.memory_mb,
         real_time=summary.real_time,
+        first_pose=summary.first_pose,
     )
 
 

@@ -332,7 +332,8 @@ def _ratio(row: ComparisonRow) -> Ratio:
 
 def remarks(rows: Sequence[ComparisonRow]) -> list[str]:
     """How what adapts compares with rivals and controls, and what must be known to trust it."""
-    return _rivals(rows) + _judges(rows) + _estimates(rows) + _kept_up(rows) + _restarts(rows)
+    of_drives = _kept_up(rows) + _late(rows) + _restarts(rows)
+    return _rivals(rows) + _judges(rows) + _estimates(rows) + of_drives
 
 
 def _rivals(rows: Sequence[ComparisonRow]) -> list[str]:
@@ -418,6 +419,19 @@ def _kept_up(rows: Sequence[ComparisonRow]) -> list[str]:
             f"Replayed at {rate:g} times the recorded rate, nothing came too late: {within}."
         )
     return said
+
+
+def _late(rows: Sequence[ComparisonRow]) -> list[str]:
+    """For each sequence a sentence about an odometry that gave its first pose late."""
+    late: dict[str, list[float]] = {}
+    for row in rows:
+        if row.first_pose:
+            late.setdefault(row.sequence, []).append(row.first_pose)
+    return [
+        f"On {name} the odometry gave its first pose after {max(seconds):.1f} s; errors count from "
+        f"there."
+        for name, seconds in late.items()
+    ]
 
 
 def _restarts(rows: Sequence[ComparisonRow]) -> list[str]:

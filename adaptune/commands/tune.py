@@ -99,7 +99,10 @@ def _look(path: Path) -> bool:
     first = next(iter(scans)).stamp
     some = takewhile(lambda scan: scan.stamp < first + _LOOK * 1e9, scans)
     say(f"{factory.name} on the first {_LOOK:g} s of {name}, with the baseline's parameters:")
-    found = look(factory.settings, factory.space.baseline, factory.limits, some)
+    space = factory.space
+    # The far end of each range.
+    (others,) = space.from_unit((space.to_unit([space.baseline]) < 0.5).astype(float))
+    found = look(factory.settings, space.baseline, factory.limits, some, others)
     show_table("What it does", [{"": key, "found": value} for key, value in found.items()])
     return True
 

@@ -39,8 +39,10 @@ from adaptune.errors import nearest
 from adaptune.recording.clouds import CLOUDS
 from adaptune.ros.link import LinkError, take_all
 from adaptune.ros.ros2 import (
+    BUFFER_CURE,
     FIELDS,
     PLACES,
+    RECEIVE_BUFFER,
     Service,
     full,
     message_types,
@@ -60,12 +62,10 @@ _DEPTH = 1000
 """Messages of a topic that may wait; then the oldest are dropped."""
 _PAUSE = 0.02
 """Seconds between calls of a service that is not there, or not yet."""
-_BUFFER = 1 << 22
-"""Bytes of a receive buffer that hold some clouds."""
 _CYCLONE, _FAST_DDS = b"\x01\x10", b"\x01\x0f"
 """The vendors of DDS in ROS 2, as they begin the keys of their participants."""
 _INFO = "rmw_dds_common/msg/ParticipantEntitiesInfo"
-_TRANSFORMS = "tf2_msgs/msg/TFMessage"
+TRANSFORMS = "tf2_msgs/msg/TFMessage"
 _ALL = ViewState.Any | SampleState.Any
 _DURABILITIES = tuple(
     getattr(Policy.Durability, name)
@@ -136,17 +136,17 @@ class DdsLink:
         there = [e for e in self._endpoints(0) if e.topic == full(topic)]
         if there and kind not in {e.kind for e in there}:
             raise LinkError(f"{topic} is published as {there[0].kind}, not as {kind}")
-        if kind in CLOUDS and (size := _receive_buffer()) < _BUFFER:
+        if kind in CLOUDS and (size := _receive_buffer()) < RECEIVE_BUFFER:
             what = "%s: clouds may be lost, as this machine receives %d kB ahead; run `sudo sysctl "
             what += "-w net.core.rmem_max=%d` and start again"
-            _log.warning(what, topic, size // 1000, _BUFFER)
+            _log.warning(what, topic, size // 1000, RECEIVE_BUFFER)
         messages = self._taken(topic, kind, self._topic_end(DataReader, topic, kind))
         self._threads.append(take_all(topic, messages, take if raw else self._reading(kind, take)))
 
     def _taken(self, topic: str, kind: str, reader: DataReader) -> Iterator[bytes]:
         """The bytes of messages as they come, until the link is closed."""
         senders: list[int] = []
-        mixed = kind == _TRANSFORMS  # as is usual
+        mixed = kind == TRANSFORMS  # as is usual
         for reliable in (True, False):
             for sample in self._waited(reader):
                 sender = sample.sample_info.publication_handle
@@ -237,8 +237,7 @@ class DdsLink:
         if fast := sorted({e.node for e in wanted if e.vendor == _FAST_DDS}):
             return (
                 f"{' and '.join(fast)} runs on Fast DDS, which loses clouds that do not fit in the "
-                f"receive buffer: run `sudo sysctl -w net.core.rmem_default={_BUFFER}` on its "
-                "machine, and start it again"
+                f"receive buffer: run `{BUFFER_CURE}` on its machine, and start it again"
             )
         return ""
 
@@ -344,11 +343,7 @@ class DdsLink:
 
     def _ask(self, place: str, service: Service, request: bytes, seconds: float) -> Iterator[Any]:
         with self._naming(place):
-            if place not in self._clients:
-                request_end = self._end(DataWriter, f"rq{place}Request", service.request)
-                reply_end = self._end(DataReader, f"rr{place}Reply", service.response)
-                self._clients[place] = request_end, reply_end
-            writer, reader = self._clients[place]
+            writer, reader = self._client(place, service)
             servers = writer.get_matched_subscriptions()
             if not servers or not reader.get_matched_publications():
                 return
@@ -361,6 +356,12 @@ class DdsLink:
             for sample in self._waited(reader, min(seconds, _AGAIN)):
                 if sample.data[4 : 4 + len(head)] == head:
                     yield sample.data[:4] + sample.data[4 + len(head) :]
+
+    def _client(self, place: str, service: Service) -> tuple[DataWriter, DataReader]:
+        if place not in self._clients:
+            asks = self._end(DataWriter, f"rq{place}Request", service.request)
+            self._clients[place] = asks, self._end(DataReader, f"rr{place}Reply", service.response)
+        return self._clients[place]
 
     def _places(self) -> list[str]:
         names = {e.topic_name for e in self._others(1)}
@@ -463,9 +464,12 @@ def _configuration() -> str:
             raise LinkError(f"ROS_STATIC_PEERS: {peer}: {error.strerror}") from error
     alone = f"<Tag>adaptune {os.getpid()}</Tag>" if reach == "OFF" else ""
     known = "".join(f"<Peer address={quoteattr(peer)}/>" for peer in peers)
-    parts = [f'<Internal><SocketReceiveBufferSize max="{_BUFFER} B"/></Internal>']
+    parts = [f'<Internal><SocketReceiveBufferSize max="{RECEIVE_BUFFER} B"/></Internal>']
     if reach in ("LOCALHOST", "OFF"):
-        parts.append("<General><AllowMulticast>false</AllowMulticast></General>")
+        # Cyclone DDS hears nobody on an interface that it does not use, and others greet on this.
+        other = '<NetworkInterface autodetermine="true"/>' * (len(peers) > 1)
+        faces = f'<Interfaces>{other}<NetworkInterface name="lo"/></Interfaces>'
+        parts.append(f"<General><AllowMulticast>false</AllowMulticast>{faces}</General>")
     if reach != "SYSTEM_DEFAULT":
         parts.append(
             "<Discovery><ParticipantIndex>auto</ParticipantIndex>"
@@ -479,5 +483,5 @@ def _configuration() -> str:
 def _receive_buffer() -> int:
     """Bytes that the kernel lets a socket receive ahead."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
         return probe.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2

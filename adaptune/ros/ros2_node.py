@@ -8,33 +8,18 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
-from cyclonedds.pub import DataWriter
-from cyclonedds.sub import DataReader
 
 from adaptune import processes
-from adaptune.ros.dds import DdsLink
+from adaptune.ros.dds import TRANSFORMS, DdsLink
 from adaptune.ros.link import LinkError
-from adaptune.ros.ros2 import full
+from adaptune.ros.ros2 import PLACES, full
 
 _QUIET = ("/parameter_events", "/rosout", "/clock")
 """Topics of every node."""
 
 
 class _Link(DdsLink):
-    """What `DdsLink` is, for bytes, and what it sees."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._writers: dict[str, Any] = {}
-
-    def advertise_bytes(self, topic: str, kind: str) -> Callable[[bytes], None]:
-        self._writers[topic] = writer = self._end(DataWriter, f"rt{full(topic)}", kind)
-
-        def publish(data: bytes) -> None:
-            with self._naming(topic):
-                writer.write(writer.data_type(data))
-
-        return publish
+    """A link that says what it sees."""
 
     def seen(self) -> tuple[dict[str, list[str]], dict[str, list[str]]]:
         """The topics that others publish now, and subscribe to, with their types."""
@@ -49,11 +34,6 @@ class _Link(DdsLink):
         """The nodes that publish a topic."""
         return [end.node for end in self._endpoints(0) if end.topic == topic]
 
-    def hearers(self, topic: str) -> int:
-        """How many subscribers hear what is published here."""
-        with self._naming(topic):
-            return len(self._writers[topic].get_matched_subscriptions())
-
     def nodes(self) -> list[str]:
         """The nodes that serve their parameters."""
         last = "/list_parameters"
@@ -63,11 +43,7 @@ class _Link(DdsLink):
         """Let nodes find who will ask for their parameters, which takes a while."""
         for node in self.nodes():
             for name, service in self._services.items():
-                place = f"{node}/{name.removesuffix('Parameters').lower()}_parameters"
-                if place not in self._clients:
-                    asks = self._end(DataWriter, f"rq{place}Request", service.request)
-                    hears = self._end(DataReader, f"rr{place}Reply", service.response)
-                    self._clients[place] = asks, hears
+                self._client(f"{node}/{PLACES[name]}", service)
 
 
 class _Node:
@@ -83,11 +59,15 @@ class _Node:
 
     def subscribe(self, header: Mapping[str, Any], _: bytes) -> None:
         """Subscribe as soon as somebody publishes, of whatever type."""
-        self._awaited.append(full(header["topic"]))
+        topic = full(header["topic"])
+        if topic.endswith("/tf_static"):  # this node may publish it
+            self._record(topic, TRANSFORMS)
+        else:
+            self._awaited.append(topic)
 
     def advertise(self, header: Mapping[str, Any], _: bytes) -> None:
         kind = header["kind"].replace("/", "/msg/")
-        self._publish[header["topic"]] = self._link.advertise_bytes(header["topic"], kind)
+        self._publish[header["topic"]] = self._link.advertise(header["topic"], kind, raw=True)
 
     def publish(self, header: Mapping[str, Any], data: bytes) -> None:
         self._publish[header["topic"]](data)

@@ -458,3 +458,31 @@ def test_where_a_bank_that_rests_fails_all_join_in():
     np.testing.assert_allclose(
         result.trajectory.T_world_sensor[:, 0, 3], STEP * np.arange(40), atol=1e-9
     )
+
+
+class LateToPose(InProcess):
+    """Gives its first pose for the fourth scan."""
+
+    n = 0
+
+    @property
+    def begun(self):
+        return self.n >= 3
+
+    def register(self, prepared):
+        self.n += 1
+        return super().register(prepared)
+
+
+def test_a_late_first_pose_is_told_and_what_was_before_is_left_out(tmp_path, caplog):
+    caplog.set_level("INFO")
+    late = replay(scans(np.arange(40.0)), LateToPose(Scripted()), HEALTH)
+    assert late.first_pose == 3.0
+    folder = tmp_path / "hall" / "fixed"
+    folder.mkdir(parents=True)
+    write_replay(folder, late, ABOUT, MODEL)
+    assert caplog.messages == ["hall, fixed: the odometry gave its first pose after 3.0 s"]
+    stored = StoredReplay.read(folder)
+    assert stored.summary.first_pose == 3.0
+    assert stored.summary.scans == len(stored.trajectory) == 37
+    assert replay(scans(np.arange(40.0)), InProcess(Scripted()), HEALTH).first_pose == 0.0

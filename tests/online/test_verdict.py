@@ -156,6 +156,12 @@ def test_the_verdict_of_a_study_without_a_model_goes_by_the_baseline():
     assert "(95 % interval 1.004 to 1.12)" in verdict(near, 10.0)[1]
 
 
+def test_a_late_first_pose_is_told():
+    rows = [replace(row, first_pose=1.25) for row in rows_of("a", adaptive=0.5)]
+    said = "On a the odometry gave its first pose after 1.2 s; errors count from there."
+    assert said in remarks(rows)
+
+
 def test_nothing_is_said_where_nothing_is_known():
     rows = [replace(row, rte=None, ratio=None) for row in rows_of("a", adaptive=0.5)]
     nobody = "No test sequence has a reference: nobody can say what was gained."

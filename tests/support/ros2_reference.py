@@ -12,6 +12,7 @@ TEMPLATE = """\
     points_topic: {points}
     voxel_size: 0.9
     icp: {{max_correspondence_distance: 1.5, max_iterations: 25}}
+    max_range: 60.0
     other: 1
     imitate: {imitate}
 """

@@ -19,7 +19,8 @@ from adaptune.files import temporary_prefix
 from adaptune.geometry import Poses, invert, rectify, to_pose
 from adaptune.odometry.base import Registration, Usage
 from adaptune.odometry.docker.played_bag import MAX_SCATTER, OWN_CLOCK
-from adaptune.odometry.docker.ros_system import QUIET, RosSystem, filled, read_poses
+from adaptune.odometry.docker.poses import matrix
+from adaptune.odometry.docker.ros_system import QUIET, RosSystem, filled
 from adaptune.odometry.faults import LOST, Faulting, pose_fault
 from adaptune.odometry.remote import Limits
 from adaptune.recording.clouds import LIVOX_TYPES
@@ -192,15 +193,21 @@ class Lockstep(Faulting):
         if self._settings.rate or not self._n_answered or self.name in _SEEN:
             return
         _SEEN.add(self.name)
-        before = self._used.cpu
-        time.sleep(_BACKGROUND)
-        self._look(system)
-        if self._used.cpu - before > _BUSY * _BACKGROUND:
+        if self._works_on(system):
             _warn_once(
                 f"{self.name}: it works on after its last pose, as systems that map in the "
                 f"background do; at rate: 0, it has less time for that than on a robot, so its "
-                f"poses are worse: set odometry.settings.rate: 1"
+                f"poses may be worse: set odometry.settings.rate: 1, or let `adaptune inspect` of "
+                f"the study say by how much they differ"
             )
+
+    def _works_on(self, system: RosSystem) -> bool:
+        """Whether it uses CPU time now, after its last pose."""
+        self._look(system)
+        before = self._used.cpu
+        time.sleep(_BACKGROUND)
+        self._look(system)
+        return self._used.cpu - before > _BUSY * _BACKGROUND
 
     def __del__(self) -> None:
         self.close()
@@ -225,7 +232,8 @@ class Lockstep(Faulting):
         link, topics = system.link, (self._settings.points or POINTS, self._settings.imu or IMU)
         self._messages = Messages(link.version)
         take = weakref.WeakMethod(self._take)  # the link must not keep this alive
-        link.record(self._settings.odometry, lambda *given: (do := take()) and do(*given))
+        self._reader = system.reader()
+        self._reader.hear(lambda *given: (do := take()) and do(*given))
         self._clock = system.run_clock(scan.stamp, self._settings.rate or 1.0)
         self._kind = system.cloud_type(topics[0])
         self._send_cloud = link.advertise_bytes(topics[0], self._kind)
@@ -309,8 +317,10 @@ class Lockstep(Faulting):
         if self._silent >= _MOST_SILENT:
             published = system.link.topics().keys() - {*QUIET, *self._topics}
             needs = "" if self._settings.imu else "an IMU (odometry.settings.imu), or "
-            why = system.link.why_unheard(self._topics[0]) or (
-                f"does it need {needs}all that the bag holds (play: bag)?"
+            why = (
+                self._reader.lacking
+                or system.link.why_unheard(self._topics[0])
+                or (f"does it need {needs}all that the bag holds (play: bag)?")
             )
             raise OdometryError(
                 f"no pose {'' if self._n_answered else 'yet '}on {self._settings.odometry} for "
@@ -319,9 +329,9 @@ class Lockstep(Faulting):
             )
         n, answered = self._n_shown, self._n_answered
         if n >= _MOST_SILENT and answered < _LEAST_ANSWERED * n:
+            why = system.link.why_unheard(self._topics[0]) or "set odometry.settings.play: bag"
             raise OdometryError(
-                f"it gave poses for {answered} of {n} scans, and lockstep needs one for each; set "
-                f"odometry.settings.play: bag"
+                f"it gave poses for {answered} of {n} scans, and lockstep needs one for each; {why}"
             )
 
     def _at_scan(self, stamp: int, T_own_sensor: Poses) -> Poses:
@@ -343,22 +353,22 @@ class Lockstep(Faulting):
         earliest = self._stamp - _EARLY + (0 if self._late is None else self._late // 2)
 
         def there() -> bool:
-            return bool(self._poses) and self._poses[-1][0] >= earliest
+            found = bool(self._poses) and self._poses[-1][0] >= earliest
+            return found or bool(self._reader.fault)
 
         with self._news:
-            return self._poses[-1] if self._news.wait_for(there, seconds) else None
+            came = self._news.wait_for(there, seconds)
+            if self._reader.fault:
+                raise OdometryError(self._reader.fault)
+            return self._poses[-1] if came else None
 
     def _take(self, kind: str, data: bytes) -> None:
         if self._system is None:
             return
-        for stamp, _, p, q in read_poses(self._system.link, kind, data)[-1:]:
-            try:
-                T = to_pose((p.x, p.y, p.z, q.x, q.y, q.z, q.w))
-            except ValueError:
-                T = np.full((4, 4), np.nan)
-            with self._news:
-                self._poses = [(stamp, T)]
-                self._news.notify_all()
+        poses = [] if self._reader.fault else self._reader.read(kind, data)[-1:]
+        with self._news:
+            self._poses = [(stamp, matrix(p, q)) for stamp, _, p, q in poses] or self._poses
+            self._news.notify_all()
 
     def _told(self, error: Exception) -> str:
         """An error, and the last lines that the system wrote; no engine is no fault of a trial."""

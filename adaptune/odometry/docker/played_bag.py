@@ -12,10 +12,10 @@ from rosbags.highlevel import AnyReader
 
 from adaptune.errors import AdaptuneError, OdometryError
 from adaptune.odometry.docker.engine import kept_log
-from adaptune.odometry.docker.ros_system import QUIET, RosSystem, filled, read_poses
+from adaptune.odometry.docker.poses import PoseReader
+from adaptune.odometry.docker.ros_system import QUIET, RosSystem, filled
 from adaptune.odometry.program import ProgramInput, WholeRun, when_known
 from adaptune.recording.clouds import PATH, POSES, Pose, usable
-from adaptune.ros.relay import Relay
 from adaptune.trajectory import Trajectory
 
 _BETWEEN_TOPIC_LOOKS = 0.1
@@ -39,12 +39,12 @@ _log = logging.getLogger(__name__)
 class PoseRecorder:
     """Records what a system publishes on the topic of its poses."""
 
-    def __init__(self, link: Relay, topic: str):
-        self.topic, self._link = topic, link
+    def __init__(self, reader: PoseReader):
+        self.topic, self.reader = reader.topic, reader
         self.received: list[tuple[str, bytes]] = []
         self.last = time.monotonic()
         self.longest_pause = 0.0
-        link.record(topic, self._take)
+        reader.hear(self._take)
 
     def _take(self, kind: str, data: bytes) -> None:
         now = time.monotonic()
@@ -62,15 +62,12 @@ class PoseRecorder:
             raise OdometryError(
                 f"{self.topic} is {kind}; odometry.settings.odometry must name poses"
             )
-        return [pose for kind, data in messages for pose in self._poses(kind, data)]
+        return [pose for kind, data in messages for pose in self.reader.read(kind, data)]
 
     def newest(self) -> tuple[int, int]:
         """How many poses there are, and the stamp of the one that came last."""
-        poses = self._poses(*self.received[-1]) if self.received else []
+        poses = self.reader.read(*self.received[-1]) if self.received else []
         return len(self.received) + max(len(poses) - 1, 0), poses[-1][0] if poses else 0
-
-    def _poses(self, kind: str, data: bytes) -> list[Pose]:
-        return read_poses(self._link, kind, data)
 
 
 class Drain:
@@ -111,16 +108,17 @@ class PlayedBag(WholeRun):
         template, text = filled(self.settings, self.parameters)
         memory = self._limits.memory
         system = self.settings.system(self.settings, memory, text, folder, given)
-        recorder, fault = PoseRecorder(system.link, self.settings.odometry), ""
+        recorder, fault = PoseRecorder(system.reader()), ""
         with closing(system):
             try:
-                renamed = self._renamed(given)
-                system.wait(renamed.get(given.points, given.points))
+                points = self._renamed(given).get(given.points, given.points)
+                system.wait(points)
                 system.check(template, self.parameters)
                 self._play(system, recorder, given)
                 system.warn_of_unread()
-                self._check_published(system, recorder)
-                return self._checked(recorder, given)
+                why = system.link.why_unheard(points)
+                self._check_published(system, recorder, why)
+                return self._checked(recorder, given, why)
             except AdaptuneError as error:
                 fault = str(error)
                 raise
@@ -145,7 +143,7 @@ class PlayedBag(WholeRun):
             if time.monotonic() - looked > _BETWEEN_STATES:
                 looked = time.monotonic()
                 self._see(system, n)
-            self._check_time()
+            self._check(recorder)
         # Nodes that sleep by the clock must wake up to finish.
         with AnyReader([given.path]) as reader:
             end = int(reader.end_time)
@@ -153,7 +151,7 @@ class PlayedBag(WholeRun):
         drain = Drain(recorder, n, int(given.stamps[-1]), lambda: self._see(system, n))
         while not drain.over():
             time.sleep(_BETWEEN_TOPIC_LOOKS)
-            self._check_time()
+            self._check(recorder)
         self._see(system, n)
 
     def _see(self, system: RosSystem, n: int) -> float:
@@ -166,13 +164,17 @@ class PlayedBag(WholeRun):
         self._usage = system.usage._replace(seconds=cpu / n, other_cpu=cpu)
         return cpu
 
-    def _check_time(self) -> None:
+    def _check(self, recorder: PoseRecorder) -> None:
+        if recorder.reader.fault:
+            raise OdometryError(recorder.reader.fault)
         if time.monotonic() > self._end:
             raise self.too_long
 
-    def _check_published(self, system: RosSystem, recorder: PoseRecorder) -> None:
+    def _check_published(self, system: RosSystem, recorder: PoseRecorder, why: str = "") -> None:
         if recorder.received:
             return
+        if why:
+            raise OdometryError(f"nothing was published on {recorder.topic}: {why}")
         topics = ", ".join(sorted(system.link.topics().keys() - QUIET))
         raise OdometryError(
             f"nothing was published on {self.settings.odometry} until the system had rested for "
@@ -190,9 +192,12 @@ class PlayedBag(WholeRun):
             if kept is not None:
                 system.keep(kept)
 
-    def _checked(self, recorder: PoseRecorder, given: ProgramInput) -> Trajectory:
+    def _checked(self, recorder: PoseRecorder, given: ProgramInput, why: str = "") -> Trajectory:
         """The trajectory, if its stamps are those of the data, or each scan has one pose."""
         poses = recorder.poses()
+        if not poses:
+            what = recorder.reader.lacking or "its messages hold none"
+            raise OdometryError(f"no pose on {recorder.topic}: {what}")
         stamps = np.array([stamp for stamp, *_ in poses], np.int64)
         try:
             check_stamps(stamps, given.stamps)
@@ -214,10 +219,14 @@ class PlayedBag(WholeRun):
             stamps, given.stamps + 2.0 * half
         )
         if (~near).sum() > 0.01 * n:
+            help_ = why or (
+                "if it drops scans, set play: lockstep, a lower rate, or more cpus "
+                "(odometry.settings)"
+            )
             _log.warning(
-                "%s: %d of %d scans have no pose at rate %g; %s; if it drops scans, set play: "
-                "lockstep, a lower rate, or more cpus (odometry.settings)",
-                *(self.name, (~near).sum(), n, self.settings.rate, when_known(near, given.stamps)),
+                "%s: %d of %d scans have no pose at rate %g; %s; %s",
+                *(self.name, (~near).sum(), n, self.settings.rate),
+                *(when_known(near, given.stamps), help_),
             )
         return trajectory
 

@@ -1,20 +1,26 @@
 """Look at what a ROS system does, before it is tuned."""
 
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from contextlib import closing
 from typing import Any
 
 import numpy as np
 
 from adaptune.errors import OdometryError
+from adaptune.geometry import Poses
 from adaptune.odometry.docker.lockstep import Lockstep
 from adaptune.odometry.docker.played_bag import MAX_SCATTER
 from adaptune.odometry.docker.ros_system import QUIET
 from adaptune.odometry.remote import Limits
 from adaptune.recording.scan import Scan
 from adaptune.ros.link import LinkError
-from adaptune.space import ParameterSet
+from adaptune.space import ParameterSet, Selection
+
+_SHORT = 50
+"""Scans by which it is seen what a parameter changes while the system runs."""
+_BEFORE = 10
+"""Scans of these before it is set."""
 
 
 class _Watched(Lockstep):
@@ -29,14 +35,23 @@ class _Watched(Lockstep):
 
 
 def look(
-    settings: Any, parameters: ParameterSet, limits: Limits, scans: Iterable[Scan]
+    settings: Any,
+    parameters: ParameterSet,
+    limits: Limits,
+    scans: Iterable[Scan],
+    others: ParameterSet | None = None,
 ) -> dict[str, str]:
-    """Start a system on scans at the pace of the recording, and say what it does, by subject."""
+    """Start a system on scans at the pace of the recording, and say what it does, by subject.
+
+    Where it works on after its poses, it is driven without waiting, too. Where the settings name a
+    node, it is also driven on the first scans with each of the `others` set on the way.
+    """
     plain = settings.model_copy(update={"play": "lockstep", "rate": 1.0, "node": None})
-    system = _Watched(parameters, plain, limits)
+    system, scans = _Watched(parameters, plain, limits), list(scans)
     system.came = []
     found: dict[str, str] = {}
     shown: list[tuple[float, int]] = []
+    path, works_on = [np.eye(4)], False
     with closing(system):
         begin, steps = time.monotonic(), iter(scans)
         first = next(steps)
@@ -46,12 +61,13 @@ def look(
         took = system._shown[1] - begin
         shown.append((system._shown[1], first.stamp))
         for scan in steps:
-            system.register(scan)
+            path.append(system.register(scan).T_odom_sensor)
             if system.ended:
                 break
             shown.append((system._shown[1], scan.stamp))
-        if not system.ended:
-            found |= _topics(system._system)
+        if (inside := system._system) is not None:
+            found |= _topics(inside)
+            works_on = system._works_on(inside)
     seconds = max(1e-9 * (shown[-1][1] - shown[0][1]), 0.1)
     found["time of a start"] = f"{took:.1f} s"
     found |= _poses(system.came, shown)
@@ -59,6 +75,72 @@ def look(
     found["memory"] = f"{system.usage.memory or 0.0:.0f} MB"
     for fault in system.faults:
         found["went wrong"] = fault
+    if works_on:
+        hurried = _driven(plain.model_copy(update={"rate": 0.0}), parameters, limits, scans)
+        found["works on after a pose"] = _apart(path, hurried)
+    if settings.node is not None and others and not system.faults:
+        found |= _effects(settings, parameters, limits, scans[:_SHORT], others)
+    return found
+
+
+def _driven(
+    settings: Any,
+    parameters: ParameterSet,
+    limits: Limits,
+    scans: Sequence[Scan],
+    change: ParameterSet | None = None,
+) -> list[Poses]:
+    """The path of a system, which gets a change of its parameters on the way."""
+    with closing(Lockstep(parameters, settings, limits)) as system:
+        system.start(scans[0], np.eye(4))
+        path = [np.eye(4)]
+        for n, scan in enumerate(scans[1:], 1):
+            if n == _BEFORE and change:
+                system.apply(Selection(0, change))
+            path.append(system.register(scan).T_odom_sensor)
+    return path
+
+
+def _furthest(path: Sequence[Poses], other: Sequence[Poses]) -> float:
+    """The most metres between poses of two paths over the same scans."""
+    n = min(len(path), len(other))
+    off = np.array(path)[:n, :3, 3] - np.array(other)[:n, :3, 3]
+    return float(np.nan_to_num(np.linalg.norm(off, axis=1), nan=np.inf).max())
+
+
+def _apart(path: Sequence[Poses], hurried: Sequence[Poses]) -> str:
+    metres = float(np.linalg.norm(np.diff(np.array(path)[:, :3, 3], axis=0), axis=1).sum())
+    return (
+        f"yes: at rate: 0 its path is up to {_furthest(path, hurried):.2f} m off that at rate: 1, "
+        f"on {metres:.1f} m; keep odometry.settings.rate: 1 where that counts"
+    )
+
+
+def _effects(
+    settings: Any,
+    parameters: ParameterSet,
+    limits: Limits,
+    scans: Sequence[Scan],
+    others: ParameterSet,
+) -> dict[str, str]:
+    """Which parameters change the path while the system runs, and which are in vain."""
+    fast = settings.model_copy(update={"play": "lockstep", "rate": 0.0})
+    path, again = (_driven(fast, parameters, limits, scans) for _ in range(2))
+    chance = 3.0 * _furthest(path, again) + 1e-6
+    live: list[str] = []
+    vain: list[str] = []
+    for name, value in others.items():
+        try:
+            changed = _driven(fast, parameters, limits, scans, {name: value})
+        except OdometryError as error:
+            vain.append(f"{name} is refused ({error})")
+            continue
+        (live if _furthest(path, changed) > chance else vain).append(name)
+    found = {"takes effect while it runs": ", ".join(live) or "nothing: leave out settings.node"}
+    if vain:
+        found["has no effect while it runs"] = (
+            f"{', '.join(vain)}: do not switch live with these among the parameters"
+        )
     return found
 
 

@@ -11,9 +11,9 @@ import tempfile
 import textwrap
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, Literal
 
 from pydantic import Field, field_validator
 from rosbags.highlevel import AnyReader
@@ -27,13 +27,12 @@ from adaptune.odometry.base import Usage
 from adaptune.odometry.docker.engine import (
     Container,
     Mount,
-    image_digest,
     own_container,
     remove_shared,
 )
 from adaptune.odometry.docker.ros_system import RosSettings, RosSystem, SimClock, image_user
 from adaptune.odometry.docker.rustle import Rustle
-from adaptune.odometry.template import Template, check_names, placeholders, replace
+from adaptune.odometry.template import Template, placeholders, replace
 from adaptune.recording.clouds import LIVOX_TYPES, POSES, TRANSFORMS
 from adaptune.recording.config import Transform
 from adaptune.ros.link import LinkError, equal_values
@@ -81,6 +80,8 @@ _LEAD = 300_000_000
 """Nanoseconds between the begin of the clock and of the recording."""
 _DOMAINS = range(60, 101)
 """Of systems on this machine; ports of higher ones are given to other programs."""
+_PORT, _PORTS = 7400, 250
+"""The first port of the first domain, and how many each has."""
 
 _log = logging.getLogger(__name__)
 
@@ -106,8 +107,8 @@ class Ros2System(RosSystem):
         common = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "PYTHONUNBUFFERED": "1"}
         if settings.image is None:
             self._inside = str(self.folder)
-            self._domain = _free_domain()
-            common["ROS_DOMAIN_ID"] = str(self._domain.number)
+            domain, self._domain = _free_domain()
+            common["ROS_DOMAIN_ID"] = str(domain)
             self._node = Here([sys.executable, "-m", _MODULE, f"{self.folder}/link"], common, 1.0)
             parameters = str(self._parameters)
         else:
@@ -233,12 +234,6 @@ class Ros2System(RosSystem):
                     f"{node} holds {name} = {value!r}, not {wanted[name]!r}: does it read the file "
                     f"{{parameters}}, and has the launch file another value?"
                 )
-
-    def warn_of_unread(self) -> None:
-        """Nobody tells which parameters a node of ROS 2 has read."""
-
-    def set_parameters(self, values: Mapping[str, Any]) -> Mapping[str, Any]:
-        return self.link.set_parameters(self._settings.node, values)
 
     def play(self, rate: float, renamed: Mapping[str, str]) -> None:
         assert self._recording is not None
@@ -370,8 +365,9 @@ class Here:
         self._program.close()
 
 
-def _free_domain() -> Any:
-    """An open file that holds a ROS domain which no other process of adaptune's has."""
+def _free_domain() -> tuple[int, Any]:
+    """A ROS domain in which nobody is on this machine, and an open file that holds it."""
+    taken = {(port - _PORT) // _PORTS for port in _ports()}
     for number in _DOMAINS:
         path = Path(tempfile.gettempdir()) / f"adaptune-ros-domain-{number}.lock"
         with contextlib.suppress(OSError):
@@ -380,17 +376,20 @@ def _free_domain() -> Any:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError:
                 file.close()
-            else:
-                return _Domain(number, file)
-    raise OdometryError("all ROS domains of adaptune's are in use on this machine")
+                continue
+            if number not in taken:
+                return number, file
+            file.close()
+    which = f"from {_DOMAINS[0]} to {_DOMAINS[-1]}"
+    raise OdometryError(f"all ROS domains {which} are in use on this machine; end what runs there")
 
 
-class _Domain(NamedTuple):
-    number: int
-    file: Any
-
-    def close(self) -> None:
-        self.file.close()
+def _ports() -> Iterator[int]:
+    """UDP ports that programs of this machine hold."""
+    for name in ("udp", "udp6"):
+        with contextlib.suppress(OSError):
+            for line in Path("/proc/net", name).read_text().splitlines()[1:]:
+                yield int(line.split()[1].rpartition(":")[2], 16)
 
 
 class Ros2Settings(RosSettings):
@@ -429,13 +428,9 @@ class Ros2(Rustle):
     @staticmethod
     def check(settings: Any, parameters: ParameterSet) -> None:
         """Raise an `OdometryError` if the system is not here, or a parameter is not in its file."""
-        template = Template(Path(settings.template))
-        if template.path.suffix not in (".yaml", ".yml"):
-            raise OdometryError(f"template: {template.path} is not YAML, as ROS 2 reads it")
-        check_names(parameters, template, ())
+        Rustle.check(settings, parameters)
         import_extra("ros2", "cyclonedds")
         if settings.image is not None:
-            image_digest(settings.image)
             return
         program = settings.command[0]
         find = ["/bin/bash", "-l", "-c", _FIND + 'command -v "$1"', "bash", program]

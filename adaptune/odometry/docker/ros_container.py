@@ -146,9 +146,6 @@ class Ros1System(RosSystem):
     def warn_of_unread(self) -> None:
         warn_of_unread(self.link, self._settings.image, self._keys)
 
-    def set_parameters(self, values: Mapping[str, Any]) -> Mapping[str, Any]:
-        return self.link.set_parameters(self._settings.node, values, self._keys)
-
     def whole_name(self, template: Template, name: str) -> str:
         return "/".join(template.path_of(name))
 

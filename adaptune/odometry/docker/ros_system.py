@@ -6,7 +6,6 @@ import os
 import re
 import shutil
 import socket
-import struct
 import threading
 import time
 from abc import ABC, abstractmethod
@@ -17,7 +16,6 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import AfterValidator, Field, model_validator
-from rosbags.serde import SerdeError
 
 from adaptune import processes
 from adaptune.errors import OdometryError
@@ -32,9 +30,9 @@ from adaptune.odometry.docker.engine import (
     opened,
     regular_files,
 )
+from adaptune.odometry.docker.poses import PoseReader
 from adaptune.odometry.program import ProgramInput, WholeSettings
 from adaptune.odometry.template import Template
-from adaptune.recording.clouds import POSES, Pose
 from adaptune.recording.config import resolve
 from adaptune.ros.link import LinkError, Run, Steering
 from adaptune.ros.relay import Relay
@@ -113,6 +111,7 @@ class RosSystem(ABC):
         self._settings, self._topics = settings, [settings.odometry]
         self.usage, self._memory, self._recording = Usage(0.0, 0.0), memory, recording
         self._clock: SimClock | None = None
+        self._keys: Mapping[str, Sequence[str]] = {}  # of a parameter server
         self.folder, self._given = make_shared(folder / "shared"), folder / "given"
         self._given.mkdir()
         self._parameters = self._given / "params.yaml"
@@ -149,13 +148,8 @@ class RosSystem(ABC):
     def check(self, template: Template, parameters: ParameterSet) -> None:
         """Raise an `OdometryError` if the nodes hold other parameters."""
 
-    @abstractmethod
-    def warn_of_unread(self) -> None:
-        """Log which of the parameters that were checked no node has read."""
-
-    @abstractmethod
-    def set_parameters(self, values: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Set parameters of the settings' node, by whole names; what it then holds."""
+    def warn_of_unread(self) -> None:  # noqa: B027
+        """Log which of the parameters that were checked no node has read, where that is known."""
 
     def cloud_type(self, topic: str) -> str:  # noqa: ARG002
         """The type of the messages with points that the system hears."""
@@ -224,6 +218,12 @@ class RosSystem(ABC):
             f"odometry.settings.points, or change it in the template"
         )
 
+    def reader(self) -> PoseReader:
+        """What reads the system's poses."""
+        given = self._settings
+        fixed = getattr(given, "transforms", None)
+        return PoseReader(self.link, given.odometry, given.frame, fixed)
+
     def run_clock(self, stamp: int, rate: float = 1.0) -> "SimClock":
         """Publish a clock from now on, until this is closed."""
         if self._clock is None:
@@ -232,8 +232,10 @@ class RosSystem(ABC):
 
     def steering(self) -> Steering | None:
         """What sets parameters of the settings' node while it runs, if that is named."""
-        node = self._settings.node
-        return None if node is None else Steering(node, self.set_parameters, *self._command())
+        if (node := self._settings.node) is None:
+            return None
+        set_them = lambda values: self.link.set_parameters(node, values, self._keys)  # noqa: E731
+        return Steering(node, set_them, *self._command())
 
     def _command(self) -> tuple[Sequence[str] | None, Run | None]:
         """What sets a parameter in place of ROS, and what runs it, if anything."""
@@ -342,11 +344,3 @@ def _probed(image: str, user: str, script: str, words: tuple[str, ...]) -> str:
         _log.info("only root finds %s in the image, so root runs it", " ".join(words))
         return "0"
     return user
-
-
-def read_poses(link: Relay, kind: str, data: bytes) -> list[Pose]:
-    """The poses in a message; none if it is of another type."""
-    try:
-        return POSES[kind](link.decode(data, kind)) if kind in POSES else []
-    except (SerdeError, struct.error, ValueError, IndexError) as error:
-        raise OdometryError(f"it publishes a {kind} that cannot be read ({error})") from error

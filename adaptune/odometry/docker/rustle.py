@@ -66,10 +66,13 @@ class Rustle:
         """Raise an `OdometryError` if the image is not here, or a parameter is not in its file."""
         template = Template(Path(settings.template))
         if template.path.suffix not in (".yaml", ".yml"):
-            raise OdometryError(f"template: {template.path} is not YAML, as ROS 1 reads it")
+            ros = f"ROS {settings.system.ros}"
+            raise OdometryError(f"template: {template.path} is not YAML, as {ros} reads it")
         check_names(parameters, template, ())
-        template.warn_of_texts()
-        image_digest(settings.image)
+        if settings.system.ros == 1:
+            template.warn_of_texts()
+        if settings.image is not None:
+            image_digest(settings.image)
 
     @staticmethod
     def own_file(parameters: ParameterSet, settings: Any) -> OwnFile:

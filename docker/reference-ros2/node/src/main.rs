@@ -16,16 +16,17 @@ use std::{
 };
 
 use futures::StreamExt;
-use nalgebra::Vector3;
+use nalgebra::{Isometry3, Translation3, Vector3};
 use ros2_client::{
     Context, ContextOptions, DEFAULT_PUBLISHER_QOS, DEFAULT_SUBSCRIPTION_QOS, MessageTypeName,
-    Name, Node, NodeName, NodeOptions, ParameterValue, QosProfile, Subscription,
-    builtin_interfaces::Time, qos::History,
+    Name, Node, NodeName, NodeOptions, ParameterValue, Publisher, QosProfile, Subscription,
+    builtin_interfaces::Time,
+    qos::{Durability, History},
 };
 use serde_yaml::Value;
 
 use icp::{Icp, Settings};
-use messages::{Header, Imu, Odometry, PointCloud2};
+use messages::{Header, Imu, Odometry, PointCloud2, TransformStamped, Transforms};
 
 type Parameters = BTreeMap<String, ParameterValue>;
 
@@ -196,24 +197,63 @@ fn subscribe<M: 'static>(
     node.create_subscription(&topic, Some(qos)).unwrap()
 }
 
+fn publisher<M: ros2_client::Message>(
+    node: &mut Node,
+    name: &str,
+    kind: MessageTypeName,
+    durability: Durability,
+) -> Publisher<M> {
+    let qos = DEFAULT_PUBLISHER_QOS.history(History::KeepLast { depth: 1000 });
+    let qos = qos.durability(durability);
+    let topic = node
+        .create_topic(&Name::new("/", name).unwrap(), kind, &qos)
+        .unwrap();
+    node.create_publisher(&topic, Some(qos)).unwrap()
+}
+
+fn transform(stamp: Time, parent: &str, child: &str, pose: &Isometry3<f64>) -> TransformStamped {
+    TransformStamped {
+        header: Header {
+            stamp,
+            frame_id: parent.into(),
+        },
+        child_frame_id: child.into(),
+        translation: pose.translation.vector.into(),
+        rotation: pose.rotation.coords.into(),
+    }
+}
+
+/// The LiDAR on the robot: it does not move there.
+fn mounted() -> Isometry3<f64> {
+    Isometry3::new(Vector3::new(1.0, 0.5, 0.3), Vector3::new(0.0, 0.0, 0.7))
+}
+
 async fn spin(all: Parameters, habits: Habits) {
     std::thread::sleep(habits.seconds("ready_delay"));
     let live = Arc::new(Mutex::new(all.clone()));
     let mut node = make_node(&all, &live);
     smol::spawn(node.spinner().unwrap().spin()).detach();
-    let kind = MessageTypeName::new("nav_msgs", "Odometry");
-    let deep = DEFAULT_PUBLISHER_QOS.history(History::KeepLast { depth: 100 });
-    let topic = node
-        .create_topic(&Name::new("/", "odometry").unwrap(), kind, &deep)
-        .unwrap();
-    let publisher = node
-        .create_publisher::<Odometry>(&topic, Some(deep))
-        .unwrap();
+    let kind = || MessageTypeName::new("nav_msgs", "Odometry");
+    let said = publisher::<Odometry>(&mut node, "odometry", kind(), Durability::Volatile);
+    let _other = habits
+        .has("twice")
+        .then(|| publisher::<Odometry>(&mut node, "odometry", kind(), Durability::Volatile));
+    let kind = || MessageTypeName::new("tf2_msgs", "TFMessage");
+    let transforms = habits.has("tf").then(|| {
+        let fixed = publisher(&mut node, "tf_static", kind(), Durability::TransientLocal);
+        let frames = vec![transform(Time::ZERO, "base", "lidar", &mounted())];
+        fixed.publish(Transforms(frames)).unwrap();
+        let moving = publisher::<Transforms>(&mut node, "tf", kind(), Durability::Volatile);
+        (moving, fixed)
+    });
     let ParameterValue::String(points) = &all["points_topic"] else {
         unreachable!()
     };
     // As LiDAR nodes do.
-    let sensor = DEFAULT_SUBSCRIPTION_QOS.history(History::KeepLast { depth: 50 });
+    let mut sensor = DEFAULT_SUBSCRIPTION_QOS.history(History::KeepLast { depth: 50 });
+    if habits.has("wants_old") {
+        sensor = sensor.durability(Durability::TransientLocal);
+    }
     let clouds = subscribe::<PointCloud2>(
         &mut node,
         points,
@@ -262,9 +302,19 @@ async fn spin(all: Parameters, habits: Habits) {
         let nan = if habits.is("jump", n) { f64::NAN } else { 1.0 };
         let rotation = pose.rotation.coords;
         let zero = ([0.0; 18], [0.0; 18]);
-        let said = publisher.publish(Odometry {
+        let stamp = later(stamp, habits.seconds("stamp_later"));
+        if let Some((moving, _)) = &transforms {
+            let base = pose * mounted().inverse();
+            let wheel = Isometry3::from(Translation3::new(0.0, 0.0, n as f64));
+            let all = vec![
+                transform(stamp, "odom", "base", &base),
+                transform(stamp, "base", "wheel", &wheel),
+            ];
+            let _ = moving.publish(Transforms(all));
+        }
+        let message = Odometry {
             header: Header {
-                stamp: later(stamp, habits.seconds("stamp_later")),
+                stamp,
                 frame_id: "odom".into(),
             },
             child_frame_id: "lidar".into(),
@@ -273,9 +323,11 @@ async fn spin(all: Parameters, habits: Habits) {
             pose_covariance: zero,
             twist: [0.0; 6],
             twist_covariance: zero,
-        });
-        if let Err(error) = said {
-            eprintln!("icp: a pose is lost: {error:?}");
+        };
+        for _ in 0..habits.number("times").unwrap_or(1.0) as i64 {
+            if let Err(error) = said.publish(message.clone()) {
+                eprintln!("icp: a pose is lost: {error:?}");
+            }
         }
         if habits.is("die_at", n) {
             eprintln!("icp: terminating after {n} scans: the map is corrupt");

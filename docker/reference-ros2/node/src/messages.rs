@@ -51,3 +51,15 @@ pub struct Odometry {
     pub twist_covariance: Covariance,
 }
 impl Message for Odometry {}
+
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub struct TransformStamped {
+    pub header: Header,
+    pub child_frame_id: String,
+    pub translation: [f64; 3],
+    pub rotation: [f64; 4],
+}
+
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub struct Transforms(pub Vec<TransformStamped>);
+impl Message for Transforms {}

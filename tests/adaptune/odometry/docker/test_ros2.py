@@ -4,6 +4,7 @@ Its node is RustDDS, which shares no code with what carries adaptune's messages.
 """
 
 import re
+import socket
 
 import numpy as np
 import pytest
@@ -165,6 +166,24 @@ def test_what_it_does_is_told_before_it_is_tuned(tmp_path):
     assert not containers()
 
 
+def test_parameters_that_are_accepted_in_vain_are_told(tmp_path):
+    given = ros2(tmp_path / "icp.yaml", node="/icp", patience=9.0)
+    values = VALUES | {"max_range": 60.0}
+    others = {"voxel_size": 2.0, "max_range": 3.0, "icp.max_iterations": "many"}
+    found = look(given, values, LIMITS, scans()[:16], others)
+    assert found["takes effect while it runs"] == "voxel_size"
+    vain = found["has no effect while it runs"]
+    assert re.match(r"max_range, icp\.max_iterations is refused \(.*\): do not switch live", vain)
+
+
+def test_one_that_works_on_is_driven_without_waiting_too(tmp_path):
+    given = ros2(tmp_path / "icp.yaml", imitate={"background": 0.8}, patience=9.0)
+    found = look(given, VALUES, LIMITS, scans()[:5])
+    words = r"yes: at rate: 0 its path is up to 0\.00 m off that at rate: 1, on 1\.\d m; keep"
+    assert re.match(words, found["works on after a pose"])
+    assert "takes effect while it runs" not in found
+
+
 def test_an_imu_is_heard_until_the_end_of_a_scan(make):
     odometry = make(imitate={"imu": True}, imu="/imu", patience=10.0)
     given = []
@@ -191,3 +210,63 @@ def test_a_ros_1_bag_is_played_as_it_was_recorded(make, tmp_path, monkeypatch):
     assert "ready for /points" in (kept / "output.log").read_text()
     assert "digest" in (kept / "trial.yaml").read_text()
     assert len(poses) == N_SCANS
+
+
+def mounted():
+    """The reference's LiDAR on its base."""
+    T = np.eye(4)
+    T[:2, :2] = [[np.cos(0.7), -np.sin(0.7)], [np.sin(0.7), np.cos(0.7)]]
+    T[:3, 3] = 1.0, 0.5, 0.3
+    return T
+
+
+@pytest.mark.parametrize("play", ["lockstep", "bag"])
+def test_poses_may_come_as_transforms(make, tmp_path, play):
+    given = recording(tmp_path / "bag") if play == "bag" else None
+    odometry = make(imitate={"tf": True}, odometry="/tf", given=given, play=play, rate=4.0)
+    poses = drive(odometry)
+    assert not odometry.faults
+    # In the frame of the LiDAR, by way of the base, and not of the wheel.
+    np.testing.assert_allclose(poses[:, :3, 3], truth()[:, :3, 3], atol=0.08)
+
+
+def test_a_frame_that_is_not_there_is_told(make, monkeypatch):
+    monkeypatch.setattr(lockstep, "_MOST_SILENT", 4)
+    odometry = make(imitate={"tf": True}, odometry="/tf", frame="laser", patience=0.3)
+    drive(odometry)
+    words = "/tf moves base, wheel, and does not say where laser is; name the sensor's frame"
+    assert words in odometry.faults[0]
+
+
+@pytest.mark.parametrize(
+    ("imitate", "words"),
+    [
+        ({"twice": True}, "/odometry is published by two (/icp and /icp), whose poses would mix"),
+        ({"times": 3000}, "it publishes more than 2000 messages a second on /odometry"),
+        ({"wants_old": True}, "/icp wants /points transient local, with what was published before"),
+    ],
+)
+def test_what_a_node_does_that_no_odometry_may_is_told(make, imitate, words):
+    odometry = make(imitate=imitate, ready=6)
+
+    def fault():
+        drive(odometry)
+        raise OdometryError(odometry.faults[0])
+
+    with pytest.raises(OdometryError, match=re.escape(words)):
+        fault()
+    assert odometry.ended
+
+
+def test_a_domain_that_others_use_is_left_to_them(monkeypatch):
+    free, held = ros2_system._free_domain()
+    held.close()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("", 7400 + 250 * free + 11))
+        chosen, held = ros2_system._free_domain()
+        held.close()
+        assert chosen != free
+        monkeypatch.setattr(ros2_system, "_DOMAINS", range(free, free + 1))
+        words = f"all ROS domains from {free} to {free} are in use on this machine"
+        with pytest.raises(OdometryError, match=words):
+            ros2_system._free_domain()

@@ -16,6 +16,7 @@ from rooms import moved
 from adaptune.odometry import OdometryError
 from adaptune.odometry.docker.engine import EngineError
 from adaptune.odometry.docker.played_bag import Drain, PlayedBag, PoseRecorder, check_stamps
+from adaptune.odometry.docker.poses import PoseReader
 from adaptune.odometry.docker.rustle import Rustle, RustleSettings
 from adaptune.odometry.program import ProgramInput
 from adaptune.recording.clouds import usable
@@ -81,6 +82,10 @@ class Recorded:
         self.take(kind, bytes(local_link.STORE.serialize_ros1(message, kind)))
 
 
+def heard(link, topic):
+    return PoseRecorder(PoseReader(link, topic))
+
+
 def odometry(i, x=0.0):
     return local_link.odometry(int(SCANS[i]), moved(x))
 
@@ -91,7 +96,7 @@ def link():
 
 
 def test_poses_are_kept_as_they_come(link):
-    recorder = PoseRecorder(link, "/found")
+    recorder = heard(link, "/found")
     assert link.topic == "/found"
     assert recorder.poses() == []
     for i in (0, 1, 3, 2):
@@ -103,7 +108,7 @@ def test_poses_are_kept_as_they_come(link):
 
 
 def test_a_message_that_is_none_is_named(link):
-    recorder = PoseRecorder(link, "/found")
+    recorder = heard(link, "/found")
     link.publish(odometry(0))
     kind, data = recorder.received[0]
     recorder.received.append((kind, data[:-9]))
@@ -119,7 +124,7 @@ def test_a_message_that_is_none_is_named(link):
 def test_a_system_is_waited_for_until_it_rests(link, monkeypatch, interval, cores, seconds):
     now = [100.0]
     monkeypatch.setattr("time.monotonic", lambda: now[0])
-    recorder = PoseRecorder(link, "/found")
+    recorder = heard(link, "/found")
     for i in range(3 if interval else 0):
         now[0] += interval
         link.publish(odometry(i))
@@ -133,7 +138,7 @@ def test_a_system_is_waited_for_until_it_rests(link, monkeypatch, interval, core
 def test_a_pose_that_comes_late_is_waited_for(link, monkeypatch):
     now = [100.0]
     monkeypatch.setattr("time.monotonic", lambda: now[0])
-    recorder = PoseRecorder(link, "/found")
+    recorder = heard(link, "/found")
     drain = Drain(recorder, len(SCANS), int(SCANS[-1]), lambda: 0.4 * now[0])
     for i in range(39):
         # Stamps of a clock that goes on tell nothing of the end.
@@ -145,7 +150,7 @@ def test_a_pose_that_comes_late_is_waited_for(link, monkeypatch):
 
 
 def test_messages_that_hold_no_poses_are_refused(link):
-    recorder = PoseRecorder(link, "/found")
+    recorder = heard(link, "/found")
     link.publish(local_link.imu(0))
     with pytest.raises(OdometryError, match=r"/found is sensor_msgs/msg/Imu; odometry\.settings"):
         recorder.poses()
@@ -168,11 +173,11 @@ def test_a_topic_without_poses_is_told_with_the_others(link, played):
         "on /Odometry until the system had rested for 10 s after the bag; nodes announce /odom. "
     )
     with pytest.raises(OdometryError, match=words):
-        played._check_published(system, PoseRecorder(link, "/Odometry"))
+        played._check_published(system, heard(link, "/Odometry"))
 
 
 def test_poses_that_are_none_are_refused(link, played):
-    recorder = PoseRecorder(link, "/Odometry")
+    recorder = heard(link, "/Odometry")
     for i in range(40):
         link.publish(odometry(i, np.nan if i == 20 else 0.3 * i))
     with pytest.raises(OdometryError, match="1 of 40 poses are not finite or have no rotation"):
@@ -180,7 +185,7 @@ def test_poses_that_are_none_are_refused(link, played):
 
 
 def test_scans_without_a_pose_are_counted(link, played, caplog):
-    recorder = PoseRecorder(link, "/Odometry")
+    recorder = heard(link, "/Odometry")
     for i in range(0, 40, 2):
         link.publish(odometry(i, 0.3 * i))
     assert len(played._checked(recorder, GIVEN)) == 20
@@ -188,7 +193,7 @@ def test_scans_without_a_pose_are_counted(link, played, caplog):
 
 
 def test_stamps_of_a_clock_are_matched_by_number_or_refused(link, played, caplog):
-    recorder, late = PoseRecorder(link, "/Odometry"), np.linspace(0, 4 * PERIOD, 40, dtype=int)
+    recorder, late = heard(link, "/Odometry"), np.linspace(0, 4 * PERIOD, 40, dtype=int)
     for i in range(40):
         link.publish(local_link.odometry(int(SCANS[i] + late[i]), moved(0.3 * i)))
     found = played._checked(recorder, GIVEN)
@@ -201,7 +206,7 @@ def test_stamps_of_a_clock_are_matched_by_number_or_refused(link, played, caplog
 
 
 def test_of_paths_the_last_holds_all(link):
-    recorder, types = PoseRecorder(link, "/path"), local_link.TYPES
+    recorder, types = heard(link, "/path"), local_link.TYPES
     poses = []
     for i in range(3):
         said = odometry(i, 0.1 * i)
