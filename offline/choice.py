@@ -21,6 +21,8 @@ STANDARD_ERRORS = 2.0
 """Of the difference from the baseline, by which a set has to be better."""
 COST_CLASS = 1.1
 """Costs that differ by no larger factor, about, are the same: the machine's load makes as much."""
+MOST_OF_PERIOD = 0.5
+"""Share of the time from scan to scan: single scans take more than the mean, and others need cores."""
 LEAST_COST = 1.0
 """Milliseconds of CPU time a scan; less is nothing, and mostly noise."""
 AS_GOOD = 1.03
@@ -46,6 +48,7 @@ class BlockErrors(NamedTuple):
     sequence: NDArray[np.intp]  # (n_blocks,): number of each block's recording
     costs: NDArray[np.float64]  # (n_trials,): ms of CPU time a scan; NaN if unknown
     restarts: NDArray[np.float64]  # (n_trials,): infinite for a set that failed
+    period: float = np.inf  # milliseconds from scan to scan
 
     @property
     def baseline(self) -> int:
@@ -158,6 +161,8 @@ UNUSABLE = (
 def affordable(blocks: BlockErrors, budget: float | None) -> NDArray[np.bool_]:
     """Which sets cost no more than a budget, or than the baseline, of shape (n_trials,).
 
+    What takes more than `MOST_OF_PERIOD`, and more than the baseline, may come too late.
+
     Raises
     ------
     AdaptuneError
@@ -165,6 +170,8 @@ def affordable(blocks: BlockErrors, budget: float | None) -> NDArray[np.bool_]:
     """
     if budget is None:
         return cost_classes(blocks) <= 0.0
+    in_time = max(MOST_OF_PERIOD * blocks.period, float(blocks.costs[blocks.baseline]))
+    budget = min(budget, in_time)
     few = ~(blocks.costs > max(budget + ROUNDING, LEAST_COST))
     if not few.any():
         cheapest = int(np.argmin(blocks.costs))

@@ -427,8 +427,13 @@ class LabelledData(NamedTuple):
         costs = np.array([self.costs.alone(trial) for trial in self.sets])
         errors = [s.in_blocks() for s in self.sequences]
         number = np.repeat(np.arange(len(errors)), [len(of) for of in errors])
-        of_all = np.concatenate(errors), number, costs, np.sum(restarts, axis=0)
+        of_all = np.concatenate(errors), number, costs, np.sum(restarts, axis=0), self.period
         return BlockErrors(list(self.sets), *of_all)
+
+    @property
+    def period(self) -> float:
+        """Milliseconds from scan to scan."""
+        return min(1e-6 * float(np.median(np.diff(s.simulation.stamps))) for s in self.sequences)
 
     def whole_blocks(self, trials: Collection[int]) -> BlockErrors:
         """What drives of whole recordings say, of those of some sets that have made them."""
@@ -439,7 +444,7 @@ class LabelledData(NamedTuple):
         number = np.repeat(np.arange(len(errors)), [len(of) for of in errors])
         restarts = np.sum([[s.whole_restarts[n] for n in known] for s in self.sequences], axis=0)
         of_known = np.array([self.costs.alone(n) for n in known]), restarts
-        return BlockErrors(known, np.concatenate(errors), number, *of_known)
+        return BlockErrors(known, np.concatenate(errors), number, *of_known, self.period)
 
     def finalists(self) -> list[int]:
         """Trials whose sets drive whole recordings, see `offline.choice.finalists`."""

@@ -18,7 +18,6 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from adaptune.archive import Summary
 from adaptune.geometry import Poses
@@ -45,21 +44,12 @@ class Verdict(NamedTuple):
 
     parameters: ParameterSet
     value: float  # mean of the objective over the sequences
-    # Distance from the value to the upper end of its one-sided 95 % confidence interval; 0
-    # unless trials are repeated.
-    margin: float = 0.0
     failure: str = ""  # why it is never chosen; empty if it may be
-    restarts: float = 0.0  # by the health check, on these sequences
 
     @property
     def state(self) -> str:
         """What became of it: `complete`, or `failed`, and why."""
         return f"failed: {self.failure}" if self.failure else "complete"
-
-    @property
-    def bound(self) -> float:
-        """What the value surely is below: the upper end of its interval."""
-        return self.value + self.margin
 
 
 def trajectory_metrics(T_ref_sensor: Poses, T_odom_sensor: Poses) -> dict[str, float]:
@@ -80,15 +70,8 @@ def trajectory_metrics(T_ref_sensor: Poses, T_odom_sensor: Poses) -> dict[str, f
 
 def judge(config: OfflineConfig, runs: Sequence[Summary]) -> Verdict:
     """Judge a parameter set by its trials on some sequences."""
-    metrics = [run.metrics for run in runs]
-    value = float(mean_value(np.array([weighted(config.objective, one) for one in metrics])))
-    failure = next((run.failure for run in runs if run.failure), "")
-    above = 0.0
-    # Without repeats, nothing is known of the other sets' intervals.
-    if config.repeats > 1 and all(run.repeats for run in runs):
-        above = float(margin(np.array([repeated(config.objective, r.repeats) for r in runs])))
-    restarts = float(sum(run.restarts for run in runs))
-    return Verdict(runs[0].parameters, value, above, failure=failure, restarts=restarts)
+    value = float(np.mean([weighted(config.objective, run.metrics) for run in runs]))
+    return Verdict(runs[0].parameters, value, next((r.failure for r in runs if r.failure), ""))
 
 
 def weighted(weights: Mapping[Metric, float], metrics: Mapping[str, float]) -> float:
@@ -100,27 +83,6 @@ def repeated(weights: Mapping[Metric, float], runs: Sequence[Mapping[str, float]
     """The weighted sum of the metrics that can repeat, in every run of a trial."""
     repeatable = {name: w for name, w in weights.items() if name not in TIMED}
     return [weighted(repeatable, run) for run in runs]
-
-
-def mean_value(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Mean over the sequences of values of shape (..., n_sequences)."""
-    return np.asarray(np.ascontiguousarray(values).mean(axis=-1))
-
-
-def margin(repeats: NDArray[np.float64]) -> NDArray[np.float64]:
-    """From a mean over sequences to the upper end of its one-sided 95 % confidence interval.
-
-    The interval is Student's. Runs of a set vary, the sequences do not. `repeats` has the shape
-    (..., n_sequences, n_repeats). A single run does not show how they vary: then it is 0.
-    """
-    from scipy import stats
-
-    n_sequences, n_repeats = repeats.shape[-2:]
-    if n_repeats < 2:
-        return np.zeros(repeats.shape[:-2])
-    variance = repeats.var(axis=-1, ddof=1).sum(axis=-1)
-    error = np.sqrt(variance / n_repeats) / n_sequences
-    return np.asarray(stats.t.ppf(0.95, n_sequences * (n_repeats - 1)) * error)
 
 
 def told(verdicts: Sequence[Verdict]) -> list[tuple[ParameterSet, float]]:

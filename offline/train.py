@@ -306,8 +306,6 @@ def _trial_rows(
             row[label(config.objective)] = verdict.value
             for metric in sorted(config.objective):
                 row[metric] = float(np.mean([run.metrics[metric] for run in runs]))
-        if config.repeats > 1:
-            row["margin"] = verdict.margin
         row["mean"] = float(np.mean([run.mean_error for run in runs]))
         row |= {name: of[n].mean_error for name, of in finished.items()}
         rows.append(row)

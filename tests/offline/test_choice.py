@@ -49,6 +49,14 @@ def test_the_best_that_costs_no_more_is_chosen():
         choose(blocks(errors, [10.0, 12.0, 30.0]), budget=5.0)
 
 
+def test_what_comes_too_late_is_not_chosen():
+    found = blocks(noisy([1.0, 0.7, 0.4]), [10.0, 40.0, 60.0])
+    assert choose(found, budget=100.0) == 2
+    assert choose(found._replace(period=100.0), budget=100.0) == 1
+    # Nor is there another way where the baseline does.
+    assert choose(found._replace(period=10.0), budget=100.0) == 0
+
+
 def test_of_equally_good_sets_the_cheapest_is_chosen():
     same = np.repeat(noisy([1.0]), 3, axis=1)
     assert choose(blocks(same, [10.0, 5.0, 9.0])) == 1

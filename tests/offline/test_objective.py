@@ -22,27 +22,11 @@ def test_a_sum_is_a_mean_over_sequences():
     assert verdict.value == pytest.approx(0.5 * (1.0 + 1.0) + 0.5 * (3.0 + 3.0))
 
 
-def test_of_repeated_trials_the_surely_best_is_taken():
-    def summary(*errors):
-        repeats = [{"rte": e} for e in errors]
-        return Summary({}, float(np.mean(errors)), 0, 0, 1.0, repeats=repeats)
-
-    steady, lucky = [summary(1.1, 1.1, 1.1)] * 2, [summary(0.2, 0.9, 1.9), summary(1.0, 1.0, 1.0)]
-    verdicts = [judge(config(repeats=3), runs) for runs in (steady, lucky)]
-    assert verdicts[0].margin == 0.0
-    # The standard error of the mean of two means of three, times Student's t with four degrees.
-    error = np.sqrt(np.var([0.2, 0.9, 1.9], ddof=1) / 3) / 2
-    assert verdicts[1].margin == pytest.approx(2.1318 * error, rel=1e-4)
-    assert verdicts[1].value < verdicts[0].value
-    assert verdicts[0].bound < verdicts[1].bound
-    assert judge(config(), [Summary({}, 1.0, 0, 0, 1.0)]).margin == 0.0
-
-
-def test_runs_of_the_baseline_alone_give_it_no_margin_but_a_sentence():
+def test_runs_of_the_baseline_give_a_sentence():
     repeats = [{"rte": e, "rpe": 0.1 * e} for e in (1.0, 2.0, 3.0)]
     runs = [Summary({}, 2.0, 0, 0, 1.0, {"rpe": 0.2}, repeats)] * 2
     once = config(baseline_runs=3, objective="rpe")
-    assert judge(once, runs).bound == judge(once, runs).value == pytest.approx(0.2)
+    assert judge(once, runs).value == pytest.approx(0.2)
     assert baseline_words(once, runs) == [
         "The baseline ran 3 times: rpe [m] 0.2 in the mean, 0.1 to 0.3, standard deviation 0.1."
     ]
