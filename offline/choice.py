@@ -22,7 +22,7 @@ STANDARD_ERRORS = 2.0
 COST_CLASS = 1.1
 """Costs that differ by no larger factor, about, are the same: the machine's load makes as much."""
 MOST_OF_PERIOD = 0.5
-"""Share of the time from scan to scan: single scans take more than the mean, and others need cores."""
+"""Share of the time from scan to scan that a scan may take: some take more than the mean."""
 LEAST_COST = 1.0
 """Milliseconds of CPU time a scan; less is nothing, and mostly noise."""
 AS_GOOD = 1.03
