@@ -15,7 +15,7 @@ from adaptune.files import write_text
 from adaptune.machine import available
 from adaptune.metrics import cap, lost_in_words
 from adaptune.model import ErrorModel, ModelError
-from adaptune.model.rules import BASELINE, complementary, mean_errors
+from adaptune.model.rules import complementary, mean_errors
 from adaptune.odometry.registry import ODOMETRIES, PROGRAMS
 from adaptune.progress import Progress, unseen
 from adaptune.recording.config import NO_REFERENCE
@@ -29,7 +29,7 @@ from adaptune.study.references import (
     estimates_in_words,
     estimates_of,
 )
-from adaptune.study.study import BANK, FIXED_SET, OracleErrors, StudySequences, oracle_errors
+from adaptune.study.study import FIXED_SET, OracleErrors, StudySequences, oracle_errors
 from offline.campaign import (
     Campaign,
     Schedule,
@@ -37,9 +37,8 @@ from offline.campaign import (
     drive_whole,
     run_baseline,
 )
-from offline.choice import BlockErrors, front, left_out_ratio, mean_and_error, ratio_to_baseline
-from offline.choice import choose as choose_fixed
 from offline.config import OfflineConfig, OfflineStudy
+from offline.front import COST, front_rows, left_out_in_words
 from offline.labelled import LabelledData, labelled_data, with_vectors, with_whole_drives
 from offline.objective import (
     Verdict,
@@ -52,9 +51,6 @@ from offline.search import BUDGETS, Finished
 from offline.trial import TrialSettings, TrialSetup
 from offline.tuning import DO_NOT_ADAPT, NO_BANK, choose, driven_cost, reserve, rivals
 from offline.workers import Cluster, Workers, spare_memory
-
-COST = "cost [ms]"
-"""Column of CPU time a scan, preparation included."""
 
 _log = logging.getLogger(__name__)
 
@@ -146,63 +142,6 @@ def train(study: OfflineStudy, progress: Progress = unseen, cluster: str | None 
     rows_of_front = front_rows(usable, model)
     tables.write_rows(study.folder, "front", rows_of_front)
     return Training(model, trials, rows, said, rows_of_front)
-
-
-MOST_ROWS = 5
-"""Rows of the front, the baseline's included."""
-
-
-def front_rows(data: LabelledData, model: ErrorModel) -> list[dict[str, Any]]:
-    """Error over cost: the fixed set, the baseline, what costs more and errs less, and the bank.
-
-    Errors are those of drives of whole recordings in training, with intervals of 95 % of their
-    ratio to the baseline's.
-    """
-    blocks = data.whole_blocks(data.finalists())
-    rows = []
-    others = [trial for trial in front(blocks) if trial not in (model.fixed, BASELINE)]
-    for trial in list(dict.fromkeys([model.fixed, BASELINE, *others]))[: MOST_ROWS - 1]:
-        what = "baseline" if trial == BASELINE else f"trial {trial}"
-        ratio = ratio_to_baseline(blocks, trial)
-        rows.append(_front_row(what, data.costs.alone(trial), blocks, ratio))
-        rows[-1]["parameters"] = in_words(data.sets[trial])
-    if of_bank := model.expected.get(BANK):
-        members = [trial for trial in model.bank if trial not in model.reserve]
-        by = (of_bank["geometric"], of_bank["low"], of_bank["high"])
-        value, low, high = np.multiply(ratio_to_baseline(blocks, model.fixed), by).tolist()
-        what, cost = f"bank of {len(members)}", data.costs.adaptive(members)
-        rows.append(_front_row(what, cost, blocks, (value, low, high)))
-        rows[-1]["parameters"] = f"trials {', '.join(map(str, members))}"
-    rows[0]["recommended"] = True
-    return [rows[0], *sorted(rows[1:], key=lambda row: row[COST])]
-
-
-def _front_row(
-    what: str, cost: float, blocks: BlockErrors, ratio: tuple[float, float, float]
-) -> dict[str, Any]:
-    base = float(mean_and_error(blocks.errors, blocks.sequence)[0][blocks.baseline])
-    value, low, high = ratio
-    return {
-        "what": what,
-        COST: cost,
-        "error [%]": base * value,
-        "vs baseline": value,
-        "low": low,
-        "high": high,
-        "recommended": False,
-    }
-
-
-def left_out_in_words(data: LabelledData) -> list[str]:
-    """What to expect elsewhere of a set that is chosen as the fixed one is."""
-    found = left_out_ratio(data.blocks(), lambda blocks: choose_fixed(blocks, data.budget))
-    if found is None:
-        return ["There is too little to tell how the fixed set does where it was not chosen."]
-    ratio, low, high = found
-    return [
-        f"Where they were not chosen, sets chosen so have {ratio:.2f} times the baseline's error "
-        f"in these recordings (95 % interval {low:.2f}-{high:.2f})."
-    ]
 
 
 def _ready_archive(study: OfflineStudy, progress: Progress) -> Archive:

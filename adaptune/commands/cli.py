@@ -27,7 +27,7 @@ app = typer.Typer(
 
 for _command in (
     *(tune.tune, tune.inspect, offline.simulate, offline.reference),
-    *(offline.offline, offline.trials, offline.validate),
+    *(offline.offline, offline.trials, offline.validate, offline.cost),
     *(online.online, online.compare, online.record),
     offline.import_rustle,
 ):

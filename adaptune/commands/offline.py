@@ -25,7 +25,7 @@ from adaptune.commands.terminal import (
     say_next_online,
     show_table,
 )
-from adaptune.commands.tune import check_no_study, show_front
+from adaptune.commands.tune import BUYS, check_no_study, show_front
 from adaptune.errors import AdaptuneError, Finding
 from adaptune.files import write_text
 
@@ -90,7 +90,7 @@ def offline(
         say(sentence)
     say(driven(model, loaded.config.online, loaded.odometry, loaded.mechanism))
     say_fixed(loaded)
-    show_front(training)
+    show_front(training.front, *BUYS)
     show_table(
         f"RTE [%] over {model.length:g} m in training, {n} parameter sets",
         training.rows,

@@ -297,7 +297,7 @@ def tune(
         training = train(loaded, show)
     replay_missing(loaded)
     compared(loaded, details=details)
-    show_front(training)
+    show_front(training.front, *BUYS)
     say_odometries(loaded, training)
     say_next("replays to look at in Foxglove", "record", folder)
 
@@ -597,31 +597,35 @@ def _estimate(study: "OfflineStudy", names: Sequence[str]) -> None:
         raise AdaptuneError(f"{error}; or give a --reference") from error
 
 
-def show_front(training: "Training") -> None:
-    """What CPU time buys: the table of the front."""
-    rows = [
+def show_front(rows: "Sequence[Mapping[str, Any]]", title: str, caption: str) -> None:
+    """The table of what CPU time buys."""
+    shown = [
         {
             "": ("-> " if row["recommended"] else "") + row["what"],
-            "cost [ms]": row["cost [ms]"],
+            **{key: row[key] for key in ("cost [ms]", "99 % [ms]", "memory [MB]") if key in row},
             "RTE [%]": row["error [%]"],
             "vs baseline": row["vs baseline"],
-            "95 %": None if row["low"] != row["low"] else f"{row['low']:.2f}-{row['high']:.2f}",
+            "95 %": None
+            if row["low"] is None or row["low"] != row["low"]
+            else f"{row['low']:.2f}-{row['high']:.2f}",
             "parameters": row["parameters"],
         }
-        for row in training.front
+        for row in rows
     ]
-    show_table(
-        "What CPU time buys, in training",
-        rows,
-        "The arrow marks what is recommended: the best of what costs no more than the baseline, or "
-        "than `--budget`, in milliseconds of CPU time a scan.",
-    )
+    show_table(title, shown, caption)
+
+
+BUYS = (
+    "What CPU time buys, in training",
+    "The arrow marks what is recommended: the best of what costs no more CPU time than the baseline, "
+    "or than the budget, if it is surely better than the baseline.",
+)
 
 
 def say_odometries(study: "OfflineStudy", training: "Training") -> None:
     """Of several odometries, what each gives with its own parameters and tuned, in training."""
     from adaptune.space import ODOMETRY
-    from offline.train import COST
+    from offline.front import COST
 
     labels = list(study.config.odometries)
     if len(labels) < 2:
