@@ -171,6 +171,38 @@ def validate(
     say_next_online(loaded)
 
 
+def cost(
+    study: StudyFile,
+    recording: Annotated[
+        Path, typer.Argument(metavar="BAG", help="A recording of the robot's.", show_default=False)
+    ],
+    override: Override = [],  # noqa: B006
+    folder: Folder = None,
+    points: Points = None,
+) -> None:
+    """Measure on this machine what the rows of a study's front cost, and rank them again.
+
+    Run it on the robot, with nothing else running: it drives each over a minute of a recording. A
+    row whose 99th percentile takes more than half of the time from scan to scan is not recommended.
+    """
+    from adaptune.recording.inspect import inspect
+    from adaptune.recording.recording import open_sequence
+    from adaptune.reference.estimate import recording_config
+    from offline.front import measured_front
+
+    loaded = load(study, override, folder, runs=True)
+    scans = open_sequence(recording_config(inspect(recording), points))
+    with progress() as show:
+        rows = measured_front(loaded, scans, show)
+    chosen = next(row for row in rows if row["recommended"])
+    say(f"Drive {chosen['what']}: {chosen['parameters']}.")
+    show_front(
+        rows,
+        f"What the front costs on {recording.name}, here",
+        "CPU time and the 99th percentile of the time a scan; errors are those of training.",
+    )
+
+
 def reference(
     recording: Annotated[
         Path, typer.Argument(metavar="BAG", help="A bag, or a folder.", show_default=False)

@@ -617,8 +617,8 @@ def show_front(rows: "Sequence[Mapping[str, Any]]", title: str, caption: str) ->
 
 BUYS = (
     "What CPU time buys, in training",
-    "The arrow marks what is recommended: the best of what costs no more CPU time than the baseline, "
-    "or than the budget, if it is surely better than the baseline.",
+    "The arrow marks what is recommended: of what costs no more than the baseline, or than the"
+    " budget, the best, if it is surely better than the baseline.",
 )
 
 
