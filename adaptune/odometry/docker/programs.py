@@ -32,9 +32,9 @@ from adaptune.odometry.program import (
     check_arguments,
     find_output,
     read_output,
+    replace,
 )
 from adaptune.odometry.remote import FIRST_ANSWER, Limits, UserProgram, described
-from adaptune.odometry.template import replace
 from adaptune.space import ParameterSet
 from adaptune.trajectory import Trajectory
 

@@ -14,9 +14,13 @@ from typing import Any
 from adaptune import processes
 from adaptune.errors import OdometryError
 from adaptune.odometry.base import Usage
-from adaptune.odometry.docker.engine import Container, Mount, remove_shared
+from adaptune.odometry.docker.engine import (
+    Container,
+    Mount,
+    remove_shared,
+)
 from adaptune.odometry.docker.ros_system import RosSystem, image_user
-from adaptune.odometry.template import Template
+from adaptune.odometry.program import Template
 from adaptune.ros import ros1_node
 from adaptune.ros.link import Run, equal_values
 from adaptune.ros.ros1 import Ros1
