@@ -149,7 +149,7 @@ def front_chart(rows: Sequence[Mapping[str, Any]], label: str = "error [%]") -> 
         "Error over cost of all that was tried",
         (Panel(x, y, tuple(drawn), height=1.3),),
         "Nothing that was tried has both less error and less cost than what lies on the front. "
-        "Right of where the front is flat, CPU time buys nothing.",
+        "Where the front is flat, more CPU time buys nothing.",
     )
 
 

@@ -15,7 +15,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from adaptune.commands.online import Details, compared, replay_missing
-from adaptune.commands.terminal import Points, console, load, progress, say, say_next, show_table
+from adaptune.commands.terminal import (
+    Points,
+    console,
+    load,
+    progress,
+    say,
+    say_next,
+    show_table,
+)
 from adaptune.errors import AdaptuneError, NotInstalledError
 from adaptune.files import plain_name, write_text
 from adaptune.progress import Progress

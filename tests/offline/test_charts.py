@@ -158,12 +158,15 @@ def study(study_file, tmp_path):
 
 def test_trials_have_their_charts(study):
     assert charts_of_trials(study) == ([], ["No trials: run `adaptune offline`."])
-    write_trials(study, lambda _, p: p["keyframe_interval"], 20)
+    cost = {"register_ms": 2.0, "prepare_ms": 1.0}
+    write_trials(study, lambda _, p: p["keyframe_interval"], 20, usage=cost)
     charts, notes = charts_of_trials(study)
-    assert [chart.key for chart in charts] == ["iterations", "importance", "parameter-scatter"]
+    assert [chart.key for chart in charts] == [
+        *("iterations", "importance", "parameter-scatter", "front")
+    ]
     assert notes == []
     # The most important one comes first.
-    assert charts[-1].panels[0].x.label == "keyframe_interval [m]"
+    assert charts[2].panels[0].x.label == "keyframe_interval [m]"
 
 
 def test_each_of_several_odometries_has_a_scatter(tmp_path):

@@ -3,6 +3,8 @@
 The error of a set on a sequence is told by a function of both.
 """
 
+from dataclasses import replace
+
 import numpy as np
 from random_models import SPACE
 from rooms import along_x
@@ -39,12 +41,13 @@ def made_table(error, n=40, fixed=None):
     return trial_table(OfflineConfig(), SPACE, finished, None if fixed is None else sets[fixed])
 
 
-def write_trials(study, error, n):
+def write_trials(study, error, n, **changed):
     """Fill a study's archive, with the same sets on all training sequences."""
     archive = Archive(study.folder / "trials")
     for name in study.training:
         for number, parameters in enumerate(made_sets(n, study.odometry.space)):
-            archive.write(name, number, made_trial(parameters, error(name, parameters)))
+            trial = replace(made_trial(parameters, error(name, parameters)), **changed)
+            archive.write(name, number, trial)
 
 
 class Drawn:
