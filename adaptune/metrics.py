@@ -135,6 +135,21 @@ def sub_trajectory_vectors(
     return vectors
 
 
+def sub_trajectory_turns(
+    T_ref_sensor: Poses, T_odom_sensor: Poses, length: float
+) -> NDArray[np.float64]:
+    """Rotation error at the end of the sub-trajectory from every frame, degrees a metre, (n,).
+
+    NaN for frames without a full sub-trajectory; `length` is in metres.
+    """
+    ends = window_ends(T_ref_sensor, length)
+    starts = np.flatnonzero(ends >= 0)
+    d_gt, d_est = _window_motions(T_ref_sensor, T_odom_sensor, starts, ends[starts])
+    turns = np.full(len(T_ref_sensor), np.nan)
+    turns[starts] = np.degrees(rotation_angle(invert(d_est) @ d_gt)) / length
+    return turns
+
+
 def height_error(T_ref_sensor: Poses, T_odom_sensor: Poses, length: float) -> float:
     """Mean drift in height over the sub-trajectories of `length` metres, in percent of it.
 

@@ -49,6 +49,9 @@ class BlockErrors(NamedTuple):
     costs: NDArray[np.float64]  # (n_trials,): ms of CPU time a scan; NaN if unknown
     restarts: NDArray[np.float64]  # (n_trials,): infinite for a set that failed
     period: float = np.inf  # milliseconds from scan to scan
+    # (n_blocks, n_trials): mean rotation errors, where they are known: a short sub-trajectory hides
+    # a heading that drifts.
+    turns: NDArray[np.float64] | None = None
 
     @property
     def baseline(self) -> int:
@@ -111,7 +114,8 @@ def bounds(blocks: BlockErrors, n_errors: float = STANDARD_ERRORS) -> NDArray[np
 
     It is the mean error plus `n_errors` standard errors of the difference from the baseline's. It
     is infinite for sets that are not admissible: they failed, were restarted more often than the
-    baseline (whoever takes its parameters elsewhere has no health check), or are surely worse.
+    baseline (whoever takes its parameters elsewhere has no health check), or are surely worse, also
+    in rotation.
     """
     mean, _ = mean_and_error(blocks.errors, blocks.sequence)
     with np.errstate(invalid="ignore"):
@@ -120,7 +124,10 @@ def bounds(blocks: BlockErrors, n_errors: float = STANDARD_ERRORS) -> NDArray[np
     bound = mean + n_errors * np.where(np.isfinite(error), error, 0.0)
     usable = np.isfinite(blocks.restarts) & np.isfinite(bound)
     usable &= blocks.restarts <= blocks.restarts[blocks.baseline]
-    return np.where(usable & ~surely_worse(blocks), bound, np.inf)
+    usable &= ~surely_worse(blocks)
+    if blocks.turns is not None:
+        usable &= ~surely_worse(blocks._replace(errors=blocks.turns))
+    return np.where(usable, bound, np.inf)
 
 
 def cost_classes(blocks: BlockErrors) -> NDArray[np.float64]:

@@ -17,6 +17,7 @@ from adaptune.metrics import (
     cap,
     span,
     sub_trajectory_rte,
+    sub_trajectory_turns,
     sub_trajectory_vectors,
     travelled,
     window_ends,
@@ -260,6 +261,7 @@ class LabelledSequence:
     # (n_blocks,), their mean capped errors in blocks of all frames, or (1,), another objective; and
     # how often each was restarted. None where some frames are left out.
     whole_means: Mapping[int, NDArray[np.float64]] | None = None
+    whole_turns: Mapping[int, NDArray[np.float64]] | None = None  # rotation errors, likewise
     whole_restarts: Mapping[int, float] = field(default_factory=dict)
 
     @cached_property
@@ -317,7 +319,7 @@ class LabelledSequence:
         if self.values is not None:  # of some frames, it is not known
             return some
         few = {n: errors[kept] for n, errors in self.whole.items()}
-        return replace(some, whole=few, whole_means=None)
+        return replace(some, whole=few, whole_means=None, whole_turns=None)
 
     def in_blocks(self, whole: Sequence[int] = ()) -> NDArray[np.float64]:
         """Mean capped errors in blocks, of shape (n_blocks, n_sets), or the objective, (1, n_sets).
@@ -444,7 +446,11 @@ class LabelledData(NamedTuple):
         number = np.repeat(np.arange(len(errors)), [len(of) for of in errors])
         restarts = np.sum([[s.whole_restarts[n] for n in known] for s in self.sequences], axis=0)
         of_known = np.array([self.costs.alone(n) for n in known]), restarts
-        return BlockErrors(known, np.concatenate(errors), number, *of_known, self.period)
+        turns = None
+        if all(s.whole_turns is not None for s in self.sequences):
+            rotations = [s.whole_turns or {} for s in self.sequences]
+            turns = np.concatenate([np.stack([of[n] for n in known], axis=1) for of in rotations])
+        return BlockErrors(known, np.concatenate(errors), number, *of_known, self.period, turns)
 
     def finalists(self) -> list[int]:
         """Trials whose sets drive whole recordings, see `offline.choice.finalists`."""
@@ -563,10 +569,18 @@ def with_whole_drives(
     for s in data.sequences:
         trials = {n: archive.read(s.name, n, whole=True) for n in sorted(known)}
         errors = np.stack([trial.errors for trial in trials.values()], axis=1)
+        turns = None
         if s.values is None:
             frames = np.flatnonzero(~np.isnan(errors).any(axis=1))
             everywhere = replace(s.simulation, T_ref_counted=s.simulation.T_ref_sensor)
-            means = block_means(errors[frames], stretches(everywhere, frames, PER_BLOCK))
+            block = stretches(everywhere, frames, PER_BLOCK)
+            means = block_means(errors[frames], block)
+            paths = [trial.T_odom_sensor for trial in trials.values()]
+            T_ref_sensor, length = s.simulation.T_ref_sensor, s.simulation.length
+            rotations = [sub_trajectory_turns(T_ref_sensor, T, length)[frames] for T in paths]
+            turns = dict(
+                zip(trials, block_means(np.stack(rotations, axis=1), block).T, strict=True)
+            )
         else:
             weights = config.offline.objective
             means = np.array([[weighted(weights, drives[s.name][n].metrics) for n in trials]])
@@ -577,6 +591,7 @@ def with_whole_drives(
                 s,
                 whole=dict(zip(trials, errors[s.known].T, strict=True)),
                 whole_means=dict(zip(trials, means.T, strict=True)),
+                whole_turns=turns,
                 whole_restarts=restarts | failed,
             )
         )

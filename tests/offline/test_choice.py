@@ -72,6 +72,12 @@ def test_who_is_restarted_more_often_than_the_baseline_is_not_chosen():
         choose(blocks(errors[:, :2], restarts=[np.inf, np.inf]))
 
 
+def test_a_set_whose_heading_drifts_is_not_chosen():
+    errors = noisy([1.0, 0.5])
+    assert choose(blocks(errors)._replace(turns=noisy([1.0, 1.0]))) == 1
+    assert choose(blocks(errors)._replace(turns=noisy([1.0, 3.0]))) == 0
+
+
 def test_a_set_that_is_surely_worse_on_one_recording_is_not_chosen():
     errors, places = noisy([1.0, 0.5], 24), np.repeat([0, 1], 12)
     errors[12:, 1] += 0.8
