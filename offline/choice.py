@@ -17,8 +17,10 @@ PER_BLOCK = 2.0
 """Sub-trajectories in a block: errors of neighbouring frames share most of theirs."""
 SURE = 0.95
 """Confidence, on one side, with which a set is worse than the baseline."""
-STANDARD_ERRORS = 2.0
-"""Of the difference from the baseline, by which a set has to be better."""
+STANDARD_ERRORS = 1.0
+"""Of the logarithm of the ratio to the baseline's error, by which a set has to be better."""
+FLOOR = 0.05
+"""Share of the baseline's mean error that is added to both errors of a ratio."""
 COST_CLASS = 1.1
 """Costs that differ by no larger factor, about, are the same: the machine's load makes as much."""
 MOST_OF_PERIOD = 0.5
@@ -110,18 +112,19 @@ def surely_worse(blocks: BlockErrors) -> NDArray[np.bool_]:
 
 
 def bounds(blocks: BlockErrors, n_errors: float = STANDARD_ERRORS) -> NDArray[np.float64]:
-    """Upper bound of the mean error of each set in percent, of shape (n_trials,).
+    """Upper bound of the error of each set in percent, of shape (n_trials,).
 
-    It is the mean error plus `n_errors` standard errors of the difference from the baseline's. It
-    is infinite for sets that are not admissible: they failed, were restarted more often than the
-    baseline (whoever takes its parameters elsewhere has no health check), or are surely worse, also
-    in rotation.
+    It is the baseline's mean error times the geometric mean of the ratios to it in blocks, plus
+    `n_errors` standard errors of its logarithm. It is infinite for sets that are not admissible:
+    they failed, were restarted more often than the baseline (whoever takes its parameters elsewhere
+    has no health check), or are surely worse, also in rotation.
     """
-    mean, _ = mean_and_error(blocks.errors, blocks.sequence)
+    base = blocks.errors[:, [blocks.baseline]]
+    (mean,), _ = mean_and_error(base, blocks.sequence)
     with np.errstate(invalid="ignore"):
-        more = blocks.errors - blocks.errors[:, [blocks.baseline]]
-        _, error = mean_and_error(more, blocks.sequence)
-    bound = mean + n_errors * np.where(np.isfinite(error), error, 0.0)
+        logs = np.log(blocks.errors + FLOOR * mean) - np.log(base + FLOOR * mean)
+        log, error = mean_and_error(logs, blocks.sequence)
+        bound = mean * np.exp(log + n_errors * np.where(np.isfinite(error), error, 0.0))
     usable = np.isfinite(blocks.restarts) & np.isfinite(bound)
     usable &= blocks.restarts <= blocks.restarts[blocks.baseline]
     usable &= ~surely_worse(blocks)

@@ -48,8 +48,8 @@ def front_rows(data: LabelledData, model: ErrorModel) -> list[dict[str, Any]]:
         ratio = ratio_to_baseline(blocks, trial)
         rows.append(_front_row(what, data.costs.alone(trial), blocks, ratio))
         rows[-1] |= {"parameters": in_words(data.sets[trial]), "trial": trial}
-    if of_bank := model.expected.get(BANK):
-        members = [trial for trial in model.bank if trial not in model.reserve]
+    members = [trial for trial in model.bank if trial not in model.reserve]
+    if (of_bank := model.expected.get(BANK)) and len(members) > 1:
         by = (of_bank["geometric"], of_bank["low"], of_bank["high"])
         value, low, high = np.multiply(ratio_to_baseline(blocks, model.fixed), by).tolist()
         what, cost = f"bank of {len(members)}", data.costs.adaptive(members)
@@ -75,16 +75,16 @@ def _front_row(
     }
 
 
-def left_out_in_words(data: LabelledData) -> list[str]:
+def left_out_in_words(data: LabelledData) -> str:
     """What to expect elsewhere of a set that is chosen as the fixed one is."""
     found = left_out_ratio(data.blocks(), lambda blocks: choose(blocks, data.budget))
     if found is None:
-        return ["There is too little to tell how the fixed set does where it was not chosen."]
+        return "There is too little to tell how sets do where they were not chosen: record more."
     ratio, low, high = found
-    return [
+    return (
         f"Where they were not chosen, sets chosen so have {ratio:.2f} times the baseline's error "
         f"in these recordings (95 % interval {low:.2f}-{high:.2f})."
-    ]
+    )
 
 
 SECONDS = 60.0

@@ -66,6 +66,7 @@ class Training(NamedTuple):
 
     # What error costs, a row for each choice, that which is recommended first.
     front: Sequence[dict[str, Any]] = ()
+    elsewhere: str = ""  # what to expect of such a choice elsewhere
 
     @property
     def words(self) -> list[str]:
@@ -85,6 +86,7 @@ class Training(NamedTuple):
             return [f"{least}{where}; the fixed set is the baseline.", *self.said, baseline]
         return [
             f"Fixed: {of_fixed:.3f} %{at} against the baseline's {own:.3f} %{at_own} {where}.",
+            self.elsewhere,
             *self.said,
             f"Parameters of the fixed set: {in_words(sets[fixed])}",
             baseline,
@@ -136,12 +138,11 @@ def train(study: OfflineStudy, progress: Progress = unseen, cluster: str | None 
         lambda worst: hard_to_track(study.sequences.open(worst)),
     )
     said += estimates_in_words(estimates, model.length)
-    said += left_out_in_words(usable)
     said += failed_in_words(verdicts)
     said += baseline_words(config, [runs[0] for runs in finished.values()])
     rows_of_front = front_rows(usable, model)
     tables.write_rows(study.folder, "front", rows_of_front)
-    return Training(model, trials, rows, said, rows_of_front)
+    return Training(model, trials, rows, said, rows_of_front, left_out_in_words(usable))
 
 
 def _ready_archive(study: OfflineStudy, progress: Progress) -> Archive:

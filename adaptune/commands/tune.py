@@ -305,6 +305,7 @@ def tune(
         training = train(loaded, show)
     replay_missing(loaded)
     compared(loaded, details=details)
+    say(training.elsewhere)
     show_front(training.front, *BUYS)
     say_odometries(loaded, training)
     say_next("replays to look at in Foxglove", "record", folder)
