@@ -226,7 +226,7 @@ def _answer(stream, header, answer):  # type: (Stream, dict[str, Any], Any) -> N
 
 
 def converse(stream, name, more=None):  # type: (Stream, str, dict[str, Any] | None) -> None
-    """Pass messages on until the other side closes the socket.
+    """Be a node until the other side closes the socket.
 
     `more` holds functions that answer other messages, by their type.
     """
@@ -234,7 +234,12 @@ def converse(stream, name, more=None):  # type: (Stream, str, dict[str, Any] | N
 
     rospy.init_node(name, anonymous=True, disable_signals=True)
     node = _Node(rospy, stream)
-    answers = dict(more or {}, **{kind: getattr(node, kind) for kind in _ASKED})
+    serve(stream, node, dict(more or {}, **{kind: getattr(node, kind) for kind in _ASKED}))
+    rospy.signal_shutdown("adaptune has ended")
+
+
+def serve(stream, node, answers):  # type: (Stream, Any, dict[str, Any]) -> None
+    """Have a node do what comes, or answer it, until the other side closes the socket."""
     stream.send({"type": "ready"})
     while True:
         received = stream.receive()
@@ -248,7 +253,6 @@ def converse(stream, name, more=None):  # type: (Stream, str, dict[str, Any] | N
             thread.start()
         else:
             getattr(node, kind)(header, data)
-    rospy.signal_shutdown("adaptune has ended")
 
 
 def _start_master(asked):  # type: (dict[str, set[str]]) -> None

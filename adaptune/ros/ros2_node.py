@@ -3,15 +3,12 @@
 import contextlib
 import socket
 import sys
-import threading
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import numpy as np
-
-from adaptune import processes
 from adaptune.ros.dds import TRANSFORMS, DdsLink
 from adaptune.ros.link import LinkError
+from adaptune.ros.ros1_node import Stream, serve
 from adaptune.ros.ros2 import PLACES, full
 
 _QUIET = ("/parameter_events", "/rosout", "/clock")
@@ -47,15 +44,10 @@ class _Link(DdsLink):
 
 
 class _Node:
-    def __init__(self, link: _Link, stream: processes.SocketStream):
-        self._link, self._stream, self._lock = link, stream, threading.Lock()
+    def __init__(self, link: _Link, stream: Stream):
+        self._link, self._stream = link, stream
         self._publish: dict[str, Callable[[bytes], None]] = {}
         self._awaited: list[str] = []
-
-    def send(self, header: Mapping[str, Any], data: Any = None) -> None:
-        with self._lock, contextlib.suppress(OSError, ValueError):  # the other side may have gone
-            arrays = {} if data is None else {"data": data}
-            processes.send(self._stream, header, **arrays)
 
     def subscribe(self, header: Mapping[str, Any], _: bytes) -> None:
         """Subscribe as soon as somebody publishes, of whatever type."""
@@ -92,7 +84,7 @@ class _Node:
 
     def _record(self, topic: str, kind: str) -> None:
         head = {"type": "message", "topic": topic, "kind": kind.replace("/msg/", "/")}
-        take = lambda data: self.send(head, np.frombuffer(data, np.uint8))  # noqa: E731
+        take = lambda data: self._stream.send(head, data)  # noqa: E731
         with contextlib.suppress(LinkError):  # of a type that nobody knows
             self._link.subscribe(topic, kind, take, raw=True)
 
@@ -111,13 +103,6 @@ class _Node:
                 found[node] = self._link.parameters(node)
         return found
 
-    def answer(self, header: Mapping[str, Any], about: Callable[[Any], Any]) -> None:
-        try:
-            found = {"found": about(header)}
-        except Exception as error:
-            found = {"refused": str(error) or type(error).__name__}
-        self.send({**found, "type": "answer", "number": header["number"]})
-
 
 _ASKED = ("state", "topics", "set_parameters", "parameters")
 
@@ -126,22 +111,14 @@ def main(path: str) -> None:
     """Be a node, and pass messages on through a socket, until its other side has gone."""
     connection = socket.socket(socket.AF_UNIX)
     connection.connect(path)
-    stream = processes.SocketStream(connection)
+    stream = Stream(connection)
     try:
         link = _Link()
     except LinkError as error:
-        processes.send(stream, {"type": "failed", "message": str(error)})
+        stream.send({"type": "failed", "message": str(error)})
         return
     node = _Node(link, stream)
-    node.send({"type": "ready"})
-    while (message := processes.receive(stream)) is not None:
-        kind = message.header["type"]
-        if kind in _ASKED:
-            given = (message.header, getattr(node, kind))
-            threading.Thread(target=node.answer, args=given, daemon=True).start()
-        else:
-            data = message.arrays.get("data")
-            getattr(node, kind)(message.header, b"" if data is None else data.tobytes())
+    serve(stream, node, {kind: getattr(node, kind) for kind in _ASKED})
     link.close()
 
 

@@ -67,6 +67,8 @@ def look(
             shown.append((system._shown[1], scan.stamp))
         if (inside := system._system) is not None:
             found |= _topics(inside)
+            if about := system._reader.about:
+                found["poses are of"] = about + _extrinsic(about.split()[0], settings)
             works_on = system._works_on(inside)
     seconds = max(1e-9 * (shown[-1][1] - shown[0][1]), 0.1)
     found["time of a start"] = f"{took:.1f} s"
@@ -81,6 +83,13 @@ def look(
     if settings.node is not None and others and not system.faults:
         found |= _effects(settings, parameters, limits, scans[:_SHORT], others)
     return found
+
+
+def _extrinsic(frame: str, settings: Any) -> str:
+    """What to set where poses are of another frame than scans are."""
+    if frame == settings.frame or settings.extrinsic is not None:
+        return ""
+    return f"; scans are of {settings.frame}: set odometry.settings.extrinsic if it is not there"
 
 
 def _driven(
