@@ -38,6 +38,7 @@ from stages import bare_gicp
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests" / "support"))
 
 import drives
+from rooms import along_x
 
 from adaptune import yaml12
 from adaptune.archive import Archive, Frames
@@ -196,7 +197,7 @@ class Drawn:
             return [(0, {number: [_drawn(number, stretch)] for number in self._task.sets})]
         frames = Frames(
             np.arange(N_FRAMES) * 10**8,
-            np.tile(np.eye(4), (N_FRAMES, 1, 1)),
+            along_x(0.3 * np.arange(N_FRAMES)),
             np.random.default_rng(0).integers(0, 99, (N_FRAMES, 90)).astype(np.float32),
             {"ndt": 90},
             np.zeros(N_FRAMES, np.float32),
@@ -207,7 +208,8 @@ class Drawn:
 
 def _drawn(number: int, stretch: Stretch) -> Drive:
     rng, drive = np.random.default_rng(number), Drive.lost(stretch)
-    drive.T_odom_sensor[:, :3, 3] += rng.normal(size=(len(stretch.stamps), 3))
+    factor = 1.0 + 0.01 * rng.gamma(1.0)
+    drive.T_odom_sensor = along_x(0.3 * factor * np.arange(len(stretch.stamps)))
     drive.registered[:] = drive.tried[:] = True
     drive.without_pose[:] = False
     drive.seconds[1:] = rng.gamma(1.0, size=len(stretch.stamps) - 1)

@@ -56,8 +56,7 @@ class Schedule:
         self.done = 0  # trials on sequences
         self._archive, self._what, self._progress = archive, what, progress
         self._whole, self._measure = whole, measure
-        self._settings = TrialSettings.of(study.config)
-        self._one_by_one = study.odometry.one_by_one
+        self._settings, self._odometry = TrialSettings.of(study.config), study.odometry
         self._described: dict[str, Frames] = {}
         self._frames: dict[str, Frames] = {}  # the same, with the stretches that are driven
         self._unread: list[str] = []
@@ -65,8 +64,8 @@ class Schedule:
         self._unsaved: set[str] = set()  # whose frames the archive does not have
         self._due: dict[str, dict[int, _Due]] = {}
         self._stretches: dict[Hashable, Stretch] = {}
-        # By stretch, the sets that are still to be driven there.
-        self._waiting: dict[Hashable, dict[int, ParameterSet]] = {}
+        # By stretch and preparation of its scans, the sets that are still to be driven there.
+        self._waiting: dict[tuple[Hashable, Hashable], dict[int, ParameterSet]] = {}
         self._partly: dict[Hashable, float] = {}  # by task, how much of it is done
 
     def need(self, name: str) -> None:
@@ -122,21 +121,21 @@ class Schedule:
             name = self._unmeasured.pop(0)
             return Task(name, self._described[name])
 
-        def rank(key: Hashable) -> tuple[bool, bool, int]:
+        def rank(key: tuple[Hashable, Hashable]) -> tuple[bool, bool, int]:
             return key not in held, key not in held and key in others, min(self._waiting[key])
 
         key = min(self._waiting, key=rank)
-        waiting, stretch = self._waiting[key], self._stretches[key]
-        # Some are left for others, and for the time when the next sets wait.
-        size = math.ceil(len(waiting) / max(2, n / len(self._waiting)))
-        numbers = sorted(waiting)[: 1 if self._one_by_one else size]
+        waiting, stretch = self._waiting[key], self._stretches[key[0]]
+        # Of a search, some are left for the time when the next sets wait.
+        size = math.ceil(len(waiting) / max(1 if self._whole else 2, n / len(self._waiting)))
+        numbers = sorted(waiting)[: 1 if self._odometry.one_by_one else size]
         sets = {number: waiting.pop(number) for number in numbers}
         if not waiting:
             del self._waiting[key]
         name, n_scans = stretch.sequence, len(stretch.stamps)
         most_ms, share = self.most_ms.get(name, np.inf), self._share(stretch)
         most = max(1e-3 * most_ms * n_scans, LEAST_SECONDS * share)
-        return Task(name, stretch=stretch, sets=sets, most=most)
+        return Task(name, stretch=stretch, sets=sets, most=most, prepares=key)
 
     def note(self, task: Task, progress: TaskProgress) -> None:
         """See `offline.workers.Work`."""
@@ -160,9 +159,10 @@ class Schedule:
 
     def _open(self, name: str, number: int) -> None:
         due = self._due[name][number]
+        preparation = self._odometry(due.parameters).preparation
         for stretch in stretches_along(name, self._frames[name]):
             self._stretches[stretch.key] = stretch
-            self._waiting.setdefault(stretch.key, {})[number] = due.parameters
+            self._waiting.setdefault((stretch.key, preparation), {})[number] = due.parameters
             due.left += 1
 
     def _driven(self, task: Task, result: Result) -> Iterator[tuple[str, int, Trial]]:
@@ -187,7 +187,7 @@ class Schedule:
     def _stop(self, name: str, number: int) -> int:
         """Drive a set no more on a sequence; returns along how many stretches it is not driven."""
         stopped = 0
-        for key in [key for key in self._waiting if self._stretches[key].sequence == name]:
+        for key in [key for key in self._waiting if self._stretches[key[0]].sequence == name]:
             stopped += self._waiting[key].pop(number, None) is not None
             if not self._waiting[key]:
                 del self._waiting[key]

@@ -48,6 +48,7 @@ class Task(NamedTuple):
     stretch: Stretch | None = None  # along which sets are driven
     sets: Mapping[int, ParameterSet] = {}  # by trial number, what is driven on one pass
     most: float = np.inf  # seconds of CPU time above which a set is stopped
+    prepares: Hashable = None  # identifies the scans that the worker then holds prepared
     apart: bool = False  # run classes of the user in processes of their own, also clean ones
 
     @property
@@ -111,9 +112,9 @@ class Work(Protocol):
         ...
 
     def take(self, held: Collection[Hashable], others: Collection[Hashable], n: int) -> Task:
-        """Take a task for one of `n` workers, which holds the scans of stretches of these keys.
+        """Take a task for one of `n` idle workers.
 
-        The other workers hold `others`.
+        It holds these prepared scans, the other workers hold `others`.
         """
         ...
 
@@ -155,7 +156,7 @@ class _Crew(Generic[W]):
         self.failure: AdaptuneError | None = None
         self._pool, self._work = pool, work
         self._running: dict[W, Task] = {}
-        self._held: dict[W, set[Hashable]] = {}  # keys of the stretches that each has prepared
+        self._held: dict[W, set[Hashable]] = {}  # the scans that each has prepared
         self._again: list[Task] = []
         self._deaths = Counter[Hashable]()
         self._suspects: set[int] = set()  # trials at which a worker died
@@ -168,18 +169,19 @@ class _Crew(Generic[W]):
     def start(self) -> None:
         """Give tasks to idle workers."""
         workers = self._pool.workers() if self.failure is None else ()
-        for worker in [worker for worker in workers if worker not in self._running]:
+        idle = [worker for worker in workers if worker not in self._running]
+        for left, worker in zip(range(len(idle), 0, -1), idle, strict=True):
             if not self._again and not self._work.waits():
                 return
             held = self._held.setdefault(worker, set())
             others = set().union(*(keys for w, keys in self._held.items() if w != worker))
-            task = self._again.pop() if self._again else self._work.take(held, others, len(workers))
+            task = self._again.pop() if self._again else self._work.take(held, others, left)
             # A class that is not as clean as it says then costs its own trials only.
             task = task._replace(apart=not self._suspects.isdisjoint(task.sets))
-            if task.stretch is not None:
-                held.add(task.stretch.key)
+            if task.prepares is not None:
+                held.add(task.prepares)
             self._running[worker] = task
-            self._pool.start(worker, task)
+            self._pool.start(worker, task._replace(prepares=None))  # which need not pickle
 
     def wait(self) -> None:
         """Wait for some of the tasks."""

@@ -28,7 +28,7 @@ def schedule(study_file, tmp_path):
     archive.write_frames("one", CUT)
     made = Schedule(study, archive, "runs")
     for number in range(4):
-        made.add("one", number, {"n": number})
+        made.add("one", number, {"keyframe_interval": 1.0 + number})
     return made
 
 
@@ -38,17 +38,30 @@ def begins(*tasks):
 
 def test_a_worker_goes_on_where_its_scans_are_and_else_where_nobody_is(schedule):
     one = schedule.take(set(), set(), 2)
-    held = {one.stretch.key}
+    held = {one.prepares}
     other = schedule.take(set(), held, 2)
-    again = schedule.take(held, {other.stretch.key}, 2)
+    again = schedule.take(held, {other.prepares}, 2)
     assert begins(one, other, again) == [0, 14, 0]
     # Some are left for others, and for the time when the next sets wait.
     assert [list(task.sets) for task in (one, other, again)] == [[0, 1], [0, 1], [2]]
-    held_by_other = {other.stretch.key}
+    held_by_other = {other.prepares}
     last = schedule.take(held, held_by_other, 2)
     assert (begins(last), list(last.sets)) == ([0], [3])
     # Where nothing waits that it holds, it takes what nobody has.
     assert begins(schedule.take(held, held_by_other, 2)) == [28]
+
+
+def test_sets_that_take_scans_alike_are_driven_together(schedule, study_file, tmp_path):
+    study = load_study(study_file, ["odometry={name: gicp}"], tmp_path / "other")
+    schedule = Schedule(study, schedule._archive, "runs")
+    sets = [{"downsampling": 0.5 if number % 2 else 0.25} for number in range(4)]
+    for number, parameters in enumerate(sets):
+        schedule.add("one", number, study.odometry.space.complete(parameters))
+    one = schedule.take(set(), set(), 2)
+    other = schedule.take(set(), {one.prepares}, 2)
+    again = schedule.take({one.prepares}, {other.prepares}, 2)
+    assert [list(task.sets) for task in (one, other, again)] == [[0], [0], [2]]
+    assert begins(one, other, again) == [0, 14, 0]
 
 
 class Slow(Drawn):
@@ -62,7 +75,7 @@ class Slow(Drawn):
 
 
 def test_trials_are_made_of_their_stretches_and_a_slow_set_is_driven_no_more(schedule):
-    pool = Slow(lambda _, parameters: float(parameters["n"]))
+    pool = Slow(lambda _, parameters: parameters["keyframe_interval"] - 1.0)
     found = {number: trial for _, number, trial in schedule.run(pool)}
     assert sorted(found) == [0, 1, 2, 3]
     driven = [task.stretch.first for task in pool.tasks if 1 in task.sets]
