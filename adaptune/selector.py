@@ -210,10 +210,8 @@ class Selector(_Measuring):
         self._reserve = frozenset(model.reserve if weighs else ()).intersection(self.members)
         self._always = [member for member in self.members if member not in self._reserve]
         if weighs:
-            at = [model.bank.index(member) for member in self._always]
-            spreads = spread_of(
-                np.nan_to_num(model.vectors[:, at], posinf=FAILURE, neginf=-FAILURE)
-            )
+            vectors = model.vectors[:, [model.bank.index(member) for member in self._always]]
+            spreads = spread_of(np.where(np.isfinite(vectors), vectors, FAILURE))
             self._usual_spread = float(np.quantile(spreads, UNUSUAL))
         data = model.training_data(self._pca, self.members or None)
         self._rule = cls.of(model, weighs).fit(data)

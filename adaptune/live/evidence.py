@@ -245,7 +245,7 @@ class LiveEvidence:
         self._metres = 0.0
         self._newest: _Anchor | None = None
         self._short = self._since = self._n_starts = 0
-        self._restarted = 0.0  # metres driven until the last restart
+        self._restarted = 0  # stamp of the scan of the last restart
         self._begin()
 
     def _begin(self) -> None:
@@ -304,7 +304,7 @@ class LiveEvidence:
         restarted = self._newest is not None and motions.starts > self._n_starts
         self._n_starts = motions.starts
         if restarted:
-            self._restart()
+            self._restart(before)
         # The first scan is where the odometry starts, whatever motion it was given.
         if self._newest is None:
             T[:] = np.eye(4)
@@ -331,13 +331,13 @@ class LiveEvidence:
             while len(self._anchors) > 2 and self._metres - self._anchors[2].metres >= LENGTHS[0]:
                 self._anchors.popleft()
 
-    def _restart(self) -> None:
-        """Take note that the odometry, or all members of a bank, have begun anew."""
+    def _restart(self, stamp: int) -> None:
+        """Take note that the odometry, or all members of a bank, have begun anew at a scan."""
         own, anchors, measured = self._own, self._anchors, self._measured
         self._begin()
         # What a member did before says nothing of it now, but the drive has the jump.
         self._own, self._anchors, self._measured = own, anchors, measured
-        self._restarted = self._metres
+        self._restarted = stamp
 
     def measure(self) -> Measured | None:
         """Register the newest scan whose motion is known to one some metres before.
@@ -361,7 +361,7 @@ class LiveEvidence:
         if found is not None and np.trace(found.hop.projection) < _MIN_DIRECTIONS:
             return None
         if found is None or not self._is_confirmed(found):
-            self._rejected += starts[-1].metres >= self._restarted
+            self._rejected += starts[-1].stamp >= self._restarted
             return None
         self._take(found)
         return found
@@ -430,7 +430,7 @@ class LiveEvidence:
         errors[end.no_pose > start.no_pose] = np.nan
         ends = start.metres, end.metres, end.stamp * 1e-9
         measured = np.asarray(np.isfinite(errors).all(axis=1))
-        if start.metres >= self._restarted:
+        if start.stamp >= self._restarted:
             self._compare(errors, measured, ends)
         if measured[0]:
             self._own.add(Link(*ends, start.T_odom_sensor[0], end.T_odom_sensor[0], hop))

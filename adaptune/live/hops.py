@@ -25,8 +25,9 @@ DEGENERATE = 0.002
 _CELL, _NEIGHBOURS, _MIN_RANGE = 0.25, 20, 1.0
 _MIN_POINTS = 100
 """Points; small_gicp crashes on an empty target, and three points always converge."""
-_REACH = 1.0
-"""Metres of the greatest distance of correspondences."""
+REACHES, OFFLINE_REACHES = (1.0,), (2.0, 0.5)
+"""Metres of the greatest distance of correspondences, one registration after the other; the second
+where there is time for two."""
 _ITERATIONS = 20
 _OF_A_PLANE = 0.5
 """Information that small_gicp ascribes to a pair of points along their plane; there is none."""
@@ -111,7 +112,11 @@ def _prepare(scan: Scan, T_previous_current: Poses, seconds: float) -> Any:
 
 
 def register(
-    start: HopCloud, end: HopCloud, guesses: Iterable[Poses], min_inliers: float = MIN_INLIERS
+    start: HopCloud,
+    end: HopCloud,
+    guesses: Iterable[Poses],
+    min_inliers: float = MIN_INLIERS,
+    reaches: Sequence[float] = REACHES,
 ) -> Hop | None:
     """Register two scans; the first guess that leads to a sound registration wins.
 
@@ -124,13 +129,15 @@ def register(
 
     (target, tree), (source, _) = start.prepared, end.prepared
     for T_start_end in guesses:
-        result = small_gicp.align(
-            *(target, source, tree),
-            init_T_target_source=T_start_end,
-            max_correspondence_distance=_REACH,
-            max_iterations=_ITERATIONS,
-            num_threads=1,
-        )
+        for reach in reaches:
+            result = small_gicp.align(
+                *(target, source, tree),
+                init_T_target_source=T_start_end,
+                max_correspondence_distance=reach,
+                max_iterations=_ITERATIONS,
+                num_threads=1,
+            )
+            T_start_end = result.T_target_source  # noqa: PLW2901
         T = rectify(result.T_target_source)
         if np.isfinite(T).all() and result.num_inliers >= min_inliers * source.size():
             return Hop(T, T[:3, :3] @ _known_directions(result) @ T[:3, :3].T)

@@ -1,5 +1,7 @@
 """The selection rules by name: adaptune's own, and the user's."""
 
+from collections.abc import Collection
+
 from adaptune import strict
 from adaptune.errors import AdaptuneError
 from adaptune.model.rules import Rule
@@ -18,13 +20,14 @@ class RuleError(AdaptuneError):
     """A selection rule that does not exist, or is none."""
 
 
-def rule_class(name: str) -> type[Rule]:
+def rule_class(name: str, also: Collection[str] = ()) -> type[Rule]:
     """Class of a selection rule: one of `RULES`, an announced one, or ``module:Class``.
 
-    A `RuleError` says why there is none.
+    A `RuleError` says why there is none, and names `also` modes that are no rules.
     """
     try:
-        path = strict.path_of(name, "mode", RULES, ENTRY_POINTS, "Class")
+        ours = RULES | dict.fromkeys(also, "")
+        path = strict.path_of(name, "mode", ours, ENTRY_POINTS, "Class")
         found = strict.load(name, path, "class")
     except strict.PluginError as error:
         raise RuleError(str(error)) from error

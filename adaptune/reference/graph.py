@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from adaptune.bank.bank import Bank
 from adaptune.geometry import Poses, invert, rectify, rotation_angle, steps
-from adaptune.live.hops import Hop, HopCloud, register
+from adaptune.live.hops import OFFLINE_REACHES, Hop, HopCloud, register
 from adaptune.metrics import travelled
 from adaptune.odometry.base import InProcess
 from adaptune.odometry.registry import odometry_class
@@ -229,7 +229,8 @@ class _Registering:
 
 def _registered(start: _Anchor, end: _Anchor, T_start_end: Poses) -> Hop | None:
     """A registration that stays near its guess."""
-    hop = register(start.cloud, end.cloud, [T_start_end], MIN_INLIERS_OFFLINE)
+    given = [T_start_end], MIN_INLIERS_OFFLINE, OFFLINE_REACHES
+    hop = register(start.cloud, end.cloud, *given)
     if hop is None:
         return None
     metres, share = DEPARTURE
@@ -401,7 +402,7 @@ def closed(scans: Iterable[Scan], wanted: Sequence[Loop], T_world_sensor: Poses)
         if start not in clouds or end not in clouds:
             continue  # the last scan, whose motion is not known
         T = invert(T_world_sensor[start]) @ T_world_sensor[end]
-        hop = register(clouds[start], clouds[end], [T])
+        hop = register(clouds[start], clouds[end], [T], reaches=OFFLINE_REACHES)
         most = max(_DEPARTURE[0], _DEPARTURE[1] * (metres[end] - metres[start]))
         if hop is not None and np.linalg.norm(hop.T_start_end[:3, 3] - T[:3, 3]) <= most:
             edges.append(Edge(start, end, hop, again=True))

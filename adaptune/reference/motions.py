@@ -6,7 +6,7 @@ from itertools import islice
 import numpy as np
 
 from adaptune.geometry import Poses, invert, rotation_angle
-from adaptune.live.hops import Hop, HopCloud, Hops, register
+from adaptune.live.hops import OFFLINE_REACHES, Hop, HopCloud, Hops, register
 from adaptune.recording.compensation import neighbour_motions
 from adaptune.recording.scan import Scan
 
@@ -75,8 +75,9 @@ def _motions_over(stretch: list[Scan]) -> Iterator[tuple[int, int, Hop]]:
             metres = np.linalg.norm(guess[:3, 3])
             if metres < METRES and i - start < SCANS // 2 // stride:
                 break
-            hop = register(clouds[start], clouds[i], [guess]) if metres >= STANDING else None
-            if hop is not None:
+            ends = clouds[start], clouds[i]
+            given = [guess] if metres >= STANDING else []
+            if (hop := register(*ends, given, reaches=OFFLINE_REACHES)) is not None:
                 apart = hop.projection @ (hop.T_start_end - guess)[:3, 3]
                 if np.linalg.norm(apart) < _AGREE:
                     yield start * stride, i * stride, hop

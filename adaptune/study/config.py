@@ -150,7 +150,7 @@ def _known_mode(name: str) -> str:
 
     try:
         if name not in (*RULES, *ALSO):
-            rule_class(name)
+            rule_class(name, ALSO)
     except RuleError as error:
         raise ValueError(str(error)) from error
     return name

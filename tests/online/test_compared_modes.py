@@ -152,7 +152,10 @@ def test_the_command_line(own, study_file):
     assert "paper" not in done.stdout
     done = CliRunner().invoke(app, ["compare", *words, "--details"])
     assert "replays are missing: `paper` on three" in done.stdout
-    for value, words_ in (("[even, even]", "one of them is named twice"), ("[odd]", "not 'odd'")):
+    for value, words_ in (
+        ("[even, even]", "one of them is named twice"),
+        ("[odd]", "no mode 'odd'"),
+    ):
         done = CliRunner().invoke(app, ["online", *words, "-o", f"online.modes={value}"])
         assert done.exit_code == 2
         assert words_ in done.stderr

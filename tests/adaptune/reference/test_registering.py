@@ -62,10 +62,10 @@ class Made:
         self.most = max(self.most, len(self.alive))
         return cloud
 
-    def _register(self, start, end, guesses, min_inliers):
+    def _register(self, start, end, guesses, min_inliers, reaches):
         assert start in self.alive
         assert end in self.alive
-        assert min_inliers == MIN_INLIERS_OFFLINE
+        assert (min_inliers, reaches) == (MIN_INLIERS_OFFLINE, (2.0, 0.5))
         (guess,) = guesses
         self.asked.append(guess)
         return self.answer(guess)
