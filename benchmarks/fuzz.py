@@ -40,7 +40,8 @@ from adaptune.model import ErrorModel
 from adaptune.model.error_model import render
 from adaptune.odometry import wire
 from adaptune.odometry.docker.played_bag import PoseRecorder
-from adaptune.odometry.program import CommandSettings, Template, read_output
+from adaptune.odometry.program import CommandSettings, read_output
+from adaptune.odometry.template import Template
 from adaptune.recording import Scan, SequenceConfig
 from adaptune.recording.folder import read_scan
 from adaptune.recording.recording import open_sequence

@@ -1,6 +1,5 @@
 """Odometries in programs that read a recording and a parameter file and write a trajectory."""
 
-import copy
 import json
 import logging
 import os
@@ -10,9 +9,7 @@ import subprocess
 import time
 from abc import abstractmethod
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import closing, suppress
-from functools import cache, reduce
-from operator import getitem
+from contextlib import closing
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, Self
 
@@ -20,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator
 
-from adaptune import files, processes
+from adaptune import processes
 from adaptune.errors import OdometryError, UnavailableError, nearest
 from adaptune.files import locked, replacing_folder, temporary_folder
 from adaptune.geometry import Poses, invert, nearest_rotation, rotation_angle, to_pose
@@ -35,6 +32,7 @@ from adaptune.odometry.base import (
     pose_fault,
 )
 from adaptune.odometry.remote import Arguments, Limits
+from adaptune.odometry.template import Template
 from adaptune.recording.config import SequenceConfig, Transform, resolve
 from adaptune.recording.export import IMU, POINTS, Layout, export
 from adaptune.recording.scan import Recording, Scan
@@ -43,160 +41,6 @@ from adaptune.space import ParameterSet, Selection
 from adaptune.trajectory import Trajectory, TrajectoryError, read_kitti, read_tum
 
 _log = logging.getLogger(__name__)
-
-# Parameter files made from a template: YAML, also in the layouts of ROS 1 and ROS 2, and JSON.
-
-_SUFFIXES = (".yaml", ".yml", ".json")
-
-_ROS2 = "ros__parameters"
-
-_Place = tuple[tuple[str, ...], Any, Any, tuple[Any, ...]]
-"""Path of a value, what holds it, under which key, and all keys as they are."""
-
-
-class Template:
-    """A parameter file with values to be replaced, in the format of its suffix.
-
-    A parameter's name is its keys from the outermost on, with points or slashes between them.
-    Leading keys may be left out if the rest names one value only. Points and slashes within a key,
-    as in ROS, separate keys too; ROS 2's ``/**`` and ``ros__parameters`` do not count. There is an
-    `OdometryError` if the file cannot be read.
-    """
-
-    def __init__(self, path: Path):
-        self.path = path
-        if path.suffix not in _SUFFIXES:
-            raise OdometryError(f"{path}: a template is a file of {', '.join(_SUFFIXES)}")
-        try:
-            # Ends of lines stay as they are.
-            self._text = path.read_bytes().decode()
-            self._document = self._parsed(self._text)
-        except FileNotFoundError as error:
-            raise OdometryError(f"{path}: there is no such file") from error
-        except (OSError, ValueError, files.YamlError) as error:
-            raise OdometryError(f"{path}: {error}") from error
-        self._data: Any = self._document.data
-        held = isinstance(self._data, dict | list)
-        self._places = list(_places(self._data)) if held else []
-
-    def _parsed(self, text: str) -> files.Document:
-        if self.path.suffix == ".json":
-            json.loads(text)
-            # JSON is YAML but for tabs, which it has between values only.
-            text = text.replace("\t", " ")
-        return files.Document(text, foreign=True)
-
-    def path_of(self, name: str) -> tuple[str, ...]:
-        """Keys of a value, from the outermost on; none if there is no such, an error if several."""
-        place = self._find(name)
-        return () if place is None else place[0]
-
-    def ros2_name(self, name: str) -> str:
-        """Name of a value as ROS 2 has it: its keys below the node, with points between them."""
-        place = self._find(name)
-        keys = [] if place is None else [str(key) for key in place[-1]]
-        return ".".join(keys[keys.index(_ROS2) + 1 if _ROS2 in keys else 0 :])
-
-    @property
-    def ros2(self) -> bool:
-        """Whether the file is laid out as ROS 2 wants it."""
-        return any(_ROS2 in place[-1] for place in self._places)
-
-    def warn_of_texts(self) -> None:
-        """Log numbers that ROS 1 reads as texts: those with an exponent and without a point."""
-        for path, held_in, key, keys in self._places:
-            value = held_in[key]
-            if isinstance(value, str) and _EXPONENT.fullmatch(value):
-                begin, end = self._document.span(keys) or (0, 0)
-                if self._text[begin:end] == value:
-                    _warn_of_text(self.path, self._document.line(keys), ".".join(path), value)
-
-    @property
-    def names(self) -> list[str]:
-        """Paths of all values."""
-        return [".".join(path) for path, *_ in self._places]
-
-    def value(self, name: str) -> Any:
-        """A value; an `OdometryError` if there is none of this name, or several."""
-        if (place := self._find(name)) is None:
-            known = nearest(name, self.names)
-            raise OdometryError(f"{self.path.name} has no such value; {known}")
-        return place[1][place[2]]
-
-    def fill(self, parameters: Mapping[str, Any]) -> str:
-        """The file's text with new values; parameters that are not in it are ignored.
-
-        A real number stays one where the new value is whole. All else stays as it is, byte for
-        byte. An `OdometryError` names a value that cannot be replaced alone.
-        """
-        changed, data = {}, copy.deepcopy(self._data)
-        for name, value in parameters.items():
-            if (place := self._find(name)) is not None:
-                *_, key = keys = place[-1]
-                held_in = reduce(getitem, keys[:-1], data)
-                real = isinstance(held_in[key], float) or _EXPONENT.fullmatch(str(held_in[key]))
-                held_in[key] = float(value) if real and type(value) is int else value
-                changed[keys] = held_in[key]
-        return self._replaced(changed, data)
-
-    def _replaced(self, changed: Mapping[tuple[Any, ...], Any], data: Any) -> str:
-        """The text with new values in their places, by their keys."""
-        text, spans = self._text, []
-        for keys, value in changed.items():
-            begin, end = self._document.span(keys) or (0, 0)
-            new = files.dump([value]).removeprefix("- ").strip()
-            if self.path.suffix == ".json" and isinstance(value, str):
-                new = json.dumps(value)
-            spans.append((begin, end, new if begin < end else f" {new}"))
-        for begin, end, new in sorted(spans, reverse=True):
-            text = text[:begin] + new + text[end:]
-        with suppress(files.YamlError):
-            # Where nan is nan.
-            if repr(self._parsed(text).data) == repr(data):
-                return text
-        where = ", ".join(str(self._document.line(keys)) for keys in changed)
-        raise OdometryError(
-            f"{self.path}: a parameter cannot be replaced alone (line {where}); write its value "
-            f"without anchors, aliases and tags"
-        )
-
-    def _find(self, name: str) -> _Place | None:
-        wanted = _parts(name)
-        found = [place for place in self._places if place[0][-len(wanted) :] == wanted]
-        if len(found) > 1:
-            found = [place for place in found if place[0] == wanted] or found
-        if len(found) > 1:
-            paths = ", ".join(".".join(path) for path, *_ in found)
-            raise OdometryError(f"{self.path}: {name!r} may be any of {paths}; name one of them")
-        return found[0] if found else None
-
-
-def _parts(name: Any) -> tuple[str, ...]:
-    return tuple(part for part in re.split(r"[./]", str(name)) if part)
-
-
-def _places(data: Any, path: tuple[str, ...] = (), keys: tuple[Any, ...] = ()) -> Iterator[_Place]:
-    """Every value that is neither a mapping nor a list of them."""
-    items = data.items() if isinstance(data, dict) else enumerate(data)
-    for key, value in items:
-        below = path if key in (_ROS2, "/**") else path + _parts(key)
-        if isinstance(value, dict | list) and value:
-            yield from _places(value, below, (*keys, key))
-        else:
-            yield below, data, key, (*keys, key)
-
-
-@cache
-def _warn_of_text(path: Path, line: int | None, name: str, value: str) -> None:
-    _log.warning(
-        "%s:%s: ROS 1 takes %s: %s for a text, and many systems go back to their default then; "
-        "write %s",
-        *(path, line, name, value, float(value)),
-    )
-
-
-_EXPONENT = re.compile(r"[-+]?[.\d]+[eE][-+]?\d+")
-
 
 _PLACEHOLDER = re.compile(r"\{([\w./-]+)\}")
 

@@ -16,7 +16,7 @@ from pydantic import AliasChoices, AliasPath, ConfigDict, Field
 
 from adaptune import files
 from adaptune.errors import AdaptuneError, Finding, Key, OdometryError, nearest
-from adaptune.odometry.program import Template
+from adaptune.odometry.template import Template
 from adaptune.strict import StrictModel, validated
 
 _Number = int | float

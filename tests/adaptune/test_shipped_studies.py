@@ -7,7 +7,7 @@ from needs import needs_evalio
 
 from adaptune import files
 from adaptune.odometry.docker import rustle
-from adaptune.odometry.program import Template
+from adaptune.odometry.template import Template
 from adaptune.strict import ConfigurationError
 from offline.config import load_study
 

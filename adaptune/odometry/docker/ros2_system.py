@@ -33,7 +33,8 @@ from adaptune.odometry.docker.engine import (
 )
 from adaptune.odometry.docker.ros_system import RosSettings, RosSystem, SimClock, image_user
 from adaptune.odometry.docker.rustle import Rustle
-from adaptune.odometry.program import Template, check_names, placeholders, replace
+from adaptune.odometry.program import check_names, placeholders, replace
+from adaptune.odometry.template import Template
 from adaptune.recording.clouds import LIVOX_TYPES, POSES, TRANSFORMS
 from adaptune.recording.config import Transform
 from adaptune.ros.link import LinkError, equal_values

@@ -20,7 +20,7 @@ from adaptune.odometry.docker.engine import (
     remove_shared,
 )
 from adaptune.odometry.docker.ros_system import RosSystem, image_user
-from adaptune.odometry.program import Template
+from adaptune.odometry.template import Template
 from adaptune.ros import ros1_node
 from adaptune.ros.link import Run, equal_values
 from adaptune.ros.ros1 import Ros1

@@ -32,7 +32,8 @@ from adaptune.odometry.docker.engine import (
     opened,
     regular_files,
 )
-from adaptune.odometry.program import ProgramInput, Template, WholeSettings
+from adaptune.odometry.program import ProgramInput, WholeSettings
+from adaptune.odometry.template import Template
 from adaptune.recording.clouds import POSES, Pose
 from adaptune.recording.config import resolve
 from adaptune.ros.link import LinkError, Run, Steering

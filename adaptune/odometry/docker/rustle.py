@@ -17,8 +17,9 @@ from adaptune.odometry.docker.lockstep import Lockstep
 from adaptune.odometry.docker.played_bag import PlayedBag
 from adaptune.odometry.docker.ros_container import Ros1System
 from adaptune.odometry.docker.ros_system import RosSettings, RosSystem, filled
-from adaptune.odometry.program import ProgramInput, Template, check_names
+from adaptune.odometry.program import ProgramInput, check_names
 from adaptune.odometry.remote import Limits
+from adaptune.odometry.template import Template
 from adaptune.ros.link import SetCommand
 from adaptune.space import ParameterSet
 

@@ -11,7 +11,7 @@ from setups import setup_of
 
 from adaptune.archive import Archive, rows
 from adaptune.errors import OdometryError
-from adaptune.odometry.program import Template
+from adaptune.odometry.template import Template
 from adaptune.odometry.tracker import HealthCheck
 from adaptune.strict import ConfigurationError
 from offline.campaign import BaselineError

@@ -5,9 +5,9 @@ import yaml
 
 from adaptune.errors import OdometryError
 from adaptune.odometry.kiss_icp import Kiss
-from adaptune.odometry.program import Template
 from adaptune.odometry.registry import OdometryFactory, is_user_class, odometry_class
 from adaptune.odometry.remote import Limits, Process
+from adaptune.odometry.template import Template
 from adaptune.space import ParameterSpace
 
 

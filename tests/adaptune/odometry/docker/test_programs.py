@@ -32,8 +32,8 @@ from adaptune.odometry.docker.programs import (
     DockerProcessSettings,
 )
 from adaptune.odometry.keyframe import KeyframeGicp
-from adaptune.odometry.program import Template
 from adaptune.odometry.remote import Limits
+from adaptune.odometry.template import Template
 from adaptune.space import Selection
 from adaptune.strict import ConfigurationError
 from offline.config import load_study

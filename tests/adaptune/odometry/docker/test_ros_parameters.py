@@ -7,7 +7,7 @@ from pydantic import ValidationError
 from adaptune.odometry import OdometryError
 from adaptune.odometry.docker.ros2_system import DIED, NOISE, Ros2Settings, Ros2System
 from adaptune.odometry.docker.ros_container import server_keys, warn_of_unread
-from adaptune.odometry.program import Template
+from adaptune.odometry.template import Template
 
 HELD = {
     "gicp": {"keyframe_interval": 1.5, "iterations": 20, "robust": True, "name": "x"},
