@@ -10,6 +10,7 @@ import numpy as np
 
 from adaptune import __version__, files, manifest
 from adaptune.archive import Archive
+from adaptune.archive import rows as listed
 from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
 from adaptune.metrics import cap, lost_in_words
@@ -134,11 +135,13 @@ def train(study: OfflineStudy, progress: Progress = unseen, cluster: str | None 
     fixed = _fixed(config, verdicts, best, whole)
     model = _fitted(study, archive, every_set, finished, fixed)
     write_fixed(study, verdicts[fixed].parameters)
-    trials = _trial_rows(config, space, verdicts, finished)
+    trials = _trial_rows(config, listed(archive, names), verdicts)
     tables.write_rows(study.folder, "trials", trials)
     estimates = estimates_of(study.sequences, names)
     errors = {name: stored.error(model.length) for name, stored in estimates.items()}
     rows = _training_rows(config, verdicts, finished, fixed, whole, errors, space)
+    for row in rows:
+        row["_left out"] = _left_out(config, finished, best, whole, row["sequence"])
     tables.write_rows(study.folder, "training", rows)
     said = lost_in_words(
         f"the fixed set, the best of {len(trials)} parameter sets,",
@@ -196,6 +199,20 @@ def _fixed(
     if np.isinf(min(values[n] for n in best)):
         raise NothingUsableError(UNUSABLE.format(n=f"the {len(best)} best"))
     return choose_fixed({n: verdicts[n].bound for n in best}, values)
+
+
+def _left_out(
+    config: OfflineConfig, finished: Finished, best: Sequence[int], whole: WholeDrives, name: str
+) -> float | None:
+    """Error on a recording of the finalist that the others would have chosen, if there are any."""
+    others = [other for other in whole if other != name]
+    if not others:
+        return None
+    verdicts = {n: judge(config, [finished[other][n] for other in others]) for n in best}
+    with contextlib.suppress(NothingUsableError):
+        chosen = _fixed(config, verdicts, best, {other: whole[other] for other in others})
+        return whole[name][chosen].mean_error
+    return None
 
 
 def trial_workers(
@@ -256,28 +273,19 @@ def _fitted(
 
 
 def _trial_rows(
-    config: OfflineConfig,
-    space: ParameterSpace,
-    verdicts: Mapping[int, Verdict],
-    finished: Finished,
+    config: OfflineConfig, table: Sequence[dict[str, Any]], verdicts: Mapping[int, Verdict]
 ) -> list[dict[str, Any]]:
-    """A row for every trial: its parameters, how it was judged, its mean errors in percent."""
+    """A row for every trial: as `adaptune trials` lists it, and how it was judged."""
     rows = []
-    for n, verdict in verdicts.items():
-        runs = [finished[name][n] for name in verdict.sequences]
-        row: dict[str, Any] = {"trial": n, **space.row(verdict.parameters)}
+    for row in table:
+        if (verdict := verdicts.get(row["trial"])) is None:
+            continue
+        row[COST] = row.pop("cost")
         row["state"] = verdict.state
-        row[COST] = float(np.mean([run.cost for run in runs]))
         if set(config.objective) != {"rte"}:
             row[label(config.objective)] = verdict.value
-            for metric in sorted(config.objective):
-                row[metric] = float(np.mean([run.metrics[metric] for run in runs]))
         if config.repeats > 1:
             row["margin"] = verdict.margin
-        mean = float(np.mean([run.mean_error for run in runs])) if verdict.complete else None
-        row["mean"] = mean
-        for name, trials in finished.items():
-            row[name] = trials[n].mean_error if n in trials else None
         rows.append(row)
     return rows
 

@@ -3,8 +3,13 @@
 import csv
 import itertools
 import math
+import os
+import platform
+import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, Self
 
@@ -40,6 +45,7 @@ class ReplaySummary(BaseModel):
     cpu_ms: float | None = None  # milliseconds of CPU time a scan, without reading it
     memory_mb: float | None = None  # most megabytes of all processes
     real_time: dict[str, float] | None = None  # how it kept up, see `kept_up`
+    machine: str | None = None  # on which it was driven
     model_file: str | None  # of the model that it was made with; None if it needed none
     inputs: dict[str, Any] = Field({}, exclude=True)  # see `adaptune.manifest`
 
@@ -188,10 +194,21 @@ def write_replay(
         cpu_ms=round(replay.cpu_ms, 3),
         memory_mb=round(replay.memory, 1),
         real_time=kept_up(replay),
+        machine=machine(),
         model_file=None if model_file is None else str(model_file.resolve()),
     )
     manifest.record(folder / manifest.FILE, inputs)
     write_text(folder / "replay.json", summary.model_dump_json(indent=2) + "\n")
+
+
+@cache
+def machine() -> str:
+    """The kind of this machine: costs that were measured on others cannot be compared."""
+    with suppress(OSError):
+        listed = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
+        if found := re.search(r"model name\s*: (.*)", listed):
+            return f"{found[1]}, {os.cpu_count()} cores"
+    return f"{platform.machine()}, {os.cpu_count()} cores"
 
 
 def kept_up(replay: ReplayRecord) -> dict[str, float] | None:

@@ -123,8 +123,8 @@ def trials(
     finished = table.rows(archive, names)
     if not finished:
         raise AdaptuneError(f"{archive.folder}: no trial is finished yet; run `adaptune offline`")
-    chosen = table.select(finished, sort, top)
     labels = loaded.odometry.space.labels
+    chosen = table.select(finished, sort, top, table.headings(names, labels))
     title = f"{len(chosen)} of {len(finished)} trials"
     show_table(title, table.with_units(chosen, names, labels))
     if judged := [row for row in finished if row["mean"] is not None]:
