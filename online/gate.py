@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 from xml.etree import ElementTree as Xml
@@ -15,7 +14,7 @@ from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
 from adaptune.metrics import MIN_BLOCKS, RESAMPLES, resampled_means
 from adaptune.report.tables import Listing, markdown
-from adaptune.study.study import PER_STRETCH, Study, is_written_to
+from adaptune.study.study import MIN_RECORDINGS, PER_STRETCH, Study, is_written_to
 from online.compare import SEED, allowed, pooled_logs
 from online.modes import BASELINE, FIXED
 from online.record import StoredReplay
@@ -24,8 +23,8 @@ from online.statistics import ALL, Reference
 Verdict = Literal["better", "worse", "equal", "unclear"]
 """`equal` is surely within the bound, `unclear` too little to tell."""
 ERROR, COST, P99, LOST = "error", "cost", "cost, 99th percentile", "lost tracks"
-_WARM_UP = 10
-"""Scans whose costs do not count: caches fill."""
+_WARM_UP, _COSTS = 10, 5
+"""Scans whose costs do not count, because caches fill, and scans whose costs are drawn together."""
 _SHARE = 0.05
 """Of the intervals of all recordings together, so many may miss the truth."""
 
@@ -62,8 +61,7 @@ class Side(NamedTuple):
         )
 
 
-@dataclass(frozen=True)
-class GateRow:
+class GateRow(NamedTuple):
     """One quantity on a recording, or over all of them."""
 
     recording: str
@@ -103,26 +101,24 @@ class Gate(NamedTuple):
 
 
 class _Pair(NamedTuple):
-    """Both sides on a recording, at the same scans; new first."""
+    """Both sides on a recording, new first, at the same scans."""
 
     name: str
-    errors: NDArray[np.float64]  # (2, n): percent, where both are known
-    seconds: NDArray[np.float64]  # (n,): of these scans
-    costs: NDArray[np.float64]  # (2, m): milliseconds a scan
-    block: int  # frames of a sub-trajectory
+    # By quantity, values of shape (2, n): percent where both are known, and milliseconds.
+    values: Mapping[str, NDArray[np.float64]]
+    blocks: Mapping[str, int]  # scans that are drawn together
+    seconds: NDArray[np.float64]  # (n,): from the first scan, of the errors
     lost: tuple[int, int]
-    machines: tuple[str | None, str | None]
-    reference: Reference
+    obstacles: Mapping[str, str]  # why a quantity says nothing
+    reference_error: float | None
 
 
-def judged(ratio: float, ends: tuple[float, float] | None, bound: float) -> Verdict:
+def judged(ratio: float, ends: tuple[float, float], bound: float) -> Verdict:
     """What a ratio of new to old says, with its interval.
 
     It is worse beyond the bound, where the interval shows a loss; equal, or better, only where the
     interval ends below the bound.
     """
-    if ends is None:
-        return "unclear"
     low, high = ends
     if low > 1.0 and ratio > 1.0 + bound:
         return "worse"
@@ -217,89 +213,83 @@ def _check_same(
 
 
 def _pair(name: str, replays: Sequence[StoredReplay], reference: Reference) -> _Pair:
-    stamps = [replay.trajectory.stamps for replay in replays]
-    common = np.intersect1d(*stamps)
-    at = [np.isin(of, common) for of in stamps]
-    errors = np.stack(
-        [reference.errors(r.trajectory)[own] for r, own in zip(replays, at, strict=True)]
-    )
-    costs = np.stack(
-        [
-            (r.frames["prepare_ms"] + r.frames["register_ms"])[own]
-            for r, own in zip(replays, at, strict=True)
-        ]
-    )[:, _WARM_UP:]
+    common = np.intersect1d(*(replay.trajectory.stamps for replay in replays))
+    errors, costs = [], []
+    for replay in replays:
+        kept = np.isin(replay.trajectory.stamps, common)
+        errors.append(reference.errors(replay.trajectory)[kept])
+        costs.append((replay.frames["prepare_ms"] + replay.frames["register_ms"])[kept])
     known = np.isfinite(errors).all(axis=0)
-    lost, machines = zip(*((r.summary.restarts, r.summary.machine) for r in replays), strict=True)
+    cost = np.array(costs)[:, _WARM_UP:]
+    cost = cost[:, np.isfinite(cost).all(axis=0)]
+    machines = {replay.summary.machine for replay in replays}
+    why = {} if known.any() else {ERROR: "no reference"}
+    if None in machines or len(machines) > 1:
+        why |= dict.fromkeys((COST, P99), "driven on different machines")
+    elif not cost.shape[1]:
+        why |= dict.fromkeys((COST, P99), "no times")
     return _Pair(
         name,
-        errors[:, known],
+        {ERROR: np.array(errors)[:, known], COST: cost, P99: cost},
+        {ERROR: reference.block, COST: _COSTS, P99: _COSTS},
         (common[known] - common[0]) * 1e-9,
-        costs[:, np.isfinite(costs).all(axis=0)],
-        reference.block,
-        lost,
-        machines,
-        reference,
+        (replays[0].summary.restarts, replays[1].summary.restarts),
+        why,
+        reference.error,
     )
 
 
 def _rows(quantity: str, pairs: Sequence[_Pair], bound: float) -> list[GateRow]:
     """A row for each recording, and if there are several, one for all."""
-    rng, rows, resampled = np.random.default_rng(SEED), list[GateRow](), []
+    rng, rows, pooled = np.random.default_rng(SEED), list[GateRow](), list[Any]()
     share = 100.0 * _SHARE / len(pairs)
     for pair in pairs:
-        values = pair.errors if quantity == ERROR else pair.costs
-        if why := _lacking(quantity, pair, values):
-            rows.append(GateRow(pair.name, quantity, *_both(quantity, values), "unclear", why=why))
+        if why := pair.obstacles.get(quantity):
+            rows.append(GateRow(pair.name, quantity, None, None, "unclear", why=why))
             continue
-        new, old = _both(quantity, values)
-        ratio = max(new, 1e-12) / max(old, 1e-12)
-        logs = _resampled(quantity, values, _block(quantity, pair), rng)
-        wider = allowed(values, pair.reference.error) if quantity == ERROR else (0.0, 0.0)
+        values, block = pair.values[quantity], pair.blocks[quantity]
+        new, old = _both(quantity, values).tolist()
+        row = GateRow(pair.name, quantity, new, old, "unclear", new / max(old, 1e-12))
+        if quantity == ERROR:
+            row = row._replace(stretches=_stretches(pair))
         same = bool((values[0] == values[1]).all())
-        resampled.append(logs + (0.0 if same else np.where(logs < np.median(logs), *wider)))
-        low, high = np.exp(np.percentile(resampled[-1], [share / 2, 100.0 - share / 2])).tolist()
-        said = judged(ratio, (low, high), bound)
-        stretches = _stretches(pair) if quantity == ERROR else ()
-        row = GateRow(pair.name, quantity, new, old, said, ratio, low, high, "", stretches)
+        logs = _resampled(quantity, values, block, rng)
+        if quantity == ERROR and not same:
+            logs += np.where(logs < np.median(logs), *allowed(values, pair.reference_error))
+        enough = same or values.shape[1] >= MIN_BLOCKS * block
+        if enough:
+            ends = np.exp(np.percentile(logs, [share / 2, 100.0 - share / 2])).tolist()
+            row = _judged(row, ends, bound)
+        else:
+            row = row._replace(why="too short")
+        if enough or len(pairs) >= MIN_RECORDINGS:
+            pooled.append((new, old, row.ratio, logs))
         rows.append(row)
-    if len(pairs) < 2:
-        return rows
-    known = [row for row in rows if row.ratio is not None]
-    if 2 * len(known) < len(rows) or not known:
-        why = f"known on {len(known)} of {len(rows)} recordings"
-        return [*rows, GateRow(ALL, quantity, None, None, "unclear", why=why)]
-    new, old = (float(np.mean([getattr(row, of) for row in known])) for of in ("new", "old"))
-    low, high = np.exp(pooled_logs(np.array(resampled), np.arange(len(known)), rng)).tolist()
-    ratio = float(np.exp(np.mean(np.log([row.ratio for row in known]))))
-    said = judged(ratio, (low, high), bound)
-    why = "" if len(known) == len(rows) else f"known on {len(known)} of {len(rows)} recordings"
-    return [*rows, GateRow(ALL, quantity, new, old, said, ratio, low, high, why)]
+    return [*rows, _over_all(quantity, pooled, len(pairs), bound)] if len(pairs) > 1 else rows
 
 
-def _lacking(quantity: str, pair: _Pair, values: NDArray[np.float64]) -> str:
-    """Why nothing can be said of a quantity; empty if it can."""
-    if not values.shape[1]:
-        return "no reference" if quantity == ERROR else "no times"
-    if quantity != ERROR and (None in pair.machines or len({*pair.machines}) > 1):
-        return "driven on different machines"
-    same = (values[0] == values[1]).all()
-    if not same and values.shape[1] < MIN_BLOCKS * _block(quantity, pair):
-        return f"shorter than {MIN_BLOCKS} sub-trajectories"
-    return ""
+def _over_all(quantity: str, pooled: Sequence[Any], n: int, bound: float) -> GateRow:
+    """The row of all recordings: geometric mean of the ratios, and its interval."""
+    why = "" if len(pooled) == n else f"known on {len(pooled)} of {n} recordings"
+    if 2 * len(pooled) < n or not pooled:
+        return GateRow(ALL, quantity, None, None, "unclear", why=why)
+    new, old, ratios, logs = zip(*pooled, strict=True)
+    ends = pooled_logs(np.array(logs), np.arange(len(logs)), np.random.default_rng(SEED))
+    ratio = float(np.exp(np.mean(np.log(np.maximum(ratios, 1e-12)))))
+    row = GateRow(ALL, quantity, float(np.mean(new)), float(np.mean(old)), "unclear", ratio)
+    return _judged(row._replace(why=why), np.exp(ends).tolist(), bound)
 
 
-def _block(quantity: str, pair: _Pair) -> int:
-    """Scans that are drawn together: errors share sub-trajectories, costs the scene."""
-    return pair.block if quantity == ERROR else min(pair.block, _WARM_UP)
+def _judged(row: GateRow, ends: Sequence[float], bound: float) -> GateRow:
+    low, high = ends
+    said = judged(row.ratio or 0.0, (low, high), bound)
+    return row._replace(low=low, high=high, verdict=said)
 
 
-def _both(quantity: str, values: NDArray[np.float64]) -> list[Any]:
-    """The quantity on both sides."""
-    if not values.shape[1]:
-        return [None, None]
+def _both(quantity: str, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The quantity on both sides, of shape (2,)."""
     found = np.percentile(values, 99, axis=1) if quantity == P99 else values.mean(axis=1)
-    return [float(value) for value in found]
+    return np.asarray(found)
 
 
 def _resampled(
@@ -309,24 +299,21 @@ def _resampled(
     n = values.shape[1]
     block = min(block, n)
     if quantity != P99:
-        means = np.maximum(resampled_means(values, block, rng), 1e-12)
-        return np.asarray(np.log(means[0] / means[1]))
-    starts = rng.integers(0, n - block + 1, (RESAMPLES, -(-n // block)))
-    inside = np.arange(block)
-    ends = [np.percentile(values[:, (s[:, None] + inside).ravel()], 99, axis=1) for s in starts]
-    high = np.maximum(ends, 1e-12)
-    return np.asarray(np.log(high[:, 0] / high[:, 1]))
+        found = resampled_means(values, block, rng)
+    else:
+        starts = rng.integers(0, n - block + 1, (RESAMPLES, -(-n // block), 1))
+        drawn = (starts + np.arange(block)).reshape(RESAMPLES, -1)
+        found = np.array([_both(quantity, values[:, frames]) for frames in drawn]).T
+    new, old = np.maximum(found, 1e-12)
+    return np.asarray(np.log(new / old))
 
 
 def _stretches(pair: _Pair) -> tuple[tuple[float, float], ...]:
     """By stretch of `PER_STRETCH` sub-trajectories its first second, and the ratio there."""
-    n = max(1, len(pair.seconds) // (PER_STRETCH * pair.block))
-    parts = zip(
-        np.array_split(pair.seconds, n), np.array_split(pair.errors, n, axis=1), strict=True
-    )
+    n = max(1, len(pair.seconds) // (PER_STRETCH * pair.blocks[ERROR]))
+    parts = np.array_split(np.vstack([pair.seconds, pair.values[ERROR]]), n, axis=1)
     return tuple(
-        (round(float(seconds[0]), 1), float(of[0].mean() / max(of[1].mean(), 1e-12)))
-        for seconds, of in parts
+        (round(float(t[0]), 1), float(new.mean() / max(old.mean(), 1e-12))) for t, new, old in parts
     )
 
 
@@ -370,7 +357,7 @@ def _in_words(new: Side, old: Side, verdict: Verdict, rows: Sequence[GateRow]) -
 
 def write_gate(folder: Path, gate: Gate) -> None:
     """Write ``gate.json``, ``junit.xml`` and ``summary.md``, for a CI service."""
-    data = {"verdict": gate.verdict, "words": gate.words, "rows": [asdict(r) for r in gate.rows]}
+    data = {"verdict": gate.verdict, "words": gate.words, "rows": [r._asdict() for r in gate.rows]}
     write_text(folder / "gate.json", json.dumps(data, indent=1) + "\n")
     counts = {kind: str(sum(r.verdict == kind for r in gate.rows)) for kind in ("worse", "unclear")}
     about = {

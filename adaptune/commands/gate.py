@@ -6,10 +6,11 @@ import shutil
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
+from statistics import median
 from typing import TYPE_CHECKING, Any
 
+from adaptune.commands.recordings import Asked, recorded
 from adaptune.commands.terminal import load, progress
-from adaptune.commands.tune import Asked, recorded
 from adaptune.errors import AdaptuneError, NotInstalledError
 from adaptune.files import Document, YamlError, dump, plain_name, write_text
 
@@ -56,7 +57,8 @@ def _driven(
     """Both sides as studies of the same recordings."""
     from adaptune.commands.tune import loaded_text
     from adaptune.manifest import digest
-    from adaptune.reference.check import proposed_sub_trajectory
+    from adaptune.metrics import MIN_BLOCKS
+    from adaptune.reference.check import path_after, proposed_sub_trajectory
     from adaptune.study.references import ensure_references
 
     named, _ = recorded(Asked(recordings, ""))
@@ -69,8 +71,13 @@ def _driven(
     with progress() as show:
         refused = ensure_references(first.sequences, names, 5.0, show, required=False)
     known = [first.sequences.open(name).reference() for name in names if name not in refused]
-    lengths = [proposed_sub_trajectory(one) for one in known if one is not None]
-    shared["sub_trajectory"] = min(lengths, default=5.0)
+    # As many as intervals need fit into most recordings.
+    lengths = [
+        min(proposed_sub_trajectory(one), path_after(one, 0.0)[0] / (MIN_BLOCKS + 2))
+        for one in known
+        if one is not None
+    ]
+    shared["sub_trajectory"] = round(median(lengths), 1) if lengths else 5.0
     if folders[0] != folders[1] and (estimates := folders[0] / "references").exists():
         shutil.copytree(estimates, folders[1] / "references", dirs_exist_ok=True)
     paths = [folder / f"{folder.name}.yaml" for folder in folders]

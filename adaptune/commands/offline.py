@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from adaptune.commands.recordings import check_no_study
 from adaptune.commands.terminal import (
     Cluster,
     Folder,
@@ -25,7 +26,6 @@ from adaptune.commands.terminal import (
     say_next_online,
     show_table,
 )
-from adaptune.commands.tune import check_no_study
 from adaptune.errors import AdaptuneError, Finding
 from adaptune.files import write_text
 

@@ -7,14 +7,15 @@ import shutil
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
-from itertools import chain, count, takewhile
+from itertools import takewhile
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from adaptune.commands.online import Details, compared, replay_missing
+from adaptune.commands.recordings import Asked, check_no_study, recorded
 from adaptune.commands.terminal import (
     Cluster,
     Override,
@@ -160,15 +161,6 @@ def _look(path: Path) -> bool:
     return True
 
 
-def check_no_study(path: Path) -> None:
-    """Refuse a study where a recording is expected."""
-    if path.suffix in (".yaml", ".yml") or (path / "study.yaml").is_file():
-        raise AdaptuneError(
-            f"{path}: is a study, not a recording; `adaptune offline`, `online` and `compare` take "
-            f"it, and `adaptune inspect` takes its folder once it has a model"
-        )
-
-
 def _show_model(file: Path) -> None:
     from adaptune.model import ErrorModel
     from adaptune.model.error_model import render
@@ -285,31 +277,6 @@ Given = Annotated[
         show_default="the recording's own, or estimated",
     ),
 ]
-
-
-class Asked(NamedTuple):
-    """For what a study is decided."""
-
-    recordings: Sequence[Path]  # or folders of them
-    odometry: str
-    points: str | None = None
-    reference: str | None = None
-    config: Path | None = None  # the user's parameter file
-    test: Sequence[Path] = ()
-    reading: "Reading | None" = None
-
-    @property
-    def line(self) -> str:
-        """The first line of the study."""
-        words = [*(str(bag.resolve()) for bag in self.recordings), "--odometry", self.odometry]
-        words += ["--points", self.points] if self.points else []
-        words += ["--reference", self.reference] if self.reference else []
-        words += ["--config", str(self.config.resolve())] if self.config else []
-        words += [word for bag in self.test for word in ("--test", str(bag.resolve()))]
-        words += ["--as", self.reading] if self.reading else []
-        # A name may hold the end of a line, or what is no character.
-        plain = (c if c.isprintable() else ascii(c)[1:-1] for c in shlex.join(words))
-        return f"# adaptune tune {''.join(plain)}\n"
 
 
 def tune(
@@ -502,36 +469,6 @@ def _decided(asked: Asked, budget: tuple[int | None, float | None], folder: Path
     return study(*_split(loaded_text(study("5.0"), folder), list(named)))
 
 
-def recorded(asked: Asked) -> "tuple[dict[str, Inspection], list[str]]":
-    """The recordings by the names of their sequences, and the names of those for the test."""
-    from adaptune.recording.fleet import check_alike, recordings_at
-
-    for path in asked.recordings:
-        check_no_study(path)
-    tested = recordings_at(asked.test, asked.reading)
-    others = recordings_at(asked.recordings, asked.reading)
-    kept = {path.resolve() for path in tested}
-    paths = [*(path for path in others if path.resolve() not in kept), *tested]
-    for path in paths:
-        if [one.resolve() for one in paths].count(path.resolve()) > 1:
-            raise AdaptuneError(f"{path}: is named twice; the test needs a recording of its own")
-    if tested and len(paths) == len(tested):
-        raise AdaptuneError("--test: leaves no recording to tune on")
-    if len(paths) > 1 and asked.reference is not None and Path(asked.reference).is_file():
-        raise AdaptuneError(
-            f"--reference {asked.reference}: is a file, and of {len(paths)} recordings each needs "
-            f"its own; write a study file, see docs/your-bag.md"
-        )
-    with progress() as show:
-        found = [_usable(path, asked.points, asked.reference, show) for path in paths]
-    check_alike(found)
-    named: dict[str, Inspection] = {}
-    for one in found:
-        names = chain([one.name], (f"{one.name}_{i}" for i in count(2)))
-        named[next(name for name in names if name not in named)] = one
-    return named, list(named)[len(paths) - len(tested) :]
-
-
 def _grown(path: Path, asked: Asked) -> list[str]:
     """Add the recordings that a study does not name yet to its training; their names."""
     from adaptune import files
@@ -596,28 +533,6 @@ def _replace_noisy(named: "Mapping[str, Inspection]", loaded: "Callable[[], Offl
         one.given = before
 
 
-def _usable(path: Path, points: str | None, reference: str | None, show: Progress) -> "Inspection":
-    """Look at a recording; it has scans of one topic, and a reference or is to get one."""
-    from adaptune.recording.clouds import CLOUDS
-    from adaptune.recording.inspect import inspect as inspect_file
-    from adaptune.reference.check import recording_config
-
-    check_no_study(path)
-    found = inspect_file(path, False, show)
-    clouds = [topic for topic in found.topics.values() if topic.type in CLOUDS]
-    if len(clouds) > 1 and points is None:
-        each = ", ".join(f"{one.name} ({one.count:,} of {one.type})" for one in clouds)
-        raise AdaptuneError(
-            f"{path}: has {len(clouds)} topics of point clouds: {each}; name one with --points"
-        )
-    recording_config(found, points, reference)
-    if reference is None and found.missing["offline"]:
-        why = "; ".join(str(one) for one in found.findings if one.of == "reference")
-        say(f"{path}: its reference does not serve ({why}): one is estimated")
-        found.given["reference"] = "estimated"
-    return found
-
-
 _SYSTEM = """\
 odometry:
   name: ros2    # or rustle, for a ROS 1 system, see docs/docker.md
@@ -668,10 +583,8 @@ def _propose(asked: Asked) -> bool:
     training = [name for name in named if name not in test]
     rest = roles(training, UNKNOWN_LENGTH, ["ros2"], test=test).partition("odometry:")[0]
     imu = "imu: /imu" if all("imu" in one.given for one in named.values()) else "# imu: /imu"
-    template, listed = _LACKING, ""
-    if asked.config is not None:
-        template, listed = json.dumps(str(asked.config.resolve())), _to_tune(asked.config)
-    block = _SYSTEM.format(lacking=_LACKING, template=template, imu=imu, **system) + listed
+    template = json.dumps(str(asked.config.resolve())) if asked.config else _LACKING
+    block = _SYSTEM.format(lacking=_LACKING, template=template, imu=imu, **system)
     entries = "\n".join(one.entry.removeprefix("sequences:\n") for one in named.values())
     write_text(path, f"sequences:\n{entries}\n{rest}{block}")
     say(
@@ -680,22 +593,6 @@ def _propose(asked: Asked) -> bool:
     )
     say(f"  adaptune inspect {path}")
     return True
-
-
-def _to_tune(file: Path) -> str:
-    """The numbers of a parameter file as parameters in comments, to choose from."""
-    from adaptune.odometry.template import Template
-
-    template, lines = Template(file), []
-    for name in template.names:
-        value = template.value(name)
-        if type(value) in (int, float) and value > 0:
-            kind, low = (
-                ("integer", max(1, value // 4)) if type(value) is int else ("float", value / 4)
-            )
-            ends = f"low: {low:.6g}, high: {4 * value:.6g}, baseline: {value}"
-            lines.append(f"    # {name}: {{type: {kind}, {ends}}}\n")
-    return "".join(lines)
 
 
 def odometries_of(given: str, imu: bool) -> list[str]:
