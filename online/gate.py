@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Mapping, Sequence
+from functools import reduce
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 from xml.etree import ElementTree as Xml
@@ -54,8 +55,11 @@ class Side(NamedTuple):
             )
         for mode in (FIXED, BASELINE):
             made = sorted((self.study.folder / "replays").glob(f"*/{mode}/replay.json"))
-            if made:
-                return {path.parents[1].name: path.parent for path in made}
+            found = {path.parents[1].name: path.parent for path in made}
+            # Earlier ones may be of recordings that the study does not name any more.
+            named = {*self.study.config.sequences, *self.study.config.courses}
+            if there := {name: folder for name, folder in found.items() if name in named}:
+                return there
         raise AdaptuneError(
             f"{self.study.folder}: holds no replays; run `adaptune online` with this study first"
         )
@@ -213,7 +217,7 @@ def _check_same(
 
 
 def _pair(name: str, replays: Sequence[StoredReplay], reference: Reference) -> _Pair:
-    common = np.intersect1d(*(replay.trajectory.stamps for replay in replays))
+    common = reduce(np.intersect1d, (replay.trajectory.stamps for replay in replays))
     errors, costs = [], []
     for replay in replays:
         kept = np.isin(replay.trajectory.stamps, common)
@@ -344,7 +348,7 @@ def _in_words(new: Side, old: Side, verdict: Verdict, rows: Sequence[GateRow]) -
     for row in over_all:
         if row.quantity == LOST:
             parts.append(f"{row.new} lost tracks instead of {row.old}")
-        elif row.ratio is None:
+        elif row.low is None:
             parts.append(f"{row.quantity} unclear ({row.why})")
         else:
             ends = f"{row.low:.2f}-{row.high:.2f}"
@@ -365,7 +369,7 @@ def write_gate(folder: Path, gate: Gate) -> None:
         "failures": counts["worse"],
         "skipped": counts["unclear"],
     }
-    suite = Xml.Element("testsuite", name="adaptune compare", **about)
+    suite = Xml.Element("testsuite", about | {"name": "adaptune compare"})
     for row in gate.rows:
         case = Xml.SubElement(suite, "testcase", classname=row.recording, name=row.quantity)
         shown = ", ".join(f"{k}: {v}" for k, v in row.columns().items() if v is not None)

@@ -63,7 +63,10 @@ def _driven(
 
     named, _ = recorded(Asked(recordings, ""))
     names = list(named)
-    shared = {"sequences": {name: one.given for name, one in named.items()}, "training": names}
+    shared: dict[str, Any] = {
+        "sequences": {name: one.given for name, one in named.items()},
+        "training": names,
+    }
     entries = [_entry(name, odometry) for name in given]
     folders = [FOLDER / f"{plain_name(Path(name))[-40:]}_{digest(name)[:6]}" for name in given]
     first = loaded_text(dump(shared | {"odometry": entries[0]}), folders[0])

@@ -476,7 +476,7 @@ def _grown(path: Path, asked: Asked) -> list[str]:
 
     text = path.read_text("utf-8")
     try:
-        data = files.Document(text).data
+        data: Any = files.Document(text).data
         known = {str(one.get(key)) for one in data["sequences"].values() for key in KINDS_OF_PATH}
     except (files.YamlError, AttributeError, KeyError, TypeError):
         return []  # loading it says what is wrong
@@ -497,7 +497,8 @@ def _grown(path: Path, asked: Asked) -> list[str]:
     listed = "".join(f", {files.dump([name]).removeprefix('- ').strip()}" for name in added)
     grown = re.sub(r"(?m)^sequences:\n", lambda m: m[0] + indented, text, count=1)
     grown = re.sub(r"(?m)^(training: \[.*)\]", lambda m: f"{m[1]}{listed}]", grown, count=1)
-    if not all(name in files.Document(grown).data["training"] for name in added):
+    data = files.Document(grown).data
+    if not all(name in data["training"] for name in added):
         raise AdaptuneError(f"{path}: add {', '.join(added)} to sequences and training by hand")
     write_text(path, grown)
     return list(added)

@@ -16,8 +16,9 @@ if TYPE_CHECKING:
 
 Reading = Literal["one", "several"]
 """How the bags of a folder are read."""
-_NEXT, _APART = 2.0, 60.0
-"""Seconds. Parts of one recording are no further apart, and separate recordings at least so far."""
+_OVERLAP, _NEXT, _APART = -0.5, 2.0, 60.0
+"""Seconds. Between parts of one recording lies no less and no more than the first two, between
+separate ones less than the first or more than the last."""
 _RATES = 1.25
 """Rates that differ by a larger factor are those of different sensors."""
 
@@ -54,9 +55,9 @@ def read_folder(path: Path) -> FolderReading:
     names = {re.sub(r"[\d_.-]+$", "", bag.stem) for bag in bags}
     what = f"{gaps.min():,.1f} to {gaps.max():,.1f} s lie between them"
     reading: Reading | None = None
-    if (gaps > _APART).all() or (gaps < -_NEXT).any():
+    if (gaps > _APART).all() or (gaps < _OVERLAP).any():
         reading = "several"
-    elif (np.abs(gaps) <= _NEXT).all() and len(names) == 1:
+    elif (gaps <= _NEXT).all() and len(names) == 1:
         reading = "one"
     return FolderReading(tuple(bag for *_, bag in spans), reading, what)
 
