@@ -409,10 +409,9 @@ def _say_recordings(rows: Sequence[Mapping[str, Any]], found: "ComparedReplays")
         return
     table.sort(key=lambda row: -row["ratio"])
     show_table(
-        "Each recording, by what the others recommend; the worst first",
+        "Each recording left out, the worst first",
         table,
-        "Recommended is the finalist that is chosen without the recording; of the test, the fixed "
-        "set.",
+        "Recommended is the finalist that the others choose; for the test, the fixed set.",
     )
 
 
