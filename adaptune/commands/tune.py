@@ -7,27 +7,52 @@ import shutil
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
-from itertools import chain, count, takewhile
+from itertools import takewhile
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from adaptune.commands.online import Details, compared, replay_missing
-from adaptune.commands.terminal import Points, console, load, progress, say, say_next, show_table
+from adaptune.commands.recordings import Asked, check_no_study, recorded
+from adaptune.commands.terminal import (
+    Cluster,
+    Override,
+    Points,
+    console,
+    load,
+    progress,
+    say,
+    say_next,
+    show_table,
+)
 from adaptune.errors import AdaptuneError, NotInstalledError
 from adaptune.files import plain_name, write_text
 from adaptune.progress import Progress
 
 if TYPE_CHECKING:
+    from adaptune.recording.fleet import Reading
     from adaptune.recording.inspect import Inspection
     from adaptune.trajectory import Trajectory
     from offline.config import OfflineStudy
     from offline.train import Training
+    from online.compare import ComparedReplays
 
+KINDS_OF_PATH = ("bag", "kitti", "folder")
+"""Keys of a sequence that say where it was recorded."""
 UNKNOWN_LENGTH = "5.0    # metres; 10.0 for a path of 200 m or more, 25.0 for one of 500 m or more"
 """The length of sub-trajectories to propose where the path is not known."""
+
+
+As = Annotated[
+    Literal["one", "several"] | None,
+    typer.Option(
+        "--as",
+        help="Read the bags of a folder as parts of one recording, or as several.",
+        show_default="as their times and names tell",
+    ),
+]
 
 
 def inspect(
@@ -44,10 +69,12 @@ def inspect(
         Path | None,
         typer.Option(metavar="YAML", help="Write the study to this file.", dir_okay=False),
     ] = None,
+    reading: As = None,
 ) -> None:
     """Show what is in a recording, what each stage lacks, and how to name it in a study.
 
-    Of an error model, or of a study's folder, show what it is of and its best sets.
+    Of a folder with several recordings, show each in a line. Of an error model, or of a study's
+    folder, show what it is of and its best sets.
     """
     if file.suffix == ".safetensors" or (file / "model.safetensors").exists():
         _show_model(file)
@@ -60,6 +87,8 @@ def inspect(
     from adaptune.recording.inspect import inspect as inspect_file
     from adaptune.recording.rendering import render_inspection
 
+    if _show_several(file, reading):
+        return
     with progress() as show:
         found = inspect_file(file, deep, show)
         share, length, accuracy = _proposed(found, deep, show)
@@ -79,6 +108,34 @@ def inspect(
     if study is not None:
         write_text(study, f"{found.entry}\n{rest}")
     say_next("train on a part of it", "offline", path, first=first)
+
+
+def _show_several(path: Path, reading: "Reading | None") -> bool:
+    """Show the recordings of a folder, a line each; False if it holds one, or may."""
+    from adaptune.recording.fleet import both_readings, check_alike, read_folder
+    from adaptune.recording.inspect import inspect as inspect_file
+
+    folder = read_folder(path) if path.exists() else None
+    if folder is None or (reading or folder.reading) == "one":
+        return False
+    if reading is None and folder.reading is None:
+        say(f"{path}: {both_readings(folder)}. As several:")
+    with progress() as show:
+        found = [inspect_file(one, False, show) for one in folder.recordings]
+    rows = []
+    for one in found:
+        topic = one.topics.get(one.used.get("points", ""))
+        scans = {"scans": topic and topic.count, "rate [Hz]": topic and topic.rate}
+        given = {"reference": one.used.get("reference", "estimated")}
+        wrong = {"lacks": ", ".join(one.missing.get("offline", ())) or None}
+        rows.append({"recording": one.path.name, **scans, **given, **wrong})
+    show_table(f"{path}: {len(rows)} recordings ({folder.why})", rows)
+    if reading is None and folder.reading is None:
+        say("As one:")
+        return False
+    check_alike([one for one in found if "points" in one.used])
+    say_next("tune on all of them", "tune", path)
+    return True
 
 
 _ROS = ("ros2", "rustle")
@@ -105,15 +162,6 @@ def _look(path: Path) -> bool:
     found = look(factory.settings, space.baseline, factory.limits, some, others)
     show_table("What it does", [{"": key, "found": value} for key, value in found.items()])
     return True
-
-
-def check_no_study(path: Path) -> None:
-    """Refuse a study where a recording is expected."""
-    if path.suffix in (".yaml", ".yml") or (path / "study.yaml").is_file():
-        raise AdaptuneError(
-            f"{path}: is a study, not a recording; `adaptune offline`, `online` and `compare` take "
-            f"it, and `adaptune inspect` takes its folder once it has a model"
-        )
 
 
 def _show_model(file: Path) -> None:
@@ -173,29 +221,38 @@ def _undo_motion(recordings: Sequence["Inspection"], odometries: Sequence[str]) 
 
 
 def roles(
-    names: Sequence[str], length: str, odometries: Sequence[str], share: float | None = None
+    names: Sequence[str],
+    length: str,
+    odometries: Sequence[str],
+    share: float | None = None,
+    test: Sequence[str] = (),
+    config: Path | None = None,
 ) -> str:
     """YAML of a study: what it trains and tests on, over which metres, and the odometry.
 
-    Of a single recording, what follows after a `share` of its duration is kept for the test; of
-    several, the last one.
+    Without a `test`, what follows after a `share` of the duration of a single recording is kept for
+    it; of several, the last one. `config` is the user's parameter file.
     """
     from adaptune.reference.check import TRAINING
     from adaptune.yaml12 import dump
 
-    names = [dump([name]).removeprefix("- ").strip() for name in names]
-    if len(names) == 1:
+    names, test = ([dump([n]).removeprefix("- ").strip() for n in of] for of in (names, test))
+    if test:
+        training, tested = ", ".join(names), ", ".join(test)
+    elif len(names) == 1:
         end = f"{100 * (share or TRAINING):.0f}"
-        training, test = f"{names[0]}: 0-{end}%", f"{names[0]}: {end}-100%"
+        training, tested = f"{names[0]}: 0-{end}%", f"{names[0]}: {end}-100%"
     else:
-        training, test = ", ".join(names[:-1]), names[-1]
-    if len(odometries) == 1:
+        training, tested = ", ".join(names[:-1]), names[-1]
+    if config is not None:
+        own = {"name": odometries[0], "settings": {"config": str(config.resolve())}}
+        odometry = dump({"odometry": own}).removeprefix("odometry:").rstrip()
+    elif len(odometries) == 1:
         odometry = f"{{name: {odometries[0]}}}    # or another one, see docs/odometries.md"
     else:
         odometry = "".join(f"\n  - {{name: {name}}}" for name in odometries)
-    return (
-        f"training: [{training}]\ntest: [{test}]\nsub_trajectory: {length}\nodometry: {odometry}\n"
-    )
+    judged = f"training: [{training}]\ntest: [{tested}]\nsub_trajectory: {length}\n"
+    return f"{judged}odometry: {odometry}\n"
 
 
 # Tune an odometry on recordings.
@@ -240,66 +297,138 @@ def tune(
     recordings: Annotated[
         list[Path],
         typer.Argument(
-            metavar="BAG...", help="Bags of one robot, or folders (KITTI).", show_default=False
+            metavar="BAG...", help="Bags of one robot, or folders of them.", show_default=False
         ),
     ],
     odometry: Annotated[
-        str,
+        str | None,
         typer.Option(
             metavar="NAME",
             help="gicp, my_module:MyClass, ..., several with commas, or `all`; or an image.",
+            show_default="gicp; with --config kiss_icp",
         ),
-    ] = "gicp",
+    ] = None,
+    config: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Your parameter file: the baseline, and all that is not tuned."
+        ),
+    ] = None,
+    test: Annotated[
+        list[Path], typer.Option(metavar="BAG", help="A recording for the test. May be repeated.")
+    ] = [],  # noqa: B006
+    reading: As = None,
     points: Points = None,
     reference: Given = None,
     trials: Trials = None,
     minutes: Minutes = None,
     budget: Budget = None,
+    override: Override = [],  # noqa: B006
     folder: Annotated[
         Path | None,
         typer.Option(help="The study's folder.", show_default="the first bag's name, under runs/"),
     ] = None,
+    cluster: Cluster = None,
     details: Details = False,
 ) -> None:
     """Tune an odometry on recordings, and say what to drive.
 
     It keeps the last 40 % of one recording (of its path, where the robot stands for long), or the
-    last of several, for the test. It tries sets on the rest, replays the test, and compares.
+    last of several, for the test. It tries sets on the rest, replays the test, and compares. Of
+    three or more, it says what the others would have recommended for each.
 
-    What it decides is written to a study file in its folder; run the same command to resume.
+    What it decides is written to a study file in its folder; run the same command to resume, also
+    when a folder holds more recordings than before.
     Of a ROS 2 system (an image, or `ros2 launch ...`), it writes a study to fill in.
     """
     if reference is not None and Path(reference).is_file():
         reference = str(Path(reference).resolve())
-    if _propose(recordings, odometry, points, reference):
+    odometry = odometry or ("gicp" if config is None else "kiss_icp")
+    asked = Asked(recordings, odometry, points, reference, config, test, reading)
+    if _propose(asked):
         return
     folder = folder or Path("runs") / _study_name(recordings, odometry)
     path = folder / f"{folder.resolve().name}.yaml"
-    made_by = _made_by(recordings, odometry, points, reference)
-    overrides: list[str] = []
+    overrides, more, limits = [*override], list[str](), _limits(trials, minutes, budget)
     if not path.exists():
-        limits = _limits(trials, minutes), budget
-        text = _decided(recordings, odometry, (points, reference), limits, folder)
-        _write(path, made_by + text)
-    elif not path.read_text("utf-8").startswith(made_by):
+        _write(path, asked.line + _decided(asked, limits, folder))
+    elif not path.read_text("utf-8").startswith(asked.line):
         raise AdaptuneError(
             f"{path}: another `adaptune tune` made it, for what its first line says; name the same "
             f"to resume it, or another --folder"
         )
     else:
-        overrides = [f"offline.{key}={value}" for key, value in _limits(trials, minutes).items()]
-        overrides += [] if budget is None else [f"online.budget={budget:g}"]
+        overrides += [f"{key}={value}" for key, value in limits.items()]
+        more = _grown(path, asked)
     from offline.train import train
 
     loaded = load(path, overrides, folder, runs=True)
     say(f"Study: {path}")
+    _say_untuned(loaded)
+    before = loaded.fixed
     with progress() as show:
-        training = train(loaded, show)
+        training = train(loaded, show, cluster)
     replay_missing(loaded)
-    compared(loaded, details=details)
+    found = compared(loaded, details=details)
     show_front(training)
+    if more:
+        _say_grown(more, before, loaded.fixed)
+    _say_recordings(training.rows, found)
     say_odometries(loaded, training)
     say_next("replays to look at in Foxglove", "record", folder)
+
+
+def _say_untuned(study: "OfflineStudy") -> None:
+    """Name the parameters that are not tuned because the user's file does not hold them."""
+    from adaptune.odometry.registry import ODOMETRIES, odometry_class
+
+    for own in study.config.odometries.values():
+        if own.name in ODOMETRIES and (config := own.settings.get("config")):
+            known = odometry_class(own.name).space.names
+            if lacking := [name for name in known if name not in study.odometry.space.names]:
+                say(f"Not tuned, because {config} does not hold them: {', '.join(lacking)}.")
+
+
+def _say_grown(more: Sequence[str], before: Any, now: Any) -> None:
+    """What recordings that were not there before have changed."""
+    from adaptune.space import in_words
+
+    changed = "the recommended set is the same as before"
+    if before is not None and before != now:
+        names = [name for name in now if now[name] != before.get(name)]
+        old, new = (in_words({name: of.get(name, "-") for name in names}) for of in (before, now))
+        changed = f"recommended is {new} instead of {old}"
+    say(f"New in training: {', '.join(more)}; {changed}.")
+
+
+def _say_recordings(rows: Sequence[Mapping[str, Any]], found: "ComparedReplays") -> None:
+    """What the other recordings recommend for each, the worst first; or what a third would add."""
+    from online.modes import BASELINE, FIXED
+    from online.statistics import ALL
+
+    names = list(dict.fromkeys(row.sequence for row in found.rows if row.sequence != ALL))
+    whole = {(row.sequence, row.mode): row.rte for row in found.rows}
+    known = [
+        (row["sequence"], row["baseline, whole"], row["_left out"], "training") for row in rows
+    ]
+    known += [(n, whole.get((n, BASELINE)), whole.get((n, FIXED)), "test") for n in names]
+    table = [
+        {"recording": name, "baseline [%]": own, "recommended [%]": rte, "ratio": rte / own, "": of}
+        for name, own, rte, of in known
+        if own and rte is not None
+    ]
+    if len(rows) < 2 or len(table) < 3:
+        say(
+            "With three recordings, each would also be left out in turn: the table would say "
+            "where the recommended set does worst."
+        )
+        return
+    table.sort(key=lambda row: -row["ratio"])
+    show_table(
+        "Each recording left out, the worst first",
+        table,
+        "Recommended is the finalist that the others choose; for the test, the fixed set.",
+    )
 
 
 def _write(path: Path, text: str) -> None:
@@ -319,69 +448,78 @@ def _study_name(recordings: Sequence[Path], odometry: str) -> str:
     return stem if odometry == "gicp" else f"{stem}_{others}"
 
 
-def _made_by(
-    recordings: Sequence[Path], odometry: str, points: str | None, reference: str | None
-) -> str:
-    """The first line of a study: what it was decided for."""
-    words = [*(str(bag.resolve()) for bag in recordings), "--odometry", odometry]
-    words += ["--points", points] if points else []
-    words += ["--reference", reference] if reference else []
-    # A name may hold the end of a line, or what is no character.
-    plain = (c if c.isprintable() else ascii(c)[1:-1] for c in shlex.join(words))
-    return f"# adaptune tune {''.join(plain)}\n"
-
-
-def _limits(trials: int | None, minutes: float | None) -> dict[str, str]:
-    """The budget of the search by its keys in a study."""
-    given = {"trials": trials, "hours": None if minutes is None else minutes / 60.0}
+def _limits(trials: int | None, minutes: float | None, budget: float | None) -> dict[str, str]:
+    """What may be spent, by its keys in a study."""
+    hours = None if minutes is None else minutes / 60.0
+    given = {"offline.trials": trials, "offline.hours": hours, "online.budget": budget}
     return {key: f"{value:.10g}" for key, value in given.items() if value is not None}
 
 
-def _decided(
-    recordings: Sequence[Path],
-    odometry: str,
-    topics: tuple[str | None, str | None],
-    limits: tuple[dict[str, str], float | None],
-    folder: Path,
-) -> str:
+def _decided(asked: Asked, limits: Mapping[str, str], folder: Path) -> str:
     """The study of some recordings as YAML, with comments; nothing is written but references."""
-    points, reference = topics
-    for path in recordings:
-        if [one.resolve() for one in recordings].count(path.resolve()) > 1:
-            raise AdaptuneError(f"{path}: is named twice; the test needs a recording of its own")
-    if len(recordings) > 1 and reference is not None and Path(reference).is_file():
-        raise AdaptuneError(
-            f"--reference {reference}: is a file, and of {len(recordings)} recordings each needs "
-            f"its own; write a study file, see docs/your-bag.md"
-        )
-    with progress() as show:
-        found = [_usable(path, points, reference, show) for path in recordings]
-    named: dict[str, Inspection] = {}
-    for one in found:
-        names = chain([one.name], (f"{one.name}_{i}" for i in count(2)))
-        named[next(name for name in names if name not in named)] = one
-    odometries = odometries_of(odometry, all("imu" in one.given for one in found))
-    _undo_motion(found, odometries)
-    search, budget = limits
-    search = search or {"trials": str(max(TRIALS, EACH * len(odometries)))}
-    tried = ", ".join(f"{key}: {value}" for key, value in search.items())
-    spent = "" if budget is None else f", budget: {budget:g}"
+    named, test = recorded(asked)
+    odometries = odometries_of(asked.odometry, all("imu" in one.given for one in named.values()))
+    if asked.config is not None and len(odometries) != 1:
+        raise AdaptuneError(f"--config {asked.config}: is of one odometry; name one --odometry")
+    _undo_motion([*named.values()], odometries)
+    if not any(key.startswith("offline.") for key in limits):
+        limits = {"offline.trials": str(max(TRIALS, EACH * len(odometries)))} | limits
+    tried, spent = (
+        "".join(f", {key.removeprefix(stage)}: {v}" for key, v in limits.items() if stage in key)
+        for stage in ("offline.", "online.")
+    )
 
     def study(length: str, share: float | None = None, health: str = "") -> str:
         from adaptune import yaml12
 
-        recorded = yaml12.dump({"sequences": {name: one.given for name, one in named.items()}})
+        given = yaml12.dump({"sequences": {name: one.given for name, one in named.items()}})
+        rest = [name for name in named if name not in test]
         return (
-            f"# Every command works with this file; change what you like.\n\n{recorded}\n"
+            f"# Every command works with this file; change what you like.\n\n{given}\n"
             f"# The part for the test is not trained on.\n"
-            f"{roles(list(named), length, odometries, share)}{health}"
-            f"offline: {{{tried}}}    # parameter sets to try, or the time for it\n"
+            f"{roles(rest, length, odometries, share, test, asked.config)}{health}"
+            f"offline: {{{tried[2:]}}}    # parameter sets to try, or the time for it\n"
             f"online: {{modes: [adaptive]{spent}}}\n"
         )
 
-    if reference is None:
-        _replace_noisy(named, lambda: _loaded(study("5.0"), folder))
-    return study(*_split(_loaded(study("5.0"), folder), list(named)))
+    if asked.reference is None:
+        _replace_noisy(named, lambda: loaded_text(study("5.0"), folder))
+    return study(*_split(loaded_text(study("5.0"), folder), list(named)))
+
+
+def _grown(path: Path, asked: Asked) -> list[str]:
+    """Add the recordings that a study does not name yet to its training; their names."""
+    from adaptune import yaml12
+    from adaptune.recording.fleet import recordings_at
+
+    text = path.read_text("utf-8")
+    try:
+        data: Any = yaml12.Document(text).data
+        known = {str(one.get(key)) for one in data["sequences"].values() for key in KINDS_OF_PATH}
+    except (yaml12.YamlError, AttributeError, KeyError, TypeError):
+        return []  # loading it says what is wrong
+    there = recordings_at([*asked.recordings, *asked.test], asked.reading)
+    new = [one for one in there if str(one.resolve()) not in known]
+    if not new:
+        return []
+    named, _ = recorded(asked._replace(recordings=there, test=(), reading="one"))
+    _undo_motion([*named.values()], odometries_of(asked.odometry, False))
+    paths = {one.resolve() for one in new}
+    added = {name: one for name, one in named.items() if one.path in paths}
+    if taken := [name for name in added if name in data["sequences"]]:
+        raise AdaptuneError(
+            f"{path}: sequences.{taken[0]} is another recording; rename the new one"
+        )
+    entries = yaml12.dump({name: one.given for name, one in added.items()})
+    indented = "".join(f"  {line}\n" for line in entries.splitlines())
+    listed = "".join(f", {yaml12.dump([name]).removeprefix('- ').strip()}" for name in added)
+    grown = re.sub(r"(?m)^sequences:\n", lambda m: m[0] + indented, text, count=1)
+    grown = re.sub(r"(?m)^(training: \[.*)\]", lambda m: f"{m[1]}{listed}]", grown, count=1)
+    data = yaml12.Document(grown).data
+    if not all(name in data["training"] for name in added):
+        raise AdaptuneError(f"{path}: add {', '.join(added)} to sequences and training by hand")
+    write_text(path, grown)
+    return list(added)
 
 
 def _replace_noisy(named: "Mapping[str, Inspection]", loaded: "Callable[[], OfflineStudy]") -> None:
@@ -414,34 +552,12 @@ def _replace_noisy(named: "Mapping[str, Inspection]", loaded: "Callable[[], Offl
         one.given = before
 
 
-def _usable(path: Path, points: str | None, reference: str | None, show: Progress) -> "Inspection":
-    """Look at a recording; it has scans of one topic, and a reference or is to get one."""
-    from adaptune.recording.clouds import CLOUDS
-    from adaptune.recording.inspect import inspect as inspect_file
-    from adaptune.reference.estimate import recording_config
-
-    check_no_study(path)
-    found = inspect_file(path, False, show)
-    clouds = [topic for topic in found.topics.values() if topic.type in CLOUDS]
-    if len(clouds) > 1 and points is None:
-        each = ", ".join(f"{one.name} ({one.count:,} of {one.type})" for one in clouds)
-        raise AdaptuneError(
-            f"{path}: has {len(clouds)} topics of point clouds: {each}; name one with --points"
-        )
-    recording_config(found, points, reference)
-    if reference is None and found.missing["offline"]:
-        why = "; ".join(str(one) for one in found.findings if one.of == "reference")
-        say(f"{path}: its reference does not serve ({why}): one is estimated")
-        found.given["reference"] = "estimated"
-    return found
-
-
 _SYSTEM = """\
 odometry:
   name: ros2    # or rustle, for a ROS 1 system, see docs/docker.md
   settings:
     {image}command: {command}
-    template: {lacking}    # the parameter file that you use now
+    template: {template}    # the parameter file that you use now
     odometry: /{lacking}    # the topic of its poses
     points: /points    # the topics that it hears
     {imu}
@@ -475,21 +591,20 @@ def _system(given: str) -> dict[str, str] | None:
     return {"image": f"image: {given}\n    ", "command": json.dumps(launch)}
 
 
-def _propose(
-    recordings: Sequence[Path], odometry: str, points: str | None, reference: str | None
-) -> bool:
+def _propose(asked: Asked) -> bool:
     """Write a study of a ROS system to fill in; False if the odometry is none."""
-    if (system := _system(odometry)) is None:
+    if (system := _system(asked.odometry)) is None:
         return False
-    path = Path(f"{plain_name(recordings[0].resolve())}_ros2.yaml")
+    path = Path(f"{plain_name(asked.recordings[0].resolve())}_ros2.yaml")
     if path.exists():
         raise AdaptuneError(f"{path}: exists; fill it in, or move it away")
-    with progress() as show:
-        found = [_usable(one, points, reference, show) for one in recordings]
-    rest = roles([one.name for one in found], UNKNOWN_LENGTH, ["ros2"]).partition("odometry:")[0]
-    imu = "imu: /imu" if all("imu" in one.given for one in found) else "# imu: /imu"
-    block = _SYSTEM.format(lacking=_LACKING, imu=imu, **system)
-    entries = "\n".join(one.entry.removeprefix("sequences:\n") for one in found)
+    named, test = recorded(asked)
+    training = [name for name in named if name not in test]
+    rest = roles(training, UNKNOWN_LENGTH, ["ros2"], test=test).partition("odometry:")[0]
+    imu = "imu: /imu" if all("imu" in one.given for one in named.values()) else "# imu: /imu"
+    template = json.dumps(str(asked.config.resolve())) if asked.config else _LACKING
+    block = _SYSTEM.format(lacking=_LACKING, template=template, imu=imu, **system)
+    entries = "\n".join(one.entry.removeprefix("sequences:\n") for one in named.values())
     write_text(path, f"sequences:\n{entries}\n{rest}{block}")
     say(
         f"{path}: is a study of this system. Fill in what stands there as {_LACKING}, as "
@@ -521,7 +636,7 @@ def odometries_of(given: str, imu: bool) -> list[str]:
     return there
 
 
-def _loaded(text: str, folder: Path) -> "OfflineStudy":
+def loaded_text(text: str, folder: Path) -> "OfflineStudy":
     """A study whose YAML is given and that is in no file yet."""
     from offline.config import load_study
 

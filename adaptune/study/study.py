@@ -223,6 +223,16 @@ BANK_MEMORY = 16.0
 _locks: dict[str, IO[str]] = {}
 """Open files whose locks last as long as the process."""
 
+
+def is_written_to(folder: Path) -> bool:
+    """Whether another process works in a study's folder."""
+    lock = folder / ".lock"
+    if str(folder) in _locks or not lock.exists():
+        return False
+    with lock.open() as file:
+        return not locked(file, wait=False)
+
+
 C_co = TypeVar("C_co", bound=StudyConfig, covariant=True, default=StudyConfig)
 
 _log = logging.getLogger(__name__)
