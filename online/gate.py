@@ -14,6 +14,7 @@ from adaptune import manifest
 from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
 from adaptune.metrics import MIN_BLOCKS, RESAMPLES, resampled_means
+from adaptune.odometry.base import MAX_SHARE_WITHOUT_POSE
 from adaptune.report.tables import Listing, markdown
 from adaptune.study.study import MIN_RECORDINGS, PER_STRETCH, Study, is_written_to
 from online.compare import SEED, allowed, pooled_logs
@@ -170,6 +171,13 @@ def _pairs(new: Side, old: Side) -> tuple[list[_Pair], str]:
         )
         raise AdaptuneError(f"no recording is in both, by content and part: {listed}")
     pairs = []
+    for name, replay in sides[1].items():
+        lacking, n = replay.summary.unhealthy.get("no_pose", 0), replay.summary.scans
+        if lacking >= MAX_SHARE_WITHOUT_POSE * n:
+            raise AdaptuneError(
+                f"{name}: {old.name} gives no pose for {lacking} of {n} scans, so nothing compares "
+                f"with it; mend it, or leave the recording out"
+            )
     for key in common:
         name, other = (of[key] for of in keys)
         replays = sides[0][name], sides[1][other]

@@ -479,14 +479,14 @@ def _grown(path: Path, asked: Asked) -> list[str]:
         known = {str(one.get(key)) for one in data["sequences"].values() for key in KINDS_OF_PATH}
     except (files.YamlError, AttributeError, KeyError, TypeError):
         return []  # loading it says what is wrong
-    there = recordings_at([*asked.recordings, *asked.test], asked.reading)
-    new = [one for one in there if str(one.resolve()) not in known]
+    given = recordings_at([*asked.recordings, *asked.test], asked.reading)
+    there = list(dict.fromkeys(one.resolve() for one in given))
+    new = [one for one in there if str(one) not in known]
     if not new:
         return []
     named, _ = recorded(asked._replace(recordings=there, test=(), reading="one"))
     _undo_motion([*named.values()], odometries_of(asked.odometry, False))
-    paths = {one.resolve() for one in new}
-    added = {name: one for name, one in named.items() if one.path in paths}
+    added = {name: one for name, one in named.items() if one.path in new}
     if taken := [name for name in added if name in data["sequences"]]:
         raise AdaptuneError(
             f"{path}: sequences.{taken[0]} is another recording; rename the new one"
