@@ -496,6 +496,11 @@ def _grown(path: Path, asked: Asked) -> list[str]:
     listed = "".join(f", {files.dump([name]).removeprefix('- ').strip()}" for name in added)
     grown = re.sub(r"(?m)^sequences:\n", lambda m: m[0] + indented, text, count=1)
     grown = re.sub(r"(?m)^(training: \[.*)\]", lambda m: f"{m[1]}{listed}]", grown, count=1)
+    if isinstance(n := (data.get("offline") or {}).get("stretches", 12), int):
+        # As many stretches of each as before: the trials that there are stay.
+        before, now = len(data["training"]), len(data["training"]) + len(added)
+        pinned = f"offline: {{stretches: {max(4, -(-n // before)) * now}, "
+        grown = re.sub(r"(?m)^offline: \{(stretches: \d+, )?", pinned, grown, count=1)
     data = files.Document(grown).data
     if not all(name in data["training"] for name in added):
         raise AdaptuneError(f"{path}: add {', '.join(added)} to sequences and training by hand")
