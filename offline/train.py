@@ -115,6 +115,8 @@ def train(study: OfflineStudy, progress: Progress = unseen, cluster: str | None 
     AdaptuneError
         If a sequence, its reference or the odometry cannot be used, or no set gives poses.
     """
+    if not any(study.odometry.space.baselines):
+        raise AdaptuneError("odometry.parameters: is empty, so there is nothing to tune; name some")
     archive = _ready_archive(study, progress)
     config = study.config.offline
     names, space = study.training, study.odometry.space

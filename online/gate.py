@@ -14,6 +14,7 @@ from adaptune import manifest
 from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
 from adaptune.metrics import MIN_BLOCKS, RESAMPLES, resampled_means
+from adaptune.odometry.base import MAX_SHARE_WITHOUT_POSE
 from adaptune.report.tables import Listing, markdown
 from adaptune.study.study import MIN_RECORDINGS, PER_STRETCH, Study, is_written_to
 from online.compare import SEED, allowed, pooled_logs
@@ -144,8 +145,11 @@ def compare_sides(new: Side, old: Side, bounds: Bounds) -> Gate:
         raise AdaptuneError(f"sub_trajectory: errors over {' and '.join(lengths)} do not compare")
     pairs, left_out = _pairs(new, old)
     rows: list[GateRow] = []
-    for quantity, bound in ((ERROR, bounds.error), (COST, bounds.cost), (P99, bounds.cost)):
-        rows += _rows(quantity, pairs, bound)
+    whole = new.study.odometry.description.whole
+    rows += _rows(ERROR, pairs, bounds.error)
+    # A program that runs whole recordings has no cost of each scan.
+    for quantity in (COST,) if whole else (COST, P99):
+        rows += _rows(quantity, pairs, bounds.cost)
     lost = [(pair.name, *pair.lost) for pair in pairs]
     if len(pairs) > 1:
         lost.append((ALL, *np.sum([pair.lost for pair in pairs], axis=0).tolist()))
@@ -169,12 +173,19 @@ def _pairs(new: Side, old: Side) -> tuple[list[_Pair], str]:
             f"{side.name} has {', '.join(of)}" for side, of in zip((new, old), sides, strict=True)
         )
         raise AdaptuneError(f"no recording is in both, by content and part: {listed}")
-    pairs = []
+    pairs, whole = [], new.study.odometry.description.whole
+    for name, replay in sides[1].items():
+        lacking, n = replay.summary.unhealthy.get("no_pose", 0), replay.summary.scans
+        if lacking >= MAX_SHARE_WITHOUT_POSE * n:
+            raise AdaptuneError(
+                f"{name}: {old.name} gives no pose for {lacking} of {n} scans, so nothing compares "
+                f"with it; mend it, or leave the recording out"
+            )
     for key in common:
         name, other = (of[key] for of in keys)
         replays = sides[0][name], sides[1][other]
         _check_same(name, other, new, old, [replay.summary.inputs for replay in replays])
-        pairs.append(_pair(name, replays, Reference.read(new.study, name)))
+        pairs.append(_pair(name, replays, Reference.read(new.study, name), whole))
     alone = [
         f"{', '.join(of[key] for key in of if key not in common)} (only in {side.name})"
         for side, of in zip((new, old), keys, strict=True)
@@ -216,7 +227,7 @@ def _check_same(
         )
 
 
-def _pair(name: str, replays: Sequence[StoredReplay], reference: Reference) -> _Pair:
+def _pair(name: str, replays: Sequence[StoredReplay], reference: Reference, whole: bool) -> _Pair:
     common = reduce(np.intersect1d, (replay.trajectory.stamps for replay in replays))
     errors, costs = [], []
     for replay in replays:
@@ -225,6 +236,10 @@ def _pair(name: str, replays: Sequence[StoredReplay], reference: Reference) -> _
         costs.append((replay.frames["prepare_ms"] + replay.frames["register_ms"])[kept])
     known = np.isfinite(errors).all(axis=0)
     cost = np.array(costs)[:, _WARM_UP:]
+    if whole:
+        cost = np.repeat(
+            [[r.summary.cpu_ms or np.nan] for r in replays], MIN_BLOCKS * _COSTS, axis=1
+        )
     cost = cost[:, np.isfinite(cost).all(axis=0)]
     machines = {replay.summary.machine for replay in replays}
     why = {} if known.any() else {ERROR: "no reference"}

@@ -69,7 +69,7 @@ def _driven(
         "training": names,
     }
     entries = [_entry(name, odometry) for name in given]
-    folders = [FOLDER / f"{plain_name(Path(name))[-40:]}_{digest(name)[:6]}" for name in given]
+    folders = [FOLDER / f"{plain_name(Path(name))[:40]}_{digest(name)[:6]}" for name in given]
     first = loaded_text(dump(shared | {"odometry": entries[0]}), folders[0])
     first.open()
     with progress() as show:
@@ -96,7 +96,7 @@ def _entry(given: str, odometry: str | None) -> dict[str, Any]:
     from adaptune.odometry.registry import is_user_class, odometry_class
 
     file = Path(given)
-    if file.suffix not in (".yaml", ".yml", ".json"):
+    if len(shlex.split(given)) > 1 or file.suffix not in (".yaml", ".yml", ".json"):
         return _named(given)
     if not file.is_file():
         raise AdaptuneError(f"{given}: there is no such file")
@@ -127,7 +127,7 @@ def _named(given: str) -> dict[str, Any]:
     words = shlex.split(given)
     if len(words) > 1:
         # It runs in a folder of its own.
-        words = [str(Path(w).resolve()) if Path(w).is_file() else w for w in words]
+        words = [str(Path(w).absolute()) if Path(w).is_file() else w for w in words]
         return {"name": "command", "settings": {"command": words}, "parameters": {}}
     if given not in registry.ODOMETRIES and re.fullmatch(r"[a-z0-9][\w./-]*(:[\w.-]+)?", given):
         with suppress(EngineError, NotInstalledError):

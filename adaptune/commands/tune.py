@@ -498,14 +498,14 @@ def _grown(path: Path, asked: Asked) -> list[str]:
         known = {str(one.get(key)) for one in data["sequences"].values() for key in KINDS_OF_PATH}
     except (yaml12.YamlError, AttributeError, KeyError, TypeError):
         return []  # loading it says what is wrong
-    there = recordings_at([*asked.recordings, *asked.test], asked.reading)
-    new = [one for one in there if str(one.resolve()) not in known]
+    given = recordings_at([*asked.recordings, *asked.test], asked.reading)
+    there = list(dict.fromkeys(one.resolve() for one in given))
+    new = [one for one in there if str(one) not in known]
     if not new:
         return []
     named, _ = recorded(asked._replace(recordings=there, test=(), reading="one"))
     _undo_motion([*named.values()], odometries_of(asked.odometry, False))
-    paths = {one.resolve() for one in new}
-    added = {name: one for name, one in named.items() if one.path in paths}
+    added = {name: one for name, one in named.items() if one.path in new}
     if taken := [name for name in added if name in data["sequences"]]:
         raise AdaptuneError(
             f"{path}: sequences.{taken[0]} is another recording; rename the new one"
@@ -515,6 +515,11 @@ def _grown(path: Path, asked: Asked) -> list[str]:
     listed = "".join(f", {yaml12.dump([name]).removeprefix('- ').strip()}" for name in added)
     grown = re.sub(r"(?m)^sequences:\n", lambda m: m[0] + indented, text, count=1)
     grown = re.sub(r"(?m)^(training: \[.*)\]", lambda m: f"{m[1]}{listed}]", grown, count=1)
+    if isinstance(n := (data.get("offline") or {}).get("stretches", 12), int):
+        # As many stretches of each as before: the trials that there are stay.
+        before, now = len(data["training"]), len(data["training"]) + len(added)
+        pinned = f"offline: {{stretches: {max(4, -(-n // before)) * now}, "
+        grown = re.sub(r"(?m)^offline: \{(stretches: \d+, )?", pinned, grown, count=1)
     data = yaml12.Document(grown).data
     if not all(name in data["training"] for name in added):
         raise AdaptuneError(f"{path}: add {', '.join(added)} to sequences and training by hand")
