@@ -193,7 +193,7 @@ def ratio_to(judged: Sequence[JudgedModes], mode: str, other: str | None = None)
     n, rng = int(place.max()) + 1, np.random.default_rng(SEED)
     if n < MIN_RECORDINGS and any(e.shape[1] < MIN_BLOCKS * block for e, block in pairs):
         return Ratio(value)
-    logs = np.array([_resampled_logs(errors, block, rng) for errors, block in pairs])
+    logs = np.array([resampled_logs(errors, block, rng) for errors, block in pairs])
     low, high = pooled_logs(logs, place, rng)
     reference_errors = [one.rows[0].reference_error for one in judged]
     wider = np.mean(
@@ -230,7 +230,7 @@ def _log(errors: NDArray[np.float64]) -> float:
     return float(np.log(mine / others))
 
 
-def _resampled_logs(
+def resampled_logs(
     errors: NDArray[np.float64], block: int, rng: np.random.Generator
 ) -> NDArray[np.float64]:
     """Logarithms of the ratio in resamples of one sequence, of shape (RESAMPLES,)."""

@@ -1,7 +1,7 @@
 """The gate: whether one side of the same recordings is worse than another."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import reduce
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from adaptune import manifest
 from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
-from adaptune.metrics import MIN_BLOCKS, RESAMPLES, resampled_means
-from adaptune.odometry.base import MAX_SHARE_WITHOUT_POSE
+from adaptune.metrics import MIN_BLOCKS, RESAMPLES
+from adaptune.odometry.faults import MAX_SHARE_WITHOUT_POSE
 from adaptune.report.tables import Listing, markdown
 from adaptune.study.study import MIN_RECORDINGS, PER_STRETCH, Study, is_written_to
-from online.compare import SEED, allowed, pooled_logs
+from online.compare import SEED, allowed, pooled_logs, resampled_logs
 from online.modes import BASELINE, FIXED
 from online.record import StoredReplay
 from online.statistics import ALL, Reference
@@ -44,8 +44,8 @@ class Side(NamedTuple):
     name: str
     study: Study
 
-    def replays(self) -> dict[str, Path]:
-        """The folder of the replay of each sequence, by its name: of the fixed set, or baseline.
+    def replays(self) -> dict[str, StoredReplay]:
+        """The replay of each sequence, by its name: of the fixed set, or of the baseline.
 
         An AdaptuneError says that there is none, or that they are still being made.
         """
@@ -59,7 +59,7 @@ class Side(NamedTuple):
             found = {path.parents[1].name: path.parent for path in made}
             # Earlier ones may be of recordings that the study does not name any more.
             named = {*self.study.config.sequences, *self.study.config.courses}
-            if there := {name: folder for name, folder in found.items() if name in named}:
+            if there := {n: StoredReplay.read(at) for n, at in found.items() if n in named}:
                 return there
         raise AdaptuneError(
             f"{self.study.folder}: holds no replays; run `adaptune online` with this study first"
@@ -71,9 +71,9 @@ class GateRow(NamedTuple):
 
     recording: str
     quantity: str
-    new: float | None
-    old: float | None
-    verdict: Verdict
+    new: float | None = None
+    old: float | None = None
+    verdict: Verdict = "unclear"
     ratio: float | None = None
     low: float | None = None  # ends of the ratio's interval
     high: float | None = None
@@ -163,68 +163,64 @@ def compare_sides(new: Side, old: Side, bounds: Bounds) -> Gate:
 
 def _pairs(new: Side, old: Side) -> tuple[list[_Pair], str]:
     """The recordings of both sides, and in words those of one side only."""
-    folders = [side.replays() for side in (new, old)]
-    sides = [{name: StoredReplay.read(folder) for name, folder in of.items()} for of in folders]
-    keys = [
-        {_key(name, replay.summary.inputs): name for name, replay in of.items()} for of in sides
-    ]
-    if not (common := [key for key in keys[0] if key in keys[1]]):
-        listed = "; ".join(
-            f"{side.name} has {', '.join(of)}" for side, of in zip((new, old), sides, strict=True)
-        )
-        raise AdaptuneError(f"no recording is in both, by content and part: {listed}")
-    pairs, whole = [], new.study.odometry.description.whole
-    for name, replay in sides[1].items():
-        lacking, n = replay.summary.unhealthy.get("no_pose", 0), replay.summary.scans
-        if lacking >= MAX_SHARE_WITHOUT_POSE * n:
-            raise AdaptuneError(
-                f"{name}: {old.name} gives no pose for {lacking} of {n} scans, so nothing compares "
-                f"with it; mend it, or leave the recording out"
-            )
-    for key in common:
-        name, other = (of[key] for of in keys)
-        replays = sides[0][name], sides[1][other]
-        _check_same(name, other, new, old, [replay.summary.inputs for replay in replays])
-        pairs.append(_pair(name, replays, Reference.read(new.study, name), whole))
-    alone = [
+    sides = new.replays(), old.replays()
+    keys = [{_key(n, replay.summary.inputs): n for n, replay in of.items()} for of in sides]
+    common = [key for key in keys[0] if key in keys[1]]
+    alone = "; ".join(
         f"{', '.join(of[key] for key in of if key not in common)} (only in {side.name})"
         for side, of in zip((new, old), keys, strict=True)
         if len(of) > len(common)
-    ]
-    return pairs, "; ".join(alone)
+    )
+    if not common:
+        raise AdaptuneError(f"no recording is in both, by content and part: {alone}")
+    pairs = []
+    whole = any(side.study.odometry.description.whole for side in (new, old))
+    for name, other in ((keys[0][key], keys[1][key]) for key in common):
+        replays = sides[0][name], sides[1][other]
+        lacking, n = replays[1].summary.unhealthy.get("no_pose", 0), replays[1].summary.scans
+        if lacking >= MAX_SHARE_WITHOUT_POSE * n:
+            raise AdaptuneError(
+                f"{other}: {old.name} gives no pose for {lacking} of {n} scans, so nothing "
+                f"compares with it; mend it, or leave the recording out"
+            )
+        _check_same((name, other), (new, old), [replay.summary.inputs for replay in replays])
+        pairs.append(_pair(name, replays, Reference.read(new.study, name), whole))
+    return pairs, alone
+
+
+def _settings(name: str, inputs: manifest.Inputs) -> dict[str, Any]:
+    """How a recording was read."""
+    return dict(inputs["sequences" if "sequences" in inputs else "courses"][name])
 
 
 def _key(name: str, inputs: manifest.Inputs) -> str:
     """A recording by its content, and which part of it was driven."""
-    settings = next(inputs[kind][name] for kind in ("sequences", "courses") if kind in inputs)
-    part = [settings.get(key) for key in ("part", "start", "stop")]
+    part = [_settings(name, inputs).get(key) for key in ("part", "start", "stop")]
     return manifest.digest([inputs["recording"][name], part])
 
 
 def _check_same(
-    name: str, other: str, new: Side, old: Side, inputs: Sequence[manifest.Inputs]
+    names: Sequence[str], sides: Sequence[Side], inputs: Sequence[manifest.Inputs]
 ) -> None:
     """Refuse another reading of the same recording, and another reference."""
-    scans = [
-        {"reader": of["reader"], "settings": of.get("sequences", of.get("courses"))[own]}
-        for own, of in zip((name, other), inputs, strict=True)
-    ]
-    if said := manifest.changes(scans[1], scans[0]):
-        raise AdaptuneError(
-            f"{name}: {new.name} and {old.name} read it differently: {'; '.join(said)}; replay "
-            f"both alike"
-        )
-    found = [
-        manifest.recorded(side.study.folder / "replays" / own / f"reference.{manifest.FILE}") or {}
-        for side, own in ((new, name), (old, other))
-    ]
+    both = f"{names[0]}: {sides[0].name} and {sides[1].name}"
+    new, old = (
+        {"reader": of["reader"], "settings": _settings(name, of)}
+        for name, of in zip(names, inputs, strict=True)
+    )
+    if said := manifest.changes(old, new):
+        raise AdaptuneError(f"{both} read it differently: {'; '.join(said)}; replay both alike")
+    paths = (
+        side.study.folder / "replays" / name / f"reference.{manifest.FILE}"
+        for side, name in zip(sides, names, strict=True)
+    )
     # Without the names of the sequence.
-    references = [[list(v.values()) for v in of.values() if isinstance(v, dict)] for of in found]
-    if references[0] != references[1]:
-        raise AdaptuneError(
-            f"{name}: {new.name} and {old.name} are judged by different references; name the same "
-            f"in both"
-        )
+    mine, other = (
+        [list(v.values()) for v in (manifest.recorded(path) or {}).values() if isinstance(v, dict)]
+        for path in paths
+    )
+    if mine != other:
+        raise AdaptuneError(f"{both} are judged by different references; name the same in both")
 
 
 def _pair(name: str, replays: Sequence[StoredReplay], reference: Reference, whole: bool) -> _Pair:
@@ -237,9 +233,8 @@ def _pair(name: str, replays: Sequence[StoredReplay], reference: Reference, whol
     known = np.isfinite(errors).all(axis=0)
     cost = np.array(costs)[:, _WARM_UP:]
     if whole:
-        cost = np.repeat(
-            [[r.summary.cpu_ms or np.nan] for r in replays], MIN_BLOCKS * _COSTS, axis=1
-        )
+        means = [[replay.summary.cpu_ms or np.nan] for replay in replays]
+        cost = np.repeat(means, MIN_BLOCKS * _COSTS, axis=1)
     cost = cost[:, np.isfinite(cost).all(axis=0)]
     machines = {replay.summary.machine for replay in replays}
     why = {} if known.any() else {ERROR: "no reference"}
@@ -264,23 +259,21 @@ def _rows(quantity: str, pairs: Sequence[_Pair], bound: float) -> list[GateRow]:
     share = 100.0 * _SHARE / len(pairs)
     for pair in pairs:
         if why := pair.obstacles.get(quantity):
-            rows.append(GateRow(pair.name, quantity, None, None, "unclear", why=why))
+            rows.append(GateRow(pair.name, quantity, why=why))
             continue
         values, block = pair.values[quantity], pair.blocks[quantity]
         new, old = _both(quantity, values).tolist()
-        row = GateRow(pair.name, quantity, new, old, "unclear", new / max(old, 1e-12))
-        if quantity == ERROR:
-            row = row._replace(stretches=_stretches(pair))
+        row = GateRow(pair.name, quantity, new, old, ratio=new / max(old, 1e-12), why="too short")
         same = bool((values[0] == values[1]).all())
         logs = _resampled(quantity, values, block, rng)
-        if quantity == ERROR and not same:
-            logs += np.where(logs < np.median(logs), *allowed(values, pair.reference_error))
+        if quantity == ERROR:
+            row = row._replace(stretches=_stretches(pair))
+            if not same:
+                logs += np.where(logs < np.median(logs), *allowed(values, pair.reference_error))
         enough = same or values.shape[1] >= MIN_BLOCKS * block
         if enough:
-            ends = np.exp(np.percentile(logs, [share / 2, 100.0 - share / 2])).tolist()
-            row = _judged(row, ends, bound)
-        else:
-            row = row._replace(why="too short")
+            ends = np.percentile(logs, [share / 2, 100.0 - share / 2])
+            row = _judged(row._replace(why=""), ends, bound)
         if enough or len(pairs) >= MIN_RECORDINGS:
             pooled.append((new, old, row.ratio, logs))
         rows.append(row)
@@ -290,19 +283,20 @@ def _rows(quantity: str, pairs: Sequence[_Pair], bound: float) -> list[GateRow]:
 def _over_all(quantity: str, pooled: Sequence[Any], n: int, bound: float) -> GateRow:
     """The row of all recordings: geometric mean of the ratios, and its interval."""
     why = "" if len(pooled) == n else f"known on {len(pooled)} of {n} recordings"
+    row = GateRow(ALL, quantity, why=why)
     if 2 * len(pooled) < n or not pooled:
-        return GateRow(ALL, quantity, None, None, "unclear", why=why)
-    new, old, ratios, logs = zip(*pooled, strict=True)
-    ends = pooled_logs(np.array(logs), np.arange(len(logs)), np.random.default_rng(SEED))
-    ratio = float(np.exp(np.mean(np.log(np.maximum(ratios, 1e-12)))))
-    row = GateRow(ALL, quantity, float(np.mean(new)), float(np.mean(old)), "unclear", ratio)
-    return _judged(row._replace(why=why), np.exp(ends).tolist(), bound)
+        return row
+    new, old, ratios, logs = map(np.array, zip(*pooled, strict=True))
+    ends = pooled_logs(logs, np.arange(len(logs)), np.random.default_rng(SEED))
+    ratio = float(np.exp(np.log(np.maximum(ratios, 1e-12)).mean()))
+    row = row._replace(new=float(new.mean()), old=float(old.mean()), ratio=ratio)
+    return _judged(row, ends, bound)
 
 
-def _judged(row: GateRow, ends: Sequence[float], bound: float) -> GateRow:
-    low, high = ends
-    said = judged(row.ratio or 0.0, (low, high), bound)
-    return row._replace(low=low, high=high, verdict=said)
+def _judged(row: GateRow, ends: Iterable[float], bound: float) -> GateRow:
+    """The row with its interval, from its ends as logarithms, and what it says."""
+    low, high = (float(np.exp(end)) for end in ends)
+    return row._replace(low=low, high=high, verdict=judged(row.ratio or 0.0, (low, high), bound))
 
 
 def _both(quantity: str, values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -315,15 +309,13 @@ def _resampled(
     quantity: str, values: NDArray[np.float64], block: int, rng: np.random.Generator
 ) -> NDArray[np.float64]:
     """Logarithms of the ratio in resamples of blocks, the same on both sides, (RESAMPLES,)."""
+    if quantity != P99:
+        return resampled_logs(values, block, rng)
     n = values.shape[1]
     block = min(block, n)
-    if quantity != P99:
-        found = resampled_means(values, block, rng)
-    else:
-        starts = rng.integers(0, n - block + 1, (RESAMPLES, -(-n // block), 1))
-        drawn = (starts + np.arange(block)).reshape(RESAMPLES, -1)
-        found = np.array([_both(quantity, values[:, frames]) for frames in drawn]).T
-    new, old = np.maximum(found, 1e-12)
+    starts = rng.integers(0, n - block + 1, (RESAMPLES, -(-n // block), 1))
+    drawn = (starts + np.arange(block)).reshape(RESAMPLES, -1)
+    new, old = np.array([_both(P99, np.maximum(values[:, frames], 1e-12)) for frames in drawn]).T
     return np.asarray(np.log(new / old))
 
 
@@ -378,19 +370,14 @@ def write_gate(folder: Path, gate: Gate) -> None:
     """Write ``gate.json``, ``junit.xml`` and ``summary.md``, for a CI service."""
     data = {"verdict": gate.verdict, "words": gate.words, "rows": [r._asdict() for r in gate.rows]}
     write_text(folder / "gate.json", json.dumps(data, indent=1) + "\n")
-    counts = {kind: str(sum(r.verdict == kind for r in gate.rows)) for kind in ("worse", "unclear")}
-    about = {
-        "tests": str(len(gate.rows)),
-        "failures": counts["worse"],
-        "skipped": counts["unclear"],
-    }
-    suite = Xml.Element("testsuite", about | {"name": "adaptune compare"})
+    suite = Xml.Element("testsuite", name="adaptune compare", tests=str(len(gate.rows)))
     for row in gate.rows:
         case = Xml.SubElement(suite, "testcase", classname=row.recording, name=row.quantity)
-        shown = ", ".join(f"{k}: {v}" for k, v in row.columns().items() if v is not None)
-        if row.verdict in ("worse", "unclear"):
-            kind = "failure" if row.verdict == "worse" else "skipped"
+        if kind := {"worse": "failure", "unclear": "skipped"}.get(row.verdict):
+            shown = ", ".join(f"{k}: {v}" for k, v in row.columns().items() if v is not None)
             Xml.SubElement(case, kind, message=shown)
+    for counted, kind in (("failures", "failure"), ("skipped", "skipped")):
+        suite.set(counted, str(len(suite.findall(f"testcase/{kind}"))))
     write_text(folder / "junit.xml", Xml.tostring(suite, "unicode", xml_declaration=True) + "\n")
     listing = Listing(gate.words, [row.columns() for row in gate.rows])
     write_text(folder / "summary.md", markdown(listing))

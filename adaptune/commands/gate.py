@@ -1,6 +1,5 @@
 """The gate for changes: drive what is not known yet on both sides, and compare."""
 
-import re
 import shlex
 import shutil
 from collections.abc import Sequence
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from adaptune.commands.recordings import Asked, recorded
 from adaptune.commands.terminal import load, progress
-from adaptune.errors import AdaptuneError, NotInstalledError
+from adaptune.errors import AdaptuneError
 from adaptune.files import plain_name, write_text
 from adaptune.yaml12 import Document, YamlError, dump
 
@@ -121,18 +120,15 @@ def _entry(given: str, odometry: str | None) -> dict[str, Any]:
 
 def _named(given: str) -> dict[str, Any]:
     """An odometry by its name, its command, or its image."""
-    from adaptune.odometry import registry
-    from adaptune.odometry.docker.engine import EngineError, image_digest
+    from adaptune.commands.tune import is_image
 
     words = shlex.split(given)
     if len(words) > 1:
         # It runs in a folder of its own.
         words = [str(Path(w).absolute()) if Path(w).is_file() else w for w in words]
         return {"name": "command", "settings": {"command": words}, "parameters": {}}
-    if given not in registry.ODOMETRIES and re.fullmatch(r"[a-z0-9][\w./-]*(:[\w.-]+)?", given):
-        with suppress(EngineError, NotInstalledError):
-            image_digest(given)
-            return {"name": "docker_command", "settings": {"image": given}, "parameters": {}}
+    if is_image(given):
+        return {"name": "docker_command", "settings": {"image": given}, "parameters": {}}
     return {"name": given}
 
 

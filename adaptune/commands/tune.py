@@ -39,8 +39,6 @@ if TYPE_CHECKING:
     from offline.train import Training
     from online.compare import ComparedReplays
 
-KINDS_OF_PATH = ("bag", "kitti", "folder")
-"""Keys of a sequence that say where it was recorded."""
 UNKNOWN_LENGTH = "5.0    # metres; 10.0 for a path of 200 m or more, 25.0 for one of 500 m or more"
 """The length of sub-trajectories to propose where the path is not known."""
 
@@ -406,12 +404,9 @@ def _say_recordings(rows: Sequence[Mapping[str, Any]], found: "ComparedReplays")
     from online.modes import BASELINE, FIXED
     from online.statistics import ALL
 
-    names = list(dict.fromkeys(row.sequence for row in found.rows if row.sequence != ALL))
-    whole = {(row.sequence, row.mode): row.rte for row in found.rows}
-    known = [
-        (row["sequence"], row["baseline, whole"], row["_left out"], "training") for row in rows
-    ]
-    known += [(n, whole.get((n, BASELINE)), whole.get((n, FIXED)), "test") for n in names]
+    rte = {(row.sequence, row.mode): row.rte for row in found.rows if row.sequence != ALL}
+    known = [(r["sequence"], r["baseline, whole"], r["_left out"], "training") for r in rows]
+    known += [(n, rte[n, BASELINE], rte.get((n, FIXED)), "test") for n, of in rte if of == BASELINE]
     table = [
         {"recording": name, "baseline [%]": own, "recommended [%]": rte, "ratio": rte / own, "": of}
         for name, own, rte, of in known
@@ -490,12 +485,13 @@ def _decided(asked: Asked, limits: Mapping[str, str], folder: Path) -> str:
 def _grown(path: Path, asked: Asked) -> list[str]:
     """Add the recordings that a study does not name yet to its training; their names."""
     from adaptune import yaml12
+    from adaptune.recording.config import SOURCES
     from adaptune.recording.fleet import recordings_at
 
     text = path.read_text("utf-8")
     try:
         data: Any = yaml12.Document(text).data
-        known = {str(one.get(key)) for one in data["sequences"].values() for key in KINDS_OF_PATH}
+        known = {str(one.get(key)) for one in data["sequences"].values() for key in SOURCES}
     except (yaml12.YamlError, AttributeError, KeyError, TypeError):
         return []  # loading it says what is wrong
     given = recordings_at([*asked.recordings, *asked.test], asked.reading)
@@ -579,21 +575,27 @@ def _system(given: str) -> dict[str, str] | None:
         if not any("{parameters}" in word for word in words):
             words.append("FILL_IN:={parameters}")
         return {"image": "", "command": json.dumps(words)}
-    if not re.fullmatch(r"[a-z0-9][\w./-]*(:[\w.-]+)?", given):
+    if not is_image(given):
         return None
+    launch = ["ros2", "launch", _LACKING, f"{_LACKING}.launch.py", f"{_LACKING}:={{parameters}}"]
+    return {"image": f"image: {given}\n    ", "command": json.dumps(launch)}
+
+
+def is_image(given: str) -> bool:
+    """Whether a name is that of an image, and of no odometry."""
     from adaptune.odometry import registry
     from adaptune.odometry.docker.engine import EngineError, image_digest
 
-    if given in registry.ODOMETRIES or given in registry.PROGRAMS or given == "all":
-        return None
+    of_odometry = given in {*registry.ODOMETRIES, *registry.PROGRAMS, "all"}
+    if of_odometry or not re.fullmatch(r"[a-z0-9][\w./-]*(:[\w.-]+)?", given):
+        return False
     try:
         image_digest(given)
     except (EngineError, NotInstalledError):
         if "/" in given:  # no name of an odometry
             raise
-        return None
-    launch = ["ros2", "launch", _LACKING, f"{_LACKING}.launch.py", f"{_LACKING}:={{parameters}}"]
-    return {"image": f"image: {given}\n    ", "command": json.dumps(launch)}
+        return False
+    return True
 
 
 def _propose(asked: Asked) -> bool:
