@@ -31,13 +31,6 @@ _SHARE = 0.05
 """Of the intervals of all recordings together, so many may miss the truth."""
 
 
-class Bounds(NamedTuple):
-    """By which share the new side may be worse."""
-
-    error: float = 0.05
-    cost: float = 0.10
-
-
 class Side(NamedTuple):
     """Replays of one side."""
 
@@ -109,12 +102,12 @@ class _Pair(NamedTuple):
     """Both sides on a recording, new first, at the same scans."""
 
     name: str
-    # By quantity, values of shape (2, n): percent where both are known, and milliseconds.
-    values: Mapping[str, NDArray[np.float64]]
-    blocks: Mapping[str, int]  # scans that are drawn together
+    errors: NDArray[np.float64]  # (2, n): percent, where both are known
+    costs: NDArray[np.float64]  # (2, n_costs): milliseconds
+    block: int  # scans whose errors are drawn together
     seconds: NDArray[np.float64]  # (n,): from the first scan, of the errors
     lost: tuple[int, int]
-    obstacles: Mapping[str, str]  # why a quantity says nothing
+    obstacle: str  # why costs say nothing
     reference_error: float | None
 
 
@@ -132,8 +125,10 @@ def judged(ratio: float, ends: tuple[float, float], bound: float) -> Verdict:
     return "equal" if high <= 1.0 + bound else "unclear"
 
 
-def compare_sides(new: Side, old: Side, bounds: Bounds) -> Gate:
+def compare_sides(new: Side, old: Side, error: float = 0.05, cost: float = 0.1) -> Gate:
     """Pair the replays of two sides by recording, and judge error, cost and lost tracks.
+
+    The new side's error and cost may be larger by these shares.
 
     Raises
     ------
@@ -146,10 +141,10 @@ def compare_sides(new: Side, old: Side, bounds: Bounds) -> Gate:
     pairs, left_out = _pairs(new, old)
     rows: list[GateRow] = []
     whole = new.study.odometry.description.whole
-    rows += _rows(ERROR, pairs, bounds.error)
+    rows += _rows(ERROR, pairs, error)
     # A program that runs whole recordings has no cost of each scan.
     for quantity in (COST,) if whole else (COST, P99):
-        rows += _rows(quantity, pairs, bounds.cost)
+        rows += _rows(quantity, pairs, cost)
     lost = [(pair.name, *pair.lost) for pair in pairs]
     if len(pairs) > 1:
         lost.append((ALL, *np.sum([pair.lost for pair in pairs], axis=0).tolist()))
@@ -237,15 +232,14 @@ def _pair(name: str, replays: Sequence[StoredReplay], reference: Reference, whol
         cost = np.repeat(means, MIN_BLOCKS * _COSTS, axis=1)
     cost = cost[:, np.isfinite(cost).all(axis=0)]
     machines = {replay.summary.machine for replay in replays}
-    why = {} if known.any() else {ERROR: "no reference"}
+    why = "" if cost.shape[1] else "no times"
     if None in machines or len(machines) > 1:
-        why |= dict.fromkeys((COST, P99), "driven on different machines")
-    elif not cost.shape[1]:
-        why |= dict.fromkeys((COST, P99), "no times")
+        why = "driven on different machines"
     return _Pair(
         name,
-        {ERROR: np.array(errors)[:, known], COST: cost, P99: cost},
-        {ERROR: reference.block, COST: _COSTS, P99: _COSTS},
+        np.array(errors)[:, known],
+        cost,
+        reference.block,
         (common[known] - common[0]) * 1e-9,
         (replays[0].summary.restarts, replays[1].summary.restarts),
         why,
@@ -258,10 +252,13 @@ def _rows(quantity: str, pairs: Sequence[_Pair], bound: float) -> list[GateRow]:
     rng, rows, pooled = np.random.default_rng(SEED), list[GateRow](), list[Any]()
     share = 100.0 * _SHARE / len(pairs)
     for pair in pairs:
-        if why := pair.obstacles.get(quantity):
+        values, block, why = pair.costs, _COSTS, pair.obstacle
+        if quantity == ERROR:
+            values, block = pair.errors, pair.block
+            why = "" if values.shape[1] else "no reference"
+        if why:
             rows.append(GateRow(pair.name, quantity, why=why))
             continue
-        values, block = pair.values[quantity], pair.blocks[quantity]
         new, old = _both(quantity, values).tolist()
         row = GateRow(pair.name, quantity, new, old, ratio=new / max(old, 1e-12), why="too short")
         same = bool((values[0] == values[1]).all())
@@ -321,8 +318,8 @@ def _resampled(
 
 def _stretches(pair: _Pair) -> tuple[tuple[float, float], ...]:
     """By stretch of `PER_STRETCH` sub-trajectories its first second, and the ratio there."""
-    n = max(1, len(pair.seconds) // (PER_STRETCH * pair.blocks[ERROR]))
-    parts = np.array_split(np.vstack([pair.seconds, pair.values[ERROR]]), n, axis=1)
+    n = max(1, len(pair.seconds) // (PER_STRETCH * pair.block))
+    parts = np.array_split(np.vstack([pair.seconds, pair.errors]), n, axis=1)
     return tuple(
         (round(float(t[0]), 1), float(new.mean() / max(old.mean(), 1e-12))) for t, new, old in parts
     )

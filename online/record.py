@@ -213,11 +213,11 @@ def write_replay(
 @cache
 def machine() -> str:
     """The kind of this machine: costs that were measured on others cannot be compared."""
+    found = None
     with suppress(OSError):
         listed = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
-        if found := re.search(r"model name\s*: (.*)", listed):
-            return f"{found[1]}, {os.cpu_count()} cores"
-    return f"{platform.machine()}, {os.cpu_count()} cores"
+        found = re.search(r"model name\s*: (.*)", listed)
+    return f"{found[1] if found else platform.machine()}, {os.cpu_count()} cores"
 
 
 def kept_up(replay: ReplayRecord) -> dict[str, float] | None:

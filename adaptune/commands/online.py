@@ -266,11 +266,11 @@ def _gate(
 ) -> None:
     """Say whether the first side is worse than the second one, and exit with a code."""
     from adaptune.commands.gate import sides
-    from online.gate import Bounds, compare_sides, write_gate
+    from online.gate import compare_sides, write_gate
 
     shares = [_share_of(text, key) for text, key in zip(percents, ("worse", "cost"), strict=True)]
     begin_work()
-    gate = compare_sides(*sides(given, recordings, odometry), Bounds(*shares))
+    gate = compare_sides(*sides(given, recordings, odometry), *shares)
     write_gate(out, gate)
     say(gate.words)
     show_table("New against old", [row.columns() for row in gate.rows])

@@ -39,11 +39,10 @@ class Asked(NamedTuple):
     def line(self) -> str:
         """The first line of the study."""
         words = [*(str(bag.resolve()) for bag in self.recordings), "--odometry", self.odometry]
-        words += ["--points", self.points] if self.points else []
-        words += ["--reference", self.reference] if self.reference else []
-        words += ["--config", str(self.config.resolve())] if self.config else []
-        words += [word for bag in self.test for word in ("--test", str(bag.resolve()))]
-        words += ["--as", self.reading] if self.reading else []
+        given = [("--points", self.points), ("--reference", self.reference)]
+        given += [("--config", self.config and str(self.config.resolve()))]
+        given += [*(("--test", str(bag.resolve())) for bag in self.test), ("--as", self.reading)]
+        words += [word for key, value in given if value for word in (key, value)]
         # A name may hold the end of a line, or what is no character.
         plain = (c if c.isprintable() else ascii(c)[1:-1] for c in shlex.join(words))
         return f"# adaptune tune {''.join(plain)}\n"
@@ -55,8 +54,7 @@ def recorded(asked: Asked) -> "tuple[dict[str, Inspection], list[str]]":
 
     for path in asked.recordings:
         check_no_study(path)
-    tested = recordings_at(asked.test, asked.reading)
-    others = recordings_at(asked.recordings, asked.reading)
+    tested, others = (recordings_at(p, asked.reading) for p in (asked.test, asked.recordings))
     kept = {path.resolve() for path in tested}
     paths = [*(path for path in others if path.resolve() not in kept), *tested]
     for path in paths:

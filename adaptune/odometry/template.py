@@ -11,8 +11,6 @@ from operator import getitem
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
-
 from adaptune import yaml12
 from adaptune.errors import OdometryError, nearest
 from adaptune.space import Categorical, Float, Integer, ParameterSet, ParameterSpace
@@ -111,21 +109,19 @@ class Template:
         """
         tuned: dict[str, Float | Integer | Categorical] = {}
         for name, value in self.held(space.names, under).items():
-            own = space.parameters[name]
-            changes: dict[str, Any] = {"baseline": value}
+            own, changes = space.parameters[name], {"baseline": value}
             try:
                 if not isinstance(own, Categorical):
                     # 1e-3 is a text to YAML 1.1.
                     number = value if type(value) is int else float(value)
-                    low, high = min(own.low, number), max(own.high, number)
-                    changes = {"baseline": number, "low": low, "high": high}
+                    changes = {"low": min(own.low, number), "high": max(own.high, number)}
+                    changes["baseline"] = number
                 tuned[name] = type(own).model_validate(own.model_dump() | changes)
-            except (ValidationError, ValueError, TypeError) as error:
+            except (ValueError, TypeError) as error:
                 line = self._document.where(self.path, (self._find(under + name) or ((),))[-1])
                 kind = "whole number" if isinstance(own, Integer) else "number"
-                raise OdometryError(
-                    f"{line}: {name}: {value!r} is no {kind} to begin at"
-                ) from error
+                what = f"{line}: {name}: {value!r} is no {kind} to begin at"
+                raise OdometryError(what) from error
         if not tuned:
             raise OdometryError(
                 f"{self.path}: holds none of {', '.join(under + name for name in space.names)}; "
