@@ -234,7 +234,7 @@ def roles(
     from adaptune.reference.check import TRAINING
     from adaptune.yaml12 import dump
 
-    names, test = ([dump([n]).removeprefix("- ").strip() for n in of] for of in (names, test))
+    names, test = ([*map(_in_yaml, of)] for of in (names, test))
     if test:
         training, tested = ", ".join(names), ", ".join(test)
     elif len(names) == 1:
@@ -251,6 +251,13 @@ def roles(
         odometry = "".join(f"\n  - {{name: {name}}}" for name in odometries)
     judged = f"training: [{training}]\ntest: [{tested}]\nsub_trajectory: {length}\n"
     return f"{judged}odometry: {odometry}\n"
+
+
+def _in_yaml(name: str) -> str:
+    """A name in a list of YAML."""
+    from adaptune.yaml12 import dump
+
+    return dump([name]).removeprefix("- ").strip()
 
 
 # Tune an odometry on recordings.
@@ -483,7 +490,7 @@ def _decided(asked: Asked, limits: Mapping[str, str], folder: Path) -> str:
 
 
 def _grown(path: Path, asked: Asked) -> list[str]:
-    """Add the recordings that a study does not name yet to its training; their names."""
+    """Add the recordings that a study does not name yet to where they belong; their names."""
     from adaptune import yaml12
     from adaptune.recording.config import SOURCES
     from adaptune.recording.fleet import recordings_at
@@ -494,8 +501,9 @@ def _grown(path: Path, asked: Asked) -> list[str]:
         known = {str(one.get(key)) for one in data["sequences"].values() for key in SOURCES}
     except (yaml12.YamlError, AttributeError, KeyError, TypeError):
         return []  # loading it says what is wrong
-    given = recordings_at([*asked.recordings, *asked.test], asked.reading)
-    there = list(dict.fromkeys(one.resolve() for one in given))
+    tested = [one.resolve() for one in recordings_at(asked.test, asked.reading)]
+    others = [one.resolve() for one in recordings_at(asked.recordings, asked.reading)]
+    there = list(dict.fromkeys([*others, *tested]))
     new = [one for one in there if str(one) not in known]
     if not new:
         return []
@@ -508,17 +516,26 @@ def _grown(path: Path, asked: Asked) -> list[str]:
         )
     entries = yaml12.dump({name: one.given for name, one in added.items()})
     indented = "".join(f"  {line}\n" for line in entries.splitlines())
-    listed = "".join(f", {yaml12.dump([name]).removeprefix('- ').strip()}" for name in added)
     grown = re.sub(r"(?m)^sequences:\n", lambda m: m[0] + indented, text, count=1)
-    grown = re.sub(r"(?m)^(training: \[.*)\]", lambda m: f"{m[1]}{listed}]", grown, count=1)
-    if isinstance(n := (data.get("offline") or {}).get("stretches", 12), int):
+    into = {
+        "training": [name for name, one in added.items() if one.path not in tested],
+        "test": [name for name, one in added.items() if one.path in tested],
+    }
+    for role, names in into.items():
+        listed = "".join(f", {_in_yaml(name)}" for name in names)
+        pattern = rf"(?m)^({role}: \[.*)\]"
+        grown = re.sub(pattern, lambda m, more=listed: f"{m[1]}{more}]", grown, count=1)
+    n = (data.get("offline") or {}).get("stretches", 12)
+    if into["training"] and isinstance(n, int):
         # As many stretches of each as before: the trials that there are stay.
-        before, now = len(data["training"]), len(data["training"]) + len(added)
+        before, now = len(data["training"]), len(data["training"]) + len(into["training"])
         pinned = f"offline: {{stretches: {max(4, -(-n // before)) * now}, "
         grown = re.sub(r"(?m)^offline: \{(stretches: \d+, )?", pinned, grown, count=1)
     data = yaml12.Document(grown).data
-    if not all(name in data["training"] for name in added):
-        raise AdaptuneError(f"{path}: add {', '.join(added)} to sequences and training by hand")
+    if not all(name in data[role] for role, names in into.items() for name in names):
+        raise AdaptuneError(
+            f"{path}: add {', '.join(added)} to sequences, and training or test, by hand"
+        )
     write_text(path, grown)
     return list(added)
 
