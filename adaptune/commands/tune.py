@@ -279,30 +279,36 @@ Given = Annotated[
 ]
 
 
+Bags = Annotated[
+    list[Path],
+    typer.Argument(
+        metavar="BAG...", help="Bags of one robot, or folders of them.", show_default=False
+    ),
+]
+Odometry = Annotated[
+    str | None,
+    typer.Option(
+        metavar="NAME",
+        help="gicp, my_module:MyClass, ..., several with commas, or `all`; or an image.",
+        show_default="gicp; with --config kiss_icp",
+    ),
+]
+Config = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE", help="Your parameter file: the baseline, and all that is not tuned."
+    ),
+]
+Test = Annotated[
+    list[Path], typer.Option(metavar="BAG", help="A recording for the test. May be repeated.")
+]
+
+
 def tune(
-    recordings: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="BAG...", help="Bags of one robot, or folders of them.", show_default=False
-        ),
-    ],
-    odometry: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME",
-            help="gicp, my_module:MyClass, ..., several with commas, or `all`; or an image.",
-            show_default="gicp; with --config kiss_icp",
-        ),
-    ] = None,
-    config: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE", help="Your parameter file: the baseline, and all that is not tuned."
-        ),
-    ] = None,
-    test: Annotated[
-        list[Path], typer.Option(metavar="BAG", help="A recording for the test. May be repeated.")
-    ] = [],  # noqa: B006
+    recordings: Bags,
+    odometry: Odometry = None,
+    config: Config = None,
+    test: Test = [],  # noqa: B006
     reading: As = None,
     points: Points = None,
     reference: Given = None,
@@ -659,7 +665,10 @@ def _split(study: "OfflineStudy", whole: Sequence[str]) -> tuple[str, float]:
             f"{LEAST_PATH:g} m at least; record a longer drive, or name another recording for the "
             f"test as the last one"
         )
-    length = proposed_sub_trajectory(reference, training=share)
+    # One that fits into each of several.
+    others = filter(None, (sequences.open(name).reference() for name in whole[:-1]))
+    lengths = [proposed_sub_trajectory(other, training=0.0) for other in others]
+    length = min([proposed_sub_trajectory(reference, training=share), *lengths])
     words = f"{length}    # metres over which errors are measured; the test moves {metres:.0f} m"
     return words, share
 
