@@ -182,38 +182,42 @@ def now(record: "ReplayRecord") -> str:
     return ", ".join(words)
 
 
+NewSide = Annotated[
+    str,
+    typer.Argument(metavar="STUDY", help="A study's YAML, or its folder.", show_default=False),
+]
+Driven = Annotated[
+    list[Path] | None,
+    typer.Argument(metavar="[BAG]...", help="With --against, what to drive.", show_default=False),
+]
+Against = Annotated[
+    str | None,
+    typer.Option(
+        metavar="OLD",
+        help="Is STUDY worse than this one? Both may also be parameter files, or odometries "
+        "(names, commands, images), to be driven on bags.",
+    ),
+]
+OfFiles = Annotated[str | None, typer.Option(metavar="NAME", help="Of parameter files.")]
+Worse = Annotated[str, typer.Option(metavar="PERCENT", help="Error that is no matter.")]
+Cost = Annotated[str, typer.Option(metavar="PERCENT", help="Cost that is no matter.")]
+Unclear = Annotated[
+    Literal["pass", "fail"], typer.Option(help="What too little to tell counts as.")
+]
+Out = Annotated[
+    Path, typer.Option(help="Folder of gate.json, junit.xml and summary.md.", file_okay=False)
+]
+
+
 def compare(
-    study: Annotated[
-        str,
-        typer.Argument(
-            metavar="STUDY", help="The study's YAML, or its folder.", show_default=False
-        ),
-    ],
-    recordings: Annotated[
-        list[Path] | None,
-        typer.Argument(
-            metavar="[BAG]...", help="With --against, what to drive.", show_default=False
-        ),
-    ] = None,
-    against: Annotated[
-        str | None,
-        typer.Option(
-            metavar="OLD",
-            help="Is STUDY worse than this one? Both may also be parameter files, or odometries "
-            "(names, commands, images), to be driven on bags.",
-        ),
-    ] = None,
-    odometry: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Of parameter files.")
-    ] = None,
-    worse: Annotated[str, typer.Option(metavar="PERCENT", help="Error that is no matter.")] = "5%",
-    cost: Annotated[str, typer.Option(metavar="PERCENT", help="Cost that is no matter.")] = "10%",
-    unclear: Annotated[
-        Literal["pass", "fail"], typer.Option(help="What too little to tell counts as.")
-    ] = "pass",
-    out: Annotated[
-        Path, typer.Option(help="Folder of gate.json, junit.xml and summary.md.", file_okay=False)
-    ] = Path("runs/compare"),
+    study: NewSide,
+    recordings: Driven = None,
+    against: Against = None,
+    odometry: OfFiles = None,
+    worse: Worse = "5%",
+    cost: Cost = "10%",
+    unclear: Unclear = "pass",
+    out: Out = Path("runs/compare"),
     override: Override = [],  # noqa: B006
     folder: Folder = None,
     details: Details = False,

@@ -298,30 +298,36 @@ Given = Annotated[
 ]
 
 
+Bags = Annotated[
+    list[Path],
+    typer.Argument(
+        metavar="BAG...", help="Bags of one robot, or folders of them.", show_default=False
+    ),
+]
+Odometry = Annotated[
+    str | None,
+    typer.Option(
+        metavar="NAME",
+        help="gicp, my_module:MyClass, ..., several with commas, or `all`; or an image.",
+        show_default="gicp; with --config kiss_icp",
+    ),
+]
+Config = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE", help="Your parameter file: the baseline, and all that is not tuned."
+    ),
+]
+Test = Annotated[
+    list[Path], typer.Option(metavar="BAG", help="A recording for the test. May be repeated.")
+]
+
+
 def tune(
-    recordings: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="BAG...", help="Bags of one robot, or folders of them.", show_default=False
-        ),
-    ],
-    odometry: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME",
-            help="gicp, my_module:MyClass, ..., several with commas, or `all`; or an image.",
-            show_default="gicp; with --config kiss_icp",
-        ),
-    ] = None,
-    config: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE", help="Your parameter file: the baseline, and all that is not tuned."
-        ),
-    ] = None,
-    test: Annotated[
-        list[Path], typer.Option(metavar="BAG", help="A recording for the test. May be repeated.")
-    ] = [],  # noqa: B006
+    recordings: Bags,
+    odometry: Odometry = None,
+    config: Config = None,
+    test: Test = [],  # noqa: B006
     reading: As = None,
     points: Points = None,
     reference: Given = None,
@@ -686,8 +692,8 @@ def _split(study: "OfflineStudy", whole: Sequence[str]) -> tuple[str, float, str
     from adaptune.trajectory import read_trajectory
 
     sequences = study.sequences
-    known = [one for name in whole if (one := sequences.open(name).reference()) is not None]
-    reference = sequences.open(whole[-1]).reference()
+    known = {n: one for n in whole if (one := sequences.open(n).reference()) is not None}
+    reference = known.get(whole[-1])
     if reference is None:
         _estimate(study, whole[-1:])
         reference = read_trajectory(sequences.estimate_path(whole[-1]))
@@ -699,9 +705,12 @@ def _split(study: "OfflineStudy", whole: Sequence[str]) -> tuple[str, float, str
             f"{LEAST_PATH:g} m at least; record a longer drive, or name another recording for the "
             f"test as the last one"
         )
-    length = proposed_sub_trajectory(reference, training=share)
+    others = [one for name, one in known.items() if name != whole[-1]]
+    # One that fits into each of several.
+    lengths = [proposed_sub_trajectory(other, training=0.0) for other in others]
+    length = min([proposed_sub_trajectory(reference, training=share), *lengths])
     words = f"{length}    # metres over which errors are measured; the test moves {metres:.0f} m"
-    speed = max(LEAST_SPEED, 2.0 * max(map(greatest_speed, [*known, reference])))
+    speed = max(LEAST_SPEED, 2.0 * max(map(greatest_speed, [*known.values(), reference])))
     health = f"health: {{max_speed: {speed:.0f}}}    # m/s: twice the speed of the fastest second\n"
     return words, share, health
 
