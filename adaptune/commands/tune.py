@@ -510,7 +510,7 @@ def _grown(path: Path, asked: Asked) -> list[str]:
     tested = [one.resolve() for one in recordings_at(asked.test, asked.reading)]
     others = [one.resolve() for one in recordings_at(asked.recordings, asked.reading)]
     there = list(dict.fromkeys([*others, *tested]))
-    new = [one for one in there if str(one) not in known]
+    new = [one for one in there if known.isdisjoint({str(one), str(one.parent)})]
     if not new:
         return []
     named, _ = recorded(asked._replace(recordings=there, test=(), reading="one"))

@@ -47,8 +47,8 @@ def read_folder(path: Path) -> FolderReading:
     folders = [p for p in sorted(path.iterdir()) if p.is_dir() and _is_recording(p)]
     if folders:
         return FolderReading((*folders, *bags), "several", "each folder is a recording")
-    if len(bags) < 2:
-        return alone
+    if len(bags) < 2:  # by its own name: there may be more later
+        return FolderReading(tuple(bags), "one") if bags else alone
     spans = sorted((*_span(bag), bag) for bag in bags)
     ends = np.maximum.accumulate([end for _, end, _ in spans])
     gaps = np.array([spans[i + 1][0] - ends[i] for i in range(len(spans) - 1)]) * 1e-9
@@ -85,7 +85,8 @@ def recordings_at(paths: Sequence[Path], reading: Reading | None = None) -> list
         folder = read_folder(path)
         if (way := reading or folder.reading) is None:
             raise SequenceError(f"{path}: {both_readings(folder)}")
-        found += folder.recordings if way == "several" else (path,)
+        apart = way == "several" or len(folder.recordings) == 1
+        found += folder.recordings if apart else (path,)
     return found
 
 

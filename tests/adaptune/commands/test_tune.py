@@ -320,3 +320,20 @@ def test_a_folder_is_looked_at(tmp_path):
     assert "2 recordings" in shown
     assert "Next: adaptune tune" in shown
     assert "--test: leaves no recording" in failed(folder, "--test", folder, "--folder", "z")
+
+
+@pytest.mark.usefixtures("decided")
+def test_what_is_new_goes_where_its_folder_belongs(tmp_path):
+    def add(seed, name):
+        late = [(stamp + seed * 10**12, *rest) for stamp, *rest in drives.scans(seed)]
+        drives.write_bag(tmp_path / f"{name}.bag", late)
+
+    call = ("bags", "--test", "kept", "--folder", "runs/many")
+    add(0, "bags/park")
+    add(1, "kept/yard")
+    failed(*call)
+    add(2, "bags/street")
+    add(3, "kept/alley")
+    failed(*call)
+    study = study_in("runs/many/many.yaml").config
+    assert (study.training, study.test) == (("park", "street"), ("yard", "alley"))

@@ -41,6 +41,10 @@ def test_where_it_is_not_clear_an_option_chooses(tmp_path):
     assert recordings_at(bags) == bags
 
 
+def test_the_only_bag_of_a_folder_has_its_own_name(tmp_path):
+    assert recordings_at([write(tmp_path, drive_0=0.0)]) == [tmp_path / "drive_0.bag"]
+
+
 def test_a_folder_of_folders_holds_several(tmp_path):
     for name in ("monday", "tuesday"):
         write(tmp_path / name, drive_0=0.0, drive_1=1.0)
