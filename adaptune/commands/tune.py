@@ -360,20 +360,11 @@ def tune(
         return
     folder = folder or Path("runs") / _study_name(recordings, odometry)
     path = folder / f"{folder.resolve().name}.yaml"
-    overrides, more, limits = [*override], list[str](), _limits(trials, minutes, budget)
-    if not path.exists():
-        _write(path, asked.line + _decided(asked, limits, folder))
-    elif not path.read_text("utf-8").startswith(asked.line):
-        raise AdaptuneError(
-            f"{path}: another `adaptune tune` made it, for what its first line says; name the same "
-            f"to resume it, or another --folder"
-        )
-    else:
-        overrides += [f"{key}={value}" for key, value in limits.items()]
-        more = _grown(path, asked)
+    limits = _limits(trials, minutes, budget)
+    overrides, more = _written(path, asked, limits, folder)
     from offline.train import train
 
-    loaded = load(path, overrides, folder, runs=True)
+    loaded = load(path, [*override, *overrides], folder, runs=True)
     say(f"Study: {path}")
     _say_untuned(loaded)
     before = loaded.fixed
@@ -387,6 +378,24 @@ def tune(
     _say_recordings(training.rows, found)
     say_odometries(loaded, training)
     say_next("replays to look at in Foxglove", "record", folder)
+
+
+def _written(
+    path: Path, asked: Asked, limits: dict[str, str], folder: Path
+) -> tuple[list[str], list[str]]:
+    """Write the study, or add what is new to the one that is there.
+
+    Returns what overrides it, and the names of new recordings.
+    """
+    if not path.exists():
+        _write(path, asked.line + _decided(asked, limits, folder))
+        return [], []
+    if not path.read_text("utf-8").startswith(asked.line):
+        raise AdaptuneError(
+            f"{path}: another `adaptune tune` made it, for what its first line says; name the same "
+            f"to resume it, or another --folder"
+        )
+    return [f"{key}={value}" for key, value in limits.items()], _grown(path, asked)
 
 
 def _say_untuned(study: "OfflineStudy") -> None:
@@ -463,7 +472,7 @@ def _limits(trials: int | None, minutes: float | None, budget: float | None) -> 
     return {key: f"{value:.10g}" for key, value in given.items() if value is not None}
 
 
-def _decided(asked: Asked, limits: Mapping[str, str], folder: Path) -> str:
+def _decided(asked: Asked, limits: dict[str, str], folder: Path) -> str:
     """The study of some recordings as YAML, with comments; nothing is written but references."""
     named, test = recorded(asked)
     odometries = odometries_of(asked.odometry, all("imu" in one.given for one in named.values()))
