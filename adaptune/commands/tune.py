@@ -304,6 +304,12 @@ Test = Annotated[
 ]
 
 
+Kept = Annotated[
+    Path | None,
+    typer.Option(help="The study's folder.", show_default="the first bag's name, under runs/"),
+]
+
+
 def tune(
     recordings: Bags,
     odometry: Odometry = None,
@@ -315,10 +321,7 @@ def tune(
     trials: Trials = None,
     minutes: Minutes = None,
     override: Override = [],  # noqa: B006
-    folder: Annotated[
-        Path | None,
-        typer.Option(help="The study's folder.", show_default="the first bag's name, under runs/"),
-    ] = None,
+    folder: Kept = None,
     cluster: Cluster = None,
     details: Details = False,
 ) -> None:
