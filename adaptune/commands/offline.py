@@ -26,7 +26,7 @@ from adaptune.commands.terminal import (
     say_next_online,
     show_table,
 )
-from adaptune.commands.tune import show_front
+from adaptune.commands.trained import show_front
 from adaptune.errors import AdaptuneError, Finding
 from adaptune.files import write_text
 

@@ -27,6 +27,13 @@ from adaptune.commands.terminal import (
     say_next,
     show_table,
 )
+from adaptune.commands.trained import (
+    say_grown,
+    say_odometries,
+    say_recordings,
+    say_untuned,
+    show_front,
+)
 from adaptune.errors import AdaptuneError, NotInstalledError
 from adaptune.files import plain_name, write_text
 from adaptune.progress import Progress
@@ -36,8 +43,6 @@ if TYPE_CHECKING:
     from adaptune.recording.inspect import Inspection
     from adaptune.trajectory import Trajectory
     from offline.config import OfflineStudy
-    from offline.train import Training
-    from online.compare import ComparedReplays
 
 UNKNOWN_LENGTH = "5.0    # metres; 10.0 for a path of 200 m or more, 25.0 for one of 500 m or more"
 """The length of sub-trajectories to propose where the path is not known."""
@@ -323,6 +328,12 @@ Test = Annotated[
 ]
 
 
+Kept = Annotated[
+    Path | None,
+    typer.Option(help="The study's folder.", show_default="the first bag's name, under runs/"),
+]
+
+
 def tune(
     recordings: Bags,
     odometry: Odometry = None,
@@ -335,10 +346,7 @@ def tune(
     minutes: Minutes = None,
     budget: Budget = None,
     override: Override = [],  # noqa: B006
-    folder: Annotated[
-        Path | None,
-        typer.Option(help="The study's folder.", show_default="the first bag's name, under runs/"),
-    ] = None,
+    folder: Kept = None,
     cluster: Cluster = None,
     details: Details = False,
 ) -> None:
@@ -366,7 +374,7 @@ def tune(
 
     loaded = load(path, [*override, *overrides], folder, runs=True)
     say(f"Study: {path}")
-    _say_untuned(loaded)
+    say_untuned(loaded)
     before = loaded.fixed
     with progress() as show:
         training = train(loaded, show, cluster)
@@ -374,8 +382,8 @@ def tune(
     found = compared(loaded, details=details)
     show_front(training)
     if more:
-        _say_grown(more, before, loaded.fixed)
-    _say_recordings(training.rows, found)
+        say_grown(more, before, loaded.fixed)
+    say_recordings(training.rows, found)
     say_odometries(loaded, training)
     say_next("replays to look at in Foxglove", "record", folder)
 
@@ -396,56 +404,6 @@ def _written(
             f"to resume it, or another --folder"
         )
     return [f"{key}={value}" for key, value in limits.items()], _grown(path, asked)
-
-
-def _say_untuned(study: "OfflineStudy") -> None:
-    """Name the parameters that are not tuned because the user's file does not hold them."""
-    from adaptune.odometry.registry import ODOMETRIES, odometry_class
-
-    for own in study.config.odometries.values():
-        if own.name in ODOMETRIES and (config := own.settings.get("config")):
-            known = odometry_class(own.name).space.names
-            if lacking := [name for name in known if name not in study.odometry.space.names]:
-                say(f"Not tuned, because {config} does not hold them: {', '.join(lacking)}.")
-
-
-def _say_grown(more: Sequence[str], before: Any, now: Any) -> None:
-    """What recordings that were not there before have changed."""
-    from adaptune.space import in_words
-
-    changed = "the recommended set is the same as before"
-    if before is not None and before != now:
-        names = [name for name in now if now[name] != before.get(name)]
-        old, new = (in_words({name: of.get(name, "-") for name in names}) for of in (before, now))
-        changed = f"recommended is {new} instead of {old}"
-    say(f"New in training: {', '.join(more)}; {changed}.")
-
-
-def _say_recordings(rows: Sequence[Mapping[str, Any]], found: "ComparedReplays") -> None:
-    """What the other recordings recommend for each, the worst first; or what a third would add."""
-    from online.modes import BASELINE, FIXED
-    from online.statistics import ALL
-
-    rte = {(row.sequence, row.mode): row.rte for row in found.rows if row.sequence != ALL}
-    known = [(r["sequence"], r["baseline, whole"], r["_left out"], "training") for r in rows]
-    known += [(n, rte[n, BASELINE], rte.get((n, FIXED)), "test") for n, of in rte if of == BASELINE]
-    table = [
-        {"recording": name, "baseline [%]": own, "recommended [%]": rte, "ratio": rte / own, "": of}
-        for name, own, rte, of in known
-        if own and rte is not None
-    ]
-    if len(rows) < 2 or len(table) < 3:
-        say(
-            "With three recordings, each would also be left out in turn: the table would say "
-            "where the recommended set does worst."
-        )
-        return
-    table.sort(key=lambda row: -row["ratio"])
-    show_table(
-        "Each recording left out, the worst first",
-        table,
-        "Recommended is the finalist that the others choose; for the test, the fixed set.",
-    )
 
 
 def _write(path: Path, text: str) -> None:
@@ -752,54 +710,3 @@ def _estimate(study: "OfflineStudy", names: Sequence[str]) -> None:
         if not there:
             shutil.rmtree(study.folder)
         raise AdaptuneError(f"{error}; or give a --reference") from error
-
-
-def show_front(training: "Training") -> None:
-    """What CPU time buys: the table of the front."""
-    rows = [
-        {
-            "": ("-> " if row["recommended"] else "") + row["what"],
-            "cost [ms]": row["cost [ms]"],
-            "RTE [%]": row["error [%]"],
-            "vs baseline": row["vs baseline"],
-            "95 %": None if row["low"] != row["low"] else f"{row['low']:.2f}-{row['high']:.2f}",
-            "parameters": row["parameters"],
-        }
-        for row in training.front
-    ]
-    show_table(
-        "What CPU time buys, in training",
-        rows,
-        "The arrow marks what is recommended: the best of what costs no more than the baseline, or "
-        "than `--budget`, in milliseconds of CPU time a scan.",
-    )
-
-
-def say_odometries(study: "OfflineStudy", training: "Training") -> None:
-    """Of several odometries, what each gives with its own parameters and tuned, in training."""
-    from adaptune.space import ODOMETRY
-    from offline.train import COST
-
-    labels = list(study.config.odometries)
-    if len(labels) < 2:
-        return
-    rows = []
-    for label in labels:
-        mine = [row for row in training.trials if row[ODOMETRY] == label]
-        known = [row for row in mine if row["mean"] is not None]
-        best = min(known, key=lambda row: row["mean"], default=None)
-        rows.append(
-            {
-                "odometry": label,
-                "its own parameters [%]": mine[0]["mean"] if mine else None,
-                "tuned [%]": None if best is None else best["mean"],
-                COST: None if best is None else best[COST],
-            }
-        )
-    rows.sort(key=lambda row: row["tuned [%]"] if row["tuned [%]"] is not None else float("inf"))
-    fixed = training.model.sets[training.model.fixed][ODOMETRY]
-    say(
-        f"Best odometry in training: {rows[0]['odometry']}. On the test, the fixed set is "
-        f"{fixed}'s, the baseline {labels[0]}'s; to see another there, name it alone (--odometry)."
-    )
-    show_table("RTE of each odometry in training", rows)

@@ -47,8 +47,11 @@ class ToolSettings(RangeSettings):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        if twice := self.model_fields_set.intersection(self.in_file if self.config else ()):
-            raise ValueError(f"{min(twice)} is taken from {self.config}; change it there")
+        # The study in a folder names the defaults, too.
+        plain = type(self).model_construct(config=self.config)
+        twice = [key for key in self.in_file if getattr(self, key) != getattr(plain, key)]
+        if self.config is not None and twice:
+            raise ValueError(f"{twice[0]} is taken from {self.config}; change it there")
         return self
 
     @property

@@ -184,5 +184,13 @@ def test_a_file_of_something_else_is_refused(tmp_path, name, text, words):
     with pytest.raises(OdometryError, match=r"users\.yaml") as caught:
         declare(name, {"config": str(path)})
     assert words in str(caught.value)
-    mistakes = declare(name, {"config": str(path), "deskew": True, "parameters": {}}).mistakes
-    assert mistakes
+
+
+def test_what_the_file_gives_is_not_given_twice(tmp_path):
+    (tmp_path / "users.yaml").write_text(USERS)
+    given = {"config": str(tmp_path / "users.yaml")}
+    (mistake,) = declare("kiss_icp", given | {"min_range": 2.0}).mistakes
+    assert "min_range is taken from" in str(mistake)
+    # A study's folder names the defaults, too.
+    whole = Kiss.settings_type(**given).model_dump()
+    assert declare("kiss_icp", whole).mistakes == []
