@@ -40,7 +40,7 @@ class Asked(NamedTuple):
         """The first line of the study."""
         words = [*(str(bag.resolve()) for bag in self.recordings), "--odometry", self.odometry]
         given = [("--points", self.points), ("--reference", self.reference)]
-        given += [("--config", self.config and str(self.config.resolve()))]
+        given += [("--config", str(self.config.resolve()) if self.config else None)]
         given += [*(("--test", str(bag.resolve())) for bag in self.test), ("--as", self.reading)]
         words += [word for key, value in given if value for word in (key, value)]
         # A name may hold the end of a line, or what is no character.

@@ -496,8 +496,8 @@ def _grown(path: Path, asked: Asked) -> list[str]:
     }
     for role, names in into.items():
         listed = "".join(f", {_in_yaml(name)}" for name in names)
-        pattern = rf"(?m)^({role}: \[.*)\]"
-        grown = re.sub(pattern, lambda m, more=listed: f"{m[1]}{more}]", grown, count=1)
+        if found := re.search(rf"(?m)^{role}: \[.*(?=\])", grown):
+            grown = grown[: found.end()] + listed + grown[found.end() :]
     n = (data.get("offline") or {}).get("stretches", 12)
     if into["training"] and isinstance(n, int):
         # As many stretches of each as before: the trials that there are stay.
