@@ -255,7 +255,7 @@ def roles(
     else:
         odometry = "".join(f"\n  - {{name: {name}}}" for name in odometries)
     judged = f"training: [{training}]\ntest: [{tested}]\nsub_trajectory: {length}\n"
-    return f"{judged}odometry: {odometry}\n"
+    return f"{judged}odometry: {odometry}\n".replace(": \n", ":\n")
 
 
 def _in_yaml(name: str) -> str:
