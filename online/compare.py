@@ -476,8 +476,7 @@ def _with_fixed_rivals(
 ) -> dict[str, StoredReplay]:
     """The replays by mode; a best default that is the fixed set has its replay."""
     same: dict[str, StoredReplay] = {}
-    if model is not None and "fixed" in replays and len(model.sets.space.baselines) > 1:
-        of_fixed = [BEST_DEFAULT] if model.rivals.get(BEST_DEFAULT) == model.fixed else []
-        same |= dict.fromkeys(of_fixed, replays["fixed"])
+    if model is not None and "fixed" in replays and model.rivals.get(BEST_DEFAULT) == model.fixed:
+        same[BEST_DEFAULT] = replays["fixed"]
     every = {**same, **replays}
     return {mode: every[mode] for mode in in_order(every)}

@@ -41,7 +41,7 @@ class ToolSettings(RangeSettings):
     is not tuned; parameters that it does not hold are not tuned.
     """
 
-    in_file: ClassVar[tuple[str, ...]]
+    in_file: ClassVar[tuple[str, ...]] = ("min_range", "max_range", "deskew")
     """Settings that the file gives."""
     config: Annotated[str, AfterValidator(resolve)] | None = None
 
@@ -319,8 +319,8 @@ class Odometry(ABC):
     @classmethod
     def describe(cls, settings: Any) -> Description:
         """What a study must know of the odometry with these settings."""
-        if isinstance(settings, ToolSettings) and settings.config is not None:
-            cls(settings=settings)  # raises where a value of the file does not fit
+        if isinstance(settings, ToolSettings):
+            cls(settings=settings)  # raises where a value does not fit
         known = cls.tuned(settings), cls.live, cls.needs_imu
         return Description(*known, clean=cls.clean, module=cls.__module__)
 

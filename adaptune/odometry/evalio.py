@@ -179,8 +179,6 @@ class Pipeline(OwnFrameOdometry):
     @classmethod
     def describe(cls, settings: Any) -> Description:
         evalio_modules()  # raises if there is no evalio
-        if settings is not None and settings.parameters:
-            cls(settings=settings)  # raises if a parameter is unknown, or a value of another type
         return super().describe(settings)
 
     @classmethod

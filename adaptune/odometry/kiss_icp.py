@@ -1,7 +1,7 @@
 """KISS-ICP, through its Python class."""
 
 from functools import cached_property
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from kiss_icp.config import KISSConfig
@@ -27,13 +27,6 @@ from adaptune.odometry.own_frame import END, MIDDLE, AtStamp, duration_of
 from adaptune.recording.scan import Scan
 from adaptune.space import Float, Integer, ParameterSet, ParameterSpace
 from adaptune.strict import in_one_line
-
-
-class KissSettings(ToolSettings):
-    """Settings of KISS-ICP."""
-
-    in_file: ClassVar[tuple[str, ...]] = ("min_range", "max_range", "deskew")
-
 
 _SECTION = {
     name: section
@@ -68,7 +61,7 @@ class Kiss(Odometry):
         min_motion_th=Float(low=0.01, high=1.0, baseline=0.1, log=True, unit="m"),
         max_num_iterations=Integer(low=5, high=500, baseline=500, log=True),
     )
-    settings_type = KissSettings
+    settings_type = ToolSettings
     live = True
     clean = True
 
@@ -82,7 +75,7 @@ class Kiss(Odometry):
         super().__init__(parameters, settings)
         # What adaptune sets; or all that the user's file gives, also in the layouts of ROS.
         template = self.settings.template
-        self._untuned = self.settings.model_dump(include={*KissSettings.in_file})
+        self._untuned = self.settings.model_dump(include={*ToolSettings.in_file})
         if template is not None:
             self._untuned = template.held(_SECTION)
             self.settings = self.settings.model_copy(update=dict(self._config().data))

@@ -112,9 +112,8 @@ def check_alike(recordings: Sequence["Inspection"]) -> None:
         if (topic := one.topics.get(one.given.get("points", one.used["points"]))) is None:
             continue  # opening it says so
         own = topic.rate or 1.0
-        rate = next((r for r in rates if max(r, own) <= _RATES * min(r, own)), None)
-        if rate is None:
-            rates.append(rate := own)
+        rate = next((r for r in rates if max(r, own) <= _RATES * min(r, own)), own)
+        rates.append(rate)
         kind = f"{rate:.1f} Hz, {topic.type}, {' '.join(one.fields) or 'scans'}"
         kinds.setdefault(kind, []).append(one.path.name)
     if len(kinds) > 1:
