@@ -67,16 +67,22 @@ def _mean(values: Sequence[float | None]) -> float | None:
     return float(np.mean(known)) if len(known) == len(values) else None
 
 
-def select(table: Sequence[Row], sort: str | None = None, top: int | None = None) -> list[Row]:
+def select(
+    table: Sequence[Row],
+    sort: str | None = None,
+    top: int | None = None,
+    shown: Mapping[str, str] | None = None,
+) -> list[Row]:
     """The first `top` rows in the order of a column, by default of the mean; else all rows.
 
-    With ``-`` before the column, the largest value comes first; unknown values come last.
+    With ``-`` before the column, the largest value comes first; unknown values come last. `shown`
+    has by column the heading under which it is printed, which names it, too.
     """
     if sort is None and top is None:
         return list(table)
     sort = sort or "mean"
     name = sort.removeprefix("-")
-    column = _COLUMN.get(name, name)
+    column = (_COLUMN | {heading: key for key, heading in (shown or {}).items()}).get(name, name)
     if table and column not in table[0]:
         known = nearest(column, table[0])
         raise AdaptuneError(f"--sort {sort}: there is no column {column!r}: {known}")
@@ -85,15 +91,20 @@ def select(table: Sequence[Row], sort: str | None = None, top: int | None = None
     return [*chosen, *(row for row in table if row[column] is None)][:top]
 
 
-def with_units(table: Sequence[Row], names: Sequence[str], labels: Mapping[str, str]) -> list[Row]:
-    """Rows for reading: headings say what is measured on the sequences, and units.
+def headings(names: Sequence[str], labels: Mapping[str, str]) -> dict[str, str]:
+    """By column, its heading in a table for reading.
 
     `labels` are those of the parameters, see `ParameterSpace.labels`.
     """
-    headings = {**labels, **_HEADINGS} | {name: f"RTE [%] {name}" for name in names}
+    return {**labels, **_HEADINGS} | {name: f"RTE [%] {name}" for name in names}
+
+
+def with_units(table: Sequence[Row], names: Sequence[str], labels: Mapping[str, str]) -> list[Row]:
+    """Rows for reading: see `headings`."""
+    shown = headings(names, labels)
     if table and ODOMETRY in table[0]:
         table = [_short(row) for row in table]
-    return [{headings.get(key, key): value for key, value in row.items()} for row in table]
+    return [{shown.get(key, key): value for key, value in row.items()} for row in table]
 
 
 def _short(row: Row) -> Row:

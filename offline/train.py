@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from adaptune import __version__, manifest, yaml12
+from adaptune import __version__, manifest, trial_rows, yaml12
 from adaptune.archive import Archive
 from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
@@ -37,6 +37,7 @@ from offline.campaign import (
     drive_whole,
     run_baseline,
 )
+from offline.choice import NothingUsableError
 from offline.config import OfflineConfig, OfflineStudy
 from offline.front import COST, front_rows, left_out_in_words
 from offline.labelled import LabelledData, labelled_data, with_vectors, with_whole_drives
@@ -106,6 +107,8 @@ def train(study: OfflineStudy, progress: Progress = unseen, cluster: str | None 
     AdaptuneError
         If a sequence, its reference or the odometry cannot be used, or no set gives poses.
     """
+    if not any(study.odometry.space.baselines):
+        raise AdaptuneError("odometry.parameters: is empty, so there is nothing to tune; name some")
     archive = _ready_archive(study, progress)
     config = study.config.offline
     names, space = study.training, study.odometry.space
@@ -125,11 +128,15 @@ def train(study: OfflineStudy, progress: Progress = unseen, cluster: str | None 
     fixed = usable.fixed()
     model = _fitted(study, data, with_vectors(usable, archive), finished, fixed)
     write_fixed(study, verdicts[fixed].parameters)
-    trials = _trial_rows(config, space, verdicts, finished)
+    trials = _trial_rows(config, trial_rows.rows(archive, names), verdicts)
     tables.write_rows(study.folder, "trials", trials)
     estimates = estimates_of(study.sequences, names)
     errors = {name: stored.error(model.length) for name, stored in estimates.items()}
     rows = _training_rows(config, verdicts, finished, fixed, whole, errors, space)
+    left_out = chosen_elsewhere(usable)
+    for row in rows:
+        chosen = left_out.get(name := row["sequence"])
+        row["_left out"] = None if chosen is None else whole[name][chosen].mean_error
     tables.write_rows(study.folder, "training", rows)
     said = lost_in_words(
         f"the fixed set, the best of {len(trials)} parameter sets,",
@@ -143,6 +150,17 @@ def train(study: OfflineStudy, progress: Progress = unseen, cluster: str | None 
     rows_of_front = front_rows(usable, model)
     tables.write_rows(study.folder, "front", rows_of_front)
     return Training(model, trials, rows, said, rows_of_front, left_out_in_words(usable))
+
+
+def chosen_elsewhere(data: LabelledData) -> dict[str, int]:
+    """By sequence, the trial that the other recordings choose, if there are any."""
+    found = {}
+    for one in data.sequences:
+        others = [s for s in data.sequences if s.recording != one.recording]
+        with contextlib.suppress(NothingUsableError):
+            if others:
+                found[one.name] = data._replace(sequences=others).fixed()
+    return found
 
 
 def _ready_archive(study: OfflineStudy, progress: Progress) -> Archive:
@@ -230,24 +248,17 @@ def _fitted(
 
 
 def _trial_rows(
-    config: OfflineConfig,
-    space: ParameterSpace,
-    verdicts: Mapping[int, Verdict],
-    finished: Finished,
+    config: OfflineConfig, table: Sequence[dict[str, Any]], verdicts: Mapping[int, Verdict]
 ) -> list[dict[str, Any]]:
-    """A row for every trial: its parameters, how it was judged, its mean errors in percent."""
+    """A row for every trial: as `adaptune trials` lists it, and how it was judged."""
     rows = []
-    for n, verdict in verdicts.items():
-        runs = [of[n] for of in finished.values()]
-        row: dict[str, Any] = {"trial": n, **space.row(verdict.parameters)}
-        row |= {"state": verdict.state, "proposed by": runs[0].source}
-        row[COST] = float(np.mean([run.cost for run in runs]))
+    for row in table:
+        if (verdict := verdicts.get(row["trial"])) is None:
+            continue
+        row[COST] = row.pop("cost")
+        row["state"] = verdict.state
         if set(config.objective) != {"rte"}:
             row[label(config.objective)] = verdict.value
-            for metric in sorted(config.objective):
-                row[metric] = float(np.mean([run.metrics[metric] for run in runs]))
-        row["mean"] = float(np.mean([run.mean_error for run in runs]))
-        row |= {name: of[n].mean_error for name, of in finished.items()}
         rows.append(row)
     return rows
 

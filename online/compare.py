@@ -22,6 +22,7 @@ from adaptune.reference.check import hard_to_track
 from adaptune.report import tables as report
 from adaptune.study.config import ALSO
 from adaptune.study.study import (
+    BEST_DEFAULT,
     MIN_RECORDINGS,
     PER_STRETCH,
     RIVALS,
@@ -189,11 +190,27 @@ def ratio_to(judged: Sequence[JudgedModes], mode: str, other: str | None = None)
     pairs = [(one.pair(mode, other), one.block) for one in judged]
     value = float(np.exp(np.mean([_log(errors) for errors, _ in pairs])))
     place = np.unique([one.recording or one.name for one in judged], return_inverse=True)[1]
-    n, rng, scale = int(place.max()) + 1, np.random.default_rng(SEED), 1.0
+    n, rng = int(place.max()) + 1, np.random.default_rng(SEED)
     if n < MIN_RECORDINGS and any(e.shape[1] < MIN_BLOCKS * block for e, block in pairs):
         return Ratio(value)
-    logs = np.array([_resampled_logs(errors, block, rng) for errors, block in pairs])
-    counts = np.bincount(place).astype(float)
+    logs = np.array([resampled_logs(errors, block, rng) for errors, block in pairs])
+    low, high = pooled_logs(logs, place, rng)
+    reference_errors = [one.rows[0].reference_error for one in judged]
+    wider = np.mean(
+        [allowed(errors, own) for (errors, _), own in zip(pairs, reference_errors, strict=True)], 0
+    )
+    return Ratio(value, (float(np.exp(low + wider[0])), float(np.exp(high + wider[1]))))
+
+
+def pooled_logs(
+    logs: NDArray[np.float64], place: NDArray[np.intp], rng: np.random.Generator
+) -> tuple[float, float]:
+    """Ends of the 95 % interval of a mean logarithm over recordings, see `ratio_to`.
+
+    `logs`, of shape (k, RESAMPLES), are resamples of k sequences; `place`, of shape (k,), has the
+    number of the recording that each is a part of.
+    """
+    n, counts, scale = int(place.max()) + 1, np.bincount(place).astype(float), 1.0
     sums = np.zeros((n, RESAMPLES))
     np.add.at(sums, place, logs)
     if n >= MIN_RECORDINGS:
@@ -204,11 +221,7 @@ def ratio_to(judged: Sequence[JudgedModes], mode: str, other: str | None = None)
     else:
         means = sums.sum(axis=0) / counts.sum()
     low, high = means.mean() + scale * (np.percentile(means, [2.5, 97.5]) - means.mean())
-    reference_errors = [one.rows[0].reference_error for one in judged]
-    wider = np.mean(
-        [_allowed(errors, own) for (errors, _), own in zip(pairs, reference_errors, strict=True)], 0
-    )
-    return Ratio(value, (float(np.exp(low + wider[0])), float(np.exp(high + wider[1]))))
+    return float(low), float(high)
 
 
 def _log(errors: NDArray[np.float64]) -> float:
@@ -217,7 +230,7 @@ def _log(errors: NDArray[np.float64]) -> float:
     return float(np.log(mine / others))
 
 
-def _resampled_logs(
+def resampled_logs(
     errors: NDArray[np.float64], block: int, rng: np.random.Generator
 ) -> NDArray[np.float64]:
     """Logarithms of the ratio in resamples of one sequence, of shape (RESAMPLES,)."""
@@ -225,7 +238,7 @@ def _resampled_logs(
     return np.asarray(np.log(means[0] / means[1]))
 
 
-def _allowed(errors: NDArray[np.float64], reference_error: float | None) -> tuple[float, float]:
+def allowed(errors: NDArray[np.float64], reference_error: float | None) -> tuple[float, float]:
     """By how much the reference's own error may move the logarithm of a ratio, down and up."""
     if reference_error is None:
         return 0.0, 0.0
@@ -461,10 +474,9 @@ def _against(
 def _with_fixed_rivals(
     replays: Mapping[str, StoredReplay], model: ErrorModel | None
 ) -> dict[str, StoredReplay]:
-    """The replays by mode; of several odometries, a rival that is the fixed set has its replay."""
+    """The replays by mode; a best default that is the fixed set has its replay."""
     same: dict[str, StoredReplay] = {}
-    if model is not None and "fixed" in replays and len(model.sets.space.baselines) > 1:
-        of_fixed = [mode for mode in RIVALS if model.rivals.get(mode) == model.fixed]
-        same |= dict.fromkeys(of_fixed, replays["fixed"])
+    if model is not None and "fixed" in replays and model.rivals.get(BEST_DEFAULT) == model.fixed:
+        same[BEST_DEFAULT] = replays["fixed"]
     every = {**same, **replays}
     return {mode: every[mode] for mode in in_order(every)}

@@ -330,7 +330,7 @@ def run_replays(study: Study, model_path: Path, progress: Progress = unseen) -> 
     for why in dict.fromkeys(filter(None, obstacles.values())):
         names = " and ".join(name for name, of in obstacles.items() if of == why)
         _log.warning("not replayed: %s, because %s", names, why)
-    return _replay_all(study, study.config.test, setup.modes(model), progress, (model, model_path))
+    return replay_modes(study, study.config.test, setup.modes(model), progress, (model, model_path))
 
 
 def run_untrained(study: Study, progress: Progress = unseen) -> int:
@@ -346,10 +346,10 @@ def run_untrained(study: Study, progress: Progress = unseen) -> int:
     """
     ReplaySetup.of(study).mode(UNTRAINED)  # or an error
     names = sequences_without_model(study.config)
-    return _replay_all(study, names, WITHOUT_MODEL, progress)
+    return replay_modes(study, names, WITHOUT_MODEL, progress)
 
 
-def _replay_all(
+def replay_modes(
     study: Study,
     sequences: Sequence[str],
     modes: Sequence[str],
@@ -359,7 +359,7 @@ def _replay_all(
     """Replay what was not replayed before; the number of replays that were made.
 
     Sequences without a reference get an estimated one before, where that is possible. `fitted` is
-    the error model and its file.
+    the error model and its file. Baseline alone needs none.
     """
     study.open()
     length = study.config.sub_trajectory

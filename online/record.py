@@ -4,8 +4,13 @@ import csv
 import itertools
 import logging
 import math
+import os
+import platform
+import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, Self
 
@@ -45,6 +50,7 @@ class ReplaySummary(BaseModel):
     memory_mb: float | None = None  # most megabytes of all processes
     real_time: dict[str, float] | None = None  # how it kept up, see `kept_up`
     first_pose: float = 0.0  # seconds from the first scan; what was before is left out
+    machine: str | None = None  # on which it was driven
     model_file: str | None  # of the model that it was made with; None if it needed none
     inputs: dict[str, Any] = Field({}, exclude=True)  # see `adaptune.manifest`
 
@@ -194,6 +200,7 @@ def write_replay(
         memory_mb=round(replay.memory, 1),
         real_time=kept_up(replay),
         first_pose=round(replay.first_pose, 3),
+        machine=machine(),
         model_file=None if model_file is None else str(model_file.resolve()),
     )
     if replay.first_pose:
@@ -201,6 +208,16 @@ def write_replay(
         _log.info(what, folder.parent.name, folder.name, replay.first_pose)
     manifest.record(folder / manifest.FILE, inputs)
     write_text(folder / "replay.json", summary.model_dump_json(indent=2) + "\n")
+
+
+@cache
+def machine() -> str:
+    """The kind of this machine: costs that were measured on others cannot be compared."""
+    found = None
+    with suppress(OSError):
+        listed = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
+        found = re.search(r"model name\s*: (.*)", listed)
+    return f"{found[1] if found else platform.machine()}, {os.cpu_count()} cores"
 
 
 def kept_up(replay: ReplayRecord) -> dict[str, float] | None:

@@ -39,7 +39,9 @@ PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
 GUIDE = [page for page in (ROOT / "docs").glob("*.md") if page.stem != "README"]
 CODE = re.compile(r"^```.*?^```|^    .*?$|`[^`\n]+`", re.MULTILINE | re.DOTALL)
 HEADING = re.compile(r"^#+ (.+)$", re.MULTILINE)
-ELSEWHERE = re.compile(r"--ros|--cluster|import-rustle|configs/|adaptune tune|tuned.yaml|_ros2")
+ELSEWHERE = re.compile(
+    r"--ros|--cluster|import-rustle|configs/|adaptune tune|tuned.yaml|_ros2|bags/|--against"
+)
 """Lines of commands that other tests run: with ROS, a cluster, RUSTLE's files, the demo."""
 QUICKER = {"online.real_time.rate=1": "online.real_time.rate=50"}
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from adaptune.commands.recordings import check_no_study
 from adaptune.commands.terminal import (
     Cluster,
     Folder,
@@ -25,7 +26,7 @@ from adaptune.commands.terminal import (
     say_next_online,
     show_table,
 )
-from adaptune.commands.tune import BUYS, check_no_study, show_front
+from adaptune.commands.trained import BUYS, show_front
 from adaptune.errors import AdaptuneError, Finding
 from adaptune.files import write_text
 
@@ -124,8 +125,8 @@ def trials(
     finished = trial_rows.rows(archive, names)
     if not finished:
         raise AdaptuneError(f"{archive.folder}: no trial is finished yet; run `adaptune offline`")
-    chosen = trial_rows.select(finished, sort, top)
     labels = loaded.odometry.space.labels
+    chosen = trial_rows.select(finished, sort, top, trial_rows.headings(names, labels))
     title = f"{len(chosen)} of {len(finished)} trials"
     show_table(title, trial_rows.with_units(chosen, names, labels))
     if judged := [row for row in finished if row["mean"] is not None]:

@@ -3,9 +3,10 @@
 import logging
 import math
 import os
-from contextlib import ExitStack, closing
+from collections.abc import Sequence
+from contextlib import ExitStack, closing, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -127,7 +128,7 @@ def _oracle(loaded: "OfflineStudy", cluster: str | None) -> None:
     say(f"Trials: {loaded.folder / 'oracle'}/")
 
 
-def _alone(study: "OfflineStudy") -> ExitStack:
+def alone(study: "OfflineStudy") -> ExitStack:
     """Bind this process to one core, and leave the others to what it starts."""
     from adaptune.machine import pin
 
@@ -142,7 +143,7 @@ def replay_missing(
     """Make the replays that are missing; how many were made."""
     from online.modes import run_replays, run_untrained
 
-    with _alone(loaded), progress() as show:
+    with alone(loaded), progress() as show:
         if untrained:
             return run_untrained(loaded, show)
         return run_replays(loaded, model or loaded.model_path, show)
@@ -161,7 +162,7 @@ def _drive(
     path = None if mode in WITHOUT_MODEL else model or loaded.model_path
     drive = RobotDrive(loaded, mode, path)
     link = local_ros2() if ros2 else local_ros1()
-    with closing(link), _alone(loaded), progress() as show:
+    with closing(link), alone(loaded), progress() as show:
         log.info("drive, %s: Ctrl-C ends it", mode)
         driven = drive.run(link, lambda of: show("drive", of.done, of.done, now(of)))
     dropped = f", {driven.record.dropped} of them dropped" if driven.record.dropped else ""
@@ -181,8 +182,42 @@ def now(record: "ReplayRecord") -> str:
     return ", ".join(words)
 
 
+NewSide = Annotated[
+    str,
+    typer.Argument(metavar="STUDY", help="A study's YAML, or its folder.", show_default=False),
+]
+Driven = Annotated[
+    list[Path] | None,
+    typer.Argument(metavar="[BAG]...", help="With --against, what to drive.", show_default=False),
+]
+Against = Annotated[
+    str | None,
+    typer.Option(
+        metavar="OLD",
+        help="Is STUDY worse than this one? Both may also be parameter files, or odometries "
+        "(names, commands, images), to be driven on bags.",
+    ),
+]
+OfFiles = Annotated[str | None, typer.Option(metavar="NAME", help="Of parameter files.")]
+Worse = Annotated[str, typer.Option(metavar="PERCENT", help="Error that is no matter.")]
+Cost = Annotated[str, typer.Option(metavar="PERCENT", help="Cost that is no matter.")]
+Unclear = Annotated[
+    Literal["pass", "fail"], typer.Option(help="What too little to tell counts as.")
+]
+Out = Annotated[
+    Path, typer.Option(help="Folder of gate.json, junit.xml and summary.md.", file_okay=False)
+]
+
+
 def compare(
-    study: StudyFile,
+    study: NewSide,
+    recordings: Driven = None,
+    against: Against = None,
+    odometry: OfFiles = None,
+    worse: Worse = "5%",
+    cost: Cost = "10%",
+    unclear: Unclear = "pass",
+    out: Out = Path("runs/compare"),
     override: Override = [],  # noqa: B006
     folder: Folder = None,
     details: Details = False,
@@ -197,10 +232,18 @@ def compare(
     The study's folder receives a page (HTML) of all that is known of the study, also of one that
     is not finished. It opens without a network, and its charts lie beside it as PNG and SVG. All
     tables are there as CSV, JSON and Markdown, too; `--details` prints them.
+
+    With `--against`, it says whether STUDY is worse than OLD, recording by recording, in error, in
+    cost and in lost tracks. Its exit code is 3 then.
     """
+    if against is not None:
+        _gate((study, against), recordings or (), odometry, (worse, cost), unclear, out)
+        return
+    if recordings or odometry:
+        raise AdaptuneError("BAG and --odometry go with --against, which names the other side")
     from adaptune.study.study import MIN_RECORDINGS
 
-    loaded = load(study, override, folder)
+    loaded = load(Path(study), override, folder)
     found = compared(loaded, details=details)
     if found.rows[0].yardstick == "baseline":
         say_next_of_study("look for better sets", "offline")
@@ -211,6 +254,41 @@ def compare(
         say_next_of_study("find out what adapting gains elsewhere", "offline", first)
     else:
         say_next_of_study("replays to look at in Foxglove", "record")
+
+
+WORSE = 3
+"""Exit code of the gate."""
+
+
+def _gate(
+    given: tuple[str, str],
+    recordings: Sequence[Path],
+    odometry: str | None,
+    percents: tuple[str, str],
+    unclear: str,
+    out: Path,
+) -> None:
+    """Say whether the first side is worse than the second one, and exit with a code."""
+    from adaptune.commands.gate import sides
+    from online.gate import compare_sides, write_gate
+
+    shares = [_share_of(text, key) for text, key in zip(percents, ("worse", "cost"), strict=True)]
+    begin_work()
+    gate = compare_sides(*sides(given, recordings, odometry), *shares)
+    write_gate(out, gate)
+    say(gate.words)
+    show_table("New against old", [row.columns() for row in gate.rows])
+    say(f"Files: {out}/gate.json, junit.xml, summary.md")
+    if gate.verdict == "worse" or (gate.verdict == "unclear" and unclear == "fail"):
+        raise typer.Exit(WORSE)
+
+
+def _share_of(text: str, key: str) -> float:
+    """A percentage as a share."""
+    with suppress(ValueError):
+        if 0.0 <= (share := float(text.removesuffix("%")) / 100.0) < math.inf:
+            return share
+    raise AdaptuneError(f"--{key} {text}: give a percentage, as in --{key} 5%")
 
 
 def compared(loaded: "OfflineStudy", *, details: bool = False) -> "ComparedReplays":

@@ -7,15 +7,18 @@ import shutil
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
-from itertools import chain, count, takewhile
+from itertools import takewhile
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from adaptune.commands.online import Details, compared, replay_missing
+from adaptune.commands.recordings import Asked, check_no_study, recorded
 from adaptune.commands.terminal import (
+    Cluster,
+    Override,
     Points,
     console,
     load,
@@ -24,18 +27,36 @@ from adaptune.commands.terminal import (
     say_next,
     show_table,
 )
+from adaptune.commands.trained import (
+    BUYS,
+    say_grown,
+    say_odometries,
+    say_recordings,
+    say_untuned,
+    show_front,
+)
 from adaptune.errors import AdaptuneError, NotInstalledError
 from adaptune.files import plain_name, write_text
 from adaptune.progress import Progress
 
 if TYPE_CHECKING:
+    from adaptune.recording.fleet import Reading
     from adaptune.recording.inspect import Inspection
     from adaptune.trajectory import Trajectory
     from offline.config import OfflineStudy
-    from offline.train import Training
 
 UNKNOWN_LENGTH = "5.0    # metres; 10.0 for a path of 200 m or more, 25.0 for one of 500 m or more"
 """The length of sub-trajectories to propose where the path is not known."""
+
+
+As = Annotated[
+    Literal["one", "several"] | None,
+    typer.Option(
+        "--as",
+        help="Read the bags of a folder as parts of one recording, or as several.",
+        show_default="as their times and names tell",
+    ),
+]
 
 
 def inspect(
@@ -52,10 +73,12 @@ def inspect(
         Path | None,
         typer.Option(metavar="YAML", help="Write the study to this file.", dir_okay=False),
     ] = None,
+    reading: As = None,
 ) -> None:
     """Show what is in a recording, what each stage lacks, and how to name it in a study.
 
-    Of an error model, or of a study's folder, show what it is of and its best sets.
+    Of a folder with several recordings, show each in a line. Of an error model, or of a study's
+    folder, show what it is of and its best sets.
     """
     if file.suffix == ".safetensors" or (file / "model.safetensors").exists():
         _show_model(file)
@@ -68,6 +91,8 @@ def inspect(
     from adaptune.recording.inspect import inspect as inspect_file
     from adaptune.recording.rendering import render_inspection
 
+    if _show_several(file, reading):
+        return
     with progress() as show:
         found = inspect_file(file, deep, show)
         share, length, accuracy = _proposed(found, deep, show)
@@ -87,6 +112,34 @@ def inspect(
     if study is not None:
         write_text(study, f"{found.entry}\n{rest}")
     say_next("train on a part of it", "offline", path, first=first)
+
+
+def _show_several(path: Path, reading: "Reading | None") -> bool:
+    """Show the recordings of a folder, a line each; False if it holds one, or may."""
+    from adaptune.recording.fleet import both_readings, check_alike, read_folder
+    from adaptune.recording.inspect import inspect as inspect_file
+
+    folder = read_folder(path) if path.exists() else None
+    if folder is None or (reading or folder.reading) == "one":
+        return False
+    if reading is None and folder.reading is None:
+        say(f"{path}: {both_readings(folder)}. As several:")
+    with progress() as show:
+        found = [inspect_file(one, False, show) for one in folder.recordings]
+    rows = []
+    for one in found:
+        topic = one.topics.get(one.used.get("points", ""))
+        scans = {"scans": topic and topic.count, "rate [Hz]": topic and topic.rate}
+        given = {"reference": one.used.get("reference", "estimated")}
+        wrong = {"lacks": ", ".join(one.missing.get("offline", ())) or None}
+        rows.append({"recording": one.path.name, **scans, **given, **wrong})
+    show_table(f"{path}: {len(rows)} recordings ({folder.why})", rows)
+    if reading is None and folder.reading is None:
+        say("As one:")
+        return False
+    check_alike([one for one in found if "points" in one.used])
+    say_next("tune on all of them", "tune", path)
+    return True
 
 
 _ROS = ("ros2", "rustle")
@@ -113,15 +166,6 @@ def _look(path: Path) -> bool:
     found = look(factory.settings, space.baseline, factory.limits, some, others)
     show_table("What it does", [{"": key, "found": value} for key, value in found.items()])
     return True
-
-
-def check_no_study(path: Path) -> None:
-    """Refuse a study where a recording is expected."""
-    if path.suffix in (".yaml", ".yml") or (path / "study.yaml").is_file():
-        raise AdaptuneError(
-            f"{path}: is a study, not a recording; `adaptune offline`, `online` and `compare` take "
-            f"it, and `adaptune inspect` takes its folder once it has a model"
-        )
 
 
 def _show_model(file: Path) -> None:
@@ -181,29 +225,45 @@ def _undo_motion(recordings: Sequence["Inspection"], odometries: Sequence[str]) 
 
 
 def roles(
-    names: Sequence[str], length: str, odometries: Sequence[str], share: float | None = None
+    names: Sequence[str],
+    length: str,
+    odometries: Sequence[str],
+    share: float | None = None,
+    test: Sequence[str] = (),
+    config: Path | None = None,
 ) -> str:
     """YAML of a study: what it trains and tests on, over which metres, and the odometry.
 
-    Of a single recording, what follows after a `share` of its duration is kept for the test; of
-    several, the last one.
+    Without a `test`, what follows after a `share` of the duration of a single recording is kept for
+    it; of several, the last one. `config` is the user's parameter file.
     """
     from adaptune.reference.check import TRAINING
     from adaptune.yaml12 import dump
 
-    names = [dump([name]).removeprefix("- ").strip() for name in names]
-    if len(names) == 1:
+    names, test = ([*map(_in_yaml, of)] for of in (names, test))
+    if test:
+        training, tested = ", ".join(names), ", ".join(test)
+    elif len(names) == 1:
         end = f"{100 * (share or TRAINING):.0f}"
-        training, test = f"{names[0]}: 0-{end}%", f"{names[0]}: {end}-100%"
+        training, tested = f"{names[0]}: 0-{end}%", f"{names[0]}: {end}-100%"
     else:
-        training, test = ", ".join(names[:-1]), names[-1]
-    if len(odometries) == 1:
+        training, tested = ", ".join(names[:-1]), names[-1]
+    if config is not None:
+        own = {"name": odometries[0], "settings": {"config": str(config.resolve())}}
+        odometry = dump({"odometry": own}).removeprefix("odometry:").rstrip()
+    elif len(odometries) == 1:
         odometry = f"{{name: {odometries[0]}}}    # or another one, see docs/odometries.md"
     else:
         odometry = "".join(f"\n  - {{name: {name}}}" for name in odometries)
-    return (
-        f"training: [{training}]\ntest: [{test}]\nsub_trajectory: {length}\nodometry: {odometry}\n"
-    )
+    judged = f"training: [{training}]\ntest: [{tested}]\nsub_trajectory: {length}\n"
+    return f"{judged}odometry: {odometry}\n".replace(": \n", ":\n")
+
+
+def _in_yaml(name: str) -> str:
+    """A name in a list of YAML."""
+    from adaptune.yaml12 import dump
+
+    return dump([name]).removeprefix("- ").strip()
 
 
 # Tune an odometry on recordings.
@@ -244,71 +304,108 @@ Given = Annotated[
 ]
 
 
+Bags = Annotated[
+    list[Path],
+    typer.Argument(
+        metavar="BAG...", help="Bags of one robot, or folders of them.", show_default=False
+    ),
+]
+Odometry = Annotated[
+    str | None,
+    typer.Option(
+        metavar="NAME",
+        help="gicp, my_module:MyClass, ..., several with commas, or `all`; or an image.",
+        show_default="gicp; with --config kiss_icp",
+    ),
+]
+Config = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE", help="Your parameter file: the baseline, and all that is not tuned."
+    ),
+]
+Test = Annotated[
+    list[Path], typer.Option(metavar="BAG", help="A recording for the test. May be repeated.")
+]
+
+
+Kept = Annotated[
+    Path | None,
+    typer.Option(help="The study's folder.", show_default="the first bag's name, under runs/"),
+]
+
+
 def tune(
-    recordings: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="BAG...", help="Bags of one robot, or folders (KITTI).", show_default=False
-        ),
-    ],
-    odometry: Annotated[
-        str,
-        typer.Option(
-            metavar="NAME",
-            help="gicp, my_module:MyClass, ..., several with commas, or `all`; or an image.",
-        ),
-    ] = "gicp",
+    recordings: Bags,
+    odometry: Odometry = None,
+    config: Config = None,
+    test: Test = [],  # noqa: B006
+    reading: As = None,
     points: Points = None,
     reference: Given = None,
     trials: Trials = None,
     minutes: Minutes = None,
     budget: Budget = None,
-    folder: Annotated[
-        Path | None,
-        typer.Option(help="The study's folder.", show_default="the first bag's name, under runs/"),
-    ] = None,
+    override: Override = [],  # noqa: B006
+    folder: Kept = None,
+    cluster: Cluster = None,
     details: Details = False,
 ) -> None:
     """Tune an odometry on recordings, and say what to drive.
 
     It keeps the last 40 % of one recording (of its path, where the robot stands for long), or the
-    last of several, for the test. It tries sets on the rest, replays the test, and compares.
+    last of several, for the test. It tries sets on the rest, replays the test, and compares. Of
+    three or more, it says what the others would have recommended for each.
 
-    What it decides is written to a study file in its folder; run the same command to resume.
+    What it decides is written to a study file in its folder; run the same command to resume, also
+    when a folder holds more recordings than before.
     Of a ROS 2 system (an image, or `ros2 launch ...`), it writes a study to fill in.
     """
     if reference is not None and Path(reference).is_file():
         reference = str(Path(reference).resolve())
-    if _propose(recordings, odometry, points, reference):
+    odometry = odometry or ("gicp" if config is None else "kiss_icp")
+    asked = Asked(recordings, odometry, points, reference, config, test, reading)
+    if _propose(asked):
         return
     folder = folder or Path("runs") / _study_name(recordings, odometry)
     path = folder / f"{folder.resolve().name}.yaml"
-    made_by = _made_by(recordings, odometry, points, reference)
-    overrides: list[str] = []
+    limits = _limits(trials, minutes, budget)
+    overrides, more = _written(path, asked, limits, folder)
+    from offline.train import train
+
+    loaded = load(path, [*override, *overrides], folder, runs=True)
+    say(f"Study: {path}")
+    say_untuned(loaded)
+    before = loaded.fixed
+    with progress() as show:
+        training = train(loaded, show, cluster)
+    replay_missing(loaded)
+    found = compared(loaded, details=details)
+    say(training.elsewhere)
+    show_front(training.front, *BUYS)
+    if more:
+        say_grown(more, before, loaded.fixed)
+    say_recordings(training.rows, found)
+    say_odometries(loaded, training)
+    say_next("replays to look at in Foxglove", "record", folder)
+
+
+def _written(
+    path: Path, asked: Asked, limits: dict[str, str], folder: Path
+) -> tuple[list[str], list[str]]:
+    """Write the study, or add what is new to the one that is there.
+
+    Returns what overrides it, and the names of new recordings.
+    """
     if not path.exists():
-        limits = _limits(trials, minutes), budget
-        text = _decided(recordings, odometry, (points, reference), limits, folder)
-        _write(path, made_by + text)
-    elif not path.read_text("utf-8").startswith(made_by):
+        _write(path, asked.line + _decided(asked, limits, folder))
+        return [], []
+    if not path.read_text("utf-8").startswith(asked.line):
         raise AdaptuneError(
             f"{path}: another `adaptune tune` made it, for what its first line says; name the same "
             f"to resume it, or another --folder"
         )
-    else:
-        overrides = [f"offline.{key}={value}" for key, value in _limits(trials, minutes).items()]
-        overrides += [] if budget is None else [f"online.budget={budget:g}"]
-    from offline.train import train
-
-    loaded = load(path, overrides, folder, runs=True)
-    say(f"Study: {path}")
-    with progress() as show:
-        training = train(loaded, show)
-    replay_missing(loaded)
-    compared(loaded, details=details)
-    say(training.elsewhere)
-    show_front(training.front, *BUYS)
-    say_odometries(loaded, training)
-    say_next("replays to look at in Foxglove", "record", folder)
+    return [f"{key}={value}" for key, value in limits.items()], _grown(path, asked)
 
 
 def _write(path: Path, text: str) -> None:
@@ -328,69 +425,94 @@ def _study_name(recordings: Sequence[Path], odometry: str) -> str:
     return stem if odometry == "gicp" else f"{stem}_{others}"
 
 
-def _made_by(
-    recordings: Sequence[Path], odometry: str, points: str | None, reference: str | None
-) -> str:
-    """The first line of a study: what it was decided for."""
-    words = [*(str(bag.resolve()) for bag in recordings), "--odometry", odometry]
-    words += ["--points", points] if points else []
-    words += ["--reference", reference] if reference else []
-    # A name may hold the end of a line, or what is no character.
-    plain = (c if c.isprintable() else ascii(c)[1:-1] for c in shlex.join(words))
-    return f"# adaptune tune {''.join(plain)}\n"
-
-
-def _limits(trials: int | None, minutes: float | None) -> dict[str, str]:
-    """The budget of the search by its keys in a study."""
-    given = {"trials": trials, "hours": None if minutes is None else minutes / 60.0}
+def _limits(trials: int | None, minutes: float | None, budget: float | None) -> dict[str, str]:
+    """What may be spent, by its keys in a study."""
+    hours = None if minutes is None else minutes / 60.0
+    given = {"offline.trials": trials, "offline.hours": hours, "online.budget": budget}
     return {key: f"{value:.10g}" for key, value in given.items() if value is not None}
 
 
-def _decided(
-    recordings: Sequence[Path],
-    odometry: str,
-    topics: tuple[str | None, str | None],
-    limits: tuple[dict[str, str], float | None],
-    folder: Path,
-) -> str:
+def _decided(asked: Asked, limits: dict[str, str], folder: Path) -> str:
     """The study of some recordings as YAML, with comments; nothing is written but references."""
-    points, reference = topics
-    for path in recordings:
-        if [one.resolve() for one in recordings].count(path.resolve()) > 1:
-            raise AdaptuneError(f"{path}: is named twice; the test needs a recording of its own")
-    if len(recordings) > 1 and reference is not None and Path(reference).is_file():
-        raise AdaptuneError(
-            f"--reference {reference}: is a file, and of {len(recordings)} recordings each needs "
-            f"its own; write a study file, see docs/your-bag.md"
-        )
-    with progress() as show:
-        found = [_usable(path, points, reference, show) for path in recordings]
-    named: dict[str, Inspection] = {}
-    for one in found:
-        names = chain([one.name], (f"{one.name}_{i}" for i in count(2)))
-        named[next(name for name in names if name not in named)] = one
-    odometries = odometries_of(odometry, all("imu" in one.given for one in found))
-    _undo_motion(found, odometries)
-    search, budget = limits
-    search = search or {"trials": str(max(TRIALS, EACH * len(odometries)))}
-    tried = ", ".join(f"{key}: {value}" for key, value in search.items())
-    spent = "" if budget is None else f", budget: {budget:g}"
+    named, test = recorded(asked)
+    odometries = odometries_of(asked.odometry, all("imu" in one.given for one in named.values()))
+    if asked.config is not None and len(odometries) != 1:
+        raise AdaptuneError(f"--config {asked.config}: is of one odometry; name one --odometry")
+    _undo_motion([*named.values()], odometries)
+    if not any(key.startswith("offline.") for key in limits):
+        limits = {"offline.trials": str(max(TRIALS, EACH * len(odometries)))} | limits
+    tried, spent = (
+        "".join(f", {key.removeprefix(stage)}: {v}" for key, v in limits.items() if stage in key)
+        for stage in ("offline.", "online.")
+    )
 
     def study(length: str, share: float | None = None, health: str = "") -> str:
         from adaptune import yaml12
 
-        recorded = yaml12.dump({"sequences": {name: one.given for name, one in named.items()}})
+        given = yaml12.dump({"sequences": {name: one.given for name, one in named.items()}})
+        rest = [name for name in named if name not in test]
         return (
-            f"# Every command works with this file; change what you like.\n\n{recorded}\n"
+            f"# Every command works with this file; change what you like.\n\n{given}\n"
             f"# The part for the test is not trained on.\n"
-            f"{roles(list(named), length, odometries, share)}{health}"
-            f"offline: {{{tried}}}    # parameter sets to try, or the time for it\n"
+            f"{roles(rest, length, odometries, share, test, asked.config)}{health}"
+            f"offline: {{{tried[2:]}}}    # parameter sets to try, or the time for it\n"
             f"online: {{modes: [adaptive]{spent}}}\n"
         )
 
-    if reference is None:
-        _replace_noisy(named, lambda: _loaded(study("5.0"), folder))
-    return study(*_split(_loaded(study("5.0"), folder), list(named)))
+    if asked.reference is None:
+        _replace_noisy(named, lambda: loaded_text(study("5.0"), folder))
+    return study(*_split(loaded_text(study("5.0"), folder), list(named)))
+
+
+def _grown(path: Path, asked: Asked) -> list[str]:
+    """Add the recordings that a study does not name yet to where they belong; their names."""
+    from adaptune import yaml12
+    from adaptune.recording.config import SOURCES
+    from adaptune.recording.fleet import recordings_at
+
+    text = path.read_text("utf-8")
+    try:
+        data: Any = yaml12.Document(text).data
+        known = {str(one.get(key)) for one in data["sequences"].values() for key in SOURCES}
+    except (yaml12.YamlError, AttributeError, KeyError, TypeError):
+        return []  # loading it says what is wrong
+    tested = [one.resolve() for one in recordings_at(asked.test, asked.reading)]
+    others = [one.resolve() for one in recordings_at(asked.recordings, asked.reading)]
+    there = list(dict.fromkeys([*others, *tested]))
+    new = [one for one in there if known.isdisjoint({str(one), str(one.parent)})]
+    if not new:
+        return []
+    named, _ = recorded(asked._replace(recordings=there, test=(), reading="one"))
+    _undo_motion([*named.values()], odometries_of(asked.odometry, False))
+    added = {name: one for name, one in named.items() if one.path in new}
+    if taken := [name for name in added if name in data["sequences"]]:
+        raise AdaptuneError(
+            f"{path}: sequences.{taken[0]} is another recording; rename the new one"
+        )
+    entries = yaml12.dump({name: one.given for name, one in added.items()})
+    indented = "".join(f"  {line}\n" for line in entries.splitlines())
+    grown = re.sub(r"(?m)^sequences:\n", lambda m: m[0] + indented, text, count=1)
+    into = {
+        "training": [name for name, one in added.items() if one.path not in tested],
+        "test": [name for name, one in added.items() if one.path in tested],
+    }
+    for role, names in into.items():
+        listed = "".join(f", {_in_yaml(name)}" for name in names)
+        if found := re.search(rf"(?m)^{role}: \[.*(?=\])", grown):
+            grown = grown[: found.end()] + listed + grown[found.end() :]
+    n = (data.get("offline") or {}).get("stretches", 12)
+    if into["training"] and isinstance(n, int):
+        # As many stretches of each as before: the trials that there are stay.
+        before, now = len(data["training"]), len(data["training"]) + len(into["training"])
+        pinned = f"offline: {{stretches: {max(4, -(-n // before)) * now}, "
+        grown = re.sub(r"(?m)^offline: \{(stretches: \d+, )?", pinned, grown, count=1)
+    data = yaml12.Document(grown).data
+    if not all(name in data[role] for role, names in into.items() for name in names):
+        raise AdaptuneError(
+            f"{path}: add {', '.join(added)} to sequences, and training or test, by hand"
+        )
+    write_text(path, grown)
+    return list(added)
 
 
 def _replace_noisy(named: "Mapping[str, Inspection]", loaded: "Callable[[], OfflineStudy]") -> None:
@@ -423,34 +545,12 @@ def _replace_noisy(named: "Mapping[str, Inspection]", loaded: "Callable[[], Offl
         one.given = before
 
 
-def _usable(path: Path, points: str | None, reference: str | None, show: Progress) -> "Inspection":
-    """Look at a recording; it has scans of one topic, and a reference or is to get one."""
-    from adaptune.recording.clouds import CLOUDS
-    from adaptune.recording.inspect import inspect as inspect_file
-    from adaptune.reference.estimate import recording_config
-
-    check_no_study(path)
-    found = inspect_file(path, False, show)
-    clouds = [topic for topic in found.topics.values() if topic.type in CLOUDS]
-    if len(clouds) > 1 and points is None:
-        each = ", ".join(f"{one.name} ({one.count:,} of {one.type})" for one in clouds)
-        raise AdaptuneError(
-            f"{path}: has {len(clouds)} topics of point clouds: {each}; name one with --points"
-        )
-    recording_config(found, points, reference)
-    if reference is None and found.missing["offline"]:
-        why = "; ".join(str(one) for one in found.findings if one.of == "reference")
-        say(f"{path}: its reference does not serve ({why}): one is estimated")
-        found.given["reference"] = "estimated"
-    return found
-
-
 _SYSTEM = """\
 odometry:
   name: ros2    # or rustle, for a ROS 1 system, see docs/docker.md
   settings:
     {image}command: {command}
-    template: {lacking}    # the parameter file that you use now
+    template: {template}    # the parameter file that you use now
     odometry: /{lacking}    # the topic of its poses
     points: /points    # the topics that it hears
     {imu}
@@ -467,38 +567,43 @@ def _system(given: str) -> dict[str, str] | None:
         if not any("{parameters}" in word for word in words):
             words.append("FILL_IN:={parameters}")
         return {"image": "", "command": json.dumps(words)}
-    if not re.fullmatch(r"[a-z0-9][\w./-]*(:[\w.-]+)?", given):
-        return None
-    from adaptune.odometry import registry
-    from adaptune.odometry.docker.engine import EngineError, image_digest
-
-    if given in registry.ODOMETRIES or given in registry.PROGRAMS or given == "all":
-        return None
-    try:
-        image_digest(given)
-    except (EngineError, NotInstalledError):
-        if "/" in given:  # no name of an odometry
-            raise
+    if not is_image(given):
         return None
     launch = ["ros2", "launch", _LACKING, f"{_LACKING}.launch.py", f"{_LACKING}:={{parameters}}"]
     return {"image": f"image: {given}\n    ", "command": json.dumps(launch)}
 
 
-def _propose(
-    recordings: Sequence[Path], odometry: str, points: str | None, reference: str | None
-) -> bool:
-    """Write a study of a ROS system to fill in; False if the odometry is none."""
-    if (system := _system(odometry)) is None:
+def is_image(given: str) -> bool:
+    """Whether a name is that of an image, and of no odometry."""
+    from adaptune.odometry import registry
+    from adaptune.odometry.docker.engine import EngineError, image_digest
+
+    of_odometry = given in {*registry.ODOMETRIES, *registry.PROGRAMS, "all"}
+    if of_odometry or not re.fullmatch(r"[a-z0-9][\w./-]*(:[\w.-]+)?", given):
         return False
-    path = Path(f"{plain_name(recordings[0].resolve())}_ros2.yaml")
+    try:
+        image_digest(given)
+    except (EngineError, NotInstalledError):
+        if "/" in given:  # no name of an odometry
+            raise
+        return False
+    return True
+
+
+def _propose(asked: Asked) -> bool:
+    """Write a study of a ROS system to fill in; False if the odometry is none."""
+    if (system := _system(asked.odometry)) is None:
+        return False
+    path = Path(f"{plain_name(asked.recordings[0].resolve())}_ros2.yaml")
     if path.exists():
         raise AdaptuneError(f"{path}: exists; fill it in, or move it away")
-    with progress() as show:
-        found = [_usable(one, points, reference, show) for one in recordings]
-    rest = roles([one.name for one in found], UNKNOWN_LENGTH, ["ros2"]).partition("odometry:")[0]
-    imu = "imu: /imu" if all("imu" in one.given for one in found) else "# imu: /imu"
-    block = _SYSTEM.format(lacking=_LACKING, imu=imu, **system)
-    entries = "\n".join(one.entry.removeprefix("sequences:\n") for one in found)
+    named, test = recorded(asked)
+    training = [name for name in named if name not in test]
+    rest = roles(training, UNKNOWN_LENGTH, ["ros2"], test=test).partition("odometry:")[0]
+    imu = "imu: /imu" if all("imu" in one.given for one in named.values()) else "# imu: /imu"
+    template = json.dumps(str(asked.config.resolve())) if asked.config else _LACKING
+    block = _SYSTEM.format(lacking=_LACKING, template=template, imu=imu, **system)
+    entries = "\n".join(one.entry.removeprefix("sequences:\n") for one in named.values())
     write_text(path, f"sequences:\n{entries}\n{rest}{block}")
     say(
         f"{path}: is a study of this system. Fill in what stands there as {_LACKING}, as "
@@ -530,7 +635,7 @@ def odometries_of(given: str, imu: bool) -> list[str]:
     return there
 
 
-def _loaded(text: str, folder: Path) -> "OfflineStudy":
+def loaded_text(text: str, folder: Path) -> "OfflineStudy":
     """A study whose YAML is given and that is in no file yet."""
     from offline.config import load_study
 
@@ -556,8 +661,8 @@ def _split(study: "OfflineStudy", whole: Sequence[str]) -> tuple[str, float, str
     from adaptune.trajectory import read_trajectory
 
     sequences = study.sequences
-    known = [one for name in whole if (one := sequences.open(name).reference()) is not None]
-    reference = sequences.open(whole[-1]).reference()
+    known = {n: one for n in whole if (one := sequences.open(n).reference()) is not None}
+    reference = known.get(whole[-1])
     if reference is None:
         _estimate(study, whole[-1:])
         reference = read_trajectory(sequences.estimate_path(whole[-1]))
@@ -569,9 +674,12 @@ def _split(study: "OfflineStudy", whole: Sequence[str]) -> tuple[str, float, str
             f"{LEAST_PATH:g} m at least; record a longer drive, or name another recording for the "
             f"test as the last one"
         )
-    length = proposed_sub_trajectory(reference, training=share)
+    others = [one for name, one in known.items() if name != whole[-1]]
+    # One that fits into each of several.
+    lengths = [proposed_sub_trajectory(other, training=0.0) for other in others]
+    length = min([proposed_sub_trajectory(reference, training=share), *lengths])
     words = f"{length}    # metres over which errors are measured; the test moves {metres:.0f} m"
-    speed = max(LEAST_SPEED, 2.0 * max(map(greatest_speed, [*known, reference])))
+    speed = max(LEAST_SPEED, 2.0 * max(map(greatest_speed, [*known.values(), reference])))
     health = f"health: {{max_speed: {speed:.0f}}}    # m/s: twice the speed of the fastest second\n"
     return words, share, health
 
@@ -604,58 +712,3 @@ def _estimate(study: "OfflineStudy", names: Sequence[str]) -> None:
         if not there:
             shutil.rmtree(study.folder)
         raise AdaptuneError(f"{error}; or give a --reference") from error
-
-
-def show_front(rows: "Sequence[Mapping[str, Any]]", title: str, caption: str) -> None:
-    """The table of what CPU time buys."""
-    shown = [
-        {
-            "": ("-> " if row["recommended"] else "") + row["what"],
-            **{key: row[key] for key in ("cost [ms]", "99 % [ms]", "memory [MB]") if key in row},
-            "RTE [%]": row["error [%]"],
-            "vs baseline": row["vs baseline"],
-            "95 %": None
-            if row["low"] is None or row["low"] != row["low"]
-            else f"{row['low']:.2f}-{row['high']:.2f}",
-            "parameters": row["parameters"],
-        }
-        for row in rows
-    ]
-    show_table(title, shown, caption)
-
-
-BUYS = (
-    "What CPU time buys, in training",
-    "The arrow marks what is recommended: of what costs no more than the baseline, or than the"
-    " budget, the best, if it is surely better than the baseline.",
-)
-
-
-def say_odometries(study: "OfflineStudy", training: "Training") -> None:
-    """Of several odometries, what each gives with its own parameters and tuned, in training."""
-    from adaptune.space import ODOMETRY
-    from offline.front import COST
-
-    labels = list(study.config.odometries)
-    if len(labels) < 2:
-        return
-    rows = []
-    for label in labels:
-        mine = [row for row in training.trials if row[ODOMETRY] == label]
-        known = [row for row in mine if row["mean"] is not None]
-        best = min(known, key=lambda row: row["mean"], default=None)
-        rows.append(
-            {
-                "odometry": label,
-                "its own parameters [%]": mine[0]["mean"] if mine else None,
-                "tuned [%]": None if best is None else best["mean"],
-                COST: None if best is None else best[COST],
-            }
-        )
-    rows.sort(key=lambda row: row["tuned [%]"] if row["tuned [%]"] is not None else float("inf"))
-    fixed = training.model.sets[training.model.fixed][ODOMETRY]
-    say(
-        f"Best odometry in training: {rows[0]['odometry']}. On the test, the fixed set is "
-        f"{fixed}'s, the baseline {labels[0]}'s; to see another there, name it alone (--odometry)."
-    )
-    show_table("RTE of each odometry in training", rows)

@@ -4,13 +4,16 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from functools import cached_property
-from typing import Any, ClassVar, NamedTuple
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, NamedTuple, Self
 
 import numpy as np
-from pydantic import Field
+from pydantic import AfterValidator, Field, model_validator
 
 from adaptune.errors import OdometryError, nearest
 from adaptune.geometry import Poses, invert
+from adaptune.odometry.template import Template
+from adaptune.recording.config import resolve
 from adaptune.recording.scan import Scan
 from adaptune.space import ParameterSet, ParameterSpace, Selection
 from adaptune.strict import StrictModel
@@ -29,6 +32,32 @@ class RangeSettings(BaseSettings):
     min_range: float = Field(1.0, ge=0, le=1e6)
     max_range: float = Field(100.0, gt=0, le=1e6)
     deskew: bool = True
+
+
+class ToolSettings(RangeSettings):
+    """Settings of odometries with a tool of their own.
+
+    `config` is the user's parameter file for that tool. It gives the baseline, and every value that
+    is not tuned; parameters that it does not hold are not tuned.
+    """
+
+    in_file: ClassVar[tuple[str, ...]] = ("min_range", "max_range", "deskew")
+    """Settings that the file gives."""
+    config: Annotated[str, AfterValidator(resolve)] | None = None
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        # The study in a folder names the defaults, too.
+        plain = type(self).model_construct(config=self.config)
+        twice = [key for key in self.in_file if getattr(self, key) != getattr(plain, key)]
+        if self.config is not None and twice:
+            raise ValueError(f"{twice[0]} is taken from {self.config}; change it there")
+        return self
+
+    @property
+    def template(self) -> Template | None:
+        """The user's file, if there is one."""
+        return None if self.config is None else Template(Path(self.config))
 
 
 class Registration(NamedTuple):
@@ -271,18 +300,42 @@ class Odometry(ABC):
         self, parameters: ParameterSet | None = None, settings: BaseSettings | None = None
     ):
         self.settings: Any = self.settings_type() if settings is None else settings
-        self.parameters = self.space.baseline | self._known(parameters or {})
+        self.parameters = self.tuned(settings).baseline | self._known(parameters or {})
 
     @classmethod
-    def describe(cls, settings: Any) -> Description:  # noqa: ARG003
+    def tuned(cls, settings: Any) -> ParameterSpace:
+        """The parameters that can be tuned, with baselines from the user's file, if there is one.
+
+        An `OdometryError` says what is wrong with the file.
+        """
+        template = settings.template if isinstance(settings, ToolSettings) else None
+        return cls.space if template is None else template.based(cls.space, cls._under(template))
+
+    @classmethod
+    def _under(cls, template: Template) -> str:  # noqa: ARG003
+        """The path in the user's file under which its values stand."""
+        return ""
+
+    @classmethod
+    def describe(cls, settings: Any) -> Description:
         """What a study must know of the odometry with these settings."""
-        known = cls.space, cls.live, cls.needs_imu
+        if isinstance(settings, ToolSettings):
+            cls(settings=settings)  # raises where a value does not fit
+        known = cls.tuned(settings), cls.live, cls.needs_imu
         return Description(*known, clean=cls.clean, module=cls.__module__)
 
     @classmethod
-    def own_file(cls, parameters: ParameterSet, settings: Any) -> OwnFile | None:  # noqa: ARG003
-        """A set as the odometry's own tool reads it; None if it has no such tool."""
-        return None
+    def own_file(cls, parameters: ParameterSet, settings: Any) -> OwnFile | None:
+        """A set as the odometry's own tool reads it; None if it has no such tool.
+
+        It is the user's file, if there is one, with nothing but these values changed.
+        """
+        template = settings.template if isinstance(settings, ToolSettings) else None
+        if template is None:
+            return None
+        under, path = cls._under(template), template.path
+        text = template.fill({under + name: value for name, value in parameters.items()})
+        return OwnFile(path.suffix, text, f"in the place of {path.name}")
 
     @property
     def preparation(self) -> Hashable:

@@ -12,8 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from adaptune.errors import OdometryError, import_extra, nearest
 from adaptune.geometry import Poses, invert, squared_ranges
-from adaptune.odometry.base import MIN_POINTS, BaseSettings, Description, RangeSettings
+from adaptune.odometry.base import MIN_POINTS, BaseSettings, Description, ToolSettings
 from adaptune.odometry.own_frame import END, MIDDLE, NO_IMU, OwnFrameOdometry, duration_of
+from adaptune.odometry.template import Template
 from adaptune.recording.scan import Imu, Scan
 from adaptune.space import Float, Integer, ParameterSet, ParameterSpace, Value
 
@@ -110,8 +111,10 @@ GRAVITY = 9.80665
 NO_FIELD = "{} needs to know {}, and the scans do not say; record clouds with a {} field"
 
 
-class EvalioSettings(RangeSettings):
+class EvalioSettings(ToolSettings):
     """Settings of all pipelines."""
+
+    in_file: ClassVar[tuple[str, ...]] = ("parameters",)
 
     # Values of any of the pipeline's parameters, where they are not tuned.
     parameters: dict[str, Value] = Field(default_factory=dict)
@@ -163,7 +166,12 @@ class Pipeline(OwnFrameOdometry):
     ):
         super().__init__(parameters, settings)
         self._defaults = evalio_modules()[0].all_pipelines()[self.pipeline].default_params()
-        kept = {name: self._typed(name, v) for name, v in self.settings.parameters.items()}
+        of_user, template = self.settings.parameters, self.settings.template
+        if template is not None:
+            # adaptune drives on one thread, whatever the file says.
+            names = [name for name in self._defaults if name not in self.untuned]
+            of_user = template.held(names, self._under(template))
+        kept = {name: self._typed(name, v) for name, v in of_user.items()}
         given = {name: self._typed(name, v) for name, v in (parameters or {}).items()}
         self.parameters |= {name: v for name, v in kept.items() if name in self.space.names} | given
         self._given = kept | self.parameters
@@ -171,14 +179,24 @@ class Pipeline(OwnFrameOdometry):
     @classmethod
     def describe(cls, settings: Any) -> Description:
         evalio_modules()  # raises if there is no evalio
-        if settings is not None and settings.parameters:
-            cls(settings=settings)  # raises if a parameter is unknown, or a value of another type
         return super().describe(settings)
+
+    @classmethod
+    def _under(cls, template: Template) -> str:
+        # evalio lists its pipelines; ROS has the values alone.
+        names = [name for name in template.names if name.endswith(".pipeline")]
+        own = [name for name in names if template.value(name) == cls.pipeline]
+        if names and len(own) != 1:
+            there = ", ".join(str(template.value(name)) for name in names)
+            raise OdometryError(
+                f"{template.path}: is to hold one pipeline {cls.pipeline!r}; there is {there}"
+            )
+        return own[0].removesuffix("pipeline") if own else ""
 
     def _values(self, deskew: bool) -> ParameterSet:
         """All parameters of the pipeline; `deskew` counts unless the settings name it, too."""
         values: ParameterSet = self._defaults | self.untuned | self._given
-        if "deskew" in self._defaults and "deskew" not in self.settings.parameters:
+        if "deskew" in self._defaults and "deskew" not in self._given:
             values["deskew"] = deskew
         return values
 

@@ -10,13 +10,30 @@ from kiss_icp.mapping import get_voxel_hash_map
 from kiss_icp.registration import get_registration
 from kiss_icp.threshold import get_threshold_estimator
 from numpy.typing import NDArray
+from pydantic import ValidationError
 
 from adaptune import yaml12
+from adaptune.errors import OdometryError
 from adaptune.geometry import Poses, count_within
-from adaptune.odometry.base import MIN_POINTS, Odometry, OwnFile, RangeSettings, Registration
+from adaptune.odometry.base import (
+    MIN_POINTS,
+    BaseSettings,
+    Odometry,
+    OwnFile,
+    Registration,
+    ToolSettings,
+)
 from adaptune.odometry.own_frame import END, MIDDLE, AtStamp, duration_of
 from adaptune.recording.scan import Scan
 from adaptune.space import Float, Integer, ParameterSet, ParameterSpace
+from adaptune.strict import in_one_line
+
+_SECTION = {
+    name: section
+    for section, of in KISSConfig.model_fields.items()
+    for name in getattr(of.annotation, "model_fields", ())
+}
+"""By value, the section of KISS-ICP's configuration that holds it."""
 
 
 class KissScan(NamedTuple):
@@ -44,7 +61,7 @@ class Kiss(Odometry):
         min_motion_th=Float(low=0.01, high=1.0, baseline=0.1, log=True, unit="m"),
         max_num_iterations=Integer(low=5, high=500, baseline=500, log=True),
     )
-    settings_type = RangeSettings
+    settings_type = ToolSettings
     live = True
     clean = True
 
@@ -52,23 +69,39 @@ class Kiss(Odometry):
     def _kiss(self) -> Any:
         return KissICP(self._config())
 
+    def __init__(
+        self, parameters: ParameterSet | None = None, settings: BaseSettings | None = None
+    ):
+        super().__init__(parameters, settings)
+        # What adaptune sets; or all that the user's file gives, also in the layouts of ROS.
+        template = self.settings.template
+        self._untuned = self.settings.model_dump(include={*ToolSettings.in_file})
+        if template is not None:
+            self._untuned = template.held(_SECTION)
+            self.settings = self.settings.model_copy(update=dict(self._config().data))
+
     def _config(self) -> Any:
-        config = KISSConfig()
-        for name, value in self.settings:
-            setattr(config.data, name, value)
-        config.registration.max_num_threads = 1
-        config.registration.max_num_iterations = self.parameters["max_num_iterations"]
-        config.mapping.voxel_size = self.parameters["voxel_size"]
-        config.mapping.max_points_per_voxel = self.parameters["max_points_per_voxel"]
-        config.adaptive_threshold.initial_threshold = self.parameters["initial_threshold"]
-        config.adaptive_threshold.min_motion_th = self.parameters["min_motion_th"]
+        values = self._untuned | self.parameters | {"max_num_threads": 1}
+        sections: dict[str, dict[str, Any]] = {}
+        for name, value in values.items():
+            sections.setdefault(_SECTION[name], {})[name] = value
+        try:
+            config = KISSConfig(**sections)
+        except ValidationError as error:
+            raise OdometryError(f"{self.settings.config}: {in_one_line(error)}") from error
+        if config.mapping.voxel_size is None:  # as KISS-ICP's own tool does
+            config.mapping.voxel_size = config.data.max_range / 100.0
         return config
 
     @classmethod
     def own_file(cls, parameters: ParameterSet, settings: Any) -> OwnFile:
+        use = "kiss_icp_pipeline --config FILE DATA"
+        if (users := super().own_file(parameters, settings)) is not None:
+            sections = {name.partition(".")[0] for name in settings.template.names}
+            return users._replace(use=use) if sections <= {*KISSConfig.model_fields} else users
         # Where results go stays open: KISS-ICP has an environment variable for it.
         data = cls(parameters, settings)._config().model_dump(exclude={"out_dir"})
-        return OwnFile(".yaml", yaml12.dump(data), "kiss_icp_pipeline --config FILE DATA")
+        return OwnFile(".yaml", yaml12.dump(data), use)
 
     def configure(self, parameters: ParameterSet) -> None:
         # The adaptive threshold restarts at a new `initial_threshold`; with a new `min_motion_th`

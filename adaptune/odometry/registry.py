@@ -208,12 +208,17 @@ def odometry_content(name: str, settings: Any, module: str = "") -> Content:
     The settings name the files of a program. `module` is the one in which a class is written, if
     another one exports it.
     """
+    from adaptune.recording.cache import fingerprint
+
     if name in PROGRAMS:
         return _program(settings)
     if name in ODOMETRIES:
         module = ODOMETRIES[name].partition(":")[0]
         package = PACKAGES.get(name, module.rpartition(".")[2])
-        return {f"version of {package}": _version(package)}
+        found = {f"version of {package}": _version(package)}
+        if (config := getattr(settings, "config", None)) is not None:
+            found[config] = fingerprint(Path(config))
+        return found
     return python_content(name, ENTRY_POINTS, module)
 
 

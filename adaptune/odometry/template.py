@@ -4,7 +4,7 @@ import copy
 import json
 import logging
 import re
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
 from functools import cache, reduce
 from operator import getitem
@@ -13,7 +13,7 @@ from typing import Any
 
 from adaptune import yaml12
 from adaptune.errors import OdometryError, nearest
-from adaptune.space import ParameterSet
+from adaptune.space import Categorical, Float, Integer, ParameterSet, ParameterSpace
 
 _log = logging.getLogger(__name__)
 
@@ -94,17 +94,55 @@ class Template:
             raise OdometryError(f"{self.path.name} has no such value; {known}")
         return place[1][place[2]]
 
+    def held(self, names: Iterable[str], under: str = "") -> dict[str, Any]:
+        """The values of those names that the file has and that are not null, `under` a path."""
+        return {
+            name: value
+            for name in names
+            if self.path_of(under + name) and (value := self.value(under + name)) is not None
+        }
+
+    def based(self, space: ParameterSpace, under: str = "") -> ParameterSpace:
+        """Those parameters of a space that the file holds, with its values as their baselines.
+
+        Ranges widen to hold them. An `OdometryError` says that it holds none, or what is no value.
+        """
+        tuned: dict[str, Float | Integer | Categorical] = {}
+        for name, value in self.held(space.names, under).items():
+            own, changes = space.parameters[name], {"baseline": value}
+            try:
+                if not isinstance(own, Categorical):
+                    # 1e-3 is a text to YAML 1.1.
+                    number = value if type(value) is int else float(value)
+                    changes = {"low": min(own.low, number), "high": max(own.high, number)}
+                    changes["baseline"] = number
+                tuned[name] = type(own).model_validate(own.model_dump() | changes)
+            except (ValueError, TypeError) as error:
+                line = self._document.where(self.path, (self._find(under + name) or ((),))[-1])
+                kind = "whole number" if isinstance(own, Integer) else "number"
+                what = f"{line}: {name}: {value!r} is no {kind} to begin at"
+                raise OdometryError(what) from error
+        if not tuned:
+            raise OdometryError(
+                f"{self.path}: holds none of {', '.join(under + name for name in space.names)}; "
+                f"name the parameter file of this odometry"
+            )
+        return ParameterSpace(tuned)
+
     def fill(self, parameters: Mapping[str, Any]) -> str:
         """The file's text with new values; parameters that are not in it are ignored.
 
-        A real number stays one where the new value is whole. All else stays as it is, byte for
-        byte. An `OdometryError` names a value that cannot be replaced alone.
+        A real number stays one where the new value is whole. All else, also a value that is the
+        same, stays as it is, byte for byte. An `OdometryError` names a value that cannot be
+        replaced alone.
         """
         changed, data = {}, copy.deepcopy(self._data)
         for name, value in parameters.items():
             if (place := self._find(name)) is not None:
                 *_, key = keys = place[-1]
                 held_in = reduce(getitem, keys[:-1], data)
+                if type(value) is float and repr(value) == _number(held_in[key]):
+                    continue
                 real = isinstance(held_in[key], float) or _EXPONENT.fullmatch(str(held_in[key]))
                 held_in[key] = float(value) if real and type(value) is int else value
                 changed[keys] = held_in[key]
@@ -166,9 +204,14 @@ def _warn_of_text(path: Path, line: int | None, name: str, value: str) -> None:
     )
 
 
+def _number(held: Any) -> str:
+    """A number as Python writes it, also one that YAML 1.1 takes for a text."""
+    with suppress(ValueError, TypeError):
+        return repr(float(held))
+    return ""
+
+
 _EXPONENT = re.compile(r"[-+]?[.\d]+[eE][-+]?\d+")
-
-
 _PLACEHOLDER = re.compile(r"\{([\w./-]+)\}")
 
 

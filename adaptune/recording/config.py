@@ -24,7 +24,7 @@ MOST_VIEWS = 16
 REFERENCE_FILES = (".tum", ".txt", ".csv")
 ESTIMATED, NO_REFERENCE = "estimated", "none"
 """In place of a `reference`: it is estimated from the scans, or there is none."""
-_SOURCES = ("bag", "kitti", "folder")
+SOURCES = ("bag", "kitti", "folder")
 _STANDARD_GRAVITY = 9.80665
 
 
@@ -224,10 +224,10 @@ class SequenceConfig(StrictModel):
 
     @model_validator(mode="after")
     def _check_source(self) -> Self:
-        given = [name for name in _SOURCES if getattr(self, name) is not None]
+        given = [name for name in SOURCES if getattr(self, name) is not None]
         if len(given) != 1:
             found = " and ".join(given) or "none"
-            raise ValueError(f"give one of {', '.join(_SOURCES)}, not {found}")
+            raise ValueError(f"give one of {', '.join(SOURCES)}, not {found}")
         if self.stop is not None and self.stop <= self.start:
             raise ValueError(f"start ({self.start:g}) must be less than stop ({self.stop:g})")
         for key in ("points", "frame"):

@@ -42,7 +42,7 @@ class OdometryConfig(StrictModel):
     # What the odometry is called in parameter sets and tables, if a study has several.
     label: Name | None = None
     settings: dict[str, Any] = Field(default_factory=dict)
-    parameters: Annotated[dict[str, dict[str, Any]], Field(min_length=1)] | None = None
+    parameters: dict[str, dict[str, Any]] | None = None
 
     @model_validator(mode="before")
     @classmethod

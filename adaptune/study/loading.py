@@ -118,7 +118,7 @@ def _check_odometry(
 
 def _check_parameters(name: str, space: ParameterSpace | None, tuned: Any) -> list[Finding]:
     mistakes: list[Finding] = []
-    if space is None and not tuned:
+    if space is None and tuned is None:
         mistakes.append(Finding((), f"define the parameters: a {name} does not know its own"))
     for parameter, given in tuned.items() if isinstance(tuned, dict) else ():
         if space is not None and parameter not in space.names:

@@ -27,7 +27,7 @@ from adaptune.odometry.base import Description, OwnFile
 from adaptune.odometry.program import ProgramInput, program_input
 from adaptune.odometry.registry import Factory, OdometryFactory, OdometryPool, declare
 from adaptune.recording.cache import fingerprints
-from adaptune.recording.config import REFERENCE_FILES, SequenceConfig
+from adaptune.recording.config import REFERENCE_FILES, SOURCES, SequenceConfig
 from adaptune.recording.export import Layout
 from adaptune.recording.parts import part_name
 from adaptune.recording.recording import (
@@ -55,7 +55,6 @@ _READER = 2
 # The sequences of a study by name: recordings and simulated courses.
 
 
-_PATHS = ("bag", "kitti", "folder")
 _OF_POSES = ("reference", "child_frame", "extrinsic", "clock_offset", "max_gap")
 """Keys of a sequence that change its reference only."""
 _AS_ESTIMATED = {
@@ -134,7 +133,7 @@ class StudySequences:
     def recorded_in(self, name: str) -> str:
         """What a sequence was recorded in: parts of a recording share it."""
         config = self.config(name)
-        return str(next(path for key in _PATHS if (path := getattr(config, key)) is not None))
+        return str(next(path for key in SOURCES if (path := getattr(config, key)) is not None))
 
     def open(self, name: str) -> Recording:
         """Open a sequence, or a recorded course.
@@ -168,7 +167,7 @@ class StudySequences:
         A recording is known by its content, not by its path.
         """
         course = self.courses.get(name)
-        others = {*_PATHS, *_AS_ESTIMATED, "cache"}
+        others = {*SOURCES, *_AS_ESTIMATED, "cache"}
         config = self.config(name).model_dump(mode="json", exclude=others)
         config |= {} if course is None else course.model_dump(mode="json")
         recording = fingerprints(self.files(name).recording)
@@ -222,6 +221,16 @@ BANK_MEMORY = 16.0
 
 _locks: dict[str, IO[str]] = {}
 """Open files whose locks last as long as the process."""
+
+
+def is_written_to(folder: Path) -> bool:
+    """Whether another process works in a study's folder."""
+    lock = folder / ".lock"
+    if str(folder) in _locks or not lock.exists():
+        return False
+    with lock.open() as file:
+        return not locked(file, wait=False)
+
 
 C_co = TypeVar("C_co", bound=StudyConfig, covariant=True, default=StudyConfig)
 

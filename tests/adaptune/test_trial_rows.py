@@ -6,7 +6,7 @@ import pytest
 
 from adaptune.archive import Archive, Trial
 from adaptune.errors import AdaptuneError
-from adaptune.trial_rows import rows, select, with_units
+from adaptune.trial_rows import headings, rows, select, with_units
 from offline.config import Metric
 
 STAMPS = 1_700_000_000_123_456_789 + np.arange(20) * 100_000_000
@@ -57,6 +57,16 @@ def test_the_cost_is_a_column_and_its_parts_are_none(archive):
     assert not {"register_ms", "prepare_ms"} & set(table[4])
     assert table[4]["memory"] == 9.0
     assert "cost [ms]" in with_units(table, ["cave", "street"], {})[0]
+
+
+def test_what_is_printed_sorts(archive):
+    names, labels = ["cave", "street"], {"distance": "distance [m]"}
+    table = rows(archive, names)
+    shown = headings(names, labels)
+    for heading in with_units(table, names, labels)[0]:
+        assert len(select(table, f"-{heading}", None, shown)) == len(table)
+    by_distance = select(table, "distance [m]", None, shown)
+    assert by_distance == sorted(table, key=lambda row: row["distance"])
 
 
 def test_every_metric_of_an_objective_is_a_column(archive):

@@ -9,7 +9,7 @@ import drives
 import pytest
 import rec
 
-from adaptune.commands import tune
+from adaptune.commands import trained, tune
 from adaptune.simulation import Course
 from adaptune.simulation.record import record
 from offline.config import load_study
@@ -143,14 +143,14 @@ def test_the_last_of_several_bags_is_the_test(bag, study_file, tmp_path):
 
 def test_of_several_odometries_the_replayed_one_is_named(monkeypatch):
     said = []
-    monkeypatch.setattr(tune, "say", said.append)
-    monkeypatch.setattr(tune, "show_table", lambda *_: None)
+    monkeypatch.setattr(trained, "say", said.append)
+    monkeypatch.setattr(trained, "show_table", lambda *_: None)
     study = SimpleNamespace(config=SimpleNamespace(odometries={"gicp": 0, "ndt": 0}))
     trials = [
         {"odometry": name, "mean": mean, COST: 1.0} for name, mean in (("gicp", 2), ("ndt", 1))
     ]
     model = SimpleNamespace(fixed=7, sets={7: {"odometry": "gicp"}})
-    tune.say_odometries(study, SimpleNamespace(trials=trials, model=model))
+    trained.say_odometries(study, SimpleNamespace(trials=trials, model=model))
     assert said == [
         "Best odometry in training: ndt. On the test, the fixed set is gicp's, the baseline "
         "gicp's; to see another there, name it alone (--odometry)."
@@ -261,3 +261,79 @@ def test_mistakes_are_told_in_a_sentence_and_nothing_is_made(tmp_path, arguments
     (tmp_path / "poses.tum").write_text("1 0 0 0 0 0 0 1\n2 1 0 0 0 0 0 1\n")
     assert words in failed(*arguments)
     assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.services
+def test_a_fleet_leaves_each_out_and_grows(tmp_path):
+    """A recording more runs only what is new, at the same sets."""
+
+    def add(*names):
+        for name in names:
+            seed = sum(map(ord, name))
+            late = [(stamp + seed * 10**12, *rest) for stamp, *rest in drives.scans(seed)]
+            drives.write_bag(tmp_path / "bags" / f"{name}.bag", late)
+
+    add("park", "street", "yard")
+    call = ("tune", "bags", *FAKE, "--trials", 4, "-o", "offline.seed=5", "--test", "bags/park.bag")
+    said = commands.succeeded(*call).stdout
+    assert "Each recording left out, the worst first" in said
+    folder = tmp_path / "runs/bags_fake_odometry_Fake"
+    study = study_in(folder / f"{folder.name}.yaml").config
+    assert ({*study.training}, study.test) == ({"street", "yard"}, ("park",))
+    # The same night again changes nothing.
+    trials = {path: path.stat().st_mtime_ns for path in folder.glob("trials/*/*.npz")}
+    rows = (folder / "trials.csv").read_text().splitlines()
+    assert "faults" in rows[0]
+    assert "restarts" in rows[0]
+    commands.succeeded(*call)
+    assert {path: path.stat().st_mtime_ns for path in trials} == trials
+    add("alley")
+    said = commands.succeeded(*call).stdout
+    assert "New in training: alley; " in said
+    study = study_in(folder / f"{folder.name}.yaml").config
+    assert ({*study.training}, study.test) == ({"street", "yard", "alley"}, ("park",))
+    numbers = {path.stem for path in folder.glob("trials/street/?????.npz")}
+    assert {path.stem for path in folder.glob("trials/alley/?????.npz")} == numbers
+    assert {path: path.stat().st_mtime_ns for path in trials} == trials
+    assert (folder / "trials.csv").read_text().splitlines()[1].startswith(rows[1].split(".")[0])
+
+
+@pytest.mark.usefixtures("decided")
+def test_the_user_s_file_is_the_baseline(bag, tmp_path):
+    (tmp_path / "mine.yaml").write_text("mapping: {voxel_size: 0.8}\n")
+    assert failed(bag, "--config", "mine.yaml") == "error: runs/one_kiss_icp/one_kiss_icp.yaml"
+    study = study_in("runs/one_kiss_icp/one_kiss_icp.yaml")
+    assert study.odometry.space.baseline == {"voxel_size": 0.8}
+    several = failed(bag, "--config", "mine.yaml", "--odometry", "gicp,ndt", "--folder", "x")
+    assert "is of one odometry" in several
+    assert "voxel_sise" in failed(bag, "--config", "voxel_sise.yaml", "--folder", "y")
+
+
+@pytest.mark.usefixtures("decided")
+def test_a_folder_is_looked_at(tmp_path):
+    folder = tmp_path / "bags"
+    for seed, name in enumerate(("park", "street")):
+        drives.write_bag(folder / f"{name}.bag", drives.scans(seed))
+    failed(folder)
+    assert study_in("runs/bags/bags.yaml").config.training == ("park",)
+    shown = commands.succeeded("inspect", folder).stdout
+    assert "2 recordings" in shown
+    assert "Next: adaptune tune" in shown
+    assert "--test: leaves no recording" in failed(folder, "--test", folder, "--folder", "z")
+
+
+@pytest.mark.usefixtures("decided")
+def test_what_is_new_goes_where_its_folder_belongs(tmp_path):
+    def add(seed, name):
+        late = [(stamp + seed * 10**12, *rest) for stamp, *rest in drives.scans(seed)]
+        drives.write_bag(tmp_path / f"{name}.bag", late)
+
+    call = ("bags", "--test", "kept", "--folder", "runs/many")
+    add(0, "bags/park")
+    add(1, "kept/yard")
+    failed(*call)
+    add(2, "bags/street")
+    add(3, "kept/alley")
+    failed(*call)
+    study = study_in("runs/many/many.yaml").config
+    assert (study.training, study.test) == (("park", "street"), ("yard", "alley"))

@@ -5,7 +5,7 @@ import yaml
 
 from adaptune.errors import OdometryError
 from adaptune.odometry.kiss_icp import Kiss
-from adaptune.odometry.registry import OdometryFactory, is_user_class, odometry_class
+from adaptune.odometry.registry import OdometryFactory, declare, is_user_class, odometry_class
 from adaptune.odometry.remote import Limits, Process
 from adaptune.odometry.template import Template
 from adaptune.space import ParameterSpace
@@ -117,3 +117,80 @@ def test_a_value_that_others_share_is_not_replaced(tmp_path, text):
     path.write_text(text)
     with pytest.raises(OdometryError, match=r"shared.yaml: .* \(line 2\); write its value without"):
         Template(path).fill({"a": 3.0})
+
+
+USERS = """# of the robot \u00b0
+out_dir: "/data"   # a big disk
+data: {deskew: on, max_range: 80.0, min_range: 3}
+mapping:
+  voxel_size:  0.8
+adaptive_threshold: {initial_threshold: 2, min_motion_th: 1e-1}
+"""
+ROS2 = "kiss_icp_node:\n  ros__parameters:\n    base_frame: base\n    voxel_size: 5.0\n"
+EVALIO = "pipelines:\n  - {pipeline: kiss, voxel_size: 0.7, max_num_threads: 0}\n  - loam\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "baseline"),
+    [
+        ("kiss_icp", USERS, {"voxel_size": 0.8, "initial_threshold": 2.0, "min_motion_th": 0.1}),
+        ("kiss_icp", ROS2, {"voxel_size": 5.0}),
+        ("evalio_kiss_icp", EVALIO, {"voxel_size": 0.7}),
+        ("evalio_kiss_icp", ROS2, {"voxel_size": 5.0}),
+    ],
+)
+def test_the_user_s_file_is_the_start_and_keeps_all_else(tmp_path, name, text, baseline):
+    path = tmp_path / "users.yaml"
+    path.write_text(text)
+    settings, described = declare(name, {"config": str(path)}).sound(name)
+    assert described.space.baseline == baseline
+    factory = OdometryFactory(name, settings, described.space, Limits())
+    assert factory.own_file(baseline).text == text
+    changed = factory.own_file(baseline | {"voxel_size": 0.25}).text
+    assert changed == text.replace(str(baseline["voxel_size"]), "0.25")
+    # Results do not outlive a change of the file.
+    before = factory.content
+    path.write_text(text + "# changed\n")
+    assert factory.content != before
+
+
+def test_kiss_icp_drives_what_its_own_tool_would(tmp_path):
+    from kiss_icp.config import load_config
+
+    path = tmp_path / "users.yaml"
+    path.write_text(USERS.replace("  voxel_size:  0.8\n", "  max_points_per_voxel: 9\n"))
+    made = Kiss(None, Kiss.settings_type(config=str(path)))
+    expected = load_config(path)
+    used = made._kiss.config
+    assert (used.data, used.mapping) == (expected.data, expected.mapping)
+    assert used.mapping.voxel_size == 0.8  # a hundredth of the range, as there
+    assert (made.settings.min_range, made.settings.max_range) == (3.0, 80.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "words"),
+    [
+        ("kiss_icp", "mapping:\n  voxel_size: big\n", "line 2: voxel_size: 'big' is no number"),
+        ("kiss_icp", "a: 1\n", "holds none of voxel_size"),
+        ("kiss_icp", "mapping: {voxel_size: 1.0}\ndata: {deskew: x}\n", "data.deskew"),
+        ("genz_icp", EVALIO, "is to hold one pipeline 'genz'; there is kiss"),
+        ("kiss_icp", None, "there is no such file"),
+    ],
+)
+def test_a_file_of_something_else_is_refused(tmp_path, name, text, words):
+    path = tmp_path / "users.yaml"
+    if text is not None:
+        path.write_text(text)
+    with pytest.raises(OdometryError, match=r"users\.yaml") as caught:
+        declare(name, {"config": str(path)})
+    assert words in str(caught.value)
+
+
+def test_what_the_file_gives_is_not_given_twice(tmp_path):
+    (tmp_path / "users.yaml").write_text(USERS)
+    given = {"config": str(tmp_path / "users.yaml")}
+    (mistake,) = declare("kiss_icp", given | {"min_range": 2.0}).mistakes
+    assert "min_range is taken from" in str(mistake)
+    # A study's folder names the defaults, too.
+    whole = Kiss.settings_type(**given).model_dump()
+    assert declare("kiss_icp", whole).mistakes == []

@@ -1,0 +1,151 @@
+"""The gate for changes: drive what is not known yet on both sides, and compare."""
+
+import shlex
+import shutil
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from statistics import median
+from typing import TYPE_CHECKING, Any
+
+from adaptune.commands.recordings import Asked, recorded
+from adaptune.commands.terminal import load, progress
+from adaptune.errors import AdaptuneError
+from adaptune.files import plain_name, write_text
+from adaptune.yaml12 import Document, YamlError, dump
+
+if TYPE_CHECKING:
+    from offline.config import OfflineStudy
+    from online.gate import Side
+
+FOLDER = Path("runs/compare")
+"""Where what the gate drives is kept."""
+
+
+def sides(
+    given: Sequence[str], recordings: Sequence[Path], odometry: str | None
+) -> "tuple[Side, Side]":
+    """The replays of both sides, the new one first; those that are missing are made.
+
+    A side is a study or its folder; or with `recordings` a parameter file of the `odometry`, or an
+    odometry: a name, a command or an image. They are driven by turns, each alone on a core.
+    """
+    from online.gate import Side
+
+    studies = _studies(given) if not recordings else _driven(given, recordings, odometry)
+    _drive(studies)
+    new, old = (Side(name, study) for name, study in zip(given, studies, strict=True))
+    return new, old
+
+
+def _studies(given: Sequence[str]) -> "list[OfflineStudy]":
+    for name in given:
+        if not (path := Path(name)).exists():
+            raise AdaptuneError(f"{name}: there is no such study; or name the bags to drive, too")
+        with suppress(YamlError):
+            data = Document.of_file(path).data if path.is_file() else {"odometry": ""}
+            if not isinstance(data, dict) or "odometry" not in data:
+                raise AdaptuneError(
+                    f"{name}: is no study; of a parameter file, name the bags and --odometry, too"
+                )
+    return [load(Path(name), [], None, runs=Path(name).is_file()) for name in given]
+
+
+def _driven(
+    given: Sequence[str], recordings: Sequence[Path], odometry: str | None
+) -> "list[OfflineStudy]":
+    """Both sides as studies of the same recordings."""
+    from adaptune.commands.tune import loaded_text
+    from adaptune.manifest import digest
+    from adaptune.metrics import MIN_BLOCKS
+    from adaptune.reference.check import path_after, proposed_sub_trajectory
+    from adaptune.study.references import ensure_references
+
+    named, _ = recorded(Asked(recordings, ""))
+    names = list(named)
+    shared: dict[str, Any] = {
+        "sequences": {name: one.given for name, one in named.items()},
+        "training": names,
+    }
+    entries = [_entry(name, odometry) for name in given]
+    folders = [FOLDER / f"{plain_name(Path(name))[:40]}_{digest(name)[:6]}" for name in given]
+    first = loaded_text(dump(shared | {"odometry": entries[0]}), folders[0])
+    first.open()
+    with progress() as show:
+        refused = ensure_references(first.sequences, names, 5.0, show, required=False)
+    known = [first.sequences.open(name).reference() for name in names if name not in refused]
+    # As many as intervals need fit into most recordings.
+    lengths = [
+        min(proposed_sub_trajectory(one), path_after(one, 0.0)[0] / (MIN_BLOCKS + 2))
+        for one in known
+        if one is not None
+    ]
+    shared["sub_trajectory"] = round(median(lengths), 1) if lengths else 5.0
+    if folders[0] != folders[1] and (estimates := folders[0] / "references").exists():
+        shutil.copytree(estimates, folders[1] / "references", dirs_exist_ok=True)
+    paths = [folder / f"{folder.name}.yaml" for folder in folders]
+    for path, entry in zip(paths, entries, strict=True):
+        write_text(path, dump(shared | {"odometry": entry}))
+    return [load(path, [], path.parent, runs=True) for path in paths]
+
+
+def _entry(given: str, odometry: str | None) -> dict[str, Any]:
+    """What a study says of the odometry of a side."""
+    from adaptune.odometry.base import ToolSettings
+    from adaptune.odometry.registry import is_user_class, odometry_class
+
+    file = Path(given)
+    if len(shlex.split(given)) > 1 or file.suffix not in (".yaml", ".yml", ".json"):
+        return _named(given)
+    if not file.is_file():
+        raise AdaptuneError(f"{given}: there is no such file")
+    if odometry is None:
+        raise AdaptuneError(f"{given}: is a parameter file; name its --odometry, too")
+    entry = _named(odometry)
+    if entry["name"] in ("command", "docker_command"):
+        entry["settings"]["template"] = str(file.resolve())
+    elif not is_user_class(odometry) and issubclass(
+        odometry_class(odometry).settings_type, ToolSettings
+    ):
+        entry["settings"] = {"config": str(file.resolve())}
+    else:  # a set as adaptune writes it
+        values = Document.of_file(file).data
+        if not isinstance(values, dict) or any(isinstance(v, dict | list) for v in values.values()):
+            raise AdaptuneError(
+                f"{given}: give the value of each parameter, as fixed.yaml has them"
+            )
+        entry["parameters"] = {name: {"baseline": value} for name, value in values.items()}
+    return entry
+
+
+def _named(given: str) -> dict[str, Any]:
+    """An odometry by its name, its command, or its image."""
+    from adaptune.commands.tune import is_image
+
+    words = shlex.split(given)
+    if len(words) > 1:
+        # It runs in a folder of its own.
+        words = [str(Path(w).absolute()) if Path(w).is_file() else w for w in words]
+        return {"name": "command", "settings": {"command": words}, "parameters": {}}
+    if is_image(given):
+        return {"name": "docker_command", "settings": {"image": given}, "parameters": {}}
+    return {"name": given}
+
+
+def _drive(studies: "Sequence[OfflineStudy]") -> None:
+    """Make the replays of the baselines that are missing, of a study that is a file.
+
+    Both sides take turns on each recording, so that both meet the same state of the machine.
+    """
+    from adaptune.commands.online import alone
+    from online.modes import BASELINE, replay_modes, sequences_without_model
+
+    due = [
+        (name, study)
+        for study in studies
+        if not list((study.folder / "replays").glob("*/fixed/replay.json"))
+        for name in sequences_without_model(study.config)
+    ]
+    for name, study in sorted(due, key=lambda one: one[0]):
+        with alone(study), progress() as show:
+            replay_modes(study, [name], (BASELINE,), show)

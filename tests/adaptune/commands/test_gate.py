@@ -1,0 +1,115 @@
+"""Two sides of the same recordings: is the new one worse?"""
+
+import json
+from pathlib import Path
+from xml.etree import ElementTree as Xml
+
+import commands
+import drives
+import pytest
+
+from online.gate import judged
+
+FAKE = ("--odometry", "fake_odometry:Fake")
+COSTS = ("--cost", "1000000")
+"""Nobody knows what else the machine does."""
+
+
+@pytest.fixture(scope="module")
+def bags(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("bags")
+    for seed, name in enumerate("abc"):
+        drives.write_bag(folder / f"drive_{name}.bag", drives.scans(seed, 150))
+    for name, interval in {"good": 1.0, "same": 1.0, "bad": 30.0}.items():
+        (folder / f"{name}.yaml").write_text(f"keyframe_interval: {interval}\n")
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def here(bags, monkeypatch):
+    """What one test has driven, the others find."""
+    monkeypatch.chdir(bags)
+
+
+def gate(new, old, *options, recordings=("drive_a.bag", "drive_b.bag", "drive_c.bag")):
+    given = (f"{new}.yaml", *recordings, "--against", f"{old}.yaml", *FAKE, *COSTS)
+    return commands.call("compare", *given, *options)
+
+
+@pytest.mark.services
+def test_a_worse_set_fails_and_the_same_one_does_not(bags):
+    done = gate("bad", "good", "--out", "out")
+    assert done.exit_code == 3, done.output
+    assert "WORSE: bad.yaml against good.yaml, 3 recordings: error x" in done.stdout
+    data = json.loads((bags / "out/gate.json").read_text())
+    assert data["verdict"] == "worse"
+    errors = [row for row in data["rows"] if row["quantity"] == "error"]
+    assert [row["recording"] for row in errors] == ["drive_a", "drive_b", "drive_c", "all"]
+    assert all(row["ratio"] > 1.05 for row in errors)
+    suite = Xml.parse(bags / "out/junit.xml").getroot()
+    assert int(suite.get("failures")) == len(suite.findall("testcase/failure")) >= 1
+    assert "| drive_a | error |" in (bags / "out/summary.md").read_text()
+    assert gate("good", "bad").exit_code == 0
+    # Another file of the same values is driven anew, and equal bit by bit.
+    done = gate("same", "good", "--out", "out")
+    assert done.exit_code == 0, done.output
+    rows = json.loads((bags / "out/gate.json").read_text())["rows"]
+    assert {row["ratio"] for row in rows if row["quantity"] == "error"} == {1.0}
+
+
+@pytest.mark.services
+def test_nothing_known_is_driven_again_and_folders_are_sides(bags):
+    gate("bad", "good")
+    replays = sorted((bags / "runs/compare").glob("*/replays/*/baseline/replay.json"))
+    times = [path.stat().st_mtime_ns for path in replays]
+    gate("bad", "good")
+    assert [path.stat().st_mtime_ns for path in replays] == times
+    bad, good = (next(Path("runs/compare").glob(f"{name}_*/")) for name in ("bad", "good"))
+    assert commands.call("compare", bad, "--against", good, *COSTS).exit_code == 3
+    study = good / f"{good.name}.yaml"
+    text = study.read_text()
+    study.write_text(text.replace("sub_trajectory: ", "sub_trajectory: 1"))
+    said = commands.refused("compare", bad, "--against", study)
+    study.write_text(text)
+    assert "sub_trajectory: errors over" in said
+
+
+@pytest.mark.services
+def test_too_little_to_tell_is_a_result_of_its_own(bags):
+    drives.write_bag(bags / "short.bag", drives.scans(7, 25))
+    few = {"recordings": ("short.bag",)}
+    done = gate("bad", "good", **few)
+    assert "TOO LITTLE TO TELL" in done.stdout
+    assert done.exit_code == 0
+    assert gate("bad", "good", "--unclear", "fail", **few).exit_code == 3
+
+
+@pytest.mark.parametrize(
+    ("ratio", "ends", "verdict"),
+    [
+        (1.1, (1.02, 1.2), "worse"),
+        (1.03, (1.02, 1.04), "equal"),
+        (1.0, (0.9, 1.2), "unclear"),
+        (1.1, (0.99, 1.2), "unclear"),
+        (0.9, (0.8, 0.99), "better"),
+        (1.0, (1.0, 1.0), "equal"),
+    ],
+)
+def test_the_interval_decides(ratio, ends, verdict):
+    assert judged(ratio, ends, 0.05) == verdict
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["none", "--against", "good.yaml"], "none: there is no such study"),
+        (["bad.yaml", "--against", "good.yaml"], "bad.yaml: is no study"),
+        (["bad.yaml", "drive_a.bag", "--against", "good.yaml"], "name its --odometry"),
+        (["bad.yaml", "drive_a.bag"], "go with --against"),
+        (["bad.yaml", "--against", "good.yaml", "--worse", "much"], "--worse much: give a perce"),
+        (["bad.yaml", "none.bag", "--against", "good.yaml", *FAKE], "none.bag: there is no such"),
+        (["no.yaml", "drive_a.bag", "--against", "good.yaml", *FAKE], "no.yaml: there is no such"),
+    ],
+)
+def test_mistakes_are_told_in_a_sentence(arguments, words):
+    assert words in commands.refused("compare", *arguments)

@@ -1,0 +1,68 @@
+"""Folders: the parts of one recording, or several recordings."""
+
+import drives
+import pytest
+
+from adaptune.recording.fleet import check_alike, read_folder, recordings_at
+from adaptune.recording.inspect import inspect
+from adaptune.recording.scan import SequenceError
+
+
+def write(folder, **starts):
+    """Bags of 1 s by name, each with the seconds at which it begins."""
+    for name, start in starts.items():
+        late = [(stamp + round(start * 1e9), xyz, T) for stamp, xyz, T in drives.scans(0, 10)]
+        drives.write_bag(folder / f"{name}.bag", late)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("starts", "reading"),
+    [
+        ({"drive_0": 0.0, "drive_1": 1.0, "drive_2": 2.0}, "one"),
+        ({"drive_0": 0.0, "drive_1": 500.0}, "several"),
+        ({"street": 0.0, "park": 0.0}, "several"),
+        ({"street": 0.0, "park": 1.0}, None),
+        ({"drive_0": 0.0, "drive_1": 20.0}, None),
+        ({"drive_0": 0.0}, "one"),
+    ],
+)
+def test_times_and_names_tell(tmp_path, starts, reading):
+    assert read_folder(write(tmp_path, **starts)).reading == reading
+
+
+def test_where_it_is_not_clear_an_option_chooses(tmp_path):
+    write(tmp_path, park=0.0, street=1.0)
+    with pytest.raises(SequenceError, match=r"in 2 parts, or 2 recordings: .* `--as one` or"):
+        recordings_at([tmp_path])
+    assert recordings_at([tmp_path], "one") == [tmp_path]
+    bags = [tmp_path / "park.bag", tmp_path / "street.bag"]
+    assert recordings_at([tmp_path], "several") == bags
+    assert recordings_at(bags) == bags
+
+
+def test_the_only_bag_of_a_folder_has_its_own_name(tmp_path):
+    assert recordings_at([write(tmp_path, drive_0=0.0)]) == [tmp_path / "drive_0.bag"]
+
+
+def test_a_folder_of_folders_holds_several(tmp_path):
+    for name in ("monday", "tuesday"):
+        write(tmp_path / name, drive_0=0.0, drive_1=1.0)
+    assert recordings_at([tmp_path]) == [tmp_path / "monday", tmp_path / "tuesday"]
+
+
+def test_a_bag_that_is_being_recorded_is_told(tmp_path):
+    write(tmp_path, drive_0=0.0)
+    (tmp_path / "drive_1.bag.active").touch()
+    with pytest.raises(SequenceError, match=r"drive_1.bag.active: is still being recorded"):
+        read_folder(tmp_path)
+
+
+def test_recordings_of_different_rates_are_refused_together(tmp_path):
+    write(tmp_path, fast=0.0)
+    slow = [(3 * stamp - 2 * drives.FIRST_STAMP, *rest) for stamp, *rest in drives.scans(0, 10)]
+    drives.write_bag(tmp_path / "slow.bag", slow)
+    found = [inspect(tmp_path / f"{name}.bag") for name in ("fast", "slow")]
+    check_alike(found[:1])
+    with pytest.raises(SequenceError, match=r"fast.bag \(10.0 Hz, .*; slow.bag \(3.3 Hz"):
+        check_alike(found)
