@@ -43,6 +43,8 @@ GROWTH = -0.15
 LOG_DEVIATION = 0.3
 """Standard deviation of the logarithm of an estimate that rests on one chain; and of one that is
 scaled to e times the metres of its chains."""
+SCATTER = 0.6
+"""Standard deviation of the logarithm of the error from one sub-trajectory to the next."""
 HOP_ERROR = 0.05
 """Metres by which a hop itself is wrong where registrations are worst, as among plants."""
 HIDDEN = 0.0075
@@ -128,7 +130,11 @@ class OwnErrors:
         start, end, reach, error, hops = (of[long] for of in (start, end, reach, error, hops))
         times = max(1.0, self._length / float(reach.mean()))
         mean = times**GROWTH * float((100.0 * error / reach).mean())
-        deviation = LOG_DEVIATION * np.sqrt(1.0 / windows(start, end) + np.log(times) ** 2)
+        n = windows(start, end)
+        # What no chain covers may be another sort of place.
+        missed = max(0.0, 1.0 - n * float(reach.mean()) / float(end.max() - start.min()))
+        of_one = LOG_DEVIATION**2 + SCATTER**2 * missed
+        deviation = np.sqrt(of_one / n + (LOG_DEVIATION * np.log(times)) ** 2)
         factor = float(np.exp(1.96 * deviation))
         # Some of it, or all, may be what the hops are wrong by.
         of_a_metre = times**GROWTH * float((100.0 * np.sqrt(hops) / reach).mean())
