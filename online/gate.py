@@ -141,8 +141,7 @@ def compare_sides(new: Side, old: Side, error: float = 0.05, cost: float = 0.1) 
     # A program that runs whole recordings has no cost of each scan.
     whole = any(side.study.odometry.description.whole for side in (new, old))
     pairs, left_out = _pairs(new, old, whole)
-    rows: list[GateRow] = []
-    rows += _rows(ERROR, pairs, error)
+    rows = _rows(ERROR, pairs, error)
     for quantity in (COST,) if whole else (COST, P99):
         rows += _rows(quantity, pairs, cost)
     lost = [(pair.name, *pair.lost) for pair in pairs]
