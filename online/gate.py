@@ -138,11 +138,10 @@ def compare_sides(new: Side, old: Side, error: float = 0.05, cost: float = 0.1) 
     if new.study.config.sub_trajectory != old.study.config.sub_trajectory:
         lengths = [f"{side.study.config.sub_trajectory:g} m ({side.name})" for side in (new, old)]
         raise AdaptuneError(f"sub_trajectory: errors over {' and '.join(lengths)} do not compare")
-    pairs, left_out = _pairs(new, old)
-    rows: list[GateRow] = []
-    whole = new.study.odometry.description.whole
-    rows += _rows(ERROR, pairs, error)
     # A program that runs whole recordings has no cost of each scan.
+    whole = any(side.study.odometry.description.whole for side in (new, old))
+    pairs, left_out = _pairs(new, old, whole)
+    rows = _rows(ERROR, pairs, error)
     for quantity in (COST,) if whole else (COST, P99):
         rows += _rows(quantity, pairs, cost)
     lost = [(pair.name, *pair.lost) for pair in pairs]
@@ -156,7 +155,7 @@ def compare_sides(new: Side, old: Side, error: float = 0.05, cost: float = 0.1) 
     return Gate(verdict, rows, f"{words} Not compared: {left_out}." if left_out else words)
 
 
-def _pairs(new: Side, old: Side) -> tuple[list[_Pair], str]:
+def _pairs(new: Side, old: Side, whole: bool) -> tuple[list[_Pair], str]:
     """The recordings of both sides, and in words those of one side only."""
     sides = new.replays(), old.replays()
     keys = [{_key(n, replay.summary.inputs): n for n, replay in of.items()} for of in sides]
@@ -169,7 +168,6 @@ def _pairs(new: Side, old: Side) -> tuple[list[_Pair], str]:
     if not common:
         raise AdaptuneError(f"no recording is in both, by content and part: {alone}")
     pairs = []
-    whole = any(side.study.odometry.description.whole for side in (new, old))
     for name, other in ((keys[0][key], keys[1][key]) for key in common):
         replays = sides[0][name], sides[1][other]
         lacking, n = replays[1].summary.unhealthy.get("no_pose", 0), replays[1].summary.scans
