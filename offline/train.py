@@ -77,16 +77,14 @@ class Training(NamedTuple):
             sum(row[f"{mode}, whole"] for row in self.rows) / n for mode in ("baseline", "fixed")
         )
         costs, where = self.model.costs, f"in training ({n} sequence{'s' if n > 1 else ''})"
-        at_own, at = (
-            "" if costs is None else f" at {costs.alone(trial):.1f} ms of CPU time a scan"
-            for trial in (0, fixed)
-        )
+        own_ms, ms = (np.nan if costs is None else costs.alone(trial) for trial in (0, fixed))
         baseline = f"Parameters of the baseline: {in_words(sets.space.baseline)}"
         if fixed == 0:
-            least = f"No set that costs no more surely beat the baseline's {own:.3f} %{at_own} "
-            return [f"{least}{where}; the fixed set is the baseline.", *self.said, baseline]
+            least = f"No set that costs no more surely beat the baseline's {own:.3f} % {where}"
+            return [f"{least}; the fixed set is the baseline.", *self.said, baseline]
         return [
-            f"Fixed: {of_fixed:.3f} %{at} against the baseline's {own:.3f} %{at_own} {where}.",
+            f"Fixed: {of_fixed:.3f} % against the baseline's {own:.3f} % {where}, at {ms:.1f} "
+            f"instead of {own_ms:.1f} ms of CPU time a scan.",
             self.elsewhere,
             *self.said,
             f"Parameters of the fixed set: {in_words(sets[fixed])}",
