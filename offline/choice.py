@@ -122,7 +122,8 @@ def bounds(blocks: BlockErrors, n_errors: float = STANDARD_ERRORS) -> NDArray[np
     base = blocks.errors[:, [blocks.baseline]]
     (mean,), _ = mean_and_error(base, blocks.sequence)
     with np.errstate(invalid="ignore"):
-        logs = np.log(blocks.errors + FLOOR * mean) - np.log(base + FLOOR * mean)
+        floor = max(FLOOR * mean, 1e-9)
+        logs = np.log(blocks.errors + floor) - np.log(base + floor)
         log, error = mean_and_error(logs, blocks.sequence)
         bound = mean * np.exp(log + n_errors * np.where(np.isfinite(error), error, 0.0))
     usable = np.isfinite(blocks.restarts) & np.isfinite(bound)
@@ -154,7 +155,7 @@ def choose(
     NothingUsableError
         If no set can be chosen.
     """
-    bound = np.where(affordable(blocks, budget), bounds(blocks, n_errors), np.inf)
+    bound = _within(blocks, budget, n_errors)
     if not np.isfinite(bound).any():
         raise NothingUsableError(UNUSABLE.format(n=len(blocks.trials)))
     good, classes = np.flatnonzero(bound <= AS_GOOD * bound.min()), cost_classes(blocks)
@@ -166,6 +167,21 @@ UNUSABLE = (
     "sequence, so none can be chosen (`adaptune trials` lists their faults): mend the odometry, or "
     "narrow the ranges of the parameters (odometry.parameters)"
 )
+
+
+def _within(
+    blocks: BlockErrors, budget: float | None, n_errors: float = STANDARD_ERRORS
+) -> NDArray[np.float64]:
+    """The bounds of sets within a budget, of shape (n_trials,), infinite for others.
+
+    Where the budget allows none that is admissible, those that are usable count by their error.
+    """
+    few = affordable(blocks, budget)
+    bound = np.where(few, bounds(blocks, n_errors), np.inf)
+    if np.isfinite(bound).any():
+        return bound
+    mean, _ = mean_and_error(blocks.errors, blocks.sequence)
+    return np.where(few & np.isfinite(blocks.restarts), mean, np.inf)
 
 
 def affordable(blocks: BlockErrors, budget: float | None) -> NDArray[np.bool_]:
@@ -207,8 +223,7 @@ def front(blocks: BlockErrors) -> list[int]:
 
 def finalists(blocks: BlockErrors, budget: float | None = None) -> list[int]:
     """Trials whose sets drive whole recordings, the baseline's and the front's among them."""
-    few = affordable(blocks, budget)
-    bound = np.where(few, bounds(blocks), np.inf)
+    few, bound = affordable(blocks, budget), _within(blocks, budget)
     order = [k for k in np.argsort(bound, kind="stable") if np.isfinite(bound[k])]
     best = [blocks.trials[k] for k in order[:FINALISTS]]
     allowed = dict(zip(blocks.trials, few, strict=True))

@@ -39,7 +39,14 @@ from adaptune.space import ParameterSets
 from adaptune.study.config import WORTH
 from adaptune.study.study import MIN_RECORDINGS, PER_STRETCH
 from offline.campaign import read_whole_drives
-from offline.choice import PER_BLOCK, BlockErrors, choose, finalists
+from offline.choice import (
+    PER_BLOCK,
+    STANDARD_ERRORS,
+    BlockErrors,
+    affordable,
+    choose,
+    finalists,
+)
 from offline.config import OfflineStudyConfig
 from offline.objective import weighted
 
@@ -456,17 +463,24 @@ class LabelledData(NamedTuple):
         """Trials whose sets drive whole recordings, see `offline.choice.finalists`."""
         return finalists(self.blocks(), self.budget)
 
-    def fixed(self, budget: float | None = None) -> int:
-        """Trial number of the fixed set within a budget, the study's by default.
+    def fixed(self) -> int:
+        """Trial number of the fixed set within the study's budget.
 
         It is chosen among the finalists, by their drives of whole recordings.
         """
-        budget = self.budget if budget is None else budget
-        return choose(self.whole_blocks(finalists(self.blocks(), budget)), budget)
+        return self._best(self.budget)
 
     def rival(self, cost: float) -> int:
         """Trial number of the set with the least error that costs no more milliseconds a scan."""
-        return choose(self.whole_blocks(finalists(self.blocks(), cost)), cost, n_errors=0.0)
+        return self._best(cost, n_errors=0.0)
+
+    def _best(self, budget: float | None, n_errors: float = STANDARD_ERRORS) -> int:
+        blocks = self.blocks()
+        few = finalists(blocks, budget)
+        driven, cheap = self.whole_blocks(few), affordable(blocks, budget)
+        if not cheap[[blocks.trials.index(trial) for trial in driven.trials]].any():
+            driven = blocks.some(few)  # with something left out, others may be finalists
+        return choose(driven, budget, n_errors)
 
     def training_data(self) -> tuple[TrainingData, "ScaledPCA"]:
         """What selection rules are fitted to, and the transformation of descriptors for them."""

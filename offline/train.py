@@ -81,12 +81,12 @@ class Training(NamedTuple):
         baseline = f"Parameters of the baseline: {in_words(sets.space.baseline)}"
         if fixed == 0:
             least = f"No set that costs no more surely beat the baseline's {own:.3f} % {where}"
-            return [f"{least}; the fixed set is the baseline.", *self.said, baseline]
+            return [*self.said, f"{least}; the fixed set is the baseline.", baseline]
         return [
+            *self.said,
             f"Fixed: {of_fixed:.3f} % against the baseline's {own:.3f} % {where}, at {ms:.1f} "
             f"instead of {own_ms:.1f} ms of CPU time a scan.",
             self.elsewhere,
-            *self.said,
             f"Parameters of the fixed set: {in_words(sets[fixed])}",
             baseline,
         ]

@@ -235,14 +235,19 @@ def least_loss(
 ) -> Policy:
     """The settings with the least loss, of one set at a time and of a bank.
 
-    `logs` is of shape (n_stretches, n_single + len(banks) * (len(BANK_SETTINGS) + 1)); its first
-    `n_single` columns are about one set at a time, its last ones about the best set at the cost of
-    each bank. `banks` has the members of each, `worth` the share of the error that a bank has to
-    spare of what such a set has.
+    `logs` is of shape (n_stretches, n_single + len(banks) * len(BANK_SETTINGS), 2); its first
+    `n_single` columns are about one set at a time, the others about banks, each with the best set
+    that costs no more. `banks` has the members of each, `worth` the share of the error that a bank
+    has to spare of what such a set has.
     """
-    n_rivals = len(banks)
-    logs, of_rivals = logs[:, : logs.shape[1] - n_rivals], logs[:, logs.shape[1] - n_rivals :]
-    losses = np.array([expected_loss(column, recordings) for column in logs.T])
+    logs, of_rivals = logs[..., 0], logs[..., 1]
+    # What does not beat the set that costs as much has no merit.
+    losses = np.array(
+        [
+            max(expected_loss(own, recordings), expected_loss(own - rival, recordings))
+            for own, rival in zip(logs.T, of_rivals.T, strict=True)
+        ]
+    )
     losses[~(np.abs(losses) > ROUNDING)] = 0.0
     expected: dict[str, Figures] = {}
     one_set, bank, members = DO_NOT_ADAPT, NO_BANK, banks[0] if banks else []
@@ -256,7 +261,7 @@ def least_loss(
         expected[BANK] = figures(logs[:, best], recordings)
         way, which = divmod(best - n_single, len(BANK_SETTINGS))
         members = banks[way]
-        rival = figures(logs[:, best] - of_rivals[:, way], recordings)
+        rival = figures(logs[:, best] - of_rivals[:, best], recordings)
         of_both = rival, expected[BANK]
         spares = all(is_worth(one.geometric, one.high, worth) for one in of_both)
         if spares and losses[best] < min(0.0, losses[:n_single].min(initial=0.0)):
@@ -280,22 +285,25 @@ def _logs(
 ) -> NDArray[np.float64]:
     """Logarithms of ratios to the fixed set's error, on a fold.
 
-    Returns shape (n_stretches, n_ways): first those of one set at a time with each of
-    `PAIRED_SETTINGS`, then those of each bank with each of `BANK_SETTINGS`, then those of the best
-    set that costs no more than each bank.
+    Returns shape (n_stretches, n_ways, 2): first those of one set at a time with each of
+    `PAIRED_SETTINGS`, then those of each bank with each of `BANK_SETTINGS`; each with that of the
+    best set that costs no more.
     """
-    fitted = data, pca = others.training_data()
-    fixed = cap(left_out.errors[:, data.sets.column(data.fixed)])
-    columns = []
-    if one_set:
-        columns += list(_paired_errors(left_out, data, pca))
+    fitted = others.training_data()
+    data, _ = fitted
+    capped, stretch = cap(left_out.errors), left_out.stretch
+    fixed = capped[:, data.sets.column(data.fixed)]
+
+    def rival(cost: float) -> NDArray[np.float64]:
+        trial = others.rival(cost) if np.isfinite(cost) else data.fixed
+        return capped[:, data.sets.column(trial)]
+
+    pairs = []
+    for errors, cost in _paired_errors(left_out, others, fitted) if one_set else ():
+        pairs.append((errors, rival(cost)))
     known: dict[tuple[int, ...], list[NDArray[np.float64]]] = {}
-    of_rivals = []
     for make in choosers:
         found = make(others, data.fixed)
-        cost = others.costs.adaptive(found)
-        rival = others.rival(cost) if np.isfinite(cost) else data.fixed
-        of_rivals.append(cap(left_out.errors[:, data.sets.column(rival)]))
         # Whatever the order of the others is, they are the same bank.
         members = (*found[:1], *sorted(found[1:]))
         if members not in known and len(members) < 2:
@@ -303,11 +311,12 @@ def _logs(
         elif members not in known:
             simulated = bank_errors(left_out, others, fitted, members, BANK_SETTINGS)
             known[members] = [errors for errors, _ in simulated]
-        columns += known[members]
-    if not columns:
-        return np.empty((len(np.unique(left_out.stretch)), 0))
-    columns += of_rivals
-    return np.stack([log_ratios(e, fixed, left_out.stretch) for e in columns], axis=1)
+        beside = rival(others.costs.adaptive(found))
+        pairs += [(errors, beside) for errors in known[members]]
+    if not pairs:
+        return np.empty((len(np.unique(stretch)), 0, 2))
+    logs = [[log_ratios(one, fixed, stretch) for one in pair] for pair in pairs]
+    return np.moveaxis(np.array(logs), -1, 0)
 
 
 def bank_errors(
@@ -344,9 +353,10 @@ def bank_errors(
 
 
 def _paired_errors(
-    left_out: LabelledSequence, data: TrainingData, pca: "ScaledPCA"
-) -> Iterator[NDArray[np.float64]]:
-    """Capped errors of one set at a time with each of `PAIRED_SETTINGS`."""
+    left_out: LabelledSequence, others: LabelledData, fitted: tuple[TrainingData, "ScaledPCA"]
+) -> Iterator[tuple[NDArray[np.float64], float]]:
+    """Capped errors of one set at a time with each of `PAIRED_SETTINGS`, and its mean cost."""
+    data, pca = fitted
     most = max(settings.n_sets for settings in PAIRED_SETTINGS)
     rule = PairedExpectedRatio(PairedSettings(n_sets=most)).fit(data)
     first, period = periods(left_out.period)
@@ -356,8 +366,11 @@ def _paired_errors(
         # The complementary sets are chosen one after the other: the first of them are those of
         # fewer sets.
         few = near._replace(errors=near.errors[..., : settings.n_sets])
-        chosen = data.sets.columns(rule.choices(few, settings.sharpness))
-        yield capped[np.arange(len(capped)), chosen[period]]
+        trials = rule.choices(few, settings.sharpness)
+        costs = [others.costs.alone(trial) for trial in trials]
+        chosen = data.sets.columns(trials)
+        cost = float(np.mean(costs)) + others.costs.evidence
+        yield capped[np.arange(len(capped)), chosen[period]], cost
 
 
 def cancelling_members(

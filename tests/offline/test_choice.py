@@ -49,6 +49,13 @@ def test_the_best_that_costs_no_more_is_chosen():
         choose(blocks(errors, [10.0, 12.0, 30.0]), budget=5.0)
 
 
+def test_a_budget_below_the_baseline_may_take_what_is_worse():
+    found = blocks(noisy([1.0, 2.0, 3.0]), [10.0, 4.0, 4.0])
+    assert choose(found) == 0
+    assert choose(found, budget=5.0) == 1
+    assert finalists(found, 5.0)[:2] == [0, 1]
+
+
 def test_what_comes_too_late_is_not_chosen():
     found = blocks(noisy([1.0, 0.7, 0.4]), [10.0, 40.0, 60.0])
     assert choose(found, budget=100.0) == 2

@@ -179,7 +179,8 @@ def test_a_default_study_asks_its_sampler(name, trials):
     sources = Counter(search.sources.values())
     assert sources["baseline"] == 1
     assert sources[name] >= 0.7 * len(search.done)
-    assert sources["sobol"] + 1 == config.n_initial
+    # What keeps the baseline's values may have been tried before.
+    assert config.n_initial // 2 < sources["sobol"] < config.n_initial
 
 
 def test_the_clock_goes_on_counting(tmp_path):

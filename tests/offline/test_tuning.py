@@ -93,12 +93,13 @@ def test_a_bank_that_gains_nothing_does_not_adapt(monkeypatch):
 
 
 def test_the_least_loss_wins():
-    logs = np.zeros((8, len(PAIRED_SETTINGS) + 2 * len(BANK_SETTINGS) + 2))
+    both = np.zeros((8, len(PAIRED_SETTINGS) + 2 * len(BANK_SETTINGS), 2))
+    logs, rivals = both[..., 0], both[..., 1]
     names = [str(i) for i in range(8)]
     banks = [[0, 1], [0, 2]]
 
     def best():
-        return tuning.least_loss(logs, names, banks, len(PAIRED_SETTINGS), 0.1)
+        return tuning.least_loss(both, names, banks, len(PAIRED_SETTINGS), 0.1)
 
     assert (best().one_set, best().bank) == (DO_NOT_ADAPT, NO_BANK)
     logs[:, 5] = -0.2
@@ -124,7 +125,7 @@ def test_the_least_loss_wins():
         (0.3, 0.0, 1, 0.1, False),
     ):
         logs[:, second + 3] = -gain + spread * (-1.0) ** np.arange(8)
-        found = tuning.least_loss(logs[:n], names[:n], banks, len(PAIRED_SETTINGS), worth)
+        found = tuning.least_loss(both[:n], names[:n], banks, len(PAIRED_SETTINGS), worth)
         assert found.bank.adapt == adapts, (gain, spread, n, worth)
         if n > 1:
             assert found.expected["bank"].loss == expected_loss(logs[:n, second + 3], names[:n])
@@ -132,8 +133,11 @@ def test_the_least_loss_wins():
     logs[:] = 0.0
     logs[:, second + 3] = -0.3
     assert best().bank.adapt
-    logs[:, -1] = -0.25
+    rivals[:, second + 3] = -0.25
     assert not best().bank.adapt
+    logs[:, 5] = rivals[:, 5] = -0.2
+    assert not best().one_set.adapt
+    rivals[:] = 0.0
     # What rounding gains is no gain.
     logs[:] = 0.0
     logs[:, second + 3] = -1e-9

@@ -51,7 +51,9 @@ def test_a_set_that_fails_is_never_chosen(study_file, tmp_path, fails, given):
 
 
 def test_where_all_others_fail_the_baseline_is_left(study_file, tmp_path):
-    _, training = trained(study_file, tmp_path / "study", "but the baseline", FAST)
+    _, training = trained(
+        study_file, tmp_path / "study", "but the baseline", FAST, "offline.sampler=random"
+    )
     assert (training.model.fixed, training.model.bank) == (0, [0])
     assert any(
         "9 of 10 parameter sets failed and are never chosen" in text for text in training.words
