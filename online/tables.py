@@ -240,7 +240,13 @@ def verdict(
     if best.mode not in _ONE_SET:
         has = f"It has {best.ratio:.2f} times the {_YARDSTICKS[best.yardstick]}'s error"
         cost = _for_cost(best, last[best.yardstick])
-        return [f"{said}.", f"{has} ({_interval(_ratio(best))}){cost}."]
+        beside = [f"{said}.", f"{has} ({_interval(_ratio(best))}){cost}."]
+        rival = last.get(EQUAL_COST)
+        if rival is None or rival.ratio is None or rival.cpu_ms is None:
+            return beside
+        ratio = _to(best, rival)
+        what = f"the best single set that costs no more ({rival.cpu_ms:.1f} ms)"
+        return [*beside, f"It has {ratio.value:.2f} times the error of {what}."]
     said = f"{said}{_doubt(best, last)}."
     return [said, *_dearer(best, last), *_why_not(main, best, rows, obstacle, worth)]
 
