@@ -19,6 +19,8 @@ SURE = 0.95
 """Confidence, on one side, with which a set is worse than the baseline."""
 STANDARD_ERRORS = 1.0
 """Of the logarithm of the ratio to the baseline's error, by which a set has to be better."""
+ONE_RECORDING = 2.0
+"""The same where there is one recording: it says little of others."""
 FLOOR = 0.05
 """Share of the baseline's mean error that is added to both errors of a ratio."""
 COST_CLASS = 1.1
@@ -111,14 +113,17 @@ def surely_worse(blocks: BlockErrors) -> NDArray[np.bool_]:
     return worse
 
 
-def bounds(blocks: BlockErrors, n_errors: float = STANDARD_ERRORS) -> NDArray[np.float64]:
+def bounds(blocks: BlockErrors, sure: bool = True) -> NDArray[np.float64]:
     """Upper bound of the error of each set in percent, of shape (n_trials,).
 
-    It is the baseline's mean error times the geometric mean of the ratios to it in blocks, plus
-    `n_errors` standard errors of its logarithm. It is infinite for sets that are not admissible:
+    It is the baseline's mean error times the geometric mean of the ratios to it in blocks, and if
+    it is to be `sure`, a standard error above. It is infinite for sets that are not admissible:
     they failed, were restarted more often than the baseline (whoever takes its parameters elsewhere
     has no health check), or are surely worse, also in rotation.
     """
+    n_errors = 0.0
+    if sure:
+        n_errors = ONE_RECORDING if len(np.unique(blocks.sequence)) == 1 else STANDARD_ERRORS
     base = blocks.errors[:, [blocks.baseline]]
     (mean,), _ = mean_and_error(base, blocks.sequence)
     with np.errstate(invalid="ignore"):
@@ -140,9 +145,7 @@ def cost_classes(blocks: BlockErrors) -> NDArray[np.float64]:
     return np.asarray(np.nan_to_num(np.round(classes - classes[blocks.baseline]), nan=0.0))
 
 
-def choose(
-    blocks: BlockErrors, budget: float | None = None, n_errors: float = STANDARD_ERRORS
-) -> int:
+def choose(blocks: BlockErrors, budget: float | None = None, sure: bool = True) -> int:
     """Trial number of the fixed set.
 
     Of the admissible sets that cost no more than the baseline, or than a `budget` in milliseconds
@@ -155,7 +158,7 @@ def choose(
     NothingUsableError
         If no set can be chosen.
     """
-    bound = _within(blocks, budget, n_errors)
+    bound = _within(blocks, budget, sure)
     if not np.isfinite(bound).any():
         raise NothingUsableError(UNUSABLE.format(n=len(blocks.trials)))
     good, classes = np.flatnonzero(bound <= AS_GOOD * bound.min()), cost_classes(blocks)
@@ -169,15 +172,13 @@ UNUSABLE = (
 )
 
 
-def _within(
-    blocks: BlockErrors, budget: float | None, n_errors: float = STANDARD_ERRORS
-) -> NDArray[np.float64]:
+def _within(blocks: BlockErrors, budget: float | None, sure: bool = True) -> NDArray[np.float64]:
     """The bounds of sets within a budget, of shape (n_trials,), infinite for others.
 
     Where the budget allows none that is admissible, those that are usable count by their error.
     """
     few = affordable(blocks, budget)
-    bound = np.where(few, bounds(blocks, n_errors), np.inf)
+    bound = np.where(few, bounds(blocks, sure), np.inf)
     if np.isfinite(bound).any():
         return bound
     mean, _ = mean_and_error(blocks.errors, blocks.sequence)
@@ -212,7 +213,7 @@ def affordable(blocks: BlockErrors, budget: float | None) -> NDArray[np.bool_]:
 
 def front(blocks: BlockErrors) -> list[int]:
     """Trials by rising cost, each with clearly less error than all that cost less."""
-    bound, classes = bounds(blocks, 0.0), cost_classes(blocks)
+    bound, classes = bounds(blocks, sure=False), cost_classes(blocks)
     found, least = [], np.inf
     for k in sorted(range(len(bound)), key=lambda k: (classes[k], bound[k])):
         if np.isfinite(bound[k]) and bound[k] * AS_GOOD < least:

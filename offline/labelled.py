@@ -41,7 +41,6 @@ from adaptune.study.study import MIN_RECORDINGS, PER_STRETCH
 from offline.campaign import read_whole_drives
 from offline.choice import (
     PER_BLOCK,
-    STANDARD_ERRORS,
     BlockErrors,
     affordable,
     choose,
@@ -472,15 +471,15 @@ class LabelledData(NamedTuple):
 
     def rival(self, cost: float) -> int:
         """Trial number of the set with the least error that costs no more milliseconds a scan."""
-        return self._best(cost, n_errors=0.0)
+        return self._best(cost, sure=False)
 
-    def _best(self, budget: float | None, n_errors: float = STANDARD_ERRORS) -> int:
+    def _best(self, budget: float | None, sure: bool = True) -> int:
         blocks = self.blocks()
         few = finalists(blocks, budget)
         driven, cheap = self.whole_blocks(few), affordable(blocks, budget)
         if not cheap[[blocks.trials.index(trial) for trial in driven.trials]].any():
             driven = blocks.some(few)  # with something left out, others may be finalists
-        return choose(driven, budget, n_errors)
+        return choose(driven, budget, sure)
 
     def training_data(self) -> tuple[TrainingData, "ScaledPCA"]:
         """What selection rules are fitted to, and the transformation of descriptors for them."""

@@ -449,7 +449,9 @@ def rivals(data: LabelledData, cost: float) -> dict[str, int]:
     """
     found = {}
     if len(data.sets.space.baselines) > 1:
-        found[BEST_DEFAULT] = choose_fixed(data.whole_blocks(data.sets.defaults), np.inf, 0.0)
+        found[BEST_DEFAULT] = choose_fixed(
+            data.whole_blocks(data.sets.defaults), np.inf, sure=False
+        )
     if np.isfinite(cost):
         found[EQUAL_COST] = data.rival(cost)
     return found

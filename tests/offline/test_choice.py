@@ -133,7 +133,7 @@ def test_what_is_chosen_may_be_chosen(n, n_blocks, seed):
 def test_what_is_left_out_tells_how_a_choice_does_elsewhere():
     # All sets are alike: the least of many errors is chance, and gone where it was not chosen.
     errors = np.random.default_rng(1).exponential(1.0, (30, 20))
-    ratio, low, high = left_out_ratio(blocks(errors), lambda of: choose(of, n_errors=0.0))
+    ratio, low, high = left_out_ratio(blocks(errors), lambda of: choose(of, sure=False))
     assert low < 1.0 < high
     assert ratio > errors.mean(axis=0).min() / errors[:, 0].mean()
     assert left_out_ratio(blocks(errors[:3]), choose) is None
