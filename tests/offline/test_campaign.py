@@ -42,7 +42,8 @@ def test_finalists_are_driven_along_the_whole_of_long_recordings(study_file, tmp
     study = load_study(study_file, LONG, tmp_path / "study")
     training = train(study)
     archive, means = Archive(study.folder / "trials"), [row["mean"] for row in training.trials]
-    finalists = {int(path.name[:5]) for path in archive.folder.glob("one/*-whole.npz")}
+    files = list(archive.folder.glob("one/*-whole.npz"))
+    finalists = {int(path.name[:5]) for path in files}
     assert {0, int(np.argmin(means)), training.model.fixed} <= finalists
     assert len(finalists) < len(means)
     whole = {n: archive.read("one", n, whole=True).mean_error for n in finalists}
