@@ -254,12 +254,13 @@ def verdict(
 def _dearer(best: ComparisonRow, last: Mapping[str, ComparisonRow]) -> list[str]:
     """That a single set which costs more does better, where it surely does."""
     row = last.get(EQUAL_COST)
-    if row is None or row.ratio is None or not _surely_better(row, best):
+    if row is None or row.ratio is None or (ratio := _to(row, best)).interval is None:
         return []
-    ratio, cost = _to(row, best), _for_cost(row, best)
-    has = f"{ratio.value:.2f} times its error ({_interval(ratio)}){cost}"
-    budget = "" if row.cpu_ms is None else f": `--budget {row.cpu_ms:.0f}` allows it"
-    return [f"A single set that costs more has {has}{budget}."]
+    costs = row.cpu_ms or 0.0
+    if not _surely_better(row, best) or not best.cpu_ms or costs <= best.cpu_ms:
+        return []
+    has = f"{ratio.value:.2f} times its error ({_interval(ratio)}){_for_cost(row, best)}"
+    return [f"A single set that costs more has {has}: `--budget {costs:.0f}` allows it."]
 
 
 def _doubt(best: ComparisonRow, last: Mapping[str, ComparisonRow]) -> str:

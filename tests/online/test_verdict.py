@@ -186,3 +186,17 @@ def test_all_estimates_that_the_reference_contradicts_are_one_sentence():
         "reference it is 1.000 %. Either the estimate or the reference is wrong there over this "
         "length."
     ]
+
+
+def test_a_single_set_that_costs_more_is_told_where_it_is_surely_better():
+    rows = every(equal_cost=0.7)
+    costs = {"equal_cost": 12.0}
+    dear = [replace(row, cpu_ms=costs.get(row.mode, 5.0)) for row in rows]
+    assert verdict(dear, 10.0)[1] == (
+        "A single set that costs more has 0.70 times its error (95 % interval 0.68 to 0.72), for "
+        "2.4 times its CPU time (12.0 ms a scan): `--budget 12` allows it."
+    )
+    cheap = [replace(row, cpu_ms=5.0) for row in rows]
+    assert len(verdict(cheap, 10.0)) < len(verdict(dear, 10.0))
+    short = [replace(row, ratio_interval=None) for row in dear]
+    assert not any("--budget" in said for said in verdict(short, 10.0))
