@@ -1,0 +1,39 @@
+"""What CPU time buys, and what it costs here."""
+
+import json
+import shutil
+
+import pytest
+
+from adaptune.errors import AdaptuneError
+from offline.config import load_study
+from offline.front import COST, measured_front
+
+
+@pytest.fixture
+def study(study_file, trained_folder, tmp_path):
+    return load_study(study_file, [], shutil.copytree(trained_folder, tmp_path / "study"))
+
+
+def test_the_front_begins_with_what_is_recommended(study):
+    rows = json.loads((study.folder / "front.json").read_text("utf-8"))
+    assert [row["recommended"] for row in rows] == [True] + [False] * (len(rows) - 1)
+    assert rows[0]["trial"] == study.model().fixed
+    (base,) = (row for row in rows if row["trial"] == 0)
+    assert base["vs baseline"] == pytest.approx(1.0)
+    costs = [row[COST] for row in rows[1:]]
+    assert costs == sorted(costs)
+    for row in rows:
+        assert row["error [%]"] == pytest.approx(base["error [%]"] * row["vs baseline"])
+
+
+def test_the_front_is_measured_on_another_recording(study):
+    scans = study.sequences.open("two")
+    rows = measured_front(study, scans)
+    assert sum(row["recommended"] for row in rows) == 1
+    assert all(row["99 % [ms]"] > 0.0 and row["memory [MB]"] > 0.0 for row in rows)
+    assert [row[COST] for row in rows] == sorted(row[COST] for row in rows)
+    assert {row["trial"] for row in rows} >= {0, study.model().fixed}
+    (study.folder / "front.json").unlink()
+    with pytest.raises(AdaptuneError, match=r"front.json: there is no such file; run .* offline"):
+        measured_front(study, scans)
