@@ -29,8 +29,8 @@ from adaptune.progress import unseen
 from adaptune.space import ParameterSet
 from offline import campaign
 from offline.campaign import Campaign, drive_whole, run_baseline
+from offline.choice import FINALISTS
 from offline.config import load_study
-from offline.objective import candidates
 from offline.trial import Drive, Stretch, stretches_of
 from offline.workers import Result, Task
 
@@ -132,7 +132,8 @@ def run(n: int, scans: Mapping[str, int], trials: int, kept: float) -> list[floa
         ends = [pool.now]
         verdicts = Campaign(study, archive, pool).run()
         ends.append(pool.now)
-        sets = {number: verdicts[number].parameters for number in candidates(verdicts)}
+        best = sorted(verdicts, key=lambda number: verdicts[number].value)[:FINALISTS]
+        sets = {number: verdicts[number].parameters for number in sorted({0, *best})}
         drive_whole(study, sets, archive, pool, unseen)
         ends.append(pool.now)
         return [*np.diff(ends, prepend=0.0).tolist(), pool.now, pool.busy / pool.now / n]

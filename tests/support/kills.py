@@ -28,10 +28,10 @@ def contents(folder: Path) -> dict[Path, object]:
                 for key in data
                 if key not in ("seconds", "usage", "evidence_ms")
             }
-    found[Path("fixed.yaml")] = (folder / "fixed.yaml").read_bytes()
-    # All of the model but what its sets cost.
+    # What is chosen follows from what sets cost, too, which no two campaigns measure alike.
     model = ErrorModel.load(folder / "model.safetensors")
-    found[Path("model.safetensors")] = model.digest, model.provenance, model.expected
+    errors = model.errors.tobytes(), model.descriptors.tobytes()
+    found[Path("model.safetensors")] = model.sets.trials, model.sets.parameters, errors
     return found
 
 

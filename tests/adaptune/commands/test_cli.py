@@ -57,7 +57,7 @@ def test_one_bag_is_enough_and_every_command_names_the_next(adaptune, study_file
         assert words[1:] == ["one.yaml", "--folder", "my study[v2]", *overrides]
         lines = [line for line in done.stdout.splitlines() if line.strip()]
         assert len(set(lines)) == len(lines)
-        there = "The parameters: my study[v2]/fixed.yaml." in done.stdout
+        there = ": my study[v2]/fixed.yaml." in done.stdout
         assert (command == "online") != there
         assert (command == "online") == ("4 replays made: my study[v2]/replays/" in done.stdout)
         trained = "% in training (1 sequence)"
