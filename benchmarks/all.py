@@ -68,7 +68,9 @@ BENCHMARKS = {
         ["campaign.py", "speed"],
         ["campaign.py", "speed", "4", "350"],
         [
-            Figure("campaign, one worker", BARE, rf"1 worker .*: {N} times the bare", "", 1.1, True),
+            Figure(
+                "campaign, one worker", BARE, rf"1 worker .*: {N} times the bare", "", 1.1, True
+            ),
             Figure(
                 "campaign, two workers", "one worker", rf"2 workers .*: {N} times", "", 1.8, True
             ),
