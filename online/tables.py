@@ -240,15 +240,18 @@ def verdict(
     if best.mode not in _ONE_SET:
         has = f"It has {best.ratio:.2f} times the {_YARDSTICKS[best.yardstick]}'s error"
         cost = _for_cost(best, last[best.yardstick])
-        beside = [f"{said}.", f"{has} ({_interval(_ratio(best))}){cost}."]
-        rival = last.get(EQUAL_COST)
-        if rival is None or rival.ratio is None or rival.cpu_ms is None:
-            return beside
-        ratio = _to(best, rival)
-        what = f"the best single set that costs no more ({rival.cpu_ms:.1f} ms)"
-        return [*beside, f"It has {ratio.value:.2f} times the error of {what}."]
+        return [f"{said}.", f"{has} ({_interval(_ratio(best))}){cost}{_beside(best, last)}."]
     said = f"{said}{_doubt(best, last)}."
     return [said, *_dearer(best, last), *_why_not(main, best, rows, obstacle, worth)]
+
+
+def _beside(best: ComparisonRow, last: Mapping[str, ComparisonRow]) -> str:
+    """How what adapts compares with the best single set that costs no more."""
+    rival = last.get(EQUAL_COST)
+    if rival is None or rival.ratio is None or rival.cpu_ms is None:
+        return ""
+    ratio, ms = _to(best, rival).value, rival.cpu_ms
+    return f", and {ratio:.2f} times that of the best single set that costs no more ({ms:.1f} ms)"
 
 
 def _dearer(best: ComparisonRow, last: Mapping[str, ComparisonRow]) -> list[str]:
