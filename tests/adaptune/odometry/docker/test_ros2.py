@@ -180,7 +180,7 @@ def test_parameters_that_are_accepted_in_vain_are_told(tmp_path):
 
 
 def test_one_that_works_on_is_driven_without_waiting_too(tmp_path):
-    given = ros2(tmp_path / "icp.yaml", imitate={"background": 0.8}, patience=9.0)
+    given = ros2(tmp_path / "icp.yaml", imitate={"background": 2.5}, patience=9.0)
     found = look(given, VALUES, LIMITS, scans()[:5])
     words = r"yes: at rate: 0 its path is up to 0\.00 m off that at rate: 1, on 1\.\d m; keep"
     assert re.match(words, found["works on after a pose"])
