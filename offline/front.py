@@ -2,6 +2,7 @@
 
 import json
 import time
+from collections.abc import Sequence
 from itertools import islice
 from typing import Any
 
@@ -138,8 +139,18 @@ def measured_front(
         row[COST] = 1e3 * (prepared + used.cpu) / len(took)
         row["99 % [ms]"] = 1e3 * float(np.percentile(took, 99.0))
         row["memory [MB]"] = used.memory or resident_megabytes()
-    most = next(row[COST] for row in rows if row["trial"] == BASELINE)
-    most = max(most, study.config.online.budget or 0.0)
-    few = [r for r in rows if r[COST] <= most and r["99 % [ms]"] <= MOST_OF_PERIOD * period]
-    best = min(few or rows, key=lambda row: row["error [%]"] if few else row[COST])
+    best = recommended(rows, study.config.online.budget, period)
     return [row | {"recommended": row is best} for row in sorted(rows, key=lambda row: row[COST])]
+
+
+def recommended(
+    rows: Sequence[dict[str, Any]], budget: float | None, period: float
+) -> dict[str, Any]:
+    """The row with the least error within a budget, or what the baseline costs, that is in time.
+
+    Budget and the time from scan to scan are in milliseconds. Where there is none, the cheapest.
+    """
+    base = next(row[COST] for row in rows if row["trial"] == BASELINE)
+    most = base if budget is None else budget
+    few = [r for r in rows if r[COST] <= most and r["99 % [ms]"] <= MOST_OF_PERIOD * period]
+    return min(few or rows, key=lambda row: row["error [%]"] if few else row[COST])

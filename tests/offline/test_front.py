@@ -7,7 +7,7 @@ import pytest
 
 from adaptune.errors import AdaptuneError
 from offline.config import load_study
-from offline.front import COST, measured_front
+from offline.front import COST, measured_front, recommended
 
 
 @pytest.fixture
@@ -37,3 +37,18 @@ def test_the_front_is_measured_on_another_recording(study):
     (study.folder / "front.json").unlink()
     with pytest.raises(AdaptuneError, match=r"front.json: there is no such file; run .* offline"):
         measured_front(study, scans)
+
+
+def test_a_budget_decides_also_below_what_the_baseline_costs():
+    rows = [
+        {"trial": trial, COST: cost, "99 % [ms]": 2.0 * cost, "error [%]": error}
+        for trial, cost, error in ((0, 10.0, 1.0), (1, 9.0, 0.5), (2, 4.0, 2.0), (3, 30.0, 0.1))
+    ]
+    for budget, period, trial in (
+        (None, 100.0, 1),
+        (40.0, 200.0, 3),
+        (40.0, 100.0, 1),  # the dearest may come too late
+        (5.0, 100.0, 2),
+        (1.0, 100.0, 2),
+    ):
+        assert recommended(rows, budget, period)["trial"] == trial
