@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptune.errors import AdaptuneError
+from adaptune.metrics import resampled_means
 from adaptune.model.rules import BASELINE, ROUNDING
 
 PER_BLOCK = 2.0
@@ -65,15 +66,19 @@ class BlockErrors(NamedTuple):
     def some(self, trials: Sequence[int]) -> Self:
         """The same of some trials."""
         columns = [list(self.trials).index(trial) for trial in trials]
-        errors, costs = self.errors[:, columns], self.costs[columns]
         return self._replace(
-            trials=list(trials), errors=errors, costs=costs, restarts=self.restarts[columns]
+            trials=list(trials),
+            errors=self.errors[:, columns],
+            costs=self.costs[columns],
+            restarts=self.restarts[columns],
+            turns=None if self.turns is None else self.turns[:, columns],
         )
 
     def without(self, block: int) -> Self:
         """The same without a block."""
         kept = np.arange(len(self.errors)) != block
-        return self._replace(errors=self.errors[kept], sequence=self.sequence[kept])
+        turns = None if self.turns is None else self.turns[kept]
+        return self._replace(errors=self.errors[kept], sequence=self.sequence[kept], turns=turns)
 
 
 def mean_and_error(
@@ -261,10 +266,8 @@ def left_out_ratio(
         return None
     columns = [blocks.trials.index(rule(blocks.without(block))) for block in range(n)]
     chosen, base = blocks.errors[range(n), columns], blocks.errors[:, blocks.baseline]
-    rng = np.random.default_rng(0)
-    drawn = rng.integers(0, n, (2000, n))
-    ratios = chosen[drawn].mean(axis=1) / np.maximum(base[drawn].mean(axis=1), 1e-12)
-    low, high = np.percentile(ratios, [2.5, 97.5])
+    means = resampled_means(np.stack([chosen, base]), 1, np.random.default_rng(0))
+    low, high = np.percentile(means[0] / np.maximum(means[1], 1e-12), [2.5, 97.5])
     return float(chosen.mean() / max(base.mean(), 1e-12)), float(low), float(high)
 
 
