@@ -3,6 +3,7 @@
 PYTHON ?= $(shell python3.11 -c '' 2>/dev/null && echo python3.11 || echo python3)
 VENV ?= .venv
 BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 STUDY := configs/demo.yaml
 SUDO := $(if $(filter 0,$(shell id -u)),,sudo)
 
@@ -20,7 +21,7 @@ help:
 	@echo "make format  format the code"
 	@echo "make clean   remove the virtual environment, caches and runs"
 
-demo: $(VENV)/.installed
+demo: $(VENV)/.demo
 	$(BIN)/adaptune simulate $(STUDY)
 	$(BIN)/adaptune offline $(STUDY)
 	$(BIN)/adaptune online $(STUDY)
@@ -67,10 +68,15 @@ format: $(VENV)/.installed
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-$(VENV)/.installed: pyproject.toml constraints.txt
+# What the package itself needs; tests, linters and optional odometries are three times as large.
+$(VENV)/.demo: pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "adaptune needs Python 3.11 or newer; set PYTHON, as in: make demo PYTHON=python3.12")'
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	$(PIP) -e .
+	touch $@
+
+$(VENV)/.installed: $(VENV)/.demo
+	$(PIP) -e '.[dev]'
 	touch $@
 
 PURELIB := -c 'import sysconfig; print(sysconfig.get_path("purelib"))'
