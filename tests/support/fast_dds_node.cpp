@@ -1,5 +1,6 @@
 // A node on Fast DDS, as LiDAR nodes of ROS 2 are by default: it hears /points best effort, and says
-// a pose at the origin on /odometry for each cloud that comes. It prints how many have come.
+// a pose at the origin on /odometry for each cloud that comes. It prints how many have come. Then it
+// is busy for a while, as with a map, and reads nothing: what comes waits in the kernel's buffer.
 #include <fastdds/dds/domain/DomainParticipant.hpp>
 #include <fastdds/dds/domain/DomainParticipantFactory.hpp>
 #include <fastdds/dds/publisher/DataWriter.hpp>
@@ -79,6 +80,7 @@ struct Heard : DataReaderListener {
             std::fflush(stdout);
             Bytes said = odometry(cloud);
             writer->write(&said);
+            usleep(100000);
         }
     }
 };

@@ -22,5 +22,6 @@ def ros2(file, points="/points", imitate=(), **settings):
     """Settings of the ROS 2 reference, in its image."""
     file.write_text(TEMPLATE.format(points=points, imitate=json.dumps(dict(imitate))))
     command = ("adaptune-reference-ros2", "--params-file", "{parameters}")
-    given = {"image": ros2_image(), "command": command, "odometry": "/odometry", "rate": 0.0}
+    image = settings.pop("image") if "image" in settings else ros2_image()
+    given = {"image": image, "command": command, "odometry": "/odometry", "rate": 0.0}
     return Ros2Settings(template=str(file), **(given | settings))
