@@ -299,8 +299,8 @@ class Archive:
         if partly and "limits" in differing:
             # A limit may have ended a drive of the whole recording alone.
             faulty = {n for n, run in self.finished(name).items() if run.faults}
-            whole = [int(file.name[:5]) for file in folder.glob("*-whole.npz")]
-            faulty |= {n for n in whole if self.read(name, n, whole=True).faults}
+            drives = [file for file in folder.glob("[0-9]*-*.npz") if _read_trial(file).faults]
+            faulty |= {int(file.name.partition("-")[0]) for file in drives}
             files += (file for n in faulty for file in folder.glob(f"{n:05d}*.npz"))
         manifest.set_aside(study, folder, before, files)
         # The record changes last: until then, it is known what these depend on.
@@ -327,10 +327,15 @@ class Archive:
         self._finished = None
         return files
 
-    def trial_path(self, sequence: str, number: int, whole: bool = False) -> Path:
-        """File of a trial, or of its drive along the whole recording, if that is another one."""
-        whole = whole and not self.is_uncut(sequence)
-        return self.folder / sequence / f"{number:05d}{'-whole' if whole else ''}.npz"
+    def trial_path(
+        self, sequence: str, number: int, whole: bool = False, bare: bool = False
+    ) -> Path:
+        """File of a trial, or of its drive along the whole recording, if that is another one.
+
+        A `bare` drive is one of the whole without the health check.
+        """
+        whole = whole and not bare and not self.is_uncut(sequence)
+        return self.folder / sequence / f"{number:05d}{'-whole' * whole}{'-bare' * bare}.npz"
 
     def tidy(self) -> None:
         """Remove unfinished files and repair the index. No process may be writing."""
@@ -428,10 +433,12 @@ class Archive:
         except (KeyError, ValueError, TypeError) as error:
             raise _damaged(path, error) from error
 
-    def write(self, sequence: str, number: int, trial: Trial, whole: bool = False) -> None:
-        """Write a trial."""
+    def write(
+        self, sequence: str, number: int, trial: Trial, whole: bool = False, bare: bool = False
+    ) -> None:
+        """Write a trial, or another drive, see `trial_path`."""
         self._note(sequence)
-        path = self.trial_path(sequence, number, whole)
+        path = self.trial_path(sequence, number, whole, bare)
         data = {name: getattr(trial, name) for name in _ARRAYS}
         data |= {name: getattr(trial, name).astype(np.float32) for name in _SINGLE}
         data |= {name: _packed(getattr(trial, name)) for name in _PLAIN}
@@ -446,18 +453,9 @@ class Archive:
         if self._finished is not None:
             self._finished.setdefault(sequence, {})[number] = summary
 
-    def read(self, sequence: str, number: int, whole: bool = False) -> Trial:
-        """Read a trial."""
-        path = self.trial_path(sequence, number, whole)
-        data = _read(path)
-        try:
-            parts: dict[str, Any] = {name: data[name] for name in _ARRAYS}
-            parts |= {name: data[name].astype(np.float64) for name in _SINGLE}
-            parts |= {name: _unpacked(data[name]) for name in _PLAIN}
-            parts |= {name: tuple(parts[name]) for name in ("faults", "repeats")}
-            return Trial(**parts)
-        except (KeyError, ValueError) as error:
-            raise _damaged(path, error) from error
+    def read(self, sequence: str, number: int, whole: bool = False, bare: bool = False) -> Trial:
+        """Read a trial, or another drive, see `trial_path`."""
+        return _read_trial(self.trial_path(sequence, number, whole, bare))
 
     def read_errors(self, sequence: str, numbers: Sequence[int]) -> NDArray[np.float32]:
         """Errors of several trials on a sequence, of shape (n_frames, n_trials).
@@ -500,6 +498,18 @@ def _damaged(path: Path, error: Exception) -> ArchiveError:
     # NumPy says how to load such a file unsafely.
     why = "it does not hold NumPy's numbers" if "pickle" in str(error) else error
     return ArchiveError(f"{path}: is damaged ({why}); remove it and run again")
+
+
+def _read_trial(path: Path) -> Trial:
+    data = _read(path)
+    try:
+        parts: dict[str, Any] = {name: data[name] for name in _ARRAYS}
+        parts |= {name: data[name].astype(np.float64) for name in _SINGLE}
+        parts |= {name: _unpacked(data[name]) for name in _PLAIN}
+        parts |= {name: tuple(parts[name]) for name in ("faults", "repeats")}
+        return Trial(**parts)
+    except (KeyError, ValueError) as error:
+        raise _damaged(path, error) from error
 
 
 def _read(path: Path, names: Sequence[str] | None = None) -> dict[str, NDArray[Any]]:

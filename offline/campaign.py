@@ -11,6 +11,7 @@ import numpy as np
 
 from adaptune.archive import REGISTER_MS, Archive, ArchiveError, Frames, Summary, Trial, summarise
 from adaptune.errors import AdaptuneError
+from adaptune.model.rules import BASELINE
 from adaptune.progress import Progress, unseen
 from adaptune.space import ParameterSet, PooledSpace
 from adaptune.study.references import contradictions_of
@@ -40,7 +41,8 @@ class Schedule:
     """Trials on sequences, each driven stretch by stretch, by whoever holds the prepared scans.
 
     A sequence that is not described yet is described first, and the hops along it are measured
-    when there is nothing else to do. With `whole`, whole recordings are driven.
+    when there is nothing else to do. With `whole`, whole recordings are driven; with `bare`, they
+    are driven without the health check.
     """
 
     def __init__(
@@ -50,12 +52,13 @@ class Schedule:
         what: str,
         progress: Progress = unseen,
         whole: bool = False,
+        bare: bool = False,
         measure: bool = True,
     ):
         self.most_ms: Mapping[str, float] = {}  # of CPU time a scan, above which a set is stopped
         self.done = 0  # trials on sequences
         self._archive, self._what, self._progress = archive, what, progress
-        self._whole, self._measure = whole, measure
+        self._whole, self._bare, self._measure = whole or bare, bare, measure
         self._settings, self._odometry = TrialSettings.of(study.config), study.odometry
         self._described: dict[str, Frames] = {}
         self._frames: dict[str, Frames] = {}  # the same, with the stretches that are driven
@@ -102,7 +105,7 @@ class Schedule:
     def store(self, name: str, number: int, trial: Trial) -> None:
         """Store a trial, and before it what all on the sequence share: which scans are driven."""
         self._save(name)
-        self._archive.write(name, number, trial, self._whole)
+        self._archive.write(name, number, trial, self._whole, self._bare)
 
     def close(self) -> None:
         """Store the frames that no trial was stored with."""
@@ -135,7 +138,7 @@ class Schedule:
         name, n_scans = stretch.sequence, len(stretch.stamps)
         most_ms, share = self.most_ms.get(name, np.inf), self._share(stretch)
         most = max(1e-3 * most_ms * n_scans, LEAST_SECONDS * share)
-        return Task(name, stretch=stretch, sets=sets, most=most, prepares=key)
+        return Task(name, stretch=stretch, sets=sets, most=most, bare=self._bare, prepares=key)
 
     def note(self, task: Task, progress: TaskProgress) -> None:
         """See `offline.workers.Work`."""
@@ -268,14 +271,14 @@ WholeDrives = Mapping[str, Mapping[int, Summary]]
 
 
 def read_whole_drives(
-    archive: Archive, names: Sequence[str], numbers: Iterable[int]
+    archive: Archive, names: Sequence[str], numbers: Iterable[int], bare: bool = False
 ) -> dict[str, dict[int, Summary]]:
     """The drives of whole recordings that there are of some trials."""
     found: dict[str, dict[int, Summary]] = {name: {} for name in names}
     for name in names:
         for n in numbers:
             with suppress(ArchiveError):
-                found[name][n] = summarise(archive.read(name, n, whole=True))
+                found[name][n] = summarise(archive.read(name, n, whole=True, bare=bare))
     return found
 
 
@@ -286,17 +289,38 @@ def drive_whole(
     workers: Pool[Any],
     progress: Progress,
 ) -> dict[str, dict[int, Summary]]:
-    """Drive sets along whole training sequences, unless that was done before."""
+    """Drive sets along whole training sequences, unless that was done before.
+
+    Where the health check acts, it may hide that a set fails without it. So admissible sets, and
+    the baseline, drive such sequences once more, bare.
+    """
     names = study.training
-    there = read_whole_drives(archive, names, sets)
     schedule = Schedule(study, archive, "whole drives", progress, whole=True)
-    for name in names:
+    _drive(schedule, workers, read_whole_drives(archive, names, sets), dict.fromkeys(names, sets))
+    whole = read_whole_drives(archive, names, sets)
+    restarts = {n: sum(of[n].restarts for of in whole.values()) for n in sets}
+    helped = [n for n in sets if 0 < restarts[n] <= restarts[BASELINE]]
+    if helped == [BASELINE]:
+        return whole
+    schedule = Schedule(study, archive, "drives without health check", progress, bare=True)
+    needed = {name: {n: sets[n] for n in helped if of[n].restarts} for name, of in whole.items()}
+    _drive(schedule, workers, read_whole_drives(archive, names, helped, bare=True), needed)
+    return whole
+
+
+def _drive(
+    schedule: Schedule,
+    workers: Pool[Any],
+    there: WholeDrives,
+    needed: Mapping[str, Mapping[int, ParameterSet]],
+) -> None:
+    """Drive the sets that are needed on each sequence, unless that is there."""
+    for name, sets in needed.items():
         for n, parameters in sets.items():
             if n not in there[name]:
                 schedule.add(name, n, parameters)
     for done in schedule.run(workers):
         schedule.store(*done)
-    return read_whole_drives(archive, names, sets) if schedule.done else there
 
 
 class BaselineError(AdaptuneError):

@@ -30,6 +30,7 @@ from adaptune.study.references import (
     estimates_of,
 )
 from adaptune.study.study import FIXED_SET, OracleErrors, StudySequences, oracle_errors
+from offline.bare import bare_in_words, without_worse_bare
 from offline.campaign import (
     Campaign,
     Schedule,
@@ -122,7 +123,8 @@ def train(study: OfflineStudy, progress: Progress = unseen, cluster: str | None 
         usable = data.usable()
         sets = {n: verdicts[n].parameters for n in {*usable.finalists(), *every_set.defaults}}
         whole = drive_whole(study, dict(sorted(sets.items())), archive, workers, progress)
-    usable = with_whole_drives(usable, archive, study.config)
+    driven = with_whole_drives(usable, archive, study.config)
+    usable = without_worse_bare(driven, archive, config)
     fixed = usable.fixed()
     model = _fitted(study, data, with_vectors(usable, archive), finished, fixed)
     write_fixed(study, verdicts[fixed].parameters)
@@ -145,6 +147,7 @@ def train(study: OfflineStudy, progress: Progress = unseen, cluster: str | None 
     said += estimates_in_words(estimates, model.length)
     said += failed_in_words(verdicts)
     said += baseline_words(config, [runs[0] for runs in finished.values()])
+    said += bare_in_words(archive, whole, fixed, sorted({*driven.sets} - {*usable.sets}))
     rows_of_front = front_rows(usable, model)
     tables.write_rows(study.folder, "front", rows_of_front)
     return Training(model, trials, rows, said, rows_of_front, left_out_in_words(usable))

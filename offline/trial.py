@@ -236,9 +236,11 @@ class _Driver:
         stretch: Stretch,
         health: HealthCheck,
         most: float,
+        bare: bool,
     ):
         self.drive = Drive.lost(stretch)
         self._make, self._stretch, self._health, self._most = make, stretch, health, most
+        self._bare = bare
         self._stamps = stretch.stamps.tolist()
         self._odometry: OdometryInstance | None = None
 
@@ -277,10 +279,12 @@ class _Driver:
                 self._health,
                 T_odom_start=self._stretch.T_odom_start,
                 T_before_start=self._stretch.T_before_start,
+                bare=self._bare,
             )
         found = self._tracker.register_prepared(self._stamps[i], prepared)
         drive.T_odom_sensor[i], drive.tried[i] = found.T_odom_sensor, True
-        drive.without_pose[i] = found.unhealthy == "no_pose"
+        lost = not np.isfinite(found.T_odom_sensor).all()
+        drive.without_pose[i] = lost or found.unhealthy == "no_pose"
         drive.registered[i] = found.registered and not drive.without_pose[i]
         drive.restarted[i] = found.unhealthy is not None
         if found.unhealthy not in (None, "no_pose"):
@@ -478,17 +482,19 @@ class TrialSetup:
         stretch: Stretch,
         sets: Iterable[ParameterSet],
         most: float = np.inf,
+        bare: bool = False,
         progress: Progress = unseen,
     ) -> list[list[Drive]]:
         """Drive with several parameter sets on one pass along a stretch; each for every repeat.
 
-        Sets that take more than `most` seconds of CPU time are stopped.
+        Sets that take more than `most` seconds of CPU time are stopped. What is driven `bare`, once
+        and without the health check, shows how a set does elsewhere.
         """
         health, n = self.settings.health, len(stretch.stamps)
         drivers = [
             [
-                _Driver(partial(self.odometry, one, stretch.sequence), stretch, health, most)
-                for _ in range(self._n_repeats(one))
+                _Driver(partial(self.odometry, one, stretch.sequence), stretch, health, most, bare)
+                for _ in range(1 if bare else self._n_repeats(one))
             ]
             for one in sets
         ]

@@ -31,6 +31,7 @@ from adaptune.study.study import (
     driven,
     expected_in_words,
 )
+from offline.bare import without_worse_bare
 from offline.charts import stretch_chart
 from offline.config import OfflineStudy
 from offline.labelled import (
@@ -355,7 +356,8 @@ def _labelled(study: OfflineStudy, model: ErrorModel) -> LabelledData:
     archive, of = Archive(study.folder / "trials"), study.sequences.recorded_in
     about = (model.sequences, model.sets, study.config, study.window, of, study.odometry)
     data = labelled_data(archive, *about).usable()
-    return with_vectors(with_whole_drives(data, archive, study.config), archive)
+    data = with_whole_drives(data, archive, study.config)
+    return with_vectors(without_worse_bare(data, archive, study.config.offline), archive)
 
 
 def _rows(validation: Validation) -> list[dict[str, Any]]:

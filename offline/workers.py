@@ -48,6 +48,7 @@ class Task(NamedTuple):
     stretch: Stretch | None = None  # along which sets are driven
     sets: Mapping[int, ParameterSet] = {}  # by trial number, what is driven on one pass
     most: float = np.inf  # seconds of CPU time above which a set is stopped
+    bare: bool = False  # without the health check
     prepares: Hashable = None  # identifies the scans that the worker then holds prepared
     apart: bool = False  # run classes of the user in processes of their own, also clean ones
 
@@ -244,7 +245,8 @@ class Bench:
             self._shared = {task.apart: SharedScans(self._memory)}
         shared, sets = self._shared[task.apart], task.sets
         assert stretch is not None
-        drives = setup.drive(shared, scans, stretch, sets.values(), task.most, progress)
+        limits = task.most, task.bare
+        drives = setup.drive(shared, scans, stretch, sets.values(), *limits, progress)
         return dict(zip(sets, drives, strict=True))
 
 

@@ -40,15 +40,17 @@ def random_frames(seed=0):
 
 
 def test_trials_survive(tmp_path):
-    archive, trial, whole = Archive(tmp_path / "trials"), random_trial(1), random_trial(2)
+    archive, (trial, whole, bare) = Archive(tmp_path / "trials"), map(random_trial, (1, 2, 3))
     archive.write("cave", 12, trial)
     archive.write("cave", 12, whole, whole=True)
+    archive.write("cave", 12, bare, bare=True)
     again = Archive(tmp_path / "trials")
     assert_same(again.read("cave", 12), trial)
     assert_same(again.read("cave", 12, whole=True), whole)
+    assert_same(again.read("cave", 12, whole=True, bare=True), bare)
     assert again.trial_path("cave", 12).is_file()
     assert again.trial_path("cave", 12) != again.trial_path("cave", 12, whole=True)
-    assert len(list((tmp_path / "trials" / "cave").iterdir())) == 2
+    assert len(list((tmp_path / "trials" / "cave").iterdir())) == 3
     assert list(again.finished("cave")) == [12]
 
 

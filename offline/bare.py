@@ -1,0 +1,68 @@
+"""What the health check hides: drives of whole recordings without it."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from adaptune.archive import Archive, summarise
+from adaptune.model.rules import BASELINE
+from offline.campaign import WholeDrives, read_whole_drives
+from offline.choice import PER_BLOCK, BlockErrors, surely_worse
+from offline.config import OfflineConfig
+from offline.labelled import LabelledData, block_means, stretches
+from offline.objective import weighted
+
+
+def bare_blocks(data: LabelledData, archive: Archive, config: OfflineConfig) -> BlockErrors | None:
+    """Errors of finalists without the health check; None where it helped none of them.
+
+    Where it did not act, a drive is bare as it is.
+    """
+    names, asked = [s.name for s in data.sequences], [*data.finalists(), *data.sets.defaults]
+    bare = read_whole_drives(archive, names, asked, bare=True)
+    if not any(bare.values()):
+        return None
+    known = sorted(set.intersection(*map(set, read_whole_drives(archive, names, asked).values())))
+    errors = []
+    for s in data.sequences:
+        drives = [archive.read(s.name, n, whole=True, bare=n in bare[s.name]) for n in known]
+        if s.values is not None:
+            values = [weighted(config.objective, summarise(drive).metrics) for drive in drives]
+            errors.append(np.array([values]))
+            continue
+        of_frames = np.stack([drive.errors for drive in drives], axis=1)
+        frames = np.flatnonzero(~np.isnan(of_frames).any(axis=1))
+        everywhere = replace(s.simulation, T_ref_counted=s.simulation.T_ref_sensor)
+        block = stretches(everywhere, frames, PER_BLOCK)
+        errors.append(block_means(of_frames[frames], block))
+    number = np.repeat(np.arange(len(errors)), [len(of) for of in errors])
+    none = np.zeros(len(known))
+    return BlockErrors(known, np.concatenate(errors), number, none, none)
+
+
+def without_worse_bare(data: LabelledData, archive: Archive, config: OfflineConfig) -> LabelledData:
+    """The same without sets that are surely worse than the baseline without the health check."""
+    if (blocks := bare_blocks(data, archive, config)) is None:
+        return data
+    worse = set(np.array(blocks.trials)[surely_worse(blocks)].tolist())
+    return data.subset([n for n in data.sets if n not in worse])
+
+
+def bare_in_words(
+    archive: Archive, whole: WholeDrives, fixed: int, worse: Sequence[int]
+) -> list[str]:
+    """What fixed set and baseline do without the health check, if that is another thing."""
+    bare = read_whole_drives(archive, list(whole), [BASELINE, fixed], bare=True)
+    if not any(bare.values()):
+        return []
+    base, of_fixed = (
+        np.mean([bare[name].get(n, of[n]).mean_error for name, of in whole.items()])
+        for n in (BASELINE, fixed)
+    )
+    said = f"Without the health check, as in your launch file, the baseline has {base:.3f} %"
+    if fixed != BASELINE:
+        said += f" in training, the fixed set {of_fixed:.3f} %"
+    if worse:
+        said += f"; surely worse, and not recommended: trial {', '.join(map(str, worse))}"
+    return [f"{said}."]
