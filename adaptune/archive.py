@@ -2,9 +2,9 @@
 
 import json
 import logging
-import os
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from adaptune import manifest
 from adaptune.errors import AdaptuneError
-from adaptune.files import DAMAGED_NPZ, needing_room, replacing, write_text
+from adaptune.files import DAMAGED_NPZ, replacing
 from adaptune.geometry import Poses
 from adaptune.live.hops import Hops
 from adaptune.metrics import FAILURE, cap
@@ -164,24 +164,6 @@ def summarise(trial: Trial) -> Summary:
     )
 
 
-_Key = tuple[str, int, int, int]
-"""A trial in the index: sequence and number, size and time, which reveal a change of its file."""
-
-
-def _line(key: _Key, summary: Summary) -> str:
-    """A line of the index."""
-    return json.dumps([key, asdict(summary)]) + "\n"
-
-
-def _indexed(line: str) -> tuple[_Key, Summary] | None:
-    """Parse a line of the index; None for one that is damaged."""
-    try:
-        (sequence, number, size, mtime_ns), summary = json.loads(line)
-        return (str(sequence), int(number), int(size), int(mtime_ns)), Summary(**summary)
-    except (ValueError, TypeError, OverflowError):
-        return None
-
-
 class Sources(NamedTuple):
     """What the trials of a study depend on."""
 
@@ -200,20 +182,19 @@ class Sources(NamedTuple):
         return {file: status_key(file) for of in self.files(sequence).values() for file in of}
 
 
-INDEX = "index.jsonl"
 _ARRAYS, _SINGLE = ("T_odom_sensor", "restarted", "registered"), ("errors", "seconds")
 _PLAIN = ("parameters", "faults", "metrics", "usage", "repeats", "unhealthy", "failure", "source")
 """Parts of a trial that are stored as they are, in single precision, and as JSON."""
+_SUMMARY = "summary"
+"""Stored beside them, so that the others need not be read."""
 _TRIAL = re.compile(r"\d{5,}\.npz")
 
 
 class Archive:
     """The trials of a study, a file for each trial and sequence.
 
-    Its folder holds ``<sequence>/frames.npz`` and ``<sequence>/<number>.npz``. The files are the
-    truth; the index of their summaries, ``index.jsonl``, only avoids opening them. A line does not
-    count if its file has changed or is gone; a trial without a line is read. All methods raise an
-    ArchiveError where a file that they need is missing or damaged.
+    Its folder holds ``<sequence>/frames.npz`` and ``<sequence>/<number>.npz``. All methods raise
+    an ArchiveError where a file that they need is missing or damaged.
 
     Parameters
     ----------
@@ -338,12 +319,9 @@ class Archive:
         return self.folder / sequence / f"{number:05d}{'-whole' * whole}{'-bare' * bare}.npz"
 
     def tidy(self) -> None:
-        """Remove unfinished files and repair the index. No process may be writing."""
-        for unfinished in (*self.folder.glob("*/.*.npz"), *self.folder.glob(".index.*")):
+        """Remove unfinished files. No process may be writing."""
+        for unfinished in self.folder.glob("*/.*.npz"):
             unfinished.unlink()
-        index = "".join(_line(*entry) for entry in self._entries())
-        if index != self._index():
-            write_text(self.folder / INDEX, index)
 
     def finished(self, sequence: str) -> Mapping[int, Summary]:
         """The finished trials on a sequence by number, without the drives of whole recordings.
@@ -355,8 +333,10 @@ class Archive:
     def _all(self) -> dict[str, dict[int, Summary]]:
         if self._finished is None:
             self._finished = {}
-            for (sequence, number, *_), summary in self._entries():
-                self._finished.setdefault(sequence, {})[number] = summary
+            paths = [path for path in self.folder.glob("*/*") if _TRIAL.fullmatch(path.name)]
+            for path in sorted(paths, key=lambda path: (path.parent, int(path.stem))):
+                of_sequence = self._finished.setdefault(path.parent.name, {})
+                of_sequence[int(path.stem)] = _read_summary(path)
         return self._finished
 
     def known(self) -> dict[int, Summary]:
@@ -366,21 +346,6 @@ class Archive:
     def sets(self) -> dict[int, ParameterSet]:
         """Their parameter sets."""
         return {number: run.parameters for number, run in self.known().items()}
-
-    def _entries(self) -> Iterator[tuple[_Key, Summary]]:
-        """Entries that the index should have."""
-        indexed = dict(filter(None, map(_indexed, self._index().splitlines())))
-        for path in sorted(self.folder.glob("*/")):
-            with os.scandir(path) as files:
-                found = [file for file in files if _TRIAL.fullmatch(file.name)]
-            trials = sorted((int(file.name[:-4]), file.stat()) for file in found)
-            for number, status in trials:
-                key = (path.name, number, status.st_size, status.st_mtime_ns)
-                yield key, indexed.get(key) or summarise(self.read(path.name, number))
-
-    def _index(self) -> str:
-        path = self.folder / INDEX
-        return path.read_text("utf-8", errors="replace") if path.exists() else ""
 
     def has_frames(self, sequence: str, names: Sequence[str]) -> bool:
         """Whether the data that all trials on a sequence share exists, with these descriptors."""
@@ -442,15 +407,10 @@ class Archive:
         data = {name: getattr(trial, name) for name in _ARRAYS}
         data |= {name: getattr(trial, name).astype(np.float32) for name in _SINGLE}
         data |= {name: _packed(getattr(trial, name)) for name in _PLAIN}
+        data[_SUMMARY] = _packed(asdict(summary := summarise(trial)))
         with replacing(path) as temporary, temporary.open("wb") as file:
             np.savez(file, **data)
-        if path != self.trial_path(sequence, number):
-            return
-        status, summary = path.stat(), summarise(trial)
-        line = _line((sequence, number, status.st_size, status.st_mtime_ns), summary)
-        with needing_room(i := self.folder / INDEX), i.open("a", encoding="utf-8") as file:
-            file.write(line)
-        if self._finished is not None:
+        if path == self.trial_path(sequence, number) and self._finished is not None:
             self._finished.setdefault(sequence, {})[number] = summary
 
     def read(self, sequence: str, number: int, whole: bool = False, bare: bool = False) -> Trial:
@@ -510,6 +470,12 @@ def _read_trial(path: Path) -> Trial:
         return Trial(**parts)
     except (KeyError, ValueError) as error:
         raise _damaged(path, error) from error
+
+
+def _read_summary(path: Path) -> Summary:
+    with suppress(ArchiveError):
+        return Summary(**_unpacked(_read(path, [_SUMMARY])[_SUMMARY]))
+    return summarise(_read_trial(path))  # it is of an earlier version, or damaged
 
 
 def _read(path: Path, names: Sequence[str] | None = None) -> dict[str, NDArray[Any]]:
