@@ -1,6 +1,9 @@
 """How far a long task is."""
 
-from typing import Protocol
+from collections.abc import Iterable, Iterator
+from typing import Protocol, TypeVar
+
+T = TypeVar("T")
 
 
 class Progress(Protocol):
@@ -12,3 +15,12 @@ class Progress(Protocol):
 
 def unseen(text: str, done: float, of: int, remark: str = "", /) -> None:
     """Take no note."""
+
+
+def watched(scans: Iterable[T], n: int, what: str, progress: Progress) -> Iterator[T]:
+    """The same, and note how many of `n` are done."""
+    done = 0
+    for done, scan in enumerate(scans, start=1):
+        yield scan
+        progress(what, min(done, n), n)
+    progress(what, done, done)

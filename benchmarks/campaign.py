@@ -44,10 +44,12 @@ from adaptune import yaml12
 from adaptune.archive import Archive, Frames
 from adaptune.odometry.keyframe import crop
 from adaptune.simulation.record import record
+from offline import shared_scans, workers
 from offline import train as training
-from offline import trial, workers
 from offline.config import OfflineStudy, load_study
-from offline.trial import Drive, Stretch, TrialSettings, TrialSetup, stretches_along
+from offline.drive import Drive, TrialSetup
+from offline.frames import describe
+from offline.stretches import Stretch, stretches_along
 from offline.workers import Result, Task
 
 STUDY = """\
@@ -132,12 +134,11 @@ def speed(trials: int, scans: int) -> None:
 def rounds(study: OfflineStudy, n: int, as_it_is: bool) -> tuple[float, float]:
     """Memory of a worker's process after some rounds, over what it keeps, and its CPU seconds."""
     if not as_it_is:
-        workers.apart = trial.apart = contextlib.nullcontext  # type: ignore[assignment]
-    setup = TrialSetup(TrialSettings.of(study.config), study.odometry, study.sequences)
+        shared_scans.apart = contextlib.nullcontext  # type: ignore[assignment]
+    setup = TrialSetup(study.config, study.odometry, study.sequences)
     bench = workers.Bench(setup, 0.4e9)
-    stretches = {
-        name: stretches_along(name, setup.describe(name).uncut)[0] for name in study.training
-    }
+    frames = {name: describe(study.config, study.sequences, name) for name in study.training}
+    stretches = {name: stretches_along(name, of.uncut)[0] for name, of in frames.items()}
     before, begin = _memory(), time.process_time()
     # All but the baseline's clouds are prepared while trials run.
     sets = [study.odometry.space.baseline | {"downsampling": d} for d in (0.25, 0.35, 0.7)]

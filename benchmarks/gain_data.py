@@ -24,7 +24,11 @@ from adaptune.recording.scan import Scan
 from adaptune.simulation import Course
 from adaptune.simulation.record import simulate
 from adaptune.space import ParameterSets, ParameterSpace
+from adaptune.study.config import OdometryConfig
 from adaptune.study.study import StudySequences
+from offline.config import OfflineStudyConfig
+from offline.drive import TrialSetup
+from offline.frames import with_measured_hops
 from offline.labelled import (
     BankSimulation,
     LabelledData,
@@ -33,7 +37,6 @@ from offline.labelled import (
     recorded_motions,
 )
 from offline.samplers import sobol_points
-from offline.trial import TrialSettings, TrialSetup, with_measured_hops
 
 MEMORY = 3e9
 """Bytes of prepared scans."""
@@ -46,6 +49,8 @@ WINDOW = 3
 PERIOD = 10
 """Scans from one selection to the next."""
 LOST_TRACK = 3.0  # metres a second by which members of a bank may differ
+DEFAULTS = OfflineStudyConfig(odometry=OdometryConfig(name="gicp"), training=("one",))
+"""The settings of drives are those of every study."""
 NO_SEQUENCES = StudySequences({}, {}, Path())
 """Of a study: the courses are in no study."""
 
@@ -99,12 +104,12 @@ def run(path: Path, course: Course, odometry: str, seed: int) -> None:
         {"ndt": N_FEATURES},
         np.array([lowest_elevation(scan) for scan in scans], np.float32),
     )
-    factory, settings = factory_of(odometry), TrialSettings()
+    factory = factory_of(odometry)
     sets = [factory.space.baseline, *sobol_points(factory.space, seed, range(1, N_SETS))]
     frames, read = with_measured_hops(scans, frames), Simulated(path.stem, scans)
-    setup = TrialSetup(settings, factory, NO_SEQUENCES)
+    setup = TrialSetup(DEFAULTS, factory, NO_SEQUENCES)
     trials = trials_of(setup, sets, path.stem, frames, read, memory=MEMORY)
-    length = settings.sub_trajectory
+    length = DEFAULTS.sub_trajectory
     vectors = [error_vectors(frames.T_ref_sensor, trial, length) for trial in trials]
     motions = recorded_motions(frames, trials)[..., :3, :]
     with replacing(path) as temporary, temporary.open("wb") as file:
@@ -159,14 +164,13 @@ def labelled_sequence(name: str, found: Any) -> LabelledSequence:
     described = averaged(found["histograms"].astype(np.float32), stamps, WINDOW, 1.0)
     motions: NDArray[np.float64] = np.tile(np.eye(4), (*few.shape[:2], 1, 1))
     motions[..., :3, :] = few
-    settings = TrialSettings()
     simulation = BankSimulation(
         stamps,
         found["T_world_sensor"],
         found["T_world_sensor"],
         described,
         period,
-        settings.sub_trajectory,
+        DEFAULTS.sub_trajectory,
         LOST_TRACK,
         Hops(*(found[f"hops_{name}"] for name in Hops._fields)),
         partial(np.take, motions, axis=1),

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from gain_data import (
+    DEFAULTS,
     LOST_TRACK,
     MEMORY,
     NO_SEQUENCES,
@@ -30,6 +31,8 @@ from adaptune.odometry.registry import OdometryFactory, OdometryPool, odometry_c
 from adaptune.odometry.remote import Limits
 from adaptune.simulation.record import simulate
 from adaptune.space import ODOMETRY, ParameterSet, ParameterSets, ParameterSpace
+from offline.drive import TrialSetup
+from offline.frames import with_measured_hops
 from offline.labelled import (
     BankSimulation,
     LabelledData,
@@ -38,7 +41,6 @@ from offline.labelled import (
     recorded_motions,
 )
 from offline.samplers import sobol_points
-from offline.trial import TrialSettings, TrialSetup, with_measured_hops
 
 POINTS: dict[str, tuple[int, ...]] = {
     "gicp": tuple(range(16)),
@@ -111,10 +113,9 @@ def _write(
     path: Path, odometry: str, sets: list[ParameterSet], frames: Frames, read: Simulated
 ) -> None:
     """Run sets of an odometry, and keep their errors, motions and costs."""
-    settings = TrialSettings()
-    setup = TrialSetup(settings, pool().factories[odometry], NO_SEQUENCES)
+    setup = TrialSetup(DEFAULTS, pool().factories[odometry], NO_SEQUENCES)
     trials = trials_of(setup, sets, read.name, frames, read, memory=MEMORY)
-    T_ref_sensor, length = frames.T_ref_sensor, settings.sub_trajectory
+    T_ref_sensor, length = frames.T_ref_sensor, DEFAULTS.sub_trajectory
     vectors = [error_vectors(T_ref_sensor, trial, length) for trial in trials]
     motions = recorded_motions(frames, trials)[..., :3, :]
     with replacing(path) as temporary, temporary.open("wb") as file:
@@ -161,7 +162,7 @@ _COSTS = ("register_ms", "prepare_ms")
 
 def _labelled(name: str, found: list[dict[str, NDArray[Any]]]) -> LabelledSequence:
     """A sequence of the labelled data set, from the arrays in the files of all odometries."""
-    first, settings = found[0], TrialSettings()
+    first = found[0]
     errors, vectors, few = (
         np.concatenate([d[key] for d in found], axis=1) for key in ("errors", "vectors", "motions")
     )
@@ -176,7 +177,7 @@ def _labelled(name: str, found: list[dict[str, NDArray[Any]]]) -> LabelledSequen
         first["T_world_sensor"],
         described,
         period,
-        settings.sub_trajectory,
+        DEFAULTS.sub_trajectory,
         LOST_TRACK,
         Hops(*(first[f"hops_{key}"] for key in Hops._fields)),
         partial(np.take, motions, axis=1),

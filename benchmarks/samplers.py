@@ -40,8 +40,9 @@ from adaptune.report.drawing import draw_chart
 from adaptune.simulation.record import record
 from adaptune.space import Categorical, Float, ParameterSet, ParameterSpace
 from offline.config import OfflineConfig, load_study
+from offline.drive import TrialSetup
+from offline.frames import describe
 from offline.samplers import Sampler, make_sampler
-from offline.trial import TrialSettings, TrialSetup
 
 TRIALS = 96
 SEEDS = range(20)
@@ -173,8 +174,8 @@ def prepare(folder: Path, *overrides: str) -> tuple[TrialSetup, Frames]:
     study = load_study(file, overrides, folder / "run")
     if not study.sequences.recording("course").exists():
         record(study.config.courses["course"], study.sequences.recording("course"))
-    setup = TrialSetup(TrialSettings.of(study.config), study.odometry, study.sequences)
-    return setup, setup.describe("course")
+    setup = TrialSetup(study.config, study.odometry, study.sequences)
+    return setup, describe(study.config, study.sequences, "course")
 
 
 def table(folder: Path) -> None:

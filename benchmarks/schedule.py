@@ -31,7 +31,8 @@ from offline import campaign
 from offline.campaign import Campaign, drive_whole, run_baseline
 from offline.choice import FINALISTS
 from offline.config import load_study
-from offline.trial import Drive, Stretch, stretches_of
+from offline.drive import Drive
+from offline.stretches import Stretch, stretches_of
 from offline.workers import Result, Task
 
 CASES = {

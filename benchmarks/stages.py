@@ -31,8 +31,12 @@ from adaptune.selector import Selector
 from adaptune.space import ParameterSet, Selection
 from adaptune.trajectory import read_kitti
 from offline.config import OfflineStudy, load_study
+from offline.drive import TrialSetup, drive_sets
+from offline.frames import describe
+from offline.shared_scans import SharedScans
+from offline.stretches import stretches_along
 from offline.train import train
-from offline.trial import SharedScans, TrialSettings, TrialSetup, stretches_along, trial_of
+from offline.trial import trial_of
 from online.replay import ReplayRecord, replay
 
 REPETITIONS = 5
@@ -85,8 +89,8 @@ def bare_gicp(
 
 def trial(study: OfflineStudy) -> None:
     """One trial over prepared scans."""
-    setup = TrialSetup(TrialSettings.of(study.config), study.odometry, study.sequences)
-    frames = setup.describe("hall_begin").uncut
+    setup = TrialSetup(study.config, study.odometry, study.sequences)
+    frames = describe(study.config, study.sequences, "hall_begin").uncut
     (stretch,) = stretches_along("hall_begin", frames)
     shared, read = SharedScans(8e9), study.sequences.open("hall_begin")
     parameters: ParameterSet = {"max_correspondence_distance": 2.0, "keyframe_interval": 1.0}
@@ -96,8 +100,8 @@ def trial(study: OfflineStudy) -> None:
     iterations = study.odometry.settings.iterations
 
     def ours() -> None:
-        (drives,) = setup.drive(shared, read, stretch, [parameters])
-        trial_of(setup.settings, parameters, frames, {0: drives})
+        (drives,) = drive_sets(setup, shared, read, stretch, [parameters])
+        trial_of(study.config, parameters, frames, {0: drives})
 
     compare(
         f"trial, {len(prepared)} scans",

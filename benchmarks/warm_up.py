@@ -29,7 +29,9 @@ from adaptune.simulation.course import as_sequence
 from adaptune.space import ParameterSet
 from adaptune.strict import ConfigurationError
 from offline.config import OfflineStudy, load_study
-from offline.trial import SharedScans, TrialSettings, TrialSetup, stretches_along
+from offline.drive import TrialSetup, drive_sets
+from offline.shared_scans import SharedScans
+from offline.stretches import stretches_along
 
 WINDOW = 2.5
 """Metres of a sub-trajectory."""
@@ -73,16 +75,15 @@ def ratios(
     """Errors to those of drives through by metres and by seconds, and the latter in percent."""
     scans = setup.sequences.open("one")
     (whole,) = stretches_along("one", frames.uncut)
-    through = [
-        drive.T_odom_sensor for (drive,) in setup.drive(SharedScans(4e9), scans, whole, sets)
-    ]
+    driven = drive_sets(setup, SharedScans(4e9), scans, whole, sets)
+    through = [drive.T_odom_sensor for (drive,) in driven]
     metres, seconds = travelled(frames.T_ref_sensor), (frames.stamps - frames.stamps[0]) * 1e-9
     of_through = [cap(sub_trajectory_rte(frames.T_ref_sensor, T, WINDOW)) for T in through]
     rows = []  # metres, seconds, error, that of the drive through
     for stretch in stretches_along("one", frames):
         part = slice(stretch.first, stretch.first + len(stretch.stamps))
         T_ref_sensor, begin = frames.T_ref_sensor[part], stretch.first
-        driven = setup.drive(SharedScans(2e9), scans, stretch, sets)
+        driven = drive_sets(setup, SharedScans(2e9), scans, stretch, sets)
         for (drive,), errors in zip(driven, of_through, strict=True):
             began = cap(sub_trajectory_rte(T_ref_sensor, drive.T_odom_sensor, WINDOW))
             since = metres[part] - metres[begin], seconds[part] - seconds[begin]
@@ -139,7 +140,7 @@ def row(given: argparse.Namespace, name: str, folder: Path) -> None:
     frames = Frames(stamps, T_ref_sensor, *none, stretches=stretches)
     space, rng = study.odometry.space, np.random.default_rng(0)
     sets = [space.baseline, *space.from_unit(rng.random((given.sets - 1, len(space))))]
-    setup = TrialSetup(TrialSettings.of(study.config), study.odometry, study.sequences)
+    setup = TrialSetup(study.config, study.odometry, study.sequences)
     of_metres, of_seconds, through = ratios(setup, frames, sets)
     for what, values in (("metres", of_metres), ("seconds", of_seconds)):
         label = f"{name:16} {len(sets):2} {through:6.2f} {what:7}"

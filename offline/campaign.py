@@ -16,9 +16,11 @@ from adaptune.progress import Progress, unseen
 from adaptune.space import ParameterSet, PooledSpace
 from adaptune.study.references import contradictions_of
 from offline.config import OfflineStudy
+from offline.drive import Drive
 from offline.objective import Verdict, label
 from offline.search import Clock, Search
-from offline.trial import Drive, Stretch, TrialSettings, stretches_along, trial_of
+from offline.stretches import Stretch, stretches_along
+from offline.trial import trial_of
 from offline.workers import Pool, Result, Task, TaskProgress, run
 
 _log = logging.getLogger(__name__)
@@ -59,7 +61,7 @@ class Schedule:
         self.done = 0  # trials on sequences
         self._archive, self._what, self._progress = archive, what, progress
         self._whole, self._bare, self._measure = whole or bare, bare, measure
-        self._settings, self._odometry = TrialSettings.of(study.config), study.odometry
+        self._config, self._odometry = study.config, study.odometry
         self._described: dict[str, Frames] = {}
         self._frames: dict[str, Frames] = {}  # the same, with the stretches that are driven
         self._unread: list[str] = []
@@ -76,7 +78,7 @@ class Schedule:
         if name in self._due:
             return
         self._due[name] = {}
-        if self._archive.has_frames(name, self._settings.descriptors):
+        if self._archive.has_frames(name, self._config.descriptor):
             self._know(name, self._archive.read_frames(name))
         else:
             self._unread.append(name)
@@ -184,7 +186,7 @@ class Schedule:
                 del self._due[name][number]
                 self.done += 1
                 of = (due.parameters, self._frames[name], due.drives)
-                yield name, number, trial_of(self._settings, *of)
+                yield name, number, trial_of(self._config, *of)
         self._show()
 
     def _stop(self, name: str, number: int) -> int:

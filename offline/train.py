@@ -40,6 +40,7 @@ from offline.campaign import (
 )
 from offline.choice import NothingUsableError
 from offline.config import OfflineConfig, OfflineStudy
+from offline.drive import TrialSetup
 from offline.front import COST, front_rows, left_out_in_words
 from offline.labelled import LabelledData, labelled_data, with_vectors, with_whole_drives
 from offline.objective import (
@@ -50,7 +51,6 @@ from offline.objective import (
     label,
 )
 from offline.search import BUDGETS, Finished
-from offline.trial import TrialSettings, TrialSetup
 from offline.tuning import DO_NOT_ADAPT, NO_BANK, choose, driven_cost, reserve, rivals
 from offline.workers import Cluster, Workers, spare_memory
 
@@ -209,7 +209,7 @@ def trial_workers(
     where = cluster or f"{n} worker{'s' if n > 1 else ''}"
     _log.info("trials run on %s; each sequence is prepared before its first one", where)
     odometry = study.odometry.changed(user_code=True)
-    setup = TrialSetup(TrialSettings.of(study.config), odometry, study.sequences)
+    setup = TrialSetup(study.config, odometry, study.sequences)
     return Cluster(setup, names, cluster) if cluster else Workers(setup, n, spare_memory())
 
 

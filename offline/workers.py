@@ -1,6 +1,7 @@
 """Processes that drive, and keep the scans that they have prepared."""
 
 import contextlib
+import dataclasses
 import logging
 import os
 import threading
@@ -8,7 +9,6 @@ import time
 import traceback
 from collections import Counter
 from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerProcess
 from pathlib import Path
@@ -28,7 +28,10 @@ from adaptune.recording.cache import fingerprints
 from adaptune.recording.scan import Recording
 from adaptune.space import ParameterSet
 from adaptune.study.study import StudySequences
-from offline.trial import Drive, SharedScans, Stretch, TrialSetup, with_measured_hops
+from offline.drive import Drive, TrialSetup, drive_sets
+from offline.frames import describe, with_measured_hops
+from offline.shared_scans import SharedScans
+from offline.stretches import Stretch
 
 MOST_DEATHS = 3
 """A task fails after so many workers have died at it."""
@@ -226,27 +229,28 @@ class Bench:
 
     def __init__(self, setup: TrialSetup, memory: float):
         self._setup = setup
-        self._apart = replace(setup, odometry=setup.odometry.changed(user_code=False))
+        self._apart = setup._replace(odometry=setup.odometry.changed(user_code=False))
         self._memory = min(memory, MOST_PREPARED)
         self._recordings: dict[str, Recording] = {}
         self._shared: dict[bool, SharedScans] = {}
 
     def run(self, task: Task, progress: Progress) -> Result:
         """Do a task."""
+        setup = self._setup
         if (stretch := task.stretch) is None and task.frames is None:
-            return self._setup.describe(task.sequence, progress)
+            return describe(setup.config, setup.sequences, task.sequence, progress)
         if task.sequence not in self._recordings:
-            self._recordings[task.sequence] = self._setup.sequences.open(task.sequence)
+            self._recordings[task.sequence] = setup.sequences.open(task.sequence)
         scans = self._recordings[task.sequence]
         if task.frames is not None:
             return with_measured_hops(scans, task.frames, progress)
-        setup = self._apart if task.apart else self._setup
+        setup = self._apart if task.apart else setup
         if task.apart not in self._shared:  # other instances take scans in another way
             self._shared = {task.apart: SharedScans(self._memory)}
         shared, sets = self._shared[task.apart], task.sets
         assert stretch is not None
         limits = task.most, task.bare
-        drives = setup.drive(shared, scans, stretch, sets.values(), *limits, progress)
+        drives = drive_sets(setup, shared, scans, stretch, sets.values(), *limits, progress)
         return dict(zip(sets, drives, strict=True))
 
 
@@ -314,7 +318,7 @@ class Workers:
         return outcomes
 
     def _spawn(self, w: int) -> tuple[ForkServerProcess, Connection]:
-        context = fork_server("offline.trial", "adaptune.model.descriptor")
+        context = fork_server("offline.frames", "offline.drive", "adaptune.model.descriptor")
         here, there = context.Pipe()
         given = (there, os.getpid() + w, self.memory / self.n)
         process = context.Process(target=_serve, args=given, daemon=True)
@@ -504,10 +508,10 @@ class Cluster:
 
 def _elsewhere(setup: TrialSetup) -> TrialSetup:
     """The setup for workers, which run in other folders."""
-    sequences = replace(setup.sequences, folder=setup.sequences.folder.absolute())
+    sequences = dataclasses.replace(setup.sequences, folder=setup.sequences.folder.absolute())
     # Alarms need a main thread, and Dask runs tasks in others: processes end what hangs.
     odometry = setup.odometry.changed(user_code=False, program_input=sequences.program_input)
-    return replace(setup, odometry=odometry, sequences=sequences)
+    return setup._replace(odometry=odometry, sequences=sequences)
 
 
 def contents(sequences: StudySequences, name: str) -> dict[Path, str]:

@@ -2,7 +2,7 @@ import numpy as np
 from rooms import scan_at, street
 
 from adaptune.archive import Frames
-from offline.trial import with_measured_hops
+from offline.frames import with_measured_hops
 
 STEP = 1.0
 WORLD = street()

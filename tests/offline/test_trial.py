@@ -6,7 +6,7 @@ from typing import ClassVar
 import drives
 import numpy as np
 import pytest
-from made_drives import trials_of
+from made_drives import described, trials_of
 from setups import made_of, setup_of
 
 from adaptune.errors import AdaptuneError
@@ -19,7 +19,9 @@ from adaptune.recording import SequenceConfig
 from adaptune.recording.scan import Scan, SequenceError
 from adaptune.trajectory import Trajectory
 from offline.config import OfflineConfig, load_study
-from offline.trial import STALE, SharedScans, Stretch, TrialSettings, reference_poses, stretches_of
+from offline.frames import reference_poses
+from offline.shared_scans import STALE, SharedScans
+from offline.stretches import Stretch, stretches_of
 from online.replay import replay
 
 GOOD = {"max_correspondence_distance": 2.0, "keyframe_interval": 1.0}
@@ -30,8 +32,15 @@ def study(study_file, tmp_path_factory):
     return load_study(study_file, [], tmp_path_factory.mktemp("run"))
 
 
+@pytest.fixture(scope="module")
+def short(study_file, tmp_path_factory):
+    """The same with four stretches of each sequence."""
+    given = ["sub_trajectory=0.3", "offline.stretches=4"]
+    return load_study(study_file, given, tmp_path_factory.mktemp("run"))
+
+
 def test_a_good_trial(study):
-    frames = setup_of(study).describe("one")
+    frames = described(setup_of(study))
     (trial,) = trials_of(setup_of(study), [GOOD], frames=frames)
     assert trial.parameters == GOOD
     assert not trial.restarted.any()
@@ -46,7 +55,7 @@ def test_a_good_trial(study):
 
 def test_motion_is_described_by_the_reference_before_each_scan(study_file, tmp_path):
     study = load_study(study_file, ["descriptor=[ndt, motion]"], tmp_path)
-    frames = setup_of(study).describe("one")
+    frames = described(setup_of(study))
     assert frames.blocks == {"ndt": 90, "motion": 2}
     np.testing.assert_allclose(frames.descriptors[:2, 90], 0.0)
     # 0.3 m a scan, ten scans a second.
@@ -91,7 +100,7 @@ class Lost(Slipping):
 
 def test_a_trial_is_a_drive_with_the_health_check(study):
     setup = setup_of(study, made_of(Lost, study))
-    frames = setup.describe("one")
+    frames = described(setup)
     (trial,) = trials_of(setup, [GOOD], frames=frames)
     scans = study.sequences.open("one")
     replayed = replay(scans, made_of(Lost, study)(GOOD), study.config.health)
@@ -103,15 +112,15 @@ def test_a_trial_is_a_drive_with_the_health_check(study):
     np.testing.assert_array_equal(whole.T_odom_sensor, trial.T_odom_sensor)
 
 
-def test_each_stretch_begins_at_the_reference_and_in_motion(study):
+def test_each_stretch_begins_at_the_reference_and_in_motion(short):
     instances = []
-    setup = setup_of(study, made_of(Slipping, study, instances), sub_trajectory=0.5, stretches=3)
-    frames = setup.describe("one")
+    setup = setup_of(short, made_of(Slipping, short, instances))
+    frames = described(setup)
     (trial,) = trials_of(setup, [GOOD], frames=frames)
     stretches = frames.stretches
-    assert len(stretches) == 3
+    assert len(stretches) == 4
     T_ref_sensor, starts = frames.T_ref_sensor, [one.starts[0] for one in instances]
-    assert len(starts) == 3
+    assert len(starts) == 4
     for (first, begin, end), (_, T, motion) in zip(stretches[1:], starts[1:], strict=True):
         np.testing.assert_array_equal(T, T_ref_sensor[first])
         np.testing.assert_allclose(
@@ -138,9 +147,9 @@ class FailsOnce(KeyframeGicp):
         super().start(*args)
 
 
-def test_a_drive_that_fails_at_its_first_scan_counts_as_lost(study):
-    setup = setup_of(study, made_of(FailsOnce, study), sub_trajectory=0.5, stretches=3)
-    frames = setup.describe("one")
+def test_a_drive_that_fails_at_its_first_scan_counts_as_lost(short):
+    setup = setup_of(short, made_of(FailsOnce, short))
+    frames = described(setup)
     (trial,) = trials_of(setup, [GOOD], frames=frames)
     for i, (_, begin, end) in enumerate(frames.stretches):
         known = trial.errors[begin:end][~np.isnan(trial.errors[begin:end])]
@@ -240,7 +249,7 @@ class Unable(KeyframeGicp):
 def test_an_exception_is_a_fault_of_its_trial(study, where):
     unable = type("Unable", (Unable,), {"where": where})
     setup = setup_of(study, made_of(unable, study))
-    frames = setup.describe("one")
+    frames = described(setup)
     sets = [GOOD | {"keyframe_interval": 7.0}, GOOD]
     bad, good = trials_of(setup, sets, frames=frames)
     (fault,) = bad.faults
@@ -282,23 +291,24 @@ def test_repeats_are_averaged_and_kept(study):
 def test_a_path_that_is_too_short_is_told(study, tmp_path, part):
     bag, name = tmp_path / "hall.bag", "hall" if part is None else "hall_0-30"
     drives.write_bag(bag, drives.scans(0, 9 if part is None else 40))
-    config = SequenceConfig(bag=str(bag), points="/points", reference="/truth", part=part)
-    sequences = dataclasses.replace(study.sequences, recordings={name: config})
-    settings = TrialSettings(sub_trajectory=3.0 if part is None else 9.0)
-    setup = dataclasses.replace(setup_of(study), sequences=sequences, settings=settings)
+    given = SequenceConfig(bag=str(bag), points="/points", reference="/truth", part=part)
+    sequences = dataclasses.replace(study.sequences, recordings={name: given})
+    config = study.config.model_copy(update={"sub_trajectory": 3.0 if part is None else 9.0})
+    setup = setup_of(study)._replace(sequences=sequences, config=config)
     key = r"sequences\.hall" if part is None else r"\[hall: 0-30%\]"
     with pytest.raises(AdaptuneError, match=rf"^{key}: its path of .* holds no sub-trajectory"):
-        setup.describe(name)
+        described(setup, name)
 
 
-def test_a_reference_with_too_few_poses_names_max_gap():
+def test_a_reference_with_too_few_poses_names_max_gap(study):
     stamps = np.round(np.arange(20) * 1.4e9).astype(np.int64)
     T = np.tile(np.eye(4), (20, 1, 1))
     T[:, 0, 3] = np.arange(20)
-    scans, settings = np.arange(0, 26 * 10**9, 10**8) + 1, TrialSettings(sub_trajectory=5.0)
+    scans = np.arange(0, 26 * 10**9, 10**8) + 1
+    config = study.config.model_copy(update={"sub_trajectory": 5.0})
     with pytest.raises(AdaptuneError, match=r"^sequences\.one: 19 of 19 gaps .*`max_gap: 1\.5`"):
-        reference_poses("sequences.one", Trajectory(stamps, T), scans, settings)
-    assert reference_poses("", Trajectory(stamps, T, 1.5), scans, settings).shape == (260, 4, 4)
+        reference_poses("sequences.one", Trajectory(stamps, T), scans, config)
+    assert reference_poses("", Trajectory(stamps, T, 1.5), scans, config).shape == (260, 4, 4)
 
 
 N, SIZE = 5, 1000
@@ -403,5 +413,5 @@ def test_how_many_stretches_are_driven(study_file, name, offline, n):
     odometry = config.odometry.model_copy(update={"name": name})
     given = OfflineConfig.model_validate(offline)
     changed = config.model_copy(update={"odometry": odometry, "offline": given})
-    assert changed.stretches == TrialSettings.of(changed).stretches == n
+    assert changed.stretches == n
     assert changed.search_inputs["stretches"] == (n or "all")

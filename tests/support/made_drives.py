@@ -2,26 +2,35 @@
 
 import numpy as np
 
-from offline.trial import SharedScans, stretches_along, trial_of
+from offline.drive import drive_sets
+from offline.frames import describe
+from offline.shared_scans import SharedScans
+from offline.stretches import stretches_along
+from offline.trial import trial_of
 from offline.workers import Task
+
+
+def described(setup, name="one"):
+    """The frames of a sequence."""
+    return describe(setup.config, setup.sequences, name)
 
 
 def trials_of(setup, sets, name="one", frames=None, scans=None, most=np.inf, memory=1e9):
     """Drive sets along the stretches of a sequence, and make trials of that."""
-    frames = setup.describe(name) if frames is None else frames
+    frames = described(setup, name) if frames is None else frames
     scans = setup.sequences.open(name) if scans is None else scans
     shared, found = SharedScans(memory), [{} for _ in sets]
     for stretch in stretches_along(name, frames):
-        drives = setup.drive(shared, scans, stretch, sets, most)
+        drives = drive_sets(setup, shared, scans, stretch, sets, most)
         for of_set, drive in zip(found, drives, strict=True):
             of_set[stretch.first] = drive
     pairs = zip(sets, found, strict=True)
-    return [trial_of(setup.settings, one, frames, of_set) for one, of_set in pairs]
+    return [trial_of(setup.config, one, frames, of_set) for one, of_set in pairs]
 
 
 def task_of(setup, name, sets):
     """A task that drives sets along a whole sequence."""
-    (stretch,) = stretches_along(name, setup.describe(name).uncut)
+    (stretch,) = stretches_along(name, described(setup, name).uncut)
     return Task(name, stretch=stretch, sets=sets)
 
 

@@ -11,7 +11,7 @@ from rooms import along_x
 
 from adaptune.archive import Archive, Frames, Summary, Trial
 from offline.config import OfflineConfig
-from offline.trial import Drive
+from offline.drive import Drive
 from offline.trial_table import trial_table
 
 N_FRAMES = 40

@@ -1,19 +1,18 @@
 """What trials of a study need, and what is wrong with a study."""
 
-import dataclasses
-
 import pytest
 
 from adaptune.odometry import InProcess
 from adaptune.strict import ConfigurationError
 from offline.config import load_study
-from offline.trial import TrialSettings, TrialSetup
+from offline.drive import TrialSetup
 
 
 def setup_of(study, odometry=None, **settings):
-    """The setup of a study, with another odometry or other settings."""
-    of_study = dataclasses.replace(TrialSettings.of(study.config), **settings)
-    return TrialSetup(of_study, odometry or study.odometry, study.sequences)
+    """The setup of a study, with another odometry or other settings of the offline stage."""
+    offline = study.config.offline.model_copy(update=settings)
+    config = study.config.model_copy(update={"offline": offline})
+    return TrialSetup(config, odometry or study.odometry, study.sequences)
 
 
 def made_of(odometry_class, study, made=None):

@@ -7,7 +7,7 @@ import numpy as np
 import program
 import pytest
 import yaml
-from made_drives import trials_of
+from made_drives import described, trials_of
 from setups import setup_of
 
 from adaptune.archive import Archive
@@ -63,7 +63,7 @@ OTHER = {"registration.voxel": 0.6, "distance": 2.0}
 
 def run(study):
     setup = setup_of(study)
-    frames = setup.describe("one")
+    frames = described(setup)
     (trial,) = trials_of(setup, [OTHER], frames=frames)
     return trial, frames
 

@@ -17,7 +17,7 @@ from contained import (
     template,
     truth,
 )
-from made_drives import trials_of
+from made_drives import described, trials_of
 from needs import reference_image
 from rooms import moved
 from setups import setup_of
@@ -201,7 +201,7 @@ def test_an_engine_that_goes_away_is_no_trial(tmp_path, study_file, monkeypatch)
         raise EngineError("the Docker engine does not answer any more")
 
     setup = setup_of(load_study(study_file, study_overrides(tmp_path), tmp_path / "run"))
-    frames = setup.describe("one")
+    frames = described(setup)
     monkeypatch.setattr(Container, "ended", gone)
     with pytest.raises(EngineError, match="does not answer"):
         trials_of(setup, [{"max_correspondence_distance": 2.0}], frames=frames)
