@@ -19,7 +19,7 @@ from adaptune.geometry import Poses
 from adaptune.live.hops import Hops
 from adaptune.metrics import FAILURE, cap
 from adaptune.recording.cache import status_key
-from adaptune.space import ParameterSet, in_words
+from adaptune.space import ParameterSet
 from adaptune.strict import ConfigurationError
 
 # In `Trial.usage`; the last one in seconds, where the first scan has no pose.
@@ -104,11 +104,6 @@ class Trial:
     unhealthy: dict[str, int] = field(default_factory=dict)
     failure: str = ""  # why the set is never chosen; empty if it may be
     source: str = ""  # what proposed the set, see `offline.samplers.Proposal`
-
-    def __repr__(self) -> str:
-        n = self.restarted.sum()
-        told = f"{self.mean_error:.3f} %, {n:g} restarts, {len(self.faults)} faults"
-        return f"<Trial of {in_words(self.parameters)}: {told}>"
 
     @property
     def mean_error(self) -> float:
@@ -209,9 +204,6 @@ class Archive:
         self._sources = sources
         self._statuses: dict[str, dict[Path, str]] = {}
         self._finished: dict[str, dict[int, Summary]] | None = None
-
-    def __repr__(self) -> str:
-        return f"<Archive in {self.folder}>"
 
     def _note(self, sequence: str) -> None:
         """Record what the trials on a sequence depend on, before the first of them is written."""
@@ -416,6 +408,12 @@ class Archive:
     def read(self, sequence: str, number: int, whole: bool = False, bare: bool = False) -> Trial:
         """Read a trial, or another drive, see `trial_path`."""
         return _read_trial(self.trial_path(sequence, number, whole, bare))
+
+    def summary(
+        self, sequence: str, number: int, whole: bool = False, bare: bool = False
+    ) -> Summary:
+        """Read the summary of a trial, or of another drive, see `trial_path`."""
+        return _read_summary(self.trial_path(sequence, number, whole, bare))
 
     def read_errors(self, sequence: str, numbers: Sequence[int]) -> NDArray[np.float32]:
         """Errors of several trials on a sequence, of shape (n_frames, n_trials).

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from adaptune.archive import REGISTER_MS, Archive, ArchiveError, Frames, Summary, Trial, summarise
+from adaptune.archive import REGISTER_MS, Archive, ArchiveError, Frames, Summary, Trial
 from adaptune.errors import AdaptuneError
 from adaptune.model.rules import BASELINE
 from adaptune.progress import Progress, unseen
@@ -280,7 +280,7 @@ def read_whole_drives(
     for name in names:
         for n in numbers:
             with suppress(ArchiveError):
-                found[name][n] = summarise(archive.read(name, n, whole=True, bare=bare))
+                found[name][n] = archive.summary(name, n, whole=True, bare=bare)
     return found
 
 

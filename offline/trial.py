@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -110,20 +111,17 @@ def _mean(repeats: Sequence[Trial]) -> Trial:
     if len(repeats) == 1:
         return repeats[0]
     metrics = set.intersection(*(set(trial.metrics) for trial in repeats))
-    return Trial(
-        repeats[0].parameters,
-        repeats[0].T_odom_sensor,
-        np.mean([cap(trial.errors) for trial in repeats], axis=0),
-        np.mean([trial.restarted for trial in repeats], axis=0),
-        np.all([trial.registered for trial in repeats], axis=0),
-        np.mean([trial.seconds for trial in repeats], axis=0),
-        tuple(fault for trial in repeats for fault in trial.faults),
-        {m: float(np.mean([t.metrics[m] for t in repeats])) for m in sorted(metrics)},
-        {
-            m: float(np.mean([t.usage.get(m, 0.0) for t in repeats]))
-            for m in {m: None for t in repeats for m in t.usage}
-        },
-        tuple({"rte": trial.mean_error} | trial.metrics for trial in repeats),
-        max(repeats, key=lambda trial: trial.unhealthy.get("no_pose", 0)).unhealthy,
-        next((trial.failure for trial in repeats if trial.failure), ""),
+    usage = {m: None for trial in repeats for m in trial.usage}
+    return replace(
+        repeats[0],
+        errors=np.mean([cap(trial.errors) for trial in repeats], axis=0),
+        restarted=np.mean([trial.restarted for trial in repeats], axis=0),
+        registered=np.all([trial.registered for trial in repeats], axis=0),
+        seconds=np.mean([trial.seconds for trial in repeats], axis=0),
+        faults=tuple(fault for trial in repeats for fault in trial.faults),
+        metrics={m: float(np.mean([t.metrics[m] for t in repeats])) for m in sorted(metrics)},
+        usage={m: float(np.mean([t.usage.get(m, 0.0) for t in repeats])) for m in usage},
+        repeats=tuple({"rte": trial.mean_error} | trial.metrics for trial in repeats),
+        unhealthy=max(repeats, key=lambda trial: trial.unhealthy.get("no_pose", 0)).unhealthy,
+        failure=next((trial.failure for trial in repeats if trial.failure), ""),
     )

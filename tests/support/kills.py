@@ -26,7 +26,7 @@ def contents(folder: Path) -> dict[Path, object]:
             found[path.relative_to(folder)] = {
                 key: data[key].tobytes()
                 for key in data
-                if key not in ("seconds", "usage", "evidence_ms")
+                if key not in ("seconds", "usage", "summary", "evidence_ms")
             }
     # What is chosen follows from what sets cost, too, which no two campaigns measure alike.
     model = ErrorModel.load(folder / "model.safetensors")
