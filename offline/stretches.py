@@ -50,7 +50,7 @@ def stretches_along(name: str, frames: Frames) -> list[Stretch]:
 
 STRETCH, OVERHANG = 2.0, 1.0
 """Sub-trajectories that begin along a stretch, and that it is longer than that."""
-WARM_UP = 10.0, 3.0
+WARM_UP = 20.0, 6.0
 """Metres and seconds that do not count at the begin of a stretch: an odometry has no map yet."""
 MOST_DRIVEN = 0.7
 """Share of a recording above which all of it is driven."""
