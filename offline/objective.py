@@ -79,12 +79,6 @@ def weighted(weights: Mapping[Metric, float], metrics: Mapping[str, float]) -> f
     return sum(weight * metrics.get(name, LARGEST_METRIC) for name, weight in weights.items())
 
 
-def repeated(weights: Mapping[Metric, float], runs: Sequence[Mapping[str, float]]) -> list[float]:
-    """The weighted sum of the metrics that can repeat, in every run of a trial."""
-    repeatable = {name: w for name, w in weights.items() if name not in TIMED}
-    return [weighted(repeatable, run) for run in runs]
-
-
 def told(verdicts: Sequence[Verdict]) -> list[tuple[ParameterSet, float]]:
     """Parameters and values of trials as samplers are told; the first one is the baseline's."""
     worst = PENALTY * (verdicts[0].value or 1.0) if verdicts else 0.0
@@ -112,9 +106,11 @@ def failed_in_words(verdicts: Mapping[int, Verdict]) -> list[str]:
 def baseline_words(config: OfflineConfig, runs: Sequence[Summary]) -> list[str]:
     """A sentence about the spread of the baseline over its runs, if it was run several times."""
     objective = config.objective
-    if not all(run.repeats for run in runs) or set(objective) <= set(TIMED):
+    # Times never repeat.
+    weights = {name: weight for name, weight in objective.items() if name not in TIMED}
+    if not all(run.repeats for run in runs) or not weights:
         return []
-    found = np.mean([repeated(objective, run.repeats) for run in runs], axis=0)
+    found = np.mean([[weighted(weights, one) for one in run.repeats] for run in runs], axis=0)
     return [
         f"The baseline ran {len(found)} times: {label(objective, units=True)} {found.mean():.4g} "
         f"in the mean, {found.min():.4g} to {found.max():.4g}, "

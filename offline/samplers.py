@@ -71,28 +71,20 @@ class Sampler(ABC):
         """
 
 
-def untried(
+def another(
     space: ParameterSpace, tried: Collection[str], rng: np.random.Generator
-) -> ParameterSet | None:
+) -> Proposal | None:
     """Draw a set whose `key` is not among those that were tried; None if none is left."""
     everything = Grid.of(space)
     if everything is not None and everything.size <= _ENUMERABLE:
         sets = map(everything.__getitem__, range(everything.size))
         left = [parameters for parameters in sets if key(parameters) not in tried]
-        return left[rng.integers(len(left))] if left else None
+        return Proposal(left[rng.integers(len(left))], "random") if left else None
     for _ in range(_DRAWS):
         (drawn,) = space.from_unit(rng.random((1, len(space))))
         if key(drawn) not in tried:
-            return drawn
+            return Proposal(drawn, "random")
     return None
-
-
-def another(
-    space: ParameterSpace, tried: Collection[str], rng: np.random.Generator
-) -> Proposal | None:
-    """Propose a set that was not tried, see `untried`."""
-    drawn = untried(space, tried, rng)
-    return None if drawn is None else Proposal(drawn, "random")
 
 
 KEPT = 0.5
