@@ -1,6 +1,6 @@
 """What the health check hides: drives of whole recordings without it."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -9,8 +9,8 @@ from adaptune.archive import Archive, summarise
 from adaptune.model.rules import BASELINE
 from offline.campaign import WholeDrives, read_whole_drives
 from offline.choice import PER_BLOCK, BlockErrors, surely_worse
-from offline.config import OfflineConfig
-from offline.labelled import LabelledData, block_means, stretches
+from offline.config import OfflineConfig, OfflineStudyConfig
+from offline.labelled import LabelledData, block_means, stretches, with_whole_drives
 from offline.objective import weighted
 
 
@@ -41,12 +41,25 @@ def bare_blocks(data: LabelledData, archive: Archive, config: OfflineConfig) -> 
     return BlockErrors(known, np.concatenate(errors), number, none, none)
 
 
-def without_worse_bare(data: LabelledData, archive: Archive, config: OfflineConfig) -> LabelledData:
-    """The same without sets that are surely worse than the baseline without the health check."""
-    if (blocks := bare_blocks(data, archive, config)) is None:
-        return data
-    worse = set(np.array(blocks.trials)[surely_worse(blocks)].tolist())
-    return data.subset([n for n in data.sets if n not in worse])
+def in_whole_drives(
+    data: LabelledData,
+    archive: Archive,
+    config: OfflineStudyConfig,
+    drive: Callable[[LabelledData], object] = lambda _: None,
+) -> LabelledData:
+    """The same with the drives of finalists along whole recordings, see `with_whole_drives`.
+
+    Those that are surely worse than the baseline without the health check are left out, and others
+    take their place. `drive` makes the drives that are lacking.
+    """
+    while True:
+        drive(data)
+        driven = with_whole_drives(data, archive, config)
+        blocks = bare_blocks(driven, archive, config.offline)
+        worse = [] if blocks is None else np.array(blocks.trials)[surely_worse(blocks)].tolist()
+        if not worse:
+            return driven
+        data = data.subset([n for n in data.sets if n not in worse])
 
 
 def bare_in_words(

@@ -30,7 +30,7 @@ from adaptune.study.references import (
     estimates_of,
 )
 from adaptune.study.study import FIXED_SET, OracleErrors, StudySequences, oracle_errors
-from offline.bare import bare_in_words, without_worse_bare
+from offline.bare import bare_in_words, in_whole_drives
 from offline.campaign import (
     Campaign,
     Schedule,
@@ -42,7 +42,7 @@ from offline.choice import NothingUsableError
 from offline.config import OfflineConfig, OfflineStudy
 from offline.drive import TrialSetup
 from offline.front import COST, front_rows, left_out_in_words
-from offline.labelled import LabelledData, labelled_data, with_vectors, with_whole_drives
+from offline.labelled import LabelledData, labelled_data, with_vectors
 from offline.objective import (
     Verdict,
     baseline_words,
@@ -120,11 +120,14 @@ def train(study: OfflineStudy, progress: Progress = unseen, cluster: str | None 
         recorded_in = study.sequences.recorded_in
         about = (names, every_set, study.config, study.window, recorded_in, study.odometry)
         data = labelled_data(archive, *about)
-        usable = data.usable()
-        sets = {n: verdicts[n].parameters for n in {*usable.finalists(), *every_set.defaults}}
-        whole = drive_whole(study, dict(sorted(sets.items())), archive, workers, progress)
-    driven = with_whole_drives(usable, archive, study.config)
-    usable = without_worse_bare(driven, archive, config)
+
+        def drive(data: LabelledData) -> WholeDrives:
+            asked = {*data.finalists(), *every_set.defaults}
+            sets = {n: verdicts[n].parameters for n in sorted(asked)}
+            return drive_whole(study, sets, archive, workers, progress)
+
+        usable = in_whole_drives(data.usable(), archive, study.config, drive)
+        whole = drive(usable)
     fixed = usable.fixed()
     model = _fitted(study, data, with_vectors(usable, archive), finished, fixed)
     write_fixed(study, verdicts[fixed].parameters)
@@ -147,7 +150,7 @@ def train(study: OfflineStudy, progress: Progress = unseen, cluster: str | None 
     said += estimates_in_words(estimates, model.length)
     said += failed_in_words(verdicts)
     said += baseline_words(config, [runs[0] for runs in finished.values()])
-    said += bare_in_words(archive, whole, fixed, sorted({*driven.sets} - {*usable.sets}))
+    said += bare_in_words(archive, whole, fixed, sorted({*data.usable().sets} - {*usable.sets}))
     rows_of_front = front_rows(usable, model)
     tables.write_rows(study.folder, "front", rows_of_front)
     return Training(model, trials, rows, said, rows_of_front, left_out_in_words(usable))

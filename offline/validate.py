@@ -31,7 +31,7 @@ from adaptune.study.study import (
     driven,
     expected_in_words,
 )
-from offline.bare import without_worse_bare
+from offline.bare import in_whole_drives
 from offline.charts import stretch_chart
 from offline.config import OfflineStudy
 from offline.labelled import (
@@ -40,7 +40,6 @@ from offline.labelled import (
     labelled_data,
     periods,
     with_vectors,
-    with_whole_drives,
 )
 from offline.tuning import (
     MOST_FOLDS,
@@ -356,8 +355,7 @@ def _labelled(study: OfflineStudy, model: ErrorModel) -> LabelledData:
     archive, of = Archive(study.folder / "trials"), study.sequences.recorded_in
     about = (model.sequences, model.sets, study.config, study.window, of, study.odometry)
     data = labelled_data(archive, *about).usable()
-    data = with_whole_drives(data, archive, study.config)
-    return with_vectors(without_worse_bare(data, archive, study.config.offline), archive)
+    return with_vectors(in_whole_drives(data, archive, study.config), archive)
 
 
 def _rows(validation: Validation) -> list[dict[str, Any]]:
