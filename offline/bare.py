@@ -73,9 +73,10 @@ def bare_in_words(
         np.mean([bare[name].get(n, of[n]).mean_error for name, of in whole.items()])
         for n in (BASELINE, fixed)
     )
-    said = f"Without the health check, as in your launch file, the baseline has {base:.3f} %"
+    without = "Without the health check, as in your launch file"
+    said = f"{without}, the baseline has {base:.3f} % in training"
     if fixed != BASELINE:
-        said += f" in training, the fixed set {of_fixed:.3f} %"
+        said += f", the fixed set {of_fixed:.3f} %"
     if worse:
         said += f"; surely worse, and not recommended: trial {', '.join(map(str, worse))}"
     return [f"{said}."]
