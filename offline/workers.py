@@ -524,11 +524,8 @@ def contents(sequences: StudySequences, name: str) -> dict[Path, str]:
     return found
 
 
-# What follows runs on the workers.
-
-
 def check_files(sequences: StudySequences, name: str, there: Mapping[Path, str]) -> None:
-    """Refuse to read other files of a sequence than those `there`, where the campaign was started.
+    """On a worker, refuse to read other files of a sequence than where the campaign was started.
 
     Raises
     ------
@@ -554,7 +551,7 @@ _held: tuple[str, Bench] | None = None
 def perform(
     token: str, setup: TrialSetup, files: Mapping[Path, str], task: Task, core: int, share: float
 ) -> Outcome:
-    """Do a task, with the scans that earlier tasks of the same campaign have prepared.
+    """On a worker, do a task, with the scans that earlier tasks of the campaign have prepared.
 
     They take this `share` of the machine's memory for them.
     """
