@@ -189,4 +189,4 @@ def in_place(
     frames = np.flatnonzero(known)
     of = (name, name, simulation, frames, np.zeros(len(frames), np.intp), errors)
     of_sets = dict(enumerate(np.moveaxis(vectors, 1, 0)))
-    return LabelledSequence(*of, errors[:, 0].astype(float), {"ndt": N_FEATURES}, of_sets)
+    return LabelledSequence(*of, {"ndt": N_FEATURES}, of_sets)

@@ -19,6 +19,13 @@ other, adapting can only be expected to do no harm.
 
 FOLDER receives recorded.csv and recorded.json: a row for every study, test sequence and mode that
 is there, also of former runs.
+
+    python benchmarks/recorded.py FOLDER --fixed [--sets 24] [--seed 0] [--recordings town road ...]
+
+drives the same sets of GICP along all of each recording, once. Then it chooses the fixed set on
+each recording alone, and on all but one, and looks up how it did on the others: error and cost to
+the baseline's, by the rule in use and by the least mean error at any cost. FOLDER receives
+fixed.csv and fixed.json.
 """
 
 import argparse
@@ -28,20 +35,29 @@ import shutil
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from adaptune import machine, yaml12
 from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
+from adaptune.metrics import cap, sub_trajectory_turns
+from adaptune.model.rules import BASELINE, Costs
+from adaptune.progress import unseen
 from adaptune.recording.config import ESTIMATED
 from adaptune.recording.parts import part_name, read_part
 from adaptune.report import tables
+from adaptune.space import ParameterSets
 from adaptune.study.config import ALSO
+from adaptune.study.references import ensure_references
+from offline.campaign import Campaign, run_baseline
+from offline.choice import mean_and_error
 from offline.config import OfflineStudy, load_study
-from offline.train import train
+from offline.labelled import LabelledData, labelled_data
+from offline.train import train, trial_workers
 from online.modes import run_replays, run_untrained
 from online.record import StoredReplay
 from online.statistics import ComparisonRow, Reference, compare_modes
@@ -199,6 +215,111 @@ def summary(ratios: Mapping[str, Sequence[float]]) -> list[str]:
     ]
 
 
+RECORDINGS = {
+    **dict.fromkeys(CARS, 25.0),
+    "campus": 25.0,
+    "nuscenes_0006_keyframes": 25.0,
+    "livox_hku_1": 10.0,
+    "livox_hku_2": 10.0,
+    "hall": 5.0,
+}
+"""Recordings for `--fixed`, and the metres of their sub-trajectories."""
+ALIKE = [CARS, ("livox_hku_1", "livox_hku_2")]
+"""Recordings of one sensor on one kind of robot."""
+
+
+def driven(given: argparse.Namespace, name: str) -> LabelledData:
+    """Drive all sets along all of a recording, unless that was done, and read how they did."""
+    direction = Direction((name,), (), RECORDINGS[name])
+    defined = definition(direction, "gicp", given.sets, given.seed, given.no_reference)
+    defined["offline"] = {"initial": given.sets, "trials": given.sets, "seed": given.seed}
+    defined["offline"] |= {"stretches": "all", "workers": 1}
+    path = given.folder / f"{name}.yaml"
+    write_text(path, yaml12.dump(defined))
+    study = load_study(path, folder=given.folder / name)
+    study.open()
+    ensure_references(study.sequences, study.training, direction.sub_trajectory)
+    archive = study.archive(more={"offline": study.config.search_inputs})
+    archive.renew(study.training)
+    with trial_workers(study, study.training, None) as workers:
+        run_baseline(study, archive, workers, unseen)
+        verdicts = Campaign(study, archive, workers).run()
+    tried = tuple(verdict.parameters for verdict in verdicts.values())
+    sets = ParameterSets(study.odometry.space, tuple(verdicts), tried)
+    about = (sets, study.config, study.window, study.sequences.recorded_in, study.odometry)
+    data = labelled_data(archive, study.training, *about)
+    (one,) = data.sequences
+    T_ref_sensor, paths = one.simulation.T_ref_sensor, [archive.read(name, n) for n in sets]
+    turns = [
+        sub_trajectory_turns(T_ref_sensor, path.T_odom_sensor, direction.sub_trajectory)
+        for path in paths
+    ]
+    whole = replace(one, turns=np.stack(turns, axis=1)[one.known])
+    return data._replace(sequences=[replace(one, whole=whole)], driven=list(sets))
+
+
+def together(parts: Sequence[LabelledData]) -> LabelledData:
+    """Several recordings as the training sequences of one study, where a set has its mean cost."""
+    of_sets = {n: [part.costs.sets[n] for part in parts] for n in parts[0].sets}
+    costs = {
+        n: of[0]._replace(
+            register=float(np.mean([one.register for one in of])),
+            prepare=float(np.mean([one.prepare for one in of])),
+        )
+        for n, of in of_sets.items()
+    }
+    sequences = [s for part in parts for s in part.sequences]
+    return parts[0]._replace(sequences=sequences, costs=Costs(costs, np.nan))
+
+
+def least_error(data: LabelledData) -> int:
+    """Trial number of the set with the least mean error at any cost: the rule of before."""
+    blocks = data.blocks()
+    means, _ = mean_and_error(blocks.errors, blocks.sequence)
+    return blocks.trials[int(np.argmin(np.where(np.isfinite(blocks.restarts), means, np.inf)))]
+
+
+def fixed_sets(given: argparse.Namespace) -> None:
+    """Choose the fixed set on each recording alone and on all but one, and look it up elsewhere."""
+    of = {name: driven(given, name) for name in given.recordings}
+    rows: list[dict[str, Any]] = []
+    trainings = [(name,) for name in of] + [tuple(n for n in of if n != name) for name in of]
+    for names in trainings:
+        data = together([of[name] for name in names]).usable()
+        for rule, trial in (("in use", data.fixed()), ("least error", least_error(data))):
+            for test in sorted(set(of) - set(names)):
+                (one,), costs = of[test].sequences, of[test].costs
+                columns = of[test].sets.columns([trial, BASELINE])
+                error, base = cap(one.errors[:, columns]).mean(axis=0).tolist()
+                alone = len(names) == 1
+                alike = any({*names, test} <= {*those} for those in ALIKE)
+                row = {"training": names[0] if alone else "all others", "test": test}
+                row |= {"rule": rule, "trial": trial, "alike": alone and alike}
+                row |= {"error [%]": error, "baseline [%]": base, "ratio": error / base}
+                rows.append(row | {"cost": costs.alone(trial) / costs.alone(BASELINE)})
+    tables.write_rows(given.folder, "fixed", rows)
+    for training in dict.fromkeys(row["training"] for row in rows):
+        print(*fixed_lines(training, [r for r in rows if r["training"] == training]), sep="\n")
+    alone = [row for row in rows if row["training"] != "all others"]
+    print(*fixed_lines("each alone", alone), sep="\n")
+    print(*fixed_lines("each alone, alike", [r for r in alone if r["alike"]]), sep="\n")
+
+
+def fixed_lines(what: str, rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """A line for each rule: error and cost to the baseline's, and how often it is kept."""
+    lines = []
+    for rule in dict.fromkeys(row["rule"] for row in rows):
+        mine = [row for row in rows if row["rule"] == rule]
+        error, cost = (np.exp(np.mean([np.log(r[key]) for r in mine])) for key in ("ratio", "cost"))
+        worst = max(mine, key=lambda row: row["ratio"])
+        kept = sum(row["trial"] == BASELINE for row in mine)
+        lines.append(
+            f"{what:24} {rule:12} error {error:.2f}, worst {worst['ratio']:.2f} on {worst['test']}"
+            f"   cost {cost:.2f}   baseline kept {kept} of {len(mine)}"
+        )
+    return lines
+
+
 def main() -> None:
     """Run the studies that were asked for, and print what they gave and took."""
     parser = argparse.ArgumentParser(
@@ -210,12 +331,17 @@ def main() -> None:
     parser.add_argument("--sets", type=int, default=16)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--no-reference", action="store_true")
+    parser.add_argument("--fixed", action="store_true")
+    parser.add_argument("--recordings", nargs="+", default=list(RECORDINGS), choices=RECORDINGS)
     parser.add_argument("--also", nargs="+", default=(), choices=sorted({*ALSO} - {*MODES}))
     given = parser.parse_args()
     if "ADAPTUNE_TEST_DATA" not in os.environ:
         sys.exit("ADAPTUNE_TEST_DATA does not name the folder of the recordings")
     machine.pin(os.getpid())
     given.folder.mkdir(parents=True, exist_ok=True)
+    if given.fixed:
+        fixed_sets(given)
+        return
     for odometry in given.odometries:
         ratios: dict[str, list[float]] = {mode: [] for mode in (*MODES, *given.also)}
         for name in given.directions:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune.archive import PREPARE_MS, REGISTER_MS, Archive, Frames, Trial
+from adaptune.archive import PREPARE_MS, REGISTER_MS, Archive, Frames, Trial, summarise
 from adaptune.bank.members import LEVER, Agreement, share
 from adaptune.geometry import Poses, invert, mean_motion, rectify, rotation_angle, steps
 from adaptune.live.evidence import SPACING, USUAL_SHARE
@@ -250,7 +250,6 @@ class LabelledSequence:
     stretch: NDArray[np.intp]  # (n,): number of each frame's stretch
     # (n, n_sets): percent, infinite where the track was lost, NaN where a set never gave a pose.
     errors: NDArray[np.float32]
-    baseline: NDArray[np.float64]  # (n,): errors of the baseline
     blocks: Mapping[str, int]  # by name, in order, the lengths of the descriptors
     # By trial number (n, 3): errors of the best sets as vectors, see `adaptune.model.TrainingData`.
     vectors: Mapping[int, NDArray[np.float32]] = field(default_factory=dict)
@@ -262,13 +261,9 @@ class LabelledSequence:
     elevation: float = np.nan  # degrees, see `adaptune.model.descriptor.lowest_elevation`
     # (n_sets,): how often the health check restarted each set, infinite if it failed
     restarts: NDArray[np.float64] | None = None
-    # Of finalists by trial number, in drives of the whole recording: (n,), their errors;
-    whole: Mapping[int, NDArray[np.float64]] = field(default_factory=dict)
-    # (n_blocks,), their mean capped errors in blocks of all frames, or (1,), another objective; and
-    # how often each was restarted. None where some frames are left out.
-    whole_means: Mapping[int, NDArray[np.float64]] | None = None
-    whole_turns: Mapping[int, NDArray[np.float64]] | None = None  # rotation errors, likewise
-    whole_restarts: Mapping[int, float] = field(default_factory=dict)
+    turns: NDArray[np.float64] | None = None  # (n, n_sets): degrees a metre, where they are known
+    # The same of all frames, from drives of the whole recording, see `LabelledData.driven`.
+    whole: "LabelledSequence | None" = None
 
     @cached_property
     def period(self) -> NDArray[np.int64]:
@@ -313,31 +308,23 @@ class LabelledSequence:
         """The same with some of the frames."""
         if kept.all():
             return self
-        some = replace(
+        known, whole = self.known[kept], self.whole
+        return replace(
             self,
-            known=self.known[kept],
+            known=known,
             stretch=self.stretch[kept],
             errors=self.errors[kept],
-            baseline=self.baseline[kept],
             vectors={trial: vectors[kept] for trial, vectors in self.vectors.items()},
             blocks_of=self.blocks_of[kept],
+            turns=None if self.turns is None else self.turns[kept],
+            whole=whole and whole.frames(np.isin(whole.known, known)),
         )
-        if self.values is not None:  # of some frames, it is not known
-            return some
-        few = {n: errors[kept] for n, errors in self.whole.items()}
-        return replace(some, whole=few, whole_means=None, whole_turns=None)
 
-    def in_blocks(self, whole: Sequence[int] = ()) -> NDArray[np.float64]:
-        """Mean capped errors in blocks, of shape (n_blocks, n_sets), or the objective, (1, n_sets).
-
-        Of all sets in their trials; or of those with the numbers `whole` in drives of all of it.
-        """
-        if whole and self.whole_means is not None:
-            return np.stack([self.whole_means[n] for n in whole], axis=1)
+    def in_blocks(self) -> NDArray[np.float64]:
+        """Mean capped errors, of shape (n_blocks, n_sets), or the objective, (1, n_sets)."""
         if self.values is not None:
             return self.values[None]
-        errors = np.stack([self.whole[n] for n in whole], axis=1) if whole else self.errors
-        return block_means(errors, self.blocks_of)
+        return block_means(self.errors, self.blocks_of)
 
     def part(self) -> "LabelledSequence":
         """The same with the part of the simulation that its frames take."""
@@ -380,6 +367,7 @@ class LabelledData(NamedTuple):
     budget: float | None = None
     worth: float = WORTH  # share of the error that a bank has to spare
     live: bool = True  # whether the odometry changes from one set to another between scans
+    driven: Sequence[int] = ()  # finalists: trial numbers, the columns of drives of the whole
 
     def subset(self, trials: Sequence[int]) -> "LabelledData":
         """The same with some of the sets."""
@@ -430,13 +418,20 @@ class LabelledData(NamedTuple):
 
     def blocks(self) -> BlockErrors:
         """What the trials of all sets say."""
-        none = np.zeros(len(self.sets))
-        restarts = [none if s.restarts is None else s.restarts for s in self.sequences]
-        costs = np.array([self.costs.alone(trial) for trial in self.sets])
-        errors = [s.in_blocks() for s in self.sequences]
-        number = np.repeat(np.arange(len(errors)), [len(of) for of in errors])
-        of_all = np.concatenate(errors), number, costs, np.sum(restarts, axis=0), self.period
-        return BlockErrors(list(self.sets), *of_all)
+        return self._blocks(self.sequences, list(self.sets))
+
+    def _blocks(self, sequences: Sequence[LabelledSequence], trials: Sequence[int]) -> BlockErrors:
+        none, errors = np.zeros(len(trials)), [s.in_blocks() for s in sequences]
+        turns = [block_means(s.turns, s.blocks_of) for s in sequences if s.turns is not None]
+        return BlockErrors(
+            trials,
+            np.concatenate(errors),
+            np.repeat(np.arange(len(errors)), [len(of) for of in errors]),
+            np.array([self.costs.alone(trial) for trial in trials]),
+            np.sum([none if s.restarts is None else s.restarts for s in sequences], axis=0),
+            self.period,
+            np.concatenate(turns) if len(turns) == len(errors) else None,
+        )
 
     @property
     def period(self) -> float:
@@ -445,18 +440,10 @@ class LabelledData(NamedTuple):
 
     def whole_blocks(self, trials: Collection[int]) -> BlockErrors:
         """What drives of whole recordings say, of those of some sets that have made them."""
-        known = [n for n in self.sets if n in trials and all(n in s.whole for s in self.sequences)]
-        if not known:
+        whole = [s.whole for s in self.sequences if s.whole is not None]
+        if not (known := [n for n in self.driven if n in trials]):
             return self.blocks().some(list(trials))
-        errors = [s.in_blocks(known) for s in self.sequences]
-        number = np.repeat(np.arange(len(errors)), [len(of) for of in errors])
-        restarts = np.sum([[s.whole_restarts[n] for n in known] for s in self.sequences], axis=0)
-        of_known = np.array([self.costs.alone(n) for n in known]), restarts
-        turns = None
-        if all(s.whole_turns is not None for s in self.sequences):
-            rotations = [s.whole_turns or {} for s in self.sequences]
-            turns = np.concatenate([np.stack([of[n] for n in known], axis=1) for of in rotations])
-        return BlockErrors(known, np.concatenate(errors), number, *of_known, self.period, turns)
+        return self._blocks(whole, self.driven).some(known)
 
     def finalists(self) -> list[int]:
         """Trials whose sets drive whole recordings, see `offline.choice.finalists`."""
@@ -575,40 +562,39 @@ def with_whole_drives(
     data: LabelledData, archive: Archive, config: OfflineStudyConfig
 ) -> LabelledData:
     """The same with the drives of whole recordings that there are of finalists."""
-    names = [s.name for s in data.sequences]
-    drives = read_whole_drives(archive, names, [*data.finalists(), *data.sets.defaults])
-    known = set.intersection(*map(set, drives.values()))
-    sequences = []
-    for s in data.sequences:
-        trials = {n: archive.read(s.name, n, whole=True) for n in sorted(known)}
-        errors = np.stack([trial.errors for trial in trials.values()], axis=1)
-        turns = None
-        if s.values is None:
-            frames = np.flatnonzero(~np.isnan(errors).any(axis=1))
-            everywhere = replace(s.simulation, T_ref_counted=s.simulation.T_ref_sensor)
-            block = stretches(everywhere, frames, PER_BLOCK)
-            means = block_means(errors[frames], block)
-            paths = [trial.T_odom_sensor for trial in trials.values()]
-            T_ref_sensor, length = s.simulation.T_ref_sensor, s.simulation.length
-            rotations = [sub_trajectory_turns(T_ref_sensor, T, length)[frames] for T in paths]
-            turns = dict(
-                zip(trials, block_means(np.stack(rotations, axis=1), block).T, strict=True)
-            )
-        else:
-            weights = config.offline.objective
-            means = np.array([[weighted(weights, drives[s.name][n].metrics) for n in trials]])
-        restarts = {n: drives[s.name][n].restarts for n in trials}
-        failed = {n: np.inf for n in trials if drives[s.name][n].failure}
-        sequences.append(
-            replace(
-                s,
-                whole=dict(zip(trials, errors[s.known].T, strict=True)),
-                whole_means=dict(zip(trials, means.T, strict=True)),
-                whole_turns=turns,
-                whole_restarts=restarts | failed,
-            )
-        )
-    return data._replace(sequences=sequences)
+    asked = [*data.finalists(), *data.sets.defaults]
+    drives = read_whole_drives(archive, [s.name for s in data.sequences], asked)
+    if not (known := sorted(set.intersection(*map(set, drives.values())))):
+        return data
+    sequences = [
+        replace(s, whole=_whole(s, [archive.read(s.name, n, whole=True) for n in known], config))
+        for s in data.sequences
+    ]
+    return data._replace(sequences=sequences, driven=known)
+
+
+def _whole(
+    s: LabelledSequence, trials: Sequence[Trial], config: OfflineStudyConfig
+) -> LabelledSequence:
+    T_ref_sensor, length = s.simulation.T_ref_sensor, s.simulation.length
+    everywhere = replace(s.simulation, T_ref_counted=T_ref_sensor)
+    errors = np.stack([trial.errors for trial in trials], axis=1).astype(np.float32)
+    turns = [sub_trajectory_turns(T_ref_sensor, trial.T_odom_sensor, length) for trial in trials]
+    frames = np.flatnonzero(~np.isnan(errors).any(axis=1))
+    block, drives = stretches(everywhere, frames, PER_BLOCK), [summarise(trial) for trial in trials]
+    values = [weighted(config.offline.objective, drive.metrics) for drive in drives]
+    return replace(
+        s,
+        simulation=everywhere,
+        known=frames,
+        stretch=block,
+        errors=errors[frames],
+        vectors={},
+        blocks_of=block,
+        values=None if s.values is None else np.array(values),
+        restarts=np.array([np.inf if drive.failure else drive.restarts for drive in drives]),
+        turns=np.stack(turns, axis=1)[frames],
+    )
 
 
 def with_vectors(data: LabelledData, archive: Archive) -> LabelledData:
@@ -647,10 +633,8 @@ def _labelled(
     """A labelled sequence without error vectors and drives of the whole."""
     frames, length = archive.read_frames(name), config.sub_trajectory
     errors = archive.read_errors(name, list(sets))
-    baseline = archive.read(name, 0).errors
     # All trials know the same frames, but for those before an odometry's first pose.
-    ran = np.column_stack([errors[:, ~np.isnan(errors).all(axis=0)], baseline])
-    known = np.flatnonzero(~np.isnan(ran).any(axis=1))
+    known = np.flatnonzero(~np.isnan(errors[:, ~np.isnan(errors).all(axis=0)]).any(axis=1))
     objective = config.offline.objective
     summaries = [archive.finished(name)[trial] for trial in sets]
     values = [np.inf if s.failure else weighted(objective, s.metrics) for s in summaries]
@@ -679,7 +663,6 @@ def _labelled(
         known,
         stretches(simulation, known),
         errors[known],
-        baseline[known],
         frames.blocks,
         blocks_of=stretches(simulation, known, PER_BLOCK),
         values=None if set(objective) == {"rte"} else np.array(values),

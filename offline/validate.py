@@ -17,7 +17,7 @@ from adaptune.errors import AdaptuneError
 from adaptune.metrics import bootstrap, cap
 from adaptune.model import ErrorModel, ModelError, PairedExpectedRatio
 from adaptune.model.registry import ADAPTIVE, RULES, rule_class
-from adaptune.model.rules import ERROR_FLOOR
+from adaptune.model.rules import BASELINE, ERROR_FLOOR
 from adaptune.progress import Progress, unseen
 from adaptune.report import tables
 from adaptune.report.drawing import draw_chart
@@ -246,7 +246,7 @@ def leave_out(
     fixed = capped[:, data.sets.column(data.fixed)]
     first, period = periods(sequence.period)
     frames = np.arange(len(capped))
-    errors, adapted = {"baseline": cap(sequence.baseline), "fixed": fixed}, {}
+    errors, adapted = {"baseline": capped[:, data.sets.column(BASELINE)], "fixed": fixed}, {}
     chosen = choose(others, bank, by_recording, MOST_FOLDS)
     alone, costs = others.costs.alone, dict[str, float]()
     one_at_a_time = {name: rule_class(name)() for name in rules if name != ADAPTIVE}

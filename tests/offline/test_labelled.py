@@ -24,21 +24,23 @@ def in_whole(data, *of_sequences):
     sequences = [
         replace(
             s,
-            whole={n: np.full(len(s.errors), value) for n, value in means.items()},
-            whole_means={n: np.full(5, value) for n, value in means.items()},
-            whole_restarts=dict.fromkeys(means, 0.0),
+            whole=replace(
+                s,
+                errors=np.tile(np.array([*means.values()], np.float32), (len(s.errors), 1)),
+                restarts=np.zeros(len(means)),
+            ),
         )
         for s, means in zip(data.sequences, of_sequences, strict=True)
     ]
-    return data._replace(sequences=sequences)
+    return data._replace(sequences=sequences, driven=list(of_sequences[0]))
 
 
 def test_drives_of_whole_recordings_decide_where_there_are_some():
     data = labelled([3.0, 2.0, 1.0], [3.0, 2.0, 1.0])
     assert data.fixed() == data.training_data()[0].fixed == 5
     assert in_whole(data, {0: 3.0, 2: 1.0, 5: 3.0}, {0: 3.0, 2: 1.0, 5: 2.0}).fixed() == 2
-    # Those that are not driven on all of them are not chosen.
-    assert in_whole(data, {0: 3.0, 5: 1.0}, {0: 3.0, 2: 1.0}).fixed() == 0
+    # Those that are not driven are not chosen.
+    assert in_whole(data, {0: 3.0, 2: 4.0}, {0: 3.0, 2: 4.0}).fixed() == 0
     # With a sequence left out, the drives on the others decide.
     both = in_whole(data, {0: 3.0, 2: 1.0, 5: 3.0}, {0: 3.0, 2: 2.0, 5: 1.0})
     (_, without_first), (_, without_second) = both.folds(by_recording=True)

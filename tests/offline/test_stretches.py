@@ -127,22 +127,21 @@ def test_parts_of_a_recording_are_one_recording():
 def test_a_stretch_takes_its_part_of_everything():
     one = with_motions("one", np.random.default_rng(3), 500)
     n = len(one.errors)
-    whole = {0: np.linspace(0.0, 1.0, n), 3: np.full(n, 50.0)}
-    means = {0: np.full(7, 0.5), 3: np.full(7, 30.0)}
-    one = replace(one, baseline=np.arange(n, dtype=float), whole=whole, whole_means=means)
-    assert one.in_blocks([3, 0]).shape == (7, 2)
+    errors = np.column_stack([np.linspace(0.0, 1.0, n), np.full(n, 50.0)])
+    one = replace(one, whole=replace(one, errors=errors, turns=errors, vectors={}))
     kept = one.stretch == 1
     some = one.frames(kept)
     # What is left of the drives follows from their errors.
     blocks = np.unique(one.blocks_of[kept])
     assert some.in_blocks().shape == (len(blocks), 5)
-    expected = whole[0][kept & (one.blocks_of == blocks[0])].mean()
-    np.testing.assert_allclose(some.in_blocks([0, 3])[0], [expected, 30.0])
-    assert len(some.baseline) == len(some.period) == len(some.errors) == kept.sum()
+    expected = errors[kept & (one.blocks_of == blocks[0]), 0].mean()
+    np.testing.assert_allclose(some.whole.in_blocks()[0], [expected, 30.0])
+    assert len(some.period) == len(some.errors) == len(some.whole.turns) == kept.sum()
     assert {len(of) for of in some.vectors.values()} == {kept.sum()}
     # Another objective is known of the whole alone.
-    other = replace(one, values=np.ones(5)).frames(kept)
-    assert other.in_blocks([3, 0]).tolist() == one.in_blocks([3, 0]).tolist()
+    other = replace(one, values=np.ones(5), whole=replace(one.whole, values=np.zeros(2)))
+    other = other.frames(kept)
+    np.testing.assert_array_equal(other.whole.in_blocks(), np.zeros((1, 2)))
     np.testing.assert_array_equal(other.in_blocks(), np.ones((1, 5)))
     assert one.frames(np.ones(n, bool)) is one
     cut_again = some.frames(np.arange(kept.sum()) < 5)

@@ -52,7 +52,7 @@ def in_place(name, simulation, known, errors, **more):
     frames = np.flatnonzero(known)
     place = (name, name, simulation, frames, stretches(simulation, frames))
     more |= {"blocks_of": stretches(simulation, frames, 2.0)}
-    return LabelledSequence(*place, errors, errors[:, 0], {"ndt": 90}, **more)
+    return LabelledSequence(*place, errors, {"ndt": 90}, **more)
 
 
 def two_kinds(rng):
