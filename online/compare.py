@@ -62,9 +62,8 @@ from online.statistics import (
     mean_of,
     oracle_row,
 )
-from online.tables import CALLED, decided, remarks, tables, verdict
-
-# Which replays are compared: the modes that were replayed on every sequence.
+from online.tables import tables
+from online.verdict import CALLED, decided, remarks, verdict
 
 
 class ComparedModes(NamedTuple):
@@ -116,9 +115,6 @@ def replayed_by(asked: Sequence[str], mode: str) -> str:
     on_demand = mode in ALSO and mode not in asked
     option = "--untrained" if mode == UNTRAINED else "-o online.modes=all"
     return f"`adaptune online{f' {option}' if on_demand else ''}`"
-
-
-# The comparison over all sequences.
 
 
 SEED = 0
@@ -257,9 +253,6 @@ def _of_stretches(judged: Sequence[JudgedModes], mode: str) -> NDArray[np.float6
         n = max(1, errors.shape[1] // (PER_STRETCH * one.block))
         found += [_log(part) for part in np.array_split(errors, n, axis=1)]
     return np.array(found)
-
-
-# Replays that are not of what the study is now: neither compared nor drawn.
 
 
 class CurrentReplays(NamedTuple):

@@ -5,18 +5,11 @@ from typing import Any
 
 from adaptune.model.registry import rule_class
 from adaptune.report.tables import Listing
-from adaptune.study.config import WORTH
-from adaptune.study.study import EQUAL_COST, MIN_RECORDINGS, RIVAL_WORDS, RIVALS, is_worth
-from online.modes import EVEN
-from online.statistics import (
-    ALL,
-    ERROR_FACTOR,
-    ORACLE,
-    ComparisonRow,
-    Ratio,
-)
+from adaptune.study.study import MIN_RECORDINGS
+from online.statistics import ALL, ERROR_FACTOR, ORACLE, ComparisonRow
 
 _COUNTS = ("restarts", "switches")
+YARDSTICKS = {"fixed": "fixed set", "baseline": "baseline"}
 
 
 def tables(rows: Sequence[ComparisonRow], length: float) -> list[Listing]:
@@ -64,14 +57,14 @@ def modes_in_words(rows: Sequence[ComparisonRow]) -> Listing:
     return Listing("What the modes are", cells)
 
 
-def _last(rows: Sequence[ComparisonRow]) -> list[ComparisonRow]:
+def last_rows(rows: Sequence[ComparisonRow]) -> list[ComparisonRow]:
     """The rows over all sequences, or those of the only one."""
     return [row for row in rows if row.sequence == rows[-1].sequence]
 
 
 def _of_modes(rows: Sequence[ComparisonRow], length: float) -> Listing:
     """One row a mode."""
-    last = _last(rows)
+    last = last_rows(rows)
     cells = [row.summary_columns() for row in last]
     # A column in which nothing is known, or nothing happened, tells nothing.
     empty = {k for k in cells[0] if all(row[k] is None for row in cells)} - {"RTE [%]"}
@@ -83,7 +76,7 @@ def _of_modes(rows: Sequence[ComparisonRow], length: float) -> Listing:
 
 
 def _caption(rows: Sequence[ComparisonRow], shown: Mapping[str, Any]) -> str:
-    of, to = rows[0].yardstick, _YARDSTICKS[rows[0].yardstick]
+    of, to = rows[0].yardstick, YARDSTICKS[rows[0].yardstick]
     said = [
         "Intervals of 95 %: paired block bootstrap, seed 0, where there is enough to draw from; "
         f"with fewer than {MIN_RECORDINGS} test recordings, they speak of these alone.",
@@ -119,7 +112,7 @@ def _of_sequences(rows: Sequence[ComparisonRow], length: float) -> Listing:
 
 def _standard(rows: Sequence[ComparisonRow]) -> Listing | None:
     """Errors as evo and KITTI's benchmark define them."""
-    last = [row for row in _last(rows) if row.standard is not None]
+    last = [row for row in last_rows(rows) if row.standard is not None]
     if not last:
         return None
     kitti = any(row.standard is not None and bool(row.standard.kitti.lengths) for row in last)
@@ -136,328 +129,3 @@ def _standard(rows: Sequence[ComparisonRow]) -> Listing | None:
     )
     cells = [row.standard_columns(kitti) for row in last]
     return Listing(title, cells, caption)
-
-
-# The decision: what to drive, what that gives, and at what cost.
-
-
-ROUNDING = 1e-6
-"""A ratio that differs less from 1 is 1."""
-_YARDSTICKS = {"fixed": "fixed set", "baseline": "baseline"}
-CALLED = {
-    "baseline": "the odometry's own parameters",
-    "fixed": "the fixed set",
-    "adaptive": "adaptive",
-    "untrained": "the untrained bank",
-    **RIVAL_WORDS,
-}
-_ONE_SET = ("baseline", "fixed", "best_default")
-"""Modes that drive one set; those that cost less first."""
-
-
-def _judged(rows: Sequence[ComparisonRow]) -> dict[str, ComparisonRow]:
-    """Those of `_last` by mode that have an error."""
-    return {row.mode: row for row in _last(rows) if row.ratio is not None}
-
-
-def decided(rows: Sequence[ComparisonRow], worth: float = WORTH) -> ComparisonRow | None:
-    """What to drive: the fixed set, unless another one is surely better, or what is worth its cost.
-
-    Adapting has to spare the share `worth` of the error, and to beat the best set that costs as
-    much. The rows over all sequences come last. None if no test sequence has a reference.
-    """
-    last = _judged(rows)
-    if not last:
-        return None
-    one = next(last[mode] for mode in _ONE_SET if mode in last)
-    if "fixed" in last:
-        same = "baseline" in last and abs(_ratio(last["baseline"]).value - 1.0) < ROUNDING
-        one = last["baseline" if same else "fixed"]
-    for mode in _ONE_SET:
-        if mode in last and _surely_better(last[mode], one):
-            one = last[mode]
-    candidates = [one]
-    for mode in ("adaptive", "untrained"):
-        if (row := last.get(mode)) is not None:
-            ratio, rival = _to(row, one), last.get(EQUAL_COST)
-            beats = rival is None or _surely_better(row, rival)
-            spares = ratio.interval is not None and is_worth(ratio.value, ratio.interval[1], worth)
-            candidates += [row] if spares and beats else []
-    return min(candidates, key=lambda row: _ratio(row).value)
-
-
-def _surely_better(row: ComparisonRow, other: ComparisonRow) -> bool:
-    """Whether a mode has less error, by more than chance where that is known."""
-    ratio = _to(row, other)
-    return ratio.value < 1.0 and (ratio.interval is None or ratio.interval[1] < 1.0)
-
-
-def _to(row: ComparisonRow, one: ComparisonRow) -> Ratio:
-    """Ratio of two modes' errors, with its interval where that is known."""
-    if one.mode == row.yardstick:
-        return _ratio(row)
-    return row.against.get(one.mode, Ratio(_ratio(row).value / max(_ratio(one).value, 1e-12)))
-
-
-def adapting(rows: Sequence[ComparisonRow]) -> ComparisonRow | None:
-    """The mode that adapts: `adaptive`, or without a model the untrained bank; None if none is."""
-    last = _judged(rows)
-    return next((last[mode] for mode in ("adaptive", "untrained") if mode in last), None)
-
-
-def verdict(
-    rows: Sequence[ComparisonRow], length: float, obstacle: str = "", worth: float = WORTH
-) -> list[str]:
-    """What to do, and why, in at most three sentences.
-
-    Parameters
-    ----------
-    rows
-        Those over all sequences come last.
-    length
-        Metres of a sub-trajectory.
-    obstacle
-        Why nothing adapts, if nothing does.
-    worth
-        Share of the error that adapting has to spare.
-    """
-    last = {row.mode: row for row in _last(rows)}
-    if (best := decided(rows, worth)) is None:
-        nobody = "No test sequence has a reference: nobody can say what was gained."
-        return [nobody, *_estimates(rows)[:2]]
-    main = adapting(rows)
-    errors = {m: f"{row.rte:.3f} %" for m, row in last.items() if row.rte is not None}
-    others = [m for m in ("fixed", "baseline") if m in errors and m != best.mode]
-    judge = " by an estimated reference" * any(row.reference == "estimated" for row in rows)
-    where = f"RTE over {length:g} m, {_where(rows)}{judge}"
-    if best.mode == "baseline" and "fixed" in last and _is_yardstick(best):
-        said = f"Keep {CALLED[best.mode]}: {errors[best.mode]} {where}. No set that was tried did "
-        said += "surely better in training"
-    else:
-        instead = " and ".join(f"{errors[m]} with {CALLED[m]}" for m in others)
-        said = f"{'Keep' if best.mode == 'baseline' else 'Drive'} {CALLED[best.mode]}: "
-        said += f"{errors[best.mode]}{f' instead of {instead},' if instead else ''} {where}"
-    if best.mode not in _ONE_SET:
-        has = f"It has {best.ratio:.2f} times the {_YARDSTICKS[best.yardstick]}'s error"
-        cost = _for_cost(best, last[best.yardstick])
-        return [f"{said}.", f"{has} ({_interval(_ratio(best))}){cost}{_beside(best, last)}."]
-    said = f"{said}{_doubt(best, last)}."
-    return [said, *_dearer(best, last), *_why_not(main, best, rows, obstacle, worth)]
-
-
-def _beside(best: ComparisonRow, last: Mapping[str, ComparisonRow]) -> str:
-    """How what adapts compares with the best single set that costs no more."""
-    rival = last.get(EQUAL_COST)
-    if rival is None or rival.ratio is None or rival.cpu_ms is None:
-        return ""
-    ratio, ms = _to(best, rival).value, rival.cpu_ms
-    return f", and {ratio:.2f} times that of the best single set that costs no more ({ms:.1f} ms)"
-
-
-def _dearer(best: ComparisonRow, last: Mapping[str, ComparisonRow]) -> list[str]:
-    """That a single set which costs more does better, where it surely does."""
-    row = last.get(EQUAL_COST)
-    if row is None or row.ratio is None or (ratio := _to(row, best)).interval is None:
-        return []
-    costs = row.cpu_ms or 0.0
-    if not _surely_better(row, best) or not best.cpu_ms or costs <= best.cpu_ms:
-        return []
-    has = f"{ratio.value:.2f} times its error ({_interval(ratio)}){_for_cost(row, best)}"
-    return [f"A single set that costs more has {has}: `--budget {costs:.0f}` allows it."]
-
-
-def _doubt(best: ComparisonRow, last: Mapping[str, ComparisonRow]) -> str:
-    """That the fixed set and the baseline may differ by chance only, where that is so."""
-    row = last.get("baseline")
-    if best.mode == "best_default" or row is None or "fixed" not in last or _is_yardstick(row):
-        return ""
-    ends = row.ratio_interval
-    chance = ends is None or ends[0] <= 1.0 <= ends[1]
-    return f"; the two may differ by chance ({_interval(_ratio(row))})" if chance else ""
-
-
-def _for_cost(main: ComparisonRow, one: ComparisonRow) -> str:
-    if main.cpu_ms is None or not one.cpu_ms:
-        return ""
-    return f", for {main.cpu_ms / one.cpu_ms:.1f} times its CPU time ({main.cpu_ms:.1f} ms a scan)"
-
-
-def _why_not(
-    main: ComparisonRow | None,
-    best: ComparisonRow,
-    rows: Sequence[ComparisonRow],
-    obstacle: str,
-    worth: float,
-) -> list[str]:
-    """Why not to adapt."""
-    if main is None:
-        return [f"Adapting was not tried: {obstacle}."] if obstacle else []
-    if _is_yardstick(main):
-        return ["Adapting kept the fixed set."]
-    ratio = _to(main, best)
-    cost = _for_cost(main, best)
-    has = f"{ratio.value:.2f} times its error ({_interval(ratio)}){cost}"
-    if ratio.value <= 1.0 - worth:
-        more = "drive more test recordings, or longer ones, to know"
-        return [f"Adapting had {has}, which may be chance: {more}."]
-    if ratio.value <= 1.0:
-        what = "is not worth its cost"
-    else:
-        surely = ratio.interval is not None and ratio.interval[0] > 1.0
-        what = "did worse" if surely else "did no better"
-    return [f"Adapting {what} {_where(rows)}: {has}."]
-
-
-def _is_yardstick(row: ComparisonRow) -> bool:
-    """Whether a mode did what the yardstick did."""
-    # A bank whose other members rest moves as the fixed set does, but for rounding.
-    return row.ratio is not None and abs(row.ratio - 1.0) < ROUNDING and not row.switches
-
-
-def _where(rows: Sequence[ComparisonRow]) -> str:
-    names = {row.sequence for row in rows if row.rte is not None} - {ALL}
-    return f"on {len(names)} test sequences" if len(names) > 1 else f"on {names.pop()}"
-
-
-def _interval(ratio: Ratio) -> str:
-    ends = ratio.interval
-    if ends is None:
-        return "no interval: the test is too short"
-    return f"95 % interval {_end(ends[0])} to {_end(ends[1])}"
-
-
-def _end(ratio: float) -> str:
-    """An end of an interval; one that is near 1 has more digits, to show on which side it lies."""
-    text = f"{ratio:.2f}"
-    return f"{ratio:.3f}" if text == "1.00" and ratio != 1.0 else text
-
-
-def _ratio(row: ComparisonRow) -> Ratio:
-    assert row.ratio is not None
-    return Ratio(row.ratio, row.ratio_interval)
-
-
-# What must be known to trust a comparison, in words.
-
-
-def remarks(rows: Sequence[ComparisonRow]) -> list[str]:
-    """How what adapts compares with rivals and controls, and what must be known to trust it."""
-    of_drives = _kept_up(rows) + _late(rows) + _restarts(rows)
-    return _rivals(rows) + _judges(rows) + _estimates(rows) + of_drives
-
-
-def _rivals(rows: Sequence[ComparisonRow]) -> list[str]:
-    """How what adapts compares on the same frames with what costs as much, or chooses nothing."""
-    main, last = adapting(rows), {row.mode: row for row in _last(rows)}
-    said = []
-    for mode, ratio in ({} if main is None else main.against).items():
-        if mode in (*RIVALS, EVEN) and main is not None:
-            what, cost = RIVAL_WORDS.get(mode, "the same bank with even weights"), ""
-            other = last.get(mode)
-            if other is not None and other.cpu_ms is not None and main.cpu_ms is not None:
-                cost = f", at {main.cpu_ms:.1f} ms of CPU time a scan against {other.cpu_ms:.1f}"
-            has = f"`{main.mode}` has {ratio.value:.2f} times the error of {what}"
-            said.append(f"{has} ({_interval(ratio)}){cost}.")
-    return said
-
-
-def _judges(rows: Sequence[ComparisonRow]) -> list[str]:
-    """A sentence about every sequence that an estimated reference judges."""
-    judged = {row.sequence: row for row in rows if row.sequence != ALL}
-    said = []
-    for name, row in judged.items():
-        if row.reference != "estimated":
-            continue
-        if row.reference_error is None:
-            own = "its own error is not known, and not in the intervals"
-        elif row.rte_interval is None:
-            own = f"its own error is about {row.reference_error:.2g} %"
-        else:
-            own = f"its own error, about {row.reference_error:.2g} %, is in the intervals"
-        said.append(f"On {name} an estimated reference judged: {own}.")
-    return said
-
-
-def _estimates(rows: Sequence[ComparisonRow]) -> list[str]:
-    """What is estimated where there is no reference, and where the reference contradicts it."""
-    said = []
-    contradicted: dict[str, list[str]] = {}
-    for row in rows:
-        if row.estimated is None or row.sequence == ALL:
-            continue
-        ends = row.estimated_interval
-        interval = "" if ends is None else f"95 % interval {ends[0]:.3f}-{ends[1]:.3f} %"
-        if row.rte is None:
-            said.append(
-                f"{row.sequence} has no reference. `{row.mode}` estimates its own mean RTE there: "
-                f"{row.estimated:.3f} %{interval and f' ({interval})'}."
-            )
-        elif ends is not None and not ends[0] <= row.rte <= ends[1]:
-            judge = "estimated reference" if row.reference == "estimated" else "reference"
-            contradicted.setdefault(row.mode, []).append(
-                f"{row.estimated:.3f} % ({interval}) on {row.sequence}, where by the {judge} it is "
-                f"{row.rte:.3f} %"
-            )
-    for mode, those in contradicted.items():
-        said.append(
-            f"`{mode}` estimates its own mean RTE at {'; '.join(those)}. "
-            f"Either the estimate or the reference is wrong there over this length."
-        )
-    return said
-
-
-def _kept_up(rows: Sequence[ComparisonRow]) -> list[str]:
-    """Of replays in real time, a sentence about each that did not get all scans or selections."""
-    said, timed = [], [(row, row.real_time) for row in rows if row.real_time is not None]
-    for row, kept in timed:
-        found = [
-            f"{kept[key]:.0f} {what}{'' if kept[key] == 1 else 's'}"
-            for key, what in (("dropped_scans", "scan"), ("missed_selections", "selection"))
-            if kept[key]
-        ]
-        if found:
-            said.append(
-                f"On {row.sequence} `{row.mode}` was too late for {' and '.join(found)}, at "
-                f"{kept['rate']:g} times the recorded rate; 99 % of its poses came within "
-                f"{kept['pose_ms_p99']:.0f} ms of the scans."
-            )
-    if timed and not said:
-        rate = timed[0][1]["rate"]
-        ms = max(kept["pose_ms_p99"] for _, kept in timed)
-        within = f"99 % of the poses came within {ms:.0f} ms of their scans, in every mode"
-        said.append(
-            f"Replayed at {rate:g} times the recorded rate, nothing came too late: {within}."
-        )
-    return said
-
-
-def _late(rows: Sequence[ComparisonRow]) -> list[str]:
-    """For each sequence a sentence about an odometry that gave its first pose late."""
-    late: dict[str, list[float]] = {}
-    for row in rows:
-        if row.first_pose:
-            late.setdefault(row.sequence, []).append(row.first_pose)
-    return [
-        f"On {name} the odometry gave its first pose after {max(seconds):.1f} s; errors count from "
-        f"there."
-        for name, seconds in late.items()
-    ]
-
-
-def _restarts(rows: Sequence[ComparisonRow]) -> list[str]:
-    """For each sequence a sentence about the modes that the health check restarted."""
-    said = []
-    for name in dict.fromkeys(row.sequence for row in rows if row.first_restart is not None):
-        mine = [row for row in rows if row.sequence == name]
-        modes: dict[str, list[str]] = {}
-        for row in mine:
-            if row.first_restart is not None:
-                at = f"at {row.first_restart:.1f} s"
-                when = at if row.restarts == 1 else f"{row.restarts} times, first {at}"
-                modes.setdefault(f"{when} ({', '.join(row.unhealthy)})", []).append(row.mode)
-        each = (
-            f"{'all modes' if len(those) == len(mine) else ', '.join(those)} {what}"
-            for what, those in modes.items()
-        )
-        said.append(f"On {name} the health check restarted {'; '.join(each)}.")
-    return said

@@ -18,7 +18,7 @@ from online.modes import run_replays
 from online.record import StoredReplay, StoredReplayError
 from online.replayed import read_replays
 from online.statistics import ComparisonRow, Reference
-from online.tables import remarks
+from online.verdict import remarks
 
 MODES = ["baseline", "fixed", "adaptive", "paper"]
 

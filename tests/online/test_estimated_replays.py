@@ -10,7 +10,8 @@ from offline.config import load_study
 from online.compare import compare
 from online.modes import run_untrained
 from online.statistics import allowing_for
-from online.tables import remarks, tables
+from online.tables import tables
+from online.verdict import remarks
 
 BOTH = ["baseline", "untrained"]
 

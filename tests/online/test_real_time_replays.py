@@ -14,7 +14,7 @@ from offline.config import load_study
 from online.compare import compare
 from online.modes import run_replays
 from online.record import StoredReplay, StoredReplayError
-from online.tables import remarks
+from online.verdict import remarks
 
 RATE = "online.real_time.rate=5"
 WAITS = "online.real_time.deadline=60"

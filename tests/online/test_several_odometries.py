@@ -15,7 +15,8 @@ from offline.config import load_study
 from offline.train import train
 from online.compare import compare
 from online.modes import run_replays
-from online.tables import remarks, tables
+from online.tables import tables
+from online.verdict import remarks
 
 ODOMETRIES = """\
 odometry:

@@ -15,7 +15,8 @@ from online.compare import compare
 from online.modes import ReplaySetup, run_untrained, sequences_without_model
 from online.record import StoredReplay, StoredReplayError
 from online.replayed import read_replays
-from online.tables import remarks, tables
+from online.tables import tables
+from online.verdict import remarks
 
 MODES = ["baseline", "untrained"]
 BLIND = "sequences.three.reference=none"
