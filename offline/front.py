@@ -83,8 +83,8 @@ def left_out_in_words(data: LabelledData) -> str:
         return "There is too little to tell how sets do where they were not chosen: record more."
     ratio, low, high = found
     return (
-        f"Where they were not chosen, sets chosen so have {ratio:.2f} times the baseline's error "
-        f"in these recordings (95 % interval {low:.2f}-{high:.2f})."
+        f"Sets chosen in the same way, without the part that they are tested on, have {ratio:.2f} "
+        f"times the baseline's error there (95 % interval {low:.2f}-{high:.2f})."
     )
 
 
