@@ -80,7 +80,9 @@ def left_out_in_words(data: LabelledData) -> str:
     """What to expect elsewhere of a set that is chosen as the fixed one is."""
     found = left_out_ratio(data.blocks(), lambda blocks: choose(blocks, data.budget))
     if found is None:
-        return "There is too little to tell how sets do where they were not chosen: record more."
+        return (
+            "Too little was recorded to tell how sets that are chosen so do elsewhere: record more."
+        )
     ratio, low, high = found
     return (
         f"Sets chosen in the same way, without the part that they are tested on, have {ratio:.2f} "

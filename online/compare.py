@@ -62,8 +62,8 @@ from online.statistics import (
     mean_of,
     oracle_row,
 )
-from online.tables import tables
-from online.verdict import CALLED, decided, remarks, verdict
+from online.tables import last_rows, tables
+from online.verdict import CALLED, decided, error_and_cost, remarks, verdict
 
 
 class ComparedModes(NamedTuple):
@@ -416,7 +416,7 @@ def compare(study: Study) -> ComparedReplays:
     length, worth = study.config.sub_trajectory, study.config.online.worth
     best = decided(rows, worth)
     said = wrong[:1] or (
-        [] if best is None else _lost(study.odometry.name, study.sequences, judged, best.mode)
+        [] if best is None else _lost(study.odometry.name, study.sequences, rows, best)
     )
     said += verdict(rows, length, obstacle, worth)
     details = [*wrong, *remarks(rows), *compared.words]
@@ -428,17 +428,22 @@ def compare(study: Study) -> ComparedReplays:
 
 
 def _lost(
-    odometry: str, sequences: StudySequences, judged: Sequence[JudgedModes], best: str
+    odometry: str, sequences: StudySequences, rows: Sequence[ComparisonRow], best: ComparisonRow
 ) -> list[str]:
-    """A sentence where even the best mode has lost its way."""
-    every = [row for one in judged for row in one.rows if row.mode == best]
-    errors = {row.sequence: row.rte for row in every if row.rte is not None}
-    return lost_in_words(
-        CALLED[best],
-        errors,
+    """Where what is advised has lost its way, the likeliest cause, and what errs least."""
+    known = [row for row in rows if row.rte is not None]
+    of_best = [row for row in known if row.mode == best.mode and row.sequence != ALL]
+    said = lost_in_words(
+        CALLED[best.mode],
+        {row.sequence: row.rte for row in of_best if row.rte is not None},
         odometry,
         lambda worst: hard_to_track(sequences.open(worst)),
     )
+    last = [row for row in last_rows(known) if row.mode in CALLED]
+    least = min(last, key=lambda row: row.rte or 0.0)
+    if said and least.mode != best.mode:
+        said.append(f"What errs least there is {CALLED[least.mode]}: {error_and_cost(least)}.")
+    return said
 
 
 def _rows(judged: Sequence[JudgedModes], oracles: Sequence[ComparisonRow]) -> list[ComparisonRow]:

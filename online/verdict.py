@@ -93,10 +93,13 @@ def verdict(
         return [nobody, *_estimates(rows)[:2]]
     main = adapting(rows)
     others = [m for m in ("fixed", "baseline") if m in last and m != best.mode]
-    instead = " and ".join(f"{_at(last[m])} with {CALLED[m]}" for m in others if last[m].rte)
+    instead = " and ".join(
+        f"{error_and_cost(last[m])} with {CALLED[m]}" for m in others if last[m].rte
+    )
     judge = " by an estimated reference" * any(row.reference == "estimated" for row in rows)
     where = f"RTE over {length:g} m, {_where(rows)}{judge}"
-    said = f"{'Keep' if best.mode == 'baseline' else 'Drive'} {CALLED[best.mode]}: {_at(best)}"
+    said = "Keep " if best.mode == "baseline" else "Drive "
+    said += f"{CALLED[best.mode]}: {error_and_cost(best)}"
     if best.mode == "baseline" and "fixed" in last and _is_yardstick(best):
         said += f", {where}. No set that was tried did surely better in training"
     else:
@@ -109,7 +112,7 @@ def verdict(
     return [said, *_dearer(best, last), *_why_not(main, best, rows, obstacle, worth)]
 
 
-def _at(row: ComparisonRow) -> str:
+def error_and_cost(row: ComparisonRow) -> str:
     """The error of a mode, and what it costs."""
     return f"{row.rte:.3f} %" + (f" at {row.cpu_ms:.1f} ms a scan" if row.cpu_ms else "")
 
@@ -166,11 +169,11 @@ def _why_not(
     if _is_yardstick(main):
         return ["Adapting kept the fixed set."]
     ratio = _to(main, best)
-    cost = _for_cost(main, best)
-    has = f"{ratio.value:.2f} times its error ({_interval(ratio)}){cost}"
+    sure = "" if ratio.interval is None else f" ({_interval(ratio)})"
+    has = f"{ratio.value:.2f} times its error{sure}{_for_cost(main, best)}"
     if ratio.value <= 1.0 - worth:
         more = "drive more test recordings, or longer ones, to know"
-        return [f"Adapting had {has}, which may be chance: {more}."]
+        return [f"Adapting had {has}; that may be chance: {more}."]
     if ratio.value <= 1.0:
         what = "is not worth its cost"
     else:

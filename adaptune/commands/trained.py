@@ -32,7 +32,8 @@ def show_front(rows: Sequence[Mapping[str, Any]], title: str, caption: str) -> N
 BUYS = (
     "What CPU time buys, in training",
     "The arrow marks what is recommended: of what costs no more than the baseline, or than the "
-    "budget, the best, if it is surely better than the baseline.",
+    "budget, the best, if it is better than the baseline by a standard error (by two, of a single "
+    "recording).",
 )
 
 

@@ -64,7 +64,7 @@ def test_a_gain_that_may_be_chance_is_not_advised(interval):
     first, second = verdict(rows, 10.0)
     assert first.startswith("Drive the fixed set: ")
     assert second.endswith(
-        "which may be chance: drive more test recordings, or longer ones, to know."
+        "that may be chance: drive more test recordings, or longer ones, to know."
     )
 
 
