@@ -1,17 +1,15 @@
 """What the health check hides: drives of whole recordings without it."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 
 import numpy as np
 
-from adaptune.archive import Archive, summarise
+from adaptune.archive import Archive
 from adaptune.model.rules import BASELINE
 from offline.campaign import WholeDrives, read_whole_drives
-from offline.choice import PER_BLOCK, BlockErrors, surely_worse
-from offline.config import OfflineConfig, OfflineStudyConfig
-from offline.labelled import LabelledData, block_means, stretches, with_whole_drives
-from offline.objective import weighted
+from offline.choice import BlockErrors, surely_worse
+from offline.config import OfflineConfig
+from offline.labelled import LabelledData, with_whole_drives
 
 
 def bare_blocks(data: LabelledData, archive: Archive, config: OfflineConfig) -> BlockErrors | None:
@@ -23,28 +21,13 @@ def bare_blocks(data: LabelledData, archive: Archive, config: OfflineConfig) -> 
     bare = read_whole_drives(archive, names, asked, bare=True)
     if not any(bare.values()):
         return None
-    known = sorted(set.intersection(*map(set, read_whole_drives(archive, names, asked).values())))
-    errors = []
-    for s in data.sequences:
-        drives = [archive.read(s.name, n, whole=True, bare=n in bare[s.name]) for n in known]
-        if s.values is not None:
-            values = [weighted(config.objective, summarise(drive).metrics) for drive in drives]
-            errors.append(np.array([values]))
-            continue
-        of_frames = np.stack([drive.errors for drive in drives], axis=1)
-        frames = np.flatnonzero(~np.isnan(of_frames).any(axis=1))
-        everywhere = replace(s.simulation, T_ref_counted=s.simulation.T_ref_sensor)
-        block = stretches(everywhere, frames, PER_BLOCK)
-        errors.append(block_means(of_frames[frames], block))
-    number = np.repeat(np.arange(len(errors)), [len(of) for of in errors])
-    none = np.zeros(len(known))
-    return BlockErrors(known, np.concatenate(errors), number, none, none)
+    return with_whole_drives(data, archive, config, bare).whole_blocks(asked)
 
 
 def in_whole_drives(
     data: LabelledData,
     archive: Archive,
-    config: OfflineStudyConfig,
+    config: OfflineConfig,
     drive: Callable[[LabelledData], object] = lambda _: None,
 ) -> LabelledData:
     """The same with the drives of finalists along whole recordings, see `with_whole_drives`.
@@ -55,7 +38,7 @@ def in_whole_drives(
     while True:
         drive(data)
         driven = with_whole_drives(data, archive, config)
-        blocks = bare_blocks(driven, archive, config.offline)
+        blocks = bare_blocks(driven, archive, config)
         worse = [] if blocks is None else np.array(blocks.trials)[surely_worse(blocks)].tolist()
         if not worse:
             return driven

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, lru_cache, partial
+from types import MappingProxyType
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -46,7 +47,7 @@ from offline.choice import (
     choose,
     finalists,
 )
-from offline.config import OfflineStudyConfig
+from offline.config import OfflineConfig, OfflineStudyConfig
 from offline.objective import weighted
 
 if TYPE_CHECKING:
@@ -441,7 +442,7 @@ class LabelledData(NamedTuple):
     def whole_blocks(self, trials: Collection[int]) -> BlockErrors:
         """What drives of whole recordings say, of those of some sets that have made them."""
         whole = [s.whole for s in self.sequences if s.whole is not None]
-        if not (known := [n for n in self.driven if n in trials]):
+        if not (known := [n for n in self.driven if n in trials and n in self.sets]):
             return self.blocks().some(list(trials))
         return self._blocks(whole, self.driven).some(known)
 
@@ -559,30 +560,35 @@ def labelled_data(
 
 
 def with_whole_drives(
-    data: LabelledData, archive: Archive, config: OfflineStudyConfig
+    data: LabelledData,
+    archive: Archive,
+    config: OfflineConfig,
+    bare: Mapping[str, Collection[int]] = MappingProxyType({}),
 ) -> LabelledData:
-    """The same with the drives of whole recordings that there are of finalists."""
+    """The same with the drives of whole recordings that there are of finalists.
+
+    Of those that are named in `bare`, by sequence, without the health check.
+    """
     asked = [*data.finalists(), *data.sets.defaults]
     drives = read_whole_drives(archive, [s.name for s in data.sequences], asked)
     if not (known := sorted(set.intersection(*map(set, drives.values())))):
         return data
-    sequences = [
-        replace(s, whole=_whole(s, [archive.read(s.name, n, whole=True) for n in known], config))
-        for s in data.sequences
-    ]
+    sequences = []
+    for s in data.sequences:
+        without = bare.get(s.name, ())
+        trials = [archive.read(s.name, n, whole=True, bare=n in without) for n in known]
+        sequences.append(replace(s, whole=_whole(s, trials, config)))
     return data._replace(sequences=sequences, driven=known)
 
 
-def _whole(
-    s: LabelledSequence, trials: Sequence[Trial], config: OfflineStudyConfig
-) -> LabelledSequence:
+def _whole(s: LabelledSequence, trials: Sequence[Trial], config: OfflineConfig) -> LabelledSequence:
     T_ref_sensor, length = s.simulation.T_ref_sensor, s.simulation.length
     everywhere = replace(s.simulation, T_ref_counted=T_ref_sensor)
     errors = np.stack([trial.errors for trial in trials], axis=1).astype(np.float32)
     turns = [sub_trajectory_turns(T_ref_sensor, trial.T_odom_sensor, length) for trial in trials]
     frames = np.flatnonzero(~np.isnan(errors).any(axis=1))
     block, drives = stretches(everywhere, frames, PER_BLOCK), [summarise(trial) for trial in trials]
-    values = [weighted(config.offline.objective, drive.metrics) for drive in drives]
+    values = [weighted(config.objective, drive.metrics) for drive in drives]
     return replace(
         s,
         simulation=everywhere,

@@ -126,7 +126,7 @@ def train(study: OfflineStudy, progress: Progress = unseen, cluster: str | None 
             sets = {n: verdicts[n].parameters for n in sorted(asked)}
             return drive_whole(study, sets, archive, workers, progress)
 
-        usable = in_whole_drives(data.usable(), archive, study.config, drive)
+        usable = in_whole_drives(data.usable(), archive, config, drive)
         whole = drive(usable)
     fixed = usable.fixed()
     model = _fitted(study, data, with_vectors(usable, archive), finished, fixed)

@@ -355,7 +355,7 @@ def _labelled(study: OfflineStudy, model: ErrorModel) -> LabelledData:
     archive, of = Archive(study.folder / "trials"), study.sequences.recorded_in
     about = (model.sequences, model.sets, study.config, study.window, of, study.odometry)
     data = labelled_data(archive, *about).usable()
-    return with_vectors(in_whole_drives(data, archive, study.config), archive)
+    return with_vectors(in_whole_drives(data, archive, study.config.offline), archive)
 
 
 def _rows(validation: Validation) -> list[dict[str, Any]]:

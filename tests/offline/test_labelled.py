@@ -41,6 +41,9 @@ def test_drives_of_whole_recordings_decide_where_there_are_some():
     assert in_whole(data, {0: 3.0, 2: 1.0, 5: 3.0}, {0: 3.0, 2: 1.0, 5: 2.0}).fixed() == 2
     # Those that are not driven are not chosen.
     assert in_whole(data, {0: 3.0, 2: 4.0}, {0: 3.0, 2: 4.0}).fixed() == 0
+    # Nor are those that are no more among the sets.
+    all_driven = in_whole(data, {0: 3.0, 2: 1.0, 5: 2.0}, {0: 3.0, 2: 1.0, 5: 2.0})
+    assert (all_driven.fixed(), all_driven.subset([0, 5]).fixed()) == (2, 5)
     # With a sequence left out, the drives on the others decide.
     both = in_whole(data, {0: 3.0, 2: 1.0, 5: 3.0}, {0: 3.0, 2: 2.0, 5: 1.0})
     (_, without_first), (_, without_second) = both.folds(by_recording=True)
