@@ -22,12 +22,15 @@ MIN_INLIERS = 0.35
 """Least share of points near a point of the other scan; a registration with fewer is rejected."""
 DEGENERATE = 0.002
 """A direction is unknown if its information is less than this share of the best direction's."""
-_CELL, _NEIGHBOURS, _MIN_RANGE = 0.25, 20, 1.0
+_MIN_RANGE = 1.0
 _MIN_POINTS = 100
 """Points; small_gicp crashes on an empty target, and three points always converge."""
 REACHES, OFFLINE_REACHES = (1.0,), (2.0, 0.5)
 """Metres of the greatest distance of correspondences, one registration after the other; the second
 where there is time for two."""
+CLOUD, OFFLINE_CLOUD = (0.5, 10), (0.25, 20)
+"""Metres between points of a cloud, and neighbours that give a point's covariance; the second where
+there is time for it."""
 _ITERATIONS = 20
 _OF_A_PLANE = 0.5
 """Information that small_gicp ascribes to a pair of points along their plane; there is none."""
@@ -75,8 +78,15 @@ class HopCloud:
     next one where that is known, which took so many seconds; 0 for no compensation.
     """
 
-    def __init__(self, scan: Scan, T_previous_current: Poses, seconds: float):
+    def __init__(
+        self,
+        scan: Scan,
+        T_previous_current: Poses,
+        seconds: float,
+        fineness: tuple[float, int] = CLOUD,
+    ):
         self._scan: Scan | None = scan
+        self._fineness = fineness
         self._motion = T_previous_current, seconds
         self._cloud: Any = None
 
@@ -93,11 +103,13 @@ class HopCloud:
     def prepared(self) -> Any:
         """Cloud with covariances, and its tree; None if there are too few points."""
         if self._scan is not None:
-            self._cloud, self._scan = _prepare(self._scan, *self._motion), None
+            self._cloud, self._scan = _prepare(self._scan, *self._motion, self._fineness), None
         return self._cloud
 
 
-def _prepare(scan: Scan, T_previous_current: Poses, seconds: float) -> Any:
+def _prepare(
+    scan: Scan, T_previous_current: Poses, seconds: float, fineness: tuple[float, int]
+) -> Any:
     import small_gicp  # takes long to import
 
     if seconds > 0.0:
@@ -105,8 +117,9 @@ def _prepare(scan: Scan, T_previous_current: Poses, seconds: float) -> Any:
     points = scan.points[squared_ranges(scan.points) >= _MIN_RANGE**2].astype(np.float64)
     if len(points) < _MIN_POINTS:
         return None
+    cell, neighbours = fineness
     cloud, tree = small_gicp.preprocess_points(
-        points, downsampling_resolution=_CELL, num_neighbors=_NEIGHBOURS, num_threads=1
+        points, downsampling_resolution=cell, num_neighbors=neighbours, num_threads=1
     )
     return (cloud, tree) if cloud.size() >= _MIN_POINTS else None
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from adaptune.bank.bank import Bank
 from adaptune.geometry import Poses, invert, rectify, rotation_angle, steps
-from adaptune.live.hops import OFFLINE_REACHES, Hop, HopCloud, register
+from adaptune.live.hops import OFFLINE_CLOUD, OFFLINE_REACHES, Hop, HopCloud, register
 from adaptune.metrics import travelled
 from adaptune.odometry.base import InProcess
 from adaptune.odometry.registry import odometry_class
@@ -196,7 +196,7 @@ class _Registering:
             if soon and not last:
                 return
             metres = before.metres + way
-        cloud = HopCloud(scan, T_current_next, seconds)
+        cloud = HopCloud(scan, T_current_next, seconds, OFFLINE_CLOUD)
         end = _Anchor(number, scan.stamp, metres, cloud, self._tracks.copy())
         for start in self._starts(metres):
             self.guesses += self._tries(start, end)
@@ -394,7 +394,7 @@ def closed(scans: Iterable[Scan], wanted: Sequence[Loop], T_world_sensor: Poses)
     for number, scan in enumerate(scans):
         if last is not None and number - 1 in numbers:
             seconds = (scan.stamp - last.stamp) * 1e-9
-            cloud = clouds[number - 1] = HopCloud(last, motions[number - 1], seconds)
+            cloud = clouds[number - 1] = HopCloud(last, motions[number - 1], seconds, OFFLINE_CLOUD)
             _ = cloud.prepared  # the scan itself is not kept
         last = scan
     metres, edges = travelled(T_world_sensor), []

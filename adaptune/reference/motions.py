@@ -6,7 +6,7 @@ from itertools import islice
 import numpy as np
 
 from adaptune.geometry import Poses, invert, rotation_angle
-from adaptune.live.hops import OFFLINE_REACHES, Hop, HopCloud, Hops, register
+from adaptune.live.hops import OFFLINE_CLOUD, OFFLINE_REACHES, Hop, HopCloud, Hops, register
 from adaptune.recording.compensation import neighbour_motions
 from adaptune.recording.scan import Scan
 
@@ -67,7 +67,8 @@ def _motions_over(stretch: list[Scan]) -> Iterator[tuple[int, int, Hop]]:
         if i and step is None:
             break
         T.append(np.eye(4) if step is None else T[-1] @ step)
-        clouds.append(HopCloud(scan, np.eye(4) if step is None else step, seconds if i else 0.0))
+        motion = np.eye(4) if step is None else step
+        clouds.append(HopCloud(scan, motion, seconds if i else 0.0, OFFLINE_CLOUD))
         if i == 1 and step is not None:
             clouds[0].moved(step, seconds)
         while start < i:
