@@ -79,9 +79,8 @@ def geometric(data: LabelledData) -> int:
 
 
 def model_of(odometry: str, data: LabelledData) -> ErrorModel:
-    """The error model, with the settings of the paired rule chosen on the same sequences."""
-    model = fit(data, data.fixed(), factory_of(odometry).identity, 25.0, WINDOW, {})
-    return replace(model, paired=choose(data, 0).one_set)
+    """The error model."""
+    return fit(data, data.fixed(), factory_of(odometry).identity, 25.0, WINDOW, {})
 
 
 def untrained(factory: OdometryFactory) -> Way:
@@ -95,7 +94,7 @@ def bank_of(
     data: LabelledData, model: ErrorModel, factory: OdometryFactory, size: int
 ) -> tuple[Policy, Way]:
     """A bank that is chosen on sequences, and what chose it."""
-    chosen = choose(data._replace(live=False), size)
+    chosen = choose(data, size)
     members = {trial: model.sets[trial] for trial in chosen.members}
     of_bank = replace(
         model,
@@ -110,7 +109,6 @@ def bank_of(
 def ways(odometry: str, data: LabelledData, modes: Sequence[str]) -> dict[str, Way]:
     """Ways to replay a course, by name."""
     model = model_of(odometry, data)
-    print(f"settings of the paired rule: {model.paired}")
     factory, sets = factory_of(odometry), model.sets
 
     def alone(trial: int | None) -> Way:

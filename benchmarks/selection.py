@@ -32,7 +32,7 @@ from adaptune.model import (
     BankRule,
     BankSettings,
     ErrorModel,
-    PairedExpectedRatio,
+    FixedSet,
     Rule,
     TrainingData,
 )
@@ -213,7 +213,7 @@ def draw_growth(path: Path, n_sets: int = 64, n_sequences: int = 16) -> None:
             0,
         )
         asked = data.features[rng.integers(0, n, 100)] + 0.1
-        for name, rule in (("paper", NearestNeighbours()), ("adaptive", PairedExpectedRatio())):
+        for name, rule in (("paper", NearestNeighbours()), ("adaptive", FixedSet())):
             rule.fit(data)
             costs(rule.select, asked[:5])
             medians[name].append(float(np.median(costs(rule.select, asked)[1])))
@@ -235,7 +235,7 @@ def main(png: Path | None) -> None:
         print("\n1536 sets, the same for all sequences")
         model = measure_file(kitti_size(0, own_sets=False), Path(folder))
         measure_selection(model, "paper", NearestNeighbours(), "limits: median 1, 99 % 5")
-        measure_selection(model, "adaptive", PairedExpectedRatio(), "limit: median 5")
+        measure_selection(model, "adaptive", FixedSet(), "limit: median 5")
         bank = BankRule(BankSettings(n_frames=BANK_FRAMES))
         measure_selection(model, "bank", bank, "limit: median 5", model.bank)
     if png is not None:

@@ -16,7 +16,6 @@ from adaptune.odometry.tracker import Tracker
 from adaptune.progress import Progress, unseen
 from adaptune.recording.scan import Recording
 from adaptune.space import in_words
-from adaptune.study.study import BANK
 from offline.choice import (
     MOST_OF_PERIOD,
     BlockErrors,
@@ -50,7 +49,7 @@ def front_rows(data: LabelledData, model: ErrorModel) -> list[dict[str, Any]]:
         rows.append(_front_row(what, data.costs.alone(trial), blocks, ratio))
         rows[-1] |= {"parameters": in_words(data.sets[trial]), "trial": trial}
     members = [trial for trial in model.bank if trial not in model.reserve]
-    if (of_bank := model.expected.get(BANK)) and len(members) > 1:
+    if (of_bank := model.expected) and len(members) > 1:
         by = (of_bank["geometric"], of_bank["low"], of_bank["high"])
         value, low, high = np.multiply(ratio_to_baseline(blocks, model.fixed), by).tolist()
         what, cost = f"bank of {len(members)}", data.costs.adaptive(members)

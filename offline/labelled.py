@@ -367,7 +367,6 @@ class LabelledData(NamedTuple):
     # Milliseconds of CPU time a scan that may be spent, live evidence included.
     budget: float | None = None
     worth: float = WORTH  # share of the error that a bank has to spare
-    live: bool = True  # whether the odometry changes from one set to another between scans
     driven: Sequence[int] = ()  # finalists: trial numbers, the columns of drives of the whole
 
     def subset(self, trials: Sequence[int]) -> "LabelledData":
@@ -555,8 +554,7 @@ def labelled_data(
             )
         read[name] = _labelled(archive, name, sets, config, window, recorded_in(name))
     costs, online = measured_costs(archive, names, sets, odometry), config.online
-    live = odometry.description.live
-    return LabelledData(list(read.values()), sets, costs, online.budget, online.worth, live)
+    return LabelledData(list(read.values()), sets, costs, online.budget, online.worth)
 
 
 def with_whole_drives(

@@ -51,7 +51,7 @@ from offline.objective import (
     label,
 )
 from offline.search import BUDGETS, Finished
-from offline.tuning import DO_NOT_ADAPT, NO_BANK, choose, driven_cost, reserve, rivals
+from offline.tuning import NO_BANK, choose, driven_cost, reserve, rivals
 from offline.workers import Cluster, Workers, spare_memory
 
 _log = logging.getLogger(__name__)
@@ -324,7 +324,6 @@ def fit(
         elevations=[s.elevation for s in sequences],
         provenance=provenance,
         stretch=np.concatenate([s.stretch for s in sequences]),
-        paired=DO_NOT_ADAPT,
         bank_settings=NO_BANK,
         budget=data.budget,
         worth=data.worth,
@@ -333,22 +332,20 @@ def fit(
 
 
 def tuned(model: ErrorModel, usable: LabelledData, switching: SwitchingConfig) -> ErrorModel:
-    """Choose what is driven: the rule's settings, the bank and those of its weights."""
+    """Choose what is driven: the fixed set, or a bank, and the settings of its weights."""
     chosen = choose(usable, switching.size, fixed=model.fixed)
     members = chosen.members or [model.fixed]
     besides = reserve(members, usable)
     members = [*members, *besides]
     return replace(
         model,
-        paired=chosen.one_set,
         bank=members,
         vectors=usable.vectors(members),
         bank_settings=chosen.bank.model_copy(update={"reserve": len(besides)}),
         # As they are read back, so that the same model is the same file.
-        expected={
-            way: {key: float(value) for key, value in figures._asdict().items()}
-            for way, figures in chosen.expected.items()
-        },
+        expected={}
+        if chosen.expected is None
+        else {key: float(value) for key, value in chosen.expected._asdict().items()},
         rivals=rivals(usable, driven_cost(usable, chosen, model.fixed)),
     )
 

@@ -1,6 +1,6 @@
-"""Choice of what is driven: the fixed set, one set at a time, or a bank, and with what settings.
+"""Choice of what is driven: the fixed set, or a bank, and with what settings.
 
-All are compared by their expected loss on evidence that is left out, see `expected_loss`.
+They are compared by their expected loss on evidence that is left out, see `expected_loss`.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from adaptune.metrics import cap, worst_tenth
-from adaptune.model import BankRule, BankSettings, PairedExpectedRatio, PairedSettings, TrainingData
+from adaptune.model import BankRule, BankSettings, TrainingData
 from adaptune.model.rules import BASELINE, ERROR_FLOOR, Spending, complementary, mean_errors
 from adaptune.model.weights import (
     MEMBER_POOL_SIZE,
@@ -23,11 +23,9 @@ from adaptune.model.weights import (
     smooth_weights,
 )
 from adaptune.study.study import (
-    BANK,
     BEST_DEFAULT,
     EQUAL_COST,
     MIN_RECORDINGS,
-    ONE_SET,
     is_worth,
 )
 from offline.choice import choose as choose_fixed
@@ -139,12 +137,6 @@ def figures(logs: Logs, recordings: Sequence[str]) -> Figures:
     return Figures(loss, geometric, low, high, tenth, worst, len(logs), n_recordings)
 
 
-PAIRED_SETTINGS = [
-    PairedSettings(n_sets=n_sets, sharpness=sharpness)
-    for n_sets in (2, 3, 5)
-    for sharpness in (6.0, 12.0, 24.0, 48.0)
-]
-"""One set at a time is driven with one of these; of equally good ones the first."""
 BANK_FRAMES = 1000
 """Nearest frames of each stretch in a bank: products of errors need more frames than means do."""
 BANK_SETTINGS = [
@@ -162,7 +154,6 @@ MOST_FOLDS = 12
 """So many folds at most compare ways to adapt where evidence is left out already."""
 ROUNDING = 1e-6
 """A smaller loss, or gain, is one of rounding."""
-DO_NOT_ADAPT = PairedSettings(adapt=False)
 NO_BANK = BankSettings(adapt=False)
 
 Chooser = Callable[[LabelledData, int], list[int]]
@@ -172,12 +163,10 @@ Chooser = Callable[[LabelledData, int], list[int]]
 class Policy(NamedTuple):
     """What is driven."""
 
-    one_set: PairedSettings  # adapts if that has less expected loss than the fixed set
-    bank: BankSettings  # adapts if that has the least expected loss of all, and is worth its cost
+    bank: BankSettings  # adapts if that has less expected loss, and is worth its cost
     members: list[int]  # of the bank; trial numbers, the fixed set's first
-    # By `BANK` and `ONE_SET`, what is expected with the best settings; empty where there is too
-    # little to compare.
-    expected: dict[str, Figures]
+    # What is expected of a bank with the best settings; None where there is too little to compare.
+    expected: Figures | None
 
 
 def choose(
@@ -207,8 +196,6 @@ def choose(
         folds = [folds[i] for i in np.linspace(0, len(folds) - 1, most).round().astype(int)]
     fixed = data.fixed() if fixed is None else fixed
     spending = data.spending
-    # Whether the budget allows live evidence beside the fixed set.
-    one_set = data.live and (spending is None or spending.allows([fixed]))
     made = [(make, make(data, fixed)) for make in _choosers(bank, spending)]
     choosers = [make for make, members in made if len(members) > 1]
     banks = [members for _, members in made if len(members) > 1]
@@ -217,28 +204,22 @@ def choose(
     # The matrices are small: more threads would mostly wait for each other.
     with threadpool_limits(1, "blas"):
         for left_out, others in folds:
-            logs.append(_logs(left_out, others, choosers, one_set))
+            logs.append(_logs(left_out, others, choosers))
             recordings += [left_out.recording] * len(logs[-1])
     if len(recordings) < 2 or not logs[0].shape[1]:
         # The bank rests, and joins in where it measures that the fixed set fails.
-        return Policy(DO_NOT_ADAPT, NO_BANK, banks[0] if banks else [], {})
-    n_single = len(PAIRED_SETTINGS) if one_set else 0
-    return least_loss(np.concatenate(logs), recordings, banks, n_single, data.worth)
+        return Policy(NO_BANK, banks[0] if banks else [], None)
+    return least_loss(np.concatenate(logs), recordings, banks, data.worth)
 
 
 def least_loss(
-    logs: NDArray[np.float64],
-    recordings: Sequence[str],
-    banks: Sequence[list[int]],
-    n_single: int,
-    worth: float,
+    logs: NDArray[np.float64], recordings: Sequence[str], banks: Sequence[list[int]], worth: float
 ) -> Policy:
-    """The settings with the least loss, of one set at a time and of a bank.
+    """The bank, and its settings, with the least loss.
 
-    `logs` is of shape (n_stretches, n_single + len(banks) * len(BANK_SETTINGS), 2); its first
-    `n_single` columns are about one set at a time, the others about banks, each with the best set
-    that costs no more. `banks` has the members of each, `worth` the share of the error that a bank
-    has to spare of what such a set has.
+    `logs` is of shape (n_stretches, len(banks) * len(BANK_SETTINGS), 2): of each bank, and of the
+    best set that costs no more. `banks` has the members of each, `worth` the share of the error
+    that a bank has to spare of what such a set has.
     """
     logs, of_rivals = logs[..., 0], logs[..., 1]
     # What does not beat the set that costs as much has no merit.
@@ -249,24 +230,14 @@ def least_loss(
         ]
     )
     losses[~(np.abs(losses) > ROUNDING)] = 0.0
-    expected: dict[str, Figures] = {}
-    one_set, bank, members = DO_NOT_ADAPT, NO_BANK, banks[0] if banks else []
-    if n_single:
-        best = int(np.argmin(losses[:n_single]))
-        expected[ONE_SET] = figures(logs[:, best], recordings)
-        if losses[best] < 0.0:
-            one_set = PAIRED_SETTINGS[best]
-    if banks:
-        best = n_single + int(np.argmin(losses[n_single:]))
-        expected[BANK] = figures(logs[:, best], recordings)
-        way, which = divmod(best - n_single, len(BANK_SETTINGS))
-        members = banks[way]
-        rival = figures(logs[:, best] - of_rivals[:, best], recordings)
-        of_both = rival, expected[BANK]
-        spares = all(is_worth(one.geometric, one.high, worth) for one in of_both)
-        if spares and losses[best] < min(0.0, losses[:n_single].min(initial=0.0)):
-            bank = BANK_SETTINGS[which]
-    return Policy(one_set, bank, members, expected)
+    best = int(np.argmin(losses))
+    way, which = divmod(best, len(BANK_SETTINGS))
+    expected = figures(logs[:, best], recordings)
+    rival = figures(logs[:, best] - of_rivals[:, best], recordings)
+    adapts = losses[best] < 0.0 and all(
+        is_worth(one.geometric, one.high, worth) for one in (rival, expected)
+    )
+    return Policy(BANK_SETTINGS[which] if adapts else NO_BANK, banks[way], expected)
 
 
 def _choosers(bank: int, spending: Spending | None) -> list[Chooser]:
@@ -281,13 +252,11 @@ def _logs(
     left_out: LabelledSequence,
     others: LabelledData,
     choosers: Sequence[Chooser],
-    one_set: bool,
 ) -> NDArray[np.float64]:
     """Logarithms of ratios to the fixed set's error, on a fold.
 
-    Returns shape (n_stretches, n_ways, 2): first those of one set at a time with each of
-    `PAIRED_SETTINGS`, then those of each bank with each of `BANK_SETTINGS`; each with that of the
-    best set that costs no more.
+    Returns shape (n_stretches, n_ways, 2): those of each bank with each of `BANK_SETTINGS`, each
+    with that of the best set that costs no more.
     """
     fitted = others.training_data()
     data, _ = fitted
@@ -299,8 +268,6 @@ def _logs(
         return capped[:, data.sets.column(trial)]
 
     pairs = []
-    for errors, cost in _paired_errors(left_out, others, fitted) if one_set else ():
-        pairs.append((errors, rival(cost)))
     known: dict[tuple[int, ...], list[NDArray[np.float64]]] = {}
     for make in choosers:
         found = make(others, data.fixed)
@@ -350,27 +317,6 @@ def bank_errors(
         # Who agrees takes long to find, and hangs on the settings but little.
         agreeing = simulation.agreeing(smoothed) if agreeing is None else agreeing
         yield simulation.errors(smoothed, agreeing)[left_out.known], smoothed
-
-
-def _paired_errors(
-    left_out: LabelledSequence, others: LabelledData, fitted: tuple[TrainingData, "ScaledPCA"]
-) -> Iterator[tuple[NDArray[np.float64], float]]:
-    """Capped errors of one set at a time with each of `PAIRED_SETTINGS`, and its mean cost."""
-    data, pca = fitted
-    most = max(settings.n_sets for settings in PAIRED_SETTINGS)
-    rule = PairedExpectedRatio(PairedSettings(n_sets=most)).fit(data)
-    first, period = periods(left_out.period)
-    near = rule.near(pca.transform(left_out.descriptors[first]))
-    capped = cap(left_out.errors)
-    for settings in PAIRED_SETTINGS:
-        # The complementary sets are chosen one after the other: the first of them are those of
-        # fewer sets.
-        few = near._replace(errors=near.errors[..., : settings.n_sets])
-        trials = rule.choices(few, settings.sharpness)
-        costs = [others.costs.alone(trial) for trial in trials]
-        chosen = data.sets.columns(trials)
-        cost = float(np.mean(costs)) + others.costs.evidence
-        yield capped[np.arange(len(capped)), chosen[period]], cost
 
 
 def cancelling_members(
@@ -432,10 +378,6 @@ def driven_cost(data: LabelledData, policy: Policy, fixed: int) -> float:
     """Milliseconds of CPU time a scan that a policy costs; NaN if it is unknown."""
     if policy.bank.adapt:
         return data.costs.adaptive(policy.members)
-    if policy.one_set.adapt:
-        of_rule, _ = data.training_data()
-        few = complementary(of_rule, policy.one_set.n_sets)
-        return max(data.costs.adaptive([trial]) for trial in few)
     return data.costs.alone(fixed)
 
 

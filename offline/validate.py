@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from adaptune.archive import Archive
 from adaptune.errors import AdaptuneError
 from adaptune.metrics import bootstrap, cap
-from adaptune.model import ErrorModel, ModelError, PairedExpectedRatio
+from adaptune.model import ErrorModel, ModelError
 from adaptune.model.registry import ADAPTIVE, RULES, rule_class
 from adaptune.model.rules import BASELINE, ERROR_FLOOR
 from adaptune.progress import Progress, unseen
@@ -24,7 +24,6 @@ from adaptune.report.drawing import draw_chart
 from adaptune.study.references import estimates_in_words, estimates_of
 from adaptune.study.study import (
     MIN_RECORDINGS,
-    ONE_SET,
     PER_STRETCH,
     RIVAL_WORDS,
     RIVALS,
@@ -159,19 +158,17 @@ class Validation:
 
     def verdict(self, rule: str) -> str:
         """What to expect of a rule, in a sentence."""
-        # One set at a time is a mode of its own where a bank was simulated.
-        bank = rule == ADAPTIVE and ONE_SET in self.ratios
-        what = f"`{rule}`, with the bank where that is best" if bank else f"`{rule}`"
         expected = expected_in_words(self.figures(rule)._asdict())
         share = 100 * np.mean([left_out.adapted.get(rule, 0.0) for left_out in self.left_out])
         if not share:
             return (
-                f"{what} kept the fixed set wherever something was left out: the rest did not show "
-                f"less expected loss; so there is no estimate of it."
+                f"`{rule}` kept the fixed set wherever something was left out: the rest did not "
+                f"show less expected loss; so there is no estimate of it."
             )
-        if bank:
-            return f"{what}: {expected}, with {share:.0f} % of the weight on other sets than fixed."
-        return f"{what}: {expected}, adapting {share:.0f} % of the time."
+        how = f"adapting {share:.0f} % of the time"
+        if rule == ADAPTIVE:
+            how = f"with {share:.0f} % of the weight on other sets than fixed"
+        return f"`{rule}`: {expected}, {how}."
 
     def against_rivals(self) -> list[str]:
         """How `ADAPTIVE` compares with its rivals, a sentence for each."""
@@ -249,19 +246,14 @@ def leave_out(
     errors, adapted = {"baseline": capped[:, data.sets.column(BASELINE)], "fixed": fixed}, {}
     chosen = choose(others, bank, by_recording, MOST_FOLDS)
     alone, costs = others.costs.alone, dict[str, float]()
-    one_at_a_time = {name: rule_class(name)() for name in rules if name != ADAPTIVE}
-    for name, rule in ({ONE_SET: PairedExpectedRatio(chosen.one_set)} | one_at_a_time).items():
-        rule.fit(data)
+    for name in (name for name in rules if name != ADAPTIVE):
+        rule = rule_class(name)().fit(data)
         trials = [rule.select(features[i]).trial for i in first]
         errors[name] = capped[frames, data.sets.columns(trials)[period]]
         adapted[name] = float(np.mean([trial != data.fixed for trial in trials]))
         costs[name] = float(np.mean([alone(trial) for trial in trials]))
-    # Where a bank does not have the least loss, one set at a time is driven, or the fixed one.
-    errors[ADAPTIVE], adapted[ADAPTIVE] = errors[ONE_SET], adapted[ONE_SET]
-    if not bank:
-        for of in (errors, adapted, costs):
-            del of[ONE_SET]
-    if bank and chosen.bank.adapt:
+    errors[ADAPTIVE], adapted[ADAPTIVE] = fixed, 0.0
+    if chosen.bank.adapt:
         simulated = bank_errors(sequence, others, fitted, chosen.members, [chosen.bank])
         errors[ADAPTIVE], weights = next(simulated)
         adapted[ADAPTIVE] = float(1.0 - weights.weights[:, 0].mean())

@@ -25,7 +25,7 @@ from typer.main import get_command
 
 from adaptune import yaml12
 from adaptune.commands.cli import app
-from adaptune.model import BankSettings, PairedSettings
+from adaptune.model import BankSettings
 from adaptune.odometry.registry import declare_here
 from adaptune.recording import SequenceConfig
 from adaptune.strict import ConfigurationError
@@ -233,8 +233,10 @@ def test_the_readme_s_example_is_what_adaptune_online_does(folder):
     last = "    T_odom_sensor = tracker.register(scan).T_odom_sensor\n"
     assert last in example
     for bank in (True, False):
-        settings = BankSettings() if bank else BankSettings(adapt=False)
-        replace(model, paired=PairedSettings(), bank_settings=settings).save(study.model_path)
+        n = len(model.bank) if bank else 1
+        settings = BankSettings(adapt=bank)
+        one = replace(model, bank=model.bank[:n], vectors=model.vectors[:, :n])
+        replace(one, bank_settings=settings).save(study.model_path)
         run_replays(study, study.model_path)
         poses = []
         exec(example.replace(last, last + "    poses.append(T_odom_sensor)\n"), {"poses": poses})

@@ -49,6 +49,17 @@ HOP_ERROR = 0.05
 """Metres by which a hop itself is wrong where registrations are worst, as among plants."""
 HIDDEN = 0.0075
 """Metres of an odometry's error that a hop may have, too, and so hide."""
+PREDICTED_WINDOWS = 2.0
+"""How many chains that do not overlap a prediction from training counts as."""
+DEVIATION, COMMON = 0.66, 0.1
+"""Standard deviation of the logarithm of one such chain's error, or of the prediction; and the part
+of its variance that all have in common."""
+LEAST = 0.01
+"""Percent; no odometry is better."""
+CONTRADICTED = 2.0
+"""A prediction does not count where the error is surely more than so many times as large."""
+FAMILIAR = 0.1
+"""A prediction counts less and less in places that are less familiar than this."""
 
 
 class OwnError(NamedTuple):
@@ -122,13 +133,8 @@ class OwnErrors:
         """The mean error over the last chains; None without any."""
         if not self._chains:
             return None
-        start, end, _, error, hops = np.array(self._chains).T
+        (start, end, error, hops), times = self._long_chains()
         reach = end - start
-        # Of a whole recording, the last chain may be a short one.
-        usual = float(reach.max() if self._whole else reach[-1])
-        long = reach >= MIN_REACH * min(self._length, usual)
-        start, end, reach, error, hops = (of[long] for of in (start, end, reach, error, hops))
-        times = max(1.0, self._length / float(reach.mean()))
         mean = times**GROWTH * float((100.0 * error / reach).mean())
         n = windows(start, end)
         # What no chain covers may be another sort of place.
@@ -140,6 +146,32 @@ class OwnErrors:
         of_a_metre = times**GROWTH * float((100.0 * np.sqrt(hops) / reach).mean())
         low = float(np.sqrt(max(0.0, mean**2 - (HOP_ERROR * of_a_metre) ** 2))) / factor
         return OwnError(mean, low, float(np.hypot(mean * factor, HIDDEN * of_a_metre)))
+
+    def estimate_with(self, predicted: float, share: float) -> OwnError | None:
+        """The mean error by the last chains, and by what training predicts, in percent.
+
+        Chains have outliers, so that their geometric mean is the better estimate. `share`, from 0
+        to 1, says how far the prediction counts. None without any chain.
+        """
+        if not self._chains:
+            return None
+        (start, end, error, _), times = self._long_chains()
+        measured = np.log(np.maximum(LEAST, times**GROWTH * 100.0 * error / (end - start))).mean()
+        n, prior = windows(start, end), PREDICTED_WINDOWS * share
+        mean = float(np.exp((n * measured + prior * np.log(max(LEAST, predicted))) / (n + prior)))
+        variance = DEVIATION**2 * (1.0 / (n + prior) + COMMON)
+        factor = float(np.exp(1.96 * np.sqrt(variance + (LOG_DEVIATION * np.log(times)) ** 2)))
+        return OwnError(mean, mean / factor, mean * factor)
+
+    def _long_chains(self) -> tuple[NDArray[np.float64], float]:
+        """Starts, ends, errors and hops of the long chains, and the length in theirs."""
+        start, end, _, error, hops = np.array(self._chains).T
+        reach = end - start
+        # Of a whole recording, the last chain may be a short one.
+        usual = float(reach.max() if self._whole else reach[-1])
+        long = reach >= MIN_REACH * min(self._length, usual)
+        times = max(1.0, self._length / float(reach[long].mean()))
+        return np.stack([start, end, error, hops])[:, long], times
 
 
 def _chain(links: deque[Link], length: float) -> _Chain:
@@ -499,11 +531,22 @@ class LiveEvidence:
         """The odometry's, or the bank's, own error over the last metres; None without any hop."""
         return self._own.estimate()
 
+    def _own_error_with(self, predicted: float, familiarity: float) -> OwnError | None:
+        """The same, with what training predicts where it knows the place."""
+        # Unknown where the training has one stretch.
+        share = 1.0 if np.isnan(familiarity) else min(1.0, familiarity / FAMILIAR)
+        alone = self.own_error()
+        if alone is None or not share or not alone.low <= CONTRADICTED * predicted:
+            return alone
+        return self._own.estimate_with(predicted, share)
+
     def estimated(self, selection: Selection) -> Selection:
         """A selection with what is measured."""
         selection = selection._replace(lost=self.lost, restart=self._told_to_restart())
         # Where registrations are rejected, the last chains are of before.
-        error = None if self._rejected >= HOPS_TO_BE_LOST else self.own_error()
+        if self._rejected >= HOPS_TO_BE_LOST:
+            return selection
+        error = self._own_error_with(selection.predicted_error, selection.familiarity)
         if error is None:
             return selection
         return selection._replace(

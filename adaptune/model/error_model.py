@@ -23,7 +23,6 @@ from adaptune.files import replacing
 from adaptune.model.descriptor import DESCRIPTORS
 from adaptune.model.rules import (
     Costs,
-    PairedSettings,
     TrainingData,
     allowed_sets,
     mean_errors,
@@ -37,7 +36,7 @@ from adaptune.strict import in_one_line
 if TYPE_CHECKING:
     from adaptune.model.knn import ScaledPCA
 
-FORMAT = 7
+FORMAT = 8
 """Raised whenever an older adaptune could not read the file, or would read it wrongly."""
 
 
@@ -117,12 +116,11 @@ class ErrorModel:
     # For each training sequence, degrees at which its scans' lowest points lie, see
     # `adaptune.model.descriptor.lowest_elevation`; empty if unknown.
     elevations: list[float] = field(default_factory=list)
-    # Both are chosen on the training sequences.
-    paired: PairedSettings = field(default_factory=PairedSettings)
+    # Chosen on the training sequences.
     bank_settings: BankSettings = field(default_factory=BankSettings)
-    # By way to adapt (`BANK`, `ONE_SET`) what was expected of it when it was chosen, see
-    # `offline.tuning.Figures`; empty where too little is known to compare.
-    expected: dict[str, dict[str, float]] = field(default_factory=dict)
+    # What was expected of a bank with these settings, see `offline.tuning.Figures`; empty where too
+    # little is known to compare.
+    expected: dict[str, float] = field(default_factory=dict)
     budget: float | None = None  # milliseconds of CPU time a scan, live evidence included
     # Share of the error that a bank had to spare to be driven; None if nobody asked.
     worth: float | None = None
@@ -152,7 +150,7 @@ class ErrorModel:
     @property
     def bank_rests(self) -> bool:
         """Whether the fixed set is driven, and the bank only where that may be wrong."""
-        return len(self.bank) > 1 and not self.bank_adapts and not self.paired.adapt
+        return len(self.bank) > 1 and not self.bank_adapts
 
     def pca(self) -> "ScaledPCA":
         """Principal components of the training frames' descriptors."""
@@ -232,7 +230,6 @@ class ErrorModel:
             "space": self.sets.space.definition(),
             "trials": self.sets.trials,
             "sets": self.sets.parameters,
-            "paired": self.paired.model_dump(),
             "bank_settings": self.bank_settings.model_dump(),
         } | {name: getattr(self, name) for name in (*plain, "bank", "budget", "worth")}
 
@@ -356,7 +353,7 @@ def _driven(model: ErrorModel) -> Iterator[str]:
     if model.bank_adapts:
         yield f"Driven: the bank of trials {', '.join(map(str, model.bank))}."
     else:
-        yield "Driven: one set at a time." if model.paired.adapt else "Driven: the fixed set."
+        yield "Driven: the fixed set."
     if (model.bank_adapts or model.bank_rests) and model.reserve:
         reserve = ", ".join(map(str, model.reserve))
         yield f"Members that work only in new places and after failures: {reserve}."

@@ -3,14 +3,13 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, NonNegativeFloat, PositiveInt
 
 from adaptune.live.hops import LiveSquares
-from adaptune.metrics import FAILURE, cap
+from adaptune.metrics import cap
 from adaptune.space import ParameterSets, Selection
 
 NOVEL_FAMILIARITY = 0.1
@@ -328,169 +327,52 @@ ERROR_FLOOR = 0.02
 """Percent, added to both errors of a ratio so that none is divided by zero."""
 BASELINE = 0
 """Trial number of the baseline; of several odometries, that of the first."""
-WIDTH = 0.12
-"""Standard deviation of the Gaussian over parameter sets, in the unit cube."""
 N_FRAMES = 300
 """Nearest frames of each sequence."""
-THRESHOLD = -0.1
-"""Logarithm of the ratio below which a set is preferred to the fixed one."""
-CAUTION = 0.5
-"""Standard errors, estimated from how much the sequences differ, that are added to a ratio."""
+SHARPNESS = 6.0
+"""How fast a sequence's weight falls with the distance of its nearest frames."""
 
 
-class PairedSettings(BaseModel):
-    """Settings of the paired rule."""
+class FixedSet(Rule):
+    """Keep the fixed set; where it does worse than predicted, the baseline may take its place.
 
-    # A file of another version may hold more.
-    model_config = ConfigDict(extra="ignore", frozen=True)
+    What is predicted of both is their mean error on the training frames nearest to the scan, of
+    each training sequence; the nearer these frames, the more a sequence weighs. The farther a scan
+    is from all training, the less the two differ. Of equals, the baseline is taken: in a place
+    unlike all training, it is the best guess there is.
 
-    adapt: bool = True  # if not, the rule keeps the fixed set as long as that does as predicted
-    # Number of complementary sets to choose among, the fixed one included. Candidates that the
-    # training data name come first.
-    n_sets: PositiveInt = 3
-    # How fast a sequence's weight falls with the distance of its nearest frames.
-    sharpness: Annotated[NonNegativeFloat, Field(allow_inf_nan=False)] = 6.0
-
-
-class Near(NamedTuple):
-    """Errors on the training frames nearest to some scans."""
-
-    evidence: Evidence
-    # (n_scans, n_sequences, n_candidates): mean error of every candidate, and of the baseline, in
-    # percent, mixed with that of its neighbours.
-    errors: NDArray[np.float64]
-    fixed: NDArray[np.float64]  # (n_scans, n_sequences): mean error of the fixed set
-
-
-class PairedExpectedRatio(Rule):
-    """Compare every set with the fixed one on the same frames, and choose by the expected ratio.
-
-    For each training sequence, the rule divides a set's mean error on the frames nearest to the
-    scan by the fixed set's on the same frames. Sequences are weighted by how near those frames
-    are, neighbouring sets share their evidence, and a set must promise enough to replace the fixed
-    one.
-
-    The rule chooses among sets that were run on every sequence, unless the data name candidates;
-    other sets count as neighbours. A sequence on which neither a set nor a close one was run does
-    not speak for it: its ratio counts as 1.
-
-    The farther a scan is from all training sequences, compared with how far these are from each
-    other, the more every ratio is drawn to 1. Beyond all of them the rule takes the fixed set.
-
-    Where a set does worse than predicted, what was measured of it counts instead. Then the baseline
-    is a candidate, too: in a place unlike all training, it is the best guess there is.
+    The baseline counts if it was run on every sequence, and the budget allows it.
     """
 
     gated = True
 
-    def __init__(self, settings: PairedSettings | None = None):
-        self.settings = settings or PairedSettings()
-
     def fit(self, data: TrainingData) -> Self:
         """See `Rule.fit`."""
         self.data_ = data
-        if not self.settings.adapt:
-            self.candidates_: tuple[int, ...] = (data.fixed,)
-        else:
-            self.candidates_ = data.candidates or tuple(complementary(data, self.settings.n_sets))
-        self._known = self._with_baseline()
-        self._fixed_at = self.candidates_.index(data.fixed)
-        self.fixed_errors_ = data.fixed_errors
-        self.errors_ = self._mixed_errors()
+        usable = np.isfinite(mean_errors(data.errors, data.sequence)) & data.allows()
+        has_baseline = BASELINE in data.sets and usable[data.sets.column(BASELINE)]
+        self.trials_ = list(dict.fromkeys([data.fixed, BASELINE] if has_baseline else [data.fixed]))
+        self.errors_ = cap(data.errors[:, data.sets.columns(self.trials_)])
         self.nearest_ = NearestFrames(N_FRAMES).fit(data.features, data.sequence)
         return self
 
-    def _with_baseline(self) -> tuple[int, ...]:
-        """The candidates, and behind them the baseline if it is none of them but may be chosen."""
-        data = self.data_
-        if BASELINE in self.candidates_ or BASELINE not in data.sets:
-            return self.candidates_
-        column = data.sets.column(BASELINE)
-        was_run = np.isfinite(mean_errors(data.errors[:, [column]], data.sequence)).all()
-        may_be = was_run and data.allows()[column]
-        return (*self.candidates_, BASELINE) if may_be else self.candidates_
-
-    def _mixed_errors(self) -> NDArray[np.float32]:
-        """Error of the candidates and the baseline on every frame, mixed with their neighbours'.
-
-        They are mixed before ratios are taken, for a ratio of means is linear in its numerator.
-        """
-        data = self.data_
-        unit = data.sets.unit
-        columns = data.sets.columns(self._known)
-        squared = ((unit[:, None] - unit[columns]) ** 2).sum(axis=2)
-        kernel = np.exp(-0.5 * squared / WIDTH**2)
-        kernel /= kernel.sum(axis=0)
-        errors = np.minimum(data.errors, np.float32(FAILURE))
-        # Where a set was not run, the fixed one's error makes it neither better nor worse.
-        fixed = self.fixed_errors_[:, None].astype(np.float32)
-        return np.asarray(np.where(np.isnan(errors), fixed, errors) @ kernel.astype(np.float32))
-
-    def near(self, features: NDArray[np.float64]) -> Near:
-        """Find the errors on the training frames nearest to scans.
-
-        Features are of shape (n_scans, n_features).
-        """
-        evidence = self.nearest_.about(features)
-        fixed = evidence.means(self.fixed_errors_)
-        return Near(evidence, evidence.means(self.errors_), fixed)
-
-    def choices(self, near: Near, sharpness: float) -> list[int]:
-        """Trial number of the best candidate for each scan, by another sharpness than fitted."""
-        _, cautious, _ = self._ratios(near, sharpness)
-        return [self.candidates_[position] for position in self._best(cautious)]
-
-    def select(
-        self,
-        feature: NDArray[np.float64],
-        live: Live = NOTHING,
-    ) -> Selection:
+    def select(self, feature: NDArray[np.float64], live: Live = NOTHING) -> Selection:
         """See `Rule.select`."""
-        measured = live.worse()
-        near = self.near(feature[None])
-        (expected,), (cautious,), (weights,) = self._ratios(near, self.settings.sharpness)
-        (best,) = self._best(cautious[None])
-        fixed = float(weights @ near.fixed[0])
-        if self._known[best] in measured:
-            errors = dict(zip(self._known, (cautious * fixed).tolist(), strict=True))
-            errors.update(measured)
-            # Far from all training, all ratios are 1.
-            of_known = [(errors[trial], trial != BASELINE) for trial in self._known]
-            best = min(range(len(of_known)), key=of_known.__getitem__)
-        trial = self._known[best]
+        evidence = self.nearest_.about(feature[None])
+        (predicted,) = np.einsum(
+            "qs,qsj->qj", evidence.weights(SHARPNESS), evidence.means(self.errors_)
+        )
+        fixed = float(predicted[0])
+        predicted = fixed + evidence.trust[0] * (predicted - fixed)
+        errors = dict(zip(self.trials_, predicted.tolist(), strict=True))
+        trial, measured = self.data_.fixed, live.worse()
+        if trial in measured:
+            errors |= {t: error for t, error in measured.items() if t in errors}
+            trial = min(errors, key=lambda t: (errors[t], t != BASELINE))
         return Selection(
             trial,
             self.data_.sets[trial],
-            predicted_error=float(expected[best]) * fixed,
+            predicted_error=float(predicted[self.trials_.index(trial)]),
             predicted_fixed=fixed,
-            familiarity=float(near.evidence.familiarity[0]),
+            familiarity=float(evidence.familiarity[0]),
         )
-
-    def _ratios(
-        self, near: Near, sharpness: float
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Ratios of the errors in `near` to the fixed set's.
-
-        Expected and cautious ones, of shape (n_scans, n_candidates), and the weights of the
-        training sequences, of shape (n_scans, n_sequences).
-        """
-        ratio = (near.errors + ERROR_FLOOR) / (near.fixed[..., None] + ERROR_FLOOR)
-        weights = near.evidence.weights(sharpness)
-        expected = np.einsum("qs,qsc->qc", weights, ratio)
-        variance = np.einsum("qs,qsc->qc", weights, (ratio - expected[:, None]) ** 2)
-        # One over the number of sequences that this rests on. The fewer they are, the less they
-        # show how much they differ: one alone is taken to differ as much as all sequences do.
-        share = (weights**2).sum(axis=1)[:, None]
-        error = np.sqrt(share * (variance + share * ratio.var(axis=1)))
-        trust = near.evidence.trust[:, None]
-        expected = 1.0 + trust * (expected - 1.0)
-        cautious = expected + trust * CAUTION * error
-        # Neither mixing nor caution is for the set that all are compared with.
-        expected[:, self._fixed_at] = cautious[:, self._fixed_at] = 1.0
-        return expected, cautious, weights
-
-    def _best(self, cautious: NDArray[np.float64]) -> NDArray[np.intp]:
-        """Position of the best candidate for each scan, of shape (n_scans,)."""
-        cautious = cautious[:, : len(self.candidates_)]
-        worth = np.log(cautious.min(axis=1)) < THRESHOLD
-        return np.where(worth, cautious.argmin(axis=1), self._fixed_at)

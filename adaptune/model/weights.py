@@ -21,9 +21,9 @@ from adaptune.model.rules import (
     ERROR_FLOOR,
     NOTHING,
     Evidence,
+    FixedSet,
     Live,
     NearestFrames,
-    PairedExpectedRatio,
     Rule,
     Spending,
     TrainingData,
@@ -97,8 +97,8 @@ class BankRule(Rule):
     Bates and Granger, Operational Research Quarterly 1969).
 
     For each training sequence S is taken over the frames nearest to the scan and divided by the
-    fixed set's mean square there. Sequences weigh as in `PairedExpectedRatio`, and no weight is
-    negative.
+    fixed set's mean square there. The nearer its frames, the more a sequence weighs, and no weight
+    is negative.
 
     What is measured while the robot drives (`adaptune.live`) is blended with it, each weighted by
     the number of its windows. The less familiar the scene, the fewer the training counts as. A bank
@@ -110,9 +110,9 @@ class BankRule(Rule):
 
     @classmethod
     def of(cls, model: Any, weighs: bool) -> Rule:
-        """See `Rule.of`: what the training chose for one set where no bank runs."""
+        """See `Rule.of`: where no bank runs, the fixed set is kept."""
         if not weighs:
-            return PairedExpectedRatio(model.paired)
+            return FixedSet()
         # A bank that need not always work weighs its members where it does.
         return cls(model.bank_settings.model_copy(update={"adapt": True}))
 

@@ -486,8 +486,6 @@ def is_worth(ratio: float, high: float, worth: float) -> bool:
     return ratio <= 1.0 - worth and high < 1.0
 
 
-BANK, ONE_SET = "bank", "one set"
-"""Names of the ways to adapt."""
 BEST_DEFAULT, EQUAL_COST = "best_default", "equal_cost"
 """Rivals: the odometry that does best with its own parameters, and the best set that costs no more
 than what is driven."""
@@ -523,25 +521,19 @@ def driven(
         f"there is too little to compare ways to adapt, which takes "
         f"{2 * PER_STRETCH * model.length:g} m of recordings, or a smaller sub_trajectory"
     )
-    expected = {way: expected_in_words(of) for way, of in model.expected.items()}
+    expected = expected_in_words(model.expected) if model.expected else ""
     if how == "bank" and model.bank_adapts:
         trials = always_at_work(switching, model)
         members = ", ".join(named(model, trial) for trial in trials)
         words = f"`online` will drive the bank of trials {members} as `adaptive`"
         if model.costs is not None and math.isfinite(cost := model.costs.adaptive(trials)):
             words += f", at {cost:.1f} ms of CPU time a scan"
-        why = f", because it is worth that: {expected[BANK]}" if BANK in expected else ""
+        why = f", because it is worth that: {expected}" if expected else ""
         return f"{words}{why}."
-    if how == "live" and model.paired.adapt:
-        words = "`online` will drive one set at a time as `adaptive`, changed live"
-        if ONE_SET in expected:
-            words += f", because it has the least expected loss: {expected[ONE_SET]}"
-        return f"{words}."
-    compared = [ONE_SET] if mechanism == "live" else [BANK, ONE_SET]
-    if compared := [way for way in compared if way in expected]:
-        way = min(compared, key=lambda way: model.expected[way]["loss"])
-        best = f"{'a bank' if way == BANK else 'one set at a time'}: {expected[way]}"
-        why = f"nothing else is worth its cost; the best alternative is {best}"
+    if mechanism == "live":
+        why = "choosing one set at a time gains nothing, and there is no bank (online.switching)"
+    elif expected:
+        why = f"nothing else is worth its cost; the best alternative is a bank: {expected}"
     return f"{fixed} as `adaptive`, because {why}."
 
 
@@ -591,7 +583,7 @@ def mechanism_of(
     """How a mode that adapts changes parameters; None if it cannot.
 
     The `mechanism` is the study's; `live`: whether the odometry changes its parameters between
-    scans. A bank with more expected loss than one set at a time would only cost.
+    scans. A bank with more expected loss than the fixed set would only cost.
     """
     # A rule that chooses one set has all sets to choose from where it can.
     bank = model.bank_adapts or model.bank_rests if mode == ADAPTIVE else not live

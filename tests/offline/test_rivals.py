@@ -3,7 +3,7 @@ import pytest
 from labelled_places import TRIALS, labelled, sequence, two_kinds, with_motions
 
 from adaptune.errors import AdaptuneError
-from adaptune.model import BankSettings, PairedSettings
+from adaptune.model import BankSettings
 from adaptune.model.registry import ADAPTIVE
 from adaptune.model.rules import Costs, SetCost, allowed_sets
 from adaptune.space import ODOMETRY, Float, ParameterSets, ParameterSpace, PooledSpace
@@ -52,12 +52,10 @@ def test_the_rival_of_equal_cost_costs_no_more(places):
 
 def test_what_is_driven_costs_what_all_of_it_costs(places):
     members = [TRIALS[2], TRIALS[0]]
-    bank = Policy(PairedSettings(adapt=False), BankSettings(), members, {})
+    bank = Policy(BankSettings(), members, None)
     assert driven_cost(data(places), bank, TRIALS[2]) == 21.0 + 1.0 + 1.0 + 1.0 + 3.0
-    fixed = Policy(PairedSettings(adapt=False), NO_BANK, members, {})
+    fixed = Policy(NO_BANK, members, None)
     assert driven_cost(data(places), fixed, TRIALS[2]) == 22.0
-    one = Policy(PairedSettings(n_sets=2), NO_BANK, members, {})
-    assert driven_cost(data(places), one, TRIALS[2]) > 22.0
     assert np.isnan(driven_cost(labelled(places), bank, TRIALS[2]))
 
 

@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from adaptune.commands.cli import app
-from adaptune.model import BankSettings, ErrorModel, PairedSettings
+from adaptune.model import BankSettings, ErrorModel
 from adaptune.study.config import ALSO
 from offline.config import load_study
 from online.compare import compare, compared_modes
@@ -25,11 +25,10 @@ def load(study_file, trained_folder, tmp_path_factory):
     """Loads a study whose model knows a better set, and keeps the fixed one all the same."""
     folder = shutil.copytree(trained_folder, tmp_path_factory.mktemp("on_demand") / "study")
     path = folder / "model.safetensors"
-    model, off = ErrorModel.load(path), {"adapt": False}
+    model = ErrorModel.load(path)
     errors = model.errors.copy()
     errors[:, model.sets.column(model.bank[1])] *= 0.1
-    settings = {"paired": PairedSettings(**off), "bank_settings": BankSettings(**off)}
-    replace(model, errors=errors, **settings).save(path)
+    replace(model, errors=errors, bank_settings=BankSettings(adapt=False)).save(path)
     return lambda *overrides, at=folder: load_study(study_file, overrides, at)
 
 
@@ -68,7 +67,7 @@ def test_all_are_compared_in_the_order_of_their_lines(replayed):
 def test_they_do_what_their_names_say(replayed):
     model = ErrorModel.load(replayed.model_path)
     trials = {int(row["trial"]) for row in selections(replayed, "adaptive")}
-    assert trials <= set(model.sets) if model.paired.adapt else trials == {model.fixed}
+    assert trials == {model.fixed}
     members = model.bank[:4]  # without the reserve
     even = " ".join(f"{member}:{1 / len(members):.3f}" for member in members)
     assert {row["weights"] for row in selections(replayed, "even")} == {even}
@@ -83,8 +82,8 @@ def test_they_are_made_once_and_again_for_another_model(own):
     assert run_replays(study, study.model_path) == 1
     assert [r["trial"] for r in selections(study, "adaptive")] == [r["trial"] for r in before]
     # Without being asked for, they are compared if they are there, and renewed by a command.
-    other = replace(ErrorModel.load(study.model_path), paired=PairedSettings(sharpness=7.0))
-    other.save(study.model_path)
+    settings = BankSettings(adapt=False, sharpness=7.0)
+    replace(ErrorModel.load(study.model_path), bank_settings=settings).save(study.model_path)
     plain = own()
     assert run_replays(plain, plain.model_path) == 2
     with pytest.raises(StoredReplayError, match=r"even: was .* -o online.modes=all` with"):

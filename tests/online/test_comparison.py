@@ -9,7 +9,7 @@ import pytest
 
 from adaptune import manifest
 from adaptune.errors import AdaptuneError
-from adaptune.model import BankSettings, ErrorModel, PairedSettings
+from adaptune.model import BankSettings, ErrorModel
 from adaptune.study.study import ModeError, bank_members
 from adaptune.trajectory import Trajectory, read_tum, write_tum
 from offline.config import load_study
@@ -79,13 +79,13 @@ def test_values_that_stay_read_as_those_that_change(own):
 
 
 @pytest.mark.parametrize("mechanism", ["live", "bank"])
-def test_one_set_at_a_time_is_driven_where_a_bank_does_not_pay(own, study_file, mechanism):
+def test_one_set_is_driven_where_there_is_no_bank(own, study_file, mechanism):
     model = ErrorModel.load(own.folder / "model.safetensors")
     given = [f"online.switching.mechanism={mechanism}"]
     study = load_study(study_file, [*given, "online.period=0.5"], own.folder)
-    path = own.folder / "unpaying.safetensors"
-    one_set = replace(model, paired=PairedSettings(), bank_settings=BankSettings(adapt=False))
-    one_set.save(path)
+    path = own.folder / "alone.safetensors"
+    off = BankSettings(adapt=False)
+    replace(model, bank=[model.fixed], vectors=model.vectors[:, :1], bank_settings=off).save(path)
     assert run_replays(study, path) == 4
     row = next(row for row in compare(study).rows if row.mode == "adaptive")
     assert row.rte < 3.0

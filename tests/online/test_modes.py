@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from random_models import random_model
 
-from adaptune.model import BankSettings, PairedSettings
+from adaptune.model import BankSettings
 from adaptune.model.rules import Costs, SetCost
 from adaptune.odometry.registry import OdometryFactory, OdometryPool, odometry_class
 from adaptune.odometry.remote import Limits
@@ -78,7 +78,7 @@ def test_a_mode_is_replayed_where_it_is_possible():
     stiff = replace(asked, odometry=OdometryPool({"a": odometry, "b": odometry}), mechanism="bank")
     unpaying = replace(alone, bank_settings=BankSettings(adapt=False))
     assert "cannot change its parameters between scans" in stiff.obstacle("adaptive", unpaying)
-    assert "adaptive" in stiff.modes(replace(model, paired=PairedSettings(adapt=False)))
+    assert "adaptive" in stiff.modes(model)
 
 
 def test_what_each_mode_drives():
@@ -88,9 +88,7 @@ def test_what_each_mode_drives():
     assert live.identity("adaptive", model, "of it")["switching"] == {"mechanism": "live"}
     assert bank.identity("adaptive", model, "of it")["switching"]["mechanism"] == "bank"
     # The bank that is driven may rest.
-    rests = replace(
-        model, paired=PairedSettings(adapt=False), bank_settings=BankSettings(adapt=False)
-    )
+    rests = replace(model, bank_settings=BankSettings(adapt=False))
     assert bank.mode("adaptive", rests).bank
     # Only `adaptive` has a reserve.
     vectors = np.zeros((len(model.errors), 3, 3), np.float32)

@@ -9,6 +9,7 @@ from adaptune.live.evidence import (
     LOG_DEVIATION,
     MIN_COVERED,
     OWN_SECONDS,
+    PREDICTED_WINDOWS,
     Link,
     OwnErrors,
 )
@@ -53,6 +54,27 @@ def test_errors_of_the_rotation_add_up_over_a_chain():
     short = 100.0 / 10.0 * np.linalg.norm((believed(10.0) - moved(10.0))[:3, 3])
     assert true > 1.9 * short
     assert found[-1].mean == pytest.approx(true * (25.0 / end) ** GROWTH, rel=0.02)
+
+
+def test_a_prediction_counts_as_a_few_chains():
+    own = OwnErrors(10.0)
+    assert own.estimate_with(1.0, 1.0) is None
+    for start in (0.0, 10.0):
+        own.add(link(start, start + 10.0, lambda metres: moved(1.02 * metres)))
+    for predicted in (0.5, 2.0):
+        shares = np.array([2.0, PREDICTED_WINDOWS]) / (2.0 + PREDICTED_WINDOWS)
+        found = own.estimate_with(predicted, 1.0)
+        assert found.mean == pytest.approx(2.0 ** shares[0] * predicted ** shares[1])
+        assert found.mean / found.low == pytest.approx(found.high / found.mean)
+        # Where it does not count, less is known.
+        alone = own.estimate_with(predicted, 0.0)
+        assert alone.mean == pytest.approx(2.0)
+        assert alone.high / alone.low > found.high / found.low
+    # One hop that is wrong by a metre does not make all of them wrong.
+    for start in (20.0, 30.0, 40.0):
+        own.add(link(start, start + 10.0, lambda metres: moved(1.02 * metres)))
+    own.add(link(50.0, 60.0, lambda metres: moved(1.12 * metres)))
+    assert own.estimate_with(2.0, 0.0).mean < 3.0 < own.estimate().mean
 
 
 def test_hops_with_short_gaps_are_chained_and_with_long_ones_not():

@@ -53,7 +53,7 @@ def test_a_model_is_explained(model, tmp_path):
         "ndt (90 numbers), as a mean over 3 selections in a row",
         "0, fixed 3.000 distance 4, kernel none",
         "1 3.000 distance 2, kernel [huber]",
-        "Driven: one set at a time.",
+        "Driven: the fixed set.",
     ):
         assert said in text, (said, text)
 
@@ -76,5 +76,5 @@ def test_a_bank_its_costs_and_rivals_are_shown(model, tmp_path):
     assert "2 11.8 - distance 9" in text  # of unknown cost
     assert "Driven: the bank of trials 0, 1." in text
     resting = dataclasses.replace(known, bank_settings=BankSettings(adapt=False))
-    assert "Driven: one set at a time." in shown(resting, tmp_path)
+    assert "Driven: the fixed set." in shown(resting, tmp_path)
     assert "cost [ms]" not in shown(model, tmp_path)
