@@ -1,6 +1,6 @@
 """What one set at a time saves: by expected errors, and by the number of points.
 
-    python benchmarks/one_set.py runs/density    # after adaptune offline; the sets differ in density
+    python benchmarks/one_set.py runs/density    # after adaptune offline of sets of GICP
 
 Each recording is left out in turn. Once a second one of the sets is chosen, by one of two rules:
 

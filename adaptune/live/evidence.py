@@ -51,7 +51,7 @@ HIDDEN = 0.0075
 """Metres of an odometry's error that a hop may have, too, and so hide."""
 PREDICTED_WINDOWS = 2.0
 """How many chains that do not overlap a prediction from training counts as."""
-DEVIATION, COMMON = 0.66, 0.1
+DEVIATION, COMMON = 0.64, 0.1
 """Standard deviation of the logarithm of one such chain's error, or of the prediction; and the part
 of its variance that all have in common."""
 LEAST = 0.01
@@ -537,6 +537,10 @@ class LiveEvidence:
         share = 1.0 if np.isnan(familiarity) else min(1.0, familiarity / FAMILIAR)
         alone = self.own_error()
         if alone is None or not share or not alone.low <= CONTRADICTED * predicted:
+            return alone
+        # Nor does training know of a failure.
+        last = 0 if self._newest is None else self._newest.stamp
+        if self._restarted and last - self._restarted < OWN_SECONDS * 1e9:
             return alone
         return self._own.estimate_with(predicted, share)
 
