@@ -6,8 +6,8 @@ import numpy as np
 from gain_data import KINDS, training_courses
 from numpy.typing import NDArray
 
-from adaptune.live.evidence import Link, OwnErrors
 from adaptune.live.hops import Hop
+from adaptune.live.own_error import Link, OwnErrors
 from adaptune.metrics import sub_trajectory_rte, travelled, window_ends
 from adaptune.model.weights import MemberWeights, clip_errors, minimum_variance_weights
 from offline.labelled import LabelledData, LabelledSequence, chained, periods

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune.live.evidence import OWN_SECONDS
+from adaptune.live.own_error import OWN_SECONDS
 from adaptune.metrics import (
     KittiError,
     absolute_error,

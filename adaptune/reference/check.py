@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptune.geometry import Poses, invert
-from adaptune.live.evidence import MIN_REACH, Link, OwnError, OwnErrors, hops_along
+from adaptune.live.evidence import hops_along
 from adaptune.live.hops import LENGTHS as HOPS
 from adaptune.live.hops import Hop, Hops
+from adaptune.live.own_error import MIN_REACH, Link, OwnError, OwnErrors
 from adaptune.metrics import cap, sub_trajectory_rte, travelled
 from adaptune.recording.scan import Recording, Scan
 from adaptune.trajectory import Trajectory

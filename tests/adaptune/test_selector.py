@@ -8,8 +8,9 @@ import rooms
 from hypothesis import given
 from hypothesis import strategies as st
 
-from adaptune.live.evidence import LiveEvidence, OwnError
+from adaptune.live.evidence import LiveEvidence
 from adaptune.live.hops import LiveSquares
+from adaptune.live.own_error import OwnError
 from adaptune.model import BankRule, BankSettings, ErrorModel
 from adaptune.model.descriptor import speed_and_turn_rate
 from adaptune.model.ndt import describe

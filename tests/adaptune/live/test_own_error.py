@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 from rooms import moved
 
-from adaptune.live.evidence import (
+from adaptune.live.hops import Hop
+from adaptune.live.own_error import (
     GROWTH,
     HIDDEN,
     HOP_ERROR,
@@ -13,7 +14,6 @@ from adaptune.live.evidence import (
     Link,
     OwnErrors,
 )
-from adaptune.live.hops import Hop
 
 KNOWN = np.eye(3)
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from rooms import along_x
 
-from adaptune.live.evidence import OwnError
+from adaptune.live.own_error import OwnError
 from adaptune.recording.inspect import inspect
 from adaptune.reference.check import MeasuredReference, advice, proposed_sub_trajectory
 from adaptune.reference.estimate import recording_config
