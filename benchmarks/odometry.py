@@ -26,8 +26,8 @@ from adaptune.odometry.base import InProcess, OdometryInstance
 from adaptune.odometry.registry import ODOMETRIES, odometry_class
 from adaptune.odometry.remote import Isolated, Limits
 from adaptune.recording import Scan, SequenceError
+from adaptune.recording.changed import with_imu
 from adaptune.recording.recording import open_sequence
-from adaptune.recording.views import with_imu
 from adaptune.simulation import Course
 from adaptune.simulation.course import as_sequence
 

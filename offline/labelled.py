@@ -300,7 +300,7 @@ class LabelledSequence:
             before = self.ends < left_out.known.min()
             found = near | ~(before | (self.known > left_out.ends.max()))
         else:
-            # Another part of it counts frames in another way, or plays them backwards.
+            # Another part of it counts frames in another way.
             at_ends = self.simulation.T_ref_sensor[self.ends, :3, 3]
             found = near | (path.query(at_ends)[0] <= length)
         return np.asarray(found)

@@ -14,9 +14,6 @@ from multiprocessing.connection import Connection
 from queue import Queue
 from typing import Any, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
 from adaptune.bank.bank import CLOCK, Bank, Clock
 from adaptune.errors import AdaptuneError
 from adaptune.forking import fork_server
@@ -219,38 +216,29 @@ class Arrival(NamedTuple):
     dropped: int  # scans before it that waited too long
 
 
-PlayedAt = Callable[[NDArray[np.int64]], NDArray[np.int64]]
-
-
 def arrivals(
     scans: Iterable[Scan],
     rate: float,
     queue: int,
     clock: Clock = CLOCK,
-    played_at: PlayedAt | None = None,
 ) -> Iterator[Arrival]:
     """Scans, each when it is due or as soon as it is asked for after that.
 
     What an IMU measured before a scan that is dropped goes to the scan after it.
 
-    For `rate` and `queue` see `RealTimeConfig`; the sensor goes by `clock`, and a recording whose
-    speed was changed by `played_at`, see `Recording`.
+    For `rate` and `queue` see `RealTimeConfig`; the sensor goes by `clock`.
     """
-
-    def played(scan: Scan) -> int:
-        return scan.stamp if played_at is None else int(played_at(np.array([scan.stamp]))[0])
-
     source = iter(scans)
     ahead = next(source, None)
     if ahead is None:
         return
-    first, begin = played(ahead), clock.now()
+    first, begin = ahead.stamp, clock.now()
     waiting: deque[tuple[Scan, float]] = deque()
     imus: list[Imu] = []
     dropped = 0
     while ahead is not None or waiting:
         while ahead is not None:
-            due = begin + (played(ahead) - first) * 1e-9 / rate
+            due = begin + (ahead.stamp - first) * 1e-9 / rate
             if due > (now := clock.now()):
                 if waiting:
                     break
@@ -304,9 +292,8 @@ def replay_in_real_time(
     drive = RealTimeDrive(odometry, health, settings, selector, record, what, clock)
     source = _read_ahead(scans)
     first = list(islice(source, _AHEAD // 2))  # read before the first one is due
-    played_at: PlayedAt | None = getattr(scans, "played_at", None)
     every = chain(first, source)
-    for arrival in arrivals(every, settings.rate, settings.queue, clock, played_at):
+    for arrival in arrivals(every, settings.rate, settings.queue, clock):
         drive.step(arrival)
         watch(record)
     drive.finish()

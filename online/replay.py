@@ -246,7 +246,7 @@ class ReplayRecord:
             If there was no scan.
         """
         if not self._n:
-            raise AdaptuneError("there is no scan to replay; check start, stop and views")
+            raise AdaptuneError("there is no scan to replay; check start and stop")
         # Scans before the first pose are unknown, unless they are so many that it has failed.
         waiting = sum(1 for _ in takewhile(lambda step: not step.begun, self.steps))
         if 0 < waiting < MAX_SHARE_WITHOUT_POSE * self._n:

@@ -96,7 +96,7 @@ def _own_bag(config: SequenceConfig, layout: str) -> Path | None:
     if not isinstance(config.bag, str) or layout == "kitti":
         return None
     plain = SequenceConfig(bag=config.bag)
-    changes = ("start", "stop", "stride", "part", "views", "compensate")
+    changes = ("start", "stop", "stride", "part", "compensate")
     if any(getattr(config, key) != getattr(plain, key) for key in changes):
         return None
     path = Path(config.bag)

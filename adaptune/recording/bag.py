@@ -11,7 +11,7 @@ from contextlib import contextmanager, suppress
 from functools import cache, partial
 from itertools import islice, pairwise
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from rosbags.highlevel import AnyReader
@@ -136,7 +136,6 @@ class BagSource:
     when they were opened before, the bags are not opened now.
     """
 
-    random_access: ClassVar[bool] = False
     pose_files: Sequence[Path] = ()
 
     def __init__(

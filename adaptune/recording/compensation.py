@@ -55,7 +55,7 @@ def neighbour_motions(scans: Iterable[Scan]) -> Iterator[tuple[Scan, Poses | Non
     Both were measured in the same motion, so that its distortion hardly matters.
 
     Yields each scan, ``T_before_scan`` of shape (4, 4), or None where it is not known, and the
-    seconds between their stamps, which are negative where scans are read backwards.
+    seconds between their stamps.
     """
     import small_gicp
 
@@ -69,7 +69,7 @@ def neighbour_motions(scans: Iterable[Scan]) -> Iterator[tuple[Scan, Poses | Non
             now = now if now[0].size() >= _FEWEST else None
         seconds = (scan.stamp - last) * 1e-9
         T_before_scan = None
-        if before is not None and now is not None and 0 < abs(seconds) <= _FAR:
+        if before is not None and now is not None and 0 < seconds <= _FAR:
             options = {"max_correspondence_distance": _REACH, "num_threads": 1}
             result = small_gicp.align(
                 before[0], now[0], before[1], init_T_target_source=guess, **options
@@ -91,12 +91,10 @@ def compensate_neighbours(scans: Iterable[Scan]) -> Iterator[Scan]:
     for scan, T_before_scan, seconds in neighbour_motions(scans):
         if T_before_scan is not None:
             known = T_before_scan, seconds, scan.stamp
-        if known is None or abs(scan.stamp - known[2]) > _FAR * 1e9:
+        if known is None or scan.stamp - known[2] > _FAR * 1e9:
             yield scan
-        elif known[1] > 0:
-            yield compensate(scan, known[0], known[1])
         else:
-            yield compensate(scan, geometry.invert(known[0]), -known[1])
+            yield compensate(scan, known[0], known[1])
 
 
 def turning_of(scans: Iterable[Scan]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:

@@ -19,8 +19,6 @@ from adaptune.strict import StrictModel
 
 Compensation = Literal["constant_velocity"] | None
 """How motion within a scan is undone; none if it is left as it is."""
-MOST_VIEWS = 16
-"""Views of one sequence, and views to train on; each costs time with every scan."""
 REFERENCE_FILES = (".tum", ".txt", ".csv")
 ESTIMATED, NO_REFERENCE = "estimated", "none"
 """In place of a `reference`: it is estimated from the scans, or there is none."""
@@ -126,35 +124,6 @@ Transform = Annotated[_Numbers | tuple[_Numbers, ...], BeforeValidator(_pose)]
 _Seconds = Annotated[float, Field(ge=0, le=1e9)]
 
 
-class ViewConfig(StrictModel):
-    """One view, by its name; views apply in the order of the list."""
-
-    # Only these parts, in seconds since the first scan.
-    cut: tuple[tuple[_Seconds, _Seconds], ...] | None = Field(None, min_length=1, max_length=1000)
-    drop: float | None = Field(None, gt=0, lt=1)  # share of the scans that is lost
-    speed: float | None = Field(None, ge=1e-3, le=1e3)  # how many times faster scans arrive
-    reverse: Literal[True] | None = None
-    noise: float | None = Field(None, gt=0, le=1e3)  # metres by which points move on their rays
-    transform: Transform | None = None  # pose of the LiDAR in the frame from which to see it
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        if len(self._given()) != 1:
-            names = ", ".join(type(self).model_fields)
-            raise ValueError(f"each view is an entry of its own, `- name: ...` with one of {names}")
-        if self.cut and (bad := [part for part in self.cut if not 0 <= part[0] < part[1]]):
-            raise ValueError(f"a part goes from a start to a later stop, not {list(bad[0])}")
-        return self
-
-    @property
-    def name(self) -> str:
-        """Which view it is."""
-        return self._given()[0]
-
-    def _given(self) -> list[str]:
-        return [name for name in type(self).model_fields if getattr(self, name) is not None]
-
-
 _Noise = Annotated[float, Field(gt=0, le=1e6)]
 
 
@@ -219,7 +188,6 @@ class SequenceConfig(StrictModel):
     elevation: float | None = Field(None, ge=-5, le=5)
     # Undo the motion within scans, as fast as it was since the scan before.
     compensate: Compensation = None
-    views: Annotated[tuple[ViewConfig, ...], Field(max_length=MOST_VIEWS)] = ()
     cache: bool = True  # whether to keep decoded bags in the cache
 
     @model_validator(mode="after")

@@ -115,7 +115,7 @@ _PART, _LITTLE = 0.6, 0.15
 # same; by which share their number and their form then differ.
 _ROW, _SOON, _OTHER = 5, 0.25, 0.35
 _LEFT_OUT = "adaptune leaves them out"
-_CUT = "leave them out with `start`, `stop` or `cut`"
+_CUT = "leave them out with `start` or `stop`"
 _LOST = f"packets are lost, the view is blocked, or nothing is in reach; {_CUT}"
 _DRIVER = "name the topic of the sensor's driver"
 

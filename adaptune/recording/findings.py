@@ -72,7 +72,7 @@ _UNDECODED = {
     "imu": ("leave `imu` out, or repair the bag", ""),
 }
 _GAPS = {
-    "points": "odometries lose track there; leave them out with `start`, `stop` or `cut`",
+    "points": "odometries lose track there; leave them out with `start` or `stop`",
     "reference": "scans in gaps beyond `max_gap` are not labelled",
 }
 

@@ -48,7 +48,6 @@ class FileSource:
     columns: Sequence[str] = KITTI  # of a point in a ``.bin`` file
     findings: Sequence[Finding] = ()  # what is odd about the files
 
-    random_access: ClassVar[bool] = True
     begins: ClassVar[Mapping[str, int]] = {}
     skipped: ClassVar[float] = 0.0
 

@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import to_pose
-from adaptune.recording import cache, compensation, views
+from adaptune.recording import cache, compensation
+from adaptune.recording.changed import without_motion
 from adaptune.recording.config import ESTIMATED, NO_REFERENCE, SequenceConfig, files_of
 from adaptune.recording.content import Content, of_looks
 from adaptune.recording.poses import sound
@@ -40,12 +40,8 @@ def open_sequence(config: SequenceConfig) -> Recording:
 
     A SequenceError says why it cannot be opened as described.
     """
-    sequence: Recording = RecordedSequence(config)
-    if config.compensate is not None:
-        sequence = views.without_motion(sequence)
-    for view in config.views:
-        sequence = views.VIEWS[view.name](sequence, getattr(view, view.name))
-    return sequence
+    sequence = RecordedSequence(config)
+    return sequence if config.compensate is None else without_motion(sequence)
 
 
 def check_sequence(config: SequenceConfig) -> "RecordedSequence":
@@ -151,7 +147,7 @@ _MOST_SCANS = 600
 
 
 class RecordedSequence:
-    """The scans of a recording as they were recorded, without views and without compensation.
+    """The scans of a recording as they were recorded, without compensation.
 
     Its methods raise a SequenceError where the recording cannot be read as described.
 
@@ -313,27 +309,6 @@ class RecordedSequence:
             yield from kept.since(begin)
         else:
             yield from self._decode(Counter(), Content(), begin)
-
-    def backward(self) -> Iterator[Scan]:
-        """Read the scans, the last one first. A bag is decoded to the cache before."""
-        if self.source.random_access:
-            frames = list(self._frames(Counter()))
-            yield from (frame.load() for frame in reversed(frames))
-            return
-        if self.key is not None and cache.find(self.key) is None:
-            for _ in self:
-                pass
-        kept = None if self.key is None else cache.find(self.key)
-        if kept is None:
-            raise SequenceError(
-                f"{self.name}: to be read backwards it must be kept decoded: leave `cache` on, and "
-                f"let the cache grow (ADAPTUNE_CACHE_GB) where it is too small"
-            )
-        yield from (kept[i] for i in reversed(range(len(kept))))
-
-    def played_at(self, stamps: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Recordings are played as they were recorded."""
-        return stamps
 
     def imu(self) -> Imu | None:
         """Measurements of the IMU in SI units, if one is set."""

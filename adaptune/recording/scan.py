@@ -163,19 +163,13 @@ class Recording(Protocol):
         """Read the scans; their stamps strictly increase."""
 
     def since(self, stamp: int) -> Iterator[Scan]:
-        """Read the scans from `stamp` on, or from some before: views need those, too."""
-
-    def backward(self) -> Iterator[Scan]:
-        """Read the scans, the last one first."""
+        """Read the scans from a little before `stamp` on."""
 
     def reference(self) -> Trajectory | None:
         """Poses of the LiDAR, if they are known."""
 
     def imu(self) -> Imu | None:
         """Measurements of the IMU, if there is one."""
-
-    def played_at(self, stamps: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Nanoseconds at which measurements of `stamps` arrive when played in real time."""
 
 
 def stretch_numbers(place: NDArray[np.intp], stretch: NDArray[np.intp]) -> NDArray[np.intp]:

@@ -23,7 +23,7 @@ from adaptune.reference.stored import (
 )
 from adaptune.study.study import StudySequences
 
-_OF_VIEWS = ("views", "compensate", "imu")
+_OF_CHANGES = ("compensate", "imu")
 """Keys of a sequence on which its scans as they were recorded do not depend."""
 
 _log = logging.getLogger(__name__)
@@ -51,7 +51,7 @@ def ensure_references(
 ) -> dict[str, str]:
     """Estimate the references that are to be estimated and are not yet, or of something else.
 
-    An estimate is made from the scans as they were recorded, without the views of a sequence.
+    An estimate is made from the scans as they were recorded.
     It knows nothing of the study's odometry: what judges a bank is not built from its members.
     One that was refused is not tried again before something has changed. The study's folder keeps
     them as ``references/<sequence>.tum``. Their accuracy is told over `length` metres.
@@ -99,7 +99,7 @@ def _ensure(
 def _about(sequences: StudySequences, name: str) -> dict[str, Any]:
     """Everything that an estimated reference depends on, as plain data."""
     scans = sequences.identity(name)
-    scans["sequences"][name] |= dict.fromkeys(_OF_VIEWS)
+    scans["sequences"][name] |= dict.fromkeys(_OF_CHANGES)
     return dict(manifest.plain({"estimator": estimate.VERSION} | scans))
 
 
@@ -156,11 +156,10 @@ def contradictions_of(
 ) -> list[Finding]:
     """What the scans of a sequence say where its reference and an odometry disagree.
 
-    For the parameters see `adaptune.reference.diagnosis.contradictions`. A view has its origin's
-    reference, seen otherwise: nothing is said of it.
+    For the parameters see `adaptune.reference.diagnosis.contradictions`.
     """
     config = sequences.config(name)
-    if config.views or not error > SUSPICIOUS:
+    if not error > SUSPICIOUS:
         return []
     # Registrations undo the motion within the scans that they need.
     scans, given = RecordedSequence(config), sequences.estimate(name) is None

@@ -379,7 +379,7 @@ def _of_tests(file: _File, algorithms: _File, datasets: _File) -> list[ImportedS
         if test.type in ("drop", "cut"):
             _log.warning(
                 f"Test {test.name!r} is left out: adaptune has no {test.type} tests, which take a "
-                f"sensor's messages away while a system runs. A sequence's `drop` view loses scans."
+                f"sensor's messages away while a system runs."
             )
             continue
         for j, name in enumerate(test.algo_list):

@@ -27,6 +27,7 @@ from adaptune.odometry.base import Description, OwnFile
 from adaptune.odometry.program import ProgramInput, program_input
 from adaptune.odometry.registry import Factory, OdometryFactory, OdometryPool, declare
 from adaptune.recording.cache import fingerprints
+from adaptune.recording.changed import with_imu
 from adaptune.recording.config import REFERENCE_FILES, SOURCES, SequenceConfig
 from adaptune.recording.export import Layout
 from adaptune.recording.parts import part_name
@@ -37,7 +38,6 @@ from adaptune.recording.recording import (
     wants_estimate,
 )
 from adaptune.recording.scan import Recording
-from adaptune.recording.views import with_imu
 from adaptune.reference.stored import BREAK, EstimateError, StoredEstimate
 from adaptune.simulation.course import Course
 from adaptune.space import ODOMETRY, ParameterSet, ParameterSpace

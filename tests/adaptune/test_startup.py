@@ -28,8 +28,8 @@ def test_help_imports_neither_numpy_nor_a_stage():
     "code",
     [
         "from adaptune.simulation.course import Course\nCourse(scenes=['cave', 'street'], imu=200)",
-        "from adaptune.recording.config import SequenceConfig, ViewConfig\n"
-        "SequenceConfig(bag='a.bag', views=[ViewConfig(reverse=True)]).model_dump()",
+        "from adaptune.recording.config import SequenceConfig\n"
+        "SequenceConfig(bag='a.bag').model_dump()",
         "import offline.config",
         "from adaptune.model.descriptor import check_descriptor\ncheck_descriptor('ndt')",
     ],

@@ -114,20 +114,6 @@ def test_scans_come_when_they_are_due():
     assert came == [(i * TENTH, pytest.approx(0.01 * i)) for i in range(8)]
 
 
-def test_a_recording_played_twice_as_fast_comes_twice_as_fast():
-    clock = SteppedClock()
-    due = [a.due for a in arrivals(scans(8), 1.0, 1, clock, lambda stamps: stamps // 2)]
-    assert due == pytest.approx([0.05 * i for i in range(8)])
-
-    class Fast(list):
-        played_at = staticmethod(lambda stamps: stamps // 4)
-
-    odometry, recording = Steady(), Fast(scans(9))
-    clock = odometry.clock
-    replay_in_real_time(recording, InProcess(odometry), HEALTH, RealTimeConfig(), clock=clock)
-    assert clock.now() == pytest.approx(0.2)
-
-
 @pytest.mark.parametrize("queue", [1, 2])
 def test_the_oldest_that_wait_are_dropped_as_in_a_queue_of_ros(queue):
     clock, found = SteppedClock(), []

@@ -189,7 +189,7 @@ def test_the_log_says_when_an_odometry_is_lost_and_when_it_goes_on(tmp_path, cap
 
 
 def test_no_scans():
-    with pytest.raises(AdaptuneError, match="no scan to replay; check start, stop and views"):
+    with pytest.raises(AdaptuneError, match="no scan to replay; check start and stop"):
         replay([], InProcess(Scripted()), HEALTH)
 
 

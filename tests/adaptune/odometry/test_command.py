@@ -131,7 +131,7 @@ def test_every_format_of_trajectories(make, name, kind):
 @pytest.mark.parametrize(
     ("kind", "points"), [("bag", "{points}"), ("ros2", "{points}"), ("kitti", "")]
 )
-def test_a_view_is_written_once_for_the_program(make, kind, points):
+def test_a_part_is_written_once_for_the_program(make, kind, points):
     arguments = f'"{{study}}/program.py", "{{input}}", "{points}", "{{output}}", "{{parameters}}"'
     study = make(
         "none",
@@ -140,7 +140,7 @@ def test_a_view_is_written_once_for_the_program(make, kind, points):
         f"odometry.settings.input={kind}",
         f"odometry.settings.format={'kitti' if kind == 'kitti' else 'tum'}",
         f"odometry.settings.output=run.{'txt' if kind == 'kitti' else 'tum'}",
-        "sequences.one.views=[{cut: [[0.0, 1.5], [2.0, 9.0]]}]",
+        "sequences.one.stop=3.5",
     )
     trial, frames = run(study)
     assert not trial.faults

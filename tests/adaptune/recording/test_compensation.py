@@ -56,8 +56,7 @@ def drive_through(room_, stamp, T, twist):
     return Scan(stamp, points.astype(np.float32), times)
 
 
-@pytest.mark.parametrize("backward", [False, True])
-def test_the_velocity_since_the_scan_before_is_undone(backward):
+def test_the_velocity_since_the_scan_before_is_undone():
     rng = np.random.default_rng(0)
     twist = np.array([2.0, 0.3, 0.0, 0.0, 0.0, 0.8])
     T, scans, worlds = np.eye(4), [], []
@@ -66,8 +65,6 @@ def test_the_velocity_since_the_scan_before_is_undone(backward):
         scans.append(drive_through(worlds[-1], 10**18 + i * 10**8, T, twist))
         worlds[-1] = (worlds[-1] - T[:3, 3]) @ T[:3, :3]
         T = T @ motion(twist)
-    order = slice(None, None, -1 if backward else 1)
-    scans, worlds = scans[order], worlds[order]
     compensated = list(compensate_neighbours(scans))
     assert compensated[0] is scans[0]
     for before, after, world in zip(scans[1:], compensated[1:], worlds[1:], strict=True):
@@ -183,5 +180,5 @@ def test_an_imu_comes_in_si_units_with_its_place(tmp_path):
     imu = open_sequence(SequenceConfig(bag=bag, imu={"unit": "g", "extrinsic": extrinsic})).imu()
     np.testing.assert_allclose(imu.acceleration[0], [0, 0, 9.80665])
     np.testing.assert_allclose(imu.T_sensor_imu[:3, 3], [1, 2, 3])
-    config = SequenceConfig(bag=bag, imu={}, views=[{"transform": extrinsic}])
+    config = SequenceConfig(bag=bag, imu={}, compensate="constant_velocity")
     assert open_sequence(config).imu() is not None
