@@ -99,7 +99,7 @@ class Trial:
     # RTE and metrics of every run, if the trial was run several times.
     repeats: tuple[dict[str, float], ...] = ()
     # Faults that the health check found, and how often, see
-    # `adaptune.odometry.tracker.Guard.check`. Of several repeats, the first one with the most
+    # `adaptune.odometry.health.Guard.check`. Of several repeats, the first one with the most
     # scans without a pose.
     unhealthy: dict[str, int] = field(default_factory=dict)
     failure: str = ""  # why the set is never chosen; empty if it may be

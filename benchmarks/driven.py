@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from adaptune.study.study import Study
 from offline.config import load_study
 from online.record import StoredReplay
-from online.statistics import Reference
+from online.reference import Reference
 
 MODES = ("baseline", "fixed", "even", "adaptive", "untrained")
 

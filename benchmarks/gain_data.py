@@ -18,14 +18,15 @@ from adaptune.files import replacing
 from adaptune.live.hops import Hops
 from adaptune.model.descriptor import averaged, lowest_elevation
 from adaptune.model.ndt import N_FEATURES, ndt_histogram
-from adaptune.odometry.registry import OdometryFactory, odometry_class
+from adaptune.odometry.factory import OdometryFactory
+from adaptune.odometry.registry import odometry_class
 from adaptune.odometry.remote import Limits
 from adaptune.recording.scan import Scan
 from adaptune.simulation import Course
 from adaptune.simulation.record import simulate
 from adaptune.space import ParameterSets, ParameterSpace
 from adaptune.study.config import OdometryConfig
-from adaptune.study.study import StudySequences
+from adaptune.study.sequences import StudySequences
 from offline.config import OfflineStudyConfig
 from offline.drive import TrialSetup
 from offline.frames import with_measured_hops

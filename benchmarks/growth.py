@@ -28,9 +28,10 @@ from reading import cloud, write
 
 from adaptune import machine, yaml12
 from adaptune.bank.bank import Bank
-from adaptune.odometry.registry import OdometryFactory, odometry_class
+from adaptune.odometry.factory import OdometryFactory
+from adaptune.odometry.health import HealthCheck
+from adaptune.odometry.registry import odometry_class
 from adaptune.odometry.remote import Limits
-from adaptune.odometry.tracker import HealthCheck
 from adaptune.simulation import Course
 from adaptune.simulation.record import simulate
 from adaptune.trajectory import Trajectory, write_tum

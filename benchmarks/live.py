@@ -18,8 +18,9 @@ import numpy as np
 from adaptune import machine
 from adaptune.live.evidence import LiveEvidence
 from adaptune.odometry.base import InProcess
+from adaptune.odometry.health import HealthCheck
 from adaptune.odometry.keyframe import KeyframeGicp
-from adaptune.odometry.tracker import HealthCheck, Tracker
+from adaptune.odometry.tracker import Tracker
 from adaptune.recording.config import SequenceConfig
 from adaptune.recording.recording import open_sequence
 from adaptune.recording.scan import Scan

@@ -32,15 +32,15 @@ from replays import ORDERS, mean_error
 from adaptune.bank.bank import Bank
 from adaptune.model import ErrorModel
 from adaptune.model.registry import ADAPTIVE
+from adaptune.odometry.health import HealthCheck
 from adaptune.odometry.remote import SERVICE
-from adaptune.odometry.tracker import HealthCheck
 from adaptune.processes import server
 from adaptune.recording.scan import Scan
 from adaptune.selector import Selector
 from adaptune.simulation import Course
 from adaptune.simulation.record import SimulatedScan, simulate
 from adaptune.study.config import SwitchingConfig
-from adaptune.study.study import BEST_DEFAULT, EQUAL_COST, RIVALS, named
+from adaptune.study.driven import BEST_DEFAULT, EQUAL_COST, RIVALS, named
 from offline.labelled import LabelledData
 from offline.train import fit, tuned
 from offline.tuning import figures

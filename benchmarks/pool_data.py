@@ -27,7 +27,8 @@ from adaptune.live.hops import Hops
 from adaptune.model.descriptor import averaged, lowest_elevation
 from adaptune.model.ndt import N_FEATURES, ndt_histogram
 from adaptune.model.rules import Costs, SetCost
-from adaptune.odometry.registry import OdometryFactory, OdometryPool, odometry_class
+from adaptune.odometry.factory import OdometryFactory, OdometryPool
+from adaptune.odometry.registry import odometry_class
 from adaptune.odometry.remote import Limits
 from adaptune.simulation.record import simulate
 from adaptune.space import ODOMETRY, ParameterSet, ParameterSets, ParameterSpace

@@ -31,10 +31,10 @@ from adaptune.bank.bank import Bank
 from adaptune.model import ErrorModel
 from adaptune.model.descriptor import lowest_elevation
 from adaptune.model.ndt import N_FEATURES, ndt_histogram
+from adaptune.odometry.factory import OdometryFactory
+from adaptune.odometry.health import HealthCheck
 from adaptune.odometry.keyframe import KeyframeGicp
-from adaptune.odometry.registry import OdometryFactory
 from adaptune.odometry.remote import Limits
-from adaptune.odometry.tracker import HealthCheck
 from adaptune.recording.config import SequenceConfig
 from adaptune.recording.recording import open_sequence
 from adaptune.recording.scan import Scan
@@ -43,9 +43,10 @@ from adaptune.simulation import Course
 from adaptune.simulation.record import simulate
 from adaptune.space import ParameterSets, ParameterSpace
 from adaptune.study.config import RealTimeConfig
-from online.real_time import SelectorProcess, replay_in_real_time
+from online.real_time import replay_in_real_time
 from online.record import kept_up
 from online.replay import replay
+from online.selector_process import SelectorProcess
 
 REPEATS = 5
 SETTINGS = {"downsampling": 0.5}

@@ -60,7 +60,8 @@ from offline.labelled import LabelledData, labelled_data
 from offline.train import train, trial_workers
 from online.modes import run_replays, run_untrained
 from online.record import StoredReplay
-from online.statistics import ComparisonRow, Reference, compare_modes
+from online.reference import Reference
+from online.statistics import ComparisonRow, compare_modes
 
 ODOMETRIES = ("gicp", "ndt", "kiss_icp")
 MODES = ("baseline", "fixed", "adaptive", "untrained")

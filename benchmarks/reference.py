@@ -27,8 +27,8 @@ from adaptune.files import replacing
 from adaptune.metrics import cap, sub_trajectory_rte, sub_trajectory_vectors
 from adaptune.model.registry import ADAPTIVE
 from adaptune.reference.estimate import VERSION, estimated
+from adaptune.reference.estimated import EstimateError
 from adaptune.reference.graph import pass_over
-from adaptune.reference.stored import EstimateError
 from adaptune.simulation import Course
 from adaptune.simulation.record import simulate
 from offline import validate as validation

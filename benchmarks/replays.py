@@ -26,8 +26,8 @@ from adaptune.model import ErrorModel
 from adaptune.model.rules import ERROR_FLOOR
 from adaptune.model.weights import weighted_selection
 from adaptune.odometry.base import Motions, OdometryInstance
-from adaptune.odometry.registry import OdometryFactory
-from adaptune.odometry.tracker import HealthCheck
+from adaptune.odometry.factory import OdometryFactory
+from adaptune.odometry.health import HealthCheck
 from adaptune.recording.scan import Scan
 from adaptune.selector import AnySelector, Selector, UntrainedSelector, untrained_sets
 from adaptune.simulation import Course

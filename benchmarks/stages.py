@@ -23,8 +23,8 @@ from adaptune.geometry import Poses
 from adaptune.metrics import sub_trajectory_rte
 from adaptune.model import ErrorModel
 from adaptune.model.ndt import ndt_histogram
+from adaptune.odometry.health import HealthCheck
 from adaptune.odometry.keyframe import crop
-from adaptune.odometry.tracker import HealthCheck
 from adaptune.recording import SequenceConfig
 from adaptune.recording.recording import open_sequence
 from adaptune.selector import Selector

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from adaptune.errors import MachineError, UnavailableError, in_a_line
 from adaptune.geometry import Poses
 from adaptune.odometry.base import Usage
-from adaptune.odometry.registry import Factory
+from adaptune.odometry.factory import Factory
 from adaptune.odometry.tracker import Tracker
 from adaptune.progress import Progress, unseen, watched
 from adaptune.recording.scan import Recording, SequenceError
 from adaptune.space import ParameterSet
-from adaptune.study.study import StudySequences
+from adaptune.study.sequences import StudySequences
 from offline.config import OfflineStudyConfig
 from offline.shared_scans import SharedScan, SharedScans
 from offline.stretches import Stretch

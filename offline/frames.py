@@ -22,7 +22,7 @@ from adaptune.model.descriptor import (
 from adaptune.odometry.base import MIN_POINTS
 from adaptune.progress import Progress, unseen, watched
 from adaptune.recording.scan import Scan
-from adaptune.study.study import StudySequences
+from adaptune.study.sequences import StudySequences
 from adaptune.trajectory import Trajectory
 from offline.config import OfflineStudyConfig
 from offline.stretches import stretches_of

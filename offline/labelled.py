@@ -34,11 +34,11 @@ from adaptune.model.rules import (
     mean_errors,
 )
 from adaptune.model.weights import MEMBER_POOL_SIZE, MemberWeights
-from adaptune.odometry.registry import Factory
+from adaptune.odometry.factory import Factory
 from adaptune.recording.scan import stretch_numbers
 from adaptune.space import ParameterSets
 from adaptune.study.config import WORTH
-from adaptune.study.study import MIN_RECORDINGS, PER_STRETCH
+from adaptune.study.driven import MIN_RECORDINGS, PER_STRETCH
 from offline.campaign import read_whole_drives
 from offline.choice import (
     PER_BLOCK,

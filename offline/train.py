@@ -23,13 +23,15 @@ from adaptune.reference.check import hard_to_track
 from adaptune.report import tables
 from adaptune.space import ParameterSet, ParameterSets, ParameterSpace, in_words
 from adaptune.study.config import StudyConfig, SwitchingConfig
+from adaptune.study.oracle import OracleErrors, oracle_errors
 from adaptune.study.references import (
     ensure_references,
     estimates_as_data,
     estimates_in_words,
     estimates_of,
 )
-from adaptune.study.study import FIXED_SET, OracleErrors, StudySequences, oracle_errors
+from adaptune.study.sequences import StudySequences
+from adaptune.study.study import FIXED_SET
 from offline.bare import bare_in_words, in_whole_drives
 from offline.campaign import (
     Campaign,

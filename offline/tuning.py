@@ -22,12 +22,7 @@ from adaptune.model.weights import (
     choose_members,
     smooth_weights,
 )
-from adaptune.study.study import (
-    BEST_DEFAULT,
-    EQUAL_COST,
-    MIN_RECORDINGS,
-    is_worth,
-)
+from adaptune.study.driven import BEST_DEFAULT, EQUAL_COST, MIN_RECORDINGS, is_worth
 from offline.choice import choose as choose_fixed
 from offline.labelled import LabelledData, LabelledSequence, periods
 

@@ -21,8 +21,7 @@ from adaptune.model.rules import BASELINE, ERROR_FLOOR
 from adaptune.progress import Progress, unseen
 from adaptune.report import tables
 from adaptune.report.drawing import draw_chart
-from adaptune.study.references import estimates_in_words, estimates_of
-from adaptune.study.study import (
+from adaptune.study.driven import (
     MIN_RECORDINGS,
     PER_STRETCH,
     RIVAL_WORDS,
@@ -30,6 +29,7 @@ from adaptune.study.study import (
     driven,
     expected_in_words,
 )
+from adaptune.study.references import estimates_in_words, estimates_of
 from offline.bare import in_whole_drives
 from offline.charts import stretch_chart
 from offline.config import OfflineStudy

@@ -27,7 +27,7 @@ from adaptune.progress import Progress, unseen
 from adaptune.recording.cache import fingerprints
 from adaptune.recording.scan import Recording
 from adaptune.space import ParameterSet
-from adaptune.study.study import StudySequences
+from adaptune.study.sequences import StudySequences
 from offline.drive import Drive, TrialSetup, drive_sets
 from offline.frames import describe, with_measured_hops
 from offline.shared_scans import SharedScans

@@ -21,15 +21,10 @@ from adaptune.model.registry import ADAPTIVE
 from adaptune.reference.check import hard_to_track
 from adaptune.report import tables as report
 from adaptune.study.config import ALSO
-from adaptune.study.study import (
-    BEST_DEFAULT,
-    MIN_RECORDINGS,
-    PER_STRETCH,
-    RIVALS,
-    Study,
-    StudySequences,
-    oracle_errors,
-)
+from adaptune.study.driven import BEST_DEFAULT, MIN_RECORDINGS, PER_STRETCH, RIVALS
+from adaptune.study.oracle import oracle_errors
+from adaptune.study.sequences import StudySequences
+from adaptune.study.study import Study
 from online.modes import (
     BASELINE,
     EVEN,
@@ -40,13 +35,8 @@ from online.modes import (
     replayed_modes,
     sequences_without_model,
 )
-from online.record import (
-    ReplaySummary,
-    StoredReplay,
-    StoredReplayError,
-    check_reference,
-    read_contradictions,
-)
+from online.record import ReplaySummary, StoredReplay, StoredReplayError
+from online.reference import Reference, StandardErrors, check_reference, read_contradictions
 from online.statistics import (
     ALL,
     ERROR_FACTOR,
@@ -55,8 +45,6 @@ from online.statistics import (
     ComparisonRow,
     JudgedModes,
     Ratio,
-    Reference,
-    StandardErrors,
     allowing_for,
     compare_modes,
     mean_of,

@@ -16,11 +16,13 @@ from adaptune.files import write_text
 from adaptune.metrics import MIN_BLOCKS, RESAMPLES
 from adaptune.odometry.faults import MAX_SHARE_WITHOUT_POSE
 from adaptune.report.tables import Listing, markdown
-from adaptune.study.study import MIN_RECORDINGS, PER_STRETCH, Study, is_written_to
+from adaptune.study.driven import MIN_RECORDINGS, PER_STRETCH
+from adaptune.study.study import Study, is_written_to
 from online.compare import SEED, allowed, pooled_logs, resampled_logs
 from online.modes import BASELINE, FIXED
 from online.record import StoredReplay
-from online.statistics import ALL, Reference
+from online.reference import Reference
+from online.statistics import ALL
 
 Verdict = Literal["better", "worse", "equal", "unclear"]
 """`equal` is surely within the bound, `unclear` too little to tell."""

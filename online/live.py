@@ -16,8 +16,9 @@ from rosbags.typesys.store import Typestore
 
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses, to_quaternions
-from adaptune.recording.clouds import CLOUDS, from_fields, header_of, message_stamp
+from adaptune.recording.clouds import CLOUDS, from_fields, header_of
 from adaptune.recording.config import ImuConfig
+from adaptune.recording.pose_messages import message_stamp
 from adaptune.recording.scan import Imu, Scan
 from adaptune.recording.timing import Timing
 from adaptune.ros.link import LinkError, RosLink

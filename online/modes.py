@@ -18,7 +18,8 @@ from adaptune.model.descriptor import DescriptorError
 from adaptune.model.registry import ADAPTIVE, ENTRY_POINTS, RULES
 from adaptune.model.weights import weighted_selection
 from adaptune.odometry.base import Motions, OdometryInstance
-from adaptune.odometry.registry import Factory, python_content
+from adaptune.odometry.content import python_content
+from adaptune.odometry.factory import Factory
 from adaptune.progress import Progress, unseen
 from adaptune.recording.parts import part_name
 from adaptune.recording.scan import Recording, Scan
@@ -26,26 +27,15 @@ from adaptune.reference.check import mean_difference
 from adaptune.selector import AnySelector, Selector, UntrainedSelector, untrained_sets
 from adaptune.space import ParameterSet, ParameterSets, Selection
 from adaptune.study.config import StudyConfig
+from adaptune.study.driven import RIVALS, ModeError, bank_members, cannot_adapt, mechanism_of
 from adaptune.study.references import contradictions_of, ensure_references
-from adaptune.study.study import (
-    RIVALS,
-    Mechanism,
-    ModeError,
-    Study,
-    bank_members,
-    cannot_adapt,
-    mechanism_of,
-)
+from adaptune.study.study import Mechanism, Study
 from adaptune.trajectory import Trajectory
-from online.real_time import SelectorProcess, replay_in_real_time
-from online.record import (
-    StoredReplay,
-    is_reference_of,
-    replay_changes,
-    write_reference,
-    write_replay,
-)
+from online.real_time import replay_in_real_time
+from online.record import StoredReplay, replay_changes, write_replay
+from online.reference import is_reference_of, write_reference
 from online.replay import ReplayRecord, replay
+from online.selector_process import SelectorProcess
 
 BASELINE, FIXED, EVEN, UNTRAINED = "baseline", "fixed", "even", "untrained"
 MODES = tuple(dict.fromkeys((BASELINE, *RIVALS, FIXED, ADAPTIVE, UNTRAINED, EVEN, *RULES)))

@@ -23,8 +23,8 @@ from adaptune.trajectory import Trajectory
 from online.compare import current_replays
 from online.live import Placed, RosMessages, placed
 from online.modes import replayed_modes, sequences_without_model
-from online.record import StoredReplay, StoredReplayError, check_reference
-from online.statistics import Reference
+from online.record import StoredReplay, StoredReplayError
+from online.reference import Reference, check_reference
 
 CLOUD_PERIOD = 1.0
 """Seconds from one cloud to the next."""

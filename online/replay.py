@@ -17,7 +17,8 @@ from adaptune.machine import resident_megabytes
 from adaptune.model.rules import BASELINE
 from adaptune.odometry.base import Motions, OdometryInstance, Usage
 from adaptune.odometry.faults import MAX_SHARE_WITHOUT_POSE
-from adaptune.odometry.tracker import HealthCheck, RegisteredScan, Tracker
+from adaptune.odometry.health import HealthCheck
+from adaptune.odometry.tracker import RegisteredScan, Tracker
 from adaptune.recording.scan import Scan
 from adaptune.selector import REMEMBERED, SETTLING, AnySelector, Schedule, used_instead
 from adaptune.space import Selection

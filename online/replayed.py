@@ -12,12 +12,14 @@ from adaptune.metrics import travelled
 from adaptune.model import ErrorModel
 from adaptune.report.charts import Spans
 from adaptune.space import ParameterSpace
-from adaptune.study.study import Study, StudySequences, named
+from adaptune.study.driven import named
+from adaptune.study.sequences import StudySequences
+from adaptune.study.study import Study
 from adaptune.trajectory import Trajectory, read_tum
 from online.compare import current_replays
 from online.modes import BASELINE, FIXED, UNTRAINED
-from online.record import StoredReplay, check_reference
-from online.statistics import Reference
+from online.record import StoredReplay
+from online.reference import Reference, check_reference
 
 
 def scene_spans(

@@ -1,243 +1,34 @@
 """Drive on a robot: scans from a topic, poses and selections on others."""
 
-import csv
-import io
 import itertools
 import logging
-import subprocess
-import threading
 from collections import deque
-from collections.abc import Iterable
 from contextlib import ExitStack, closing
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import NamedTuple
 
-import numpy as np
-
-from adaptune.errors import AdaptuneError, OdometryError, nearest
-from adaptune.geometry import Poses, invert, to_pose
-from adaptune.odometry.base import OdometryInstance, Registration
+from adaptune.errors import AdaptuneError, nearest
+from adaptune.geometry import invert
+from adaptune.odometry.base import OdometryInstance
 from adaptune.odometry.tracker import RegisteredScan
-from adaptune.recording.clouds import POSES
 from adaptune.recording.config import ImuConfig, SequenceConfig
-from adaptune.recording.scan import Scan
 from adaptune.recording.timing import Timing
-from adaptune.ros.link import LinkError, RosLink, Steering
-from adaptune.selector import BACK, Selector
-from adaptune.space import Selection
-from adaptune.strict import in_one_line
-from adaptune.study.config import RealTimeConfig, RosConfig, SteerConfig, StudyConfig
-from adaptune.study.study import ModeError, Study, StudySequences
-from adaptune.trajectory import Trajectory, tum_lines
+from adaptune.ros.link import RosLink
+from adaptune.selector import Selector
+from adaptune.study.config import RealTimeConfig, RosConfig, StudyConfig
+from adaptune.study.driven import ModeError
+from adaptune.study.sequences import StudySequences
+from adaptune.study.study import Study
+from online.drive_log import DriveLog
 from online.live import LiveScans, RosMessages, Uncertainty, placed
 from online.modes import UNTRAINED, WITHOUT_MODEL, Mode, ReplaySetup, needed
-from online.real_time import RealTimeDrive, SelectorProcess
-from online.record import FRAME_COLUMNS, SELECTION_COLUMNS, frame_row, selection_row
+from online.real_time import RealTimeDrive
 from online.replay import Choice, ReplayRecord, Watch
-
-# What a drive leaves on disk, written while it lasts.
-
-
-class DriveLog:
-    """Writes ``trajectory.tum``, ``frames.csv`` and ``selections.csv``, line by line.
-
-    Where the disk is full, the log ends and the drive goes on.
-
-    `names` are those of the parameters, columns of ``selections.csv``. With `goes_on`, the drive
-    goes on where nothing can be recorded from the start.
-
-    Attributes
-    ----------
-    lost : str
-        Why the log ended; empty while it lasts.
-
-    Raises
-    ------
-    OSError
-        If the files cannot be made, unless the drive goes on.
-    """
-
-    def __init__(self, folder: Path, names: list[str], *, goes_on: bool = False):
-        self.folder, self.lost = folder, ""
-        self._names = names
-        self._files: dict[str, IO[str]] = {}
-        try:
-            folder.mkdir(parents=True)
-            for name in ("trajectory.tum", "frames.csv", "selections.csv"):
-                # A line is on disk when it is written: the robot may be switched off.
-                file = (folder / name).open("w", buffering=1, newline="", encoding="utf-8")
-                self._files[name] = file
-        except OSError as error:
-            if not goes_on:
-                raise
-            self._end(error)
-        self._write("frames.csv", _csv(FRAME_COLUMNS))
-        self._write("selections.csv", _csv((*SELECTION_COLUMNS, *names)))
-
-    def scan(self, step: RegisteredScan, late: float) -> None:
-        """Note a scan: its pose, and how late that was in seconds."""
-        stamps = np.array([step.stamp], np.int64)
-        (line,) = tum_lines(stamps, step.T_odom_sensor[None])
-        self._write("trajectory.tum", line)
-        self._write("frames.csv", _csv(frame_row(step, late)))
-
-    def choice(self, choice: Choice) -> None:
-        """Note a selection."""
-        self._write("selections.csv", _csv(selection_row(choice, self._names)))
-
-    def close(self) -> None:
-        """Close the files."""
-        for file in self._files.values():
-            try:
-                file.close()
-            except OSError as error:
-                self._end(error)
-
-    def _write(self, name: str, line: str) -> None:
-        if not self.lost:
-            try:
-                self._files[name].write(line)
-            except OSError as error:
-                self._end(error)
-
-    def _end(self, error: OSError) -> None:
-        if not self.lost:
-            self.lost = in_one_line(error)
-            _log.warning("%s: nothing more is recorded (%s); the drive goes on", self.folder, error)
-
-
-def _csv(row: Iterable[Any]) -> str:
-    text = io.StringIO()
-    csv.writer(text).writerow(row)
-    return text.getvalue()
-
-
-# Somebody else's odometry node, of which only parameters are set.
-
-
-ODOMETRY = "nav_msgs/msg/Odometry"
-PATIENCE = 0.3
-"""Seconds after a scan in which the node's pose must be there."""
-SILENT = 10
-"""Scans of which most have no pose; then the log says so."""
-_COMMAND = 5.0
-"""Seconds for a command that sets a parameter."""
-_KEPT = 1000
-"""Poses of a node, and scans of a drive, that are kept."""
-_GAP = 1.0
-"""Seconds between poses over which a pose is interpolated."""
-
-
-class SteeredNode(OdometryInstance):
-    """An odometry that runs elsewhere and publishes its poses."""
-
-    faults = ()
-    rewinds = False
-
-    def __init__(self, link: RosLink, settings: SteerConfig, points: str):
-        self._settings, self._link, self._points = settings, link, points
-        extrinsic = settings.extrinsic
-        self._T_base_sensor = np.eye(4) if extrinsic is None else to_pose(extrinsic)
-        self._news = threading.Condition()
-        self._poses: deque[tuple[int, Poses]] = deque(maxlen=_KEPT)
-        self._begun: tuple[int, Poses] | None = None
-        self._T_odom_node: Poses | None = None
-        self._steering = Steering(
-            settings.node,
-            lambda parameters: link.set_parameters(settings.node, parameters),
-            settings.command,
-            _run,
-        )
-        self._silent: deque[bool] = deque(maxlen=SILENT)
-        self._told = False
-        link.subscribe(settings.odometry, ODOMETRY, self._take)
-
-    def start(
-        self, prepared: Scan, T_odom_sensor: Poses, T_previous_current: Poses | None = None
-    ) -> None:
-        # The node goes on; its motions continue from here.
-        self._begun, self._T_odom_node = (prepared.stamp, np.array(T_odom_sensor)), None
-        self._last_motion.start(T_odom_sensor, T_previous_current)
-
-    def submit(self, prepared: Scan) -> None:
-        self._submitted = prepared.stamp
-
-    def collect(self) -> Registration:
-        T_node = self._pose(self._submitted, PATIENCE)
-        T_odom_sensor = np.full((4, 4), np.nan)
-        known = bool(np.isfinite(T_node).all())
-        self._silent.append(not known)
-        self._tell_of_silence()
-        if known:
-            if self._T_odom_node is None:
-                assert self._begun is not None
-                stamp, T = self._begun
-                T_begin = self._pose(stamp, 0.0)
-                T_first = T_begin if np.isfinite(T_begin).all() else T_node
-                self._T_odom_node = T @ invert(T_first)
-            T_odom_sensor = self._T_odom_node @ T_node
-        self._last_motion.move(T_odom_sensor)
-        return Registration(T_odom_sensor, known)
-
-    def _tell_of_silence(self) -> None:
-        n = sum(self._silent)
-        self._told &= n > 0
-        # A node that loses clouds answers now and then.
-        if n < SILENT - 2 or len(self._silent) < SILENT or self._told:
-            return
-        self._told, settings = True, self._settings
-        try:
-            why = self._link.why_unheard(self._points)
-        except LinkError as error:
-            why = str(error)
-        what = "%s: no pose of %s for %d of %d scans; %s"
-        usual = "is it the topic, and does the node run?"
-        _log.warning(what, settings.odometry, settings.node, n, SILENT, why or usual)
-
-    def apply(self, selection: Selection) -> None:
-        """Set the parameters, see `adaptune.ros.link.Steering.apply`."""
-        self._steering.apply(selection.parameters)
-
-    def _take(self, message: Any) -> None:
-        for stamp, _, position, orientation in POSES[ODOMETRY](message):
-            values = (position.x, position.y, position.z)
-            quaternion = (orientation.x, orientation.y, orientation.z, orientation.w)
-            try:
-                T = to_pose((*values, *quaternion))
-            except ValueError:
-                continue  # no pose, which the health check sees
-            with self._news:
-                if self._poses and stamp < self._poses[-1][0] - BACK:
-                    self._poses.clear()
-                if not self._poses or stamp > self._poses[-1][0]:
-                    self._poses.append((stamp, T @ self._T_base_sensor))
-                self._news.notify()
-
-    def _pose(self, stamp: int, seconds: float) -> Poses:
-        """The node's pose at a stamp, of shape (4, 4); NaN if it does not come in time."""
-        with self._news:
-            self._news.wait_for(lambda: self._poses and self._poses[-1][0] >= stamp, seconds)
-            poses = list(self._poses)
-        if not poses:
-            return np.full((4, 4), np.nan)
-        stamps, T = zip(*poses, strict=True)
-        known = Trajectory(np.array(stamps, np.int64), np.array(T))
-        found: Poses = known.at(np.array([stamp], np.int64), _GAP)[0]
-        return found
-
-
-def _run(command: list[str]) -> tuple[int, str]:
-    try:
-        done = subprocess.run(
-            command, capture_output=True, text=True, timeout=_COMMAND, check=False
-        )
-    except (OSError, subprocess.TimeoutExpired) as error:
-        raise OdometryError(f"{command[0]}: {error}") from error
-    return done.returncode, done.stderr or done.stdout
-
+from online.selector_process import SelectorProcess
+from online.steered import _KEPT, ODOMETRY, SteeredNode
 
 SELECTION_TOPIC = "adaptune/selection"
 

@@ -9,25 +9,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune.live.own_error import OWN_SECONDS
 from adaptune.metrics import (
-    KittiError,
-    absolute_error,
     bootstrap,
     cap,
-    height_error,
-    kitti_error,
-    relative_error,
-    span,
-    sub_trajectory_rte,
-    window_ends,
 )
-from adaptune.study.study import OracleErrors, Study
-from adaptune.trajectory import Trajectory, read_tum
+from adaptune.study.oracle import OracleErrors
+from adaptune.trajectory import Trajectory
 from online.record import StoredReplay, switched
-
-# A row of the comparison: what a mode did on a sequence, or on all of them.
-
+from online.reference import Reference, StandardErrors
 
 ALL = "all"
 """In place of a sequence, all of them."""
@@ -48,25 +37,6 @@ class Ratio(NamedTuple):
 
     value: float
     interval: Interval = None
-
-
-class StandardErrors(NamedTuple):
-    """Errors of a trajectory as evo and KITTI's benchmark define them."""
-
-    ape: float  # metres, after alignment
-    rpe: float  # metres, from scan to scan
-    kitti: KittiError
-    height: float = np.nan  # percent of the sub-trajectory's length, see `height_error`
-
-    @classmethod
-    def pooled(cls, errors: "Sequence[StandardErrors]") -> "StandardErrors | None":
-        """Means over sequences; KITTI's error over the sub-trajectories of all of them."""
-        if not errors:
-            return None
-        ape, rpe, kitti, heights = zip(*errors, strict=True)
-        known = [height for height in heights if np.isfinite(height)]
-        height = float(np.mean(known)) if known else np.nan
-        return cls(float(np.mean(ape)), float(np.mean(rpe)), KittiError.pooled(kitti), height)
 
 
 @dataclass(frozen=True)
@@ -174,91 +144,6 @@ class ComparisonRow:
 
 ERROR_FACTOR = 1.5
 """By how much more than estimated an estimated reference may err."""
-
-
-class Reference(NamedTuple):
-    """The reference that errors are measured against, and over which length."""
-
-    trajectory: Trajectory | None  # None where nothing is known
-    length: float  # metres of a sub-trajectory
-    estimated: bool = False  # whether it was computed from the recording
-    error: float | None = None  # estimated mean RTE of an estimated one, percent
-
-    @classmethod
-    def read(cls, study: Study, name: str) -> "Reference":
-        """Read the reference of a replayed sequence, if it has one, from beside its replays."""
-        path, length = (
-            study.folder / "replays" / name / "reference.tum",
-            study.config.sub_trajectory,
-        )
-        trajectory = read_tum(path) if path.exists() else None
-        if trajectory is not None:
-            # Frames in a gap, and across a jump, have no label in training, and get none here.
-            known = study.sequences.open(name).reference()
-            gap = trajectory.max_gap if known is None else known.max_gap
-            trajectory = replace(trajectory, max_gap=gap)
-        stored = study.sequences.estimate(name)
-        error = math.nan if stored is None else stored.error(length)
-        return cls(trajectory, length, stored is not None, None if math.isnan(error) else error)
-
-    @property
-    def block(self) -> int:
-        """Frames of a sub-trajectory."""
-        return 1 if self.trajectory is None else span(self.trajectory.T_world_sensor, self.length)
-
-    def errors(self, odometry: Trajectory) -> NDArray[np.float64]:
-        """Capped sub-trajectory RTE at every frame in percent, NaN where it is unknown."""
-        if self.trajectory is None:
-            return np.full(len(odometry), np.nan)
-        T_ref_sensor = self.trajectory.at(odometry.stamps)
-        return cap(sub_trajectory_rte(T_ref_sensor, odometry.T_world_sensor, self.length))
-
-    def errors_around(self, odometry: Trajectory) -> NDArray[np.float64]:
-        """Mean RTE in percent of the sub-trajectories through each pose; NaN without any."""
-        starts, ends, errors = self._known(odometry)
-        poses = np.arange(len(odometry))
-        return _means(errors, np.searchsorted(ends, poses), np.searchsorted(starts, poses, "right"))
-
-    def errors_behind(self, odometry: Trajectory) -> NDArray[np.float64]:
-        """Mean RTE in percent of the sub-trajectories that ended in the last `OWN_SECONDS`.
-
-        It is what an odometry estimates while it drives. NaN where none ended.
-        """
-        _, ends, errors = self._known(odometry)
-        oldest = np.searchsorted(odometry.stamps, odometry.stamps - int(OWN_SECONDS * 1e9))
-        newest = np.searchsorted(ends, np.arange(len(odometry)), "right")
-        return _means(errors, np.searchsorted(ends, oldest), newest)
-
-    def _known(
-        self, odometry: Trajectory
-    ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.float64]]:
-        """First and last frame and RTE in percent of the sub-trajectories that are known."""
-        of = self.errors(odometry)
-        starts = np.flatnonzero(np.isfinite(of))
-        if self.trajectory is None:
-            return starts, starts, of[starts]
-        ends = window_ends(self.trajectory.at(odometry.stamps), self.length)
-        return starts, ends[starts], of[starts]
-
-    def standard(self, odometry: Trajectory) -> "StandardErrors | None":
-        """The errors that other tools give, where there are reference poses to compare with."""
-        if self.trajectory is None:
-            return None
-        T_ref_sensor, T = self.trajectory.at(odometry.stamps), odometry.T_world_sensor
-        if np.isfinite(T_ref_sensor[:, 0, 0]).sum() < 2:
-            return None
-        ape, rpe = absolute_error(T_ref_sensor, T), relative_error(T_ref_sensor, T)
-        height = height_error(T_ref_sensor, T, self.length)
-        return StandardErrors(ape, rpe, kitti_error(T_ref_sensor, T), height)
-
-
-def _means(
-    values: NDArray[np.float64], first: NDArray[np.intp], stop: NDArray[np.intp]
-) -> NDArray[np.float64]:
-    """Means of ``values[first:stop]`` for each pair of these, NaN where there is none."""
-    sums = np.concatenate([[0.0], np.cumsum(values)])
-    with np.errstate(invalid="ignore"):
-        return np.asarray((sums[stop] - sums[first]) / (stop - first))
 
 
 class JudgedModes(NamedTuple):
@@ -410,9 +295,6 @@ def _estimated(estimates: NDArray[np.float64]) -> tuple[float | None, Interval]:
         return float(known[:, 0].mean()), None
     mean, low, high = known.mean(axis=0).tolist()
     return mean, (low, high) if np.isfinite([low, high]).all() else None
-
-
-# What the best choice in hindsight would have had, from trials on the test sequences.
 
 
 def oracle_row(judged: JudgedModes, oracle: OracleErrors, fixed: int) -> ComparisonRow | None:

@@ -5,7 +5,7 @@ from typing import Any
 
 from adaptune.model.registry import rule_class
 from adaptune.report.tables import Listing
-from adaptune.study.study import MIN_RECORDINGS
+from adaptune.study.driven import MIN_RECORDINGS
 from online.statistics import ALL, ERROR_FACTOR, ORACLE, ComparisonRow
 
 _COUNTS = ("restarts", "switches")

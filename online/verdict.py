@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 
 from adaptune.study.config import WORTH
-from adaptune.study.study import EQUAL_COST, RIVAL_WORDS, RIVALS, is_worth
+from adaptune.study.driven import EQUAL_COST, RIVAL_WORDS, RIVALS, is_worth
 from online.modes import EVEN
 from online.statistics import ALL, ComparisonRow, Ratio
 from online.tables import YARDSTICKS, last_rows

@@ -49,7 +49,7 @@ def simulate(
     """
     loaded = load(study, override, folder)
     from adaptune.simulation.record import record
-    from adaptune.study.study import StudySequences
+    from adaptune.study.sequences import StudySequences
 
     if not loaded.config.courses:
         help_ = "add one, as in courses: {demo: {scenes: [cave]}}"
@@ -80,7 +80,7 @@ def offline(
     all sequences), and each sequence's best. Stop it with Ctrl-C, and run it again to resume.
     """
     loaded = load(study, override, folder, runs=True)
-    from adaptune.study.study import driven
+    from adaptune.study.driven import driven
     from offline.train import train
 
     with progress() as show:

@@ -241,7 +241,7 @@ def compare(
         return
     if recordings or odometry:
         raise AdaptuneError("BAG and --odometry go with --against, which names the other side")
-    from adaptune.study.study import MIN_RECORDINGS
+    from adaptune.study.driven import MIN_RECORDINGS
 
     loaded = load(Path(study), override, folder)
     found = compared(loaded, details=details)

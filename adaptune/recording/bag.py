@@ -5,8 +5,8 @@ import logging
 import math
 import re
 import resource
-from collections import Counter, defaultdict, deque
-from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import cache, partial
 from itertools import islice, pairwise
@@ -16,88 +16,28 @@ from typing import Any
 import numpy as np
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Connection
-from rosbags.rosbag1 import Reader
-from rosbags.rosbag1.reader import Chunk, IndexData, decompressors
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from adaptune.errors import Finding, blame_machine, nearest
 from adaptune.recording import clouds
-from adaptune.recording.clouds import (
-    CLOUDS,
+from adaptune.recording.clouds import CLOUDS, PointCloudError, header_of
+from adaptune.recording.config import files_of
+from adaptune.recording.findings import clock_parts, of_clock
+from adaptune.recording.indexed_bag import IndexReader
+from adaptune.recording.pose_messages import (
     PATH,
     POSES,
     TRANSFORMS,
-    PointCloudError,
-    header_of,
     message_stamp,
     of_frame,
     untimed,
     usable,
 )
-from adaptune.recording.config import files_of
-from adaptune.recording.findings import clock_parts, of_clock
 from adaptune.recording.scan import Frame, Imu, Scan, SequenceError
 from adaptune.recording.timing import AUTO, Timing
 from adaptune.trajectory import Trajectory
 
 _log = logging.getLogger(__name__)
-
-# ROS 1 bags that are opened by the index at their end alone.
-
-
-_NOTHING = Chunk(0, 0, bytes)
-
-
-class IndexReader(Reader):
-    """Looks a chunk up only when messages of its time are asked for.
-
-    rosbags visits every chunk when it opens a bag, which takes seconds for 100,000 of them. What
-    they hold is also listed at the end of the file.
-    """
-
-    def open(self) -> None:
-        """Read the list of chunks."""
-        super().open()
-        counts: Counter[int] = Counter()
-        for info in self.chunk_infos:
-            for connection, count in info.connection_counts.items():
-                counts[connection] += count
-        self.connections = [c._replace(msgcount=counts[c.id]) for c in self.connections]
-
-    def read_chunk(self) -> Chunk:
-        """Nothing, while the bag is opened."""
-        return _NOTHING
-
-    def read_index_data(self, pos: int, indexes: dict[int, list[IndexData]]) -> None:
-        """Nothing, while the bag is opened."""
-
-    def is_slow(self) -> bool:
-        """Whether its first chunk is packed by BZ2, which unpacks a few megabytes a second."""
-        if not self.chunk_infos:
-            return False
-        assert self.bio is not None
-        self.bio.seek(self.chunk_infos[0].pos)
-        return super().read_chunk().decompressor is decompressors["bz2"]
-
-    def messages(
-        self,
-        connections: Collection[Connection] = (),
-        start: int | None = None,
-        stop: int | None = None,
-    ) -> Generator[tuple[Connection, int, bytes], None, None]:
-        """Messages of some time, as rosbags gives them."""
-        assert self.bio is not None
-        indexes: dict[int, list[IndexData]] = defaultdict(list)
-        for info in self.chunk_infos:
-            if (start is None or info.end_time > start) and (
-                stop is None or info.start_time < stop
-            ):
-                self.bio.seek(info.pos)
-                self.chunks[info.pos] = super().read_chunk()
-                for _ in info.connection_counts:
-                    super().read_index_data(info.pos, indexes)
-        self.indexes = {c.id: sorted(indexes[c.id]) for c in self.connections}
-        yield from super().messages(connections, start, stop)
 
 
 _LATEST, _UNEVEN = 600 * 10**9, 10**9

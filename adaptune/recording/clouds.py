@@ -1,9 +1,8 @@
-"""sensor_msgs/PointCloud2 to scans."""
+"""Messages of point clouds to scans: sensor_msgs/PointCloud2, and CustomMsg of Livox's drivers."""
 
 import re
 import struct
-from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, lru_cache
 from typing import Any, NamedTuple
@@ -11,12 +10,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune import geometry
 from adaptune.compiled import compiled
-from adaptune.errors import AdaptuneError, nearest
-from adaptune.recording.scan import Scan, SequenceError
+from adaptune.errors import AdaptuneError
+from adaptune.recording.scan import Scan
 from adaptune.recording.timing import AUTO, TIME_FIELDS, Timing, TimingError, Unit
-from adaptune.trajectory import Trajectory
 
 _WORD = {order: struct.Struct(f"{order}I").unpack_from for order in "<>"}
 
@@ -372,9 +369,6 @@ def _kernel(kind: str) -> Callable[..., Any]:
     return compiled(_gather, signature)
 
 
-# livox_ros_driver/CustomMsg to scans.
-
-
 LIVOX_TYPES = ("livox_ros_driver/msg/CustomMsg", "livox_ros_driver2/msg/CustomMsg")
 
 _POINT = """uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z
@@ -446,86 +440,3 @@ def livox_points(scan: Scan) -> bytes:
             raw[name] = (np.asarray(given, np.float64) * factor).clip(0, most).round()
     behind = raw.dtype.itemsize - _LIVOX_SIZE
     return struct.pack("<I", len(scan)) + raw.tobytes()[: -behind if len(scan) else None]
-
-
-# Poses in ROS messages.
-
-
-Pose = tuple[int, str, Any, Any]
-"""Stamp, frame, translation, quaternion."""
-
-
-def message_stamp(message: Any) -> int:
-    """Nanoseconds of a message's header."""
-    return int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec)
-
-
-def _header_pose(message: Any, pose: Any) -> list[Pose]:
-    return [(message_stamp(message), message.header.frame_id, pose.position, pose.orientation)]
-
-
-def _transforms(transforms: Iterable[Any]) -> list[Pose]:
-    return [
-        (message_stamp(t), t.child_frame_id, t.transform.translation, t.transform.rotation)
-        for t in transforms
-    ]
-
-
-POSES: dict[str, Callable[[Any], list[Pose]]] = {
-    "geometry_msgs/msg/PoseStamped": lambda m: _header_pose(m, m.pose),
-    "geometry_msgs/msg/PoseWithCovarianceStamped": lambda m: _header_pose(m, m.pose.pose),
-    "nav_msgs/msg/Odometry": lambda m: _header_pose(m, m.pose.pose),
-    "nav_msgs/msg/Path": lambda m: [pose for p in m.poses for pose in _header_pose(p, p.pose)],
-    "geometry_msgs/msg/TransformStamped": lambda m: _transforms([m]),
-    "tf2_msgs/msg/TFMessage": lambda m: _transforms(m.transforms),
-    "tf/msg/tfMessage": lambda m: _transforms(m.transforms),
-}
-"""Poses in a message, by its type."""
-# Each message of this type repeats all poses of the one before.
-PATH = "nav_msgs/msg/Path"
-TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
-
-
-def of_frame(topic: str, poses: Sequence[Pose], frame: str | None) -> list[Pose]:
-    """Poses of one child frame; of the only one if `frame` is None, else a SequenceError."""
-    frames = sorted({name for _, name, *_ in poses})
-    if frame is None and len(frames) > 1:
-        help_ = f"name one of them as `child_frame`: {', '.join(frames)}"
-        raise SequenceError(f"{topic} has the transforms of several frames, {help_}")
-    if frame is not None and frame not in frames:
-        raise SequenceError(f"{topic}: no frame {frame}; {nearest(frame, frames)}")
-    return [pose for pose in poses if frame in (None, pose[1])]
-
-
-def usable(poses: Sequence[Pose]) -> tuple[Trajectory | None, list[str]]:
-    """Trajectory of the usable poses, each stamp once, and what is left out.
-
-    Poses are usable if they are finite and have a rotation, and are of the frame that most are of:
-    two nodes may publish on a topic. The trajectory is None if none is usable.
-    """
-    (frame, n), *others = Counter(name for _, name, *_ in poses).most_common()
-    left_out = [
-        f"{m} of {n + m} poses are of the frame {name!r}, not {frame!r}" for name, m in others
-    ]
-    poses = [pose for pose in poses if pose[1] == frame]
-    stamps = np.array([stamp for stamp, *_ in poses], np.int64)
-    values: NDArray[np.float64] = np.array(
-        [(p.x, p.y, p.z, q.x, q.y, q.z, q.w) for _, _, p, q in poses]
-    )
-    with np.errstate(invalid="ignore", over="ignore"):
-        norms = np.linalg.norm(values[:, 3:], axis=1)
-    good = np.isfinite(values).all(axis=1) & np.isfinite(norms) & (norms > 0.1)
-    if unusable := int(np.count_nonzero(~good)):
-        left_out += [f"{unusable} of {len(poses)} poses are not finite or have no rotation"]
-    if not good.any():
-        return None, left_out
-    unique, index = np.unique(stamps[good], return_index=True)
-    values = values[good][index]
-    T = geometry.from_quaternions(values[:, :3], values[:, 3:])
-    return Trajectory(unique, T), left_out
-
-
-def untimed(poses: Sequence[Pose]) -> str:
-    """What is wrong with poses whose stamps were never set; empty for others."""
-    first, same = poses[0][0], len({stamp for stamp, *_ in poses}) == 1 < len(poses)
-    return f"all its {len(poses)} poses have the stamp {first * 1e-9:.10g} s" if same else ""

@@ -11,18 +11,8 @@ from adaptune import files, yaml12
 from adaptune.errors import AdaptuneError, Finding, MachineError
 from adaptune.progress import Progress, unseen
 from adaptune.recording import Scan, SequenceConfig, SequenceError
-from adaptune.recording.bag import IMU_TYPES, BagSource, IndexReader, Window, storages
-from adaptune.recording.clouds import (
-    CLOUDS,
-    PATH,
-    POSES,
-    Pose,
-    decode_cloud,
-    header_of,
-    parse,
-    untimed,
-    usable,
-)
+from adaptune.recording.bag import IMU_TYPES, BagSource, Window, storages
+from adaptune.recording.clouds import CLOUDS, decode_cloud, header_of, parse
 from adaptune.recording.config import BAG_SUFFIXES, REFERENCE_FILES, bag_paths
 from adaptune.recording.content import Content
 from adaptune.recording.findings import (
@@ -34,6 +24,8 @@ from adaptune.recording.findings import (
     of_topic,
 )
 from adaptune.recording.folder import kitti, scan_folder
+from adaptune.recording.indexed_bag import IndexReader
+from adaptune.recording.pose_messages import PATH, POSES, Pose, untimed, usable
 from adaptune.trajectory import Trajectory, is_kitti, read_kitti, read_trajectory
 
 # What each stage uses.

@@ -32,9 +32,6 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 
-# Opening recordings, and what they are read from, without reading their scans.
-
-
 def open_sequence(config: SequenceConfig) -> Recording:
     """Open what a study describes; scans are not read before they are asked for.
 
@@ -124,7 +121,7 @@ def _source(config: SequenceConfig) -> "tuple[Source, str | None]":
 def _check_topics(source: "Source", config: SequenceConfig) -> None:
     """Find topics that are named and not there."""
     from adaptune.recording.bag import IMU_TYPES, BagSource
-    from adaptune.recording.clouds import POSES
+    from adaptune.recording.pose_messages import POSES
 
     topic = None if config.imu is None else config.imu.topic
     if isinstance(source, BagSource):

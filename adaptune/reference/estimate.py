@@ -14,8 +14,9 @@ from adaptune.geometry import Poses, invert, mean_motion, rectify, rotation_angl
 from adaptune.recording.config import SequenceConfig
 from adaptune.recording.inspect import Inspection
 from adaptune.recording.scan import Recording, Scan
+from adaptune.reference.consensus import HALVES
+from adaptune.reference.estimated import EstimatedReference, EstimateError, Registrations
 from adaptune.reference.graph import (
-    HALVES,
     LENGTHS,
     SPACING,
     Edge,
@@ -26,7 +27,6 @@ from adaptune.reference.graph import (
     optimised,
     pass_over,
 )
-from adaptune.reference.stored import EstimatedReference, EstimateError, Registrations
 
 VERSION = 1
 """Counts changes after which the same recording has another estimate."""

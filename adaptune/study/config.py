@@ -7,11 +7,11 @@ from typing import Annotated, Any, Literal, NamedTuple
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from adaptune.errors import Finding, nearest
+from adaptune.odometry.health import HealthCheck
 from adaptune.odometry.remote import Limits
-from adaptune.odometry.tracker import HealthCheck
 from adaptune.recording.config import SequenceConfig, Transform
 from adaptune.recording.parts import Fractions, part_name, read_part
-from adaptune.ros.link import SetCommand
+from adaptune.ros.steering import SetCommand
 from adaptune.simulation.course import Course
 from adaptune.space import ParameterSpace
 from adaptune.strict import StrictModel
@@ -212,10 +212,11 @@ class StudyConfig(StrictModel):
         given = (self.odometry,) if isinstance(self.odometry, OdometryConfig) else self.odometry
         return {one.label or one.name: one for one in given}
 
-    # What a stage that adds settings of its own overrides.
-
     def mistakes(self, space: ParameterSpace | None) -> "Iterable[Finding]":  # noqa: ARG002
-        """Find what does not fit the tuned parameters; None where these have mistakes."""
+        """Find what does not fit the tuned parameters; None where these have mistakes.
+
+        A stage that adds settings of its own overrides it, and `resolved`.
+        """
         return ()
 
     def resolved(self) -> dict[str, Any]:

@@ -14,14 +14,9 @@ from adaptune.machine import pin
 from adaptune.recording.recording import RecordedSequence, wants_estimate
 from adaptune.reference import estimate
 from adaptune.reference.diagnosis import SUSPICIOUS, contradictions
-from adaptune.reference.stored import (
-    EstimatedReference,
-    EstimateError,
-    Refusal,
-    StoredEstimate,
-    write_estimate,
-)
-from adaptune.study.study import StudySequences
+from adaptune.reference.estimated import EstimatedReference, EstimateError
+from adaptune.reference.stored import Refusal, StoredEstimate, write_estimate
+from adaptune.study.sequences import StudySequences
 
 _OF_CHANGES = ("compensate", "imu")
 """Keys of a sequence on which its scans as they were recorded do not depend."""

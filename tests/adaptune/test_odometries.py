@@ -4,8 +4,8 @@ import pytest
 from drives import study_with
 from setups import failure
 
+from adaptune.odometry.factory import OdometryPool
 from adaptune.odometry.keyframe import KeyframeGicp, KeyframeVgicp
-from adaptune.odometry.registry import OdometryPool
 from adaptune.space import ODOMETRY
 from offline.config import load_study
 

@@ -13,7 +13,7 @@ from adaptune import processes
 from adaptune.commands.tune import inspect
 from adaptune.model import ModelError
 from adaptune.model.error_model import ErrorModel
-from adaptune.odometry.registry import OdometryFactory
+from adaptune.odometry.factory import OdometryFactory
 from adaptune.odometry.remote import Limits
 from adaptune.selector import Selector
 from adaptune.space import Float, ParameterSpace

@@ -7,7 +7,7 @@ import pytest
 
 from adaptune.recording.config import SequenceConfig
 from adaptune.recording.recording import open_sequence, wants_estimate
-from adaptune.reference.stored import EstimateError
+from adaptune.reference.estimated import EstimateError
 from adaptune.study.references import ensure_references, estimates_as_data, estimates_of
 from offline.config import load_study
 

@@ -11,7 +11,7 @@ from adaptune.model.rules import NOTHING, Rule
 from adaptune.space import Selection
 from adaptune.strict import ConfigurationError
 from adaptune.study.config import SwitchingConfig
-from adaptune.study.study import driven
+from adaptune.study.driven import driven
 from offline import tuning
 from offline import validate as validation
 from offline.config import load_study

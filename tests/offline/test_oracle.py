@@ -7,7 +7,7 @@ from commands import succeeded
 from adaptune.archive import Archive
 from adaptune.metrics import cap
 from adaptune.model import ErrorModel
-from adaptune.study.study import oracle_errors
+from adaptune.study.oracle import oracle_errors
 from offline.config import load_study
 from offline.train import oracle_sets, run_oracle, train
 

@@ -7,7 +7,7 @@ from adaptune.model import BankSettings
 from adaptune.model.registry import ADAPTIVE
 from adaptune.model.rules import Costs, SetCost, allowed_sets
 from adaptune.space import ODOMETRY, Float, ParameterSets, ParameterSpace, PooledSpace
-from adaptune.study.study import BEST_DEFAULT, EQUAL_COST
+from adaptune.study.driven import BEST_DEFAULT, EQUAL_COST
 from offline.tuning import NO_BANK, Policy, driven_cost, rivals
 from offline.validate import leave_one_out
 

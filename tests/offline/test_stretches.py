@@ -14,7 +14,7 @@ from adaptune.live.hops import CLIP, Hop, Hops
 from adaptune.metrics import sub_trajectory_rte, travelled, window_ends
 from adaptune.model.weights import MemberWeights
 from adaptune.space import Selection
-from adaptune.study.study import PER_STRETCH
+from adaptune.study.driven import PER_STRETCH
 from offline.labelled import BankSimulation, error_vectors, recorded_motions
 
 LENGTH = 10.0

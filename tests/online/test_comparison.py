@@ -10,14 +10,15 @@ import pytest
 from adaptune import manifest
 from adaptune.errors import AdaptuneError
 from adaptune.model import BankSettings, ErrorModel
-from adaptune.study.study import ModeError, bank_members
+from adaptune.study.driven import ModeError, bank_members
 from adaptune.trajectory import Trajectory, read_tum, write_tum
 from offline.config import load_study
 from online.compare import compare
 from online.modes import run_replays
 from online.record import StoredReplay, StoredReplayError
+from online.reference import Reference
 from online.replayed import read_replays
-from online.statistics import ComparisonRow, Reference
+from online.statistics import ComparisonRow
 from online.verdict import remarks
 
 MODES = ["baseline", "fixed", "adaptive", "paper"]

@@ -5,7 +5,8 @@ import pytest
 
 from adaptune.metrics import KittiError
 from online.modes import MODES
-from online.statistics import ALL, ORACLE, ComparisonRow, StandardErrors
+from online.reference import StandardErrors
+from online.statistics import ALL, ORACLE, ComparisonRow
 from online.tables import modes_in_words, tables
 
 SHORT = KittiError(np.nan, np.nan, ())

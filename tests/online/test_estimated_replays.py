@@ -5,7 +5,7 @@ import json
 import estimates
 import pytest
 
-from adaptune.reference.stored import EstimateError
+from adaptune.reference.estimated import EstimateError
 from offline.config import load_study
 from online.compare import compare
 from online.modes import run_untrained

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from adaptune.study.study import OracleErrors
+from adaptune.study.oracle import OracleErrors
 from online.statistics import ORACLE, ComparisonRow, JudgedModes, oracle_row
 
 

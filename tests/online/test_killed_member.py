@@ -9,9 +9,10 @@ from needs import needs_evalio
 from wicked import tell
 
 from adaptune.bank.bank import Bank
-from adaptune.odometry.registry import OdometryFactory, OdometryPool, odometry_class
+from adaptune.odometry.factory import OdometryFactory, OdometryPool
+from adaptune.odometry.health import HealthCheck
+from adaptune.odometry.registry import odometry_class
 from adaptune.odometry.remote import SERVICE, Limits
-from adaptune.odometry.tracker import HealthCheck
 from adaptune.recording import Scan
 from adaptune.selector import UntrainedSelector
 from adaptune.space import ParameterSets

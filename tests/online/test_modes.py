@@ -8,11 +8,12 @@ from random_models import random_model
 
 from adaptune.model import BankSettings
 from adaptune.model.rules import Costs, SetCost
-from adaptune.odometry.registry import OdometryFactory, OdometryPool, odometry_class
+from adaptune.odometry.factory import OdometryFactory, OdometryPool
+from adaptune.odometry.registry import odometry_class
 from adaptune.odometry.remote import Limits
 from adaptune.space import ParameterSpace
 from adaptune.study.config import ALSO, RealTimeConfig, StudyConfig
-from adaptune.study.study import ModeError
+from adaptune.study.driven import ModeError
 from online.modes import ReplaySetup
 
 

@@ -13,13 +13,14 @@ from noting_selector import Noting, refusing
 
 from adaptune.errors import AdaptuneError
 from adaptune.odometry.base import InProcess, Motions, Registration
+from adaptune.odometry.health import HealthCheck
 from adaptune.odometry.keyframe import KeyframeGicp
-from adaptune.odometry.tracker import HealthCheck
 from adaptune.recording.scan import Imu, ImuNoise, Scan
 from adaptune.selector import TimedSelector, UntrainedSelector, untrained_sets
 from adaptune.space import Selection
 from adaptune.study.config import RealTimeConfig
-from online.real_time import SLOTS, Answer, SelectorProcess, arrivals, replay_in_real_time
+from online.real_time import arrivals, replay_in_real_time
+from online.selector_process import SLOTS, Answer, SelectorProcess
 
 TENTH = 10**8
 """Nanoseconds between scans."""

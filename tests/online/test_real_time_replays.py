@@ -31,7 +31,7 @@ def study(study_file, trained_folder, tmp_path_factory):
     replace(model, bank_settings=BankSettings()).save(study.model_path)
     with pytest.MonkeyPatch.context() as patch:
         # The selector sees every scan, also where the tests share a core.
-        patch.setattr("online.real_time.SLOTS", 100)
+        patch.setattr("online.selector_process.SLOTS", 100)
         run_replays(study, study.model_path)
     return study
 

@@ -11,8 +11,8 @@ import pytest
 from adaptune.bank.bank import Bank
 from adaptune.errors import AdaptuneError, OdometryError
 from adaptune.odometry.base import InProcess, Odometry, Registration, Usage
+from adaptune.odometry.health import HealthCheck
 from adaptune.odometry.keyframe import KeyframeGicp
-from adaptune.odometry.tracker import HealthCheck
 from adaptune.recording.scan import Scan
 from adaptune.space import Float, ParameterSpace, Selection
 from adaptune.trajectory import read_tum

@@ -20,14 +20,15 @@ from adaptune.recording.scan import Scan
 from adaptune.ros.link import LinkError
 from adaptune.space import Selection
 from adaptune.study.config import SteerConfig
-from adaptune.study.study import ModeError
+from adaptune.study.driven import ModeError
 from adaptune.trajectory import read_tum
 from offline.config import load_study
-from online import robot
 from online import robot as robot_drive
+from online.drive_log import DriveLog
 from online.modes import ReplaySetup
 from online.replay import Choice, replay
-from online.robot import DriveLog, RobotDrive, SteeredNode
+from online.robot import RobotDrive
+from online.steered import SteeredNode
 
 PATIENT = ("online.real_time={deadline: 60, queue: 0}", "online.ros={points: /points, tf: true}")
 SCANS = drives.scans(2, 25)
@@ -170,7 +171,7 @@ def test_a_node_is_steered(make):
 
 
 def test_the_log_says_once_that_the_odometry_restarts(make, monkeypatch, caplog):
-    monkeypatch.setattr(robot, "PATIENCE", 0.01)
+    monkeypatch.setattr("online.steered.PATIENCE", 0.01)
     drive(make(STEER), "adaptive", clouds(), 5)  # the node is silent
     said = "the odometry restarts: the health check found no_pose"
     assert caplog.messages.count(said) == 1
@@ -224,7 +225,7 @@ def link():
 
 @pytest.fixture
 def node(link, monkeypatch):
-    monkeypatch.setattr(robot, "PATIENCE", 0.01)
+    monkeypatch.setattr("online.steered.PATIENCE", 0.01)
 
     def make(**settings):
         return SteeredNode(link, SteerConfig(node="/node", odometry="/odom", **settings), "/points")

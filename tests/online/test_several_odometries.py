@@ -10,7 +10,7 @@ from adaptune import yaml12
 from adaptune.archive import Archive
 from adaptune.model import ErrorModel
 from adaptune.space import ODOMETRY, PooledSpace
-from adaptune.study.study import driven
+from adaptune.study.driven import driven
 from offline.config import load_study
 from offline.train import train
 from online.compare import compare

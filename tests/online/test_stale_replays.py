@@ -18,7 +18,8 @@ from offline.validate import validate
 from online.charts import charts_of_replays
 from online.compare import compare, current_replays
 from online.modes import run_replays
-from online.record import StoredReplayError, check_reference
+from online.record import StoredReplayError
+from online.reference import check_reference
 from online.replayed import read_replays
 
 

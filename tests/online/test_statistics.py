@@ -6,7 +6,8 @@ import pytest
 from adaptune.metrics import KittiError, kitti_error
 from adaptune.trajectory import Trajectory, read_kitti
 from online.compare import pooled
-from online.statistics import ComparisonRow, JudgedModes, Reference, StandardErrors
+from online.reference import Reference, StandardErrors
+from online.statistics import ComparisonRow, JudgedModes
 
 
 def trajectory(T, first=0):

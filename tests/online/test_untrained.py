@@ -9,7 +9,7 @@ from commands import refused, succeeded
 
 from adaptune import manifest
 from adaptune.selector import UntrainedSelector, untrained_sets
-from adaptune.study.study import ModeError
+from adaptune.study.driven import ModeError
 from offline.config import load_study
 from online.compare import compare
 from online.modes import ReplaySetup, run_untrained, sequences_without_model

@@ -3,7 +3,7 @@
 import numpy as np
 from rooms import along_x
 
-from adaptune.reference.stored import EstimatedReference, Registrations
+from adaptune.reference.estimated import EstimatedReference, Registrations
 
 STEP = 0.3
 

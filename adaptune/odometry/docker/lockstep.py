@@ -161,7 +161,7 @@ class Lockstep(Faulting):
         return self._waiting
 
     def apply(self, selection: Selection) -> None:
-        """Set the node's parameters, see `adaptune.ros.link.Steering.apply`."""
+        """Set the node's parameters, see `adaptune.ros.steering.Steering.apply`."""
         if unknown := selection.parameters.keys() - self.parameters.keys():
             raise OdometryError(f"{self.name} has no parameter {min(unknown)!r}")
         self.parameters |= selection.parameters

@@ -10,7 +10,7 @@ from rosbags.serde import SerdeError
 
 from adaptune.errors import OdometryError
 from adaptune.geometry import Poses, to_pose, to_quaternions
-from adaptune.recording.clouds import POSES, TRANSFORMS, Pose, message_stamp
+from adaptune.recording.pose_messages import POSES, TRANSFORMS, Pose, message_stamp
 from adaptune.ros.relay import Relay
 
 _FLOOD = 2000

@@ -1,4 +1,4 @@
-"""Programs in Docker images that read a recording and leave a trajectory."""
+"""Programs in Docker images: those that read a whole recording, and those that receive scans."""
 
 import contextlib
 import socket
@@ -18,13 +18,10 @@ from adaptune.odometry.docker.engine import (
     Container,
     ContainerSettings,
     Mount,
-    copy_regular,
     default_user,
     image_digest,
-    kept_log,
-    make_shared,
-    remove_shared,
 )
+from adaptune.odometry.docker.folders import copy_regular, kept_log, make_shared, remove_shared
 from adaptune.odometry.program import (
     FileRun,
     FileSettings,
@@ -117,8 +114,6 @@ class DockerCommand(FileRun):
             return self._limits.bounds.full
         return processes.how_it_ended(code) if code else None
 
-
-# Programs in Docker images that receive scans and return poses, one after the other.
 
 _FOLDER = "/adaptune"
 _BETWEEN_SOCKET_LOOKS = 0.02

@@ -24,19 +24,17 @@ from adaptune.errors import OdometryError, import_extra, in_a_line, nearest
 from adaptune.geometry import to_pose, to_quaternions
 from adaptune.keeper import Ended
 from adaptune.odometry.base import Usage
-from adaptune.odometry.docker.engine import (
-    Container,
-    Mount,
-    own_container,
-    remove_shared,
-)
+from adaptune.odometry.docker.engine import Container, Mount, own_container
+from adaptune.odometry.docker.folders import remove_shared
 from adaptune.odometry.docker.ros_system import RosSettings, RosSystem, SimClock, image_user
 from adaptune.odometry.docker.rustle import Rustle
 from adaptune.odometry.template import Template, placeholders, replace
-from adaptune.recording.clouds import LIVOX_TYPES, POSES, TRANSFORMS
+from adaptune.recording.clouds import LIVOX_TYPES
 from adaptune.recording.config import Transform
-from adaptune.ros.link import LinkError, equal_values
+from adaptune.recording.pose_messages import POSES, TRANSFORMS
+from adaptune.ros.link import LinkError
 from adaptune.ros.relay import Ros2Relay
+from adaptune.ros.steering import equal_values
 from adaptune.space import ParameterSet
 
 _FOLDER, _PARAMETERS = "/adaptune", "/adaptune-parameters/params.yaml"

@@ -20,22 +20,15 @@ from pydantic import AfterValidator, Field, model_validator
 from adaptune import processes
 from adaptune.errors import OdometryError
 from adaptune.odometry.base import Usage
-from adaptune.odometry.docker.engine import (
-    Container,
-    ContainerSettings,
-    copy_regular,
-    default_user,
-    image_digest,
-    make_shared,
-    opened,
-    regular_files,
-)
+from adaptune.odometry.docker.engine import Container, ContainerSettings, default_user, image_digest
+from adaptune.odometry.docker.folders import copy_regular, make_shared, opened, regular_files
 from adaptune.odometry.docker.poses import PoseReader
 from adaptune.odometry.program import ProgramInput, WholeSettings
 from adaptune.odometry.template import Template
 from adaptune.recording.config import resolve
-from adaptune.ros.link import LinkError, Run, Steering
+from adaptune.ros.link import LinkError
 from adaptune.ros.relay import Relay
+from adaptune.ros.steering import Run, Steering
 from adaptune.space import ParameterSet
 
 QUIET = {"/clock", "/rosout", "/rosout_agg", "/parameter_events"}

@@ -20,7 +20,7 @@ from adaptune.odometry.docker.ros_system import RosSettings, RosSystem, filled
 from adaptune.odometry.program import ProgramInput
 from adaptune.odometry.remote import Limits
 from adaptune.odometry.template import Template, check_names
-from adaptune.ros.link import SetCommand
+from adaptune.ros.steering import SetCommand
 from adaptune.space import ParameterSet
 
 

@@ -12,9 +12,11 @@ from wicked import tell
 from adaptune.bank.bank import MAX_LATE_SECONDS, Bank, Lateness
 from adaptune.bank.members import SERVICE
 from adaptune.odometry.base import LastMotion, OdometryInstance, Registration
-from adaptune.odometry.registry import OdometryFactory, OdometryPool, odometry_class
+from adaptune.odometry.factory import OdometryFactory, OdometryPool
+from adaptune.odometry.health import HealthCheck
+from adaptune.odometry.registry import odometry_class
 from adaptune.odometry.remote import Limits
-from adaptune.odometry.tracker import HealthCheck, Tracker
+from adaptune.odometry.tracker import Tracker
 from adaptune.recording.scan import Scan
 from adaptune.space import Selection
 

@@ -6,7 +6,8 @@ from wicked import tell
 from adaptune.bank.bank import Bank
 from adaptune.bank.members import KEPT, SERVICE, Member, spread
 from adaptune.odometry.base import InProcess
-from adaptune.odometry.registry import OdometryFactory, OdometryPool, odometry_class
+from adaptune.odometry.factory import OdometryFactory, OdometryPool
+from adaptune.odometry.registry import odometry_class
 from adaptune.odometry.remote import Limits
 from adaptune.recording.scan import Scan
 from adaptune.space import Selection

@@ -12,8 +12,8 @@ from setups import setup_of
 
 from adaptune.archive import Archive
 from adaptune.errors import OdometryError
+from adaptune.odometry.health import HealthCheck
 from adaptune.odometry.template import Template
-from adaptune.odometry.tracker import HealthCheck
 from adaptune.strict import ConfigurationError
 from adaptune.trial_rows import rows
 from offline.campaign import BaselineError

@@ -5,8 +5,8 @@ import pytest
 from pydantic import ValidationError
 from rooms import moved
 
-from adaptune.odometry import tracker
-from adaptune.odometry.tracker import Guard, HealthCheck
+from adaptune.odometry import health
+from adaptune.odometry.health import Guard, HealthCheck
 
 
 class Cautious(HealthCheck):
@@ -88,7 +88,7 @@ def test_what_would_have_been_said_of_a_drive(monkeypatch):
     monkeypatch.setattr(HealthCheck, "max_unregistered", 3)
     steps = [0.1, 0.1, 9.0, 0.1, 0.1, np.nan, 0.1, *[0.0] * 6, 0.1, *[0.8] * 10, *[0.1] * 5]
     monkeypatch.setattr(HealthCheck, "max_freeze", 0.45)
-    monkeypatch.setattr(tracker, "_FROZEN_SCANS", 1)
+    monkeypatch.setattr(health, "_FROZEN_SCANS", 1)
     check = HealthCheck(max_speed=10.0)
     registered = np.ones(len(steps) + 1, bool)
     registered[-4:] = False

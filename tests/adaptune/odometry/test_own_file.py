@@ -4,8 +4,9 @@ import pytest
 import yaml
 
 from adaptune.errors import OdometryError
+from adaptune.odometry.factory import OdometryFactory
 from adaptune.odometry.kiss_icp import Kiss
-from adaptune.odometry.registry import OdometryFactory, declare, is_user_class, odometry_class
+from adaptune.odometry.registry import declare, is_user_class, odometry_class
 from adaptune.odometry.remote import Limits, Process
 from adaptune.odometry.template import Template
 from adaptune.space import ParameterSpace

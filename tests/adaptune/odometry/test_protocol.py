@@ -8,8 +8,8 @@ from adaptune.bank.bank import Bank
 from adaptune.geometry import invert
 from adaptune.odometry import OdometryError
 from adaptune.odometry.base import InProcess, OdometryInstance, Usage
+from adaptune.odometry.factory import OdometryFactory
 from adaptune.odometry.keyframe import KeyframeGicp, KeyframeSettings
-from adaptune.odometry.registry import OdometryFactory
 from adaptune.odometry.remote import Isolated, Limits
 from adaptune.space import Selection
 

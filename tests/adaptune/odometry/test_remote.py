@@ -22,12 +22,13 @@ from adaptune import processes
 from adaptune.archive import Archive
 from adaptune.odometry import OdometryError, wire
 from adaptune.odometry.base import InProcess
+from adaptune.odometry.factory import OdometryFactory
 from adaptune.odometry.faults import MOST_FAULTS
 from adaptune.odometry.guarded import Guarded
+from adaptune.odometry.health import HealthCheck
 from adaptune.odometry.keyframe import KeyframeGicp
-from adaptune.odometry.registry import OdometryFactory, make_here
+from adaptune.odometry.registry import make_here
 from adaptune.odometry.remote import SERVICE, Isolated, Limits, Process, ProcessSettings
-from adaptune.odometry.tracker import HealthCheck
 from adaptune.recording import Imu, Scan
 from adaptune.recording.scan import ImuNoise
 from adaptune.space import Selection

@@ -6,7 +6,7 @@ from adaptune.live.own_error import OwnError
 from adaptune.recording.inspect import inspect
 from adaptune.reference.check import MeasuredReference, advice, proposed_sub_trajectory
 from adaptune.reference.estimate import recording_config
-from adaptune.reference.stored import EstimateError
+from adaptune.reference.estimated import EstimateError
 from adaptune.trajectory import Trajectory
 
 

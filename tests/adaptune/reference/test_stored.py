@@ -12,17 +12,15 @@ from hypothesis import strategies as st
 from made_passes import straight
 
 from adaptune.metrics import window_ends
-from adaptune.reference.stored import (
+from adaptune.reference.estimated import (
     BREAK,
     HALVES_TO_WHOLE,
     OF_BOTH,
     EstimatedReference,
     EstimateError,
     Registrations,
-    StoredEstimate,
-    estimate_chart,
-    write_estimate,
 )
+from adaptune.reference.stored import StoredEstimate, estimate_chart, write_estimate
 from adaptune.report.charts import Points, Spans
 
 ABOUT = {"bag": "drive.bag", "topics": ["/points"], "version": 1}

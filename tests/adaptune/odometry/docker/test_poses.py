@@ -6,7 +6,7 @@ from rooms import moved
 from adaptune.geometry import invert, to_pose, to_quaternions
 from adaptune.odometry.docker import poses
 from adaptune.odometry.docker.poses import PoseReader, matrix
-from adaptune.recording.clouds import TRANSFORMS
+from adaptune.recording.pose_messages import TRANSFORMS
 from adaptune.ros.ros2 import message_types
 
 STORE = message_types()

@@ -19,7 +19,7 @@ from adaptune.odometry.docker.played_bag import Drain, PlayedBag, PoseRecorder, 
 from adaptune.odometry.docker.poses import PoseReader
 from adaptune.odometry.docker.rustle import Rustle, RustleSettings
 from adaptune.odometry.program import ProgramInput
-from adaptune.recording.clouds import usable
+from adaptune.recording.pose_messages import usable
 
 PERIOD = 10**8
 SCANS = 1_700_000_000_123_456_789 + PERIOD * np.arange(40)

@@ -1,0 +1,174 @@
+"""What makes instances of one odometry, or of several."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
+from typing import TYPE_CHECKING, Any
+
+from adaptune.odometry.base import Description, InProcess, OdometryInstance, OwnFile
+from adaptune.odometry.guarded import Guarded
+from adaptune.odometry.remote import Isolated, Limits
+from adaptune.space import ParameterSet, ParameterSpace, PooledSpace
+
+if TYPE_CHECKING:
+    from adaptune.odometry.program import ProgramInput
+from adaptune.odometry.content import Content, odometry_content
+from adaptune.odometry.registry import CONTAINERS, PROGRAMS, declare, is_user_class, odometry_class
+
+
+@dataclass(frozen=True)
+class OdometryFactory:
+    """Makes instances of one odometry, in any process: it pickles."""
+
+    name: str  # the odometry, see `adaptune.odometry.registry.odometry_class`
+    settings: Any  # its settings; a mapping is validated
+    space: ParameterSpace  # the parameters that are tuned
+    limits: Limits  # of odometries in processes of their own
+    # gives the recording of a sequence, for programs that run whole recordings
+    program_input: Callable[[str], "ProgramInput"] | None = None
+    # Whether classes of the user may run in this process, if they are clean. Only processes that
+    # the user can do without may allow it.
+    user_code: bool = False
+    description: Description = field(init=False)  # what a study must know of the odometry
+
+    def __post_init__(self) -> None:
+        settings, description = declare(self.name, self.settings).sound(self.name)
+        vars(self).update(settings=settings, description=description)
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """Name and settings, by which a model knows the odometry that it was made for."""
+        return {"name": self.name, "settings": self.settings.model_dump(mode="json")}
+
+    @property
+    def content(self) -> Content:
+        """What the poses depend on besides name, settings and parameters."""
+        return odometry_content(self.name, self.settings, self.description.module)
+
+    def changed(self, **changes: Any) -> "OdometryFactory":
+        """The same with another `user_code` or `program_input`."""
+        return replace(self, **changes)
+
+    @property
+    def apart(self) -> bool:
+        """Whether it runs in processes of their own, which have limits."""
+        return not self.description.clean or is_user_class(self.name)
+
+    @property
+    def one_by_one(self) -> bool:
+        """Whether trials gain nothing from sharing a pass: what runs them shares nothing."""
+        return self.description.whole or self.name in CONTAINERS
+
+    def alone(self, parameters: ParameterSet) -> tuple["OdometryFactory", ParameterSet]:
+        """What makes the odometry that a set is for, and all parameters that it takes."""
+        return self, self.space.complete(parameters)
+
+    def own_file(self, parameters: ParameterSet) -> OwnFile | None:
+        """All parameters as the odometry's own tool reads them; None if it has no such tool."""
+        if is_user_class(self.name):
+            return None  # which is not imported here
+        found: OwnFile | None = odometry_class(self.name).own_file(parameters, self.settings)
+        return found
+
+    def __call__(
+        self,
+        parameters: ParameterSet | None = None,
+        sequence: str | None = None,
+    ) -> OdometryInstance:
+        """Make a new instance; parameters not given keep their baseline.
+
+        Programs that run whole recordings need the name of the sequence on which it will run.
+        """
+        given = self.space.complete(parameters or {})
+        if self.name in PROGRAMS:
+            read = None
+            if sequence is not None and self.program_input is not None:
+                read = partial(self.program_input, sequence)
+            program: Any = odometry_class(self.name)
+            made: OdometryInstance = program.instance(given, self.settings, self.limits, read)
+            return made
+        is_users = is_user_class(self.name)
+        if not self.description.clean or (is_users and not self.user_code):
+            return Isolated(self.name, given, self.settings, self.limits)
+        if is_users:
+            return Guarded(self.name, odometry_class, given, self.settings, self.limits.seconds)
+        cls: Any = odometry_class(self.name)
+        return InProcess(cls(given, self.settings))
+
+
+@dataclass(frozen=True)
+class OdometryPool:
+    """Makes instances of several odometries, as `OdometryFactory` does of one: it pickles.
+
+    Parameter sets are those of a `PooledSpace`.
+    """
+
+    factories: Mapping[str, OdometryFactory]  # by label, what makes each odometry
+    space: PooledSpace = field(init=False)
+
+    def __post_init__(self) -> None:
+        spaces = {label: factory.space for label, factory in self.factories.items()}
+        object.__setattr__(self, "space", PooledSpace(spaces))
+
+    @property
+    def name(self) -> str:
+        """All labels."""
+        return ", ".join(self.factories)
+
+    @cached_property
+    def description(self) -> Description:
+        """What a study must know of all together.
+
+        No instance changes from one odometry to another, so none is live.
+        """
+        every = [factory.description for factory in self.factories.values()]
+        return Description(
+            self.space,
+            live=False,
+            needs_imu=any(one.needs_imu for one in every),
+            whole=any(one.whole for one in every),
+        )
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """The labels, and by label name and settings, by which a model knows what it is of."""
+        settings = {label: factory.identity for label, factory in self.factories.items()}
+        return {"name": self.name, "settings": settings}
+
+    @property
+    def apart(self) -> bool:
+        """Whether any of them runs in processes of its own, which have limits."""
+        return any(factory.apart for factory in self.factories.values())
+
+    @property
+    def one_by_one(self) -> bool:
+        """See `OdometryFactory`."""
+        return any(factory.one_by_one for factory in self.factories.values())
+
+    @property
+    def content(self) -> Content:
+        """See `OdometryFactory`."""
+        return {k: v for factory in self.factories.values() for k, v in factory.content.items()}
+
+    def changed(self, **changes: Any) -> "OdometryPool":
+        """See `OdometryFactory.changed`."""
+        return OdometryPool({k: f.changed(**changes) for k, f in self.factories.items()})
+
+    def alone(self, parameters: ParameterSet) -> tuple[OdometryFactory, ParameterSet]:
+        """See `OdometryFactory.alone`."""
+        label, own = self.space.split(parameters)
+        return self.factories[label].alone(own)
+
+    def __call__(
+        self,
+        parameters: ParameterSet | None = None,
+        sequence: str | None = None,
+    ) -> OdometryInstance:
+        """Make a new instance of the odometry that the set names, see `OdometryFactory`."""
+        whole = self.space.baseline if parameters is None else parameters
+        label, own = self.space.split(whole)
+        return self.factories[label](own, sequence)
+
+
+Factory = OdometryFactory | OdometryPool
+"""What makes instances of one odometry, or of several."""

@@ -1,0 +1,102 @@
+"""Parameters of a node that somebody else wrote, set while it runs."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import AfterValidator, Field
+
+from adaptune.errors import OdometryError
+from adaptune.ros.link import _log
+from adaptune.space import ParameterSet
+
+Run = Callable[[list[str]], tuple[int, str]]
+"""Runs a command; its exit code, and what it wrote."""
+
+
+def _names_both(command: tuple[str, ...]) -> tuple[str, ...]:
+    words = " ".join(command)
+    if lacking := [key for key in ("{name}", "{value}") if key not in words]:
+        raise ValueError(f"names no {' and no '.join(lacking)} in its arguments")
+    return command
+
+
+SetCommand = Annotated[tuple[str, ...], Field(min_length=1), AfterValidator(_names_both)]
+"""A program that sets a parameter, and its arguments, with ``{node}``, ``{name}``, ``{value}``."""
+
+
+class Steering:
+    """Sets parameters of a node, through ROS, or by a program that `run` runs in place of it.
+
+    The command is the program and its arguments, with ``{node}``, ``{name}`` and ``{value}``.
+    """
+
+    def __init__(
+        self,
+        node: str,
+        set_parameters: Callable[[ParameterSet], Mapping[str, Any]],
+        command: Sequence[str] | None,
+        run: Run | None,
+    ):
+        self._node, self._set_parameters = node, set_parameters
+        self._command, self._run = command, run
+        self._told: set[str] = set()
+        self._holds = False
+
+    def apply(self, parameters: ParameterSet) -> None:
+        """Set the parameters, and make sure that the node holds them where it tells.
+
+        There is an `OdometryError` if it cannot be reached or holds other values, and a `LinkError`
+        if it refuses them.
+        """
+        if self._command is not None:
+            for name, value in parameters.items():
+                self._set(self._command, name, value)
+            return
+        held = self._set_parameters(parameters)
+        for name, value in parameters.items():
+            if name not in held:
+                self._warn(name)
+            elif not equal_values(value, held[name]):
+                raise OdometryError(f"{self._node} holds {name} = {held[name]}")
+        if held and not self._holds:
+            self._holds = True
+            what = "%s holds what is set; a node that reads it only at its start does not tell"
+            _log.info(what, self._node)
+
+    def _warn(self, name: str) -> None:
+        if name not in self._told:
+            self._told.add(name)
+            what = "%s: nobody says whether %s takes effect before the node starts again"
+            _log.warning(what, self._node, name)
+
+    def _set(self, command: Sequence[str], name: str, value: Any) -> None:
+        values = {"{node}": self._node, "{name}": name, "{value}": _text(value)}
+        arguments = []
+        for argument in command:
+            for key, text in values.items():
+                argument = argument.replace(key, text)  # noqa: PLW2901
+            arguments.append(argument)
+        assert self._run is not None
+        code, written = self._run(arguments)
+        if code:
+            words = " | ".join(written.split("\n")[-4:]).strip(" |")
+            raise OdometryError(f"{' '.join(arguments)}: exit code {code}: {words}")
+
+
+def equal_values(wanted: Any, held: Any) -> bool:
+    """Whether a node holds what was set, but for the rounding of real numbers."""
+    if isinstance(wanted, bool) or isinstance(held, bool):
+        return bool(wanted is held)
+    if isinstance(wanted, float) and isinstance(held, int | float):
+        return bool(np.isclose(wanted, held, rtol=1e-5, atol=1e-9))
+    return bool(wanted == held)
+
+
+def _text(value: Any) -> str:
+    # `1e-05` is a text to some readers of YAML, and `True` to others.
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, float):
+        return np.format_float_positional(value, trim="0")
+    return str(value)

@@ -1,0 +1,143 @@
+"""Somebody else's odometry node, of which only parameters are set."""
+
+import logging
+import subprocess
+import threading
+from collections import deque
+from typing import Any
+
+import numpy as np
+
+from adaptune.errors import OdometryError
+from adaptune.geometry import Poses, invert, to_pose
+from adaptune.odometry.base import OdometryInstance, Registration
+from adaptune.recording.pose_messages import POSES
+from adaptune.recording.scan import Scan
+from adaptune.ros.link import LinkError, RosLink
+from adaptune.ros.steering import Steering
+from adaptune.selector import BACK
+from adaptune.space import Selection
+from adaptune.study.config import SteerConfig
+from adaptune.trajectory import Trajectory
+
+_log = logging.getLogger(__name__)
+
+ODOMETRY = "nav_msgs/msg/Odometry"
+PATIENCE = 0.3
+"""Seconds after a scan in which the node's pose must be there."""
+SILENT = 10
+"""Scans of which most have no pose; then the log says so."""
+_COMMAND = 5.0
+"""Seconds for a command that sets a parameter."""
+_KEPT = 1000
+"""Poses of a node, and scans of a drive, that are kept."""
+_GAP = 1.0
+"""Seconds between poses over which a pose is interpolated."""
+
+
+class SteeredNode(OdometryInstance):
+    """An odometry that runs elsewhere and publishes its poses."""
+
+    faults = ()
+    rewinds = False
+
+    def __init__(self, link: RosLink, settings: SteerConfig, points: str):
+        self._settings, self._link, self._points = settings, link, points
+        extrinsic = settings.extrinsic
+        self._T_base_sensor = np.eye(4) if extrinsic is None else to_pose(extrinsic)
+        self._news = threading.Condition()
+        self._poses: deque[tuple[int, Poses]] = deque(maxlen=_KEPT)
+        self._begun: tuple[int, Poses] | None = None
+        self._T_odom_node: Poses | None = None
+        self._steering = Steering(
+            settings.node,
+            lambda parameters: link.set_parameters(settings.node, parameters),
+            settings.command,
+            _run,
+        )
+        self._silent: deque[bool] = deque(maxlen=SILENT)
+        self._told = False
+        link.subscribe(settings.odometry, ODOMETRY, self._take)
+
+    def start(
+        self, prepared: Scan, T_odom_sensor: Poses, T_previous_current: Poses | None = None
+    ) -> None:
+        # The node goes on; its motions continue from here.
+        self._begun, self._T_odom_node = (prepared.stamp, np.array(T_odom_sensor)), None
+        self._last_motion.start(T_odom_sensor, T_previous_current)
+
+    def submit(self, prepared: Scan) -> None:
+        self._submitted = prepared.stamp
+
+    def collect(self) -> Registration:
+        T_node = self._pose(self._submitted, PATIENCE)
+        T_odom_sensor = np.full((4, 4), np.nan)
+        known = bool(np.isfinite(T_node).all())
+        self._silent.append(not known)
+        self._tell_of_silence()
+        if known:
+            if self._T_odom_node is None:
+                assert self._begun is not None
+                stamp, T = self._begun
+                T_begin = self._pose(stamp, 0.0)
+                T_first = T_begin if np.isfinite(T_begin).all() else T_node
+                self._T_odom_node = T @ invert(T_first)
+            T_odom_sensor = self._T_odom_node @ T_node
+        self._last_motion.move(T_odom_sensor)
+        return Registration(T_odom_sensor, known)
+
+    def _tell_of_silence(self) -> None:
+        n = sum(self._silent)
+        self._told &= n > 0
+        # A node that loses clouds answers now and then.
+        if n < SILENT - 2 or len(self._silent) < SILENT or self._told:
+            return
+        self._told, settings = True, self._settings
+        try:
+            why = self._link.why_unheard(self._points)
+        except LinkError as error:
+            why = str(error)
+        what = "%s: no pose of %s for %d of %d scans; %s"
+        usual = "is it the topic, and does the node run?"
+        _log.warning(what, settings.odometry, settings.node, n, SILENT, why or usual)
+
+    def apply(self, selection: Selection) -> None:
+        """Set the parameters, see `adaptune.ros.steering.Steering.apply`."""
+        self._steering.apply(selection.parameters)
+
+    def _take(self, message: Any) -> None:
+        for stamp, _, position, orientation in POSES[ODOMETRY](message):
+            values = (position.x, position.y, position.z)
+            quaternion = (orientation.x, orientation.y, orientation.z, orientation.w)
+            try:
+                T = to_pose((*values, *quaternion))
+            except ValueError:
+                continue  # no pose, which the health check sees
+            with self._news:
+                if self._poses and stamp < self._poses[-1][0] - BACK:
+                    self._poses.clear()
+                if not self._poses or stamp > self._poses[-1][0]:
+                    self._poses.append((stamp, T @ self._T_base_sensor))
+                self._news.notify()
+
+    def _pose(self, stamp: int, seconds: float) -> Poses:
+        """The node's pose at a stamp, of shape (4, 4); NaN if it does not come in time."""
+        with self._news:
+            self._news.wait_for(lambda: self._poses and self._poses[-1][0] >= stamp, seconds)
+            poses = list(self._poses)
+        if not poses:
+            return np.full((4, 4), np.nan)
+        stamps, T = zip(*poses, strict=True)
+        known = Trajectory(np.array(stamps, np.int64), np.array(T))
+        found: Poses = known.at(np.array([stamp], np.int64), _GAP)[0]
+        return found
+
+
+def _run(command: list[str]) -> tuple[int, str]:
+    try:
+        done = subprocess.run(
+            command, capture_output=True, text=True, timeout=_COMMAND, check=False
+        )
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise OdometryError(f"{command[0]}: {error}") from error
+    return done.returncode, done.stderr or done.stdout
