@@ -98,8 +98,10 @@ def sub_trajectory_rte(
 ) -> NDArray[np.float64]:
     """Relative translation error of the sub-trajectory that starts at every frame, of shape (n,).
 
-    After Koide et al., *Adaptive Hyperparameter Tuning for Black-box LiDAR Odometry*, IROS 2021.
-    In percent of the length: the lengths of `sub_trajectory_vectors`.
+    The error ``y_ij`` of frame i with parameter set j in Koide et al., *Adaptive Hyperparameter
+    Tuning for Black-box LiDAR Odometry*, IROS 2021: with the motions d from the first frame of the
+    sub-trajectory to its last, ``100 / L * ||trans(inv(d_est) d_ref)||``, in percent of the length.
+    Its vectors are those of `sub_trajectory_vectors`.
     """
     vectors = sub_trajectory_vectors(T_ref_sensor, T_odom_sensor, length, lost, ends)
     return np.asarray(np.linalg.norm(vectors, axis=1))

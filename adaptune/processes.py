@@ -189,22 +189,32 @@ class Program:
     """A program of the user in a session of its own, under a keeper.
 
     The memory limits the address space of each of its processes, in gigabytes. `core` is the only
-    one that it may use; None for those of this process. The streams, and its folder, are those of
-    `subprocess.Popen`.
+    one that it may use; None for those of this process. Other options are those of
+    `subprocess.Popen`; what it writes is kept for `last_lines`, if no stream takes it.
     """
 
+    out_of_memory = False  # as a container tells
+
     def __init__(
-        self, command: Sequence[str], memory: float, core: int | None = None, **streams: Any
+        self,
+        command: Sequence[str],
+        memory: float,
+        core: int | None = None,
+        environment: Mapping[str, str] | None = None,
+        **options: Any,
     ):
+        self._ended: Ended | None = None
+        self._output = output = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the instance
+        options = {"stdin": subprocess.DEVNULL, "stdout": output, "stderr": output} | options
         self._here, there = socket.socketpair()
         under = [sys.executable, "-I", "-S", keeper.__file__, str(there.fileno()), str(memory)]
         with there:
             self._keeper = subprocess.Popen(
                 [*under, *command],
                 pass_fds=[there.fileno()],
-                env=os.environ | ONE_THREAD,
+                env=os.environ | ONE_THREAD | dict(environment or {}),
                 start_new_session=True,
-                **streams,
+                **options,
             )
         if core is not None:
             # The keeper has not begun yet.
@@ -212,17 +222,33 @@ class Program:
 
     def wait(self, seconds: float) -> Ended | None:
         """Wait for the program to end; None if it runs longer."""
-        self._here.settimeout(seconds)
-        try:
-            code, cpu, memory = self._here.recv(1 << 10).split()
-        except TimeoutError:
-            return None
-        except (OSError, ValueError):  # the keeper itself was killed
-            return Ended(-signal.SIGKILL, 0.0, 0.0)
-        return Ended(int(code), float(cpu), float(memory))
+        if self._ended is None:
+            self._here.settimeout(seconds)
+            try:
+                code, cpu, memory = self._here.recv(1 << 10).split()
+                self._ended = Ended(int(code), float(cpu), float(memory))
+            except TimeoutError:
+                return None
+            except (OSError, ValueError):  # the keeper itself was killed
+                self._ended = Ended(-signal.SIGKILL, 0.0, 0.0)
+        return self._ended
+
+    def ended(self) -> int | None:
+        """Exit code, or minus the signal's number; None while it runs."""
+        ended = self.wait(1e-3)
+        return None if ended is None else ended.code
+
+    def last_lines(self) -> str:
+        """The last lines that it wrote."""
+        return last_lines(self._output)
+
+    def hold_to_cores(self) -> None:
+        """Let it use no more cores than a container may: there is no limit on this machine."""
 
     def used(self) -> Ended:
-        """CPU seconds and megabytes of what runs now."""
+        """CPU seconds and megabytes of what runs now, or of all until it ended."""
+        if self._ended is not None:
+            return self._ended
         running = keeper.descendants(self._keeper.pid)
         used = [keeper.used(process) for process in running]
         return Ended(0, sum(cpu for cpu, _ in used), sum(memory for _, memory in used))

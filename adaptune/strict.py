@@ -15,9 +15,6 @@ from pydantic_core import CoreSchema, PydanticKnownError, core_schema
 
 from adaptune.errors import AdaptuneError, Finding, Key, nearest
 
-# Base class of everything that a user sets: its numbers are numbers.
-
-
 _LARGEST = 10**100
 """No number is as large; the square of one is still a number."""
 
@@ -67,9 +64,6 @@ class StrictModel(BaseModel):
             model = model["schema"]
         model["schema"] = _strict(model["schema"])
         return schema
-
-
-# What pydantic finds wrong, in plain words.
 
 
 UNKNOWN = "unknown key"
@@ -188,9 +182,6 @@ def _plain(message: str) -> str:
     message = re.sub(r"^(Value error|Assertion failed), ", "", message)
     message = re.sub(r"\b[Ii]nput should be\b", "give", message)
     return re.sub(r" (after|during) validation", "", message).replace("Input should", "it should")
-
-
-# Mistakes in a study's YAML, each with the path of its key.
 
 
 M = TypeVar("M", bound=BaseModel)

@@ -63,7 +63,8 @@ class ScaledPCA:
 class NearestNeighbours(Rule):
     """Mean error of the k nearest pairs of a frame and a parameter set, least over the sets.
 
-    After Koide et al., IROS 2021: a k-nearest-neighbour regressor on the concatenation of
+    The parameter-error function ``S(E_i, x_j) ~ y_ij`` of Koide et al., IROS 2021, and their choice
+    ``x = argmin_x S(E, x)``: a k-nearest-neighbour regressor on the concatenation ``[E_i, x_j]`` of
     descriptor and parameters, here with the parameters in the unit cube, divided by the mean of
     their standard deviations as the descriptor's components are.
 

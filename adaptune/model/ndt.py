@@ -168,6 +168,9 @@ def _histogram(points: NDArray[np.float32]) -> NDArray[np.float64]:
 def ndt_histogram(points: NDArray[np.float32]) -> NDArray[np.float64]:
     """Count the NDT cells of a scan by distance and shape.
 
+    The feature vector of Magnusson et al. (2009), and the environment descriptor ``E_i`` of Koide
+    et al. (2021) before its principal components.
+
     Cells are linear (l2/l1 < 0.1), planar (l3/l2 < 0.1) or spherical, where l1 >= l2 >= l3 are the
     eigenvalues of the points' covariance. Linear cells are classified by thirds of abs(z) of their
     direction, planar cells by thirds of abs(z) of their normal, spherical cells by l2/l1. A turn

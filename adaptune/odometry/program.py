@@ -4,7 +4,6 @@ import json
 import logging
 import os
 import shutil
-import subprocess
 import time
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -397,28 +396,18 @@ class Command(FileRun):
         if (file := self.filled_template(folder)) is not None:
             paths["parameters"] = file
         command = self.arguments(given, **paths)
-        self._execute(command, here, folder / "output", len(given.stamps))
+        self._execute(command, here, len(given.stamps))
         found = find_output(here, self.settings.output)
         return read_output(found, self.settings, given.stamps)
 
-    def _execute(self, command: list[str], folder: Path, log: Path, n: int) -> None:
+    def _execute(self, command: list[str], folder: Path, n: int) -> None:
         """Run the program; an `OdometryError` says how it ended if not well."""
         begin = time.perf_counter()
-        with log.open("wb") as file:
-            program = processes.Program(
-                command,
-                self._limits.memory,
-                cwd=folder,
-                stdin=subprocess.DEVNULL,
-                stdout=file,
-                stderr=subprocess.STDOUT,
-            )
-            with closing(program):
-                ended = in_time = program.wait(self._limits.seconds * n)
-                if ended is None:
-                    ended = program.end()
-        with log.open("rb") as written:
-            self._words = processes.last_lines(written)
+        with closing(processes.Program(command, self._limits.memory, cwd=folder)) as program:
+            ended = in_time = program.wait(self._limits.seconds * n)
+            if ended is None:
+                ended = program.end()
+            self._words = program.last_lines()
         if ended is not None:
             seconds = (time.perf_counter() - begin) / n
             self._usage = Usage(ended.cpu, ended.memory, seconds, other_cpu=ended.cpu)

@@ -5,7 +5,6 @@ milliseconds, and global state of the odometry ends with its process.
 """
 
 import socket
-import tempfile
 from contextlib import nullcontext
 from functools import cache
 from pathlib import Path
@@ -241,7 +240,6 @@ class ProgramTransport(processes.Transport):
         # A program may use several cores, unless this process must not.
         self._core = next_core() if available() == 1 else None
         self._program: processes.Program | None = None
-        self._written: Any = None
 
     def connect(self) -> processes.SocketStream:
         connection = self._begin() if self._address is None else _reached(self._address)
@@ -250,7 +248,6 @@ class ProgramTransport(processes.Transport):
 
     def _begin(self) -> socket.socket:
         here, there = socket.socketpair()
-        self._written = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the instance
         with there:
             self._program = processes.Program(
                 self._command or (),
@@ -258,7 +255,6 @@ class ProgramTransport(processes.Transport):
                 self._core,
                 stdin=there.fileno(),
                 stdout=there.fileno(),
-                stderr=self._written,
             )
         return here
 
@@ -267,7 +263,7 @@ class ProgramTransport(processes.Transport):
             return what.replace("its process ended", "it ended the conversation")
         if (ended := self._program.wait(0.5)) is not None:
             what = processes.how_it_ended(ended.code)
-        return processes.quoting(what, processes.last_lines(self._written))
+        return processes.quoting(what, self._program.last_lines())
 
     def close(self) -> None:
         if self._program is not None:

@@ -11,7 +11,7 @@ import tempfile
 import textwrap
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -22,7 +22,6 @@ from rosbags.typesys.store import Typestore
 from adaptune import processes
 from adaptune.errors import OdometryError, import_extra, in_a_line, nearest
 from adaptune.geometry import to_pose, to_quaternions
-from adaptune.keeper import Ended
 from adaptune.odometry.base import Usage
 from adaptune.odometry.docker.engine import Container, Mount, own_container
 from adaptune.odometry.docker.folders import remove_shared
@@ -107,7 +106,8 @@ class Ros2System(RosSystem):
             self._inside = str(self.folder)
             domain, self._domain = _free_domain()
             common["ROS_DOMAIN_ID"] = str(domain)
-            self._node = Here([sys.executable, "-m", _MODULE, f"{self.folder}/link"], common, 1.0)
+            node = [sys.executable, "-m", _MODULE, f"{self.folder}/link"]
+            self._node = processes.Program(node, 1.0, environment=common)
             parameters = str(self._parameters)
         else:
             common["ROS_DOMAIN_ID"] = "0"
@@ -127,7 +127,7 @@ class Ros2System(RosSystem):
         setup = _FIND if settings.image is None else _FIND + _SETUP
         shell = ["/bin/bash", "-l", "-c", setup + _RUN, "bash", *command]
         if settings.image is None:
-            self._container = Here(shell, environment, self._memory)
+            self._container = processes.Program(shell, self._memory, environment=environment)
             return
         if user.partition(":")[0] not in ("0", "root"):
             environment["HOME"] = _FOLDER
@@ -327,40 +327,6 @@ class _Player(threading.Thread):
             self._clock.reach(stamp)
             kind, publish = self._publish[connection.topic]
             publish(raw if reader.is2 else self._store.ros1_to_cdr(raw, kind))
-
-
-class Here:
-    """A program on this machine, with what a `Container` says and does."""
-
-    out_of_memory = False
-
-    def __init__(self, command: Sequence[str], environment: Mapping[str, str], memory: float):
-        self._output = tempfile.TemporaryFile()  # noqa: SIM115
-        variables = [f"{name}={value}" for name, value in environment.items()]
-        self._program = processes.Program(
-            ["env", *variables, *command],
-            memory,
-            stdin=subprocess.DEVNULL,
-            stdout=self._output,
-            stderr=subprocess.STDOUT,
-        )
-        self._how: Ended | None = None
-
-    def ended(self) -> int | None:
-        self._how = self._how or self._program.wait(1e-3)
-        return None if self._how is None else self._how.code
-
-    def used(self) -> Ended:
-        return self._how or self._program.used()
-
-    def last_lines(self) -> str:
-        return processes.last_lines(self._output)
-
-    def hold_to_cores(self) -> None:
-        """There is no limit on this machine."""
-
-    def close(self) -> None:
-        self._program.close()
 
 
 def _free_domain() -> tuple[int, Any]:
