@@ -91,11 +91,11 @@ def charts_of_replays(replayed: ReplayedSequence) -> Charts:
 def error_chart(replayed: ReplayedSequence) -> Chart | None:
     """Error of every mode over time; and what modes have measured themselves."""
     panels = []
-    if any(np.isfinite(of.errors).any() for of in replayed.modes.values()):
+    if any(np.isfinite(track.errors).any() for track in replayed.modes.values()):
         panels.append(_errors(replayed))
-    for mode, of in replayed.modes.items():
-        if np.isfinite(of.estimated[:, 0]).any() or of.lost.any():
-            panels.append(_estimates(mode, of, replayed))
+    for mode, track in replayed.modes.items():
+        if np.isfinite(track.estimated[:, 0]).any() or track.lost.any():
+            panels.append(_estimates(mode, track, replayed))
     if not panels:
         return None
     measured = (
@@ -162,7 +162,9 @@ def choice_chart(replayed: ReplayedSequence) -> Chart | None:
 
 
 def _parameters(replayed: ReplayedSequence) -> Iterator[Panel]:
-    single = {mode: of for mode, of in replayed.modes.items() if not of.weights}
+    single = {
+        mode: mode_replay for mode, mode_replay in replayed.modes.items() if not mode_replay.weights
+    }
     for name in dict.fromkeys(name for track in single.values() for name in track.choices):
         chosen = {mode: t.choices[name] for mode, t in single.items() if name in t.choices}
         every = [value for values in chosen.values() for value in values]
@@ -171,8 +173,10 @@ def _parameters(replayed: ReplayedSequence) -> Iterator[Panel]:
         drawn = _scenes(replayed)
         for mode, values in chosen.items():
             y = [_place(value, names) for value in values]
-            of = single[mode]
-            drawn.append(Line(of.span, [*y, y[-1]], mode, steps=True, dashed=not of.adapts))
+            mode_replay = single[mode]
+            drawn.append(
+                Line(mode_replay.span, [*y, y[-1]], mode, steps=True, dashed=not mode_replay.adapts)
+            )
         log = name in replayed.space.logarithmic and names is None
         axis = Axis(replayed.space.labels[name], log=log, names=names)
         yield Panel(TIME, axis, tuple(drawn), name)
@@ -224,7 +228,9 @@ def overview_chart(
     for row in rows:
         if row.sequence != ALL and row.mode in main and row.rte is not None:
             errors.setdefault(row.sequence, {})[row.mode] = max(row.rte, 1e-12)
-    ratios = {of: max(e.values()) / min(e.values()) for of, e in errors.items() if len(e) > 1}
+    ratios = {
+        sequence: max(e.values()) / min(e.values()) for sequence, e in errors.items() if len(e) > 1
+    }
     if not ratios:
         return None
     name = max(ratios, key=lambda name: ratios[name])
@@ -247,17 +253,17 @@ def overview_chart(
 
 def _path(replayed: ReplayedSequence, places: NDArray[np.float64]) -> Panel:
     """The path, coloured by kind of place, or where none is known by the error of the last mode."""
-    mode, of = list(replayed.modes.items())[-1]
+    mode, track = list(replayed.modes.items())[-1]
     x, y = places.T
     drawn: list[Drawn] = []
     named = [(int(np.isfinite(x).argmax()), "start")]
     if (scenes := replayed.scenes) is None:
         some = np.linspace(0, len(x) - 1, _MOST_PLACES).astype(int)
-        some = some[np.isfinite(of.errors_around[some])]
+        some = some[np.isfinite(track.errors_around[some])]
         drawn.append(Line(x, y, "", faint=True))
-        drawn.append(Points(x[some], y[some], "", of.errors_around[some], "error [%]"))
+        drawn.append(Points(x[some], y[some], "", track.errors_around[some], "error [%]"))
     else:
-        ends = np.searchsorted(of.seconds, scenes.edges)
+        ends = np.searchsorted(track.seconds, scenes.edges)
         for begin, end, name in zip(ends[:-1], ends[1:], scenes.names, strict=True):
             drawn.append(Line(x[begin : end + 1], y[begin : end + 1], name, width=7.0))
         named += [*zip((ends[:-1] + ends[1:]) // 2, scenes.names, strict=True)]
@@ -280,21 +286,21 @@ def _turned(places: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _errors_around(replayed: ReplayedSequence) -> Panel:
     fixed, lines = replayed.modes.get(FIXED), []
-    for mode, of in replayed.modes.items():
-        same = fixed is not None and np.array_equal(of.errors, fixed.errors, equal_nan=True)
+    for mode, track in replayed.modes.items():
+        same = fixed is not None and np.array_equal(track.errors, fixed.errors, equal_nan=True)
         # It would hide the line of the fixed set, which it has kept.
-        lines.append(Line(of.seconds, of.errors_around, mode, dashed=mode != FIXED and same))
+        lines.append(Line(track.seconds, track.errors_around, mode, dashed=mode != FIXED and same))
     title = f"error (RTE over {replayed.length:g} m) around each moment"
     return Panel(TIME, Axis("error [%]", log=True), (*_scenes(replayed), *lines), title, height=1.6)
 
 
 def _chosen(replayed: ReplayedSequence) -> Iterator[Panel]:
     """What the last mode chose: weights, or the parameter that it changed most often."""
-    mode, of = list(replayed.modes.items())[-1]
-    if of.weights:
-        yield from _weights(replace(replayed, modes={mode: of}))
-    elif of.adapts:
-        changes = {name: switched({name: values}).sum() for name, values in of.choices.items()}
+    mode, track = list(replayed.modes.items())[-1]
+    if track.weights:
+        yield from _weights(replace(replayed, modes={mode: track}))
+    elif track.adapts:
+        changes = {name: switched({name: values}).sum() for name, values in track.choices.items()}
         most = max(changes, key=lambda name: changes[name])
         if changes[most]:
             (panel,) = (panel for panel in _parameters(replayed) if panel.title == most)

@@ -319,7 +319,9 @@ def _applied(columns: Mapping[str, list[str]], n: int) -> dict[str, list[str]]:
         raise ValueError("not a row for every selection")
     last = {columns["stamp_ns"][i]: i for i in rows}.values()
     texts = ("why_not", "fallen_back")
-    return {name: [of[i] for i in last] for name, of in columns.items() if name not in texts}
+    return {
+        name: [values[i] for i in last] for name, values in columns.items() if name not in texts
+    }
 
 
 def _weights(texts: Sequence[str]) -> dict[int, Sequence[float]]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from adaptune import manifest
 from adaptune.files import write_text
-from adaptune.live.evidence import OWN_SECONDS
+from adaptune.live.own_error import OWN_SECONDS
 from adaptune.metrics import (
     KittiError,
     absolute_error,
@@ -167,12 +167,12 @@ class Reference(NamedTuple):
         self, odometry: Trajectory
     ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.float64]]:
         """First and last frame and RTE in percent of the sub-trajectories that are known."""
-        of = self.errors(odometry)
-        starts = np.flatnonzero(np.isfinite(of))
+        errors = self.errors(odometry)
+        starts = np.flatnonzero(np.isfinite(errors))
         if self.trajectory is None:
-            return starts, starts, of[starts]
+            return starts, starts, errors[starts]
         ends = window_ends(self.trajectory.at(odometry.stamps), self.length)
-        return starts, ends[starts], of[starts]
+        return starts, ends[starts], errors[starts]
 
     def standard(self, odometry: Trajectory) -> "StandardErrors | None":
         """The errors that other tools give, where there are reference poses to compare with."""

@@ -150,7 +150,7 @@ def _read_mode(replay: StoredReplay, reference: Reference, model: ErrorModel | N
         replay.restarted,
         np.asarray((replay.choice_stamps - stamps[0]) * 1e-9),
         replay.choices,
-        {_member(replay, model, number): of for number, of in replay.weights.items()},
+        {_member(replay, model, number): weights for number, weights in replay.weights.items()},
         replay.estimated,
         replay.lost,
         places,

@@ -141,7 +141,10 @@ class Guard:
         else:
             self._healthy, self._healthy_noise, self._since = way, noise, 0.0
             self._recent.append(way)
-            while sum(of for _, of in self._recent) - self._recent[0][1] >= _RECENT:
+            while (
+                sum(step_seconds for _, step_seconds in self._recent) - self._recent[0][1]
+                >= _RECENT
+            ):
                 self._recent.popleft()
             self._doubtful = np.eye(4), 0.0
         return None
@@ -188,8 +191,8 @@ class Guard:
         the last scans. The second is the motion from there, for so many seconds.
         """
         T_previous_current, seconds = np.eye(4), 0.0
-        for T, of in self._recent:
-            T_previous_current, seconds = T_previous_current @ T, seconds + of
+        for T, step_seconds in self._recent:
+            T_previous_current, seconds = T_previous_current @ T, seconds + step_seconds
         seconds = seconds or 1.0
         T_way, of_way = self._taken_back
         T_previous_healthy = invert(T_way) @ scale(T_previous_current, of_way / seconds)

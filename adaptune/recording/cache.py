@@ -227,13 +227,13 @@ def _make_room(size: int) -> None:
         with suppress(OSError):  # another process may remove it
             used = (index.parent / _ABOUT).stat().st_mtime
             entries.append((used, _size(index.parent), index.parent))
-    total = sum(of for _, of, _ in entries) + size
-    for _, of, path in sorted(entries):
+    total = sum(n_bytes for _, n_bytes, _ in entries) + size
+    for _, n_bytes, path in sorted(entries):
         if total <= cap():
             return
         # Processes that have mapped it keep their arrays.
         shutil.rmtree(path, ignore_errors=True)
-        total -= of
+        total -= n_bytes
 
 
 def _sweep(root: Path) -> None:

@@ -126,15 +126,15 @@ def of_looks(looks: Sequence[Look], where: Key = (), start: float = 0.0) -> Iter
         return
     stamps, readings, *rest = zip(*looks, strict=True)
     n, near, turn, _, repeats, soon = map(np.array, rest)
-    of, seconds = "points", start + (np.array(stamps, np.int64) - stamps[0]) * 1e-9
+    role, seconds = "points", start + (np.array(stamps, np.int64) - stamps[0]) * 1e-9
     few, more, usual = n < LEAST_POINTS, np.diff(n), np.quantile(n, (0.75, 0.9))
     part = (n < _PART * usual[0]) & (turn < _PART * np.quantile(turn, 0.75))
     if (marks := float(np.median([reading.marks for reading in readings]))) > 0.01:
         what = f"{marks:.0%} of the points mark rays that did not come back, far away"
-        yield Finding(where, what, _LEFT_OUT, of=of)
+        yield Finding(where, what, _LEFT_OUT, of=role)
     if grow := sum(more > 0) > _ROW and np.mean(more >= 0) > 0.95 and n[-1] > 3 * n[0]:
         what = f"the clouds grow from {n[0]:,} to {n[-1]:,} points: they are a map"
-        yield Finding(where, what, _DRIVER, of=of)
+        yield Finding(where, what, _DRIVER, of=role)
     kinds = (
         (few, 1, f"hold fewer than {LEAST_POINTS} valid points", f"odometries fail; {_CUT}"),
         (repeats, 1, "repeat the points of the one before", _LEFT_OUT),
@@ -143,18 +143,18 @@ def of_looks(looks: Sequence[Look], where: Key = (), start: float = 0.0) -> Iter
         (part, 3, "see a part of the usual turn", _LOST),
         (n < _LITTLE * usual[1], 3, f"hold less than {_LITTLE:.0%} of the usual points", _LOST),
     )
-    told = np.zeros(len(n), np.bool_)
+    reported = np.zeros(len(n), np.bool_)
     for flags, fewest, what, mend in kinds[: 3 if grow else None]:
-        index = np.flatnonzero(flags & ~told)
-        told |= flags
+        index = np.flatnonzero(flags & ~reported)
+        reported |= flags
         runs = np.split(index, np.flatnonzero(np.diff(index) > 2 * _ROW) + 1)
         for run in runs if len(runs) <= 3 else [index]:
             if len(run) >= fewest:
                 many = f"all {len(n)}" if len(run) == len(n) else f"{len(run)} of {len(n)}"
                 when = (float(seconds[run[0]]), float(seconds[run[-1]]))
                 lacks = "clouds with points" if few.all() else ""
-                yield Finding(where, f"{many} clouds {what}", mend, when, of, lacks)
-    kept = np.flatnonzero(~told)
+                yield Finding(where, f"{many} clouds {what}", mend, when, role, lacks)
+    kept = np.flatnonzero(~reported)
     yield from _changes([looks[i] for i in kept.tolist()], seconds[kept], where)
 
 

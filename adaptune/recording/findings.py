@@ -77,51 +77,51 @@ _GAPS = {
 }
 
 
-def of_topic(topic: Topic, of: str, complete: bool, apart: bool) -> Iterator[Finding]:
-    """What is wrong with the messages of a topic, which is used as `of`, and with their stamps."""
+def of_topic(topic: Topic, role: str, complete: bool, apart: bool) -> Iterator[Finding]:
+    """What is wrong with the messages of a topic, used as `role`, and with their stamps."""
     where = (topic.name,)
-    if of and len(topic.types) > 1:
+    if role and len(topic.types) > 1:
         many = ", ".join(f"{n} {kind}" for kind, n in topic.types.items())
         mend = "" if topic.undecoded else "adaptune reads each as what it is"
-        yield Finding(where, f"messages of {len(topic.types)} types ({many})", mend, of=of)
+        yield Finding(where, f"messages of {len(topic.types)} types ({many})", mend, of=role)
     if topic.undecoded:
         (seconds, why), n = topic.undecoded[0], len(topic.undecoded)
-        mend, lacks = _UNDECODED[of]
-        mend = "the stages refuse them" if of == "points" and "`" in why else mend
+        mend, lacks = _UNDECODED[role]
+        mend = "the stages refuse them" if role == "points" and "`" in why else mend
         many = f"all {n}" if n == topic.n_read else f"{n} of {topic.n_read}"
         what = f"{many} messages do not decode, the first at {seconds:.1f} s ({why})"
-        yield Finding(where, what, mend, of=of, lacks=lacks)
-    if of and topic.count and not topic.n_read and not complete:
+        yield Finding(where, what, mend, of=role, lacks=lacks)
+    if role and topic.count and not topic.n_read and not complete:
         what = f"its {topic.count} messages are not in the sample"
-        yield Finding(where, what, "`--deep` reads them", of=of)
+        yield Finding(where, what, "`--deep` reads them", of=role)
     if topic.stamped and any(topic.stamps) and not apart:
-        yield from _stamps(topic, of)
+        yield from _stamps(topic, role)
         if not complete and sum(map(len, topic.stamps)) < topic.count:
-            yield from _count(topic, of)
+            yield from _count(topic, role)
 
 
-def _stamps(topic: Topic, of: str) -> Iterator[Finding]:
+def _stamps(topic: Topic, role: str) -> Iterator[Finding]:
     where, n = (topic.name,), len(topic.times)
     wrong = int(np.count_nonzero(np.diff(topic.times) <= 0))
-    if of == "points" and wrong:
+    if role == "points" and wrong:
         left, stamps = Counter[str](), topic.times.tolist()
         unread: Any = repeat(None)
         deque(in_order(map(Frame, stamps, topic.recorded or stamps, unread), left), 0)
         wrong = left.total()
     if wrong:
-        mend = "adaptune leaves such scans out" if of == "points" else ""
-        lacks = "stamps that increase" if wrong == n - 1 and of in ("points", "reference") else ""
+        mend = "adaptune leaves such scans out" if role == "points" else ""
+        lacks = "stamps that increase" if wrong == n - 1 and role in ("points", "reference") else ""
         what = f"{wrong} of {n} stamps do not come after the one before"
-        yield Finding(where, what, mend, of=of, lacks=lacks)
+        yield Finding(where, what, mend, of=role, lacks=lacks)
     if len(topic.steps):
         gap, usual = topic.steps.max(), np.median(topic.steps)
         if gap > 3.5 * usual and gap > 0.2:
             lost = np.count_nonzero(topic.steps > 3.5 * usual)
             what = f"{lost} gaps, the longest of {gap:.2f} s"
-            yield Finding(where, what, _GAPS.get(of, ""), of=of)
+            yield Finding(where, what, _GAPS.get(role, ""), of=role)
 
 
-def _count(topic: Topic, of: str) -> Iterator[Finding]:
+def _count(topic: Topic, role: str) -> Iterator[Finding]:
     """Messages that are missing between the parts of a sample, by their number in the whole."""
     usual = np.median(topic.steps) if len(topic.steps) else np.inf
     steps = topic.steps[np.abs(topic.steps - usual) < 0.2 * usual]
@@ -132,7 +132,7 @@ def _count(topic: Topic, of: str) -> Iterator[Finding]:
     doubt = max(_MISSED, 3.0 * float(steps.std() / steps.mean()) / len(steps) ** 0.5)
     if topic.count < (1.0 - doubt) * expected:
         what = f"about {expected - topic.count:,} of {expected:,} messages are missing"
-        yield Finding((topic.name,), what, "`--deep` looks for the gaps", of=of)
+        yield Finding((topic.name,), what, "`--deep` looks for the gaps", of=role)
 
 
 class Part(NamedTuple):
@@ -203,14 +203,14 @@ def of_clock(name: str, parts: Sequence[Part], used: Part) -> Finding:
 
 def of_clouds(topic: Topic, content: Content) -> Iterator[Finding]:
     """What is wrong with the clouds that were read."""
-    where, of = (topic.name,), "points"
+    where, role = (topic.name,), "points"
     if topic.count == 1:
         what = "holds a single cloud: no motion"
-        yield Finding(where, what, of=of, lacks="more than one cloud")
+        yield Finding(where, what, of=role, lacks="more than one cloud")
     if len(topic.frames) > 1:
         what = f"holds clouds of {', '.join(sorted(map(repr, topic.frames)))}"
         mend = "name one of these frames as `frame`"
-        yield Finding(where, what, mend, of=of, lacks="clouds of one frame")
+        yield Finding(where, what, mend, of=role, lacks="clouds of one frame")
     else:
         yield from of_looks(content.looks, where)
 
@@ -230,17 +230,17 @@ def of_reference(
 
     Seconds count from `begin`, the stamp of the first scan.
     """
-    of, lacks = "reference", "a reference that moves"
+    role, lacks = "reference", "a reference that moves"
     if len(reference) < 2:
         if complete:
             mend = "no motion follows from it; name another topic, or a file of poses"
-            yield Finding((), "the reference holds a single pose", mend, of=of, lacks=lacks)
+            yield Finding((), "the reference holds a single pose", mend, of=role, lacks=lacks)
         return
     positions = reference.T_world_sensor[:, :3, 3]
     if np.linalg.norm(positions - positions[0], axis=1).max() < _STILL:
         what = f"the reference stands still: all {len(reference)} poses are within 1 cm"
         mend = "errors are per metre; drive, or name another topic or a file of poses"
-        yield Finding((), what, mend, of=of, lacks=lacks)
+        yield Finding((), what, mend, of=role, lacks=lacks)
         return
     seconds = np.diff(reference.stamps) * 1e-9
     if timed and complete:  # between the parts of a sample, all may happen
@@ -251,12 +251,12 @@ def of_reference(
     if complete and timed and (gaps := np.count_nonzero(seconds > reference.max_gap)):
         what = f"the reference has {gaps} gaps beyond {reference.max_gap:g} s"
         what += f", the longest of {seconds.max():.2f} s: their scans get no label"
-        yield Finding((), reference.sparse or what, of=of)
+        yield Finding((), reference.sparse or what, of=role)
 
 
 def of_overlap(reference: Trajectory, stamps: NDArray[np.int64], slack: float) -> Iterator[Finding]:
     """Scans outside the reference; both may go on for `slack` seconds beyond what was read."""
-    of = "reference"
+    role = "reference"
     begin, end = int(reference.stamps[0]), int(reference.stamps[-1])
     scans = int(stamps.min()), int(stamps.max())
     times = [f"{stamp * 1e-9:.3f}" for stamp in (begin, end, *scans)]
@@ -267,10 +267,10 @@ def of_overlap(reference: Trajectory, stamps: NDArray[np.int64], slack: float) -
             "same drive; `adaptune offline` proposes them"
         )
         lacks = "a reference of the same time"
-        yield Finding((), f"the reference {spans}", mend, of=of, lacks=lacks)
+        yield Finding((), f"the reference {spans}", mend, of=role, lacks=lacks)
         return
     seconds = (scans[1] - scans[0]) * 1e-9
     outside = [(begin - scans[0]) * 1e-9, (scans[1] - end) * 1e-9]
     lost = sum(s for s in outside if s > slack + 1.0)
     if lost > 0.05 * seconds:
-        yield Finding((), f"the reference {spans}: the scans outside get no label", of=of)
+        yield Finding((), f"the reference {spans}: the scans outside get no label", of=role)

@@ -88,15 +88,15 @@ class Inspection:
         if not self.name:
             return {}
         lacks = {
-            of: [one.lacks for one in self.findings if one.of == of and one.lacks]
-            for of in ("points", "reference", "imu")
+            role: [one.lacks for one in self.findings if one.of == role and one.lacks]
+            for role in ("points", "reference", "imu")
         }
         if self.scan is None and not any(one.of == "points" for one in self.findings):
             lacks["points"].append("point clouds that can be read")
         if self.scan is not None and self.scan.times is None:
             lacks["imu"].append("a time for each point")
         return {
-            stage: tuple(dict.fromkeys(what for of in inputs for what in lacks[of]))
+            stage: tuple(dict.fromkeys(what for role in inputs for what in lacks[role]))
             for stage, inputs in INPUTS.items()
         }
 
@@ -189,9 +189,9 @@ def _find(found: Inspection, apart: bool, slack: float) -> None:
     Between bags that are `apart` nothing is missing. Scans and reference may both go on for `slack`
     seconds beyond what was read.
     """
-    of = {name: key for key, name in found.used.items()}
+    roles = {name: key for key, name in found.used.items()}
     for topic in found.topics.values():
-        found.findings += of_topic(topic, of.get(topic.name, ""), found.complete, apart)
+        found.findings += of_topic(topic, roles.get(topic.name, ""), found.complete, apart)
     scans = found.topics.get(found.used.get("points", ""))
     if scans is not None:
         found.findings += [*of_clouds(scans, found.content), *of_times(scans, found.content)]
@@ -255,9 +255,9 @@ def _used(topics: dict[str, Topic]) -> dict[str, str]:
     """Which topics adaptune would use: of several, the densest; others are parts of it."""
     poses = [kind for kind in POSES if "tf" not in kind]
     used = {}
-    for of, kinds in (("points", tuple(CLOUDS)), ("reference", poses), ("imu", IMU_TYPES)):
+    for role, kinds in (("points", tuple(CLOUDS)), ("reference", poses), ("imu", IMU_TYPES)):
         if fit := [t for t in topics.values() if t.type in kinds and t.count]:
-            used[of] = max(fit, key=lambda t: (t.count, t.name)).name
+            used[role] = max(fit, key=lambda t: (t.count, t.name)).name
     return used
 
 

@@ -120,7 +120,10 @@ def _revised(found: Pass) -> tuple[Poses, list[Edge]]:
     weak = _support(len(found.stamps), edges) < FEWEST
     of_members = [_edges(found.guesses, m) for m in range(found.T_previous_current.shape[1])]
     for first, stop in _runs(weak):
-        near = [[e for e in of if e.start < stop and e.end > first] for of in of_members]
+        near = [
+            [e for e in member_edges if e.start < stop and e.end > first]
+            for member_edges in of_members
+        ]
         best = max(range(len(near)), key=lambda m: len(near[m]))
         supported = _support(len(found.stamps), near[best])[first:stop]
         theirs = found.T_previous_current[first + 1 : stop + 1, best]

@@ -76,11 +76,13 @@ class EstimatedReference:
         breaks = np.diff(self.stamps[first : last + 1]) * 1e-9
         if breaks.max(initial=0.0) > BREAK + 2.0 * float(np.median(np.diff(self.stamps)) * 1e-9):
             return f"no scans for {breaks.max():.1f} s"
-        of = self.registrations
-        across = (of.start < last) & (of.end > first) & ~of.accepted
+        registrations = self.registrations
+        across = (
+            (registrations.start < last) & (registrations.end > first) & ~registrations.accepted
+        )
         if not across.any():
             return "too few registrations"
-        differ = np.isfinite(of.residual[across]).mean()
+        differ = np.isfinite(registrations.residual[across]).mean()
         return "registrations contradict each other" if differ > 0.5 else "registrations fail"
 
     def trajectory(self) -> Trajectory:

@@ -266,7 +266,7 @@ def _noise(edge: Edge) -> Any:
     hop = edge.hop
     way = float(np.linalg.norm(hop.T_start_end[:3, 3]))
     shorter = 1.0 if edge.again else _LONG / np.clip(way, LENGTHS[0], _LONG)
-    metres, radians = (of * shorter**by for of, by in zip(_OF_A_HOP, _SHORTER, strict=True))
+    metres, radians = (sigma * shorter**by for sigma, by in zip(_OF_A_HOP, _SHORTER, strict=True))
     known = np.eye(3) - hop.projection
     if np.abs(known).max() < 1e-6:
         return _sigmas(metres, radians)
@@ -284,8 +284,8 @@ def _robust(noise: Any, bounded: bool = True) -> Any:
     """
     import gtsam
 
-    of = gtsam.noiseModel.mEstimator
-    kernel = of.Cauchy(1.0) if bounded else of.Huber(1.345)
+    estimators = gtsam.noiseModel.mEstimator
+    kernel = estimators.Cauchy(1.0) if bounded else estimators.Huber(1.345)
     return gtsam.noiseModel.Robust.Create(kernel, noise)
 
 

@@ -142,17 +142,19 @@ def estimate_chart(title: str, found: EstimatedReference) -> Chart:
     x, y = found.known_poses[:, :2, 3].T
     drawn: tuple[Drawn, ...] = Line(x, y, "path"), Points(x[:1], y[:1], "start", shape="cross")
     path = Panel(Axis("x [m]"), Axis("y [m]"), drawn, "path", equal=True)
-    seconds, of = (found.stamps - found.stamps[0]) * 1e-9, found.registrations
-    differs = 100.0 * of.residual
+    seconds, registrations = (found.stamps - found.stamps[0]) * 1e-9, found.registrations
+    differs = 100.0 * registrations.residual
     failed = np.isnan(differs)
     centimetres = np.where(failed, 2.0 * np.max(differs[~failed], initial=1.0), differs)
     drawn = tuple(
         Points(
-            seconds[of.end[which]], np.maximum(centimetres[which], 0.01), f"{which.sum()} {what}"
+            seconds[registrations.end[which]],
+            np.maximum(centimetres[which], 0.01),
+            f"{which.sum()} {what}",
         )
         for what, which in (
-            ("differ", ~of.accepted & ~failed),
-            ("agree", of.accepted),
+            ("differ", ~registrations.accepted & ~failed),
+            ("agree", registrations.accepted),
             ("failed", failed),
         )
         if which.any()

@@ -269,9 +269,9 @@ class DdsLink:
         return sorted(names)
 
     def _held(self, node: str, names: list[str]) -> dict[str, Any]:
-        told = self._call(node, "GetParameters", len(names), names=names).values
+        values = self._call(node, "GetParameters", len(names), names=names).values
         fields = dict(enumerate(FIELDS.values(), 1))
-        held = zip(names, told, strict=False)  # none, where a node does not tell
+        held = zip(names, values, strict=False)  # none, where a node does not tell
         return {n: getattr(value, fields[value.type]) for n, value in held if value.type in fields}
 
     def _lacking(self, node: str, names: Iterable[str]) -> str:
@@ -367,10 +367,10 @@ class DdsLink:
         names = {e.topic_name for e in self._others(1)}
         return sorted(n[2:-7] for n in names if n.startswith("rq/"))
 
-    def _topic_end(self, of: type, topic: str, kind: str, *, reliable: bool = True) -> Any:
-        return self._end(of, f"rt{full(topic)}", kind, reliable=reliable)
+    def _topic_end(self, end_type: type, topic: str, kind: str, *, reliable: bool = True) -> Any:
+        return self._end(end_type, f"rt{full(topic)}", kind, reliable=reliable)
 
-    def _end(self, of: type, name: str, kind: str, *, reliable: bool = True) -> Any:
+    def _end(self, end_type: type, name: str, kind: str, *, reliable: bool = True) -> Any:
         """Make a reader or a writer of a topic, as DDS names it, and announce it."""
         if kind not in self.store.types:
             raise LinkError(f"{name[2:]}: the message type {kind} is not known")
@@ -379,16 +379,16 @@ class DdsLink:
             policy.Reliable(duration(seconds=_ANSWER)) if reliable else policy.BestEffort,
             # What is published once is for those who come later, too.
             _DURABILITIES[info or (name == "rt/tf_static" and reliable)],
-            Policy.History.KeepLast(1 if info and of is DataWriter else _DEPTH),
+            Policy.History.KeepLast(1 if info and end_type is DataWriter else _DEPTH),
             Policy.Userdata(f"typehash={self.store.hash_rihs01(kind)};".encode()),
         )
         with self._naming(name[2:]), self._announcing:
-            end = of(self._participant, Topic(self._participant, name, _carrier(kind)), qos)
+            end = end_type(self._participant, Topic(self._participant, name, _carrier(kind)), qos)
             self._kept.append(end)
-            if of is DataReader:
+            if end_type is DataReader:
                 end.set_status_mask(DDSStatus.RequestedIncompatibleQos)
             if not info:
-                self._gids[of].append(self._gid(end))
+                self._gids[end_type].append(self._gid(end))
                 self._announce()
         return end
 

@@ -69,11 +69,11 @@ class Relay(ABC):
         self._waiting.append(received)
         mistaken = set()
 
-        def put(of: str, data: bytes) -> None:
-            if of != kind and of not in mistaken:
-                mistaken.add(of)
-                _log.warning("%s is %s, not %s: its messages are ignored", topic, of, kind)
-            elif of == kind and received.qsize() < _WAITING:
+        def put(sent_kind: str, data: bytes) -> None:
+            if sent_kind != kind and sent_kind not in mistaken:
+                mistaken.add(sent_kind)
+                _log.warning("%s is %s, not %s: its messages are ignored", topic, sent_kind, kind)
+            elif sent_kind == kind and received.qsize() < _WAITING:
                 received.put(data)
 
         messages = iter(received.get, None)

@@ -93,8 +93,8 @@ def parameter_message(store: Typestore, name: str, value: Any) -> Any:
     plain = value.item() if hasattr(value, "item") else value  # numpy's, too
     if type(plain) not in FIELDS:
         raise LinkError(f"{name} = {value!r} is not a boolean, a number or a text")
-    fields: dict[str, Any] = {field: of() for of, field in FIELDS.items()}
-    fields |= {f"{name}_array_value": np.empty(0, of) for name, of in _ARRAYS.items()}
+    fields: dict[str, Any] = {field: kind() for kind, field in FIELDS.items()}
+    fields |= {f"{name}_array_value": np.empty(0, kind) for name, kind in _ARRAYS.items()}
     fields["string_array_value"] = []
     fields |= {"type": 1 + list(FIELDS).index(type(plain)), FIELDS[type(plain)]: plain}
     held = store.types["rcl_interfaces/msg/ParameterValue"](**fields)

@@ -277,7 +277,7 @@ def settle_roles(data: dict[str, Any]) -> tuple[dict[str, str], list[Finding]]:
 
 def _read(data: dict[str, Any], entry: Any, origins: dict[str, str]) -> _Named:
     """The entry of a list; a ValueError says what is wrong with it."""
-    known = {name: of for kind in _KINDS for name, of in data.get(kind, {}).items()}
+    known = {name: section for kind in _KINDS for name, section in data.get(kind, {}).items()}
     if isinstance(entry, dict) and len(entry) != 1:
         raise ValueError("each part is an entry of its own, as in [hall: 0-60%, town: 0-60%]")
     name = next(iter(entry)) if isinstance(entry, dict) else entry
@@ -315,5 +315,5 @@ def _add_part(data: dict[str, Any], named: _Named) -> None:
     for kind in _KINDS:
         section = data.get(kind, {})
         if isinstance(entry := section.get(named.origin), dict):
-            of = {"of": named.origin} if kind == "courses" else {}
-            data[kind] = section | {named.name: entry | of | {"part": list(named.part)}}
+            origin = {"of": named.origin} if kind == "courses" else {}
+            data[kind] = section | {named.name: entry | origin | {"part": list(named.part)}}

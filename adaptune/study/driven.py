@@ -110,14 +110,14 @@ def expected_in_words(expected: Mapping[str, float]) -> str:
         reach = "in other recordings"
     else:
         reach = f"elsewhere along {'this recording' if recordings == 1 else 'these recordings'}"
-    of = "one recording" if recordings == 1 else f"{recordings} recordings"
+    sources = "one recording" if recordings == 1 else f"{recordings} recordings"
     interval = (
         f"95 % interval {low:.0f} to {high:.0f} %" if low >= -1000.0 else "no interval: too few"
     )
     return (
         f"expected gain {gain:.0f} % ({interval}), in the worst tenth "
         f"{expected['worst_tenth']:.2f} times the fixed set's error, {reach} "
-        f"({stretches} stretches of {of})"
+        f"({stretches} stretches of {sources})"
     )
 
 

@@ -127,7 +127,7 @@ def estimates_of(sequences: StudySequences, names: Iterable[str]) -> dict[str, S
 
 def estimates_in_words(estimates: Mapping[str, StoredEstimate], length: float) -> list[str]:
     """A sentence about the sequences that an estimated reference judges, if there are any."""
-    each = "; ".join(f"{name} ({_accuracy(of, length)})" for name, of in estimates.items())
+    each = "; ".join(f"{name} ({_accuracy(stored, length)})" for name, stored in estimates.items())
     words = f"Judged by an estimated reference: {each}. Intervals do not include its error."
     return [words] if each else []
 

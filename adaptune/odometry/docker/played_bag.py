@@ -210,7 +210,7 @@ class PlayedBag(WholeRun):
                 raise OdometryError(f"{error}, and {help_}") from error
             _log.warning("%s: %s; poses are matched to scans by number", self.name, error)
             stamps = given.stamps
-            poses = [(s, *of) for s, (_, *of) in zip(stamps.tolist(), poses, strict=True)]
+            poses = [(s, *pose) for s, (_, *pose) in zip(stamps.tolist(), poses, strict=True)]
         trajectory, left_out = usable(poses)
         if trajectory is None or left_out:
             raise OdometryError(left_out[0])
