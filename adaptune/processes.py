@@ -205,7 +205,7 @@ class Program:
     ):
         self._ended: Ended | None = None
         self._output = output = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the instance
-        usual: Any = {"stdin": subprocess.DEVNULL, "stdout": output, "stderr": output}
+        streams: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": output, "stderr": output}
         self._here, there = socket.socketpair()
         under = [sys.executable, "-I", "-S", keeper.__file__, str(there.fileno()), str(memory)]
         with there:
@@ -214,7 +214,7 @@ class Program:
                 pass_fds=[there.fileno()],
                 env=os.environ | ONE_THREAD | dict(environment or {}),
                 start_new_session=True,
-                **usual | options,
+                **(streams | options),
             )
         if core is not None:
             # The keeper has not begun yet.
