@@ -1,7 +1,8 @@
 """YAML with the numbers and booleans of YAML 1.2, unique keys, and line numbers."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import takewhile
 from pathlib import Path
 from typing import Any, Self
 
@@ -14,6 +15,8 @@ class YamlError(AdaptuneError):
     """Text that is not YAML, or gives a key twice."""
 
 
+YamlPath = tuple[str | int, ...]
+"""The keys and indices that lead to a part of a document."""
 _TAGS = ("null", "bool", "int", "float", "str", "seq", "map")
 
 
@@ -114,6 +117,7 @@ class Document:
     """
 
     def __init__(self, text: str, foreign: bool = False):
+        self._text = text
         try:
             loader = _Foreign(text) if foreign else _Loader(text)
             self._node = loader.get_single_node()
@@ -178,10 +182,36 @@ class Document:
             node = entries[-1][1]
         return found
 
+    @property
+    def comments(self) -> dict[YamlPath, str]:
+        """The comments above keys, and at the end of their lines, by the path of the key."""
+        lines, found = self._text.split("\n"), dict[YamlPath, str]()
+        for path, key, value in _keys(self._node):
+            before = lines[: key.start_mark.line]
+            above = [*takewhile(lambda line: line.lstrip().startswith("#"), reversed(before))]
+            same = value.start_mark.line == key.end_mark.line
+            mark = value.end_mark if same else key.end_mark
+            rest = lines[mark.line][mark.column :].strip(": ")
+            told = [*above[::-1], rest] if rest.startswith("#") else above[::-1]
+            if text := "\n".join(line.strip().lstrip("#").strip() for line in told):
+                found.setdefault(path, text)
+        return found
+
     def where(self, file: Path, path: Sequence[str | int]) -> str:
         """The file of this text, and the line of `path` in it."""
         line = self.line(path)
         return f"{file}, line {line}" if line else str(file)
+
+
+def _keys(node: Any, path: YamlPath = ()) -> Iterator[tuple[YamlPath, Any, Any]]:
+    """The keys of all mappings in a node, with their paths and the nodes of both."""
+    if isinstance(node, yaml.MappingNode):
+        for key, value in node.value:
+            yield (*path, key.value), key, value
+            yield from _keys(value, (*path, key.value))
+    elif isinstance(node, yaml.SequenceNode):
+        for i, value in enumerate(node.value):
+            yield from _keys(value, (*path, i))
 
 
 def scalar(text: str) -> Any:
@@ -210,10 +240,19 @@ for _tag, _regexp, _first in (("int", _INT, "-+0123456789"), ("float", _FLOAT, "
     _Dumper.add_implicit_resolver(_PREFIX + _tag, _regexp, list(_first))
 
 
-def dump(data: Any) -> str:
+def dump(data: Any, comments: Mapping[YamlPath, str] | None = None) -> str:
     """Plain data as YAML that is read back as just these, keys in their order.
 
-    An AdaptuneError names a text that YAML cannot hold.
+    Comments stand above the keys at their paths; those of keys that are not there are left out. An
+    AdaptuneError names a text that YAML cannot hold.
     """
     text: str = yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=100)
-    return text
+    if not comments:
+        return text
+    lines = text.split("\n")
+    for path, key, _ in reversed([*_keys(Document(text)._node)]):
+        told, indent = comments.get(path, ""), " " * key.start_mark.column
+        lines[key.start_mark.line : key.start_mark.line] = [
+            f"{indent}# {line}" for line in told.splitlines()
+        ]
+    return "\n".join(lines)

@@ -36,6 +36,7 @@ default_role = "code"
 
 LINK = re.compile(r"\]\(([\w/-]+)\.md[#)]")
 OBJECTS = """
+adaptune.tuning.tuned: tune Tuned
 adaptune.recording: Scan Imu SequenceConfig
 adaptune.recording.recording: open_sequence
 adaptune.trajectory: Trajectory read_trajectory read_tum write_tum read_kitti
@@ -49,6 +50,7 @@ adaptune.selector: Selector TimedSelector
 adaptune.errors: AdaptuneError
 offline.config: load_study
 offline.train: train Training
+offline.scenario: scenario Scenario read_scenario write_scenario
 offline.annealing: AnnealingSampler
 online.modes: ReplaySetup
 online.replay: replay ReplayRecord

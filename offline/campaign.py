@@ -18,7 +18,7 @@ from adaptune.study.references import contradictions_of
 from offline.config import OfflineStudy
 from offline.drive import Drive
 from offline.objective import Verdict, label
-from offline.search import Clock, Search
+from offline.search import ELAPSED, Clock, Search
 from offline.stretches import Stretch, stretches_along
 from offline.trial import trial_of
 from offline.workers import Pool, Result, Task, TaskProgress, run
@@ -206,14 +206,21 @@ class Schedule:
             self._archive.write_frames(name, self._described[name])
             self._unsaved.remove(name)
 
-    def _show(self) -> None:
+    @property
+    def driven(self) -> float:
+        """How many of them are done, with the parts of those that are not."""
         due = sum(due.share for of in self._due.values() for due in of.values())
-        done = round(self.done + due + sum(self._partly.values()), 6)
-        self._progress(self._what, done, self.total, "")
+        return round(self.done + due + sum(self._partly.values()), 6)
+
+    def _show(self) -> None:
+        self._progress(self._what, self.driven, self.total, "")
 
 
 class Campaign:
-    """Runs the search of a study."""
+    """Runs the search of a study.
+
+    `seconds` are those that a set takes, about, and those of what follows the search.
+    """
 
     def __init__(
         self,
@@ -221,10 +228,14 @@ class Campaign:
         archive: Archive,
         workers: Pool[Any],
         progress: Progress = unseen,
+        clock: Clock | None = None,
+        seconds: tuple[float, float] = (0.0, 0.0),
     ):
         self._archive, self._workers, self._progress = archive, workers, progress
         self._config, self._names = study.config.offline, study.training
-        self._clock = Clock(study.folder / "elapsed.json")
+        self._clock, self._resumed = clock or Clock(study.folder / ELAPSED), 0
+        self._begun = self._clock.hours
+        self._each, self._rest = seconds
         self._finished = {name: archive.finished(name) for name in self._names}
         space, known = study.odometry.space, archive.known()
         self._search = Search(self._config, space, self._finished, known)
@@ -251,12 +262,23 @@ class Campaign:
 
     def _begin(self) -> None:
         """Begin as many trials as can begin now."""
-        while (number := self._search.begin(self._clock.hours)) is not None:
+        while (number := self._search.begin(self._hours)) is not None:
             for name in self._names:
                 if number in self._finished[name]:
                     self._schedule.done += 1
+                    self._resumed += 1
                 else:
                     self._schedule.add(name, number, self._search.sets[number])
+
+    @property
+    def _hours(self) -> float:
+        """Hours after which all is done, if one more set begins now."""
+        now, n, driven = self._clock.hours, len(self._names), self._schedule.driven
+        # What was expected counts as much as the first set.
+        spent = self._each + 3600.0 * (now - self._begun)
+        each = spent / (1.0 + (driven - self._resumed) / n)
+        left = (self._schedule.total - driven) / n + 1.0
+        return now + (each * left + self._rest) / 3600.0
 
     def _show(self, what: str, done: float, of: int, remark: str = "", /) -> None:
         search = self._search

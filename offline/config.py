@@ -21,9 +21,9 @@ from adaptune.space import (
     Value,
     describe,
 )
-from adaptune.strict import StrictModel, validated
+from adaptune.strict import ConfigurationError, StrictModel, validated
 from adaptune.study.config import StudyConfig
-from adaptune.study.study import Study
+from adaptune.study.study import CONFIGURATION, Study
 
 OPTUNA = {"tpe": "optuna.samplers:TPESampler"}
 """Optuna's samplers that have a name; their settings are the keywords of the class."""
@@ -514,13 +514,25 @@ OfflineStudy = Study[OfflineStudyConfig]
 
 
 def load_study(
-    path: Path | str,
+    study: Path | str | Mapping[str, Any],
     overrides: Sequence[str] = (),
     folder: Path | None = None,
     runs: Path = Path("runs"),
     needed: bool = True,
 ) -> OfflineStudy:
-    """Read and check the whole YAML of a study, see `adaptune.study.loading.read_study`."""
+    """Read and check a whole study, see `adaptune.study.loading.read_study`.
+
+    It is a YAML file, its data, or the folder of a study that has begun.
+    """
     from adaptune.study.loading import read_study  # which opens recordings
 
-    return read_study(Path(path), OfflineStudyConfig, overrides, folder, runs, needed)
+    given = Path(study) if isinstance(study, str) else study
+    if isinstance(given, Path) and not given.exists():
+        what = "give the YAML of a study, or the folder of one that has begun"
+        raise ConfigurationError(f"{given}: there is no such file or folder; {what}")
+    if isinstance(given, Path) and given.is_dir():
+        if not (given / CONFIGURATION).exists():
+            what = "is no study's folder: there is no study.yaml in it"
+            raise ConfigurationError(f"{given}: {what}")
+        given, folder = given / CONFIGURATION, folder or given
+    return read_study(given, OfflineStudyConfig, overrides, folder, runs, needed)

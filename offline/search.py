@@ -22,17 +22,26 @@ BUDGETS = ("trials", "hours", "stagnation")
 """Settings that may change when a study is resumed."""
 
 
+ELAPSED = "elapsed.json"
+"""What a `Clock` keeps, in a study's folder."""
+
+
 class Clock:
     """The time that a search took, kept in a file, so that a resumed one continues counting.
 
-    What a damaged file says does not count.
+    What a damaged file says does not count. Of the time that is allowed, also the `replays` of the
+    test may have to come.
     """
 
-    def __init__(self, path: Path):
-        self._path, self._begin, self._before = path, time.monotonic(), 0.0
+    def __init__(self, path: Path, replays: bool = False):
+        self._path, self._begin, self.replays = path, time.monotonic(), replays
+
+    @cached_property
+    def _before(self) -> float:
         with suppress(OSError, ValueError, TypeError, AttributeError):
-            read = json.loads(path.read_text(encoding="utf-8"))
-            self._before = sum(map(float, read.values()))
+            read = json.loads(self._path.read_text(encoding="utf-8"))
+            return sum(map(float, read.values()))
+        return 0.0
 
     @property
     def hours(self) -> float:
@@ -89,7 +98,10 @@ class Search:
         return len(self.sets) if self.end or self._limit is None else self._limit
 
     def begin(self, hours: float) -> int | None:
-        """Begin a trial after so many hours; returns its number, None if none can begin now."""
+        """Begin a trial with which all is done after so many hours, unless these are too many.
+
+        Returns its number, None if none can begin now.
+        """
         for number in [n for n in self.sets if n not in self.done]:
             if all(number in of for of in self._finished.values()):
                 runs = [of[number] for of in self._finished.values()]
@@ -116,7 +128,8 @@ class Search:
         number = next(n for n in count() if n not in self.sets)
         if number not in self._known:
             over = self._config.hours is not None and hours >= self._config.hours
-            end = f"{hours:.2f} hours have passed" if over else self._sampler.end
+            over &= number >= len(self._space.baselines)
+            end = "no more sets fit into the time" if over else self._sampler.end
             proposal = None
             if not over:
                 results = told([self.done[n] for n in seen])

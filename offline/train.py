@@ -43,6 +43,7 @@ from offline.campaign import (
 from offline.choice import NothingUsableError
 from offline.config import OfflineConfig, OfflineStudy
 from offline.drive import TrialSetup
+from offline.forecast import forecast
 from offline.front import COST, front_rows, left_out_in_words
 from offline.labelled import LabelledData, labelled_data, with_vectors
 from offline.objective import (
@@ -52,9 +53,9 @@ from offline.objective import (
     judge,
     label,
 )
-from offline.search import BUDGETS, Finished
+from offline.search import BUDGETS, ELAPSED, Clock, Finished
 from offline.tuning import NO_BANK, choose, driven_cost, reserve, rivals
-from offline.workers import Cluster, Workers, spare_memory
+from offline.workers import Cluster, Pool, Workers, spare_memory
 
 _log = logging.getLogger(__name__)
 
@@ -95,27 +96,28 @@ class Training(NamedTuple):
         ]
 
 
-def train(study: OfflineStudy, progress: Progress = unseen, cluster: str | None = None) -> Training:
+def train(
+    study: OfflineStudy,
+    progress: Progress = unseen,
+    cluster: str | None = None,
+    clock: Clock | None = None,
+) -> Training:
     """Estimate the references that are lacking, run the trials that are, and fit the model.
 
     The study's folder receives the archive, the error model, the fixed set (see `write_fixed`),
     and tables of the trials (``trials``) and of the training sequences (``training``). `cluster`
     is the address of a Dask scheduler whose workers run the trials. Trials of other inputs than
-    now are run again.
-
-    Raises
-    ------
-    AdaptuneError
-        If a sequence, its reference or the odometry cannot be used, or no set gives poses.
+    now are run again. `offline.hours` are those of the `clock`, by default those of this call.
+    There is an AdaptuneError if a sequence, its reference or the odometry cannot be used, or no set
+    gives poses.
     """
     if not any(study.odometry.space.baselines):
         raise AdaptuneError("odometry.parameters: is empty, so there is nothing to tune; name some")
+    clock = clock or Clock(study.folder / ELAPSED)
     archive = _ready_archive(study, progress)
-    config = study.config.offline
-    names, space = study.training, study.odometry.space
+    config, names, space = study.config.offline, study.training, study.odometry.space
     with trial_workers(study, names, cluster) as workers:
-        run_baseline(study, archive, workers, progress)
-        verdicts = Campaign(study, archive, workers, progress).run()
+        verdicts = _searched(study, archive, workers, progress, clock)
         finished = {name: {n: archive.finished(name)[n] for n in verdicts} for name in names}
         tried = tuple(verdict.parameters for verdict in verdicts.values())
         every_set = ParameterSets(space, tuple(verdicts), tried)
@@ -138,10 +140,7 @@ def train(study: OfflineStudy, progress: Progress = unseen, cluster: str | None 
     estimates = estimates_of(study.sequences, names)
     errors = {name: stored.error(model.length) for name, stored in estimates.items()}
     rows = _training_rows(config, verdicts, finished, fixed, whole, errors, space)
-    left_out = chosen_elsewhere(usable)
-    for row in rows:
-        chosen = left_out.get(name := row["sequence"])
-        row["_left out"] = None if chosen is None else whole[name][chosen].mean_error
+    _note_left_out(rows, usable, whole)
     tables.write_rows(study.folder, "training", rows)
     said = lost_in_words(
         f"the fixed set, the best of {len(trials)} parameter sets,",
@@ -156,6 +155,29 @@ def train(study: OfflineStudy, progress: Progress = unseen, cluster: str | None 
     rows_of_front = front_rows(usable, model)
     tables.write_rows(study.folder, "front", rows_of_front)
     return Training(model, trials, rows, said, rows_of_front, left_out_in_words(usable))
+
+
+def _note_left_out(
+    rows: Sequence[dict[str, Any]], usable: LabelledData, whole: WholeDrives
+) -> None:
+    """Add to the row of each sequence the error of the trial that the other recordings choose."""
+    left_out = chosen_elsewhere(usable)
+    for row in rows:
+        chosen = left_out.get(name := row["sequence"])
+        row["_left out"] = None if chosen is None else whole[name][chosen].mean_error
+
+
+def _searched(
+    study: OfflineStudy, archive: Archive, workers: Pool[Any], progress: Progress, clock: Clock
+) -> dict[int, Verdict]:
+    """Drive the baseline, say how long the rest takes, and try sets."""
+    run_baseline(study, archive, workers, progress)
+    expected, config = forecast(study, archive, len(workers.workers()), clock), study.config.offline
+    left = (config.most_trials or np.inf) - min(len(archive.finished(n)) for n in study.training)
+    most = 3600.0 * ((config.hours or np.inf) - clock.hours)
+    if left > 0 and most > 0.0 and min(left, most) < np.inf:
+        _log.info("%s", expected.words(left, most))
+    return Campaign(study, archive, workers, progress, clock, expected).run()
 
 
 def chosen_elsewhere(data: LabelledData) -> dict[str, int]:

@@ -1,5 +1,6 @@
 """The documentation leads where it says, and what it says to type works: commands, Python, YAML."""
 
+import json
 import re
 import shlex
 import shutil
@@ -163,7 +164,7 @@ def folder(tmp_path, monkeypatch):
     text = re.sub(r"\bthree:", "home:", text).replace("[three]", "[home]")
     text = text.replace("trials: 10, initial: 4, batch: 4", "trials: 6, initial: 3, batch: 3")
     (tmp_path / "my.yaml").write_text(text)
-    for name in ("my.bag", "drive.bag"):
+    for name in ("my.bag", "drive.bag", "hall.bag"):
         shutil.copy(tmp_path / "three.bag", tmp_path / name)
     return tmp_path
 
@@ -224,11 +225,11 @@ def test_commands_work(pages):
         assert result.output
 
 
-def test_the_readme_s_example_is_what_adaptune_online_does(folder):
+def test_the_loop_on_a_robot_is_what_adaptune_online_does(folder):
     overrides = ["online.switching.mechanism=bank"]
     study = load_study(folder / "my.yaml", overrides)
     model = train(study).model
-    (example,) = (code for page, code in blocks("python") if page == "README.md")
+    (example,) = (code for _, code in blocks("python") if "TimedSelector(mode" in code)
     example = example.replace('"my.yaml"', f'"my.yaml", {overrides}')
     last = "    T_odom_sensor = tracker.register(scan).T_odom_sensor\n"
     assert last in example
@@ -248,7 +249,7 @@ def test_the_readme_s_example_is_what_adaptune_online_does(folder):
 
 @pytest.mark.usefixtures("folder")
 def test_python_works():
-    # The README's is run and compared above; this one trains the study of the others.
+    # The first ones train the study of the others; the README's is run with the notebook.
     found = sorted(blocks("python"), key=lambda block: block[0] != "python.md")
     found = [(page, code) for page, code in found if page != "README.md"]
     assert len(found) > 5
@@ -257,14 +258,35 @@ def test_python_works():
         names: dict[str, Any] = {"__name__": page}
         with pd.option_context("plotting.backend", "plotly"):
             exec(compile(quicker, page, "exec"), names)
-        if page == "python.md" and "sub_trajectory_rte" in code:
-            assert (names["errors"] < 30.0).any()
-            assert {"trial", "keyframe_interval", "mean"} <= set(names["trials"])
-            assert sum(names["selection"].weights.values()) == pytest.approx(1.0)
-            shown = {key: repr(names[key]) for key in ("study", "home", "record")}
-            shown |= {"model": repr(names["trained"].model), "space": repr(names["study"].odometry)}
-            assert all(" object at 0x" not in text and len(text) < 600 for text in shown.values())
-            assert shown["record"] == "<ReplayRecord: 40 scans, 0 selections, 0 restarts>"
+        if "adaptune.tune(" in code:
+            assert {"trial", "keyframe_interval", "mean"} <= set(names["tuned"].trials)
+            assert repr(names["tuned"]).endswith(" More: runs/hall/report/report.html>")
+        if "read_scenario" in code:
+            assert names["best"] in names["errors"].trial
+            shown = {key: repr(names[key]) for key in ("study", "trained")}
+            assert "<Study in runs/my: " in shown["study"]
+
+
+def test_the_notebook_runs_and_so_does_the_readme(folder, monkeypatch):
+    cells = json.loads((ROOT / "docs/tune.ipynb").read_text("utf-8"))["cells"]
+    codes = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
+    assert all(not cell.get("outputs") and not cell.get("execution_count") for cell in cells)
+    monkeypatch.syspath_prepend(folder)
+    monkeypatch.setenv("PYTHONPATH", str(folder), prepend=":")
+    (readme,) = (code for page, code in blocks("python") if page == "README.md")
+    names: dict[str, Any] = {}
+    for code in [*codes, readme.replace("budget=15", "budget=1e6")]:
+        magic, _, rest = code.partition("\n")
+        if magic.startswith("%%writefile "):
+            (folder / magic.split()[1]).write_text(rest)
+        else:
+            exec(re.sub(r"trials=\d", "trials=3", code), names)
+    assert names["again"].study.odometry.space.baseline == {"voxel": 0.3}
+    tuned = names["tuned"]
+    assert tuned.study.config.online.budget == 1e6
+    assert [f"rte_{n}" for n in tuned.trials["trial"]] == list(tuned.errors.filter(like="rte_"))
+    assert '<img style="max-width: 100%" src="data:image/png;base64,' in tuned._repr_html_()
+    assert {"study", "fixed", "model", "page", "trials"} <= set(tuned.files)
 
 
 @pytest.mark.parametrize(("page", "block"), blocks("yaml"), ids=[p for p, _ in blocks("yaml")])

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from adaptune.commands.recordings import check_no_study
 from adaptune.commands.terminal import (
     Cluster,
     Folder,
@@ -29,6 +28,7 @@ from adaptune.commands.terminal import (
 from adaptune.commands.trained import BUYS, show_front
 from adaptune.errors import AdaptuneError, Finding
 from adaptune.files import write_text
+from adaptune.tuning.asked import check_no_study
 
 if TYPE_CHECKING:
     from adaptune.reference.stored import StoredEstimate
@@ -110,14 +110,26 @@ def trials(
         typer.Option(metavar="COLUMN", help="With `-` before it, the largest first."),
     ] = None,
     top: Annotated[int | None, typer.Option(help="Show so many, the best first.", min=1)] = None,
+    errors: Annotated[
+        Path | None,
+        typer.Option(help="Write errors by frame and set, as CSV or Parquet.", dir_okay=False),
+    ] = None,
 ) -> None:
     """List the study's finished trials, also while it runs.
 
     The columns are the trial number, the parameters, the `mean` RTE in percent over all training
     sequences and the RTE on each of them, the number of restarts by the health check and of ended
     processes, and the other metrics.
+
+    With `--errors`, it writes a table to compare selection rules on: for every frame its sequence,
+    fold and descriptor, and the error of every set; costs go to a table beside it.
     """
     loaded = load(study, override, folder)
+    if errors is not None:
+        from offline.scenario import scenario, write_scenario
+
+        say(f"{errors}: errors by frame and set; costs: {write_scenario(errors, scenario(loaded))}")
+        return
     from adaptune import trial_rows
     from adaptune.archive import Archive
 

@@ -2,9 +2,8 @@
 
 import logging
 import math
-import os
 from collections.abc import Sequence
-from contextlib import ExitStack, closing, suppress
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -108,7 +107,10 @@ def online(
     if oracle:
         _oracle(loaded, cluster)
     else:
-        made = replay_missing(loaded, model, untrained=untrained)
+        from adaptune.tuning.tuned import replay_missing
+
+        with progress() as show:
+            made = replay_missing(loaded, model, untrained=untrained, show=show)
         there = f"{made} replays made" if made else "All replays were there already"
         say(f"{there}: {loaded.folder / 'replays'}/")
     say_next_of_study("table and pictures of the modes", "compare")
@@ -128,33 +130,13 @@ def _oracle(loaded: "OfflineStudy", cluster: str | None) -> None:
     say(f"Trials: {loaded.folder / 'oracle'}/")
 
 
-def alone(study: "OfflineStudy") -> ExitStack:
-    """Bind this process to one core, and leave the others to what it starts."""
-    from adaptune.machine import pin
-
-    # Ask for the number of cores before.
-    _ = study.mechanism
-    return pin(os.getpid(), alone=True)
-
-
-def replay_missing(
-    loaded: "OfflineStudy", model: Path | None = None, *, untrained: bool = False
-) -> int:
-    """Make the replays that are missing; how many were made."""
-    from online.modes import run_replays, run_untrained
-
-    with alone(loaded), progress() as show:
-        if untrained:
-            return run_untrained(loaded, show)
-        return run_replays(loaded, model or loaded.model_path, show)
-
-
 def _drive(
     loaded: "OfflineStudy", mode: str | None, model: Path | None, *, untrained: bool, ros2: bool
 ) -> None:
     """Drive on a robot until Ctrl-C."""
     from adaptune.ros.ros1 import local_ros1
     from adaptune.ros.ros2 import local_ros2
+    from adaptune.tuning.tuned import alone
     from online.modes import UNTRAINED, WITHOUT_MODEL
     from online.robot import RobotDrive
 
@@ -242,9 +224,12 @@ def compare(
     if recordings or odometry:
         raise AdaptuneError("BAG and --odometry go with --against, which names the other side")
     from adaptune.study.driven import MIN_RECORDINGS
+    from adaptune.tuning.tuned import compared
 
     loaded = load(Path(study), override, folder)
-    found = compared(loaded, details=details)
+    begin_work()
+    found, page = compared(loaded)
+    say_compared(loaded, found, page, details=details)
     if found.rows[0].yardstick == "baseline":
         say_next_of_study("look for better sets", "offline")
     elif found.unfinished:
@@ -269,12 +254,13 @@ def _gate(
     out: Path,
 ) -> None:
     """Say whether the first side is worse than the second one, and exit with a code."""
-    from adaptune.commands.gate import sides
+    from adaptune.tuning.sides import sides
     from online.gate import compare_sides, write_gate
 
     shares = [_share_of(text, key) for text, key in zip(percents, ("worse", "cost"), strict=True)]
-    begin_work()
-    gate = compare_sides(*sides(given, recordings, odometry), *shares)
+    with progress() as show:
+        both = sides(given, recordings, odometry, show)
+    gate = compare_sides(*both, *shares)
     write_gate(out, gate)
     say(gate.words)
     show_table("New against old", [row.columns() for row in gate.rows])
@@ -291,26 +277,15 @@ def _share_of(text: str, key: str) -> float:
     raise AdaptuneError(f"--{key} {text}: give a percentage, as in --{key} 5%")
 
 
-def compared(loaded: "OfflineStudy", *, details: bool = False) -> "ComparedReplays":
-    """Compare a study's replays, write the page, and print what to do and a table.
-
-    With `details`, print all sentences and tables of the page, too.
-    """
-    from adaptune.commands.page import write_study_page
+def say_compared(
+    loaded: "OfflineStudy", found: "ComparedReplays", page: Path, *, details: bool = False
+) -> None:
+    """Print what to do and a table; with `details`, all sentences and tables of the page."""
     from adaptune.model.registry import ADAPTIVE
-    from online.compare import compare as compare_replays
     from online.modes import BASELINE, FIXED
     from online.tables import decision_table, tables
 
-    begin_work()
-    try:
-        found = compare_replays(loaded)
-    except AdaptuneError as error:
-        # A study that still runs has a page, too.
-        if (loaded.folder / "study.yaml").exists():
-            say(f"Page: {write_study_page(loaded, f'No comparison: {error}.')}")
-        raise
-    page, length = write_study_page(loaded, found), loaded.config.sub_trajectory
+    length = loaded.config.sub_trajectory
     say(" ".join(found.verdict))
     if found.rows[0].yardstick == "fixed":
         same = (BASELINE,) if loaded.fixed == loaded.odometry.space.baseline else ()
@@ -321,7 +296,6 @@ def compared(loaded: "OfflineStudy", *, details: bool = False) -> "ComparedRepla
         say(sentence)
     for made in shown:
         show_table(*made)
-    return found
 
 
 def record(

@@ -1,13 +1,11 @@
 """What every command shares: where it prints, its progress, and its exit after an error."""
 
-import logging
 import os
 import shlex
 import signal
 import sys
-import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -16,11 +14,9 @@ from rich.console import Console
 from typer.core import TyperGroup
 
 from adaptune.errors import OUT_OF_MEMORY, AdaptuneError
-from adaptune.progress import Progress
+from adaptune.progress import Progress, bars
 
 if TYPE_CHECKING:
-    from rich.progress import Task, TaskID
-
     from offline.config import OfflineStudy
 
 
@@ -67,64 +63,12 @@ def begin_work() -> None:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-LOG_EVERY = 5.0
-"""Seconds between two lines about progress in a log."""
-
-MOST_FINISHED = 8
-"""Bars that stay on the screen when they are full."""
-
-
 @contextmanager
 def progress() -> Iterator[Progress]:
     """Show a bar for each thing that is done; without a terminal, write a line now and then."""
     begin_work()
-    from rich import progress as columns
-
-    bars = columns.Progress(
-        columns.TextColumn("{task.description}", markup=False),
-        columns.BarColumn(),
-        columns.MofNCompleteColumn(),
-        columns.TimeElapsedColumn(),
-        columns.TextColumn("{task.fields[remark]}", markup=False),
-        console=errors,
-        get_time=time.monotonic,
-    )
-    tasks: dict[str, TaskID] = {}
-    log, told = logging.getLogger("adaptune"), time.monotonic()
-
-    def show(what: str, done: float, total: int, remark: str = "", /) -> None:
-        nonlocal told
-        if what not in tasks:
-            over = [task.id for task in bars.tasks if task.finished]
-            for finished in over[:-MOST_FINISHED]:
-                bars.update(finished, visible=False)
-            tasks[what] = bars.add_task(what, total=total, remark="")
-        task = bars.tasks[tasks[what]]
-        # Several workers may read the same, one after the other.
-        if task.finished and task.total == total:
-            return
-        # What a resumed study has done already comes in the first moment, and says nothing.
-        bars.speed_estimate_period = 0.8 * (task.elapsed or 0.0)
-        bars.update(task.id, completed=done, total=max(total, done))
-        words = ", ".join(filter(None, (_time_left(task), remark)))
-        bars.update(task.id, remark=words)
-        if not errors.is_terminal and time.monotonic() - told > LOG_EVERY:
-            told = time.monotonic()
-            log.info("%s: %d of %d%s", what, done, total, words and f", {words}")
-
-    with bars if errors.is_terminal else nullcontext():
+    with bars(errors) as show:
         yield show
-
-
-def _time_left(task: "Task") -> str:
-    """In words; empty before a first piece is done, and in the first seconds."""
-    seconds = task.time_remaining
-    if not seconds or (task.elapsed or 0.0) < LOG_EVERY:
-        return ""
-    for unit, length in (("h", 3600.0), ("min", 60.0)):
-        if seconds > 2.0 * length:
-            return f"about {seconds / length:.0f} {unit} left"
-    return f"about {seconds:.0f} s left"
 
 
 def say_fixed(study: "OfflineStudy", advised: bool = True) -> None:
@@ -212,13 +156,6 @@ def load(
     """
     from offline.config import load_study
 
-    if not path.exists():
-        what = "give the YAML of a study, or the folder of one that has begun"
-        raise AdaptuneError(f"{path}: there is no such file or folder; {what}")
     of_folder = [] if folder is None else ["--folder", folder]
     _study_words[:] = [path, *of_folder, *(word for text in overrides for word in ("-o", text))]
-    if path.is_dir():
-        if not (path / "study.yaml").exists():
-            raise AdaptuneError(f"{path}: is no study's folder: there is no study.yaml in it")
-        path, folder = path / "study.yaml", folder or path
     return load_study(path, overrides, folder, needed=runs)

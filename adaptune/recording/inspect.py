@@ -105,15 +105,19 @@ class Inspection:
         """YAML for a study."""
         if not self.name:
             return yaml12.dump(self.given)
-        text = yaml12.dump({"sequences": {self.name: self.given}})
-        if "bag" not in self.given:
-            return text
-        hint = "    # reference: a topic, or a TUM, KITTI or EuRoC file; estimated if left out\n"
-        text += hint if "reference" not in self.used else ""
-        if "compensate" in self.given:
-            text += "    # without `compensate` for an odometry that undoes the motion itself\n"
-        hint = "    # stamp: end - if headers mark scans' ends and times count from the start\n"
-        return text + (hint if self.scan is not None and self.scan.times is not None else "")
+        return yaml12.dump({"sequences": {self.name: self.given}}, self.hints)
+
+    @property
+    def hints(self) -> dict[yaml12.YamlPath, str]:
+        """Comments for a study: what else its entry may say."""
+        said = []
+        if "bag" in self.given and "reference" not in self.used:
+            said.append("reference: a topic, or a TUM, KITTI or EuRoC file; estimated if left out")
+        if "bag" in self.given and "compensate" in self.given:
+            said.append("without `compensate` for an odometry that undoes the motion itself")
+        if "bag" in self.given and self.scan is not None and self.scan.times is not None:
+            said.append("stamp: end - if headers mark scans' ends and times count from the start")
+        return {("sequences", self.name): "\n".join(said)}
 
 
 def inspect(path: Path, deep: bool = False, show: Progress = unseen) -> Inspection:

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from copy import deepcopy
 from itertools import combinations, product
 from pathlib import Path
 from typing import Any, TypeVar
@@ -200,36 +201,42 @@ C = TypeVar("C", bound=StudyConfig)
 
 
 def read_study(
-    path: Path,
+    given: Path | Mapping[str, Any],
     config_type: type[C],
     overrides: Sequence[str] = (),
     folder: Path | None = None,
     runs: Path = Path("runs"),
     needed: bool = True,
 ) -> Study[C]:
-    """Read and check the YAML of a study, with ``key.of.a.key=value`` as overrides.
+    """Read and check a study, a file or its data, with ``key.of.a.key=value`` as overrides.
 
-    The study's folder is by default the YAML's name under `runs`. The odometry is `needed` if it
-    must be there to run. A ConfigurationError lists mistakes, each with its line, its key and
-    what to do.
+    The study's folder is by default the YAML's name under `runs`; that of data must be given. The
+    odometry is `needed` if it must be there to run. A ConfigurationError lists mistakes, each with
+    its line, its key and what to do.
     """
     # A wrong variable is no mistake of the study.
     cache.folder()
     cache.cap()
-    document = _read(path)
-    data: Any = document.data
+    if isinstance(given, Path):
+        document: yaml12.Document | None = _read(given)
+        here, folder = given.parent.resolve(), folder or runs / given.stem
+    else:
+        document, here = None, Path.cwd()
+    data: Any = deepcopy(given) if document is None else document.data
+    if folder is None:
+        raise ConfigurationError("a study that is no file needs a `folder`")
     for role in ROLES:  # 00 is a name there
         named = data.get(role) if isinstance(data.get(role), list) else []
         for i, name in enumerate(named):
             if not isinstance(name, str | list | dict):
-                named[i] = document.name((role, i))
+                named[i] = str(name) if document is None else document.name((role, i))
     overridden = [_override(data, text) for text in overrides]
-    config, mistakes = _check(config_type, data, path.parent.resolve(), needed)
+    config, mistakes = _check(config_type, data, here, needed)
     if mistakes or config is None:
-        mistakes.sort(key=lambda mistake: document.line(mistake.where) or 0)
-        said = dict.fromkeys(_say(m, path, document, overridden) for m in mistakes)
+        mistakes.sort(key=lambda mistake: (document and document.line(mistake.where)) or 0)
+        said = dict.fromkeys(_say(m, given, document, overridden) for m in mistakes)
         raise ConfigurationError("\n".join(said))
-    return Study(config, folder or runs / path.stem)
+    return Study(config, folder)
 
 
 def _read(path: Path) -> yaml12.Document:
@@ -263,11 +270,14 @@ def _override(data: dict[str, Any], text: str) -> Key:
     return path
 
 
-def _say(mistake: Finding, path: Path, document: yaml12.Document, overridden: Sequence[Key]) -> str:
+def _say(
+    mistake: Finding, file: Any, document: yaml12.Document | None, overridden: Sequence[Key]
+) -> str:
     key = mistake.where
     # The mistake of a whole section may be the mistake of a value in it.
-    by_override = any(key[: len(o)] == o[: len(key)] for o in overridden)
-    return f"{'-o' if by_override else document.where(path, key)}: {mistake}"
+    if any(key[: len(o)] == o[: len(key)] for o in overridden):
+        return f"-o: {mistake}"
+    return str(mistake) if document is None else f"{document.where(file, key)}: {mistake}"
 
 
 def _check(

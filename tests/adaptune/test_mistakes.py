@@ -112,13 +112,15 @@ def test_a_wrong_size_of_the_cache_is_told_once(study_file, monkeypatch, given):
 @pytest.mark.parametrize("kind", ["folder", "device", "large"])
 def test_what_cannot_be_a_study_is_not_read(tmp_path, kind):
     path = tmp_path / "study.yaml"
+    told = "a study is a file of YAML, of 1 MB at most"
     if kind == "folder":
         path.mkdir()
+        told = "is no study's folder: there is no study.yaml in it"
     elif kind == "device":
         path.symlink_to("/dev/zero")
     else:
         path.write_text("a: b\n" * 300_000)
-    assert failure(path) == f"{path}: a study is a file of YAML, of 1 MB at most"
+    assert failure(path) == f"{path}: {told}"
 
 
 def test_damaged_studies_give_a_study_or_an_error(tmp_path):

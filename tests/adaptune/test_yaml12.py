@@ -133,6 +133,19 @@ def test_what_is_dumped_is_read_back(data):
     assert repr(back) == repr(data)
 
 
+def test_comments_come_back():
+    text = "# mine\na: 1 # at its end\nb:  # of b\n  # inner\n  c: [1]\nd:\n- e: 1 # item\n  f: 2\n"
+    document = Document(text)
+    found = dump(document.data, document.comments)
+    assert found == (
+        "# mine\n# at its end\na: 1\n# of b\nb:\n  # inner\n  c:\n  - 1\n"
+        "d:\n  # item\n- e: 1\n  f: 2\n"
+    )
+    again = Document(found)
+    assert (again.data, dump(again.data, again.comments)) == (document.data, found)
+    assert dump({"x": 1}, document.comments) == "x: 1\n"
+
+
 @pytest.mark.parametrize("text", ["a\udcff.bag", "a\0", "\ud800"])
 def test_what_cannot_be_read_back_is_not_written(text):
     for data in ({text: 1}, [{"bag": text}]):

@@ -1,13 +1,16 @@
 import itertools
 import re
 from collections import Counter
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from clocks import SteppedClock
 from made_trials import Drawn
 
 from adaptune.archive import Archive, Summary
 from adaptune.space import Categorical, Integer, ParameterSpace
+from offline import search
 from offline.campaign import Campaign
 from offline.config import OfflineConfig, load_study
 from offline.search import Clock, Search
@@ -148,7 +151,7 @@ def test_verdicts_belong_to_their_trials_where_numbers_are_left_out():
     [
         ({"trials": 3}, [1.0] * 3, 0.0, 3, "3 trials are done"),
         ({}, [1.0] * 64, 0.0, 64, "64 trials"),
-        ({"hours": 2.0}, [], 2.0, 0, "2.00 hours have passed"),
+        ({"hours": 2.0}, [1.0], 2.0, 1, "no more sets fit into the time"),
         ({"stagnation": 3}, [5.0, 2.0, 3.0, 3.0, 2.0], 0.0, 5, "none of 3 trials .* than the best"),
     ],
 )
@@ -193,6 +196,39 @@ def test_the_clock_goes_on_counting(tmp_path):
     assert 1.5 <= Clock(path).hours < 1.6
     path.write_text("damaged")
     assert Clock(path).hours < 0.1
+
+
+class Slow(Drawn):
+    """Takes ten seconds of a clock for a set on a sequence."""
+
+    def __init__(self, clock):
+        super().__init__(error)
+        self.clock = clock
+
+    def start(self, worker, task):
+        super().start(worker, task)
+        self.clock.seconds += 10.0 * len(task.sets)
+
+
+@pytest.mark.parametrize("expected", [3.0, 30.0, 90.0])
+def test_no_set_begins_that_would_not_end_in_time(study_of, monkeypatch, expected):
+    clock = SteppedClock()
+    monkeypatch.setattr(search, "time", SimpleNamespace(monotonic=clock.now))
+    study = study_of(trials="", hours=1500 / 3600)
+    of_study = Clock(study.folder / "elapsed.json")
+    clock.seconds = 100.0  # reading the bags
+    given = Archive(study.folder / "trials"), Slow(clock)
+    verdicts = Campaign(study, *given, clock=of_study, seconds=(expected, 300.0)).run()
+    assert clock.seconds == 100.0 + 30.0 * len(verdicts)
+    assert 0.8 * 1500.0 <= clock.seconds + 300.0 <= 1500.0
+
+
+def test_however_short_the_time_the_baseline_is_driven(study_file, tmp_path, caplog):
+    caplog.set_level("INFO")
+    study = load_study(study_file, ["offline.trials=", "offline.hours=1e-9"], tmp_path / "run")
+    training = train(study)
+    assert [row["trial"] for row in training.trials] == [training.model.fixed] == [0]
+    assert "the search ends: no more sets fit into the time" in caplog.text
 
 
 def trials(folder):

@@ -66,7 +66,7 @@ def test_nothing_known_is_driven_again_and_folders_are_sides(bags):
     assert [path.stat().st_mtime_ns for path in replays] == times
     bad, good = (next(Path("runs/compare").glob(f"{name}_*/")) for name in ("bad", "good"))
     assert commands.call("compare", bad, "--against", good, *COSTS).exit_code == 3
-    study = good / f"{good.name}.yaml"
+    study = good / "study.yaml"
     text = study.read_text()
     study.write_text(text.replace("sub_trajectory: ", "sub_trajectory: 1"))
     said = commands.refused("compare", bad, "--against", study)

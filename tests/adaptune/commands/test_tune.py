@@ -9,9 +9,10 @@ import drives
 import pytest
 import rec
 
-from adaptune.commands import trained, tune
+from adaptune.commands import trained
 from adaptune.simulation import Course
 from adaptune.simulation.record import record
+from adaptune.tuning import asked, tuned
 from offline.config import load_study
 from offline.train import COST
 
@@ -42,10 +43,13 @@ def bag(study_file, tmp_path):
 def decided(monkeypatch):
     """Only decide; nothing is run."""
 
-    def stop(path, overrides, _, *, runs):  # noqa: ARG001
-        raise tune.AdaptuneError(f"{path} {' '.join(overrides)}".strip())
+    written = tuned.written
 
-    monkeypatch.setattr(tune, "load", stop)
+    def stop(*given):
+        path, overrides, _ = written(*given)
+        raise tuned.AdaptuneError(f"{path} {' '.join(overrides)}".strip())
+
+    monkeypatch.setattr(tuned, "written", stop)
 
 
 @pytest.mark.services
@@ -103,12 +107,12 @@ def test_a_name_that_is_no_text_is_refused(bag, tmp_path):
 def test_what_it_decides_stands_in_a_study_file(bag, tmp_path):
     assert failed(bag) == "error: runs/one/one.yaml"
     text = (tmp_path / "runs/one/one.yaml").read_text()
-    assert text.startswith(f"# adaptune tune {bag.resolve()} --odometry gicp\n")
+    assert "# The part for the test is not trained on.\ntraining:\n- one: 0-60%\n" in text
     study = study_in("runs/one/one.yaml")
     assert study.training == ["one_0-60"]
     assert study.config.test == ("one_60-100",)
     assert study.config.sub_trajectory == 2.0
-    assert study.config.offline.trials == tune.TRIALS
+    assert study.config.offline.trials == asked.TRIALS
     assert study.config.sequences["one"].points == "/points"
     assert study.config.sequences["one"].reference == "/truth"
 
@@ -123,7 +127,10 @@ def test_what_the_user_changed_stays(bag, tmp_path):
     )
     assert "lost_track: 2.0" in path.read_text()
     said = failed(bag, "--reference", "estimated")
-    assert "runs/one/one.yaml: another `adaptune tune` made it, for what its first line" in said
+    assert "runs/one/one.yaml: another `adaptune tune` made it: reference is new;" in said
+    # Its comments are the user's.
+    path.write_text("# mine\n" + path.read_text())
+    assert failed(bag) == "error: runs/one/one.yaml"
 
 
 @pytest.mark.usefixtures("decided")
@@ -162,8 +169,8 @@ def test_several_odometries_share_a_study(bag):
     failed(bag, "--odometry", "gicp,kiss_icp")
     study = study_in("runs/one_gicp+kiss_icp/one_gicp+kiss_icp.yaml")
     assert list(study.config.odometries) == ["gicp", "kiss_icp"]
-    assert study.config.offline.trials == 2 * tune.EACH
-    every = tune.odometries_of("all", imu=False)
+    assert study.config.offline.trials == 2 * asked.EACH
+    every = asked.odometries_of("all", imu=False)
     assert {"gicp", "vgicp", "ndt", "kiss_icp"} <= set(every)
     assert "evalio_kiss_icp" not in every
 
@@ -173,7 +180,7 @@ def test_of_a_launch_command_a_study_is_written_to_fill_in(bag):
     done = commands.succeeded(*given, "ros2 launch kiss_icp odometry.launch.py topic:=/points")
     assert "adaptune inspect one_ros2.yaml" in done.output
     text = Path("one_ros2.yaml").read_text()
-    assert '"kiss_icp", "odometry.launch.py", "topic:=/points", "FILL_IN:={parameters}"' in text
+    assert "- odometry.launch.py\n    - topic:=/points\n    - FILL_IN:={parameters}\n" in text
     # Once it is filled in, it is a study.
     Path("p.yaml").write_text("voxel: 1.0\n")
     Path("one_ros2.yaml").write_text(
@@ -332,8 +339,13 @@ def test_what_is_new_goes_where_its_folder_belongs(tmp_path):
     add(0, "bags/park")
     add(1, "kept/yard")
     failed(*call)
+    path = tmp_path / "runs/many/many.yaml"
+    path.write_text("# mine\n" + path.read_text().replace("health:", "health:  # a robot's"))
     add(2, "bags/street")
     add(3, "kept/alley")
     failed(*call)
     study = study_in("runs/many/many.yaml").config
     assert (study.training, study.test) == (("park", "street"), ("yard", "alley"))
+    text = path.read_text()
+    assert text.startswith("# mine\n")
+    assert "# a robot's\nhealth:\n  # m/s: twice" in text

@@ -8,11 +8,13 @@ from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
-from adaptune.commands.recordings import Asked, recorded
-from adaptune.commands.terminal import load, progress
 from adaptune.errors import AdaptuneError
-from adaptune.files import plain_name, write_text
-from adaptune.yaml12 import Document, YamlError, dump
+from adaptune.files import plain_name
+from adaptune.progress import Progress
+from adaptune.tuning.asked import Asked, recorded
+from adaptune.tuning.systems import is_image
+from adaptune.tuning.tuned import alone
+from adaptune.yaml12 import Document, YamlError
 
 if TYPE_CHECKING:
     from offline.config import OfflineStudy
@@ -23,7 +25,7 @@ FOLDER = Path("runs/compare")
 
 
 def sides(
-    given: Sequence[str], recordings: Sequence[Path], odometry: str | None
+    given: Sequence[str], recordings: Sequence[Path], odometry: str | None, show: Progress
 ) -> "tuple[Side, Side]":
     """The replays of both sides, the new one first; those that are missing are made.
 
@@ -32,13 +34,15 @@ def sides(
     """
     from online.gate import Side
 
-    studies = _studies(given) if not recordings else _driven(given, recordings, odometry)
-    _drive(studies)
+    studies = _driven(given, recordings, odometry, show) if recordings else _studies(given)
+    _drive(studies, show)
     new, old = (Side(name, study) for name, study in zip(given, studies, strict=True))
     return new, old
 
 
 def _studies(given: Sequence[str]) -> "list[OfflineStudy]":
+    from offline.config import load_study
+
     for name in given:
         if not (path := Path(name)).exists():
             raise AdaptuneError(f"{name}: there is no such study; or name the bags to drive, too")
@@ -48,20 +52,20 @@ def _studies(given: Sequence[str]) -> "list[OfflineStudy]":
                 raise AdaptuneError(
                     f"{name}: is no study; of a parameter file, name the bags and --odometry, too"
                 )
-    return [load(Path(name), [], None, runs=Path(name).is_file()) for name in given]
+    return [load_study(name, needed=Path(name).is_file()) for name in given]
 
 
 def _driven(
-    given: Sequence[str], recordings: Sequence[Path], odometry: str | None
+    given: Sequence[str], recordings: Sequence[Path], odometry: str | None, show: Progress
 ) -> "list[OfflineStudy]":
     """Both sides as studies of the same recordings."""
-    from adaptune.commands.tune import loaded_text
     from adaptune.manifest import digest
     from adaptune.metrics import MIN_BLOCKS
     from adaptune.reference.check import path_after, proposed_sub_trajectory
     from adaptune.study.references import ensure_references
+    from offline.config import load_study
 
-    named, _ = recorded(Asked(recordings, ""))
+    named, _ = recorded(Asked(recordings), show)
     names = list(named)
     shared: dict[str, Any] = {
         "sequences": {name: one.given for name, one in named.items()},
@@ -69,10 +73,9 @@ def _driven(
     }
     entries = [_entry(name, odometry) for name in given]
     folders = [FOLDER / f"{plain_name(Path(name))[:40]}_{digest(name)[:6]}" for name in given]
-    first = loaded_text(dump(shared | {"odometry": entries[0]}), folders[0])
+    first = load_study(shared | {"odometry": entries[0]}, folder=folders[0])
     first.open()
-    with progress() as show:
-        refused = ensure_references(first.sequences, names, 5.0, show, required=False)
+    refused = ensure_references(first.sequences, names, 5.0, show, required=False)
     known = [first.sequences.open(name).reference() for name in names if name not in refused]
     # As many as intervals need fit into most recordings.
     lengths = [
@@ -83,10 +86,8 @@ def _driven(
     shared["sub_trajectory"] = round(median(lengths), 1) if lengths else 5.0
     if folders[0] != folders[1] and (estimates := folders[0] / "references").exists():
         shutil.copytree(estimates, folders[1] / "references", dirs_exist_ok=True)
-    paths = [folder / f"{folder.name}.yaml" for folder in folders]
-    for path, entry in zip(paths, entries, strict=True):
-        write_text(path, dump(shared | {"odometry": entry}))
-    return [load(path, [], path.parent, runs=True) for path in paths]
+    both = zip(entries, folders, strict=True)
+    return [load_study(shared | {"odometry": of}, folder=folder) for of, folder in both]
 
 
 def _entry(given: str, odometry: str | None) -> dict[str, Any]:
@@ -120,8 +121,6 @@ def _entry(given: str, odometry: str | None) -> dict[str, Any]:
 
 def _named(given: str) -> dict[str, Any]:
     """An odometry by its name, its command, or its image."""
-    from adaptune.commands.tune import is_image
-
     words = shlex.split(given)
     if len(words) > 1:
         # It runs in a folder of its own.
@@ -132,12 +131,11 @@ def _named(given: str) -> dict[str, Any]:
     return {"name": given}
 
 
-def _drive(studies: "Sequence[OfflineStudy]") -> None:
+def _drive(studies: "Sequence[OfflineStudy]", show: Progress) -> None:
     """Make the replays of the baselines that are missing, of a study that is a file.
 
     Both sides take turns on each recording, so that both meet the same state of the machine.
     """
-    from adaptune.commands.online import alone
     from online.modes import BASELINE, replay_modes, sequences_without_model
 
     due = [
@@ -147,5 +145,5 @@ def _drive(studies: "Sequence[OfflineStudy]") -> None:
         for name in sequences_without_model(study.config)
     ]
     for name, study in sorted(due, key=lambda one: one[0]):
-        with alone(study), progress() as show:
+        with alone(study):
             replay_modes(study, [name], (BASELINE,), show)

@@ -1,0 +1,1 @@
+"""What the commands do, as functions: decide a study of recordings, tune, compare, and the page."""

@@ -1,0 +1,156 @@
+"""What a user asks to tune: recordings, or folders of them, and an odometry."""
+
+import logging
+import sys
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from itertools import chain, count
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from adaptune.errors import AdaptuneError, NotInstalledError
+from adaptune.progress import Progress
+
+if TYPE_CHECKING:
+    from adaptune.odometry import Odometry
+    from adaptune.recording.fleet import Reading
+    from adaptune.recording.inspect import Inspection
+
+_log = logging.getLogger(__name__)
+TRIALS, EACH = 32, 16
+"""Parameter sets to try, and at least for each of several odometries."""
+
+
+class Asked(NamedTuple):
+    """For what a study is decided."""
+
+    recordings: Sequence[Path]  # or folders of them
+    odometry: str = "gicp"
+    points: str | None = None
+    reference: str | None = None
+    config: Path | None = None  # the user's parameter file
+    test: Sequence[Path] = ()
+    reading: "Reading | None" = None
+    about: Mapping[str, Any] = {}  # of the odometry: its settings and parameters, if given
+    trials: int | None = None
+    minutes: float | None = None
+    budget: float | None = None
+
+    @property
+    def limits(self) -> dict[str, float]:
+        """What may be spent, by its keys in a study."""
+        hours = None if self.minutes is None else self.minutes / 60.0
+        limits = {"offline.trials": self.trials, "offline.hours": hours}
+        limits |= {"online.budget": self.budget}
+        return {key: value for key, value in limits.items() if value is not None}
+
+    @property
+    def inputs(self) -> dict[str, Any]:
+        """The rest as plain data, by which a study is known."""
+        found = self._asdict() | {"config": self.config and str(self.config.resolve())}
+        found |= {key: [str(p.resolve()) for p in found[key]] for key in ("recordings", "test")}
+        return {k: v for k, v in found.items() if k not in ("trials", "minutes", "budget")}
+
+
+def check_no_study(path: Path) -> None:
+    """Refuse a study where a recording is expected."""
+    if path.suffix in (".yaml", ".yml") or (path / "study.yaml").is_file():
+        raise AdaptuneError(
+            f"{path}: is a study, not a recording; `adaptune offline`, `online` and `compare` take "
+            f"it, and `adaptune inspect` takes its folder once it has a model"
+        )
+
+
+def recorded(asked: Asked, show: Progress) -> "tuple[dict[str, Inspection], list[str]]":
+    """The recordings by the names of their sequences, and the names of those for the test."""
+    from adaptune.recording.fleet import check_alike, recordings_at
+
+    for path in asked.recordings:
+        check_no_study(path)
+    tested, others = (recordings_at(p, asked.reading) for p in (asked.test, asked.recordings))
+    kept = {path.resolve() for path in tested}
+    paths = [*(path for path in others if path.resolve() not in kept), *tested]
+    for path in paths:
+        if [one.resolve() for one in paths].count(path.resolve()) > 1:
+            raise AdaptuneError(f"{path}: is named twice; the test needs a recording of its own")
+    if tested and len(paths) == len(tested):
+        raise AdaptuneError("--test: leaves no recording to tune on")
+    if len(paths) > 1 and asked.reference is not None and Path(asked.reference).is_file():
+        raise AdaptuneError(
+            f"--reference {asked.reference}: is a file, and of {len(paths)} recordings each needs "
+            f"its own; write a study file, see docs/your-bag.md"
+        )
+    found = [usable(path, asked.points, asked.reference, show) for path in paths]
+    check_alike(found)
+    named: dict[str, Inspection] = {}
+    for one in found:
+        names = chain([one.name], (f"{one.name}_{i}" for i in count(2)))
+        named[next(name for name in names if name not in named)] = one
+    return named, list(named)[len(paths) - len(tested) :]
+
+
+def usable(path: Path, points: str | None, reference: str | None, show: Progress) -> "Inspection":
+    """Look at a recording; it has scans of one topic, and a reference or is to get one."""
+    from adaptune.recording.clouds import CLOUDS
+    from adaptune.recording.inspect import inspect as inspect_file
+    from adaptune.reference.estimate import recording_config
+
+    check_no_study(path)
+    found = inspect_file(path, False, show)
+    clouds = [topic for topic in found.topics.values() if topic.type in CLOUDS]
+    if len(clouds) > 1 and points is None:
+        each = ", ".join(f"{one.name} ({one.count:,} of {one.type})" for one in clouds)
+        raise AdaptuneError(
+            f"{path}: has {len(clouds)} topics of point clouds: {each}; name one with --points"
+        )
+    recording_config(found, points, reference)
+    if reference is None and found.missing["offline"]:
+        why = "; ".join(str(one) for one in found.findings if one.of == "reference")
+        _log.warning("%s: its reference does not serve (%s): one is estimated", path, why)
+        found.given["reference"] = "estimated"
+    return found
+
+
+def named_odometry(given: "str | type[Odometry] | Odometry") -> tuple[str, dict[str, Any]]:
+    """The name of an odometry in a study, and the settings and parameters of an object.
+
+    The class of a script has the name that other processes import it by.
+    """
+    if isinstance(given, str):
+        return given, {}
+    from adaptune.odometry.content import module_file
+    from adaptune.odometry.registry import ODOMETRIES
+
+    cls = given if isinstance(given, type) else type(given)
+    module, main = cls.__module__, getattr(sys.modules["__main__"], "__file__", None)
+    if module == "__main__" and main and module_file(Path(main).stem) == Path(main).absolute():
+        module = Path(main).stem
+    path = f"{module}:{cls.__qualname__}"
+    name = next((name for name, where in ODOMETRIES.items() if where == path), path)
+    if isinstance(given, type):
+        return name, {}
+    parameters = {key: {"baseline": value} for key, value in given.parameters.items()}
+    settings = given.settings.model_dump(mode="json", exclude_unset=True)
+    return name, {"settings": settings, "parameters": parameters}
+
+
+def odometries_of(given: str, imu: bool) -> list[str]:
+    """The odometries that a name, several, or `all` stand for."""
+    from adaptune.odometry import registry
+
+    if given != "all":
+        names = list(dict.fromkeys(filter(None, map(str.strip, given.split(",")))))
+        if programs := [name for name in names if name in registry.PROGRAMS]:
+            raise AdaptuneError(
+                f"--odometry {programs[0]}: a program needs settings; write a study file, see "
+                f"docs/programs.md"
+            )
+        return names
+    there = []
+    for name in registry.ODOMETRIES:
+        with suppress(NotInstalledError):
+            needs_imu = registry.declare(name, {}).sound(name)[1].needs_imu
+            # The other one is the same KISS-ICP.
+            if name != "evalio_kiss_icp" and (imu or not needs_imu):
+                there.append(name)
+    return there

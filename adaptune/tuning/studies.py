@@ -1,0 +1,315 @@
+"""A study of recordings alone: what it trains and tests on, over which metres, and how long."""
+
+import logging
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from adaptune import manifest
+from adaptune.errors import AdaptuneError
+from adaptune.files import write_text
+from adaptune.progress import Progress
+from adaptune.tuning.asked import EACH, TRIALS, Asked, odometries_of, recorded
+from adaptune.yaml12 import Document, YamlError, YamlPath, dump
+
+if TYPE_CHECKING:
+    from adaptune.recording.inspect import Inspection
+    from adaptune.trajectory import Trajectory
+    from offline.config import OfflineStudy
+
+_log = logging.getLogger(__name__)
+
+DISTORTED = {"gicp", "vgicp", "ndt"}
+"""Odometries that do not undo the motion within scans themselves: it is undone for them."""
+UNEVEN = 0.2
+"""By how much the share of the path may differ from that of the duration, before the split goes by
+the path."""
+LEAST_SPEED = 2.0
+"""Metres a second below which no step is called impossible."""
+LEAST_PATH = 2.0
+"""Metres that the part for the test has to hold."""
+USUAL_LENGTH = 5.0
+"""Metres of the sub-trajectories to propose where the path is not known."""
+ROLES: dict[YamlPath, str] = {
+    ("training",): "The part for the test is not trained on.",
+    ("sub_trajectory",): "Metres over which errors are measured: 10.0 for a path of 200 m or more, "
+    "25.0 for one of 500 m or more.",
+}
+"""Comments of what `roles` returns."""
+_COMMENTS: dict[YamlPath, str] = ROLES | {
+    ("sequences",): "Every command works with this file; change what you like.",
+    ("odometry",): "Or another one, see docs/odometries.md.",
+    ("health", "max_speed"): "m/s: twice the speed of the fastest second.",
+    ("offline",): "Parameter sets to try, or the time for it.",
+}
+ASKED = "asked.json"
+"""For what the study in a folder was decided."""
+
+
+def roles(
+    names: Sequence[str],
+    length: float,
+    odometry: Any,
+    share: float | None = None,
+    test: Sequence[str] = (),
+) -> dict[str, Any]:
+    """What a study trains and tests on, over which metres, and the odometry.
+
+    Without a `test`, what follows after a `share` of the duration of a single recording is kept for
+    it; of several, the last one.
+    """
+    from adaptune.reference.check import TRAINING
+
+    training: list[Any] = list(names)
+    tested: list[Any] = list(test)
+    if not test and len(names) == 1:
+        end = f"{100 * (share or TRAINING):.0f}"
+        training, tested = [{names[0]: f"0-{end}%"}], [{names[0]: f"{end}-100%"}]
+    elif not test:
+        *training, last = names
+        tested = [last]
+    judged = {"training": training, "test": tested, "sub_trajectory": length}
+    return judged | {"odometry": odometry}
+
+
+def undo_motion(recordings: Sequence["Inspection"], odometries: Sequence[str]) -> None:
+    """Propose to undo the motion within scans for odometries that do not do so themselves."""
+    for one in recordings if set(odometries) <= DISTORTED else ():
+        if one.scan is not None and one.scan.times is not None and one.scan.times.any():
+            one.given["compensate"] = "constant_velocity"
+
+
+def proposed(found: "Inspection", deep: bool, show: Progress) -> tuple[float | None, float, str]:
+    """The split to propose, the length of sub-trajectories, and how wrong the reference is.
+
+    Only what can be used to train is measured. What the scans say against it joins the findings.
+    """
+    if found.name:
+        undo_motion([found], ["gicp"])
+    if found.reference is None or len(found.reference) < 2 or found.missing.get("offline"):
+        return None, USUAL_LENGTH, ""
+    from adaptune.recording.recording import open_sequence
+    from adaptune.reference import check
+    from adaptune.reference.diagnosis import diagnose_reference
+    from adaptune.reference.motions import measured_motions
+
+    share = share_of(found.reference)
+    usual = check.proposed_sub_trajectory(found.reference, training=share)
+    if not deep:
+        return share, usual, "`--deep` also measures how wrong it is"
+    try:
+        scans = open_sequence(found.config())
+        if (reference := scans.reference()) is None:
+            return share, usual, ""
+        measured = check.measure_reference(scans, reference, partial(show, "registering"))
+        motions = measured_motions(scans, len(measured.stamps))
+        if (cause := diagnose_reference(reference, measured.stamps, motions)) is not None:
+            found.findings.append(cause.below((check.CONTRADICTS,)))
+    except AdaptuneError as error:
+        return share, usual, f"its error cannot be measured: {error}"
+    length = check.proposed_sub_trajectory(reference, measured, share)
+    words = check.accuracy_words(measured, usual, length), check.advice(measured, reference, share)
+    return share, length, "; ".join(filter(None, words))
+
+
+def written(asked: Asked, folder: Path, show: Progress) -> tuple[Path, list[str], list[str]]:
+    """Write the study, or add what is new to the one that is there.
+
+    Returns its file, what overrides it, and the names of new recordings.
+    """
+    path, known = folder / f"{folder.resolve().name}.yaml", folder / ASKED
+    if not path.exists():
+        text = dump(_decided(asked, folder, show), _COMMENTS)
+        try:
+            manifest.record(known, asked.inputs)
+            write_text(path, text)
+        except OSError as error:
+            raise AdaptuneError(
+                f"{folder}: cannot be written to ({error.strerror}); name another folder with "
+                f"--folder"
+            ) from error
+        return path, [], []
+    if others := manifest.changes(manifest.recorded(known), asked.inputs):
+        raise AdaptuneError(
+            f"{path}: another `adaptune tune` made it: {'; '.join(others)}; name the same to "
+            f"resume it, or another --folder"
+        )
+    overrides = [f"{key}={value:.10g}" for key, value in asked.limits.items()]
+    return path, overrides, _grown(path, asked, show)
+
+
+def _decided(asked: Asked, folder: Path, show: Progress) -> dict[str, Any]:
+    """The study of some recordings; nothing is written but references."""
+    from offline.config import load_study
+
+    named, test = recorded(asked, show)
+    odometries = odometries_of(asked.odometry, all("imu" in one.given for one in named.values()))
+    if asked.config is not None and len(odometries) != 1:
+        raise AdaptuneError(f"--config {asked.config}: is of one odometry; name one --odometry")
+    undo_motion([*named.values()], odometries)
+    entries: list[Any] = [{"name": name, **manifest.plain(asked.about)} for name in odometries]
+    if asked.config is not None:
+        entries[0]["settings"] = {"config": str(asked.config.resolve())}
+    if asked.trials is None and asked.minutes is None:
+        asked = asked._replace(trials=max(TRIALS, EACH * len(odometries)))
+    spent: dict[str, dict[str, Any]] = {"offline": {}, "online": {"modes": ["adaptive"]}}
+    for key, value in asked.limits.items():
+        stage, _, name = key.partition(".")
+        spent[stage][name] = value
+    odometry = entries[0] if len(entries) == 1 else entries
+    rest = [name for name in named if name not in test]
+
+    def study(length: float, share: float | None = None) -> dict[str, Any]:
+        sequences = {name: dict(one.given) for name, one in named.items()}
+        return {"sequences": sequences, **roles(rest, length, odometry, share, test)} | spent
+
+    def loaded() -> "OfflineStudy":
+        return load_study(study(USUAL_LENGTH), folder=folder)
+
+    if asked.reference is None:
+        _replace_noisy(named, loaded, show)
+    length, share, speed = _split(loaded(), list(named), show)
+    return study(length, share) | {"health": {"max_speed": speed}}
+
+
+def _grown(path: Path, asked: Asked, show: Progress) -> list[str]:
+    """Add the recordings that a study does not name yet to where they belong; their names."""
+    from adaptune.recording.config import SOURCES
+    from adaptune.recording.fleet import recordings_at
+
+    try:
+        document = Document.of_file(path)
+        data: Any = document.data
+        known = {str(one.get(key)) for one in data["sequences"].values() for key in SOURCES}
+    except (YamlError, AttributeError, KeyError, TypeError):
+        return []  # loading it says what is wrong
+    tested = [one.resolve() for one in recordings_at(asked.test, asked.reading)]
+    others = [one.resolve() for one in recordings_at(asked.recordings, asked.reading)]
+    there = list(dict.fromkeys([*others, *tested]))
+    new = [one for one in there if known.isdisjoint({str(one), str(one.parent)})]
+    if not new:
+        return []
+    named, _ = recorded(asked._replace(recordings=there, test=(), reading="one"), show)
+    undo_motion([*named.values()], odometries_of(asked.odometry, False))
+    added = {name: one for name, one in named.items() if one.path in new}
+    if taken := [name for name in added if name in data["sequences"]]:
+        raise AdaptuneError(
+            f"{path}: sequences.{taken[0]} is another recording; rename the new one"
+        )
+    into: dict[str, list[str]] = {
+        "training": [name for name, one in added.items() if one.path not in tested],
+        "test": [name for name, one in added.items() if one.path in tested],
+    }
+    offline = data.get("offline") or {}
+    roles_now = {role: list(data.get(role) or ()) for role in into}
+    n, before = offline.get("stretches", 12), len(roles_now["training"]) or 1
+    if into["training"] and isinstance(n, int):
+        # As many stretches of each as before: the trials that there are stay.
+        each, now = max(4, -(-n // before)), before + len(into["training"])
+        data["offline"] = offline | {"stretches": each * now}
+    data["sequences"] |= {name: one.given for name, one in added.items()}
+    for role, names in into.items():
+        # 00 is a name there.
+        data[role] = [
+            name if isinstance(name, str | dict) else document.name((role, i))
+            for i, name in enumerate(roles_now[role])
+        ] + names
+    write_text(path, dump(data, document.comments))
+    return list(added)
+
+
+def _replace_noisy(
+    named: "Mapping[str, Inspection]", loaded: "Callable[[], OfflineStudy]", show: Progress
+) -> None:
+    """Let references be estimated that are surely noisier than estimates of them."""
+    from adaptune.recording.recording import open_sequence
+    from adaptune.reference.check import measure_reference, proposed_sub_trajectory
+
+    for name, one in named.items():
+        scans = open_sequence(one.config())
+        if "estimated" in one.given.values() or (reference := scans.reference()) is None:
+            continue
+        length = proposed_sub_trajectory(reference, training=share_of(reference))
+        measured = measure_reference(scans, reference, partial(show, "registering"))
+        if not measured.is_noisy(length) or (error := measured.error(length)) is None:
+            continue
+        before, one.given = one.given, one.given | {"reference": "estimated"}
+        with suppress(AdaptuneError):
+            study = loaded()
+            _estimate(study, [name], show)
+            own = study.sequences.estimate(name)
+            if own is not None and own.error(length) < error.low:
+                _log.warning(
+                    f"{name}: its reference is wrong by {error.mean:.2g} % ({error.low:.2g}-"
+                    f"{error.high:.2g}) over {length:g} m, as registrations of scans tell; an "
+                    f"estimated one, by {own.error(length):.2g} %, judges instead. To insist: "
+                    f"`--reference {before.get('reference', 'FILE')}`"
+                )
+                continue
+        one.given = before
+
+
+def _split(
+    study: "OfflineStudy", whole: Sequence[str], show: Progress
+) -> tuple[float, float, float]:
+    """Metres of the sub-trajectories by which a study should judge.
+
+    And the share of a single recording to train on, and the speed of which the health check is to
+    know. A reference that is lacking is estimated: it tells how far the robot has moved. `whole`
+    has the names of the recordings.
+    """
+    from adaptune.reference.check import greatest_speed, path_after, proposed_sub_trajectory
+    from adaptune.trajectory import read_trajectory
+
+    sequences = study.sequences
+    known = {n: one for n in whole if (one := sequences.open(n).reference()) is not None}
+    reference = known.get(whole[-1])
+    if reference is None:
+        _estimate(study, whole[-1:], show)
+        reference = read_trajectory(sequences.estimate_path(whole[-1]))
+    share = share_of(reference) if len(whole) == 1 else 0.0
+    metres, _ = path_after(reference, share)
+    if metres < LEAST_PATH:
+        raise AdaptuneError(
+            f"{whole[-1]}: moves {metres:.1f} m in the part for the test, which takes "
+            f"{LEAST_PATH:g} m at least; record a longer drive, or name another recording for the "
+            f"test as the last one"
+        )
+    others = [one for name, one in known.items() if name != whole[-1]]
+    # One that fits into each of several.
+    lengths = [proposed_sub_trajectory(other, training=0.0) for other in others]
+    length = min([proposed_sub_trajectory(reference, training=share), *lengths])
+    speed = max(LEAST_SPEED, 2.0 * max(map(greatest_speed, [*known.values(), reference])))
+    return length, share, float(round(speed))
+
+
+def share_of(reference: "Trajectory") -> float:
+    """Share of a recording's duration to train on: of its path, where it stands for long."""
+    import numpy as np
+
+    from adaptune.metrics import travelled
+    from adaptune.reference.check import TRAINING
+
+    metres = travelled(reference.T_world_sensor)
+    time = (reference.stamps - reference.stamps[0]) / np.ptp(reference.stamps)
+    of_path = float(np.interp(TRAINING, time, metres / max(float(metres[-1]), 1e-9)))
+    if abs(of_path - TRAINING) <= UNEVEN:
+        return TRAINING
+    return round(float(np.interp(TRAINING * metres[-1], metres, time).clip(0.01, 0.99)), 2)
+
+
+def _estimate(study: "OfflineStudy", names: Sequence[str], show: Progress) -> None:
+    """Estimate references; where one is refused, nothing is left behind."""
+    from adaptune.study.references import ensure_references
+
+    there = study.folder.exists()
+    study.open()
+    try:
+        ensure_references(study.sequences, names, 5.0, show)
+    except AdaptuneError as error:
+        if not there:
+            shutil.rmtree(study.folder)
+        raise AdaptuneError(f"{error}; or give a --reference") from error

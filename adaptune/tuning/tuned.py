@@ -1,0 +1,235 @@
+"""Tune an odometry on recordings, in one call: decide a study, train, replay and compare."""
+
+import base64
+import logging
+import os
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from adaptune.errors import AdaptuneError
+from adaptune.files import plain_name
+from adaptune.progress import Progress, bars_and_words, unseen
+from adaptune.tuning.asked import Asked, named_odometry
+from adaptune.tuning.studies import written
+
+if TYPE_CHECKING:
+    from adaptune.odometry import Odometry
+    from adaptune.recording.fleet import Reading
+    from adaptune.space import ParameterSet
+    from offline.config import OfflineStudy
+    from offline.train import Training
+    from online.compare import ComparedReplays
+
+_log = logging.getLogger(__name__)
+Paths = str | Path | Sequence[str | Path]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Tuned:
+    """What tuning has found.
+
+    Tables are data frames if pandas is installed, else lists of rows, `errors` has columns.
+    """
+
+    study: "OfflineStudy"
+    training: "Training"
+    comparison: "ComparedReplays"
+    page: Path  # HTML, with all charts and tables
+    more: Sequence[str] = ()  # recordings that the study did not name before
+    before: "ParameterSet | None" = None  # the fixed set before, where there was one
+
+    @property
+    def verdict(self) -> str:
+        """What to drive, and why."""
+        return " ".join(self.comparison.verdict)
+
+    @property
+    def fixed(self) -> "ParameterSet":
+        """The fixed set; the verdict says whether to drive it."""
+        return self.study.fixed or {}
+
+    @property
+    def front(self) -> Any:
+        """What CPU time buys: a row for each choice, with its error and its cost."""
+        return _table(self.training.front)
+
+    @property
+    def trials(self) -> Any:
+        """A row for each parameter set that was tried."""
+        return _table(self.training.trials)
+
+    @property
+    def errors(self) -> Any:
+        """Errors by frame in training, a column for each set, with descriptors and folds."""
+        from offline.scenario import scenario
+
+        return _table(scenario(self.study).columns())
+
+    @property
+    def files(self) -> dict[str, Path]:
+        """The study, the fixed set (again as the odometry's own tool reads it), model, tables."""
+        own = self.study.own_file(self.fixed)
+        folder = self.study.folder
+        named = {"study": folder / f"{folder.resolve().name}.yaml", "page": self.page}
+        named |= {"fixed": folder / "fixed.yaml", "model": self.study.model_path}
+        named |= {"own": own[0]} if own else {}
+        named |= {key: folder / f"{key}.csv" for key in ("trials", "front", "training")}
+        return {key: path for key, path in named.items() if path.exists()}
+
+    def __repr__(self) -> str:
+        return f"<Tuned: {self.comparison.verdict[0]} More: {self.page}>"
+
+    def _repr_html_(self) -> str:
+        """Its verdict, the picture of the drive on the page, and the front."""
+        from html import escape
+
+        from adaptune.report.page import FIGURES
+
+        shown, picture = "", self.page.parent / FIGURES / "overview.png"
+        if picture.exists():
+            source = f"data:image/png;base64,{base64.b64encode(picture.read_bytes()).decode()}"
+            shown = f'<img style="max-width: 100%" src="{source}">'
+        table = getattr(self.front, "_repr_html_", str)()
+        return f"<p>{escape(self.verdict)}</p>{shown}{table}"
+
+
+def _table(rows: Any) -> Any:
+    try:
+        import pandas as pd
+    except ImportError:
+        return rows
+    return pd.DataFrame(rows)
+
+
+def tune(
+    recordings: Paths,
+    odometry: "str | type[Odometry] | Odometry | None" = None,
+    *,
+    config: str | Path | None = None,
+    test: Paths = (),
+    reading: "Reading | None" = None,
+    points: str | None = None,
+    reference: str | Path | None = None,
+    trials: int | None = None,
+    minutes: float | None = None,
+    budget: float | None = None,
+    overrides: Sequence[str] = (),
+    folder: str | Path | None = None,
+    cluster: str | None = None,
+    progress: Progress | None = None,
+) -> Tuned:
+    """Tune an odometry on recordings, and say what to drive, as the command `tune` does.
+
+    The same call again resumes it. In a script, call it below ``if __name__ == "__main__":``. An
+    AdaptuneError says what to do about a recording, a reference, an odometry or a setting.
+
+    Parameters
+    ----------
+    recordings
+        Bags, or folders of them; `reading`, ``"one"`` or ``"several"``, says how to read these.
+    odometry
+        A name, as ``"kiss_icp"`` or ``"my_module:MyIcp"``; such a class; or an object of it, whose
+        parameters are the baseline. By default ``"gicp"``, with a `config` ``"kiss_icp"``.
+    config
+        The user's parameter file: the baseline, and all that is not tuned.
+    test
+        Recordings for the test; by default the last one, or the end of the only one.
+    points, reference
+        Topics, where not the recording's own; or a reference's file, or ``"estimated"``.
+    trials, minutes, budget
+        Parameter sets to try, time for all of it, and milliseconds of CPU time a scan that may be
+        spent, by default what the baseline takes.
+    overrides, folder
+        Values of the study, as in ``["offline.seed=1"]``, and where all results go.
+    cluster
+        Address of a Dask scheduler whose workers run the trials.
+    progress
+        Called with how far each task is; by default, bars show it.
+    """
+    name, about = named_odometry(odometry or ("gicp" if config is None else "kiss_icp"))
+    judged = None if reference is None else str(reference)
+    file = None if config is None else Path(config)
+    tested, limits = _paths(test), (trials, minutes, budget)
+    asked = Asked(_paths(recordings), name, points, judged, file, tested, reading, about, *limits)
+    with ExitStack() as stack:
+        show = progress or stack.enter_context(bars_and_words())
+        return tune_asked(asked, overrides, Path(folder) if folder else None, cluster, show)
+
+
+def tune_asked(
+    asked: Asked,
+    overrides: Sequence[str],
+    folder: Path | None,
+    cluster: str | None,
+    show: Progress,
+) -> Tuned:
+    """Do what `tune` does of what was asked."""
+    from offline.config import load_study
+    from offline.search import ELAPSED, Clock
+    from offline.train import train
+
+    if asked.reference is not None and Path(asked.reference).is_file():
+        asked = asked._replace(reference=str(Path(asked.reference).resolve()))
+    folder = folder or Path("runs") / _study_name(asked)
+    clock = Clock(folder / ELAPSED, replays=True)
+    path, now, more = written(asked, folder, show)
+    study = load_study(path, [*overrides, *now], folder)
+    _log.info("study: %s", path)
+    before = study.fixed
+    training = train(study, show, cluster, clock)
+    replay_missing(study, show=show)
+    return Tuned(study, training, *compared(study), more, before)
+
+
+def _paths(given: Paths) -> list[Path]:
+    return [Path(given)] if isinstance(given, str | Path) else [Path(path) for path in given]
+
+
+def _study_name(asked: Asked) -> str:
+    recordings, odometry = asked.recordings, asked.odometry
+    stem = plain_name(recordings[0].resolve()) + "_and_more" * (len(recordings) > 1)
+    names = (name.strip().replace(":", "_") for name in odometry.split(","))
+    others = "+".join(dict.fromkeys(names))
+    return stem if odometry == "gicp" else f"{stem}_{others}"
+
+
+def alone(study: "OfflineStudy") -> ExitStack:
+    """Bind this process to one core, and leave the others to what it starts."""
+    from adaptune.machine import pin
+
+    # Ask for the number of cores before.
+    _ = study.mechanism
+    return pin(os.getpid(), alone=True)
+
+
+def replay_missing(
+    study: "OfflineStudy",
+    model: Path | None = None,
+    *,
+    untrained: bool = False,
+    show: Progress = unseen,
+) -> int:
+    """Make the replays that are missing; how many were made."""
+    from online.modes import run_replays, run_untrained
+
+    with alone(study):
+        if untrained:
+            return run_untrained(study, show)
+        return run_replays(study, model or study.model_path, show)
+
+
+def compared(study: "OfflineStudy") -> "tuple[ComparedReplays, Path]":
+    """Compare a study's replays, and write the page, which is there also if it still runs."""
+    from adaptune.tuning.page import write_study_page
+    from online.compare import compare
+
+    try:
+        found = compare(study)
+    except AdaptuneError as error:
+        if (study.folder / "study.yaml").exists():
+            _log.warning("page: %s", write_study_page(study, f"No comparison: {error}."))
+        raise
+    return found, write_study_page(study, found)

@@ -1,0 +1,65 @@
+"""`adaptune.tune`: what `tune` does, as a function."""
+
+import logging
+import sys
+from pathlib import Path
+
+import drives
+import fake_odometry
+import pytest
+
+import adaptune
+from adaptune.errors import AdaptuneError
+from adaptune.odometry.keyframe import KeyframeGicp
+from adaptune.progress import bars_and_words
+from adaptune.tuning.asked import named_odometry
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def test_an_odometry_is_a_name_a_class_or_an_object(monkeypatch, tmp_path):
+    assert named_odometry("mine:Icp") == ("mine:Icp", {})
+    assert named_odometry(KeyframeGicp) == ("gicp", {})
+    name, about = named_odometry(fake_odometry.Fake({"keyframe_interval": 3.0}))
+    assert name == fake_odometry.NAME
+    assert about["settings"] == {}
+    assert about["parameters"]["keyframe_interval"] == {"baseline": 3.0}
+
+    # A script's own class is imported by the script's name; a session has none.
+    class Own(fake_odometry.Fake):
+        __module__ = "__main__"
+
+    Own.__qualname__ = "Own"
+    script = tmp_path / "my_script.py"
+    script.touch()
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(sys.modules["__main__"], "__file__", str(script))
+    assert named_odometry(Own) == ("my_script:Own", {})
+    monkeypatch.delattr(sys.modules["__main__"], "__file__")
+    assert named_odometry(Own) == ("__main__:Own", {})
+
+
+def test_a_class_of_a_session_is_refused_in_a_sentence():
+    drives.write_bag(Path("one.bag"), drives.scans(n_scans=60))
+    with pytest.raises(AdaptuneError, match="Own lives in this session only; put it into a file"):
+        adaptune.tune("one.bag", odometry="__main__:Own")
+
+
+def test_a_session_without_logging_sees_what_is_logged(capsys, monkeypatch):
+    monkeypatch.setattr(logging.getLogger(), "handlers", [])
+    log = logging.getLogger("offline.train")
+    with bars_and_words() as show:
+        show("runs", 1, 2)
+        log.info("it takes about 3 min [all]")
+    log.info("later")
+    said = capsys.readouterr().err
+    assert "it takes about 3 min [all]" in said
+    assert "later" not in said
+
+
+def test_the_package_has_no_other_names():
+    with pytest.raises(AttributeError, match="has no attribute 'tuna'"):
+        _ = adaptune.tuna

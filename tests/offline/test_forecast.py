@@ -1,0 +1,48 @@
+import numpy as np
+import pytest
+
+from adaptune.archive import Archive
+from offline import campaign
+from offline import forecast as forecasting
+from offline.config import load_study
+from offline.forecast import ALONE, COST, FITTING, Forecast, forecast
+from offline.search import Clock
+
+
+@pytest.fixture
+def study(study_file, trained_folder):
+    return load_study(study_file, [], trained_folder)
+
+
+def test_it_follows_from_the_baseline_s_drives(study, tmp_path):
+    archive = Archive(study.folder / "trials")
+    costs = [1e-3 * archive.finished(name)[0].cost for name in ("one", "two")]
+    alone = forecast(study, archive, 1, Clock(tmp_path))
+    assert alone.each == pytest.approx(COST * 40 * sum(costs))  # scans of both
+    assert alone.rest == FITTING  # trials drove the whole recordings
+    two = forecast(study, archive, 2, Clock(tmp_path, replays=True))
+    assert two.each == alone.each / 2
+    members = 5 if study.mechanism == "bank" else 1
+    replays = ALONE + members * len(study.rules)
+    assert two.rest - FITTING == pytest.approx(40 * np.mean(costs) * replays)
+
+
+def test_finalists_drive_the_rest_of_long_recordings(study, tmp_path, monkeypatch):
+    archive = Archive(study.folder / "trials")
+    drives = campaign.read_whole_drives(archive, ["one", "two"], [0])
+    monkeypatch.setattr(forecasting, "read_whole_drives", lambda *_: drives)
+    monkeypatch.setattr(archive, "is_uncut", lambda _: False)
+    found = forecast(study, archive, 1, Clock(tmp_path))
+    assert found.rest - FITTING == pytest.approx(6 * found.each)
+
+
+@pytest.mark.parametrize(
+    ("left", "most", "words"),
+    [
+        (32, np.inf, "it takes about 7 min: 32 parameter sets of 10.0 s, and the rest"),
+        (32, 200.0, "it takes about 3 min: 10 parameter sets of 10.0 s, and the rest"),
+        (np.inf, 90.0, "it takes about 90 s: 0 parameter sets of 10.0 s, and the rest"),
+    ],
+)
+def test_it_is_said_in_a_line(left, most, words):
+    assert Forecast(10.0, 100.0).words(left, most) == words
