@@ -36,11 +36,13 @@ def _few_settings(monkeypatch):
 
 def test_rules_gain_where_places_tell_the_sets_apart():
     validation = leave_one_out(labelled(two_kinds(np.random.default_rng(0))), bank=0)
-    for rule in ("adaptive", "paper"):
-        np.testing.assert_allclose(validation.ratios[rule], [0.5] * 4 + [0.4] * 4, rtol=0.05)
-        said = validation.verdict(rule)
-        assert said.startswith(f"`{rule}`: expected gain 5")
-        assert "in other recordings (8 stretches of 8 recordings), adapting 100 %" in said
+    np.testing.assert_allclose(validation.ratios["paper"], [0.5] * 4 + [0.4] * 4, rtol=0.05)
+    said = validation.verdict("paper")
+    assert said.startswith("`paper`: expected gain 5")
+    assert "in other recordings (8 stretches of 8 recordings), adapting 100 %" in said
+    # Without a bank, the fixed set is kept.
+    assert validation.ratios["adaptive"].tolist() == [1.0] * 8
+    assert "kept the fixed set" in validation.verdict("adaptive")
     np.testing.assert_allclose(validation.ratios["baseline"], [1.5] * 4 + [2.0] * 4, rtol=0.05)
 
 
