@@ -226,25 +226,23 @@ def test_commands_work(pages):
 
 
 def test_the_loop_on_a_robot_is_what_adaptune_online_does(folder):
-    overrides = ["online.switching.mechanism=bank"]
-    study = load_study(folder / "my.yaml", overrides)
-    model = train(study).model
-    (example,) = (code for _, code in blocks("python") if "TimedSelector(mode" in code)
-    example = example.replace('"my.yaml"', f'"my.yaml", {overrides}')
+    (text,) = (code for _, code in blocks("python") if "TimedSelector(mode" in code)
     last = "    T_odom_sensor = tracker.register(scan).T_odom_sensor\n"
-    assert last in example
-    for bank in (True, False):
-        n = len(model.bank) if bank else 1
-        settings = BankSettings(adapt=bank)
-        one = replace(model, bank=model.bank[:n], vectors=model.vectors[:, :n])
-        replace(one, bank_settings=settings).save(study.model_path)
+    assert last in text
+    model = None
+    for mechanism in ("bank", "live"):
+        overrides = [f"online.switching.mechanism={mechanism}"]
+        study = load_study(folder / "my.yaml", overrides)
+        model = model or train(study).model
+        replace(model, bank_settings=BankSettings()).save(study.model_path)
         run_replays(study, study.model_path)
         poses = []
+        example = text.replace('"my.yaml"', f'"my.yaml", {overrides}')
         exec(example.replace(last, last + "    poses.append(T_odom_sensor)\n"), {"poses": poses})
         replays = study.folder / "replays/home/adaptive"
         replayed = read_tum(replays / "trajectory.tum")
         np.testing.assert_allclose(replayed.T_world_sensor, poses, atol=1e-8)
-        assert (":" in (replays / "selections.csv").read_text()) is bank
+        assert (":" in (replays / "selections.csv").read_text()) is (mechanism == "bank")
 
 
 @pytest.mark.usefixtures("folder")

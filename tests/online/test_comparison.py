@@ -79,14 +79,12 @@ def test_values_that_stay_read_as_those_that_change(own):
     assert choices == {"mode": ["True"], "size": [3.0], "kernel": ["none"]}
 
 
-@pytest.mark.parametrize("mechanism", ["live", "bank"])
-def test_one_set_is_driven_where_there_is_no_bank(own, study_file, mechanism):
+def test_one_set_is_driven_where_there_is_no_bank(own, study_file):
     model = ErrorModel.load(own.folder / "model.safetensors")
-    given = [f"online.switching.mechanism={mechanism}"]
+    given = ["online.switching.mechanism=live"]
     study = load_study(study_file, [*given, "online.period=0.5"], own.folder)
     path = own.folder / "alone.safetensors"
-    off = BankSettings(adapt=False)
-    replace(model, bank=[model.fixed], vectors=model.vectors[:, :1], bank_settings=off).save(path)
+    replace(model, bank_settings=BankSettings(adapt=False)).save(path)
     assert run_replays(study, path) == 4
     row = next(row for row in compare(study).rows if row.mode == "adaptive")
     assert row.rte < 3.0
