@@ -19,6 +19,7 @@ from adaptune.commands.terminal import (
     progress,
     say,
     say_fixed,
+    say_next,
     say_next_of_study,
     show_table,
 )
@@ -234,6 +235,8 @@ def compare(
         say_next_of_study("look for better sets", "offline")
     elif found.unfinished:
         say_next_of_study("replay what is missing", "online")
+    elif {*loaded.config.training, *loaded.config.test} <= loaded.config.courses.keys():
+        say_next("tune on a recording of your own", "tune", "your.bag")
     elif loaded.rules and (n := len(loaded.config.training)) < MIN_RECORDINGS:
         first = f"name {MIN_RECORDINGS} training recordings or more, the study has {n}; then "
         say_next_of_study("find out what adapting gains elsewhere", "offline", first)

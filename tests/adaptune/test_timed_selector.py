@@ -151,9 +151,15 @@ def test_the_guide_s_example(tmp_path, monkeypatch, caplog):
     first, *scans = [Scan(stamp, points) for stamp, points, _ in drives.scans(n_scans=25)]
     odometry.start(odometry.prepare(first), np.eye(4))
     poses = []
-    thread = threading.Thread(
-        target=lambda: poses.extend(names["step"](scan, odometry) for scan in scans)
-    )
+
+    def drive():
+        for scan in scans:
+            selection = names["timed"].update(scan.stamp, scan, odometry.motions)
+            if selection is not None:
+                odometry.apply(selection)
+            poses.append(odometry.register(odometry.prepare(scan)).T_odom_sensor)
+
+    thread = threading.Thread(target=drive)
     thread.start()
     thread.join()
     np.testing.assert_allclose(poses[-1][:3, 3], [24 * 0.3, 0.0, 0.0], atol=0.15)

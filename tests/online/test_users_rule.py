@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from adaptune import manifest
-from adaptune.commands.online import compared
 from adaptune.model import ErrorModel
 from adaptune.model.registry import RuleError, rule_class
 from adaptune.selector import Selector
 from adaptune.strict import ConfigurationError
+from adaptune.tuning.tuned import compared
 from offline.config import load_study
 from offline.validate import validate
 from online.modes import run_replays
@@ -62,7 +62,7 @@ def test_it_is_validated_replayed_compared_and_shown(study, study_file, tmp_path
     assert np.unique(replay.selections["trial"]).tolist() == [least]
     assert run_replays(study, study.model_path) == 0
 
-    rows = compared(study).rows
+    rows = compared(study)[0].rows
     assert [row.mode for row in rows] == ["baseline", "fixed", "adaptive", mode]
     page = (study.folder / "report/report.html").read_text()
     assert "the set that costs least, wherever it is" in page

@@ -193,15 +193,18 @@ def test_a_finished_study_has_a_page_of_everything(finished):
         assert f">{mode}</td>" in page
 
 
-@pytest.mark.parametrize(("rules", "next_one"), [(("paired",), "offline"), ((), "record")])
+@pytest.mark.parametrize(("rules", "next_one"), [(("adaptive",), "offline"), ((), "record")])
 def test_recordings_are_asked_for_only_where_something_adapts(
     adaptune, monkeypatch, rules, next_one
 ):
-    study = SimpleNamespace(rules=rules, config=SimpleNamespace(training=("one",)))
+    study = SimpleNamespace(
+        rules=rules, config=SimpleNamespace(training=("one",), test=("two",), courses={})
+    )
     found = SimpleNamespace(rows=[SimpleNamespace(yardstick="fixed")], unfinished=False)
     named = []
     monkeypatch.setattr(online, "load", lambda *_: study)
-    monkeypatch.setattr(online, "compared", lambda *_, **__: found)
+    monkeypatch.setattr("adaptune.tuning.tuned.compared", lambda _: (found, "page.html"))
+    monkeypatch.setattr(online, "say_compared", lambda *_, **__: None)
     monkeypatch.setattr(online, "say_next_of_study", lambda _, command, *__: named.append(command))
     adaptune("compare", "study.yaml")
     assert named == [next_one]

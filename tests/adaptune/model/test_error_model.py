@@ -48,7 +48,7 @@ def several_odometries():
             "window": 3,
             "descriptors": np.random.default_rng(1).normal(size=(50, 90)).astype(np.float32),
             "stretch": np.arange(50) // 7,
-            "expected": {"bank": {"loss": -0.2, "n_stretches": 4.0}},
+            "expected": {"loss": -0.2, "n_stretches": 4.0},
         },
         {"sets": several_odometries()},
     ],
