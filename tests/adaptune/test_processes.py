@@ -187,7 +187,7 @@ from adaptune import processes
 from adaptune.odometry.base import BaseSettings
 from adaptune.odometry.remote import Isolated, Limits
 from adaptune.recording import Scan
-program = processes.Program(["sh", "-c", {leaves!r} + "wait"], 4.0)
+program = processes.Program(["sh", "-c", {leaves!r} + "wait"], 4.0, stdout=None)
 odometry = Isolated("with_children:Mine", {{}}, BaseSettings(), Limits())
 odometry.start(Scan(0, np.zeros((5, 3), np.float32)), np.eye(4))
 time.sleep(60)
