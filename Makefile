@@ -68,11 +68,11 @@ format: $(VENV)/.installed
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-# What the package itself needs; tests, linters and optional odometries are three times as large.
+# What the demo needs; Open3D casts the rays of simulated sensors.
 $(VENV)/.demo: pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "adaptune needs Python 3.11 or newer; set PYTHON, as in: make demo PYTHON=python3.12")'
 	$(PYTHON) -m venv $(VENV)
-	$(PIP) -e .
+	$(PIP) -e '.[open3d]'
 	touch $@
 
 $(VENV)/.installed: $(VENV)/.demo

@@ -11,6 +11,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from adaptune.files import write_text
 from adaptune.strict import ConfigurationError, in_one_line
 
@@ -29,7 +31,14 @@ Inputs = Mapping[str, Any]
 
 def plain(inputs: Any) -> Any:
     """Data as they are read from a file: lists for tuples, texts for keys."""
-    return json.loads(json.dumps(inputs))
+    return json.loads(json.dumps(inputs, default=_scalar))
+
+
+def _scalar(value: Any) -> Any:
+    """A number of numpy as Python's own."""
+    if not isinstance(value, np.generic):
+        raise TypeError(f"{type(value).__name__} is no plain data")
+    return value.item()
 
 
 def digest(inputs: Any) -> str:

@@ -155,10 +155,10 @@ class Selector(_Measuring):
     metres, and that of each member of a bank, with a direct registration, see `adaptune.live`. What
     is measured counts from the next selection on. The selector reads no clock and no file.
 
-    With the paired rule and a bank, the selections are weights of the bank's members, smoothed over
-    the last selections. A single odometry leaves a set that surely does worse than predicted, if
-    another one, or the baseline, is predicted to do better than that. The reserve of a bank
-    (`ErrorModel.reserve`) rests, except for a minute after a place that training does not know, and
+    With `adaptive` and a bank, the selections are weights of the bank's members, smoothed over the
+    last selections. A single odometry keeps the fixed set, and leaves it for the baseline where it
+    surely does worse than predicted, and worse than the baseline is predicted to do. The reserve of
+    a bank (`ErrorModel.reserve`) rests, except for a minute after a place that training does not know, and
     after a failure. Scans of a sensor or mount that was not trained with (`ErrorModel.is_foreign`)
     get the fixed set, or in a bank weights by what is measured alone.
 
@@ -169,8 +169,8 @@ class Selector(_Measuring):
     rule
         Its name, see `adaptune.model.registry`.
     members
-        Trial numbers of the members of the bank that runs, the fixed set first: the paired rule
-        weighs them, others choose among them. None takes the model's bank for the paired rule if
+        Trial numbers of the members of the bank that runs, the fixed set first: `adaptive`
+        weighs them, others choose among them. None takes the model's bank for `adaptive` if
         that is what is driven; an empty one is for a single odometry.
     descriptors
         Descriptors besides adaptune's own that may be used: a model that names another is refused.

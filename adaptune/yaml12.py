@@ -188,7 +188,7 @@ class Document:
         lines, found = self._text.split("\n"), dict[YamlPath, str]()
         for path, key, value in _keys(self._node):
             before = lines[: key.start_mark.line]
-            above = [*takewhile(lambda line: line.lstrip().startswith("#"), reversed(before))]
+            above = [*takewhile(lambda line: line.strip()[:1] in ("", "#"), reversed(before))]
             same = value.start_mark.line == key.end_mark.line
             mark = value.end_mark if same else key.end_mark
             rest = lines[mark.line][mark.column :].strip(": ")

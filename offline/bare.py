@@ -3,13 +3,20 @@
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from adaptune.archive import Archive
+from adaptune.metrics import FAILURE
 from adaptune.model.rules import BASELINE
 from offline.campaign import WholeDrives, read_whole_drives
 from offline.choice import BlockErrors, surely_worse
 from offline.config import OfflineConfig
 from offline.labelled import LabelledData, with_whole_drives
+
+MOST_ROUNDS = 3
+"""How often other finalists take the place of those that fail without the health check."""
+LOST = 0.5
+"""Share of the capped error, as the mean of a block, above which track counts as lost there."""
 
 
 def bare_blocks(data: LabelledData, archive: Archive, config: OfflineConfig) -> BlockErrors | None:
@@ -32,17 +39,26 @@ def in_whole_drives(
 ) -> LabelledData:
     """The same with the drives of finalists along whole recordings, see `with_whole_drives`.
 
-    Those that are surely worse than the baseline without the health check are left out, and others
-    take their place. `drive` makes the drives that are lacking.
+    Those that are surely worse than the baseline without the health check, or lose track more
+    often, are left out, and others take their place. `drive` makes the drives that are lacking.
     """
-    while True:
+    for _ in range(MOST_ROUNDS):
         drive(data)
         driven = with_whole_drives(data, archive, config)
         blocks = bare_blocks(driven, archive, config)
-        worse = [] if blocks is None else np.array(blocks.trials)[surely_worse(blocks)].tolist()
+        worse = [] if blocks is None else np.array(blocks.trials)[_worse(blocks)].tolist()
         if not worse:
             return driven
         data = data.subset([n for n in data.sets if n not in worse])
+    # Only those that were driven.
+    data = data.subset([n for n in data.sets if n in driven.driven])
+    return with_whole_drives(data, archive, config)
+
+
+def _worse(blocks: BlockErrors) -> NDArray[np.bool_]:
+    """Which sets are surely worse than the baseline, or lost in more blocks than it."""
+    lost = (blocks.errors >= LOST * FAILURE).sum(axis=0)
+    return np.asarray(surely_worse(blocks) | (lost > lost[blocks.baseline]))
 
 
 def bare_in_words(
@@ -58,7 +74,8 @@ def bare_in_words(
     )
     without = "Without the health check, as in your launch file"
     said = f"{without}, the baseline has {base:.3f} % in training"
-    if fixed != BASELINE:
+    driven = all(fixed in bare[name] or not of[fixed].restarts for name, of in whole.items())
+    if fixed != BASELINE and driven:
         said += f", the fixed set {of_fixed:.3f} %"
     if worse:
         said += f"; surely worse, and not recommended: trial {', '.join(map(str, worse))}"

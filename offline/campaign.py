@@ -18,7 +18,7 @@ from adaptune.study.references import contradictions_of
 from offline.config import OfflineStudy
 from offline.drive import Drive
 from offline.objective import Verdict, label
-from offline.search import ELAPSED, Clock, Search
+from offline.search import ELAPSED, TIME_IS_UP, Clock, Search
 from offline.stretches import Stretch, stretches_along
 from offline.trial import trial_of
 from offline.workers import Pool, Result, Task, TaskProgress, run
@@ -256,6 +256,9 @@ class Campaign:
             self._clock.save()
             self._begin()
         self._schedule.close()
+        if search.end == TIME_IS_UP:
+            # The same command again begins no more.
+            self._clock.save(self._config.hours or 0.0)
         _log.info("the search ends: %s", search.end)
         self._show("runs", search.total * len(self._names), 0)
         return dict(sorted(search.done.items()))

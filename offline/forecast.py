@@ -49,6 +49,7 @@ def forecast(study: OfflineStudy, archive: Archive, workers: int, clock: Clock) 
         each += COST * costs[-1] * frames.n_driven * study.config.offline.repeats
         if not archive.is_uncut(name):
             rest += COST * costs[-1] * len(frames.stamps) * (FINALISTS + DEARER)
+    workers = max(workers, 1)  # those of a cluster may come later
     rest = FITTING + rest / workers
     if clock.replays:
         members = study.config.online.switching.size if study.mechanism == "bank" else 0

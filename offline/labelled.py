@@ -43,6 +43,7 @@ from offline.campaign import read_whole_drives
 from offline.choice import (
     PER_BLOCK,
     BlockErrors,
+    NothingUsableError,
     affordable,
     choose,
     finalists,
@@ -376,7 +377,15 @@ class LabelledData(NamedTuple):
         return self._replace(sequences=few, sets=self.sets.subset(trials))
 
     def usable(self) -> "LabelledData":
-        """The same with the sets that did not fail."""
+        """The same with the sets that did not fail.
+
+        There is a NothingUsableError where the baseline is none of them.
+        """
+        if not self.costs.usable(BASELINE):
+            raise NothingUsableError(
+                "the baseline fails where it begins within a recording, though not along a whole "
+                "one; set offline.stretches: all"
+            )
         return self.subset([n for n in self.sets if self.costs.usable(n)])
 
     @property

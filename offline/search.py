@@ -22,6 +22,8 @@ BUDGETS = ("trials", "hours", "stagnation")
 """Settings that may change when a study is resumed."""
 
 
+TIME_IS_UP = "no more sets fit into the time"
+"""Why a search ends."""
 ELAPSED = "elapsed.json"
 """What a `Clock` keeps, in a study's folder."""
 
@@ -48,9 +50,10 @@ class Clock:
         """Hours that it took so far."""
         return (self._before + time.monotonic() - self._begin) / 3600.0
 
-    def save(self) -> None:
-        """Keep the time so far."""
-        write_text(self._path, json.dumps({"seconds": 3600.0 * self.hours}) + "\n")
+    def save(self, least: float = 0.0) -> None:
+        """Keep the time so far, at least so many hours."""
+        seconds = 3600.0 * max(self.hours, least)
+        write_text(self._path, json.dumps({"seconds": seconds}) + "\n")
 
 
 Finished = Mapping[str, Mapping[int, Summary]]
@@ -129,7 +132,7 @@ class Search:
         if number not in self._known:
             over = self._config.hours is not None and hours >= self._config.hours
             over &= number >= len(self._space.baselines)
-            end = "no more sets fit into the time" if over else self._sampler.end
+            end = TIME_IS_UP if over else self._sampler.end
             proposal = None
             if not over:
                 results = told([self.done[n] for n in seen])

@@ -133,6 +133,8 @@ def train(
         usable = in_whole_drives(data.usable(), archive, config, drive)
         whole = drive(usable)
     fixed = usable.fixed()
+    dropped = sorted({*data.usable().sets} - {*usable.sets})
+    data = data._replace(costs=data.costs.without(dropped))
     model = _fitted(study, data, with_vectors(usable, archive), finished, fixed)
     write_fixed(study, verdicts[fixed].parameters)
     trials = _trial_rows(config, trial_rows.rows(archive, names), verdicts)
@@ -151,7 +153,7 @@ def train(
     said += estimates_in_words(estimates, model.length)
     said += failed_in_words(verdicts)
     said += baseline_words(config, [runs[0] for runs in finished.values()])
-    said += bare_in_words(archive, whole, fixed, sorted({*data.usable().sets} - {*usable.sets}))
+    said += bare_in_words(archive, whole, fixed, dropped)
     rows_of_front = front_rows(usable, model)
     tables.write_rows(study.folder, "front", rows_of_front)
     return Training(model, trials, rows, said, rows_of_front, left_out_in_words(usable))
@@ -164,7 +166,8 @@ def _note_left_out(
     left_out = chosen_elsewhere(usable)
     for row in rows:
         chosen = left_out.get(name := row["sequence"])
-        row["_left out"] = None if chosen is None else whole[name][chosen].mean_error
+        run = None if chosen is None else whole[name].get(chosen)
+        row["_left out"] = run and run.mean_error
 
 
 def _searched(

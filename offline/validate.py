@@ -321,7 +321,7 @@ def validate(study: OfflineStudy, progress: Progress = unseen) -> Validated:
 def _verdicts(rules: Collection[str], bank: bool, validation: Validation) -> list[str]:
     """The estimate for what `adaptune online` will drive, then for what else it drives."""
     said = []
-    if ADAPTIVE in rules:
+    if bank and ADAPTIVE in rules:
         said += [validation.verdict(ADAPTIVE), *validation.against_rivals()]
     said.append(baseline_in_words(validation))
     others = [name for name in rules if name != ADAPTIVE]

@@ -430,7 +430,8 @@ def _lost(
     last = [row for row in last_rows(known) if row.mode in CALLED]
     least = min(last, key=lambda row: row.rte or 0.0)
     if said and least.mode != best.mode:
-        said.append(f"What errs least there is {CALLED[least.mode]}: {error_and_cost(least)}.")
+        what = f"{CALLED[least.mode]} errs least: {error_and_cost(least)}"
+        said.append(f"Over all test sequences, {what}.")
     return said
 
 

@@ -363,7 +363,8 @@ class LiveEvidence:
         # Unknown where the training has one stretch.
         share = 1.0 if np.isnan(familiarity) else min(1.0, familiarity / FAMILIAR)
         alone = self.own_error()
-        if alone is None or not share or not alone.low <= CONTRADICTED * predicted:
+        # A bank's prediction has live evidence in it already.
+        if self.members or alone is None or not share or not alone.low <= CONTRADICTED * predicted:
             return alone
         # Nor does training know of a failure.
         last = 0 if self._newest is None else self._newest.stamp

@@ -107,7 +107,7 @@ class ErrorModel:
     # (n_frames, n_sets): percent, infinite where the track was lost, NaN where a set was not run.
     errors: NDArray[np.float32]
     provenance: dict[str, Any]  # where the model comes from, for people
-    # (n_frames,): number of each frame's stretch in its recording, the same in a view of it; by
+    # (n_frames,): number of each frame's stretch in its recording; by
     # default each recording is one stretch.
     stretch: NDArray[np.intp] = field(default_factory=lambda: np.empty(0, np.intp))
     bank: list[int] = field(default_factory=list)  # its members' trials, the fixed set's first

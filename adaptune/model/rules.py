@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
@@ -155,8 +155,13 @@ class Costs:
         """Milliseconds of CPU time a scan of one instance, no live evidence; NaN if unknown."""
         return self.sets[trial].alone if trial in self.sets else np.nan
 
+    def without(self, trials: Collection[int]) -> "Costs":
+        """The same where some trials are not usable."""
+        none = {n: SetCost(np.inf, np.inf, -1) for n in trials}
+        return replace(self, sets={**self.sets, **none})
+
     def usable(self, trial: int) -> bool:
-        """Whether the odometry works with a set, see `adaptune.archive.Summary.usable`."""
+        """Whether the odometry works with a set."""
         return not np.isinf(self.alone(trial))
 
     def adaptive(self, trials: Iterable[int]) -> float:

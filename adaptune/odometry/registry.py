@@ -171,6 +171,12 @@ def declare_here(name: str, settings: Any, folder: Path | None = None) -> Declar
     return Declaration(found, mistakes, cls.describe(found) if describes else None)
 
 
+def forget_user_code() -> None:
+    """Import it anew from here on: in one session, it may have been edited."""
+    processes.forget_servers()
+    _ask.cache_clear()
+
+
 @cache
 def _ask(name: str, settings: str, folder: str) -> dict[str, Any]:
     bounds = processes.Bounds(processes.IMPORT_SECONDS)

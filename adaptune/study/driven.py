@@ -74,7 +74,9 @@ def driven(
             words += f", at {cost:.1f} ms of CPU time a scan"
         why = f", because it is worth that: {expected}" if expected else ""
         return f"{words}{why}."
-    if mechanism == "live":
+    if mechanism == "bank" and len(model.bank) < 2:
+        why = "no second set may join it in a bank (online.budget, or the others fail)"
+    elif mechanism == "live":
         why = "choosing one set at a time gains nothing, and there is no bank (online.switching)"
     elif expected:
         why = f"nothing else is worth its cost; the best alternative is a bank: {expected}"

@@ -42,14 +42,14 @@ WINDOW = 3.0
 BANK_MEMORY = 16.0
 """Gigabytes that the members of a bank may take where nobody asks for one."""
 
-_locks: dict[str, IO[str]] = {}
-"""Open files whose locks last as long as the process."""
+_locks: dict[Path, IO[str]] = {}
+"""Open files whose locks last as long as the process, or until `Study.close`."""
 
 
 def is_written_to(folder: Path) -> bool:
     """Whether another process works in a study's folder."""
     lock = folder / ".lock"
-    if str(folder) in _locks or not lock.exists():
+    if folder.resolve() in _locks or not lock.exists():
         return False
     with lock.open() as file:
         return not locked(file, wait=False)
@@ -245,7 +245,7 @@ class Study(Generic[C_co]):
                 f"{folder}: the study's folder cannot be made ({error.strerror}); name another "
                 f"with --folder"
             ) from error
-        if str(folder) not in _locks:
+        if folder.resolve() not in _locks:
             lock = (folder / ".lock").open("w")
             if not locked(lock, wait=False):
                 lock.close()
@@ -253,9 +253,14 @@ class Study(Generic[C_co]):
                     f"{folder}: another adaptune is at work here; wait for it, or give this study "
                     f"another folder (--folder)"
                 )
-            _locks[str(folder)] = lock
+            _locks[folder.resolve()] = lock
         with contextlib.suppress(OdometryError):  # one that is not here, and not needed now
             write_text(folder / CONFIGURATION, yaml12.dump(self._resolved()))
+
+    def close(self) -> None:
+        """Let other processes work in the folder."""
+        if lock := _locks.pop(self.folder.resolve(), None):
+            lock.close()
 
     def _resolved(self) -> dict[str, Any]:
         """The configuration with nothing left to defaults."""

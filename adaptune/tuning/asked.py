@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from adaptune.errors import AdaptuneError, NotInstalledError
+from adaptune.manifest import plain
 from adaptune.progress import Progress
 
 if TYPE_CHECKING:
@@ -42,14 +43,16 @@ class Asked(NamedTuple):
         hours = None if self.minutes is None else self.minutes / 60.0
         limits = {"offline.trials": self.trials, "offline.hours": hours}
         limits |= {"online.budget": self.budget}
-        return {key: value for key, value in limits.items() if value is not None}
+        return dict(plain({key: v for key, v in limits.items() if v is not None}))
 
     @property
     def inputs(self) -> dict[str, Any]:
         """The rest as plain data, by which a study is known."""
         found = self._asdict() | {"config": self.config and str(self.config.resolve())}
         found |= {key: [str(p.resolve()) for p in found[key]] for key in ("recordings", "test")}
-        return {k: v for k, v in found.items() if k not in ("trials", "minutes", "budget")}
+        spelt = {"reading": "--as", "about": "the odometry's object", "recordings": "BAG"}
+        limits = ("trials", "minutes", "budget")
+        return dict(plain({spelt.get(k, f"--{k}"): v for k, v in found.items() if k not in limits}))
 
 
 def check_no_study(path: Path) -> None:
@@ -118,17 +121,23 @@ def named_odometry(given: "str | type[Odometry] | Odometry") -> tuple[str, dict[
     """
     if isinstance(given, str):
         return given, {}
+    from adaptune.odometry import Odometry
     from adaptune.odometry.content import module_file
     from adaptune.odometry.registry import ODOMETRIES
 
     cls = given if isinstance(given, type) else type(given)
     module, main = cls.__module__, getattr(sys.modules["__main__"], "__file__", None)
-    if module == "__main__" and main and module_file(Path(main).stem) == Path(main).absolute():
-        module = Path(main).stem
+    if module == "__main__" and main and (file := module_file(Path(main).stem)):
+        module = Path(main).stem if file.resolve() == Path(main).resolve() else module
     path = f"{module}:{cls.__qualname__}"
     name = next((name for name, where in ODOMETRIES.items() if where == path), path)
     if isinstance(given, type):
         return name, {}
+    if not isinstance(given, Odometry):
+        raise AdaptuneError(
+            "odometry: give a name, or several with commas; a class derived from "
+            "adaptune.odometry.Odometry; or an object of one"
+        )
     parameters = {key: {"baseline": value} for key, value in given.parameters.items()}
     settings = given.settings.model_dump(mode="json", exclude_unset=True)
     return name, {"settings": settings, "parameters": parameters}

@@ -132,7 +132,12 @@ def written(asked: Asked, folder: Path, show: Progress) -> tuple[Path, list[str]
                 f"--folder"
             ) from error
         return path, [], []
-    if others := manifest.changes(manifest.recorded(known), asked.inputs):
+    if (before := manifest.recorded(known)) is None:
+        raise AdaptuneError(
+            f"{path}: {ASKED} beside it is gone, or an older adaptune made it; `adaptune offline "
+            f"{path}` goes on with it; or name another --folder"
+        )
+    if others := manifest.changes(before, asked.inputs):
         raise AdaptuneError(
             f"{path}: another `adaptune tune` made it: {'; '.join(others)}; name the same to "
             f"resume it, or another --folder"
@@ -147,6 +152,8 @@ def _decided(asked: Asked, folder: Path, show: Progress) -> dict[str, Any]:
 
     named, test = recorded(asked, show)
     odometries = odometries_of(asked.odometry, all("imu" in one.given for one in named.values()))
+    if asked.config is not None and asked.about:
+        raise AdaptuneError("config: give it in the object's settings, or name its class")
     if asked.config is not None and len(odometries) != 1:
         raise AdaptuneError(f"--config {asked.config}: is of one odometry; name one --odometry")
     undo_motion([*named.values()], odometries)
@@ -184,6 +191,9 @@ def _grown(path: Path, asked: Asked, show: Progress) -> list[str]:
         document = Document.of_file(path)
         data: Any = document.data
         known = {str(one.get(key)) for one in data["sequences"].values() for key in SOURCES}
+        if not all(isinstance(data.get(role) or [], list) for role in ("training", "test")):
+            return []
+        offline: dict[str, Any] = {} | (data.get("offline") or {})
     except (YamlError, AttributeError, KeyError, TypeError):
         return []  # loading it says what is wrong
     tested = [one.resolve() for one in recordings_at(asked.test, asked.reading)]
@@ -203,7 +213,6 @@ def _grown(path: Path, asked: Asked, show: Progress) -> list[str]:
         "training": [name for name, one in added.items() if one.path not in tested],
         "test": [name for name, one in added.items() if one.path in tested],
     }
-    offline = data.get("offline") or {}
     roles_now = {role: list(data.get(role) or ()) for role in into}
     n, before = offline.get("stretches", 12), len(roles_now["training"]) or 1
     if into["training"] and isinstance(n, int):

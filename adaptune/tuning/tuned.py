@@ -2,9 +2,10 @@
 
 import base64
 import logging
+import multiprocessing
 import os
 from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -49,7 +50,8 @@ class Tuned:
     @property
     def fixed(self) -> "ParameterSet":
         """The fixed set; the verdict says whether to drive it."""
-        return self.study.fixed or {}
+        sets = self.training.model.sets
+        return sets[self.training.model.fixed]
 
     @property
     def front(self) -> Any:
@@ -156,7 +158,8 @@ def tune(
     asked = Asked(_paths(recordings), name, points, judged, file, tested, reading, about, *limits)
     with ExitStack() as stack:
         show = progress or stack.enter_context(bars_and_words())
-        return tune_asked(asked, overrides, Path(folder) if folder else None, cluster, show)
+        into = Path(folder).absolute() if folder else None
+        return tune_asked(asked, overrides, into, cluster, show)
 
 
 def tune_asked(
@@ -167,10 +170,19 @@ def tune_asked(
     show: Progress,
 ) -> Tuned:
     """Do what `tune` does of what was asked."""
+    from adaptune.odometry.registry import forget_user_code
     from offline.config import load_study
     from offline.search import ELAPSED, Clock
     from offline.train import train
 
+    if not asked.recordings:
+        raise AdaptuneError("name a recording: the list is empty")
+    if getattr(multiprocessing.current_process(), "_inheriting", False):
+        raise AdaptuneError(
+            'call adaptune.tune below `if __name__ == "__main__":`, because its workers import the '
+            "script"
+        )
+    forget_user_code()
     if asked.reference is not None and Path(asked.reference).is_file():
         asked = asked._replace(reference=str(Path(asked.reference).resolve()))
     folder = folder or Path("runs") / _study_name(asked)
@@ -179,9 +191,10 @@ def tune_asked(
     study = load_study(path, [*overrides, *now], folder)
     _log.info("study: %s", path)
     before = study.fixed
-    training = train(study, show, cluster, clock)
-    replay_missing(study, show=show)
-    return Tuned(study, training, *compared(study), more, before)
+    with closing(study):
+        training = train(study, show, cluster, clock)
+        replay_missing(study, show=show)
+        return Tuned(study, training, *compared(study), more, before)
 
 
 def _paths(given: Paths) -> list[Path]:

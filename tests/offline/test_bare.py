@@ -4,6 +4,8 @@ from fake_odometry import SPEED, Fake
 
 from adaptune.archive import Archive
 from adaptune.odometry import Registration
+from offline.bare import _worse
+from offline.choice import BlockErrors
 from offline.config import load_study
 from offline.train import train
 
@@ -79,3 +81,16 @@ def test_bare_drives_are_those_of_helped_sets_and_of_the_baseline(helped):
 
 def test_there_are_none_where_the_health_check_does_nothing(trained_folder):
     assert not list(trained_folder.glob("trials/*/*-bare.npz"))
+
+
+def test_a_set_that_is_lost_more_often_is_worse_however_good_it_is_elsewhere():
+    errors = np.ones((8, 4))
+    errors[:, 1] = 0.5
+    errors[-1, 1:3] = 30.0
+    errors[0, 3] = 14.0
+    number, none = np.zeros(8, np.intp), np.zeros(4)
+    blocks = BlockErrors([0, 1, 2, 3], errors, number, none, none)
+    assert _worse(blocks).tolist() == [False, True, True, False]
+    # As often as the baseline is no reason.
+    errors[0, 0] = 30.0
+    assert not _worse(blocks)[1]

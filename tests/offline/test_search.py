@@ -221,6 +221,9 @@ def test_no_set_begins_that_would_not_end_in_time(study_of, monkeypatch, expecte
     verdicts = Campaign(study, *given, clock=of_study, seconds=(expected, 300.0)).run()
     assert clock.seconds == 100.0 + 30.0 * len(verdicts)
     assert 0.8 * 1500.0 <= clock.seconds + 300.0 <= 1500.0
+    # Nor if the same command, again, finds that one more would fit.
+    again = Campaign(study, *given, clock=Clock(study.folder / "elapsed.json"), seconds=(1.0, 1.0))
+    assert again.run().keys() == verdicts.keys()
 
 
 def test_however_short_the_time_the_baseline_is_driven(study_file, tmp_path, caplog):

@@ -6,13 +6,15 @@ from pathlib import Path
 
 import drives
 import fake_odometry
+import numpy as np
 import pytest
+import yaml
 
 import adaptune
 from adaptune.errors import AdaptuneError
 from adaptune.odometry.keyframe import KeyframeGicp
 from adaptune.progress import bars_and_words
-from adaptune.tuning.asked import named_odometry
+from adaptune.tuning.asked import Asked, named_odometry
 
 
 @pytest.fixture(autouse=True)
@@ -58,6 +60,34 @@ def test_a_session_without_logging_sees_what_is_logged(capsys, monkeypatch):
     said = capsys.readouterr().err
     assert "it takes about 3 min [all]" in said
     assert "later" not in said
+
+
+def test_numbers_may_be_those_of_numpy():
+    about = {"parameters": {"n": {"baseline": np.int64(3)}}}
+    asked = Asked([Path("a.bag")], about=about, budget=np.float64(5.0))
+    assert yaml.safe_dump(asked.limits) == "online.budget: 5.0\n"
+    assert asked.inputs["the odometry's object"] == {"parameters": {"n": {"baseline": 3}}}
+
+
+@pytest.mark.parametrize("given", [lambda: None, ["gicp", "kiss_icp"], None])
+def test_what_is_no_odometry_is_refused(given):
+    with pytest.raises(AdaptuneError, match="odometry: give a name, or several with commas"):
+        named_odometry(given)
+
+
+def test_no_recording_is_refused():
+    with pytest.raises(AdaptuneError, match="name a recording"):
+        adaptune.tune([])
+
+
+def test_a_study_of_which_nobody_knows_how_it_was_made_is_kept():
+    drives.write_bag(Path("one.bag"), drives.scans(n_scans=60))
+    path = Path("runs/one/one.yaml")
+    path.parent.mkdir(parents=True)
+    path.write_text("odometry: gicp\n")
+    with pytest.raises(AdaptuneError, match=r"asked\.json beside it is gone, or an older adaptune"):
+        adaptune.tune("one.bag")
+    assert path.read_text() == "odometry: gicp\n"
 
 
 def test_the_package_has_no_other_names():
