@@ -159,8 +159,8 @@ class Selector(_Measuring):
     last selections. A single odometry keeps the fixed set, and leaves it for the baseline where it
     surely does worse than predicted, and worse than the baseline is predicted to do. The reserve of
     a bank (`ErrorModel.reserve`) rests, except for a minute after a place that training does not
-    know, and after a failure. Scans of a sensor or mount that was not trained with (`ErrorModel.is_foreign`)
-    get the fixed set, or in a bank weights by what is measured alone.
+    know, and after a failure. Scans of a sensor or mount that was not trained with
+    (`ErrorModel.is_foreign`) get the fixed set, or in a bank weights by what is measured alone.
 
     Parameters
     ----------
