@@ -138,7 +138,7 @@ def test_its_manners_are_those_of_ros_1(make, monkeypatch):
 def test_one_that_works_on_or_stamps_by_a_clock_is_told(make, caplog):
     lockstep._warn_once.cache_clear()
     lockstep._SEEN.clear()
-    busy = make(imitate={"background": 0.8})
+    busy = make(imitate={"background": 5.0})
     on = [busy.prepare(scan) for scan in scans()[:2]]
     busy.start(on[0], np.eye(4))
     busy.register(on[1])
