@@ -1,4 +1,5 @@
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -7,6 +8,7 @@ from rooms import moved, scan_at, street
 from adaptune.live import evidence
 from adaptune.live.evidence import LOST, SELDOM, LiveEvidence, spread_of
 from adaptune.live.hops import Hop
+from adaptune.live.own_error import OwnError
 from adaptune.model.weights import measured_weights
 from adaptune.odometry.base import Motions
 from adaptune.recording.scan import Scan
@@ -410,3 +412,31 @@ def test_where_nobody_has_a_pose_all_keep_their_weight():
     nothing = np.full((4, 4), np.nan)
     drive(live, 3, lambda _: Motions(nothing, {0: nothing, 1: nothing}))
     assert live.present().all()
+
+
+@pytest.mark.parametrize(
+    ("case", "share"),
+    [
+        ({}, 1.0),
+        ({"familiarity": np.nan}, 1.0),
+        ({"familiarity": 0.5 * evidence.FAMILIAR}, 0.5),
+        ({"familiarity": 0.0}, None),
+        ({"predicted": 0.4 / evidence.CONTRADICTED}, None),
+        ({"restarted": 90 * 10**9}, None),
+        ({"restarted": 10 * 10**9}, 1.0),
+        ({"members": (3, 7)}, None),
+    ],
+)
+def test_a_prediction_counts_where_training_knows_the_place(case, share):
+    given = {"familiarity": 1.0, "predicted": 1.0, "restarted": 0, "members": ()} | case
+    alone = OwnError(1.0, 0.5, 2.0)
+    own = SimpleNamespace(estimate_with=lambda _, known: known)
+    live = SimpleNamespace(
+        members=given["members"],
+        own_error=lambda: alone,
+        _own=own,
+        _newest=SimpleNamespace(stamp=100 * 10**9),
+        _restarted=given["restarted"],
+    )
+    found = LiveEvidence._own_error_with(live, given["predicted"], given["familiarity"])
+    assert found == (alone if share is None else share)
