@@ -11,8 +11,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from adaptune.files import write_text
 from adaptune.strict import ConfigurationError, in_one_line
 
@@ -36,7 +34,7 @@ def plain(inputs: Any) -> Any:
 
 def _scalar(value: Any) -> Any:
     """A number of numpy as Python's own."""
-    if not isinstance(value, np.generic):
+    if not hasattr(value, "dtype"):
         raise TypeError(f"{type(value).__name__} is no plain data")
     return value.item()
 

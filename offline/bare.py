@@ -46,7 +46,7 @@ def in_whole_drives(
         drive(data)
         driven = with_whole_drives(data, archive, config)
         blocks = bare_blocks(driven, archive, config)
-        worse = [] if blocks is None else np.array(blocks.trials)[_worse(blocks)].tolist()
+        worse = [] if blocks is None else np.array(blocks.trials)[worse_without(blocks)].tolist()
         if not worse:
             return driven
         data = data.subset([n for n in data.sets if n not in worse])
@@ -55,7 +55,7 @@ def in_whole_drives(
     return with_whole_drives(data, archive, config)
 
 
-def _worse(blocks: BlockErrors) -> NDArray[np.bool_]:
+def worse_without(blocks: BlockErrors) -> NDArray[np.bool_]:
     """Which sets are surely worse than the baseline, or lost in more blocks than it."""
     lost = (blocks.errors >= LOST * FAILURE).sum(axis=0)
     return np.asarray(surely_worse(blocks) | (lost > lost[blocks.baseline]))

@@ -150,8 +150,7 @@ def train(
         study.odometry.name,
         lambda worst: hard_to_track(study.sequences.open(worst)),
     )
-    said += estimates_in_words(estimates, model.length)
-    said += failed_in_words(verdicts)
+    said += estimates_in_words(estimates, model.length) + failed_in_words(verdicts)
     said += baseline_words(config, [runs[0] for runs in finished.values()])
     said += bare_in_words(archive, whole, fixed, dropped)
     rows_of_front = front_rows(usable, model)

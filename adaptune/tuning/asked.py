@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from adaptune.errors import AdaptuneError, NotInstalledError
-from adaptune.manifest import plain
 from adaptune.progress import Progress
 
 if TYPE_CHECKING:
@@ -43,6 +42,8 @@ class Asked(NamedTuple):
         hours = None if self.minutes is None else self.minutes / 60.0
         limits = {"offline.trials": self.trials, "offline.hours": hours}
         limits |= {"online.budget": self.budget}
+        from adaptune.manifest import plain
+
         return dict(plain({key: v for key, v in limits.items() if v is not None}))
 
     @property
@@ -50,6 +51,8 @@ class Asked(NamedTuple):
         """The rest as plain data, by which a study is known."""
         found = self._asdict() | {"config": self.config and str(self.config.resolve())}
         found |= {key: [str(p.resolve()) for p in found[key]] for key in ("recordings", "test")}
+        from adaptune.manifest import plain
+
         spelt = {"reading": "--as", "about": "the odometry's object", "recordings": "BAG"}
         limits = ("trials", "minutes", "budget")
         return dict(plain({spelt.get(k, f"--{k}"): v for k, v in found.items() if k not in limits}))

@@ -4,7 +4,7 @@ from fake_odometry import SPEED, Fake
 
 from adaptune.archive import Archive
 from adaptune.odometry import Registration
-from offline.bare import _worse
+from offline.bare import worse_without
 from offline.choice import BlockErrors
 from offline.config import load_study
 from offline.train import train
@@ -90,7 +90,7 @@ def test_a_set_that_is_lost_more_often_is_worse_however_good_it_is_elsewhere():
     errors[0, 3] = 14.0
     number, none = np.zeros(8, np.intp), np.zeros(4)
     blocks = BlockErrors([0, 1, 2, 3], errors, number, none, none)
-    assert _worse(blocks).tolist() == [False, True, True, False]
+    assert worse_without(blocks).tolist() == [False, True, True, False]
     # As often as the baseline is no reason.
     errors[0, 0] = 30.0
-    assert not _worse(blocks)[1]
+    assert not worse_without(blocks)[1]
