@@ -192,8 +192,8 @@ class Document:
             same = value.start_mark.line == key.end_mark.line
             mark = value.end_mark if same else key.end_mark
             rest = lines[mark.line][mark.column :].strip(": ")
-            told = [*above[::-1], rest] if rest.startswith("#") else above[::-1]
-            if text := "\n".join(line.strip().lstrip("#").strip() for line in told):
+            told = [line.strip() for line in (*reversed(above), rest)]
+            if text := "\n".join(line.lstrip("#").strip() for line in told if line[:1] == "#"):
                 found.setdefault(path, text)
         return found
 

@@ -144,6 +144,8 @@ def test_comments_come_back():
     again = Document(found)
     assert (again.data, dump(again.data, again.comments)) == (document.data, found)
     assert dump({"x": 1}, document.comments) == "x: 1\n"
+    spaced = Document("# head\n\n\na: 1\n\n\nb: 2\n")
+    assert dump(spaced.data, spaced.comments) == "# head\na: 1\nb: 2\n"
 
 
 @pytest.mark.parametrize("text", ["a\udcff.bag", "a\0", "\ud800"])
