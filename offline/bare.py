@@ -35,7 +35,7 @@ def in_whole_drives(
     data: LabelledData,
     archive: Archive,
     config: OfflineConfig,
-    drive: Callable[[LabelledData], object] = lambda _: None,
+    drive: Callable[[LabelledData], None] = lambda _: None,
 ) -> LabelledData:
     """The same with the drives of finalists along whole recordings, see `with_whole_drives`.
 
@@ -62,10 +62,10 @@ def worse_without(blocks: BlockErrors) -> NDArray[np.bool_]:
 
 
 def bare_in_words(
-    archive: Archive, whole: WholeDrives, fixed: int, worse: Sequence[int]
+    archive: Archive, whole: WholeDrives, fixed: int, dropped: Sequence[int]
 ) -> list[str]:
     """What fixed set and baseline do without the health check, if that is another thing."""
-    bare = read_whole_drives(archive, list(whole), [BASELINE, fixed], bare=True)
+    bare = read_whole_drives(archive, list(whole), [BASELINE, fixed, *dropped], bare=True)
     if not any(bare.values()):
         return []
     base, of_fixed = (
@@ -77,6 +77,7 @@ def bare_in_words(
     driven = all(fixed in bare[name] or not of[fixed].restarts for name, of in whole.items())
     if fixed != BASELINE and driven:
         said += f", the fixed set {of_fixed:.3f} %"
-    if worse:
+    # Others were dropped because they did not drive.
+    if worse := [n for n in dropped if any(n in of for of in bare.values())]:
         said += f"; surely worse, and not recommended: trial {', '.join(map(str, worse))}"
     return [f"{said}."]

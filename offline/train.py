@@ -38,6 +38,7 @@ from offline.campaign import (
     Schedule,
     WholeDrives,
     drive_whole,
+    read_whole_drives,
     run_baseline,
 )
 from offline.choice import NothingUsableError
@@ -125,13 +126,13 @@ def train(
         about = (names, every_set, study.config, study.window, recorded_in, study.odometry)
         data = labelled_data(archive, *about)
 
-        def drive(data: LabelledData) -> WholeDrives:
+        def drive(data: LabelledData) -> None:
             asked = {*data.finalists(), *every_set.defaults}
             sets = {n: verdicts[n].parameters for n in sorted(asked)}
-            return drive_whole(study, sets, archive, workers, progress)
+            drive_whole(study, sets, archive, workers, progress)
 
         usable = in_whole_drives(data.usable(), archive, config, drive)
-        whole = drive(usable)
+    whole = read_whole_drives(archive, names, [*usable.finalists(), *every_set.defaults])
     fixed = usable.fixed()
     dropped = sorted({*data.usable().sets} - {*usable.sets})
     data = data._replace(costs=data.costs.without(dropped))
