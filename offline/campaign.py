@@ -315,7 +315,7 @@ def drive_whole(
     archive: Archive,
     workers: Pool[Any],
     progress: Progress,
-) -> dict[str, dict[int, Summary]]:
+) -> None:
     """Drive sets along whole training sequences, unless that was done before.
 
     Where the health check acts, it may hide that a set fails without it. So admissible sets, and
@@ -328,11 +328,10 @@ def drive_whole(
     restarts = {n: sum(of[n].restarts for of in whole.values()) for n in sets}
     helped = [n for n in sets if 0 < restarts[n] <= restarts[BASELINE]]
     if len(helped) < 2:  # none, or the baseline
-        return whole
+        return
     schedule = Schedule(study, archive, "drives without health check", progress, bare=True)
     needed = {name: {n: sets[n] for n in helped if of[n].restarts} for name, of in whole.items()}
     _drive(schedule, workers, read_whole_drives(archive, names, helped, bare=True), needed)
-    return whole
 
 
 def _drive(
