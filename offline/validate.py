@@ -162,8 +162,8 @@ class Validation:
         share = 100 * np.mean([left_out.adapted.get(rule, 0.0) for left_out in self.left_out])
         if not share:
             return (
-                f"`{rule}` kept the fixed set wherever something was left out: the rest did not "
-                f"show less expected loss; so there is no estimate of it."
+                f"`{rule}` kept the fixed set on each part that was left out, because it promised "
+                f"no gain on the others. So there is no estimate of its gain."
             )
         how = f"adapting {share:.0f} % of the time"
         if rule == ADAPTIVE:
