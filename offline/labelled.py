@@ -518,19 +518,28 @@ def periods(period: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArray[np.int
 def measured_costs(
     archive: Archive, names: Sequence[str], sets: ParameterSets, odometry: Factory
 ) -> Costs:
-    """Mean costs of sets over sequences."""
+    """Mean costs of sets over sequences.
+
+    Sets with the same preparation have the median of what it took in their trials: it is the same
+    work, and differs with what else the machine did.
+    """
     numbers: dict[Hashable, int] = {}
-    found: dict[int, SetCost] = {}
+    register: dict[int, float] = {}
+    prepare: dict[int, dict[int, float]] = {}  # by number of the preparation
     for trial in sets:
         runs = [archive.finished(name)[trial] for name in names]
-        register, prepare = (
+        took, prepared = (
             float(np.mean([one.others.get(key, np.nan) for one in runs]))
             for key in (REGISTER_MS, PREPARE_MS)
         )
-        if any(one.failure for one in runs):
-            register = np.inf
-        key = odometry(sets[trial]).preparation
-        found[trial] = SetCost(register, prepare, numbers.setdefault(key, len(numbers)))
+        register[trial] = np.inf if any(one.failure for one in runs) else took
+        number = numbers.setdefault(odometry(sets[trial]).preparation, len(numbers))
+        prepare.setdefault(number, {})[trial] = prepared
+    found = {
+        trial: SetCost(register[trial], float(np.median([*times.values()])), number)
+        for number, times in prepare.items()
+        for trial in times
+    }
     every_second = float(np.mean([archive.read_frames(name).evidence_ms for name in names]))
     return Costs(found, USUAL_SHARE * every_second)
 

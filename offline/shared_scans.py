@@ -21,20 +21,19 @@ class _Kept:
     nbytes: int = 0
     seconds: float = 0.0  # of CPU time for `n_prepared` scans
     n_prepared: int = 0
-    used: int = 0  # number of the pass
+    used: int = 0  # number of the last pass that asked for it,
+    before: int = 0  # and of the one before
 
 
 SharedScan = Callable[[OdometryInstance], Any]
 """Gives a scan as an instance takes it."""
-STALE = 64
-"""Passes after which prepared scans that are not used make room for others."""
 
 
 class SharedScans:
     """The scans of stretches, each prepared once for all instances with the same preparation.
 
     Prepared scans that exceed `memory` bytes are read and prepared again on every pass, once for
-    all that share it.
+    all that share it. What was asked for longest ago makes room for what is asked for more often.
     """
 
     def __init__(self, memory: float):
@@ -69,7 +68,8 @@ class SharedScans:
         """Scan `i` as an instance takes it; `fresh` has what there is no room for."""
         preparation = instance.preparation
         kept = self._kept.setdefault((*key, preparation), _Kept())
-        kept.used = self._n_passes
+        if kept.used < self._n_passes:
+            kept.before, kept.used = kept.used, self._n_passes
         if i in kept.scans:
             return kept.scans[i]
         if preparation in fresh:
@@ -81,7 +81,7 @@ class SharedScans:
             prepared = instance.prepare(scan)
             kept.seconds += time.process_time() - begin
         kept.n_prepared += 1
-        if self._has_room(size := prepared_bytes(prepared)):
+        if self._has_room(size := prepared_bytes(prepared), kept.before):
             kept.scans[i] = prepared
             kept.nbytes += size
             self.nbytes += size
@@ -94,14 +94,16 @@ class SharedScans:
         kept = self._kept.get((*stretch.key, instance.preparation))
         return 1e3 * kept.seconds / kept.n_prepared if kept and kept.n_prepared else 0.0
 
-    def _has_room(self, size: int) -> bool:
-        """Whether so many bytes more are allowed; where they are not, make room."""
-        for kept in self._kept.values():
-            if self.nbytes + size <= self._memory:
+    def _has_room(self, size: int, since: int) -> bool:
+        """Whether so many bytes more are allowed; make room of what has no use since a pass.
+
+        So stretches that are driven by turns, and do not fit together, do not drive each other out.
+        """
+        for kept in sorted(self._kept.values(), key=lambda kept: kept.used):
+            if self.nbytes + size <= self._memory or kept.used >= since:
                 break
-            if self._n_passes - kept.used > STALE:
-                self.nbytes -= kept.nbytes
-                kept.scans, kept.nbytes = {}, 0
+            self.nbytes -= kept.nbytes
+            kept.scans, kept.nbytes = {}, 0
         return self.nbytes + size <= self._memory
 
 

@@ -228,8 +228,7 @@ def _pair(name: str, replays: Sequence[StoredReplay], reference: Reference, whol
     known = np.isfinite(errors).all(axis=0)
     cost = np.array(costs)[:, _WARM_UP:]
     if whole:
-        means = [[replay.summary.cpu_ms or np.nan] for replay in replays]
-        cost = np.repeat(means, MIN_BLOCKS * _COSTS, axis=1)
+        cost = np.array([[replay.summary.cpu_ms or np.nan] for replay in replays])
     cost = cost[:, np.isfinite(cost).all(axis=0)]
     machines = {replay.summary.machine for replay in replays}
     why = "" if cost.shape[1] else "no times"
@@ -260,7 +259,8 @@ def _rows(quantity: str, pairs: Sequence[_Pair], bound: float) -> list[GateRow]:
             rows.append(GateRow(pair.name, quantity, why=why))
             continue
         new, old = _both(quantity, values).tolist()
-        row = GateRow(pair.name, quantity, new, old, ratio=new / max(old, 1e-12), why="too short")
+        few = "one figure a run" if values.shape[1] == 1 else "too short"
+        row = GateRow(pair.name, quantity, new, old, ratio=new / max(old, 1e-12), why=few)
         same = bool((values[0] == values[1]).all())
         logs = _resampled(quantity, values, block, rng)
         if quantity == ERROR:

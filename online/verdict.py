@@ -109,7 +109,7 @@ def verdict(
         cost = _for_cost(best, last[best.yardstick])
         return [f"{said}.", f"{has} ({_interval(_ratio(best))}){cost}{_beside(best, last)}."]
     said = f"{said}{_doubt(best, last)}."
-    return [said, *_dearer(best, last), *_why_not(main, best, rows, obstacle, worth)]
+    return [said, *_other_set(best, last), *_why_not(main, best, rows, obstacle, worth)]
 
 
 def error_and_cost(row: ComparisonRow) -> str:
@@ -126,16 +126,20 @@ def _beside(best: ComparisonRow, last: Mapping[str, ComparisonRow]) -> str:
     return f", and {ratio:.2f} times that of the best single set that costs no more ({ms:.1f} ms)"
 
 
-def _dearer(best: ComparisonRow, last: Mapping[str, ComparisonRow]) -> list[str]:
-    """That a single set which costs more does better, where it surely does."""
+def _other_set(best: ComparisonRow, last: Mapping[str, ComparisonRow]) -> list[str]:
+    """That another single set does better here: surely, where it costs more."""
     row = last.get(EQUAL_COST)
-    if row is None or row.ratio is None or (ratio := _to(row, best)).interval is None:
+    if row is None or row.ratio is None or not row.cpu_ms or not best.cpu_ms:
         return []
-    costs = row.cpu_ms or 0.0
-    if not _surely_better(row, best) or not best.cpu_ms or costs <= best.cpu_ms:
-        return []
-    has = f"{ratio.value:.2f} times its error ({_interval(ratio)}){_for_cost(row, best)}"
-    return [f"A single set that costs more has {has}: `--budget {costs:.0f}` allows it."]
+    ratio, costs = _to(row, best), row.cpu_ms
+    sure = "" if ratio.interval is None else f" ({_interval(ratio)})"
+    has = f"{ratio.value:.2f} times its error{sure}{_for_cost(row, best)}"
+    if costs > best.cpu_ms and ratio.interval and _surely_better(row, best):
+        return [f"A single set that costs more has {has}: `--budget {costs:.0f}` allows it."]
+    if costs <= best.cpu_ms and ratio.value <= 1.0 - WORTH:
+        more = "drive both on another recording, to know"
+        return [f"A set that was not surely better in training has {has}: {more}."]
+    return []
 
 
 def _doubt(best: ComparisonRow, last: Mapping[str, ComparisonRow]) -> str:

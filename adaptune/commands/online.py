@@ -2,7 +2,7 @@
 
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping
 from contextlib import closing, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -10,9 +10,12 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from adaptune.commands.terminal import (
+    As,
     Cluster,
     Folder,
+    Given,
     Override,
+    Points,
     StudyFile,
     begin_work,
     load,
@@ -24,6 +27,7 @@ from adaptune.commands.terminal import (
     show_table,
 )
 from adaptune.errors import AdaptuneError
+from adaptune.tuning.asked import Asked
 
 if TYPE_CHECKING:
     from offline.config import OfflineStudy
@@ -197,6 +201,9 @@ def compare(
     recordings: Driven = None,
     against: Against = None,
     odometry: OfFiles = None,
+    points: Points = None,
+    reference: Given = None,
+    reading: As = None,
     worse: Worse = "5%",
     cost: Cost = "10%",
     unclear: Unclear = "pass",
@@ -219,11 +226,18 @@ def compare(
     With `--against`, it says whether STUDY is worse than OLD, recording by recording, in error, in
     cost and in lost tracks. Its exit code is 3 then.
     """
+    of_bags: dict[str, object] = {"BAG": recordings, "--odometry": odometry, "--points": points}
+    of_bags |= {"--reference": reference, "--as": reading}
     if against is not None:
-        _gate((study, against), recordings or (), odometry, (worse, cost), unclear, out)
+        if override or folder or details:
+            raise AdaptuneError("-o, --folder and --details go with one study, not with --against")
+        if not recordings and any(of_bags.values()):
+            raise AdaptuneError(f"{_given(of_bags)}: goes with the bags to drive; name them, too")
+        asked = Asked(recordings or (), odometry or "", points, reference, reading=reading)
+        _gate((study, against), asked, (worse, cost), unclear, out)
         return
-    if recordings or odometry:
-        raise AdaptuneError("BAG and --odometry go with --against, which names the other side")
+    if any(of_bags.values()):
+        raise AdaptuneError(f"{_given(of_bags)}: goes with --against, which names the other side")
     from adaptune.study.driven import MIN_RECORDINGS
     from adaptune.tuning.tuned import compared
 
@@ -248,10 +262,14 @@ WORSE = 3
 """Exit code of the gate."""
 
 
+def _given(options: Mapping[str, object]) -> str:
+    """The names of options that are given."""
+    return ", ".join(name for name, value in options.items() if value)
+
+
 def _gate(
     given: tuple[str, str],
-    recordings: Sequence[Path],
-    odometry: str | None,
+    asked: Asked,
     percents: tuple[str, str],
     unclear: str,
     out: Path,
@@ -262,7 +280,7 @@ def _gate(
 
     shares = [_share_of(text, key) for text, key in zip(percents, ("worse", "cost"), strict=True)]
     with progress() as show:
-        both = sides(given, recordings, odometry, show)
+        both = sides(given, asked, show)
     gate = compare_sides(*both, *shares)
     write_gate(out, gate)
     say(gate.words)

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 from rich.console import Console
@@ -132,6 +132,22 @@ Folder = Annotated[
     Path | None,
     typer.Option(
         help="The study's folder.", show_default="the YAML's name, under runs/", file_okay=False
+    ),
+]
+As = Annotated[
+    Literal["one", "several"] | None,
+    typer.Option(
+        "--as",
+        help="Read the bags of a folder as parts of one recording, or as several.",
+        show_default="as their times and names tell",
+    ),
+]
+Given = Annotated[
+    str | None,
+    typer.Option(
+        metavar="TOPIC|FILE",
+        help="The reference, or `estimated` to compute one from the scans.",
+        show_default="the recording's own, or estimated",
     ),
 ]
 Points = Annotated[

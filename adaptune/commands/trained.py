@@ -33,7 +33,8 @@ BUYS = (
     "What CPU time buys, in training",
     "The arrow marks what is recommended: of what costs no more than the baseline, or than the "
     "budget, the best, if it is better than the baseline by a standard error (by two, of a single "
-    "recording).",
+    "recording). A bank has the error of parts that it did not learn from; the others have that of "
+    "training.",
 )
 
 

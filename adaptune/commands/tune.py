@@ -2,13 +2,15 @@
 
 from itertools import takewhile
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from adaptune.commands.online import Details, say_compared
 from adaptune.commands.terminal import (
+    As,
     Cluster,
+    Given,
     Override,
     Points,
     console,
@@ -32,15 +34,6 @@ from adaptune.tuning.asked import TRIALS, Asked, check_no_study
 
 if TYPE_CHECKING:
     from adaptune.recording.fleet import Reading
-
-As = Annotated[
-    Literal["one", "several"] | None,
-    typer.Option(
-        "--as",
-        help="Read the bags of a folder as parts of one recording, or as several.",
-        show_default="as their times and names tell",
-    ),
-]
 
 
 def inspect(
@@ -180,14 +173,6 @@ Budget = Annotated[
         help="Milliseconds of CPU time a scan that may be spent.",
         min=1e-3,
         show_default="what the odometry's own parameters take",
-    ),
-]
-Given = Annotated[
-    str | None,
-    typer.Option(
-        metavar="TOPIC|FILE",
-        help="The reference, or `estimated` to compute one from the scans.",
-        show_default="the recording's own, or estimated",
     ),
 ]
 

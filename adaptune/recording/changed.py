@@ -1,10 +1,9 @@
-"""Recordings whose scans are changed while they are read: motion undone, measurements added."""
+"""Recordings whose scans are changed while they are read: an IMU's measurements are added."""
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cache as once
 
-from adaptune.recording.compensation import compensate_neighbours
 from adaptune.recording.scan import Imu, Recording, Scan, SequenceError
 from adaptune.trajectory import Trajectory
 
@@ -44,23 +43,6 @@ class ChangedRecording:
     def imu(self) -> Imu | None:
         """Measurements of the IMU, if there is one."""
         return self.inner.imu()
-
-
-def without_motion(sequence: Recording) -> Recording:
-    """Points as if the sensor had kept its place since the scan's start, at constant velocity.
-
-    The velocity is that since the scan before, which is registered for it.
-    """
-
-    def timed(scans: Iterator[Scan]) -> Iterator[Scan]:
-        for scan in scans:
-            if scan.times is None and len(scan):
-                raise SequenceError(
-                    f"{sequence.name}: its points have no times; leave `compensate` out"
-                )
-            yield scan
-
-    return ChangedRecording(sequence, lambda scans: compensate_neighbours(timed(scans)))
 
 
 def with_imu(sequence: Recording) -> Recording:

@@ -41,7 +41,7 @@ def compensate(scan: Scan, T_start_end: Poses, duration: float) -> Scan:
     # a 64th of the scan's rotation, is met by interpolating the rotated points linearly.
     place = np.clip(scan.times / np.float32(moments[1]), 0, _MOMENTS - 1)
     low = np.minimum(place.astype(np.intp), _MOMENTS - 2)
-    share = (place - low)[:, None]
+    share = (place - low).astype(np.float32)[:, None]
     before = np.einsum("nij,nj->ni", matrices[low], scan.points)
     after = np.einsum("nij,nj->ni", matrices[low + 1], scan.points)
     points = before + share * (after - before)

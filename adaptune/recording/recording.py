@@ -15,7 +15,6 @@ import numpy as np
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import to_pose
 from adaptune.recording import cache, compensation
-from adaptune.recording.changed import without_motion
 from adaptune.recording.config import ESTIMATED, NO_REFERENCE, SequenceConfig, files_of
 from adaptune.recording.content import Content, of_looks
 from adaptune.recording.poses import sound
@@ -37,8 +36,7 @@ def open_sequence(config: SequenceConfig) -> Recording:
 
     A SequenceError says why it cannot be opened as described.
     """
-    sequence = RecordedSequence(config)
-    return sequence if config.compensate is None else without_motion(sequence)
+    return RecordedSequence(config)
 
 
 def check_sequence(config: SequenceConfig) -> "RecordedSequence":
@@ -110,7 +108,8 @@ def _source(config: SequenceConfig) -> "tuple[Source, str | None]":
         return BagSource(paths, config.points, timing, config.frame, None, within), None
     try:
         part = (config.start, config.stop, config.stride, config.part)
-        key = cache.key(files_of(paths), (config.points, config.frame, timing, *part))
+        read = (config.points, config.frame, timing, *part, config.compensate)
+        key = cache.key(files_of(paths), read)
     except OSError as error:
         raise SequenceError(f"{paths[0]}: cannot be read ({error})") from error
     entry = cache.find(key)
@@ -144,7 +143,7 @@ _MOST_SCANS = 600
 
 
 class RecordedSequence:
-    """The scans of a recording as they were recorded, without compensation.
+    """The scans of a recording, in which motion is undone if its configuration says so.
 
     Its methods raise a SequenceError where the recording cannot be read as described.
 
@@ -215,13 +214,31 @@ class RecordedSequence:
             odd = kept.about["odd"]
         else:
             about = self.source.about() | {"left_out": left_out, "odd": odd}
-            decoded = self._checked(left_out, odd)
+            decoded = self._compensated(self._checked(left_out, odd))
             yield from decoded if self.key is None else cache.tee(decoded, self.key, about)
         if left_out:
             what = ", ".join(f"{n} {reason}" for reason, n in left_out.items())
             _log.warning("%s: left out %s", self.name, what)
         for text in odd:
             _warn(self.name, text)
+
+    def _compensated(self, scans: Iterator[Scan]) -> Iterator[Scan]:
+        """Points as if the sensor had kept its place since the scan's start, if that is set.
+
+        The velocity is constant, and that since the scan before, which is registered for it.
+        """
+        if self._config.compensate is None:
+            return scans
+
+        def timed() -> Iterator[Scan]:
+            for scan in scans:
+                if scan.times is None and len(scan):
+                    raise SequenceError(
+                        f"{self.name}: its points have no times; leave `compensate` out"
+                    )
+                yield scan
+
+        return compensation.compensate_neighbours(timed())
 
     def _checked(self, left_out: Counter[str], odd: list[str]) -> Iterator[Scan]:
         """The scans, unless the first ones have times that cannot be; what is odd about them."""
@@ -305,7 +322,7 @@ class RecordedSequence:
         if kept is not None:
             yield from kept.since(begin)
         else:
-            yield from self._decode(Counter(), Content(), begin)
+            yield from self._compensated(self._decode(Counter(), Content(), begin))
 
     def imu(self) -> Imu | None:
         """Measurements of the IMU in SI units, if one is set."""

@@ -21,6 +21,9 @@ from adaptune.study.sequences import StudySequences
 _OF_CHANGES = ("compensate", "imu")
 """Keys of a sequence on which its scans as they were recorded do not depend."""
 
+_AS_RECORDED = {"compensate": None}
+"""Registrations undo the motion within the scans that they need."""
+
 _log = logging.getLogger(__name__)
 
 
@@ -102,7 +105,7 @@ def _estimate(
     sequences: StudySequences, name: str, advance: Callable[[int, int], None]
 ) -> EstimatedReference | str:
     """The reference of a sequence, or why it cannot be estimated."""
-    scans = RecordedSequence(sequences.unseen(name))
+    scans = RecordedSequence(sequences.unseen(name).model_copy(update=_AS_RECORDED))
     # GTSAM's sums may depend on its threads: only on one core do results repeat bit by bit.
     try:
         with pin(os.getpid()):
@@ -156,7 +159,7 @@ def contradictions_of(
     config = sequences.config(name)
     if not error > SUSPICIOUS:
         return []
-    # Registrations undo the motion within the scans that they need.
-    scans, given = RecordedSequence(config), sequences.estimate(name) is None
+    scans = RecordedSequence(config.model_copy(update=_AS_RECORDED))
+    given = sequences.estimate(name) is None
     place = None if config.extrinsic is None else to_pose(config.extrinsic)
     return list(contradictions(scans, T_odom_sensor, error, place, given, seen))

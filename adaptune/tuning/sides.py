@@ -24,17 +24,16 @@ FOLDER = Path("runs/compare")
 """Where what the gate drives is kept."""
 
 
-def sides(
-    given: Sequence[str], recordings: Sequence[Path], odometry: str | None, show: Progress
-) -> "tuple[Side, Side]":
+def sides(given: Sequence[str], asked: Asked, show: Progress) -> "tuple[Side, Side]":
     """The replays of both sides, the new one first; those that are missing are made.
 
-    A side is a study or its folder; or with `recordings` a parameter file of the `odometry`, or an
-    odometry: a name, a command or an image. They are driven by turns, each alone on a core.
+    A side is a study or its folder; or where recordings are `asked` for, a parameter file of the
+    odometry, or an odometry: a name, a command or an image. They are driven by turns, each alone on
+    a core.
     """
     from online.gate import Side
 
-    studies = _driven(given, recordings, odometry, show) if recordings else _studies(given)
+    studies = _driven(given, asked, show) if asked.recordings else _studies(given)
     _drive(studies, show)
     new, old = (Side(name, study) for name, study in zip(given, studies, strict=True))
     return new, old
@@ -55,9 +54,7 @@ def _studies(given: Sequence[str]) -> "list[OfflineStudy]":
     return [load_study(name, needed=Path(name).is_file()) for name in given]
 
 
-def _driven(
-    given: Sequence[str], recordings: Sequence[Path], odometry: str | None, show: Progress
-) -> "list[OfflineStudy]":
+def _driven(given: Sequence[str], asked: Asked, show: Progress) -> "list[OfflineStudy]":
     """Both sides as studies of the same recordings."""
     from adaptune.manifest import digest
     from adaptune.metrics import MIN_BLOCKS
@@ -65,13 +62,13 @@ def _driven(
     from adaptune.study.references import ensure_references
     from offline.config import load_study
 
-    named, _ = recorded(Asked(recordings), show)
+    named, _ = recorded(asked, show)
     names = list(named)
     shared: dict[str, Any] = {
         "sequences": {name: one.given for name, one in named.items()},
         "training": names,
     }
-    entries = [_entry(name, odometry) for name in given]
+    entries = [_entry(name, asked.odometry) for name in given]
     folders = [FOLDER / f"{plain_name(Path(name))[:40]}_{digest(name)[:6]}" for name in given]
     first = load_study(shared | {"odometry": entries[0]}, folder=folders[0])
     first.open()
@@ -90,7 +87,7 @@ def _driven(
     return [load_study(shared | {"odometry": of}, folder=folder) for of, folder in both]
 
 
-def _entry(given: str, odometry: str | None) -> dict[str, Any]:
+def _entry(given: str, odometry: str) -> dict[str, Any]:
     """What a study says of the odometry of a side."""
     from adaptune.odometry.base import ToolSettings
     from adaptune.odometry.registry import is_user_class, odometry_class
@@ -100,7 +97,7 @@ def _entry(given: str, odometry: str | None) -> dict[str, Any]:
         return _named(given)
     if not file.is_file():
         raise AdaptuneError(f"{given}: there is no such file")
-    if odometry is None:
+    if not odometry:
         raise AdaptuneError(f"{given}: is a parameter file; name its --odometry, too")
     entry = _named(odometry)
     if entry["name"] in ("command", "docker_command"):
