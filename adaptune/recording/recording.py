@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import to_pose
@@ -290,6 +291,13 @@ class RecordedSequence:
                 if number % self.stride == 0:
                     yield frame
                 number += 1
+
+    def holds(self, stamps: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Which scans of the recording are in the part that is used, by their stamps: (n,)."""
+        first = next(iter(self.source.frames())).stamp
+        seconds = self.source.skipped + (stamps - first) * 1e-9
+        stop = math.inf if self.stop is None else self.stop
+        return np.asarray((seconds >= self.start) & (seconds < stop))
 
     def shares_scans(self, other: "RecordedSequence") -> bool:
         """Whether both use the same scans, of one file or written again.

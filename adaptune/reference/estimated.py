@@ -46,6 +46,26 @@ class EstimatedReference:
     halves: Poses  # (2, n, 4, 4): the poses from either half of the registrations alone
     registrations: Registrations
 
+    def part(self, within: NDArray[np.bool_]) -> "EstimatedReference":
+        """That of a part of the recording; `within` says which scans are in it, of shape (n,)."""
+        first, last = np.flatnonzero(within)[[0, -1]].tolist()
+        of_part, found = slice(first, last + 1), self.registrations
+        inside = (found.start >= first) & (found.end <= last)
+        T_first_world = np.linalg.inv(self.T_world_sensor[first])
+        T_first_halves = np.linalg.inv(self.halves[:, first])
+        return EstimatedReference(
+            self.stamps[of_part],
+            T_first_world @ self.T_world_sensor[of_part],
+            self.trusted[first:last],
+            T_first_halves[:, None] @ self.halves[:, of_part],
+            Registrations(
+                found.start[inside] - first,
+                found.end[inside] - first,
+                found.accepted[inside],
+                found.residual[inside],
+            ),
+        )
+
     @property
     def known(self) -> NDArray[np.bool_]:
         """Which poses are given, of shape (n,).

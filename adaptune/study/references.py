@@ -11,6 +11,9 @@ from adaptune import manifest
 from adaptune.errors import Finding
 from adaptune.geometry import Poses, to_pose
 from adaptune.machine import pin
+from adaptune.recording.cache import fingerprints
+from adaptune.recording.config import SequenceConfig
+from adaptune.recording.parts import Fractions
 from adaptune.recording.recording import RecordedSequence, wants_estimate
 from adaptune.reference import estimate
 from adaptune.reference.diagnosis import SUSPICIOUS, contradictions
@@ -23,6 +26,11 @@ _OF_CHANGES = ("compensate", "imu")
 
 _AS_RECORDED = {"compensate": None}
 """Registrations undo the motion within the scans that they need."""
+_WHOLE = {"part": None}
+_MOST = 0.5
+"""Parts that are a larger share of a recording take theirs from that of the whole."""
+_newest: dict[tuple[str, ...], EstimatedReference] = {}
+"""The last estimate of a whole recording."""
 
 _log = logging.getLogger(__name__)
 
@@ -105,13 +113,52 @@ def _estimate(
     sequences: StudySequences, name: str, advance: Callable[[int, int], None]
 ) -> EstimatedReference | str:
     """The reference of a sequence, or why it cannot be estimated."""
-    scans = RecordedSequence(sequences.unseen(name).model_copy(update=_AS_RECORDED))
+    config = sequences.unseen(name).model_copy(update=_AS_RECORDED)
+    if _is_one_of_parts(sequences, config):
+        whole = config.model_copy(update=_WHOLE)
+        known = _newest.get(_key(sequences, name, whole))
+        found = known or _estimated(sequences, name, whole, advance)
+        if isinstance(found, EstimatedReference):
+            found = found.part(RecordedSequence(config).holds(found.stamps))
+            if found.path() >= estimate.SHORTEST and found.unknown_share() < estimate.MOST_UNKNOWN:
+                return found
+    return _estimated(sequences, name, config, advance)
+
+
+def _estimated(
+    sequences: StudySequences,
+    name: str,
+    config: SequenceConfig,
+    advance: Callable[[int, int], None],
+) -> EstimatedReference | str:
+    """The same of scans that are read in some way; that of the last whole recording is kept."""
+    scans = RecordedSequence(config)
     # GTSAM's sums may depend on its threads: only on one core do results repeat bit by bit.
     try:
         with pin(os.getpid()):
-            return estimate.estimate_reference(scans, advance)
+            found = estimate.estimate_reference(scans, advance)
     except EstimateError as error:
         return str(error) if scans.name in str(error) else f"{scans.name}: {error}"
+    if config.part is None:
+        _newest.clear()
+        _newest[_key(sequences, name, config)] = found
+    return found
+
+
+def _key(sequences: StudySequences, name: str, config: SequenceConfig) -> tuple[str, ...]:
+    """All that the estimated reference of a recording depends on."""
+    return config.model_dump_json(), *fingerprints(sequences.files(name).recording)
+
+
+def _is_one_of_parts(sequences: StudySequences, config: SequenceConfig) -> bool:
+    """Whether a sequence is one of several parts that are most of a recording."""
+    if config.part is None or config.stride > 1:
+        return False
+    whole, parts = config.model_copy(update=_WHOLE), set[Fractions]()
+    for one in sequences.recordings.values():
+        if one.part is not None and one.model_copy(update=_AS_RECORDED | _WHOLE) == whole:
+            parts.add(one.part)
+    return len(parts) > 1 and sum(end - begin for begin, end in parts) > _MOST
 
 
 def _accuracy(stored: StoredEstimate, length: float) -> str:

@@ -9,6 +9,7 @@ from adaptune.recording.config import SequenceConfig
 from adaptune.recording.recording import open_sequence, wants_estimate
 from adaptune.reference.estimated import EstimateError
 from adaptune.study.references import ensure_references, estimates_as_data, estimates_of
+from adaptune.trajectory import read_trajectory
 from offline.config import load_study
 
 LEFT_OUT = "sequences.one.reference="
@@ -164,6 +165,32 @@ def test_a_recording_that_allows_none_is_named_and_not_tried_again(estimator, lo
     assert not ensure(study, ["one"], required=False)
     assert caplog.messages[0] == "one: its reference is estimated again: sequences.one.stop is gone"
     assert study.sequences.estimate("one") is not None
+
+
+def other_than_before(number):
+    """A process remembers the last estimate of a recording that is read as before."""
+    return (f"sequences.one.max_gap={9 + number}",)
+
+
+def test_parts_of_a_recording_take_theirs_from_the_whole(estimator, load, monkeypatch):
+    halves = load(LEFT_OUT, "training=[one: 0-50%]", "test=[one: 50-100%]", *other_than_before(1))
+    monkeypatch.setattr("adaptune.reference.estimate.SHORTEST", 3.0)
+    for name in ("one_0-50", "one_50-100"):
+        ensure(halves, [name])
+        made = read_trajectory(halves.sequences.estimate_path(name))
+        assert made.stamps.tolist() == [scan.stamp for scan in halves.sequences.open(name)]
+        np.testing.assert_allclose(made.T_world_sensor[0], np.eye(4), atol=1e-6)
+        assert halves.sequences.estimate(name).error(3.0) == pytest.approx(0.31, abs=0.01)
+    assert len(estimator.asked) == 1
+
+
+def test_a_part_that_is_little_or_does_not_serve_is_estimated_by_itself(estimator, load):
+    few = load(LEFT_OUT, "training=[one: 0-30%]", "test=[three]")
+    ensure(few, ["one_0-30"])
+    assert len(estimator.asked) == 1
+    short = load(LEFT_OUT, "training=[one: 0-50%]", "test=[one: 50-100%]", *other_than_before(2))
+    ensure(short, ["one_50-100"])
+    assert len(estimator.asked) == 3
 
 
 def test_an_interruption_leaves_those_that_are_done(estimator, load, monkeypatch):
