@@ -403,10 +403,11 @@ def compare(study: Study) -> ComparedReplays:
     obstacle = "" if ADAPTIVE in modes else ReplaySetup.of(study).obstacle(ADAPTIVE, model)
     length, worth = study.config.sub_trajectory, study.config.online.worth
     best = decided(rows, worth)
-    said = wrong[:1] or (
-        [] if best is None else _lost(study.odometry.name, study.sequences, rows, best)
-    )
-    said += verdict(rows, length, obstacle, worth)
+    said = wrong[:1]
+    if not said and best is not None:
+        said = _lost(study.odometry.name, study.sequences, rows, best, length)
+    if wrong or not said:
+        said += verdict(rows, length, obstacle, worth)
     details = [*wrong, *remarks(rows), *compared.words]
     folder = study.folder / "comparison"
     report.write_rows(folder, "comparison", [row.columns() for row in rows])
@@ -416,7 +417,11 @@ def compare(study: Study) -> ComparedReplays:
 
 
 def _lost(
-    odometry: str, sequences: StudySequences, rows: Sequence[ComparisonRow], best: ComparisonRow
+    odometry: str,
+    sequences: StudySequences,
+    rows: Sequence[ComparisonRow],
+    best: ComparisonRow,
+    length: float,
 ) -> list[str]:
     """Where what is advised has lost its way, the likeliest cause, and what errs least."""
     known = [row for row in rows if row.rte is not None]
@@ -427,11 +432,13 @@ def _lost(
         odometry,
         lambda worst: hard_to_track(sequences.open(worst)),
     )
-    last = [row for row in last_rows(known) if row.mode in CALLED]
-    least = min(last, key=lambda row: row.rte or 0.0)
-    if said and least.mode != best.mode:
-        what = f"{CALLED[least.mode]} errs least: {error_and_cost(least)}"
-        said.append(f"Over all test sequences, {what}.")
+    if said:
+        tried = [row for row in last_rows(known) if row.mode in CALLED]
+        each = [
+            f"{CALLED[row.mode]} {error_and_cost(row)}"
+            for row in sorted(tried, key=lambda row: row.rte or 0.0)
+        ]
+        said.append(f"Until then, rely on none: RTE over {length:g} m, {', '.join(each)}.")
     return said
 
 

@@ -55,7 +55,14 @@ def test_another_estimate_replays_nothing(load, monkeypatch):
     estimator.factor = 1.1
     monkeypatch.setattr("adaptune.reference.estimate.VERSION", 0)
     assert run_untrained(study) == 0
-    assert abs(compare(study).rows[0].rte - before) > 1.0
+    found = compare(study)
+    assert abs(found.rows[0].rte - before) > 1.0
+    # Both are far from this reference: nothing is advised.
+    lost, none = found.verdict
+    assert lost.startswith("Even with the odometry's own parameters track is lost on three: ")
+    assert none.startswith("Until then, rely on none: RTE over 3 m, ")
+    assert "the odometry's own parameters" in none
+    assert "the untrained bank" in none
 
 
 def test_where_none_can_be_estimated_it_is_replayed_all_the_same(load, monkeypatch, caplog):
