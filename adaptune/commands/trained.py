@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Any
 from adaptune.commands.terminal import say, show_table
 
 if TYPE_CHECKING:
+    from adaptune.tuning.tuned import Tuned
     from offline.config import OfflineStudy
     from offline.train import Training
-    from online.compare import ComparedReplays
 
 
 def show_front(rows: Sequence[Mapping[str, Any]], title: str, caption: str) -> None:
@@ -61,29 +61,20 @@ def say_grown(more: Sequence[str], before: Any, now: Any) -> None:
     say(f"New in training: {', '.join(more)}; {changed}.")
 
 
-def say_recordings(rows: Sequence[Mapping[str, Any]], found: "ComparedReplays") -> None:
+def say_recordings(tuned: "Tuned") -> None:
     """What the other recordings recommend for each, the worst first; or what a third would add."""
-    from online.modes import BASELINE, FIXED
-    from online.statistics import ALL
+    from adaptune.tuning.tuned import left_out_rows
 
-    rte = {(row.sequence, row.mode): row.rte for row in found.rows if row.sequence != ALL}
-    known = [(r["sequence"], r["baseline, whole"], r["_left out"], "training") for r in rows]
-    known += [(n, rte[n, BASELINE], rte.get((n, FIXED)), "test") for n, of in rte if of == BASELINE]
-    table = [
-        {"recording": name, "baseline [%]": own, "recommended [%]": rte, "ratio": rte / own, "": of}
-        for name, own, rte, of in known
-        if own and rte is not None
-    ]
-    if len(rows) < 2 or len(table) < 3:
+    rows = left_out_rows(tuned.training, tuned.comparison)
+    if len(tuned.training.rows) < 2 or len(rows) < 3:
         say(
             "With three recordings, each would also be left out in turn: the table would say "
             "where the recommended set does worst."
         )
         return
-    table.sort(key=lambda row: -row["ratio"])
     show_table(
         "Each recording left out, the worst first",
-        table,
+        rows,
         "Recommended is the finalist that the others choose; for the test, the fixed set.",
     )
 

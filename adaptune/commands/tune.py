@@ -256,6 +256,6 @@ def tune(
     show_front(tuned.training.front, *BUYS)
     if tuned.more:
         say_grown(tuned.more, tuned.before, tuned.fixed)
-    say_recordings(tuned.training.rows, tuned.comparison)
+    say_recordings(tuned)
     say_odometries(tuned.study, tuned.training)
     say_next("replays to look at in Foxglove", "record", tuned.study.folder)

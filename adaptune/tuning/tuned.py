@@ -71,6 +71,11 @@ class Tuned:
         return _table(scenario(self.study).columns())
 
     @property
+    def left_out(self) -> Any:
+        """A row for each recording: what the baseline has there, and what the others recommend."""
+        return _table(left_out_rows(self.training, self.comparison))
+
+    @property
     def files(self) -> dict[str, Path]:
         """The study, the fixed set (again as the odometry's own tool reads it), model, tables."""
         own = self.study.own_file(self.fixed)
@@ -96,6 +101,35 @@ class Tuned:
             shown = f'<img style="max-width: 100%" src="{source}">'
         table = getattr(self.front, "_repr_html_", str)()
         return f"<p>{escape(self.verdict)}</p>{shown}{table}"
+
+
+def left_out_rows(training: "Training", comparison: "ComparedReplays") -> list[dict[str, Any]]:
+    """Errors of the baseline and of what the other recordings recommend on each, the worst first.
+
+    For the test, that is the fixed set.
+    """
+    from online.modes import BASELINE, FIXED
+    from online.statistics import ALL
+
+    rows = comparison.rows
+    rte = {(row.sequence, row.mode): row.rte for row in rows if row.sequence != ALL}
+    known = [
+        (row["sequence"], row["baseline, whole"], row["_left out"], "training")
+        for row in training.rows
+    ]
+    known += [(n, rte[n, BASELINE], rte.get((n, FIXED)), "test") for n, m in rte if m == BASELINE]
+    found = [
+        {
+            "recording": name,
+            "baseline [%]": own,
+            "recommended [%]": rte,
+            "ratio": rte / own,
+            "role": role,
+        }
+        for name, own, rte, role in known
+        if own and rte is not None
+    ]
+    return sorted(found, key=lambda row: -row["ratio"])
 
 
 def _table(rows: Any) -> Any:

@@ -46,20 +46,24 @@ def scheduler(tmp_path_factory):
         time.sleep(0.05)
     address = file.read_text()
 
-    def worker(version=None):
+    def worker(version="", slow=0.0):
+        """Of another version; or one whose disk takes so many seconds to open a recording."""
         code = (
-            "import asyncio, sys; from distributed import Worker\n"
-            "if len(sys.argv) > 2:\n"
+            "import asyncio, io, sys, time; from distributed import Worker\n"
+            "if sys.argv[2]:\n"
             "    import importlib.metadata\n"
             "    importlib.metadata.version = lambda name: sys.argv[2]\n"
+            "fast, slow = io.open, float(sys.argv[3])\n"
+            "def opened(file, *args, **options):\n"
+            "    time.sleep(slow * str(file).endswith('.bag'))\n"
+            "    return fast(file, *args, **options)\n"
+            "io.open = opened if slow else fast\n"
             "async def main():\n"
             "    async with Worker(sys.argv[1], nthreads=1, dashboard=False) as w:\n"
             "        await w.finished()\n"
             "asyncio.run(main())"
         )
-        made = subprocess.Popen(
-            [sys.executable, "-c", code, address, *([version] if version else [])], **silent
-        )
+        made = subprocess.Popen([sys.executable, "-c", code, address, version, str(slow)], **silent)
         processes.append(made)
         return made
 
@@ -137,6 +141,20 @@ def test_a_class_of_the_user_that_hangs_is_ended(study_file, tmp_path, scheduler
     with Cluster(setup, ["one"], scheduler[0]) as pool:
         ((_, result),) = run(pool, tasks)
     assert "a scan took longer than" in result[0][0].faults[0]
+
+
+def test_a_worker_whose_disk_is_slow_takes_longer(
+    study_file, tmp_path, scheduler, workers, local, monkeypatch
+):
+    monkeypatch.setattr(cluster, "_TIMEOUT", 2.0)
+    address, worker = scheduler
+    slow = worker(slow=3.0)
+    with distributed.Client(address, set_as_default=False) as client:
+        client.wait_for_workers(len(workers) + 1)
+    study = load_study(study_file, [], tmp_path / "study")
+    train(study, cluster=address)
+    slow.kill()
+    assert kills.contents(study.folder) == local
 
 
 def test_a_killed_worker_s_trials_run_elsewhere(
