@@ -3,7 +3,7 @@ import sys
 import numpy as np
 import pytest
 
-from adaptune.archive import Archive
+from adaptune.archive import PREPARE_MS, REGISTER_MS, Archive
 from adaptune.errors import AdaptuneError
 from offline.config import load_study
 from offline.scenario import read_scenario, scenario, write_scenario
@@ -27,7 +27,14 @@ def test_it_holds_what_the_archive_does(study):
         here = found.sequence == name
         errors = archive.read_errors(name, found.trial.tolist())[found.frame[here]]
         np.testing.assert_array_equal(found.performances[here], errors)
-    costs = [np.mean([archive.finished(n)[t].cost for n in ("one", "two")]) for t in found.trial]
+    register, prepare = (
+        np.array(
+            [[archive.finished(n)[t].others[key] for n in ("one", "two")] for t in found.trial]
+        )
+        for key in (REGISTER_MS, PREPARE_MS)
+    )
+    # All are prepared alike, so that this costs the same.
+    costs = register.mean(axis=1) + np.median(prepare.mean(axis=1))
     np.testing.assert_allclose(found.cost, costs)
     # Two recordings are few: stretches are left out, and none is of both.
     folds = [set(found.fold[found.sequence == name]) for name in ("one", "two")]
