@@ -3,7 +3,8 @@
 import logging
 import math
 import os
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from contextlib import suppress
 from functools import partial
 from typing import Any
 
@@ -73,6 +74,9 @@ def ensure_references(
             if required:
                 raise
             refused[name] = str(error)
+    for name in _others_of_newest(sequences):
+        with suppress(EstimateError):
+            _ensure(sequences, name, length, lambda *_: None)
     return refused
 
 
@@ -116,13 +120,23 @@ def _estimate(
     config = sequences.unseen(name).model_copy(update=_AS_RECORDED)
     if _is_one_of_parts(sequences, config):
         whole = config.model_copy(update=_WHOLE)
-        known = _newest.get(_key(sequences, name, whole))
-        found = known or _estimated(sequences, name, whole, advance)
-        if isinstance(found, EstimatedReference):
-            found = found.part(RecordedSequence(config).holds(found.stamps))
-            if found.path() >= estimate.SHORTEST and found.unknown_share() < estimate.MOST_UNKNOWN:
-                return found
+        if _key(sequences, name, whole) not in _newest:
+            _estimated(sequences, name, whole, advance)
+        if (found := _part_of_newest(sequences, name, config)) is not None:
+            return found
     return _estimated(sequences, name, config, advance)
+
+
+def _part_of_newest(
+    sequences: StudySequences, name: str, config: SequenceConfig
+) -> EstimatedReference | None:
+    """The reference of a part, if that of the whole was the last to be estimated, and it serves."""
+    whole = _newest.get(_key(sequences, name, config.model_copy(update=_WHOLE)))
+    if whole is None or not (within := RecordedSequence(config).holds(whole.stamps)).any():
+        return None
+    found = whole.part(within)
+    enough = found.path() >= estimate.SHORTEST and found.unknown_share() < estimate.MOST_UNKNOWN
+    return found if enough else None
 
 
 def _estimated(
@@ -148,6 +162,14 @@ def _estimated(
 def _key(sequences: StudySequences, name: str, config: SequenceConfig) -> tuple[str, ...]:
     """All that the estimated reference of a recording depends on."""
     return config.model_dump_json(), *fingerprints(sequences.files(name).recording)
+
+
+def _others_of_newest(sequences: StudySequences) -> Iterator[str]:
+    """Sequences whose reference follows from the last estimate: another process lacks that."""
+    for name in to_estimate(sequences, sequences.recordings) if _newest else ():
+        config = sequences.unseen(name).model_copy(update=_AS_RECORDED)
+        if _is_one_of_parts(sequences, config) and _part_of_newest(sequences, name, config):
+            yield name
 
 
 def _is_one_of_parts(sequences: StudySequences, config: SequenceConfig) -> bool:
