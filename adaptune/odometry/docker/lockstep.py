@@ -45,6 +45,8 @@ _IMPATIENCE = 0.5
 """Seconds."""
 _BACKGROUND, _BUSY = 0.5, 0.2
 """Seconds after the last pose, and cores, at which a system works on."""
+OTHER_CLOCK = 2 * 10**9
+"""Nanoseconds between the stamps of a scan and of its pose that no system adds to a scan's."""
 _EARLY = 1_000_000
 """Nanoseconds by which a pose's stamp may be before the scan's."""
 
@@ -290,7 +292,8 @@ class Lockstep(Faulting):
             raise OdometryError(f"it gave a pose {wrong}")
         if self._late is None:
             self._late = stamp - self._stamp
-        if abs(stamp - self._stamp - self._late) >= MAX_SCATTER:
+        scatter = abs(stamp - self._stamp - self._late)
+        if scatter >= MAX_SCATTER or abs(self._late) >= OTHER_CLOCK:
             self._steady = False
             _warn_once(f"{self.name}: {OWN_CLOCK}; poses are matched to scans by their order")
             if silent := self._n_shown - self._n_answered:

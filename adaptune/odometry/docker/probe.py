@@ -9,7 +9,7 @@ import numpy as np
 
 from adaptune.errors import OdometryError
 from adaptune.geometry import Poses
-from adaptune.odometry.docker.lockstep import Lockstep
+from adaptune.odometry.docker.lockstep import OTHER_CLOCK, Lockstep
 from adaptune.odometry.docker.played_bag import MAX_SCATTER
 from adaptune.odometry.docker.ros_system import QUIET
 from adaptune.odometry.remote import Limits
@@ -179,7 +179,7 @@ def _poses(came: list[tuple[float, int]], shown: list[tuple[float, int]]) -> dic
     since = len(shown) - int(of_scan[0])
     share = answered / since
     stamped = "its own clock"
-    if steady:
+    if steady and abs(np.median(late)) < OTHER_CLOCK:
         stamped = f"the scans, {1e-6 * np.median(late):.0f} ms after their begin"
     fits = share >= 0.75
     return {

@@ -180,7 +180,8 @@ class Ros2System(RosSystem):
             raise ended
         topic = self._settings.odometry
         found: dict[str, Any] = self.link.ask("state", topics=self._topics[1:], own=[topic])
-        if (kinds := found["published"].get(topic)) and kinds[0] not in POSES:
+        kinds = found["published"].get(topic) or [TRANSFORMS[0]]
+        if kinds[0] not in POSES:
             raise OdometryError(
                 f"{topic} is {kinds[0]}; odometry.settings.odometry must name poses"
             )
@@ -226,6 +227,9 @@ class Ros2System(RosSystem):
                 f"no node declares the parameter {name}, so its value changes nothing; "
                 f"{nearest(name, declared)}"
             )
+        if lacking:
+            what = "%s: no node tells its parameters, so nobody knows whether %s has any effect"
+            _log.warning(what, self._settings.image or self._settings.command[0], min(lacking))
         for node, name, value in held:
             if not equal_values(wanted[name], value):
                 raise OdometryError(

@@ -3,9 +3,13 @@
 Its node is RustDDS, which shares no code with what carries adaptune's messages.
 """
 
+import json
 import re
 import socket
+from types import SimpleNamespace
 
+import commands
+import drives
 import numpy as np
 import pytest
 from contained import LIMITS, N_SCANS, containers, drive, recording, scans, truth
@@ -146,9 +150,7 @@ def test_one_that_works_on_or_stamps_by_a_clock_is_told(make, caplog):
     assert "it works on after its last pose" in caplog.text
     assert "by its own clock" not in caplog.text
     clocked = make(imitate={"own_clock": 0.0})
-    clocked.start(on[0], np.eye(4))
-    for scan in scans()[1:4]:
-        clocked.register(scan)
+    clocked.start(on[0], np.eye(4))  # a recording is of another time than this one
     assert "by its own clock, not by the scans; poses are matched to scans" in caplog.text
 
 
@@ -259,6 +261,49 @@ def test_what_a_node_does_that_no_odometry_may_is_told(make, imitate, words):
     with pytest.raises(OdometryError, match=re.escape(words)):
         fault()
     assert odometry.ended
+
+
+def test_nodes_that_do_not_tell_their_parameters_are_told(tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr(ros2_system, "_UNDECLARED", 0.0)
+    settings = ros2(tmp_path / "icp.yaml")
+    deaf = SimpleNamespace(ask=lambda _: {})
+    system = SimpleNamespace(link=deaf, _settings=settings, whole_name=lambda _, name: name)
+    Ros2System.check(system, None, {"voxel_size": 0.5})
+    assert "no node tells its parameters, so nobody knows whether voxel_size has" in caplog.text
+
+
+def test_a_study_looks_tunes_and_replays_one(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for seed, name in enumerate("ab"):
+        drives.write_bag(tmp_path / f"{name}.bag", drives.scans(seed, 60))
+    settings = ros2(tmp_path / "icp.yaml").model_dump(mode="json", exclude_defaults=True)
+    study = {
+        "sequences": {
+            name: {"bag": f"{name}.bag", "points": "/points", "reference": "/truth"}
+            for name in "ab"
+        },
+        "training": ["a"],
+        "test": ["b"],
+        "sub_trajectory": 3.0,
+        "odometry": {
+            "name": "ros2",
+            "settings": settings,
+            "parameters": {
+                "voxel_size": {"type": "float", "low": 0.2, "high": 1.5, "baseline": 0.9}
+            },
+        },
+        "offline": {"trials": 3, "workers": 1},
+        "online": {"modes": ["adaptive"]},
+    }
+    (tmp_path / "icp_study.yaml").write_text(json.dumps(study))
+    looked = commands.call("inspect", "icp_study.yaml")
+    assert looked.exit_code == 0, looked.output
+    assert "lockstep" in looked.stdout
+    for command in ("offline", "online", "compare"):
+        done = commands.call(command, "icp_study.yaml")
+        assert done.exit_code == 0, done.output
+    assert (tmp_path / "runs/icp_study/fixed_icp.yaml").exists()
+    assert not containers()
 
 
 def test_a_domain_that_others_use_is_left_to_them(monkeypatch):
