@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Iterable, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from adaptune.odometry.docker.lockstep import OTHER_CLOCK, Lockstep
 from adaptune.odometry.docker.played_bag import MAX_SCATTER
 from adaptune.odometry.docker.ros_system import QUIET
 from adaptune.odometry.remote import Limits
+from adaptune.odometry.template import Template
 from adaptune.recording.scan import Scan
 from adaptune.ros.link import LinkError
 from adaptune.space import ParameterSet, Selection
@@ -66,7 +67,7 @@ def look(
                 break
             shown.append((system._shown[1], scan.stamp))
         if (inside := system._system) is not None:
-            found |= _topics(inside)
+            found |= _topics(inside) | _declared(inside, system._template)
             if about := system._reader.about:
                 found["poses are of"] = about + _extrinsic(about.split()[0], settings)
             works_on = system._works_on(inside)
@@ -164,6 +165,18 @@ def _topics(system: Any) -> dict[str, str]:
         "subscribed topics": ", ".join(sorted(heard - QUIET)),
         "published topics": ", ".join(sorted(published - QUIET)),
     }
+
+
+def _declared(system: Any, template: Template) -> dict[str, str]:
+    """Parameters that nodes of ROS 2 declare, and that could be tuned if the template had them."""
+    nodes: dict[str, dict[str, Any]] = {}
+    with suppress(LinkError, OdometryError):
+        nodes = system.link.ask("parameters") if system.link.is2 else {}
+    known = {system.whole_name(template, name) for name in template.names} | {"use_sim_time"}
+    more = {k: v for of in nodes.values() for k, v in of.items() if k not in known}
+    # Those ROS declares by itself.
+    own = [f"{k} = {v}" for k, v in sorted(more.items()) if not k.startswith("qos_overrides.")]
+    return {"declared, not in the template": ", ".join(own)} if own else {}
 
 
 def _poses(came: list[tuple[float, int]], shown: list[tuple[float, int]]) -> dict[str, str]:

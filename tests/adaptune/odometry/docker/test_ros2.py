@@ -163,11 +163,15 @@ def test_what_it_does_is_told_before_it_is_tuned(tmp_path):
     assert found["stamps"] == "of the scans, 50 ms after their begin"
     assert found["poses are of"] == "lidar in odom"
     assert found["lockstep"] == "yes"
+    assert "declared, not in the template" not in found
     every_second = ros2(tmp_path / "icp.yaml", frame="os", imitate={"one_of": 2}, patience=0.2)
+    file = tmp_path / "icp.yaml"
+    file.write_text(re.sub("max_range: .*", "", file.read_text()))
     found = look(every_second, VALUES, LIMITS, scans()[:8])
     assert found["lockstep"] == "no: set odometry.settings.play: bag"
     words = "lidar in odom; scans are of os: set odometry.settings.extrinsic if it is not there"
     assert found["poses are of"] == words
+    assert found["declared, not in the template"].startswith("max_range = ")
     assert not containers()
 
 
