@@ -1,6 +1,9 @@
 """Two sides of the same recordings: is the new one worse?"""
 
 import json
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 from xml.etree import ElementTree as Xml
 
@@ -8,6 +11,7 @@ import commands
 import drives
 import pytest
 
+from adaptune import manifest
 from online.gate import judged
 
 FAKE = ("--odometry", "fake_odometry:Fake")
@@ -116,3 +120,46 @@ def test_the_interval_decides(ratio, ends, verdict):
 )
 def test_mistakes_are_told_in_a_sentence(arguments, words):
     assert words in commands.refused("compare", *arguments)
+
+
+def copied(folder, name, file="", **changed):
+    """A copy of a side as replays of a fixed set; one file of the first drive has a change."""
+    copy = shutil.copytree(folder, folder.with_name(name))
+    for path in (copy / "replays").iterdir():
+        (path / "baseline").rename(path / "fixed")
+    if file:
+        path = copy / "replays/drive_a" / file
+        manifest.record(path, manifest.recorded(path) | changed)
+    return copy
+
+
+def refused(new, old):
+    return commands.refused("compare", new, "--against", old)
+
+
+@pytest.mark.services
+@pytest.mark.usefixtures("bags")
+def test_what_does_not_compare_is_refused():
+    gate("bad", "good")
+    made = (next(Path("runs/compare").glob(f"{name}_*/")) for name in ("bad", "good"))
+    bad, good = (copied(folder, name) for folder, name in zip(made, "xy", strict=True))
+    before = next(Path("runs/compare").glob("good_*/"))
+    other = copied(before, "other", "fixed/inputs.json", reader=92)
+    assert "read it differently: reader changed from" in refused(bad, other)
+    judged_by = copied(before, "judge", "reference.inputs.json", reference={"drive_a": ["x"]})
+    assert "are judged by different references" in refused(bad, judged_by)
+    old = copied(before, "old")
+    (old / "replays/drive_a/fixed/inputs.json").unlink()
+    assert "an older adaptune did not record what this replay was made from" in refused(bad, old)
+    code = "import fcntl, sys, time; f = open(sys.argv[1], 'a'); fcntl.flock(f, fcntl.LOCK_EX)"
+    with subprocess.Popen(
+        [sys.executable, "-c", f"{code}; print(flush=True); time.sleep(600)", good / ".lock"],
+        stdout=subprocess.PIPE,
+    ) as holder:
+        holder.stdout.readline()
+        assert "another adaptune writes to it" in refused(bad, good)
+        holder.kill()
+    for name in ("drive_b", "drive_c"):
+        shutil.rmtree(bad / "replays" / name)
+    shutil.rmtree(good / "replays/drive_a")
+    assert "no recording is in both, by content and part: " in refused(bad, good)
