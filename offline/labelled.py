@@ -536,12 +536,18 @@ def measured_costs(
         number = numbers.setdefault(odometry(sets[trial]).preparation, len(numbers))
         prepare.setdefault(number, {})[trial] = prepared
     found = {
-        trial: SetCost(register[trial], float(np.median([*times.values()])), number)
+        trial: SetCost(register[trial], _usual(times, register, own), number)
         for number, times in prepare.items()
-        for trial in times
+        for trial, own in times.items()
     }
     every_second = float(np.mean([archive.read_frames(name).evidence_ms for name in names]))
     return Costs(found, USUAL_SHARE * every_second)
+
+
+def _usual(times: Mapping[int, float], register: Mapping[int, float], own: float) -> float:
+    """Median of what preparation took; sets that failed, or did not tell, do not count."""
+    known = [ms for trial, ms in times.items() if np.isfinite([ms, register[trial]]).all()]
+    return float(np.median(known)) if known else own
 
 
 def labelled_data(

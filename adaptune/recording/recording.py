@@ -294,7 +294,8 @@ class RecordedSequence:
 
     def holds(self, stamps: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Which scans of the recording are in the part that is used, by their stamps: (n,)."""
-        first = next(iter(self.source.frames())).stamp
+        # Stamps of scans may be those of their messages, or not.
+        first = next(in_order(self.source.frames(), Counter())).load().stamp
         seconds = self.source.skipped + (stamps - first) * 1e-9
         stop = math.inf if self.stop is None else self.stop
         return np.asarray((seconds >= self.start) & (seconds < stop))

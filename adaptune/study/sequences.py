@@ -26,7 +26,7 @@ from adaptune.reference.stored import StoredEstimate
 from adaptune.simulation.course import Course
 from adaptune.strict import ConfigurationError
 
-_READER = 2
+_READER = 3
 """Changes where the same files give other scans or poses than before."""
 _OF_POSES = ("reference", "child_frame", "extrinsic", "clock_offset", "max_gap")
 """Keys of a sequence that change its reference only."""
