@@ -99,6 +99,8 @@ class SharedScans:
 
         So stretches that are driven by turns, and do not fit together, do not drive each other out.
         """
+        if self.nbytes + size <= self._memory:
+            return True
         for kept in sorted(self._kept.values(), key=lambda kept: kept.used):
             if self.nbytes + size <= self._memory or kept.used >= since:
                 break

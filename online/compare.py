@@ -347,6 +347,10 @@ def _model_file(replays: Path, summaries: Collection[ReplaySummary], own: Path) 
     return own
 
 
+NONE = "none"
+"""Advised where track is lost."""
+
+
 class ComparedReplays(NamedTuple):
     """What `compare` has found."""
 
@@ -354,7 +358,7 @@ class ComparedReplays(NamedTuple):
     rows: list[ComparisonRow]
     verdict: list[str]  # sentences: what to do, and why
     details: list[str]  # sentences: what must be known to trust it
-    advised: str = ""  # the mode to drive; empty where nobody can say
+    advised: str = ""  # the mode to drive, or `NONE`; empty where nobody can say
     unfinished: Sequence[str] = ()  # sequences that are not compared, for want of replays
 
 
@@ -403,16 +407,16 @@ def compare(study: Study) -> ComparedReplays:
     obstacle = "" if ADAPTIVE in modes else ReplaySetup.of(study).obstacle(ADAPTIVE, model)
     length, worth = study.config.sub_trajectory, study.config.online.worth
     best = decided(rows, worth)
-    said = wrong[:1]
+    said, advised = wrong[:1], "" if best is None else best.mode
     if not said and best is not None:
         said = _lost(study.odometry.name, study.sequences, rows, best, length)
-    if wrong or not said:
+        advised = NONE if said else advised
+    if advised != NONE:
         said += verdict(rows, length, obstacle, worth)
     details = [*wrong, *remarks(rows), *compared.words]
     folder = study.folder / "comparison"
     report.write_rows(folder, "comparison", [row.columns() for row in rows])
     report.write_tables(folder, study.name, tables(rows, length), [*said, *details])
-    advised = "" if best is None else best.mode
     return ComparedReplays(rows, said, details, advised, compared.unfinished)
 
 

@@ -259,7 +259,8 @@ def _rows(quantity: str, pairs: Sequence[_Pair], bound: float) -> list[GateRow]:
             rows.append(GateRow(pair.name, quantity, why=why))
             continue
         new, old = _both(quantity, values).tolist()
-        few = "one figure a run" if values.shape[1] == 1 else "too short"
+        one = quantity == COST and values.shape[1] == 1
+        few = "one figure a run" if one else "too short"
         row = GateRow(pair.name, quantity, new, old, ratio=new / max(old, 1e-12), why=few)
         same = bool((values[0] == values[1]).all())
         logs = _resampled(quantity, values, block, rng)

@@ -137,8 +137,9 @@ def _other_set(best: ComparisonRow, last: Mapping[str, ComparisonRow]) -> list[s
     if costs > best.cpu_ms and ratio.interval and _surely_better(row, best):
         return [f"A single set that costs more has {has}: `--budget {costs:.0f}` allows it."]
     if costs <= best.cpu_ms and ratio.value <= 1.0 - WORTH:
+        sure = "that was not surely better in training " * (best.mode == "baseline")
         more = "drive both on another recording, to know"
-        return [f"A set that was not surely better in training has {has}: {more}."]
+        return [f"A set {sure}(`{EQUAL_COST}`) has {has}: {more}."]
     return []
 
 

@@ -30,8 +30,8 @@ _AS_RECORDED = {"compensate": None}
 _WHOLE = {"part": None}
 _MOST = 0.5
 """Parts that are a larger share of a recording take theirs from that of the whole."""
-_newest: dict[tuple[str, ...], EstimatedReference] = {}
-"""The last estimate of a whole recording."""
+_newest: dict[tuple[str, ...], EstimatedReference | str] = {}
+"""The last estimate of a whole recording, or why there is none."""
 
 _log = logging.getLogger(__name__)
 
@@ -74,9 +74,9 @@ def ensure_references(
             if required:
                 raise
             refused[name] = str(error)
-    for name in _others_of_newest(sequences):
-        with suppress(EstimateError):
-            _ensure(sequences, name, length, lambda *_: None)
+        for other in _others_of_newest(sequences):
+            with suppress(EstimateError):
+                _ensure(sequences, other, length, lambda *_: None)
     return refused
 
 
@@ -110,7 +110,9 @@ def _about(sequences: StudySequences, name: str) -> dict[str, Any]:
     """Everything that an estimated reference depends on, as plain data."""
     scans = sequences.identity(name)
     scans["sequences"][name] |= dict.fromkeys(_OF_CHANGES)
-    return dict(manifest.plain({"estimator": estimate.VERSION} | scans))
+    config = sequences.unseen(name).model_copy(update=_AS_RECORDED)
+    whole = {"from": "the whole"} if _is_one_of_parts(sequences, config) else {}
+    return dict(manifest.plain({"estimator": estimate.VERSION} | whole | scans))
 
 
 def _estimate(
@@ -132,7 +134,9 @@ def _part_of_newest(
 ) -> EstimatedReference | None:
     """The reference of a part, if that of the whole was the last to be estimated, and it serves."""
     whole = _newest.get(_key(sequences, name, config.model_copy(update=_WHOLE)))
-    if whole is None or not (within := RecordedSequence(config).holds(whole.stamps)).any():
+    if not isinstance(whole, EstimatedReference):
+        return None
+    if not (within := RecordedSequence(config).holds(whole.stamps)).any():
         return None
     found = whole.part(within)
     enough = found.path() >= estimate.SHORTEST and found.unknown_share() < estimate.MOST_UNKNOWN
@@ -148,11 +152,12 @@ def _estimated(
     """The same of scans that are read in some way; that of the last whole recording is kept."""
     scans = RecordedSequence(config)
     # GTSAM's sums may depend on its threads: only on one core do results repeat bit by bit.
+    found: EstimatedReference | str
     try:
         with pin(os.getpid()):
             found = estimate.estimate_reference(scans, advance)
     except EstimateError as error:
-        return str(error) if scans.name in str(error) else f"{scans.name}: {error}"
+        found = str(error) if scans.name in str(error) else f"{scans.name}: {error}"
     if config.part is None:
         _newest.clear()
         _newest[_key(sequences, name, config)] = found

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from adaptune.recording.config import SequenceConfig
-from adaptune.recording.recording import open_sequence, wants_estimate
+from adaptune.recording.recording import RecordedSequence, open_sequence, wants_estimate
 from adaptune.reference.estimated import EstimateError
 from adaptune.study.references import ensure_references, estimates_as_data, estimates_of
 from adaptune.trajectory import read_trajectory
@@ -183,6 +183,30 @@ def test_parts_of_a_recording_take_theirs_from_the_whole(estimator, load, monkey
         assert halves.sequences.estimate(name).error(3.0) == pytest.approx(0.31, abs=0.01)
     ensure(halves, ["one_50-100"])
     assert len(estimator.asked) == 1
+    # Each by itself before, it is estimated anew.
+    alone = load(LEFT_OUT, "training=[one: 0-50%]", "test=[three]", *other_than_before(1))
+    ensure(alone, ["one_0-50"])
+    assert len(estimator.asked) == 2
+
+
+def test_parts_of_two_recordings_take_one_pass_of_each(estimator, load, monkeypatch):
+    monkeypatch.setattr("adaptune.reference.estimate.SHORTEST", 3.0)
+    roles = ("training=[one: 0-50%, two: 0-50%]", "test=[one: 50-100%, two: 50-100%]")
+    study = load(LEFT_OUT, "sequences.two.reference=", *roles, *other_than_before(3))
+    ensure(study, study.training)
+    ensure(study, study.config.test)
+    assert estimator.names == ["one.bag", "two.bag"]
+
+
+@pytest.mark.parametrize("stamp", ["start", "end"])
+def test_parts_are_cut_by_the_stamps_of_their_scans(load, stamp):
+    study = load("training=[one: 0-50%]", "test=[one: 50-100%]", f"sequences.one.stamp={stamp}")
+    config = study.sequences.unseen("one_50-100")
+    whole = np.array(
+        [scan.stamp for scan in open_sequence(config.model_copy(update={"part": None}))]
+    )
+    part = RecordedSequence(config)
+    assert whole[part.holds(whole)].tolist() == [scan.stamp for scan in part]
 
 
 def test_a_part_that_is_little_or_does_not_serve_is_estimated_by_itself(estimator, load):

@@ -1,12 +1,14 @@
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from labelled_places import of_errors
 from tables import table
 
+from adaptune.archive import Summary
 from adaptune.model.rules import ERROR_FLOOR
-from offline.labelled import LabelledData
+from offline.labelled import LabelledData, measured_costs
 from offline.tuning import expected_loss, interval_of, log_ratios, standard_error, worst_tenth
 
 
@@ -48,6 +50,22 @@ def test_drives_of_whole_recordings_decide_where_there_are_some():
     both = in_whole(data, {0: 3.0, 2: 1.0, 5: 3.0}, {0: 3.0, 2: 2.0, 5: 1.0})
     (_, without_first), (_, without_second) = both.folds(by_recording=True)
     assert (without_first.fixed(), without_second.fixed()) == (5, 2)
+
+
+def test_what_failed_tells_nothing_of_preparing():
+    def run(register, prepare, failure=""):
+        others = {"register_ms": register, "prepare_ms": prepare}
+        return Summary({}, 1.0, 0, 0, 1.0, others, failure=failure)
+
+    runs = {0: run(4.0, 5.0), 2: run(3.0, 0.0, "no pose"), 5: run(2.0, np.nan), 7: run(3.0, 6.0)}
+    archive = SimpleNamespace(
+        finished=lambda _: runs, read_frames=lambda _: SimpleNamespace(evidence_ms=0.0)
+    )
+    sets = dict.fromkeys(runs)
+    alike = SimpleNamespace(preparation="alike")
+    costs = measured_costs(archive, ["s"], sets, lambda _: alike)
+    assert [costs.alone(trial) for trial in (0, 5, 7)] == [9.5, 7.5, 8.5]
+    assert not costs.usable(2)
 
 
 def test_restarts_of_all_sequences_count():

@@ -7,7 +7,7 @@ import pytest
 
 from adaptune.reference.estimated import EstimateError
 from offline.config import load_study
-from online.compare import compare
+from online.compare import NONE, compare
 from online.modes import run_untrained
 from online.statistics import allowing_for
 from online.tables import tables
@@ -63,6 +63,7 @@ def test_another_estimate_replays_nothing(load, monkeypatch):
     assert none.startswith("Until then, rely on none: RTE over 3 m, ")
     assert "the odometry's own parameters" in none
     assert "the untrained bank" in none
+    assert found.advised == NONE
 
 
 def test_where_none_can_be_estimated_it_is_replayed_all_the_same(load, monkeypatch, caplog):

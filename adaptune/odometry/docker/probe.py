@@ -167,15 +167,25 @@ def _topics(system: Any) -> dict[str, str]:
     }
 
 
+_OF_ROS = {"use_sim_time", "start_type_description_service"}
+"""Parameters that every node has."""
+_SHOWN = 40
+"""Characters of a value."""
+
+
 def _declared(system: Any, template: Template) -> dict[str, str]:
     """Parameters that nodes of ROS 2 declare, and that could be tuned if the template had them."""
     nodes: dict[str, dict[str, Any]] = {}
     with suppress(LinkError, OdometryError):
         nodes = system.link.ask("parameters") if system.link.is2 else {}
-    known = {system.whole_name(template, name) for name in template.names} | {"use_sim_time"}
+    known = {system.whole_name(template, name) for name in template.names} | _OF_ROS
     more = {k: v for of in nodes.values() for k, v in of.items() if k not in known}
     # Those ROS declares by itself.
-    own = [f"{k} = {v}" for k, v in sorted(more.items()) if not k.startswith("qos_overrides.")]
+    own = [
+        f"{k} = {str(v)[:_SHOWN]}"
+        for k, v in sorted(more.items())
+        if not k.startswith("qos_overrides.")
+    ]
     return {"declared, not in the template": ", ".join(own)} if own else {}
 
 
