@@ -437,12 +437,13 @@ def _lost(
         lambda worst: hard_to_track(sequences.open(worst)),
     )
     if said:
+        judge = " by an estimated reference" * any(row.reference == "estimated" for row in known)
         tried = [row for row in last_rows(known) if row.mode in CALLED]
         each = [
             f"{CALLED[row.mode]} {error_and_cost(row)}"
             for row in sorted(tried, key=lambda row: row.rte or 0.0)
         ]
-        said.append(f"Until then, rely on none: RTE over {length:g} m, {', '.join(each)}.")
+        said.append(f"Until then, rely on none: RTE over {length:g} m{judge}, {', '.join(each)}.")
     return said
 
 

@@ -55,7 +55,9 @@ def scheduler(tmp_path_factory):
             "    importlib.metadata.version = lambda name: sys.argv[2]\n"
             "fast, slow = io.open, float(sys.argv[3])\n"
             "def opened(file, *args, **options):\n"
-            "    time.sleep(slow * str(file).endswith('.bag'))\n"
+            "    if slow and str(file).endswith('.bag'):\n"
+            "        fast('slept', 'a').write('once\\n')\n"
+            "        time.sleep(slow)\n"
             "    return fast(file, *args, **options)\n"
             "io.open = opened if slow else fast\n"
             "async def main():\n"
@@ -67,6 +69,7 @@ def scheduler(tmp_path_factory):
         processes.append(made)
         return made
 
+    worker.folder = cwd
     yield address, worker
     for process in processes:
         process.kill()
@@ -152,9 +155,12 @@ def test_a_worker_whose_disk_is_slow_takes_longer(
     with distributed.Client(address, set_as_default=False) as client:
         client.wait_for_workers(len(workers) + 1)
     study = load_study(study_file, [], tmp_path / "study")
-    train(study, cluster=address)
-    slow.kill()
+    try:
+        train(study, cluster=address)
+    finally:
+        slow.kill()
     assert kills.contents(study.folder) == local
+    assert (worker.folder / "slept").exists()
 
 
 def test_a_killed_worker_s_trials_run_elsewhere(

@@ -157,8 +157,10 @@ def test_what_does_not_compare_is_refused():
         stdout=subprocess.PIPE,
     ) as holder:
         holder.stdout.readline()
-        assert "another adaptune writes to it" in refused(bad, good)
-        holder.kill()
+        try:
+            assert "another adaptune writes to it" in refused(bad, good)
+        finally:
+            holder.kill()
     for name in ("drive_b", "drive_c"):
         shutil.rmtree(bad / "replays" / name)
     shutil.rmtree(good / "replays/drive_a")
