@@ -4,6 +4,7 @@ Instances are frames, algorithms are parameter sets. So selection rules compare 
 """
 
 import csv
+import json
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,8 +14,11 @@ from numpy.typing import NDArray
 from adaptune.archive import Archive
 from adaptune.errors import AdaptuneError
 from adaptune.files import replacing, write_text
+from adaptune.metrics import cap
+from adaptune.model import Rule, TrainingData
+from adaptune.model.rules import BASELINE, mean_errors
 from adaptune.report.tables import csv_text
-from adaptune.space import ParameterSets
+from adaptune.space import ParameterSets, load_space
 from adaptune.study.driven import MIN_RECORDINGS
 from offline.config import OfflineStudy
 from offline.labelled import labelled_data
@@ -25,18 +29,72 @@ class Scenario(NamedTuple):
 
     sequence: NDArray[np.str_]  # (n,)
     frame: NDArray[np.intp]  # (n,): number in the sequence
+    end: NDArray[np.intp]  # (n,): last frame of its sub-trajectory
+    stretch: NDArray[np.intp]  # (n,): number of its stretch
     fold: NDArray[np.intp]  # (n,): of a recording or, with few of them, of a stretch
     features: NDArray[np.float32]  # (n, n_features): averaged descriptors
     # (n, n_sets): RTE in percent, infinite where the track was lost
     performances: NDArray[np.float32]
-    trial: NDArray[np.intp]  # (n_sets,): number of each set
-    cost: NDArray[np.float64]  # (n_sets,): milliseconds of CPU time a scan
+    blocks: dict[str, int]  # by name, in order, the number of features of each descriptor
+    sets: ParameterSets
+    cost: NDArray[np.float64]  # (n_sets,): milliseconds of CPU time a scan; NaN if unknown
 
     def columns(self) -> dict[str, NDArray[Any]]:
-        """All but the costs, as columns of equal length."""
-        features = {f"feature_{i}": of for i, of in enumerate(self.features.T)}
-        errors = {f"rte_{n}": of for n, of in zip(self.trial, self.performances.T, strict=True)}
-        return {name: getattr(self, name) for name in self._fields[:3]} | features | errors
+        """What is known of frames, as columns of equal length."""
+        features = {f"feature_{i}": values for i, values in enumerate(self.features.T)}
+        errors = {
+            f"rte_{n}": values for n, values in zip(self.sets, self.performances.T, strict=True)
+        }
+        return {name: getattr(self, name) for name in _OF_FRAMES} | features | errors
+
+    def fixed(self, frames: NDArray[np.bool_]) -> int:
+        """Trial of the least mean error on some frames that costs no more than the baseline."""
+        means = mean_errors(self.performances[frames], self.stretch[frames])
+        allowed = ~(self.cost > self.cost[self.sets.column(BASELINE)])
+        return self.sets.trials[int(np.argmin(np.where(allowed, means, np.inf)))]
+
+    def score(self, rule: Rule) -> NDArray[np.float64]:
+        """Capped errors in percent of the sets that a rule selects, of shape (n,).
+
+        Each fold is left out in turn, and with it the frames whose sub-trajectories overlap it. The
+        rule is fitted to the rest, with the fixed set that is best there.
+
+        Raises
+        ------
+        AdaptuneError
+            If there is only one fold, or if the rule weighs the members of a bank.
+        """
+        from adaptune.model.knn import ScaledPCA  # takes long to import
+
+        if len(folds := np.unique(self.fold)) < 2:
+            raise AdaptuneError("there is one fold: nothing is left to learn from without it")
+        errors = np.empty(len(self.frame))
+        for fold in folds:
+            left_out = self.fold == fold
+            rest = ~(left_out | self._overlapping(left_out))
+            pca = ScaledPCA(self.blocks.values())
+            features = pca.fit(self.features[rest]).transform(self.features)
+            of_rest = features[rest], self.stretch[rest], self.performances[rest]
+            rule.fit(TrainingData(*of_rest, self.sets, self.fixed(rest)))
+            for i in np.flatnonzero(left_out):
+                selection = rule.select(features[i])
+                if selection.weights is not None:
+                    why = "its error is not one of the table's; take `adaptune validate`"
+                    raise AdaptuneError(f"{type(rule).__name__}: weighs a bank: {why}")
+                errors[i] = self.performances[i, self.sets.column(selection.trial)]
+        return cap(errors)
+
+    def _overlapping(self, left_out: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Frames of the same sequences whose sub-trajectories overlap those of some frames."""
+        found = np.zeros(len(left_out), np.bool_)
+        for name in np.unique(self.sequence[left_out]):
+            these = left_out & (self.sequence == name)
+            first, last = self.frame[these].min(), self.end[these].max()
+            found |= (self.sequence == name) & (self.end >= first) & (self.frame <= last)
+        return found
+
+
+_OF_FRAMES = ("sequence", "frame", "end", "stretch", "fold")
 
 
 def scenario(study: OfflineStudy) -> Scenario:
@@ -61,53 +119,67 @@ def scenario(study: OfflineStudy) -> Scenario:
     return Scenario(
         np.concatenate([np.full(len(s.known), s.name) for s in data.sequences]),
         np.concatenate([s.known for s in data.sequences]),
+        np.concatenate([s.ends for s in data.sequences]),
+        data.stretches(),
         fold,
         np.concatenate([s.descriptors for s in data.sequences]),
         np.concatenate([s.errors for s in data.sequences]),
-        np.array(numbers),
+        dict(data.sequences[0].blocks),
+        sets,
         np.array([data.costs.alone(n) for n in numbers]),
     )
 
 
 def write_scenario(path: Path | str, found: Scenario) -> Path:
-    """Write the table as CSV or Parquet, and beside it the costs, to the file that is returned."""
+    """Write the table as CSV or Parquet, and beside it the sets, to the file that is returned."""
     path = Path(path)
-    columns, costs = found.columns(), path.with_name(f"{path.stem}_costs.csv")
+    columns = found.columns()
     if path.suffix == ".parquet":
         with replacing(path) as temporary:
             _pandas(path).DataFrame(columns).to_parquet(temporary)
     else:
-        write_text(path, _csv(columns))
-    write_text(costs, _csv({"trial": found.trial, "cost": found.cost}))
-    return costs
+        rows = zip(*columns.values(), strict=True)
+        write_text(path, csv_text([dict(zip(columns, row, strict=True)) for row in rows]))
+    known = [
+        {"trial": trial, "cost": cost if np.isfinite(cost) else None, "parameters": parameters}
+        for trial, cost, parameters in zip(
+            found.sets, found.cost, found.sets.parameters, strict=True
+        )
+    ]
+    about = {"blocks": found.blocks, "space": found.sets.space.dump(), "sets": known}
+    write_text(_beside(path), json.dumps(about, indent=1))
+    return _beside(path)
 
 
 def read_scenario(path: Path | str) -> Scenario:
     """Read what `write_scenario` wrote; an AdaptuneError says that it is no such table."""
     path = Path(path)
     try:
-        columns = _columns(path)
-        costs = _columns(path.with_name(f"{path.stem}_costs.csv"))
+        columns, about = _columns(path), json.loads(_beside(path).read_text("utf-8"))
         features, errors = (
             np.stack([of for name, of in columns.items() if name.startswith(kind)], axis=1)
             for kind in ("feature_", "rte_")
         )
+        trials, costs, parameters = zip(*(one.values() for one in about["sets"]), strict=True)
+        frame, end, stretch, fold = (columns[name].astype(np.intp) for name in _OF_FRAMES[1:])
         return Scenario(
             columns["sequence"].astype(str),
-            columns["frame"].astype(np.intp),
-            columns["fold"].astype(np.intp),
+            frame,
+            end,
+            stretch,
+            fold,
             features.astype(np.float32),
             errors.astype(np.float32),
-            costs["trial"].astype(np.intp),
-            costs["cost"].astype(float),
+            about["blocks"],
+            ParameterSets(load_space(about["space"]), trials, parameters),
+            np.array(costs, float),
         )
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise AdaptuneError(f"{path}: is no table of errors: {error}") from error
 
 
-def _csv(columns: dict[str, NDArray[Any]]) -> str:
-    rows = zip(*columns.values(), strict=True)
-    return csv_text([dict(zip(columns, row, strict=True)) for row in rows])
+def _beside(path: Path) -> Path:
+    return path.with_name(f"{path.stem}_sets.json")
 
 
 def _columns(path: Path) -> dict[str, NDArray[Any]]:

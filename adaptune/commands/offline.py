@@ -122,13 +122,13 @@ def trials(
     processes, and the other metrics.
 
     With `--errors`, it writes a table to compare selection rules on: for every frame its sequence,
-    fold and descriptor, and the error of every set; costs go to a table beside it.
+    fold and descriptor, and the error of every set; sets and costs go to a file beside it.
     """
     loaded = load(study, override, folder)
     if errors is not None:
         from offline.scenario import scenario, write_scenario
 
-        say(f"{errors}: errors by frame and set; costs: {write_scenario(errors, scenario(loaded))}")
+        say(f"{errors}: errors by frame and set; sets: {write_scenario(errors, scenario(loaded))}")
         return
     from adaptune import trial_rows
     from adaptune.archive import Archive

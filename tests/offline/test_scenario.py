@@ -5,6 +5,11 @@ import pytest
 
 from adaptune.archive import PREPARE_MS, REGISTER_MS, Archive
 from adaptune.errors import AdaptuneError
+from adaptune.metrics import cap
+from adaptune.model import Rule
+from adaptune.model.knn import NearestNeighbours
+from adaptune.model.rules import BASELINE
+from adaptune.space import Selection
 from offline.config import load_study
 from offline.scenario import read_scenario, scenario, write_scenario
 
@@ -15,22 +20,23 @@ def study(study_file, trained_folder):
 
 
 def same(one, other):
-    for a, b in zip(one, other, strict=True):
-        np.testing.assert_array_equal(a, b)
+    for name, a, b in zip(one._fields, one, other, strict=True):
+        if name == "sets":
+            assert (a.space, a.trials, a.parameters) == (b.space, b.trials, b.parameters)
+        else:
+            np.testing.assert_array_equal(a, b)
 
 
 def test_it_holds_what_the_archive_does(study):
     found = scenario(study)
     archive = Archive(study.folder / "trials")
-    assert found.performances.shape == (len(found.frame), len(found.trial)) == (42, 10)
+    assert found.performances.shape == (len(found.frame), len(found.sets)) == (42, 10)
     for name in ("one", "two"):
         here = found.sequence == name
-        errors = archive.read_errors(name, found.trial.tolist())[found.frame[here]]
+        errors = archive.read_errors(name, list(found.sets))[found.frame[here]]
         np.testing.assert_array_equal(found.performances[here], errors)
     register, prepare = (
-        np.array(
-            [[archive.finished(n)[t].others[key] for n in ("one", "two")] for t in found.trial]
-        )
+        np.array([[archive.finished(n)[t].others[key] for n in ("one", "two")] for t in found.sets])
         for key in (REGISTER_MS, PREPARE_MS)
     )
     # All are prepared alike, so that this costs the same.
@@ -40,6 +46,70 @@ def test_it_holds_what_the_archive_does(study):
     folds = [set(found.fold[found.sequence == name]) for name in ("one", "two")]
     assert folds[0].isdisjoint(folds[1])
     assert found.features.shape == (42, 90)
+
+
+class Baseline(Rule):
+    def fit(self, data):
+        self.data = data
+        return self
+
+    def select(self, feature, live=None):  # noqa: ARG002
+        return Selection(BASELINE, self.data.sets[BASELINE])
+
+
+class Fixed(Baseline):
+    def select(self, feature, live=None):  # noqa: ARG002
+        return Selection(self.data.fixed, self.data.sets[self.data.fixed])
+
+
+class Best(Baseline):
+    """Sees the error of the very frame, which no fold that is left out may show."""
+
+    def select(self, feature, live=None):  # noqa: ARG002
+        (frame,) = np.flatnonzero((self.data.features == feature).all(axis=1))
+        return Selection(self.data.sets.trials[frame], self.data.sets[0])
+
+
+def test_rules_are_scored_without_an_odometry(study):
+    found = scenario(study)
+    baseline, fixed = found.score(Baseline()), found.score(Fixed())
+    np.testing.assert_array_equal(baseline, found.performances[:, 0])
+    assert not np.array_equal(fixed, baseline)
+    near = found.score(NearestNeighbours(k=3))
+    assert near.shape == (42,)
+    assert np.isin(near, cap(found.performances)).all()
+    with pytest.raises(ValueError, match="not enough values"):
+        found.score(Best())
+    with pytest.raises(AdaptuneError, match="there is one fold"):
+        found._replace(fold=np.zeros(42, np.intp)).score(Baseline())
+
+
+def test_a_bank_is_not_scored(study):
+    class Bank(Baseline):
+        def select(self, feature, live=None):  # noqa: ARG002
+            return super().select(feature)._replace(weights={0: 1.0})
+
+    with pytest.raises(AdaptuneError, match=r"Bank: weighs a bank: .* `adaptune validate`"):
+        scenario(study).score(Bank())
+
+
+def test_frames_that_overlap_a_fold_are_left_out_with_it(study):
+    found, seen = scenario(study), []
+    found = found._replace(fold=(found.frame > np.median(found.frame)).astype(int))
+
+    class Seen(Baseline):
+        def fit(self, data):
+            seen.append(len(data.features))
+            return super().fit(data)
+
+    found.score(Seen())
+    for fold, n in zip(np.unique(found.fold), seen, strict=True):
+        left_out, apart = found.fold == fold, np.zeros(42, bool)
+        for name in ("one", "two"):
+            here = found.sequence == name
+            first, last = found.frame[here & left_out].min(), found.end[here & left_out].max()
+            apart |= here & ((found.frame > last) | (found.end < first))
+        assert n == apart.sum() < (~left_out).sum()
 
 
 @pytest.mark.parametrize("name", ["errors.csv", "errors.parquet"])
