@@ -62,16 +62,16 @@ class Scenario(NamedTuple):
         Raises
         ------
         AdaptuneError
-            If there is only one fold, or if the rule weighs the members of a bank.
+            If nothing is left without a fold, or if the rule weighs the members of a bank.
         """
         from adaptune.model.knn import ScaledPCA  # takes long to import
 
-        if len(folds := np.unique(self.fold)) < 2:
-            raise AdaptuneError("there is one fold: nothing is left to learn from without it")
         errors = np.empty(len(self.frame))
-        for fold in folds:
+        for fold in np.unique(self.fold):
             left_out = self.fold == fold
             rest = ~(left_out | self._overlapping(left_out))
+            if not rest.any():
+                raise AdaptuneError(f"nothing is left to learn from without fold {fold}")
             pca = ScaledPCA(self.blocks.values())
             features = pca.fit(self.features[rest]).transform(self.features)
             of_rest = features[rest], self.stretch[rest], self.performances[rest]
