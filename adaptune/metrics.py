@@ -267,8 +267,7 @@ def lost_in_words(
     if not (mean := sum(errors.values()) / len(errors)) > LOST_ABOVE:
         return []
     where = ", ".join(name for name, error in errors.items() if error > LOST_ABOVE)
-    over = f"{mean:.1f} % is more than {LOST_ABOVE:g} %"
-    lost = f"Even with {best} track is lost on {where}: {over}. "
+    lost = f"Even with {best} track is lost on {where}: RTE {mean:.1f} %. "
     if cause := find_cause(max(errors, key=lambda name: errors[name])):
         help_ = "Drive slower, record more scans a second, or, where there is an IMU, try `rko_lio`"
         return [f"{lost}The likeliest cause: {cause}. {help_}."]

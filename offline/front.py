@@ -66,8 +66,8 @@ def _front_row(
     value, low, high = ratio
     return {
         "what": what,
-        COST: cost,
         "error [%]": base * value,
+        COST: cost,
         "vs baseline": value,
         "low": low,
         "high": high,
@@ -80,7 +80,7 @@ def left_out_in_words(data: LabelledData) -> str:
     found = left_out_ratio(data.blocks(), lambda blocks: choose(blocks, data.budget))
     if found is None:
         return (
-            "Too little was recorded to tell how sets that are chosen so do elsewhere: record more."
+            "There is too little data to tell how a chosen set does on other drives: record more."
         )
     ratio, low, high = found
     return (

@@ -4,6 +4,7 @@ import contextlib
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,6 +24,7 @@ from adaptune.reference.check import hard_to_track
 from adaptune.report import tables
 from adaptune.space import ParameterSet, ParameterSets, ParameterSpace, in_words
 from adaptune.study.config import StudyConfig, SwitchingConfig
+from adaptune.study.driven import RIVALS
 from adaptune.study.oracle import OracleErrors, oracle_errors
 from adaptune.study.references import (
     ensure_references,
@@ -69,7 +71,7 @@ class Training(NamedTuple):
     # For every training sequence what the baseline, the fixed set and its own best set do there.
     rows: list[dict[str, Any]]
     said: Sequence[str] = ()  # further sentences
-
+    failed: Sequence[str] = ()  # a sentence if some sets failed
     # What error costs, a row for each choice, that which is recommended first.
     front: Sequence[dict[str, Any]] = ()
     elsewhere: str = ""  # what to expect of such a choice elsewhere
@@ -78,6 +80,7 @@ class Training(NamedTuple):
     def words(self) -> list[str]:
         """What the fixed set is, and what it gains in training."""
         sets, fixed, n = self.model.sets, self.model.fixed, len(self.rows)
+        said = [*self.said, *self.failed]
         own, of_fixed = (
             sum(row[f"{mode}, whole"] for row in self.rows) / n for mode in ("baseline", "fixed")
         )
@@ -86,9 +89,9 @@ class Training(NamedTuple):
         baseline = f"Parameters of the baseline: {in_words(sets.space.baseline)}"
         if fixed == 0:
             least = f"No set that costs no more surely beat the baseline's {own:.3f} % {where}"
-            return [*self.said, f"{least}; the fixed set is the baseline.", baseline]
+            return [*said, f"{least}; the fixed set is the baseline.", baseline]
         return [
-            *self.said,
+            *said,
             f"Fixed: {of_fixed:.3f} % against the baseline's {own:.3f} % {where}, at {ms:.1f} "
             f"instead of {own_ms:.1f} ms of CPU time a scan.",
             self.elsewhere,
@@ -105,7 +108,7 @@ def train(
 ) -> Training:
     """Estimate the references that are lacking, run the trials that are, and fit the model.
 
-    The study's folder receives the archive, the error model, the fixed set (see `write_fixed`),
+    The study's folder receives the archive, the error model, the fixed set (see `write_sets`),
     and tables of the trials (``trials``) and of the training sequences (``training``). `cluster`
     is the address of a Dask scheduler whose workers run the trials. Trials of other inputs than
     now are run again. `offline.hours` are those of the `clock`, by default those of this call.
@@ -137,7 +140,7 @@ def train(
     dropped = sorted({*data.usable().sets} - {*usable.sets})
     data = data._replace(costs=data.costs.without(dropped))
     model = _fitted(study, data, with_vectors(usable, archive), finished, fixed)
-    write_fixed(study, verdicts[fixed].parameters)
+    write_sets(study, every_set[fixed], {n: every_set[t] for n, t in model.rivals.items()})
     trials = _trial_rows(config, trial_rows.rows(archive, names), verdicts)
     tables.write_rows(study.folder, "trials", trials)
     estimates = estimates_of(study.sequences, names)
@@ -151,12 +154,13 @@ def train(
         study.odometry.name,
         lambda worst: hard_to_track(study.sequences.open(worst)),
     )
-    said += estimates_in_words(estimates, model.length) + failed_in_words(verdicts)
+    said += estimates_in_words(estimates, model.length)
     said += baseline_words(config, [runs[0] for runs in finished.values()])
     said += bare_in_words(archive, whole, fixed, dropped)
     rows_of_front = front_rows(usable, model)
     tables.write_rows(study.folder, "front", rows_of_front)
-    return Training(model, trials, rows, said, rows_of_front, left_out_in_words(usable))
+    failed, elsewhere = failed_in_words(verdicts), left_out_in_words(usable)
+    return Training(model, trials, rows, said, failed, rows_of_front, elsewhere)
 
 
 def _note_left_out(
@@ -215,10 +219,15 @@ def _ready_archive(study: OfflineStudy, progress: Progress) -> Archive:
     return archive
 
 
-def write_fixed(study: OfflineStudy, fixed: ParameterSet) -> None:
+def write_sets(
+    study: OfflineStudy,
+    fixed: ParameterSet,
+    rivals: Mapping[str, ParameterSet] = MappingProxyType({}),
+) -> None:
     """Write the fixed set (``fixed.yaml``), and again as its odometry's own tool reads it, if any.
 
-    The latter is ``fixed_<odometry>``, with a suffix. That of another odometry is removed.
+    The latter is ``fixed_<odometry>``, with a suffix. That of another odometry is removed. Rivals
+    are written, too, as ``equal_cost.yaml``.
     """
     own = study.own_file(fixed)
     ours = {f"fixed_{name}" for name in (*ODOMETRIES, *PROGRAMS)}
@@ -228,6 +237,12 @@ def write_fixed(study: OfflineStudy, fixed: ParameterSet) -> None:
     write_text(study.folder / FIXED_SET, yaml12.dump(fixed))
     if own is not None:
         write_text(own[0], own[1].text)
+    for name in RIVALS:
+        path = study.folder / f"{name}.yaml"
+        if name in rivals:
+            write_text(path, yaml12.dump(rivals[name]))
+        else:
+            path.unlink(missing_ok=True)
 
 
 def trial_workers(

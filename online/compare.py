@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from adaptune import manifest
 from adaptune.metrics import (
+    LOST_ABOVE,
     MIN_BLOCKS,
     RESAMPLES,
     lost_in_words,
@@ -18,6 +19,7 @@ from adaptune.metrics import (
 )
 from adaptune.model import ErrorModel
 from adaptune.model.registry import ADAPTIVE
+from adaptune.model.rules import mean_errors
 from adaptune.reference.check import hard_to_track
 from adaptune.report import tables as report
 from adaptune.study.config import ALSO
@@ -51,7 +53,7 @@ from online.statistics import (
     oracle_row,
 )
 from online.tables import last_rows, tables
-from online.verdict import CALLED, decided, error_and_cost, remarks, verdict
+from online.verdict import CALLED, adapts, decided, error_and_cost, remarks, verdict
 
 
 class ComparedModes(NamedTuple):
@@ -409,7 +411,7 @@ def compare(study: Study) -> ComparedReplays:
     best = decided(rows, worth)
     said, advised = wrong[:1], "" if best is None else best.mode
     if not said and best is not None:
-        said = _lost(study.odometry.name, study.sequences, rows, best, length)
+        said = _lost(study.odometry.name, study.sequences, rows, best, length, model)
         advised = NONE if said else advised
     if advised != NONE:
         said += verdict(rows, length, obstacle, worth)
@@ -426,6 +428,7 @@ def _lost(
     rows: Sequence[ComparisonRow],
     best: ComparisonRow,
     length: float,
+    model: ErrorModel | None,
 ) -> list[str]:
     """Where what is advised has lost its way, the likeliest cause, and what errs least."""
     known = [row for row in rows if row.rte is not None]
@@ -444,7 +447,19 @@ def _lost(
             for row in sorted(tried, key=lambda row: row.rte or 0.0)
         ]
         said.append(f"Until then, rely on none: RTE over {length:g} m{judge}, {', '.join(each)}.")
+        said += [] if model is None else _of_training(model)
     return said
+
+
+def _of_training(model: ErrorModel) -> list[str]:
+    """The best set in training, where it keeps track there and costs more than the fixed one."""
+    means = mean_errors(model.errors, model.sequence)
+    trial = model.sets.trials[int(np.argmin(means))]
+    costs = [np.nan if model.costs is None else model.costs.alone(t) for t in (trial, model.fixed)]
+    if not means.min() <= LOST_ABOVE or not costs[0] > costs[1]:
+        return []
+    has = f"trial {trial} has {means.min():.2f} % at {costs[0]:.0f} ms a scan"
+    return [f"In training {has}: `--budget {np.ceil(costs[0]):.0f}` allows it."]
 
 
 def _rows(judged: Sequence[JudgedModes], oracles: Sequence[ComparisonRow]) -> list[ComparisonRow]:
@@ -464,7 +479,7 @@ def _against(
     row: ComparisonRow, judged: Sequence[JudgedModes], rows: Sequence[ComparisonRow]
 ) -> ComparisonRow:
     """Compare a mode that adapts with controls and rivals, too, on the same frames."""
-    if row.mode not in ("adaptive", UNTRAINED):
+    if not adapts(row.mode):
         return row
     others = [other.mode for other in rows if other.mode in (BASELINE, EVEN, *RIVALS)]
     return replace(row, against={other: ratio_to(judged, row.mode, other) for other in others})

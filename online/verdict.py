@@ -4,8 +4,8 @@ from collections.abc import Mapping, Sequence
 
 from adaptune.study.config import WORTH
 from adaptune.study.driven import EQUAL_COST, RIVAL_WORDS, RIVALS, is_worth
-from online.modes import EVEN
-from online.statistics import ALL, ComparisonRow, Ratio
+from online.modes import EVEN, MODES
+from online.statistics import ALL, ORACLE, ComparisonRow, Ratio
 from online.tables import YARDSTICKS, last_rows
 
 ROUNDING = 1e-6
@@ -43,12 +43,11 @@ def decided(rows: Sequence[ComparisonRow], worth: float = WORTH) -> ComparisonRo
         if mode in last and _surely_better(last[mode], one):
             one = last[mode]
     candidates = [one]
-    for mode in ("adaptive", "untrained"):
-        if (row := last.get(mode)) is not None:
-            ratio, rival = _to(row, one), last.get(EQUAL_COST)
-            beats = rival is None or _surely_better(row, rival)
-            spares = ratio.interval is not None and is_worth(ratio.value, ratio.interval[1], worth)
-            candidates += [row] if spares and beats else []
+    for row in _adapting(last):
+        ratio, rival = _to(row, one), last.get(EQUAL_COST)
+        beats = rival is None or _surely_better(row, rival)
+        spares = ratio.interval is not None and is_worth(ratio.value, ratio.interval[1], worth)
+        candidates += [row] if spares and beats else []
     return min(candidates, key=lambda row: _ratio(row).value)
 
 
@@ -65,10 +64,25 @@ def _to(row: ComparisonRow, one: ComparisonRow) -> Ratio:
     return row.against.get(one.mode, Ratio(_ratio(row).value / max(_ratio(one).value, 1e-12)))
 
 
+def adapts(mode: str) -> bool:
+    """Whether a mode adapts, and is no control: ours, without a model, or a rule of the user's."""
+    return mode in ("adaptive", "untrained") or mode not in (*MODES, ORACLE)
+
+
+def _adapting(last: Mapping[str, ComparisonRow]) -> list[ComparisonRow]:
+    """Those of `_judged` that adapt; rules of the user's come last."""
+    found = [row for mode, row in last.items() if adapts(mode)]
+    return sorted(found, key=lambda row: [*MODES, row.mode].index(row.mode))
+
+
 def adapting(rows: Sequence[ComparisonRow]) -> ComparisonRow | None:
-    """The mode that adapts: `adaptive`, or without a model the untrained bank; None if none is."""
-    last = _judged(rows)
-    return next((last[mode] for mode in ("adaptive", "untrained") if mode in last), None)
+    """The mode that adapts: `adaptive` if it was driven; None if none was."""
+    return next(iter(_adapting(_judged(rows))), None)
+
+
+def called(mode: str) -> str:
+    """What a mode is called in a sentence."""
+    return CALLED.get(mode, f"`{mode}`")
 
 
 def verdict(
@@ -94,12 +108,12 @@ def verdict(
     main = adapting(rows)
     others = [m for m in ("fixed", "baseline") if m in last and m != best.mode]
     instead = " and ".join(
-        f"{error_and_cost(last[m])} with {CALLED[m]}" for m in others if last[m].rte
+        f"{error_and_cost(last[m])} with {called(m)}" for m in others if last[m].rte
     )
     judge = " by an estimated reference" * any(row.reference == "estimated" for row in rows)
     where = f"RTE over {length:g} m, {_where(rows)}{judge}"
     said = "Keep " if best.mode == "baseline" else "Drive "
-    said += f"{CALLED[best.mode]}: {error_and_cost(best)}"
+    said += f"{called(best.mode)}: {error_and_cost(best)}"
     if best.mode == "baseline" and "fixed" in last and _is_yardstick(best):
         said += f", {where}. No set that was tried did surely better in training"
     else:
@@ -107,9 +121,11 @@ def verdict(
     if best.mode not in _ONE_SET:
         has = f"It has {best.ratio:.2f} times the {YARDSTICKS[best.yardstick]}'s error"
         cost = _for_cost(best, last[best.yardstick])
-        return [f"{said}.", f"{has} ({_interval(_ratio(best))}){cost}{_beside(best, last)}."]
+        has = f"{has} ({_interval(_ratio(best))}){cost}{_beside(best, last)}."
+        return [f"{said}.", has, *_other_rules(best, main, last)]
     said = f"{said}{_doubt(best, last)}."
-    return [said, *_other_set(best, last), *_why_not(main, best, rows, obstacle, worth)]
+    why = _other_set(best, last) + _why_not(main, best, rows, obstacle, worth)
+    return [said, *why, *_other_rules(best, main, last)]
 
 
 def error_and_cost(row: ComparisonRow) -> str:
@@ -139,8 +155,21 @@ def _other_set(best: ComparisonRow, last: Mapping[str, ComparisonRow]) -> list[s
     if costs <= best.cpu_ms and ratio.value <= 1.0 - WORTH:
         sure = "that was not surely better in training " * (best.mode == "baseline")
         more = "drive both on another recording, to know"
-        return [f"A set {sure}(`{EQUAL_COST}`) has {has}: {more}."]
+        return [f"A set {sure}(`{EQUAL_COST}.yaml`) has {has}: {more}."]
     return []
+
+
+def _other_rules(
+    best: ComparisonRow, main: ComparisonRow | None, last: Mapping[str, ComparisonRow]
+) -> list[str]:
+    """How those rules did of which nothing else is said, as the user's."""
+    return [
+        f"`{row.mode}` had {_ratio(row).value:.2f} times the "
+        f"{YARDSTICKS[row.yardstick]}'s error ({_interval(_ratio(row))})"
+        f"{_for_cost(row, last[row.yardstick])}."
+        for row in _adapting(last)
+        if row is not best and (row is not main or best.mode not in _ONE_SET) and row.ratio
+    ]
 
 
 def _doubt(best: ComparisonRow, last: Mapping[str, ComparisonRow]) -> str:
@@ -172,7 +201,7 @@ def _why_not(
     if main is None:
         return [f"Adapting was not tried: {obstacle}."] if obstacle else []
     if _is_yardstick(main):
-        return ["Adapting kept the fixed set."]
+        return ["Training showed no gain from adapting: `adaptive` drove the same set."]
     ratio = _to(main, best)
     sure = "" if ratio.interval is None else f" ({_interval(ratio)})"
     has = f"{ratio.value:.2f} times its error{sure}{_for_cost(main, best)}"

@@ -31,10 +31,9 @@ def show_front(rows: Sequence[Mapping[str, Any]], title: str, caption: str) -> N
 
 BUYS = (
     "What CPU time buys, in training",
-    "The arrow marks what is recommended: of what costs no more than the baseline, or than the "
-    "budget, the best, if it is better than the baseline by a standard error (by two, of a single "
-    "recording). A bank has the error of parts that it did not learn from; the others have that of "
-    "training.",
+    "The arrow marks the fixed set: the best that costs no more than the baseline, or the budget, "
+    "if it is better than the baseline by a standard error (two, for a single recording). RTE is "
+    "that of whole drives, capped where track is lost; a bank's is of parts left out of training.",
 )
 
 

@@ -252,7 +252,8 @@ def tune(
         return
     say_untuned(tuned.study)
     say_compared(tuned.study, tuned.comparison, tuned.page, details=details)
-    say(tuned.training.elsewhere)
+    for sentence in (tuned.training.elsewhere, *tuned.training.failed):
+        say(sentence)
     show_front(tuned.training.front, *BUYS)
     if tuned.more:
         say_grown(tuned.more, tuned.before, tuned.fixed)

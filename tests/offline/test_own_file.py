@@ -5,7 +5,7 @@ from adaptune import yaml12
 from adaptune.commands import terminal
 from adaptune.space import ODOMETRY
 from offline.config import load_study
-from offline.train import write_fixed
+from offline.train import write_sets
 
 ODOMETRIES = "odometry: [{name: gicp}, {name: kiss_icp}]\n"
 
@@ -19,7 +19,7 @@ def study(study_file, tmp_path):
 
 def write(study, label, **parameters):
     fixed = study.odometry.space.complete({ODOMETRY: label, **parameters})
-    write_fixed(study, fixed)
+    write_sets(study, fixed)
     assert yaml12.Document.of_file(study.folder / "fixed.yaml").data == fixed
 
 
@@ -40,8 +40,18 @@ def test_the_fixed_set_s_odometry_decides(study, capsys):
     # Of a study that was trained before there was such a file.
     own.unlink()
     assert said(study, capsys) == f"{alone}."
-    write(study, "kiss_icp")
+    write(study, "kiss_icp", voxel_size=0.7)
     assert "which is not advised here" in said(study, capsys, advised=False)
     write(study, "gicp")
     assert sorted(study.folder.glob("fixed*")) == [study.folder / "fixed.yaml", users]
-    assert said(study, capsys) == f"{alone}."
+    none = f"The parameters, no value of which is changed: {study.folder}/fixed.yaml."
+    assert said(study, capsys) == none
+
+
+def test_rivals_are_written_and_go(study):
+    fixed = study.odometry.space.baseline
+    write_sets(study, fixed, {"equal_cost": {"odometry": "gicp", "downsampling": 0.1}})
+    path = study.folder / "equal_cost.yaml"
+    assert yaml12.Document.of_file(path).data == {"odometry": "gicp", "downsampling": 0.1}
+    write_sets(study, fixed)
+    assert not path.exists()

@@ -10,10 +10,11 @@ import pytest
 from adaptune import manifest
 from adaptune.errors import AdaptuneError
 from adaptune.model import BankSettings, ErrorModel
+from adaptune.model.rules import mean_errors
 from adaptune.study.driven import ModeError, bank_members
 from adaptune.trajectory import Trajectory, read_tum, write_tum
 from offline.config import load_study
-from online.compare import compare
+from online.compare import NONE, compare
 from online.modes import run_replays
 from online.record import StoredReplay, StoredReplayError
 from online.reference import Reference
@@ -34,6 +35,21 @@ def trained(study_file, trained_folder, tmp_path_factory):
 def replayed(trained):
     run_replays(trained, trained.folder / "model.safetensors")
     return trained
+
+
+def test_where_track_is_lost_it_names_what_kept_it_in_training(replayed, monkeypatch):
+    monkeypatch.setattr("adaptune.metrics.LOST_ABOVE", -1.0)
+    model = ErrorModel.load(replayed.model_path)
+    costs = [model.costs.alone(trial) for trial in model.sets]
+    dear = replace(model, fixed=model.sets.trials[int(np.argmin(costs))])
+    monkeypatch.setattr("online.compare.current_replays", lambda *_: (dear, None, []))
+    found = compare(replayed)
+    assert found.advised == NONE
+    means = mean_errors(model.errors, model.sequence)
+    best = model.sets.trials[int(means.argmin())]
+    assert found.verdict[-1].startswith(f"In training trial {best} has {means.min():.2f} % at ")
+    monkeypatch.setattr("online.compare.LOST_ABOVE", 0.0)
+    assert compare(replayed).verdict == found.verdict[:-1]
 
 
 @pytest.fixture

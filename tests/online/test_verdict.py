@@ -88,6 +88,7 @@ def test_own_parameters_are_kept_where_they_do_best():
         ({"best_default": 0.9, "baseline": 1.1}, "Drive the best odometry with its own param"),
         ({"even": 0.5, "adaptive": 0.8}, "Drive adaptive: 0.800 %"),
         ({"paper": 0.5, "adaptive": 0.8}, "Drive adaptive: 0.800 %"),
+        ({"mine:Rule": 0.6, "adaptive": 0.8}, "Drive `mine:Rule`: 0.600 %"),
         ({"baseline": 1.0}, "Keep the odometry's own parameters: 1.000 %"),
     ],
 )
@@ -95,11 +96,23 @@ def test_only_what_can_be_driven_is_advised(ratios, start):
     assert verdict(every(**ratios), 10.0)[0].startswith(start)
 
 
+def test_a_rule_of_the_user_s_is_named():
+    of_rule = "`mine:Rule` had 0.95 times the fixed set's error (95 % interval 0.92 to 0.98), for "
+    for adaptive in (0.8, 1.02):
+        rows = cheap(adaptive=adaptive, **{"mine:Rule": 0.95})
+        assert verdict(rows, 10.0)[-1].startswith(of_rule)
+    assert verdict(cheap(adaptive=0.7, **{"mine:Rule": 0.6}), 10.0)[-1].startswith(
+        "`adaptive` had 0.7"
+    )
+
+
 def test_why_nothing_was_adapted_is_told():
     why = "a program that runs whole recordings cannot change its parameters"
     assert verdict(every(), 5.0, why)[1:] == [f"Adapting was not tried: {why}."]
     kept = [replace(row, switches=0) for row in every(adaptive=1.0)]
-    assert verdict(kept, 5.0)[1:] == ["Adapting kept the fixed set."]
+    assert verdict(kept, 5.0)[1:] == [
+        "Training showed no gain from adapting: `adaptive` drove the same set."
+    ]
 
 
 def test_how_sure_it_is_that_one_set_is_better_is_told():
@@ -204,8 +217,8 @@ def test_a_single_set_that_costs_more_is_told_where_it_is_surely_better():
     )
     cheap = [replace(row, cpu_ms=5.0) for row in rows]
     assert verdict(cheap, 10.0)[1] == (
-        "A set (`equal_cost`) has 0.70 times its error (95 % interval 0.68 to 0.72), for 1.0 times "
-        "its CPU time (5.0 ms a scan): drive both on another recording, to know."
+        "A set (`equal_cost.yaml`) has 0.70 times its error (95 % interval 0.68 to 0.72), for 1.0 "
+        "times its CPU time (5.0 ms a scan): drive both on another recording, to know."
     )
     as_good = [replace(row, cpu_ms=5.0) for row in every(equal_cost=0.95)]
     assert not any("drive both" in said for said in verdict(as_good, 10.0))
