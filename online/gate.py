@@ -26,7 +26,9 @@ from online.statistics import ALL
 
 Verdict = Literal["better", "worse", "equal", "unclear"]
 """`equal` is surely within the bound, `unclear` too little to tell."""
-ERROR, COST, P99, LOST = "error", "cost", "cost, 99th percentile", "lost tracks"
+ERROR, COST, P99, RESTARTS = "error", "cost", "cost, 99th percentile", "restarts"
+_UNITS = {ERROR: "RTE [%]", COST: "cost [ms]", P99: "cost, 99th percentile [ms]"}
+"""Quantities as tables name them."""
 _WARM_UP, _COSTS = 10, 5
 """Scans whose costs do not count, because caches fill, and scans whose costs are drawn together."""
 _SHARE = 0.05
@@ -82,7 +84,7 @@ class GateRow(NamedTuple):
         worst = max(self.stretches, key=lambda stretch: stretch[1], default=None)
         return {
             "recording": self.recording,
-            "of": self.quantity,
+            "of": _UNITS.get(self.quantity, self.quantity),
             "new": self.new,
             "old": self.old,
             "ratio": self.ratio,
@@ -128,7 +130,7 @@ def judged(ratio: float, ends: tuple[float, float], bound: float) -> Verdict:
 
 
 def compare_sides(new: Side, old: Side, error: float = 0.05, cost: float = 0.1) -> Gate:
-    """Pair the replays of two sides by recording, and judge error, cost and lost tracks.
+    """Pair the replays of two sides by recording, and judge error, cost and restarts.
 
     The new side's error and cost may be larger by these shares.
 
@@ -151,7 +153,7 @@ def compare_sides(new: Side, old: Side, error: float = 0.05, cost: float = 0.1) 
         lost.append((ALL, *np.sum([pair.lost for pair in pairs], axis=0).tolist()))
     for name, mine, others in lost:
         said: Verdict = "equal" if mine == others else "worse" if mine > others else "better"
-        rows.append(GateRow(name, LOST, mine, others, said))
+        rows.append(GateRow(name, RESTARTS, mine, others, said))
     verdict = _overall(rows)
     words = _in_words(new, old, verdict, rows)
     return Gate(verdict, rows, f"{words} Not compared: {left_out}." if left_out else words)
@@ -351,8 +353,8 @@ def _in_words(new: Side, old: Side, verdict: Verdict, rows: Sequence[GateRow]) -
     over_all = [row for row in rows if row.recording == ALL] or rows
     parts = []
     for row in over_all:
-        if row.quantity == LOST:
-            parts.append(f"{row.new} lost tracks instead of {row.old}")
+        if row.quantity == RESTARTS:
+            parts.append(f"{row.new} restarts by the health check instead of {row.old}")
         elif row.low is None:
             parts.append(f"{row.quantity} unclear ({row.why})")
         else:

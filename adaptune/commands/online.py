@@ -224,7 +224,7 @@ def compare(
     tables are there as CSV, JSON and Markdown, too; `--details` prints them.
 
     With `--against`, it says whether STUDY is worse than OLD, recording by recording, in error, in
-    cost and in lost tracks. Its exit code is 3 then.
+    cost and in restarts by the health check. Its exit code is 3 then.
     """
     of_bags: dict[str, object] = {"BAG": recordings, "--odometry": odometry, "--points": points}
     of_bags |= {"--reference": reference, "--as": reading}
@@ -284,7 +284,8 @@ def _gate(
     gate = compare_sides(*both, *shares)
     write_gate(out, gate)
     say(gate.words)
-    show_table("New against old", [row.columns() for row in gate.rows])
+    metres = both[0].study.config.sub_trajectory
+    show_table(f"New against old, RTE over {metres:g} m", [row.columns() for row in gate.rows])
     say(f"Files: {out}/gate.json, junit.xml, summary.md")
     if gate.verdict == "worse" or (gate.verdict == "unclear" and unclear == "fail"):
         raise typer.Exit(WORSE)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, NamedTuple, Self
 
 import numpy as np
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, Field, model_serializer, model_validator
 
 from adaptune.errors import OdometryError, nearest
 from adaptune.geometry import Poses, invert
@@ -45,9 +45,14 @@ class ToolSettings(RangeSettings):
     """Settings that the file gives."""
     config: Annotated[str, AfterValidator(resolve)] | None = None
 
+    @model_serializer(mode="wrap")
+    def _dump(self, dump: Any) -> Any:
+        given = () if self.config is None else self.in_file
+        return {key: value for key, value in dump(self).items() if key not in given}
+
     @model_validator(mode="after")
     def _check(self) -> Self:
-        # The study in a folder names the defaults, too.
+        # Studies of earlier versions name the defaults, too.
         plain = type(self).model_construct(config=self.config)
         twice = [key for key in self.in_file if getattr(self, key) != getattr(plain, key)]
         if self.config is not None and twice:

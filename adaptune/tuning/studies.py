@@ -5,6 +5,7 @@ import shutil
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -138,9 +139,11 @@ def written(asked: Asked, folder: Path, show: Progress) -> tuple[Path, list[str]
             f"{path}` goes on with it; or name another --folder"
         )
     if others := manifest.changes(before, asked.inputs):
+        numbered = (folder.with_name(f"{folder.resolve().name}_{n}") for n in count(2))
+        free = next(one for one in numbered if not one.exists())
         raise AdaptuneError(
             f"{path}: another `adaptune tune` made it: {'; '.join(others)}; name the same to "
-            f"resume it, or another --folder"
+            f"resume it, or tune in a folder of its own with `--folder {free}`"
         )
     overrides = [f"{key}={value:.10g}" for key, value in asked.limits.items()]
     return path, overrides, _grown(path, asked, show)

@@ -52,7 +52,7 @@ def test_a_worse_set_fails_and_the_same_one_does_not(bags):
     assert all(row["ratio"] > 1.05 for row in errors)
     suite = Xml.parse(bags / "out/junit.xml").getroot()
     assert int(suite.get("failures")) == len(suite.findall("testcase/failure")) >= 1
-    assert "| drive_a | error |" in (bags / "out/summary.md").read_text()
+    assert "| drive_a | RTE [%] |" in (bags / "out/summary.md").read_text()
     assert gate("good", "bad").exit_code == 0
     # Another file of the same values is driven anew, and equal bit by bit.
     done = gate("same", "good", "--out", "out")

@@ -128,6 +128,7 @@ def test_what_the_user_changed_stays(bag, tmp_path):
     assert "lost_track: 2.0" in path.read_text()
     said = failed(bag, "--reference", "estimated")
     assert "runs/one/one.yaml: another `adaptune tune` made it: --reference is new;" in said
+    assert said.endswith("with `--folder runs/one_2`")
     # Its comments are the user's.
     path.write_text("# mine\n" + path.read_text())
     assert failed(bag) == "error: runs/one/one.yaml"

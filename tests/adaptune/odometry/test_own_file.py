@@ -192,6 +192,8 @@ def test_what_the_file_gives_is_not_given_twice(tmp_path):
     given = {"config": str(tmp_path / "users.yaml")}
     (mistake,) = declare("kiss_icp", given | {"min_range": 2.0}).mistakes
     assert "min_range is taken from" in str(mistake)
-    # A study's folder names the defaults, too.
     whole = Kiss.settings_type(**given).model_dump()
+    assert whole == given
     assert declare("kiss_icp", whole).mistakes == []
+    # Folders of earlier studies name the defaults, too.
+    assert declare("kiss_icp", given | {"min_range": 1.0, "deskew": True}).mistakes == []
