@@ -75,8 +75,8 @@ def host_poses(**parameters):
     return drive(InProcess(KeyframeGicp(VALUES | FIXED | parameters)))
 
 
-def containers():
-    """Containers that this process has started and not removed."""
+def containers(pid=None):
+    """Containers that a process, by default this one, has started and not removed."""
     labelled = engine().api.containers(all=True, filters={"label": LABEL})
-    pid = f".{os.getpid()}."
+    pid = f".{pid or os.getpid()}."
     return [found["Id"] for found in labelled if pid in found["Labels"][LABEL]]

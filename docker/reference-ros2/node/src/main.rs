@@ -9,13 +9,14 @@ mod messages;
 
 use std::{
     collections::BTreeMap,
+    pin::Pin,
     process::exit,
     sync::atomic::{AtomicI64, Ordering},
     sync::{Arc, Mutex},
     time::{Duration, Instant},
 };
 
-use futures::StreamExt;
+use futures::{Stream, StreamExt, future::ready};
 use nalgebra::{Isometry3, Translation3, Vector3};
 use ros2_client::{
     Context, ContextOptions, DEFAULT_PUBLISHER_QOS, DEFAULT_SUBSCRIPTION_QOS, MessageTypeName,
@@ -26,7 +27,9 @@ use ros2_client::{
 use serde_yaml::Value;
 
 use icp::{Icp, Settings};
-use messages::{Header, Imu, Odometry, PointCloud2, TransformStamped, Transforms};
+use messages::{
+    Clock, CustomMsg, Header, Imu, Odometry, PointCloud2, TransformStamped, Transforms,
+};
 
 type Parameters = BTreeMap<String, ParameterValue>;
 
@@ -187,10 +190,10 @@ fn make_node(all: &Parameters, live: &Arc<Mutex<Parameters>>) -> Node {
 fn subscribe<M: 'static>(
     node: &mut Node,
     name: &str,
-    of: &str,
+    (package, of): (&str, &str),
     qos: QosProfile,
 ) -> Subscription<M> {
-    let kind = MessageTypeName::new("sensor_msgs", of);
+    let kind = MessageTypeName::new(package, of);
     let topic = node
         .create_topic(&Name::parse(name).unwrap(), kind, &qos)
         .unwrap();
@@ -228,6 +231,44 @@ fn mounted() -> Isometry3<f64> {
     Isometry3::new(Vector3::new(1.0, 0.5, 0.3), Vector3::new(0.0, 0.0, 0.7))
 }
 
+/// Keeps the newest of the times that messages of a topic have.
+fn follow<M: ros2_client::Message + Send + Sync + 'static>(
+    subscription: Subscription<M>,
+    time: fn(&M) -> i64,
+) -> Arc<AtomicI64> {
+    let newest = Arc::new(AtomicI64::new(0));
+    let held = newest.clone();
+    smol::spawn(async move {
+        let mut stream = Box::pin(subscription.async_stream());
+        while let Some(Ok((message, _))) = stream.next().await {
+            held.fetch_max(time(&message), Ordering::SeqCst);
+        }
+    })
+    .detach();
+    newest
+}
+
+async fn reached(newest: &AtomicI64, time: i64) {
+    while newest.load(Ordering::SeqCst) < time {
+        smol::Timer::after(Duration::from_millis(1)).await;
+    }
+}
+
+/// Waits until somebody says where the IMU is on the LiDAR.
+async fn find_imu(node: &mut Node) {
+    let qos = DEFAULT_SUBSCRIPTION_QOS.durability(Durability::TransientLocal);
+    let fixed = subscribe::<Transforms>(node, "/tf_static", ("tf2_msgs", "TFMessage"), qos);
+    let mut stream = Box::pin(fixed.async_stream());
+    while let Some(Ok((Transforms(all), _))) = stream.next().await {
+        if let Some(imu) = all.iter().find(|it| it.child_frame_id == "imu") {
+            println!("imu in {} at {:?}", imu.header.frame_id, imu.translation);
+            return;
+        }
+    }
+}
+
+type Clouds<'a> = Pin<Box<dyn Stream<Item = (Time, Vec<Vector3<f64>>)> + 'a>>;
+
 async fn spin(all: Parameters, habits: Habits) {
     std::thread::sleep(habits.seconds("ready_delay"));
     let live = Arc::new(Mutex::new(all.clone()));
@@ -254,51 +295,65 @@ async fn spin(all: Parameters, habits: Habits) {
     if habits.has("wants_old") {
         sensor = sensor.durability(Durability::TransientLocal);
     }
-    let clouds = subscribe::<PointCloud2>(
-        &mut node,
-        points,
-        "PointCloud2",
-        sensor.clone().reliability_best_effort(),
-    );
-    let measured = Arc::new(AtomicI64::new(0));
-    if habits.has("imu") {
-        let imu = subscribe::<Imu>(&mut node, "/imu", "Imu", sensor.reliability_best_effort());
-        let newest = measured.clone();
-        smol::spawn(async move {
-            let mut stream = Box::pin(imu.async_stream());
-            while let Some(Ok((message, _))) = stream.next().await {
-                newest.fetch_max(message.header.stamp.to_nanos(), Ordering::SeqCst);
-            }
-        })
-        .detach();
+    let sensor = sensor.reliability_best_effort();
+    if habits.has("wants_imu_frame") {
+        find_imu(&mut node).await;
     }
+    let imu = habits.has("imu").then(|| {
+        let kind = ("sensor_msgs", "Imu");
+        let imu = subscribe::<Imu>(&mut node, "/imu", kind, sensor.clone());
+        follow(imu, |message| message.header.stamp.to_nanos())
+    });
+    let clock = (all["use_sim_time"] == ParameterValue::Boolean(true)).then(|| {
+        let kind = ("rosgraph_msgs", "Clock");
+        let clock = subscribe::<Clock>(&mut node, "/clock", kind, sensor.clone());
+        follow(clock, |message| message.clock.to_nanos())
+    });
+    let (livox, clouds);
+    let mut stream: Clouds = if habits.has("livox") {
+        let kind = ("livox_ros_driver2", "CustomMsg");
+        livox = subscribe::<CustomMsg>(&mut node, points, kind, sensor);
+        Box::pin(livox.async_stream().filter_map(|received| {
+            ready(received.ok().map(|(scan, _)| {
+                let positions = scan.points.iter().map(|point| point.position);
+                let all = positions.map(|at| Vector3::from(at.map(f64::from)));
+                (scan.header.stamp, all.collect())
+            }))
+        }))
+    } else {
+        clouds =
+            subscribe::<PointCloud2>(&mut node, points, ("sensor_msgs", "PointCloud2"), sensor);
+        Box::pin(clouds.async_stream().filter_map(|received| {
+            ready(
+                received
+                    .ok()
+                    .map(|(cloud, _)| (cloud.header.stamp, points_of(&cloud))),
+            )
+        }))
+    };
     println!("ready for {points}");
     let (mut odometry, mut n) = (Icp::default(), 0);
-    let mut stream = Box::pin(clouds.async_stream());
-    while let Some(received) = stream.next().await {
-        let Ok((cloud, _)) = received else { continue };
+    while let Some((of_scan, points)) = stream.next().await {
         n += 1;
         if n as f64 <= habits.number("late").unwrap_or(0.0) {
             continue;
         }
         // As systems that deskew by an IMU: they need it until the scan's end.
-        let end = cloud.header.stamp.to_nanos() + 100_000_000;
-        while habits.has("imu") && measured.load(Ordering::SeqCst) < end {
-            smol::Timer::after(Duration::from_millis(1)).await;
+        if let Some(newest) = &imu {
+            reached(newest, of_scan.to_nanos() + 100_000_000).await;
+        }
+        if let Some(newest) = &clock {
+            reached(newest, of_scan.to_nanos()).await;
         }
         let begin = Instant::now();
-        let pose = odometry.register(&points_of(&cloud), &settings(&live.lock().unwrap()));
+        let pose = odometry.register(&points, &settings(&live.lock().unwrap()));
         std::thread::sleep(habits.seconds("seconds_per_scan"));
         if habits.has("silent") || (n - 1) % habits.number("one_of").unwrap_or(1.0) as i64 != 0 {
             continue;
         }
         let clocked = habits.number("own_clock").is_some();
         smol::Timer::after(habits.seconds("own_clock")).await;
-        let stamp = if clocked {
-            Time::now()
-        } else {
-            cloud.header.stamp
-        };
+        let stamp = if clocked { Time::now() } else { of_scan };
         let nan = if habits.is("jump", n) { f64::NAN } else { 1.0 };
         let rotation = pose.rotation.coords;
         let zero = ([0.0; 18], [0.0; 18]);

@@ -31,6 +31,33 @@ pub struct PointCloud2 {
 }
 impl Message for PointCloud2 {}
 
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub struct CustomPoint {
+    pub offset_time: u32,
+    pub position: [f32; 3],
+    pub reflectivity: u8,
+    pub tag: u8,
+    pub line: u8,
+}
+
+/// The scan of a Livox, as its own driver sends it.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub struct CustomMsg {
+    pub header: Header,
+    pub timebase: u64,
+    pub point_num: u32,
+    pub lidar_id: u8,
+    pub rsvd: [u8; 3],
+    pub points: Vec<CustomPoint>,
+}
+impl Message for CustomMsg {}
+
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub struct Clock {
+    pub clock: Time,
+}
+impl Message for Clock {}
+
 /// Of a measurement of an IMU, the begin: the rest is not read.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Imu {

@@ -1,6 +1,10 @@
 """Trials of the reference image on a short bag; those that need no other run side by side."""
 
+import os
 import re
+import subprocess
+import sys
+import time
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
@@ -148,3 +152,40 @@ def test_an_image_without_ros(tmp_path):
     (fault,) = trial.odometry.faults
     assert "no roscore: its process ended with code 127: " in fault
     assert "no Python of the image imports rospy: is it a ROS 1 image?" in fault
+
+
+KILLED = """
+import sys
+from pathlib import Path
+from contained import LIMITS, VALUES, drive, recording, rustle, template
+from adaptune.odometry.docker.played_bag import PlayedBag
+from adaptune.odometry.docker.rustle import Rustle
+see = PlayedBag._see
+def seen(*given):
+    print("plays", flush=True)
+    return see(*given)
+PlayedBag._see = seen
+folder = Path(sys.argv[1])
+settings = rustle(template(folder / "template.yaml"), rate=0.01)
+given = recording(folder / "bag")
+drive(Rustle.instance(VALUES, settings, LIMITS, lambda: given))
+"""
+
+
+def test_a_killed_process_leaves_no_container_while_a_bag_plays(tmp_path):
+    reference_image()
+    process = subprocess.Popen(
+        [sys.executable, "-c", KILLED, tmp_path],
+        stdout=subprocess.PIPE,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+        text=True,
+    )
+    with process:
+        assert process.stdout.readline() == "plays\n"
+        assert containers(process.pid)
+        process.kill()
+    # The bag would play for minutes.
+    end = time.monotonic() + 60.0
+    while containers(process.pid):
+        assert time.monotonic() < end
+        time.sleep(0.1)

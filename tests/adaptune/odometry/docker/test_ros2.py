@@ -205,6 +205,25 @@ def test_an_imu_is_heard_until_the_end_of_a_scan(make):
     assert all(odometry.register(scan).registered for scan in given[1:])
 
 
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"imitate": {"livox": True}},
+        {"sim_time": True},
+        {
+            "imitate": {"wants_imu_frame": True},
+            "transforms": {"imu": ("lidar", (0.1, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0))},
+        },
+    ],
+    ids=["a Livox's messages", "the recording's clock", "frames of the robot"],
+)
+def test_it_is_given_what_it_wants(make, given):
+    odometry = make(**given)
+    poses = drive(odometry)
+    np.testing.assert_allclose(poses[:, :3, 3], truth()[:, :3, 3], atol=0.08)
+    assert not odometry.faults
+
+
 def test_a_ros_1_bag_is_played_as_it_was_recorded(make, tmp_path, monkeypatch):
     monkeypatch.setattr(played_bag, "_FIRST", 2.0)
     logs = tmp_path / "logs"
