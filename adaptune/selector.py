@@ -13,7 +13,7 @@ from adaptune.bank.members import share
 from adaptune.geometry import Poses
 from adaptune.live.evidence import LiveEvidence, spread_of
 from adaptune.metrics import FAILURE
-from adaptune.model import ErrorModel
+from adaptune.model import ErrorModel, ModelError
 from adaptune.model.descriptor import (
     MOTION,
     SECOND,
@@ -371,6 +371,11 @@ class Selector(_Measuring):
     def _of_those_present(self, selection: Selection) -> Selection:
         """Replace a member that gives no poses by the first one that does."""
         present = self._live.present()
+        if selection.trial not in self.members:
+            raise ModelError(
+                f"{type(self._rule).__name__}: selects trial {selection.trial}, which is not in "
+                f"the bank (trials {', '.join(map(str, self.members))}); choose among data.candidates"
+            )
         if present[self.members.index(selection.trial)]:
             return selection
         trial = self.members[int(present.argmax())]

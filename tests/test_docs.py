@@ -27,7 +27,7 @@ from typer.main import get_command
 from adaptune import yaml12
 from adaptune.commands.cli import app
 from adaptune.model import BankSettings, FixedSet
-from adaptune.odometry.registry import declare_here
+from adaptune.odometry.registry import ODOMETRIES, declare_here
 from adaptune.recording import SequenceConfig
 from adaptune.strict import ConfigurationError
 from adaptune.trajectory import read_tum
@@ -90,6 +90,12 @@ def test_commands_exist(page):
     code = "\n".join(CODE.findall(page.read_text(encoding="utf-8")))
     named = set(re.findall(r"(?:^|[\s`/])adaptune ([a-z]+(?:-[a-z]+)*)\b", code))
     assert named <= set(get_command(app).commands)
+
+
+def test_every_odometry_has_a_row():
+    page = (ROOT / "docs/odometries.md").read_text("utf-8")
+    ours = {name for name in ODOMETRIES if ":" not in name}
+    assert ours <= set(re.findall(r"(?m)^\| `(\w+)` \|", page))
 
 
 def test_the_guide_is_short():

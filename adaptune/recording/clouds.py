@@ -421,7 +421,8 @@ CLOUDS: dict[str, Callable[[bytes | memoryview, bool, Timing], Scan]] = {
     "sensor_msgs/msg/PointCloud2": decode_cloud,
     **dict.fromkeys(LIVOX_TYPES, decode_livox),
 }
-"""What decodes a serialised message of point clouds, by its type."""
+"""What decodes a serialised message of point clouds, by its type. Where nobody publishes a topic
+yet, it is taken to be of the first."""
 
 
 def livox_points(scan: Scan) -> bytes:

@@ -57,7 +57,7 @@ FOREIGN = re.compile(r"pydantic|https://|Input should|validation|Value error|tup
         ),
         (
             "online.modes=[paired]",
-            "online.modes.0: there is no mode 'paired': there is 'adaptive', 'even', 'paper', ",
+            "online.modes.0: there is no mode 'paired': there is 'adaptive', ",
         ),
         ("offline.objective={rtf: 3}", "offline.objective.rtf: give 'rte', 'kitti', 'rpe', 'ape'"),
         (

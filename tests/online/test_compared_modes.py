@@ -12,12 +12,13 @@ from typer.testing import CliRunner
 from adaptune.commands.cli import app
 from adaptune.model import BankSettings, ErrorModel
 from adaptune.study.config import ALSO
+from adaptune.study.driven import RIVALS
 from offline.config import load_study
 from online.compare import compare, compared_modes
-from online.modes import run_replays, run_untrained
+from online.modes import MODES, run_replays, run_untrained
 from online.record import StoredReplayError
 
-EVERY = ["baseline", "fixed", "adaptive", "untrained", "even", "paper"]
+EVERY = [mode for mode in MODES if mode not in RIVALS]
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from adaptune import manifest
-from adaptune.model import ErrorModel
+from adaptune.model import ErrorModel, ModelError
 from adaptune.model.registry import RuleError, rule_class
 from adaptune.selector import Selector
 from adaptune.strict import ConfigurationError
@@ -28,11 +28,18 @@ class Cheapest(Rule):
 
     def fit(self, data):
         self.sets, costs = data.sets, data.costs
-        self.best = min(data.sets, key=costs.alone)
+        self.best = min(data.candidates or data.sets, key=costs.alone)
         return self
 
     def select(self, feature, live=NOTHING):
         return Selection(self.best, self.sets[self.best], predicted_error=1.0)
+
+
+class Outside(Cheapest):
+    def fit(self, data):
+        super().fit(data)
+        self.best = next(trial for trial in data.sets if trial not in data.candidates)
+        return self
 
 
 class Other:
@@ -74,6 +81,15 @@ def test_it_is_validated_replayed_compared_and_shown(study, study_file, tmp_path
     assert run_replays(again, again.model_path) == 1
     about = manifest.recorded(study.folder / "replays/three" / mode / manifest.FILE)
     assert about["rule"]
+
+
+def test_it_chooses_among_the_members_of_a_bank(study):
+    model = ErrorModel.load(study.model_path)
+    members = model.bank[:2]
+    assert len(members) < len(model.sets)
+    assert Selector(model, "my_rules:Cheapest", members).members == tuple(members)
+    with pytest.raises(ModelError, match=r"Outside: selects trial .* choose among data.candidates"):
+        Selector(model, "my_rules:Outside", members)
 
 
 @pytest.mark.parametrize(

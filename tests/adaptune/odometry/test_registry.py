@@ -12,7 +12,7 @@ from adaptune.odometry.content import odometry_content
 from adaptune.odometry.factory import OdometryFactory, OdometryPool
 from adaptune.odometry.keyframe import KeyframeGicp, KeyframeNdt, KeyframeSettings
 from adaptune.odometry.program import CommandSettings
-from adaptune.odometry.registry import odometry_class
+from adaptune.odometry.registry import ODOMETRIES, declare, odometry_class
 from adaptune.odometry.remote import Limits, ProcessSettings
 from adaptune.space import ODOMETRY, Float, ParameterSpace, SpaceError
 
@@ -226,3 +226,11 @@ def test_descriptors_of_the_user_are_their_modules(package):
     after = descriptor_content(["ndt", "theirs.odometry:describe"])
     assert before.keys() == after.keys() == {"module theirs.odometry"}
     assert before != after
+
+
+@pytest.mark.parametrize("name", ODOMETRIES)
+def test_the_version_of_every_odometry_is_known(name):
+    settings, description = declare(name, {}).sound(name)
+    content = odometry_content(name, settings, description.module)
+    assert content
+    assert "unknown" not in content.values()
