@@ -372,9 +372,10 @@ class Selector(_Measuring):
         """Replace a member that gives no poses by the first one that does."""
         present = self._live.present()
         if selection.trial not in self.members:
+            name, members = type(self._rule).__name__, ", ".join(map(str, self.members))
             raise ModelError(
-                f"{type(self._rule).__name__}: selects trial {selection.trial}, which is not in "
-                f"the bank (trials {', '.join(map(str, self.members))}); choose among data.candidates"
+                f"{name}: selects trial {selection.trial}, which is not in the bank (trials "
+                f"{members}); choose among data.candidates"
             )
         if present[self.members.index(selection.trial)]:
             return selection
