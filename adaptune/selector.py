@@ -114,11 +114,7 @@ class _Measuring:
             self._live.measure()
 
     def _in_doubt(self) -> bool:
-        """Whether there is a reason to measure now."""
-        return self._differ()
-
-    def _differ(self) -> bool:
-        """Whether the members differ by more than they do in training."""
+        """Whether to measure now: the members differ by more than they do in training."""
         return self._live.spread() > self._usual_spread
 
     def fall_back(self) -> Selection:
@@ -321,7 +317,7 @@ class Selector(_Measuring):
     def _in_doubt(self) -> bool:
         """Whether a bank at work is in a new place, or differs by more than in training."""
         at_work = self._weighs and self._resting != frozenset(self.members[1:])
-        return at_work and (self._is_new() or self._differ())
+        return at_work and (self._is_new() or super()._in_doubt())
 
     def _is_enough(self, predicted: float) -> bool:
         """Whether the members that always work are enough.

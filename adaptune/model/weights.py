@@ -335,10 +335,7 @@ def _next_member(
     chosen: Sequence[int],
     spending: Spending | None,
 ) -> int | None:
-    """The set that most lowers the error of those chosen; None if none may.
-
-    It is a place in `pool`, as those in `chosen` are.
-    """
+    """Place in `pool` of the set that most lowers the error of those chosen; None if none may."""
     rest = [j for j in range(len(pool)) if j not in chosen]
     members = [pool[j] for j in chosen]
     if spending is not None:
@@ -348,7 +345,9 @@ def _next_member(
 
 
 def _root_mean_square(squares: list[NDArray[np.float64]], members: list[int]) -> float:
-    of_members = [s[np.ix_(members, members)] for s in squares]
-    return float(
-        np.mean([np.sqrt(w @ s @ w) for s in of_members for w in [minimum_variance_weights(s)]])
-    )
+    errors = []
+    for products in squares:
+        of_members = products[np.ix_(members, members)]
+        weights = minimum_variance_weights(of_members)
+        errors.append(np.sqrt(weights @ of_members @ weights))
+    return float(np.mean(errors))
