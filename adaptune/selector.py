@@ -151,12 +151,9 @@ class Selector(_Measuring):
     metres, and that of each member of a bank, with a direct registration, see `adaptune.live`. What
     is measured counts from the next selection on. The selector reads no clock and no file.
 
-    With `adaptive` and a bank, the selections are weights of the bank's members, smoothed over the
-    last selections. A single odometry keeps the fixed set, and leaves it for the baseline where it
-    surely does worse than predicted, and worse than the baseline is predicted to do. The reserve of
-    a bank (`ErrorModel.reserve`) rests, except for a minute after a place that training does not
-    know, and after a failure. Scans of a sensor or mount that was not trained with
-    (`ErrorModel.is_foreign`) get the fixed set, or in a bank weights by what is measured alone.
+    With `adaptive` and a bank, the selections are weights of the bank's members; a single odometry
+    keeps the fixed set, or leaves it for the baseline. ``docs/method.md`` says when, and when
+    members rest, and what becomes of scans of another sensor.
 
     Parameters
     ----------

@@ -336,12 +336,9 @@ SHARPNESS = 6.0
 class FixedSet(Rule):
     """Keep the fixed set; where it does worse than predicted, the baseline may take its place.
 
-    What is predicted of both is their mean error on the training frames nearest to the scan, of
-    each training sequence; the nearer these frames, the more a sequence weighs. The farther a scan
-    is from all training, the less the two differ. Of equals, the baseline is taken: in a place
-    unlike all training, it is the best guess there is.
-
-    The baseline counts if it was run on every sequence, and the budget allows it.
+    See "One set" in ``docs/method.md``. The farther a scan is from all training, the less the two
+    predictions differ, and of equals the baseline is taken. It counts if it was run on every
+    sequence, and the budget allows it.
     """
 
     gated = True
