@@ -114,11 +114,7 @@ class _Measuring:
             self._live.measure()
 
     def _in_doubt(self) -> bool:
-        """Whether there is a reason to measure now."""
-        return self._differ()
-
-    def _differ(self) -> bool:
-        """Whether the members differ by more than they do in training."""
+        """Whether to measure now: the members differ by more than they do in training."""
         return self._live.spread() > self._usual_spread
 
     def fall_back(self) -> Selection:
@@ -155,12 +151,9 @@ class Selector(_Measuring):
     metres, and that of each member of a bank, with a direct registration, see `adaptune.live`. What
     is measured counts from the next selection on. The selector reads no clock and no file.
 
-    With `adaptive` and a bank, the selections are weights of the bank's members, smoothed over the
-    last selections. A single odometry keeps the fixed set, and leaves it for the baseline where it
-    surely does worse than predicted, and worse than the baseline is predicted to do. The reserve of
-    a bank (`ErrorModel.reserve`) rests, except for a minute after a place that training does not
-    know, and after a failure. Scans of a sensor or mount that was not trained with
-    (`ErrorModel.is_foreign`) get the fixed set, or in a bank weights by what is measured alone.
+    With `adaptive` and a bank, the selections are weights of the bank's members; a single odometry
+    keeps the fixed set, or leaves it for the baseline. ``docs/method.md`` says when, and when
+    members rest, and what becomes of scans of another sensor.
 
     Parameters
     ----------
@@ -321,7 +314,7 @@ class Selector(_Measuring):
     def _in_doubt(self) -> bool:
         """Whether a bank at work is in a new place, or differs by more than in training."""
         at_work = self._weighs and self._resting != frozenset(self.members[1:])
-        return at_work and (self._is_new() or self._differ())
+        return at_work and (self._is_new() or super()._in_doubt())
 
     def _is_enough(self, predicted: float) -> bool:
         """Whether the members that always work are enough.

@@ -30,10 +30,9 @@ _HEADINGS = {
 def rows(archive: Archive, names: Sequence[str]) -> list[Row]:
     """A row for every trial that is finished on at least one of the sequences.
 
-    It has number, parameters, mean error in percent (None before the trial is finished on all
-    sequences), mean error on each sequence, then over all sequences how often the health check
-    restarted it and how often its process ended, its other metrics (None if a sequence is too short
-    for one), and its cost in milliseconds of CPU time a scan (None if it was not measured).
+    Errors are means in percent; that over all sequences is None before the trial is finished on all
+    of them. A metric is None if a sequence is too short for it, the cost, in milliseconds of CPU
+    time a scan, if it was not measured.
     """
     finished = {name: archive.finished(name) for name in names}
     every = [trial for trials in finished.values() for trial in trials.values()]

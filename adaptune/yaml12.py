@@ -152,9 +152,9 @@ class Document:
 
     def span(self, path: Sequence[str | int]) -> tuple[int, int] | None:
         """Where in the text a single value begins and ends; None if there is none."""
-        found = self._along(path)
-        node = found[-1][1] if found else self._node
-        if len(found) < len(path) or not isinstance(node, yaml.ScalarNode):
+        nodes = self._along(path)
+        node = nodes[-1][1] if nodes else self._node
+        if len(nodes) < len(path) or not isinstance(node, yaml.ScalarNode):
             return None
         return node.start_mark.index, node.end_mark.index
 
@@ -164,8 +164,8 @@ class Document:
 
     def line(self, path: Sequence[str | int]) -> int | None:
         """Line of the deepest part of `path` that is there; none for an empty document."""
-        found = self._along(path)
-        return found[-1][0].start_mark.line + 1 if found else None
+        nodes = self._along(path)
+        return nodes[-1][0].start_mark.line + 1 if nodes else None
 
     def _along(self, path: Sequence[str | int]) -> list[tuple[Any, Any]]:
         """The nodes of the keys on a path, as far as they are there, and of their values."""

@@ -83,10 +83,8 @@ class Chain:
     @property
     def stalled(self) -> bool:
         """Whether it has made enough steps without an acceptance or a new best."""
-        s = self.settings
-        return self._since(self._accepted, s.stall_accepted) or self._since(
-            self._new_best, s.stall_best
-        )
+        accepted, best = self.settings.stall_accepted, self.settings.stall_best
+        return self._since(self._accepted, accepted) or self._since(self._new_best, best)
 
 
 class AnnealingSampler(BaseSampler):

@@ -289,10 +289,7 @@ def most_important(table: TrialTable, shares: Mapping[str, float]) -> list[str]:
 def charts_of_validation(folder: Path) -> Charts:
     """The chart of what `adaptune validate` found, or what is missing.
 
-    Raises
-    ------
-    AdaptuneError
-        If its file is not as `adaptune validate` wrote it.
+    An AdaptuneError says that its file is not as `adaptune validate` wrote it.
     """
     path = folder / "stretches.json"
     if not path.exists():

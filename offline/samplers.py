@@ -13,14 +13,7 @@ from numpy.typing import NDArray
 from scipy.stats import qmc
 
 from adaptune.errors import in_a_line
-from adaptune.space import (
-    ODOMETRY,
-    Categorical,
-    Float,
-    ParameterSet,
-    ParameterSpace,
-    PooledSpace,
-)
+from adaptune.space import ODOMETRY, Categorical, Float, ParameterSet, ParameterSpace, PooledSpace
 from offline.annealing import AnnealingSampler
 from offline.config import (
     AnnealingSettings,

@@ -130,14 +130,8 @@ class Work(Protocol):
 def run(pool: Pool[W], work: Work) -> Iterator[tuple[Task, Result]]:
     """Run tasks, and yield each as it is done, with its result, until there are no more.
 
-    If a worker dies, its task is run again.
-
-    Raises
-    ------
-    AdaptuneError
-        What a task raised.
-    WorkerError
-        If several workers died at the same task.
+    If a worker dies, its task is run again; a WorkerError says that several died at the same one.
+    An AdaptuneError that a task raised is raised here.
     """
     crew = _Crew(pool, work)
     while True:
@@ -371,14 +365,9 @@ class ClusterError(AdaptuneError):
 class Cluster:
     """The workers of a Dask cluster, as a `Pool`.
 
-    A worker reads the recordings, which must be under the same path there.
-
-    Use it as a context: leaving it cancels the tasks that are not done.
-
-    Raises
-    ------
-    ClusterError
-        If it cannot be reached, has no workers, or workers of another version.
+    A worker reads the recordings, which must be under the same path there. Leaving it as a context
+    cancels the tasks that are not done. A ClusterError says that it cannot be reached, has no
+    workers, or workers of another version.
     """
 
     def __init__(self, setup: TrialSetup, names: Iterable[str], address: str):
@@ -525,12 +514,9 @@ def contents(sequences: StudySequences, name: str) -> dict[Path, str]:
 
 
 def check_files(sequences: StudySequences, name: str, there: Mapping[Path, str]) -> None:
-    """On a worker, refuse to read other files of a sequence than where the campaign was started.
+    """On a worker, refuse files of a sequence other than those where the campaign was started.
 
-    Raises
-    ------
-    ClusterError
-        It names a file that is missing here, or has another content.
+    A ClusterError names a file that is missing here, or has another content.
     """
     here: dict[Path, str] = {}
     with contextlib.suppress(AdaptuneError):

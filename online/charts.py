@@ -162,9 +162,7 @@ def choice_chart(replayed: ReplayedSequence) -> Chart | None:
 
 
 def _parameters(replayed: ReplayedSequence) -> Iterator[Panel]:
-    single = {
-        mode: mode_replay for mode, mode_replay in replayed.modes.items() if not mode_replay.weights
-    }
+    single = {mode: track for mode, track in replayed.modes.items() if not track.weights}
     for name in dict.fromkeys(name for track in single.values() for name in track.choices):
         chosen = {mode: t.choices[name] for mode, t in single.items() if name in t.choices}
         every = [value for values in chosen.values() for value in values]
@@ -173,10 +171,8 @@ def _parameters(replayed: ReplayedSequence) -> Iterator[Panel]:
         drawn = _scenes(replayed)
         for mode, values in chosen.items():
             y = [_place(value, names) for value in values]
-            mode_replay = single[mode]
-            drawn.append(
-                Line(mode_replay.span, [*y, y[-1]], mode, steps=True, dashed=not mode_replay.adapts)
-            )
+            span, dashed = single[mode].span, not single[mode].adapts
+            drawn.append(Line(span, [*y, y[-1]], mode, steps=True, dashed=dashed))
         log = name in replayed.space.logarithmic and names is None
         axis = Axis(replayed.space.labels[name], log=log, names=names)
         yield Panel(TIME, axis, tuple(drawn), name)

@@ -21,12 +21,7 @@ from adaptune.archive import compact
 from adaptune.errors import AdaptuneError
 from adaptune.files import replacing
 from adaptune.model.descriptor import DESCRIPTORS
-from adaptune.model.rules import (
-    Costs,
-    TrainingData,
-    allowed_sets,
-    mean_errors,
-)
+from adaptune.model.rules import Costs, TrainingData, allowed_sets, mean_errors
 from adaptune.model.weights import BankSettings
 from adaptune.recording.scan import stretch_numbers
 from adaptune.report import tables

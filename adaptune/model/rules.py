@@ -57,8 +57,8 @@ class Evidence(NamedTuple):
         for s, frames in enumerate(self.frames):
             # All frames are near to every scan: the mean is the same.
             same = frames.strides[0] == 0
-            of = values[frames[:1]] if same else values[frames]
-            means[:, s] = of.mean(axis=1, dtype=np.float64)
+            near = values[frames[:1]] if same else values[frames]
+            means[:, s] = near.mean(axis=1, dtype=np.float64)
         return means
 
 
@@ -171,9 +171,9 @@ class Costs:
         """
         known = [self.sets.get(trial, SetCost(np.nan, np.nan, -1)) for trial in trials]
         prepare: dict[int, float] = {}
-        for one in known:
-            prepare[one.preparation] = max(one.prepare, prepare.get(one.preparation, 0.0))
-        return sum(one.register for one in known) + sum(prepare.values()) + self.evidence
+        for cost in known:
+            prepare[cost.preparation] = max(cost.prepare, prepare.get(cost.preparation, 0.0))
+        return sum(cost.register for cost in known) + sum(prepare.values()) + self.evidence
 
 
 class Spending(NamedTuple):
@@ -232,11 +232,6 @@ class TrainingData:
             return np.ones(len(self.sets), np.bool_)
         return np.isin(self.sets.trials, self.allowed)
 
-    @property
-    def fixed_errors(self) -> NDArray[np.float64]:
-        """Capped errors of the fixed set, of shape (n_frames,)."""
-        return cap(self.errors[:, self.sets.column(self.fixed)])
-
 
 def mean_errors(errors: NDArray[np.floating], sequence: NDArray[np.intp]) -> NDArray[np.float64]:
     """Mean capped error of every set; each sequence has the same weight.
@@ -273,7 +268,7 @@ def complementary(data: TrainingData, size: int, spending: Spending | None = Non
     everywhere = np.isfinite(mean_errors(data.errors, data.sequence)) & data.allows()
     capped = np.where(np.isnan(data.errors) | ~everywhere, np.inf, cap(data.errors))
     chosen = [data.fixed]
-    least = data.fixed_errors
+    least = cap(data.errors[:, data.sets.column(data.fixed)])
     while len(chosen) < size:
         means = mean_errors(np.minimum(capped, least[:, None]), data.sequence)
         now = means[data.sets.column(data.fixed)]
@@ -341,12 +336,9 @@ SHARPNESS = 6.0
 class FixedSet(Rule):
     """Keep the fixed set; where it does worse than predicted, the baseline may take its place.
 
-    What is predicted of both is their mean error on the training frames nearest to the scan, of
-    each training sequence; the nearer these frames, the more a sequence weighs. The farther a scan
-    is from all training, the less the two differ. Of equals, the baseline is taken: in a place
-    unlike all training, it is the best guess there is.
-
-    The baseline counts if it was run on every sequence, and the budget allows it.
+    See "One set" in ``docs/method.md``. The farther a scan is from all training, the less the two
+    predictions differ, and of equals the baseline is taken. It counts if it was run on every
+    sequence, and the budget allows it.
     """
 
     gated = True

@@ -92,17 +92,9 @@ class NearProducts(NamedTuple):
 class BankRule(Rule):
     """Weigh the members of a bank so that the mean of their motions has the least expected error.
 
-    While errors are small, the mean square error of a weighted mean of motions is w'Sw, where S_jk
-    is the mean product of the errors of members j and k, which are vectors (as with forecasts:
-    Bates and Granger, Operational Research Quarterly 1969).
-
-    For each training sequence S is taken over the frames nearest to the scan and divided by the
-    fixed set's mean square there. The nearer its frames, the more a sequence weighs, and no weight
-    is negative.
-
-    What is measured while the robot drives (`adaptune.live`) is blended with it, each weighted by
-    the number of its windows. The less familiar the scene, the fewer the training counts as. A bank
-    applies the mean over a few selections, see `smooth_weights`.
+    That is w'Sw while errors are small, where S_jk is the mean product of the errors of members j
+    and k (Bates and Granger, Operational Research Quarterly 1969); see "Bank" and "Live evidence"
+    in ``docs/method.md``. Weights are not smoothed here, see `smooth_weights`.
     """
 
     sentence = "what adapts with the least expected loss in training, or the fixed set"
@@ -335,10 +327,7 @@ def _next_member(
     chosen: Sequence[int],
     spending: Spending | None,
 ) -> int | None:
-    """The set that most lowers the error of those chosen; None if none may.
-
-    It is a place in `pool`, as those in `chosen` are.
-    """
+    """Place in `pool` of the set that most lowers the error of those chosen; None if none may."""
     rest = [j for j in range(len(pool)) if j not in chosen]
     members = [pool[j] for j in chosen]
     if spending is not None:
@@ -348,7 +337,9 @@ def _next_member(
 
 
 def _root_mean_square(squares: list[NDArray[np.float64]], members: list[int]) -> float:
-    of_members = [s[np.ix_(members, members)] for s in squares]
-    return float(
-        np.mean([np.sqrt(w @ s @ w) for s in of_members for w in [minimum_variance_weights(s)]])
-    )
+    errors = []
+    for products in squares:
+        of_members = products[np.ix_(members, members)]
+        weights = minimum_variance_weights(of_members)
+        errors.append(np.sqrt(weights @ of_members @ weights))
+    return float(np.mean(errors))

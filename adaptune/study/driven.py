@@ -10,10 +10,7 @@ from adaptune.model import ErrorModel
 from adaptune.model.registry import ADAPTIVE
 from adaptune.odometry.factory import Factory
 from adaptune.space import ODOMETRY, ParameterSet
-from adaptune.study.config import (
-    OnlineConfig,
-    SwitchingConfig,
-)
+from adaptune.study.config import OnlineConfig, SwitchingConfig
 from adaptune.study.study import Mechanism
 
 PER_STRETCH = 4

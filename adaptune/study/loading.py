@@ -24,13 +24,7 @@ from adaptune.recording.config import SequenceConfig
 from adaptune.recording.recording import RecordedSequence, check_sequence
 from adaptune.space import Categorical, Float, Integer, ParameterSpace, PooledSpace
 from adaptune.strict import ConfigurationError, validated
-from adaptune.study.config import (
-    ROLES,
-    OdometryConfig,
-    OnlineConfig,
-    StudyConfig,
-    settle_roles,
-)
+from adaptune.study.config import ROLES, OdometryConfig, OnlineConfig, StudyConfig, settle_roles
 from adaptune.study.study import Study, declared_odometry, tuned_space, whole_definition
 
 _KINDS: dict[str, type[Float | Integer | Categorical]] = {

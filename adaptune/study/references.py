@@ -58,8 +58,7 @@ def ensure_references(
 ) -> dict[str, str]:
     """Estimate the references that are to be estimated and are not yet, or of something else.
 
-    An estimate is made from the scans as they were recorded.
-    It knows nothing of the study's odometry: what judges a bank is not built from its members.
+    An estimate is made from the scans as they were recorded, without the study's odometry.
     One that was refused is not tried again before something has changed. The study's folder keeps
     them as ``references/<sequence>.tum``. Their accuracy is told over `length` metres.
 

@@ -23,10 +23,7 @@ from adaptune.odometry.factory import Factory, OdometryFactory, OdometryPool
 from adaptune.odometry.registry import declare
 from adaptune.space import ParameterSet, ParameterSpace
 from adaptune.strict import ConfigurationError
-from adaptune.study.config import (
-    OdometryConfig,
-    StudyConfig,
-)
+from adaptune.study.config import OdometryConfig, StudyConfig
 from adaptune.study.sequences import StudySequences
 
 CONFIGURATION = "study.yaml"
