@@ -118,7 +118,6 @@ def _railings(tile: Tile, middle: float) -> list[Mesh]:
 
 
 GARDEN = Scene(
-    summary="paths under dense trees, hedges, slopes, a riverside clearing, bridges",
     build=_garden_build,
     relief=_garden_relief,
     surface=paved((1.6, Material.SOIL), (np.inf, Material.GRASS)),

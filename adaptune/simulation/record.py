@@ -24,6 +24,7 @@ from adaptune.simulation.course import (
     NOISE,
     POINTS,
     POSES,
+    SCENES,
     SENSORS,
     T_IMU_LIDAR,
     Course,
@@ -31,7 +32,6 @@ from adaptune.simulation.course import (
     directions,
 )
 from adaptune.simulation.mesh import REFLECTIVITY, Mesh
-from adaptune.simulation.scenes import SCENES
 from adaptune.simulation.tiles import TILE
 from adaptune.simulation.world import Ride, Road, World
 from adaptune.trajectory import Trajectory, write_tum
@@ -78,10 +78,11 @@ class Drive:
         """Scan the world from one end of the drive to the other."""
         course, sensor = self.course, SENSORS[self.course.sensor]
         columns = course.columns or sensor.columns
-        rings = np.tile(np.arange(sensor.rings, dtype=np.uint16), columns)
-        offsets = np.arange(columns) / (columns * course.turns)
-        times = np.repeat(offsets, sensor.rings).astype(np.float32)
         looks = directions(course.sensor, columns)
+        n_rings = looks.shape[1]
+        rings = np.tile(np.arange(n_rings, dtype=np.uint16), columns)
+        offsets = np.arange(columns) / (columns * course.turns)
+        times = np.repeat(offsets, n_rings).astype(np.float32)
         receiver = kernels.Receiver(*sensor.range, sensor.noise, sensor.dropout)
         caster = _Caster(self, sensor.range[1])
         for number, stamp in enumerate(self.stamps()[:-1].tolist()):
@@ -150,12 +151,8 @@ def simulate(course: Course) -> Iterator[SimulatedScan]:
 GRAVITY = 9.80665
 """m/s^2, downwards along the world's z axis."""
 
-
 Inertial = tuple[NDArray[np.float64], NDArray[np.float64]]
-"""Angular velocities (rad/s) and specific forces (m/s^2) in the IMU's frame, of shape (n, 3).
-
-The specific force points up at rest.
-"""
+"""Angular velocities (rad/s) and specific forces (m/s^2, up at rest) in the IMU's frame, (n, 3)."""
 
 
 def ideal(ride: Ride, times: NDArray[np.float64]) -> Inertial:
@@ -173,10 +170,7 @@ def ideal(ride: Ride, times: NDArray[np.float64]) -> Inertial:
 
 
 def measure(ride: Ride, times: NDArray[np.float64], rate: float, seed: int) -> Inertial:
-    """Measure with biases that wander, and white noise, at times that are `rate` a second.
-
-    `seed` is that of the errors; see `ideal`.
-    """
+    """Measure as `ideal`, `rate` times a second, with wandering biases and white noise."""
     rng = np.random.default_rng([seed, 5])
     gyro, accel = ideal(ride, times)
 

@@ -2,12 +2,15 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from adaptune.simulation.mesh import Material, Mesh, grid, merge, place
+
+if TYPE_CHECKING:
+    from adaptune.simulation.world import Road
 
 Floats = NDArray[np.float64]
 
@@ -27,24 +30,11 @@ class Spots:
     d: Floats
 
 
-class Line(Protocol):
-    """What scenes need of a road, see `adaptune.simulation.world.Road`."""
-
-    def heading(self, s: Floats) -> Floats:
-        """Radians from the x axis at each station."""
-
-    def plane(self, s: Floats, d: Floats) -> tuple[Floats, Floats]:
-        """Coordinates x and y of a station and an offset."""
-
-    def ground(self, x: Floats, y: Floats) -> Floats:
-        """Height of the ground."""
-
-
 @dataclass(frozen=True)
 class Tile:
     """A piece of a scene: up to twenty metres of road and its surroundings."""
 
-    road: Line
+    road: "Road"
     index: int  # its number along the road: it begins at station ``index * TILE``
     # Stations of its ends, in metres; a leg may begin or end within it.
     start: float
@@ -83,10 +73,10 @@ class Tile:
     def scatter(
         self, density: float, near: float, far: float, margin: float = 0.0
     ) -> tuple[Floats, Floats]:
-        """Stations and offsets of objects strewn on both sides of the road.
+        """Stations and offsets of objects strewn beside the road, `density` on a square metre.
 
-        `density` is their mean number on a square metre, `near` and `far` bound their distance from
-        the road's middle, and `margin` is kept free at the ends where another scene begins.
+        `near` and `far` bound their distance from the road's middle. `margin` is kept free at the
+        ends where another scene begins.
         """
         start = self.start + margin * self.opens
         # The last tile of a leg may be shorter than the margin.
@@ -101,7 +91,6 @@ class Tile:
 class Scene:
     """A kind of place."""
 
-    summary: str  # what it is, in a line
     build: Callable[[Tile], list[Mesh]]  # makes what stands on the ground of a tile
     # Height of the ground above the road's line at some spots, for a seed.
     relief: Callable[[Spots, int], Floats]

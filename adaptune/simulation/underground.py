@@ -133,7 +133,6 @@ def _columns(tile: Tile, cone: Mesh) -> list[Mesh]:
 
 
 CAVE = Scene(
-    summary="winding, rough tunnel with narrows, side chambers and dripstones",
     build=_cave_build,
     relief=_cave_relief,
     surface=paved((np.inf, Material.ROCK)),
@@ -163,7 +162,6 @@ def _mine_build(tile: Tile) -> list[Mesh]:
 
 
 MINE = Scene(
-    summary="narrow gallery that bends every few metres, with uneven walls",
     build=_mine_build,
     relief=_cave_relief,
     surface=paved((np.inf, Material.ROCK)),

@@ -15,10 +15,8 @@ from adaptune.simulation.tiles import TILE, Scene, Spots, Tile, smooth
 
 APRON = 40.0
 """Metres of world before the start and after the end of the drive."""
-
-BLEND = 4.0
+_BLEND = 4.0
 """Metres on either side of a border over which the ground of one scene turns into the next's."""
-
 _STEP = 0.25
 
 Floats = NDArray[np.float64]
@@ -38,10 +36,7 @@ class Road:
 
     Stations are metres along the line, 0 where the drive starts; offsets are metres to its left.
     It stays within 70 degrees of the x axis and so never meets itself: each x belongs to one
-    station. Each scene comes with the metres driven in it; the seed is that of bends and slopes.
-
-    Its `legs` are the scenes along it; neighbours of one kind are one leg. The drive's `length` is
-    in metres.
+    station. Each scene comes with the metres driven in it; neighbours of one kind are one leg.
     """
 
     def __init__(self, scenes: Sequence[tuple[Scene, float]], seed: int) -> None:
@@ -87,8 +82,8 @@ class Road:
         shares = []
         for leg in self.legs:
             first, last = leg is self.legs[0], leg is self.legs[-1]
-            rise = np.ones_like(s) if first else smooth((s - leg.start) / (2 * BLEND) + 0.5)
-            fall = np.ones_like(s) if last else smooth((leg.stop - s) / (2 * BLEND) + 0.5)
+            rise = np.ones_like(s) if first else smooth((s - leg.start) / (2 * _BLEND) + 0.5)
+            fall = np.ones_like(s) if last else smooth((leg.stop - s) / (2 * _BLEND) + 0.5)
             shares.append((leg, rise * fall))
         return shares
 
@@ -140,7 +135,6 @@ def _bends(
 
 _CELL = 0.7
 """Metres between vertices of the ground near the road."""
-
 _GROUND = 115.0
 """Metres of ground on either side of the road."""
 
@@ -154,10 +148,9 @@ def _offsets() -> NDArray[np.float64]:
 
 
 class World:
-    """All static objects along a road that rays can hit.
+    """All static objects along a road that rays can hit; only tiles in reach are kept.
 
-    Every tile has its own random numbers and is always built the same. Only tiles in reach are
-    kept: `tiles` holds their meshes by index.
+    Every tile has its own random numbers and is always built the same.
     """
 
     def __init__(self, road: Road) -> None:
@@ -217,8 +210,6 @@ class World:
 
 _KNOTS = 50.0
 """Knots of the trajectory's spline in a second; nothing in it moves faster than a tenth of it."""
-
-
 _START = 2.0
 """Seconds in which a vehicle that stood reaches its speed."""
 
@@ -227,10 +218,8 @@ class Ride:
     """The sensor's trajectory in continuous time, with its derivatives.
 
     One spline of fifth order through positions and roll, pitch and yaw contains the ground, the
-    vehicle and its shake. Poses, velocities and accelerations thus match exactly. The seed is that
-    of its straying, its speed and its shake. It stands for some seconds first.
-
-    Its `duration` is seconds until the end of the road's drive.
+    vehicle and its shake, so that poses, velocities and accelerations match exactly. It stands for
+    some seconds first; `duration` is seconds until the end of the road's drive.
     """
 
     def __init__(self, road: Road, motion: Motion, seed: int, standstill: float = 0.0) -> None:

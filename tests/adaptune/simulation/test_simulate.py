@@ -103,7 +103,7 @@ def test_a_robot_can_drive_through_every_scene_into_every_other(seed):
     worst = int(np.argmin(clearance))
     station = float(drive.road.station(T[worst, 0, 3]))
     leg = next(leg for leg in drive.road.legs if leg.start <= station <= leg.stop)
-    assert clearance[worst] > 0.35, (station, leg.scene.summary)
+    assert clearance[worst] > 0.35, (station, leg.scene)
 
 
 @pytest.mark.parametrize("scene", SCENES)

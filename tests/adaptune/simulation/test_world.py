@@ -2,8 +2,7 @@ import numpy as np
 import pytest
 
 from adaptune.geometry import from_quaternions
-from adaptune.simulation import kernels
-from adaptune.simulation.scenes import SCENES
+from adaptune.simulation import SCENES, kernels
 from adaptune.simulation.world import APRON, Road
 
 
