@@ -39,10 +39,9 @@ class MeasuredReference:
     def error(self, length: float) -> OwnError | None:
         """Mean error of the reference, in percent of sub-trajectories of `length` metres.
 
-        What the registrations themselves are wrong by is part of it. A registration is `HOPS`
-        metres long at most; over less, the reference counts as wrong by as many metres. None if
-        the registrations that follow each other reach nowhere over the length, or most of them do
-        not show motion along the way.
+        That of the registrations is part of it. Over less than their length, the reference counts
+        as wrong by as many metres. None if registrations that follow each other reach nowhere over
+        the length, or most of them do not show motion along the way.
         """
         if self.unseen:
             return None
@@ -77,10 +76,7 @@ class MeasuredReference:
 
     @cached_property
     def unseen(self) -> str:
-        """Axis of the sensor along which the place does not show motion, though it moves so.
-
-        Empty where most registrations show it. All scans of a tunnel look alike along it.
-        """
+        """Axis of the sensor along which the place, as a tunnel, does not show motion, or empty."""
         T = invert(self.T_ref_sensor[self.hops.start]) @ self.T_ref_sensor[self.hops.end]
         way = T[:, :3, 3] / np.linalg.norm(T[:, :3, 3], axis=1, keepdims=True)
         lost = way - np.einsum("nij,nj->ni", self.hops.projection, way)
@@ -104,10 +100,7 @@ class MeasuredReference:
 def measure_reference(
     scans: Recording, reference: Trajectory, advance: "Advance" = lambda *_: None
 ) -> MeasuredReference:
-    """Register the scans of a recording to find how wrong a reference of its LiDAR is.
-
-    `advance` is called after every scan.
-    """
+    """Register the scans of a recording to find how wrong a reference of its LiDAR is."""
     stamps, poses = [], []
     n, doubt = scans.n_messages, hard_to_track(scans)
 
@@ -132,10 +125,9 @@ def _pose_at(reference: Trajectory, stamp: int) -> Poses:
 
 
 def mean_difference(T_one: Poses, T_other: Poses, length: float) -> float:
-    """Mean RTE in percent of one reference by another, over `length` metres.
+    """Mean RTE in percent of one reference by another, over `length` metres; NaN if unknown.
 
-    The poses are of shape (n, 4, 4), at the same stamps, and NaN where they are unknown. The
-    result is NaN where both together hold no sub-trajectory.
+    The poses are of shape (n, 4, 4), at the same stamps, and NaN where they are unknown.
     """
     known = np.isfinite(T_one + T_other).all(axis=(1, 2), keepdims=True)
     T_one, T_other = (np.where(known, T, np.nan) for T in (T_one, T_other))
@@ -195,12 +187,10 @@ def proposed_sub_trajectory(
 ) -> float:
     """Metres of the sub-trajectories that a study should judge by.
 
-    The test begins after the share `training` of the reference's duration.
-
-    The first of `LENGTHS` for which the test's part of the path is long enough, 1 m if none is,
-    or a longer one if that does not last `SECONDS`. Where registrations say that the reference is
-    too noisy for it, the first longer one that fits and for which it is not; where it is for all,
-    the longest that fits, up to the greatest of `LENGTHS`.
+    The first of `LENGTHS` for which the path after the share `training` of the time is long enough,
+    1 m if none is, or a longer one if that does not last `SECONDS`. Where registrations say that
+    the reference is too noisy for it, the first longer one that fits and for which it is not; where
+    it is for all, the longest that fits, up to the greatest of `LENGTHS`.
     """
     path, seconds = path_after(reference, training)
     usual = next((length for length, n in LENGTHS.items() if n * length <= path), 1.0)

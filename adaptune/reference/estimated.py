@@ -85,10 +85,8 @@ class EstimatedReference:
         edges = np.flatnonzero(np.diff(self.known.astype(int), prepend=1, append=1))
         begins, ends = np.maximum(edges[::2] - 1, 0), np.minimum(edges[1::2], len(seconds) - 1)
         return [
-            Finding(
-                (), self._reason(begin, end), seconds=(float(seconds[begin]), float(seconds[end]))
-            )
-            for begin, end in zip(begins.tolist(), ends.tolist(), strict=True)
+            Finding((), self._reason(i, k), seconds=(float(seconds[i]), float(seconds[k])))
+            for i, k in zip(begins.tolist(), ends.tolist(), strict=True)
         ]
 
     def _reason(self, first: int, last: int) -> str:
@@ -124,10 +122,7 @@ class EstimatedReference:
         return 1.0 - float(self.known.mean())
 
     def error(self, length: float) -> float:
-        """Estimated mean RTE of the reference itself, in percent over `length` metres.
-
-        NaN where no sub-trajectory is as long.
-        """
+        """Estimated mean RTE of the reference in percent over `length` metres; NaN if unknown."""
         known = self.known[:, None, None]
         one, other = (np.where(known, half, np.nan) for half in self.halves)
         errors = sub_trajectory_rte(one, other, length)

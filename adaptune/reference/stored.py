@@ -31,14 +31,6 @@ class StoredEstimate(NamedTuple):
     # its estimated mean RTE in percent, by the length of sub-trajectories in metres
     errors: dict[float, float]
 
-    @classmethod
-    def of(cls, path: Path, found: EstimatedReference, about: dict[str, Any]) -> "StoredEstimate":
-        """What is known about an estimate that is to be written to `path`."""
-        by_length = {length: found.error(length) for length in LENGTHS}
-        errors = {length: round(e, 4) for length, e in by_length.items() if math.isfinite(e)}
-        metres, share = round(found.path(), 3), round(found.unknown_share(), 4)
-        return cls(path, about, len(found.stamps), metres, share, errors)
-
     def error(self, length: float) -> float:
         """Estimated mean RTE of the reference in percent over `length` metres; NaN if unknown."""
         lengths = sorted(self.errors)
@@ -53,8 +45,7 @@ class StoredEstimate(NamedTuple):
     def read(cls, path: Path) -> "StoredEstimate | None":
         """What is known about the estimated reference in a TUM file; None if it is not one.
 
-        Nor is it one where an estimate was refused, see `Refusal`. There is an `EstimateError` if
-        the file beside it is damaged.
+        There is an `EstimateError` if the file beside it is damaged.
         """
         beside = path.with_suffix(".json")
         try:
@@ -74,11 +65,11 @@ class StoredEstimate(NamedTuple):
 
 
 def write_estimate(path: Path, found: EstimatedReference, about: dict[str, Any]) -> StoredEstimate:
-    """Write ``.png``, ``.tum`` and, last, ``.json``.
-
-    If it is interrupted, no ``.json`` is there, and so nothing that counts as an estimate.
-    """
-    stored = StoredEstimate.of(path, found, about)
+    """Write ``.png``, ``.tum`` and, last, ``.json``: without that, it does not count as one."""
+    by_length = {length: found.error(length) for length in LENGTHS}
+    errors = {length: round(e, 4) for length, e in by_length.items() if math.isfinite(e)}
+    metres, share = round(found.path(), 3), round(found.unknown_share(), 4)
+    stored = StoredEstimate(path, about, len(found.stamps), metres, share, errors)
     path.parent.mkdir(parents=True, exist_ok=True)
     # What is known of an estimate before is not of these poses.
     path.with_suffix(".json").unlink(missing_ok=True)
@@ -94,10 +85,7 @@ def write_estimate(path: Path, found: EstimatedReference, about: dict[str, Any])
 
 
 def check_writable(path: Path) -> None:
-    """Make the folder of an estimate; an `EstimateError` if that cannot be written to.
-
-    There is one, too, if a file there is no estimate.
-    """
+    """Make the folder of an estimate; an `EstimateError` if it, or a file there, is not for one."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with TemporaryFile(dir=path.parent):

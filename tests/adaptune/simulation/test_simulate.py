@@ -82,7 +82,7 @@ def test_every_sensor_scans(name):
     assert len(scan) > 0.6 * len(sensor.elevations) * sensor.columns
     assert away.min() > sensor.range[0] - 0.1
     assert away.max() < sensor.range[1] + 0.1
-    assert set(scan.rings.tolist()) == set(range(sensor.rings))
+    assert set(scan.rings.tolist()) == set(range(len(sensor.elevations)))
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
