@@ -12,18 +12,41 @@ from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, mod
 from adaptune import geometry
 from adaptune.errors import AdaptuneError
 from adaptune.files import expand_user
-from adaptune.recording.parts import Part
 from adaptune.recording.scan import USUAL, Imu, ImuNoise, SequenceError
 from adaptune.recording.timing import Mark, Unit
 from adaptune.strict import StrictModel
 
 Compensation = Literal["constant_velocity"] | None
 """How motion within a scan is undone; none if it is left as it is."""
+Fractions = tuple[float, float]
+"""Where a part of a sequence begins and ends, as fractions of its duration."""
 REFERENCE_FILES = (".tum", ".txt", ".csv")
 ESTIMATED, NO_REFERENCE = "estimated", "none"
 """In place of a `reference`: it is estimated from the scans, or there is none."""
 SOURCES = ("bag", "kitti", "folder")
 _STANDARD_GRAVITY = 9.80665
+_PERCENT = re.compile(r"\s*(\d+(?:\.\d+)?)\s*-\s*(\d+(?:\.\d+)?)\s*%\s*")
+
+
+def read_part(given: Any) -> Fractions:
+    """Read ``0-60%``, or two fractions; a ValueError says what is wrong."""
+    begin, end = 1.0, 0.0
+    if isinstance(given, str) and (match := _PERCENT.fullmatch(given)):
+        begin, end = (float(percent) / 100.0 for percent in match.groups())
+    elif isinstance(given, list | tuple) and [type(f) for f in given] in ([float] * 2, [int] * 2):
+        begin, end = map(float, given)
+    if not 0.0 <= begin < end <= 1.0:
+        raise ValueError("give a part in percent of the duration, from 0 to 100, as in 0-60%")
+    return begin, end
+
+
+def part_name(name: str, part: Fractions) -> str:
+    """Name of a part of a sequence, which may be the name of a file."""
+    begin, end = (f"{100.0 * fraction:.10g}" for fraction in part)
+    return f"{name}_{begin}-{end}"
+
+
+Part = Annotated[Fractions, BeforeValidator(read_part)]
 
 
 def expand(text: str) -> str:
@@ -34,15 +57,12 @@ def expand(text: str) -> str:
 
 
 def resolve(path: str, info: ValidationInfo) -> str:
-    """Make a path absolute: `expand`, replace ~, start from the folder of the study's file.
-
-    What is there under just this name is meant, whatever signs the name holds.
-    """
+    """Make a path absolute: `expand`, replace ~, start from the folder of the study's file."""
     folder = (info.context or {}).get("folder", Path())
     if not path.strip():
         raise ValueError("give a path, not an empty text")
     try:
-        given = Path(folder, path)
+        given = Path(folder, path)  # whatever signs its name holds, if it is there
         whole = (given if given.exists() else folder / expand_user(expand(path))).resolve()
         whole.exists()
     except AdaptuneError as error:
@@ -72,10 +92,7 @@ BAG_SUFFIXES = (".bag", ".mcap", ".db3")
 
 
 def bag_paths(given: Sequence[str]) -> list[Path]:
-    """Bags to open for the paths, folders and patterns that a user gives.
-
-    A SequenceError names what does not exist or holds no bag.
-    """
+    """Bags to open for paths, folders and patterns; a SequenceError names what holds no bag."""
     paths: list[Path] = []
     for text in given:
         path = Path(text)
@@ -119,11 +136,7 @@ def _pose(given: Any) -> Any:
 _Numbers = tuple[float, ...]
 Transform = Annotated[_Numbers | tuple[_Numbers, ...], BeforeValidator(_pose)]
 """A pose as seven numbers, or as the rows of a matrix."""
-
-
 _Seconds = Annotated[float, Field(ge=0, le=1e9)]
-
-
 _Noise = Annotated[float, Field(gt=0, le=1e6)]
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
-from adaptune.recording.bag import BagSource
+from adaptune.recording.bag import UNOPENED, BagSource
 from adaptune.recording.config import BAG_SUFFIXES, bag_paths
 from adaptune.recording.scan import SequenceError
 
@@ -34,9 +34,8 @@ class FolderReading(NamedTuple):
 def read_folder(path: Path) -> FolderReading:
     """Tell the parts of one recording from separate recordings.
 
-    Parts follow each other, and have one name with numbers. Separate recordings are a minute
-    apart, or some overlap, or they are folders of their own. A SequenceError names a bag that
-    cannot be opened or is still being written.
+    Parts follow each other, and have one name with numbers. Separate recordings are a minute apart,
+    or some overlap, or they are folders of their own. A SequenceError names a bag that is unfit.
     """
     alone = FolderReading((path,), "one")
     if not path.is_dir() or (path / "metadata.yaml").exists() or (path / "velodyne").is_dir():
@@ -70,8 +69,7 @@ def _is_recording(path: Path) -> bool:
 
 def _span(bag: Path) -> tuple[int, int]:
     """First and last time of a bag, nanoseconds."""
-    about = {"topics": {}, "points": "", "n_messages": 0, "duration": 0, "begins": {}}
-    with BagSource(bag_paths([str(bag)]), about=about).open(by_index=True) as reader:
+    with BagSource(bag_paths([str(bag)]), about=UNOPENED).open(by_index=True) as reader:
         return reader.start_time, reader.end_time
 
 
@@ -100,12 +98,7 @@ def both_readings(folder: FolderReading) -> str:
 
 
 def check_alike(recordings: Sequence["Inspection"]) -> None:
-    """Refuse recordings of different sensors or rates together, with the list of them.
-
-    Raises
-    ------
-    SequenceError
-    """
+    """Refuse recordings of different sensors or rates by a SequenceError that lists them."""
     kinds: dict[str, list[str]] = {}
     rates: list[float] = []
     for one in recordings:

@@ -11,7 +11,14 @@ from adaptune import files, yaml12
 from adaptune.errors import AdaptuneError, Finding, MachineError
 from adaptune.progress import Progress, unseen
 from adaptune.recording import Scan, SequenceConfig, SequenceError
-from adaptune.recording.bag import IMU_TYPES, BagSource, Window, storages
+from adaptune.recording.bag import (
+    IMU_TYPES,
+    UNOPENED,
+    BagSource,
+    IndexReader,
+    Window,
+    storages,
+)
 from adaptune.recording.clouds import CLOUDS, decode_cloud, header_of, parse
 from adaptune.recording.config import BAG_SUFFIXES, REFERENCE_FILES, bag_paths
 from adaptune.recording.content import Content
@@ -24,7 +31,6 @@ from adaptune.recording.findings import (
     of_topic,
 )
 from adaptune.recording.folder import kitti, scan_folder
-from adaptune.recording.indexed_bag import IndexReader
 from adaptune.recording.pose_messages import PATH, POSES, Pose, untimed, usable
 from adaptune.trajectory import Trajectory, is_kitti, read_kitti, read_trajectory
 
@@ -81,10 +87,7 @@ class Inspection:
 
     @property
     def missing(self) -> dict[str, tuple[str, ...]]:
-        """What each stage still needs; empty if it can run.
-
-        Where there is no reference, one is estimated.
-        """
+        """What each stage still needs; empty if it can run."""
         if not self.name:
             return {}
         lacks = {
@@ -123,9 +126,8 @@ class Inspection:
 def inspect(path: Path, deep: bool = False, show: Progress = unseen) -> Inspection:
     """Read a recording and report what it holds: a sample of it if it is long and not `deep`.
 
-    It is a bag, a folder with bags, a KITTI sequence, a folder of scans, or a file of
-    poses. An AdaptuneError says that it cannot be opened at all. What fails later is among
-    its findings.
+    It is a bag, a folder with bags, a KITTI sequence, a folder of scans, or a file of poses. An
+    AdaptuneError says that it cannot be opened; what fails later is among its findings.
     """
     if not path.exists():
         raise SequenceError(f"{path}: there is no such file or folder")
@@ -188,11 +190,7 @@ def _inspect_scans(path: Path, kind: str, deep: bool, show: Progress) -> Inspect
 
 
 def _find(found: Inspection, apart: bool, slack: float) -> None:
-    """Add what is wrong with what was read.
-
-    Between bags that are `apart` nothing is missing. Scans and reference may both go on for `slack`
-    seconds beyond what was read.
-    """
+    """Add what is wrong with what was read, see `of_topic` and `of_overlap`."""
     roles = {name: key for key, name in found.used.items()}
     for topic in found.topics.values():
         found.findings += of_topic(topic, roles.get(topic.name, ""), found.complete, apart)
@@ -222,8 +220,7 @@ _APART = 60.0
 
 
 def _inspect_bags(path: Path, deep: bool, show: Progress) -> Inspection:
-    about = {"topics": {}, "points": "", "n_messages": 0, "duration": 0, "begins": {}}
-    source = BagSource(bag_paths([str(path)]), about=about)
+    source = BagSource(bag_paths([str(path)]), about=UNOPENED)
     with source.open(by_index=True) as reader:
         topics = _topics(reader)
         used = _used(topics)

@@ -4,6 +4,7 @@ import logging
 import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import cache as once
 from functools import cached_property
 from itertools import chain, islice, product
@@ -38,17 +39,6 @@ def open_sequence(config: SequenceConfig) -> Recording:
     A SequenceError says why it cannot be opened as described.
     """
     return RecordedSequence(config)
-
-
-def check_sequence(config: SequenceConfig) -> "RecordedSequence":
-    """Open a recording, and find what would fail while it is read, without reading its scans.
-
-    A SequenceError says that it cannot be opened as described, ends before its `start`, or that its
-    reference is of another time.
-    """
-    recorded = RecordedSequence(config)
-    recorded.check()
-    return recorded
 
 
 def wants_estimate(config: SequenceConfig) -> bool:
@@ -171,9 +161,6 @@ class RecordedSequence:
             self.stop = self.stop if end == 1.0 else self.start + end * whole
             self.start += begin * whole
 
-    def __repr__(self) -> str:
-        return f"<RecordedSequence {self.name}: about {self.n_messages} scans>"
-
     @property
     def name(self) -> str:
         """The recording's file."""
@@ -201,8 +188,7 @@ class RecordedSequence:
         """Read the scans one after the other.
 
         Scans whose stamps do not come after the one before, or that repeat it, are left out. That,
-        and what else is odd about the scans, is reported in the log. Times that cannot be are a
-        SequenceError.
+        and what else is odd, is logged. Times that cannot be are a SequenceError.
         """
         for finding in self.source.findings:
             _warn(self.name, str(finding))
@@ -224,10 +210,7 @@ class RecordedSequence:
             _warn(self.name, text)
 
     def _compensated(self, scans: Iterator[Scan]) -> Iterator[Scan]:
-        """Points as if the sensor had kept its place since the scan's start, if that is set.
-
-        The velocity is constant, and that since the scan before, which is registered for it.
-        """
+        """Points as if the sensor had kept its place since the scan's start, if that is set."""
         if self._config.compensate is None:
             return scans
 
@@ -303,7 +286,7 @@ class RecordedSequence:
     def shares_scans(self, other: "RecordedSequence") -> bool:
         """Whether both use the same scans, of one file or written again.
 
-        Scans of one stamp tell it, those in the middle of the common time first.
+        Scans of one stamp tell, those in the middle of the common time first.
         """
         begin, end, files = 0, _NEVER, list[set[Path]]()
         for one in (self, other):
@@ -357,10 +340,9 @@ class RecordedSequence:
         return self._checked_poses(Trajectory(stamps, T, config.max_gap))
 
     def check(self) -> None:
-        """Find early what would fail while reading the scans, without reading them.
+        """Refuse a section after the end and a reference of another time, without reading scans.
 
-        The section may begin after the end; the reference may be unreadable or of another time. Of
-        poses on a topic, only the first one is checked.
+        Of poses on a topic, only the first one is checked.
         """
         span = self.source.span()
         if span is None:
@@ -435,3 +417,67 @@ class RecordedSequence:
 @once
 def _warn(name: str, text: str) -> None:
     _log.warning("%s: %s", name, text)
+
+
+_LATE = 10 * 10**9
+"""Nanoseconds after the first scan at which an IMU that is on the same clock has begun."""
+
+
+@dataclass(frozen=True, eq=False)
+class RecordingWithImu:
+    """A recording whose scans carry the measurements of its IMU.
+
+    Reading raises a SequenceError if there is no IMU, or it measured at another time.
+    """
+
+    inner: Recording
+
+    @property
+    def name(self) -> str:
+        """The recording's file."""
+        return self.inner.name
+
+    @property
+    def n_messages(self) -> int:
+        """About how many scans there are."""
+        return self.inner.n_messages
+
+    def __iter__(self) -> Iterator[Scan]:
+        return self._carrying(iter(self.inner))
+
+    def since(self, stamp: int) -> Iterator[Scan]:
+        """Read the scans from a little before `stamp` on."""
+        return self._carrying(self.inner.since(stamp))
+
+    def reference(self) -> Trajectory | None:
+        """Poses of the LiDAR, if they are known."""
+        return self.inner.reference()
+
+    def imu(self) -> Imu | None:
+        """Measurements of the IMU, if there is one."""
+        return self._imu
+
+    @cached_property
+    def _imu(self) -> Imu | None:
+        return self.inner.imu()
+
+    def _carrying(self, scans: Iterator[Scan]) -> Iterator[Scan]:
+        imu = self._imu
+        if imu is None or not len(imu):
+            what = "holds no measurements of an IMU; name their topic"
+            raise SequenceError(f"{self.name}: {what}")
+        first: int | None = None
+        for scan in scans:
+            if first is None:
+                begin, end = imu.stamps[0], imu.stamps[-1]
+                if not begin - _LATE < scan.stamp < end:
+                    first_scan, *covered = (f"{t * 1e-9:.3f} s" for t in (scan.stamp, begin, end))
+                    raise SequenceError(
+                        f"{self.name}: the IMU covers {' to '.join(covered)}, the first scan is "
+                        f"of {first_scan}: record both on the same clock, or leave `imu` out"
+                    )
+                # Those during the first scan, and the one before.
+                first = max(int(imu.stamps.searchsorted(scan.stamp, "right")) - 1, 0)
+            last = max(int(imu.stamps.searchsorted(scan.stamp + scan.span)) + 1, first)
+            yield replace(scan, imu=imu.part(first, last))
+            first = last

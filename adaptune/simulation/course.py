@@ -13,8 +13,7 @@ from pydantic import AfterValidator, Field, model_validator
 from adaptune import geometry
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses
-from adaptune.recording.config import Compensation, SequenceConfig
-from adaptune.recording.parts import Part
+from adaptune.recording.config import Compensation, Part, SequenceConfig
 from adaptune.recording.scan import ImuNoise
 from adaptune.simulation.corridor import CORRIDOR
 from adaptune.simulation.garden import GARDEN

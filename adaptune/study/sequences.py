@@ -10,11 +10,10 @@ from typing import Any
 from adaptune.manifest import merged
 from adaptune.odometry.program import ProgramInput, program_input
 from adaptune.recording.cache import fingerprints
-from adaptune.recording.changed import with_imu
-from adaptune.recording.config import REFERENCE_FILES, SOURCES, SequenceConfig
+from adaptune.recording.config import REFERENCE_FILES, SOURCES, SequenceConfig, part_name
 from adaptune.recording.export import Layout
-from adaptune.recording.parts import part_name
 from adaptune.recording.recording import (
+    RecordingWithImu,
     SequenceFiles,
     open_sequence,
     sequence_files,
@@ -116,7 +115,7 @@ class StudySequences:
         """
         self._check_recorded(name)
         sequence = open_sequence(self.config(name))
-        return with_imu(sequence) if self.with_imu else sequence
+        return RecordingWithImu(sequence) if self.with_imu else sequence
 
     def _check_recorded(self, name: str) -> None:
         if name in self.courses and not self.recording(name).exists():

@@ -3,8 +3,7 @@ import pytest
 import rec
 
 from adaptune.recording import Imu, Scan, SequenceConfig, SequenceError
-from adaptune.recording.changed import with_imu
-from adaptune.recording.recording import open_sequence
+from adaptune.recording.recording import RecordingWithImu, open_sequence
 
 
 class Inertial:
@@ -25,7 +24,7 @@ class Inertial:
 
 
 def hundredths(begin, end):
-    measured = [scan.imu for scan in with_imu(Inertial(begin, end))]
+    measured = [scan.imu for scan in RecordingWithImu(Inertial(begin, end))]
     return [(imu.stamps // 10**7).tolist() for imu in measured]
 
 
