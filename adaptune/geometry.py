@@ -22,8 +22,7 @@ def invert(T_target_source: Poses) -> Poses:
 def rectify(T_target_source: Poses) -> Poses:
     """Remove rounding errors from rotations by one Newton step of the polar decomposition.
 
-    Chained motions amplify them. Where each pose is predicted from the two before it, they more
-    than double with every scan.
+    Where each pose is predicted from the two before it, they more than double with every scan.
     """
     T = T_target_source.copy()
     R = T[..., :3, :3]
@@ -33,7 +32,7 @@ def rectify(T_target_source: Poses) -> Poses:
 
 def squared_ranges(points: NDArray[Any]) -> NDArray[Any]:
     """Squared distances of points of shape (n, 3) from the origin, of shape (n,)."""
-    # Three passes over columns take a third of the time of `einsum` over rows of three.
+    # Columns take a third of the time of `einsum` over rows.
     x, y, z = points.T
     return np.asarray(x * x + y * y + z * z)
 
@@ -50,10 +49,7 @@ def steps(T_world_sensor: Poses) -> Poses:
 
 
 def scale(T_previous_current: Poses, share: float) -> Poses:
-    """Scale a motion, of shape (4, 4), to a share of its time, at the same velocities.
-
-    The result is the exponential of `share` times the motion's logarithm.
-    """
+    """Scale a motion, of shape (4, 4), to a share of its time: the exponential of its logarithm."""
     if share == 1.0:
         return T_previous_current
     from scipy.spatial.transform import RigidTransform
@@ -106,10 +102,7 @@ def nearest_rotation(
 
 
 def from_quaternions(translations: ArrayLike, quaternions: ArrayLike) -> Poses:
-    """Poses of shape (n, 4, 4) from translations (n, 3) and quaternions x, y, z, w (n, 4).
-
-    Quaternions are normalised.
-    """
+    """Poses (n, 4, 4) from translations (n, 3) and quaternions x, y, z, w (n, 4) of any length."""
     from scipy.spatial.transform import Rotation
 
     translations = np.asarray(translations, np.float64).reshape(-1, 3)
@@ -129,11 +122,10 @@ def to_quaternions(T_target_source: Poses) -> NDArray[np.float64]:
 def interpolate(
     stamps: NDArray[np.int64], T_world_sensor: Poses, at: NDArray[np.int64], max_gap: int
 ) -> Poses:
-    """Interpolate poses at other stamps: linearly in translation, spherically in rotation.
+    """Poses (m, 4, 4) at other stamps (m,): linear in translation, spherical in rotation.
 
-    Stamps of shape (n,) are strictly increasing nanoseconds, those `at` which to interpolate are of
-    shape (m,). Poses are of shape (n, 4, 4), those found of shape (m, 4, 4): NaN outside `stamps`,
-    and between poses that are further apart than `max_gap` nanoseconds.
+    They are NaN outside `stamps`, of shape (n,), which strictly increase, and between poses that
+    are further apart than `max_gap` nanoseconds.
     """
     T = np.full((len(at), 4, 4), np.nan)
     if not len(stamps) or not len(at):

@@ -1,7 +1,6 @@
 """Trajectories, and their files in the TUM, KITTI and EuRoC formats.
 
-All readers raise a TrajectoryError that names the file and the line that is not a pose, or whose
-stamp lies before the one before it.
+All readers raise a TrajectoryError that names the file, and the line where one is wrong.
 """
 
 import logging
@@ -56,10 +55,6 @@ class Trajectory:
     def __len__(self) -> int:
         return len(self.stamps)
 
-    def __repr__(self) -> str:
-        seconds = np.ptp(self.stamps) * 1e-9 if len(self) else 0.0
-        return f"<Trajectory: {len(self)} poses in {seconds:.1f} s>"
-
     @property
     def sparse(self) -> str:
         """Where many poses are further apart than `max_gap`: how many, and what to set."""
@@ -73,10 +68,7 @@ class Trajectory:
         return f"{what} = {self.max_gap:g} s: {help_}"
 
     def at(self, stamps: NDArray[np.int64], max_gap: float | None = None) -> Poses:
-        """Interpolated poses of shape (m, 4, 4) at m stamps; NaN where there is no pose.
-
-        `max_gap` is in seconds, in place of the trajectory's own.
-        """
+        """Interpolated poses of shape (m, 4, 4) at m stamps; NaN where there is no pose."""
         gap = self.max_gap if max_gap is None else max_gap
         return geometry.interpolate(self.stamps, self.T_world_sensor, stamps, round(gap * 1e9))
 
@@ -278,10 +270,7 @@ def read_tum(path: Path) -> Trajectory:
 
 
 def read_trajectory(path: Path) -> Trajectory:
-    """Read poses with stamps: of a ``.csv`` in nanoseconds as EuRoC writes them, else as TUM does.
-
-    A header of names gives any other order.
-    """
+    """Read poses with stamps: ``.csv`` in nanoseconds as EuRoC's, else TUM; or as a header says."""
     return _read(path, csv=path.suffix == ".csv")
 
 

@@ -57,10 +57,7 @@ def folder() -> Path:
 
 
 def cap() -> int:
-    """Bytes that all entries together may take: ``$ADAPTUNE_CACHE_GB`` gigabytes, or 50.
-
-    An AdaptuneError if the variable is no number of gigabytes.
-    """
+    """Bytes that all entries together may take: ``$ADAPTUNE_CACHE_GB`` gigabytes, or 50."""
     given = os.environ.get("ADAPTUNE_CACHE_GB", "").strip()
     with suppress(ValueError):
         gigabytes = float(given or _CAP_GB)
@@ -72,10 +69,7 @@ def cap() -> int:
 
 
 def key(files: Sequence[Path], settings: Any) -> str:
-    """Digest of files and settings; an OSError if a file cannot be read.
-
-    A file counts by all that changes when it is written, moved or replaced, see `status_key`.
-    """
+    """Digest of the `status_key` of files, and of settings; an OSError if a file cannot be read."""
     about = f"{_VERSION} {settings!r} {' '.join(map(status_key, files))}"
     return hashlib.blake2b(about.encode(), digest_size=_SIZE).hexdigest()
 
@@ -252,20 +246,15 @@ FILE = "fingerprints.txt"
 """File in the cache's folder: on every line the hash of a file's status, and of its content."""
 MANY = 64
 """So many files have one hash together."""
-
 _LONG = 1 << 30
 """Bytes that take more than a second to read."""
 _SIZE = 16
-
 remembered: dict[str, str] = {}
 """Hashes that this process knows, also where the cache's folder cannot be written."""
 
 
 def fingerprints(files: Sequence[Path]) -> list[str]:
-    """Hash the content of each file; `MANY` or more files are hashed as one.
-
-    There is an AdaptuneError if a file cannot be read, or changes while it is read.
-    """
+    """Hash the content of each file, `MANY` or more as one; an AdaptuneError if one changes."""
     new: dict[str, str] = {}
     found = []
     try:

@@ -62,7 +62,7 @@ class Content:
     def of_place(self, reference: Trajectory, known: bool, where: Key = ()) -> Iterator[Finding]:
         """Clouds that stay in place while the reference moves: they are in the frame of a map.
 
-        Where nothing else says so (`known`), only a way that is longer than the view tells.
+        Unless that is `known`, only a way that is longer than the view tells.
         """
         looks = [look for look in self.looks if look.n >= LEAST_POINTS]
         T = reference.at(np.array([look.stamp for look in looks], np.int64))

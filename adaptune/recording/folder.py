@@ -107,10 +107,9 @@ def read_scan(
 
 
 def turn_up(points: NDArray[np.float32], degrees: float) -> NDArray[np.float32]:
-    """Turn every ray up by `degrees`, in the vertical plane in which it lies.
+    """Turn the rays to points of shape (n, 3) up by `degrees`, each in its vertical plane.
 
-    The rays of KITTI's HDL-64E lie 0.205 too low (Deschaud, IMLS-SLAM, ICRA 2018; KISS-ICP corrects
-    it likewise). `points` are of shape (n, 3).
+    Those of KITTI's HDL-64E lie 0.205 too low (Deschaud, IMLS-SLAM, ICRA 2018).
     """
     sine, cosine = np.sin(np.deg2rad(degrees)), np.cos(np.deg2rad(degrees))
     distance = np.hypot(points[:, 0], points[:, 1])
@@ -255,10 +254,7 @@ _NAMES = (
 
 
 def _named_stamps(files: Sequence[Path]) -> tuple[NDArray[np.int64] | None, str]:
-    """Nanoseconds that the files' names are, if they are times, and in which unit.
-
-    If they only look like times, the first name is given in place of the unit.
-    """
+    """Nanoseconds that the files' names are, and their unit, or a name that only looks like one."""
     stems = [re.sub(r"(\.(bin|npy|pcd|ply))+$", "", path.name) for path in files]
     for pattern, power, unit in _NAMES:
         found = [match.groups() for match in map(re.compile(pattern).search, stems) if match]

@@ -35,9 +35,9 @@ def sound(
 ) -> tuple[Trajectory, list[Finding]]:
     """The poses without those that no robot can have had, and what was wrong with them.
 
-    A pose that is repeated while the robot moves says nothing: it is left out. At a jump a gap of
-    more than `max_gap`, and of `hole` seconds at least, is left: no sub-trajectory crosses it.
-    Seconds of the findings count from `begin`, in nanoseconds, by default from the first pose.
+    A pose that is repeated while the robot moves is left out. At a jump a gap of more than
+    `max_gap`, and of `hole` seconds at least, is left: no sub-trajectory crosses it. Seconds of the
+    findings count from `begin`, in nanoseconds, by default from the first pose.
     """
     begin = int(reference.stamps[0]) if begin is None else begin
     lost = _repeated(reference)
@@ -119,10 +119,7 @@ def _to_and_fro(reference: Trajectory) -> float:
 
 
 def _jumps(reference: Trajectory) -> tuple[NDArray[np.int64], float]:
-    """Steps that neither neighbours nor the robot's speed explain.
-
-    Returned are the stamps around each, of shape (n, 2), and how far the farthest leads.
-    """
+    """Stamps around steps that nothing explains, (n, 2), and how far the farthest leads."""
     from scipy.spatial.transform import Rotation
 
     _, some = np.unique((reference.stamps - reference.stamps[0]) // _PERIOD, return_index=True)
@@ -143,10 +140,7 @@ def _jumps(reference: Trajectory) -> tuple[NDArray[np.int64], float]:
 
 
 def _around(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Medians of the values, of shape (n, k), before and after each one: (2, n, k).
-
-    At the ends, where there are fewer, the other side stands for both. Few values are their own.
-    """
+    """Medians of the values, of shape (n, k), before and after each one: (2, n, k)."""
     n, k = values.shape
     if n < _AROUND:
         return np.stack([values, values])
@@ -154,6 +148,7 @@ def _around(values: NDArray[np.float64]) -> NDArray[np.float64]:
     padded = np.concatenate([padding, values, padding])
     windows = np.lib.stride_tricks.sliding_window_view(padded, _AROUND, axis=0)
     sides = np.stack([windows[:n], windows[_AROUND + 1 :]])
+    # At the ends, where there are fewer, the other side stands for both.
     few = np.isfinite(sides[..., 0, :]).sum(axis=-1) < 3
     sides = np.where(few[..., None, None], sides[::-1], sides)
     return np.asarray(np.nanmedian(sides, axis=-1))

@@ -53,14 +53,11 @@ class Timing:
     def resolve(
         self, stamp: int, values: NDArray[Any] | None, extent: tuple[float, float]
     ) -> tuple[int, NDArray[np.float32] | None, Reading]:
-        """Find the start of a scan, and the time of each point since then.
+        """Start of a scan in nanoseconds, float32 seconds of the points since then, and how read.
 
-        The header's stamp is nanoseconds. `values` are the times of the valid points as the driver
-        wrote them, of shape (n,): relative to the stamp, or absolute, all finite; `extent` is the
-        least and the greatest of them.
-
-        Returns the start in nanoseconds, and the float32 seconds of the points since then, of
-        shape (n,), none below zero.
+        `values` are the times of the valid points as the driver wrote them, of shape (n,): relative
+        to the header's stamp, or absolute, all finite; `extent` is the least and the greatest of
+        them. No point is before the start.
         """
         if values is None or not len(values) or self.unit == "none":
             start = stamp - round(self.period * 1e9) if self.stamp == "end" else stamp
@@ -175,8 +172,6 @@ def _unwrapped(
 
 AUTO = Timing()
 """Follow the points."""
-
-
 FIRST_SCANS = 10
 """Scans at the beginning of a recording that show how it is timed."""
 SOONEST = 1_000_000
