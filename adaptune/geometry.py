@@ -153,8 +153,7 @@ def interpolate(
     return T
 
 
-_FARTHEST = 1e6
-"""Metres between two frames of one platform."""
+_FARTHEST = 1e6  # metres between two frames of one platform
 
 
 def to_pose(given: Any) -> Poses:

@@ -18,8 +18,7 @@ WORST = 0.1
 KITTI_LENGTHS = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 JITTER = 0.1
 """Metres. A robot that stands does not drive by the noise of its poses, where that is less."""
-_AS_STRAIGHT = 0.9
-"""Share of the path that is left without noise, from which noise does not matter."""
+_AS_STRAIGHT = 0.9  # share of the path that is left without noise, from which noise does not matter
 
 
 def travelled(T_world_sensor: Poses) -> NDArray[np.float64]:

@@ -246,8 +246,7 @@ FILE = "fingerprints.txt"
 """File in the cache's folder: on every line the hash of a file's status, and of its content."""
 MANY = 64
 """So many files have one hash together."""
-_LONG = 1 << 30
-"""Bytes that take more than a second to read."""
+_LONG = 1 << 30  # bytes that take more than a second to read
 _SIZE = 16
 remembered: dict[str, str] = {}
 """Hashes that this process knows, also where the cache's folder cannot be written."""

@@ -16,10 +16,8 @@ from adaptune.trajectory import Trajectory
 _MOMENTS = 64
 # Metres: cells and search radius for the registration of a scan with its neighbour.
 _CELL, _REACH = 0.5, 2.0
-# small_gicp crashes on an empty target.
-_FEWEST = 20
-# Seconds; the mean velocity between scans further apart is not that of either.
-_FAR = 1.0
+_FEWEST = 20  # small_gicp crashes on an empty target
+_FAR = 1.0  # seconds; the mean velocity between scans further apart is not that of either
 
 
 def compensate(scan: Scan, T_start_end: Poses, duration: float) -> Scan:
@@ -105,10 +103,8 @@ def turning_of(scans: Iterable[Scan]) -> tuple[NDArray[np.int64], NDArray[np.flo
     return np.array(stamps, np.int64), np.array(rates, np.float64)
 
 
-_LEAST_CORRELATION = 0.8
-"""Of two rates of turning that show the same motion."""
-_RATE = 50.0
-"""Samples per second to compare."""
+_LEAST_CORRELATION = 0.8  # of two rates of turning that show the same motion
+_RATE = 50.0  # samples per second to compare
 
 
 def clock_offset(

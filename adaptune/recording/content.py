@@ -19,8 +19,7 @@ LEAST_POINTS = 20
 
 # A look takes so many points, and sees whether there are any in so many directions.
 _SAMPLE, _DIRECTIONS = 256, 24
-# Metres. Nothing but a cover surrounds a sensor so closely.
-_COVER = 1.0
+_COVER = 1.0  # metres; nothing but a cover surrounds a sensor so closely
 
 
 class Look(NamedTuple):

@@ -19,8 +19,7 @@ Reading = Literal["one", "several"]
 _OVERLAP, _NEXT, _APART = -0.5, 2.0, 60.0
 """Seconds. Between parts of one recording lies no less and no more than the first two, between
 separate ones less than the first or more than the last."""
-_RATES = 1.25
-"""Rates that differ by a larger factor are those of different sensors."""
+_RATES = 1.25  # rates that differ by a larger factor are those of different sensors
 
 
 class FolderReading(NamedTuple):

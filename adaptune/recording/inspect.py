@@ -160,8 +160,7 @@ def _inspect_poses(path: Path) -> Inspection:
     return found
 
 
-# Scan files that are read, unless all are to be.
-_FILES = 40
+_FILES = 40  # scan files that are read, unless all are to be
 
 
 def _inspect_scans(path: Path, kind: str, deep: bool, show: Progress) -> Inspection:
@@ -213,10 +212,8 @@ def _find(found: Inspection, apart: bool, slack: float) -> None:
 SECONDS = 1.0
 # Bytes read in a second, with BZ2 and without; seconds that a message takes to decode.
 _SLOW, _FAST, _DECODE = 2.5e6, 2e8, 4e-5
-# Parts of a sample, and messages of a topic in each.
-_FEWEST, _MOST, _EACH = 5, 20, 2.5
-# Seconds. Bags of one drive are not further apart.
-_APART = 60.0
+_FEWEST, _MOST, _EACH = 5, 20, 2.5  # parts of a sample, and messages of a topic in each
+_APART = 60.0  # seconds; bags of one drive are not further apart
 
 
 def _inspect_bags(path: Path, deep: bool, show: Progress) -> Inspection:

@@ -11,23 +11,16 @@ FASTEST = 100.0
 """Metres per second. No platform that carries a LiDAR is faster."""
 _JUMP = 0.2
 """Metres; a radian counts as one. Smaller steps than that are noise."""
-_ACCELERATION = 10.0
-"""Metres per second squared of a robot, or of the hand that holds a sensor."""
-_STAMPS = 0.5, 0.05
-"""Share of a usual step, and seconds, by which stamps may be wrong."""
-_NOISE = 8.0
-"""Times the median difference from neighbours: no noise is as large."""
-_MANY = 0.1
-"""Share of the poses; where more go to and fro, no stretch between is right."""
+_ACCELERATION = 10.0  # metres per second squared of a robot, or of the hand that holds a sensor
+_STAMPS = 0.5, 0.05  # share of a usual step, and seconds, by which stamps may be wrong
+_NOISE = 8.0  # times the median difference from neighbours: no noise is as large
+_MANY = 0.1  # share of the poses; where more go to and fro, no stretch between is right
 _HELD, _AS_FAST = 0.02, 0.6
 """Metres that a robot moves at least while its pose is repeated, and the share of its usual speed
 at which the next pose makes up for it."""
-_PERIOD = 40_000_000
-"""Nanoseconds. Of poses that follow each other faster, some are enough."""
-_AROUND = 5
-"""Steps before, and after, that say how the robot moves."""
-_SAID = 3
-"""Stretches that are told one by one."""
+_PERIOD = 40_000_000  # nanoseconds; of poses that follow each other faster, some are enough
+_AROUND = 5  # steps before, and after, that say how the robot moves
+_SAID = 3  # stretches that are told one by one
 
 
 def sound(

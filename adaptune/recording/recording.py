@@ -68,8 +68,7 @@ def sequence_files(config: SequenceConfig) -> SequenceFiles:
 
 _LOOK, _NEVER = 10**9, 1 << 62
 """Nanoseconds of a recording that are searched for a scan of another one; later than all stamps."""
-_NOTES = (".txt", ".yaml")
-"""Files beside scans: two recordings may have the same."""
+_NOTES = (".txt", ".yaml")  # files beside scans: two recordings may have the same
 
 
 def _alike(one: Scan, other: Scan) -> bool:
@@ -129,8 +128,7 @@ def _check_topics(source: "Source", config: SequenceConfig) -> None:
 _BEFORE = 3.0
 """Seconds by which reading from a stamp on begins earlier: that of a message may mark the end of a
 scan, and what is seen of a scan may depend on those before."""
-# At most so many scans are registered to find a clock offset.
-_MOST_SCANS = 600
+_MOST_SCANS = 600  # at most so many scans are registered to find a clock offset
 
 
 class RecordedSequence:

@@ -222,8 +222,7 @@ def in_order(frames: Iterable[Frame], left_out: Counter[str]) -> Iterator[Frame]
         yield doubtful
 
 
-# Nanoseconds; a recorder is seldom later than this.
-_DOUBT = 50_000_000
+_DOUBT = 50_000_000  # nanoseconds; a recorder is seldom later than this
 
 
 def _leap(last: Frame | None, frame: Frame) -> int:

@@ -22,8 +22,7 @@ LEAVE_OUT = "no `time_unit` mends them: write `time_unit: none` to leave the tim
 _LONGEST = 10.0
 # A header and its points are on the same clock if they are no further apart than this.
 _SAME_CLOCK = 10.0
-# Times below a day or so are absolute, too, if they agree with the header to this.
-_AGREE = 0.1
+_AGREE = 0.1  # times below a day or so are absolute, too, if they agree with the header to this
 
 
 class TimingError(AdaptuneError):

@@ -37,14 +37,10 @@ _METRES, _EACH = 4.0, 4
 every fourth scan of it."""
 _NEAR = 0.6, 0.1, 0.5
 """Metres, radians and seconds between neighbours, below which scans in between are left out."""
-_STANDING = 0.5
-"""Metres below which a motion is noise."""
-_ENOUGH = 10.0
-"""Metres after which the rest of a stretch is not looked at."""
-_MOTIONS = 12
-"""Motions after which no more are measured, an equal share of them in each stretch."""
-_AGREE = 0.3
-"""Metres by which two ways of registering the same scans may differ."""
+_STANDING = 0.5  # metres below which a motion is noise
+_ENOUGH = 10.0  # metres after which the rest of a stretch is not looked at
+_MOTIONS = 12  # motions after which no more are measured, an equal share of them in each stretch
+_AGREE = 0.3  # metres by which two ways of registering the same scans may differ
 
 
 def measured_motions(scans: Iterable[Scan], n_scans: int) -> Hops:

@@ -38,8 +38,7 @@ MOST_UNKNOWN = 0.5
 """Share of the scans whose pose may be unknown."""
 _AGREES = (0.1, 0.02)
 """A registration agrees with the graph within so many metres and this share of its length."""
-_LITTLE_IN_COMMON = 0.8 * LENGTHS[-1]
-"""Metres from which on scans may have too little in common."""
+_LITTLE_IN_COMMON = 0.8 * LENGTHS[-1]  # metres from which on scans may have too little in common
 _NEAR = 0.1
 """Metres within which a member's motion from scan to scan counts for a half of the reference."""
 

@@ -33,8 +33,7 @@ POOL: tuple[tuple[str, Mapping[str, float]], ...] = (
 odometry is not made with it."""
 HALVES = ((0, 1, 2), (3, 4))
 """Members of either half, which have no algorithm in common."""
-_DOWNSAMPLING = 0.45
-"""Metres between points of their clouds."""
+_DOWNSAMPLING = 0.45  # metres between points of their clouds
 
 
 class Consensus:
@@ -83,8 +82,7 @@ than this share of the way."""
 MIN_INLIERS_OFFLINE = 0.3
 """Least share of points near a point of the other scan. Many registrations check each other, so it
 may be lower than while driving."""
-_APART = 0.3
-"""Metres between guesses that are worth a registration each."""
+_APART = 0.3  # metres between guesses that are worth a registration each
 
 
 class Guess(NamedTuple):
@@ -239,8 +237,7 @@ def _metres_apart(T: Poses, other: Poses) -> float:
 
 _OF_A_STEP = (0.005, 0.002)
 """Metres and radians by which the motion from scan to scan is wrong, about, if it is small."""
-_SHARE = (0.05, 0.02)
-"""What each metre adds to the metres, and each radian to the radians."""
+_SHARE = (0.05, 0.02)  # what each metre adds to the metres, and each radian to the radians
 _OF_A_HOP = (0.02, 0.003)
 """Metres and radians by which a registration over `_LONG` metres is wrong, about."""
 _LONG = LENGTHS[-1]
@@ -249,8 +246,7 @@ _SHORTER = (1.0, 0.5)
 what they get wrong alike adds up: on open ground, the rings of the laser on the ground pull each
 towards no motion. So they count as more wrong: in metres as the way is shorter, in radians as its
 square root."""
-_UNKNOWN = 10.0
-"""Metres by which a registration is wrong along a direction that it does not tell."""
+_UNKNOWN = 10.0  # metres by which a registration is wrong along a direction that it does not tell
 _ITERATIONS = 50
 
 

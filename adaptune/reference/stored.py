@@ -16,8 +16,7 @@ from adaptune.trajectory import write_tum
 
 LENGTHS = (1.0, 2.0, 5.0, 10.0, 25.0, 50.0, 100.0, 200.0, 400.0, 800.0)
 """Metres over which the error of a reference is noted."""
-_BEYOND = 1.5
-"""By how much a length may exceed the longest that is noted."""
+_BEYOND = 1.5  # by how much a length may exceed the longest that is noted
 
 
 class StoredEstimate(NamedTuple):

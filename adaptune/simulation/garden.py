@@ -20,8 +20,7 @@ from adaptune.simulation.tiles import TILE, Floats, Scene, Spots, Tile, beyond, 
 
 _KINDS = {"wood": 0.035, "avenue": 0.012, "hedges": 0.014, "clearing": 0.002, "bridge": 0.012}
 """Trees on a square metre of each kind of tile."""
-_BANK, _RIVER = -13.0, -30.0
-"""Offsets of the river's near and far bank."""
+_BANK, _RIVER = -13.0, -30.0  # offsets of the river's near and far bank
 
 
 def _kind(index: int, seed: int) -> str:

@@ -39,8 +39,7 @@ from adaptune.trajectory import Trajectory, write_tum
 EPOCH = 1_600_000_000_000_000_000
 """Nanoseconds at which every recording starts."""
 
-_DETOUR = 1.2
-"""Metres of road in a metre of sight, where it winds."""
+_DETOUR = 1.2  # metres of road in a metre of sight, where it winds
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

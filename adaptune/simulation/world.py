@@ -133,10 +133,8 @@ def _bends(
     return np.asarray(PchipInterpolator(nodes, values)(stations), np.float64)
 
 
-_CELL = 0.7
-"""Metres between vertices of the ground near the road."""
-_GROUND = 115.0
-"""Metres of ground on either side of the road."""
+_CELL = 0.7  # metres between vertices of the ground near the road
+_GROUND = 115.0  # metres of ground on either side of the road
 
 
 def _offsets() -> NDArray[np.float64]:
@@ -210,8 +208,7 @@ class World:
 
 _KNOTS = 50.0
 """Knots of the trajectory's spline in a second; nothing in it moves faster than a tenth of it."""
-_START = 2.0
-"""Seconds in which a vehicle that stood reaches its speed."""
+_START = 2.0  # seconds in which a vehicle that stood reaches its speed
 
 
 class Ride:
