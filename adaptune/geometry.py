@@ -119,40 +119,6 @@ def to_quaternions(T_target_source: Poses) -> NDArray[np.float64]:
     return np.asarray(Rotation.from_matrix(T_target_source[:, :3, :3]).as_quat(canonical=True))
 
 
-def interpolate(
-    stamps: NDArray[np.int64], T_world_sensor: Poses, at: NDArray[np.int64], max_gap: int
-) -> Poses:
-    """Poses (m, 4, 4) at other stamps (m,): linear in translation, spherical in rotation.
-
-    They are NaN outside `stamps`, of shape (n,), which strictly increase, and between poses that
-    are further apart than `max_gap` nanoseconds.
-    """
-    T = np.full((len(at), 4, 4), np.nan)
-    if not len(stamps) or not len(at):
-        return T
-    after = np.searchsorted(stamps, at, side="left")
-    inside = (at >= stamps[0]) & (at <= stamps[-1])
-    after = np.clip(after, 0, len(stamps) - 1)
-    exact = inside & (stamps[after] == at)
-    T[exact] = T_world_sensor[after[exact]]
-    between = inside & ~exact
-    between[between] = (stamps[after[between]] - stamps[after[between] - 1]) <= max_gap
-    if between.any():
-        from scipy.spatial.transform import Rotation, Slerp
-
-        # Stamps are exact integers; only differences, which fit a double, become floats.
-        seconds = (stamps - stamps[0]) * 1e-9
-        query = (at[between] - stamps[0]) * 1e-9
-        T[between] = np.eye(4)
-        rotations = Rotation.from_matrix(T_world_sensor[:, :3, :3])
-        T[between, :3, :3] = Slerp(seconds, rotations)(query).as_matrix()
-        left = after[between] - 1
-        share = ((query - seconds[left]) / (seconds[left + 1] - seconds[left]))[:, None]
-        translations = T_world_sensor[:, :3, 3]
-        T[between, :3, 3] = (1.0 - share) * translations[left] + share * translations[left + 1]
-    return T
-
-
 _FARTHEST = 1e6  # metres between two frames of one platform
 
 

@@ -68,9 +68,36 @@ class Trajectory:
         return f"{what} = {self.max_gap:g} s: {help_}"
 
     def at(self, stamps: NDArray[np.int64], max_gap: float | None = None) -> Poses:
-        """Interpolated poses of shape (m, 4, 4) at m stamps; NaN where there is no pose."""
-        gap = self.max_gap if max_gap is None else max_gap
-        return geometry.interpolate(self.stamps, self.T_world_sensor, stamps, round(gap * 1e9))
+        """Poses of shape (m, 4, 4) at m stamps: linear in translation, spherical in rotation.
+
+        They are NaN outside the trajectory, and between poses further apart than `max_gap` seconds,
+        by default its own.
+        """
+        T = np.full((len(stamps), 4, 4), np.nan)
+        if not len(self) or not len(stamps):
+            return T
+        gap = round((self.max_gap if max_gap is None else max_gap) * 1e9)
+        after = np.searchsorted(self.stamps, stamps, side="left")
+        inside = (stamps >= self.stamps[0]) & (stamps <= self.stamps[-1])
+        after = np.clip(after, 0, len(self) - 1)
+        exact = inside & (self.stamps[after] == stamps)
+        T[exact] = self.T_world_sensor[after[exact]]
+        between = inside & ~exact
+        between[between] = (self.stamps[after[between]] - self.stamps[after[between] - 1]) <= gap
+        if between.any():
+            from scipy.spatial.transform import Rotation, Slerp
+
+            # Stamps are exact integers; only differences, which fit a double, become floats.
+            seconds = (self.stamps - self.stamps[0]) * 1e-9
+            query = (stamps[between] - self.stamps[0]) * 1e-9
+            T[between] = np.eye(4)
+            rotations = Rotation.from_matrix(self.T_world_sensor[:, :3, :3])
+            T[between, :3, :3] = Slerp(seconds, rotations)(query).as_matrix()
+            left = after[between] - 1
+            share = ((query - seconds[left]) / (seconds[left + 1] - seconds[left]))[:, None]
+            positions = self.T_world_sensor[:, :3, 3]
+            T[between, :3, 3] = (1.0 - share) * positions[left] + share * positions[left + 1]
+        return T
 
 
 Row = tuple[int, list[str]]
@@ -102,7 +129,6 @@ def _lines(path: Path) -> Iterator[tuple[int, str, list[str]]]:
 
 @cache
 def _assume(path: Path, what: str) -> None:
-    """Say once how a file is read."""
     _log.info("%s: %s", path, what)
 
 

@@ -3,8 +3,8 @@
 import logging
 import math
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from functools import cache as once
 from functools import cached_property
 from itertools import chain, islice, product
@@ -33,12 +33,12 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 
-def open_sequence(config: SequenceConfig) -> Recording:
+def open_sequence(config: SequenceConfig, with_imu: bool = False) -> Recording:
     """Open what a study describes; scans are not read before they are asked for.
 
     A SequenceError says why it cannot be opened as described.
     """
-    return RecordedSequence(config)
+    return RecordedSequence(config, with_imu)
 
 
 def wants_estimate(config: SequenceConfig) -> bool:
@@ -108,7 +108,6 @@ def _source(config: SequenceConfig) -> "tuple[Source, str | None]":
 
 
 def _check_topics(source: "Source", config: SequenceConfig) -> None:
-    """Find topics that are named and not there."""
     from adaptune.recording.bag import IMU_TYPES, BagSource
     from adaptune.recording.pose_messages import POSES
 
@@ -132,26 +131,18 @@ _MOST_SCANS = 600  # at most so many scans are registered to find a clock offset
 
 
 class RecordedSequence:
-    """The scans of a recording, in which motion is undone if its configuration says so.
+    """The scans of a recording in [start, stop) seconds since the first one, every stride-th.
 
-    Its methods raise a SequenceError where the recording cannot be read as described.
-
-    Attributes
-    ----------
-    source : BagSource or FileSource
-        The whole recording.
-    start, stop, stride : float, float or None, int
-        The scans to use: those in [start, stop) seconds since the first one, every stride-th.
-    key : str or None
-        Of the decoded scans in the cache; None if they are not kept.
+    They carry the measurements of the IMU if `with_imu`. Methods raise a SequenceError where the
+    recording cannot be read as described.
     """
 
-    def __init__(self, config: SequenceConfig):
+    def __init__(self, config: SequenceConfig, with_imu: bool = False):
         if (file := config.poses_file) is not None and not file.is_file():
             raise SequenceError(f"{file}: there is no such file")
         self.source, self.key = _source(config)
         self.start, self.stop = max(config.start, self.source.skipped), config.stop
-        self.stride, self._config = config.stride, config
+        self.stride, self._config, self._with_imu = config.stride, config, with_imu
         _check_topics(self.source, config)
         if config.part is not None and self._seconds:
             begin, end = config.part
@@ -172,7 +163,6 @@ class RecordedSequence:
 
     @property
     def _until(self) -> float:
-        """Seconds at which the used part ends."""
         return self._seconds if self.stop is None else min(self.stop, self._seconds)
 
     @property
@@ -188,6 +178,23 @@ class RecordedSequence:
         Scans whose stamps do not come after the one before, or that repeat it, are left out. That,
         and what else is odd, is logged. Times that cannot be are a SequenceError.
         """
+        return self._carrying(self._scans())
+
+    def since(self, stamp: int) -> Iterator[Scan]:
+        """Read the scans from a little before `stamp` on, without a word about what is odd."""
+        return self._carrying(self._scans_since(stamp - round(_BEFORE * 1e9)))
+
+    def _carrying(self, scans: Iterator[Scan]) -> Iterator[Scan]:
+        yield from carry_imu(scans, self._measured, self.name) if self._with_imu else scans
+
+    def _scans_since(self, begin: int) -> Iterator[Scan]:
+        kept = None if self.key is None else cache.find(self.key)
+        if kept is not None:
+            yield from kept.since(begin)
+        else:
+            yield from self._compensated(self._decode(Counter(), Content(), begin))
+
+    def _scans(self) -> Iterator[Scan]:
         for finding in self.source.findings:
             _warn(self.name, str(finding))
         left_out: Counter[str] = Counter()
@@ -305,14 +312,9 @@ class RecordedSequence:
                 return False
         return False
 
-    def since(self, stamp: int) -> Iterator[Scan]:
-        """Read the scans from a little before `stamp` on, without a word about what is odd."""
-        begin = stamp - round(_BEFORE * 1e9)
-        kept = None if self.key is None else cache.find(self.key)
-        if kept is not None:
-            yield from kept.since(begin)
-        else:
-            yield from self._compensated(self._decode(Counter(), Content(), begin))
+    @cached_property
+    def _measured(self) -> Imu | None:
+        return self.imu()
 
     def imu(self) -> Imu | None:
         """Measurements of the IMU in SI units, if one is set."""
@@ -399,7 +401,6 @@ class RecordedSequence:
         )
 
     def _proposal(self, trajectory: Trajectory) -> str:
-        """The offset found from how the scans turn."""
         _log.info("%s: comparing how its scans turn with the reference", self.name)
         try:
             turns = compensation.turning_of(islice(self._decode(Counter(), Content()), _MOST_SCANS))
@@ -421,61 +422,23 @@ _LATE = 10 * 10**9
 """Nanoseconds after the first scan at which an IMU that is on the same clock has begun."""
 
 
-@dataclass(frozen=True, eq=False)
-class RecordingWithImu:
-    """A recording whose scans carry the measurements of its IMU.
-
-    Reading raises a SequenceError if there is no IMU, or it measured at another time.
-    """
-
-    inner: Recording
-
-    @property
-    def name(self) -> str:
-        """The recording's file."""
-        return self.inner.name
-
-    @property
-    def n_messages(self) -> int:
-        """About how many scans there are."""
-        return self.inner.n_messages
-
-    def __iter__(self) -> Iterator[Scan]:
-        return self._carrying(iter(self.inner))
-
-    def since(self, stamp: int) -> Iterator[Scan]:
-        """Read the scans from a little before `stamp` on."""
-        return self._carrying(self.inner.since(stamp))
-
-    def reference(self) -> Trajectory | None:
-        """Poses of the LiDAR, if they are known."""
-        return self.inner.reference()
-
-    def imu(self) -> Imu | None:
-        """Measurements of the IMU, if there is one."""
-        return self._imu
-
-    @cached_property
-    def _imu(self) -> Imu | None:
-        return self.inner.imu()
-
-    def _carrying(self, scans: Iterator[Scan]) -> Iterator[Scan]:
-        imu = self._imu
-        if imu is None or not len(imu):
-            what = "holds no measurements of an IMU; name their topic"
-            raise SequenceError(f"{self.name}: {what}")
-        first: int | None = None
-        for scan in scans:
-            if first is None:
-                begin, end = imu.stamps[0], imu.stamps[-1]
-                if not begin - _LATE < scan.stamp < end:
-                    first_scan, *covered = (f"{t * 1e-9:.3f} s" for t in (scan.stamp, begin, end))
-                    raise SequenceError(
-                        f"{self.name}: the IMU covers {' to '.join(covered)}, the first scan is "
-                        f"of {first_scan}: record both on the same clock, or leave `imu` out"
-                    )
-                # Those during the first scan, and the one before.
-                first = max(int(imu.stamps.searchsorted(scan.stamp, "right")) - 1, 0)
-            last = max(int(imu.stamps.searchsorted(scan.stamp + scan.span)) + 1, first)
-            yield replace(scan, imu=imu.part(first, last))
-            first = last
+def carry_imu(scans: Iterable[Scan], imu: Imu | None, name: str) -> Iterator[Scan]:
+    """Scans with the measurements of the IMU; a SequenceError if these are of another time."""
+    if imu is None or not len(imu):
+        what = "holds no measurements of an IMU; name their topic"
+        raise SequenceError(f"{name}: {what}")
+    first: int | None = None
+    for scan in scans:
+        if first is None:
+            begin, end = imu.stamps[0], imu.stamps[-1]
+            if not begin - _LATE < scan.stamp < end:
+                first_scan, *covered = (f"{t * 1e-9:.3f} s" for t in (scan.stamp, begin, end))
+                raise SequenceError(
+                    f"{name}: the IMU covers {' to '.join(covered)}, the first scan is "
+                    f"of {first_scan}: record both on the same clock, or leave `imu` out"
+                )
+            # Those during the first scan, and the one before.
+            first = max(int(imu.stamps.searchsorted(scan.stamp, "right")) - 1, 0)
+        last = max(int(imu.stamps.searchsorted(scan.stamp + scan.span)) + 1, first)
+        yield replace(scan, imu=imu.part(first, last))
+        first = last

@@ -80,7 +80,6 @@ class Timing:
     def _check(
         self, dtype: np.dtype[Any], extent: tuple[float, float], scale: float, absolute: bool
     ) -> None:
-        """Refuse times that no scan has."""
         low, high = extent
         span = (high - low) * scale
         # Seconds from the stamp to the first point, or from the last one to the stamp.

@@ -87,7 +87,6 @@ def estimated(name: str, found: Pass, scans: Iterable[Scan] = ()) -> EstimatedRe
 
 
 def _check(name: str, found: Pass) -> None:
-    """Refuse a recording by which nothing can be judged."""
     way = _way(found.T_odom_sensor[:, :3, 3]) if len(found.stamps) else 0.0
     if way < SHORTEST:
         raise EstimateError(

@@ -107,8 +107,6 @@ class Pass:
 
 
 class _Anchor(NamedTuple):
-    """A scan that is registered."""
-
     number: int
     stamp: int
     metres: float  # driven until there
@@ -222,7 +220,6 @@ class _Registering:
 
 
 def _registered(start: _Anchor, end: _Anchor, T_start_end: Poses) -> Hop | None:
-    """A registration that stays near its guess."""
     hop = register(start.cloud, end.cloud, [T_start_end], MIN_INLIERS_OFFLINE, OFFLINE_REACHES)
     if hop is None:
         return None

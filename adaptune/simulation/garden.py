@@ -105,7 +105,6 @@ def _hedges(tile: Tile) -> list[Mesh]:
 
 
 def _railings(tile: Tile, middle: float) -> list[Mesh]:
-    """Build the parapets of a bridge and its piers."""
     meshes = []
     for side in (-1.0, 1.0):
         posts = np.arange(middle - 5.0, middle + 5.1, 1.25)

@@ -241,9 +241,7 @@ class Ride:
         along = gaussian_filter1d(along, 0.15 * _KNOTS, mode="reflect")
         values = np.stack([np.interp(along, s, column) for column in lane.T], axis=1)
         values = gaussian_filter1d(values, 0.1 * _KNOTS, axis=0, mode="nearest")
-        roughness = np.zeros_like(along)
-        for leg, share in road.shares(along):
-            roughness += share * leg.scene.shake
+        roughness = sum(share * leg.scene.shake for leg, share in road.shares(along))
         shake = _shake(motion, knots, rng) * (roughness * moves)[:, None]
         # The mount shakes about its own axes; yaw turns what shakes along and across.
         yaw = values[:, 5]
@@ -301,9 +299,7 @@ def _schedule(
     """Seconds at each station, within the vehicle's speed, acceleration and turning."""
     swing = gaussian_filter1d(rng.normal(size=len(s)), 12.0 / _STEP, mode="nearest")
     swing *= 0.1 / max(float(swing.std()), 1e-9)
-    pace = np.zeros_like(s)
-    for leg, share in road.shares(s):
-        pace += share * leg.scene.pace
+    pace = sum(share * leg.scene.pace for leg, share in road.shares(s))
     curvature = np.abs(np.gradient(gaussian_filter1d(lane[:, 5], 1.0 / _STEP), s))
     bends = np.sqrt(motion.turning / np.maximum(curvature, 1e-6))
     speed = np.minimum(motion.speed * pace * np.clip(1.0 + swing, 0.7, 1.3), bends)
@@ -350,7 +346,6 @@ def _angular_velocity(angles: Floats, rates: Floats) -> Floats:
 
 
 def _angular_acceleration(angles: Floats, rates: Floats, second: Floats) -> Floats:
-    """Differentiate `_angular_velocity`."""
     (sr, sp), (cr, cp) = np.sin(angles[:, :2]).T, np.cos(angles[:, :2]).T
     d_roll, d_pitch, d_yaw = rates.T
     dd_roll, dd_pitch, dd_yaw = second.T

@@ -13,7 +13,6 @@ from adaptune.recording.cache import fingerprints
 from adaptune.recording.config import REFERENCE_FILES, SOURCES, SequenceConfig, part_name
 from adaptune.recording.export import Layout
 from adaptune.recording.recording import (
-    RecordingWithImu,
     SequenceFiles,
     open_sequence,
     sequence_files,
@@ -114,8 +113,7 @@ class StudySequences:
         been recorded.
         """
         self._check_recorded(name)
-        sequence = open_sequence(self.config(name))
-        return RecordingWithImu(sequence) if self.with_imu else sequence
+        return open_sequence(self.config(name), self.with_imu)
 
     def _check_recorded(self, name: str) -> None:
         if name in self.courses and not self.recording(name).exists():
