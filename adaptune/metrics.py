@@ -160,8 +160,7 @@ class KittiError(NamedTuple):
 
     translation: float = np.nan  # percent; NaN when the path is shorter than every length
     rotation: float = np.nan  # degrees a metre
-    # The lengths in metres for which there was at least one sub-trajectory.
-    lengths: tuple[float, ...] = ()
+    lengths: tuple[float, ...] = ()  # metres, those for which there was a sub-trajectory
     n: int = 0  # number of sub-trajectories
 
     @classmethod

@@ -160,9 +160,9 @@ def _named(header: str) -> dict[str, list[int]]:
     names = re.split(r"\s*[,;]\s*" if re.search("[,;]", header) else r"\s+", header)
     found: dict[str, list[int]] = {}
     for i, name in enumerate(names):
-        of = next((of for of, known in _NAMES.items() if re.fullmatch(known, name)), None)
-        if of is not None:
-            found.setdefault(of if len(of) > 1 else of + name[-1], []).append(i)
+        kind = next((k for k, known in _NAMES.items() if re.fullmatch(known, name)), None)
+        if kind is not None:
+            found.setdefault(kind if len(kind) > 1 else kind + name[-1], []).append(i)
     # A message's own stamp comes before the time at which it was recorded.
     for times in (found.get("timestamp", []), found.get("nanoseconds", [])):
         times.sort(key=lambda i: ("header" not in names[i], "stamp" not in names[i]))

@@ -169,15 +169,12 @@ class ImuConfig(StrictModel):
 class SequenceConfig(StrictModel):
     """A recording, from one of `bag`, `kitti` and `folder`, and what of it to use."""
 
-    # Seconds since the first scan.
-    start: _Seconds = 0.0
+    start: _Seconds = 0.0  # since the first scan
     stop: _Seconds | None = None
     # Bags that follow each other: files, ROS 2 folders, folders of bags, patterns.
     bag: Annotated[str | tuple[str, ...] | None, BeforeValidator(_resolve_bags)] = None
-    # Folder of a KITTI odometry sequence.
-    kitti: Annotated[str, AfterValidator(resolve)] | None = None
-    # Folder of ``.pcd``, ``.ply``, ``.npy`` or ``.bin`` files.
-    folder: Annotated[str, AfterValidator(resolve)] | None = None
+    kitti: Annotated[str, AfterValidator(resolve)] | None = None  # folder of an odometry sequence
+    folder: Annotated[str, AfterValidator(resolve)] | None = None  # of files, one a scan
     points: str | None = None  # topic of the point clouds
     frame: str | None = None  # `frame_id` of the point clouds, where the topic has several
     stamp: Mark = "auto"  # what a stamp marks of its scan
@@ -192,15 +189,12 @@ class SequenceConfig(StrictModel):
     reference: Annotated[str, AfterValidator(_resolve_file)] | None = None
     child_frame: str | None = None  # of the transforms, where `reference` is a topic of them
     extrinsic: Transform | None = None  # the LiDAR's pose in the frame of the reference poses
-    # Seconds to add to the reference's stamps, as far as those of other clocks lie.
-    clock_offset: float = Field(0.0, ge=-3e9, le=3e9)
-    # Seconds. The reference is unknown between poses further apart.
-    max_gap: float = Field(1.0, gt=0, le=1e9)
+    clock_offset: float = Field(0.0, ge=-3e9, le=3e9)  # seconds to add to the reference's stamps
+    max_gap: float = Field(1.0, gt=0, le=1e9)  # seconds; between poses further apart it is unknown
     imu: ImuConfig | None = None
     # Degrees by which to turn up every ray of a `kitti` recording; 0.205 when left out.
     elevation: float | None = Field(None, ge=-5, le=5)
-    # Undo the motion within scans, as fast as it was since the scan before.
-    compensate: Compensation = None
+    compensate: Compensation = None  # undo the motion within scans
     cache: bool = True  # whether to keep decoded bags in the cache
 
     @model_validator(mode="after")

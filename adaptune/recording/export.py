@@ -172,4 +172,4 @@ def write_kitti_sequence(scans: Iterable[Scan], root: Path, name: str = "00") ->
     write_text(sequence / "times.txt", "".join(f"{t:.6e}\n" for t in seconds))
     identity = " ".join(f"{v:.12e}" for v in np.eye(3, 4).ravel())
     names = ("P0", "P1", "P2", "P3", "Tr")
-    write_text(sequence / "calib.txt", "".join(f"{of}: {identity}\n" for of in names))
+    write_text(sequence / "calib.txt", "".join(f"{name}: {identity}\n" for name in names))

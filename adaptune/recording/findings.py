@@ -243,7 +243,7 @@ def of_reference(
         yield from sound(reference, begin)[1]
     elif not timed:  # ten a second, as most LiDARs measure
         numbered = Trajectory(reference.stamps * 10**8, reference.T_world_sensor)
-        yield from (one._replace(seconds=None) for one in sound(numbered)[1])
+        yield from (finding._replace(seconds=None) for finding in sound(numbered)[1])
     if complete and timed and (gaps := np.count_nonzero(seconds > reference.max_gap)):
         what = f"the reference has {gaps} gaps beyond {reference.max_gap:g} s"
         what += f", the longest of {seconds.max():.2f} s: their scans get no label"

@@ -100,14 +100,14 @@ def check_alike(recordings: Sequence["Inspection"]) -> None:
     """Refuse recordings of different sensors or rates by a SequenceError that lists them."""
     kinds: dict[str, list[str]] = {}
     rates: list[float] = []
-    for one in recordings:
-        if (topic := one.topics.get(one.given.get("points", one.used["points"]))) is None:
+    for drive in recordings:
+        if (topic := drive.topics.get(drive.given.get("points", drive.used["points"]))) is None:
             continue  # opening it says so
-        own = topic.rate or 1.0
-        rate = next((r for r in rates if max(r, own) <= _RATES * min(r, own)), own)
+        own_rate = topic.rate or 1.0
+        rate = next((r for r in rates if max(r, own_rate) <= _RATES * min(r, own_rate)), own_rate)
         rates.append(rate)
-        kind = f"{rate:.1f} Hz, {topic.type}, {' '.join(one.fields) or 'scans'}"
-        kinds.setdefault(kind, []).append(one.path.name)
+        kind = f"{rate:.1f} Hz, {topic.type}, {' '.join(drive.fields) or 'scans'}"
+        kinds.setdefault(kind, []).append(drive.path.name)
     if len(kinds) > 1:
         listed = "; ".join(f"{', '.join(names)} ({kind})" for kind, names in kinds.items())
         raise SequenceError(

@@ -39,8 +39,7 @@ class FileSource:
     scans: Sequence[Path]
     stamps: NDArray[np.int64]  # nanoseconds of each file, of shape (n,)
     timing: Timing = AUTO  # what the stamps mean
-    # Reads the LiDAR's poses stored with the files.
-    own_poses: Callable[[], Trajectory] | None = None
+    own_poses: Callable[[], Trajectory] | None = None  # reads the LiDAR's poses
     elevation: float = 0.0  # degrees by which every ray is to be turned up
     stamp_files: Sequence[Path] = ()  # hold the stamps, where the files' names do not
     pose_files: Sequence[Path] = ()  # hold the poses

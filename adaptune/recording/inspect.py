@@ -34,8 +34,7 @@ from adaptune.recording.folder import kitti, scan_folder
 from adaptune.recording.pose_messages import PATH, POSES, Pose, untimed, usable
 from adaptune.trajectory import Trajectory, is_kitti, read_kitti, read_trajectory
 
-# What each stage uses.
-INPUTS = {
+INPUTS = {  # of each stage
     "offline": ("points", "reference"),
     "online": ("points",),
     "motion compensation": ("points", "imu"),
@@ -91,10 +90,10 @@ class Inspection:
         if not self.name:
             return {}
         lacks = {
-            role: [one.lacks for one in self.findings if one.of == role and one.lacks]
+            role: [f.lacks for f in self.findings if f.of == role and f.lacks]
             for role in ("points", "reference", "imu")
         }
-        if self.scan is None and not any(one.of == "points" for one in self.findings):
+        if self.scan is None and not any(finding.of == "points" for finding in self.findings):
             lacks["points"].append("point clouds that can be read")
         if self.scan is not None and self.scan.times is None:
             lacks["imu"].append("a time for each point")
@@ -113,14 +112,14 @@ class Inspection:
     @property
     def hints(self) -> dict[yaml12.YamlPath, str]:
         """Comments for a study: what else its entry may say."""
-        said = []
+        hints = []
         if "bag" in self.given and "reference" not in self.used:
-            said.append("reference: a topic, or a TUM, KITTI or EuRoC file; estimated if left out")
+            hints.append("reference: a topic, or a TUM, KITTI or EuRoC file; estimated if left out")
         if "bag" in self.given and "compensate" in self.given:
-            said.append("without `compensate` for an odometry that undoes the motion itself")
+            hints.append("without `compensate` for an odometry that undoes the motion itself")
         if "bag" in self.given and self.scan is not None and self.scan.times is not None:
-            said.append("stamp: end - if headers mark scans' ends and times count from the start")
-        return {("sequences", self.name): "\n".join(said)}
+            hints.append("stamp: end - if headers mark scans' ends and times count from the start")
+        return {("sequences", self.name): "\n".join(hints)}
 
 
 def inspect(path: Path, deep: bool = False, show: Progress = unseen) -> Inspection:
@@ -289,7 +288,7 @@ class _Survey:
         # Number of clouds; where there are none, of messages.
         points = found.topics.get(source.points)
         self._usual = found.n_messages if points is None else points.count
-        self._of = {name: of for of, name in found.used.items()}
+        self._roles = {name: role for role, name in found.used.items()}
         if points is not None:
             self._load = source.loader(reader)
         self._poses: list[Pose] = []
@@ -332,10 +331,11 @@ class _Survey:
         found, done = self._found, 0
         spans = self._spans(number, self._usual)
         found.complete = spans == [self._source.window]
+        rare: list[str] = []
         if not found.complete:
             self.slack = self._length * 1e-9 / (len(spans) - 1)
-        # What comes more rarely than the clouds has parts of its own.
-        rare = [t for t in self._of if found.topics[t].count < self._usual and not found.complete]
+            # What comes more rarely than the clouds has parts of its own.
+            rare = [t for t in self._roles if found.topics[t].count < self._usual]
         jobs: list[tuple[str | None, Window]] = [(None, span) for span in spans]
         jobs += [(t, span) for t in rare for span in self._spans(number, found.topics[t].count)]
         for name, span in jobs:
@@ -364,14 +364,14 @@ class _Survey:
             topic.stamps[-1].append(stamp)
             topic.recorded.append(when)
             topic.frames.add(frame)
-        if kind == PATH and topic.name in self._of:
+        if kind == PATH and topic.name in self._roles:
             self._path = data  # each path repeats the one before: the last one will do
         else:
             self._decode(topic, kind, when, data)
 
     def _decode(self, topic: Topic, kind: str, when: int, data: bytes) -> None:
         try:
-            match self._of.get(topic.name):
+            match self._roles.get(topic.name):
                 case "points":
                     first = self._found.scan is None
                     self._found.keep(self._load(kind, data, "message"))

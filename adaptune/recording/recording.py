@@ -57,13 +57,13 @@ class SequenceFiles(NamedTuple):
 
 def sequence_files(config: SequenceConfig) -> SequenceFiles:
     """The files that a sequence is read from; a SequenceError if it cannot be opened."""
-    own = None if config.poses_file is None else [config.poses_file]
+    poses = None if config.poses_file is None else [config.poses_file]
     if config.reference in (ESTIMATED, NO_REFERENCE):
-        own = []
+        poses = []
     if config.bag is not None:
-        return SequenceFiles(files_of(config.bags()), own or ())
+        return SequenceFiles(files_of(config.bags()), poses or ())
     source, _ = _source(config)
-    return SequenceFiles(source.files, source.pose_files if own is None else own)
+    return SequenceFiles(source.files, source.pose_files if poses is None else poses)
 
 
 _LOOK, _NEVER = 10**9, 1 << 62

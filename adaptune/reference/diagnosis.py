@@ -178,7 +178,7 @@ def diagnose_reference(
         return Trajectory(reference.stamps, T, reference.max_gap).at(stamps)
 
     candidates = [
-        *(one._replace(T_world_sensor=at_scans(one.T_world_sensor)) for one in _conventions(given)),
+        *(c._replace(T_world_sensor=at_scans(c.T_world_sensor)) for c in _conventions(given)),
         *_far_apart(reference, stamps),
         *_clock(reference, stamps, hops),
         *_places(at_scans(given) @ invert(T_given_sensor), hops, T_given_sensor),

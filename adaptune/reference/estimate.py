@@ -221,8 +221,8 @@ def _halves(found: Pass, edges: Sequence[Edge], T_world_sensor: Poses) -> Poses:
     halves = []
     for half, members in enumerate(HALVES):
         T = _chained(T_world_sensor[0], _steps_of(found, T_world_sensor, members))
-        own = [edge for edge in edges if ends[edge.end] == half]
-        halves.append(optimised(T, own, T_world_sensor))
+        half_edges = [edge for edge in edges if ends[edge.end] == half]
+        halves.append(optimised(T, half_edges, T_world_sensor))
     return np.array(halves)
 
 

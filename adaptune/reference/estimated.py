@@ -31,8 +31,7 @@ class Registrations(NamedTuple):
     start: NDArray[np.intp]  # (m,): numbers of the scans
     end: NDArray[np.intp]
     accepted: NDArray[np.bool_]  # (m,): whether the pose graph agrees with it
-    # (m,): metres by which it differs from the pose graph; NaN if the registration failed
-    residual: NDArray[np.float64]
+    residual: NDArray[np.float64]  # (m,): metres off the pose graph; NaN if it failed
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,8 +40,7 @@ class EstimatedReference:
 
     stamps: NDArray[np.int64]  # (n,): of all scans, in nanoseconds
     T_world_sensor: Poses  # (n, 4, 4): the pose of every scan; the first is the identity
-    # (n - 1,): whether the motion from each scan to the next can be trusted
-    trusted: NDArray[np.bool_]
+    trusted: NDArray[np.bool_]  # (n - 1,): whether the motion to the next scan can be trusted
     halves: Poses  # (2, n, 4, 4): the poses from either half of the registrations alone
     registrations: Registrations
 

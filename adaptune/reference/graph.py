@@ -91,8 +91,7 @@ class Guess(NamedTuple):
     start: int  # numbers of the scans
     end: int
     member: int  # whose motion it began at; -1 for the consensus
-    # what was found; None if too few points lie on each other, or it departs too far
-    hop: Hop | None
+    hop: Hop | None  # None if too few points lie on each other, or it departs too far
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,8 +100,7 @@ class Pass:
 
     stamps: NDArray[np.int64]  # (n,): of the scans, in nanoseconds
     T_odom_sensor: Poses  # (n, 4, 4): of the consensus
-    # (n, n_members, 4, 4): motions of the members; NaN where one has none
-    T_previous_current: Poses
+    T_previous_current: Poses  # (n, n_members, 4, 4): of the members; NaN where one has none
     guesses: Sequence[Guess]  # all registrations, by end, start, and member
 
 

@@ -27,8 +27,7 @@ class StoredEstimate(NamedTuple):
     scans: int
     metres: float  # length of its path
     unknown_share: float  # share of the scans whose pose is unknown
-    # its estimated mean RTE in percent, by the length of sub-trajectories in metres
-    errors: dict[float, float]
+    errors: dict[float, float]  # its mean RTE in percent, by the length of sub-trajectories
 
     def error(self, length: float) -> float:
         """Estimated mean RTE of the reference in percent over `length` metres; NaN if unknown."""

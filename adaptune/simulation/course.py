@@ -134,28 +134,21 @@ def _known(kind: str, names: Collection[str]) -> AfterValidator:
 
 
 class Course(StrictModel):
-    """A simulated recording: its scenes, its sensor and its motion."""
+    """A simulated recording: its scenes in driving order, its sensor and its motion."""
 
-    # Scenes in driving order.
     scenes: tuple[Annotated[str, _known("scene", SCENES)], ...] = Field(min_length=1)
     # Metres driven in every scene; twice as many where it is named twice.
-    length: float = Field(default=60.0, ge=10.0, le=LONGEST)
+    length: float = Field(60.0, ge=10.0, le=LONGEST)
     sensor: Annotated[str, _known("sensor", SENSORS)] = "hdl32e"
     motion: Annotated[str, _known("motion", MOTIONS)] = "robot"
-    # Another seed is another world, another drive and other noise.
-    seed: int = Field(default=0, ge=0, lt=2**31)
-    # Turns of the sensor in a second; the sensor's own if not given.
-    rate: float | None = Field(default=None, gt=0.0, le=100.0)
-    # Firings in a turn; the sensor's own if not given.
-    columns: int | None = Field(default=None, ge=16, le=8192)
+    seed: int = Field(0, ge=0, lt=2**31)  # of the world, the drive and the noise
+    rate: float | None = Field(None, gt=0.0, le=100.0)  # turns a second, in place of the sensor's
+    columns: int | None = Field(None, ge=16, le=8192)  # firings a turn, in place of the sensor's
     # Seconds at rest before it drives off, which LiDAR-inertial systems need to begin.
-    standstill: float = Field(default=0.0, ge=0.0, le=60.0)
-    # Hz of the inertial measurements; none are made if not given.
-    imu: Literal[200, 400] | None = None
-    # How motion within a scan is undone, as for a recorded sequence.
-    compensate: Compensation = None
-    # Whether a recording's headers mark the start or the end of each scan.
-    stamp: Literal["start", "end"] = "start"
+    standstill: float = Field(0.0, ge=0.0, le=60.0)
+    imu: Literal[200, 400] | None = None  # Hz of the inertial measurements, if there are any
+    compensate: Compensation = None  # how motion within a scan is undone when it is read
+    stamp: Literal["start", "end"] = "start"  # what headers mark of each scan
     # The course whose recording it is a part of; a study's `training` and `test` name such parts.
     of: Annotated[str, Field(pattern=r"^\w[\w.-]*$")] | None = None
     part: Part | None = None

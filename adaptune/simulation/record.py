@@ -44,10 +44,8 @@ _DETOUR = 1.2  # metres of road in a metre of sight, where it winds
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SimulatedScan(Scan):
-    """A scan with intensities, rings and its true pose."""
+    """A scan with its true pose; intensities are from 0 to 255."""
 
-    intensities: NDArray[np.float32]  # from 0 to 255
-    rings: NDArray[np.uint16]
     T_world_sensor: Poses  # at the scan's stamp, of shape (4, 4)
 
 

@@ -22,12 +22,10 @@ TILE = 20.0
 class Spots:
     """Places on the ground, as arrays of one shape."""
 
-    # In the world.
-    x: Floats
+    x: Floats  # in the world
     y: Floats
-    # Station along the road and offset to its left.
-    s: Floats
-    d: Floats
+    s: Floats  # station along the road
+    d: Floats  # offset to its left
 
 
 @dataclass(frozen=True)
@@ -36,12 +34,10 @@ class Tile:
 
     road: "Road"
     index: int  # its number along the road: it begins at station ``index * TILE``
-    # Stations of its ends, in metres; a leg may begin or end within it.
-    start: float
+    start: float  # station of its beginning, in metres; a leg may begin or end within it
     stop: float
-    # Whether it is the leg's first or last tile with another scene next to it.
-    opens: bool
-    closes: bool
+    opens: bool  # whether it is the leg's first tile, after another scene
+    closes: bool  # whether it is the last one, before another scene
     rng: np.random.Generator = field(compare=False)  # its own random numbers
     seed: int  # seed of the whole world, for shapes that continue from tile to tile
 
@@ -92,17 +88,14 @@ class Scene:
     """A kind of place."""
 
     build: Callable[[Tile], list[Mesh]]  # makes what stands on the ground of a tile
-    # Height of the ground above the road's line at some spots, for a seed.
-    relief: Callable[[Spots, int], Floats]
+    relief: Callable[[Spots, int], Floats]  # height of the ground above the road, for a seed
     surface: Callable[[Floats], NDArray[np.uint8]]  # material of the ground at an offset
-    # Radians by which the road swings to and fro, and metres from one side to the other.
-    winding: float
-    bend: float
+    winding: float  # radians by which the road swings to and fro
+    bend: float  # metres from one side to the other
     slope: float  # greatest rise of the road, as a ratio
     shake: float  # how rough the ride is; 1 is a paved road
     pace: float = 1.0  # share of its usual speed at which a vehicle goes
-    # Whether it winds from its mouth on, however long the bends before it are.
-    winds_at_once: bool = False
+    winds_at_once: bool = False  # from its mouth on, however long the bends before it are
 
 
 def paved(*bands: tuple[float, Material]) -> Callable[[Floats], NDArray[np.uint8]]:
