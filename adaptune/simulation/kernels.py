@@ -63,15 +63,6 @@ class Cast(NamedTuple):
     reflectivity: F32  # of shape (n,)
 
 
-class Receiver(NamedTuple):
-    """A sensor's range in metres, its standard deviation, and the share of echoes lost."""
-
-    nearest: float
-    farthest: float
-    noise: float
-    dropout: float
-
-
 @compiled
 def aim(directions: F32, T_world_sensor: F64, origin: F64) -> F32:
     """Send every ray from its own column's pose: (n_columns * n_rings, 6), origin and direction.
@@ -98,13 +89,14 @@ def aim(directions: F32, T_world_sensor: F64, origin: F64) -> F32:
 def receive(
     directions: F32,
     cast: Cast,
-    sensor: Receiver,
+    sensor: tuple[float, float, float, float],
     chance: F32,
     normal: F32,
 ) -> tuple[F32, F32, NDArray[np.int64]]:
     """Points (m, 3), intensities from 0 to 255 (m,) and numbers (m,) of the rays that come back.
 
-    Directions, of shape (n, 3), and points are in the sensor's frame at the time of each ray;
+    Directions, of shape (n, 3), and points are in the sensor's frame at the time of each ray. Of
+    the `sensor`: least and greatest range in metres, their deviation, and the share of echoes lost.
     `chance` and `normal` are uniform and normal random numbers, of shape (n,).
     """
     rays, hits, normals, reflectivity = cast

@@ -80,7 +80,7 @@ class Drive:
         rings = np.tile(np.arange(n_rings, dtype=np.uint16), columns)
         offsets = np.arange(columns) / (columns * course.turns)
         times = np.repeat(offsets, n_rings).astype(np.float32)
-        receiver = kernels.Receiver(*sensor.range, sensor.noise, sensor.dropout)
+        receiver = (*sensor.range, sensor.noise, sensor.dropout)
         caster = _Caster(self, sensor.range[1])
         for number, stamp in enumerate(self.stamps()[:-1].tolist()):
             start = (stamp - EPOCH) * 1e-9

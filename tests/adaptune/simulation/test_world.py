@@ -42,7 +42,7 @@ def receive(distance, *, cosine=1.0, reflectivity=0.5, dropout=0.0, n=2000, nois
             normals,
             np.full(n, reflectivity, np.float32),
         ),
-        kernels.Receiver(1.0, 100.0, noise, dropout),
+        (1.0, 100.0, noise, dropout),
         rng.random(n, np.float32),
         rng.standard_normal(n, np.float32),
     )
