@@ -9,12 +9,9 @@ from numpy.typing import NDArray
 
 from adaptune.geometry import Poses, invert, nearest_rotation, rotation_angle, steps
 
-RESAMPLES = 2000
-"""Resamples of a bootstrap."""
-MIN_BLOCKS = 10
-"""Least number of blocks of a recording: with fewer, an interval means nothing."""
-WORST = 0.1
-"""Share of the stretches that are the worst."""
+RESAMPLES = 2000  # resamples of a bootstrap
+MIN_BLOCKS = 10  # least number of blocks of a recording: with fewer, an interval means nothing
+WORST = 0.1  # share of the stretches that are the worst
 KITTI_LENGTHS = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 JITTER = 0.1
 """Metres. A robot that stands does not drive by the noise of its poses, where that is less."""
@@ -228,10 +225,8 @@ def relative_error(T_ref_sensor: Poses, T_odom_sensor: Poses) -> float:
     return float(np.sqrt(np.mean(np.sum(E[known, :3, 3] ** 2, axis=1))))
 
 
-FAILURE = 30.0
-"""Percent. A lost track and every larger error count as this."""
-LOST_ABOVE = 5.0
-"""Percent. An odometry with a larger mean error does not track."""
+FAILURE = 30.0  # percent; a lost track and every larger error count as this
+LOST_ABOVE = 5.0  # percent; an odometry with a larger mean error does not track
 
 
 def cap(errors: NDArray[np.floating]) -> NDArray[np.float64]:

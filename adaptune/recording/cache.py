@@ -240,12 +240,10 @@ def _size(path: Path) -> int:
     return sum(p.stat().st_size for p in path.iterdir() if p.is_file())
 
 
-SMALL = 1 << 24
-"""Bytes of files below which their content is read every time."""
+SMALL = 1 << 24  # bytes of files below which their content is read every time
 FILE = "fingerprints.txt"
 """File in the cache's folder: on every line the hash of a file's status, and of its content."""
-MANY = 64
-"""So many files have one hash together."""
+MANY = 64  # so many files have one hash together
 _LONG = 1 << 30  # bytes that take more than a second to read
 _SIZE = 16
 remembered: dict[str, str] = {}

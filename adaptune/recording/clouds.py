@@ -88,8 +88,7 @@ _LARGEST_POINT = 1 << 20
 RING_FIELDS = ("ring", "line", "channel", "laser_id")
 # CloudCompare puts a prefix before the names of what it stores in a PLY file.
 INTENSITY_FIELDS = ("intensity", "reflectivity", "scalar_intensity", "scalar_Intensity")
-FARTHEST = 1000.0
-"""Metres beyond which a point is doubted."""
+FARTHEST = 1000.0  # metres beyond which a point is doubted
 _NEVER = 1e4  # metres beyond which no LiDAR sees
 
 

@@ -14,8 +14,7 @@ from adaptune.recording.scan import Reading, Scan
 from adaptune.recording.timing import SOONEST
 from adaptune.trajectory import Trajectory
 
-LEAST_POINTS = 20
-"""Valid points that an odometry needs."""
+LEAST_POINTS = 20  # valid points that an odometry needs
 
 # A look takes so many points, and sees whether there are any in so many directions.
 _SAMPLE, _DIRECTIONS = 256, 24

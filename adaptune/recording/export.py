@@ -19,8 +19,7 @@ Message = tuple[str, int, Any]
 Layout = Literal["bag", "ros2", "kitti"]
 """ROS 1 bag, ROS 2 folder with sqlite3, KITTI odometry folder."""
 
-POINTS, IMU = "/points", "/imu"
-"""Topics of the bags."""
+POINTS, IMU = "/points", "/imu"  # topics of the bags
 
 _KINDS = {"<f4": 7, "<u2": 4}
 

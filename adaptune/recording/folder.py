@@ -25,10 +25,8 @@ from adaptune.recording.timing import AUTO, Timing
 from adaptune.trajectory import Trajectory, read_kitti
 
 SUFFIXES = (".bin", ".npy", ".pcd", ".ply")
-KITTI = ("x", "y", "z", "intensity")
-"""What KITTI's ``.bin`` files hold of each point."""
-ELEVATION = 0.205
-"""Degrees by which KITTI's LiDAR reports its rays too low."""
+KITTI = ("x", "y", "z", "intensity")  # what KITTI's ``.bin`` files hold of each point
+ELEVATION = 0.205  # degrees by which KITTI's LiDAR reports its rays too low
 
 
 @dataclass(frozen=True, eq=False)

@@ -168,12 +168,9 @@ def _unwrapped(
     return values, extent
 
 
-AUTO = Timing()
-"""Follow the points."""
-FIRST_SCANS = 10
-"""Scans at the beginning of a recording that show how it is timed."""
-SOONEST = 1_000_000
-"""Nanoseconds from one scan to the next one; no LiDAR is faster."""
+AUTO = Timing()  # follow the points
+FIRST_SCANS = 10  # scans at the beginning of a recording that show how it is timed
+SOONEST = 1_000_000  # nanoseconds from one scan to the next one; no LiDAR is faster
 _POSSIBLE = "possible times of the points"
 
 

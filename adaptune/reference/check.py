@@ -23,8 +23,7 @@ if TYPE_CHECKING:
 
 
 CONTRADICTS = "the reference contradicts the scans"
-UNSEEN = 0.7
-"""Share of a way that a registration does not show, from which it does not count."""
+UNSEEN = 0.7  # share of a way that a registration does not show, from which it does not count
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,15 +155,12 @@ LENGTHS = {25.0: 8, 10.0: 8, 5.0: 1.4, 2.0: 2}
 the noise of the reference counts too much."""
 LONGER = (5.0, 10.0, 25.0, 50.0, 100.0)
 """Metres to choose from where the first of `LENGTHS` that fits is too short after all."""
-FEWEST = 1.4
-"""How many of them the path of the test must hold then."""
+FEWEST = 1.4  # how many of them the path of the test must hold then
 SECONDS = 2.0
 """A sub-trajectory lasts as long at least, up to the greatest of `LENGTHS`: who is fast often has
 a reference of GPS, which is noisy."""
-NOISY = 0.5
-"""Percent by which a reference may be wrong, as far as registrations can tell."""
-TRAINING = 0.6
-"""Share of a recording's duration that is proposed for training, before the test."""
+NOISY = 0.5  # percent by which a reference may be wrong, as far as registrations can tell
+TRAINING = 0.6  # share of a recording's duration that is proposed for training, before the test
 
 
 def path_after(reference: Trajectory, training: float) -> tuple[float, float]:

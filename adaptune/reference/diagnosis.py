@@ -102,22 +102,15 @@ def _motions_over(stretch: list[Scan]) -> Iterator[tuple[int, int, Hop]]:
             break
 
 
-SUSPICIOUS = 1.5
-"""Percent. Poses that differ less from what scans show break no convention."""
-EXPLAINED = 0.5
-"""A cause explains the difference if it leaves less than this share of it."""
-FEWEST_HOPS = 5
-"""Measured motions that a verdict needs."""
-TRUSTED = 0.8
-"""Share of the measured motions that are right at least, those that fit best."""
-CLOCK = 30.0
-"""Seconds by which clocks may differ to be found."""
-FAR_APART = 0.25
-"""Seconds between poses, from which on the way between them is not straight."""
+SUSPICIOUS = 1.5  # percent; poses that differ less from what scans show break no convention
+EXPLAINED = 0.5  # a cause explains the difference if it leaves less than this share of it
+FEWEST_HOPS = 5  # measured motions that a verdict needs
+TRUSTED = 0.8  # share of the measured motions that are right at least, those that fit best
+CLOCK = 30.0  # seconds by which clocks may differ to be found
+FAR_APART = 0.25  # seconds between poses, from which on the way between them is not straight
 TURNED = 0.1
 """Radians, the root of their mean square, by which motions must turn a lever arm to show it."""
-SAME_CLOCK = 0.01
-"""Seconds by which two clocks may differ and count as the same."""
+SAME_CLOCK = 0.01  # seconds by which two clocks may differ and count as the same
 
 
 def _cause(what: str, mend: str, before: float, after: float = np.nan) -> Finding:

@@ -28,14 +28,10 @@ from adaptune.reference.graph import (
     pass_over,
 )
 
-VERSION = 1
-"""Counts changes after which the same recording has another estimate."""
-SHORTEST = 10.0
-"""Metres. On a shorter path, nothing is known about any odometry."""
-FEWEST = 2
-"""Registrations that must span a motion, so that it can be trusted."""
-MOST_UNKNOWN = 0.5
-"""Share of the scans whose pose may be unknown."""
+VERSION = 1  # counts changes after which the same recording has another estimate
+SHORTEST = 10.0  # metres; on a shorter path, nothing is known about any odometry
+FEWEST = 2  # registrations that must span a motion, so that it can be trusted
+MOST_UNKNOWN = 0.5  # share of the scans whose pose may be unknown
 _AGREES = (0.1, 0.02)
 """A registration agrees with the graph within so many metres and this share of its length."""
 _LITTLE_IN_COMMON = 0.8 * LENGTHS[-1]  # metres from which on scans may have too little in common

@@ -11,8 +11,7 @@ from adaptune.geometry import Poses
 from adaptune.metrics import sub_trajectory_rte, travelled
 from adaptune.trajectory import Trajectory
 
-BREAK = 1.0
-"""Seconds. Where the reference is not to be trusted, a longer gap without poses says so."""
+BREAK = 1.0  # seconds; where the reference is not to be trusted, a longer gap without poses says so
 HALVES_TO_WHOLE = 0.75
 """Error of the whole reference, as a share of the difference between its two halves: half of it if
 they had nothing in common, but they share what all registrations get wrong."""

@@ -31,8 +31,7 @@ POOL: tuple[tuple[str, Mapping[str, float]], ...] = (
 )
 """Odometries and their parameters. No study's trials are among them: the reference that judges an
 odometry is not made with it."""
-HALVES = ((0, 1, 2), (3, 4))
-"""Members of either half, which have no algorithm in common."""
+HALVES = ((0, 1, 2), (3, 4))  # members of either half, which have no algorithm in common
 _DOWNSAMPLING = 0.45  # metres between points of their clouds
 
 
@@ -323,14 +322,10 @@ def _robust(noise: Any, bounded: bool = True) -> Any:
     return gtsam.noiseModel.Robust.Create(kernel, noise)
 
 
-LATER = 30.0
-"""Metres driven until a place counts as one that the path comes by again."""
-NEAR = 3.0
-"""Metres from such a place, at most."""
-EVERY = 5.0
-"""Metres driven from one to the next."""
-MOST = 100
-"""Places. Their scans are in memory at the same time."""
+LATER = 30.0  # metres driven until a place counts as one that the path comes by again
+NEAR = 3.0  # metres from such a place, at most
+EVERY = 5.0  # metres driven from one to the next
+MOST = 100  # places; their scans are in memory at the same time
 _DEPARTURE = (0.3, 0.01)
 """A registration is rejected if it departs by more than so many metres, and by more than this share
 of the way between the two scans: it may be of another place that looks alike."""

@@ -116,8 +116,7 @@ MOTIONS: Mapping[str, Motion] = {
 """Ways of carrying a sensor, by name."""
 
 
-LONGEST = 20_000.0
-"""Metres; a longer course is most likely a mistake."""
+LONGEST = 20_000.0  # metres; a longer course is most likely a mistake
 
 
 class SimulationError(AdaptuneError):
@@ -189,8 +188,7 @@ T_IMU_LIDAR: Poses = np.array(
 )
 """Pose of the LiDAR in the IMU's frame, as on BotanicGarden's robot."""
 
-NOISE = ImuNoise(5.2e-5, 5.9e-4, 2.0e-6, 3.0e-5)
-"""Noise of an Xsens MTi-680G."""
+NOISE = ImuNoise(5.2e-5, 5.9e-4, 2.0e-6, 3.0e-5)  # noise of an Xsens MTi-680G
 
 
 def as_sequence(course: Course, path: Path) -> SequenceConfig:

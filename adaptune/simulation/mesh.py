@@ -175,8 +175,7 @@ def foliage(centres: NDArray[np.float64], radii: ArrayLike, leaf: float, seed: i
     return mesh(vertices.reshape(-1, 3), np.arange(3 * n), Material.LEAVES)
 
 
-VARIANTS = 4
-"""How many different trees, bushes and boulders there are."""
+VARIANTS = 4  # how many different trees, bushes and boulders there are
 
 
 def variants(model: Callable[[int], Mesh]) -> list[Mesh]:

@@ -36,8 +36,7 @@ from adaptune.simulation.tiles import TILE
 from adaptune.simulation.world import Ride, Road, World
 from adaptune.trajectory import Trajectory, write_tum
 
-EPOCH = 1_600_000_000_000_000_000
-"""Nanoseconds at which every recording starts."""
+EPOCH = 1_600_000_000_000_000_000  # nanoseconds at which every recording starts
 
 _DETOUR = 1.2  # metres of road in a metre of sight, where it winds
 
@@ -145,8 +144,7 @@ def simulate(course: Course) -> Iterator[SimulatedScan]:
     return Drive(course).scans()
 
 
-GRAVITY = 9.80665
-"""m/s^2, downwards along the world's z axis."""
+GRAVITY = 9.80665  # m/s^2, downwards along the world's z axis
 
 Inertial = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Angular velocities (rad/s) and specific forces (m/s^2, up at rest) in the IMU's frame, (n, 3)."""

@@ -14,8 +14,7 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
-TILE = 20.0
-"""Metres of road in a tile; tiles begin at multiples of it."""
+TILE = 20.0  # metres of road in a tile; tiles begin at multiples of it
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,8 +13,7 @@ from adaptune.simulation.course import Motion
 from adaptune.simulation.mesh import Mesh, grid, merge
 from adaptune.simulation.tiles import TILE, Scene, Spots, Tile, smooth
 
-APRON = 40.0
-"""Metres of world before the start and after the end of the drive."""
+APRON = 40.0  # metres of world before the start and after the end of the drive
 _BLEND = 4.0
 """Metres on either side of a border over which the ground of one scene turns into the next's."""
 _STEP = 0.25
