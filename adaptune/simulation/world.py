@@ -61,10 +61,6 @@ class Road:
         """Radians from the x axis at each station."""
         return np.asarray(np.interp(s, self._stations, self._heading), np.float64)
 
-    def height(self, s: Floats) -> Floats:
-        """Metres above the start at each station."""
-        return np.asarray(np.interp(s, self._stations, self._z), np.float64)
-
     def plane(self, s: Floats, d: Floats) -> tuple[Floats, Floats]:
         """Coordinates x and y of a station and an offset."""
         heading = self.heading(s)
@@ -91,7 +87,7 @@ class Road:
         s = self.station(x)
         d = (y - np.interp(s, self._stations, self._y)) * np.cos(self.heading(s))
         spots = Spots(x, y, s, d)
-        z = self.height(s)
+        z = np.asarray(np.interp(s, self._stations, self._z), np.float64)
         for leg, share in self.shares(s):
             if share.any():
                 z = z + share * leg.scene.relief(spots, self.seed)
@@ -152,7 +148,7 @@ class World:
 
     def __init__(self, road: Road) -> None:
         self._road = road
-        self.tiles: dict[int, Mesh] = {}
+        self._tiles: dict[int, Mesh] = {}
         self._last = int(np.floor((road.length + APRON) / TILE))
 
     def around(self, station: float, reach: float) -> Mesh:
@@ -160,11 +156,10 @@ class World:
         first = max(int(np.floor((station - reach) / TILE)), int(-APRON // TILE))
         last = min(int(np.floor((station + reach) / TILE)), self._last)
         wanted = range(first, last + 1)
-        self.tiles = {i: self.tiles[i] if i in self.tiles else self.tile(i) for i in wanted}
-        return merge(list(self.tiles.values()))
+        self._tiles = {i: self._tiles[i] if i in self._tiles else self._tile(i) for i in wanted}
+        return merge(list(self._tiles.values()))
 
-    def tile(self, index: int) -> Mesh:
-        """Build the tile that begins at station ``index * TILE``."""
+    def _tile(self, index: int) -> Mesh:
         road = self._road
         start, stop = index * TILE, (index + 1) * TILE
         meshes = [self._ground(start, stop)]
