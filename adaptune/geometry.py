@@ -22,8 +22,7 @@ def invert(T_target_source: Poses) -> Poses:
 def rectify(T_target_source: Poses) -> Poses:
     """Remove rounding errors from rotations by one Newton step of the polar decomposition.
 
-    Chained motions amplify them. Where each pose is predicted from the two before it, they more
-    than double with every scan.
+    Where each pose is predicted from the two before it, they more than double with every scan.
     """
     T = T_target_source.copy()
     R = T[..., :3, :3]
@@ -33,7 +32,7 @@ def rectify(T_target_source: Poses) -> Poses:
 
 def squared_ranges(points: NDArray[Any]) -> NDArray[Any]:
     """Squared distances of points of shape (n, 3) from the origin, of shape (n,)."""
-    # Three passes over columns take a third of the time of `einsum` over rows of three.
+    # Columns take a third of the time of `einsum` over rows.
     x, y, z = points.T
     return np.asarray(x * x + y * y + z * z)
 
@@ -50,10 +49,7 @@ def steps(T_world_sensor: Poses) -> Poses:
 
 
 def scale(T_previous_current: Poses, share: float) -> Poses:
-    """Scale a motion, of shape (4, 4), to a share of its time, at the same velocities.
-
-    The result is the exponential of `share` times the motion's logarithm.
-    """
+    """Scale a motion, of shape (4, 4), to a share of its time: the exponential of its logarithm."""
     if share == 1.0:
         return T_previous_current
     from scipy.spatial.transform import RigidTransform
@@ -106,10 +102,7 @@ def nearest_rotation(
 
 
 def from_quaternions(translations: ArrayLike, quaternions: ArrayLike) -> Poses:
-    """Poses of shape (n, 4, 4) from translations (n, 3) and quaternions x, y, z, w (n, 4).
-
-    Quaternions are normalised.
-    """
+    """Poses (n, 4, 4) from translations (n, 3) and quaternions x, y, z, w (n, 4) of any length."""
     from scipy.spatial.transform import Rotation
 
     translations = np.asarray(translations, np.float64).reshape(-1, 3)
@@ -126,43 +119,7 @@ def to_quaternions(T_target_source: Poses) -> NDArray[np.float64]:
     return np.asarray(Rotation.from_matrix(T_target_source[:, :3, :3]).as_quat(canonical=True))
 
 
-def interpolate(
-    stamps: NDArray[np.int64], T_world_sensor: Poses, at: NDArray[np.int64], max_gap: int
-) -> Poses:
-    """Interpolate poses at other stamps: linearly in translation, spherically in rotation.
-
-    Stamps of shape (n,) are strictly increasing nanoseconds, those `at` which to interpolate are of
-    shape (m,). Poses are of shape (n, 4, 4), those found of shape (m, 4, 4): NaN outside `stamps`,
-    and between poses that are further apart than `max_gap` nanoseconds.
-    """
-    T = np.full((len(at), 4, 4), np.nan)
-    if not len(stamps) or not len(at):
-        return T
-    after = np.searchsorted(stamps, at, side="left")
-    inside = (at >= stamps[0]) & (at <= stamps[-1])
-    after = np.clip(after, 0, len(stamps) - 1)
-    exact = inside & (stamps[after] == at)
-    T[exact] = T_world_sensor[after[exact]]
-    between = inside & ~exact
-    between[between] = (stamps[after[between]] - stamps[after[between] - 1]) <= max_gap
-    if between.any():
-        from scipy.spatial.transform import Rotation, Slerp
-
-        # Stamps are exact integers; only differences, which fit a double, become floats.
-        seconds = (stamps - stamps[0]) * 1e-9
-        query = (at[between] - stamps[0]) * 1e-9
-        T[between] = np.eye(4)
-        rotations = Rotation.from_matrix(T_world_sensor[:, :3, :3])
-        T[between, :3, :3] = Slerp(seconds, rotations)(query).as_matrix()
-        left = after[between] - 1
-        share = ((query - seconds[left]) / (seconds[left + 1] - seconds[left]))[:, None]
-        translations = T_world_sensor[:, :3, 3]
-        T[between, :3, 3] = (1.0 - share) * translations[left] + share * translations[left + 1]
-    return T
-
-
-_FARTHEST = 1e6
-"""Metres between two frames of one platform."""
+_FARTHEST = 1e6  # metres between two frames of one platform
 
 
 def to_pose(given: Any) -> Poses:

@@ -9,19 +9,13 @@ from numpy.typing import NDArray
 
 from adaptune.geometry import Poses, invert, nearest_rotation, rotation_angle, steps
 
-RESAMPLES = 2000
-"""Resamples of a bootstrap."""
-MIN_BLOCKS = 10
-"""Least number of blocks of a recording: with fewer, an interval means nothing."""
-WORST = 0.1
-"""Share of the stretches that are the worst."""
+RESAMPLES = 2000  # resamples of a bootstrap
+MIN_BLOCKS = 10  # least number of blocks of a recording: with fewer, an interval means nothing
+WORST = 0.1  # share of the stretches that are the worst
 KITTI_LENGTHS = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
-
-
 JITTER = 0.1
 """Metres. A robot that stands does not drive by the noise of its poses, where that is less."""
-_AS_STRAIGHT = 0.9
-"""Share of the path that is left without noise, from which noise does not matter."""
+_AS_STRAIGHT = 0.9  # share of the path that is left without noise, from which noise does not matter
 
 
 def travelled(T_world_sensor: Poses) -> NDArray[np.float64]:
@@ -64,11 +58,10 @@ def _shaking(positions: NDArray[np.float64]) -> float:
 
 
 def window_ends(T_world_sensor: Poses, length: float) -> NDArray[np.intp]:
-    """End of the sub-trajectory of `length` metres that starts at each pose.
+    """Index of the end of the sub-trajectory of `length` metres from each pose, of shape (n,).
 
-    The end is the first pose further along the path than `length` from the start, as in KITTI's
-    development kit: its index, of shape (n,); -1 where the path ends before, or where a pose on the
-    way is NaN.
+    It is the first pose further along the path, as in KITTI's development kit; -1 where the path
+    ends before, or where a pose on the way is NaN.
     """
     distance = travelled(T_world_sensor)
     ends = np.searchsorted(distance, distance + length, side="right")
@@ -101,7 +94,7 @@ def sub_trajectory_rte(
     The error ``y_ij`` of frame i with parameter set j in Koide et al., *Adaptive Hyperparameter
     Tuning for Black-box LiDAR Odometry*, IROS 2021: with the motions d from the first frame of the
     sub-trajectory to its last, ``100 / L * ||trans(inv(d_est) d_ref)||``, in percent of the length.
-    Its vectors are those of `sub_trajectory_vectors`.
+    See `sub_trajectory_vectors`.
     """
     vectors = sub_trajectory_vectors(T_ref_sensor, T_odom_sensor, length, lost, ends)
     return np.asarray(np.linalg.norm(vectors, axis=1))
@@ -140,10 +133,7 @@ def sub_trajectory_vectors(
 def sub_trajectory_turns(
     T_ref_sensor: Poses, T_odom_sensor: Poses, length: float
 ) -> NDArray[np.float64]:
-    """Rotation error at the end of the sub-trajectory from every frame, degrees a metre, (n,).
-
-    NaN for frames without a full sub-trajectory; `length` is in metres.
-    """
+    """Rotation error of the sub-trajectory from every frame in degrees a metre, or NaN, (n,)."""
     ends = window_ends(T_ref_sensor, length)
     starts = np.flatnonzero(ends >= 0)
     d_gt, d_est = _window_motions(T_ref_sensor, T_odom_sensor, starts, ends[starts])
@@ -153,10 +143,7 @@ def sub_trajectory_turns(
 
 
 def height_error(T_ref_sensor: Poses, T_odom_sensor: Poses, length: float) -> float:
-    """Mean drift in height over the sub-trajectories of `length` metres, in percent of it.
-
-    Height is along the z axis of the reference's frame. NaN where no sub-trajectory is whole.
-    """
+    """Mean drift along the reference's z axis over sub-trajectories, in percent, or NaN."""
     vectors = sub_trajectory_vectors(T_ref_sensor, T_odom_sensor, length)
     known = np.isfinite(vectors).all(axis=1)
     if not known.any():
@@ -170,8 +157,7 @@ class KittiError(NamedTuple):
 
     translation: float = np.nan  # percent; NaN when the path is shorter than every length
     rotation: float = np.nan  # degrees a metre
-    # The lengths in metres for which there was at least one sub-trajectory.
-    lengths: tuple[float, ...] = ()
+    lengths: tuple[float, ...] = ()  # metres, those for which there was a sub-trajectory
     n: int = 0  # number of sub-trajectories
 
     @classmethod
@@ -194,7 +180,7 @@ def kitti_error(
 ) -> KittiError:
     """Error of KITTI's odometry benchmark (Geiger et al., CVPR 2012) over lengths in metres.
 
-    `stride` is the number of frames from one start of a sub-trajectory to the next.
+    A sub-trajectory starts every `stride` frames.
     """
     translations, rotations, used = [], [], []
     for length in lengths:
@@ -239,30 +225,22 @@ def relative_error(T_ref_sensor: Poses, T_odom_sensor: Poses) -> float:
     return float(np.sqrt(np.mean(np.sum(E[known, :3, 3] ** 2, axis=1))))
 
 
-FAILURE = 30.0
-"""Percent. A lost track and every larger error count as this."""
-LOST_ABOVE = 5.0
-"""Percent. An odometry with a larger mean error does not track."""
+FAILURE = 30.0  # percent; a lost track and every larger error count as this
+LOST_ABOVE = 5.0  # percent; an odometry with a larger mean error does not track
 
 
 def cap(errors: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Bound errors in percent by `FAILURE`, so that one lost track does not hide all others.
-
-    NaN stays NaN.
-    """
+    """Bound errors in percent by `FAILURE`, so that one lost track does not hide all others."""
     return np.minimum(errors.astype(np.float64), FAILURE)
 
 
 def lost_in_words(
-    best: str,
-    errors: Mapping[str, float],
-    odometry: str,
-    find_cause: Callable[[str], str],
+    best: str, errors: Mapping[str, float], odometry: str, find_cause: Callable[[str], str]
 ) -> list[str]:
     """A sentence where even the best does not track: the likeliest cause, and what to try.
 
-    `errors` has by sequence the mean error of the best, in percent. Where it does not track,
-    `find_cause` says what is known of the cause on the worst sequence.
+    `errors` has by sequence the mean error of the best, in percent; `find_cause` says what is known
+    of the cause on the worst one.
     """
     if not (mean := sum(errors.values()) / len(errors)) > LOST_ABOVE:
         return []
@@ -286,9 +264,8 @@ def bootstrap(
 
     A moving-block bootstrap (Künsch, Annals of Statistics 1989): errors of neighbouring frames
     share most of their sub-trajectories, and `block` frames are drawn together. The interval holds
-    for this recording, not for other places. With few blocks it is too narrow, above all for skewed
-    errors; there is none with fewer than `MIN_BLOCKS`. Errors, of shape (n,), are in percent, and
-    those of the fixed set are of the same frames.
+    for this recording, not for other places. With few blocks it is too narrow; there is none with
+    fewer than `MIN_BLOCKS`. Errors of the same frames, of shape (n,), are in percent.
     """
     if len(errors) < MIN_BLOCKS * block:
         return None
@@ -301,10 +278,7 @@ def bootstrap(
 def resampled_means(
     values: NDArray[np.float64], block: int, rng: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Means of the resamples of a moving-block bootstrap, of shape (k, RESAMPLES).
-
-    Values of shape (k, n) are k of each frame; `block` frames, n at most, are drawn together.
-    """
+    """Means of the resamples of a moving-block bootstrap of values (k, n): (k, RESAMPLES)."""
     n = values.shape[1]
     n_blocks = -(-n // block)
     starts = rng.integers(0, n - block + 1, (RESAMPLES, n_blocks))
@@ -314,10 +288,9 @@ def resampled_means(
 
 
 def worst_tenth(logs: NDArray[np.float64]) -> float:
-    """Mean logarithm over the worst tenth of the stretches, over one stretch at least.
+    """Mean over the worst tenth of the stretches' logarithms of the ratio to the fixed set's error.
 
     It is the conditional value at risk: where a tenth is no whole number, a stretch counts in part.
-    `logs` are logarithms of the ratio to the fixed set's error, a number for each stretch.
     """
     share = max(1.0, WORST * len(logs))
     counts = np.clip(share - np.arange(len(logs)), 0.0, 1.0)

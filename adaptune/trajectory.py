@@ -1,7 +1,6 @@
 """Trajectories, and their files in the TUM, KITTI and EuRoC formats.
 
-All readers raise a TrajectoryError that names the file and the line that is not a pose, or whose
-stamp lies before the one before it.
+All readers raise a TrajectoryError that names the file, and the line where one is wrong.
 """
 
 import logging
@@ -56,10 +55,6 @@ class Trajectory:
     def __len__(self) -> int:
         return len(self.stamps)
 
-    def __repr__(self) -> str:
-        seconds = np.ptp(self.stamps) * 1e-9 if len(self) else 0.0
-        return f"<Trajectory: {len(self)} poses in {seconds:.1f} s>"
-
     @property
     def sparse(self) -> str:
         """Where many poses are further apart than `max_gap`: how many, and what to set."""
@@ -73,12 +68,36 @@ class Trajectory:
         return f"{what} = {self.max_gap:g} s: {help_}"
 
     def at(self, stamps: NDArray[np.int64], max_gap: float | None = None) -> Poses:
-        """Interpolated poses of shape (m, 4, 4) at m stamps; NaN where there is no pose.
+        """Poses of shape (m, 4, 4) at m stamps: linear in translation, spherical in rotation.
 
-        `max_gap` is in seconds, in place of the trajectory's own.
+        They are NaN outside the trajectory, and between poses further apart than `max_gap` seconds,
+        by default its own.
         """
-        gap = self.max_gap if max_gap is None else max_gap
-        return geometry.interpolate(self.stamps, self.T_world_sensor, stamps, round(gap * 1e9))
+        T = np.full((len(stamps), 4, 4), np.nan)
+        if not len(self) or not len(stamps):
+            return T
+        gap = round((self.max_gap if max_gap is None else max_gap) * 1e9)
+        after = np.searchsorted(self.stamps, stamps, side="left")
+        inside = (stamps >= self.stamps[0]) & (stamps <= self.stamps[-1])
+        after = np.clip(after, 0, len(self) - 1)
+        exact = inside & (self.stamps[after] == stamps)
+        T[exact] = self.T_world_sensor[after[exact]]
+        between = inside & ~exact
+        between[between] = (self.stamps[after[between]] - self.stamps[after[between] - 1]) <= gap
+        if between.any():
+            from scipy.spatial.transform import Rotation, Slerp
+
+            # Stamps are exact integers; only differences, which fit a double, become floats.
+            seconds = (self.stamps - self.stamps[0]) * 1e-9
+            query = (stamps[between] - self.stamps[0]) * 1e-9
+            T[between] = np.eye(4)
+            rotations = Rotation.from_matrix(self.T_world_sensor[:, :3, :3])
+            T[between, :3, :3] = Slerp(seconds, rotations)(query).as_matrix()
+            left = after[between] - 1
+            share = ((query - seconds[left]) / (seconds[left + 1] - seconds[left]))[:, None]
+            positions = self.T_world_sensor[:, :3, 3]
+            T[between, :3, 3] = (1.0 - share) * positions[left] + share * positions[left + 1]
+        return T
 
 
 Row = tuple[int, list[str]]
@@ -110,7 +129,6 @@ def _lines(path: Path) -> Iterator[tuple[int, str, list[str]]]:
 
 @cache
 def _assume(path: Path, what: str) -> None:
-    """Say once how a file is read."""
     _log.info("%s: %s", path, what)
 
 
@@ -142,9 +160,9 @@ def _named(header: str) -> dict[str, list[int]]:
     names = re.split(r"\s*[,;]\s*" if re.search("[,;]", header) else r"\s+", header)
     found: dict[str, list[int]] = {}
     for i, name in enumerate(names):
-        of = next((of for of, known in _NAMES.items() if re.fullmatch(known, name)), None)
-        if of is not None:
-            found.setdefault(of if len(of) > 1 else of + name[-1], []).append(i)
+        kind = next((k for k, known in _NAMES.items() if re.fullmatch(known, name)), None)
+        if kind is not None:
+            found.setdefault(kind if len(kind) > 1 else kind + name[-1], []).append(i)
     # A message's own stamp comes before the time at which it was recorded.
     for times in (found.get("timestamp", []), found.get("nanoseconds", [])):
         times.sort(key=lambda i: ("header" not in names[i], "stamp" not in names[i]))
@@ -278,10 +296,7 @@ def read_tum(path: Path) -> Trajectory:
 
 
 def read_trajectory(path: Path) -> Trajectory:
-    """Read poses with stamps: of a ``.csv`` in nanoseconds as EuRoC writes them, else as TUM does.
-
-    A header of names gives any other order.
-    """
+    """Read poses with stamps: ``.csv`` in nanoseconds as EuRoC's, else TUM; or as a header says."""
     return _read(path, csv=path.suffix == ".csv")
 
 

@@ -26,7 +26,6 @@ from adaptune.odometry.base import InProcess, OdometryInstance
 from adaptune.odometry.registry import ODOMETRIES, odometry_class
 from adaptune.odometry.remote import Isolated, Limits
 from adaptune.recording import Scan, SequenceError
-from adaptune.recording.changed import with_imu
 from adaptune.recording.recording import open_sequence
 from adaptune.simulation import Course
 from adaptune.simulation.course import as_sequence
@@ -74,7 +73,7 @@ def read(path: Path) -> tuple[list[Scan], Poses]:
     course = Course(scenes=("garden",), imu=200)
     sequence: Any
     try:
-        sequence = with_imu(open_sequence(as_sequence(course, path)))
+        sequence = open_sequence(as_sequence(course, path), with_imu=True)
     except SequenceError:
         sequence = open_sequence(as_sequence(course.model_copy(update={"imu": None}), path))
     scans = list(sequence)

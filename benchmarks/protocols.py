@@ -28,10 +28,9 @@ import numpy as np
 
 from adaptune.geometry import Poses, invert
 from adaptune.recording.compensation import compensate
-from adaptune.recording.config import SequenceConfig
+from adaptune.recording.config import SequenceConfig, read_part
 from adaptune.recording.export import write_kitti_sequence
 from adaptune.recording.folder import ELEVATION, turn_up
-from adaptune.recording.parts import read_part
 from adaptune.recording.recording import open_sequence
 from adaptune.recording.scan import Scan
 from adaptune.simulation import Course

@@ -47,8 +47,7 @@ from adaptune.files import write_text
 from adaptune.metrics import cap, sub_trajectory_turns
 from adaptune.model.rules import BASELINE, Costs
 from adaptune.progress import unseen
-from adaptune.recording.config import ESTIMATED
-from adaptune.recording.parts import part_name, read_part
+from adaptune.recording.config import ESTIMATED, part_name, read_part
 from adaptune.report import tables
 from adaptune.space import ParameterSets
 from adaptune.study.config import ALSO

@@ -21,7 +21,7 @@ from adaptune.odometry.base import Motions, OdometryInstance
 from adaptune.odometry.content import python_content
 from adaptune.odometry.factory import Factory
 from adaptune.progress import Progress, unseen
-from adaptune.recording.parts import part_name
+from adaptune.recording.config import part_name
 from adaptune.recording.scan import Recording, Scan
 from adaptune.reference.check import mean_difference
 from adaptune.selector import AnySelector, Selector, UntrainedSelector, untrained_sets

@@ -5,8 +5,8 @@ import logging
 import math
 import re
 import resource
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections import Counter, defaultdict, deque
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import cache, partial
 from itertools import islice, pairwise
@@ -16,6 +16,8 @@ from typing import Any
 import numpy as np
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Connection
+from rosbags.rosbag1 import Reader
+from rosbags.rosbag1.reader import Chunk, IndexData, decompressors
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from adaptune.errors import Finding, blame_machine, nearest
@@ -23,7 +25,6 @@ from adaptune.recording import clouds
 from adaptune.recording.clouds import CLOUDS, PointCloudError, header_of
 from adaptune.recording.config import files_of
 from adaptune.recording.findings import clock_parts, of_clock
-from adaptune.recording.indexed_bag import IndexReader
 from adaptune.recording.pose_messages import (
     PATH,
     POSES,
@@ -39,7 +40,6 @@ from adaptune.trajectory import Trajectory
 
 _log = logging.getLogger(__name__)
 
-
 _LATEST, _UNEVEN = 600 * 10**9, 10**9
 """Nanoseconds from a bag's begin to its first scan, and by which scans come unevenly."""
 IMU_TYPES = ("sensor_msgs/msg/Imu",)
@@ -48,6 +48,17 @@ Window = tuple[int | None, int | None]
 _ALL: Window = (None, None)
 # Nanoseconds: the end of a bag that is looked at, how late messages are written, and a long pause.
 _LAST, _LATE, _PAUSE = 10 * 10**9, 5 * 10**7, 600 * 10**9
+UNOPENED: Mapping[str, Any] = {
+    "topics": {},
+    "points": "",
+    "n_messages": 0,
+    "duration": 0,
+    "begins": {},
+    "window": _ALL,
+    "skipped": 0.0,
+    "findings": [],
+}
+"""In place of what opening bags has shown, see `BagSource.about`."""
 
 
 def storages(reader: AnyReader) -> list[Any]:
@@ -65,6 +76,60 @@ def _typestore() -> Any:
     return store
 
 
+_NOTHING = Chunk(0, 0, bytes)
+
+
+class IndexReader(Reader):
+    """Reads ROS 1 bags that are opened by the index at their end alone.
+
+    rosbags visits every chunk when it opens a bag, which takes seconds for 100,000 of them.
+    """
+
+    def open(self) -> None:
+        """Read the list of chunks."""
+        super().open()
+        counts: Counter[int] = Counter()
+        for info in self.chunk_infos:
+            for connection, count in info.connection_counts.items():
+                counts[connection] += count
+        self.connections = [c._replace(msgcount=counts[c.id]) for c in self.connections]
+
+    def read_chunk(self) -> Chunk:
+        """Nothing, while the bag is opened."""
+        return _NOTHING
+
+    def read_index_data(self, pos: int, indexes: dict[int, list[IndexData]]) -> None:
+        """Nothing, while the bag is opened."""
+
+    def is_slow(self) -> bool:
+        """Whether its first chunk is packed by BZ2, which unpacks a few megabytes a second."""
+        if not self.chunk_infos:
+            return False
+        assert self.bio is not None
+        self.bio.seek(self.chunk_infos[0].pos)
+        return super().read_chunk().decompressor is decompressors["bz2"]
+
+    def messages(
+        self,
+        connections: Collection[Connection] = (),
+        start: int | None = None,
+        stop: int | None = None,
+    ) -> Generator[tuple[Connection, int, bytes], None, None]:
+        """Messages of some time, as rosbags gives them."""
+        assert self.bio is not None
+        indexes: dict[int, list[IndexData]] = defaultdict(list)
+        for info in self.chunk_infos:
+            if (start is None or info.end_time > start) and (
+                stop is None or info.start_time < stop
+            ):
+                self.bio.seek(info.pos)
+                self.chunks[info.pos] = super().read_chunk()
+                for _ in info.connection_counts:
+                    super().read_index_data(info.pos, indexes)
+        self.indexes = {c.id: sorted(indexes[c.id]) for c in self.connections}
+        yield from super().messages(connections, start, stop)
+
+
 class BagSource:
     """Scans, IMU and poses of one or more bags that follow each other.
 
@@ -72,8 +137,8 @@ class BagSource:
     no usable message on it. It names the bags and the message, or the topics that there are.
 
     `paths` are as `bag_paths` gives them. The topic of the point clouds may be left out where there
-    is only one, and their frame where the topic has only one. Given the result of `about` from
-    when they were opened before, the bags are not opened now.
+    is only one, and their frame where the topic has only one. Given the result of `about`, the bags
+    are not opened now.
     """
 
     pose_files: Sequence[Path] = ()
@@ -84,22 +149,21 @@ class BagSource:
         points: str | None = None,
         timing: Timing = AUTO,
         frame: str | None = None,
-        about: dict[str, Any] | None = None,
+        about: Mapping[str, Any] | None = None,
         within: tuple[float, float] = (0.0, math.inf),
     ):
         self.paths, self.timing, self.frame = tuple(paths), timing, frame
+        given = UNOPENED if about is None else about
+        self.topics: dict[str, str] = dict(given["topics"])
+        self.points: str = given["points"]
+        self.n_messages: int = given["n_messages"]
+        self._duration: int = given["duration"]
+        self.begins: dict[str, int] = dict(given["begins"])
         # Nanoseconds on the recorder's clock of what is used, and seconds before it.
-        self.window: Window = _ALL
-        self.skipped, self.findings = 0.0, list[Finding]()
+        self.window: Window = tuple(given["window"])
+        self.skipped: float = given["skipped"]
+        self.findings = [Finding((), text, of="points") for text in given["findings"]]
         if about is not None:
-            self.topics: dict[str, str] = dict(about["topics"])
-            self.points: str = about["points"]
-            self.n_messages: int = about["n_messages"]
-            self._duration: int = about["duration"]
-            self.begins: dict[str, int] = dict(about["begins"])
-            if "window" in about:
-                self.window, self.skipped = tuple(about["window"]), about["skipped"]
-                self.findings = [Finding((), text, of="points") for text in about["findings"]]
             return
         with self.open() as reader:
             self.topics = {c.topic: c.msgtype for c in reader.connections}
@@ -128,10 +192,7 @@ class BagSource:
     def look_at_clock(
         self, reader: AnyReader, within: tuple[float, float] = (0.0, math.inf)
     ) -> None:
-        """Use the longest part in which the clock goes on, where it leaps.
-
-        `within` says between which seconds it is to lie.
-        """
+        """Where the clock leaps, use the longest part between the seconds `within`."""
         if not self._leaps(reader):
             return
         stamps, recorded = np.array(list(self._clocks(reader)), np.int64).reshape(-1, 2).T
@@ -246,10 +307,7 @@ class BagSource:
         return None if first is None else (first, first + self._duration)
 
     def poses(self, name: str | None, child_frame: str | None) -> Trajectory | None:
-        """Poses on a topic, those with the same stamp once; of paths, the last one recorded.
-
-        Poses that are not finite or whose quaternion has no length are left out and counted.
-        """
+        """Poses on a topic, those with the same stamp once; of paths, the last one recorded."""
         if name is None:
             return None
         name = self.topic(name, POSES, "poses")
@@ -356,10 +414,7 @@ class BagSource:
             reader.close()
 
     def read(
-        self,
-        reader: AnyReader,
-        topic: str | None = None,
-        span: Window = _ALL,
+        self, reader: AnyReader, topic: str | None = None, span: Window = _ALL
     ) -> Iterator[tuple[Connection, int, bytes]]:
         """Serialised messages of a topic, or of all topics; `span`, those recorded then."""
         chosen = [c for c in reader.connections if topic in (None, c.topic)]

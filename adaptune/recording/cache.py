@@ -17,7 +17,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, suppress
 from functools import partial
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import platformdirs
@@ -57,10 +57,7 @@ def folder() -> Path:
 
 
 def cap() -> int:
-    """Bytes that all entries together may take: ``$ADAPTUNE_CACHE_GB`` gigabytes, or 50.
-
-    An AdaptuneError if the variable is no number of gigabytes.
-    """
+    """Bytes that all entries together may take: ``$ADAPTUNE_CACHE_GB`` gigabytes, or 50."""
     given = os.environ.get("ADAPTUNE_CACHE_GB", "").strip()
     with suppress(ValueError):
         gigabytes = float(given or _CAP_GB)
@@ -72,10 +69,7 @@ def cap() -> int:
 
 
 def key(files: Sequence[Path], settings: Any) -> str:
-    """Digest of files and settings; an OSError if a file cannot be read.
-
-    A file counts by all that changes when it is written, moved or replaced, see `status_key`.
-    """
+    """Digest of the `status_key` of files, and of settings; an OSError if a file cannot be read."""
     about = f"{_VERSION} {settings!r} {' '.join(map(status_key, files))}"
     return hashlib.blake2b(about.encode(), digest_size=_SIZE).hexdigest()
 
@@ -140,29 +134,20 @@ def find(key: str) -> CachedScans | None:
         return None
 
 
-class Writer:
-    """Writes an entry scan by scan, as a context: it is there when the block ends well.
+class _Writer:
+    """Writes an entry scan by scan to a folder of its own; an OSError where that cannot be."""
 
-    `key` is the entry's digest, `about` notes on the sequence (plain data).
-    """
-
-    def __init__(self, key: str, about: dict[str, Any]):
-        self._key, self._about = key, about
-        self._done = False
+    def __init__(self) -> None:
         root = folder()
         root.mkdir(parents=True, exist_ok=True)
         _sweep(root)
         # Others may read it as far as the umask lets them.
-        self._temporary = root / f".writing-{secrets.token_hex(4)}"
-        self._temporary.mkdir()
-        self._files = {name: (self._temporary / name).open("wb") for name in _ARRAYS}
+        self._folder = root / f".writing-{secrets.token_hex(4)}"
+        self._folder.mkdir()
+        self._files = {name: (self._folder / name).open("wb") for name in _ARRAYS}
         self._index: list[list[int]] = []
 
-    def __enter__(self) -> Self:
-        return self
-
     def append(self, scan: Scan) -> None:
-        """Add a scan."""
         row = [scan.stamp]
         for name, file in self._files.items():
             kind, columns = _ARRAYS[name]
@@ -173,34 +158,36 @@ class Writer:
             row += [-1, -1] if values is None else [begin, begin + len(values)]
         self._index.append(row)
 
-    def done(self) -> None:
-        """Mark the entry as complete."""
-        self._done = True
+    def keep(self, key: str, about: dict[str, Any]) -> None:
+        """Put the entry in its place, with notes on the sequence (plain data)."""
+        for file in self._files.values():
+            file.close()
+        index = np.array(self._index, np.int64).reshape(-1, 1 + 2 * len(_ARRAYS))
+        np.save(self._folder / _INDEX, index)
+        (self._folder / _ABOUT).write_text(json.dumps(about, indent=1), "utf-8")
+        _make_room(_size(self._folder))
+        # Another process may have been first; its arrays are the same.
+        if not (folder() / key).exists():
+            self._folder.rename(folder() / key)
 
-    def __exit__(self, kind: object, error: object, trace: object) -> None:
-        try:
-            for file in self._files.values():
+    def remove(self) -> None:
+        """Remove what is not in its place."""
+        for file in self._files.values():
+            with suppress(OSError):
                 file.close()
-            if self._done and error is None:
-                index = np.array(self._index, np.int64).reshape(-1, 1 + 2 * len(_ARRAYS))
-                np.save(self._temporary / _INDEX, index)
-                (self._temporary / _ABOUT).write_text(json.dumps(self._about, indent=1), "utf-8")
-                _make_room(_size(self._temporary))
-                # Another process may have been first; its arrays are the same.
-                if not (folder() / self._key).exists():
-                    self._temporary.rename(folder() / self._key)
-        except OSError as problem:
-            _log.warning(_NOT_KEPT, self._about.get("name"), problem)
-        finally:
-            shutil.rmtree(self._temporary, ignore_errors=True)
+        shutil.rmtree(self._folder, ignore_errors=True)
 
 
 def tee(scans: Iterable[Scan], key: str, about: dict[str, Any]) -> Iterator[Scan]:
-    """Pass scans on and keep them. Nothing is kept unless all of them are read."""
+    """Pass scans on and keep them. Nothing is kept unless all of them are read.
+
+    `key` is the entry's digest, `about` notes on the sequence (plain data).
+    """
     with ExitStack() as stack:
         writer, total = None, 0
         try:
-            writer = stack.enter_context(Writer(key, about))
+            writer = _Writer()
+            stack.callback(writer.remove)
         except OSError as error:
             _log.warning(_NOT_KEPT, about.get("name"), error)
         for scan in scans:
@@ -216,8 +203,11 @@ def tee(scans: Iterable[Scan], key: str, about: dict[str, Any]) -> Iterator[Scan
                 _log.warning(_NOT_KEPT, about.get("name"), error)
                 writer = None
             yield scan
-        if writer is not None:
-            writer.done()
+        try:
+            if writer is not None:
+                writer.keep(key, about)
+        except OSError as error:
+            _log.warning(_NOT_KEPT, about.get("name"), error)
 
 
 def _make_room(size: int) -> None:
@@ -250,26 +240,18 @@ def _size(path: Path) -> int:
     return sum(p.stat().st_size for p in path.iterdir() if p.is_file())
 
 
-SMALL = 1 << 24
-"""Bytes of files below which their content is read every time."""
+SMALL = 1 << 24  # bytes of files below which their content is read every time
 FILE = "fingerprints.txt"
 """File in the cache's folder: on every line the hash of a file's status, and of its content."""
-MANY = 64
-"""So many files have one hash together."""
-
-_LONG = 1 << 30
-"""Bytes that take more than a second to read."""
+MANY = 64  # so many files have one hash together
+_LONG = 1 << 30  # bytes that take more than a second to read
 _SIZE = 16
-
 remembered: dict[str, str] = {}
 """Hashes that this process knows, also where the cache's folder cannot be written."""
 
 
 def fingerprints(files: Sequence[Path]) -> list[str]:
-    """Hash the content of each file; `MANY` or more files are hashed as one.
-
-    There is an AdaptuneError if a file cannot be read, or changes while it is read.
-    """
+    """Hash the content of each file, `MANY` or more as one; an AdaptuneError if one changes."""
     new: dict[str, str] = {}
     found = []
     try:

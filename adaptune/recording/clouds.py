@@ -18,10 +18,9 @@ from adaptune.recording.timing import AUTO, TIME_FIELDS, Timing, TimingError, Un
 _WORD = {order: struct.Struct(f"{order}I").unpack_from for order in "<>"}
 
 
-class Serialized:
-    """Reads a message, as it lies in the bag, from its beginning.
+class _Serialized:
+    """Reads a message from its beginning, serialised as in ROS 2 if `cdr`: with aligned numbers.
 
-    `cdr` says whether it is serialised as in ROS 2: in either byte order, and with aligned numbers.
     All methods raise ValueError, IndexError or struct.error where the message is not long enough.
     """
 
@@ -36,25 +35,21 @@ class Serialized:
         self._unpack = _WORD[self.order]
 
     def align(self, size: int) -> None:
-        """Pass over the padding before a number of this size."""
         if self._cdr:
             self.at = -(-self.at // size) * size
 
     def uint32(self) -> int:
-        """Read a number of four bytes."""
         self.align(4)
         (number,) = self._unpack(self.data, self.at)
         self.at += 4
         return int(number)
 
     def uint8(self) -> int:
-        """Read a number of one byte."""
         number = self.data[self.at]
         self.at += 1
         return number
 
     def block(self, size: int) -> memoryview:
-        """Read so many bytes."""
         begin, self.at = self.at, self.at + size
         if self.at > len(self.data):
             raise ValueError(f"{size} bytes are declared, there are {len(self.data) - begin}")
@@ -73,7 +68,6 @@ class Serialized:
         return stamp
 
     def end(self) -> None:
-        """Make sure that nothing is left but padding."""
         left = len(self.data) - self.at
         if left > (3 if self._cdr else 0):
             raise ValueError(f"{left} bytes are left over")
@@ -82,29 +76,28 @@ class Serialized:
 def header_of(data: bytes | memoryview, cdr: bool) -> tuple[int | None, str]:
     """Stamp and frame of a message that begins with a header; no stamp if it is damaged there."""
     try:
-        message = Serialized(data, cdr)
+        message = _Serialized(data, cdr)
         return message.header(), message.frame
     except (ValueError, IndexError, struct.error):
         return None, ""
 
 
 # The numbers of sensor_msgs/PointField's datatypes.
-DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+_DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 _LARGEST_POINT = 1 << 20
 RING_FIELDS = ("ring", "line", "channel", "laser_id")
 # CloudCompare puts a prefix before the names of what it stores in a PLY file.
 INTENSITY_FIELDS = ("intensity", "reflectivity", "scalar_intensity", "scalar_Intensity")
-FARTHEST = 1000.0
-"""Metres beyond which a point is doubted."""
+FARTHEST = 1000.0  # metres beyond which a point is doubted
 _NEVER = 1e4  # metres beyond which no LiDAR sees
-
-
-class PointCloudError(AdaptuneError):
-    """A message that does not describe a point cloud."""
 
 
 Field = tuple[str, int, int, int]
 """Name, offset, datatype and count, in the order of sensor_msgs/PointField."""
+
+
+class PointCloudError(AdaptuneError):
+    """A message that does not describe a point cloud."""
 
 
 class PointCloud2(NamedTuple):
@@ -121,12 +114,9 @@ class PointCloud2(NamedTuple):
 
 
 def parse(data: bytes | memoryview, cdr: bool) -> PointCloud2:
-    """Read a message, serialised as in ROS 2 if `cdr`, without a copy of its points.
-
-    A PointCloudError reports a message that is cut short, or longer than it declares.
-    """
+    """Read a message without a copy of its points; a PointCloudError if it is not a whole one."""
     try:
-        body = Serialized(data, cdr)
+        body = _Serialized(data, cdr)
         cloud = PointCloud2(
             stamp=body.header(),
             height=body.uint32(),
@@ -154,11 +144,11 @@ def point_dtype(fields: tuple[Field, ...], is_bigendian: bool, point_step: int) 
         raise PointCloudError(f"a point of {point_step} bytes is none")
     names, formats, offsets = [], [], []
     for name, offset, datatype, count in fields:
-        if datatype not in DATATYPES:
+        if datatype not in _DATATYPES:
             raise PointCloudError(f"field {name!r} has unknown datatype {datatype}")
         if name in names:
             raise PointCloudError(f"field {name!r} appears twice")
-        single = np.dtype((">" if is_bigendian else "<") + DATATYPES[datatype])
+        single = np.dtype((">" if is_bigendian else "<") + _DATATYPES[datatype])
         # Some drivers leave the count at zero.
         if offset + single.itemsize * max(count, 1) > point_step:
             raise PointCloudError(f"field {name!r} ends beyond the point's {point_step} bytes")
@@ -175,10 +165,7 @@ def point_dtype(fields: tuple[Field, ...], is_bigendian: bool, point_step: int) 
 
 
 def read_points(cloud: PointCloud2) -> NDArray[Any]:
-    """All points of a message as a structured array of shape (height * width,), without a copy.
-
-    A PointCloudError reports a message without x, y or z, or with too few bytes.
-    """
+    """All points of a message as a structured array of shape (height * width,), without a copy."""
     height, width, size = cloud.height, cloud.width, len(cloud.data)
     dtype = point_dtype(cloud.fields, cloud.is_bigendian, cloud.point_step)
     if not height * width:
@@ -249,9 +236,8 @@ def from_fields(raw: NDArray[Any] | Mapping[str, NDArray[Any]], stamp: int, timi
         start, seconds, reading = timing.resolve(stamp, timed, (low, high))
     except TimingError as error:
         raise PointCloudError(str(error)) from error
-    reading = reading._replace(marks=marks)
     given_rings, given_lights = rings if ring else None, lights if intensity else None
-    reading = reading._replace(unread=unread)
+    reading = reading._replace(marks=marks, unread=unread)
     return Scan(start, points, seconds, given_rings, None, given_lights, reading)
 
 
@@ -303,8 +289,6 @@ def _marks(columns: Sequence[NDArray[Any]]) -> NDArray[np.bool_]:
 
 _NO_TIMES, _NO_RINGS = np.empty(0, np.float32), np.empty(0, np.uint16)
 _NO_INTENSITIES = np.empty(0, np.float32)
-
-
 # Single precision keeps the loop fast.
 _ZERO, _INFINITE = np.float32(0.0), np.float32(np.inf)
 _DOUBTED = np.float32(FARTHEST**2)
@@ -390,14 +374,13 @@ DEFINITIONS = {
 
 
 def decode_livox(data: bytes | memoryview, cdr: bool, timing: Timing = AUTO) -> Scan:
-    """Decode a serialised message without an object for each of its points.
+    """Decode a serialised CustomMsg; a PointCloudError reports a message that is cut short.
 
     The points' offsets count from the time base. The stamp marks the same moment, unless `timing`
-    sets it to mark the scan's end, or takes the time base in its place. A PointCloudError reports a
-    message that is cut short.
+    sets it to mark the scan's end, or takes the time base in its place.
     """
     try:
-        body = Serialized(data, cdr)
+        body = _Serialized(data, cdr)
         stamp = body.header()
         body.align(8)
         base = int(np.frombuffer(body.block(8), body.order + "u8")[0])

@@ -16,18 +16,15 @@ from adaptune.trajectory import Trajectory
 _MOMENTS = 64
 # Metres: cells and search radius for the registration of a scan with its neighbour.
 _CELL, _REACH = 0.5, 2.0
-# small_gicp crashes on an empty target.
-_FEWEST = 20
-# Seconds; the mean velocity between scans further apart is not that of either.
-_FAR = 1.0
+_FEWEST = 20  # small_gicp crashes on an empty target
+_FAR = 1.0  # seconds; the mean velocity between scans further apart is not that of either
 
 
 def compensate(scan: Scan, T_start_end: Poses, duration: float) -> Scan:
     """Undo a motion of constant velocity: the points as seen from the sensor at the scan's stamp.
 
-    `T_start_end` is the sensor's pose `duration` seconds after the stamp, seen from where it was at
-    the stamp. Afterwards all points have the time 0. A scan whose points have no times is returned
-    as it is.
+    `T_start_end` is the sensor's pose `duration` seconds later, seen from there. Afterwards all
+    points have the time 0. A scan whose points have no times is returned as it is.
     """
     if scan.times is None or not len(scan):
         return scan
@@ -50,9 +47,7 @@ def compensate(scan: Scan, T_start_end: Poses, duration: float) -> Scan:
 
 
 def neighbour_motions(scans: Iterable[Scan]) -> Iterator[tuple[Scan, Poses | None, float]]:
-    """Register each scan with the one read before it (GICP).
-
-    Both were measured in the same motion, so that its distortion hardly matters.
+    """Register each scan with the one read before it (GICP): both are distorted alike.
 
     Yields each scan, ``T_before_scan`` of shape (4, 4), or None where it is not known, and the
     seconds between their stamps.
@@ -70,9 +65,11 @@ def neighbour_motions(scans: Iterable[Scan]) -> Iterator[tuple[Scan, Poses | Non
         seconds = (scan.stamp - last) * 1e-9
         T_before_scan = None
         if before is not None and now is not None and 0 < seconds <= _FAR:
-            options = {"max_correspondence_distance": _REACH, "num_threads": 1}
             result = small_gicp.align(
-                before[0], now[0], before[1], init_T_target_source=guess, **options
+                *(before[0], now[0], before[1]),
+                init_T_target_source=guess,
+                max_correspondence_distance=_REACH,
+                num_threads=1,
             )
             if result.converged and result.num_inliers > now[0].size() / 2:
                 T_before_scan = geometry.rectify(result.T_target_source)
@@ -84,8 +81,7 @@ def neighbour_motions(scans: Iterable[Scan]) -> Iterator[tuple[Scan, Poses | Non
 def compensate_neighbours(scans: Iterable[Scan]) -> Iterator[Scan]:
     """Undo the motion within each scan, as fast as it was since the one read before.
 
-    Where that is not known, the motion known last still holds for a second. Other scans, such as
-    the first, pass as they are.
+    The motion known last holds for a second. Other scans, such as the first, pass as they are.
     """
     known: tuple[Poses, float, int] | None = None
     for scan, T_before_scan, seconds in neighbour_motions(scans):
@@ -107,24 +103,17 @@ def turning_of(scans: Iterable[Scan]) -> tuple[NDArray[np.int64], NDArray[np.flo
     return np.array(stamps, np.int64), np.array(rates, np.float64)
 
 
-_LEAST_CORRELATION = 0.8
-"""Of two rates of turning that show the same motion."""
-_RATE = 50.0
-"""Samples per second to compare."""
+_LEAST_CORRELATION = 0.8  # of two rates of turning that show the same motion
+_RATE = 50.0  # samples per second to compare
 
 
 def clock_offset(
-    trajectory: Trajectory,
-    stamps: NDArray[np.int64],
-    turning: NDArray[np.float64],
+    trajectory: Trajectory, stamps: NDArray[np.int64], turning: NDArray[np.float64]
 ) -> float | None:
-    """Seconds to add to a trajectory's stamps so that it turns when the LiDAR does.
+    """Seconds to add to a trajectory's stamps so that it turns as in `turning_of`.
 
-    The rates of turning, which no choice of frames changes, are correlated at every offset at
-    which the shorter recording lies at least half inside the other. `stamps` are nanoseconds on
-    the other clock, `turning` radians per second, both of shape (n,).
-
-    Returns None if the two do not show the same motion.
+    The rates of turning, which no choice of frames changes, are correlated at every offset at which
+    the shorter recording lies at least half inside the other. None if they show other motions.
     """
     if len(trajectory) < 3 or len(stamps) < 3:
         return None

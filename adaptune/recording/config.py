@@ -12,18 +12,41 @@ from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, mod
 from adaptune import geometry
 from adaptune.errors import AdaptuneError
 from adaptune.files import expand_user
-from adaptune.recording.parts import Part
 from adaptune.recording.scan import USUAL, Imu, ImuNoise, SequenceError
 from adaptune.recording.timing import Mark, Unit
 from adaptune.strict import StrictModel
 
 Compensation = Literal["constant_velocity"] | None
 """How motion within a scan is undone; none if it is left as it is."""
+Fractions = tuple[float, float]
+"""Where a part of a sequence begins and ends, as fractions of its duration."""
 REFERENCE_FILES = (".tum", ".txt", ".csv")
 ESTIMATED, NO_REFERENCE = "estimated", "none"
 """In place of a `reference`: it is estimated from the scans, or there is none."""
 SOURCES = ("bag", "kitti", "folder")
 _STANDARD_GRAVITY = 9.80665
+_PERCENT = re.compile(r"\s*(\d+(?:\.\d+)?)\s*-\s*(\d+(?:\.\d+)?)\s*%\s*")
+
+
+def read_part(given: Any) -> Fractions:
+    """Read ``0-60%``, or two fractions; a ValueError says what is wrong."""
+    begin, end = 1.0, 0.0
+    if isinstance(given, str) and (match := _PERCENT.fullmatch(given)):
+        begin, end = (float(percent) / 100.0 for percent in match.groups())
+    elif isinstance(given, list | tuple) and [type(f) for f in given] in ([float] * 2, [int] * 2):
+        begin, end = map(float, given)
+    if not 0.0 <= begin < end <= 1.0:
+        raise ValueError("give a part in percent of the duration, from 0 to 100, as in 0-60%")
+    return begin, end
+
+
+def part_name(name: str, part: Fractions) -> str:
+    """Name of a part of a sequence, which may be the name of a file."""
+    begin, end = (f"{100.0 * fraction:.10g}" for fraction in part)
+    return f"{name}_{begin}-{end}"
+
+
+Part = Annotated[Fractions, BeforeValidator(read_part)]
 
 
 def expand(text: str) -> str:
@@ -34,15 +57,12 @@ def expand(text: str) -> str:
 
 
 def resolve(path: str, info: ValidationInfo) -> str:
-    """Make a path absolute: `expand`, replace ~, start from the folder of the study's file.
-
-    What is there under just this name is meant, whatever signs the name holds.
-    """
+    """Make a path absolute: `expand`, replace ~, start from the folder of the study's file."""
     folder = (info.context or {}).get("folder", Path())
     if not path.strip():
         raise ValueError("give a path, not an empty text")
     try:
-        given = Path(folder, path)
+        given = Path(folder, path)  # whatever signs its name holds, if it is there
         whole = (given if given.exists() else folder / expand_user(expand(path))).resolve()
         whole.exists()
     except AdaptuneError as error:
@@ -72,10 +92,7 @@ BAG_SUFFIXES = (".bag", ".mcap", ".db3")
 
 
 def bag_paths(given: Sequence[str]) -> list[Path]:
-    """Bags to open for the paths, folders and patterns that a user gives.
-
-    A SequenceError names what does not exist or holds no bag.
-    """
+    """Bags to open for paths, folders and patterns; a SequenceError names what holds no bag."""
     paths: list[Path] = []
     for text in given:
         path = Path(text)
@@ -119,11 +136,7 @@ def _pose(given: Any) -> Any:
 _Numbers = tuple[float, ...]
 Transform = Annotated[_Numbers | tuple[_Numbers, ...], BeforeValidator(_pose)]
 """A pose as seven numbers, or as the rows of a matrix."""
-
-
 _Seconds = Annotated[float, Field(ge=0, le=1e9)]
-
-
 _Noise = Annotated[float, Field(gt=0, le=1e6)]
 
 
@@ -156,15 +169,12 @@ class ImuConfig(StrictModel):
 class SequenceConfig(StrictModel):
     """A recording, from one of `bag`, `kitti` and `folder`, and what of it to use."""
 
-    # Seconds since the first scan.
-    start: _Seconds = 0.0
+    start: _Seconds = 0.0  # since the first scan
     stop: _Seconds | None = None
     # Bags that follow each other: files, ROS 2 folders, folders of bags, patterns.
     bag: Annotated[str | tuple[str, ...] | None, BeforeValidator(_resolve_bags)] = None
-    # Folder of a KITTI odometry sequence.
-    kitti: Annotated[str, AfterValidator(resolve)] | None = None
-    # Folder of ``.pcd``, ``.ply``, ``.npy`` or ``.bin`` files.
-    folder: Annotated[str, AfterValidator(resolve)] | None = None
+    kitti: Annotated[str, AfterValidator(resolve)] | None = None  # folder of an odometry sequence
+    folder: Annotated[str, AfterValidator(resolve)] | None = None  # of files, one a scan
     points: str | None = None  # topic of the point clouds
     frame: str | None = None  # `frame_id` of the point clouds, where the topic has several
     stamp: Mark = "auto"  # what a stamp marks of its scan
@@ -179,15 +189,12 @@ class SequenceConfig(StrictModel):
     reference: Annotated[str, AfterValidator(_resolve_file)] | None = None
     child_frame: str | None = None  # of the transforms, where `reference` is a topic of them
     extrinsic: Transform | None = None  # the LiDAR's pose in the frame of the reference poses
-    # Seconds to add to the reference's stamps, as far as those of other clocks lie.
-    clock_offset: float = Field(0.0, ge=-3e9, le=3e9)
-    # Seconds. The reference is unknown between poses further apart.
-    max_gap: float = Field(1.0, gt=0, le=1e9)
+    clock_offset: float = Field(0.0, ge=-3e9, le=3e9)  # seconds to add to the reference's stamps
+    max_gap: float = Field(1.0, gt=0, le=1e9)  # seconds; between poses further apart it is unknown
     imu: ImuConfig | None = None
     # Degrees by which to turn up every ray of a `kitti` recording; 0.205 when left out.
     elevation: float | None = Field(None, ge=-5, le=5)
-    # Undo the motion within scans, as fast as it was since the scan before.
-    compensate: Compensation = None
+    compensate: Compensation = None  # undo the motion within scans
     cache: bool = True  # whether to keep decoded bags in the cache
 
     @model_validator(mode="after")

@@ -14,13 +14,11 @@ from adaptune.recording.scan import Reading, Scan
 from adaptune.recording.timing import SOONEST
 from adaptune.trajectory import Trajectory
 
-LEAST_POINTS = 20
-"""Valid points that an odometry needs."""
+LEAST_POINTS = 20  # valid points that an odometry needs
 
 # A look takes so many points, and sees whether there are any in so many directions.
 _SAMPLE, _DIRECTIONS = 256, 24
-# Metres. Nothing but a cover surrounds a sensor so closely.
-_COVER = 1.0
+_COVER = 1.0  # metres; nothing but a cover surrounds a sensor so closely
 
 
 class Look(NamedTuple):
@@ -62,7 +60,7 @@ class Content:
     def of_place(self, reference: Trajectory, known: bool, where: Key = ()) -> Iterator[Finding]:
         """Clouds that stay in place while the reference moves: they are in the frame of a map.
 
-        Where nothing else says so (`known`), only a way that is longer than the view tells.
+        Unless that is `known`, only a way that is longer than the view tells.
         """
         looks = [look for look in self.looks if look.n >= LEAST_POINTS]
         T = reference.at(np.array([look.stamp for look in looks], np.int64))

@@ -19,8 +19,7 @@ Message = tuple[str, int, Any]
 Layout = Literal["bag", "ros2", "kitti"]
 """ROS 1 bag, ROS 2 folder with sqlite3, KITTI odometry folder."""
 
-POINTS, IMU = "/points", "/imu"
-"""Topics of the bags."""
+POINTS, IMU = "/points", "/imu"  # topics of the bags
 
 _KINDS = {"<f4": 7, "<u2": 4}
 
@@ -89,16 +88,11 @@ class Messages:
         )
 
     def write(
-        self,
-        path: Path,
-        types: Mapping[str, str],
-        messages: Iterable[Message],
-        mcap: bool = False,
+        self, path: Path, types: Mapping[str, str], messages: Iterable[Message], mcap: bool = False
     ) -> None:
-        """Write a bag where nothing is yet: a file of ROS 1, or a folder of ROS 2.
+        """Write a bag: a file of ROS 1, or a folder of ROS 2 with SQLite, or MCAP if `mcap`.
 
         `types` are those of the messages by topic, which come in the order in which they are sent.
-        The files of a ROS 2 bag are SQLite, or MCAP if `mcap`.
         """
         from rosbags import rosbag1, rosbag2
 
@@ -117,9 +111,8 @@ class Messages:
 def export(scans: Iterable[Scan], imu: Imu | None, path: Path, layout: str) -> None:
     """Write scans, and an IMU's measurements where there are any, for another program.
 
-    Bags hold `POINTS` (x, y, z, intensity, which is 0 where the scans have none, and ring and time
-    where they have them) and `IMU`. A KITTI folder holds sequence 00, its camera in the LiDAR's
-    frame. Scans are in order of time, the IMU is on their clock, and nothing is at `path` yet.
+    Bags hold `POINTS`, see `structured`, and `IMU`; a KITTI folder holds sequence 00. Scans are in
+    order of time, the IMU is on their clock, and nothing is at `path` yet.
     """
     if layout == "kitti":
         write_kitti_sequence(scans, path)
@@ -141,7 +134,7 @@ def _clouds(messages: Messages, scans: Iterable[Scan]) -> Iterator[Message]:
 
 
 def structured(scan: Scan) -> NDArray[Any]:
-    """Points as Velodyne's driver writes them, with rings and times where the scan has them."""
+    """Points as Velodyne's driver writes them: intensities, or 0, and rings and times if there."""
     x, y, z = scan.points.T
     light = np.zeros(len(scan)) if scan.intensities is None else scan.intensities
     columns = {"x": x, "y": y, "z": z, "intensity": light, "ring": scan.rings, "time": scan.times}
@@ -160,10 +153,9 @@ def measurements(messages: Messages, imu: Imu, topic: str) -> Iterator[Message]:
 
 
 def write_kitti_sequence(scans: Iterable[Scan], root: Path, name: str = "00") -> None:
-    """Write a sequence of the KITTI odometry benchmark, its camera in the LiDAR's frame, no poses.
+    """Write ``sequences/<name>`` of the KITTI odometry benchmark, without poses, below `root`.
 
-    Scans are in order of time; intensities are 0 where they have none. The benchmark's folder
-    `root` receives ``sequences/<name>``, which is not there yet.
+    Its camera is in the LiDAR's frame; intensities are 0 where scans have none.
     """
     sequence = root / "sequences" / name
     (sequence / "velodyne").mkdir(parents=True)
@@ -179,4 +171,4 @@ def write_kitti_sequence(scans: Iterable[Scan], root: Path, name: str = "00") ->
     write_text(sequence / "times.txt", "".join(f"{t:.6e}\n" for t in seconds))
     identity = " ".join(f"{v:.12e}" for v in np.eye(3, 4).ravel())
     names = ("P0", "P1", "P2", "P3", "Tr")
-    write_text(sequence / "calib.txt", "".join(f"{of}: {identity}\n" for of in names))
+    write_text(sequence / "calib.txt", "".join(f"{name}: {identity}\n" for name in names))

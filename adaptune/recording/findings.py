@@ -150,10 +150,9 @@ _LEAP, _PAUSE = 10 * 10**9, 600 * 10**9  # nanoseconds that no clock, and no dri
 
 
 def clock_parts(stamps: NDArray[np.int64], recorded: NDArray[np.int64]) -> list[Part]:
-    """Cut messages where their clock leaps for good, by their stamps and the recorder's clock.
+    """Cut messages where their clock leaps for good, by stamps and the recorder's clock: (n,).
 
-    Both are nanoseconds of shape (n,), in the order of recording. Where both clocks were set back,
-    a stretch of time comes twice, and messages come as often again there.
+    Where both clocks were set back, a stretch of time comes twice, and messages as often again.
     """
     n, steps, passed = len(stamps), np.diff(stamps), np.diff(recorded)
     cuts = {0: False, n: False}  # whether what begins there comes twice
@@ -226,10 +225,7 @@ def of_times(topic: Topic, content: Content) -> Iterator[Finding]:
 def of_reference(
     reference: Trajectory, complete: bool, timed: bool = True, begin: int | None = None
 ) -> Iterator[Finding]:
-    """What is wrong with the poses; with `timed` false, the stamps only number them.
-
-    Seconds count from `begin`, the stamp of the first scan.
-    """
+    """What is wrong with poses, numbered only if not `timed`; seconds count from `begin`."""
     role, lacks = "reference", "a reference that moves"
     if len(reference) < 2:
         if complete:
@@ -247,7 +243,7 @@ def of_reference(
         yield from sound(reference, begin)[1]
     elif not timed:  # ten a second, as most LiDARs measure
         numbered = Trajectory(reference.stamps * 10**8, reference.T_world_sensor)
-        yield from (one._replace(seconds=None) for one in sound(numbered)[1])
+        yield from (finding._replace(seconds=None) for finding in sound(numbered)[1])
     if complete and timed and (gaps := np.count_nonzero(seconds > reference.max_gap)):
         what = f"the reference has {gaps} gaps beyond {reference.max_gap:g} s"
         what += f", the longest of {seconds.max():.2f} s: their scans get no label"

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
-from adaptune.recording.bag import BagSource
+from adaptune.recording.bag import UNOPENED, BagSource
 from adaptune.recording.config import BAG_SUFFIXES, bag_paths
 from adaptune.recording.scan import SequenceError
 
@@ -19,8 +19,7 @@ Reading = Literal["one", "several"]
 _OVERLAP, _NEXT, _APART = -0.5, 2.0, 60.0
 """Seconds. Between parts of one recording lies no less and no more than the first two, between
 separate ones less than the first or more than the last."""
-_RATES = 1.25
-"""Rates that differ by a larger factor are those of different sensors."""
+_RATES = 1.25  # rates that differ by a larger factor are those of different sensors
 
 
 class FolderReading(NamedTuple):
@@ -34,9 +33,8 @@ class FolderReading(NamedTuple):
 def read_folder(path: Path) -> FolderReading:
     """Tell the parts of one recording from separate recordings.
 
-    Parts follow each other, and have one name with numbers. Separate recordings are a minute
-    apart, or some overlap, or they are folders of their own. A SequenceError names a bag that
-    cannot be opened or is still being written.
+    Parts follow each other, and have one name with numbers. Separate recordings are a minute apart,
+    or some overlap, or they are folders of their own. A SequenceError names a bag that is unfit.
     """
     alone = FolderReading((path,), "one")
     if not path.is_dir() or (path / "metadata.yaml").exists() or (path / "velodyne").is_dir():
@@ -70,8 +68,7 @@ def _is_recording(path: Path) -> bool:
 
 def _span(bag: Path) -> tuple[int, int]:
     """First and last time of a bag, nanoseconds."""
-    about = {"topics": {}, "points": "", "n_messages": 0, "duration": 0, "begins": {}}
-    with BagSource(bag_paths([str(bag)]), about=about).open(by_index=True) as reader:
+    with BagSource(bag_paths([str(bag)]), about=UNOPENED).open(by_index=True) as reader:
         return reader.start_time, reader.end_time
 
 
@@ -100,22 +97,17 @@ def both_readings(folder: FolderReading) -> str:
 
 
 def check_alike(recordings: Sequence["Inspection"]) -> None:
-    """Refuse recordings of different sensors or rates together, with the list of them.
-
-    Raises
-    ------
-    SequenceError
-    """
+    """Refuse recordings of different sensors or rates by a SequenceError that lists them."""
     kinds: dict[str, list[str]] = {}
     rates: list[float] = []
-    for one in recordings:
-        if (topic := one.topics.get(one.given.get("points", one.used["points"]))) is None:
+    for drive in recordings:
+        if (topic := drive.topics.get(drive.given.get("points", drive.used["points"]))) is None:
             continue  # opening it says so
-        own = topic.rate or 1.0
-        rate = next((r for r in rates if max(r, own) <= _RATES * min(r, own)), own)
+        own_rate = topic.rate or 1.0
+        rate = next((r for r in rates if max(r, own_rate) <= _RATES * min(r, own_rate)), own_rate)
         rates.append(rate)
-        kind = f"{rate:.1f} Hz, {topic.type}, {' '.join(one.fields) or 'scans'}"
-        kinds.setdefault(kind, []).append(one.path.name)
+        kind = f"{rate:.1f} Hz, {topic.type}, {' '.join(drive.fields) or 'scans'}"
+        kinds.setdefault(kind, []).append(drive.path.name)
     if len(kinds) > 1:
         listed = "; ".join(f"{', '.join(names)} ({kind})" for kind, names in kinds.items())
         raise SequenceError(

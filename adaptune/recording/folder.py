@@ -25,10 +25,8 @@ from adaptune.recording.timing import AUTO, Timing
 from adaptune.trajectory import Trajectory, read_kitti
 
 SUFFIXES = (".bin", ".npy", ".pcd", ".ply")
-KITTI = ("x", "y", "z", "intensity")
-"""What KITTI's ``.bin`` files hold of each point."""
-ELEVATION = 0.205
-"""Degrees by which KITTI's LiDAR reports its rays too low."""
+KITTI = ("x", "y", "z", "intensity")  # what KITTI's ``.bin`` files hold of each point
+ELEVATION = 0.205  # degrees by which KITTI's LiDAR reports its rays too low
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,8 +37,7 @@ class FileSource:
     scans: Sequence[Path]
     stamps: NDArray[np.int64]  # nanoseconds of each file, of shape (n,)
     timing: Timing = AUTO  # what the stamps mean
-    # Reads the LiDAR's poses stored with the files.
-    own_poses: Callable[[], Trajectory] | None = None
+    own_poses: Callable[[], Trajectory] | None = None  # reads the LiDAR's poses
     elevation: float = 0.0  # degrees by which every ray is to be turned up
     stamp_files: Sequence[Path] = ()  # hold the stamps, where the files' names do not
     pose_files: Sequence[Path] = ()  # hold the poses
@@ -107,10 +104,9 @@ def read_scan(
 
 
 def turn_up(points: NDArray[np.float32], degrees: float) -> NDArray[np.float32]:
-    """Turn every ray up by `degrees`, in the vertical plane in which it lies.
+    """Turn the rays to points of shape (n, 3) up by `degrees`, each in its vertical plane.
 
-    The rays of KITTI's HDL-64E lie 0.205 too low (Deschaud, IMLS-SLAM, ICRA 2018; KISS-ICP corrects
-    it likewise). `points` are of shape (n, 3).
+    Those of KITTI's HDL-64E lie 0.205 too low (Deschaud, IMLS-SLAM, ICRA 2018).
     """
     sine, cosine = np.sin(np.deg2rad(degrees)), np.cos(np.deg2rad(degrees))
     distance = np.hypot(points[:, 0], points[:, 1])
@@ -255,10 +251,7 @@ _NAMES = (
 
 
 def _named_stamps(files: Sequence[Path]) -> tuple[NDArray[np.int64] | None, str]:
-    """Nanoseconds that the files' names are, if they are times, and in which unit.
-
-    If they only look like times, the first name is given in place of the unit.
-    """
+    """Nanoseconds that the files' names are, and their unit, or a name that only looks like one."""
     stems = [re.sub(r"(\.(bin|npy|pcd|ply))+$", "", path.name) for path in files]
     for pattern, power, unit in _NAMES:
         found = [match.groups() for match in map(re.compile(pattern).search, stems) if match]

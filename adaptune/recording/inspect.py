@@ -11,7 +11,14 @@ from adaptune import files, yaml12
 from adaptune.errors import AdaptuneError, Finding, MachineError
 from adaptune.progress import Progress, unseen
 from adaptune.recording import Scan, SequenceConfig, SequenceError
-from adaptune.recording.bag import IMU_TYPES, BagSource, Window, storages
+from adaptune.recording.bag import (
+    IMU_TYPES,
+    UNOPENED,
+    BagSource,
+    IndexReader,
+    Window,
+    storages,
+)
 from adaptune.recording.clouds import CLOUDS, decode_cloud, header_of, parse
 from adaptune.recording.config import BAG_SUFFIXES, REFERENCE_FILES, bag_paths
 from adaptune.recording.content import Content
@@ -24,12 +31,10 @@ from adaptune.recording.findings import (
     of_topic,
 )
 from adaptune.recording.folder import kitti, scan_folder
-from adaptune.recording.indexed_bag import IndexReader
 from adaptune.recording.pose_messages import PATH, POSES, Pose, untimed, usable
 from adaptune.trajectory import Trajectory, is_kitti, read_kitti, read_trajectory
 
-# What each stage uses.
-INPUTS = {
+INPUTS = {  # of each stage
     "offline": ("points", "reference"),
     "online": ("points",),
     "motion compensation": ("points", "imu"),
@@ -81,17 +86,14 @@ class Inspection:
 
     @property
     def missing(self) -> dict[str, tuple[str, ...]]:
-        """What each stage still needs; empty if it can run.
-
-        Where there is no reference, one is estimated.
-        """
+        """What each stage still needs; empty if it can run."""
         if not self.name:
             return {}
         lacks = {
-            role: [one.lacks for one in self.findings if one.of == role and one.lacks]
+            role: [f.lacks for f in self.findings if f.of == role and f.lacks]
             for role in ("points", "reference", "imu")
         }
-        if self.scan is None and not any(one.of == "points" for one in self.findings):
+        if self.scan is None and not any(finding.of == "points" for finding in self.findings):
             lacks["points"].append("point clouds that can be read")
         if self.scan is not None and self.scan.times is None:
             lacks["imu"].append("a time for each point")
@@ -110,22 +112,21 @@ class Inspection:
     @property
     def hints(self) -> dict[yaml12.YamlPath, str]:
         """Comments for a study: what else its entry may say."""
-        said = []
+        hints = []
         if "bag" in self.given and "reference" not in self.used:
-            said.append("reference: a topic, or a TUM, KITTI or EuRoC file; estimated if left out")
+            hints.append("reference: a topic, or a TUM, KITTI or EuRoC file; estimated if left out")
         if "bag" in self.given and "compensate" in self.given:
-            said.append("without `compensate` for an odometry that undoes the motion itself")
+            hints.append("without `compensate` for an odometry that undoes the motion itself")
         if "bag" in self.given and self.scan is not None and self.scan.times is not None:
-            said.append("stamp: end - if headers mark scans' ends and times count from the start")
-        return {("sequences", self.name): "\n".join(said)}
+            hints.append("stamp: end - if headers mark scans' ends and times count from the start")
+        return {("sequences", self.name): "\n".join(hints)}
 
 
 def inspect(path: Path, deep: bool = False, show: Progress = unseen) -> Inspection:
     """Read a recording and report what it holds: a sample of it if it is long and not `deep`.
 
-    It is a bag, a folder with bags, a KITTI sequence, a folder of scans, or a file of
-    poses. An AdaptuneError says that it cannot be opened at all. What fails later is among
-    its findings.
+    It is a bag, a folder with bags, a KITTI sequence, a folder of scans, or a file of poses. An
+    AdaptuneError says that it cannot be opened; what fails later is among its findings.
     """
     if not path.exists():
         raise SequenceError(f"{path}: there is no such file or folder")
@@ -158,8 +159,7 @@ def _inspect_poses(path: Path) -> Inspection:
     return found
 
 
-# Scan files that are read, unless all are to be.
-_FILES = 40
+_FILES = 40  # scan files that are read, unless all are to be
 
 
 def _inspect_scans(path: Path, kind: str, deep: bool, show: Progress) -> Inspection:
@@ -188,11 +188,7 @@ def _inspect_scans(path: Path, kind: str, deep: bool, show: Progress) -> Inspect
 
 
 def _find(found: Inspection, apart: bool, slack: float) -> None:
-    """Add what is wrong with what was read.
-
-    Between bags that are `apart` nothing is missing. Scans and reference may both go on for `slack`
-    seconds beyond what was read.
-    """
+    """Add what is wrong with what was read, see `of_topic` and `of_overlap`."""
     roles = {name: key for key, name in found.used.items()}
     for topic in found.topics.values():
         found.findings += of_topic(topic, roles.get(topic.name, ""), found.complete, apart)
@@ -215,15 +211,12 @@ def _find(found: Inspection, apart: bool, slack: float) -> None:
 SECONDS = 1.0
 # Bytes read in a second, with BZ2 and without; seconds that a message takes to decode.
 _SLOW, _FAST, _DECODE = 2.5e6, 2e8, 4e-5
-# Parts of a sample, and messages of a topic in each.
-_FEWEST, _MOST, _EACH = 5, 20, 2.5
-# Seconds. Bags of one drive are not further apart.
-_APART = 60.0
+_FEWEST, _MOST, _EACH = 5, 20, 2.5  # parts of a sample, and messages of a topic in each
+_APART = 60.0  # seconds; bags of one drive are not further apart
 
 
 def _inspect_bags(path: Path, deep: bool, show: Progress) -> Inspection:
-    about = {"topics": {}, "points": "", "n_messages": 0, "duration": 0, "begins": {}}
-    source = BagSource(bag_paths([str(path)]), about=about)
+    source = BagSource(bag_paths([str(path)]), about=UNOPENED)
     with source.open(by_index=True) as reader:
         topics = _topics(reader)
         used = _used(topics)
@@ -295,7 +288,7 @@ class _Survey:
         # Number of clouds; where there are none, of messages.
         points = found.topics.get(source.points)
         self._usual = found.n_messages if points is None else points.count
-        self._of = {name: of for of, name in found.used.items()}
+        self._roles = {name: role for role, name in found.used.items()}
         if points is not None:
             self._load = source.loader(reader)
         self._poses: list[Pose] = []
@@ -338,10 +331,11 @@ class _Survey:
         found, done = self._found, 0
         spans = self._spans(number, self._usual)
         found.complete = spans == [self._source.window]
+        rare: list[str] = []
         if not found.complete:
             self.slack = self._length * 1e-9 / (len(spans) - 1)
-        # What comes more rarely than the clouds has parts of its own.
-        rare = [t for t in self._of if found.topics[t].count < self._usual and not found.complete]
+            # What comes more rarely than the clouds has parts of its own.
+            rare = [t for t in self._roles if found.topics[t].count < self._usual]
         jobs: list[tuple[str | None, Window]] = [(None, span) for span in spans]
         jobs += [(t, span) for t in rare for span in self._spans(number, found.topics[t].count)]
         for name, span in jobs:
@@ -370,14 +364,14 @@ class _Survey:
             topic.stamps[-1].append(stamp)
             topic.recorded.append(when)
             topic.frames.add(frame)
-        if kind == PATH and topic.name in self._of:
+        if kind == PATH and topic.name in self._roles:
             self._path = data  # each path repeats the one before: the last one will do
         else:
             self._decode(topic, kind, when, data)
 
     def _decode(self, topic: Topic, kind: str, when: int, data: bytes) -> None:
         try:
-            match self._of.get(topic.name):
+            match self._roles.get(topic.name):
                 case "points":
                     first = self._found.scan is None
                     self._found.keep(self._load(kind, data, "message"))

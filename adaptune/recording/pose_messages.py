@@ -59,10 +59,10 @@ def of_frame(topic: str, poses: Sequence[Pose], frame: str | None) -> list[Pose]
 
 
 def usable(poses: Sequence[Pose]) -> tuple[Trajectory | None, list[str]]:
-    """Trajectory of the usable poses, each stamp once, and what is left out.
+    """Trajectory of the usable poses, each stamp once, or None, and what is left out.
 
     Poses are usable if they are finite and have a rotation, and are of the frame that most are of:
-    two nodes may publish on a topic. The trajectory is None if none is usable.
+    two nodes may publish on a topic.
     """
     (frame, n), *others = Counter(name for _, name, *_ in poses).most_common()
     left_out = [

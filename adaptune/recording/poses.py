@@ -11,23 +11,16 @@ FASTEST = 100.0
 """Metres per second. No platform that carries a LiDAR is faster."""
 _JUMP = 0.2
 """Metres; a radian counts as one. Smaller steps than that are noise."""
-_ACCELERATION = 10.0
-"""Metres per second squared of a robot, or of the hand that holds a sensor."""
-_STAMPS = 0.5, 0.05
-"""Share of a usual step, and seconds, by which stamps may be wrong."""
-_NOISE = 8.0
-"""Times the median difference from neighbours: no noise is as large."""
-_MANY = 0.1
-"""Share of the poses; where more go to and fro, no stretch between is right."""
+_ACCELERATION = 10.0  # metres per second squared of a robot, or of the hand that holds a sensor
+_STAMPS = 0.5, 0.05  # share of a usual step, and seconds, by which stamps may be wrong
+_NOISE = 8.0  # times the median difference from neighbours: no noise is as large
+_MANY = 0.1  # share of the poses; where more go to and fro, no stretch between is right
 _HELD, _AS_FAST = 0.02, 0.6
 """Metres that a robot moves at least while its pose is repeated, and the share of its usual speed
 at which the next pose makes up for it."""
-_PERIOD = 40_000_000
-"""Nanoseconds. Of poses that follow each other faster, some are enough."""
-_AROUND = 5
-"""Steps before, and after, that say how the robot moves."""
-_SAID = 3
-"""Stretches that are told one by one."""
+_PERIOD = 40_000_000  # nanoseconds; of poses that follow each other faster, some are enough
+_AROUND = 5  # steps before, and after, that say how the robot moves
+_SAID = 3  # stretches that are told one by one
 
 
 def sound(
@@ -35,9 +28,9 @@ def sound(
 ) -> tuple[Trajectory, list[Finding]]:
     """The poses without those that no robot can have had, and what was wrong with them.
 
-    A pose that is repeated while the robot moves says nothing: it is left out. At a jump a gap of
-    more than `max_gap`, and of `hole` seconds at least, is left: no sub-trajectory crosses it.
-    Seconds of the findings count from `begin`, in nanoseconds, by default from the first pose.
+    A pose that is repeated while the robot moves is left out. At a jump a gap of more than
+    `max_gap`, and of `hole` seconds at least, is left: no sub-trajectory crosses it. Seconds of the
+    findings count from `begin`, in nanoseconds, by default from the first pose.
     """
     begin = int(reference.stamps[0]) if begin is None else begin
     lost = _repeated(reference)
@@ -119,10 +112,7 @@ def _to_and_fro(reference: Trajectory) -> float:
 
 
 def _jumps(reference: Trajectory) -> tuple[NDArray[np.int64], float]:
-    """Steps that neither neighbours nor the robot's speed explain.
-
-    Returned are the stamps around each, of shape (n, 2), and how far the farthest leads.
-    """
+    """Stamps around steps that nothing explains, (n, 2), and how far the farthest leads."""
     from scipy.spatial.transform import Rotation
 
     _, some = np.unique((reference.stamps - reference.stamps[0]) // _PERIOD, return_index=True)
@@ -143,10 +133,7 @@ def _jumps(reference: Trajectory) -> tuple[NDArray[np.int64], float]:
 
 
 def _around(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Medians of the values, of shape (n, k), before and after each one: (2, n, k).
-
-    At the ends, where there are fewer, the other side stands for both. Few values are their own.
-    """
+    """Medians of the values, of shape (n, k), before and after each one: (2, n, k)."""
     n, k = values.shape
     if n < _AROUND:
         return np.stack([values, values])
@@ -154,6 +141,7 @@ def _around(values: NDArray[np.float64]) -> NDArray[np.float64]:
     padded = np.concatenate([padding, values, padding])
     windows = np.lib.stride_tricks.sliding_window_view(padded, _AROUND, axis=0)
     sides = np.stack([windows[:n], windows[_AROUND + 1 :]])
+    # At the ends, where there are fewer, the other side stands for both.
     few = np.isfinite(sides[..., 0, :]).sum(axis=-1) < 3
     sides = np.where(few[..., None, None], sides[::-1], sides)
     return np.asarray(np.nanmedian(sides, axis=-1))

@@ -3,7 +3,8 @@
 import logging
 import math
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from functools import cache as once
 from functools import cached_property
 from itertools import chain, islice, product
@@ -32,23 +33,12 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 
-def open_sequence(config: SequenceConfig) -> Recording:
+def open_sequence(config: SequenceConfig, with_imu: bool = False) -> Recording:
     """Open what a study describes; scans are not read before they are asked for.
 
     A SequenceError says why it cannot be opened as described.
     """
-    return RecordedSequence(config)
-
-
-def check_sequence(config: SequenceConfig) -> "RecordedSequence":
-    """Open a recording, and find what would fail while it is read, without reading its scans.
-
-    A SequenceError says that it cannot be opened as described, ends before its `start`, or that its
-    reference is of another time.
-    """
-    recorded = RecordedSequence(config)
-    recorded.check()
-    return recorded
+    return RecordedSequence(config, with_imu)
 
 
 def wants_estimate(config: SequenceConfig) -> bool:
@@ -67,19 +57,18 @@ class SequenceFiles(NamedTuple):
 
 def sequence_files(config: SequenceConfig) -> SequenceFiles:
     """The files that a sequence is read from; a SequenceError if it cannot be opened."""
-    own = None if config.poses_file is None else [config.poses_file]
+    poses = None if config.poses_file is None else [config.poses_file]
     if config.reference in (ESTIMATED, NO_REFERENCE):
-        own = []
+        poses = []
     if config.bag is not None:
-        return SequenceFiles(files_of(config.bags()), own or ())
+        return SequenceFiles(files_of(config.bags()), poses or ())
     source, _ = _source(config)
-    return SequenceFiles(source.files, source.pose_files if own is None else own)
+    return SequenceFiles(source.files, source.pose_files if poses is None else poses)
 
 
 _LOOK, _NEVER = 10**9, 1 << 62
 """Nanoseconds of a recording that are searched for a scan of another one; later than all stamps."""
-_NOTES = (".txt", ".yaml")
-"""Files beside scans: two recordings may have the same."""
+_NOTES = (".txt", ".yaml")  # files beside scans: two recordings may have the same
 
 
 def _alike(one: Scan, other: Scan) -> bool:
@@ -119,7 +108,6 @@ def _source(config: SequenceConfig) -> "tuple[Source, str | None]":
 
 
 def _check_topics(source: "Source", config: SequenceConfig) -> None:
-    """Find topics that are named and not there."""
     from adaptune.recording.bag import IMU_TYPES, BagSource
     from adaptune.recording.pose_messages import POSES
 
@@ -139,40 +127,28 @@ def _check_topics(source: "Source", config: SequenceConfig) -> None:
 _BEFORE = 3.0
 """Seconds by which reading from a stamp on begins earlier: that of a message may mark the end of a
 scan, and what is seen of a scan may depend on those before."""
-# At most so many scans are registered to find a clock offset.
-_MOST_SCANS = 600
+_MOST_SCANS = 600  # at most so many scans are registered to find a clock offset
 
 
 class RecordedSequence:
-    """The scans of a recording, in which motion is undone if its configuration says so.
+    """The scans of a recording in [start, stop) seconds since the first one, every stride-th.
 
-    Its methods raise a SequenceError where the recording cannot be read as described.
-
-    Attributes
-    ----------
-    source : BagSource or FileSource
-        The whole recording.
-    start, stop, stride : float, float or None, int
-        The scans to use: those in [start, stop) seconds since the first one, every stride-th.
-    key : str or None
-        Of the decoded scans in the cache; None if they are not kept.
+    They carry the measurements of the IMU if `with_imu`. Methods raise a SequenceError where the
+    recording cannot be read as described.
     """
 
-    def __init__(self, config: SequenceConfig):
+    def __init__(self, config: SequenceConfig, with_imu: bool = False):
         if (file := config.poses_file) is not None and not file.is_file():
             raise SequenceError(f"{file}: there is no such file")
         self.source, self.key = _source(config)
         self.start, self.stop = max(config.start, self.source.skipped), config.stop
-        self.stride, self._config = config.stride, config
+        self.stride, self._config, self._with_imu = config.stride, config, with_imu
         _check_topics(self.source, config)
         if config.part is not None and self._seconds:
             begin, end = config.part
             whole = self._until - self.start
             self.stop = self.stop if end == 1.0 else self.start + end * whole
             self.start += begin * whole
-
-    def __repr__(self) -> str:
-        return f"<RecordedSequence {self.name}: about {self.n_messages} scans>"
 
     @property
     def name(self) -> str:
@@ -187,7 +163,6 @@ class RecordedSequence:
 
     @property
     def _until(self) -> float:
-        """Seconds at which the used part ends."""
         return self._seconds if self.stop is None else min(self.stop, self._seconds)
 
     @property
@@ -201,9 +176,25 @@ class RecordedSequence:
         """Read the scans one after the other.
 
         Scans whose stamps do not come after the one before, or that repeat it, are left out. That,
-        and what else is odd about the scans, is reported in the log. Times that cannot be are a
-        SequenceError.
+        and what else is odd, is logged. Times that cannot be are a SequenceError.
         """
+        return self._carrying(self._scans())
+
+    def since(self, stamp: int) -> Iterator[Scan]:
+        """Read the scans from a little before `stamp` on, without a word about what is odd."""
+        return self._carrying(self._scans_since(stamp - round(_BEFORE * 1e9)))
+
+    def _carrying(self, scans: Iterator[Scan]) -> Iterator[Scan]:
+        yield from carry_imu(scans, self._measured, self.name) if self._with_imu else scans
+
+    def _scans_since(self, begin: int) -> Iterator[Scan]:
+        kept = None if self.key is None else cache.find(self.key)
+        if kept is not None:
+            yield from kept.since(begin)
+        else:
+            yield from self._compensated(self._decode(Counter(), Content(), begin))
+
+    def _scans(self) -> Iterator[Scan]:
         for finding in self.source.findings:
             _warn(self.name, str(finding))
         left_out: Counter[str] = Counter()
@@ -224,10 +215,7 @@ class RecordedSequence:
             _warn(self.name, text)
 
     def _compensated(self, scans: Iterator[Scan]) -> Iterator[Scan]:
-        """Points as if the sensor had kept its place since the scan's start, if that is set.
-
-        The velocity is constant, and that since the scan before, which is registered for it.
-        """
+        """Points as if the sensor had kept its place since the scan's start, if that is set."""
         if self._config.compensate is None:
             return scans
 
@@ -303,7 +291,7 @@ class RecordedSequence:
     def shares_scans(self, other: "RecordedSequence") -> bool:
         """Whether both use the same scans, of one file or written again.
 
-        Scans of one stamp tell it, those in the middle of the common time first.
+        Scans of one stamp tell, those in the middle of the common time first.
         """
         begin, end, files = 0, _NEVER, list[set[Path]]()
         for one in (self, other):
@@ -324,14 +312,9 @@ class RecordedSequence:
                 return False
         return False
 
-    def since(self, stamp: int) -> Iterator[Scan]:
-        """Read the scans from a little before `stamp` on, without a word about what is odd."""
-        begin = stamp - round(_BEFORE * 1e9)
-        kept = None if self.key is None else cache.find(self.key)
-        if kept is not None:
-            yield from kept.since(begin)
-        else:
-            yield from self._compensated(self._decode(Counter(), Content(), begin))
+    @cached_property
+    def _measured(self) -> Imu | None:
+        return self.imu()
 
     def imu(self) -> Imu | None:
         """Measurements of the IMU in SI units, if one is set."""
@@ -357,10 +340,9 @@ class RecordedSequence:
         return self._checked_poses(Trajectory(stamps, T, config.max_gap))
 
     def check(self) -> None:
-        """Find early what would fail while reading the scans, without reading them.
+        """Refuse a section after the end and a reference of another time, without reading scans.
 
-        The section may begin after the end; the reference may be unreadable or of another time. Of
-        poses on a topic, only the first one is checked.
+        Of poses on a topic, only the first one is checked.
         """
         span = self.source.span()
         if span is None:
@@ -419,7 +401,6 @@ class RecordedSequence:
         )
 
     def _proposal(self, trajectory: Trajectory) -> str:
-        """The offset found from how the scans turn."""
         _log.info("%s: comparing how its scans turn with the reference", self.name)
         try:
             turns = compensation.turning_of(islice(self._decode(Counter(), Content()), _MOST_SCANS))
@@ -435,3 +416,29 @@ class RecordedSequence:
 @once
 def _warn(name: str, text: str) -> None:
     _log.warning("%s: %s", name, text)
+
+
+_LATE = 10 * 10**9
+"""Nanoseconds after the first scan at which an IMU that is on the same clock has begun."""
+
+
+def carry_imu(scans: Iterable[Scan], imu: Imu | None, name: str) -> Iterator[Scan]:
+    """Scans with the measurements of the IMU; a SequenceError if these are of another time."""
+    if imu is None or not len(imu):
+        what = "holds no measurements of an IMU; name their topic"
+        raise SequenceError(f"{name}: {what}")
+    first: int | None = None
+    for scan in scans:
+        if first is None:
+            begin, end = imu.stamps[0], imu.stamps[-1]
+            if not begin - _LATE < scan.stamp < end:
+                first_scan, *covered = (f"{t * 1e-9:.3f} s" for t in (scan.stamp, begin, end))
+                raise SequenceError(
+                    f"{name}: the IMU covers {' to '.join(covered)}, the first scan is "
+                    f"of {first_scan}: record both on the same clock, or leave `imu` out"
+                )
+            # Those during the first scan, and the one before.
+            first = max(int(imu.stamps.searchsorted(scan.stamp, "right")) - 1, 0)
+        last = max(int(imu.stamps.searchsorted(scan.stamp + scan.span)) + 1, first)
+        yield replace(scan, imu=imu.part(first, last))
+        first = last

@@ -48,7 +48,7 @@ def _read_text(inspection: Inspection) -> str:
 def _stage_text(inspection: Inspection, stage: str) -> Text:
     if lacking := inspection.missing[stage]:
         return Text(f"{stage}: lacks {' and '.join(lacking)}", style="red")
-    if any(one.of in INPUTS[stage] for one in inspection.findings):
+    if any(finding.of in INPUTS[stage] for finding in inspection.findings):
         return Text(f"{stage}: can run, but see the lines with ! above", style="yellow")
     limit = "" if inspection.complete else ", as far as the sample shows"
     return Text(f"{stage}: has all it needs{limit}", style="green")

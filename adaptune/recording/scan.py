@@ -173,10 +173,7 @@ class Recording(Protocol):
 
 
 def stretch_numbers(place: NDArray[np.intp], stretch: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Number stretches of all recordings from 0 on.
-
-    All of shape (n_frames,): each frame's number, that of its place, and of its stretch there.
-    """
+    """Number stretches of all recordings from 0 on, by place and stretch of each frame: (n,)."""
     _, number = np.unique(np.stack([place, stretch], axis=1), axis=0, return_inverse=True)
     return np.asarray(number.ravel())
 
@@ -196,9 +193,8 @@ LEAP = "scans whose stamps leap ahead of the recording"
 def in_order(frames: Iterable[Frame], left_out: Counter[str]) -> Iterator[Frame]:
     """Leave out the fewest frames so that stamps strictly increase.
 
-    If a stamp does not come after the one before it, one of the two is wrong. The one that
-    disagrees more with the recorder's clock is left out. A single stamp in the future thus costs
-    one scan, not all that follow.
+    Of two that do not, the one that disagrees more with the recorder's clock is left out: a single
+    stamp in the future costs one scan, not all that follow.
     """
     last: Frame | None = None
     doubtful: Frame | None = None
@@ -226,8 +222,7 @@ def in_order(frames: Iterable[Frame], left_out: Counter[str]) -> Iterator[Frame]
         yield doubtful
 
 
-# Nanoseconds; a recorder is seldom later than this.
-_DOUBT = 50_000_000
+_DOUBT = 50_000_000  # nanoseconds; a recorder is seldom later than this
 
 
 def _leap(last: Frame | None, frame: Frame) -> int:

@@ -22,8 +22,7 @@ LEAVE_OUT = "no `time_unit` mends them: write `time_unit: none` to leave the tim
 _LONGEST = 10.0
 # A header and its points are on the same clock if they are no further apart than this.
 _SAME_CLOCK = 10.0
-# Times below a day or so are absolute, too, if they agree with the header to this.
-_AGREE = 0.1
+_AGREE = 0.1  # times below a day or so are absolute, too, if they agree with the header to this
 
 
 class TimingError(AdaptuneError):
@@ -53,14 +52,11 @@ class Timing:
     def resolve(
         self, stamp: int, values: NDArray[Any] | None, extent: tuple[float, float]
     ) -> tuple[int, NDArray[np.float32] | None, Reading]:
-        """Find the start of a scan, and the time of each point since then.
+        """Start of a scan in nanoseconds, float32 seconds of the points since then, and how read.
 
-        The header's stamp is nanoseconds. `values` are the times of the valid points as the driver
-        wrote them, of shape (n,): relative to the stamp, or absolute, all finite; `extent` is the
-        least and the greatest of them.
-
-        Returns the start in nanoseconds, and the float32 seconds of the points since then, of
-        shape (n,), none below zero.
+        `values` are the times of the valid points as the driver wrote them, of shape (n,): relative
+        to the header's stamp, or absolute, all finite; `extent` is the least and the greatest of
+        them. No point is before the start.
         """
         if values is None or not len(values) or self.unit == "none":
             start = stamp - round(self.period * 1e9) if self.stamp == "end" else stamp
@@ -84,7 +80,6 @@ class Timing:
     def _check(
         self, dtype: np.dtype[Any], extent: tuple[float, float], scale: float, absolute: bool
     ) -> None:
-        """Refuse times that no scan has."""
         low, high = extent
         span = (high - low) * scale
         # Seconds from the stamp to the first point, or from the last one to the stamp.
@@ -173,14 +168,9 @@ def _unwrapped(
     return values, extent
 
 
-AUTO = Timing()
-"""Follow the points."""
-
-
-FIRST_SCANS = 10
-"""Scans at the beginning of a recording that show how it is timed."""
-SOONEST = 1_000_000
-"""Nanoseconds from one scan to the next one; no LiDAR is faster."""
+AUTO = Timing()  # follow the points
+FIRST_SCANS = 10  # scans at the beginning of a recording that show how it is timed
+SOONEST = 1_000_000  # nanoseconds from one scan to the next one; no LiDAR is faster
 _POSSIBLE = "possible times of the points"
 
 

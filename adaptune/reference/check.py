@@ -23,8 +23,7 @@ if TYPE_CHECKING:
 
 
 CONTRADICTS = "the reference contradicts the scans"
-UNSEEN = 0.7
-"""Share of a way that a registration does not show, from which it does not count."""
+UNSEEN = 0.7  # share of a way that a registration does not show, from which it does not count
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,10 +38,9 @@ class MeasuredReference:
     def error(self, length: float) -> OwnError | None:
         """Mean error of the reference, in percent of sub-trajectories of `length` metres.
 
-        What the registrations themselves are wrong by is part of it. A registration is `HOPS`
-        metres long at most; over less, the reference counts as wrong by as many metres. None if
-        the registrations that follow each other reach nowhere over the length, or most of them do
-        not show motion along the way.
+        That of the registrations is part of it. Over less than their length, the reference counts
+        as wrong by as many metres. None if registrations that follow each other reach nowhere over
+        the length, or most of them do not show motion along the way.
         """
         if self.unseen:
             return None
@@ -77,10 +75,7 @@ class MeasuredReference:
 
     @cached_property
     def unseen(self) -> str:
-        """Axis of the sensor along which the place does not show motion, though it moves so.
-
-        Empty where most registrations show it. All scans of a tunnel look alike along it.
-        """
+        """Axis of the sensor along which the place, as a tunnel, does not show motion, or empty."""
         T = invert(self.T_ref_sensor[self.hops.start]) @ self.T_ref_sensor[self.hops.end]
         way = T[:, :3, 3] / np.linalg.norm(T[:, :3, 3], axis=1, keepdims=True)
         lost = way - np.einsum("nij,nj->ni", self.hops.projection, way)
@@ -104,10 +99,7 @@ class MeasuredReference:
 def measure_reference(
     scans: Recording, reference: Trajectory, advance: "Advance" = lambda *_: None
 ) -> MeasuredReference:
-    """Register the scans of a recording to find how wrong a reference of its LiDAR is.
-
-    `advance` is called after every scan.
-    """
+    """Register the scans of a recording to find how wrong a reference of its LiDAR is."""
     stamps, poses = [], []
     n, doubt = scans.n_messages, hard_to_track(scans)
 
@@ -132,10 +124,9 @@ def _pose_at(reference: Trajectory, stamp: int) -> Poses:
 
 
 def mean_difference(T_one: Poses, T_other: Poses, length: float) -> float:
-    """Mean RTE in percent of one reference by another, over `length` metres.
+    """Mean RTE in percent of one reference by another, over `length` metres; NaN if unknown.
 
-    The poses are of shape (n, 4, 4), at the same stamps, and NaN where they are unknown. The
-    result is NaN where both together hold no sub-trajectory.
+    The poses are of shape (n, 4, 4), at the same stamps, and NaN where they are unknown.
     """
     known = np.isfinite(T_one + T_other).all(axis=(1, 2), keepdims=True)
     T_one, T_other = (np.where(known, T, np.nan) for T in (T_one, T_other))
@@ -164,15 +155,12 @@ LENGTHS = {25.0: 8, 10.0: 8, 5.0: 1.4, 2.0: 2}
 the noise of the reference counts too much."""
 LONGER = (5.0, 10.0, 25.0, 50.0, 100.0)
 """Metres to choose from where the first of `LENGTHS` that fits is too short after all."""
-FEWEST = 1.4
-"""How many of them the path of the test must hold then."""
+FEWEST = 1.4  # how many of them the path of the test must hold then
 SECONDS = 2.0
 """A sub-trajectory lasts as long at least, up to the greatest of `LENGTHS`: who is fast often has
 a reference of GPS, which is noisy."""
-NOISY = 0.5
-"""Percent by which a reference may be wrong, as far as registrations can tell."""
-TRAINING = 0.6
-"""Share of a recording's duration that is proposed for training, before the test."""
+NOISY = 0.5  # percent by which a reference may be wrong, as far as registrations can tell
+TRAINING = 0.6  # share of a recording's duration that is proposed for training, before the test
 
 
 def path_after(reference: Trajectory, training: float) -> tuple[float, float]:
@@ -195,12 +183,10 @@ def proposed_sub_trajectory(
 ) -> float:
     """Metres of the sub-trajectories that a study should judge by.
 
-    The test begins after the share `training` of the reference's duration.
-
-    The first of `LENGTHS` for which the test's part of the path is long enough, 1 m if none is,
-    or a longer one if that does not last `SECONDS`. Where registrations say that the reference is
-    too noisy for it, the first longer one that fits and for which it is not; where it is for all,
-    the longest that fits, up to the greatest of `LENGTHS`.
+    The first of `LENGTHS` for which the path after the share `training` of the time is long enough,
+    1 m if none is, or a longer one if that does not last `SECONDS`. Where registrations say that
+    the reference is too noisy for it, the first longer one that fits and for which it is not; where
+    it is for all, the longest that fits, up to the greatest of `LENGTHS`.
     """
     path, seconds = path_after(reference, training)
     usual = next((length for length, n in LENGTHS.items() if n * length <= path), 1.0)

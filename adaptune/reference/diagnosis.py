@@ -6,7 +6,7 @@ would be without it; the one that fits the measured motions is the likeliest.
 """
 
 from collections.abc import Collection, Iterable, Iterator
-from itertools import accumulate
+from itertools import accumulate, islice
 from typing import NamedTuple
 
 import numpy as np
@@ -23,29 +23,94 @@ from adaptune.geometry import (
     rotation_angle,
     to_quaternions,
 )
-from adaptune.live.hops import Hops
+from adaptune.live.hops import OFFLINE_CLOUD, OFFLINE_REACHES, Hop, HopCloud, Hops, register
+from adaptune.recording.compensation import neighbour_motions
 from adaptune.recording.content import Content
 from adaptune.recording.scan import Recording, Scan
 from adaptune.reference.check import CONTRADICTS, NOISY
-from adaptune.reference.motions import measured_motions
 from adaptune.trajectory import Trajectory
 
-SUSPICIOUS = 1.5
-"""Percent. Poses that differ less from what scans show break no convention."""
-EXPLAINED = 0.5
-"""A cause explains the difference if it leaves less than this share of it."""
-FEWEST_HOPS = 5
-"""Measured motions that a verdict needs."""
-TRUSTED = 0.8
-"""Share of the measured motions that are right at least, those that fit best."""
-CLOCK = 30.0
-"""Seconds by which clocks may differ to be found."""
-FAR_APART = 0.25
-"""Seconds between poses, from which on the way between them is not straight."""
+_STRETCHES, _SCANS = 4, 40
+"""Stretches of a recording that are looked at, evenly spread, and the scans of each."""
+_METRES, _EACH = 4.0, 4
+"""A motion is measured over so many metres, or over half a stretch if that is less, and begins at
+every fourth scan of it."""
+_NEAR = 0.6, 0.1, 0.5
+"""Metres, radians and seconds between neighbours, below which scans in between are left out."""
+_STANDING = 0.5  # metres below which a motion is noise
+_ENOUGH = 10.0  # metres after which the rest of a stretch is not looked at
+_MOTIONS = 12  # motions after which no more are measured, an equal share of them in each stretch
+_AGREE = 0.3  # metres by which two ways of registering the same scans may differ
+
+
+def measured_motions(scans: Iterable[Scan], n_scans: int) -> Hops:
+    """Register scans over some metres from standing still, here and there along a recording.
+
+    Neighbours are registered one after the other, then scans some metres apart directly, which owes
+    nothing to any poses. There is nothing where both ways end apart, as where the view is narrow.
+    """
+    n_stretches = min(_STRETCHES, max(n_scans // _SCANS, 1))
+    begins = np.linspace(0, max(n_scans - _SCANS, 0), n_stretches).astype(int)
+    scans, position = iter(scans), 0
+    found: list[tuple[int, int, Hop]] = []
+    for begin in begins.tolist():
+        stretch = list(islice(scans, begin - position, begin - position + _SCANS))
+        position = begin + _SCANS
+        some = islice(_motions_over(stretch), -(-_MOTIONS // n_stretches))
+        found += [(begin + i, begin + k, hop) for i, k, hop in some]
+    return Hops.of(found)
+
+
+def _stride(stretch: list[Scan]) -> int:
+    """Which scans are enough where the sensor moves slowly: every one, second or fourth."""
+    *_, (_, T, seconds) = neighbour_motions(stretch[:2])
+    T = np.full((4, 4), np.nan) if T is None else T
+    apart = np.array([np.linalg.norm(T[:3, 3]), rotation_angle(T), seconds])
+    return max(n for n in (1, 2, _EACH) if n == 1 or (n * apart < _NEAR).all())
+
+
+def _motions_over(stretch: list[Scan]) -> Iterator[tuple[int, int, Hop]]:
+    """Numbers of two scans of a stretch, and the registration of one to the other."""
+    if len(stretch) < 2:
+        return
+    stride = _stride(stretch)
+    stretch = stretch[::stride]
+    T: list[Poses] = []
+    clouds: list[HopCloud] = []
+    start = 0
+    for i, (scan, step, seconds) in enumerate(neighbour_motions(stretch)):
+        if i and step is None:
+            break
+        T.append(np.eye(4) if step is None else T[-1] @ step)
+        motion = np.eye(4) if step is None else step
+        clouds.append(HopCloud(scan, motion, seconds if i else 0.0, OFFLINE_CLOUD))
+        if i == 1 and step is not None:
+            clouds[0].moved(step, seconds)
+        while start < i:
+            guess = invert(T[start]) @ T[i]
+            metres = np.linalg.norm(guess[:3, 3])
+            if metres < _METRES and i - start < _SCANS // 2 // stride:
+                break
+            ends = clouds[start], clouds[i]
+            given = [guess] if metres >= _STANDING else []
+            if (hop := register(*ends, given, reaches=OFFLINE_REACHES)) is not None:
+                apart = hop.projection @ (hop.T_start_end - guess)[:3, 3]
+                if np.linalg.norm(apart) < _AGREE:
+                    yield start * stride, i * stride, hop
+            start += _EACH // stride
+        if np.linalg.norm(T[i][:3, 3]) > _ENOUGH:
+            break
+
+
+SUSPICIOUS = 1.5  # percent; poses that differ less from what scans show break no convention
+EXPLAINED = 0.5  # a cause explains the difference if it leaves less than this share of it
+FEWEST_HOPS = 5  # measured motions that a verdict needs
+TRUSTED = 0.8  # share of the measured motions that are right at least, those that fit best
+CLOCK = 30.0  # seconds by which clocks may differ to be found
+FAR_APART = 0.25  # seconds between poses, from which on the way between them is not straight
 TURNED = 0.1
 """Radians, the root of their mean square, by which motions must turn a lever arm to show it."""
-SAME_CLOCK = 0.01
-"""Seconds by which two clocks may differ and count as the same."""
+SAME_CLOCK = 0.01  # seconds by which two clocks may differ and count as the same
 
 
 def _cause(what: str, mend: str, before: float, after: float = np.nan) -> Finding:
@@ -87,9 +152,8 @@ def diagnose_reference(
 ) -> Finding | None:
     """Why a reference contradicts measured motions; None if it does not, or nobody can tell.
 
-    The stamps of the scans are nanoseconds, of shape (n_scans,). `place` is the LiDAR's pose in the
-    frame of the poses that were given, of shape (4, 4), as the study states it; by default they are
-    the LiDAR's own.
+    The stamps of the scans are of shape (n_scans,). `place` is the LiDAR's pose in the frame of the
+    poses that were given, of shape (4, 4), as the study states it; by default the identity.
     """
     errors = mismatch(reference.at(stamps), hops)
     before = _mean(errors)
@@ -107,7 +171,7 @@ def diagnose_reference(
         return Trajectory(reference.stamps, T, reference.max_gap).at(stamps)
 
     candidates = [
-        *(one._replace(T_world_sensor=at_scans(one.T_world_sensor)) for one in _conventions(given)),
+        *(c._replace(T_world_sensor=at_scans(c.T_world_sensor)) for c in _conventions(given)),
         *_far_apart(reference, stamps),
         *_clock(reference, stamps, hops),
         *_places(at_scans(given) @ invert(T_given_sensor), hops, T_given_sensor),
@@ -138,10 +202,7 @@ def diagnose_odometry(T_odom_sensor: Poses, hops: Hops) -> Finding | None:
 def _likeliest(
     candidates: Iterable[_Candidate], hops: Hops, contradicting: NDArray[np.float64]
 ) -> Finding | None:
-    """What leaves nearly as little as the best candidate, if that explains the difference.
-
-    On a straight way, two may fit alike. `contradicting` is how far each motion differs.
-    """
+    """What leaves nearly as little as the best candidate; on a straight way, two may fit alike."""
     before = _mean(contradicting)
 
     def after(errors: NDArray[np.float64]) -> float:
@@ -310,22 +371,11 @@ def contradictions(
     given: bool,
     seen: Collection[int] | None = None,
 ) -> Iterator[Finding]:
-    """What a recording's scans say where its reference and an odometry disagree.
+    """What scans say where a reference and an odometry differ by `error` percent, if that is large.
 
-    Parameters
-    ----------
-    scans
-        Read once more, as far as needed, where `error` is large.
-    T_odom_sensor
-        The odometry's poses, of shape (n_scans, 4, 4), which owe nothing to the reference.
-    error
-        Percent by which the odometry differs from the reference.
-    place
-        The LiDAR's pose in the reference's frame, of shape (4, 4), where a study states it.
-    given
-        Whether the reference came with the recording.
-    seen
-        Stamps of the scans that the odometry was given, if they are not all.
+    The odometry's poses, of shape (n_scans, 4, 4), owe nothing to the reference, and are those of
+    the scans with the stamps `seen`, or of all. `place` is as in `diagnose_reference`; `given` says
+    whether the reference came with the recording.
     """
     if not error > SUSPICIOUS:
         return
@@ -365,12 +415,9 @@ def contradictions(
 
 
 def _surely_worse(wrong: NDArray[np.float64], others: NDArray[np.float64]) -> bool:
-    """Whether a reference differs from measured motions, of shape (n,), more than an odometry.
-
-    By the 95 % interval of the mean difference: what a registration itself is wrong by, both share.
-    """
-    known = np.isfinite(wrong + others)
-    more = (wrong - others)[known]
+    """Whether a reference differs more than an odometry, by the 95 % interval of the mean."""
+    # What a registration itself is wrong by, both share.
+    more = (wrong - others)[np.isfinite(wrong + others)]
     if len(more) < FEWEST_HOPS or not _mean(wrong) > max(NOISY, 2.0 * _mean(others)):
         return False
     return bool(more.mean() > 2.0 * more.std(ddof=1) / len(more) ** 0.5)

@@ -7,16 +7,16 @@ also registered directly to scans some metres before. A pose graph brings both t
 from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from adaptune.bank.members import LEVER
 from adaptune.geometry import Poses, invert, mean_motion, rectify, rotation_angle, steps
 from adaptune.recording.config import SequenceConfig
 from adaptune.recording.inspect import Inspection
 from adaptune.recording.scan import Recording, Scan
-from adaptune.reference.consensus import HALVES
 from adaptune.reference.estimated import EstimatedReference, EstimateError, Registrations
 from adaptune.reference.graph import (
+    HALVES,
     LENGTHS,
     SPACING,
     Edge,
@@ -28,18 +28,13 @@ from adaptune.reference.graph import (
     pass_over,
 )
 
-VERSION = 1
-"""Counts changes after which the same recording has another estimate."""
-SHORTEST = 10.0
-"""Metres. On a shorter path, nothing is known about any odometry."""
-FEWEST = 2
-"""Registrations that must span a motion, so that it can be trusted."""
-MOST_UNKNOWN = 0.5
-"""Share of the scans whose pose may be unknown."""
+VERSION = 1  # counts changes after which the same recording has another estimate
+SHORTEST = 10.0  # metres; on a shorter path, nothing is known about any odometry
+FEWEST = 2  # registrations that must span a motion, so that it can be trusted
+MOST_UNKNOWN = 0.5  # share of the scans whose pose may be unknown
 _AGREES = (0.1, 0.02)
 """A registration agrees with the graph within so many metres and this share of its length."""
-_LITTLE_IN_COMMON = 0.8 * LENGTHS[-1]
-"""Metres from which on scans may have too little in common."""
+_LITTLE_IN_COMMON = 0.8 * LENGTHS[-1]  # metres from which on scans may have too little in common
 _NEAR = 0.1
 """Metres within which a member's motion from scan to scan counts for a half of the reference."""
 
@@ -50,10 +45,8 @@ Advance = Callable[[int, int], None]
 def estimate_reference(scans: Recording, advance: Advance = lambda *_: None) -> EstimatedReference:
     """Estimate the reference of a recording; its own is not used.
 
-    What judges an odometry is made by a pool of others. Only the scans of the last metres are kept
-    in memory. `advance` is called after every scan; the pose graphs take about a twentieth of the
-    time, after that. There is an EstimateError if the recording does not allow it: the robot hardly
-    moves, or nothing can be registered.
+    `advance` is called after every scan; the pose graphs take about a twentieth of the time, after
+    that. There is an EstimateError if the robot hardly moves, or nothing can be registered.
     """
     n = scans.n_messages
     found = pass_over(scans, lambda done: advance(done, round(1.05 * max(n, done))))
@@ -90,7 +83,6 @@ def estimated(name: str, found: Pass, scans: Iterable[Scan] = ()) -> EstimatedRe
 
 
 def _check(name: str, found: Pass) -> None:
-    """Refuse a recording by which nothing can be judged."""
     way = _way(found.T_odom_sensor[:, :3, 3]) if len(found.stamps) else 0.0
     if way < SHORTEST:
         raise EstimateError(
@@ -111,10 +103,7 @@ def _way(positions: NDArray[np.float64]) -> float:
 
 
 def _revised(found: Pass) -> tuple[Poses, list[Edge]]:
-    """Replace the consensus by a member where registrations confirm that one, and not the other.
-
-    Poses of shape (n, 4, 4), and registrations, for the pose graph.
-    """
+    """The consensus, replaced where registrations confirm only a member; the registrations used."""
     edges = _edges(found.guesses, -1)
     motions = steps(found.T_odom_sensor)
     weak = _support(len(found.stamps), edges) < FEWEST
@@ -147,15 +136,14 @@ def _edges(guesses: Iterable[Guess], member: int) -> list[Edge]:
 
 def _support(n: int, edges: Sequence[Edge]) -> NDArray[np.intp]:
     """How many registrations span the motion from each of n scans to the next."""
-    start, end = (np.array([edge[i] for edge in edges], np.intp) for i in (0, 1))
-    return _spanning(n, start, end)
+    return _spanning(n, [edge.start for edge in edges], [edge.end for edge in edges])
 
 
-def _spanning(n: int, start: NDArray[np.intp], end: NDArray[np.intp]) -> NDArray[np.intp]:
+def _spanning(n: int, start: ArrayLike, end: ArrayLike) -> NDArray[np.intp]:
     """How many of the spans from `start` to `end` hold each of n - 1 motions."""
     changes = np.zeros(n, np.intp)
-    np.add.at(changes, start, 1)
-    np.add.at(changes, end, -1)
+    np.add.at(changes, np.asarray(start, np.intp), 1)
+    np.add.at(changes, np.asarray(end, np.intp), -1)
     return np.asarray(np.cumsum(changes)[:-1])
 
 
@@ -229,8 +217,8 @@ def _halves(found: Pass, edges: Sequence[Edge], T_world_sensor: Poses) -> Poses:
     halves = []
     for half, members in enumerate(HALVES):
         T = _chained(T_world_sensor[0], _steps_of(found, T_world_sensor, members))
-        own = [edge for edge in edges if ends[edge.end] == half]
-        halves.append(optimised(T, own, T_world_sensor))
+        half_edges = [edge for edge in edges if ends[edge.end] == half]
+        halves.append(optimised(T, half_edges, T_world_sensor))
     return np.array(halves)
 
 
@@ -249,10 +237,9 @@ def _steps_of(found: Pass, T_world_sensor: Poses, members: Sequence[int]) -> Pos
 def recording_config(
     found: Inspection, points: str | None = None, reference: str | None = None
 ) -> SequenceConfig:
-    """The sequence that an inspected recording is, with what the user chose written to `found`.
+    """The sequence that an inspected recording is, with the topics or file that the user chose.
 
-    `points` and `reference` are topics in place of those that were found; the reference may be a
-    file, too. There is an `EstimateError` if there are no scans.
+    These are written to `found`. There is an `EstimateError` if there are no scans.
     """
     if not found.name:
         raise EstimateError(f"{found.path}: is a file of poses; give a recording of scans")

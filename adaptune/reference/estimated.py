@@ -11,8 +11,7 @@ from adaptune.geometry import Poses
 from adaptune.metrics import sub_trajectory_rte, travelled
 from adaptune.trajectory import Trajectory
 
-BREAK = 1.0
-"""Seconds. Where the reference is not to be trusted, a longer gap without poses says so."""
+BREAK = 1.0  # seconds; where the reference is not to be trusted, a longer gap without poses says so
 HALVES_TO_WHOLE = 0.75
 """Error of the whole reference, as a share of the difference between its two halves: half of it if
 they had nothing in common, but they share what all registrations get wrong."""
@@ -31,8 +30,7 @@ class Registrations(NamedTuple):
     start: NDArray[np.intp]  # (m,): numbers of the scans
     end: NDArray[np.intp]
     accepted: NDArray[np.bool_]  # (m,): whether the pose graph agrees with it
-    # (m,): metres by which it differs from the pose graph; NaN if the registration failed
-    residual: NDArray[np.float64]
+    residual: NDArray[np.float64]  # (m,): metres off the pose graph; NaN if it failed
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,8 +39,7 @@ class EstimatedReference:
 
     stamps: NDArray[np.int64]  # (n,): of all scans, in nanoseconds
     T_world_sensor: Poses  # (n, 4, 4): the pose of every scan; the first is the identity
-    # (n - 1,): whether the motion from each scan to the next can be trusted
-    trusted: NDArray[np.bool_]
+    trusted: NDArray[np.bool_]  # (n - 1,): whether the motion to the next scan can be trusted
     halves: Poses  # (2, n, 4, 4): the poses from either half of the registrations alone
     registrations: Registrations
 
@@ -85,10 +82,8 @@ class EstimatedReference:
         edges = np.flatnonzero(np.diff(self.known.astype(int), prepend=1, append=1))
         begins, ends = np.maximum(edges[::2] - 1, 0), np.minimum(edges[1::2], len(seconds) - 1)
         return [
-            Finding(
-                (), self._reason(begin, end), seconds=(float(seconds[begin]), float(seconds[end]))
-            )
-            for begin, end in zip(begins.tolist(), ends.tolist(), strict=True)
+            Finding((), self._reason(i, k), seconds=(float(seconds[i]), float(seconds[k])))
+            for i, k in zip(begins.tolist(), ends.tolist(), strict=True)
         ]
 
     def _reason(self, first: int, last: int) -> str:
@@ -124,10 +119,7 @@ class EstimatedReference:
         return 1.0 - float(self.known.mean())
 
     def error(self, length: float) -> float:
-        """Estimated mean RTE of the reference itself, in percent over `length` metres.
-
-        NaN where no sub-trajectory is as long.
-        """
+        """Estimated mean RTE of the reference in percent over `length` metres; NaN if unknown."""
         known = self.known[:, None, None]
         one, other = (np.where(known, half, np.nan) for half in self.halves)
         errors = sub_trajectory_rte(one, other, length)

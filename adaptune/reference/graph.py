@@ -1,21 +1,72 @@
-"""The pose graph: motions from scan to scan, and registrations over metres, made to agree.
+"""The pose graph: motions on which several odometries agree, and registrations over metres.
 
 Solved by GTSAM (Dellaert and Kaess, *Factor Graphs for Robot Perception*, 2017).
 """
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from adaptune.bank.bank import Bank
 from adaptune.geometry import Poses, invert, rectify, rotation_angle, steps
 from adaptune.live.hops import OFFLINE_CLOUD, OFFLINE_REACHES, Hop, HopCloud, register
 from adaptune.metrics import travelled
+from adaptune.odometry.base import InProcess
+from adaptune.odometry.health import HealthCheck
+from adaptune.odometry.registry import odometry_class
+from adaptune.odometry.tracker import WARM_UP, Tracker
 from adaptune.recording.scan import Scan
-from adaptune.reference.consensus import Consensus
+from adaptune.space import ParameterSet, Selection
+
+POOL: tuple[tuple[str, Mapping[str, float]], ...] = (
+    ("gicp", {"max_correspondence_distance": 2.2, "keyframe_interval": 1.3}),
+    ("gicp", {"max_correspondence_distance": 1.3, "keyframe_interval": 3.1}),
+    ("gicp", {"max_correspondence_distance": 4.5, "keyframe_interval": 5.3}),
+    ("vgicp", {"resolution": 0.9, "keyframe_interval": 1.7}),
+    ("vgicp", {"resolution": 1.8, "keyframe_interval": 3.7}),
+)
+"""Odometries and their parameters. No study's trials are among them: the reference that judges an
+odometry is not made with it."""
+HALVES = ((0, 1, 2), (3, 4))  # members of either half, which have no algorithm in common
+_DOWNSAMPLING = 0.45  # metres between points of their clouds
+
+
+class Consensus:
+    """Runs the pool scan after scan.
+
+    A bank of even weights: members that agree move it by their mean, others are warmed up on the
+    last scans at its pose.
+    """
+
+    n_members = len(POOL)
+
+    def __init__(self) -> None:
+        def make(parameters: Mapping[str, Any]) -> InProcess:
+            kind, given = POOL[int(parameters["number"])]
+            cls: Any = odometry_class(kind)
+            return InProcess(cls(dict(given), cls.settings_type(downsampling=_DOWNSAMPLING)))
+
+        sets: dict[int, ParameterSet] = {n: {"number": n} for n in range(len(POOL))}
+        self._bank = Bank(make, sets, WARM_UP)
+        even = dict.fromkeys(sets, 1.0)
+        self._bank.apply(Selection(trial=0, parameters={}, weights=even))
+        self._tracker = Tracker(self._bank, HealthCheck())
+
+    def register(self, scan: Scan) -> tuple[Poses, Poses]:
+        """Register the next scan.
+
+        Returns the consensus's pose, of shape (4, 4), and the motions of the members, of shape
+        (n_members, 4, 4), NaN where one has none.
+        """
+        found = self._tracker.register(scan)
+        members = self._bank.motions.members
+        T_previous_current = np.array([members[i] for i in range(len(POOL))])
+        return found.T_odom_sensor, T_previous_current
+
 
 LENGTHS = (2.0, 5.0, 10.0)
 """Metres over which scans are registered directly. Over 25 m, too little overlaps in caves."""
@@ -30,8 +81,7 @@ than this share of the way."""
 MIN_INLIERS_OFFLINE = 0.3
 """Least share of points near a point of the other scan. Many registrations check each other, so it
 may be lower than while driving."""
-_APART = 0.3
-"""Metres between guesses that are worth a registration each."""
+_APART = 0.3  # metres between guesses that are worth a registration each
 
 
 class Guess(NamedTuple):
@@ -40,8 +90,7 @@ class Guess(NamedTuple):
     start: int  # numbers of the scans
     end: int
     member: int  # whose motion it began at; -1 for the consensus
-    # what was found; None if too few points lie on each other, or it departs too far
-    hop: Hop | None
+    hop: Hop | None  # None if too few points lie on each other, or it departs too far
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,14 +99,11 @@ class Pass:
 
     stamps: NDArray[np.int64]  # (n,): of the scans, in nanoseconds
     T_odom_sensor: Poses  # (n, 4, 4): of the consensus
-    # (n, n_members, 4, 4): motions of the members; NaN where one has none
-    T_previous_current: Poses
+    T_previous_current: Poses  # (n, n_members, 4, 4): of the members; NaN where one has none
     guesses: Sequence[Guess]  # all registrations, by end, start, and member
 
 
 class _Anchor(NamedTuple):
-    """A scan that is registered."""
-
     number: int
     stamp: int
     metres: float  # driven until there
@@ -68,8 +114,7 @@ class _Anchor(NamedTuple):
 def pass_over(scans: Iterable[Scan], advance: Callable[[int], None] = lambda _: None) -> Pass:
     """Run the consensus along a recording, and register scans directly to those before them.
 
-    Only the scans of the last metres and seconds are kept in memory. `advance` is called after
-    every scan with how many are done.
+    Only the scans of the last metres and seconds are kept. `advance` gets how many are done.
     """
     consensus, registering = Consensus(), _Registering(Consensus.n_members)
     stamps: list[int] = []
@@ -172,9 +217,7 @@ class _Registering:
 
 
 def _registered(start: _Anchor, end: _Anchor, T_start_end: Poses) -> Hop | None:
-    """A registration that stays near its guess."""
-    given = [T_start_end], MIN_INLIERS_OFFLINE, OFFLINE_REACHES
-    hop = register(start.cloud, end.cloud, *given)
+    hop = register(start.cloud, end.cloud, [T_start_end], MIN_INLIERS_OFFLINE, OFFLINE_REACHES)
     if hop is None:
         return None
     metres, share = DEPARTURE
@@ -188,8 +231,7 @@ def _metres_apart(T: Poses, other: Poses) -> float:
 
 _OF_A_STEP = (0.005, 0.002)
 """Metres and radians by which the motion from scan to scan is wrong, about, if it is small."""
-_SHARE = (0.05, 0.02)
-"""What each metre adds to the metres, and each radian to the radians."""
+_SHARE = (0.05, 0.02)  # what each metre adds to the metres, and each radian to the radians
 _OF_A_HOP = (0.02, 0.003)
 """Metres and radians by which a registration over `_LONG` metres is wrong, about."""
 _LONG = LENGTHS[-1]
@@ -198,8 +240,7 @@ _SHORTER = (1.0, 0.5)
 what they get wrong alike adds up: on open ground, the rings of the laser on the ground pull each
 towards no motion. So they count as more wrong: in metres as the way is shorter, in radians as its
 square root."""
-_UNKNOWN = 10.0
-"""Metres by which a registration is wrong along a direction that it does not tell."""
+_UNKNOWN = 10.0  # metres by which a registration is wrong along a direction that it does not tell
 _ITERATIONS = 50
 
 
@@ -213,20 +254,12 @@ class Edge(NamedTuple):
 
 
 def optimised(
-    T_odom_sensor: Poses,
-    edges: Sequence[Edge],
-    T_first_guess: Poses | None = None,
+    T_odom_sensor: Poses, edges: Sequence[Edge], T_first_guess: Poses | None = None
 ) -> Poses:
-    """The poses, of shape (n, 4, 4), on which motions and registrations agree best.
+    """The poses on which the motions of `T_odom_sensor` and registrations agree best.
 
-    All have robust weights: a wrong one hardly counts.
-
-    Parameters
-    ----------
-    T_odom_sensor
-        Poses of shape (n, 4, 4) whose motions from scan to scan count.
-    T_first_guess
-        Where the search begins, of shape (n, 4, 4); `T_odom_sensor` when left out.
+    All have robust weights: a wrong one hardly counts. The search begins at `T_first_guess`, by
+    default at `T_odom_sensor`. All poses are of shape (n, 4, 4).
     """
     import gtsam
 
@@ -279,8 +312,8 @@ def _noise(edge: Edge) -> Any:
 def _robust(noise: Any, bounded: bool = True) -> Any:
     """Noise with Cauchy's weights, by which one that is far off hardly counts, or with Huber's.
 
-    Registrations share what they get wrong, and are many: against them, what holds together over
-    long ways would count as far off.
+    Short registrations share what they get wrong, and are many: what holds together over long ways
+    would count as far off.
     """
     import gtsam
 
@@ -289,18 +322,13 @@ def _robust(noise: Any, bounded: bool = True) -> Any:
     return gtsam.noiseModel.Robust.Create(kernel, noise)
 
 
-LATER = 30.0
-"""Metres driven until a place counts as one that the path comes by again."""
-NEAR = 3.0
-"""Metres from such a place, at most."""
-EVERY = 5.0
-"""Metres driven from one to the next."""
-MOST = 100
-"""Places. Their scans are in memory at the same time."""
+LATER = 30.0  # metres driven until a place counts as one that the path comes by again
+NEAR = 3.0  # metres from such a place, at most
+EVERY = 5.0  # metres driven from one to the next
+MOST = 100  # places; their scans are in memory at the same time
 _DEPARTURE = (0.3, 0.01)
 """A registration is rejected if it departs by more than so many metres, and by more than this share
 of the way between the two scans: it may be of another place that looks alike."""
-
 
 Loop = tuple[int, int]
 """Two scans at the same place, by their numbers."""
@@ -328,10 +356,7 @@ def loops(T_world_sensor: Poses, numbers: NDArray[np.intp]) -> list[Loop]:
 
 
 def closed(scans: Iterable[Scan], wanted: Sequence[Loop], T_world_sensor: Poses) -> list[Edge]:
-    """Register the scans of loops, which takes another pass over the recording.
-
-    `T_world_sensor`, of shape (n, 4, 4), is the path as it is known so far.
-    """
+    """Register the scans of loops in another pass; the path as known so far is (n, 4, 4)."""
     numbers, motions = {number for loop in wanted for number in loop}, steps(T_world_sensor)
     clouds: dict[int, HopCloud] = {}
     last: Scan | None = None

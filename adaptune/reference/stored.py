@@ -16,8 +16,7 @@ from adaptune.trajectory import write_tum
 
 LENGTHS = (1.0, 2.0, 5.0, 10.0, 25.0, 50.0, 100.0, 200.0, 400.0, 800.0)
 """Metres over which the error of a reference is noted."""
-_BEYOND = 1.5
-"""By how much a length may exceed the longest that is noted."""
+_BEYOND = 1.5  # by how much a length may exceed the longest that is noted
 
 
 class StoredEstimate(NamedTuple):
@@ -28,16 +27,7 @@ class StoredEstimate(NamedTuple):
     scans: int
     metres: float  # length of its path
     unknown_share: float  # share of the scans whose pose is unknown
-    # its estimated mean RTE in percent, by the length of sub-trajectories in metres
-    errors: dict[float, float]
-
-    @classmethod
-    def of(cls, path: Path, found: EstimatedReference, about: dict[str, Any]) -> "StoredEstimate":
-        """What is known about an estimate that is to be written to `path`."""
-        by_length = {length: found.error(length) for length in LENGTHS}
-        errors = {length: round(e, 4) for length, e in by_length.items() if math.isfinite(e)}
-        metres, share = round(found.path(), 3), round(found.unknown_share(), 4)
-        return cls(path, about, len(found.stamps), metres, share, errors)
+    errors: dict[float, float]  # its mean RTE in percent, by the length of sub-trajectories
 
     def error(self, length: float) -> float:
         """Estimated mean RTE of the reference in percent over `length` metres; NaN if unknown."""
@@ -53,8 +43,7 @@ class StoredEstimate(NamedTuple):
     def read(cls, path: Path) -> "StoredEstimate | None":
         """What is known about the estimated reference in a TUM file; None if it is not one.
 
-        Nor is it one where an estimate was refused, see `Refusal`. There is an `EstimateError` if
-        the file beside it is damaged.
+        There is an `EstimateError` if the file beside it is damaged.
         """
         beside = path.with_suffix(".json")
         try:
@@ -74,11 +63,11 @@ class StoredEstimate(NamedTuple):
 
 
 def write_estimate(path: Path, found: EstimatedReference, about: dict[str, Any]) -> StoredEstimate:
-    """Write ``.png``, ``.tum`` and, last, ``.json``.
-
-    If it is interrupted, no ``.json`` is there, and so nothing that counts as an estimate.
-    """
-    stored = StoredEstimate.of(path, found, about)
+    """Write ``.png``, ``.tum`` and, last, ``.json``: without that, it does not count as one."""
+    by_length = {length: found.error(length) for length in LENGTHS}
+    errors = {length: round(e, 4) for length, e in by_length.items() if math.isfinite(e)}
+    metres, share = round(found.path(), 3), round(found.unknown_share(), 4)
+    stored = StoredEstimate(path, about, len(found.stamps), metres, share, errors)
     path.parent.mkdir(parents=True, exist_ok=True)
     # What is known of an estimate before is not of these poses.
     path.with_suffix(".json").unlink(missing_ok=True)
@@ -94,10 +83,7 @@ def write_estimate(path: Path, found: EstimatedReference, about: dict[str, Any])
 
 
 def check_writable(path: Path) -> None:
-    """Make the folder of an estimate; an `EstimateError` if that cannot be written to.
-
-    There is one, too, if a file there is no estimate.
-    """
+    """Make the folder of an estimate; an `EstimateError` if it, or a file there, is not for one."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with TemporaryFile(dir=path.parent):

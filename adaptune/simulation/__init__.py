@@ -1,6 +1,5 @@
 """Simulated worlds, where the truth is known."""
 
-from adaptune.simulation.course import MOTIONS, SENSORS, Course, SimulationError
-from adaptune.simulation.scenes import SCENES
+from adaptune.simulation.course import MOTIONS, SCENES, SENSORS, Course, SimulationError
 
 __all__ = ["MOTIONS", "SCENES", "SENSORS", "Course", "SimulationError"]

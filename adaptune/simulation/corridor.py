@@ -68,7 +68,6 @@ def _front(tile: Tile, end: float) -> list[Mesh]:
 
 
 CORRIDOR = Scene(
-    summary="smooth parallel walls with doors, degenerate along its axis",
     build=_corridor_build,
     relief=lambda spots, _seed: np.zeros_like(spots.x),
     surface=paved((np.inf, Material.PAVING)),

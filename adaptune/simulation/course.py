@@ -13,11 +13,25 @@ from pydantic import AfterValidator, Field, model_validator
 from adaptune import geometry
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses
-from adaptune.recording.config import Compensation, SequenceConfig
-from adaptune.recording.parts import Part
+from adaptune.recording.config import Compensation, Part, SequenceConfig
 from adaptune.recording.scan import ImuNoise
-from adaptune.simulation.scenes import SCENES
+from adaptune.simulation.corridor import CORRIDOR
+from adaptune.simulation.garden import GARDEN
+from adaptune.simulation.open_ground import OPEN
+from adaptune.simulation.street import STREET
+from adaptune.simulation.tiles import Scene
+from adaptune.simulation.underground import CAVE, MINE
 from adaptune.strict import StrictModel
+
+SCENES: Mapping[str, Scene] = {
+    "cave": CAVE,
+    "open": OPEN,
+    "street": STREET,
+    "garden": GARDEN,
+    "corridor": CORRIDOR,
+    "mine": MINE,
+}
+"""The kinds of place a course can lead through, by name."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,43 +42,33 @@ class Sensor:
     # downwards on Ousters; of shape (n_rings,).
     elevations: NDArray[np.float64]
     columns: int  # firings in a turn; all rings fire at once
-    rate: float  # turns in a second
     # Least and greatest range in metres. The greatest holds for a target that reflects a tenth of
     # the light or more and is met squarely.
     range: tuple[float, float]
-    noise: float  # standard deviation of a range in metres
-    dropout: float  # share of echoes lost for no reason
-
-    @property
-    def rings(self) -> int:
-        """Lasers that fire at once."""
-        return len(self.elevations)
-
-
-def _sensor(degrees: NDArray[np.floating], columns: int, reach: tuple[float, float]) -> Sensor:
-    return Sensor(np.radians(degrees), columns, 10.0, reach, 0.015, 0.005)
+    rate: float = 10.0  # turns in a second
+    noise: float = 0.015  # standard deviation of a range in metres
+    dropout: float = 0.005  # share of echoes lost for no reason
 
 
 # Two blocks of 32 lasers: a third of a degree apart above, half a degree below.
 _HDL64E = np.concatenate([2.0 - np.arange(32) / 3.0, -8.83 - 0.5 * np.arange(32)])[::-1]
 
 SENSORS: Mapping[str, Sensor] = {
-    "vlp16": _sensor(np.arange(-15.0, 16.0, 2.0), 1800, (0.5, 100.0)),
+    "vlp16": Sensor(np.radians(np.arange(-15.0, 16.0, 2.0)), 1800, (0.5, 100.0)),
     # 900 columns, half of what it can do, keep a scan at 28,800 rays.
-    "hdl32e": _sensor(10.67 - (4.0 / 3.0) * np.arange(31, -1, -1), 900, (1.0, 100.0)),
-    "hdl64e": _sensor(_HDL64E, 2083, (0.9, 120.0)),
-    "os0-64": _sensor(np.linspace(45.0, -45.0, 64), 1024, (0.3, 50.0)),
-    "os1-128": _sensor(np.linspace(22.5, -22.5, 128), 1024, (0.5, 120.0)),
+    "hdl32e": Sensor(np.radians(10.67 - (4.0 / 3.0) * np.arange(31, -1, -1)), 900, (1.0, 100.0)),
+    "hdl64e": Sensor(np.radians(_HDL64E), 2083, (0.9, 120.0)),
+    "os0-64": Sensor(np.radians(np.linspace(45.0, -45.0, 64)), 1024, (0.3, 50.0)),
+    "os1-128": Sensor(np.radians(np.linspace(22.5, -22.5, 128)), 1024, (0.5, 120.0)),
 }
 """LiDARs by name."""
 
 
 @cache
 def directions(name: str, columns: int) -> NDArray[np.float32]:
-    """Where a sensor looks during one turn of some firings (`columns`).
+    """Unit vectors, (columns, n_rings, 3), along which a sensor looks during a turn, in its frame.
 
-    Unit vectors of shape (columns, n_rings, 3) are in the sensor's frame: x ahead, y to the left,
-    z up.
+    x is ahead, y to the left, z up.
     """
     elevation = SENSORS[name].elevations
     # A Velodyne turns clockwise seen from above. The seam lies behind, away from what is ahead.
@@ -92,11 +96,6 @@ class Motion:
     turn: tuple[float, float, float]  # standard deviation about x, y and z of the same, in radians
     band: tuple[float, float]  # least and greatest frequency of the shake in Hz
 
-    @property
-    def least_rate(self) -> float:
-        """Scans a second below which its shake is lost or scans lie two metres apart."""
-        return max(2.0 * self.band[1], self.speed / 2.0)
-
 
 MOTIONS: Mapping[str, Motion] = {
     # Speed, acceleration, turning, height, base and weave; shift, turn and band of the shake.
@@ -117,8 +116,7 @@ MOTIONS: Mapping[str, Motion] = {
 """Ways of carrying a sensor, by name."""
 
 
-LONGEST = 20_000.0
-"""Metres; a longer course is most likely a mistake."""
+LONGEST = 20_000.0  # metres; a longer course is most likely a mistake
 
 
 class SimulationError(AdaptuneError):
@@ -135,35 +133,30 @@ def _known(kind: str, names: Collection[str]) -> AfterValidator:
 
 
 class Course(StrictModel):
-    """A simulated recording: its scenes, its sensor and its motion."""
+    """A simulated recording: its scenes in driving order, its sensor and its motion."""
 
-    # Scenes in driving order.
     scenes: tuple[Annotated[str, _known("scene", SCENES)], ...] = Field(min_length=1)
     # Metres driven in every scene; twice as many where it is named twice.
-    length: float = Field(default=60.0, ge=10.0, le=LONGEST)
+    length: float = Field(60.0, ge=10.0, le=LONGEST)
     sensor: Annotated[str, _known("sensor", SENSORS)] = "hdl32e"
     motion: Annotated[str, _known("motion", MOTIONS)] = "robot"
-    # Another seed is another world, another drive and other noise.
-    seed: int = Field(default=0, ge=0, lt=2**31)
-    # Turns of the sensor in a second; the sensor's own if not given.
-    rate: float | None = Field(default=None, gt=0.0, le=100.0)
-    # Firings in a turn; the sensor's own if not given.
-    columns: int | None = Field(default=None, ge=16, le=8192)
+    seed: int = Field(0, ge=0, lt=2**31)  # of the world, the drive and the noise
+    rate: float | None = Field(None, gt=0.0, le=100.0)  # turns a second, in place of the sensor's
+    columns: int | None = Field(None, ge=16, le=8192)  # firings a turn, in place of the sensor's
     # Seconds at rest before it drives off, which LiDAR-inertial systems need to begin.
-    standstill: float = Field(default=0.0, ge=0.0, le=60.0)
-    # Hz of the inertial measurements; none are made if not given.
-    imu: Literal[200, 400] | None = None
-    # How motion within a scan is undone, as for a recorded sequence.
-    compensate: Compensation = None
-    # Whether a recording's headers mark the start or the end of each scan.
-    stamp: Literal["start", "end"] = "start"
+    standstill: float = Field(0.0, ge=0.0, le=60.0)
+    imu: Literal[200, 400] | None = None  # Hz of the inertial measurements, if there are any
+    compensate: Compensation = None  # how motion within a scan is undone when it is read
+    stamp: Literal["start", "end"] = "start"  # what headers mark of each scan
     # The course whose recording it is a part of; a study's `training` and `test` name such parts.
     of: Annotated[str, Field(pattern=r"^\w[\w.-]*$")] | None = None
     part: Part | None = None
 
     @model_validator(mode="after")
     def _rate_follows_motion(self) -> Self:
-        least, rate = MOTIONS[self.motion].least_rate, self.turns
+        motion, rate = MOTIONS[self.motion], self.turns
+        # With fewer scans its shake is lost, or they lie two metres apart.
+        least = max(2.0 * motion.band[1], motion.speed / 2.0)
         if rate < least:
             what = f"a {self.motion} moves too fast for {rate:g} scans a second"
             raise ValueError(f"{what}: it needs at least {least:g}")
@@ -195,14 +188,18 @@ T_IMU_LIDAR: Poses = np.array(
 )
 """Pose of the LiDAR in the IMU's frame, as on BotanicGarden's robot."""
 
-NOISE = ImuNoise(5.2e-5, 5.9e-4, 2.0e-6, 3.0e-5)
-"""Noise of an Xsens MTi-680G."""
+NOISE = ImuNoise(5.2e-5, 5.9e-4, 2.0e-6, 3.0e-5)  # noise of an Xsens MTi-680G
 
 
 def as_sequence(course: Course, path: Path) -> SequenceConfig:
     """Configuration of the sequence in the bag that was recorded of a course."""
     extrinsic = geometry.invert(T_IMU_LIDAR).tolist()
     imu: Any = {"topic": IMU, "extrinsic": extrinsic, "noise": NOISE._asdict()}
-    imu = None if course.imu is None else imu
-    given: Any = {"imu": imu, "part": course.part, "compensate": course.compensate}
-    return SequenceConfig(bag=str(path), points=POINTS, reference=POSES, **given)
+    return SequenceConfig(
+        bag=str(path),
+        points=POINTS,
+        reference=POSES,
+        imu=None if course.imu is None else imu,
+        part=course.part,
+        compensate=course.compensate,
+    )

@@ -20,8 +20,7 @@ from adaptune.simulation.tiles import TILE, Floats, Scene, Spots, Tile, beyond, 
 
 _KINDS = {"wood": 0.035, "avenue": 0.012, "hedges": 0.014, "clearing": 0.002, "bridge": 0.012}
 """Trees on a square metre of each kind of tile."""
-_BANK, _RIVER = -13.0, -30.0
-"""Offsets of the river's near and far bank."""
+_BANK, _RIVER = -13.0, -30.0  # offsets of the river's near and far bank
 
 
 def _kind(index: int, seed: int) -> str:
@@ -106,7 +105,6 @@ def _hedges(tile: Tile) -> list[Mesh]:
 
 
 def _railings(tile: Tile, middle: float) -> list[Mesh]:
-    """Build the parapets of a bridge and its piers."""
     meshes = []
     for side in (-1.0, 1.0):
         posts = np.arange(middle - 5.0, middle + 5.1, 1.25)
@@ -118,7 +116,6 @@ def _railings(tile: Tile, middle: float) -> list[Mesh]:
 
 
 GARDEN = Scene(
-    summary="paths under dense trees, hedges, slopes, a riverside clearing, bridges",
     build=_garden_build,
     relief=_garden_relief,
     surface=paved((1.6, Material.SOIL), (np.inf, Material.GRASS)),

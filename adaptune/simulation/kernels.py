@@ -63,22 +63,12 @@ class Cast(NamedTuple):
     reflectivity: F32  # of shape (n,)
 
 
-class Receiver(NamedTuple):
-    """A sensor's range in metres, its standard deviation, and the share of echoes lost."""
-
-    nearest: float
-    farthest: float
-    noise: float
-    dropout: float
-
-
 @compiled
 def aim(directions: F32, T_world_sensor: F64, origin: F64) -> F32:
     """Send every ray from its own column's pose: (n_columns * n_rings, 6), origin and direction.
 
-    Directions are unit vectors in the sensor's frame, of shape (n_columns, n_rings, 3); poses are
-    one for each column. Near `origin`, that of the rays' coordinates, single precision is exact
-    enough.
+    Directions, of shape (n_columns, n_rings, 3), are those of `course.directions`. The rays'
+    coordinates count from `origin`: near it, single precision is exact enough.
     """
     columns, rings = directions.shape[:2]
     rays = np.empty((columns * rings, 6), np.float32)
@@ -99,17 +89,15 @@ def aim(directions: F32, T_world_sensor: F64, origin: F64) -> F32:
 def receive(
     directions: F32,
     cast: Cast,
-    sensor: Receiver,
+    sensor: tuple[float, float, float, float],
     chance: F32,
     normal: F32,
 ) -> tuple[F32, F32, NDArray[np.int64]]:
-    """Decide which rays come back, and with what range and intensity.
+    """Points (m, 3), intensities from 0 to 255 (m,) and numbers (m,) of the rays that come back.
 
-    The directions of rays are unit vectors in the sensor's frame, of shape (n, 3); `chance` and
-    `normal` are uniform and normal random numbers, of shape (n,).
-
-    Returns points in the sensor's frame at the time of each ray, of shape (m, 3), intensities from
-    0 to 255, of shape (m,), and which rays came back, of shape (m,).
+    Directions, of shape (n, 3), and points are in the sensor's frame at the time of each ray. Of
+    the `sensor`: least and greatest range in metres, their deviation, and the share of echoes lost.
+    `chance` and `normal` are uniform and normal random numbers, of shape (n,).
     """
     rays, hits, normals, reflectivity = cast
     nearest, farthest, noise, dropout = sensor

@@ -12,10 +12,9 @@ Points = NDArray[np.float64]
 
 
 def fractal(points: Points, wavelength: float, seed: int, octaves: int = 1) -> NDArray[np.float64]:
-    """Sum octaves of smooth noise, each of half the wavelength and amplitude of the one before.
+    """Smooth noise of shape (n,) at points of shape (n, 3): octaves of ever half the amplitude.
 
-    The first octave has its values in -1..1, and `wavelength` metres between lattice points.
-    `points` in metres are of shape (n, 3), the noise of shape (n,).
+    The first one has its values in -1..1, and `wavelength` metres between lattice points.
     """
     from adaptune.simulation import kernels  # compiled, which takes long to import
 
@@ -86,10 +85,9 @@ def merge(meshes: Sequence[Mesh]) -> Mesh:
 
 
 def place(model: Mesh, at: ArrayLike, yaw: ArrayLike = 0.0, scale: ArrayLike = 1.0) -> Mesh:
-    """Put copies of a model, whose origin is on the ground, in the world.
+    """Put copies of a model at points of shape (3,) or (n, 3), turned by one or n yaws in radians.
 
-    `at` is metres, of shape (3,) or (n, 3), `yaw` radians, one or n. There is one `scale`, or n, or
-    it is of shape (n, 3) for an own factor along each axis.
+    There is one `scale`, or n, or it is of shape (n, 3) for an own factor along each axis.
     """
     at = np.atleast_2d(np.asarray(at, np.float64))
     n = len(at)
@@ -112,10 +110,7 @@ def place(model: Mesh, at: ArrayLike, yaw: ArrayLike = 0.0, scale: ArrayLike = 1
 
 
 def grid(vertices: NDArray[np.float64], material: ArrayLike) -> Mesh:
-    """Span a sheet over vertices of shape (rows, columns, 3).
-
-    `material` is one, or one for each column of cells, of shape (columns - 1,).
-    """
+    """Span a sheet over vertices (rows, columns, 3) of one material, or one a column of cells."""
     rows, columns = vertices.shape[:2]
     index = np.arange(rows * columns).reshape(rows, columns)
     a, b, c, d = index[:-1, :-1], index[1:, :-1], index[:-1, 1:], index[1:, 1:]
@@ -180,8 +175,7 @@ def foliage(centres: NDArray[np.float64], radii: ArrayLike, leaf: float, seed: i
     return mesh(vertices.reshape(-1, 3), np.arange(3 * n), Material.LEAVES)
 
 
-VARIANTS = 4
-"""How many different trees, bushes and boulders there are."""
+VARIANTS = 4  # how many different trees, bushes and boulders there are
 
 
 def variants(model: Callable[[int], Mesh]) -> list[Mesh]:

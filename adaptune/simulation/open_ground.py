@@ -44,7 +44,6 @@ def _open_ground_build(tile: Tile) -> list[Mesh]:
 
 
 OPEN = Scene(
-    summary="open ground with sparse boulders and bushes, far hills and trees",
     build=_open_ground_build,
     relief=_open_ground_relief,
     surface=paved((np.inf, Material.SOIL)),

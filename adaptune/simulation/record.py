@@ -24,6 +24,7 @@ from adaptune.simulation.course import (
     NOISE,
     POINTS,
     POSES,
+    SCENES,
     SENSORS,
     T_IMU_LIDAR,
     Course,
@@ -31,24 +32,19 @@ from adaptune.simulation.course import (
     directions,
 )
 from adaptune.simulation.mesh import REFLECTIVITY, Mesh
-from adaptune.simulation.scenes import SCENES
 from adaptune.simulation.tiles import TILE
 from adaptune.simulation.world import Ride, Road, World
 from adaptune.trajectory import Trajectory, write_tum
 
-EPOCH = 1_600_000_000_000_000_000
-"""Nanoseconds at which every recording starts."""
+EPOCH = 1_600_000_000_000_000_000  # nanoseconds at which every recording starts
 
-_DETOUR = 1.2
-"""Metres of road in a metre of sight, where it winds."""
+_DETOUR = 1.2  # metres of road in a metre of sight, where it winds
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SimulatedScan(Scan):
-    """A scan with intensities, rings and its true pose."""
+    """A scan with its true pose; intensities are from 0 to 255."""
 
-    intensities: NDArray[np.float32]  # from 0 to 255
-    rings: NDArray[np.uint16]
     T_world_sensor: Poses  # at the scan's stamp, of shape (4, 4)
 
 
@@ -78,11 +74,12 @@ class Drive:
         """Scan the world from one end of the drive to the other."""
         course, sensor = self.course, SENSORS[self.course.sensor]
         columns = course.columns or sensor.columns
-        rings = np.tile(np.arange(sensor.rings, dtype=np.uint16), columns)
-        offsets = np.arange(columns) / (columns * course.turns)
-        times = np.repeat(offsets, sensor.rings).astype(np.float32)
         looks = directions(course.sensor, columns)
-        receiver = kernels.Receiver(*sensor.range, sensor.noise, sensor.dropout)
+        n_rings = looks.shape[1]
+        rings = np.tile(np.arange(n_rings, dtype=np.uint16), columns)
+        offsets = np.arange(columns) / (columns * course.turns)
+        times = np.repeat(offsets, n_rings).astype(np.float32)
+        receiver = (*sensor.range, sensor.noise, sensor.dropout)
         caster = _Caster(self, sensor.range[1])
         for number, stamp in enumerate(self.stamps()[:-1].tolist()):
             start = (stamp - EPOCH) * 1e-9
@@ -147,15 +144,10 @@ def simulate(course: Course) -> Iterator[SimulatedScan]:
     return Drive(course).scans()
 
 
-GRAVITY = 9.80665
-"""m/s^2, downwards along the world's z axis."""
-
+GRAVITY = 9.80665  # m/s^2, downwards along the world's z axis
 
 Inertial = tuple[NDArray[np.float64], NDArray[np.float64]]
-"""Angular velocities (rad/s) and specific forces (m/s^2) in the IMU's frame, of shape (n, 3).
-
-The specific force points up at rest.
-"""
+"""Angular velocities (rad/s) and specific forces (m/s^2, up at rest) in the IMU's frame, (n, 3)."""
 
 
 def ideal(ride: Ride, times: NDArray[np.float64]) -> Inertial:
@@ -173,10 +165,7 @@ def ideal(ride: Ride, times: NDArray[np.float64]) -> Inertial:
 
 
 def measure(ride: Ride, times: NDArray[np.float64], rate: float, seed: int) -> Inertial:
-    """Measure with biases that wander, and white noise, at times that are `rate` a second.
-
-    `seed` is that of the errors; see `ideal`.
-    """
+    """Measure as `ideal`, `rate` times a second, with wandering biases and white noise."""
     rng = np.random.default_rng([seed, 5])
     gyro, accel = ideal(ride, times)
 

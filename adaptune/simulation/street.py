@@ -131,7 +131,6 @@ def _kerbside(tile: Tile, side: float, turn: float, crossing: bool) -> list[Mesh
 
 
 STREET = Scene(
-    summary="house fronts with gaps, lamps, parked cars, trees and crossings",
     build=_street_build,
     relief=_street_relief,
     surface=paved((_KERB, Material.ASPHALT), (np.inf, Material.PAVING)),

@@ -2,56 +2,41 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from adaptune.simulation.mesh import Material, Mesh, grid, merge, place
 
+if TYPE_CHECKING:
+    from adaptune.simulation.world import Road
+
 Floats = NDArray[np.float64]
 
-TILE = 20.0
-"""Metres of road in a tile; tiles begin at multiples of it."""
+TILE = 20.0  # metres of road in a tile; tiles begin at multiples of it
 
 
 @dataclass(frozen=True, eq=False)
 class Spots:
     """Places on the ground, as arrays of one shape."""
 
-    # In the world.
-    x: Floats
+    x: Floats  # in the world
     y: Floats
-    # Station along the road and offset to its left.
-    s: Floats
-    d: Floats
-
-
-class Line(Protocol):
-    """What scenes need of a road, see `adaptune.simulation.world.Road`."""
-
-    def heading(self, s: Floats) -> Floats:
-        """Radians from the x axis at each station."""
-
-    def plane(self, s: Floats, d: Floats) -> tuple[Floats, Floats]:
-        """Coordinates x and y of a station and an offset."""
-
-    def ground(self, x: Floats, y: Floats) -> Floats:
-        """Height of the ground."""
+    s: Floats  # station along the road
+    d: Floats  # offset to its left
 
 
 @dataclass(frozen=True)
 class Tile:
     """A piece of a scene: up to twenty metres of road and its surroundings."""
 
-    road: Line
+    road: "Road"
     index: int  # its number along the road: it begins at station ``index * TILE``
-    # Stations of its ends, in metres; a leg may begin or end within it.
-    start: float
+    start: float  # station of its beginning, in metres; a leg may begin or end within it
     stop: float
-    # Whether it is the leg's first or last tile with another scene next to it.
-    opens: bool
-    closes: bool
+    opens: bool  # whether it is the leg's first tile, after another scene
+    closes: bool  # whether it is the last one, before another scene
     rng: np.random.Generator = field(compare=False)  # its own random numbers
     seed: int  # seed of the whole world, for shapes that continue from tile to tile
 
@@ -83,10 +68,10 @@ class Tile:
     def scatter(
         self, density: float, near: float, far: float, margin: float = 0.0
     ) -> tuple[Floats, Floats]:
-        """Stations and offsets of objects strewn on both sides of the road.
+        """Stations and offsets of objects strewn beside the road, `density` on a square metre.
 
-        `density` is their mean number on a square metre, `near` and `far` bound their distance from
-        the road's middle, and `margin` is kept free at the ends where another scene begins.
+        `near` and `far` bound their distance from the road's middle. `margin` is kept free at the
+        ends where another scene begins.
         """
         start = self.start + margin * self.opens
         # The last tile of a leg may be shorter than the margin.
@@ -101,19 +86,15 @@ class Tile:
 class Scene:
     """A kind of place."""
 
-    summary: str  # what it is, in a line
     build: Callable[[Tile], list[Mesh]]  # makes what stands on the ground of a tile
-    # Height of the ground above the road's line at some spots, for a seed.
-    relief: Callable[[Spots, int], Floats]
+    relief: Callable[[Spots, int], Floats]  # height of the ground above the road, for a seed
     surface: Callable[[Floats], NDArray[np.uint8]]  # material of the ground at an offset
-    # Radians by which the road swings to and fro, and metres from one side to the other.
-    winding: float
-    bend: float
+    winding: float  # radians by which the road swings to and fro
+    bend: float  # metres from one side to the other
     slope: float  # greatest rise of the road, as a ratio
     shake: float  # how rough the ride is; 1 is a paved road
     pace: float = 1.0  # share of its usual speed at which a vehicle goes
-    # Whether it winds from its mouth on, however long the bends before it are.
-    winds_at_once: bool = False
+    winds_at_once: bool = False  # from its mouth on, however long the bends before it are
 
 
 def paved(*bands: tuple[float, Material]) -> Callable[[Floats], NDArray[np.uint8]]:

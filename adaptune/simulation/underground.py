@@ -27,7 +27,6 @@ def _cave_relief(spots: Spots, seed: int) -> Floats:
 
 
 def _chambers(s: Floats, angle: Floats, seed: int) -> Floats:
-    """Depth of the side chambers in metres."""
     depth = np.zeros(np.broadcast_shapes(s.shape, angle.shape))
     for number in np.unique(np.floor(s / _CHAMBERS)).astype(int).tolist():
         for n in (number - 1, number, number + 1):
@@ -88,7 +87,6 @@ def _cave_build(tile: Tile) -> list[Mesh]:
 
 
 def _face(tile: Tile, end: float, angle: Floats, section: _Section) -> Mesh:
-    """Build the rock face around the mouth of a tunnel."""
     d, z = section(np.full((1, 1), end), angle, tile.seed)
     foot = tile.at(np.full(1, end), np.zeros(1))[0, 2]
     growth = np.linspace(0.0, 1.0, 14)[:, None]
@@ -133,7 +131,6 @@ def _columns(tile: Tile, cone: Mesh) -> list[Mesh]:
 
 
 CAVE = Scene(
-    summary="winding, rough tunnel with narrows, side chambers and dripstones",
     build=_cave_build,
     relief=_cave_relief,
     surface=paved((np.inf, Material.ROCK)),
@@ -146,7 +143,6 @@ CAVE = Scene(
 
 
 def _gallery(s: Floats, angle: Floats, seed: int) -> tuple[Floats, Floats]:
-    """Offset and height of the rock at stations and angles from the left, over the top."""
     along = np.stack([s.ravel(), np.zeros(s.size), np.zeros(s.size)], axis=1)
     half = 2.5 + 0.5 * fractal(along, 11.0, seed + 41).reshape(s.shape)
     roof = 2.3 + 0.4 * fractal(along, 9.0, seed + 42).reshape(s.shape)
@@ -163,7 +159,6 @@ def _mine_build(tile: Tile) -> list[Mesh]:
 
 
 MINE = Scene(
-    summary="narrow gallery that bends every few metres, with uneven walls",
     build=_mine_build,
     relief=_cave_relief,
     surface=paved((np.inf, Material.ROCK)),

@@ -13,12 +13,9 @@ from adaptune.simulation.course import Motion
 from adaptune.simulation.mesh import Mesh, grid, merge
 from adaptune.simulation.tiles import TILE, Scene, Spots, Tile, smooth
 
-APRON = 40.0
-"""Metres of world before the start and after the end of the drive."""
-
-BLEND = 4.0
+APRON = 40.0  # metres of world before the start and after the end of the drive
+_BLEND = 4.0
 """Metres on either side of a border over which the ground of one scene turns into the next's."""
-
 _STEP = 0.25
 
 Floats = NDArray[np.float64]
@@ -38,10 +35,7 @@ class Road:
 
     Stations are metres along the line, 0 where the drive starts; offsets are metres to its left.
     It stays within 70 degrees of the x axis and so never meets itself: each x belongs to one
-    station. Each scene comes with the metres driven in it; the seed is that of bends and slopes.
-
-    Its `legs` are the scenes along it; neighbours of one kind are one leg. The drive's `length` is
-    in metres.
+    station. Each scene comes with the metres driven in it; neighbours of one kind are one leg.
     """
 
     def __init__(self, scenes: Sequence[tuple[Scene, float]], seed: int) -> None:
@@ -67,10 +61,6 @@ class Road:
         """Radians from the x axis at each station."""
         return np.asarray(np.interp(s, self._stations, self._heading), np.float64)
 
-    def height(self, s: Floats) -> Floats:
-        """Metres above the start at each station."""
-        return np.asarray(np.interp(s, self._stations, self._z), np.float64)
-
     def plane(self, s: Floats, d: Floats) -> tuple[Floats, Floats]:
         """Coordinates x and y of a station and an offset."""
         heading = self.heading(s)
@@ -87,8 +77,8 @@ class Road:
         shares = []
         for leg in self.legs:
             first, last = leg is self.legs[0], leg is self.legs[-1]
-            rise = np.ones_like(s) if first else smooth((s - leg.start) / (2 * BLEND) + 0.5)
-            fall = np.ones_like(s) if last else smooth((leg.stop - s) / (2 * BLEND) + 0.5)
+            rise = np.ones_like(s) if first else smooth((s - leg.start) / (2 * _BLEND) + 0.5)
+            fall = np.ones_like(s) if last else smooth((leg.stop - s) / (2 * _BLEND) + 0.5)
             shares.append((leg, rise * fall))
         return shares
 
@@ -97,7 +87,7 @@ class Road:
         s = self.station(x)
         d = (y - np.interp(s, self._stations, self._y)) * np.cos(self.heading(s))
         spots = Spots(x, y, s, d)
-        z = self.height(s)
+        z = np.asarray(np.interp(s, self._stations, self._z), np.float64)
         for leg, share in self.shares(s):
             if share.any():
                 z = z + share * leg.scene.relief(spots, self.seed)
@@ -138,11 +128,8 @@ def _bends(
     return np.asarray(PchipInterpolator(nodes, values)(stations), np.float64)
 
 
-_CELL = 0.7
-"""Metres between vertices of the ground near the road."""
-
-_GROUND = 115.0
-"""Metres of ground on either side of the road."""
+_CELL = 0.7  # metres between vertices of the ground near the road
+_GROUND = 115.0  # metres of ground on either side of the road
 
 
 def _offsets() -> NDArray[np.float64]:
@@ -154,15 +141,14 @@ def _offsets() -> NDArray[np.float64]:
 
 
 class World:
-    """All static objects along a road that rays can hit.
+    """All static objects along a road that rays can hit; only tiles in reach are kept.
 
-    Every tile has its own random numbers and is always built the same. Only tiles in reach are
-    kept: `tiles` holds their meshes by index.
+    Every tile has its own random numbers and is always built the same.
     """
 
     def __init__(self, road: Road) -> None:
         self._road = road
-        self.tiles: dict[int, Mesh] = {}
+        self._tiles: dict[int, Mesh] = {}
         self._last = int(np.floor((road.length + APRON) / TILE))
 
     def around(self, station: float, reach: float) -> Mesh:
@@ -170,11 +156,10 @@ class World:
         first = max(int(np.floor((station - reach) / TILE)), int(-APRON // TILE))
         last = min(int(np.floor((station + reach) / TILE)), self._last)
         wanted = range(first, last + 1)
-        self.tiles = {i: self.tiles[i] if i in self.tiles else self.tile(i) for i in wanted}
-        return merge(list(self.tiles.values()))
+        self._tiles = {i: self._tiles[i] if i in self._tiles else self._tile(i) for i in wanted}
+        return merge(list(self._tiles.values()))
 
-    def tile(self, index: int) -> Mesh:
-        """Build the tile that begins at station ``index * TILE``."""
+    def _tile(self, index: int) -> Mesh:
         road = self._road
         start, stop = index * TILE, (index + 1) * TILE
         meshes = [self._ground(start, stop)]
@@ -217,20 +202,15 @@ class World:
 
 _KNOTS = 50.0
 """Knots of the trajectory's spline in a second; nothing in it moves faster than a tenth of it."""
-
-
-_START = 2.0
-"""Seconds in which a vehicle that stood reaches its speed."""
+_START = 2.0  # seconds in which a vehicle that stood reaches its speed
 
 
 class Ride:
     """The sensor's trajectory in continuous time, with its derivatives.
 
     One spline of fifth order through positions and roll, pitch and yaw contains the ground, the
-    vehicle and its shake. Poses, velocities and accelerations thus match exactly. The seed is that
-    of its straying, its speed and its shake. It stands for some seconds first.
-
-    Its `duration` is seconds until the end of the road's drive.
+    vehicle and its shake, so that poses, velocities and accelerations match exactly. It stands for
+    some seconds first; `duration` is seconds until the end of the road's drive.
     """
 
     def __init__(self, road: Road, motion: Motion, seed: int, standstill: float = 0.0) -> None:
@@ -255,9 +235,7 @@ class Ride:
         along = gaussian_filter1d(along, 0.15 * _KNOTS, mode="reflect")
         values = np.stack([np.interp(along, s, column) for column in lane.T], axis=1)
         values = gaussian_filter1d(values, 0.1 * _KNOTS, axis=0, mode="nearest")
-        roughness = np.zeros_like(along)
-        for leg, share in road.shares(along):
-            roughness += share * leg.scene.shake
+        roughness = sum(share * leg.scene.shake for leg, share in road.shares(along))
         shake = _shake(motion, knots, rng) * (roughness * moves)[:, None]
         # The mount shakes about its own axes; yaw turns what shakes along and across.
         yaw = values[:, 5]
@@ -315,9 +293,7 @@ def _schedule(
     """Seconds at each station, within the vehicle's speed, acceleration and turning."""
     swing = gaussian_filter1d(rng.normal(size=len(s)), 12.0 / _STEP, mode="nearest")
     swing *= 0.1 / max(float(swing.std()), 1e-9)
-    pace = np.zeros_like(s)
-    for leg, share in road.shares(s):
-        pace += share * leg.scene.pace
+    pace = sum(share * leg.scene.pace for leg, share in road.shares(s))
     curvature = np.abs(np.gradient(gaussian_filter1d(lane[:, 5], 1.0 / _STEP), s))
     bends = np.sqrt(motion.turning / np.maximum(curvature, 1e-6))
     speed = np.minimum(motion.speed * pace * np.clip(1.0 + swing, 0.7, 1.3), bends)
@@ -364,7 +340,6 @@ def _angular_velocity(angles: Floats, rates: Floats) -> Floats:
 
 
 def _angular_acceleration(angles: Floats, rates: Floats, second: Floats) -> Floats:
-    """Differentiate `_angular_velocity`."""
     (sr, sp), (cr, cp) = np.sin(angles[:, :2]).T, np.cos(angles[:, :2]).T
     d_roll, d_pitch, d_yaw = rates.T
     dd_roll, dd_pitch, dd_yaw = second.T

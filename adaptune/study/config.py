@@ -9,8 +9,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 from adaptune.errors import Finding, nearest
 from adaptune.odometry.health import HealthCheck
 from adaptune.odometry.remote import Limits
-from adaptune.recording.config import SequenceConfig, Transform
-from adaptune.recording.parts import Fractions, part_name, read_part
+from adaptune.recording.config import Fractions, SequenceConfig, Transform, part_name, read_part
 from adaptune.ros.steering import SetCommand
 from adaptune.simulation.course import Course
 from adaptune.space import ParameterSpace

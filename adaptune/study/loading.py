@@ -21,7 +21,7 @@ from adaptune.odometry.registry import (
 )
 from adaptune.recording import cache
 from adaptune.recording.config import SequenceConfig
-from adaptune.recording.recording import RecordedSequence, check_sequence
+from adaptune.recording.recording import RecordedSequence
 from adaptune.space import Categorical, Float, Integer, ParameterSpace, PooledSpace
 from adaptune.strict import ConfigurationError, validated
 from adaptune.study.config import ROLES, OdometryConfig, OnlineConfig, StudyConfig, settle_roles
@@ -328,6 +328,8 @@ def _check_recordings(
     for name, entry in sequences.items():
         if (config := validated(SequenceConfig, entry, (), [], context)) is not None:
             try:
-                opened[name] = check_sequence(config)
+                recorded = RecordedSequence(config)
+                recorded.check()
+                opened[name] = recorded
             except AdaptuneError as error:
                 yield Finding(("sequences", name), str(error))

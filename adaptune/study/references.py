@@ -13,8 +13,7 @@ from adaptune.errors import Finding
 from adaptune.geometry import Poses, to_pose
 from adaptune.machine import pin
 from adaptune.recording.cache import fingerprints
-from adaptune.recording.config import SequenceConfig
-from adaptune.recording.parts import Fractions
+from adaptune.recording.config import Fractions, SequenceConfig
 from adaptune.recording.recording import RecordedSequence, wants_estimate
 from adaptune.reference import estimate
 from adaptune.reference.diagnosis import SUSPICIOUS, contradictions

@@ -10,10 +10,8 @@ from typing import Any
 from adaptune.manifest import merged
 from adaptune.odometry.program import ProgramInput, program_input
 from adaptune.recording.cache import fingerprints
-from adaptune.recording.changed import with_imu
-from adaptune.recording.config import REFERENCE_FILES, SOURCES, SequenceConfig
+from adaptune.recording.config import REFERENCE_FILES, SOURCES, SequenceConfig, part_name
 from adaptune.recording.export import Layout
-from adaptune.recording.parts import part_name
 from adaptune.recording.recording import (
     SequenceFiles,
     open_sequence,
@@ -115,8 +113,7 @@ class StudySequences:
         been recorded.
         """
         self._check_recorded(name)
-        sequence = open_sequence(self.config(name))
-        return with_imu(sequence) if self.with_imu else sequence
+        return open_sequence(self.config(name), self.with_imu)
 
     def _check_recorded(self, name: str) -> None:
         if name in self.courses and not self.recording(name).exists():

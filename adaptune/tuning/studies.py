@@ -94,8 +94,7 @@ def proposed(found: "Inspection", deep: bool, show: Progress) -> tuple[float | N
         return None, USUAL_LENGTH, ""
     from adaptune.recording.recording import open_sequence
     from adaptune.reference import check
-    from adaptune.reference.diagnosis import diagnose_reference
-    from adaptune.reference.motions import measured_motions
+    from adaptune.reference.diagnosis import diagnose_reference, measured_motions
 
     share = share_of(found.reference)
     usual = check.proposed_sub_trajectory(found.reference, training=share)

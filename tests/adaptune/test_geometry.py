@@ -7,7 +7,6 @@ from scipy.spatial.transform import Rotation
 
 from adaptune.geometry import (
     from_quaternions,
-    interpolate,
     invert,
     mean_motion,
     rectify,
@@ -15,6 +14,7 @@ from adaptune.geometry import (
     scale,
     to_quaternions,
 )
+from adaptune.trajectory import Trajectory
 
 modest = settings(max_examples=40, deadline=None)
 seeds = st.integers(0, 2**32 - 1)
@@ -89,7 +89,7 @@ BEGIN = 1_700_000_000_123_456_789
 def test_interpolation_follows_a_screw_free_motion(seed, offset):
     T = random_poses(seed, 2)
     stamps = BEGIN + np.array([0, 5 * 10**8])
-    got = interpolate(stamps, T, stamps[:1] + offset, 10**9)[0]
+    got = Trajectory(stamps, T).at(stamps[:1] + offset)[0]
     share = offset / (5 * 10**8)
     np.testing.assert_allclose(
         got[:3, 3], (1 - share) * T[0, :3, 3] + share * T[1, :3, 3], atol=1e-6
@@ -104,12 +104,12 @@ def test_nothing_is_interpolated_outside_or_in_gaps():
     stamps = np.array([0, 10, 20, 50, 60])
     T = np.array([moved(x=float(s)) for s in stamps])
     at = np.array([-1, 0, 5, 15, 20, 21, 35, 49, 50, 55, 60, 61])
-    x = interpolate(stamps, T, at, max_gap=10)[:, 0, 3]
+    x = Trajectory(stamps, T).at(at, 10e-9)[:, 0, 3]
     nan = np.nan
     np.testing.assert_allclose(x, [nan, 0, 5, 15, 20, nan, nan, nan, 50, 55, 60, nan])
-    x = interpolate(stamps, T, at, max_gap=30)[:, 0, 3]
+    x = Trajectory(stamps, T).at(at, 30e-9)[:, 0, 3]
     np.testing.assert_allclose(x, [nan, 0, 5, 15, 20, 21, 35, 49, 50, 55, 60, nan])
-    x = interpolate(stamps, T, at, max_gap=9)[:, 0, 3]
+    x = Trajectory(stamps, T).at(at, 9e-9)[:, 0, 3]
     np.testing.assert_allclose(x, [nan, 0, nan, nan, 20, nan, nan, nan, 50, nan, 60, nan])
 
 

@@ -7,8 +7,7 @@ from rooms import moved
 
 from adaptune.geometry import invert, rectify, steps
 from adaptune.live.hops import Hop
-from adaptune.reference.consensus import Consensus
-from adaptune.reference.graph import Guess, Pass, pass_over
+from adaptune.reference.graph import Consensus, Guess, Pass, pass_over
 from adaptune.simulation import Course
 from adaptune.simulation.record import simulate
 

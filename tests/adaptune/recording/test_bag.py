@@ -14,8 +14,8 @@ from small_bag import START, cloud, pose, texts
 
 from adaptune.errors import AdaptuneError, MachineError
 from adaptune.recording import SequenceConfig, SequenceError
+from adaptune.recording.bag import IndexReader
 from adaptune.recording.clouds import CLOUDS, LIVOX_TYPES
-from adaptune.recording.indexed_bag import IndexReader
 from adaptune.recording.inspect import inspect
 from adaptune.recording.recording import open_sequence
 

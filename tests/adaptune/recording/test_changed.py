@@ -3,20 +3,16 @@ import pytest
 import rec
 
 from adaptune.recording import Imu, Scan, SequenceConfig, SequenceError
-from adaptune.recording.changed import with_imu
-from adaptune.recording.recording import open_sequence
+from adaptune.recording.recording import carry_imu, open_sequence
 
 
 class Inertial:
     """Scans of 0.1 s, one of them lost, and an IMU of 100 Hz."""
 
-    name, n_messages = "inertial", 4
-
     def __init__(self, begin, end):
         stamps = np.arange(round(begin * 1e9), round(end * 1e9), 10**7)
         zeros = np.zeros((len(stamps), 3))
         self.imu = lambda: Imu(stamps, zeros, zeros) if len(stamps) else None
-        self.reference = None
 
     def __iter__(self):
         points, times = np.zeros((2, 3), np.float32), np.array([0.0, 0.095], np.float32)
@@ -25,7 +21,8 @@ class Inertial:
 
 
 def hundredths(begin, end):
-    measured = [scan.imu for scan in with_imu(Inertial(begin, end))]
+    scans = Inertial(begin, end)
+    measured = [scan.imu for scan in carry_imu(scans, scans.imu(), "inertial")]
     return [(imu.stamps // 10**7).tolist() for imu in measured]
 
 

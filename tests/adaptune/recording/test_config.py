@@ -8,8 +8,8 @@ from adaptune import yaml12
 from adaptune.geometry import to_pose
 from adaptune.odometry.program import program_input
 from adaptune.recording import SequenceConfig
-from adaptune.recording.parts import part_name, read_part
-from adaptune.recording.recording import check_sequence, open_sequence
+from adaptune.recording.config import part_name, read_part
+from adaptune.recording.recording import RecordedSequence, open_sequence
 from adaptune.strict import ConfigurationError
 from adaptune.trajectory import Trajectory, write_tum
 from offline.config import load_study
@@ -84,7 +84,7 @@ def test_what_would_fail_later_is_found_at_once(tmp_path):
             with pytest.raises(ConfigurationError, match=rf"line \d+: sequences\.yard: .*{told}"):
                 load_study(study)
             list(open_sequence(SequenceConfig(bag=str(bag))))
-    check_sequence(SequenceConfig(bag=str(bag), reference="/poses", start=1.5))
+    RecordedSequence(SequenceConfig(bag=str(bag), reference="/poses", start=1.5)).check()
 
 
 @pytest.mark.parametrize(
@@ -122,7 +122,7 @@ def test_the_parts_of_a_bag_are_the_bag(tmp_path):
         assert begin + end == list(range(20))
         assert len(begin) == pytest.approx(12, abs=1)
     assert first.n_messages == pytest.approx(12, abs=1)
-    check_sequence(SequenceConfig(bag=bag, part="0-60%"))
+    RecordedSequence(SequenceConfig(bag=bag, part="0-60%")).check()
     within = open_sequence(SequenceConfig(bag=bag, start=0.5, stop=1.5, part="50-100%"))
     assert tenths(within) == list(range(10, 15))
 

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from adaptune.geometry import from_quaternions, invert, to_quaternions
 from adaptune.live.hops import Hops
 from adaptune.recording.scan import Scan
-from adaptune.reference import diagnosis, motions
+from adaptune.reference import diagnosis
 from adaptune.reference.diagnosis import diagnose_odometry, diagnose_reference
 from adaptune.trajectory import Trajectory
 
@@ -281,13 +281,13 @@ def test_of_slow_scans_some_are_enough(monkeypatch, metres, seconds, used):
         for i, at in enumerate(T)
     ]
     read = []
-    of_neighbours = motions.neighbour_motions
+    of_neighbours = diagnosis.neighbour_motions
     monkeypatch.setattr(
-        motions,
+        diagnosis,
         "neighbour_motions",
         lambda some: of_neighbours(read.append(s.stamp) or s for s in some),
     )
-    found = motions.measured_motions(scans, len(scans))
+    found = diagnosis.measured_motions(scans, len(scans))
     assert len(found.start) >= diagnosis.FEWEST_HOPS
     assert diagnosis.mismatch(T, found).max() < 1.0
     between = np.diff(np.unique(np.array(read))[2:]) / (seconds * 1e9)

@@ -22,10 +22,9 @@ from adaptune.geometry import invert, steps
 from adaptune.metrics import sub_trajectory_rte
 from adaptune.recording.scan import Scan
 from adaptune.reference import estimate
-from adaptune.reference.consensus import HALVES, Consensus
 from adaptune.reference.estimate import estimate_reference, estimated
 from adaptune.reference.estimated import EstimateError
-from adaptune.reference.graph import Guess, pass_over
+from adaptune.reference.graph import HALVES, Consensus, Guess, pass_over
 
 N = 121
 TRUTH = winding(N)

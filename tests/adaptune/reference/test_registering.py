@@ -13,8 +13,16 @@ from adaptune.metrics import sub_trajectory_rte, travelled
 from adaptune.odometry.registry import odometry_class
 from adaptune.recording.scan import Scan
 from adaptune.reference import graph
-from adaptune.reference.consensus import HALVES, POOL, Consensus
-from adaptune.reference.graph import DEPARTURE, LENGTHS, MIN_INLIERS_OFFLINE, SPACING, pass_over
+from adaptune.reference.graph import (
+    DEPARTURE,
+    HALVES,
+    LENGTHS,
+    MIN_INLIERS_OFFLINE,
+    POOL,
+    SPACING,
+    Consensus,
+    pass_over,
+)
 
 N_MEMBERS = 3
 

@@ -3,9 +3,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from adaptune.geometry import invert
-from adaptune.simulation import MOTIONS
+from adaptune.simulation import MOTIONS, SCENES
 from adaptune.simulation.record import GRAVITY, T_IMU_LIDAR, ideal, measure
-from adaptune.simulation.scenes import SCENES
 from adaptune.simulation.world import Ride, Road
 
 RATE = 400

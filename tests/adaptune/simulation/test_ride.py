@@ -2,8 +2,7 @@ import numpy as np
 import pytest
 
 from adaptune.geometry import invert
-from adaptune.simulation import MOTIONS
-from adaptune.simulation.scenes import SCENES
+from adaptune.simulation import MOTIONS, SCENES
 from adaptune.simulation.world import Ride, Road
 
 

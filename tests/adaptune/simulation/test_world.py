@@ -2,8 +2,7 @@ import numpy as np
 import pytest
 
 from adaptune.geometry import from_quaternions
-from adaptune.simulation import kernels
-from adaptune.simulation.scenes import SCENES
+from adaptune.simulation import SCENES, kernels
 from adaptune.simulation.world import APRON, Road
 
 
@@ -43,7 +42,7 @@ def receive(distance, *, cosine=1.0, reflectivity=0.5, dropout=0.0, n=2000, nois
             normals,
             np.full(n, reflectivity, np.float32),
         ),
-        kernels.Receiver(1.0, 100.0, noise, dropout),
+        (1.0, 100.0, noise, dropout),
         rng.random(n, np.float32),
         rng.standard_normal(n, np.float32),
     )
