@@ -191,7 +191,7 @@ def tee(scans: Iterable[Scan], key: str, about: dict[str, Any]) -> Iterator[Scan
         except OSError as error:
             _log.warning(_NOT_KEPT, about.get("name"), error)
         for scan in scans:
-            arrays = (getattr(scan, name, None) for name in ("points", "times", "rings"))
+            arrays = (getattr(scan, name, None) for name in _ARRAYS)
             total += sum(array.nbytes for array in arrays if array is not None)
             if writer is not None and total > cap():
                 _log.warning(_NOT_KEPT, about.get("name"), "larger than the cache may grow")
