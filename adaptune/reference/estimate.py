@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from adaptune.bank.members import LEVER
+from adaptune.errors import import_extra
 from adaptune.geometry import Poses, invert, mean_motion, rectify, rotation_angle, steps
 from adaptune.recording.config import SequenceConfig
 from adaptune.recording.inspect import Inspection
@@ -48,6 +49,7 @@ def estimate_reference(scans: Recording, advance: Advance = lambda *_: None) -> 
     `advance` is called after every scan; the pose graphs take about a twentieth of the time, after
     that. There is an EstimateError if the robot hardly moves, or nothing can be registered.
     """
+    import_extra("reference", "gtsam")
     n = scans.n_messages
     found = pass_over(scans, lambda done: advance(done, round(1.05 * max(n, done))))
     return estimated(scans.name, found, scans)

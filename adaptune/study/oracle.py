@@ -1,5 +1,6 @@
 """What trials on the test sequences found: the best choice in hindsight, not learnt from."""
 
+import logging
 from typing import NamedTuple
 
 import numpy as np
@@ -7,7 +8,8 @@ from numpy.typing import NDArray
 
 from adaptune.archive import Archive
 from adaptune.model import ErrorModel
-from adaptune.study.study import _log
+
+_log = logging.getLogger(__name__)
 
 
 class OracleErrors(NamedTuple):

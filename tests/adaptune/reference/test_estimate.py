@@ -1,3 +1,4 @@
+import sys
 from types import SimpleNamespace
 
 import numpy as np
@@ -18,6 +19,7 @@ from made_passes import (
 )
 from rooms import moved
 
+from adaptune.errors import NotInstalledError, import_extra
 from adaptune.geometry import invert, steps
 from adaptune.metrics import sub_trajectory_rte
 from adaptune.recording.scan import Scan
@@ -34,6 +36,13 @@ SHORT, MIDDLE, LONG = REACHES
 def equal_members():
     motions = np.concatenate([np.eye(4)[None], steps(TRUTH)])
     return np.repeat(motions[:, None], Consensus.n_members, axis=1)
+
+
+def test_without_gtsam_it_says_at_once_what_to_install(monkeypatch):
+    import_extra.cache_clear()
+    monkeypatch.setitem(sys.modules, "gtsam", None)
+    with pytest.raises(NotInstalledError, match=r"run `pip install 'adaptune\[reference\]'`"):
+        estimate_reference(None)
 
 
 class Recorded(list):
