@@ -20,9 +20,8 @@ from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses, invert, mean_motion
 from adaptune.machine import other_core
 from adaptune.odometry import wire
-from adaptune.odometry.base import InProcess, OdometryInstance, Usage
+from adaptune.odometry.base import InProcess, OdometryInstance, PreparedScan, Usage
 from adaptune.odometry.factory import Factory, OdometryFactory
-from adaptune.odometry.prepared import PreparedScan
 from adaptune.odometry.registry import make_here, odometry_class
 from adaptune.odometry.remote import Isolated
 from adaptune.recording.scan import Scan
@@ -220,10 +219,7 @@ def _keep(held: OrderedDict[int, Any], number: int, what: Any) -> None:
 
 # What runs in the other process.
 
-
-def load(name: str) -> None:
-    """Import the odometry."""
-    odometry_class(name)
+load = odometry_class
 
 
 def members(_: str) -> processes.Answer:

@@ -1,8 +1,11 @@
 """What every odometry offers, and the base class of adapters."""
 
+import logging
+import sys
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Hashable, Iterable, Mapping, Sequence
+from dataclasses import fields, is_dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, NamedTuple, Self
@@ -20,6 +23,14 @@ from adaptune.strict import StrictModel
 
 MIN_POINTS = 20
 """An adapter does not register scans with fewer points in range."""
+MOST_FAULTS = 10
+"""An instance with so many faults does not start again: the rest of its sequence is lost."""
+MAX_SHARE_WITHOUT_POSE = 0.1
+"""Share of the scans from which an odometry that gives no pose for them has failed."""
+_TOLERANCE = 1e-3
+"""By how much a rotation times its transpose may differ from the identity."""
+
+_log = logging.getLogger(__name__)
 
 
 class BaseSettings(StrictModel):
@@ -67,6 +78,11 @@ class Registration(NamedTuple):
     registered: bool = True  # False if the scan was too poor: the last motion then goes on
 
 
+LOST = Registration(np.full((4, 4), np.nan), registered=False)
+"""What an odometry gives where there is no pose."""
+LOST.T_odom_sensor.setflags(write=False)
+
+
 class Usage(NamedTuple):
     """What an odometry has used so far."""
 
@@ -80,7 +96,7 @@ class Usage(NamedTuple):
         """What all together have used."""
         every = list(usages)
         known = [usage.memory for usage in every if usage.memory is not None]
-        cpu, other = sum(one.cpu for one in every), sum(one.other_cpu for one in every)
+        cpu, other = sum(u.cpu for u in every), sum(u.other_cpu for u in every)
         return cls(cpu, sum(known) if known else None, other_cpu=other)
 
 
@@ -418,3 +434,76 @@ class InProcess(OdometryInstance):
 
     def apply(self, selection: Selection) -> None:
         self.odometry.configure(selection.parameters)
+
+
+class Faulting(OdometryInstance):
+    """An instance that may go wrong, and notes it."""
+
+    faults: Sequence[str] = ()
+
+    def __init__(self, name: str, parameters: ParameterSet):
+        self.name = name
+        self.parameters = dict(parameters)
+
+    @property
+    def given_up(self) -> bool:
+        return len(self.faults) >= MOST_FAULTS
+
+    def note_fault(self, what: str) -> Registration:
+        """Note a fault and end; the pose of a scan with a fault."""
+        self.close()
+        if what not in self.faults:
+            _log.warning("%s with %s: %s", self.name, self.parameters, what)
+        self.faults = [*self.faults, what]
+        if self.given_up:
+            _log.warning("%s: fault number %d, it does not start again", self.name, MOST_FAULTS)
+        return LOST
+
+
+def pose_fault(T_odom_sensor: Poses) -> str | None:
+    """What is wrong with a pose, if anything."""
+    if T_odom_sensor.shape != (4, 4):
+        return f"of shape {T_odom_sensor.shape}"
+    if not np.isfinite(T_odom_sensor).all():
+        return "that is not finite"
+    R = T_odom_sensor[:3, :3]
+    if np.abs(R @ R.T - np.eye(3)).max() > _TOLERANCE or np.linalg.det(R) < 0:
+        return "that is not rigid"
+    return None
+
+
+class PreparedScan:
+    """A scan that is prepared for several instances, once for all with the same preparation.
+
+    `first` is shared by the scans: the first instance with each preparation, which prepares for all
+    of them. They share what it learned from the first scan's layout.
+    """
+
+    def __init__(self, scan: Scan, first: dict[Hashable, Any]):
+        self.scan, self._first = scan, first
+        self.stamp = scan.stamp
+        self._prepared: dict[Hashable, Any] = {}
+
+    def by(self, instance: OdometryInstance) -> Any:
+        """The scan as an instance takes it; it is prepared where nobody has asked before."""
+        if (key := instance.preparation) not in self._prepared:
+            first = self._first.setdefault(key, instance)
+            self._prepared[key] = first.prepare(self.scan)
+        return self._prepared[key]
+
+
+def prepared_bytes(prepared: Any) -> int:
+    """Memory that a prepared scan takes, roughly, in bytes.
+
+    That of a compiled object, such as a cloud with its tree, is not known: it counts a megabyte.
+    """
+    if (size := getattr(prepared, "nbytes", None)) is not None:
+        return int(size)
+    if is_dataclass(prepared):
+        prepared = [getattr(prepared, each.name) for each in fields(prepared)]
+    if isinstance(prepared, Mapping):
+        prepared = [*prepared.values()]
+    if isinstance(prepared, tuple | list):
+        return sum(map(prepared_bytes, prepared))
+    plain = prepared is None or isinstance(prepared, int | float | str | bytes)
+    return sys.getsizeof(prepared) if plain else 1_000_000

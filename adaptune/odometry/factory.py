@@ -12,8 +12,15 @@ from adaptune.space import ParameterSet, ParameterSpace, PooledSpace
 
 if TYPE_CHECKING:
     from adaptune.odometry.program import ProgramInput
-from adaptune.odometry.content import Content, odometry_content
-from adaptune.odometry.registry import CONTAINERS, PROGRAMS, declare, is_user_class, odometry_class
+from adaptune.odometry.registry import (
+    CONTAINERS,
+    PROGRAMS,
+    Content,
+    declare,
+    is_user_class,
+    odometry_class,
+    odometry_content,
+)
 
 
 @dataclass(frozen=True)
