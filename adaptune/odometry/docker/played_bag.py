@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
 
 from adaptune.errors import AdaptuneError, OdometryError
-from adaptune.odometry.docker.folders import kept_log
+from adaptune.odometry.docker.engine import kept_log
 from adaptune.odometry.docker.poses import PoseReader
 from adaptune.odometry.docker.ros_system import QUIET, RosSystem, filled
 from adaptune.odometry.program import ProgramInput, WholeRun, when_known

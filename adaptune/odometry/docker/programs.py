@@ -18,10 +18,13 @@ from adaptune.odometry.docker.engine import (
     Container,
     ContainerSettings,
     Mount,
+    copy_regular,
     default_user,
     image_digest,
+    kept_log,
+    make_shared,
+    remove_shared,
 )
-from adaptune.odometry.docker.folders import copy_regular, kept_log, make_shared, remove_shared
 from adaptune.odometry.program import (
     FileRun,
     FileSettings,

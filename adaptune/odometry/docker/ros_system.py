@@ -20,8 +20,16 @@ from pydantic import AfterValidator, Field, model_validator
 from adaptune import processes
 from adaptune.errors import OdometryError
 from adaptune.odometry.base import Usage
-from adaptune.odometry.docker.engine import Container, ContainerSettings, default_user, image_digest
-from adaptune.odometry.docker.folders import copy_regular, make_shared, opened, regular_files
+from adaptune.odometry.docker.engine import (
+    Container,
+    ContainerSettings,
+    copy_regular,
+    default_user,
+    image_digest,
+    make_shared,
+    opened,
+    regular_files,
+)
 from adaptune.odometry.docker.poses import PoseReader
 from adaptune.odometry.program import ProgramInput, WholeSettings
 from adaptune.odometry.template import Template
