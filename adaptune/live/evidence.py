@@ -20,14 +20,7 @@ from adaptune.live.hops import (
     live_squares,
     register,
 )
-from adaptune.live.own_error import (
-    CONTRADICTED,
-    FAMILIAR,
-    OWN_SECONDS,
-    Link,
-    OwnError,
-    OwnErrors,
-)
+from adaptune.live.own_error import CONTRADICTED, FAMILIAR, OWN_SECONDS, Link, OwnError, OwnErrors
 from adaptune.odometry.base import Motions
 from adaptune.recording.scan import Scan
 from adaptune.space import Selection
@@ -111,15 +104,21 @@ class LiveEvidence:
         self._newest: _Anchor | None = None
         self._short = self._since = self._n_starts = 0
         self._restarted = 0  # stamp of the scan of the last restart
-        self._begin()
+        self.forget()
 
-    def _begin(self) -> None:
-        """Forget all hops, and where they could start."""
-        n = 1 + len(self.members)
-        self._hops = HopErrors(np.empty((0, n, 3)), np.empty(0), np.empty(0), np.empty(0))
+    def forget(self) -> None:
+        """Forget the hops so far, for the odometry has got another set.
+
+        The next one begins at the newest scan.
+        """
+        self._forget_errors()
         self._own = OwnErrors(self._length)
         self._anchors: deque[_Anchor] = deque()
         self._measured = -np.inf
+
+    def _forget_errors(self) -> None:
+        n = 1 + len(self.members)
+        self._hops = HopErrors(np.empty((0, n, 3)), np.empty(0), np.empty(0), np.empty(0))
         # Hops in a row that were rejected, and by which each was wrong.
         self._rejected, self._wrong = 0, np.zeros(n, np.intp)
 
@@ -169,7 +168,9 @@ class LiveEvidence:
         restarted = self._newest is not None and motions.starts > self._n_starts
         self._n_starts = motions.starts
         if restarted:
-            self._restart(before)
+            # What a member did before says nothing of it now, but the drive has the jump.
+            self._forget_errors()
+            self._restarted = before
         # The first scan is where the odometry starts, whatever motion it was given.
         if self._newest is None:
             T[:] = np.eye(4)
@@ -183,26 +184,13 @@ class LiveEvidence:
         if self._newest is not None and finite[0] and not restarted:
             # This, not the motion before it, is how the sensor moved while it took the last scan.
             self._newest.cloud.moved(T[0], seconds)
-        self._newest = _Anchor(
-            before,
-            self._metres,
-            HopCloud(scan, T[0], 0.0 if restarted else seconds),
-            self._T_odom_sensor,
-            self._no_pose,
-        )
+        cloud = HopCloud(scan, T[0], 0.0 if restarted else seconds)
+        self._newest = _Anchor(before, self._metres, cloud, self._T_odom_sensor, self._no_pose)
         if not self._anchors or self._metres - self._anchors[-1].metres >= SPACING:
             self._anchors.append(self._newest)
             # Before the start of the longest hop, one more is kept, to confirm it.
             while len(self._anchors) > 2 and self._metres - self._anchors[2].metres >= LENGTHS[0]:
                 self._anchors.popleft()
-
-    def _restart(self, stamp: int) -> None:
-        """Take note that the odometry, or all members of a bank, have begun anew at a scan."""
-        own, anchors, measured = self._own, self._anchors, self._measured
-        self._begin()
-        # What a member did before says nothing of it now, but the drive has the jump.
-        self._own, self._anchors, self._measured = own, anchors, measured
-        self._restarted = stamp
 
     def measure(self) -> Measured | None:
         """Register the newest scan whose motion is known to one some metres before.
@@ -221,15 +209,15 @@ class LiveEvidence:
         self._measured, self._since = end.metres, 0
         if end is not self._anchors[-1]:
             self._anchors.append(end)
-        found = self._register(starts, end)
+        measured = self._register(starts, end)
         # On an open plain only height can be told; that is no loss of track.
-        if found is not None and np.trace(found.hop.projection) < _MIN_DIRECTIONS:
+        if measured is not None and np.trace(measured.hop.projection) < _MIN_DIRECTIONS:
             return None
-        if found is None or not self._is_confirmed(found):
+        if measured is None or not self._is_confirmed(measured):
             self._rejected += starts[-1].stamp >= self._restarted
             return None
-        self._take(found)
-        return found
+        self._take(measured)
+        return measured
 
     def _starts(self, end: _Anchor) -> list[_Anchor]:
         """Where a hop may start, in the order in which that is tried."""
@@ -271,54 +259,47 @@ class LiveEvidence:
                 tried.append(T)
         return tried
 
-    def _is_confirmed(self, found: Measured) -> bool:
+    def _is_confirmed(self, measured: Measured) -> bool:
         """Whether a hop agrees with the odometry, or a hop from another scan agrees with it."""
-        wrong, end = found.errors()[0], found.end
+        wrong, end = measured.errors()[0], measured.end
         if np.linalg.norm(wrong) <= DOUBTFUL:
             return True
-        at = self._anchors.index(found.start)
+        at = self._anchors.index(measured.start)
         # The scan before, so that it spans the same way; at the begin of a drive the scan after.
         other = self._anchors[at - 1 if at else 1]
         if other.stamp >= end.stamp:
             return False
         guess = invert(other.T_odom_sensor[0]) @ end.T_odom_sensor[0]
-        if not found.by_odometry:
-            between = invert(other.T_odom_sensor[0]) @ found.start.T_odom_sensor[0]
-            guess = between @ found.hop.T_start_end
+        if not measured.by_odometry:
+            between = invert(other.T_odom_sensor[0]) @ measured.start.T_odom_sensor[0]
+            guess = between @ measured.hop.T_start_end
         hop = register(other.cloud, end.cloud, [guess])
-        return hop is not None and _alike(wrong, Measured(other, end, hop).errors()[0])
+        if hop is None:
+            return False
+        confirming = Measured(other, end, hop).errors()[0]
+        # About the same direction and length.
+        lengths = np.linalg.norm(wrong), np.linalg.norm(confirming)
+        return bool(np.linalg.norm(wrong - confirming) < min(lengths))
 
-    def _take(self, found: Measured) -> None:
-        """Compare with what was measured."""
-        start, end, hop, _ = found
-        errors = found.errors()
+    def _take(self, measured: Measured) -> None:
+        """Compare with what was measured; over a restart there are no errors of members."""
+        start, end, hop, _ = measured
+        errors = measured.errors()
         errors[end.no_pose > start.no_pose] = np.nan
         ends = start.metres, end.metres, end.stamp * 1e-9
-        measured = np.asarray(np.isfinite(errors).all(axis=1))
+        known = np.asarray(np.isfinite(errors).all(axis=1))
         if start.stamp >= self._restarted:
-            self._compare(errors, measured, ends)
-        if measured[0]:
+            # Those that are back count as measured, not as lost.
+            self._hops = self._hops.filled(known & np.isfinite(self._without))
+            self._hops = self._hops.with_hop(errors, *ends)
+            self._without[known] = -np.inf
+            # A scan without a pose says nothing of the rest of the hop.
+            with np.errstate(invalid="ignore"):
+                wrong = np.linalg.norm(errors, axis=1) > LOST
+            self._wrong = np.where(wrong, self._wrong + 1, 0)
+        if known[0]:
             self._own.add(Link(*ends, start.T_odom_sensor[0], end.T_odom_sensor[0], hop))
         self._rejected = 0
-
-    def _compare(
-        self,
-        errors: NDArray[np.float64],
-        measured: NDArray[np.bool_],
-        ends: tuple[float, float, float],
-    ) -> None:
-        """Take note of a hop's errors, of shape (1 + n_members, 3); over a restart there are none.
-
-        `measured` says which of them are known, `ends` where the hop starts and ends, and when.
-        """
-        # Those that are back count as measured, not as lost.
-        self._hops = self._hops.filled(measured & np.isfinite(self._without))
-        self._hops = self._hops.with_hop(errors, *ends)
-        self._without[measured] = -np.inf
-        # A scan without a pose says nothing of the rest of the hop.
-        with np.errstate(invalid="ignore"):
-            wrong = np.linalg.norm(errors, axis=1) > LOST
-        self._wrong = np.where(wrong, self._wrong + 1, 0)
 
     def _told_to_restart(self) -> frozenset[int]:
         """Trial numbers of the members that two hops in a row have shown to be lost.
@@ -346,13 +327,6 @@ class LiveEvidence:
         chosen = self.members if members is None else members
         columns = [i for i, trial in enumerate(self.members, 1) if trial in chosen] or [0]
         return live_squares(self._hops._replace(errors=self._hops.errors[:, columns]))
-
-    def forget(self) -> None:
-        """Forget the hops so far, for the odometry has got another set.
-
-        The next one begins at the newest scan.
-        """
-        self._begin()
 
     def own_error(self) -> OwnError | None:
         """The odometry's, or the bank's, own error over the last metres; None without any hop."""
@@ -394,12 +368,6 @@ def spread_of(vectors: NDArray[np.floating]) -> NDArray[np.float64]:
     return np.asarray(np.sqrt((apart**2).sum(axis=-1).mean(axis=-1)))
 
 
-def _alike(error: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
-    """Whether two errors, of shape (3,), have about the same direction and length."""
-    apart = np.linalg.norm(error - other)
-    return bool(apart < min(np.linalg.norm(error), np.linalg.norm(other)))
-
-
 def _apart(T: Poses, other: Poses) -> float:
     """How far two motions are apart, in metres; a radian counts as much as ten metres."""
     moved = invert(other) @ T
@@ -422,7 +390,7 @@ def hops_along(
     scan with how many are done.
     """
     live = LiveEvidence()
-    found: list[tuple[int, int, Hop]] = []
+    hops: list[tuple[int, int, Hop]] = []
     frame_of: dict[int, int] = {}
     due, last, step = 0, np.full((4, 4), np.nan), np.eye(4)
     for i, (scan, T) in enumerate(scans):
@@ -436,8 +404,9 @@ def hops_along(
         due = due if i else scan.stamp
         if scan.stamp >= due:
             due += (int(scan.stamp - due) // PERIOD + 1) * PERIOD
-            if (one := live.measure()) is not None:
-                found.append((frame_of[one.start.stamp], frame_of[one.end.stamp], one.hop))
+            if (measured := live.measure()) is not None:
+                ends = frame_of[measured.start.stamp], frame_of[measured.end.stamp]
+                hops.append((*ends, measured.hop))
         last = T
         advance(i + 1)
-    return Hops.of(found)
+    return Hops.of(hops)

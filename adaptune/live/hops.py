@@ -166,13 +166,12 @@ def _known_directions(result: Any) -> NDArray[np.float64]:
         of_rotation, information[:3, 3:]
     )
     values, vectors = np.linalg.eigh(marginal)
-    found = values - _OF_A_PLANE * result.num_inliers
-    known = vectors[:, found >= DEGENERATE * values[-1]]
+    beyond_planes = values - _OF_A_PLANE * result.num_inliers
+    known = vectors[:, beyond_planes >= DEGENERATE * values[-1]]
     return np.asarray(known @ known.T)
 
 
 # How wrong the members of a bank were over the last hops, and what that says of their weights.
-
 
 SECONDS, METRES = 30.0, 30.0
 """A hop counts as long as it is no older, or no farther behind, than this."""
@@ -217,8 +216,7 @@ class HopErrors(NamedTuple):
 
     def recent(self, metres: float, seconds: float) -> "HopErrors":
         """Those that count when so much was driven, at this time."""
-        young = seconds - self.seconds <= SECONDS
-        kept = np.flatnonzero(young | (metres - self.start <= METRES))
+        kept = (seconds - self.seconds <= SECONDS) | (metres - self.start <= METRES)
         return HopErrors(*(array[kept] for array in self))
 
 
