@@ -15,7 +15,14 @@ from numpy.typing import NDArray
 from adaptune.bank.members import Agreement, spread
 from adaptune.errors import OdometryError
 from adaptune.geometry import Poses, invert, rectify, squared_ranges
-from adaptune.odometry.base import Motions, OdometryInstance, PreparedScan, Registration, Usage
+from adaptune.odometry.base import (
+    LOST,
+    Motions,
+    OdometryInstance,
+    PreparedScan,
+    Registration,
+    Usage,
+)
 from adaptune.odometry.factory import Factory
 from adaptune.recording.scan import Scan
 from adaptune.space import ODOMETRY, ParameterSet, Selection
@@ -28,7 +35,7 @@ Make = Callable[[ParameterSet], OdometryInstance]
 
 
 class PastScan(NamedTuple):
-    """A scan with the pose and the motion that were found for it."""
+    """A scan with its pose and its motion."""
 
     scan: PreparedScan
     T_odom_sensor: Poses
@@ -98,15 +105,15 @@ class ShortRegistrations:
         """Mean distances of shape (n_members,), see `Alignment`."""
         thinned = self._clouds[-1].thinned
         points = thinned[:: max(1, len(thinned) // N_POINTS)]
-        found = [np.full(T_then_now.shape[1], np.inf)]
+        means = []
         for T, n in zip(T_then_now, ago, strict=True):
             then = self._clouds[-1 - n] if n < len(self._clouds) else None
             if then is None or not len(points) or not len(then.thinned):
                 continue
             placed = points @ T[:, :3, :3].swapaxes(-1, -2) + T[:, None, :3, 3]
             distances, _ = then.tree.query(placed, distance_upper_bound=CUT_OFF)
-            found.append(np.minimum(distances, CUT_OFF).mean(axis=1))
-        return np.asarray(np.mean(found[1:] or found, axis=0))
+            means.append(np.minimum(distances, CUT_OFF).mean(axis=1))
+        return np.asarray(np.mean(means, axis=0) if means else np.full(T_then_now.shape[1], np.inf))
 
 
 class _Cloud:
@@ -126,7 +133,7 @@ class _Cloud:
     @cached_property
     def tree(self) -> Any:
         """What finds the nearest of its thinned points."""
-        from scipy.spatial import cKDTree
+        from scipy.spatial import cKDTree  # takes long to import
 
         return cKDTree(self.thinned)
 
@@ -221,25 +228,24 @@ class Lateness:
         `interval` is the seconds from the scan before to this one.
         """
         self._intervals.append(interval)
-        found = [Registration(np.full((4, 4), np.nan), registered=False)] * len(self._members)
+        registrations = [LOST] * len(self._members)
         for i in order:
             left = self._begun + median(self._intervals) / (self._rate or 1.0) - self._clock.now()
             if not self.absent[i] and (self._rate is None or self._members[i].ready(left)):
                 self._behind[i] = 0.0
-                found[i] = self._members[i].collect()
+                registrations[i] = self._members[i].collect()
             else:
                 self._owing[i] |= not self.absent[i]
-                self._note(i, interval)
-        if not any(np.isfinite(one.T_odom_sensor).all() for one in found):
+                if not (self.removed[i] or self.resting[i] or self.away[i]):
+                    self._note(i, interval)
+        if not any(np.isfinite(r.T_odom_sensor).all() for r in registrations):
             first = self._first(self._owing & ~self.absent)
             if first is not None:
                 self._owing[first], self._behind[first] = False, 0.0
-                found[first] = self._members[first].collect()
-        return found
+                registrations[first] = self._members[first].collect()
+        return registrations
 
     def _note(self, i: int, interval: float) -> None:
-        if self.removed[i] or self.resting[i] or self.away[i]:
-            return
         self.scans[i] += 1
         # Another member of its process may be at work.
         self._behind[i] += interval if self._owing[i] else 0.0
@@ -257,12 +263,10 @@ class Lateness:
         """
         if self.absent[i] or self._owing[i]:
             return np.full((4, 4), np.nan)
-        T_moved = self._members[i].motions.T_previous_current
-        T_given = self._T_odom_given[i]
+        T_moved, T_given = self._members[i].motions.T_previous_current, self._T_odom_given[i]
         if np.array_equal(T_given, T_odom_previous):
             return T_moved
-        missed: Poses = invert(T_odom_previous) @ T_given
-        return np.asarray(missed @ T_moved)
+        return np.asarray(invert(T_odom_previous) @ T_given @ T_moved)
 
     def given(self, T_odom_sensor: Poses) -> None:
         """Take note of the bank's pose at a scan that all present members were given."""
@@ -321,17 +325,16 @@ class Bank(OdometryInstance):
         self.trials = tuple(sets)
         self.restarts = 0
         given = [dict(parameters) for parameters in sets.values()]
-        self._members = (
-            spread(make, given, cores)
-            if isinstance(make, Factory)
-            else [make(parameters) for parameters in given]
-        )
+        if isinstance(make, Factory):
+            self._members = spread(make, given, cores)
+        else:
+            self._members = [make(parameters) for parameters in given]
         self._T_previous_current = np.tile(np.eye(4), (len(sets), 1, 1))
         # Members in processes of their own register while those of this process do.
         self._apart_first = sorted(range(len(sets)), key=lambda i: not self._members[i].apart)
         self._names = [
-            f"trial {trial}" + (f" ({of[ODOMETRY]})" if ODOMETRY in of else "")
-            for trial, of in sets.items()
+            f"trial {trial}" + (f" ({given[ODOMETRY]})" if ODOMETRY in given else "")
+            for trial, given in sets.items()
         ]
         self._told: set[int] = set()
         self._known_faults = [0] * len(sets)  # of each member, when it last worked
@@ -434,11 +437,9 @@ class Bank(OdometryInstance):
             T_previous_current, seconds, self._weights, self._short, self._lost
         )
         if not agreeing.any():
-            T_odom_sensor = np.full((4, 4), np.nan)
-            self._last_motion.move(T_odom_sensor)
-            return Registration(T_odom_sensor, registered=False)
-        T_moved = self._agreement.T_previous_current
-        T_odom_sensor = rectify(before.T_odom_sensor @ T_moved)
+            self._last_motion.move(LOST.T_odom_sensor)
+            return LOST
+        T_odom_sensor = rectify(before.T_odom_sensor @ self._agreement.T_previous_current)
         T_before_now = invert(before.T_odom_sensor) @ T_odom_sensor
         self._past.append(PastScan(scan, T_odom_sensor, T_before_now))
         while (scan.stamp - self._past[0].scan.stamp) * 1e-9 > self._warm_up:
@@ -466,11 +467,11 @@ class Bank(OdometryInstance):
         # Somebody has to go on meanwhile.
         if self._rate is None or (self.late.absent | members).all():
             # Those at the end register while those at the beginning do.
-            while waiting := [one for one in successors if one.waiting]:
-                for one in waiting:
-                    one.submit()
-                for one in reversed(waiting):
-                    one.collect()
+            while waiting := [successor for successor in successors if successor.waiting]:
+                for successor in waiting:
+                    successor.submit()
+                for successor in reversed(waiting):
+                    successor.collect()
             for i in np.flatnonzero(members).tolist():
                 self.late.back(i, self._past[-1].T_odom_sensor)
         else:
@@ -483,8 +484,8 @@ class Bank(OdometryInstance):
 
     def _catch_up(self) -> None:
         """Let those that restart see the newest scan, and one of them scans of the past."""
-        for one in self._returning:
-            one.waiting.append(self._past[-1])
+        for successor in self._returning:
+            successor.waiting.append(self._past[-1])
         if not self._returning or self._returning[0].odometry.busy:
             return
         first = self._returning[0]

@@ -31,20 +31,12 @@ KEPT = 160
 """Scans that a process keeps for members that restart: those of a warm-up, at ten a second."""
 
 
-SERVICE = __name__
-"""What a server does with an odometry of which there are several."""
-
-
 class SentScan(NamedTuple):
     """A scan that a process was sent, or can be sent, under a number."""
 
     number: int
+    stamp: int
     scan: Scan
-
-    @property
-    def stamp(self) -> int:
-        """Nanoseconds."""
-        return self.scan.stamp
 
 
 class MemberProcess:
@@ -56,9 +48,8 @@ class MemberProcess:
     def __init__(self, name: str, bounds: processes.Bounds):
         self.generation = 0  # of how many processes this is the last
         self.ending = ""  # what is known of how the last one ended
-        self.conversation = processes.Conversation(
-            processes.Forked(SERVICE, name, "members", bounds)
-        )
+        transport = processes.Forked(__name__, name, "members", bounds)
+        self.conversation = processes.Conversation(transport)
         self.users = set[int]()  # numbers of the members that are not closed
         self._numbers = itertools.count()
         self._held: OrderedDict[int, None] = OrderedDict()
@@ -80,7 +71,7 @@ class MemberProcess:
 
     def sent(self, scan: Scan) -> SentScan:
         """Give a scan a number, and send it where there is a process that takes it now."""
-        sent = SentScan(next(self._numbers), scan)
+        sent = SentScan(next(self._numbers), scan.stamp, scan)
         if not self.busy:
             self.need(sent)
         return sent
@@ -104,12 +95,12 @@ class MemberProcess:
             if end is not None and not self.conversation.ready(end - time.perf_counter()):
                 break
             try:
-                found = self.conversation.next_message()
+                answer = self.conversation.next_message()
             except processes.HostError as error:
                 self.ending, self._owed = str(error), 0
             else:
                 self._owed -= 1
-                self._answers.setdefault(found.header["member"], deque()).append(found)
+                self._answers.setdefault(answer.header["member"], deque()).append(answer)
         return mine[0] if mine else None
 
     def receive(self, member: int) -> processes.Message:
@@ -210,9 +201,9 @@ class Member(Isolated):
         return {"stamp": prepared.stamp, "scan": prepared.number}, {}
 
 
-def _keep(held: OrderedDict[int, Any], number: int, what: Any) -> None:
+def _keep(held: OrderedDict[int, Any], number: int, scan: Any) -> None:
     """Add a scan, and drop the oldest one; both sides do, so each knows what the other has."""
-    held[number] = what
+    held[number] = scan
     if len(held) > KEPT:
         held.popitem(last=False)
 
@@ -232,7 +223,7 @@ def members(_: str) -> processes.Answer:
     first: dict[Hashable, Any] = {}
     spent, used = defaultdict[int, float](float), 0.0  # CPU seconds of each member, and of all
 
-    def done(message: processes.Message) -> dict[str, Any]:
+    def do(message: processes.Message) -> dict[str, Any]:
         header = message.header
         if header["type"] == "hello":
             given = header["odometry"], header["parameters"], header["settings"]
@@ -251,13 +242,13 @@ def members(_: str) -> processes.Answer:
                 scan.by(member)
             return None
         try:
-            found = done(message)
+            done = do(message)
         except AdaptuneError as error:
-            found = {"type": "refused", "message": str(error)}
+            done = {"type": "refused", "message": str(error)}
         number, now = message.header["member"], wire.used()
         spent[number] += now["cpu"] - used
         used = now["cpu"]
-        return {**found, **now, "cpu": spent[number], "member": number}
+        return {**done, **now, "cpu": spent[number], "member": number}
 
     return answer
 

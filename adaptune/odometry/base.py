@@ -166,16 +166,11 @@ class OdometryInstance(ABC):
 
     `submit` and `collect` let several instances in other processes work at the same time. After
     `close`, `prepare` still works and `start` begins again.
-
-    Attributes
-    ----------
-    apart : bool
-        Whether it works in another process, from `submit` on; class attribute.
-    rewinds : bool
-        Whether it can be shown scans of the past again.
     """
 
+    # Whether it works in another process, from `submit` on.
     apart: ClassVar[bool] = False
+    # Whether it can be shown scans of the past again.
     rewinds: bool = True
 
     @property
@@ -260,12 +255,8 @@ class OdometryInstance(ABC):
         """Change to what was selected, before the next scan.
 
         A single odometry takes the parameters. A bank takes the weights; if there are none, the
-        member with the selected trial gets all the weight.
-
-        Raises
-        ------
-        OdometryError
-            If the odometry cannot change its parameters, or a bank does not hold the set.
+        member with the selected trial gets all the weight. There is an `OdometryError` if the
+        odometry cannot change its parameters, or a bank does not hold the set.
         """
         raise NotImplementedError
 
@@ -379,10 +370,7 @@ class Odometry(ABC):
     def configure(self, parameters: ParameterSet) -> None:
         """Change parameters between scans; the others stay.
 
-        Raises
-        ------
-        OdometryError
-            If the odometry is not `live`, or has no such parameter.
+        There is an `OdometryError` if the odometry is not `live`, or has no such parameter.
         """
         if not self.live:
             raise OdometryError(

@@ -51,7 +51,6 @@ from adaptune.ros.ros2 import (
     ros_domain,
 )
 
-_NODE = "adaptune"
 _ANSWER = 2.0
 """Seconds in which a service must answer."""
 _DISCOVERY = 1.5
@@ -133,15 +132,17 @@ class DdsLink:
         It is reliable where all who publish are. There is a `LinkError` if the topic is published
         with another type, as far as that is known by now.
         """
-        there = [e for e in self._endpoints(0) if e.topic == full(topic)]
+        there = [e for e in self.endpoints(0) if e.topic == full(topic)]
         if there and kind not in {e.kind for e in there}:
             raise LinkError(f"{topic} is published as {there[0].kind}, not as {kind}")
         if kind in CLOUDS and (size := _receive_buffer()) < RECEIVE_BUFFER:
             what = "%s: clouds may be lost, as this machine receives %d kB ahead; run `sudo sysctl "
             what += "-w net.core.rmem_max=%d` and start again"
             _log.warning(what, topic, size // 1000, RECEIVE_BUFFER)
+        # Arrays are views of the bytes.
+        read = lambda data: take(self.store.deserialize_cdr(memoryview(data), kind))  # noqa: E731
         messages = self._taken(topic, kind, self._topic_end(DataReader, topic, kind))
-        self._threads.append(take_all(topic, messages, take if raw else self._reading(kind, take)))
+        self._threads.append(take_all(topic, messages, take if raw else read))
 
     def _taken(self, topic: str, kind: str, reader: DataReader) -> Iterator[bytes]:
         """The bytes of messages as they come, until the link is closed."""
@@ -153,7 +154,7 @@ class DdsLink:
                 # A node that starts again is another one, and the first is not heard again.
                 if sender in senders[:-1] and not mixed:
                     mixed = True
-                    names = sorted({e.node for e in self._endpoints(0) if e.topic == full(topic)})
+                    names = sorted({e.node for e in self.endpoints(0) if e.topic == full(topic)})
                     what = "%s is published by two (%s), whose messages mix; end one of them"
                     _log.warning(what, topic, " and ".join(names))
                 if sender not in senders:
@@ -171,7 +172,7 @@ class DdsLink:
             ready.attach(condition)
         limit = duration(weeks=9999) if seconds is None else duration(seconds=seconds)
         while ready.wait(limit) and not self._closed:
-            yield from (one for one in reader.take(N=_DEPTH) if one.sample_info.valid_data)
+            yield from (s for s in reader.take(N=_DEPTH) if s.sample_info.valid_data)
             if reader.get_requested_incompatible_qos_status().total_count:
                 return
 
@@ -195,7 +196,7 @@ class DdsLink:
     def topics(self) -> Mapping[str, str]:
         """See `RosLink.topics`; a link that is new waits until it can know."""
         time.sleep(max(0.0, self._joined + _DISCOVERY - time.monotonic()))
-        return {e.topic: e.kind for e in self._endpoints(0)}
+        return {e.topic: e.kind for e in self.endpoints(0)}
 
     @property
     def alive(self) -> bool:
@@ -217,23 +218,19 @@ class DdsLink:
             self._writers, self._clients = {}, {}
             del self._participant, self._closing, self._info, self._infos
 
-    def _reading(self, kind: str, take: Callable[[Any], None]) -> Callable[[bytes], None]:
-        """Take messages of a type by their bytes; arrays are views of them."""
-        return lambda data: take(self.store.deserialize_cdr(memoryview(data), kind))
-
     def why_unheard(self, topic: str) -> str:
         topic = full(topic)
-        offered = [e for e in self._endpoints(0, own=True) if e.topic == topic]
-        wanted = [e for e in self._endpoints(1) if e.topic == topic]
+        offered = [e for e in self.endpoints(0, own=True) if e.topic == topic]
+        wanted = [e for e in self.endpoints(1) if e.topic == topic]
         if not wanted:
             return f"nobody else subscribes to {topic}"
-        for one in wanted:
-            fitting = [e for e in offered if e.kind == one.kind]
+        for end in wanted:
+            fitting = [e for e in offered if e.kind == end.kind]
             if offered and not fitting:
-                return f"{one.node} subscribes to {topic} as {one.kind}, not {offered[0].kind}"
-            lacks = [_lack(e.qos, one.qos) for e in fitting]
+                return f"{end.node} subscribes to {topic} as {end.kind}, not {offered[0].kind}"
+            lacks = [_lack(e.qos, end.qos) for e in fitting]
             if lacks and all(lacks):
-                return f"{one.node} wants {topic} {lacks[0]}, and it is not published so"
+                return f"{end.node} wants {topic} {lacks[0]}, and it is not published so"
         if fast := sorted({e.node for e in wanted if e.vendor == _FAST_DDS}):
             return (
                 f"{' and '.join(fast)} runs on Fast DDS, which loses clouds that do not fit in the "
@@ -264,9 +261,19 @@ class DdsLink:
         """
         return self._held(full(node), self._declared(full(node)))
 
+    def nodes(self) -> list[str]:
+        """The nodes that serve their parameters."""
+        last = "/list_parameters"
+        return [place.removesuffix(last) for place in self._places() if place.endswith(last)]
+
+    def meet(self) -> None:
+        """Let nodes find who will ask for their parameters, which takes a while."""
+        for node in self.nodes():
+            for name, service in self._services.items():
+                self._client(f"{node}/{PLACES[name]}", service)
+
     def _declared(self, node: str) -> list[str]:
-        names = self._call(node, "ListParameters", None, prefixes=[], depth=0).result.names
-        return sorted(names)
+        return sorted(self._call(node, "ListParameters", None, prefixes=[], depth=0).result.names)
 
     def _held(self, node: str, names: list[str]) -> dict[str, Any]:
         values = self._call(node, "GetParameters", len(names), names=names).values
@@ -309,7 +316,7 @@ class DdsLink:
             f"{', '.join(services) or 'none'}"
         )
 
-    def _endpoints(self, which: int, *, own: bool = False) -> list[Endpoint]:
+    def endpoints(self, which: int, *, own: bool = False) -> list[Endpoint]:
         """Who publishes topics (0), or subscribes to them (1), this link left out or not."""
         there = [e for e in self._others(which, own=own) if e.topic_name.startswith("rt/")]
         self._learn_names()
@@ -398,7 +405,7 @@ class DdsLink:
     def _announce(self) -> None:
         """Let tools of ROS 2 see this node and what it publishes and subscribes to."""
         node = self.store.types["rmw_dds_common/msg/NodeEntitiesInfo"](
-            "/", _NODE, self._gids[DataReader], self._gids[DataWriter]
+            "/", "adaptune", self._gids[DataReader], self._gids[DataWriter]
         )
         info = self.store.types[_INFO](self._gid(self._participant), [node])
         self._info.write(self._info.data_type(bytes(self.store.serialize_cdr(info, _INFO))))

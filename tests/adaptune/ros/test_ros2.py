@@ -183,8 +183,8 @@ def test_type_hashes_are_those_of_ros(alone):
 
     link, other = alone(), alone()
     link.advertise("/clouds", ros2_node.POINTS)
-    until(lambda: [e.topic for e in other._endpoints(0)] == ["/clouds"])
-    (found,) = other._endpoints(0)
+    until(lambda: [e.topic for e in other.endpoints(0)] == ["/clouds"])
+    (found,) = other.endpoints(0)
     assert found.qos[Policy.Userdata].data == f"typehash={HASH};".encode()
 
 
@@ -202,7 +202,7 @@ def test_it_is_seen_as_ros_sees_nodes_until_it_leaves(alone):
     (named,) = seen.node_entities_info_seq
     assert (named.node_namespace, named.node_name) == ("/", "adaptune")
     until(lambda: other.why_unheard("/b") == "" and "/a" in other.topics())
-    (end,) = (e for e in other._endpoints(0) if e.topic == "/a")
+    (end,) = (e for e in other.endpoints(0) if e.topic == "/a")
     assert end.node == "/adaptune"
     link.close()
     until(lambda: other.why_unheard("/b") and "/a" not in other.topics())
