@@ -33,7 +33,7 @@ from adaptune.odometry.docker import remover
 OWNER = "adaptune.owner"
 """Label of every container: the process that has started it."""
 _NOBODY = 65534
-_SIGNALS = {int(one) for one in signal.Signals}
+_SIGNALS = set(map(int, signal.Signals))
 _PERIOD = 100_000
 """Microseconds over which the use of cores is counted."""
 _WEIGHT = 10 * 1024
@@ -87,16 +87,18 @@ def engine() -> Any:
         client.ping()
     except (DockerException, OSError) as error:
         where = os.environ.get("DOCKER_HOST", "unix:///var/run/docker.sock")
-        if "Permission" in str(error):
-            help_ = "add yourself to its group, `sudo usermod -aG docker $USER`, and log in again"
-            raise EngineError(
-                f"this user may not use the Docker engine at {where}: {help_}"
-            ) from error
+        what = f"no Docker engine answers at {where}"
         help_ = "install Docker Engine, or start it: `sudo service docker start`"
-        if "DOCKER_HOST" in os.environ:
+        if "Permission" in str(error):
+            what = f"this user may not use the Docker engine at {where}"
+            help_ = "add yourself to its group, `sudo usermod -aG docker $USER`, and log in again"
+        elif "DOCKER_HOST" in os.environ:
             help_ = "is DOCKER_HOST right?"
-        raise EngineError(f"no Docker engine answers at {where}: {help_}") from error
-    _remove_leftovers(client)
+        raise EngineError(f"{what}: {help_}") from error
+    for container in client.api.containers(all=True, filters={"label": OWNER}):
+        if is_orphan(container["Labels"][OWNER]):
+            _log.info("removing container %s of an earlier run", container["Id"][:12])
+            _remove(client, container["Id"])
     return client
 
 
@@ -119,14 +121,6 @@ def is_orphan(owner: str) -> bool:
     if boot_and_space.split(".")[0] != here.split(".")[0]:
         return True
     return boot_and_space == here and _identity(int(pid)) != owner
-
-
-def _remove_leftovers(client: Any) -> None:
-    """Remove containers whose process has ended."""
-    for container in client.api.containers(all=True, filters={"label": OWNER}):
-        if is_orphan(container["Labels"][OWNER]):
-            _log.info("removing container %s of an earlier run", container["Id"][:12])
-            _remove(client, container["Id"])
 
 
 def _remove(client: Any, container: str) -> None:
@@ -198,12 +192,6 @@ def default_user(settings: ContainerSettings) -> str:
     return f"{me}:{group}" if me else f"{_NOBODY}:{_NOBODY}"
 
 
-def _home(user: str) -> dict[str, str]:
-    """A folder that a user without a name can write to."""
-    nameless = user[0].isdigit() and user.partition(":")[0] != "0"
-    return {"HOME": "/tmp"} if nameless else {}
-
-
 class Container:
     """A running container.
 
@@ -237,6 +225,9 @@ class Container:
             for m in mounts
         ]
         limit = int(memory * 1e9)
+        # A user without a name has no folder to write to.
+        nameless = user[0].isdigit() and user.partition(":")[0] != "0"
+        home = {"HOME": "/tmp"} if nameless else {}
         host = client.api.create_host_config(
             mounts=binds,
             network_mode="none" if beside is None else f"container:{beside.id}",
@@ -261,7 +252,7 @@ class Container:
                     digest,
                     None if bare else list(command) or None,
                     user=user,
-                    environment=_home(user) | dict(environment or {}),
+                    environment=home | dict(environment or {}),
                     labels={OWNER: _owner()[0]},
                     host_config=host,
                     entrypoint=list(command) if bare else None,
@@ -378,8 +369,8 @@ def own_container(
     # Links lead to places outside of an environment.
     pythons = [sys.prefix, sys.base_prefix, str(Path(sys.executable).resolve().parents[1])]
     own = [str(Path(__file__).parents[3]), "/usr", "/lib", "/lib64", "/bin", "/etc/ld.so.cache"]
-    paths = sorted(path for path in {*own, *pythons, *filter(None, sys.path)} if _is_there(path))
-    mounts = [Mount(Path(path), path) for path in paths]
+    absolute = {path for path in (*own, *pythons, *sys.path) if path[:1] == "/" and path.strip("/")}
+    mounts = [Mount(Path(path), path) for path in sorted(absolute) if Path(path).exists()]
     return Container(
         ContainerSettings(image=_EMPTY),
         1.0,
@@ -390,10 +381,6 @@ def own_container(
         | dict(environment),
         bare=True,
     )
-
-
-def _is_there(path: str) -> bool:
-    return path.strip("/") != "" and path[0] == "/" and os.path.exists(path)  # noqa: PTH110
 
 
 # Folders that containers write to, and what is kept of them.

@@ -7,7 +7,7 @@ import tempfile
 import threading
 import time
 import weakref
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -167,12 +167,9 @@ class Lockstep(Faulting):
             raise OdometryError(f"{self.name} has no parameter {min(unknown)!r}")
         self.parameters |= selection.parameters
         if self._system is not None and self._steering is not None:
-            named = {
-                self._system.whole_name(self._template, n): v
-                for n, v in selection.parameters.items()
-            }
+            name = partial(self._system.whole_name, self._template)
             try:
-                self._steering.apply(named)
+                self._steering.apply({name(k): v for k, v in selection.parameters.items()})
             except LinkError as error:
                 raise OdometryError(str(error)) from error
 
@@ -272,19 +269,19 @@ class Lockstep(Faulting):
     def _correct(self) -> bool:
         """Correct the predicted pose; False if the system gave none."""
         waits = bool(self._n_answered) or self._silent < _MOST_PATIENT
-        found = self._pose(self._patience if waits else min(self._patience, _IMPATIENCE))
-        if found is not None and self._late is None and self._silent:
+        pose = self._pose(self._patience if waits else min(self._patience, _IMPATIENCE))
+        if pose is not None and self._late is None and self._silent:
             # It may be of an earlier scan; then others follow, though nothing more was sent.
             time.sleep(self._patience)
-            found = self._pose(0.0)
+            pose = self._pose(0.0)
         assert self._system is not None
-        if self._late is not None or found is not None:
+        if self._late is not None or pose is not None:
             self._n_shown += 1
-        if found is None:
+        if pose is None:
             self._silent += 1
             self._check_silent(self._system)
             return False
-        stamp, T_own = found
+        stamp, T_own = pose
         self._silent, self._has_run = 0, True
         self._n_answered += 1
         if wrong := pose_fault(T_own):
@@ -355,8 +352,8 @@ class Lockstep(Faulting):
         earliest = self._stamp - _EARLY + (0 if self._late is None else self._late // 2)
 
         def there() -> bool:
-            found = bool(self._poses) and self._poses[-1][0] >= earliest
-            return found or bool(self._reader.fault)
+            came = bool(self._poses) and self._poses[-1][0] >= earliest
+            return came or bool(self._reader.fault)
 
         with self._news:
             came = self._news.wait_for(there, seconds)

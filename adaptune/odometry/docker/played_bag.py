@@ -203,11 +203,10 @@ class PlayedBag(WholeRun):
             check_stamps(stamps, given.stamps)
         except OdometryError as error:
             if len(stamps) != len(given.stamps):
-                counts = f"{len(stamps)} poses for {len(given.stamps)} scans"
-                help_ = (
-                    f"{counts} cannot be matched by number; set odometry.settings.play: lockstep"
-                )
-                raise OdometryError(f"{error}, and {help_}") from error
+                raise OdometryError(
+                    f"{error}, and {len(stamps)} poses for {len(given.stamps)} scans cannot be "
+                    f"matched by number; set odometry.settings.play: lockstep"
+                ) from error
             _log.warning("%s: %s; poses are matched to scans by number", self.name, error)
             stamps = given.stamps
             poses = [(s, *pose) for s, (_, *pose) in zip(stamps.tolist(), poses, strict=True)]

@@ -32,12 +32,9 @@ class PoseReader:
         frame: str = "lidar",
         fixed: Mapping[str, tuple[str, Any]] | None = None,
     ):
-        self.fault = ""
-        """What goes wrong with the messages."""
-        self.lacking = ""
-        """Why transforms hold no pose."""
-        self.about = ""
-        """Of which frame the poses are, and in which other one."""
+        self.fault = ""  # what goes wrong with the messages
+        self.lacking = ""  # why transforms hold no pose
+        self.about = ""  # of which frame the poses are, and in which other one
         self._link, self.topic, self._frame = link, topic, frame
         self._fixed = {child: (into, to_pose(T)) for child, (into, T) in (fixed or {}).items()}
         self._moving: dict[str, tuple[str, Poses]] = {}
@@ -79,11 +76,11 @@ class PoseReader:
     def _frames(message: Any, known: dict[str, tuple[str, Poses]]) -> dict[str, int]:
         """Note a message's frames; the stamp of each."""
         stamps = {}
-        for one in message.transforms:
-            p, q = one.transform.translation, one.transform.rotation
-            child, parent = one.child_frame_id.lstrip("/"), one.header.frame_id.lstrip("/")
+        for stamped in message.transforms:
+            p, q = stamped.transform.translation, stamped.transform.rotation
+            child, parent = stamped.child_frame_id.lstrip("/"), stamped.header.frame_id.lstrip("/")
             known[child] = parent, matrix(p, q)
-            stamps[child] = message_stamp(one)
+            stamps[child] = message_stamp(stamped)
         return stamps
 
     def _sensor(self, stamps: Mapping[str, int]) -> list[Pose]:

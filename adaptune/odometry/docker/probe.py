@@ -179,7 +179,7 @@ def _declared(system: Any, template: Template) -> dict[str, str]:
     with suppress(LinkError, OdometryError):
         nodes = system.link.ask("parameters") if system.link.is2 else {}
     known = {system.whole_name(template, name) for name in template.names} | _OF_ROS
-    more = {k: v for of in nodes.values() for k, v in of.items() if k not in known}
+    more = {k: v for held in nodes.values() for k, v in held.items() if k not in known}
     # Those ROS declares by itself.
     own = [
         f"{k} = {str(v)[:_SHOWN]}"

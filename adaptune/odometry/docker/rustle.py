@@ -314,10 +314,10 @@ class Rustle:
     def own_file(parameters: ParameterSet, settings: Any) -> OwnFile:
         """The parameter file that the system reads."""
         template, text = filled(settings, parameters)
-        use, node = f"in the place of {template.path.name}", settings.node or ""
-        name = node.strip("/").replace("/", "_") or template.path.stem
-        # That of a system in RUSTLE's layout is known as that.
-        return OwnFile(template.path.suffix, text, use, name * (settings.system.ros == 2))
+        use, name = f"in the place of {template.path.name}", ""
+        if settings.system.ros == 2:  # that of a system in RUSTLE's layout is known as that
+            name = (settings.node or "").strip("/").replace("/", "_") or template.path.stem
+        return OwnFile(template.path.suffix, text, use, name)
 
     @staticmethod
     def instance(
