@@ -441,10 +441,7 @@ class Conversation:
         raise HostError(what)
 
     def ask(self, header: Mapping[str, Any], **arrays: Any) -> Message:
-        """Send a message, to a new process if there is none, and `receive` the answer.
-
-        A `HostError` names the process.
-        """
+        """Send a message, to a new process if there is none, and `receive` the answer."""
         self.open()
         self.send(header, **arrays)
         try:

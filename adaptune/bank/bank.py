@@ -83,10 +83,7 @@ _NEAR = 1.0
 
 
 class ShortRegistrations:
-    """Mean distances of the newest scan from earlier ones, where motions place it: an `Alignment`.
-
-    Scans are only kept. Work is done where somebody asks.
-    """
+    """Mean distances of the newest scan from earlier ones: an `Alignment`, worked out if asked."""
 
     def __init__(self) -> None:
         self._clouds: deque[_Cloud] = deque()
@@ -164,15 +161,10 @@ class Lateness:
 
     A member in another process has until the next scan is due. One that needs longer is late: it
     has no motion over that scan, and takes part again as soon as it is done. Scans come `rate`
-    times as fast as recorded; if that is None, the bank waits for everybody.
-
-    Attributes
-    ----------
-    scans : ndarray of shape (n_members,)
-        At how many scans each member was late.
-    removed, away, resting, absent : ndarray of shape (n_members,)
-        Members that were always late and take no part any more; that are restarting; that are
-        given no scans, as the bank says before each; that have no motion over the newest scan.
+    times as fast as recorded; if that is None, the bank waits for everybody. `scans` counts at how
+    many scans each member was late; members are `removed` that were always late, `away` while they
+    restart, `resting` as the bank says before each scan, `absent` without a motion over the newest.
+    All are of shape (n_members,).
     """
 
     def __init__(
@@ -307,9 +299,7 @@ class Bank(OdometryInstance):
     cores
         That the members may use, if `make` is a factory, see `spread`. The motions are the same.
     rate
-        Times as fast as recorded at which scans come: members that are late are not waited for,
-        see `Lateness`, and those that restart see scans of the past `CATCH_UP` at a time. None
-        waits for all.
+        See `Lateness`; members that restart see scans of the past `CATCH_UP` at a time then.
     """
 
     def __init__(

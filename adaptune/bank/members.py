@@ -40,10 +40,7 @@ class SentScan(NamedTuple):
 
 
 class MemberProcess:
-    """A process with members, which the first start of one begins, and the last close ends.
-
-    `name` is an odometry that is imported before the process is forked.
-    """
+    """A process with members of an odometry, from the first start of one to the last close."""
 
     def __init__(self, name: str, bounds: processes.Bounds):
         self.generation = 0  # of how many processes this is the last
@@ -256,9 +253,8 @@ def members(_: str) -> processes.Answer:
 def spread(make: Factory, sets: Sequence[ParameterSet], cores: int) -> list[OdometryInstance]:
     """Make the members of a bank, on as many cores as they can use.
 
-    Some members run in this process, and the others in one more process for each further core.
-    Those that prepare scans in the same way run together. Members that have processes of their own
-    keep them.
+    Some run in this process, and the others in one more process for each further core, together
+    where they prepare scans in the same way. Members that have processes of their own keep them.
     """
     made = [make(parameters) for parameters in sets]
     alike: dict[Any, list[int]] = {}
@@ -317,19 +313,18 @@ Returns mean distances of shape (n_members,) in metres; infinite where there is 
 
 
 class Agreement:
-    """Tells which members of a bank agree, scan after scan.
+    """Tells which members of a bank agree, scan after scan; see docs/research/bank.md.
 
     Each pose of a member in the last second is a vector: the way, and the turn as the way it makes
-    at `LEVER` metres. A straight line through these vectors says how far the member came; so a jump
-    back and forth hardly counts, and a slow departure does. Two members are near each other if they
-    differ, in a second, by no more than ::
+    at `LEVER` metres. A straight line through these vectors says how far the member came. Two
+    members are near each other if they differ, in a second, by no more than ::
 
         least = max(FLOOR, SHARE * way)
         min(max(least, SPREAD * usual difference), MAX_TIMES_LEAST * least, lost_track)
 
     and, over the newest scan alone, by no more than `lost_track` metres a second. Before the first
     half second, the newest scan alone counts. The heaviest group of members that are all near each
-    other agrees. Every member votes with its weight.
+    other agrees.
 
     Attributes
     ----------
@@ -337,9 +332,8 @@ class Agreement:
         How the bank moved over the last scan: the weighted mean of the members that agree; NaN if
         no member had a motion.
     due : ndarray of shape (n_members,)
-        Which members should restart at the bank's pose: those that were left out at the last scan,
-        that differ by more than `FAR` times what they may, and that have not restarted in the last
-        second.
+        Which members should restart at the bank's pose: those left out at the last scan that differ
+        by more than `FAR` times what they may, and have not restarted in the last second.
     judged : bool
         Whether the short registrations decided at the last scan.
     """
@@ -370,20 +364,10 @@ class Agreement:
     ) -> NDArray[np.bool_]:
         """Which members agree at the next scan, of shape (n_members,); none if none has a motion.
 
-        Parameters
-        ----------
-        T_previous_current
-            Motions over the scan, of shape (n_members, 4, 4); NaN where there is none.
-        seconds
-            Since the scan before.
-        weights
-            Of shape (n_members,).
-        alignment
-            Short registrations. They are asked where the heaviest group does not hold more than
-            half of the votes and of the members; then only members within `MARGIN` of the best are
-            believed.
-        lost
-            Whether the bank is known to be lost: then they are asked wherever members disagree.
+        Motions over the scan are of shape (n_members, 4, 4), NaN where there is none; weights of
+        shape (n_members,). Short registrations (`alignment`) are asked where the heaviest group
+        does not hold more than half of the votes and of the members, or where the bank is known to
+        be `lost` and members disagree; then only members within `MARGIN` of the best are believed.
         """
         known = np.asarray((np.abs(T_previous_current) < _ENDLESS).all(axis=(1, 2)))
         moved = np.where(known[:, None, None], T_previous_current, np.eye(4))
@@ -426,10 +410,7 @@ class Agreement:
     def _near(
         self, known: NDArray[np.bool_], moved: Poses, seconds: float
     ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.float64]]:
-        """Which members are near each other, which are far, and by how many metres a second.
-
-        All of shape (n_members, n_members).
-        """
+        """Which members are near each other, which are far, and by how many metres a second."""
         tracks = np.array(self._tracks)[:, :-1]
         times = np.array(self._times)
         times -= times.mean()

@@ -81,12 +81,9 @@ class LiveEvidence:
     """Measures errors by hops, see `adaptune.live.hops`.
 
     Show it every scan with `observe`; once a second, `measure` registers a scan, which takes some
-    tens of milliseconds. Points that have times are motion-compensated, by the odometry's last
-    motion. Memory is bounded: it keeps the scans of the last metres, one a metre, and the errors of
-    the last hops.
-
-    `members` are trial numbers of a bank's members, as in `Motions`; empty for a single odometry.
-    `length` is that of the sub-trajectories whose mean error `own_error` estimates, in metres.
+    tens of milliseconds. Memory is bounded. `members` are trial numbers of a bank's members, as in
+    `Motions`; empty for a single odometry. `length` is that of the sub-trajectories whose mean
+    error `own_error` estimates, in metres.
     """
 
     def __init__(self, members: tuple[int, ...] = (), length: float = 25.0):
@@ -107,10 +104,7 @@ class LiveEvidence:
         self.forget()
 
     def forget(self) -> None:
-        """Forget the hops so far, for the odometry has got another set.
-
-        The next one begins at the newest scan.
-        """
+        """Forget the hops, for the odometry has another set; the next begins at the newest scan."""
         self._forget_errors()
         self._own = OwnErrors(self._length)
         self._anchors: deque[_Anchor] = deque()
@@ -302,10 +296,7 @@ class LiveEvidence:
         self._rejected = 0
 
     def _told_to_restart(self) -> frozenset[int]:
-        """Trial numbers of the members that two hops in a row have shown to be lost.
-
-        Each is told once. Then only hops that begin after that count against it.
-        """
+        """Trial numbers of members that two hops in a row show to be lost; each is told once."""
         told = self._wrong >= HOPS_TO_BE_LOST
         told[0] = False
         self._wrong = np.where(told, 0, self._wrong)

@@ -246,10 +246,7 @@ def live_squares(hops: HopErrors) -> LiveSquares | None:
 
 
 def windows(start: NDArray[np.float64], end: NDArray[np.float64]) -> float:
-    """How many stretches of a path that overlap amount to as much as if they did not.
-
-    Their starts and ends are metres driven, of shape (n,).
-    """
+    """How many stretches of a path, from metres to metres, amount to as much without overlap."""
     order = np.argsort(start)
     start, end = start[order], end[order]
     length = float((end - start).mean())

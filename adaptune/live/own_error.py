@@ -74,10 +74,7 @@ class _Chain(NamedTuple):
 
 
 class OwnErrors:
-    """Chains of the last hops, or of a whole recording.
-
-    `length` is that of the sub-trajectories whose mean error is estimated, in metres.
-    """
+    """Chains of the last hops, or of a whole recording, for the mean error over `length` metres."""
 
     def __init__(self, length: float, whole: bool = False):
         self._length, self._whole = length, whole

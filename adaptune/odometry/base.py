@@ -311,10 +311,7 @@ class Odometry(ABC):
 
     @classmethod
     def tuned(cls, settings: Any) -> ParameterSpace:
-        """The parameters that can be tuned, with baselines from the user's file, if there is one.
-
-        An `OdometryError` says what is wrong with the file.
-        """
+        """The parameters that can be tuned, with baselines from the user's file if there is one."""
         template = settings.template if isinstance(settings, ToolSettings) else None
         return cls.space if template is None else template.based(cls.space, cls._under(template))
 
@@ -346,10 +343,7 @@ class Odometry(ABC):
 
     @property
     def preparation(self) -> Hashable:
-        """What `prepare` depends on besides the scan: class and settings, unless overridden.
-
-        An adapter that prepares by parameters, too, overrides it.
-        """
+        """What `prepare` depends on besides the scan, which may be parameters, too; see there."""
         # Classes that share `prepare` may differ in what that calls.
         return type(self), self.settings.model_dump_json()
 
@@ -481,10 +475,7 @@ class PreparedScan:
 
 
 def prepared_bytes(prepared: Any) -> int:
-    """Memory that a prepared scan takes, roughly, in bytes.
-
-    That of a compiled object, such as a cloud with its tree, is not known: it counts a megabyte.
-    """
+    """Memory of a prepared scan, roughly, in bytes; a compiled object counts a megabyte."""
     if (size := getattr(prepared, "nbytes", None)) is not None:
         return int(size)
     if is_dataclass(prepared):

@@ -84,24 +84,15 @@ class Pipeline(OwnFrameOdometry):
     Pipelines read their parameters only when they begin, and begin at rest. Those that deskew do so
     to the scan's end; their poses are carried back to its stamp. Pipelines with an IMU give poses
     of the IMU, which become the LiDAR's here.
-
-    Attributes
-    ----------
-    pipeline : str
-        What evalio calls it; class attribute.
-    deskews_to : float
-        Share of a scan's duration, see `adaptune.odometry.base`; class attribute.
-    untuned : dict
-        Values that must differ from the pipeline's own defaults: one thread, no scans dropped
-        when late; class attribute.
     """
 
     settings_type = EvalioSettings
     live = False
     # Some end the process at unexpected scans, some share state between instances.
     clean = False
-    pipeline: ClassVar[str]
-    deskews_to: ClassVar[float] = END
+    pipeline: ClassVar[str]  # what evalio calls it
+    deskews_to: ClassVar[float] = END  # share of a scan's duration
+    # Values that differ from the pipeline's defaults: one thread, no scans dropped when late.
     untuned: ClassVar[ParameterSet] = {}
 
     def __init__(
@@ -388,10 +379,7 @@ class Loam(GridPipeline):
 
 
 class Form(GridPipeline):
-    """FORM (Potokar et al.): features, fixed-lag smoothing and sparse key scans.
-
-    It takes scans as they are.
-    """
+    """FORM (Potokar et al.): features, fixed-lag smoothing, key scans. It does not deskew."""
 
     pipeline = "form"
     _share = MIDDLE

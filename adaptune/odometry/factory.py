@@ -105,10 +105,7 @@ class OdometryFactory:
 
 @dataclass(frozen=True)
 class OdometryPool:
-    """Makes instances of several odometries, as `OdometryFactory` does of one: it pickles.
-
-    Parameter sets are those of a `PooledSpace`.
-    """
+    """Makes instances of several odometries, by sets of a `PooledSpace`; see `OdometryFactory`."""
 
     factories: Mapping[str, OdometryFactory]  # by label, what makes each odometry
     space: PooledSpace = field(init=False)
@@ -124,10 +121,7 @@ class OdometryPool:
 
     @cached_property
     def description(self) -> Description:
-        """What a study must know of all together.
-
-        No instance changes from one odometry to another, so none is live.
-        """
+        """What a study must know of all together; no instance changes to another odometry."""
         every = [factory.description for factory in self.factories.values()]
         return Description(
             self.space,

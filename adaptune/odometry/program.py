@@ -425,10 +425,7 @@ class Command(FileRun):
 
 
 def find_output(folder: Path, output: str) -> Path:
-    """The one file in a folder that an output, a path or a pattern, fits; links are followed.
-
-    There is an `OdometryError` if no file fits, or several.
-    """
+    """The one file in a folder that a path or a pattern fits; else an `OdometryError`."""
     root = folder.resolve()
     found = _files_in(root, root.glob(output))
     if len(found) == 1:

@@ -64,10 +64,7 @@ def is_user_class(name: str) -> bool:
 
 
 def where(name: str) -> str:
-    """Where the class of an odometry is, as ``module:Class``, without importing it.
-
-    An `OdometryError` names the nearest one if there is none.
-    """
+    """Where the class of an odometry is, as ``module:Class``; an error names the nearest one."""
     try:
         return strict.path_of(name, "odometry", ODOMETRIES | PROGRAMS, ENTRY_POINTS, "Class")
     except strict.PluginError as error:
@@ -75,13 +72,7 @@ def where(name: str) -> str:
 
 
 def odometry_class(name: str) -> type[Any]:
-    """Class of an odometry, by its name as in a study.
-
-    Raises
-    ------
-    OdometryError
-        If there is no such odometry, with the nearest name, or if the class cannot be used.
-    """
+    """Class of an odometry, by its name as in a study; an `OdometryError` if there is none."""
     try:
         found = strict.load(name, where(name), "class")
     except strict.PluginError as error:

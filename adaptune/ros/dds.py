@@ -239,10 +239,7 @@ class DdsLink:
         return ""
 
     def set_parameters(self, node: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
-        """See `RosLink.set_parameters`; what the node does not tell is as given.
-
-        If it refuses a value, it may hold the other values then.
-        """
+        """See `RosLink.set_parameters`; after a refusal the node may hold the other values."""
         node = full(node)
         given = [parameter_message(self.store, name, value) for name, value in values.items()]
         results = self._call(node, "SetParameters", len(given), parameters=given).results
@@ -255,10 +252,7 @@ class DdsLink:
         return dict(values) | self._held(node, list(values))
 
     def parameters(self, node: str) -> Mapping[str, Any]:
-        """The parameters that a node declares, and what it holds; arrays and empty ones left out.
-
-        There is a LinkError if the node is not there or does not answer.
-        """
+        """What a node declares and holds, arrays left out; a LinkError if it does not answer."""
         return self._held(full(node), self._declared(full(node)))
 
     def nodes(self) -> list[str]:

@@ -219,10 +219,7 @@ class Ros1(Relay):
 
 
 def ros_python() -> str:
-    """The Python that imports ROS 1: the first ``python3`` of the system's that does.
-
-    There is a `LinkError` if none does.
-    """
+    """The first ``python3`` of the system's that imports ROS 1; a `LinkError` if none does."""
     found = [shutil.which("python3", path=folder) for folder in os.get_exec_path()]
     for python in dict.fromkeys([*filter(None, found), "/usr/bin/python3"]):
         # Not what lies in the working folder under a name of Python's.

@@ -226,10 +226,7 @@ def _answer(stream, header, answer):  # type: (Stream, dict[str, Any], Any) -> N
 
 
 def converse(stream, name, more=None):  # type: (Stream, str, dict[str, Any] | None) -> None
-    """Be a node until the other side closes the socket.
-
-    `more` holds functions that answer other messages, by their type.
-    """
+    """Be a node until the other side closes the socket; `more` answers other messages, by type."""
     import rospy
 
     rospy.init_node(name, anonymous=True, disable_signals=True)

@@ -355,10 +355,7 @@ _EMPTY = "adaptune-empty:latest"
 def own_container(
     command: Sequence[str], folder: Path, environment: Mapping[str, str]
 ) -> Container:
-    """Run a Python program of adaptune's in a container, which sees this machine's Python.
-
-    It may write to the folder.
-    """
+    """Run a Python program of adaptune's in a container, which may write to the folder."""
     with _telling(_EMPTY):
         if not engine().api.images(_EMPTY, quiet=True):
             nothing = io.BytesIO()

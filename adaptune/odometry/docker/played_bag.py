@@ -155,10 +155,7 @@ class PlayedBag(WholeRun):
         self._see(system, n)
 
     def _see(self, system: RosSystem, n: int) -> float:
-        """See whether the system runs, and how many seconds of CPU time it has used.
-
-        The bag sets the pace, so CPU time counts as the system's time.
-        """
+        """See whether the system runs, and its CPU seconds, which count as its time."""
         system.state()
         cpu = system.usage.cpu
         self._usage = system.usage._replace(seconds=cpu / n, other_cpu=cpu)
@@ -237,12 +234,8 @@ def check_stamps(stamps: NDArray[np.int64], scans: NDArray[np.int64]) -> None:
     """Refuse stamps of poses that are not those of the scans, in nanoseconds, shapes (m,) and (n,).
 
     A system that publishes one pose for a scan stamps it with the scan's start, its end, or
-    anything fixed between. One that publishes more is judged by begin and end only.
-
-    Raises
-    ------
-    OdometryError
-        If they go back, are further off than a scan and a quarter, or scatter. It says how far.
+    anything fixed between. One that publishes more is judged by begin and end only. There is an
+    `OdometryError` if they go back, are further off than a scan and a quarter, or scatter.
     """
     if len(stamps) < 2:
         return

@@ -261,10 +261,7 @@ def _flat(data: Any, key: str = "") -> Iterator[tuple[str, Any]]:
 
 
 class RustleSettings(RosSettings):
-    """An image in RUSTLE's layout.
-
-    ``docs/docker.md`` describes the settings and their defaults.
-    """
+    """An image in RUSTLE's layout; ``docs/docker.md`` describes the settings and their defaults."""
 
     system: ClassVar[type[RosSystem]] = Ros1System
 
