@@ -7,11 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 from adaptune.odometry.base import Description, InProcess, OdometryInstance, OwnFile
 from adaptune.odometry.guarded import Guarded
-from adaptune.odometry.remote import Isolated, Limits
-from adaptune.space import ParameterSet, ParameterSpace, PooledSpace
-
-if TYPE_CHECKING:
-    from adaptune.odometry.program import ProgramInput
 from adaptune.odometry.registry import (
     CONTAINERS,
     PROGRAMS,
@@ -21,6 +16,11 @@ from adaptune.odometry.registry import (
     odometry_class,
     odometry_content,
 )
+from adaptune.odometry.remote import Isolated, Limits
+from adaptune.space import ParameterSet, ParameterSpace, PooledSpace
+
+if TYPE_CHECKING:
+    from adaptune.odometry.program import ProgramInput
 
 
 @dataclass(frozen=True)
@@ -78,9 +78,7 @@ class OdometryFactory:
         return found
 
     def __call__(
-        self,
-        parameters: ParameterSet | None = None,
-        sequence: str | None = None,
+        self, parameters: ParameterSet | None = None, sequence: str | None = None
     ) -> OdometryInstance:
         """Make a new instance; parameters not given keep their baseline.
 
@@ -92,13 +90,13 @@ class OdometryFactory:
             if sequence is not None and self.program_input is not None:
                 read = partial(self.program_input, sequence)
             program: Any = odometry_class(self.name)
-            made: OdometryInstance = program.instance(given, self.settings, self.limits, read)
-            return made
+            instance: OdometryInstance = program.instance(given, self.settings, self.limits, read)
+            return instance
         is_users = is_user_class(self.name)
         if not self.description.clean or (is_users and not self.user_code):
             return Isolated(self.name, given, self.settings, self.limits)
         if is_users:
-            return Guarded(self.name, odometry_class, given, self.settings, self.limits.seconds)
+            return Guarded(self.name, given, self.settings, self.limits.seconds)
         cls: Any = odometry_class(self.name)
         return InProcess(cls(given, self.settings))
 
@@ -123,12 +121,8 @@ class OdometryPool:
     def description(self) -> Description:
         """What a study must know of all together; no instance changes to another odometry."""
         every = [factory.description for factory in self.factories.values()]
-        return Description(
-            self.space,
-            live=False,
-            needs_imu=any(one.needs_imu for one in every),
-            whole=any(one.whole for one in every),
-        )
+        needs_imu, whole = any(d.needs_imu for d in every), any(d.whole for d in every)
+        return Description(self.space, live=False, needs_imu=needs_imu, whole=whole)
 
     @property
     def identity(self) -> dict[str, Any]:
@@ -161,9 +155,7 @@ class OdometryPool:
         return self.factories[label].alone(own)
 
     def __call__(
-        self,
-        parameters: ParameterSet | None = None,
-        sequence: str | None = None,
+        self, parameters: ParameterSet | None = None, sequence: str | None = None
     ) -> OdometryInstance:
         """Make a new instance of the odometry that the set names, see `OdometryFactory`."""
         whole = self.space.baseline if parameters is None else parameters

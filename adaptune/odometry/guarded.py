@@ -15,6 +15,7 @@ from adaptune.errors import AdaptuneError, in_a_line
 from adaptune.geometry import Poses
 from adaptune.odometry import wire
 from adaptune.odometry.base import LOST, Faulting, Odometry, Registration, Usage, pose_fault
+from adaptune.odometry.registry import odometry_class
 from adaptune.recording.scan import Scan
 from adaptune.space import ParameterSet, Selection
 
@@ -26,20 +27,13 @@ class _LateError(BaseException):
 class Guarded(Faulting):
     """A clean class of the user in this process, with the faults that `Isolated` would have.
 
-    `find` imports the class of a name. The limit of seconds for one scan holds for Python code in
-    the main thread; other code is trusted.
+    The limit of seconds for one scan holds for Python code in the main thread; other code is
+    trusted.
     """
 
-    def __init__(
-        self,
-        name: str,
-        find: Callable[[str], type[Any]],
-        parameters: ParameterSet,
-        settings: BaseModel,
-        seconds: float,
-    ):
+    def __init__(self, name: str, parameters: ParameterSet, settings: BaseModel, seconds: float):
         super().__init__(name, parameters)
-        self._find, self._seconds = find, seconds
+        self._seconds = seconds
         self._settings = settings.model_dump(mode="json")
         self._odometry: Odometry | None = None
         self._cpu = 0.0
@@ -115,7 +109,7 @@ class Guarded(Faulting):
         try:
             with _limited(self._seconds):
                 if self._odometry is None:
-                    cls = self._find(self.name)
+                    cls = odometry_class(self.name)
                     settings = cls.settings_type.model_validate(self._settings)
                     self._odometry = cls(self.parameters, settings)
                 return call(self._odometry)

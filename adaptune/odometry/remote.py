@@ -5,7 +5,6 @@ milliseconds, and global state of the odometry ends with its process.
 """
 
 import socket
-from contextlib import nullcontext
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self
@@ -208,17 +207,6 @@ FIRST_ANSWER = 60.0
 """Seconds that a program may need to begin."""
 
 
-def parse_address(address: str) -> tuple[socket.AddressFamily, Any]:
-    """Socket family and address of ``tcp://HOST:PORT`` or ``unix:PATH``; else an error."""
-    kind, colon, rest = address.partition(":")
-    if kind == "unix" and colon and rest:
-        return socket.AF_UNIX, rest
-    host, _, port = rest.removeprefix("//").rpartition(":")
-    if kind != "tcp" or not host or not port.isdigit():
-        raise OdometryError(f"address: {address!r} is neither tcp://HOST:PORT nor unix:PATH")
-    return socket.AF_INET, (host, int(port))
-
-
 class ProcessSettings(BaseSettings):
     """How to reach a program that speaks `adaptune.odometry.wire`, see ``docs/programs.md``.
 
@@ -279,12 +267,19 @@ class ProgramTransport(processes.Transport):
 
 
 def _reached(address: str) -> socket.socket:
-    family, where = parse_address(address)
-    connection = socket.socket(family)
+    """Connect to ``tcp://HOST:PORT`` or ``unix:PATH``."""
+    kind, _, rest = address.partition(":")
+    host, _, port = rest.removeprefix("//").rpartition(":")
+    is_file = kind == "unix" and rest != ""
+    if not is_file and (kind != "tcp" or not host or not port.isdigit()):
+        raise OdometryError(f"address: {address!r} is neither tcp://HOST:PORT nor unix:PATH")
+    connection = socket.socket(socket.AF_UNIX if is_file else socket.AF_INET)
     try:
-        is_file = family == socket.AF_UNIX
-        with processes.socket_name(Path(where)) if is_file else nullcontext(where) as name:
-            connection.connect(name)
+        if is_file:
+            with processes.socket_name(Path(rest)) as name:
+                connection.connect(name)
+        else:
+            connection.connect((host, int(port)))
     except OSError as error:
         connection.close()
         what = f"nothing listens at {address} ({error.strerror})"

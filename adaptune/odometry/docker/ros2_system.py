@@ -65,7 +65,6 @@ DIED = re.compile(
 NOISE = re.compile(
     rb"\[INFO\] \[(launch|[\w.-]+)\]: (All log files|Default logging|process started).*"
 )
-_TRANSFORMS = "tf2_msgs/msg/TFMessage"
 _BETWEEN_LOOKS, _BETWEEN_STATES = 0.3, 0.05
 """Seconds."""
 _UNDECLARED = 3.0
@@ -92,8 +91,6 @@ class Ros2System(RosSystem):
     ros = 2
     link: Ros2Relay
     _log_name, _noise, _inside = "output.log", NOISE, _FOLDER
-    _used = Usage(0.0, 0.0)
-    _at_begin = 0.0
     _node: Any = None
     _player: "_Player | None" = None
     _looked = -float("inf")
@@ -149,45 +146,44 @@ class Ros2System(RosSystem):
         if transforms := self._settings.transforms:
             types = link.store.types
             stamped = [_stamped(types, child, *given) for child, given in transforms.items()]
-            link.advertise("/tf_static", _TRANSFORMS)(types[_TRANSFORMS](stamped))
+            link.advertise("/tf_static", TRANSFORMS[0])(types[TRANSFORMS[0]](stamped))
         return link
 
     def _lacking(self) -> OdometryError | None:
         if self._node.ended() is not None:
             return OdometryError(f"adaptune's node ended: {self._node.last_lines()}")
         ended = self._ended()
-        return ended and OdometryError(processes.quoting(str(ended), self.words()))
+        return None if ended is None else OdometryError(processes.quoting(ended, self.words()))
 
-    def _ended(self) -> OdometryError | None:
-        if (code := self._container.ended()) is not None:
-            return OdometryError(
-                f"{' '.join(self._settings.command[:4])}: {processes.how_it_ended(code)}"
-            )
-        return None
+    def _ended(self) -> str | None:
+        """How the system ended; None while it runs."""
+        if (code := self._container.ended()) is None:
+            return None
+        return f"{' '.join(self._settings.command[:4])}: {processes.how_it_ended(code)}"
 
     def state(self) -> dict[str, Any]:
         now = time.monotonic()
         if now - self._looked > _BETWEEN_LOOKS:
             self._looked = now
             used = self._container.used()
-            cpu = max(used.cpu - self._at_begin, self.usage.cpu)
-            self.usage = Usage(cpu, max(used.memory, self.usage.memory or 0.0))
+            cpu, memory = max(used.cpu, self.usage.cpu), max(used.memory, self.usage.memory or 0.0)
+            self.usage = Usage(cpu, memory)
             if died := DIED.search(self._tail(self._log_name)):
                 name, code = died[1].decode(), int(died[2])
                 raise OdometryError(f"node {name} died: {processes.how_it_ended(code)}")
         if (ended := self._ended()) is not None:
-            raise ended
+            raise OdometryError(ended)
         topic = self._settings.odometry
-        found: dict[str, Any] = self.link.ask("state", topics=self._topics[1:], own=[topic])
-        kinds = found["published"].get(topic) or [TRANSFORMS[0]]
+        state: dict[str, Any] = self.link.ask("state", topics=self._topics[1:], own=[topic])
+        kinds = state["published"].get(topic) or [TRANSFORMS[0]]
         if kinds[0] not in POSES:
             raise OdometryError(
                 f"{topic} is {kinds[0]}; odometry.settings.odometry must name poses"
             )
-        if len(senders := found["senders"][topic]) > 1 and kinds[0] not in TRANSFORMS:
+        if len(senders := state["senders"][topic]) > 1 and kinds[0] not in TRANSFORMS:
             names = " and ".join(senders)
             raise OdometryError(f"{topic} is published by two ({names}), whose poses would mix")
-        return found
+        return state
 
     def cloud_type(self, topic: str) -> str:
         while time.monotonic() - self._begun < self._settings.ready:
