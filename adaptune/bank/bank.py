@@ -78,8 +78,7 @@ KEPT = 2.0
 _CELL = 0.25
 """Metres between points of the scans before. Without thinning, rings on the ground, which stand
 still whatever the sensor does, would outnumber the rest."""
-_NEAR = 1.0
-"""Metres within which points may be the robot's own."""
+_NEAR = 1.0  # metres within which points may be the robot's own
 
 
 class ShortRegistrations:
@@ -150,10 +149,8 @@ CLOCK = Clock(time.perf_counter, time.sleep)
 
 MAX_LATE_SECONDS = 5.0
 """A member that is late at every scan for so many seconds is removed."""
-_INTERVALS = 11
-"""Newest intervals between scans whose median says when the next scan is due."""
-_POLL = 0.005
-"""Seconds from one look at a member to the next."""
+_INTERVALS = 11  # newest intervals between scans whose median says when the next scan is due
+_POLL = 0.005  # seconds from one look at a member to the next
 
 
 class Lateness:

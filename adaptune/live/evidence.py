@@ -38,15 +38,12 @@ USUAL_SHARE = 0.4
 """About the share of the seconds in which a bank measures."""
 HOPS_TO_BE_LOST = 2
 """Hops in a row that must be rejected, or disagree, before an odometry counts as lost."""
-_APART = 0.3
-"""Metres between guesses that are worth a registration each."""
+_APART = 0.3  # metres between guesses that are worth a registration each
 _GUESSES = 3
-_TRY_AGAIN = 5
-"""After so many shorter hops, a long one is tried again."""
+_TRY_AGAIN = 5  # after so many shorter hops, a long one is tried again
 SHARED = 1.25
 """A hop may be this many times as long if it starts at a cloud that was prepared before."""
-_MIN_DIRECTIONS = 1.5
-"""A hop must tell the motion in two directions at least."""
+_MIN_DIRECTIONS = 1.5  # a hop must tell the motion in two directions at least
 _FULL_TURN = 10.0
 """Metres at which a difference in rotation counts as one in translation, in radians."""
 

@@ -23,8 +23,7 @@ MIN_INLIERS = 0.35
 DEGENERATE = 0.002
 """A direction is unknown if its information is less than this share of the best direction's."""
 _MIN_RANGE = 1.0
-_MIN_POINTS = 100
-"""Points; small_gicp crashes on an empty target, and three points always converge."""
+_MIN_POINTS = 100  # points; small_gicp crashes on an empty target, and three points always converge
 REACHES, OFFLINE_REACHES = (1.0,), (2.0, 0.5)
 """Metres of the greatest distance of correspondences, one registration after the other; the second
 where there is time for two."""

@@ -27,8 +27,7 @@ MOST_FAULTS = 10
 """An instance with so many faults does not start again: the rest of its sequence is lost."""
 MAX_SHARE_WITHOUT_POSE = 0.1
 """Share of the scans from which an odometry that gives no pose for them has failed."""
-_TOLERANCE = 1e-3
-"""By how much a rotation times its transpose may differ from the identity."""
+_TOLERANCE = 1e-3  # by how much a rotation times its transpose may differ from the identity
 
 _log = logging.getLogger(__name__)
 

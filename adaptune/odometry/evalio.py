@@ -395,11 +395,9 @@ class Form(GridPipeline):
     )
 
 
-_BEHIND = 2
-"""Scans that LIO-SAM waits for before it registers one."""
+_BEHIND = 2  # scans that LIO-SAM waits for before it registers one
 
-_SMOOTH = 3
-"""Scans over which the mean velocity is taken that carries its poses on."""
+_SMOOTH = 3  # scans over which the mean velocity is taken that carries its poses on
 
 
 class LioSam(RingedPipeline):

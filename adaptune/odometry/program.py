@@ -118,8 +118,7 @@ def _about(folder: Path) -> Any:
         return None
 
 
-_MIN_FRAMES = 10
-"""Frames below which nothing is said of a frame."""
+_MIN_FRAMES = 10  # frames below which nothing is said of a frame
 
 
 def check_frame(T_own_sensor: Poses, T_ref_sensor: Poses | None) -> None:
@@ -149,8 +148,7 @@ def check_frame(T_own_sensor: Poses, T_ref_sensor: Poses | None) -> None:
         )
 
 
-_COVERAGE = 0.9
-"""Least share of the scans for which there must be poses."""
+_COVERAGE = 0.9  # least share of the scans for which there must be poses
 
 
 class WholeSettings(BaseSettings):

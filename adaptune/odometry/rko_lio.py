@@ -19,8 +19,7 @@ from adaptune.odometry.own_frame import END, MIDDLE, NO_IMU, OwnFrameOdometry
 from adaptune.recording.scan import Imu, Scan
 from adaptune.space import Float, ParameterSet, ParameterSpace
 
-_LATER = 10**9
-"""Nanoseconds added to all stamps: at time 0 it assumes that nothing has come yet."""
+_LATER = 10**9  # nanoseconds added to all stamps: at time 0 it assumes that nothing has come yet
 
 
 class RkoLioSettings(RangeSettings):

@@ -51,16 +51,12 @@ from adaptune.ros.ros2 import (
     ros_domain,
 )
 
-_ANSWER = 2.0
-"""Seconds in which a service must answer."""
-_DISCOVERY = 1.5
-"""Seconds in which other nodes are found."""
+_ANSWER = 2.0  # seconds in which a service must answer
+_DISCOVERY = 1.5  # seconds in which other nodes are found
 _AGAIN = 0.5
 """Seconds after which a service is called again: its answer may have had no way back yet."""
-_DEPTH = 1000
-"""Messages of a topic that may wait; then the oldest are dropped."""
-_PAUSE = 0.02
-"""Seconds between calls of a service that is not there, or not yet."""
+_DEPTH = 1000  # messages of a topic that may wait; then the oldest are dropped
+_PAUSE = 0.02  # seconds between calls of a service that is not there, or not yet
 _CYCLONE, _FAST_DDS = b"\x01\x10", b"\x01\x0f"
 """The vendors of DDS in ROS 2, as they begin the keys of their participants."""
 _INFO = "rmw_dds_common/msg/ParticipantEntitiesInfo"

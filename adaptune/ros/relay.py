@@ -24,14 +24,10 @@ from adaptune.ros import ros1_node
 from adaptune.ros.link import LinkError, take_all, telling
 from adaptune.ros.ros2 import BUFFER_CURE, RECEIVE_BUFFER, message_types
 
-_START = 20.0
-"""Seconds in which the node must be ready."""
-_WAITING = 1000
-"""Messages of a topic that may wait; more are dropped."""
-_ANSWER = 5.0
-"""Seconds in which it must answer; it waits less for others."""
-_DEAF = 30.0
-"""Seconds in which it must read what is sent."""
+_START = 20.0  # seconds in which the node must be ready
+_WAITING = 1000  # messages of a topic that may wait; more are dropped
+_ANSWER = 5.0  # seconds in which it must answer; it waits less for others
+_DEAF = 30.0  # seconds in which it must read what is sent
 
 _log = logging.getLogger(__name__)
 

@@ -11,8 +11,7 @@ from adaptune.ros.link import LinkError
 from adaptune.ros.ros1_node import Stream, serve
 from adaptune.ros.ros2 import full
 
-_QUIET = ("/parameter_events", "/rosout", "/clock")
-"""Topics of every node."""
+_QUIET = ("/parameter_events", "/rosout", "/clock")  # topics of every node
 
 
 class _Node:

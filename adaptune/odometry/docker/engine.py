@@ -34,17 +34,13 @@ OWNER = "adaptune.owner"
 """Label of every container: the process that has started it."""
 _NOBODY = 65534
 _SIGNALS = set(map(int, signal.Signals))
-_PERIOD = 100_000
-"""Microseconds over which the use of cores is counted."""
+_PERIOD = 100_000  # microseconds over which the use of cores is counted
 _WEIGHT = 10 * 1024
 """Of a core against other processes: at any load, a system has the cores that it may use."""
-_MOST_WRITTEN = 4 * 1024**3
-"""Bytes of a file; a process that writes more gets SIGXFSZ."""
+_MOST_WRITTEN = 4 * 1024**3  # bytes of a file; a process that writes more gets SIGXFSZ
 _TAIL = 50
-_BETWEEN_LOOKS = 0.02
-"""Seconds."""
-_REMOVAL = 20.0
-"""Seconds that a container may take to remove what its user has written."""
+_BETWEEN_LOOKS = 0.02  # seconds
+_REMOVAL = 20.0  # seconds that a container may take to remove what its user has written
 
 _log = logging.getLogger(__name__)
 
@@ -348,8 +344,7 @@ class Container:
             _remove(engine(), self.id)
 
 
-_EMPTY = "adaptune-empty:latest"
-"""An image without a file."""
+_EMPTY = "adaptune-empty:latest"  # an image without a file
 
 
 def own_container(

@@ -32,22 +32,16 @@ from adaptune.trajectory import Trajectory
 _IMU = "sensor_msgs/msg/Imu"
 _log = logging.getLogger(__name__)
 
-_MOST_SILENT = 30
-"""Scans in a row without a pose that are a fault."""
-_LEAST_ANSWERED = 0.75
-"""Least share of scans with a pose, of so many or more since the first one."""
-_BETWEEN_LOOKS = 1.0
-"""Seconds between looks at what the system has used."""
+_MOST_SILENT = 30  # scans in a row without a pose that are a fault
+_LEAST_ANSWERED = 0.75  # least share of scans with a pose, of so many or more since the first one
+_BETWEEN_LOOKS = 1.0  # seconds between looks at what the system has used
 _MOST_PATIENT = 3
 """Scans in a row for which it waits in full before the first pose; then it waits `_IMPATIENCE`."""
-_IMPATIENCE = 0.5
-"""Seconds."""
-_BACKGROUND, _BUSY = 0.5, 0.2
-"""Seconds after the last pose, and cores, at which a system works on."""
+_IMPATIENCE = 0.5  # seconds
+_BACKGROUND, _BUSY = 0.5, 0.2  # seconds after the last pose, and cores, at which a system works on
 OTHER_CLOCK = 2 * 10**9
 """Nanoseconds between the stamps of a scan and of its pose that no system adds to a scan's."""
-_EARLY = 1_000_000
-"""Nanoseconds by which a pose's stamp may be before the scan's."""
+_EARLY = 1_000_000  # nanoseconds by which a pose's stamp may be before the scan's
 
 
 _SEEN: set[str] = set()

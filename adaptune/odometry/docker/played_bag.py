@@ -20,16 +20,11 @@ from adaptune.trajectory import Trajectory
 
 _BETWEEN_TOPIC_LOOKS = 0.1
 _BETWEEN_STATES = 1.0
-_QUIET = 2.0
-"""Seconds without a pose, and without work, that are the end."""
-_FIRST = 10.0
-"""The same where no pose has come yet."""
-_BUSY_QUIET = 60.0
-"""Seconds without a pose that are the end of a system that never rests."""
-_IDLE = 0.1
-"""Cores that a system may use while it rests: nodes wake up with the clock."""
-_STEADY = 0.9
-"""Least share of poses whose stamps are as far from the scans' as those of the others."""
+_QUIET = 2.0  # seconds without a pose, and without work, that are the end
+_FIRST = 10.0  # the same where no pose has come yet
+_BUSY_QUIET = 60.0  # seconds without a pose that are the end of a system that never rests
+_IDLE = 0.1  # cores that a system may use while it rests: nodes wake up with the clock
+_STEADY = 0.9  # least share of poses whose stamps are as far from the scans' as those of the others
 MAX_SCATTER = 5_000_000
 """Nanoseconds by which these may differ: a clock differs by more."""
 

@@ -13,8 +13,7 @@ from adaptune.geometry import Poses, to_pose, to_quaternions
 from adaptune.recording.pose_messages import POSES, TRANSFORMS, Pose, message_stamp
 from adaptune.ros.relay import Relay
 
-_FLOOD = 2000
-"""Messages of a second that are too many."""
+_FLOOD = 2000  # messages of a second that are too many
 
 
 class PoseReader:

@@ -18,10 +18,8 @@ from adaptune.recording.scan import Scan
 from adaptune.ros.link import LinkError
 from adaptune.space import ParameterSet, Selection
 
-_SHORT = 50
-"""Scans by which it is seen what a parameter changes while the system runs."""
-_BEFORE = 10
-"""Scans of these before it is set."""
+_SHORT = 50  # scans by which it is seen what a parameter changes while the system runs
+_BEFORE = 10  # scans of these before it is set
 
 
 class _Watched(Lockstep):
@@ -167,10 +165,8 @@ def _topics(system: Any) -> dict[str, str]:
     }
 
 
-_OF_ROS = {"use_sim_time", "start_type_description_service"}
-"""Parameters that every node has."""
-_SHOWN = 40
-"""Characters of a value."""
+_OF_ROS = {"use_sim_time", "start_type_description_service"}  # parameters that every node has
+_SHOWN = 40  # characters of a value
 
 
 def _declared(system: Any, template: Template) -> dict[str, str]:

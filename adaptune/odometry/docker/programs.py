@@ -39,8 +39,7 @@ from adaptune.space import ParameterSet
 from adaptune.trajectory import Trajectory
 
 _OUTPUT = "/output"
-_BETWEEN_LOOKS = 0.1
-"""Seconds."""
+_BETWEEN_LOOKS = 0.1  # seconds
 
 
 class DockerCommandSettings(ContainerSettings, FileSettings):
@@ -119,8 +118,7 @@ class DockerCommand(FileRun):
 
 
 _FOLDER = "/adaptune"
-_BETWEEN_SOCKET_LOOKS = 0.02
-"""Seconds."""
+_BETWEEN_SOCKET_LOOKS = 0.02  # seconds
 
 
 class DockerProcessSettings(ContainerSettings):

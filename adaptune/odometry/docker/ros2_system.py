@@ -65,18 +65,13 @@ DIED = re.compile(
 NOISE = re.compile(
     rb"\[INFO\] \[(launch|[\w.-]+)\]: (All log files|Default logging|process started).*"
 )
-_BETWEEN_LOOKS, _BETWEEN_STATES = 0.3, 0.05
-"""Seconds."""
-_UNDECLARED = 3.0
-"""Seconds in which a node that subscribes declares its parameters."""
-_MATCHED = 3.0
-"""Seconds in which nodes find what is published."""
-_LEAD = 300_000_000
-"""Nanoseconds between the begin of the clock and of the recording."""
+_BETWEEN_LOOKS, _BETWEEN_STATES = 0.3, 0.05  # seconds
+_UNDECLARED = 3.0  # seconds in which a node that subscribes declares its parameters
+_MATCHED = 3.0  # seconds in which nodes find what is published
+_LEAD = 300_000_000  # nanoseconds between the begin of the clock and of the recording
 _DOMAINS = range(60, 101)
 """Of systems on this machine; ports of higher ones are given to other programs."""
-_PORT, _PORTS = 7400, 250
-"""The first port of the first domain, and how many each has."""
+_PORT, _PORTS = 7400, 250  # the first port of the first domain, and how many each has
 
 _log = logging.getLogger(__name__)
 

@@ -43,10 +43,8 @@ QUIET = {"/clock", "/rosout", "/rosout_agg", "/parameter_events"}
 """Topics of every node."""
 CLOCK = "rosgraph_msgs/msg/Clock"
 _BETWEEN_LOOKS = 0.05
-_TAIL = 1 << 14
-"""Bytes of a log in which its last lines are."""
-_TICK = 0.01
-"""Seconds."""
+_TAIL = 1 << 14  # bytes of a log in which its last lines are
+_TICK = 0.01  # seconds
 _log = logging.getLogger(__name__)
 
 START = 30.0

@@ -72,10 +72,8 @@ _PROBE = (
 )
 _PLAYER = "player=$(ls /opt/ros/*/lib/rosbag/play /usr/lib/rosbag/play 2>/dev/null | head -n 1); "
 """What `rosbag play` runs; Python takes half a second to find it."""
-_UNTIL_NOTED = 0.5
-"""Seconds in which the engine notes that a container has ended."""
-_TICK = 0.01
-"""Seconds."""
+_UNTIL_NOTED = 0.5  # seconds in which the engine notes that a container has ended
+_TICK = 0.01  # seconds
 
 _log = logging.getLogger(__name__)
 
