@@ -5,17 +5,9 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
+from adaptune.odometry import registry
 from adaptune.odometry.base import Description, InProcess, OdometryInstance, OwnFile
 from adaptune.odometry.guarded import Guarded
-from adaptune.odometry.registry import (
-    CONTAINERS,
-    PROGRAMS,
-    Content,
-    declare,
-    is_user_class,
-    odometry_class,
-    odometry_content,
-)
 from adaptune.odometry.remote import Isolated, Limits
 from adaptune.space import ParameterSet, ParameterSpace, PooledSpace
 
@@ -39,7 +31,7 @@ class OdometryFactory:
     description: Description = field(init=False)  # what a study must know of the odometry
 
     def __post_init__(self) -> None:
-        settings, description = declare(self.name, self.settings).sound(self.name)
+        settings, description = registry.declare(self.name, self.settings).sound(self.name)
         vars(self).update(settings=settings, description=description)
 
     @property
@@ -48,9 +40,9 @@ class OdometryFactory:
         return {"name": self.name, "settings": self.settings.model_dump(mode="json")}
 
     @property
-    def content(self) -> Content:
+    def content(self) -> registry.Content:
         """What the poses depend on besides name, settings and parameters."""
-        return odometry_content(self.name, self.settings, self.description.module)
+        return registry.odometry_content(self.name, self.settings, self.description.module)
 
     def changed(self, **changes: Any) -> "OdometryFactory":
         """The same with another `user_code` or `program_input`."""
@@ -59,12 +51,12 @@ class OdometryFactory:
     @property
     def apart(self) -> bool:
         """Whether it runs in processes of their own, which have limits."""
-        return not self.description.clean or is_user_class(self.name)
+        return not self.description.clean or registry.is_user_class(self.name)
 
     @property
     def one_by_one(self) -> bool:
         """Whether trials gain nothing from sharing a pass: what runs them shares nothing."""
-        return self.description.whole or self.name in CONTAINERS
+        return self.description.whole or self.name in registry.CONTAINERS
 
     def alone(self, parameters: ParameterSet) -> tuple["OdometryFactory", ParameterSet]:
         """What makes the odometry that a set is for, and all parameters that it takes."""
@@ -72,9 +64,11 @@ class OdometryFactory:
 
     def own_file(self, parameters: ParameterSet) -> OwnFile | None:
         """All parameters as the odometry's own tool reads them; None if it has no such tool."""
-        if is_user_class(self.name):
+        if registry.is_user_class(self.name):
             return None  # which is not imported here
-        found: OwnFile | None = odometry_class(self.name).own_file(parameters, self.settings)
+        found: OwnFile | None = registry.odometry_class(self.name).own_file(
+            parameters, self.settings
+        )
         return found
 
     def __call__(
@@ -85,19 +79,19 @@ class OdometryFactory:
         Programs that run whole recordings need the name of the sequence on which it will run.
         """
         given = self.space.complete(parameters or {})
-        if self.name in PROGRAMS:
+        if self.name in registry.PROGRAMS:
             read = None
             if sequence is not None and self.program_input is not None:
                 read = partial(self.program_input, sequence)
-            program: Any = odometry_class(self.name)
+            program: Any = registry.odometry_class(self.name)
             instance: OdometryInstance = program.instance(given, self.settings, self.limits, read)
             return instance
-        is_users = is_user_class(self.name)
+        is_users = registry.is_user_class(self.name)
         if not self.description.clean or (is_users and not self.user_code):
             return Isolated(self.name, given, self.settings, self.limits)
         if is_users:
             return Guarded(self.name, given, self.settings, self.limits.seconds)
-        cls: Any = odometry_class(self.name)
+        cls: Any = registry.odometry_class(self.name)
         return InProcess(cls(given, self.settings))
 
 
@@ -141,7 +135,7 @@ class OdometryPool:
         return any(factory.one_by_one for factory in self.factories.values())
 
     @property
-    def content(self) -> Content:
+    def content(self) -> registry.Content:
         """See `OdometryFactory`."""
         return {k: v for factory in self.factories.values() for k, v in factory.content.items()}
 

@@ -16,17 +16,7 @@ from typing import Any, NamedTuple
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
-from cyclonedds import builtin
-from cyclonedds.core import (
-    DDSException,
-    DDSStatus,
-    GuardCondition,
-    InstanceState,
-    ReadCondition,
-    SampleState,
-    ViewState,
-    WaitSet,
-)
+from cyclonedds import builtin, core
 from cyclonedds.domain import Domain, DomainParticipant
 from cyclonedds.idl import IdlStruct
 from cyclonedds.pub import DataWriter
@@ -37,19 +27,8 @@ from cyclonedds.util import duration
 
 from adaptune.errors import nearest
 from adaptune.recording.clouds import CLOUDS
+from adaptune.ros import ros2
 from adaptune.ros.link import LinkError, take_all
-from adaptune.ros.ros2 import (
-    BUFFER_CURE,
-    FIELDS,
-    PLACES,
-    RECEIVE_BUFFER,
-    Service,
-    full,
-    message_types,
-    parameter_message,
-    register_service,
-    ros_domain,
-)
 
 _ANSWER = 2.0  # seconds in which a service must answer
 _DISCOVERY = 1.5  # seconds in which other nodes are found
@@ -61,7 +40,7 @@ _CYCLONE, _FAST_DDS = b"\x01\x10", b"\x01\x0f"
 """The vendors of DDS in ROS 2, as they begin the keys of their participants."""
 _INFO = "rmw_dds_common/msg/ParticipantEntitiesInfo"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
-_ALL = ViewState.Any | SampleState.Any
+_ALL = core.ViewState.Any | core.SampleState.Any
 _DURABILITIES = tuple(
     getattr(Policy.Durability, name)
     for name in ("Volatile", "TransientLocal", "Transient", "Persistent")
@@ -94,9 +73,9 @@ class DdsLink:
     is2 = True
 
     def __init__(self, domain: int | None = None):
-        self.domain = ros_domain(domain)
-        self.store = message_types()
-        self._services = {name: register_service(self.store, name) for name in PLACES}
+        self.domain = ros2.ros_domain(domain)
+        self.store = ros2.message_types()
+        self._services = {name: ros2.register_service(self.store, name) for name in ros2.PLACES}
         self._calling, self._closed = threading.Lock(), False
         self._threads: list[threading.Thread] = []
         self._joined = time.monotonic()
@@ -105,10 +84,12 @@ class DdsLink:
             if self.domain not in _domains:
                 _domains[self.domain] = Domain(self.domain, _configuration())
             me = DomainParticipant(self.domain, Qos(Policy.Userdata(b"enclave=/;")))
-            self._participant, self._closing = me, GuardCondition(me)
+            self._participant, self._closing = me, core.GuardCondition(me)
             pair = builtin.BuiltinTopicDcpsPublication, builtin.BuiltinTopicDcpsSubscription
             found = [builtin.BuiltinDataReader(me, topic) for topic in pair]
-            self._found = [(r, ReadCondition(r, _ALL | InstanceState.Alive)) for r in found]
+            self._found = [
+                (r, core.ReadCondition(r, _ALL | core.InstanceState.Alive)) for r in found
+            ]
             self._kept: list[Any] = []
             self._writers: dict[str, DataWriter] = {}
             self._clients: dict[str, tuple[DataWriter, DataReader]] = {}
@@ -128,13 +109,13 @@ class DdsLink:
         It is reliable where all who publish are. There is a `LinkError` if the topic is published
         with another type, as far as that is known by now.
         """
-        there = [e for e in self.endpoints(0) if e.topic == full(topic)]
+        there = [e for e in self.endpoints(0) if e.topic == ros2.full(topic)]
         if there and kind not in {e.kind for e in there}:
             raise LinkError(f"{topic} is published as {there[0].kind}, not as {kind}")
-        if kind in CLOUDS and (size := _receive_buffer()) < RECEIVE_BUFFER:
+        if kind in CLOUDS and (size := _receive_buffer()) < ros2.RECEIVE_BUFFER:
             what = "%s: clouds may be lost, as this machine receives %d kB ahead; run `sudo sysctl "
             what += "-w net.core.rmem_max=%d` and start again"
-            _log.warning(what, topic, size // 1000, RECEIVE_BUFFER)
+            _log.warning(what, topic, size // 1000, ros2.RECEIVE_BUFFER)
         # Arrays are views of the bytes.
         read = lambda data: take(self.store.deserialize_cdr(memoryview(data), kind))  # noqa: E731
         messages = self._taken(topic, kind, self._topic_end(DataReader, topic, kind))
@@ -150,7 +131,9 @@ class DdsLink:
                 # A node that starts again is another one, and the first is not heard again.
                 if sender in senders[:-1] and not mixed:
                     mixed = True
-                    names = sorted({e.node for e in self.endpoints(0) if e.topic == full(topic)})
+                    names = sorted(
+                        {e.node for e in self.endpoints(0) if e.topic == ros2.full(topic)}
+                    )
                     what = "%s is published by two (%s), whose messages mix; end one of them"
                     _log.warning(what, topic, " and ".join(names))
                 if sender not in senders:
@@ -163,8 +146,12 @@ class DdsLink:
 
     def _waited(self, reader: DataReader, seconds: float | None = None) -> Iterator[Any]:
         """Samples as they come, until that takes too long, or somebody offers another QoS."""
-        ready = WaitSet(self._participant)
-        for condition in (reader, self._closing, ReadCondition(reader, _ALL | InstanceState.Any)):
+        ready = core.WaitSet(self._participant)
+        for condition in (
+            reader,
+            self._closing,
+            core.ReadCondition(reader, _ALL | core.InstanceState.Any),
+        ):
             ready.attach(condition)
         limit = duration(weeks=9999) if seconds is None else duration(seconds=seconds)
         while ready.wait(limit) and not self._closed:
@@ -215,7 +202,7 @@ class DdsLink:
             del self._participant, self._closing, self._info, self._infos
 
     def why_unheard(self, topic: str) -> str:
-        topic = full(topic)
+        topic = ros2.full(topic)
         offered = [e for e in self.endpoints(0, own=True) if e.topic == topic]
         wanted = [e for e in self.endpoints(1) if e.topic == topic]
         if not wanted:
@@ -230,14 +217,14 @@ class DdsLink:
         if fast := sorted({e.node for e in wanted if e.vendor == _FAST_DDS}):
             return (
                 f"{' and '.join(fast)} runs on Fast DDS, which loses clouds that do not fit in the "
-                f"receive buffer: run `{BUFFER_CURE}` on its machine, and start it again"
+                f"receive buffer: run `{ros2.BUFFER_CURE}` on its machine, and start it again"
             )
         return ""
 
     def set_parameters(self, node: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
         """See `RosLink.set_parameters`; after a refusal the node may hold the other values."""
-        node = full(node)
-        given = [parameter_message(self.store, name, value) for name, value in values.items()]
+        node = ros2.full(node)
+        given = [ros2.parameter_message(self.store, name, value) for name, value in values.items()]
         results = self._call(node, "SetParameters", len(given), parameters=given).results
         if refused := [
             f"{name} = {value!r} ({result.reason or 'without a reason'})"
@@ -249,7 +236,7 @@ class DdsLink:
 
     def parameters(self, node: str) -> Mapping[str, Any]:
         """What a node declares and holds, arrays left out; a LinkError if it does not answer."""
-        return self._held(full(node), self._declared(full(node)))
+        return self._held(ros2.full(node), self._declared(ros2.full(node)))
 
     def nodes(self) -> list[str]:
         """The nodes that serve their parameters."""
@@ -260,14 +247,14 @@ class DdsLink:
         """Let nodes find who will ask for their parameters, which takes a while."""
         for node in self.nodes():
             for name, service in self._services.items():
-                self._client(f"{node}/{PLACES[name]}", service)
+                self._client(f"{node}/{ros2.PLACES[name]}", service)
 
     def _declared(self, node: str) -> list[str]:
         return sorted(self._call(node, "ListParameters", None, prefixes=[], depth=0).result.names)
 
     def _held(self, node: str, names: list[str]) -> dict[str, Any]:
         values = self._call(node, "GetParameters", len(names), names=names).values
-        fields = dict(enumerate(FIELDS.values(), 1))
+        fields = dict(enumerate(ros2.FIELDS.values(), 1))
         held = zip(names, values, strict=False)  # none, where a node does not tell
         return {n: getattr(value, fields[value.type]) for n, value in held if value.type in fields}
 
@@ -285,7 +272,7 @@ class DdsLink:
         Who calls may get the answer to another caller, which has as many values only by chance.
         """
         asked = self._services[name]
-        place = f"{node}/{PLACES[name]}"
+        place = f"{node}/{ros2.PLACES[name]}"
         request = self.store.types[asked.request](**fields)
         raw = bytes(self.store.serialize_cdr(request, asked.request))
         response = None
@@ -334,11 +321,13 @@ class DdsLink:
                 with contextlib.suppress(Exception):  # that of another ROS 2 is longer
                     info: Any = self.store.deserialize_cdr(sample.data, _INFO)
                     for node in info.node_entities_info_seq:
-                        name = full(f"{node.node_namespace.rstrip('/')}/{node.node_name}")
+                        name = ros2.full(f"{node.node_namespace.rstrip('/')}/{node.node_name}")
                         for gid in (*node.reader_gid_seq, *node.writer_gid_seq):
                             self._nodes[bytes(gid.data)] = name
 
-    def _ask(self, place: str, service: Service, request: bytes, seconds: float) -> Iterator[Any]:
+    def _ask(
+        self, place: str, service: ros2.Service, request: bytes, seconds: float
+    ) -> Iterator[Any]:
         with self._naming(place):
             writer, reader = self._client(place, service)
             servers = writer.get_matched_subscriptions()
@@ -354,7 +343,7 @@ class DdsLink:
                 if sample.data[4 : 4 + len(head)] == head:
                     yield sample.data[:4] + sample.data[4 + len(head) :]
 
-    def _client(self, place: str, service: Service) -> tuple[DataWriter, DataReader]:
+    def _client(self, place: str, service: ros2.Service) -> tuple[DataWriter, DataReader]:
         if place not in self._clients:
             asks = self._end(DataWriter, f"rq{place}Request", service.request)
             self._clients[place] = asks, self._end(DataReader, f"rr{place}Reply", service.response)
@@ -365,7 +354,7 @@ class DdsLink:
         return sorted(n[2:-7] for n in names if n.startswith("rq/"))
 
     def _topic_end(self, end_type: type, topic: str, kind: str, *, reliable: bool = True) -> Any:
-        return self._end(end_type, f"rt{full(topic)}", kind, reliable=reliable)
+        return self._end(end_type, f"rt{ros2.full(topic)}", kind, reliable=reliable)
 
     def _end(self, end_type: type, name: str, kind: str, *, reliable: bool = True) -> Any:
         """Make a reader or a writer of a topic, as DDS names it, and announce it."""
@@ -383,7 +372,7 @@ class DdsLink:
             end = end_type(self._participant, Topic(self._participant, name, _carrier(kind)), qos)
             self._kept.append(end)
             if end_type is DataReader:
-                end.set_status_mask(DDSStatus.RequestedIncompatibleQos)
+                end.set_status_mask(core.DDSStatus.RequestedIncompatibleQos)
             if not info:
                 self._gids[end_type].append(self._gid(end))
                 self._announce()
@@ -407,7 +396,7 @@ class DdsLink:
             raise LinkError(f"{what}: the link was closed")
         try:
             yield
-        except (DDSException, UnicodeError) as error:
+        except (core.DDSException, UnicodeError) as error:
             raise LinkError(f"{what}: {error}") from error
 
 
@@ -461,7 +450,7 @@ def _configuration() -> str:
             raise LinkError(f"ROS_STATIC_PEERS: {peer}: {error.strerror}") from error
     alone = f"<Tag>adaptune {os.getpid()}</Tag>" if reach == "OFF" else ""
     known = "".join(f"<Peer address={quoteattr(peer)}/>" for peer in peers)
-    parts = [f'<Internal><SocketReceiveBufferSize max="{RECEIVE_BUFFER} B"/></Internal>']
+    parts = [f'<Internal><SocketReceiveBufferSize max="{ros2.RECEIVE_BUFFER} B"/></Internal>']
     if reach in ("LOCALHOST", "OFF"):
         # Cyclone DDS hears nobody on an interface that it does not use, and others greet on this.
         other = '<NetworkInterface autodetermine="true"/>' * (len(peers) > 1)
@@ -480,5 +469,5 @@ def _configuration() -> str:
 def _receive_buffer() -> int:
     """Bytes that the kernel lets a socket receive ahead."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, ros2.RECEIVE_BUFFER)
         return probe.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2

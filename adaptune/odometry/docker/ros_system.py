@@ -20,16 +20,7 @@ from pydantic import AfterValidator, Field, model_validator
 from adaptune import processes
 from adaptune.errors import OdometryError
 from adaptune.odometry.base import Usage
-from adaptune.odometry.docker.engine import (
-    Container,
-    ContainerSettings,
-    copy_regular,
-    default_user,
-    image_digest,
-    make_shared,
-    opened,
-    regular_files,
-)
+from adaptune.odometry.docker import engine
 from adaptune.odometry.docker.poses import PoseReader
 from adaptune.odometry.program import ProgramInput, WholeSettings
 from adaptune.odometry.template import Template
@@ -60,7 +51,7 @@ def _topic(name: str) -> str:
 Topic = Annotated[str, AfterValidator(_topic)]
 
 
-class RosSettings(ContainerSettings, WholeSettings):
+class RosSettings(engine.ContainerSettings, WholeSettings):
     """What ROS systems may set; ``docs/docker.md`` describes it and its defaults."""
 
     template: Annotated[str, AfterValidator(resolve)]
@@ -111,7 +102,7 @@ class RosSystem(ABC):
         self.usage, self._memory, self._recording = Usage(0.0, 0.0), memory, recording
         self._clock: SimClock | None = None
         self._keys: Mapping[str, Sequence[str]] = {}  # of a parameter server
-        self.folder, self._given = make_shared(folder / "shared"), folder / "given"
+        self.folder, self._given = engine.make_shared(folder / "shared"), folder / "given"
         self._given.mkdir()
         self._parameters = self._given / "params.yaml"
         self._parameters.write_text(parameters, encoding="utf-8")
@@ -254,7 +245,7 @@ class RosSystem(ABC):
         return processes.plain_lines(re.sub(rb"={10,}", b"", b"\n".join(lines)))
 
     def _tail(self, name: str) -> bytes:
-        with opened(self.folder / name, self.folder) as file:
+        with engine.opened(self.folder / name, self.folder) as file:
             if file is None:
                 return b""
             file.seek(max(file.seek(0, os.SEEK_END) - _TAIL, 0))
@@ -264,10 +255,10 @@ class RosSystem(ABC):
         """Copy what was written, and what was given, to a folder."""
         shutil.copy(self._parameters, folder)
         for name in (self._log_name, "rosbag.log"):
-            copy_regular(self.folder / name, self.folder, folder / name)
+            engine.copy_regular(self.folder / name, self.folder, folder / name)
         logs = self.folder / "ros" / "log"
-        for path in regular_files(logs):
-            copy_regular(path, self.folder, folder / "ros" / path.relative_to(logs))
+        for path in engine.regular_files(logs):
+            engine.copy_regular(path, self.folder, folder / "ros" / path.relative_to(logs))
 
     def close(self) -> None:
         """End the system, and remove what it has written."""
@@ -326,17 +317,17 @@ def filled(settings: Any, parameters: ParameterSet) -> tuple[Template, str]:
 
 def image_user(settings: Any, script: str, *words: str) -> str:
     """User who runs ROS in an image: root only where a script succeeds for nobody else."""
-    user = default_user(settings)
+    user = engine.default_user(settings)
     if settings.user is not None:
         return user
-    return _probed(image_digest(settings.image), user, script, words)
+    return _probed(engine.image_digest(settings.image), user, script, words)
 
 
 @cache
 def _probed(image: str, user: str, script: str, words: tuple[str, ...]) -> str:
     command = ["/bin/bash", "-l", "-c", script, "bash", *words]
-    settings, home = ContainerSettings(image=image), {"HOME": "/"}
-    container = Container(settings, 1.0, command, user=user, environment=home, bare=True)
+    settings, home = engine.ContainerSettings(image=image), {"HOME": "/"}
+    container = engine.Container(settings, 1.0, command, user=user, environment=home, bare=True)
     with contextlib.closing(container):
         code = container.wait(START)
     if code != 0:
