@@ -10,6 +10,7 @@ import time
 from collections import OrderedDict, defaultdict, deque
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from functools import cache
+from statistics import median_high
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -422,11 +423,11 @@ class Agreement:
         near = (_distances(_vectors(moved)) <= self._lost_track * seconds) & known & known[:, None]
         if span < 0.5 * WINDOW:
             return near, ~near, apart / scale
-        ways = sorted(np.linalg.norm(came[known, 9:], axis=1).tolist())
-        least = max(FLOOR * scale, SHARE * (ways[len(ways) // 2] if ways else 0.0))
+        ways = np.linalg.norm(came[known, 9:], axis=1).tolist()
+        least = max(FLOOR * scale, SHARE * (median_high(ways) if ways else 0.0))
         # As long as nothing is usual, they may differ by the most.
-        differed = sorted(difference for _, difference in self._usual)
-        usual = SPREAD * differed[len(differed) // 2] * scale if differed else np.inf
+        differed = [difference for _, difference in self._usual]
+        usual = SPREAD * median_high(differed) * scale if differed else np.inf
         bound = min(max(least, usual), MAX_TIMES_LEAST * least)
         most = self._lost_track * span
         far = ~near | (apart > min(FAR * bound, most))

@@ -254,9 +254,7 @@ def windows(start: NDArray[np.float64], end: NDArray[np.float64]) -> float:
     return max(1.0, (float(end[0] - start[0]) + float(new.sum())) / length)
 
 
-def clip_to_best(
-    errors: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def clip_to_best(errors: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Clip errors at `CLIP` from those of the member with the least error of each hop.
 
     They are of shape (n_hops, n_members, 3), NaN where a member gave no pose. Returned are the

@@ -110,10 +110,7 @@ class Relay(ABC):
         return {}
 
     def set_parameters(
-        self,
-        node: str,
-        values: Mapping[str, Any],
-        keys: Mapping[str, Sequence[str]] | None = None,
+        self, node: str, values: Mapping[str, Any], keys: Mapping[str, Sequence[str]] | None = None
     ) -> Mapping[str, Any]:
         """See `RosLink.set_parameters`; `keys` name others at the parameter server than the node's.
 

@@ -1,20 +1,19 @@
 """A ROS system that receives scan after scan, and can change its parameters."""
 
 import contextlib
-import logging
 import shutil
 import tempfile
 import threading
 import time
 import weakref
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from adaptune import processes
-from adaptune.errors import AdaptuneError, OdometryError, UnavailableError
+from adaptune.errors import AdaptuneError, OdometryError, UnavailableError, warn_once
 from adaptune.files import temporary_prefix
 from adaptune.geometry import Poses, invert, rectify, to_pose
 from adaptune.odometry.base import LOST, Faulting, Registration, Usage, pose_fault
@@ -30,7 +29,6 @@ from adaptune.space import ParameterSet, Selection
 from adaptune.trajectory import Trajectory
 
 _IMU = "sensor_msgs/msg/Imu"
-_log = logging.getLogger(__name__)
 
 _MOST_SILENT = 30  # scans in a row without a pose that are a fault
 _LEAST_ANSWERED = 0.75  # least share of scans with a pose, of so many or more since the first one
@@ -46,11 +44,6 @@ _EARLY = 1_000_000  # nanoseconds by which a pose's stamp may be before the scan
 
 _SEEN: set[str] = set()
 """Systems of which it is known whether they work on after their last pose."""
-
-
-@cache
-def _warn_once(what: str) -> None:
-    _log.warning("%s", what)
 
 
 class Lockstep(Faulting):
@@ -186,7 +179,7 @@ class Lockstep(Faulting):
             return
         _SEEN.add(self.name)
         if self._works_on(system):
-            _warn_once(
+            warn_once(
                 f"{self.name}: it works on after its last pose, as systems that map in the "
                 f"background do; at rate: 0, it has less time for that than on a robot, so its "
                 f"poses may be worse: set odometry.settings.rate: 1, or let `adaptune inspect` of "
@@ -285,7 +278,7 @@ class Lockstep(Faulting):
         scatter = abs(stamp - self._stamp - self._late)
         if scatter >= MAX_SCATTER or abs(self._late) >= OTHER_CLOCK:
             self._steady = False
-            _warn_once(f"{self.name}: {OWN_CLOCK}; poses are matched to scans by their order")
+            warn_once(f"{self.name}: {OWN_CLOCK}; poses are matched to scans by their order")
             if silent := self._n_shown - self._n_answered:
                 raise OdometryError(
                     f"{OWN_CLOCK}, and {silent} scans had no pose after {self._patience:g} s, so "

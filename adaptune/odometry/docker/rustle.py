@@ -4,21 +4,19 @@ Such an image has a package with ``rustle.launch``, which loads ``/rustle/config
 login shell finds it. A container holds a roscore, the system's nodes, and adaptune's node.
 """
 
-import logging
 import re
 import shlex
 import shutil
 import socket
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self
 
 from pydantic import Field, model_validator
 
 from adaptune import processes
-from adaptune.errors import OdometryError
+from adaptune.errors import OdometryError, warn_once
 from adaptune.odometry.base import Description, OdometryInstance, OwnFile, Usage
 from adaptune.odometry.docker.engine import Container, Mount, image_digest, remove_shared
 from adaptune.odometry.docker.lockstep import Lockstep
@@ -74,8 +72,6 @@ _PLAYER = "player=$(ls /opt/ros/*/lib/rosbag/play /usr/lib/rosbag/play 2>/dev/nu
 """What `rosbag play` runs; Python takes half a second to find it."""
 _UNTIL_NOTED = 0.5  # seconds in which the engine notes that a container has ended
 _TICK = 0.01  # seconds
-
-_log = logging.getLogger(__name__)
 
 
 class Ros1System(RosSystem):
@@ -219,9 +215,10 @@ def server_keys(
             )
         for key in keys[whole]:
             if not equal_values(value, every[key]):
-                what = f"{key} is {every[key]!r} on the parameter server, not {value!r}"
-                help_ = "the launch file, or the node, has changed it: is it in the node's range?"
-                raise OdometryError(f"{what}: {help_}")
+                raise OdometryError(
+                    f"{key} is {every[key]!r} on the parameter server, not {value!r}: the launch "
+                    f"file, or the node, has changed it: is it in the node's range?"
+                )
     return keys
 
 
@@ -237,17 +234,10 @@ def warn_of_unread(link: Ros1, image: str, keys: Mapping[str, Sequence[str]]) ->
         # A node may ask for all that is below a name.
         above = {place[:i] for place in places for i, c in enumerate(place) if c == "/"}
         if not asked & (above | set(places)):
-            _warn(image, name)
-
-
-@cache
-def _warn(image: str, name: str) -> None:
-    _log.warning(
-        "%s: no node has read the parameter %s, so its value changes nothing; is its name in the "
-        "template right?",
-        image,
-        name,
-    )
+            warn_once(
+                f"{image}: no node has read the parameter {name}, so its value changes nothing; is "
+                f"its name in the template right?"
+            )
 
 
 def _flat(data: Any, key: str = "") -> Iterator[tuple[str, Any]]:
