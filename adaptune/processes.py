@@ -243,7 +243,7 @@ class Program:
         return last_lines(self._output)
 
     def hold_to_cores(self) -> None:
-        """Let it use no more cores than a container may: there is no limit on this machine."""
+        """Only containers have a limit."""
 
     def used(self) -> Ended:
         """CPU seconds and megabytes of what runs now, or of all until it ended."""
@@ -478,22 +478,18 @@ def answer_all(reader: "BinaryIO | _Timed", writer: BinaryIO, answer: Answer) ->
     """Answer messages until the stream ends; what an `AdaptuneError` says is refused."""
     while (message := receive(reader)) is not None:
         try:
-            found = answer(message)
+            reply = answer(message)
         except AdaptuneError as error:
-            found = {"type": "refused", "message": str(error)}
-        if found is not None:
-            arrays = {key: value for key, value in found.items() if isinstance(value, np.ndarray)}
-            rest = {key: value for key, value in found.items() if key not in arrays}
+            reply = {"type": "refused", "message": str(error)}
+        if reply is not None:
+            arrays = {key: value for key, value in reply.items() if isinstance(value, np.ndarray)}
+            rest = {key: value for key, value in reply.items() if key not in arrays}
             send(writer, {"type": "done", **rest}, **arrays)
-
-
-_LONGER = 5
-"""Seconds by which the limit on the import is longer here: it is for servers left behind."""
 
 
 def main(control: socket.socket, seconds: float, module: str, name: str) -> None:
     """Fork a process for every socket received, until the other side closes."""
-    signal.alarm(math.ceil(seconds) + _LONGER)
+    signal.alarm(math.ceil(seconds) + 5)  # for servers left behind, so a little later than there
     service, refused = import_module(module), None
     try:
         service.load(name)

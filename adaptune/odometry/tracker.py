@@ -68,10 +68,10 @@ class Tracker:
 
         A restart takes back a jump of the scans before, and may itself be wrong.
         """
-        found = self.odometry.motions
+        motions = self.odometry.motions
         if self._T_jumped is None:
-            return found
-        return found._replace(T_previous_current=self._T_jumped)
+            return motions
+        return motions._replace(T_previous_current=self._T_jumped)
 
     def register(self, scan: Scan) -> RegisteredScan:
         """Find the pose of the next scan."""
@@ -119,8 +119,8 @@ class Tracker:
         if self.fall_back is not None and scan is not None and self.odometry.rewinds:
             self._remember(scan, prepared, T_odom_sensor, T_previous_current)
         seconds, begun = time.perf_counter() - begin, self.odometry.begun
-        found = (registered and begun, unhealthy, prepare_seconds, seconds, begun)
-        self._last = RegisteredScan(stamp, T_odom_sensor, *found)
+        result = (registered and begun, unhealthy, prepare_seconds, seconds, begun)
+        self._last = RegisteredScan(stamp, T_odom_sensor, *result)
         return self._last
 
     def _remember(

@@ -23,7 +23,7 @@ from adaptune import processes
 from adaptune.errors import OdometryError, import_extra, in_a_line, nearest
 from adaptune.geometry import to_pose, to_quaternions
 from adaptune.odometry.base import Usage
-from adaptune.odometry.docker.engine import Container, Mount, own_container, remove_shared
+from adaptune.odometry.docker.engine import Container, Mount, own_container
 from adaptune.odometry.docker.ros_system import RosSettings, RosSystem, SimClock, image_user
 from adaptune.odometry.docker.rustle import Rustle
 from adaptune.odometry.template import Template, placeholders, replace
@@ -265,8 +265,6 @@ class Ros2System(RosSystem):
         super().close()
         if self._settings.image is None:
             self._domain.close()
-        else:
-            remove_shared(self.folder, self._settings.image, self._user)
 
 
 def _stamped(types: Mapping[str, Any], child: str, parent: str, given: Any) -> Any:

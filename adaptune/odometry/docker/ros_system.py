@@ -89,6 +89,7 @@ class RosSystem(ABC):
     _noise: ClassVar[re.Pattern[bytes]]
     """Lines of it that say nothing."""
     _container: Any = None
+    _user: str  # in a container
 
     def __init__(
         self,
@@ -261,9 +262,11 @@ class RosSystem(ABC):
             engine.copy_regular(path, self.folder, folder / "ros" / path.relative_to(logs))
 
     def close(self) -> None:
-        """End the system, and remove what it has written."""
+        """End the system, and remove what it has written in a container."""
         self.stop()
         self.link.close()
+        if (image := self._settings.image) is not None:
+            engine.remove_shared(self.folder, image, self._user)
 
 
 class SimClock:

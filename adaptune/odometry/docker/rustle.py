@@ -18,7 +18,7 @@ from pydantic import Field, model_validator
 from adaptune import processes
 from adaptune.errors import OdometryError, warn_once
 from adaptune.odometry.base import Description, OdometryInstance, OwnFile, Usage
-from adaptune.odometry.docker.engine import Container, Mount, image_digest, remove_shared
+from adaptune.odometry.docker.engine import Container, Mount, image_digest
 from adaptune.odometry.docker.lockstep import Lockstep
 from adaptune.odometry.docker.played_bag import PlayedBag
 from adaptune.odometry.docker.ros_system import RosSettings, RosSystem, filled, image_user
@@ -135,14 +135,14 @@ class Ros1System(RosSystem):
         return OdometryError(f"no roscore: {processes.how_it_ended(code)}: {words}")
 
     def state(self) -> dict[str, Any]:
-        found: dict[str, Any] = self.link.ask("state", topics=self._topics)
-        nodes = found["nodes"].values()
+        state: dict[str, Any] = self.link.ask("state", topics=self._topics)
+        nodes = state["nodes"].values()
         self.usage = Usage(sum(cpu for cpu, _ in nodes), sum(memory for _, memory in nodes))
-        if found["dead"]:
-            raise OdometryError(f"node {found['dead'][0]} died")
+        if state["dead"]:
+            raise OdometryError(f"node {state['dead'][0]} died")
         if (code := self._container.finished(self._launch)) is not None:
             raise OdometryError(f"roslaunch ended with code {code}")
-        return found
+        return state
 
     def check(self, template: Template, parameters: ParameterSet) -> None:
         self._keys = server_keys(template, parameters, self.link.ask("parameters"))
@@ -189,10 +189,6 @@ class Ros1System(RosSystem):
         if self._container is not None:
             self._written = self._written or self._container.log()
         super().stop()
-
-    def close(self) -> None:
-        super().close()
-        remove_shared(self.folder, self._settings.image, self._user)
 
 
 def server_keys(
