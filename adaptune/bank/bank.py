@@ -412,7 +412,7 @@ class Bank(OdometryInstance):
         for member in self._present:
             member.submit(prepared.by(member))
 
-    def collect(self) -> Registration:
+    def _collect(self) -> Registration:
         scan, before = self._submitted, self._past[-1]
         seconds = (scan.stamp - before.scan.stamp) * 1e-9
         registrations = self.late.collect(self._apart_first[::-1], seconds)
@@ -424,7 +424,6 @@ class Bank(OdometryInstance):
             T_previous_current, seconds, self._weights, self._short, self._lost
         )
         if not agreeing.any():
-            self._last_motion.move(LOST.T_odom_sensor)
             return LOST
         T_odom_sensor = rectify(before.T_odom_sensor @ self._agreement.T_previous_current)
         T_before_now = invert(before.T_odom_sensor) @ T_odom_sensor
@@ -432,7 +431,6 @@ class Bank(OdometryInstance):
         while (scan.stamp - self._past[0].scan.stamp) * 1e-9 > self._warm_up:
             self._past.popleft()
         self.late.given(T_odom_sensor)
-        self._last_motion.move(T_odom_sensor)
         self._catch_up()
         self._restart(self._agreement.due)
         registered = np.array([registration.registered for registration in registrations])

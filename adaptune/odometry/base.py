@@ -243,6 +243,11 @@ class OdometryInstance(ABC):
 
     def collect(self) -> Registration:
         """Wait for the pose of the submitted scan."""
+        registration = self._collect()
+        self._last_motion.move(registration.T_odom_sensor)
+        return registration
+
+    def _collect(self) -> Registration:
         raise NotImplementedError
 
     def register(self, prepared: Any) -> Registration:
@@ -406,11 +411,10 @@ class InProcess(OdometryInstance):
         self.odometry.start(prepared, T_odom_sensor, T_previous_current)
         self._last_motion.start(T_odom_sensor, T_previous_current)
 
-    def collect(self) -> Registration:
+    def _collect(self) -> Registration:
         begin = time.process_time()
         registration = Registration(*self.odometry.register(self._submitted))
         self._cpu += time.process_time() - begin
-        self._last_motion.move(registration.T_odom_sensor)
         return registration
 
     def apply(self, selection: Selection) -> None:

@@ -72,7 +72,7 @@ class Guarded(Faulting):
         if self._running:
             self._noted(lambda odometry: odometry.start(*given), prepared)
 
-    def collect(self) -> Registration:
+    def _collect(self) -> Registration:
         def register(odometry: Odometry) -> Registration:
             T_odom_sensor, registered = wire.unpacked(odometry.register(self._submitted))
             T_odom_sensor = np.array(T_odom_sensor, np.float64)
@@ -80,12 +80,11 @@ class Guarded(Faulting):
                 raise processes.HostError(f"it gave a pose {wrong}")
             return Registration(T_odom_sensor, bool(registered))
 
-        registration = LOST
-        if self._running:
-            begin = time.process_time()
-            registration = self._noted(register, self._submitted)
-            self._cpu += time.process_time() - begin
-        self._last_motion.move(registration.T_odom_sensor)
+        if not self._running:
+            return LOST
+        begin = time.process_time()
+        registration: Registration = self._noted(register, self._submitted)
+        self._cpu += time.process_time() - begin
         return registration
 
     def apply(self, selection: Selection) -> None:

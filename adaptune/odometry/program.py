@@ -227,11 +227,10 @@ class WholeRun(Faulting):
         self._T_odom_own = self._T_begin @ invert(T_own_sensor)
         self._begun = self._begun or bool(np.isfinite(T_own_sensor).all())
 
-    def collect(self) -> Registration:
+    def _collect(self) -> Registration:
         if not self.begun:
             self._place(self._own(self._submitted))
         T_odom_sensor = self._T_odom_own @ self._own(self._submitted)
-        self._last_motion.move(T_odom_sensor)
         return Registration(T_odom_sensor, bool(np.isfinite(T_odom_sensor).all()))
 
     def apply(self, selection: Selection) -> None:  # noqa: ARG002

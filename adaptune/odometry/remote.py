@@ -147,12 +147,7 @@ class Isolated(Faulting):
         header, arrays = self._scan(prepared)
         self._conversation.send({**header, "type": "register"}, **arrays)
 
-    def collect(self) -> Registration:
-        registration = self._registration()
-        self._last_motion.move(registration.T_odom_sensor)
-        return registration
-
-    def _registration(self) -> Registration:
+    def _collect(self) -> Registration:
         """The answer to the submitted scan; NaN if there is none, or a wrong one."""
         answer = self._receive()
         self._busy = False

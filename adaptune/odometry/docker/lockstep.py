@@ -122,21 +122,16 @@ class Lockstep(Faulting):
             except (OdometryError, LinkError) as error:
                 self.note_fault(self._told(error))
 
-    def collect(self) -> Registration:
+    def _collect(self) -> Registration:
         self._waiting = False
-        registration = LOST
-        if self._system is not None:
-            try:
-                registration = self._registration()
-            except (OdometryError, LinkError) as error:
-                registration = self.note_fault(self._told(error))
-        self._last_motion.move(registration.T_odom_sensor)
-        return registration
-
-    def _registration(self) -> Registration:
+        if self._system is None:
+            return LOST
         T_before = self._T_odom_sensor
         self._T_odom_sensor = T_before @ self._T_step
-        registered = self._correct()
+        try:
+            registered = self._correct()
+        except (OdometryError, LinkError) as error:
+            return self.note_fault(self._told(error))
         if registered:
             self._T_step = rectify(invert(T_before) @ self._T_odom_sensor)
         return Registration(self._T_odom_sensor.copy(), registered)
