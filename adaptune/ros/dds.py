@@ -109,7 +109,7 @@ class DdsLink:
         It is reliable where all who publish are. There is a `LinkError` if the topic is published
         with another type, as far as that is known by now.
         """
-        there = [e for e in self.endpoints(0) if e.topic == ros2.full(topic)]
+        there = self.endpoints(0, topic)
         if there and kind not in {e.kind for e in there}:
             raise LinkError(f"{topic} is published as {there[0].kind}, not as {kind}")
         if kind in CLOUDS and (size := _receive_buffer()) < ros2.RECEIVE_BUFFER:
@@ -131,9 +131,7 @@ class DdsLink:
                 # A node that starts again is another one, and the first is not heard again.
                 if sender in senders[:-1] and not mixed:
                     mixed = True
-                    names = sorted(
-                        {e.node for e in self.endpoints(0) if e.topic == ros2.full(topic)}
-                    )
+                    names = sorted({e.node for e in self.endpoints(0, topic)})
                     what = "%s is published by two (%s), whose messages mix; end one of them"
                     _log.warning(what, topic, " and ".join(names))
                 if sender not in senders:
@@ -203,8 +201,7 @@ class DdsLink:
 
     def why_unheard(self, topic: str) -> str:
         topic = ros2.full(topic)
-        offered = [e for e in self.endpoints(0, own=True) if e.topic == topic]
-        wanted = [e for e in self.endpoints(1) if e.topic == topic]
+        offered, wanted = self.endpoints(0, topic, own=True), self.endpoints(1, topic)
         if not wanted:
             return f"nobody else subscribes to {topic}"
         for end in wanted:
@@ -293,9 +290,13 @@ class DdsLink:
             f"{', '.join(services) or 'none'}"
         )
 
-    def endpoints(self, which: int, *, own: bool = False) -> list[Endpoint]:
-        """Who publishes topics (0), or subscribes to them (1), this link left out or not."""
-        there = [e for e in self._others(which, own=own) if e.topic_name.startswith("rt/")]
+    def endpoints(
+        self, which: int, topic: str | None = None, *, own: bool = False
+    ) -> list[Endpoint]:
+        """Who publishes topics (0), or subscribes to them (1), or to one; without this link."""
+        there = self._others(which, own=own)
+        if topic is not None:
+            there = [e for e in there if e.topic_name == f"rt{ros2.full(topic)}"]
         self._learn_names()
         return [
             Endpoint(
@@ -306,6 +307,7 @@ class DdsLink:
                 e.qos,
             )
             for e in there
+            if e.topic_name.startswith("rt/")
         ]
 
     def _others(self, which: int, *, own: bool = False) -> list[Any]:

@@ -45,12 +45,11 @@ class _Node:
             self._awaited.remove(topic)
             self._record(topic, published[topic][0])
         self._link.meet()
-        publishers = self._link.endpoints(0)
         return {
             "published": published,
             "subscribed": {t: k for t, k in self._kinds(1).items() if t not in _QUIET},
             "sending": {topic: self._link.hearers(topic) for topic in self._publish},
-            "senders": {t: [p.node for p in publishers if p.topic == t] for t in header["own"]},
+            "senders": {t: [e.node for e in self._link.endpoints(0, t)] for t in header["own"]},
             "unheard": {topic: self._link.why_unheard(topic) for topic in header["topics"]},
         }
 
