@@ -212,10 +212,7 @@ class Lateness:
         return None
 
     def collect(self, order: Sequence[int], interval: float) -> list[Registration]:
-        """The poses of all members, in this order; NaN for those that are absent, or late.
-
-        `interval` is the seconds from the scan before to this one.
-        """
+        """The poses of all members, `interval` seconds after the last; NaN for those not in time."""
         self._intervals.append(interval)
         registrations = [LOST] * len(self._members)
         for i in order:
@@ -247,8 +244,7 @@ class Lateness:
     def motion(self, i: int, T_odom_previous: Poses) -> Poses:
         """Motion of member `i` over the newest scan, of shape (4, 4); NaN if it is absent or late.
 
-        Where the member has missed scans, it moved there as the bank did. `T_odom_previous` is the
-        bank's pose at the scan before.
+        Where it has missed scans, it moved as the bank did, whose last pose is `T_odom_previous`.
         """
         if self.absent[i] or self._owing[i]:
             return np.full((4, 4), np.nan)

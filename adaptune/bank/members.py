@@ -212,10 +212,7 @@ load = odometry_class
 
 
 def members(_: str) -> processes.Answer:
-    """Answer messages with members, as `adaptune.odometry.wire` does with one odometry.
-
-    Scans come once, in messages without an answer; others name a scan by its number.
-    """
+    """Answer messages with members; scans come once, without an answer, and have numbers then."""
     made: dict[int, Any] = {}
     scans: OrderedDict[int, PreparedScan] = OrderedDict()
     first: dict[Hashable, Any] = {}

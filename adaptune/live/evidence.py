@@ -186,10 +186,10 @@ class LiveEvidence:
     def measure(self) -> Measured | None:
         """Register the newest scan whose motion is known to one some metres before.
 
-        Nothing is measured before the first hop is complete, nor where the sensor has moved less
-        than a metre since the last one. A hop that contradicts the odometry counts only if a
+        None before the first hop is complete, where the sensor has moved less than a metre, or
+        where no registration was accepted. A hop that contradicts the odometry counts only if a
         registration to another scan says the same: where a scene repeats itself, one can be wrong
-        by metres. None if no registration was accepted.
+        by metres.
         """
         end = self._newest
         if end is None or end.metres - self._measured < SPACING:
@@ -227,11 +227,7 @@ class LiveEvidence:
         return next(near, before[0] if before else None)
 
     def _register(self, starts: Sequence[_Anchor], end: _Anchor) -> Measured | None:
-        """The first registration that is accepted.
-
-        Only where the last one was rejected, members that disagree with the odometry are asked,
-        too: where a scene repeats itself, one that is lost finds a registration as well.
-        """
+        """The first registration that is accepted; if the last was rejected, members guess, too."""
         guesses = [self._guesses(start, end) for start in starts]
         for first, stop in ((0, 1), (1, _GUESSES))[: 2 if self._rejected else 1]:
             for start, of_start in zip(starts, guesses, strict=True):
@@ -373,9 +369,8 @@ def hops_along(
 ) -> Hops:
     """Register scans directly to those some metres before, once a second.
 
-    The known poses, of shape (4, 4), take the odometry's place: they give each registration its
-    first guess. Where they are unknown (NaN), nothing is measured. `advance` is called after every
-    scan with how many are done.
+    Known poses, of shape (4, 4), give each registration its first guess; where they are NaN,
+    nothing is measured. `advance` is called after every scan with how many are done.
     """
     live = LiveEvidence()
     hops: list[tuple[int, int, Hop]] = []

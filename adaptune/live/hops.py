@@ -73,8 +73,8 @@ class Hops(NamedTuple):
 class HopCloud:
     """A scan, prepared for registrations when it is first needed.
 
-    It is motion-compensated by the sensor's motion from the scan before, of shape (4, 4), or to the
-    next one where that is known, which took so many seconds; 0 for no compensation.
+    It is motion-compensated by the motion from the scan before, or to the next one where that is
+    known, of shape (4, 4), which took so many seconds; 0 for no compensation.
     """
 
     def __init__(
@@ -202,10 +202,7 @@ class HopErrors(NamedTuple):
         return added.recent(end, seconds)
 
     def filled(self, members: NDArray[np.bool_]) -> "HopErrors":
-        """Let members, of shape (n_members,), be as wrong as the worst where they gave no pose.
-
-        So they are neither lost nor at an advantage over hops that say nothing of them.
-        """
+        """Let members, of shape (n_members,), be as wrong as the worst where they gave no pose."""
         lengths = np.linalg.norm(self.errors, axis=-1)
         missing = np.isnan(lengths)
         worst = np.where(missing, -1.0, lengths).argmax(axis=1)

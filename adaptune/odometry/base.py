@@ -334,10 +334,7 @@ class Odometry(ABC):
 
     @classmethod
     def own_file(cls, parameters: ParameterSet, settings: Any) -> OwnFile | None:
-        """A set as the odometry's own tool reads it; None if it has no such tool.
-
-        It is the user's file, if there is one, with nothing but these values changed.
-        """
+        """A set in the user's file, or as the odometry's own tool reads it; None if it has none."""
         template = settings.template if isinstance(settings, ToolSettings) else None
         if template is None:
             return None

@@ -74,10 +74,7 @@ class OdometryFactory:
     def __call__(
         self, parameters: ParameterSet | None = None, sequence: str | None = None
     ) -> OdometryInstance:
-        """Make a new instance; parameters not given keep their baseline.
-
-        Programs that run whole recordings need the name of the sequence on which it will run.
-        """
+        """Make a new instance; programs that run whole recordings need the sequence's name."""
         given = self.space.complete(parameters or {})
         if self.name in registry.PROGRAMS:
             read = None

@@ -27,8 +27,7 @@ class _LateError(BaseException):
 class Guarded(Faulting):
     """A clean class of the user in this process, with the faults that `Isolated` would have.
 
-    The limit of seconds for one scan holds for Python code in the main thread; other code is
-    trusted.
+    The limit of seconds for a scan holds for Python code in the main thread.
     """
 
     def __init__(self, name: str, parameters: ParameterSet, settings: BaseModel, seconds: float):

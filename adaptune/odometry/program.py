@@ -423,10 +423,7 @@ def _files_in(root: Path, paths: Iterable[Path]) -> list[Path]:
 
 
 def read_output(path: Path, settings: FileSettings, stamps: NDArray[np.int64]) -> Trajectory:
-    """Read the trajectory that a program left; `stamps` of shape (n,) are the scans'.
-
-    There is an `OdometryError` or a `TrajectoryError` if the file holds something else.
-    """
+    """Read the trajectory that a program left, for n stamps of scans; else there is an error."""
     try:
         if settings.format == "kitti":
             poses = read_kitti(path)

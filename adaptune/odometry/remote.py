@@ -121,10 +121,7 @@ class Isolated(Faulting):
         )
 
     def begin(self) -> processes.Message | None:
-        """Begin a process that is this odometry; its answer, None if there is a fault.
-
-        There is an `OdometryError` if there has never been such a process.
-        """
+        """Begin a process; its answer, None after a fault, which is an error the first time."""
         self._cpu_before = self._cpu
         try:
             self._conversation.open()

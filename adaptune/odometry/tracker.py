@@ -64,10 +64,7 @@ class Tracker:
 
     @property
     def motions(self) -> Motions:
-        """The odometry's over the last scan; where it restarted, from the pose that it had before.
-
-        A restart takes back a jump of the scans before, and may itself be wrong.
-        """
+        """The odometry's over the last scan; after a restart, from the pose that it had before."""
         motions = self.odometry.motions
         if self._T_jumped is None:
             return motions

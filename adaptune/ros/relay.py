@@ -36,8 +36,7 @@ class Relay(ABC):
     """A node in a running ROS, see `adaptune.ros.link.RosLink`.
 
     A process of its own is the node, and messages pass through it as bytes. `running` says whether
-    it runs, `end` waits for it or ends it. There is a `LinkError` with its reason if the node does
-    not start.
+    it runs, `end` waits for it or ends it. There is a `LinkError` if it does not start.
     """
 
     version: ClassVar[Literal[1, 2]]
@@ -227,10 +226,7 @@ def ros_python() -> str:
 
 
 def local_ros1() -> "Ros1":
-    """A node in the ROS 1 that runs on this machine, or that ROS_MASTER_URI names.
-
-    There is a `LinkError` if no Python can import it, or no roscore answers.
-    """
+    """A node in the ROS 1 of this machine, or of ROS_MASTER_URI; a `LinkError` if none answers."""
     here, there = socket.socketpair()
     command = [ros_python(), ros1_node.__file__, str(there.fileno())]
     # A session of its own: Ctrl-C ends adaptune, and that ends the node.

@@ -51,10 +51,7 @@ class Service(NamedTuple):
 
 
 def local_ros2() -> "DdsLink":
-    """A node in the ROS 2 of the environment, over DDS.
-
-    There is a `LinkError` if the network does not allow it, and an error without the extra.
-    """
+    """A node in the ROS 2 of the environment, over DDS; a `LinkError` if that is not allowed."""
     (dds,) = import_extra("ros2", "adaptune.ros.dds")
     link: DdsLink = dds.DdsLink()
     link.topics()  # so that others are known

@@ -36,10 +36,7 @@ class _Node:
         self._publish[header["topic"]](data)
 
     def state(self, header: Mapping[str, Any]) -> dict[str, Any]:
-        """Who publishes which topics, and who subscribes; to whom this node is connected.
-
-        And why those do not hear the topics of this node that subscribe to them.
-        """
+        """What is published and subscribed to; whom this node reaches, and why not others."""
         published = self._kinds(0)
         for topic in [topic for topic in self._awaited if topic in published]:
             self._awaited.remove(topic)

@@ -26,10 +26,7 @@ SetCommand = Annotated[tuple[str, ...], Field(min_length=1), AfterValidator(_nam
 
 
 class Steering:
-    """Sets parameters of a node, through ROS, or by a program that `run` runs in place of it.
-
-    The command is the program and its arguments, with ``{node}``, ``{name}`` and ``{value}``.
-    """
+    """Sets parameters of a node, through ROS, or by a `SetCommand` that `run` runs."""
 
     def __init__(
         self,
@@ -46,8 +43,7 @@ class Steering:
     def apply(self, parameters: ParameterSet) -> None:
         """Set the parameters, and make sure that the node holds them where it tells.
 
-        There is an `OdometryError` if it cannot be reached or holds other values, and a `LinkError`
-        if it refuses them.
+        An `OdometryError` says that it holds others or is not reached, a `LinkError` that it refuses.
         """
         if self._command is not None:
             for name, value in parameters.items():

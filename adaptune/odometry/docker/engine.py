@@ -69,10 +69,7 @@ class Mount(NamedTuple):
 
 @cache
 def engine() -> Any:
-    """A client of the Docker engine; containers that ended processes have left are removed.
-
-    There is an `EngineError` if no engine answers, or this user may not use it.
-    """
+    """A client of the Docker engine, or an `EngineError`; removes what others have left."""
     from docker import DockerClient
     from docker.errors import DockerException
 
@@ -304,10 +301,7 @@ class Container:
         return Ended(0, 1e-9 * cpu, 1e-6 * held)
 
     def run(self, command: str, environment: Mapping[str, str] | None = None) -> str:
-        """Begin a command in a login shell; a name for `finished`.
-
-        Nobody waits for what it writes: the engine may hold that open when it has ended.
-        """
+        """Begin a command in a login shell, without its output; a name for `finished`."""
         with _telling(self.image):
             name: str = engine().api.exec_create(
                 self.id, ["/bin/bash", "-l", "-c", command], environment=dict(environment or {})

@@ -328,8 +328,8 @@ class Lockstep(Faulting):
     def _pose(self, seconds: float) -> tuple[int, Poses] | None:
         """The system's pose of the scan that was published last; None if it does not come.
 
-        It comes after the scan was published. Its stamp is as late as that of the first pose was:
-        a system gives it at the scan's begin, or at its end, where the next scan begins.
+        Its stamp is as late as that of the first pose was: a system gives it at the scan's begin,
+        or at its end, where the next scan begins.
         """
         earliest = self._stamp - _EARLY + (0 if self._late is None else self._late // 2)
 

@@ -79,8 +79,7 @@ _log = logging.getLogger(__name__)
 class Ros2System(RosSystem):
     """A ROS 2 system as it is started by hand, in an image or on this machine.
 
-    A container has no network but its own, which adaptune's node shares. On this machine, a domain
-    of its own keeps it apart from others.
+    Adaptune's node shares the container's network; here, a domain keeps it apart from others.
     """
 
     ros = 2

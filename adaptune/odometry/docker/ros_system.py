@@ -182,10 +182,7 @@ class RosSystem(ABC):
         raise OdometryError(f"adaptune's node did not begin in {START:g} s: {self.words()}")
 
     def wait(self, topic: str, sent: Sequence[str] = ()) -> None:
-        """Wait until a node subscribes to the clouds' topic, and hears what adaptune sends.
-
-        An `OdometryError` names the topics to which nodes subscribe if none does in time.
-        """
+        """Wait until a node subscribes to the clouds' topic, and hears what adaptune sends."""
         self._topics.append(topic)
         before: AbstractSet[str] = set()
         late = False
@@ -270,10 +267,7 @@ class RosSystem(ABC):
 
 
 class SimClock:
-    """Publishes ``/clock``, and goes on by itself, so that nodes that sleep by it wake up.
-
-    It begins at a stamp in nanoseconds; `rate` is seconds of it in a second.
-    """
+    """Publishes ``/clock`` from a stamp in nanoseconds on, `rate` times as fast as time passes."""
 
     def __init__(self, link: Relay, stamp: int, rate: float):
         self._types, self._publish = link.store.types, link.advertise("/clock", CLOCK)

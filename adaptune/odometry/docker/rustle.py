@@ -75,10 +75,7 @@ _TICK = 0.01  # seconds
 
 
 class Ros1System(RosSystem):
-    """A container with a roscore, and the nodes that a launch file starts.
-
-    There is an `OdometryError` if there is no such image, or it holds no ROS 1.
-    """
+    """A container with a roscore, and the nodes that a launch file starts."""
 
     link: Ros1
     _log_name, _noise = "roslaunch.log", _NOISE
