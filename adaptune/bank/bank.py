@@ -212,7 +212,7 @@ class Lateness:
         return None
 
     def collect(self, order: Sequence[int], interval: float) -> list[Registration]:
-        """The poses of all members, `interval` seconds after the last; NaN for those not in time."""
+        """The poses of all members, `interval` seconds after the last; NaN if not in time."""
         self._intervals.append(interval)
         registrations = [LOST] * len(self._members)
         for i in order:

@@ -290,11 +290,11 @@ class LiveEvidence:
 
     def _told_to_restart(self) -> frozenset[int]:
         """Trial numbers of members that two hops in a row show to be lost; each is told once."""
-        told = self._wrong >= HOPS_TO_BE_LOST
-        told[0] = False
-        self._wrong = np.where(told, 0, self._wrong)
-        self._no_pose = self._no_pose + told
-        return frozenset(np.array(self.members, np.intp)[told[1:]].tolist())
+        lost = self._wrong >= HOPS_TO_BE_LOST
+        lost[0] = False
+        self._wrong = np.where(lost, 0, self._wrong)
+        self._no_pose = self._no_pose + lost
+        return frozenset(np.array(self.members, np.intp)[lost[1:]].tolist())
 
     def present(self) -> NDArray[np.bool_]:
         """Which members may have weight, of shape (n_members,).

@@ -66,10 +66,10 @@ class OdometryFactory:
         """All parameters as the odometry's own tool reads them; None if it has no such tool."""
         if registry.is_user_class(self.name):
             return None  # which is not imported here
-        found: OwnFile | None = registry.odometry_class(self.name).own_file(
+        own_file: OwnFile | None = registry.odometry_class(self.name).own_file(
             parameters, self.settings
         )
-        return found
+        return own_file
 
     def __call__(
         self, parameters: ParameterSet | None = None, sequence: str | None = None

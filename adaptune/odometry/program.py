@@ -407,11 +407,11 @@ class Command(FileRun):
 def find_output(folder: Path, output: str) -> Path:
     """The one file in a folder that a path or a pattern fits; else an `OdometryError`."""
     root = folder.resolve()
-    found = _files_in(root, root.glob(output))
-    if len(found) == 1:
-        return found[0]
-    what = f"{len(found)} files fit {output}" if found else f"it left no {output}"
-    if left := found or _files_in(root, root.rglob("*")):
+    files = _files_in(root, root.glob(output))
+    if len(files) == 1:
+        return files[0]
+    what = f"{len(files)} files fit {output}" if files else f"it left no {output}"
+    if left := files or _files_in(root, root.rglob("*")):
         names = ", ".join(str(path.relative_to(root)) for path in left[:5])
         what += f"; there are {names}; let odometry.settings.output fit just one file"
     raise OdometryError(what)

@@ -74,7 +74,7 @@ def where(name: str) -> str:
 def odometry_class(name: str) -> type[Any]:
     """Class of an odometry, by its name as in a study; an `OdometryError` if there is none."""
     try:
-        found = strict.load(name, where(name), "class")
+        cls = strict.load(name, where(name), "class")
     except strict.PluginError as error:
         if name in ODOMETRIES and isinstance(error.__cause__, ImportError):
             what = f"{name} cannot be imported ({error.__cause__})"
@@ -82,29 +82,29 @@ def odometry_class(name: str) -> type[Any]:
             raise NotInstalledError(f"{what}; {help_}") from error
         raise OdometryError(str(error)) from error
     if name in PROGRAMS:
-        return found  # type: ignore[no-any-return]
-    if not (isinstance(found, type) and issubclass(found, Odometry)):
+        return cls  # type: ignore[no-any-return]
+    if not (isinstance(cls, type) and issubclass(cls, Odometry)):
         raise OdometryError(f"{name}: is not a class derived from adaptune.odometry.Odometry")
-    if lacking := [key for key in ("space", "live") if not hasattr(found, key)]:
+    if lacking := [key for key in ("space", "live") if not hasattr(cls, key)]:
         raise OdometryError(f"{name}: the class has no attribute {' and no '.join(lacking)}")
-    for fault in _faults(found):
+    for fault in _faults(cls):
         raise OdometryError(f"{name}: {fault}")
-    return found
+    return cls
 
 
-def _faults(found: type[Odometry]) -> Iterator[str]:
+def _faults(cls: type[Odometry]) -> Iterator[str]:
     """What keeps a class from being made, in the words of its author."""
-    space: Any = found.space
+    space: Any = cls.space
     if not isinstance(space, ParameterSpace):
         like = 'ParameterSpace({"x": Float(low=0.1, high=2.0, baseline=0.5)})'
         yield f"its `space` is a {type(space).__name__}; write it as space = {like}"
-    if lacking := sorted(found.__abstractmethods__):
+    if lacking := sorted(cls.__abstractmethods__):
         yield f"the class lacks the method{'s' * (len(lacking) > 1)} {' and '.join(lacking)}"
     try:
-        inspect.signature(found).bind(None, None)
+        inspect.signature(cls).bind(None, None)
     except TypeError:
         yield (
-            f"its __init__ takes {inspect.signature(found)}; write __init__(self, parameters=None, "
+            f"its __init__ takes {inspect.signature(cls)}; write __init__(self, parameters=None, "
             f"settings=None), and pass both on to super().__init__"
         )
 
@@ -162,9 +162,9 @@ def declare_here(name: str, settings: Any, folder: Path | None = None) -> Declar
     cls: Any = odometry_class(name)
     mistakes: list[Finding] = []
     context = None if folder is None else {"folder": folder}
-    found: Any = validated(cls.settings_type, settings, (), mistakes, context)
-    describes = found is not None or issubclass(cls, Odometry)
-    return Declaration(found, mistakes, cls.describe(found) if describes else None)
+    checked: Any = validated(cls.settings_type, settings, (), mistakes, context)
+    describes = checked is not None or issubclass(cls, Odometry)
+    return Declaration(checked, mistakes, cls.describe(checked) if describes else None)
 
 
 def forget_user_code() -> None:
@@ -232,10 +232,10 @@ def odometry_content(name: str, settings: Any, module: str = "") -> Content:
     if name in ODOMETRIES:
         module = ODOMETRIES[name].partition(":")[0]
         package = PACKAGES.get(name, module.rpartition(".")[2])
-        found = {f"version of {package}": _version(package)}
+        content = {f"version of {package}": _version(package)}
         if (config := getattr(settings, "config", None)) is not None:
-            found[config] = _fingerprint(Path(config))
-        return found
+            content[config] = _fingerprint(Path(config))
+        return content
     return python_content(name, ENTRY_POINTS, module)
 
 
@@ -280,17 +280,17 @@ def _program(settings: Any) -> Content:
     if (image := getattr(settings, "image", None)) is not None:
         from adaptune.odometry.docker.engine import image_digest
 
-        found = {f"image {image}": image_digest(image)}
+        content = {f"image {image}": image_digest(image)}
         files: tuple[str | None, ...] = ()
     else:
         program, *arguments = settings.command or ("",)
-        found, files = {}, (shutil.which(program), *arguments)
+        content, files = {}, (shutil.which(program), *arguments)
     for name in (*files, getattr(settings, "template", None)):
         # Arguments may be anything, also too long for a path.
         for file in (name or "", *(name or "").split("=", 1)[1:]):
             if os.path.isfile(file):  # noqa: PTH113
-                found[file] = _fingerprint(Path(file))
-    return found
+                content[file] = _fingerprint(Path(file))
+    return content
 
 
 def _fingerprint(file: Path) -> str:

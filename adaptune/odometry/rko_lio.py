@@ -131,7 +131,7 @@ class RkoLio(OwnFrameOdometry):
         new = zip(stamps, imu.acceleration, imu.angular_velocity, strict=True)
         measured = [*self._early, *new]
         # A measurement after the scan's end belongs to the motion to the next one.
-        self._early = [one for one in measured if one[0] >= prepared.end]
+        self._early = [m for m in measured if m[0] >= prepared.end]
         for stamp, acceleration, gyro in measured[: len(measured) - len(self._early)]:
             self._lio.add_imu_measurement(self._T_base_imu, acceleration, gyro, stamp)
         if not prepared.usable:

@@ -171,13 +171,13 @@ class Template:
 
     def _find(self, name: str) -> _Place | None:
         wanted = _parts(name)
-        found = [place for place in self._places if place[0][-len(wanted) :] == wanted]
-        if len(found) > 1:
-            found = [place for place in found if place[0] == wanted] or found
-        if len(found) > 1:
-            paths = ", ".join(".".join(path) for path, *_ in found)
+        places = [place for place in self._places if place[0][-len(wanted) :] == wanted]
+        if len(places) > 1:
+            places = [place for place in places if place[0] == wanted] or places
+        if len(places) > 1:
+            paths = ", ".join(".".join(path) for path, *_ in places)
             raise OdometryError(f"{self.path}: {name!r} may be any of {paths}; name one of them")
-        return found[0] if found else None
+        return places[0] if places else None
 
 
 def _parts(name: Any) -> tuple[str, ...]:

@@ -86,9 +86,9 @@ class DdsLink:
             me = DomainParticipant(self.domain, Qos(Policy.Userdata(b"enclave=/;")))
             self._participant, self._closing = me, core.GuardCondition(me)
             pair = builtin.BuiltinTopicDcpsPublication, builtin.BuiltinTopicDcpsSubscription
-            found = [builtin.BuiltinDataReader(me, topic) for topic in pair]
+            readers = [builtin.BuiltinDataReader(me, topic) for topic in pair]
             self._found = [
-                (r, core.ReadCondition(r, _ALL | core.InstanceState.Alive)) for r in found
+                (r, core.ReadCondition(r, _ALL | core.InstanceState.Alive)) for r in readers
             ]
             self._kept: list[Any] = []
             self._writers: dict[str, DataWriter] = {}
@@ -314,8 +314,8 @@ class DdsLink:
         """All writers (0) or readers (1) that are there now."""
         with self._naming("ROS 2"):
             (reader, alive), me = self._found[which], self._participant.guid
-            found = reader.read(N=10_000, condition=alive)
-            return [e for e in found if own or e.participant_key != me]
+            ends = reader.read(N=10_000, condition=alive)
+            return [e for e in ends if own or e.participant_key != me]
 
     def _learn_names(self) -> None:
         for sample in self._infos.take(N=_DEPTH):

@@ -125,10 +125,10 @@ class Relay(ABC):
 
     def topics(self) -> Mapping[str, str]:
         try:
-            found: dict[str, str] = self.ask("topics")
+            kinds: dict[str, str] = self.ask("topics")
         except LinkError as error:
             raise LinkError(f"ROS {self.version}: the node does not answer ({error})") from error
-        return {topic: kind.replace("/", "/msg/") for topic, kind in found.items()}
+        return {topic: kind.replace("/", "/msg/") for topic, kind in kinds.items()}
 
     def why_unheard(self, topic: str) -> str:  # noqa: ARG002
         return ""
@@ -212,8 +212,8 @@ class Ros1(Relay):
 
 def ros_python() -> str:
     """The first ``python3`` of the system's that imports ROS 1; a `LinkError` if none does."""
-    found = [shutil.which("python3", path=folder) for folder in os.get_exec_path()]
-    for python in dict.fromkeys([*filter(None, found), "/usr/bin/python3"]):
+    pythons = [shutil.which("python3", path=folder) for folder in os.get_exec_path()]
+    for python in dict.fromkeys([*filter(None, pythons), "/usr/bin/python3"]):
         # Not what lies in the working folder under a name of Python's.
         code = "import sys; sys.path[:] = filter(None, sys.path); import rospy"
         done = subprocess.run([python, "-c", code], capture_output=True, check=False)

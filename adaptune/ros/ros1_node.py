@@ -97,8 +97,8 @@ class _Node(object):
 
         def take(message):  # type: (Any) -> None
             # What this node was not asked for cannot be decoded there.
-            found = {"kind": message._connection_header["type"], "topic": topic, "type": "message"}
-            self._stream.send(found, message._buff)
+            head = {"kind": message._connection_header["type"], "topic": topic, "type": "message"}
+            self._stream.send(head, message._buff)
 
         # With the usual buffer, a cloud would be read in many pieces.
         settings = {"queue_size": 1000, "buff_size": _BUFFER, "tcp_nodelay": True}
@@ -219,10 +219,10 @@ _ASKED = ("topics", "set_parameters", "parameters", "state")
 
 def _answer(stream, header, answer):  # type: (Stream, dict[str, Any], Any) -> None
     try:
-        found = {"found": answer(header)}
+        reply = {"found": answer(header)}
     except Exception as error:
-        found = {"refused": str(error) or type(error).__name__}
-    stream.send(dict(found, type="answer", number=header["number"]))
+        reply = {"refused": str(error) or type(error).__name__}
+    stream.send(dict(reply, type="answer", number=header["number"]))
 
 
 def converse(stream, name, more=None):  # type: (Stream, str, dict[str, Any] | None) -> None

@@ -55,7 +55,7 @@ class _Node:
         kinds: dict[str, set[str]] = {}
         for end in self._link.endpoints(which):
             kinds.setdefault(end.topic, set()).add(end.kind)
-        return {topic: sorted(those) for topic, those in kinds.items()}
+        return {topic: sorted(names) for topic, names in kinds.items()}
 
     def _record(self, topic: str, kind: str) -> None:
         head = {"type": "message", "topic": topic, "kind": kind.replace("/msg/", "/")}

@@ -43,7 +43,8 @@ class Steering:
     def apply(self, parameters: ParameterSet) -> None:
         """Set the parameters, and make sure that the node holds them where it tells.
 
-        An `OdometryError` says that it holds others or is not reached, a `LinkError` that it refuses.
+        There is an `OdometryError` if it holds others or is not reached, a `LinkError` if it
+        refuses.
         """
         if self._command is not None:
             for name, value in parameters.items():

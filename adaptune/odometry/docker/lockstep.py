@@ -107,12 +107,12 @@ class Lockstep(Faulting):
             self._show(prepared)
             self._correct()
         except (OdometryError, LinkError) as error:
-            told = self._told(error)
+            fault = self._told(error)
             # One that has run can be gone for good.
             if not self._has_run:
                 self.close()
-                raise OdometryError(f"{self.name}: {told}") from error
-            self.note_fault(told)
+                raise OdometryError(f"{self.name}: {fault}") from error
+            self.note_fault(fault)
 
     def submit(self, prepared: Scan) -> None:
         self._stamp, self._waiting = prepared.stamp, True

@@ -48,7 +48,7 @@ def look(
     plain = settings.model_copy(update={"play": "lockstep", "rate": 1.0, "node": None})
     system, scans = _Watched(parameters, plain, limits), list(scans)
     system.came = []
-    found: dict[str, str] = {}
+    report: dict[str, str] = {}
     shown: list[tuple[float, int]] = []
     path, works_on = [np.eye(4)], False
     with closing(system):
@@ -65,23 +65,23 @@ def look(
                 break
             shown.append((system._shown[1], scan.stamp))
         if (inside := system._system) is not None:
-            found |= _topics(inside) | _declared(inside, system._template)
+            report |= _topics(inside) | _declared(inside, system._template)
             if about := system._reader.about:
-                found["poses are of"] = about + _extrinsic(about.split()[0], settings)
+                report["poses are of"] = about + _extrinsic(about.split()[0], settings)
             works_on = system._works_on(inside)
     seconds = max(1e-9 * (shown[-1][1] - shown[0][1]), 0.1)
-    found["time of a start"] = f"{took:.1f} s"
-    found |= _poses(system.came, shown)
-    found["CPU of a second"] = f"{system.usage.cpu / seconds:.2f} s"
-    found["memory"] = f"{system.usage.memory or 0.0:.0f} MB"
+    report["time of a start"] = f"{took:.1f} s"
+    report |= _poses(system.came, shown)
+    report["CPU of a second"] = f"{system.usage.cpu / seconds:.2f} s"
+    report["memory"] = f"{system.usage.memory or 0.0:.0f} MB"
     for fault in system.faults:
-        found["went wrong"] = fault
+        report["went wrong"] = fault
     if works_on:
         hurried = _driven(plain.model_copy(update={"rate": 0.0}), parameters, limits, scans)
-        found["works on after a pose"] = _apart(path, hurried)
+        report["works on after a pose"] = _apart(path, hurried)
     if settings.node is not None and others and not system.faults:
-        found |= _effects(settings, parameters, limits, scans[:_SHORT], others)
-    return found
+        report |= _effects(settings, parameters, limits, scans[:_SHORT], others)
+    return report
 
 
 def _extrinsic(frame: str, settings: Any) -> str:
@@ -144,12 +144,12 @@ def _effects(
             vain.append(f"{name} is refused ({error})")
             continue
         (live if _furthest(path, changed) > chance else vain).append(name)
-    found = {"takes effect while it runs": ", ".join(live) or "nothing: leave out settings.node"}
+    effects = {"takes effect while it runs": ", ".join(live) or "nothing: leave out settings.node"}
     if vain:
-        found["has no effect while it runs"] = (
+        effects["has no effect while it runs"] = (
             f"{', '.join(vain)}: do not switch live with these among the parameters"
         )
-    return found
+    return effects
 
 
 def _topics(system: Any) -> dict[str, str]:

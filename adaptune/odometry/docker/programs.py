@@ -84,9 +84,9 @@ class DockerCommand(FileRun):
         try:
             if failure is not None:
                 raise OdometryError(failure)
-            found = find_output(output, self.settings.output)
-            checked = folder / "checked" / found.name
-            engine.copy_regular(found, output.resolve(), checked)
+            written = find_output(output, self.settings.output)
+            checked = folder / "checked" / written.name
+            engine.copy_regular(written, output.resolve(), checked)
         finally:
             engine.remove_shared(shared, self.name, user)
         return read_output(checked, self.settings, given.stamps)

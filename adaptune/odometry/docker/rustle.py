@@ -219,9 +219,9 @@ def warn_of_unread(link: Ros1, image: str, keys: Mapping[str, Sequence[str]]) ->
     """Log, once for an image, which parameters no node has ever asked for."""
     asked = {
         key.rstrip("/")
-        for caller, those in link.ask("asked").items()
+        for caller, their_keys in link.ask("asked").items()
         if not caller.startswith(("/roslaunch", "/rosparam", "/adaptune"))
-        for key in those
+        for key in their_keys
     }
     for name, places in keys.items():
         # A node may ask for all that is below a name.
