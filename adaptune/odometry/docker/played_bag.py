@@ -12,8 +12,7 @@ from rosbags.highlevel import AnyReader
 
 from adaptune.errors import AdaptuneError, OdometryError
 from adaptune.odometry.docker.engine import kept_log
-from adaptune.odometry.docker.poses import PoseReader
-from adaptune.odometry.docker.ros_system import QUIET, RosSystem, filled
+from adaptune.odometry.docker.ros_system import QUIET, PoseReader, RosSystem, filled
 from adaptune.odometry.program import ProgramInput, WholeRun, when_known
 from adaptune.recording.pose_messages import PATH, POSES, Pose, usable
 from adaptune.trajectory import Trajectory
