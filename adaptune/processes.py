@@ -136,8 +136,7 @@ def _exactly(stream: "BinaryIO | SocketStream | _Timed", size: int) -> bytes | b
     return data
 
 
-IMPORT_SECONDS = 60.0
-"""An import of user code may take so long."""
+IMPORT_SECONDS = 60.0  # an import of user code may take so long
 
 _TAIL, _LINES = 1 << 14, 5
 """Messages quote the last lines, out of the last bytes, that a program wrote."""

@@ -27,8 +27,7 @@ from adaptune.odometry.factory import Factory
 from adaptune.recording.scan import Scan
 from adaptune.space import ODOMETRY, ParameterSet, Selection
 
-WARM_UP = 12.0
-"""Seconds of the last scans that a member sees when it restarts."""
+WARM_UP = 12.0  # seconds of the last scans that a member sees when it restarts
 
 Make = Callable[[ParameterSet], OdometryInstance]
 """Makes a new instance with these parameters."""
@@ -69,12 +68,9 @@ class Successor:
 
 # How well motions place the newest scan on the scans before it: what tells a lost member.
 
-N_POINTS = 2000
-"""About as many points of the newest scan are placed."""
-CUT_OFF = 1.0
-"""Metres that a distance counts at most: what was hidden before tells nothing."""
-KEPT = 2.0
-"""Seconds for which scans are kept."""
+N_POINTS = 2000  # about as many points of the newest scan are placed
+CUT_OFF = 1.0  # metres that a distance counts at most: what was hidden before tells nothing
+KEPT = 2.0  # seconds for which scans are kept
 _CELL = 0.25
 """Metres between points of the scans before. Without thinning, rings on the ground, which stand
 still whatever the sensor does, would outnumber the rest."""
@@ -144,11 +140,9 @@ class Clock(NamedTuple):
     sleep: Callable[[float], None]
 
 
-CLOCK = Clock(time.perf_counter, time.sleep)
-"""The machine's."""
+CLOCK = Clock(time.perf_counter, time.sleep)  # the machine's
 
-MAX_LATE_SECONDS = 5.0
-"""A member that is late at every scan for so many seconds is removed."""
+MAX_LATE_SECONDS = 5.0  # a member that is late at every scan for so many seconds is removed
 _INTERVALS = 11  # newest intervals between scans whose median says when the next scan is due
 _POLL = 0.005  # seconds from one look at a member to the next
 
@@ -268,8 +262,7 @@ class Lateness:
         return self._owing | self.absent | self.away
 
 
-CATCH_UP = 3
-"""Scans of the past that a member that restarts sees with every new scan, in real time."""
+CATCH_UP = 3  # scans of the past that a member that restarts sees with every new scan, in real time
 
 _log = logging.getLogger(__name__)
 

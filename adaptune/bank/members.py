@@ -277,12 +277,9 @@ def spread(make: Factory, sets: Sequence[ParameterSet], cores: int) -> list[Odom
 
 WINDOW = 1.0
 """Seconds over which motions are compared. Jitter within them cancels, departure adds up."""
-FLOOR = 0.1
-"""Metres a second by which motions may always differ and agree."""
-SHARE = 0.08
-"""Share of the way by which they may always differ and agree."""
-SPREAD = 6.0
-"""They may also differ by this many times what agreeing members usually differ by."""
+FLOOR = 0.1  # metres a second by which motions may always differ and agree
+SHARE = 0.08  # share of the way by which they may always differ and agree
+SPREAD = 6.0  # they may also differ by this many times what agreeing members usually differ by
 MAX_TIMES_LEAST = 2.0
 """But not by more than this many times what they may always differ by: a departure that was not
 noticed must not become usual."""
@@ -290,10 +287,8 @@ FAR = 2.0
 """Members restart where they differ from those that agree by this many times what they may."""
 LEVER = 5.0
 """Metres. A turn that differs counts as much as the way that it makes at this distance."""
-RESTART = 1.0
-"""Seconds that pass between restarts of the same member."""
-MEMORY = 30.0
-"""Seconds in which members show by how much they usually differ."""
+RESTART = 1.0  # seconds that pass between restarts of the same member
+MEMORY = 30.0  # seconds in which members show by how much they usually differ
 MARGIN = 0.006
 """Metres by which a scan that lies as well as the best may be farther from the scans before."""
 

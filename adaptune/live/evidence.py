@@ -25,8 +25,7 @@ from adaptune.odometry.base import Motions
 from adaptune.recording.scan import Scan
 from adaptune.space import Selection
 
-SPACING = 1.0
-"""Metres between scans that may be the start or the end of a hop."""
+SPACING = 1.0  # metres between scans that may be the start or the end of a hop
 LOST = 10.0
 """Percent of a hop. An odometry that is more wrong has lost track."""
 DOUBTFUL = 5.0
@@ -34,8 +33,7 @@ DOUBTFUL = 5.0
 SELDOM = 50
 """Scans from one measurement to the next where nothing is in doubt: five seconds of most sensors.
 The odometry costs as much a scan, whatever the sensor's rate."""
-USUAL_SHARE = 0.4
-"""About the share of the seconds in which a bank measures."""
+USUAL_SHARE = 0.4  # about the share of the seconds in which a bank measures
 HOPS_TO_BE_LOST = 2
 """Hops in a row that must be rejected, or disagree, before an odometry counts as lost."""
 _APART = 0.3  # metres between guesses that are worth a registration each
@@ -360,8 +358,7 @@ def _apart(T: Poses, other: Poses) -> float:
 
 # Hops along a recording whose poses are known, at least in part.
 
-PERIOD = 1_000_000_000
-"""Nanoseconds from one registration to the next."""
+PERIOD = 1_000_000_000  # nanoseconds from one registration to the next
 
 
 def hops_along(

@@ -14,10 +14,8 @@ from adaptune.geometry import Poses, rectify, squared_ranges
 from adaptune.recording.compensation import compensate
 from adaptune.recording.scan import Scan
 
-LENGTHS = (10.0, 5.0)
-"""Metres of a hop: the second where the first is rejected, as in narrow caves."""
-NOISE = 0.02
-"""Metres by which a registration is wrong, about."""
+LENGTHS = (10.0, 5.0)  # metres of a hop: the second where the first is rejected, as in narrow caves
+NOISE = 0.02  # metres by which a registration is wrong, about
 MIN_INLIERS = 0.35
 """Least share of points near a point of the other scan; a registration with fewer is rejected."""
 DEGENERATE = 0.002

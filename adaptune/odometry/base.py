@@ -21,8 +21,7 @@ from adaptune.recording.scan import Scan
 from adaptune.space import ParameterSet, ParameterSpace, Selection
 from adaptune.strict import StrictModel
 
-MIN_POINTS = 20
-"""An adapter does not register scans with fewer points in range."""
+MIN_POINTS = 20  # an adapter does not register scans with fewer points in range
 MOST_FAULTS = 10
 """An instance with so many faults does not start again: the rest of its sequence is lost."""
 MAX_SHARE_WITHOUT_POSE = 0.1

@@ -30,8 +30,7 @@ from adaptune.recording.scan import Scan
 from adaptune.space import ParameterSet, Selection
 from adaptune.strict import StrictModel
 
-SERVICE = "adaptune.odometry.registry"
-"""What a server does with an odometry."""
+SERVICE = "adaptune.odometry.registry"  # what a server does with an odometry
 
 
 def _in_study(argument: str, info: ValidationInfo) -> str:
@@ -195,8 +194,7 @@ class Isolated(Faulting):
             return None
 
 
-FIRST_ANSWER = 60.0
-"""Seconds that a program may need to begin."""
+FIRST_ANSWER = 60.0  # seconds that a program may need to begin
 
 
 class ProcessSettings(BaseSettings):

@@ -14,8 +14,7 @@ from adaptune.ros.link import LinkError
 if TYPE_CHECKING:
     from adaptune.ros.dds import DdsLink
 
-RECEIVE_BUFFER = 1 << 22
-"""Bytes of a receive buffer that hold some clouds."""
+RECEIVE_BUFFER = 1 << 22  # bytes of a receive buffer that hold some clouds
 BUFFER_CURE = f"sudo sysctl -w net.core.rmem_default={RECEIVE_BUFFER}"
 """What lets nodes on Fast DDS have it."""
 _MAX_DOMAIN = 232

@@ -30,8 +30,7 @@ from adaptune.keeper import Ended
 from adaptune.odometry.base import BaseSettings
 from adaptune.odometry.docker import remover
 
-OWNER = "adaptune.owner"
-"""Label of every container: the process that has started it."""
+OWNER = "adaptune.owner"  # label of every container: the process that has started it
 _NOBODY = 65534
 _SIGNALS = set(map(int, signal.Signals))
 _PERIOD = 100_000  # microseconds over which the use of cores is counted

@@ -24,8 +24,7 @@ _FIRST = 10.0  # the same where no pose has come yet
 _BUSY_QUIET = 60.0  # seconds without a pose that are the end of a system that never rests
 _IDLE = 0.1  # cores that a system may use while it rests: nodes wake up with the clock
 _STEADY = 0.9  # least share of poses whose stamps are as far from the scans' as those of the others
-MAX_SCATTER = 5_000_000
-"""Nanoseconds by which these may differ: a clock differs by more."""
+MAX_SCATTER = 5_000_000  # nanoseconds by which these may differ: a clock differs by more
 
 _log = logging.getLogger(__name__)
 

@@ -34,8 +34,7 @@ from adaptune.ros.relay import Relay
 from adaptune.ros.steering import Run, Steering
 from adaptune.space import ParameterSet
 
-QUIET = {"/clock", "/rosout", "/rosout_agg", "/parameter_events"}
-"""Topics of every node."""
+QUIET = {"/clock", "/rosout", "/rosout_agg", "/parameter_events"}  # topics of every node
 CLOCK = "rosgraph_msgs/msg/Clock"
 _BETWEEN_LOOKS = 0.05
 _TAIL = 1 << 14  # bytes of a log in which its last lines are
@@ -43,8 +42,7 @@ _TICK = 0.01  # seconds
 _FLOOD = 2000  # messages of a second that are too many
 _log = logging.getLogger(__name__)
 
-START = 30.0
-"""Seconds in which adaptune's node must be there."""
+START = 30.0  # seconds in which adaptune's node must be there
 
 
 def _topic(name: str) -> str:
