@@ -68,12 +68,11 @@ class Steering:
             _log.warning(what, self._node, name)
 
     def _set(self, command: Sequence[str], name: str, value: Any) -> None:
-        values = {"{node}": self._node, "{name}": name, "{value}": _text(value)}
-        arguments = []
-        for argument in command:
-            for key, text in values.items():
-                argument = argument.replace(key, text)  # noqa: PLW2901
-            arguments.append(argument)
+        text = _text(value)
+        arguments = [
+            argument.replace("{node}", self._node).replace("{name}", name).replace("{value}", text)
+            for argument in command
+        ]
         assert self._run is not None
         code, written = self._run(arguments)
         if code:
