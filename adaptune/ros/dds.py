@@ -72,8 +72,8 @@ class DdsLink:
 
     is2 = True
 
-    def __init__(self, domain: int | None = None):
-        self.domain = ros2.ros_domain(domain)
+    def __init__(self) -> None:
+        self.domain = ros2.ros_domain()
         self.store = ros2.message_types()
         self._services = {name: ros2.register_service(self.store, name) for name in ros2.PLACES}
         self._calling, self._closed = threading.Lock(), False

@@ -57,13 +57,12 @@ def local_ros2() -> "DdsLink":
     return link
 
 
-def ros_domain(given: int | None = None) -> int:
-    """A ROS domain; where none is given, that of the environment (``ROS_DOMAIN_ID``), or 0."""
-    name = "ROS_DOMAIN_ID" if given is None else "the ROS domain"
-    text = os.environ.get("ROS_DOMAIN_ID", "").strip() or "0" if given is None else str(given)
-    if not text.isdecimal() or not 0 <= int(text) <= _MAX_DOMAIN:
-        raise LinkError(f"{name} is {text}; it is a number from 0 to {_MAX_DOMAIN}")
-    return int(text)
+def ros_domain() -> int:
+    """The ROS domain of the environment (``ROS_DOMAIN_ID``), or 0."""
+    domain = os.environ.get("ROS_DOMAIN_ID", "").strip() or "0"
+    if not domain.isdecimal() or not 0 <= int(domain) <= _MAX_DOMAIN:
+        raise LinkError(f"ROS_DOMAIN_ID is {domain}; it is a number from 0 to {_MAX_DOMAIN}")
+    return int(domain)
 
 
 def message_types() -> Typestore:
