@@ -14,8 +14,9 @@ import uuid
 
 try:
     from typing import Any
+    from xmlrpc.client import ServerProxy
 except ImportError:
-    pass
+    from xmlrpclib import ServerProxy  # type: ignore[no-redef]
 
 _LENGTH = struct.Struct("<I")
 _SECONDS = 2.0  # in which another node must answer
@@ -179,8 +180,9 @@ class _Node(object):
 
     def _pid(self, name):  # type: (str) -> int
         if name not in self._pids:
-            slave = _server(self._master().lookupNode(name))
-            self._pids[name] = int(slave.getPid("/adaptune")[2])
+            slave = ServerProxy(self._master().lookupNode(name))
+            answer = slave.getPid("/adaptune")  # type: Any
+            self._pids[name] = int(answer[2])
         return self._pids[name]
 
     def _master(self):  # type: () -> Any
@@ -203,14 +205,6 @@ class _Node(object):
             return {name: held[own[name]] for name in values if own[name] in mine}
         finally:
             client.close()
-
-
-def _server(uri):  # type: (str) -> Any
-    try:
-        from xmlrpc.client import ServerProxy
-    except ImportError:
-        from xmlrpclib import ServerProxy  # type: ignore[no-redef]
-    return ServerProxy(uri)
 
 
 _ASKED = ("topics", "set_parameters", "parameters", "state")
@@ -257,8 +251,7 @@ def _start_master(asked):  # type: (dict[str, set[str]]) -> None
     import rosmaster.master
     import rosmaster.master_api as api
 
-    class Noting(api.ROSMasterHandler):  # type: ignore[misc]
-        pass
+    plain_handler = api.ROSMasterHandler
 
     def noting(plain):  # type: (Any) -> Any
         def answer(self, caller, *given):  # type: (Any, str, *str) -> Any
@@ -267,9 +260,9 @@ def _start_master(asked):  # type: (dict[str, set[str]]) -> None
 
         return answer
 
-    for name in ("getParam", "hasParam", "searchParam", "subscribeParam"):
-        setattr(Noting, name, noting(getattr(api.ROSMasterHandler, name)))
-    api.ROSMasterHandler = Noting
+    names = ("getParam", "hasParam", "searchParam", "subscribeParam")
+    methods = {name: noting(getattr(plain_handler, name)) for name in names}
+    api.ROSMasterHandler = type("Noting", (plain_handler,), methods)
     rosmaster.master.Master().start()
 
 
