@@ -9,7 +9,6 @@ import socket
 import struct
 import subprocess
 import threading
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from queue import Empty, SimpleQueue
@@ -32,7 +31,7 @@ _DEAF = 30.0  # seconds in which it must read what is sent
 _log = logging.getLogger(__name__)
 
 
-class Relay(ABC):
+class Relay:
     """A node in a running ROS, see `adaptune.ros.link.RosLink`.
 
     A process of its own is the node, and messages pass through it as bytes. `running` says whether
@@ -41,6 +40,8 @@ class Relay(ABC):
 
     version: ClassVar[Literal[1, 2]]
     store: Typestore
+    encode: Callable[[Any, str], Any]  # a message of a type as bytes
+    decode: Callable[[bytes, str], Any]  # the message of a type in bytes
 
     def __init__(
         self, connection: socket.socket, running: Callable[[], bool], end: Callable[[], None]
@@ -95,14 +96,6 @@ class Relay(ABC):
         self._send({"type": "advertise", "topic": topic, **names})
         header = {"type": "publish", "topic": topic}
         return lambda data: self._send(header, np.frombuffer(data, np.uint8))
-
-    @abstractmethod
-    def encode(self, message: Any, kind: str) -> Any:
-        """A message as bytes."""
-
-    @abstractmethod
-    def decode(self, data: bytes, kind: str) -> Any:
-        """The message in bytes."""
 
     def _names(self, kind: str) -> dict[str, str]:  # noqa: ARG002
         """What the node must know of a type besides its name."""
@@ -197,13 +190,8 @@ class Ros1(Relay):
         self.store = get_typestore(Stores.ROS1_NOETIC)
         text = "geometry_msgs/TransformStamped[] transforms\n"
         self.store.register(get_types_from_msg(text, "tf2_msgs/msg/TFMessage"))
+        self.encode, self.decode = self.store.serialize_ros1, self.store.deserialize_ros1
         super().__init__(*given)
-
-    def encode(self, message: Any, kind: str) -> Any:
-        return self.store.serialize_ros1(message, kind)
-
-    def decode(self, data: bytes, kind: str) -> Any:
-        return self.store.deserialize_ros1(data, kind)
 
     def _names(self, kind: str) -> dict[str, str]:
         text, md5 = self.store.generate_msgdef(kind, ros_version=1)
@@ -256,13 +244,9 @@ class Ros2Relay(Relay):
 
     def __init__(self, *given: Any):
         self.store = message_types()
+        self.encode = self.store.serialize_cdr
+        self.decode = lambda data, kind: self.store.deserialize_cdr(memoryview(data), kind)
         super().__init__(*given)
-
-    def encode(self, message: Any, kind: str) -> Any:
-        return self.store.serialize_cdr(message, kind)
-
-    def decode(self, data: bytes, kind: str) -> Any:
-        return self.store.deserialize_cdr(memoryview(data), kind)
 
     def why_unheard(self, topic: str) -> str:
         why = str(self.ask("state", topics=[topic], own=[])["unheard"][topic])
