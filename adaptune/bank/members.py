@@ -158,6 +158,8 @@ class _Channel(processes.Conversation):
 class Member(Isolated):
     """A member of a bank in another process, under a number there."""
 
+    _checks_poses = False  # as a member in this process
+
     def __init__(
         self,
         process: MemberProcess,
@@ -190,9 +192,6 @@ class Member(Isolated):
 
     def prepare(self, scan: Scan) -> Any:
         return self._process.sent(scan)
-
-    def _pose_fault(self, T_odom_sensor: Poses) -> None:
-        pass  # it is none of a member in this process either
 
     def _scan(self, prepared: SentScan) -> tuple[dict[str, Any], dict[str, Any]]:
         self._process.need(prepared)
