@@ -32,6 +32,9 @@ KEPT = 160
 """Scans that a process keeps for members that restart: those of a warm-up, at ten a second."""
 
 
+SERVICE = __name__  # what a server does with an odometry of which there are several
+
+
 class SentScan(NamedTuple):
     """A scan that a process was sent, or can be sent, under a number."""
 
@@ -46,7 +49,7 @@ class MemberProcess:
     def __init__(self, name: str, bounds: processes.Bounds):
         self.generation = 0  # of how many processes this is the last
         self.ending = ""  # what is known of how the last one ended
-        transport = processes.Forked(__name__, name, "members", bounds)
+        transport = processes.Forked(SERVICE, name, "members", bounds)
         self.conversation = processes.Conversation(transport)
         self.users = set[int]()  # numbers of the members that are not closed
         self._numbers = itertools.count()

@@ -96,10 +96,13 @@ class LiveEvidence:
         self._newest: _Anchor | None = None
         self._short = self._since = self._n_starts = 0
         self._restarted = 0  # stamp of the scan of the last restart
-        self.forget()
+        self._begin()
 
     def forget(self) -> None:
         """Forget the hops, for the odometry has another set; the next begins at the newest scan."""
+        self._begin()
+
+    def _begin(self) -> None:
         self._forget_errors()
         self._own = OwnErrors(self._length)
         self._anchors: deque[_Anchor] = deque()
