@@ -2,6 +2,7 @@
 
 import difflib
 import errno
+import logging
 import traceback
 from collections.abc import Iterable
 from functools import cache
@@ -95,6 +96,12 @@ def in_a_line(error: BaseException) -> str:
     what = "".join(traceback.format_exception_only(error)).strip()
     raised = traceback.extract_tb(error.__traceback__)
     return f"{what} ({raised[-1].filename}, line {raised[-1].lineno})" if raised else what
+
+
+@cache
+def warn_once(what: str) -> None:
+    """Log a warning, the first time that it is given."""
+    logging.getLogger(__name__).warning("%s", what)
 
 
 def nearest(name: str, names: Iterable[str]) -> str:

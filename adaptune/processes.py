@@ -136,8 +136,7 @@ def _exactly(stream: "BinaryIO | SocketStream | _Timed", size: int) -> bytes | b
     return data
 
 
-IMPORT_SECONDS = 60.0
-"""An import of user code may take so long."""
+IMPORT_SECONDS = 60.0  # an import of user code may take so long
 
 _TAIL, _LINES = 1 << 14, 5
 """Messages quote the last lines, out of the last bytes, that a program wrote."""
@@ -243,7 +242,7 @@ class Program:
         return last_lines(self._output)
 
     def hold_to_cores(self) -> None:
-        """Let it use no more cores than a container may: there is no limit on this machine."""
+        """Only containers have a limit."""
 
     def used(self) -> Ended:
         """CPU seconds and megabytes of what runs now, or of all until it ended."""
@@ -441,10 +440,7 @@ class Conversation:
         raise HostError(what)
 
     def ask(self, header: Mapping[str, Any], **arrays: Any) -> Message:
-        """Send a message, to a new process if there is none, and `receive` the answer.
-
-        A `HostError` names the process.
-        """
+        """Send a message, to a new process if there is none, and `receive` the answer."""
         self.open()
         self.send(header, **arrays)
         try:
@@ -481,22 +477,18 @@ def answer_all(reader: "BinaryIO | _Timed", writer: BinaryIO, answer: Answer) ->
     """Answer messages until the stream ends; what an `AdaptuneError` says is refused."""
     while (message := receive(reader)) is not None:
         try:
-            found = answer(message)
+            reply = answer(message)
         except AdaptuneError as error:
-            found = {"type": "refused", "message": str(error)}
-        if found is not None:
-            arrays = {key: value for key, value in found.items() if isinstance(value, np.ndarray)}
-            rest = {key: value for key, value in found.items() if key not in arrays}
+            reply = {"type": "refused", "message": str(error)}
+        if reply is not None:
+            arrays = {key: value for key, value in reply.items() if isinstance(value, np.ndarray)}
+            rest = {key: value for key, value in reply.items() if key not in arrays}
             send(writer, {"type": "done", **rest}, **arrays)
-
-
-_LONGER = 5
-"""Seconds by which the limit on the import is longer here: it is for servers left behind."""
 
 
 def main(control: socket.socket, seconds: float, module: str, name: str) -> None:
     """Fork a process for every socket received, until the other side closes."""
-    signal.alarm(math.ceil(seconds) + _LONGER)
+    signal.alarm(math.ceil(seconds) + 5)  # for servers left behind, so a little later than there
     service, refused = import_module(module), None
     try:
         service.load(name)

@@ -40,7 +40,7 @@ from adaptune.model import ErrorModel
 from adaptune.model.error_model import render
 from adaptune.odometry import wire
 from adaptune.odometry.docker.played_bag import PoseRecorder
-from adaptune.odometry.docker.poses import PoseReader
+from adaptune.odometry.docker.ros_system import PoseReader
 from adaptune.odometry.program import CommandSettings, read_output
 from adaptune.odometry.template import Template
 from adaptune.recording import Scan, SequenceConfig

@@ -39,7 +39,7 @@ NODE = FOLDERS[ROS2] / "node"
 """A program in Rust, which is built here: that of Debian 12 is too old for what it needs."""
 RUST = "1.88"
 REFERENCE_NEEDS = ("numpy", "pydantic", "scipy", "small_gicp", "typing-extensions")
-"""What `adaptune.odometry.keyframe` and `adaptune.odometry.serving` import, sooner or later."""
+"""What `adaptune.odometry.keyframe` and `adaptune.odometry.registry` import, sooner or later."""
 SOURCES = ("adaptune", "offline", "online", "pyproject.toml", "README.md", "LICENSE")
 SOURCE_DATE = "1700000000"
 """The same sources make the same wheel, to the byte."""

@@ -69,7 +69,7 @@ class SteeredNode(OdometryInstance):
     def submit(self, prepared: Scan) -> None:
         self._submitted = prepared.stamp
 
-    def collect(self) -> Registration:
+    def _collect(self) -> Registration:
         T_node = self._pose(self._submitted, PATIENCE)
         T_odom_sensor = np.full((4, 4), np.nan)
         known = bool(np.isfinite(T_node).all())
@@ -83,7 +83,6 @@ class SteeredNode(OdometryInstance):
                 T_first = T_begin if np.isfinite(T_begin).all() else T_node
                 self._T_odom_node = T @ invert(T_first)
             T_odom_sensor = self._T_odom_node @ T_node
-        self._last_motion.move(T_odom_sensor)
         return Registration(T_odom_sensor, known)
 
     def _tell_of_silence(self) -> None:

@@ -15,21 +15,26 @@ from numpy.typing import NDArray
 from adaptune.bank.members import Agreement, spread
 from adaptune.errors import OdometryError
 from adaptune.geometry import Poses, invert, rectify, squared_ranges
-from adaptune.odometry.base import Motions, OdometryInstance, Registration, Usage
+from adaptune.odometry.base import (
+    LOST,
+    Motions,
+    OdometryInstance,
+    PreparedScan,
+    Registration,
+    Usage,
+)
 from adaptune.odometry.factory import Factory
-from adaptune.odometry.prepared import PreparedScan
 from adaptune.recording.scan import Scan
 from adaptune.space import ODOMETRY, ParameterSet, Selection
 
-WARM_UP = 12.0
-"""Seconds of the last scans that a member sees when it restarts."""
+WARM_UP = 12.0  # seconds of the last scans that a member sees when it restarts
 
 Make = Callable[[ParameterSet], OdometryInstance]
 """Makes a new instance with these parameters."""
 
 
 class PastScan(NamedTuple):
-    """A scan with the pose and the motion that were found for it."""
+    """A scan with its pose and its motion."""
 
     scan: PreparedScan
     T_odom_sensor: Poses
@@ -63,24 +68,17 @@ class Successor:
 
 # How well motions place the newest scan on the scans before it: what tells a lost member.
 
-N_POINTS = 2000
-"""About as many points of the newest scan are placed."""
-CUT_OFF = 1.0
-"""Metres that a distance counts at most: what was hidden before tells nothing."""
-KEPT = 2.0
-"""Seconds for which scans are kept."""
+N_POINTS = 2000  # about as many points of the newest scan are placed
+CUT_OFF = 1.0  # metres that a distance counts at most: what was hidden before tells nothing
+KEPT = 2.0  # seconds for which scans are kept
 _CELL = 0.25
 """Metres between points of the scans before. Without thinning, rings on the ground, which stand
 still whatever the sensor does, would outnumber the rest."""
-_NEAR = 1.0
-"""Metres within which points may be the robot's own."""
+_NEAR = 1.0  # metres within which points may be the robot's own
 
 
 class ShortRegistrations:
-    """Mean distances of the newest scan from earlier ones, where motions place it: an `Alignment`.
-
-    Scans are only kept. Work is done where somebody asks.
-    """
+    """Mean distances of the newest scan from earlier ones: an `Alignment`, worked out if asked."""
 
     def __init__(self) -> None:
         self._clouds: deque[_Cloud] = deque()
@@ -99,15 +97,15 @@ class ShortRegistrations:
         """Mean distances of shape (n_members,), see `Alignment`."""
         thinned = self._clouds[-1].thinned
         points = thinned[:: max(1, len(thinned) // N_POINTS)]
-        found = [np.full(T_then_now.shape[1], np.inf)]
+        means = []
         for T, n in zip(T_then_now, ago, strict=True):
             then = self._clouds[-1 - n] if n < len(self._clouds) else None
             if then is None or not len(points) or not len(then.thinned):
                 continue
             placed = points @ T[:, :3, :3].swapaxes(-1, -2) + T[:, None, :3, 3]
             distances, _ = then.tree.query(placed, distance_upper_bound=CUT_OFF)
-            found.append(np.minimum(distances, CUT_OFF).mean(axis=1))
-        return np.asarray(np.mean(found[1:] or found, axis=0))
+            means.append(np.minimum(distances, CUT_OFF).mean(axis=1))
+        return np.asarray(np.mean(means, axis=0) if means else np.full(T_then_now.shape[1], np.inf))
 
 
 class _Cloud:
@@ -127,7 +125,7 @@ class _Cloud:
     @cached_property
     def tree(self) -> Any:
         """What finds the nearest of its thinned points."""
-        from scipy.spatial import cKDTree
+        from scipy.spatial import cKDTree  # takes long to import
 
         return cKDTree(self.thinned)
 
@@ -142,15 +140,11 @@ class Clock(NamedTuple):
     sleep: Callable[[float], None]
 
 
-CLOCK = Clock(time.perf_counter, time.sleep)
-"""The machine's."""
+CLOCK = Clock(time.perf_counter, time.sleep)  # the machine's
 
-MAX_LATE_SECONDS = 5.0
-"""A member that is late at every scan for so many seconds is removed."""
-_INTERVALS = 11
-"""Newest intervals between scans whose median says when the next scan is due."""
-_POLL = 0.005
-"""Seconds from one look at a member to the next."""
+MAX_LATE_SECONDS = 5.0  # a member that is late at every scan for so many seconds is removed
+_INTERVALS = 11  # newest intervals between scans whose median says when the next scan is due
+_POLL = 0.005  # seconds from one look at a member to the next
 
 
 class Lateness:
@@ -158,15 +152,10 @@ class Lateness:
 
     A member in another process has until the next scan is due. One that needs longer is late: it
     has no motion over that scan, and takes part again as soon as it is done. Scans come `rate`
-    times as fast as recorded; if that is None, the bank waits for everybody.
-
-    Attributes
-    ----------
-    scans : ndarray of shape (n_members,)
-        At how many scans each member was late.
-    removed, away, resting, absent : ndarray of shape (n_members,)
-        Members that were always late and take no part any more; that are restarting; that are
-        given no scans, as the bank says before each; that have no motion over the newest scan.
+    times as fast as recorded; if that is None, the bank waits for everybody. `scans` counts at how
+    many scans each member was late; members are `removed` that were always late, `away` while they
+    restart, `resting` as the bank says before each scan, `absent` without a motion over the newest.
+    All are of shape (n_members,).
     """
 
     def __init__(
@@ -217,30 +206,26 @@ class Lateness:
         return None
 
     def collect(self, order: Sequence[int], interval: float) -> list[Registration]:
-        """The poses of all members, in this order; NaN for those that are absent, or late.
-
-        `interval` is the seconds from the scan before to this one.
-        """
+        """The poses of all members, `interval` seconds after the last; NaN if not in time."""
         self._intervals.append(interval)
-        found = [Registration(np.full((4, 4), np.nan), registered=False)] * len(self._members)
+        registrations = [LOST] * len(self._members)
         for i in order:
             left = self._begun + median(self._intervals) / (self._rate or 1.0) - self._clock.now()
             if not self.absent[i] and (self._rate is None or self._members[i].ready(left)):
                 self._behind[i] = 0.0
-                found[i] = self._members[i].collect()
+                registrations[i] = self._members[i].collect()
             else:
                 self._owing[i] |= not self.absent[i]
-                self._note(i, interval)
-        if not any(np.isfinite(one.T_odom_sensor).all() for one in found):
+                if not (self.removed[i] or self.resting[i] or self.away[i]):
+                    self._note(i, interval)
+        if not any(np.isfinite(r.T_odom_sensor).all() for r in registrations):
             first = self._first(self._owing & ~self.absent)
             if first is not None:
                 self._owing[first], self._behind[first] = False, 0.0
-                found[first] = self._members[first].collect()
-        return found
+                registrations[first] = self._members[first].collect()
+        return registrations
 
     def _note(self, i: int, interval: float) -> None:
-        if self.removed[i] or self.resting[i] or self.away[i]:
-            return
         self.scans[i] += 1
         # Another member of its process may be at work.
         self._behind[i] += interval if self._owing[i] else 0.0
@@ -253,17 +238,14 @@ class Lateness:
     def motion(self, i: int, T_odom_previous: Poses) -> Poses:
         """Motion of member `i` over the newest scan, of shape (4, 4); NaN if it is absent or late.
 
-        Where the member has missed scans, it moved there as the bank did. `T_odom_previous` is the
-        bank's pose at the scan before.
+        Where it has missed scans, it moved as the bank did, whose last pose is `T_odom_previous`.
         """
         if self.absent[i] or self._owing[i]:
             return np.full((4, 4), np.nan)
-        T_moved = self._members[i].motions.T_previous_current
-        T_given = self._T_odom_given[i]
+        T_moved, T_given = self._members[i].motions.T_previous_current, self._T_odom_given[i]
         if np.array_equal(T_given, T_odom_previous):
             return T_moved
-        missed: Poses = invert(T_odom_previous) @ T_given
-        return np.asarray(missed @ T_moved)
+        return np.asarray(invert(T_odom_previous) @ T_given @ T_moved)
 
     def given(self, T_odom_sensor: Poses) -> None:
         """Take note of the bank's pose at a scan that all present members were given."""
@@ -280,8 +262,7 @@ class Lateness:
         return self._owing | self.absent | self.away
 
 
-CATCH_UP = 3
-"""Scans of the past that a member that restarts sees with every new scan, in real time."""
+CATCH_UP = 3  # scans of the past that a member that restarts sees with every new scan, in real time
 
 _log = logging.getLogger(__name__)
 
@@ -304,9 +285,7 @@ class Bank(OdometryInstance):
     cores
         That the members may use, if `make` is a factory, see `spread`. The motions are the same.
     rate
-        Times as fast as recorded at which scans come: members that are late are not waited for,
-        see `Lateness`, and those that restart see scans of the past `CATCH_UP` at a time. None
-        waits for all.
+        See `Lateness`; members that restart see scans of the past `CATCH_UP` at a time then.
     """
 
     def __init__(
@@ -322,17 +301,16 @@ class Bank(OdometryInstance):
         self.trials = tuple(sets)
         self.restarts = 0
         given = [dict(parameters) for parameters in sets.values()]
-        self._members = (
-            spread(make, given, cores)
-            if isinstance(make, Factory)
-            else [make(parameters) for parameters in given]
-        )
+        if isinstance(make, Factory):
+            self._members = spread(make, given, cores)
+        else:
+            self._members = [make(parameters) for parameters in given]
         self._T_previous_current = np.tile(np.eye(4), (len(sets), 1, 1))
         # Members in processes of their own register while those of this process do.
         self._apart_first = sorted(range(len(sets)), key=lambda i: not self._members[i].apart)
         self._names = [
-            f"trial {trial}" + (f" ({of[ODOMETRY]})" if ODOMETRY in of else "")
-            for trial, of in sets.items()
+            f"trial {trial}" + (f" ({given[ODOMETRY]})" if ODOMETRY in given else "")
+            for trial, given in sets.items()
         ]
         self._told: set[int] = set()
         self._known_faults = [0] * len(sets)  # of each member, when it last worked
@@ -423,7 +401,7 @@ class Bank(OdometryInstance):
         for member in self._present:
             member.submit(prepared.by(member))
 
-    def collect(self) -> Registration:
+    def _collect(self) -> Registration:
         scan, before = self._submitted, self._past[-1]
         seconds = (scan.stamp - before.scan.stamp) * 1e-9
         registrations = self.late.collect(self._apart_first[::-1], seconds)
@@ -435,17 +413,13 @@ class Bank(OdometryInstance):
             T_previous_current, seconds, self._weights, self._short, self._lost
         )
         if not agreeing.any():
-            T_odom_sensor = np.full((4, 4), np.nan)
-            self._last_motion.move(T_odom_sensor)
-            return Registration(T_odom_sensor, registered=False)
-        T_moved = self._agreement.T_previous_current
-        T_odom_sensor = rectify(before.T_odom_sensor @ T_moved)
+            return LOST
+        T_odom_sensor = rectify(before.T_odom_sensor @ self._agreement.T_previous_current)
         T_before_now = invert(before.T_odom_sensor) @ T_odom_sensor
         self._past.append(PastScan(scan, T_odom_sensor, T_before_now))
         while (scan.stamp - self._past[0].scan.stamp) * 1e-9 > self._warm_up:
             self._past.popleft()
         self.late.given(T_odom_sensor)
-        self._last_motion.move(T_odom_sensor)
         self._catch_up()
         self._restart(self._agreement.due)
         registered = np.array([registration.registered for registration in registrations])
@@ -467,11 +441,11 @@ class Bank(OdometryInstance):
         # Somebody has to go on meanwhile.
         if self._rate is None or (self.late.absent | members).all():
             # Those at the end register while those at the beginning do.
-            while waiting := [one for one in successors if one.waiting]:
-                for one in waiting:
-                    one.submit()
-                for one in reversed(waiting):
-                    one.collect()
+            while waiting := [successor for successor in successors if successor.waiting]:
+                for successor in waiting:
+                    successor.submit()
+                for successor in reversed(waiting):
+                    successor.collect()
             for i in np.flatnonzero(members).tolist():
                 self.late.back(i, self._past[-1].T_odom_sensor)
         else:
@@ -484,8 +458,8 @@ class Bank(OdometryInstance):
 
     def _catch_up(self) -> None:
         """Let those that restart see the newest scan, and one of them scans of the past."""
-        for one in self._returning:
-            one.waiting.append(self._past[-1])
+        for successor in self._returning:
+            successor.waiting.append(self._past[-1])
         if not self._returning or self._returning[0].odometry.busy:
             return
         first = self._returning[0]

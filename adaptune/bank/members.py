@@ -10,6 +10,7 @@ import time
 from collections import OrderedDict, defaultdict, deque
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from functools import cache
+from statistics import median_high
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,9 +21,8 @@ from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses, invert, mean_motion
 from adaptune.machine import other_core
 from adaptune.odometry import wire
-from adaptune.odometry.base import InProcess, OdometryInstance, Usage
+from adaptune.odometry.base import InProcess, OdometryInstance, PreparedScan, Usage
 from adaptune.odometry.factory import Factory, OdometryFactory
-from adaptune.odometry.prepared import PreparedScan
 from adaptune.odometry.registry import make_here, odometry_class
 from adaptune.odometry.remote import Isolated
 from adaptune.recording.scan import Scan
@@ -32,34 +32,25 @@ KEPT = 160
 """Scans that a process keeps for members that restart: those of a warm-up, at ten a second."""
 
 
-SERVICE = __name__
-"""What a server does with an odometry of which there are several."""
+SERVICE = __name__  # what a server does with an odometry of which there are several
 
 
 class SentScan(NamedTuple):
     """A scan that a process was sent, or can be sent, under a number."""
 
     number: int
+    stamp: int
     scan: Scan
-
-    @property
-    def stamp(self) -> int:
-        """Nanoseconds."""
-        return self.scan.stamp
 
 
 class MemberProcess:
-    """A process with members, which the first start of one begins, and the last close ends.
-
-    `name` is an odometry that is imported before the process is forked.
-    """
+    """A process with members of an odometry, from the first start of one to the last close."""
 
     def __init__(self, name: str, bounds: processes.Bounds):
         self.generation = 0  # of how many processes this is the last
         self.ending = ""  # what is known of how the last one ended
-        self.conversation = processes.Conversation(
-            processes.Forked(SERVICE, name, "members", bounds)
-        )
+        transport = processes.Forked(SERVICE, name, "members", bounds)
+        self.conversation = processes.Conversation(transport)
         self.users = set[int]()  # numbers of the members that are not closed
         self._numbers = itertools.count()
         self._held: OrderedDict[int, None] = OrderedDict()
@@ -81,7 +72,7 @@ class MemberProcess:
 
     def sent(self, scan: Scan) -> SentScan:
         """Give a scan a number, and send it where there is a process that takes it now."""
-        sent = SentScan(next(self._numbers), scan)
+        sent = SentScan(next(self._numbers), scan.stamp, scan)
         if not self.busy:
             self.need(sent)
         return sent
@@ -105,12 +96,12 @@ class MemberProcess:
             if end is not None and not self.conversation.ready(end - time.perf_counter()):
                 break
             try:
-                found = self.conversation.next_message()
+                answer = self.conversation.next_message()
             except processes.HostError as error:
                 self.ending, self._owed = str(error), 0
             else:
                 self._owed -= 1
-                self._answers.setdefault(found.header["member"], deque()).append(found)
+                self._answers.setdefault(answer.header["member"], deque()).append(answer)
         return mine[0] if mine else None
 
     def receive(self, member: int) -> processes.Message:
@@ -170,6 +161,8 @@ class _Channel(processes.Conversation):
 class Member(Isolated):
     """A member of a bank in another process, under a number there."""
 
+    _checks_poses = False  # as a member in this process
+
     def __init__(
         self,
         process: MemberProcess,
@@ -203,40 +196,31 @@ class Member(Isolated):
     def prepare(self, scan: Scan) -> Any:
         return self._process.sent(scan)
 
-    def _pose_fault(self, T_odom_sensor: Poses) -> None:
-        pass  # it is none of a member in this process either
-
     def _scan(self, prepared: SentScan) -> tuple[dict[str, Any], dict[str, Any]]:
         self._process.need(prepared)
         return {"stamp": prepared.stamp, "scan": prepared.number}, {}
 
 
-def _keep(held: OrderedDict[int, Any], number: int, what: Any) -> None:
+def _keep(held: OrderedDict[int, Any], number: int, scan: Any) -> None:
     """Add a scan, and drop the oldest one; both sides do, so each knows what the other has."""
-    held[number] = what
+    held[number] = scan
     if len(held) > KEPT:
         held.popitem(last=False)
 
 
 # What runs in the other process.
 
-
-def load(name: str) -> None:
-    """Import the odometry."""
-    odometry_class(name)
+load = odometry_class
 
 
 def members(_: str) -> processes.Answer:
-    """Answer messages with members, as `adaptune.odometry.wire` does with one odometry.
-
-    Scans come once, in messages without an answer; others name a scan by its number.
-    """
+    """Answer messages with members; scans come once, without an answer, and have numbers then."""
     made: dict[int, Any] = {}
     scans: OrderedDict[int, PreparedScan] = OrderedDict()
     first: dict[Hashable, Any] = {}
     spent, used = defaultdict[int, float](float), 0.0  # CPU seconds of each member, and of all
 
-    def done(message: processes.Message) -> dict[str, Any]:
+    def do(message: processes.Message) -> dict[str, Any]:
         header = message.header
         if header["type"] == "hello":
             given = header["odometry"], header["parameters"], header["settings"]
@@ -255,13 +239,13 @@ def members(_: str) -> processes.Answer:
                 scan.by(member)
             return None
         try:
-            found = done(message)
+            done = do(message)
         except AdaptuneError as error:
-            found = {"type": "refused", "message": str(error)}
+            done = {"type": "refused", "message": str(error)}
         number, now = message.header["member"], wire.used()
         spent[number] += now["cpu"] - used
         used = now["cpu"]
-        return {**found, **now, "cpu": spent[number], "member": number}
+        return {**done, **now, "cpu": spent[number], "member": number}
 
     return answer
 
@@ -269,9 +253,8 @@ def members(_: str) -> processes.Answer:
 def spread(make: Factory, sets: Sequence[ParameterSet], cores: int) -> list[OdometryInstance]:
     """Make the members of a bank, on as many cores as they can use.
 
-    Some members run in this process, and the others in one more process for each further core.
-    Those that prepare scans in the same way run together. Members that have processes of their own
-    keep them.
+    Some run in this process, and the others in one more process for each further core, together
+    where they prepare scans in the same way. Members that have processes of their own keep them.
     """
     made = [make(parameters) for parameters in sets]
     alike: dict[Any, list[int]] = {}
@@ -296,12 +279,9 @@ def spread(make: Factory, sets: Sequence[ParameterSet], cores: int) -> list[Odom
 
 WINDOW = 1.0
 """Seconds over which motions are compared. Jitter within them cancels, departure adds up."""
-FLOOR = 0.1
-"""Metres a second by which motions may always differ and agree."""
-SHARE = 0.08
-"""Share of the way by which they may always differ and agree."""
-SPREAD = 6.0
-"""They may also differ by this many times what agreeing members usually differ by."""
+FLOOR = 0.1  # metres a second by which motions may always differ and agree
+SHARE = 0.08  # share of the way by which they may always differ and agree
+SPREAD = 6.0  # they may also differ by this many times what agreeing members usually differ by
 MAX_TIMES_LEAST = 2.0
 """But not by more than this many times what they may always differ by: a departure that was not
 noticed must not become usual."""
@@ -309,10 +289,8 @@ FAR = 2.0
 """Members restart where they differ from those that agree by this many times what they may."""
 LEVER = 5.0
 """Metres. A turn that differs counts as much as the way that it makes at this distance."""
-RESTART = 1.0
-"""Seconds that pass between restarts of the same member."""
-MEMORY = 30.0
-"""Seconds in which members show by how much they usually differ."""
+RESTART = 1.0  # seconds that pass between restarts of the same member
+MEMORY = 30.0  # seconds in which members show by how much they usually differ
 MARGIN = 0.006
 """Metres by which a scan that lies as well as the best may be farther from the scans before."""
 
@@ -330,19 +308,18 @@ Returns mean distances of shape (n_members,) in metres; infinite where there is 
 
 
 class Agreement:
-    """Tells which members of a bank agree, scan after scan.
+    """Tells which members of a bank agree, scan after scan; see docs/research/bank.md.
 
     Each pose of a member in the last second is a vector: the way, and the turn as the way it makes
-    at `LEVER` metres. A straight line through these vectors says how far the member came; so a jump
-    back and forth hardly counts, and a slow departure does. Two members are near each other if they
-    differ, in a second, by no more than ::
+    at `LEVER` metres. A straight line through these vectors says how far the member came. Two
+    members are near each other if they differ, in a second, by no more than ::
 
         least = max(FLOOR, SHARE * way)
         min(max(least, SPREAD * usual difference), MAX_TIMES_LEAST * least, lost_track)
 
     and, over the newest scan alone, by no more than `lost_track` metres a second. Before the first
     half second, the newest scan alone counts. The heaviest group of members that are all near each
-    other agrees. Every member votes with its weight.
+    other agrees.
 
     Attributes
     ----------
@@ -350,9 +327,8 @@ class Agreement:
         How the bank moved over the last scan: the weighted mean of the members that agree; NaN if
         no member had a motion.
     due : ndarray of shape (n_members,)
-        Which members should restart at the bank's pose: those that were left out at the last scan,
-        that differ by more than `FAR` times what they may, and that have not restarted in the last
-        second.
+        Which members should restart at the bank's pose: those left out at the last scan that differ
+        by more than `FAR` times what they may, and have not restarted in the last second.
     judged : bool
         Whether the short registrations decided at the last scan.
     """
@@ -383,20 +359,10 @@ class Agreement:
     ) -> NDArray[np.bool_]:
         """Which members agree at the next scan, of shape (n_members,); none if none has a motion.
 
-        Parameters
-        ----------
-        T_previous_current
-            Motions over the scan, of shape (n_members, 4, 4); NaN where there is none.
-        seconds
-            Since the scan before.
-        weights
-            Of shape (n_members,).
-        alignment
-            Short registrations. They are asked where the heaviest group does not hold more than
-            half of the votes and of the members; then only members within `MARGIN` of the best are
-            believed.
-        lost
-            Whether the bank is known to be lost: then they are asked wherever members disagree.
+        Motions over the scan are of shape (n_members, 4, 4), NaN where there is none; weights of
+        shape (n_members,). Short registrations (`alignment`) are asked where the heaviest group
+        does not hold more than half of the votes and of the members, or where the bank is known to
+        be `lost` and members disagree; then only members within `MARGIN` of the best are believed.
         """
         known = np.asarray((np.abs(T_previous_current) < _ENDLESS).all(axis=(1, 2)))
         moved = np.where(known[:, None, None], T_previous_current, np.eye(4))
@@ -439,10 +405,7 @@ class Agreement:
     def _near(
         self, known: NDArray[np.bool_], moved: Poses, seconds: float
     ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.float64]]:
-        """Which members are near each other, which are far, and by how many metres a second.
-
-        All of shape (n_members, n_members).
-        """
+        """Which members are near each other, which are far, and by how many metres a second."""
         tracks = np.array(self._tracks)[:, :-1]
         times = np.array(self._times)
         times -= times.mean()
@@ -454,11 +417,11 @@ class Agreement:
         near = (_distances(_vectors(moved)) <= self._lost_track * seconds) & known & known[:, None]
         if span < 0.5 * WINDOW:
             return near, ~near, apart / scale
-        ways = sorted(np.linalg.norm(came[known, 9:], axis=1).tolist())
-        least = max(FLOOR * scale, SHARE * (ways[len(ways) // 2] if ways else 0.0))
+        ways = np.linalg.norm(came[known, 9:], axis=1).tolist()
+        least = max(FLOOR * scale, SHARE * (median_high(ways) if ways else 0.0))
         # As long as nothing is usual, they may differ by the most.
-        differed = sorted(difference for _, difference in self._usual)
-        usual = SPREAD * differed[len(differed) // 2] * scale if differed else np.inf
+        differed = [difference for _, difference in self._usual]
+        usual = SPREAD * median_high(differed) * scale if differed else np.inf
         bound = min(max(least, usual), MAX_TIMES_LEAST * least)
         most = self._lost_track * span
         far = ~near | (apart > min(FAR * bound, most))

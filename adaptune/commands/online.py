@@ -139,7 +139,7 @@ def _drive(
     loaded: "OfflineStudy", mode: str | None, model: Path | None, *, untrained: bool, ros2: bool
 ) -> None:
     """Drive on a robot until Ctrl-C."""
-    from adaptune.ros.ros1 import local_ros1
+    from adaptune.ros.relay import local_ros1
     from adaptune.ros.ros2 import local_ros2
     from adaptune.tuning.tuned import alone
     from online.modes import UNTRAINED, WITHOUT_MODEL

@@ -20,20 +20,12 @@ from adaptune.live.hops import (
     live_squares,
     register,
 )
-from adaptune.live.own_error import (
-    CONTRADICTED,
-    FAMILIAR,
-    OWN_SECONDS,
-    Link,
-    OwnError,
-    OwnErrors,
-)
+from adaptune.live.own_error import CONTRADICTED, FAMILIAR, OWN_SECONDS, Link, OwnError, OwnErrors
 from adaptune.odometry.base import Motions
 from adaptune.recording.scan import Scan
 from adaptune.space import Selection
 
-SPACING = 1.0
-"""Metres between scans that may be the start or the end of a hop."""
+SPACING = 1.0  # metres between scans that may be the start or the end of a hop
 LOST = 10.0
 """Percent of a hop. An odometry that is more wrong has lost track."""
 DOUBTFUL = 5.0
@@ -41,19 +33,15 @@ DOUBTFUL = 5.0
 SELDOM = 50
 """Scans from one measurement to the next where nothing is in doubt: five seconds of most sensors.
 The odometry costs as much a scan, whatever the sensor's rate."""
-USUAL_SHARE = 0.4
-"""About the share of the seconds in which a bank measures."""
+USUAL_SHARE = 0.4  # about the share of the seconds in which a bank measures
 HOPS_TO_BE_LOST = 2
 """Hops in a row that must be rejected, or disagree, before an odometry counts as lost."""
-_APART = 0.3
-"""Metres between guesses that are worth a registration each."""
+_APART = 0.3  # metres between guesses that are worth a registration each
 _GUESSES = 3
-_TRY_AGAIN = 5
-"""After so many shorter hops, a long one is tried again."""
+_TRY_AGAIN = 5  # after so many shorter hops, a long one is tried again
 SHARED = 1.25
 """A hop may be this many times as long if it starts at a cloud that was prepared before."""
-_MIN_DIRECTIONS = 1.5
-"""A hop must tell the motion in two directions at least."""
+_MIN_DIRECTIONS = 1.5  # a hop must tell the motion in two directions at least
 _FULL_TURN = 10.0
 """Metres at which a difference in rotation counts as one in translation, in radians."""
 
@@ -88,12 +76,9 @@ class LiveEvidence:
     """Measures errors by hops, see `adaptune.live.hops`.
 
     Show it every scan with `observe`; once a second, `measure` registers a scan, which takes some
-    tens of milliseconds. Points that have times are motion-compensated, by the odometry's last
-    motion. Memory is bounded: it keeps the scans of the last metres, one a metre, and the errors of
-    the last hops.
-
-    `members` are trial numbers of a bank's members, as in `Motions`; empty for a single odometry.
-    `length` is that of the sub-trajectories whose mean error `own_error` estimates, in metres.
+    tens of milliseconds. Memory is bounded. `members` are trial numbers of a bank's members, as in
+    `Motions`; empty for a single odometry. `length` is that of the sub-trajectories whose mean
+    error `own_error` estimates, in metres.
     """
 
     def __init__(self, members: tuple[int, ...] = (), length: float = 25.0):
@@ -113,13 +98,19 @@ class LiveEvidence:
         self._restarted = 0  # stamp of the scan of the last restart
         self._begin()
 
+    def forget(self) -> None:
+        """Forget the hops, for the odometry has another set; the next begins at the newest scan."""
+        self._begin()
+
     def _begin(self) -> None:
-        """Forget all hops, and where they could start."""
-        n = 1 + len(self.members)
-        self._hops = HopErrors(np.empty((0, n, 3)), np.empty(0), np.empty(0), np.empty(0))
+        self._forget_errors()
         self._own = OwnErrors(self._length)
         self._anchors: deque[_Anchor] = deque()
         self._measured = -np.inf
+
+    def _forget_errors(self) -> None:
+        n = 1 + len(self.members)
+        self._hops = HopErrors(np.empty((0, n, 3)), np.empty(0), np.empty(0), np.empty(0))
         # Hops in a row that were rejected, and by which each was wrong.
         self._rejected, self._wrong = 0, np.zeros(n, np.intp)
 
@@ -169,7 +160,9 @@ class LiveEvidence:
         restarted = self._newest is not None and motions.starts > self._n_starts
         self._n_starts = motions.starts
         if restarted:
-            self._restart(before)
+            # What a member did before says nothing of it now, but the drive has the jump.
+            self._forget_errors()
+            self._restarted = before
         # The first scan is where the odometry starts, whatever motion it was given.
         if self._newest is None:
             T[:] = np.eye(4)
@@ -183,34 +176,21 @@ class LiveEvidence:
         if self._newest is not None and finite[0] and not restarted:
             # This, not the motion before it, is how the sensor moved while it took the last scan.
             self._newest.cloud.moved(T[0], seconds)
-        self._newest = _Anchor(
-            before,
-            self._metres,
-            HopCloud(scan, T[0], 0.0 if restarted else seconds),
-            self._T_odom_sensor,
-            self._no_pose,
-        )
+        cloud = HopCloud(scan, T[0], 0.0 if restarted else seconds)
+        self._newest = _Anchor(before, self._metres, cloud, self._T_odom_sensor, self._no_pose)
         if not self._anchors or self._metres - self._anchors[-1].metres >= SPACING:
             self._anchors.append(self._newest)
             # Before the start of the longest hop, one more is kept, to confirm it.
             while len(self._anchors) > 2 and self._metres - self._anchors[2].metres >= LENGTHS[0]:
                 self._anchors.popleft()
 
-    def _restart(self, stamp: int) -> None:
-        """Take note that the odometry, or all members of a bank, have begun anew at a scan."""
-        own, anchors, measured = self._own, self._anchors, self._measured
-        self._begin()
-        # What a member did before says nothing of it now, but the drive has the jump.
-        self._own, self._anchors, self._measured = own, anchors, measured
-        self._restarted = stamp
-
     def measure(self) -> Measured | None:
         """Register the newest scan whose motion is known to one some metres before.
 
-        Nothing is measured before the first hop is complete, nor where the sensor has moved less
-        than a metre since the last one. A hop that contradicts the odometry counts only if a
+        None before the first hop is complete, where the sensor has moved less than a metre, or
+        where no registration was accepted. A hop that contradicts the odometry counts only if a
         registration to another scan says the same: where a scene repeats itself, one can be wrong
-        by metres. None if no registration was accepted.
+        by metres.
         """
         end = self._newest
         if end is None or end.metres - self._measured < SPACING:
@@ -221,15 +201,15 @@ class LiveEvidence:
         self._measured, self._since = end.metres, 0
         if end is not self._anchors[-1]:
             self._anchors.append(end)
-        found = self._register(starts, end)
+        measured = self._register(starts, end)
         # On an open plain only height can be told; that is no loss of track.
-        if found is not None and np.trace(found.hop.projection) < _MIN_DIRECTIONS:
+        if measured is not None and np.trace(measured.hop.projection) < _MIN_DIRECTIONS:
             return None
-        if found is None or not self._is_confirmed(found):
+        if measured is None or not self._is_confirmed(measured):
             self._rejected += starts[-1].stamp >= self._restarted
             return None
-        self._take(found)
-        return found
+        self._take(measured)
+        return measured
 
     def _starts(self, end: _Anchor) -> list[_Anchor]:
         """Where a hop may start, in the order in which that is tried."""
@@ -248,11 +228,7 @@ class LiveEvidence:
         return next(near, before[0] if before else None)
 
     def _register(self, starts: Sequence[_Anchor], end: _Anchor) -> Measured | None:
-        """The first registration that is accepted.
-
-        Only where the last one was rejected, members that disagree with the odometry are asked,
-        too: where a scene repeats itself, one that is lost finds a registration as well.
-        """
+        """The first registration that is accepted; if the last was rejected, members guess, too."""
         guesses = [self._guesses(start, end) for start in starts]
         for first, stop in ((0, 1), (1, _GUESSES))[: 2 if self._rejected else 1]:
             for start, of_start in zip(starts, guesses, strict=True):
@@ -271,65 +247,55 @@ class LiveEvidence:
                 tried.append(T)
         return tried
 
-    def _is_confirmed(self, found: Measured) -> bool:
+    def _is_confirmed(self, measured: Measured) -> bool:
         """Whether a hop agrees with the odometry, or a hop from another scan agrees with it."""
-        wrong, end = found.errors()[0], found.end
+        wrong, end = measured.errors()[0], measured.end
         if np.linalg.norm(wrong) <= DOUBTFUL:
             return True
-        at = self._anchors.index(found.start)
+        at = self._anchors.index(measured.start)
         # The scan before, so that it spans the same way; at the begin of a drive the scan after.
         other = self._anchors[at - 1 if at else 1]
         if other.stamp >= end.stamp:
             return False
         guess = invert(other.T_odom_sensor[0]) @ end.T_odom_sensor[0]
-        if not found.by_odometry:
-            between = invert(other.T_odom_sensor[0]) @ found.start.T_odom_sensor[0]
-            guess = between @ found.hop.T_start_end
+        if not measured.by_odometry:
+            between = invert(other.T_odom_sensor[0]) @ measured.start.T_odom_sensor[0]
+            guess = between @ measured.hop.T_start_end
         hop = register(other.cloud, end.cloud, [guess])
-        return hop is not None and _alike(wrong, Measured(other, end, hop).errors()[0])
+        if hop is None:
+            return False
+        confirming = Measured(other, end, hop).errors()[0]
+        # About the same direction and length.
+        lengths = np.linalg.norm(wrong), np.linalg.norm(confirming)
+        return bool(np.linalg.norm(wrong - confirming) < min(lengths))
 
-    def _take(self, found: Measured) -> None:
-        """Compare with what was measured."""
-        start, end, hop, _ = found
-        errors = found.errors()
+    def _take(self, measured: Measured) -> None:
+        """Compare with what was measured; over a restart there are no errors of members."""
+        start, end, hop, _ = measured
+        errors = measured.errors()
         errors[end.no_pose > start.no_pose] = np.nan
         ends = start.metres, end.metres, end.stamp * 1e-9
-        measured = np.asarray(np.isfinite(errors).all(axis=1))
+        known = np.asarray(np.isfinite(errors).all(axis=1))
         if start.stamp >= self._restarted:
-            self._compare(errors, measured, ends)
-        if measured[0]:
+            # Those that are back count as measured, not as lost.
+            self._hops = self._hops.filled(known & np.isfinite(self._without))
+            self._hops = self._hops.with_hop(errors, *ends)
+            self._without[known] = -np.inf
+            # A scan without a pose says nothing of the rest of the hop.
+            with np.errstate(invalid="ignore"):
+                wrong = np.linalg.norm(errors, axis=1) > LOST
+            self._wrong = np.where(wrong, self._wrong + 1, 0)
+        if known[0]:
             self._own.add(Link(*ends, start.T_odom_sensor[0], end.T_odom_sensor[0], hop))
         self._rejected = 0
 
-    def _compare(
-        self,
-        errors: NDArray[np.float64],
-        measured: NDArray[np.bool_],
-        ends: tuple[float, float, float],
-    ) -> None:
-        """Take note of a hop's errors, of shape (1 + n_members, 3); over a restart there are none.
-
-        `measured` says which of them are known, `ends` where the hop starts and ends, and when.
-        """
-        # Those that are back count as measured, not as lost.
-        self._hops = self._hops.filled(measured & np.isfinite(self._without))
-        self._hops = self._hops.with_hop(errors, *ends)
-        self._without[measured] = -np.inf
-        # A scan without a pose says nothing of the rest of the hop.
-        with np.errstate(invalid="ignore"):
-            wrong = np.linalg.norm(errors, axis=1) > LOST
-        self._wrong = np.where(wrong, self._wrong + 1, 0)
-
     def _told_to_restart(self) -> frozenset[int]:
-        """Trial numbers of the members that two hops in a row have shown to be lost.
-
-        Each is told once. Then only hops that begin after that count against it.
-        """
-        told = self._wrong >= HOPS_TO_BE_LOST
-        told[0] = False
-        self._wrong = np.where(told, 0, self._wrong)
-        self._no_pose = self._no_pose + told
-        return frozenset(np.array(self.members, np.intp)[told[1:]].tolist())
+        """Trial numbers of members that two hops in a row show to be lost; each is told once."""
+        lost = self._wrong >= HOPS_TO_BE_LOST
+        lost[0] = False
+        self._wrong = np.where(lost, 0, self._wrong)
+        self._no_pose = self._no_pose + lost
+        return frozenset(np.array(self.members, np.intp)[lost[1:]].tolist())
 
     def present(self) -> NDArray[np.bool_]:
         """Which members may have weight, of shape (n_members,).
@@ -346,13 +312,6 @@ class LiveEvidence:
         chosen = self.members if members is None else members
         columns = [i for i, trial in enumerate(self.members, 1) if trial in chosen] or [0]
         return live_squares(self._hops._replace(errors=self._hops.errors[:, columns]))
-
-    def forget(self) -> None:
-        """Forget the hops so far, for the odometry has got another set.
-
-        The next one begins at the newest scan.
-        """
-        self._begin()
 
     def own_error(self) -> OwnError | None:
         """The odometry's, or the bank's, own error over the last metres; None without any hop."""
@@ -394,12 +353,6 @@ def spread_of(vectors: NDArray[np.floating]) -> NDArray[np.float64]:
     return np.asarray(np.sqrt((apart**2).sum(axis=-1).mean(axis=-1)))
 
 
-def _alike(error: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
-    """Whether two errors, of shape (3,), have about the same direction and length."""
-    apart = np.linalg.norm(error - other)
-    return bool(apart < min(np.linalg.norm(error), np.linalg.norm(other)))
-
-
 def _apart(T: Poses, other: Poses) -> float:
     """How far two motions are apart, in metres; a radian counts as much as ten metres."""
     moved = invert(other) @ T
@@ -408,8 +361,7 @@ def _apart(T: Poses, other: Poses) -> float:
 
 # Hops along a recording whose poses are known, at least in part.
 
-PERIOD = 1_000_000_000
-"""Nanoseconds from one registration to the next."""
+PERIOD = 1_000_000_000  # nanoseconds from one registration to the next
 
 
 def hops_along(
@@ -417,12 +369,11 @@ def hops_along(
 ) -> Hops:
     """Register scans directly to those some metres before, once a second.
 
-    The known poses, of shape (4, 4), take the odometry's place: they give each registration its
-    first guess. Where they are unknown (NaN), nothing is measured. `advance` is called after every
-    scan with how many are done.
+    Known poses, of shape (4, 4), give each registration its first guess; where they are NaN,
+    nothing is measured. `advance` is called after every scan with how many are done.
     """
     live = LiveEvidence()
-    found: list[tuple[int, int, Hop]] = []
+    hops: list[tuple[int, int, Hop]] = []
     frame_of: dict[int, int] = {}
     due, last, step = 0, np.full((4, 4), np.nan), np.eye(4)
     for i, (scan, T) in enumerate(scans):
@@ -436,8 +387,9 @@ def hops_along(
         due = due if i else scan.stamp
         if scan.stamp >= due:
             due += (int(scan.stamp - due) // PERIOD + 1) * PERIOD
-            if (one := live.measure()) is not None:
-                found.append((frame_of[one.start.stamp], frame_of[one.end.stamp], one.hop))
+            if (measured := live.measure()) is not None:
+                ends = frame_of[measured.start.stamp], frame_of[measured.end.stamp]
+                hops.append((*ends, measured.hop))
         last = T
         advance(i + 1)
-    return Hops.of(found)
+    return Hops.of(hops)

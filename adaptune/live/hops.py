@@ -14,17 +14,14 @@ from adaptune.geometry import Poses, rectify, squared_ranges
 from adaptune.recording.compensation import compensate
 from adaptune.recording.scan import Scan
 
-LENGTHS = (10.0, 5.0)
-"""Metres of a hop: the second where the first is rejected, as in narrow caves."""
-NOISE = 0.02
-"""Metres by which a registration is wrong, about."""
+LENGTHS = (10.0, 5.0)  # metres of a hop: the second where the first is rejected, as in narrow caves
+NOISE = 0.02  # metres by which a registration is wrong, about
 MIN_INLIERS = 0.35
 """Least share of points near a point of the other scan; a registration with fewer is rejected."""
 DEGENERATE = 0.002
 """A direction is unknown if its information is less than this share of the best direction's."""
 _MIN_RANGE = 1.0
-_MIN_POINTS = 100
-"""Points; small_gicp crashes on an empty target, and three points always converge."""
+_MIN_POINTS = 100  # points; small_gicp crashes on an empty target, and three points always converge
 REACHES, OFFLINE_REACHES = (1.0,), (2.0, 0.5)
 """Metres of the greatest distance of correspondences, one registration after the other; the second
 where there is time for two."""
@@ -74,8 +71,8 @@ class Hops(NamedTuple):
 class HopCloud:
     """A scan, prepared for registrations when it is first needed.
 
-    It is motion-compensated by the sensor's motion from the scan before, of shape (4, 4), or to the
-    next one where that is known, which took so many seconds; 0 for no compensation.
+    It is motion-compensated by the motion from the scan before, or to the next one where that is
+    known, of shape (4, 4), which took so many seconds; 0 for no compensation.
     """
 
     def __init__(
@@ -166,13 +163,12 @@ def _known_directions(result: Any) -> NDArray[np.float64]:
         of_rotation, information[:3, 3:]
     )
     values, vectors = np.linalg.eigh(marginal)
-    found = values - _OF_A_PLANE * result.num_inliers
-    known = vectors[:, found >= DEGENERATE * values[-1]]
+    beyond_planes = values - _OF_A_PLANE * result.num_inliers
+    known = vectors[:, beyond_planes >= DEGENERATE * values[-1]]
     return np.asarray(known @ known.T)
 
 
 # How wrong the members of a bank were over the last hops, and what that says of their weights.
-
 
 SECONDS, METRES = 30.0, 30.0
 """A hop counts as long as it is no older, or no farther behind, than this."""
@@ -204,10 +200,7 @@ class HopErrors(NamedTuple):
         return added.recent(end, seconds)
 
     def filled(self, members: NDArray[np.bool_]) -> "HopErrors":
-        """Let members, of shape (n_members,), be as wrong as the worst where they gave no pose.
-
-        So they are neither lost nor at an advantage over hops that say nothing of them.
-        """
+        """Let members, of shape (n_members,), be as wrong as the worst where they gave no pose."""
         lengths = np.linalg.norm(self.errors, axis=-1)
         missing = np.isnan(lengths)
         worst = np.where(missing, -1.0, lengths).argmax(axis=1)
@@ -217,8 +210,7 @@ class HopErrors(NamedTuple):
 
     def recent(self, metres: float, seconds: float) -> "HopErrors":
         """Those that count when so much was driven, at this time."""
-        young = seconds - self.seconds <= SECONDS
-        kept = np.flatnonzero(young | (metres - self.start <= METRES))
+        kept = (seconds - self.seconds <= SECONDS) | (metres - self.start <= METRES)
         return HopErrors(*(array[kept] for array in self))
 
 
@@ -248,10 +240,7 @@ def live_squares(hops: HopErrors) -> LiveSquares | None:
 
 
 def windows(start: NDArray[np.float64], end: NDArray[np.float64]) -> float:
-    """How many stretches of a path that overlap amount to as much as if they did not.
-
-    Their starts and ends are metres driven, of shape (n,).
-    """
+    """How many stretches of a path, from metres to metres, amount to as much without overlap."""
     order = np.argsort(start)
     start, end = start[order], end[order]
     length = float((end - start).mean())
@@ -260,9 +249,7 @@ def windows(start: NDArray[np.float64], end: NDArray[np.float64]) -> float:
     return max(1.0, (float(end[0] - start[0]) + float(new.sum())) / length)
 
 
-def clip_to_best(
-    errors: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def clip_to_best(errors: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Clip errors at `CLIP` from those of the member with the least error of each hop.
 
     They are of shape (n_hops, n_members, 3), NaN where a member gave no pose. Returned are the

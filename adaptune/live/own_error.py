@@ -18,8 +18,7 @@ OWN_SECONDS = 60.0
 """A chain counts as long as it is no older, or its start is among the last metres."""
 MIN_COVERED = 0.5
 """Least share of a chain that its hops cover; in between, the odometry's own motion is taken."""
-MIN_REACH = 0.8
-"""A chain that reaches over this share of the length is long enough."""
+MIN_REACH = 0.8  # a chain that reaches over this share of the length is long enough
 GROWTH = -0.15
 """The error over some metres, as a share of them, grows with this power of the metres."""
 LOG_DEVIATION = 0.3
@@ -29,19 +28,15 @@ SCATTER = 0.6
 """Standard deviation of the logarithm of the error from one sub-trajectory to the next."""
 HOP_ERROR = 0.05
 """Metres by which a hop itself is wrong where registrations are worst, as among plants."""
-HIDDEN = 0.0075
-"""Metres of an odometry's error that a hop may have, too, and so hide."""
-PREDICTED_WINDOWS = 2.0
-"""How many chains that do not overlap a prediction from training counts as."""
+HIDDEN = 0.0075  # metres of an odometry's error that a hop may have, too, and so hide
+PREDICTED_WINDOWS = 2.0  # how many chains that do not overlap a prediction from training counts as
 DEVIATION, COMMON = 0.64, 0.1
 """Standard deviation of the logarithm of one such chain's error, or of the prediction; and the part
 of its variance that all have in common."""
-LEAST = 0.01
-"""Percent; no odometry is better."""
+LEAST = 0.01  # percent; no odometry is better
 CONTRADICTED = 2.0
 """A prediction does not count where the error is surely more than so many times as large."""
-FAMILIAR = 0.1
-"""A prediction counts less and less in places that are less familiar than this."""
+FAMILIAR = 0.1  # a prediction counts less and less in places that are less familiar than this
 
 
 class OwnError(NamedTuple):
@@ -74,10 +69,7 @@ class _Chain(NamedTuple):
 
 
 class OwnErrors:
-    """Chains of the last hops, or of a whole recording.
-
-    `length` is that of the sub-trajectories whose mean error is estimated, in metres.
-    """
+    """Chains of the last hops, or of a whole recording, for the mean error over `length` metres."""
 
     def __init__(self, length: float, whole: bool = False):
         self._length, self._whole = length, whole

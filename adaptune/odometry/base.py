@@ -1,8 +1,11 @@
 """What every odometry offers, and the base class of adapters."""
 
+import logging
+import sys
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Hashable, Iterable, Mapping, Sequence
+from dataclasses import fields, is_dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, NamedTuple, Self
@@ -18,8 +21,14 @@ from adaptune.recording.scan import Scan
 from adaptune.space import ParameterSet, ParameterSpace, Selection
 from adaptune.strict import StrictModel
 
-MIN_POINTS = 20
-"""An adapter does not register scans with fewer points in range."""
+MIN_POINTS = 20  # an adapter does not register scans with fewer points in range
+MOST_FAULTS = 10
+"""An instance with so many faults does not start again: the rest of its sequence is lost."""
+MAX_SHARE_WITHOUT_POSE = 0.1
+"""Share of the scans from which an odometry that gives no pose for them has failed."""
+_TOLERANCE = 1e-3  # by how much a rotation times its transpose may differ from the identity
+
+_log = logging.getLogger(__name__)
 
 
 class BaseSettings(StrictModel):
@@ -72,6 +81,11 @@ class Registration(NamedTuple):
     registered: bool = True  # False if the scan was too poor: the last motion then goes on
 
 
+LOST = Registration(np.full((4, 4), np.nan), registered=False)
+"""What an odometry gives where there is no pose."""
+LOST.T_odom_sensor.setflags(write=False)
+
+
 class Usage(NamedTuple):
     """What an odometry has used so far."""
 
@@ -85,7 +99,7 @@ class Usage(NamedTuple):
         """What all together have used."""
         every = list(usages)
         known = [usage.memory for usage in every if usage.memory is not None]
-        cpu, other = sum(one.cpu for one in every), sum(one.other_cpu for one in every)
+        cpu, other = sum(u.cpu for u in every), sum(u.other_cpu for u in every)
         return cls(cpu, sum(known) if known else None, other_cpu=other)
 
 
@@ -155,16 +169,11 @@ class OdometryInstance(ABC):
 
     `submit` and `collect` let several instances in other processes work at the same time. After
     `close`, `prepare` still works and `start` begins again.
-
-    Attributes
-    ----------
-    apart : bool
-        Whether it works in another process, from `submit` on; class attribute.
-    rewinds : bool
-        Whether it can be shown scans of the past again.
     """
 
+    # Whether it works in another process, from `submit` on.
     apart: ClassVar[bool] = False
+    # Whether it can be shown scans of the past again.
     rewinds: bool = True
 
     @property
@@ -238,6 +247,11 @@ class OdometryInstance(ABC):
 
     def collect(self) -> Registration:
         """Wait for the pose of the submitted scan."""
+        registration = self._collect()
+        self._last_motion.move(registration.T_odom_sensor)
+        return registration
+
+    def _collect(self) -> Registration:
         raise NotImplementedError
 
     def register(self, prepared: Any) -> Registration:
@@ -249,12 +263,8 @@ class OdometryInstance(ABC):
         """Change to what was selected, before the next scan.
 
         A single odometry takes the parameters. A bank takes the weights; if there are none, the
-        member with the selected trial gets all the weight.
-
-        Raises
-        ------
-        OdometryError
-            If the odometry cannot change its parameters, or a bank does not hold the set.
+        member with the selected trial gets all the weight. There is an `OdometryError` if the
+        odometry cannot change its parameters, or a bank does not hold the set.
         """
         raise NotImplementedError
 
@@ -309,10 +319,7 @@ class Odometry(ABC):
 
     @classmethod
     def tuned(cls, settings: Any) -> ParameterSpace:
-        """The parameters that can be tuned, with baselines from the user's file, if there is one.
-
-        An `OdometryError` says what is wrong with the file.
-        """
+        """The parameters that can be tuned, with baselines from the user's file if there is one."""
         template = settings.template if isinstance(settings, ToolSettings) else None
         return cls.space if template is None else template.based(cls.space, cls._under(template))
 
@@ -331,10 +338,7 @@ class Odometry(ABC):
 
     @classmethod
     def own_file(cls, parameters: ParameterSet, settings: Any) -> OwnFile | None:
-        """A set as the odometry's own tool reads it; None if it has no such tool.
-
-        It is the user's file, if there is one, with nothing but these values changed.
-        """
+        """A set in the user's file, or as the odometry's own tool reads it; None if it has none."""
         template = settings.template if isinstance(settings, ToolSettings) else None
         if template is None:
             return None
@@ -344,10 +348,7 @@ class Odometry(ABC):
 
     @property
     def preparation(self) -> Hashable:
-        """What `prepare` depends on besides the scan: class and settings, unless overridden.
-
-        An adapter that prepares by parameters, too, overrides it.
-        """
+        """What `prepare` depends on besides the scan, which may be parameters, too; see there."""
         # Classes that share `prepare` may differ in what that calls.
         return type(self), self.settings.model_dump_json()
 
@@ -368,10 +369,7 @@ class Odometry(ABC):
     def configure(self, parameters: ParameterSet) -> None:
         """Change parameters between scans; the others stay.
 
-        Raises
-        ------
-        OdometryError
-            If the odometry is not `live`, or has no such parameter.
+        There is an `OdometryError` if the odometry is not `live`, or has no such parameter.
         """
         if not self.live:
             raise OdometryError(
@@ -414,12 +412,81 @@ class InProcess(OdometryInstance):
         self.odometry.start(prepared, T_odom_sensor, T_previous_current)
         self._last_motion.start(T_odom_sensor, T_previous_current)
 
-    def collect(self) -> Registration:
+    def _collect(self) -> Registration:
         begin = time.process_time()
         registration = Registration(*self.odometry.register(self._submitted))
         self._cpu += time.process_time() - begin
-        self._last_motion.move(registration.T_odom_sensor)
         return registration
 
     def apply(self, selection: Selection) -> None:
         self.odometry.configure(selection.parameters)
+
+
+class Faulting(OdometryInstance):
+    """An instance that may go wrong, and notes it."""
+
+    faults: Sequence[str] = ()
+
+    def __init__(self, name: str, parameters: ParameterSet):
+        self.name = name
+        self.parameters = dict(parameters)
+
+    @property
+    def given_up(self) -> bool:
+        return len(self.faults) >= MOST_FAULTS
+
+    def note_fault(self, what: str) -> Registration:
+        """Note a fault and end; the pose of a scan with a fault."""
+        self.close()
+        if what not in self.faults:
+            _log.warning("%s with %s: %s", self.name, self.parameters, what)
+        self.faults = [*self.faults, what]
+        if self.given_up:
+            _log.warning("%s: fault number %d, it does not start again", self.name, MOST_FAULTS)
+        return LOST
+
+
+def pose_fault(T_odom_sensor: Poses) -> str | None:
+    """What is wrong with a pose, if anything."""
+    if T_odom_sensor.shape != (4, 4):
+        return f"of shape {T_odom_sensor.shape}"
+    if not np.isfinite(T_odom_sensor).all():
+        return "that is not finite"
+    R = T_odom_sensor[:3, :3]
+    if np.abs(R @ R.T - np.eye(3)).max() > _TOLERANCE or np.linalg.det(R) < 0:
+        return "that is not rigid"
+    return None
+
+
+class PreparedScan:
+    """A scan that is prepared for several instances, once for all with the same preparation.
+
+    `first` is shared by the scans: the first instance with each preparation, which prepares for all
+    of them. They share what it learned from the first scan's layout.
+    """
+
+    def __init__(self, scan: Scan, first: dict[Hashable, Any]):
+        self.scan, self._first = scan, first
+        self.stamp = scan.stamp
+        self._prepared: dict[Hashable, Any] = {}
+
+    def by(self, instance: OdometryInstance) -> Any:
+        """The scan as an instance takes it; it is prepared where nobody has asked before."""
+        if (key := instance.preparation) not in self._prepared:
+            first = self._first.setdefault(key, instance)
+            self._prepared[key] = first.prepare(self.scan)
+        return self._prepared[key]
+
+
+def prepared_bytes(prepared: Any) -> int:
+    """Memory of a prepared scan, roughly, in bytes; a compiled object counts a megabyte."""
+    if (size := getattr(prepared, "nbytes", None)) is not None:
+        return int(size)
+    if is_dataclass(prepared):
+        prepared = [getattr(prepared, each.name) for each in fields(prepared)]
+    if isinstance(prepared, Mapping):
+        prepared = [*prepared.values()]
+    if isinstance(prepared, tuple | list):
+        return sum(map(prepared_bytes, prepared))
+    plain = prepared is None or isinstance(prepared, int | float | str | bytes)
+    return sys.getsizeof(prepared) if plain else 1_000_000

@@ -1,26 +1,28 @@
-"""What the adapters of evalio's pipelines share."""
+"""The pipelines of evalio.
+
+Points go over as raw bytes, not one Python object each. The conversion is evalio's own for
+PointCloud2 messages, which is not documented: hence the pinned version.
+"""
 
 import contextlib
 from collections import deque
-from typing import Any, ClassVar
+from functools import cache
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 from scipy.spatial.transform import Rotation
 
-from adaptune.errors import OdometryError, nearest
-from adaptune.geometry import Poses, invert
+from adaptune.errors import OdometryError, import_extra, nearest
+from adaptune.geometry import Poses, invert, squared_ranges
 from adaptune.odometry.base import MIN_POINTS, BaseSettings, Description, ToolSettings
-from adaptune.odometry.evalio_scans import EvalioScan, cloud, crop, evalio_modules, image, to_evalio
 from adaptune.odometry.own_frame import END, MIDDLE, NO_IMU, OwnFrameOdometry, duration_of
 from adaptune.odometry.template import Template
 from adaptune.recording.scan import Imu, Scan
 from adaptune.space import Float, Integer, ParameterSet, ParameterSpace, Value
 
 GRAVITY = 9.80665
-
-
 NO_FIELD = "{} needs to know {}, and the scans do not say; record clouds with a {} field"
 
 
@@ -43,9 +45,37 @@ class RangeImageSettings(EvalioSettings):
     columns: int | None = Field(None, ge=16, le=8192)
 
 
+_FIELDS = ("x", "y", "z", "t", "row")
+"""A point as evalio reads it, four bytes each: float32 metres, uint32 nanoseconds since the scan's
+stamp, uint32 laser. The laser is left out where the pipeline does not ask for it."""
+
+
+class EvalioScan(NamedTuple):
+    """A scan in evalio's layout; the last columns of its cloud hold bytes of uint32."""
+
+    stamp: int
+    cloud: NDArray[np.float32]  # of shape (n, 4) or (n, 5), see `_FIELDS`; an image row by row
+    shape: tuple[int, int]  # rows and columns
+    usable: bool  # whether enough points are in range
+    duration: int  # nanoseconds from the stamp to the last point; 0 if the times do not differ
+    imu: Imu | None
+
+
+def _modules() -> tuple[Any, ...]:
+    return import_extra("evalio", "evalio.pipelines", "evalio.types", "evalio._cpp.helpers")
+
+
+@cache
+def _fields() -> Any:
+    """The description of `_FIELDS`."""
+    helpers = _modules()[2]
+    kinds = [helpers.DataType.FLOAT32] * 3 + [helpers.DataType.UINT32] * 2
+    fields = zip(_FIELDS, kinds, range(0, 20, 4), strict=True)
+    return [helpers.Field(name=name, datatype=kind, offset=at) for name, kind, at in fields]
+
+
 with contextlib.suppress(OdometryError):
-    # Processes that are forked from one with this module find evalio loaded.
-    evalio_modules()
+    _modules()  # processes that are forked from one with this module find it loaded
 
 
 class Pipeline(OwnFrameOdometry):
@@ -54,31 +84,22 @@ class Pipeline(OwnFrameOdometry):
     Pipelines read their parameters only when they begin, and begin at rest. Those that deskew do so
     to the scan's end; their poses are carried back to its stamp. Pipelines with an IMU give poses
     of the IMU, which become the LiDAR's here.
-
-    Attributes
-    ----------
-    pipeline : str
-        What evalio calls it; class attribute.
-    deskews_to : float
-        Share of a scan's duration, see `adaptune.odometry.base`; class attribute.
-    untuned : dict
-        Values that must differ from the pipeline's own defaults: one thread, no scans dropped
-        when late; class attribute.
     """
 
     settings_type = EvalioSettings
     live = False
     # Some end the process at unexpected scans, some share state between instances.
     clean = False
-    pipeline: ClassVar[str]
-    deskews_to: ClassVar[float] = END
+    pipeline: ClassVar[str]  # what evalio calls it
+    deskews_to: ClassVar[float] = END  # share of a scan's duration
+    # Values that differ from the pipeline's defaults: one thread, no scans dropped when late.
     untuned: ClassVar[ParameterSet] = {}
 
     def __init__(
         self, parameters: ParameterSet | None = None, settings: BaseSettings | None = None
     ):
         super().__init__(parameters, settings)
-        self._defaults = evalio_modules()[0].all_pipelines()[self.pipeline].default_params()
+        self._defaults = _modules()[0].all_pipelines()[self.pipeline].default_params()
         of_user, template = self.settings.parameters, self.settings.template
         if template is not None:
             # adaptune drives on one thread, whatever the file says.
@@ -91,7 +112,7 @@ class Pipeline(OwnFrameOdometry):
 
     @classmethod
     def describe(cls, settings: Any) -> Description:
-        evalio_modules()  # raises if there is no evalio
+        _modules()  # raises if there is no evalio
         return super().describe(settings)
 
     @classmethod
@@ -129,17 +150,20 @@ class Pipeline(OwnFrameOdometry):
     def prepare(self, scan: Scan) -> EvalioScan:
         if self.needs_imu and scan.imu is None:
             raise OdometryError(NO_IMU.format(self.pipeline))
-        cropped = crop(scan, self.settings.min_range, self.settings.max_range)
+        squared = squared_ranges(scan.points)
+        low, high = self.settings.min_range, self.settings.max_range
+        in_range = (squared >= low * low) & (squared <= high * high)
+        cropped = scan if in_range.all() else scan.select(in_range)
         cloud, shape = self._layout(cropped)
         usable, duration = len(cropped) >= MIN_POINTS, duration_of(cropped)
         return EvalioScan(scan.stamp, cloud, shape, usable, duration, scan.imu)
 
     def _layout(self, scan: Scan) -> tuple[NDArray[np.float32], tuple[int, int]]:
-        """Points as `FIELDS` has them, and their numbers of rows and columns."""
-        return cloud(scan, 4), (1, len(scan))
+        """Points as `_FIELDS` has them, and their numbers of rows and columns."""
+        return _cloud(scan, 4), (1, len(scan))
 
     def _begin(self, prepared: EvalioScan) -> None:
-        pipelines, types, _ = evalio_modules()
+        pipelines, types, _ = _modules()
         parameters = self._values(self.settings.deskew and prepared.duration > 0)
         # Pipelines divide by the length of the scan, and some end the process where it is 0.
         self._needs_times = bool(parameters.get("deskew"))
@@ -168,21 +192,66 @@ class Pipeline(OwnFrameOdometry):
 
     def _measure(self, imu: Imu) -> None:
         """Pass on what the IMU measured."""
-        types = evalio_modules()[1]
+        types = _modules()[1]
         stamps = map(types.Stamp.from_nsec, imu.stamps.tolist())
         for measured in zip(stamps, imu.angular_velocity, imu.acceleration, strict=True):
             self._pipeline.add_imu(types.ImuMeasurement(*measured))
 
     def _estimate(self, prepared: EvalioScan) -> Poses | None:
         """Pass a scan on, and return the last pose that comes back."""
-        self._pipeline.add_lidar(to_evalio(prepared))
+        self._pipeline.add_lidar(_to_evalio(prepared))
         estimates = self._pipeline.saved_estimates()
         return estimates[-1][1].to_mat() @ self._T_imu_sensor if estimates else None
 
 
+def _to_evalio(prepared: EvalioScan) -> Any:
+    """A prepared scan as evalio's own measurement."""
+    _, types, helpers = _modules()
+    size, n_fields = prepared.cloud.shape
+    layout = helpers.PointCloudMetadata(
+        stamp=types.Stamp.from_nsec(prepared.stamp),
+        width=size,
+        height=1,
+        point_step=4 * n_fields,
+        row_step=4 * n_fields * size,
+        is_bigendian=0,
+        is_dense=1,
+    )
+    return helpers.pc2_to_evalio(layout, _fields()[:n_fields], prepared.cloud.tobytes())
+
+
+def _cloud(scan: Scan, n_fields: int) -> NDArray[np.float32]:
+    """Points with the first so many of `_FIELDS`."""
+    points = np.empty((len(scan), n_fields), np.float32)
+    points[:, :3] = scan.points
+    whole = points.view(np.uint32)
+    # None lies before the stamp.
+    whole[:, 3] = 0 if scan.times is None else np.maximum(scan.times, 0.0) * 1e9
+    if n_fields > 4:
+        whole[:, 4] = 0 if scan.rings is None else scan.rings
+    return points
+
+
+def _image(scan: Scan, points: NDArray[np.float32], rows: int, columns: int) -> NDArray[np.float32]:
+    """All `_FIELDS` of a scan as a complete image, row by row."""
+    # The seam lies behind the sensor.
+    place = np.arctan2(scan.points[:, 1], scan.points[:, 0])
+    place *= columns / (2 * np.pi)
+    place += columns / 2
+    # Firings that fall on the borders between columns would share every other one.
+    place -= np.angle(np.exp(2j * np.pi * place[::16]).mean()) / (2 * np.pi)
+    column = np.rint(place).astype(np.int64) % columns
+    # Rays that did not come back lie at the origin, where every pipeline drops them.
+    pixels = np.zeros((rows * columns, 5), np.float32)
+    row = pixels.view(np.uint32)[:, 4]
+    row[:] = np.repeat(np.arange(rows, dtype=np.uint32), columns)
+    pixels[points.view(np.uint32)[:, 4] * np.int64(columns) + column] = points
+    return pixels
+
+
 def _imu_parameters(imu: Imu) -> Any:
     rate = 1e9 / float(np.median(np.diff(imu.stamps))) if len(imu) > 1 else 100.0
-    return evalio_modules()[1].ImuParams(
+    return _modules()[1].ImuParams(
         **dict(zip(("gyro", "accel", "gyro_bias", "accel_bias"), imu.noise, strict=True)),
         gravity=np.array([0.0, 0.0, -GRAVITY]),
         rate=rate,
@@ -201,7 +270,7 @@ class RingedPipeline(Pipeline):
             raise OdometryError(
                 NO_FIELD.format(self.pipeline, "which laser measured each point", "`ring`")
             )
-        points = cloud(scan, 5)
+        points = _cloud(scan, 5)
         if len(scan) < MIN_POINTS:
             return points, (1, len(scan))
         counts = np.bincount(scan.rings)
@@ -222,7 +291,7 @@ class GridPipeline(RingedPipeline):
 
     def _layout(self, scan: Scan) -> tuple[NDArray[np.float32], tuple[int, int]]:
         points, shape = super()._layout(scan)
-        return points if len(scan) < MIN_POINTS else image(scan, points, *shape), shape
+        return points if len(scan) < MIN_POINTS else _image(scan, points, *shape), shape
 
 
 class KissIcp(Pipeline):
@@ -310,10 +379,7 @@ class Loam(GridPipeline):
 
 
 class Form(GridPipeline):
-    """FORM (Potokar et al.): features, fixed-lag smoothing and sparse key scans.
-
-    It takes scans as they are.
-    """
+    """FORM (Potokar et al.): features, fixed-lag smoothing, key scans. It does not deskew."""
 
     pipeline = "form"
     _share = MIDDLE
@@ -329,11 +395,9 @@ class Form(GridPipeline):
     )
 
 
-_BEHIND = 2
-"""Scans that LIO-SAM waits for before it registers one."""
+_BEHIND = 2  # scans that LIO-SAM waits for before it registers one
 
-_SMOOTH = 3
-"""Scans over which the mean velocity is taken that carries its poses on."""
+_SMOOTH = 3  # scans over which the mean velocity is taken that carries its poses on
 
 
 class LioSam(RingedPipeline):

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
+from adaptune.odometry import registry
 from adaptune.odometry.base import Description, InProcess, OdometryInstance, OwnFile
 from adaptune.odometry.guarded import Guarded
 from adaptune.odometry.remote import Isolated, Limits
@@ -12,8 +13,6 @@ from adaptune.space import ParameterSet, ParameterSpace, PooledSpace
 
 if TYPE_CHECKING:
     from adaptune.odometry.program import ProgramInput
-from adaptune.odometry.content import Content, odometry_content
-from adaptune.odometry.registry import CONTAINERS, PROGRAMS, declare, is_user_class, odometry_class
 
 
 @dataclass(frozen=True)
@@ -32,7 +31,7 @@ class OdometryFactory:
     description: Description = field(init=False)  # what a study must know of the odometry
 
     def __post_init__(self) -> None:
-        settings, description = declare(self.name, self.settings).sound(self.name)
+        settings, description = registry.declare(self.name, self.settings).sound(self.name)
         vars(self).update(settings=settings, description=description)
 
     @property
@@ -41,9 +40,9 @@ class OdometryFactory:
         return {"name": self.name, "settings": self.settings.model_dump(mode="json")}
 
     @property
-    def content(self) -> Content:
+    def content(self) -> registry.Content:
         """What the poses depend on besides name, settings and parameters."""
-        return odometry_content(self.name, self.settings, self.description.module)
+        return registry.odometry_content(self.name, self.settings, self.description.module)
 
     def changed(self, **changes: Any) -> "OdometryFactory":
         """The same with another `user_code` or `program_input`."""
@@ -52,12 +51,12 @@ class OdometryFactory:
     @property
     def apart(self) -> bool:
         """Whether it runs in processes of their own, which have limits."""
-        return not self.description.clean or is_user_class(self.name)
+        return not self.description.clean or registry.is_user_class(self.name)
 
     @property
     def one_by_one(self) -> bool:
         """Whether trials gain nothing from sharing a pass: what runs them shares nothing."""
-        return self.description.whole or self.name in CONTAINERS
+        return self.description.whole or self.name in registry.CONTAINERS
 
     def alone(self, parameters: ParameterSet) -> tuple["OdometryFactory", ParameterSet]:
         """What makes the odometry that a set is for, and all parameters that it takes."""
@@ -65,43 +64,37 @@ class OdometryFactory:
 
     def own_file(self, parameters: ParameterSet) -> OwnFile | None:
         """All parameters as the odometry's own tool reads them; None if it has no such tool."""
-        if is_user_class(self.name):
+        if registry.is_user_class(self.name):
             return None  # which is not imported here
-        found: OwnFile | None = odometry_class(self.name).own_file(parameters, self.settings)
-        return found
+        own_file: OwnFile | None = registry.odometry_class(self.name).own_file(
+            parameters, self.settings
+        )
+        return own_file
 
     def __call__(
-        self,
-        parameters: ParameterSet | None = None,
-        sequence: str | None = None,
+        self, parameters: ParameterSet | None = None, sequence: str | None = None
     ) -> OdometryInstance:
-        """Make a new instance; parameters not given keep their baseline.
-
-        Programs that run whole recordings need the name of the sequence on which it will run.
-        """
+        """Make a new instance; programs that run whole recordings need the sequence's name."""
         given = self.space.complete(parameters or {})
-        if self.name in PROGRAMS:
+        if self.name in registry.PROGRAMS:
             read = None
             if sequence is not None and self.program_input is not None:
                 read = partial(self.program_input, sequence)
-            program: Any = odometry_class(self.name)
-            made: OdometryInstance = program.instance(given, self.settings, self.limits, read)
-            return made
-        is_users = is_user_class(self.name)
+            program: Any = registry.odometry_class(self.name)
+            instance: OdometryInstance = program.instance(given, self.settings, self.limits, read)
+            return instance
+        is_users = registry.is_user_class(self.name)
         if not self.description.clean or (is_users and not self.user_code):
             return Isolated(self.name, given, self.settings, self.limits)
         if is_users:
-            return Guarded(self.name, odometry_class, given, self.settings, self.limits.seconds)
-        cls: Any = odometry_class(self.name)
+            return Guarded(self.name, given, self.settings, self.limits.seconds)
+        cls: Any = registry.odometry_class(self.name)
         return InProcess(cls(given, self.settings))
 
 
 @dataclass(frozen=True)
 class OdometryPool:
-    """Makes instances of several odometries, as `OdometryFactory` does of one: it pickles.
-
-    Parameter sets are those of a `PooledSpace`.
-    """
+    """Makes instances of several odometries, by sets of a `PooledSpace`; see `OdometryFactory`."""
 
     factories: Mapping[str, OdometryFactory]  # by label, what makes each odometry
     space: PooledSpace = field(init=False)
@@ -117,17 +110,10 @@ class OdometryPool:
 
     @cached_property
     def description(self) -> Description:
-        """What a study must know of all together.
-
-        No instance changes from one odometry to another, so none is live.
-        """
+        """What a study must know of all together; no instance changes to another odometry."""
         every = [factory.description for factory in self.factories.values()]
-        return Description(
-            self.space,
-            live=False,
-            needs_imu=any(one.needs_imu for one in every),
-            whole=any(one.whole for one in every),
-        )
+        needs_imu, whole = any(d.needs_imu for d in every), any(d.whole for d in every)
+        return Description(self.space, live=False, needs_imu=needs_imu, whole=whole)
 
     @property
     def identity(self) -> dict[str, Any]:
@@ -146,7 +132,7 @@ class OdometryPool:
         return any(factory.one_by_one for factory in self.factories.values())
 
     @property
-    def content(self) -> Content:
+    def content(self) -> registry.Content:
         """See `OdometryFactory`."""
         return {k: v for factory in self.factories.values() for k, v in factory.content.items()}
 
@@ -160,9 +146,7 @@ class OdometryPool:
         return self.factories[label].alone(own)
 
     def __call__(
-        self,
-        parameters: ParameterSet | None = None,
-        sequence: str | None = None,
+        self, parameters: ParameterSet | None = None, sequence: str | None = None
     ) -> OdometryInstance:
         """Make a new instance of the odometry that the set names, see `OdometryFactory`."""
         whole = self.space.baseline if parameters is None else parameters

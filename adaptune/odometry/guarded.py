@@ -14,8 +14,8 @@ from adaptune import processes
 from adaptune.errors import AdaptuneError, in_a_line
 from adaptune.geometry import Poses
 from adaptune.odometry import wire
-from adaptune.odometry.base import Odometry, Registration, Usage
-from adaptune.odometry.faults import LOST, Faulting, pose_fault
+from adaptune.odometry.base import LOST, Faulting, Odometry, Registration, Usage, pose_fault
+from adaptune.odometry.registry import odometry_class
 from adaptune.recording.scan import Scan
 from adaptune.space import ParameterSet, Selection
 
@@ -27,20 +27,12 @@ class _LateError(BaseException):
 class Guarded(Faulting):
     """A clean class of the user in this process, with the faults that `Isolated` would have.
 
-    `find` imports the class of a name. The limit of seconds for one scan holds for Python code in
-    the main thread; other code is trusted.
+    The limit of seconds for a scan holds for Python code in the main thread.
     """
 
-    def __init__(
-        self,
-        name: str,
-        find: Callable[[str], type[Any]],
-        parameters: ParameterSet,
-        settings: BaseModel,
-        seconds: float,
-    ):
+    def __init__(self, name: str, parameters: ParameterSet, settings: BaseModel, seconds: float):
         super().__init__(name, parameters)
-        self._find, self._seconds = find, seconds
+        self._seconds = seconds
         self._settings = settings.model_dump(mode="json")
         self._odometry: Odometry | None = None
         self._cpu = 0.0
@@ -79,7 +71,7 @@ class Guarded(Faulting):
         if self._running:
             self._noted(lambda odometry: odometry.start(*given), prepared)
 
-    def collect(self) -> Registration:
+    def _collect(self) -> Registration:
         def register(odometry: Odometry) -> Registration:
             T_odom_sensor, registered = wire.unpacked(odometry.register(self._submitted))
             T_odom_sensor = np.array(T_odom_sensor, np.float64)
@@ -87,12 +79,11 @@ class Guarded(Faulting):
                 raise processes.HostError(f"it gave a pose {wrong}")
             return Registration(T_odom_sensor, bool(registered))
 
-        registration = LOST
-        if self._running:
-            begin = time.process_time()
-            registration = self._noted(register, self._submitted)
-            self._cpu += time.process_time() - begin
-        self._last_motion.move(registration.T_odom_sensor)
+        if not self._running:
+            return LOST
+        begin = time.process_time()
+        registration: Registration = self._noted(register, self._submitted)
+        self._cpu += time.process_time() - begin
         return registration
 
     def apply(self, selection: Selection) -> None:
@@ -116,7 +107,7 @@ class Guarded(Faulting):
         try:
             with _limited(self._seconds):
                 if self._odometry is None:
-                    cls = self._find(self.name)
+                    cls = odometry_class(self.name)
                     settings = cls.settings_type.model_validate(self._settings)
                     self._odometry = cls(self.parameters, settings)
                 return call(self._odometry)

@@ -10,14 +10,10 @@ from pydantic import Field
 from adaptune.geometry import Poses, invert, rotation_angle, scale
 from adaptune.strict import StrictModel
 
-_STILL = 1e-6
-"""Metres and radians by which a pose that stays where it is may move."""
-_WALK = 0.5
-"""Metres a second."""
-_INTERVALS = 11
-"""Newest intervals between scans whose median is the usual one."""
-_MOST_JITTER = 0.5
-"""The largest share of an interval that counts as jitter of its stamps."""
+_STILL = 1e-6  # metres and radians by which a pose that stays where it is may move
+_WALK = 0.5  # metres a second
+_INTERVALS = 11  # newest intervals between scans whose median is the usual one
+_MOST_JITTER = 0.5  # the largest share of an interval that counts as jitter of its stamps
 _SETTLED = 1.0
 """Seconds after which an odometry knows how fast it is: a recording may begin in motion. KISS-ICP
 in a car at 12 m/s moves after half a second, and then catches up for 0.3 s at twice that speed."""

@@ -23,8 +23,7 @@ turns more steadily than its stamps say, and a missing scan doubles the time."""
 
 DOWNSAMPLING = Categorical(choices=(0.15, 0.2, 0.25, 0.35, 0.5, 0.7, 1.0), baseline=0.5, unit="m")
 """Metres between points of a cloud. There are few values, so that sets share prepared clouds."""
-ITERATIONS = Integer(low=5, high=60, baseline=20, log=True)
-"""Of a registration, at most."""
+ITERATIONS = Integer(low=5, high=60, baseline=20, log=True)  # of a registration, at most
 
 
 class KeyframeSettings(BaseSettings):

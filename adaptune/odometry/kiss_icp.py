@@ -30,8 +30,8 @@ from adaptune.strict import in_one_line
 
 _SECTION = {
     name: section
-    for section, of in KISSConfig.model_fields.items()
-    for name in getattr(of.annotation, "model_fields", ())
+    for section, field in KISSConfig.model_fields.items()
+    for name in getattr(field.annotation, "model_fields", ())
 }
 """By value, the section of KISS-ICP's configuration that holds it."""
 

@@ -1,7 +1,6 @@
 """Odometries in programs that read a recording and a parameter file and write a trajectory."""
 
 import json
-import logging
 import os
 import shutil
 import time
@@ -20,8 +19,15 @@ from adaptune.errors import OdometryError, UnavailableError, nearest
 from adaptune.files import locked, replacing_folder, temporary_folder
 from adaptune.geometry import Poses, invert, nearest_rotation, rotation_angle, to_pose
 from adaptune.metrics import window_ends
-from adaptune.odometry.base import BaseSettings, Description, OwnFile, Registration, Usage
-from adaptune.odometry.faults import Faulting, pose_fault
+from adaptune.odometry.base import (
+    BaseSettings,
+    Description,
+    Faulting,
+    OwnFile,
+    Registration,
+    Usage,
+    pose_fault,
+)
 from adaptune.odometry.remote import Arguments, Limits
 from adaptune.odometry.template import Template, check_names, placeholders, replace
 from adaptune.recording.config import SequenceConfig, Transform, resolve
@@ -31,11 +37,7 @@ from adaptune.ros.link import LinkError
 from adaptune.space import ParameterSet, Selection
 from adaptune.trajectory import Trajectory, TrajectoryError, read_kitti, read_tum
 
-_log = logging.getLogger(__name__)
-
-
-Either = Literal["either"]
-"""A bag of ROS 1 or of ROS 2, as it is."""
+_COVERAGE = 0.9  # least share of the scans for which there must be poses
 
 
 class ProgramInput(NamedTuple):
@@ -50,9 +52,13 @@ class ProgramInput(NamedTuple):
 
 
 def program_input(
-    sequence: Recording, config: SequenceConfig, about: Any, folder: Path, layout: Layout | Either
+    sequence: Recording,
+    config: SequenceConfig,
+    about: Any,
+    folder: Path,
+    layout: Layout | Literal["either"],
 ) -> ProgramInput:
-    """Find or write the recording of a sequence for a program that reads `layout`.
+    """Find or write the recording of a sequence for a program that reads `layout`, or either bag.
 
     `about` is all that the sequence depends on, as plain data: a recording with another is
     replaced. What is written is kept in `folder`; processes wait for each other.
@@ -111,10 +117,6 @@ def _about(folder: Path) -> Any:
         return None
 
 
-_MIN_FRAMES = 10
-"""Frames below which nothing is said of a frame."""
-
-
 def check_frame(T_own_sensor: Poses, T_ref_sensor: Poses | None) -> None:
     """Refuse poses that move as the reference does, but along other axes.
 
@@ -128,7 +130,7 @@ def check_frame(T_own_sensor: Poses, T_ref_sensor: Poses | None) -> None:
     T_own, T_true = (invert(T[starts]) @ T[ends[starts]] for T in (T_own_sensor, T_ref_sensor))
     known = np.isfinite(T_own).all(axis=(1, 2))
     own, true = T_own[known, :3, 3], T_true[known, :3, 3]
-    if len(own) < _MIN_FRAMES:
+    if len(own) < 10:
         return
     T_true_own = np.eye(4)
     T_true_own[:3, :3] = R_true_own = nearest_rotation(own, true)
@@ -140,10 +142,6 @@ def check_frame(T_own_sensor: Poses, T_ref_sensor: Poses | None) -> None:
             f"the program's poses are those of another frame: turned by {angle:.0f} degrees, they "
             f"are the reference's; give the LiDAR's pose in it (odometry.settings.extrinsic)"
         )
-
-
-_COVERAGE = 0.9
-"""Least share of the scans for which there must be poses."""
 
 
 class WholeSettings(BaseSettings):
@@ -229,11 +227,10 @@ class WholeRun(Faulting):
         self._T_odom_own = self._T_begin @ invert(T_own_sensor)
         self._begun = self._begun or bool(np.isfinite(T_own_sensor).all())
 
-    def collect(self) -> Registration:
+    def _collect(self) -> Registration:
         if not self.begun:
             self._place(self._own(self._submitted))
         T_odom_sensor = self._T_odom_own @ self._own(self._submitted)
-        self._last_motion.move(T_odom_sensor)
         return Registration(T_odom_sensor, bool(np.isfinite(T_odom_sensor).all()))
 
     def apply(self, selection: Selection) -> None:  # noqa: ARG002
@@ -255,7 +252,10 @@ class WholeRun(Faulting):
                     T = trajectory.T_world_sensor @ to_pose(self.settings.extrinsic)
                     trajectory = Trajectory(trajectory.stamps, T)
                 T_own_sensor = poses_at(trajectory, given.stamps)
-                failure = _lacking(T_own_sensor, given)
+                known = np.isfinite(T_own_sensor[:, 0, 0])
+                if known.mean() < _COVERAGE:
+                    when = when_known(known, given.stamps)
+                    failure = f"it gave poses for {known.sum()} of {len(known)} scans; {when}"
             except UnavailableError:
                 raise
             except (TrajectoryError, OdometryError, LinkError) as error:
@@ -268,15 +268,6 @@ class WholeRun(Faulting):
             what = f"{self.name}, with {self.parameters}: {error}"
             raise OdometryError(processes.quoting(what, self._words)) from error
         return T_own_sensor
-
-
-def _lacking(T_own_sensor: Poses, given: ProgramInput) -> str | None:
-    """What is said where too few scans have poses."""
-    known = np.isfinite(T_own_sensor[:, 0, 0])
-    if known.mean() >= _COVERAGE:
-        return None
-    what = f"{known.sum()} of {len(known)} scans"
-    return f"it gave poses for {what}; {when_known(known, given.stamps)}"
 
 
 def when_known(known: NDArray[np.bool_], stamps: NDArray[np.int64]) -> str:
@@ -311,9 +302,6 @@ def poses_at(trajectory: Trajectory, stamps: NDArray[np.int64]) -> Poses:
             f"as the scans are"
         )
     return T
-
-
-_PLACEHOLDERS = ("input", "output", "parameters", "points", "imu")
 
 
 def _inside(output: str) -> str:
@@ -397,8 +385,7 @@ class Command(FileRun):
             paths["parameters"] = file
         command = self.arguments(given, **paths)
         self._execute(command, here, len(given.stamps))
-        found = find_output(here, self.settings.output)
-        return read_output(found, self.settings, given.stamps)
+        return read_output(find_output(here, self.settings.output), self.settings, given.stamps)
 
     def _execute(self, command: list[str], folder: Path, n: int) -> None:
         """Run the program; an `OdometryError` says how it ended if not well."""
@@ -418,16 +405,13 @@ class Command(FileRun):
 
 
 def find_output(folder: Path, output: str) -> Path:
-    """The one file in a folder that an output, a path or a pattern, fits; links are followed.
-
-    There is an `OdometryError` if no file fits, or several.
-    """
+    """The one file in a folder that a path or a pattern fits; else an `OdometryError`."""
     root = folder.resolve()
-    found = _files_in(root, root.glob(output))
-    if len(found) == 1:
-        return found[0]
-    what = f"{len(found)} files fit {output}" if found else f"it left no {output}"
-    if left := found or _files_in(root, root.rglob("*")):
+    files = _files_in(root, root.glob(output))
+    if len(files) == 1:
+        return files[0]
+    what = f"{len(files)} files fit {output}" if files else f"it left no {output}"
+    if left := files or _files_in(root, root.rglob("*")):
         names = ", ".join(str(path.relative_to(root)) for path in left[:5])
         what += f"; there are {names}; let odometry.settings.output fit just one file"
     raise OdometryError(what)
@@ -439,10 +423,7 @@ def _files_in(root: Path, paths: Iterable[Path]) -> list[Path]:
 
 
 def read_output(path: Path, settings: FileSettings, stamps: NDArray[np.int64]) -> Trajectory:
-    """Read the trajectory that a program left; `stamps` of shape (n,) are the scans'.
-
-    There is an `OdometryError` or a `TrajectoryError` if the file holds something else.
-    """
+    """Read the trajectory that a program left, for n stamps of scans; else there is an error."""
     try:
         if settings.format == "kitti":
             poses = read_kitti(path)
@@ -462,7 +443,7 @@ def read_output(path: Path, settings: FileSettings, stamps: NDArray[np.int64]) -
 
 def check_arguments(command: Sequence[str], template: str | None, parameters: ParameterSet) -> None:
     """Raise an `OdometryError` if there is no way for a parameter to a program."""
-    known = [*_PLACEHOLDERS, *parameters]
+    known = ["input", "output", "parameters", "points", "imu", *parameters]
     for argument in command:
         for name in placeholders(argument):
             if name not in known:

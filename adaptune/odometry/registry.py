@@ -2,9 +2,13 @@
 
 import inspect
 import json
+import os
+import shutil
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +16,7 @@ from pydantic import BaseModel, ConfigDict, RootModel
 
 from adaptune import processes, strict
 from adaptune.errors import Finding, NotInstalledError, OdometryError
+from adaptune.odometry import wire
 from adaptune.odometry.base import Description, Odometry
 from adaptune.odometry.remote import SERVICE
 from adaptune.space import ParameterSet, ParameterSpace
@@ -59,10 +64,7 @@ def is_user_class(name: str) -> bool:
 
 
 def where(name: str) -> str:
-    """Where the class of an odometry is, as ``module:Class``, without importing it.
-
-    An `OdometryError` names the nearest one if there is none.
-    """
+    """Where the class of an odometry is, as ``module:Class``; an error names the nearest one."""
     try:
         return strict.path_of(name, "odometry", ODOMETRIES | PROGRAMS, ENTRY_POINTS, "Class")
     except strict.PluginError as error:
@@ -70,15 +72,9 @@ def where(name: str) -> str:
 
 
 def odometry_class(name: str) -> type[Any]:
-    """Class of an odometry, by its name as in a study.
-
-    Raises
-    ------
-    OdometryError
-        If there is no such odometry, with the nearest name, or if the class cannot be used.
-    """
+    """Class of an odometry, by its name as in a study; an `OdometryError` if there is none."""
     try:
-        found = strict.load(name, where(name), "class")
+        cls = strict.load(name, where(name), "class")
     except strict.PluginError as error:
         if name in ODOMETRIES and isinstance(error.__cause__, ImportError):
             what = f"{name} cannot be imported ({error.__cause__})"
@@ -86,29 +82,29 @@ def odometry_class(name: str) -> type[Any]:
             raise NotInstalledError(f"{what}; {help_}") from error
         raise OdometryError(str(error)) from error
     if name in PROGRAMS:
-        return found  # type: ignore[no-any-return]
-    if not (isinstance(found, type) and issubclass(found, Odometry)):
+        return cls  # type: ignore[no-any-return]
+    if not (isinstance(cls, type) and issubclass(cls, Odometry)):
         raise OdometryError(f"{name}: is not a class derived from adaptune.odometry.Odometry")
-    if lacking := [key for key in ("space", "live") if not hasattr(found, key)]:
+    if lacking := [key for key in ("space", "live") if not hasattr(cls, key)]:
         raise OdometryError(f"{name}: the class has no attribute {' and no '.join(lacking)}")
-    for fault in _faults(found):
+    for fault in _faults(cls):
         raise OdometryError(f"{name}: {fault}")
-    return found
+    return cls
 
 
-def _faults(found: type[Odometry]) -> Iterator[str]:
+def _faults(cls: type[Odometry]) -> Iterator[str]:
     """What keeps a class from being made, in the words of its author."""
-    space: Any = found.space
+    space: Any = cls.space
     if not isinstance(space, ParameterSpace):
         like = 'ParameterSpace({"x": Float(low=0.1, high=2.0, baseline=0.5)})'
         yield f"its `space` is a {type(space).__name__}; write it as space = {like}"
-    if lacking := sorted(found.__abstractmethods__):
+    if lacking := sorted(cls.__abstractmethods__):
         yield f"the class lacks the method{'s' * (len(lacking) > 1)} {' and '.join(lacking)}"
     try:
-        inspect.signature(found).bind(None, None)
+        inspect.signature(cls).bind(None, None)
     except TypeError:
         yield (
-            f"its __init__ takes {inspect.signature(found)}; write __init__(self, parameters=None, "
+            f"its __init__ takes {inspect.signature(cls)}; write __init__(self, parameters=None, "
             f"settings=None), and pass both on to super().__init__"
         )
 
@@ -166,9 +162,9 @@ def declare_here(name: str, settings: Any, folder: Path | None = None) -> Declar
     cls: Any = odometry_class(name)
     mistakes: list[Finding] = []
     context = None if folder is None else {"folder": folder}
-    found: Any = validated(cls.settings_type, settings, (), mistakes, context)
-    describes = found is not None or issubclass(cls, Odometry)
-    return Declaration(found, mistakes, cls.describe(found) if describes else None)
+    checked: Any = validated(cls.settings_type, settings, (), mistakes, context)
+    describes = checked is not None or issubclass(cls, Odometry)
+    return Declaration(checked, mistakes, cls.describe(checked) if describes else None)
 
 
 def forget_user_code() -> None:
@@ -188,3 +184,123 @@ def _ask(name: str, settings: str, folder: str) -> dict[str, Any]:
         raise OdometryError(str(error)) from error
     finally:
         process.close()
+
+
+# What runs in a process of its own for an odometry, see `adaptune.processes`.
+
+load = odometry_class
+
+
+def converse(name: str) -> processes.Answer:
+    """Be an instance."""
+    return wire.conversation(name, make_here)
+
+
+def describe(name: str) -> processes.Answer:
+    """Answer what `declare` asks."""
+
+    def answer(message: processes.Message) -> dict[str, Any]:
+        folder = message.header["folder"]
+        declared = declare_here(name, message.header["settings"], Path(folder) if folder else None)
+        description = declared.description
+        assert description is not None  # it is a class
+        return {
+            **description._asdict(),
+            **wire.about(description),
+            "settings": declared.settings and declared.settings.model_dump(mode="json"),
+            "mistakes": [[list(mistake.where), mistake.what] for mistake in declared.mistakes],
+        }
+
+    return answer
+
+
+# What an odometry is, by its content: versions, sources, programs.
+
+Content = dict[str, str]
+"""By what it is of, in words, a version or the hash of a file."""
+
+
+def odometry_content(name: str, settings: Any, module: str = "") -> Content:
+    """What the poses of an odometry depend on besides its name, settings and parameters.
+
+    Nothing of the user's is imported. What a class imports, shared libraries, and a program behind
+    an address are not part of it. The settings name the files of a program. `module` is the one in
+    which a class is written, if another one exports it.
+    """
+    if name in PROGRAMS:
+        return _program(settings)
+    if name in ODOMETRIES:
+        module = ODOMETRIES[name].partition(":")[0]
+        package = PACKAGES.get(name, module.rpartition(".")[2])
+        content = {f"version of {package}": _version(package)}
+        if (config := getattr(settings, "config", None)) is not None:
+            content[config] = _fingerprint(Path(config))
+        return content
+    return python_content(name, ENTRY_POINTS, module)
+
+
+def python_content(name: str, group: str, written_in: str = "") -> Content:
+    """Source of a module, and version of the distribution that it is from.
+
+    `name` is ``module:attribute``, or what a distribution calls it in an entry-point group. The
+    source of `written_in` counts, too.
+    """
+    versions: Content = {}
+    if ":" not in name:
+        for point in metadata.entry_points(group=group, name=name):
+            name = point.value
+            if point.dist is not None:
+                versions[f"version of {point.dist.name}"] = point.dist.version
+    module = name.partition(":")[0]
+    file = module_file(module)
+    if file is None:
+        return versions
+    if not versions and "site-packages" in file.parts:
+        # This takes half a second.
+        for package in metadata.packages_distributions().get(module.partition(".")[0], ()):
+            versions[f"version of {package}"] = _version(package)
+    files = {module: file} | {m: f for m in [written_in] if m and (f := module_file(m))}
+    return versions | {f"module {m}": _fingerprint(f) for m, f in files.items()}
+
+
+def module_file(name: str) -> Path | None:
+    """File of a module, found without importing it or what it is in; None if there is none."""
+    where, origin, parts = None, None, name.split(".")
+    for i in range(len(parts)):
+        full = ".".join(parts[: i + 1])
+        specs = (finder.find_spec(full, where) for finder in sys.meta_path)
+        spec = next((spec for spec in specs if spec is not None), None)
+        if spec is None:
+            return None
+        where, origin = spec.submodule_search_locations, spec.origin
+    return Path(origin) if origin is not None and os.path.isfile(origin) else None  # noqa: PTH113
+
+
+def _program(settings: Any) -> Content:
+    if (image := getattr(settings, "image", None)) is not None:
+        from adaptune.odometry.docker.engine import image_digest
+
+        content = {f"image {image}": image_digest(image)}
+        files: tuple[str | None, ...] = ()
+    else:
+        program, *arguments = settings.command or ("",)
+        content, files = {}, (shutil.which(program), *arguments)
+    for name in (*files, getattr(settings, "template", None)):
+        # Arguments may be anything, also too long for a path.
+        for file in (name or "", *(name or "").split("=", 1)[1:]):
+            if os.path.isfile(file):  # noqa: PTH113
+                content[file] = _fingerprint(Path(file))
+    return content
+
+
+def _fingerprint(file: Path) -> str:
+    from adaptune.recording.cache import fingerprint  # needs what containers do not have
+
+    return fingerprint(file)
+
+
+def _version(package: str) -> str:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return "unknown"

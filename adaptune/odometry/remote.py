@@ -5,7 +5,6 @@ milliseconds, and global state of the odometry ends with its process.
 """
 
 import socket
-from contextlib import nullcontext
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self
@@ -18,14 +17,20 @@ from adaptune.errors import OdometryError, UnavailableError
 from adaptune.geometry import Poses
 from adaptune.machine import available, next_core
 from adaptune.odometry import wire
-from adaptune.odometry.base import BaseSettings, Description, Registration, Usage
-from adaptune.odometry.faults import LOST, Faulting, pose_fault
+from adaptune.odometry.base import (
+    LOST,
+    BaseSettings,
+    Description,
+    Faulting,
+    Registration,
+    Usage,
+    pose_fault,
+)
 from adaptune.recording.scan import Scan
 from adaptune.space import ParameterSet, Selection
 from adaptune.strict import StrictModel
 
-SERVICE = "adaptune.odometry.serving"
-"""What a server does with an odometry."""
+SERVICE = "adaptune.odometry.registry"  # what a server does with an odometry
 
 
 def _in_study(argument: str, info: ValidationInfo) -> str:
@@ -64,6 +69,7 @@ class Isolated(Faulting):
     """
 
     apart = True
+    _checks_poses: ClassVar[bool] = True
 
     def __init__(
         self,
@@ -115,10 +121,7 @@ class Isolated(Faulting):
         )
 
     def begin(self) -> processes.Message | None:
-        """Begin a process that is this odometry; its answer, None if there is a fault.
-
-        There is an `OdometryError` if there has never been such a process.
-        """
+        """Begin a process; its answer, None after a fault, which is an error the first time."""
         self._cpu_before = self._cpu
         try:
             self._conversation.open()
@@ -141,12 +144,7 @@ class Isolated(Faulting):
         header, arrays = self._scan(prepared)
         self._conversation.send({**header, "type": "register"}, **arrays)
 
-    def collect(self) -> Registration:
-        registration = self._registration()
-        self._last_motion.move(registration.T_odom_sensor)
-        return registration
-
-    def _registration(self) -> Registration:
+    def _collect(self) -> Registration:
         """The answer to the submitted scan; NaN if there is none, or a wrong one."""
         answer = self._receive()
         self._busy = False
@@ -156,7 +154,7 @@ class Isolated(Faulting):
             T_odom_sensor = np.asarray(answer.arrays["pose"], np.float64)
             late, registered = answer.header["stamp"] - self._submitted, answer.header["registered"]
             cpu, memory = (float(answer.header.get(key, 0.0)) for key in ("cpu", "memory"))
-            wrong = self._pose_fault(T_odom_sensor)
+            wrong = pose_fault(T_odom_sensor) if self._checks_poses else None
             if late:
                 wrong = f"of another time, {1e-9 * late:+.3f} s from the scan's"
             wrong = wrong and f"a pose {wrong}"
@@ -169,9 +167,6 @@ class Isolated(Faulting):
         self._cpu = self._cpu_before + cpu
         self._memory = max(self._memory, memory)
         return Registration(T_odom_sensor.copy(), bool(registered))
-
-    def _pose_fault(self, T_odom_sensor: Poses) -> str | None:
-        return pose_fault(T_odom_sensor)
 
     def apply(self, selection: Selection) -> None:
         self.parameters |= selection.parameters
@@ -197,19 +192,7 @@ class Isolated(Faulting):
             return None
 
 
-FIRST_ANSWER = 60.0
-"""Seconds that a program may need to begin."""
-
-
-def parse_address(address: str) -> tuple[socket.AddressFamily, Any]:
-    """Socket family and address of ``tcp://HOST:PORT`` or ``unix:PATH``; else an error."""
-    kind, colon, rest = address.partition(":")
-    if kind == "unix" and colon and rest:
-        return socket.AF_UNIX, rest
-    host, _, port = rest.removeprefix("//").rpartition(":")
-    if kind != "tcp" or not host or not port.isdigit():
-        raise OdometryError(f"address: {address!r} is neither tcp://HOST:PORT nor unix:PATH")
-    return socket.AF_INET, (host, int(port))
+FIRST_ANSWER = 60.0  # seconds that a program may need to begin
 
 
 class ProcessSettings(BaseSettings):
@@ -272,12 +255,19 @@ class ProgramTransport(processes.Transport):
 
 
 def _reached(address: str) -> socket.socket:
-    family, where = parse_address(address)
-    connection = socket.socket(family)
+    """Connect to ``tcp://HOST:PORT`` or ``unix:PATH``."""
+    kind, _, rest = address.partition(":")
+    host, _, port = rest.removeprefix("//").rpartition(":")
+    is_file = kind == "unix" and rest != ""
+    if not is_file and (kind != "tcp" or not host or not port.isdigit()):
+        raise OdometryError(f"address: {address!r} is neither tcp://HOST:PORT nor unix:PATH")
+    connection = socket.socket(socket.AF_UNIX if is_file else socket.AF_INET)
     try:
-        is_file = family == socket.AF_UNIX
-        with processes.socket_name(Path(where)) if is_file else nullcontext(where) as name:
-            connection.connect(name)
+        if is_file:
+            with processes.socket_name(Path(rest)) as name:
+                connection.connect(name)
+        else:
+            connection.connect((host, int(port)))
     except OSError as error:
         connection.close()
         what = f"nothing listens at {address} ({error.strerror})"

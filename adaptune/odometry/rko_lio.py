@@ -19,8 +19,7 @@ from adaptune.odometry.own_frame import END, MIDDLE, NO_IMU, OwnFrameOdometry
 from adaptune.recording.scan import Imu, Scan
 from adaptune.space import Float, ParameterSet, ParameterSpace
 
-_LATER = 10**9
-"""Nanoseconds added to all stamps: at time 0 it assumes that nothing has come yet."""
+_LATER = 10**9  # nanoseconds added to all stamps: at time 0 it assumes that nothing has come yet
 
 
 class RkoLioSettings(RangeSettings):
@@ -31,24 +30,14 @@ class RkoLioSettings(RangeSettings):
 
 
 class RkoLioScan(NamedTuple):
-    """A scan in its types: float64 points, and the nanoseconds of all, the first and the last."""
+    """A scan in its types: float64 points, and nanoseconds of all, of the first, to the last."""
 
     points: NDArray[np.float64]
     stamps: list[int]
-    begin: int
-    end: int
+    stamp: int
+    duration: int
     usable: bool
     imu: Imu
-
-    @property
-    def stamp(self) -> int:
-        """The scan's stamp, as late as the others are."""
-        return self.begin
-
-    @property
-    def duration(self) -> int:
-        """Nanoseconds from the first point to the last."""
-        return self.end - self.begin
 
     @property
     def nbytes(self) -> int:
@@ -106,10 +95,11 @@ class RkoLio(OwnFrameOdometry):
         stamps = np.full(len(scan), scan.stamp + _LATER, np.int64)
         if scan.times is not None:
             stamps += (scan.times.astype(np.float64) * 1e9).astype(np.int64)
-        begin = end = scan.stamp + _LATER
+        stamp, duration = scan.stamp + _LATER, 0
         if len(scan):
-            begin, end = int(stamps.min()), int(stamps.max())
-        return RkoLioScan(points, stamps.tolist(), begin, end, n_in_range >= MIN_POINTS, scan.imu)
+            stamp, duration = int(stamps.min()), int(np.ptp(stamps))
+        usable = n_in_range >= MIN_POINTS
+        return RkoLioScan(points, stamps.tolist(), stamp, duration, usable, scan.imu)
 
     def _begin(self, prepared: RkoLioScan) -> None:
         bindings = _bindings()
@@ -132,14 +122,15 @@ class RkoLio(OwnFrameOdometry):
         new = zip(stamps, imu.acceleration, imu.angular_velocity, strict=True)
         measured = [*self._early, *new]
         # A measurement after the scan's end belongs to the motion to the next one.
-        self._early = [one for one in measured if one[0] >= prepared.end]
+        end = prepared.stamp + prepared.duration
+        self._early = [m for m in measured if m[0] >= end]
         for stamp, acceleration, gyro in measured[: len(measured) - len(self._early)]:
             self._lio.add_imu_measurement(self._T_base_imu, acceleration, gyro, stamp)
         if not prepared.usable:
             return None
         bindings = _bindings()
         points, times = bindings._Vector3sVector(prepared.points), prepared.stamps
-        scan = points, bindings._VectorInt64(times), prepared.begin, prepared.end
+        scan = points, bindings._VectorInt64(times), prepared.stamp, end
         try:
             self._lio.register_scan(self._T_base_sensor, *scan)
         except (bindings.InputError, bindings.RegistrationError):

@@ -2,23 +2,19 @@
 
 import copy
 import json
-import logging
 import re
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
-from functools import cache, reduce
+from functools import reduce
 from operator import getitem
 from pathlib import Path
 from typing import Any
 
 from adaptune import yaml12
-from adaptune.errors import OdometryError, nearest
+from adaptune.errors import OdometryError, nearest, warn_once
 from adaptune.space import Categorical, Float, Integer, ParameterSet, ParameterSpace
 
-_log = logging.getLogger(__name__)
-
 _SUFFIXES = (".yaml", ".yml", ".json")
-
 _ROS2 = "ros__parameters"
 
 _Place = tuple[tuple[str, ...], Any, Any, tuple[Any, ...]]
@@ -80,7 +76,11 @@ class Template:
             if isinstance(value, str) and _EXPONENT.fullmatch(value):
                 begin, end = self._document.span(keys) or (0, 0)
                 if self._text[begin:end] == value:
-                    _warn_of_text(self.path, self._document.line(keys), ".".join(path), value)
+                    warn_once(
+                        f"{self.path}:{self._document.line(keys)}: ROS 1 takes {'.'.join(path)}: "
+                        f"{value} for a text, and many systems go back to their default then; "
+                        f"write {float(value)}"
+                    )
 
     @property
     def names(self) -> list[str]:
@@ -171,13 +171,13 @@ class Template:
 
     def _find(self, name: str) -> _Place | None:
         wanted = _parts(name)
-        found = [place for place in self._places if place[0][-len(wanted) :] == wanted]
-        if len(found) > 1:
-            found = [place for place in found if place[0] == wanted] or found
-        if len(found) > 1:
-            paths = ", ".join(".".join(path) for path, *_ in found)
+        places = [place for place in self._places if place[0][-len(wanted) :] == wanted]
+        if len(places) > 1:
+            places = [place for place in places if place[0] == wanted] or places
+        if len(places) > 1:
+            paths = ", ".join(".".join(path) for path, *_ in places)
             raise OdometryError(f"{self.path}: {name!r} may be any of {paths}; name one of them")
-        return found[0] if found else None
+        return places[0] if places else None
 
 
 def _parts(name: Any) -> tuple[str, ...]:
@@ -193,15 +193,6 @@ def _places(data: Any, path: tuple[str, ...] = (), keys: tuple[Any, ...] = ()) -
             yield from _places(value, below, (*keys, key))
         else:
             yield below, data, key, (*keys, key)
-
-
-@cache
-def _warn_of_text(path: Path, line: int | None, name: str, value: str) -> None:
-    _log.warning(
-        "%s:%s: ROS 1 takes %s: %s for a text, and many systems go back to their default then; "
-        "write %s",
-        *(path, line, name, value, float(value)),
-    )
 
 
 def _number(held: Any) -> str:

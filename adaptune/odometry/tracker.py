@@ -64,14 +64,11 @@ class Tracker:
 
     @property
     def motions(self) -> Motions:
-        """The odometry's over the last scan; where it restarted, from the pose that it had before.
-
-        A restart takes back a jump of the scans before, and may itself be wrong.
-        """
-        found = self.odometry.motions
+        """The odometry's over the last scan; after a restart, from the pose that it had before."""
+        motions = self.odometry.motions
         if self._T_jumped is None:
-            return found
-        return found._replace(T_previous_current=self._T_jumped)
+            return motions
+        return motions._replace(T_previous_current=self._T_jumped)
 
     def register(self, scan: Scan) -> RegisteredScan:
         """Find the pose of the next scan."""
@@ -119,8 +116,8 @@ class Tracker:
         if self.fall_back is not None and scan is not None and self.odometry.rewinds:
             self._remember(scan, prepared, T_odom_sensor, T_previous_current)
         seconds, begun = time.perf_counter() - begin, self.odometry.begun
-        found = (registered and begun, unhealthy, prepare_seconds, seconds, begun)
-        self._last = RegisteredScan(stamp, T_odom_sensor, *found)
+        result = (registered and begun, unhealthy, prepare_seconds, seconds, begun)
+        self._last = RegisteredScan(stamp, T_odom_sensor, *result)
         return self._last
 
     def _remember(

@@ -47,10 +47,6 @@ def to_scan(message: Message) -> Scan:
     return Scan(message.header["stamp"], imu=imu, **columns)
 
 
-Make = Callable[[str, ParameterSet, Any], tuple[Any, Description]]
-"""Makes an odometry by its name and settings, and describes it."""
-
-
 def hello(odometry: str | None, parameters: ParameterSet, settings: Any) -> dict[str, Any]:
     """First message of a conversation; no name where the other side is one odometry."""
     name: dict[str, Any] = {"type": "hello", "version": VERSION, "odometry": odometry}
@@ -70,8 +66,10 @@ def announced(answer: Message) -> Description:
         raise OdometryError(f"its answer to hello does not describe it: {what}") from error
 
 
-def conversation(name: str, make: Make) -> Answer:
-    """Answer messages of adaptune with an odometry."""
+def conversation(
+    name: str, make: Callable[[str, ParameterSet, Any], tuple[Any, Description]]
+) -> Answer:
+    """Answer messages of adaptune with an odometry, which `make` makes and describes."""
     odometry: Any = None
 
     def answer(message: Message) -> dict[str, Any]:
@@ -93,13 +91,13 @@ def about(described: Description) -> dict[str, Any]:
     return {"live": described.live, "needs_imu": described.needs_imu, "space": space}
 
 
-def unpacked(found: Any) -> Registration:
+def unpacked(returned: Any) -> Registration:
     """What `Odometry.register` returned; a TypeError that says so if it is no registration."""
     try:
-        return Registration(*found)
+        return Registration(*returned)
     except TypeError as error:
-        is_array = isinstance(found, np.ndarray)
-        what = f"an array of shape {found.shape}" if is_array else f"{found!r:.60}"
+        is_array = isinstance(returned, np.ndarray)
+        what = f"an array of shape {returned.shape}" if is_array else f"{returned!r:.60}"
         raise TypeError(f"register returned {what}, not a Registration(pose)") from error
 
 
@@ -124,5 +122,5 @@ def answered(odometry: Any, message: Message, prepared: Any = None) -> dict[str,
 
 def used() -> dict[str, float]:
     """CPU seconds of this process, and its peak of memory in megabytes."""
-    found = resource.getrusage(resource.RUSAGE_SELF)
-    return {"cpu": found.ru_utime + found.ru_stime, "memory": found.ru_maxrss * 1024e-6}
+    usage = resource.getrusage(resource.RUSAGE_SELF)
+    return {"cpu": usage.ru_utime + usage.ru_stime, "memory": usage.ru_maxrss * 1024e-6}

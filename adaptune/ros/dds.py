@@ -16,17 +16,7 @@ from typing import Any, NamedTuple
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
-from cyclonedds import builtin
-from cyclonedds.core import (
-    DDSException,
-    DDSStatus,
-    GuardCondition,
-    InstanceState,
-    ReadCondition,
-    SampleState,
-    ViewState,
-    WaitSet,
-)
+from cyclonedds import builtin, core
 from cyclonedds.domain import Domain, DomainParticipant
 from cyclonedds.idl import IdlStruct
 from cyclonedds.pub import DataWriter
@@ -37,36 +27,20 @@ from cyclonedds.util import duration
 
 from adaptune.errors import nearest
 from adaptune.recording.clouds import CLOUDS
+from adaptune.ros import ros2
 from adaptune.ros.link import LinkError, take_all
-from adaptune.ros.ros2 import (
-    BUFFER_CURE,
-    FIELDS,
-    PLACES,
-    RECEIVE_BUFFER,
-    Service,
-    full,
-    message_types,
-    parameter_message,
-    register_service,
-    ros_domain,
-)
 
-_NODE = "adaptune"
-_ANSWER = 2.0
-"""Seconds in which a service must answer."""
-_DISCOVERY = 1.5
-"""Seconds in which other nodes are found."""
+_ANSWER = 2.0  # seconds in which a service must answer
+_DISCOVERY = 1.5  # seconds in which other nodes are found
 _AGAIN = 0.5
 """Seconds after which a service is called again: its answer may have had no way back yet."""
-_DEPTH = 1000
-"""Messages of a topic that may wait; then the oldest are dropped."""
-_PAUSE = 0.02
-"""Seconds between calls of a service that is not there, or not yet."""
+_DEPTH = 1000  # messages of a topic that may wait; then the oldest are dropped
+_PAUSE = 0.02  # seconds between calls of a service that is not there, or not yet
 _CYCLONE, _FAST_DDS = b"\x01\x10", b"\x01\x0f"
 """The vendors of DDS in ROS 2, as they begin the keys of their participants."""
 _INFO = "rmw_dds_common/msg/ParticipantEntitiesInfo"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
-_ALL = ViewState.Any | SampleState.Any
+_ALL = core.ViewState.Any | core.SampleState.Any
 _DURABILITIES = tuple(
     getattr(Policy.Durability, name)
     for name in ("Volatile", "TransientLocal", "Transient", "Persistent")
@@ -98,10 +72,10 @@ class DdsLink:
 
     is2 = True
 
-    def __init__(self, domain: int | None = None):
-        self.domain = ros_domain(domain)
-        self.store = message_types()
-        self._services = {name: register_service(self.store, name) for name in PLACES}
+    def __init__(self) -> None:
+        self.domain = ros2.ros_domain()
+        self.store = ros2.message_types()
+        self._services = {name: ros2.register_service(self.store, name) for name in ros2.PLACES}
         self._calling, self._closed = threading.Lock(), False
         self._threads: list[threading.Thread] = []
         self._joined = time.monotonic()
@@ -110,10 +84,12 @@ class DdsLink:
             if self.domain not in _domains:
                 _domains[self.domain] = Domain(self.domain, _configuration())
             me = DomainParticipant(self.domain, Qos(Policy.Userdata(b"enclave=/;")))
-            self._participant, self._closing = me, GuardCondition(me)
+            self._participant, self._closing = me, core.GuardCondition(me)
             pair = builtin.BuiltinTopicDcpsPublication, builtin.BuiltinTopicDcpsSubscription
-            found = [builtin.BuiltinDataReader(me, topic) for topic in pair]
-            self._found = [(r, ReadCondition(r, _ALL | InstanceState.Alive)) for r in found]
+            readers = [builtin.BuiltinDataReader(me, topic) for topic in pair]
+            self._found = [
+                (r, core.ReadCondition(r, _ALL | core.InstanceState.Alive)) for r in readers
+            ]
             self._kept: list[Any] = []
             self._writers: dict[str, DataWriter] = {}
             self._clients: dict[str, tuple[DataWriter, DataReader]] = {}
@@ -133,15 +109,17 @@ class DdsLink:
         It is reliable where all who publish are. There is a `LinkError` if the topic is published
         with another type, as far as that is known by now.
         """
-        there = [e for e in self._endpoints(0) if e.topic == full(topic)]
+        there = self.endpoints(0, topic)
         if there and kind not in {e.kind for e in there}:
             raise LinkError(f"{topic} is published as {there[0].kind}, not as {kind}")
-        if kind in CLOUDS and (size := _receive_buffer()) < RECEIVE_BUFFER:
+        if kind in CLOUDS and (size := _receive_buffer()) < ros2.RECEIVE_BUFFER:
             what = "%s: clouds may be lost, as this machine receives %d kB ahead; run `sudo sysctl "
             what += "-w net.core.rmem_max=%d` and start again"
-            _log.warning(what, topic, size // 1000, RECEIVE_BUFFER)
+            _log.warning(what, topic, size // 1000, ros2.RECEIVE_BUFFER)
+        # Arrays are views of the bytes.
+        read = lambda data: take(self.store.deserialize_cdr(memoryview(data), kind))  # noqa: E731
         messages = self._taken(topic, kind, self._topic_end(DataReader, topic, kind))
-        self._threads.append(take_all(topic, messages, take if raw else self._reading(kind, take)))
+        self._threads.append(take_all(topic, messages, take if raw else read))
 
     def _taken(self, topic: str, kind: str, reader: DataReader) -> Iterator[bytes]:
         """The bytes of messages as they come, until the link is closed."""
@@ -153,7 +131,7 @@ class DdsLink:
                 # A node that starts again is another one, and the first is not heard again.
                 if sender in senders[:-1] and not mixed:
                     mixed = True
-                    names = sorted({e.node for e in self._endpoints(0) if e.topic == full(topic)})
+                    names = sorted({e.node for e in self.endpoints(0, topic)})
                     what = "%s is published by two (%s), whose messages mix; end one of them"
                     _log.warning(what, topic, " and ".join(names))
                 if sender not in senders:
@@ -166,12 +144,16 @@ class DdsLink:
 
     def _waited(self, reader: DataReader, seconds: float | None = None) -> Iterator[Any]:
         """Samples as they come, until that takes too long, or somebody offers another QoS."""
-        ready = WaitSet(self._participant)
-        for condition in (reader, self._closing, ReadCondition(reader, _ALL | InstanceState.Any)):
+        ready = core.WaitSet(self._participant)
+        for condition in (
+            reader,
+            self._closing,
+            core.ReadCondition(reader, _ALL | core.InstanceState.Any),
+        ):
             ready.attach(condition)
         limit = duration(weeks=9999) if seconds is None else duration(seconds=seconds)
         while ready.wait(limit) and not self._closed:
-            yield from (one for one in reader.take(N=_DEPTH) if one.sample_info.valid_data)
+            yield from (s for s in reader.take(N=_DEPTH) if s.sample_info.valid_data)
             if reader.get_requested_incompatible_qos_status().total_count:
                 return
 
@@ -195,7 +177,7 @@ class DdsLink:
     def topics(self) -> Mapping[str, str]:
         """See `RosLink.topics`; a link that is new waits until it can know."""
         time.sleep(max(0.0, self._joined + _DISCOVERY - time.monotonic()))
-        return {e.topic: e.kind for e in self._endpoints(0)}
+        return {e.topic: e.kind for e in self.endpoints(0)}
 
     @property
     def alive(self) -> bool:
@@ -217,37 +199,29 @@ class DdsLink:
             self._writers, self._clients = {}, {}
             del self._participant, self._closing, self._info, self._infos
 
-    def _reading(self, kind: str, take: Callable[[Any], None]) -> Callable[[bytes], None]:
-        """Take messages of a type by their bytes; arrays are views of them."""
-        return lambda data: take(self.store.deserialize_cdr(memoryview(data), kind))
-
     def why_unheard(self, topic: str) -> str:
-        topic = full(topic)
-        offered = [e for e in self._endpoints(0, own=True) if e.topic == topic]
-        wanted = [e for e in self._endpoints(1) if e.topic == topic]
+        topic = ros2.full(topic)
+        offered, wanted = self.endpoints(0, topic, own=True), self.endpoints(1, topic)
         if not wanted:
             return f"nobody else subscribes to {topic}"
-        for one in wanted:
-            fitting = [e for e in offered if e.kind == one.kind]
+        for end in wanted:
+            fitting = [e for e in offered if e.kind == end.kind]
             if offered and not fitting:
-                return f"{one.node} subscribes to {topic} as {one.kind}, not {offered[0].kind}"
-            lacks = [_lack(e.qos, one.qos) for e in fitting]
+                return f"{end.node} subscribes to {topic} as {end.kind}, not {offered[0].kind}"
+            lacks = [_lack(e.qos, end.qos) for e in fitting]
             if lacks and all(lacks):
-                return f"{one.node} wants {topic} {lacks[0]}, and it is not published so"
+                return f"{end.node} wants {topic} {lacks[0]}, and it is not published so"
         if fast := sorted({e.node for e in wanted if e.vendor == _FAST_DDS}):
             return (
                 f"{' and '.join(fast)} runs on Fast DDS, which loses clouds that do not fit in the "
-                f"receive buffer: run `{BUFFER_CURE}` on its machine, and start it again"
+                f"receive buffer: run `{ros2.BUFFER_CURE}` on its machine, and start it again"
             )
         return ""
 
     def set_parameters(self, node: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
-        """See `RosLink.set_parameters`; what the node does not tell is as given.
-
-        If it refuses a value, it may hold the other values then.
-        """
-        node = full(node)
-        given = [parameter_message(self.store, name, value) for name, value in values.items()]
+        """See `RosLink.set_parameters`; after a refusal the node may hold the other values."""
+        node = ros2.full(node)
+        given = [ros2.parameter_message(self.store, name, value) for name, value in values.items()]
         results = self._call(node, "SetParameters", len(given), parameters=given).results
         if refused := [
             f"{name} = {value!r} ({result.reason or 'without a reason'})"
@@ -258,19 +232,26 @@ class DdsLink:
         return dict(values) | self._held(node, list(values))
 
     def parameters(self, node: str) -> Mapping[str, Any]:
-        """The parameters that a node declares, and what it holds; arrays and empty ones left out.
+        """What a node declares and holds, arrays left out; a LinkError if it does not answer."""
+        return self._held(ros2.full(node), self._declared(ros2.full(node)))
 
-        There is a LinkError if the node is not there or does not answer.
-        """
-        return self._held(full(node), self._declared(full(node)))
+    def nodes(self) -> list[str]:
+        """The nodes that serve their parameters."""
+        last = "/list_parameters"
+        return [place.removesuffix(last) for place in self._places() if place.endswith(last)]
+
+    def meet(self) -> None:
+        """Let nodes find who will ask for their parameters, which takes a while."""
+        for node in self.nodes():
+            for name, service in self._services.items():
+                self._client(f"{node}/{ros2.PLACES[name]}", service)
 
     def _declared(self, node: str) -> list[str]:
-        names = self._call(node, "ListParameters", None, prefixes=[], depth=0).result.names
-        return sorted(names)
+        return sorted(self._call(node, "ListParameters", None, prefixes=[], depth=0).result.names)
 
     def _held(self, node: str, names: list[str]) -> dict[str, Any]:
         values = self._call(node, "GetParameters", len(names), names=names).values
-        fields = dict(enumerate(FIELDS.values(), 1))
+        fields = dict(enumerate(ros2.FIELDS.values(), 1))
         held = zip(names, values, strict=False)  # none, where a node does not tell
         return {n: getattr(value, fields[value.type]) for n, value in held if value.type in fields}
 
@@ -288,7 +269,7 @@ class DdsLink:
         Who calls may get the answer to another caller, which has as many values only by chance.
         """
         asked = self._services[name]
-        place = f"{node}/{PLACES[name]}"
+        place = f"{node}/{ros2.PLACES[name]}"
         request = self.store.types[asked.request](**fields)
         raw = bytes(self.store.serialize_cdr(request, asked.request))
         response = None
@@ -309,9 +290,13 @@ class DdsLink:
             f"{', '.join(services) or 'none'}"
         )
 
-    def _endpoints(self, which: int, *, own: bool = False) -> list[Endpoint]:
-        """Who publishes topics (0), or subscribes to them (1), this link left out or not."""
-        there = [e for e in self._others(which, own=own) if e.topic_name.startswith("rt/")]
+    def endpoints(
+        self, which: int, topic: str | None = None, *, own: bool = False
+    ) -> list[Endpoint]:
+        """Who publishes topics (0), or subscribes to them (1), or to one; without this link."""
+        there = self._others(which, own=own)
+        if topic is not None:
+            there = [e for e in there if e.topic_name == f"rt{ros2.full(topic)}"]
         self._learn_names()
         return [
             Endpoint(
@@ -322,14 +307,15 @@ class DdsLink:
                 e.qos,
             )
             for e in there
+            if e.topic_name.startswith("rt/")
         ]
 
     def _others(self, which: int, *, own: bool = False) -> list[Any]:
         """All writers (0) or readers (1) that are there now."""
         with self._naming("ROS 2"):
             (reader, alive), me = self._found[which], self._participant.guid
-            found = reader.read(N=10_000, condition=alive)
-            return [e for e in found if own or e.participant_key != me]
+            ends = reader.read(N=10_000, condition=alive)
+            return [e for e in ends if own or e.participant_key != me]
 
     def _learn_names(self) -> None:
         for sample in self._infos.take(N=_DEPTH):
@@ -337,11 +323,13 @@ class DdsLink:
                 with contextlib.suppress(Exception):  # that of another ROS 2 is longer
                     info: Any = self.store.deserialize_cdr(sample.data, _INFO)
                     for node in info.node_entities_info_seq:
-                        name = full(f"{node.node_namespace.rstrip('/')}/{node.node_name}")
+                        name = ros2.full(f"{node.node_namespace.rstrip('/')}/{node.node_name}")
                         for gid in (*node.reader_gid_seq, *node.writer_gid_seq):
                             self._nodes[bytes(gid.data)] = name
 
-    def _ask(self, place: str, service: Service, request: bytes, seconds: float) -> Iterator[Any]:
+    def _ask(
+        self, place: str, service: ros2.Service, request: bytes, seconds: float
+    ) -> Iterator[Any]:
         with self._naming(place):
             writer, reader = self._client(place, service)
             servers = writer.get_matched_subscriptions()
@@ -357,7 +345,7 @@ class DdsLink:
                 if sample.data[4 : 4 + len(head)] == head:
                     yield sample.data[:4] + sample.data[4 + len(head) :]
 
-    def _client(self, place: str, service: Service) -> tuple[DataWriter, DataReader]:
+    def _client(self, place: str, service: ros2.Service) -> tuple[DataWriter, DataReader]:
         if place not in self._clients:
             asks = self._end(DataWriter, f"rq{place}Request", service.request)
             self._clients[place] = asks, self._end(DataReader, f"rr{place}Reply", service.response)
@@ -368,7 +356,7 @@ class DdsLink:
         return sorted(n[2:-7] for n in names if n.startswith("rq/"))
 
     def _topic_end(self, end_type: type, topic: str, kind: str, *, reliable: bool = True) -> Any:
-        return self._end(end_type, f"rt{full(topic)}", kind, reliable=reliable)
+        return self._end(end_type, f"rt{ros2.full(topic)}", kind, reliable=reliable)
 
     def _end(self, end_type: type, name: str, kind: str, *, reliable: bool = True) -> Any:
         """Make a reader or a writer of a topic, as DDS names it, and announce it."""
@@ -386,7 +374,7 @@ class DdsLink:
             end = end_type(self._participant, Topic(self._participant, name, _carrier(kind)), qos)
             self._kept.append(end)
             if end_type is DataReader:
-                end.set_status_mask(DDSStatus.RequestedIncompatibleQos)
+                end.set_status_mask(core.DDSStatus.RequestedIncompatibleQos)
             if not info:
                 self._gids[end_type].append(self._gid(end))
                 self._announce()
@@ -398,7 +386,7 @@ class DdsLink:
     def _announce(self) -> None:
         """Let tools of ROS 2 see this node and what it publishes and subscribes to."""
         node = self.store.types["rmw_dds_common/msg/NodeEntitiesInfo"](
-            "/", _NODE, self._gids[DataReader], self._gids[DataWriter]
+            "/", "adaptune", self._gids[DataReader], self._gids[DataWriter]
         )
         info = self.store.types[_INFO](self._gid(self._participant), [node])
         self._info.write(self._info.data_type(bytes(self.store.serialize_cdr(info, _INFO))))
@@ -410,7 +398,7 @@ class DdsLink:
             raise LinkError(f"{what}: the link was closed")
         try:
             yield
-        except (DDSException, UnicodeError) as error:
+        except (core.DDSException, UnicodeError) as error:
             raise LinkError(f"{what}: {error}") from error
 
 
@@ -464,7 +452,7 @@ def _configuration() -> str:
             raise LinkError(f"ROS_STATIC_PEERS: {peer}: {error.strerror}") from error
     alone = f"<Tag>adaptune {os.getpid()}</Tag>" if reach == "OFF" else ""
     known = "".join(f"<Peer address={quoteattr(peer)}/>" for peer in peers)
-    parts = [f'<Internal><SocketReceiveBufferSize max="{RECEIVE_BUFFER} B"/></Internal>']
+    parts = [f'<Internal><SocketReceiveBufferSize max="{ros2.RECEIVE_BUFFER} B"/></Internal>']
     if reach in ("LOCALHOST", "OFF"):
         # Cyclone DDS hears nobody on an interface that it does not use, and others greet on this.
         other = '<NetworkInterface autodetermine="true"/>' * (len(peers) > 1)
@@ -483,5 +471,5 @@ def _configuration() -> str:
 def _receive_buffer() -> int:
     """Bytes that the kernel lets a socket receive ahead."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, ros2.RECEIVE_BUFFER)
         return probe.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2

@@ -29,10 +29,7 @@ class RosLink(Protocol):
     def subscribe(
         self, topic: str, kind: str, take: Callable[[Any], None], raw: bool = False
     ) -> None:
-        """Have every message of a topic taken, one after the other, in a thread of its own.
-
-        With `raw`, they are taken as bytes, as they are serialised.
-        """
+        """Have messages, or their bytes if `raw`, taken one after the other, in a thread."""
 
     def advertise(self, topic: str, kind: str) -> Callable[[Any], None]:
         """Announce a topic; what is returned publishes a message on it."""

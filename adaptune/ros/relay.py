@@ -3,44 +3,45 @@
 import contextlib
 import itertools
 import logging
+import os
+import shutil
 import socket
 import struct
+import subprocess
 import threading
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any, ClassVar, Literal
 
 import numpy as np
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from adaptune import processes
+from adaptune.ros import ros1_node
 from adaptune.ros.link import LinkError, take_all, telling
 from adaptune.ros.ros2 import BUFFER_CURE, RECEIVE_BUFFER, message_types
 
-_START = 20.0
-"""Seconds in which the node must be ready."""
-_WAITING = 1000
-"""Messages of a topic that may wait; more are dropped."""
-_ANSWER = 5.0
-"""Seconds in which it must answer; it waits less for others."""
-_DEAF = 30.0
-"""Seconds in which it must read what is sent."""
+_START = 20.0  # seconds in which the node must be ready
+_WAITING = 1000  # messages of a topic that may wait; more are dropped
+_ANSWER = 5.0  # seconds in which it must answer; it waits less for others
+_DEAF = 30.0  # seconds in which it must read what is sent
 
 _log = logging.getLogger(__name__)
 
 
-class Relay(ABC):
+class Relay:
     """A node in a running ROS, see `adaptune.ros.link.RosLink`.
 
     A process of its own is the node, and messages pass through it as bytes. `running` says whether
-    it runs, `end` waits for it or ends it. There is a `LinkError` with its reason if the node does
-    not start.
+    it runs, `end` waits for it or ends it. There is a `LinkError` if it does not start.
     """
 
     version: ClassVar[Literal[1, 2]]
     store: Typestore
+    encode: Callable[[Any, str], Any]  # a message of a type as bytes
+    decode: Callable[[bytes, str], Any]  # the message of a type in bytes
 
     def __init__(
         self, connection: socket.socket, running: Callable[[], bool], end: Callable[[], None]
@@ -96,23 +97,12 @@ class Relay(ABC):
         header = {"type": "publish", "topic": topic}
         return lambda data: self._send(header, np.frombuffer(data, np.uint8))
 
-    @abstractmethod
-    def encode(self, message: Any, kind: str) -> Any:
-        """A message as bytes."""
-
-    @abstractmethod
-    def decode(self, data: bytes, kind: str) -> Any:
-        """The message in bytes."""
-
     def _names(self, kind: str) -> dict[str, str]:  # noqa: ARG002
         """What the node must know of a type besides its name."""
         return {}
 
     def set_parameters(
-        self,
-        node: str,
-        values: Mapping[str, Any],
-        keys: Mapping[str, Sequence[str]] | None = None,
+        self, node: str, values: Mapping[str, Any], keys: Mapping[str, Sequence[str]] | None = None
     ) -> Mapping[str, Any]:
         """See `RosLink.set_parameters`; `keys` name others at the parameter server than the node's.
 
@@ -128,10 +118,10 @@ class Relay(ABC):
 
     def topics(self) -> Mapping[str, str]:
         try:
-            found: dict[str, str] = self.ask("topics")
+            kinds: dict[str, str] = self.ask("topics")
         except LinkError as error:
             raise LinkError(f"ROS {self.version}: the node does not answer ({error})") from error
-        return {topic: kind.replace("/", "/msg/") for topic, kind in found.items()}
+        return {topic: kind.replace("/", "/msg/") for topic, kind in kinds.items()}
 
     def why_unheard(self, topic: str) -> str:  # noqa: ARG002
         return ""
@@ -191,6 +181,62 @@ class Relay(ABC):
             pass  # it was closed
 
 
+class Ros1(Relay):
+    """A node in a running ROS 1: the Python of any ROS will do."""
+
+    version = 1
+
+    def __init__(self, *given: Any):
+        self.store = get_typestore(Stores.ROS1_NOETIC)
+        text = "geometry_msgs/TransformStamped[] transforms\n"
+        self.store.register(get_types_from_msg(text, "tf2_msgs/msg/TFMessage"))
+        self.encode, self.decode = self.store.serialize_ros1, self.store.deserialize_ros1
+        super().__init__(*given)
+
+    def _names(self, kind: str) -> dict[str, str]:
+        text, md5 = self.store.generate_msgdef(kind, ros_version=1)
+        return {"text": text, "md5": md5}
+
+
+def ros_python() -> str:
+    """The first ``python3`` of the system's that imports ROS 1; a `LinkError` if none does."""
+    pythons = [shutil.which("python3", path=folder) for folder in os.get_exec_path()]
+    for python in dict.fromkeys([*filter(None, pythons), "/usr/bin/python3"]):
+        # Not what lies in the working folder under a name of Python's.
+        code = "import sys; sys.path[:] = filter(None, sys.path); import rospy"
+        done = subprocess.run([python, "-c", code], capture_output=True, check=False)
+        if done.returncode == 0:
+            return python
+    raise LinkError(
+        "no python3 on PATH can import rospy: source the setup of your ROS 1 first (`source "
+        "/opt/ros/noetic/setup.bash`), or install it (`apt-get install python3-rospy`)"
+    )
+
+
+def local_ros1() -> "Ros1":
+    """A node in the ROS 1 of this machine, or of ROS_MASTER_URI; a `LinkError` if none answers."""
+    here, there = socket.socketpair()
+    command = [ros_python(), ros1_node.__file__, str(there.fileno())]
+    # A session of its own: Ctrl-C ends adaptune, and that ends the node.
+    process = subprocess.Popen(
+        command, pass_fds=[there.fileno()], stdout=subprocess.DEVNULL, start_new_session=True
+    )
+    there.close()
+
+    def end() -> None:
+        try:
+            # It takes leave of the roscore.
+            process.wait(5.0)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+    try:
+        return Ros1(here, lambda: process.poll() is None, end)
+    except LinkError as error:
+        raise LinkError(f"{error}; start `roscore`, and source your ROS's setup") from error
+
+
 class Ros2Relay(Relay):
     """A node in a running ROS 2, by the process that `main` is."""
 
@@ -198,13 +244,9 @@ class Ros2Relay(Relay):
 
     def __init__(self, *given: Any):
         self.store = message_types()
+        self.encode = self.store.serialize_cdr
+        self.decode = lambda data, kind: self.store.deserialize_cdr(memoryview(data), kind)
         super().__init__(*given)
-
-    def encode(self, message: Any, kind: str) -> Any:
-        return self.store.serialize_cdr(message, kind)
-
-    def decode(self, data: bytes, kind: str) -> Any:
-        return self.store.deserialize_cdr(memoryview(data), kind)
 
     def why_unheard(self, topic: str) -> str:
         why = str(self.ask("state", topics=[topic], own=[])["unheard"][topic])

@@ -14,8 +14,9 @@ import uuid
 
 try:
     from typing import Any
+    from xmlrpc.client import ServerProxy
 except ImportError:
-    pass
+    from xmlrpclib import ServerProxy  # type: ignore[no-redef]
 
 _LENGTH = struct.Struct("<I")
 _SECONDS = 2.0  # in which another node must answer
@@ -97,8 +98,8 @@ class _Node(object):
 
         def take(message):  # type: (Any) -> None
             # What this node was not asked for cannot be decoded there.
-            found = {"kind": message._connection_header["type"], "topic": topic, "type": "message"}
-            self._stream.send(found, message._buff)
+            head = {"kind": message._connection_header["type"], "topic": topic, "type": "message"}
+            self._stream.send(head, message._buff)
 
         # With the usual buffer, a cloud would be read in many pieces.
         settings = {"queue_size": 1000, "buff_size": _BUFFER, "tcp_nodelay": True}
@@ -179,8 +180,9 @@ class _Node(object):
 
     def _pid(self, name):  # type: (str) -> int
         if name not in self._pids:
-            slave = _server(self._master().lookupNode(name))
-            self._pids[name] = int(slave.getPid("/adaptune")[2])
+            slave = ServerProxy(self._master().lookupNode(name))
+            answer = slave.getPid("/adaptune")  # type: Any
+            self._pids[name] = int(answer[2])
         return self._pids[name]
 
     def _master(self):  # type: () -> Any
@@ -205,31 +207,20 @@ class _Node(object):
             client.close()
 
 
-def _server(uri):  # type: (str) -> Any
-    try:
-        from xmlrpc.client import ServerProxy
-    except ImportError:
-        from xmlrpclib import ServerProxy  # type: ignore[no-redef]
-    return ServerProxy(uri)
-
-
 _ASKED = ("topics", "set_parameters", "parameters", "state")
 """What is answered; another node may take its time, and messages must not wait for it."""
 
 
 def _answer(stream, header, answer):  # type: (Stream, dict[str, Any], Any) -> None
     try:
-        found = {"found": answer(header)}
+        reply = {"found": answer(header)}
     except Exception as error:
-        found = {"refused": str(error) or type(error).__name__}
-    stream.send(dict(found, type="answer", number=header["number"]))
+        reply = {"refused": str(error) or type(error).__name__}
+    stream.send(dict(reply, type="answer", number=header["number"]))
 
 
 def converse(stream, name, more=None):  # type: (Stream, str, dict[str, Any] | None) -> None
-    """Be a node until the other side closes the socket.
-
-    `more` holds functions that answer other messages, by their type.
-    """
+    """Be a node until the other side closes the socket; `more` answers other messages, by type."""
     import rospy
 
     rospy.init_node(name, anonymous=True, disable_signals=True)
@@ -260,8 +251,7 @@ def _start_master(asked):  # type: (dict[str, set[str]]) -> None
     import rosmaster.master
     import rosmaster.master_api as api
 
-    class Noting(api.ROSMasterHandler):  # type: ignore[misc]
-        pass
+    plain_handler = api.ROSMasterHandler
 
     def noting(plain):  # type: (Any) -> Any
         def answer(self, caller, *given):  # type: (Any, str, *str) -> Any
@@ -270,9 +260,9 @@ def _start_master(asked):  # type: (dict[str, set[str]]) -> None
 
         return answer
 
-    for name in ("getParam", "hasParam", "searchParam", "subscribeParam"):
-        setattr(Noting, name, noting(getattr(api.ROSMasterHandler, name)))
-    api.ROSMasterHandler = Noting
+    names = ("getParam", "hasParam", "searchParam", "subscribeParam")
+    methods = {name: noting(getattr(plain_handler, name)) for name in names}
+    api.ROSMasterHandler = type("Noting", (plain_handler,), methods)
     rosmaster.master.Master().start()
 
 

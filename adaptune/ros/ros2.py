@@ -14,8 +14,7 @@ from adaptune.ros.link import LinkError
 if TYPE_CHECKING:
     from adaptune.ros.dds import DdsLink
 
-RECEIVE_BUFFER = 1 << 22
-"""Bytes of a receive buffer that hold some clouds."""
+RECEIVE_BUFFER = 1 << 22  # bytes of a receive buffer that hold some clouds
 BUFFER_CURE = f"sudo sysctl -w net.core.rmem_default={RECEIVE_BUFFER}"
 """What lets nodes on Fast DDS have it."""
 _MAX_DOMAIN = 232
@@ -51,23 +50,19 @@ class Service(NamedTuple):
 
 
 def local_ros2() -> "DdsLink":
-    """A node in the ROS 2 of the environment, over DDS.
-
-    There is a `LinkError` if the network does not allow it, and an error without the extra.
-    """
+    """A node in the ROS 2 of the environment, over DDS; a `LinkError` if that is not allowed."""
     (dds,) = import_extra("ros2", "adaptune.ros.dds")
     link: DdsLink = dds.DdsLink()
     link.topics()  # so that others are known
     return link
 
 
-def ros_domain(given: int | None = None) -> int:
-    """A ROS domain; where none is given, that of the environment (``ROS_DOMAIN_ID``), or 0."""
-    name = "ROS_DOMAIN_ID" if given is None else "the ROS domain"
-    text = os.environ.get("ROS_DOMAIN_ID", "").strip() or "0" if given is None else str(given)
-    if not text.isdecimal() or not 0 <= int(text) <= _MAX_DOMAIN:
-        raise LinkError(f"{name} is {text}; it is a number from 0 to {_MAX_DOMAIN}")
-    return int(text)
+def ros_domain() -> int:
+    """The ROS domain of the environment (``ROS_DOMAIN_ID``), or 0."""
+    domain = os.environ.get("ROS_DOMAIN_ID", "").strip() or "0"
+    if not domain.isdecimal() or not 0 <= int(domain) <= _MAX_DOMAIN:
+        raise LinkError(f"ROS_DOMAIN_ID is {domain}; it is a number from 0 to {_MAX_DOMAIN}")
+    return int(domain)
 
 
 def message_types() -> Typestore:

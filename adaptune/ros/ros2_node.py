@@ -9,42 +9,13 @@ from typing import Any
 from adaptune.ros.dds import TRANSFORMS, DdsLink
 from adaptune.ros.link import LinkError
 from adaptune.ros.ros1_node import Stream, serve
-from adaptune.ros.ros2 import PLACES, full
+from adaptune.ros.ros2 import full
 
-_QUIET = ("/parameter_events", "/rosout", "/clock")
-"""Topics of every node."""
-
-
-class _Link(DdsLink):
-    """A link that says what it sees."""
-
-    def seen(self) -> tuple[dict[str, list[str]], dict[str, list[str]]]:
-        """The topics that others publish now, and subscribe to, with their types."""
-        found: tuple[dict[str, list[str]], dict[str, list[str]]] = {}, {}
-        for which, kinds in enumerate(found):
-            for end in self._endpoints(which):
-                if not which or end.topic not in _QUIET:
-                    kinds[end.topic] = sorted({end.kind, *kinds.get(end.topic, ())})
-        return found
-
-    def senders(self, topic: str) -> list[str]:
-        """The nodes that publish a topic."""
-        return [end.node for end in self._endpoints(0) if end.topic == topic]
-
-    def nodes(self) -> list[str]:
-        """The nodes that serve their parameters."""
-        last = "/list_parameters"
-        return [place.removesuffix(last) for place in self._places() if place.endswith(last)]
-
-    def meet(self) -> None:
-        """Let nodes find who will ask for their parameters, which takes a while."""
-        for node in self.nodes():
-            for name, service in self._services.items():
-                self._client(f"{node}/{PLACES[name]}", service)
+_QUIET = ("/parameter_events", "/rosout", "/clock")  # topics of every node
 
 
 class _Node:
-    def __init__(self, link: _Link, stream: Stream):
+    def __init__(self, link: DdsLink, stream: Stream):
         self._link, self._stream = link, stream
         self._publish: dict[str, Callable[[bytes], None]] = {}
         self._awaited: list[str] = []
@@ -65,22 +36,26 @@ class _Node:
         self._publish[header["topic"]](data)
 
     def state(self, header: Mapping[str, Any]) -> dict[str, Any]:
-        """Who publishes which topics, and who subscribes; to whom this node is connected.
-
-        And why those do not hear the topics of this node that subscribe to them.
-        """
-        published, subscribed = self._link.seen()
+        """What is published and subscribed to; whom this node reaches, and why not others."""
+        published = self._kinds(0)
         for topic in [topic for topic in self._awaited if topic in published]:
             self._awaited.remove(topic)
             self._record(topic, published[topic][0])
         self._link.meet()
         return {
             "published": published,
-            "subscribed": subscribed,
+            "subscribed": {t: k for t, k in self._kinds(1).items() if t not in _QUIET},
             "sending": {topic: self._link.hearers(topic) for topic in self._publish},
-            "senders": {topic: self._link.senders(topic) for topic in header["own"]},
+            "senders": {t: [e.node for e in self._link.endpoints(0, t)] for t in header["own"]},
             "unheard": {topic: self._link.why_unheard(topic) for topic in header["topics"]},
         }
+
+    def _kinds(self, which: int) -> dict[str, list[str]]:
+        """The topics that others publish now (0), or subscribe to (1), with their types."""
+        kinds: dict[str, set[str]] = {}
+        for end in self._link.endpoints(which):
+            kinds.setdefault(end.topic, set()).add(end.kind)
+        return {topic: sorted(names) for topic, names in kinds.items()}
 
     def _record(self, topic: str, kind: str) -> None:
         head = {"type": "message", "topic": topic, "kind": kind.replace("/msg/", "/")}
@@ -89,19 +64,18 @@ class _Node:
             self._link.subscribe(topic, kind, take, raw=True)
 
     def topics(self, _: Mapping[str, Any]) -> dict[str, str]:
-        return {t: kinds[0].replace("/msg/", "/") for t, kinds in self._link.seen()[0].items()}
+        return {t: kinds[0].replace("/msg/", "/") for t, kinds in self._kinds(0).items()}
 
     def set_parameters(self, header: Mapping[str, Any]) -> Mapping[str, Any]:
-        held: Mapping[str, Any] = self._link.set_parameters(header["node"], header["values"])
-        return held
+        return self._link.set_parameters(header["node"], header["values"])
 
     def parameters(self, _: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
         """What every node that serves its parameters holds."""
-        found = {}
+        held = {}
         for node in self._link.nodes():
             with contextlib.suppress(LinkError):
-                found[node] = self._link.parameters(node)
-        return found
+                held[node] = self._link.parameters(node)
+        return held
 
 
 _ASKED = ("state", "topics", "set_parameters", "parameters")
@@ -113,7 +87,7 @@ def main(path: str) -> None:
     connection.connect(path)
     stream = Stream(connection)
     try:
-        link = _Link()
+        link = DdsLink()
     except LinkError as error:
         stream.send({"type": "failed", "message": str(error)})
         return

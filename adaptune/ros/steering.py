@@ -26,10 +26,7 @@ SetCommand = Annotated[tuple[str, ...], Field(min_length=1), AfterValidator(_nam
 
 
 class Steering:
-    """Sets parameters of a node, through ROS, or by a program that `run` runs in place of it.
-
-    The command is the program and its arguments, with ``{node}``, ``{name}`` and ``{value}``.
-    """
+    """Sets parameters of a node, through ROS, or by a `SetCommand` that `run` runs."""
 
     def __init__(
         self,
@@ -46,8 +43,8 @@ class Steering:
     def apply(self, parameters: ParameterSet) -> None:
         """Set the parameters, and make sure that the node holds them where it tells.
 
-        There is an `OdometryError` if it cannot be reached or holds other values, and a `LinkError`
-        if it refuses them.
+        There is an `OdometryError` if it holds others or is not reached, a `LinkError` if it
+        refuses.
         """
         if self._command is not None:
             for name, value in parameters.items():
@@ -71,12 +68,11 @@ class Steering:
             _log.warning(what, self._node, name)
 
     def _set(self, command: Sequence[str], name: str, value: Any) -> None:
-        values = {"{node}": self._node, "{name}": name, "{value}": _text(value)}
-        arguments = []
-        for argument in command:
-            for key, text in values.items():
-                argument = argument.replace(key, text)  # noqa: PLW2901
-            arguments.append(argument)
+        text = _text(value)
+        arguments = [
+            argument.replace("{node}", self._node).replace("{name}", name).replace("{value}", text)
+            for argument in command
+        ]
         assert self._run is not None
         code, written = self._run(arguments)
         if code:

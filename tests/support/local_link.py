@@ -15,7 +15,7 @@ __all__ = ["STORE", "TYPES", "LocalLink", "cloud", "imu", "odometry"]
 
 
 class LocalLink:
-    """Stands for `adaptune.ros.ros1.Ros1`; `holds` are the parameters of its only node, ``/node``.
+    """Stands for `adaptune.ros.relay.Ros1`; `holds` are the parameters of its only node, ``/node``.
 
     What is `played`, topics and messages, begins when somebody subscribes to ``/points``.
     """

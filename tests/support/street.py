@@ -35,7 +35,7 @@ SERVES = """
 import sys
 sys.path[:] = {path}
 from adaptune import processes
-from adaptune.odometry.serving import converse
+from adaptune.odometry.registry import converse
 processes.answer_all(sys.stdin.buffer, sys.stdout.buffer, converse("gicp"))
 """
 TEMPLATE = """\

@@ -1,10 +1,17 @@
-"""The Docker engine: images, and containers that can reach nothing and leave nothing behind."""
+"""The Docker engine: images, and containers that can reach nothing and leave nothing behind.
+
+Nothing in the folders that containers write to is trusted.
+"""
 
 import contextlib
+import hashlib
 import io
+import json
 import logging
 import os
+import shutil
 import signal
+import stat
 import subprocess
 import sys
 import tarfile
@@ -12,30 +19,27 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, BinaryIO, Literal, NamedTuple
 
 from pydantic import Field
 
-from adaptune import processes
+from adaptune import processes, yaml12
 from adaptune.errors import NotInstalledError, OdometryError, UnavailableError
-from adaptune.files import temporary_prefix
+from adaptune.files import replacing_folder, temporary_prefix
 from adaptune.keeper import Ended
 from adaptune.odometry.base import BaseSettings
 from adaptune.odometry.docker import remover
 
-OWNER = "adaptune.owner"
-"""Label of every container: the process that has started it."""
+OWNER = "adaptune.owner"  # label of every container: the process that has started it
 _NOBODY = 65534
-_SIGNALS = {int(one) for one in signal.Signals}
-_PERIOD = 100_000
-"""Microseconds over which the use of cores is counted."""
+_SIGNALS = set(map(int, signal.Signals))
+_PERIOD = 100_000  # microseconds over which the use of cores is counted
 _WEIGHT = 10 * 1024
 """Of a core against other processes: at any load, a system has the cores that it may use."""
-_MOST_WRITTEN = 4 * 1024**3
-"""Bytes of a file; a process that writes more gets SIGXFSZ."""
+_MOST_WRITTEN = 4 * 1024**3  # bytes of a file; a process that writes more gets SIGXFSZ
 _TAIL = 50
-_BETWEEN_LOOKS = 0.02
-"""Seconds."""
+_BETWEEN_LOOKS = 0.02  # seconds
+_REMOVAL = 20.0  # seconds that a container may take to remove what its user has written
 
 _log = logging.getLogger(__name__)
 
@@ -64,10 +68,7 @@ class Mount(NamedTuple):
 
 @cache
 def engine() -> Any:
-    """A client of the Docker engine; containers that ended processes have left are removed.
-
-    There is an `EngineError` if no engine answers, or this user may not use it.
-    """
+    """A client of the Docker engine, or an `EngineError`; removes what others have left."""
     from docker import DockerClient
     from docker.errors import DockerException
 
@@ -78,16 +79,18 @@ def engine() -> Any:
         client.ping()
     except (DockerException, OSError) as error:
         where = os.environ.get("DOCKER_HOST", "unix:///var/run/docker.sock")
-        if "Permission" in str(error):
-            help_ = "add yourself to its group, `sudo usermod -aG docker $USER`, and log in again"
-            raise EngineError(
-                f"this user may not use the Docker engine at {where}: {help_}"
-            ) from error
+        what = f"no Docker engine answers at {where}"
         help_ = "install Docker Engine, or start it: `sudo service docker start`"
-        if "DOCKER_HOST" in os.environ:
+        if "Permission" in str(error):
+            what = f"this user may not use the Docker engine at {where}"
+            help_ = "add yourself to its group, `sudo usermod -aG docker $USER`, and log in again"
+        elif "DOCKER_HOST" in os.environ:
             help_ = "is DOCKER_HOST right?"
-        raise EngineError(f"no Docker engine answers at {where}: {help_}") from error
-    _remove_leftovers(client)
+        raise EngineError(f"{what}: {help_}") from error
+    for container in client.api.containers(all=True, filters={"label": OWNER}):
+        if is_orphan(container["Labels"][OWNER]):
+            _log.info("removing container %s of an earlier run", container["Id"][:12])
+            _remove(client, container["Id"])
     return client
 
 
@@ -110,14 +113,6 @@ def is_orphan(owner: str) -> bool:
     if boot_and_space.split(".")[0] != here.split(".")[0]:
         return True
     return boot_and_space == here and _identity(int(pid)) != owner
-
-
-def _remove_leftovers(client: Any) -> None:
-    """Remove containers whose process has ended."""
-    for container in client.api.containers(all=True, filters={"label": OWNER}):
-        if is_orphan(container["Labels"][OWNER]):
-            _log.info("removing container %s of an earlier run", container["Id"][:12])
-            _remove(client, container["Id"])
 
 
 def _remove(client: Any, container: str) -> None:
@@ -189,12 +184,6 @@ def default_user(settings: ContainerSettings) -> str:
     return f"{me}:{group}" if me else f"{_NOBODY}:{_NOBODY}"
 
 
-def _home(user: str) -> dict[str, str]:
-    """A folder that a user without a name can write to."""
-    nameless = user[0].isdigit() and user.partition(":")[0] != "0"
-    return {"HOME": "/tmp"} if nameless else {}
-
-
 class Container:
     """A running container.
 
@@ -228,6 +217,9 @@ class Container:
             for m in mounts
         ]
         limit = int(memory * 1e9)
+        # A user without a name has no folder to write to.
+        nameless = user[0].isdigit() and user.partition(":")[0] != "0"
+        home = {"HOME": "/tmp"} if nameless else {}
         host = client.api.create_host_config(
             mounts=binds,
             network_mode="none" if beside is None else f"container:{beside.id}",
@@ -252,7 +244,7 @@ class Container:
                     digest,
                     None if bare else list(command) or None,
                     user=user,
-                    environment=_home(user) | dict(environment or {}),
+                    environment=home | dict(environment or {}),
                     labels={OWNER: _owner()[0]},
                     host_config=host,
                     entrypoint=list(command) if bare else None,
@@ -308,10 +300,7 @@ class Container:
         return Ended(0, 1e-9 * cpu, 1e-6 * held)
 
     def run(self, command: str, environment: Mapping[str, str] | None = None) -> str:
-        """Begin a command in a login shell; a name for `finished`.
-
-        Nobody waits for what it writes: the engine may hold that open when it has ended.
-        """
+        """Begin a command in a login shell, without its output; a name for `finished`."""
         with _telling(self.image):
             name: str = engine().api.exec_create(
                 self.id, ["/bin/bash", "-l", "-c", command], environment=dict(environment or {})
@@ -348,17 +337,13 @@ class Container:
             _remove(engine(), self.id)
 
 
-_EMPTY = "adaptune-empty:latest"
-"""An image without a file."""
+_EMPTY = "adaptune-empty:latest"  # an image without a file
 
 
 def own_container(
     command: Sequence[str], folder: Path, environment: Mapping[str, str]
 ) -> Container:
-    """Run a Python program of adaptune's in a container, which sees this machine's Python.
-
-    It may write to the folder.
-    """
+    """Run a Python program of adaptune's in a container, which may write to the folder."""
     with _telling(_EMPTY):
         if not engine().api.images(_EMPTY, quiet=True):
             nothing = io.BytesIO()
@@ -369,8 +354,8 @@ def own_container(
     # Links lead to places outside of an environment.
     pythons = [sys.prefix, sys.base_prefix, str(Path(sys.executable).resolve().parents[1])]
     own = [str(Path(__file__).parents[3]), "/usr", "/lib", "/lib64", "/bin", "/etc/ld.so.cache"]
-    paths = sorted(path for path in {*own, *pythons, *filter(None, sys.path)} if _is_there(path))
-    mounts = [Mount(Path(path), path) for path in paths]
+    absolute = {path for path in (*own, *pythons, *sys.path) if path[:1] == "/" and path.strip("/")}
+    mounts = [Mount(Path(path), path) for path in sorted(absolute) if Path(path).exists()]
     return Container(
         ContainerSettings(image=_EMPTY),
         1.0,
@@ -383,5 +368,88 @@ def own_container(
     )
 
 
-def _is_there(path: str) -> bool:
-    return path.strip("/") != "" and path[0] == "/" and os.path.exists(path)  # noqa: PTH110
+# Folders that containers write to, and what is kept of them.
+
+
+def make_shared(folder: Path) -> Path:
+    """Make a folder that any user of a container may write to."""
+    folder.mkdir()
+    folder.chmod(0o777)
+    return folder
+
+
+@contextlib.contextmanager
+def opened(path: Path, root: Path) -> Iterator[BinaryIO | None]:
+    """Open a regular file below `root`; None if there is none, or it is a link, or a pipe."""
+    inside = path.parent.resolve() == root.resolve() / path.parent.relative_to(root)
+    try:
+        flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK
+        file = os.fdopen(os.open(path, flags), "rb") if inside else None
+    except OSError:
+        file = None
+    if file is None:
+        yield None
+        return
+    with file:
+        yield file if stat.S_ISREG(os.fstat(file.fileno()).st_mode) else None
+
+
+def copy_regular(path: Path, root: Path, target: Path) -> bool:
+    """Copy a regular file below `root`; False if there is none."""
+    with opened(path, root) as file:
+        if file is None:
+            return False
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with target.open("wb") as copy:
+            shutil.copyfileobj(file, copy)
+    return True
+
+
+def regular_files(root: Path) -> Iterator[Path]:
+    """All files below a folder, links and what they lead to left out."""
+    for folder, _, names in os.walk(root):
+        yield from (path for name in names if not (path := Path(folder) / name).is_symlink())
+
+
+def remove_shared(folder: Path, image: str, user: str) -> None:
+    """Remove a folder; what another user has written, that user removes in a container."""
+    shutil.rmtree(folder, ignore_errors=True)
+    if not folder.exists():
+        return
+    with contextlib.suppress(OdometryError):
+        container = Container(
+            ContainerSettings(image=image),
+            0.5,
+            ["/bin/sh", "-c", "rm -rf /shared/*"],
+            [Mount(folder, "/shared", writable=True)],
+            user=user,
+            bare=True,
+        )
+        with contextlib.closing(container):
+            container.wait(_REMOVAL)
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def kept_log(run: Any, logs: Path | None, fault: str | None, **about: Any) -> Iterator[Path | None]:
+    """A folder for the block to fill, which then replaces that of the same set; None if not kept.
+
+    `logs` is the folder of the sequence's logs. ``trial.yaml`` holds what the run of a recording
+    has used, and what `about` says.
+    """
+    if logs is None:
+        yield None
+        return
+    settings, parameters, usage = run.settings, run.parameters, run.usage
+    whole = json.dumps([settings.model_dump(mode="json"), parameters], sort_keys=True)
+    name = hashlib.blake2b(whole.encode(), digest_size=4).hexdigest()
+    with replacing_folder(logs / name) as temporary:
+        temporary.mkdir()
+        note = {"parameters": parameters, **about}
+        if settings.image is not None:
+            note = {"image": settings.image, "digest": image_digest(settings.image)} | note
+        note |= {"cpu": round(usage.cpu, 3), "memory": round(usage.memory or 0.0, 1)}
+        if fault:
+            note["fault"] = fault
+        (temporary / "trial.yaml").write_text(yaml12.dump(note), encoding="utf-8")
+        yield temporary

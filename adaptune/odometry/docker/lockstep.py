@@ -1,27 +1,24 @@
 """A ROS system that receives scan after scan, and can change its parameters."""
 
 import contextlib
-import logging
 import shutil
 import tempfile
 import threading
 import time
 import weakref
-from functools import cache
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from adaptune import processes
-from adaptune.errors import AdaptuneError, OdometryError, UnavailableError
+from adaptune.errors import AdaptuneError, OdometryError, UnavailableError, warn_once
 from adaptune.files import temporary_prefix
 from adaptune.geometry import Poses, invert, rectify, to_pose
-from adaptune.odometry.base import Registration, Usage
+from adaptune.odometry.base import LOST, Faulting, Registration, Usage, pose_fault
 from adaptune.odometry.docker.played_bag import MAX_SCATTER, OWN_CLOCK
-from adaptune.odometry.docker.poses import matrix
-from adaptune.odometry.docker.ros_system import QUIET, RosSystem, filled
-from adaptune.odometry.faults import LOST, Faulting, pose_fault
+from adaptune.odometry.docker.ros_system import QUIET, RosSystem, filled, matrix
 from adaptune.odometry.remote import Limits
 from adaptune.recording.clouds import LIVOX_TYPES
 from adaptune.recording.export import IMU, POINTS, Messages, structured
@@ -31,33 +28,21 @@ from adaptune.space import ParameterSet, Selection
 from adaptune.trajectory import Trajectory
 
 _IMU = "sensor_msgs/msg/Imu"
-_log = logging.getLogger(__name__)
 
-_MOST_SILENT = 30
-"""Scans in a row without a pose that are a fault."""
-_LEAST_ANSWERED = 0.75
-"""Least share of scans with a pose, of so many or more since the first one."""
-_BETWEEN_LOOKS = 1.0
-"""Seconds between looks at what the system has used."""
+_MOST_SILENT = 30  # scans in a row without a pose that are a fault
+_LEAST_ANSWERED = 0.75  # least share of scans with a pose, of so many or more since the first one
+_BETWEEN_LOOKS = 1.0  # seconds between looks at what the system has used
 _MOST_PATIENT = 3
 """Scans in a row for which it waits in full before the first pose; then it waits `_IMPATIENCE`."""
-_IMPATIENCE = 0.5
-"""Seconds."""
-_BACKGROUND, _BUSY = 0.5, 0.2
-"""Seconds after the last pose, and cores, at which a system works on."""
+_IMPATIENCE = 0.5  # seconds
+_BACKGROUND, _BUSY = 0.5, 0.2  # seconds after the last pose, and cores, at which a system works on
 OTHER_CLOCK = 2 * 10**9
 """Nanoseconds between the stamps of a scan and of its pose that no system adds to a scan's."""
-_EARLY = 1_000_000
-"""Nanoseconds by which a pose's stamp may be before the scan's."""
+_EARLY = 1_000_000  # nanoseconds by which a pose's stamp may be before the scan's
 
 
 _SEEN: set[str] = set()
 """Systems of which it is known whether they work on after their last pose."""
-
-
-@cache
-def _warn_once(what: str) -> None:
-    _log.warning("%s", what)
 
 
 class Lockstep(Faulting):
@@ -121,12 +106,12 @@ class Lockstep(Faulting):
             self._show(prepared)
             self._correct()
         except (OdometryError, LinkError) as error:
-            told = self._told(error)
+            fault = self._told(error)
             # One that has run can be gone for good.
             if not self._has_run:
                 self.close()
-                raise OdometryError(f"{self.name}: {told}") from error
-            self.note_fault(told)
+                raise OdometryError(f"{self.name}: {fault}") from error
+            self.note_fault(fault)
 
     def submit(self, prepared: Scan) -> None:
         self._stamp, self._waiting = prepared.stamp, True
@@ -136,21 +121,16 @@ class Lockstep(Faulting):
             except (OdometryError, LinkError) as error:
                 self.note_fault(self._told(error))
 
-    def collect(self) -> Registration:
+    def _collect(self) -> Registration:
         self._waiting = False
-        registration = LOST
-        if self._system is not None:
-            try:
-                registration = self._registration()
-            except (OdometryError, LinkError) as error:
-                registration = self.note_fault(self._told(error))
-        self._last_motion.move(registration.T_odom_sensor)
-        return registration
-
-    def _registration(self) -> Registration:
+        if self._system is None:
+            return LOST
         T_before = self._T_odom_sensor
         self._T_odom_sensor = T_before @ self._T_step
-        registered = self._correct()
+        try:
+            registered = self._correct()
+        except (OdometryError, LinkError) as error:
+            return self.note_fault(self._told(error))
         if registered:
             self._T_step = rectify(invert(T_before) @ self._T_odom_sensor)
         return Registration(self._T_odom_sensor.copy(), registered)
@@ -168,12 +148,9 @@ class Lockstep(Faulting):
             raise OdometryError(f"{self.name} has no parameter {min(unknown)!r}")
         self.parameters |= selection.parameters
         if self._system is not None and self._steering is not None:
-            named = {
-                self._system.whole_name(self._template, n): v
-                for n, v in selection.parameters.items()
-            }
+            name = partial(self._system.whole_name, self._template)
             try:
-                self._steering.apply(named)
+                self._steering.apply({name(k): v for k, v in selection.parameters.items()})
             except LinkError as error:
                 raise OdometryError(str(error)) from error
 
@@ -196,7 +173,7 @@ class Lockstep(Faulting):
             return
         _SEEN.add(self.name)
         if self._works_on(system):
-            _warn_once(
+            warn_once(
                 f"{self.name}: it works on after its last pose, as systems that map in the "
                 f"background do; at rate: 0, it has less time for that than on a robot, so its "
                 f"poses may be worse: set odometry.settings.rate: 1, or let `adaptune inspect` of "
@@ -273,19 +250,19 @@ class Lockstep(Faulting):
     def _correct(self) -> bool:
         """Correct the predicted pose; False if the system gave none."""
         waits = bool(self._n_answered) or self._silent < _MOST_PATIENT
-        found = self._pose(self._patience if waits else min(self._patience, _IMPATIENCE))
-        if found is not None and self._late is None and self._silent:
+        pose = self._pose(self._patience if waits else min(self._patience, _IMPATIENCE))
+        if pose is not None and self._late is None and self._silent:
             # It may be of an earlier scan; then others follow, though nothing more was sent.
             time.sleep(self._patience)
-            found = self._pose(0.0)
+            pose = self._pose(0.0)
         assert self._system is not None
-        if self._late is not None or found is not None:
+        if self._late is not None or pose is not None:
             self._n_shown += 1
-        if found is None:
+        if pose is None:
             self._silent += 1
             self._check_silent(self._system)
             return False
-        stamp, T_own = found
+        stamp, T_own = pose
         self._silent, self._has_run = 0, True
         self._n_answered += 1
         if wrong := pose_fault(T_own):
@@ -295,7 +272,7 @@ class Lockstep(Faulting):
         scatter = abs(stamp - self._stamp - self._late)
         if scatter >= MAX_SCATTER or abs(self._late) >= OTHER_CLOCK:
             self._steady = False
-            _warn_once(f"{self.name}: {OWN_CLOCK}; poses are matched to scans by their order")
+            warn_once(f"{self.name}: {OWN_CLOCK}; poses are matched to scans by their order")
             if silent := self._n_shown - self._n_answered:
                 raise OdometryError(
                     f"{OWN_CLOCK}, and {silent} scans had no pose after {self._patience:g} s, so "
@@ -350,14 +327,14 @@ class Lockstep(Faulting):
     def _pose(self, seconds: float) -> tuple[int, Poses] | None:
         """The system's pose of the scan that was published last; None if it does not come.
 
-        It comes after the scan was published. Its stamp is as late as that of the first pose was:
-        a system gives it at the scan's begin, or at its end, where the next scan begins.
+        Its stamp is as late as that of the first pose was: a system gives it at the scan's begin,
+        or at its end, where the next scan begins.
         """
         earliest = self._stamp - _EARLY + (0 if self._late is None else self._late // 2)
 
         def there() -> bool:
-            found = bool(self._poses) and self._poses[-1][0] >= earliest
-            return found or bool(self._reader.fault)
+            came = bool(self._poses) and self._poses[-1][0] >= earliest
+            return came or bool(self._reader.fault)
 
         with self._news:
             came = self._news.wait_for(there, seconds)

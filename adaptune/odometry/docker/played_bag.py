@@ -11,27 +11,20 @@ from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
 
 from adaptune.errors import AdaptuneError, OdometryError
-from adaptune.odometry.docker.folders import kept_log
-from adaptune.odometry.docker.poses import PoseReader
-from adaptune.odometry.docker.ros_system import QUIET, RosSystem, filled
+from adaptune.odometry.docker.engine import kept_log
+from adaptune.odometry.docker.ros_system import QUIET, PoseReader, RosSystem, filled
 from adaptune.odometry.program import ProgramInput, WholeRun, when_known
 from adaptune.recording.pose_messages import PATH, POSES, Pose, usable
 from adaptune.trajectory import Trajectory
 
 _BETWEEN_TOPIC_LOOKS = 0.1
 _BETWEEN_STATES = 1.0
-_QUIET = 2.0
-"""Seconds without a pose, and without work, that are the end."""
-_FIRST = 10.0
-"""The same where no pose has come yet."""
-_BUSY_QUIET = 60.0
-"""Seconds without a pose that are the end of a system that never rests."""
-_IDLE = 0.1
-"""Cores that a system may use while it rests: nodes wake up with the clock."""
-_STEADY = 0.9
-"""Least share of poses whose stamps are as far from the scans' as those of the others."""
-MAX_SCATTER = 5_000_000
-"""Nanoseconds by which these may differ: a clock differs by more."""
+_QUIET = 2.0  # seconds without a pose, and without work, that are the end
+_FIRST = 10.0  # the same where no pose has come yet
+_BUSY_QUIET = 60.0  # seconds without a pose that are the end of a system that never rests
+_IDLE = 0.1  # cores that a system may use while it rests: nodes wake up with the clock
+_STEADY = 0.9  # least share of poses whose stamps are as far from the scans' as those of the others
+MAX_SCATTER = 5_000_000  # nanoseconds by which these may differ: a clock differs by more
 
 _log = logging.getLogger(__name__)
 
@@ -155,10 +148,7 @@ class PlayedBag(WholeRun):
         self._see(system, n)
 
     def _see(self, system: RosSystem, n: int) -> float:
-        """See whether the system runs, and how many seconds of CPU time it has used.
-
-        The bag sets the pace, so CPU time counts as the system's time.
-        """
+        """See whether the system runs, and its CPU seconds, which count as its time."""
         system.state()
         cpu = system.usage.cpu
         self._usage = system.usage._replace(seconds=cpu / n, other_cpu=cpu)
@@ -203,11 +193,10 @@ class PlayedBag(WholeRun):
             check_stamps(stamps, given.stamps)
         except OdometryError as error:
             if len(stamps) != len(given.stamps):
-                counts = f"{len(stamps)} poses for {len(given.stamps)} scans"
-                help_ = (
-                    f"{counts} cannot be matched by number; set odometry.settings.play: lockstep"
-                )
-                raise OdometryError(f"{error}, and {help_}") from error
+                raise OdometryError(
+                    f"{error}, and {len(stamps)} poses for {len(given.stamps)} scans cannot be "
+                    f"matched by number; set odometry.settings.play: lockstep"
+                ) from error
             _log.warning("%s: %s; poses are matched to scans by number", self.name, error)
             stamps = given.stamps
             poses = [(s, *pose) for s, (_, *pose) in zip(stamps.tolist(), poses, strict=True)]
@@ -238,12 +227,8 @@ def check_stamps(stamps: NDArray[np.int64], scans: NDArray[np.int64]) -> None:
     """Refuse stamps of poses that are not those of the scans, in nanoseconds, shapes (m,) and (n,).
 
     A system that publishes one pose for a scan stamps it with the scan's start, its end, or
-    anything fixed between. One that publishes more is judged by begin and end only.
-
-    Raises
-    ------
-    OdometryError
-        If they go back, are further off than a scan and a quarter, or scatter. It says how far.
+    anything fixed between. One that publishes more is judged by begin and end only. There is an
+    `OdometryError` if they go back, are further off than a scan and a quarter, or scatter.
     """
     if len(stamps) < 2:
         return

@@ -18,10 +18,8 @@ from adaptune.recording.scan import Scan
 from adaptune.ros.link import LinkError
 from adaptune.space import ParameterSet, Selection
 
-_SHORT = 50
-"""Scans by which it is seen what a parameter changes while the system runs."""
-_BEFORE = 10
-"""Scans of these before it is set."""
+_SHORT = 50  # scans by which it is seen what a parameter changes while the system runs
+_BEFORE = 10  # scans of these before it is set
 
 
 class _Watched(Lockstep):
@@ -50,7 +48,7 @@ def look(
     plain = settings.model_copy(update={"play": "lockstep", "rate": 1.0, "node": None})
     system, scans = _Watched(parameters, plain, limits), list(scans)
     system.came = []
-    found: dict[str, str] = {}
+    report: dict[str, str] = {}
     shown: list[tuple[float, int]] = []
     path, works_on = [np.eye(4)], False
     with closing(system):
@@ -67,23 +65,23 @@ def look(
                 break
             shown.append((system._shown[1], scan.stamp))
         if (inside := system._system) is not None:
-            found |= _topics(inside) | _declared(inside, system._template)
+            report |= _topics(inside) | _declared(inside, system._template)
             if about := system._reader.about:
-                found["poses are of"] = about + _extrinsic(about.split()[0], settings)
+                report["poses are of"] = about + _extrinsic(about.split()[0], settings)
             works_on = system._works_on(inside)
     seconds = max(1e-9 * (shown[-1][1] - shown[0][1]), 0.1)
-    found["time of a start"] = f"{took:.1f} s"
-    found |= _poses(system.came, shown)
-    found["CPU of a second"] = f"{system.usage.cpu / seconds:.2f} s"
-    found["memory"] = f"{system.usage.memory or 0.0:.0f} MB"
+    report["time of a start"] = f"{took:.1f} s"
+    report |= _poses(system.came, shown)
+    report["CPU of a second"] = f"{system.usage.cpu / seconds:.2f} s"
+    report["memory"] = f"{system.usage.memory or 0.0:.0f} MB"
     for fault in system.faults:
-        found["went wrong"] = fault
+        report["went wrong"] = fault
     if works_on:
         hurried = _driven(plain.model_copy(update={"rate": 0.0}), parameters, limits, scans)
-        found["works on after a pose"] = _apart(path, hurried)
+        report["works on after a pose"] = _apart(path, hurried)
     if settings.node is not None and others and not system.faults:
-        found |= _effects(settings, parameters, limits, scans[:_SHORT], others)
-    return found
+        report |= _effects(settings, parameters, limits, scans[:_SHORT], others)
+    return report
 
 
 def _extrinsic(frame: str, settings: Any) -> str:
@@ -146,12 +144,12 @@ def _effects(
             vain.append(f"{name} is refused ({error})")
             continue
         (live if _furthest(path, changed) > chance else vain).append(name)
-    found = {"takes effect while it runs": ", ".join(live) or "nothing: leave out settings.node"}
+    effects = {"takes effect while it runs": ", ".join(live) or "nothing: leave out settings.node"}
     if vain:
-        found["has no effect while it runs"] = (
+        effects["has no effect while it runs"] = (
             f"{', '.join(vain)}: do not switch live with these among the parameters"
         )
-    return found
+    return effects
 
 
 def _topics(system: Any) -> dict[str, str]:
@@ -167,10 +165,8 @@ def _topics(system: Any) -> dict[str, str]:
     }
 
 
-_OF_ROS = {"use_sim_time", "start_type_description_service"}
-"""Parameters that every node has."""
-_SHOWN = 40
-"""Characters of a value."""
+_OF_ROS = {"use_sim_time", "start_type_description_service"}  # parameters that every node has
+_SHOWN = 40  # characters of a value
 
 
 def _declared(system: Any, template: Template) -> dict[str, str]:
@@ -179,7 +175,7 @@ def _declared(system: Any, template: Template) -> dict[str, str]:
     with suppress(LinkError, OdometryError):
         nodes = system.link.ask("parameters") if system.link.is2 else {}
     known = {system.whole_name(template, name) for name in template.names} | _OF_ROS
-    more = {k: v for of in nodes.values() for k, v in of.items() if k not in known}
+    more = {k: v for held in nodes.values() for k, v in held.items() if k not in known}
     # Those ROS declares by itself.
     own = [
         f"{k} = {str(v)[:_SHOWN]}"

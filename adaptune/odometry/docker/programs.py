@@ -14,14 +14,7 @@ from adaptune import processes
 from adaptune.errors import OdometryError
 from adaptune.files import temporary_prefix
 from adaptune.odometry.base import Description, Usage
-from adaptune.odometry.docker.engine import (
-    Container,
-    ContainerSettings,
-    Mount,
-    default_user,
-    image_digest,
-)
-from adaptune.odometry.docker.folders import copy_regular, kept_log, make_shared, remove_shared
+from adaptune.odometry.docker import engine
 from adaptune.odometry.program import (
     FileRun,
     FileSettings,
@@ -36,11 +29,10 @@ from adaptune.space import ParameterSet
 from adaptune.trajectory import Trajectory
 
 _OUTPUT = "/output"
-_BETWEEN_LOOKS = 0.1
-"""Seconds."""
+_BETWEEN_LOOKS = 0.1  # seconds
 
 
-class DockerCommandSettings(ContainerSettings, FileSettings):
+class DockerCommandSettings(engine.ContainerSettings, FileSettings):
     """An image with a program, and its files."""
 
     command: tuple[str, ...] = ()  # by default the image's own
@@ -58,48 +50,48 @@ class DockerCommand(FileRun):
     @staticmethod
     def check(settings: DockerCommandSettings, parameters: ParameterSet) -> None:
         """Raise an `OdometryError` if the image is not here, or a parameter has no way to it."""
-        image_digest(settings.image)
+        engine.image_digest(settings.image)
         check_arguments(settings.command, settings.template, parameters)
 
     def trajectory(self, given: ProgramInput, folder: Path) -> Trajectory:
-        shared = make_shared(folder / "shared")
-        output = make_shared(shared / "output")
+        shared = engine.make_shared(folder / "shared")
+        output = engine.make_shared(shared / "output")
         nested = output
         for part in Path(self.settings.output).parts[:-1] if self.told_output else ():
-            nested = make_shared(nested / part)
+            nested = engine.make_shared(nested / part)
         source = given.path.resolve()
         inside = "/data" if source.is_dir() else f"/data/{source.name}"
-        mounts = [Mount(source, inside), Mount(output, _OUTPUT, writable=True)]
+        mounts = [engine.Mount(source, inside), engine.Mount(output, _OUTPUT, writable=True)]
         paths = {"input": inside, "output": f"{_OUTPUT}/{self.settings.output}"}
         if (file := self.filled_template(folder)) is not None:
             file.chmod(0o644)
             paths["parameters"] = f"/parameters{file.suffix}"
-            mounts.append(Mount(file, paths["parameters"]))
-        container = Container(
+            mounts.append(engine.Mount(file, paths["parameters"]))
+        container = engine.Container(
             self.settings,
             self._limits.memory,
             self.arguments(given, **paths),
             mounts,
-            user=(user := default_user(self.settings)),
+            user=(user := engine.default_user(self.settings)),
             environment={"ADAPTUNE_POINTS": given.points, "ADAPTUNE_IMU": given.imu},
         )
         with closing(container):
             failure = self._watch(container, len(given.stamps))
             self._words = container.last_lines()
-            with kept_log(self, given.logs, failure) as kept:
+            with engine.kept_log(self, given.logs, failure) as kept:
                 if kept is not None:
                     (kept / "output.log").write_bytes(container.log())
         try:
             if failure is not None:
                 raise OdometryError(failure)
-            found = find_output(output, self.settings.output)
-            checked = folder / "checked" / found.name
-            copy_regular(found, output.resolve(), checked)
+            written = find_output(output, self.settings.output)
+            checked = folder / "checked" / written.name
+            engine.copy_regular(written, output.resolve(), checked)
         finally:
-            remove_shared(shared, self.name, user)
+            engine.remove_shared(shared, self.name, user)
         return read_output(checked, self.settings, given.stamps)
 
-    def _watch(self, container: Container, n: int) -> str | None:
+    def _watch(self, container: engine.Container, n: int) -> str | None:
         """Wait for the end; how it ended if not well."""
         begin, memory, cpu = time.perf_counter(), 0.0, 0.0
         while (code := container.ended()) is None:
@@ -116,11 +108,10 @@ class DockerCommand(FileRun):
 
 
 _FOLDER = "/adaptune"
-_BETWEEN_SOCKET_LOOKS = 0.02
-"""Seconds."""
+_BETWEEN_SOCKET_LOOKS = 0.02  # seconds
 
 
-class DockerProcessSettings(ContainerSettings):
+class DockerProcessSettings(engine.ContainerSettings):
     """An image with a program that speaks `adaptune.odometry.wire`.
 
     It must listen at the Unix socket ``{socket}``, which the variable ADAPTUNE_SOCKET names, too.
@@ -136,7 +127,7 @@ class ContainerTransport(processes.Transport):
     def __init__(self, settings: DockerProcessSettings, limits: Limits):
         self.name, self.bounds = settings.image, limits.bounds
         self._settings = settings
-        self._container: Container | None = None
+        self._container: engine.Container | None = None
         self._folder: Path | None = None
 
     def connect(self) -> processes.SocketStream:
@@ -144,12 +135,12 @@ class ContainerTransport(processes.Transport):
         self._folder = folder = Path(tempfile.mkdtemp(prefix=temporary_prefix()))
         folder.chmod(0o777)  # for any user of the image
         inside = f"{_FOLDER}/odometry.sock"
-        self._container = Container(
+        self._container = engine.Container(
             self._settings,
             self.bounds.memory,
             [replace(argument, {"socket": inside}) for argument in self._settings.command],
-            [Mount(folder, _FOLDER, writable=True)],
-            user=default_user(self._settings),
+            [engine.Mount(folder, _FOLDER, writable=True)],
+            user=engine.default_user(self._settings),
             environment={"ADAPTUNE_SOCKET": inside},
         )
         begin, what = time.monotonic(), "it does not listen at its socket"
@@ -186,7 +177,7 @@ class ContainerTransport(processes.Transport):
             self._container.close()
             self._container = None
         if self._folder is not None:
-            remove_shared(self._folder, self.name, default_user(self._settings))
+            engine.remove_shared(self._folder, self.name, engine.default_user(self._settings))
             self._folder = None
 
 
@@ -198,4 +189,4 @@ class DockerProcess(UserProgram):
 
     @classmethod
     def describe(cls, settings: DockerProcessSettings) -> Description:
-        return described(cls, settings.model_dump_json(), image_digest(settings.image))
+        return described(cls, settings.model_dump_json(), engine.image_digest(settings.image))

@@ -13,10 +13,7 @@ _LOOKS, _BETWEEN = 3, 1.0
 
 
 def main(label: str, prefix: str) -> None:
-    """Wait until the other side of the standard input has ended, then remove what it has left.
-
-    That is containers with a label, and folders whose path begins with a prefix.
-    """
+    """When the standard input ends, remove containers with a label, and folders with a prefix."""
     sys.stdin.buffer.read()
     from docker import DockerClient
     from docker.errors import APIError

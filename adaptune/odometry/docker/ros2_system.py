@@ -24,7 +24,6 @@ from adaptune.errors import OdometryError, import_extra, in_a_line, nearest
 from adaptune.geometry import to_pose, to_quaternions
 from adaptune.odometry.base import Usage
 from adaptune.odometry.docker.engine import Container, Mount, own_container
-from adaptune.odometry.docker.folders import remove_shared
 from adaptune.odometry.docker.ros_system import RosSettings, RosSystem, SimClock, image_user
 from adaptune.odometry.docker.rustle import Rustle
 from adaptune.odometry.template import Template, placeholders, replace
@@ -66,19 +65,13 @@ DIED = re.compile(
 NOISE = re.compile(
     rb"\[INFO\] \[(launch|[\w.-]+)\]: (All log files|Default logging|process started).*"
 )
-_TRANSFORMS = "tf2_msgs/msg/TFMessage"
-_BETWEEN_LOOKS, _BETWEEN_STATES = 0.3, 0.05
-"""Seconds."""
-_UNDECLARED = 3.0
-"""Seconds in which a node that subscribes declares its parameters."""
-_MATCHED = 3.0
-"""Seconds in which nodes find what is published."""
-_LEAD = 300_000_000
-"""Nanoseconds between the begin of the clock and of the recording."""
+_BETWEEN_LOOKS, _BETWEEN_STATES = 0.3, 0.05  # seconds
+_UNDECLARED = 3.0  # seconds in which a node that subscribes declares its parameters
+_MATCHED = 3.0  # seconds in which nodes find what is published
+_LEAD = 300_000_000  # nanoseconds between the begin of the clock and of the recording
 _DOMAINS = range(60, 101)
 """Of systems on this machine; ports of higher ones are given to other programs."""
-_PORT, _PORTS = 7400, 250
-"""The first port of the first domain, and how many each has."""
+_PORT, _PORTS = 7400, 250  # the first port of the first domain, and how many each has
 
 _log = logging.getLogger(__name__)
 
@@ -86,15 +79,12 @@ _log = logging.getLogger(__name__)
 class Ros2System(RosSystem):
     """A ROS 2 system as it is started by hand, in an image or on this machine.
 
-    A container has no network but its own, which adaptune's node shares. On this machine, a domain
-    of its own keeps it apart from others.
+    Adaptune's node shares the container's network; here, a domain keeps it apart from others.
     """
 
     ros = 2
     link: Ros2Relay
     _log_name, _noise, _inside = "output.log", NOISE, _FOLDER
-    _used = Usage(0.0, 0.0)
-    _at_begin = 0.0
     _node: Any = None
     _player: "_Player | None" = None
     _looked = -float("inf")
@@ -150,45 +140,44 @@ class Ros2System(RosSystem):
         if transforms := self._settings.transforms:
             types = link.store.types
             stamped = [_stamped(types, child, *given) for child, given in transforms.items()]
-            link.advertise("/tf_static", _TRANSFORMS)(types[_TRANSFORMS](stamped))
+            link.advertise("/tf_static", TRANSFORMS[0])(types[TRANSFORMS[0]](stamped))
         return link
 
     def _lacking(self) -> OdometryError | None:
         if self._node.ended() is not None:
             return OdometryError(f"adaptune's node ended: {self._node.last_lines()}")
         ended = self._ended()
-        return ended and OdometryError(processes.quoting(str(ended), self.words()))
+        return None if ended is None else OdometryError(processes.quoting(ended, self.words()))
 
-    def _ended(self) -> OdometryError | None:
-        if (code := self._container.ended()) is not None:
-            return OdometryError(
-                f"{' '.join(self._settings.command[:4])}: {processes.how_it_ended(code)}"
-            )
-        return None
+    def _ended(self) -> str | None:
+        """How the system ended; None while it runs."""
+        if (code := self._container.ended()) is None:
+            return None
+        return f"{' '.join(self._settings.command[:4])}: {processes.how_it_ended(code)}"
 
     def state(self) -> dict[str, Any]:
         now = time.monotonic()
         if now - self._looked > _BETWEEN_LOOKS:
             self._looked = now
             used = self._container.used()
-            cpu = max(used.cpu - self._at_begin, self.usage.cpu)
-            self.usage = Usage(cpu, max(used.memory, self.usage.memory or 0.0))
+            cpu, memory = max(used.cpu, self.usage.cpu), max(used.memory, self.usage.memory or 0.0)
+            self.usage = Usage(cpu, memory)
             if died := DIED.search(self._tail(self._log_name)):
                 name, code = died[1].decode(), int(died[2])
                 raise OdometryError(f"node {name} died: {processes.how_it_ended(code)}")
         if (ended := self._ended()) is not None:
-            raise ended
+            raise OdometryError(ended)
         topic = self._settings.odometry
-        found: dict[str, Any] = self.link.ask("state", topics=self._topics[1:], own=[topic])
-        kinds = found["published"].get(topic) or [TRANSFORMS[0]]
+        state: dict[str, Any] = self.link.ask("state", topics=self._topics[1:], own=[topic])
+        kinds = state["published"].get(topic) or [TRANSFORMS[0]]
         if kinds[0] not in POSES:
             raise OdometryError(
                 f"{topic} is {kinds[0]}; odometry.settings.odometry must name poses"
             )
-        if len(senders := found["senders"][topic]) > 1 and kinds[0] not in TRANSFORMS:
+        if len(senders := state["senders"][topic]) > 1 and kinds[0] not in TRANSFORMS:
             names = " and ".join(senders)
             raise OdometryError(f"{topic} is published by two ({names}), whose poses would mix")
-        return found
+        return state
 
     def cloud_type(self, topic: str) -> str:
         while time.monotonic() - self._begun < self._settings.ready:
@@ -275,8 +264,6 @@ class Ros2System(RosSystem):
         super().close()
         if self._settings.image is None:
             self._domain.close()
-        else:
-            remove_shared(self.folder, self._settings.image, self._user)
 
 
 def _stamped(types: Mapping[str, Any], child: str, parent: str, given: Any) -> Any:

@@ -6,43 +6,43 @@ import os
 import re
 import shutil
 import socket
+import struct
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 
+import numpy as np
 from pydantic import AfterValidator, Field, model_validator
+from rosbags.serde import SerdeError
 
 from adaptune import processes
 from adaptune.errors import OdometryError
+from adaptune.geometry import Poses, to_pose, to_quaternions
 from adaptune.odometry.base import Usage
-from adaptune.odometry.docker.engine import Container, ContainerSettings, default_user, image_digest
-from adaptune.odometry.docker.folders import copy_regular, make_shared, opened, regular_files
-from adaptune.odometry.docker.poses import PoseReader
+from adaptune.odometry.docker import engine
 from adaptune.odometry.program import ProgramInput, WholeSettings
 from adaptune.odometry.template import Template
 from adaptune.recording.config import resolve
+from adaptune.recording.pose_messages import POSES, TRANSFORMS, Pose, message_stamp
 from adaptune.ros.link import LinkError
 from adaptune.ros.relay import Relay
 from adaptune.ros.steering import Run, Steering
 from adaptune.space import ParameterSet
 
-QUIET = {"/clock", "/rosout", "/rosout_agg", "/parameter_events"}
-"""Topics of every node."""
+QUIET = {"/clock", "/rosout", "/rosout_agg", "/parameter_events"}  # topics of every node
 CLOCK = "rosgraph_msgs/msg/Clock"
 _BETWEEN_LOOKS = 0.05
-_TAIL = 1 << 14
-"""Bytes of a log in which its last lines are."""
-_TICK = 0.01
-"""Seconds."""
+_TAIL = 1 << 14  # bytes of a log in which its last lines are
+_TICK = 0.01  # seconds
+_FLOOD = 2000  # messages of a second that are too many
 _log = logging.getLogger(__name__)
 
-START = 30.0
-"""Seconds in which adaptune's node must be there."""
+START = 30.0  # seconds in which adaptune's node must be there
 
 
 def _topic(name: str) -> str:
@@ -54,7 +54,7 @@ def _topic(name: str) -> str:
 Topic = Annotated[str, AfterValidator(_topic)]
 
 
-class RosSettings(ContainerSettings, WholeSettings):
+class RosSettings(engine.ContainerSettings, WholeSettings):
     """What ROS systems may set; ``docs/docker.md`` describes it and its defaults."""
 
     template: Annotated[str, AfterValidator(resolve)]
@@ -92,6 +92,7 @@ class RosSystem(ABC):
     _noise: ClassVar[re.Pattern[bytes]]
     """Lines of it that say nothing."""
     _container: Any = None
+    _user: str  # in a container
 
     def __init__(
         self,
@@ -105,7 +106,7 @@ class RosSystem(ABC):
         self.usage, self._memory, self._recording = Usage(0.0, 0.0), memory, recording
         self._clock: SimClock | None = None
         self._keys: Mapping[str, Sequence[str]] = {}  # of a parameter server
-        self.folder, self._given = make_shared(folder / "shared"), folder / "given"
+        self.folder, self._given = engine.make_shared(folder / "shared"), folder / "given"
         self._given.mkdir()
         self._parameters = self._given / "params.yaml"
         self._parameters.write_text(parameters, encoding="utf-8")
@@ -184,10 +185,7 @@ class RosSystem(ABC):
         raise OdometryError(f"adaptune's node did not begin in {START:g} s: {self.words()}")
 
     def wait(self, topic: str, sent: Sequence[str] = ()) -> None:
-        """Wait until a node subscribes to the clouds' topic, and hears what adaptune sends.
-
-        An `OdometryError` names the topics to which nodes subscribe if none does in time.
-        """
+        """Wait until a node subscribes to the clouds' topic, and hears what adaptune sends."""
         self._topics.append(topic)
         before: AbstractSet[str] = set()
         late = False
@@ -211,7 +209,7 @@ class RosSystem(ABC):
             f"odometry.settings.points, or change it in the template"
         )
 
-    def reader(self) -> PoseReader:
+    def reader(self) -> "PoseReader":
         """What reads the system's poses."""
         given = self._settings
         fixed = getattr(given, "transforms", None)
@@ -248,7 +246,7 @@ class RosSystem(ABC):
         return processes.plain_lines(re.sub(rb"={10,}", b"", b"\n".join(lines)))
 
     def _tail(self, name: str) -> bytes:
-        with opened(self.folder / name, self.folder) as file:
+        with engine.opened(self.folder / name, self.folder) as file:
             if file is None:
                 return b""
             file.seek(max(file.seek(0, os.SEEK_END) - _TAIL, 0))
@@ -258,22 +256,125 @@ class RosSystem(ABC):
         """Copy what was written, and what was given, to a folder."""
         shutil.copy(self._parameters, folder)
         for name in (self._log_name, "rosbag.log"):
-            copy_regular(self.folder / name, self.folder, folder / name)
+            engine.copy_regular(self.folder / name, self.folder, folder / name)
         logs = self.folder / "ros" / "log"
-        for path in regular_files(logs):
-            copy_regular(path, self.folder, folder / "ros" / path.relative_to(logs))
+        for path in engine.regular_files(logs):
+            engine.copy_regular(path, self.folder, folder / "ros" / path.relative_to(logs))
 
     def close(self) -> None:
-        """End the system, and remove what it has written."""
+        """End the system, and remove what it has written in a container."""
         self.stop()
         self.link.close()
+        if (image := self._settings.image) is not None:
+            engine.remove_shared(self.folder, image, self._user)
+
+
+class PoseReader:
+    """Hears a topic, and reads its poses.
+
+    Of transforms, the poses are those of the sensor's `frame`, by way of all frames between, or
+    those of the only frame that moves. `fixed` holds frames that do not move, each with its parent
+    and its pose in that; those on ``/tf_static`` are heard, too.
+    """
+
+    def __init__(
+        self,
+        link: Relay,
+        topic: str,
+        frame: str = "lidar",
+        fixed: Mapping[str, tuple[str, Any]] | None = None,
+    ):
+        self.fault = ""  # what goes wrong with the messages
+        self.lacking = ""  # why transforms hold no pose
+        self.about = ""  # of which frame the poses are, and in which other one
+        self._link, self.topic, self._frame = link, topic, frame
+        self._fixed = {child: (into, to_pose(T)) for child, (into, T) in (fixed or {}).items()}
+        self._moving: dict[str, tuple[str, Poses]] = {}
+        self._n, self._first = 0, np.inf
+
+    def hear(self, take: Callable[[str, bytes], None]) -> None:
+        """Have messages taken, unless they are too many."""
+
+        def count(kind: str, data: bytes) -> None:
+            now = time.monotonic()
+            self._n, self._first = self._n + 1, min(self._first, now)
+            if self._n > _FLOOD * max(1.0, now - self._first):
+                self.fault = f"it publishes more than {_FLOOD} messages a second on {self.topic}"
+            take(kind, data)
+
+        self._link.record(self.topic, count)
+        if self.topic.endswith("/tf"):
+            self._link.record(f"{self.topic}_static", self._fix)
+
+    def read(self, kind: str, data: bytes) -> list[Pose]:
+        """The poses in a message; none if it is of another type."""
+        if kind not in POSES:
+            return []
+        try:
+            message = self._link.decode(data, kind)
+            if kind in TRANSFORMS:
+                return self._sensor(self._frames(message, self._moving))
+            if child := getattr(message, "child_frame_id", ""):
+                self.about = f"{child} in {message.header.frame_id}"
+            return POSES[kind](message)
+        except (SerdeError, struct.error, ValueError, IndexError) as error:
+            raise OdometryError(f"it publishes a {kind} that cannot be read ({error})") from error
+
+    def _fix(self, kind: str, data: bytes) -> None:
+        if kind in TRANSFORMS:
+            self._frames(self._link.decode(data, kind), self._fixed)
+
+    @staticmethod
+    def _frames(message: Any, known: dict[str, tuple[str, Poses]]) -> dict[str, int]:
+        """Note a message's frames; the stamp of each."""
+        stamps = {}
+        for stamped in message.transforms:
+            p, q = stamped.transform.translation, stamped.transform.rotation
+            child, parent = stamped.child_frame_id.lstrip("/"), stamped.header.frame_id.lstrip("/")
+            known[child] = parent, matrix(p, q)
+            stamps[child] = message_stamp(stamped)
+        return stamps
+
+    def _sensor(self, stamps: Mapping[str, int]) -> list[Pose]:
+        """The sensor's pose, if the frame that carries it has moved now."""
+        frame, carrier = self._frame, ""
+        if frame not in {**self._fixed, **self._moving}:
+            if len(self._moving) != 1:
+                self.lacking = (
+                    f"{self.topic} moves {', '.join(sorted(self._moving))}, and does not say where "
+                    f"{frame} is; name the sensor's frame as odometry.settings.frame"
+                )
+                return []
+            (frame,) = self._moving
+        begin, T, passed = frame, np.eye(4), set[str]()
+        while frame not in passed and (frame in self._moving or frame in self._fixed):
+            passed.add(frame)
+            carrier = carrier or (frame if frame in self._moving else "")
+            parent, T_parent_frame = self._moving.get(frame) or self._fixed[frame]
+            frame, T = parent, T_parent_frame @ T
+        self.about = f"{begin} in {frame}"
+        self.lacking = "" if carrier else f"nothing on {self.topic} moves {begin}"
+        if carrier not in stamps:
+            return []
+        types, q = self._link.store.types, np.full(4, np.nan)
+        if np.isfinite(T).all():
+            (q,) = to_quaternions(T[None])
+        position = types["geometry_msgs/msg/Vector3"](*T[:3, 3].tolist())
+        rotation = types["geometry_msgs/msg/Quaternion"](*q.tolist())
+        return [(stamps[carrier], frame, position, rotation)]
+
+
+def matrix(p: Any, q: Any) -> Poses:
+    """A pose of shape (4, 4) from a position and a quaternion, NaN where they are none."""
+    try:
+        T: Poses = to_pose((p.x, p.y, p.z, q.x, q.y, q.z, q.w))
+    except ValueError:
+        return np.full((4, 4), np.nan)
+    return T
 
 
 class SimClock:
-    """Publishes ``/clock``, and goes on by itself, so that nodes that sleep by it wake up.
-
-    It begins at a stamp in nanoseconds; `rate` is seconds of it in a second.
-    """
+    """Publishes ``/clock`` from a stamp in nanoseconds on, `rate` times as fast as time passes."""
 
     def __init__(self, link: Relay, stamp: int, rate: float):
         self._types, self._publish = link.store.types, link.advertise("/clock", CLOCK)
@@ -320,17 +421,17 @@ def filled(settings: Any, parameters: ParameterSet) -> tuple[Template, str]:
 
 def image_user(settings: Any, script: str, *words: str) -> str:
     """User who runs ROS in an image: root only where a script succeeds for nobody else."""
-    user = default_user(settings)
+    user = engine.default_user(settings)
     if settings.user is not None:
         return user
-    return _probed(image_digest(settings.image), user, script, words)
+    return _probed(engine.image_digest(settings.image), user, script, words)
 
 
 @cache
 def _probed(image: str, user: str, script: str, words: tuple[str, ...]) -> str:
     command = ["/bin/bash", "-l", "-c", script, "bash", *words]
-    settings, home = ContainerSettings(image=image), {"HOME": "/"}
-    container = Container(settings, 1.0, command, user=user, environment=home, bare=True)
+    settings, home = engine.ContainerSettings(image=image), {"HOME": "/"}
+    container = engine.Container(settings, 1.0, command, user=user, environment=home, bare=True)
     with contextlib.closing(container):
         code = container.wait(START)
     if code != 0:

@@ -6,7 +6,7 @@ import socket
 import sys
 import threading
 
-from adaptune.odometry.serving import converse
+from adaptune.odometry.registry import converse
 from adaptune.processes import answer_all
 
 

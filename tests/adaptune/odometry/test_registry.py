@@ -8,11 +8,10 @@ import pytest
 from adaptune.model.descriptor import descriptor_content
 from adaptune.odometry import OdometryError
 from adaptune.odometry.base import InProcess
-from adaptune.odometry.content import odometry_content
 from adaptune.odometry.factory import OdometryFactory, OdometryPool
 from adaptune.odometry.keyframe import KeyframeGicp, KeyframeNdt, KeyframeSettings
 from adaptune.odometry.program import CommandSettings
-from adaptune.odometry.registry import ODOMETRIES, declare, odometry_class
+from adaptune.odometry.registry import ODOMETRIES, declare, odometry_class, odometry_content
 from adaptune.odometry.remote import Limits, ProcessSettings
 from adaptune.space import ODOMETRY, Float, ParameterSpace, SpaceError
 
@@ -102,7 +101,7 @@ def test_what_serves_an_odometry_imports_little():
     """The processes of odometries are forked from one that has imported this."""
     program = (
         "import sys; before = set(sys.modules); "
-        "import adaptune.odometry.serving, adaptune.odometry.keyframe; "
+        "import adaptune.odometry.registry, adaptune.odometry.keyframe; "
         "found = [m for m in set(sys.modules) - before if '.' not in m]; "
         "print(*(m for m in found if 'site-packages' in str(sys.modules[m])))"
     )

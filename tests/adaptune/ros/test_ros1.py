@@ -18,7 +18,7 @@ from adaptune import processes
 from adaptune.keeper import descendants
 from adaptune.ros import relay
 from adaptune.ros.link import LinkError
-from adaptune.ros.ros1 import Ros1, local_ros1, ros_python
+from adaptune.ros.relay import Ros1, local_ros1, ros_python
 from adaptune.trajectory import read_tum
 from offline.config import load_study
 from offline.train import train

@@ -23,8 +23,7 @@ from adaptune.odometry import OdometryError
 from adaptune.odometry.base import InProcess
 from adaptune.odometry.docker import lockstep
 from adaptune.odometry.docker.engine import engine
-from adaptune.odometry.docker.ros_container import Ros1System
-from adaptune.odometry.docker.rustle import Rustle, RustleSettings
+from adaptune.odometry.docker.rustle import Ros1System, Rustle, RustleSettings
 from adaptune.odometry.keyframe import KeyframeGicp
 from adaptune.space import Selection
 

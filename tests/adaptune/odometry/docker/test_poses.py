@@ -4,8 +4,8 @@ import pytest
 from rooms import moved
 
 from adaptune.geometry import invert, to_pose, to_quaternions
-from adaptune.odometry.docker import poses
-from adaptune.odometry.docker.poses import PoseReader, matrix
+from adaptune.odometry.docker import ros_system
+from adaptune.odometry.docker.ros_system import PoseReader, matrix
 from adaptune.recording.pose_messages import TRANSFORMS
 from adaptune.ros.ros2 import message_types
 
@@ -98,11 +98,11 @@ def test_a_flood_is_told(heard, monkeypatch):
     now = [0.0]
     monkeypatch.setattr("time.monotonic", lambda: now[0])
     link, _, reader = heard()
-    for n in range(3 * poses._FLOOD):
-        now[0] = n / (0.9 * poses._FLOOD)
+    for n in range(3 * ros_system._FLOOD):
+        now[0] = n / (0.9 * ros_system._FLOOD)
         link.publish("/tf")
     assert not reader.fault
-    for _ in range(poses._FLOOD):
+    for _ in range(ros_system._FLOOD):
         link.publish("/tf")
     assert reader.fault == "it publishes more than 2000 messages a second on /tf"
 

@@ -16,6 +16,7 @@ from contained import LIMITS, N_SCANS, containers, drive, recording, scans, trut
 from needs import module_of, ros2_image
 from ros2_reference import ros2
 
+from adaptune.errors import warn_once
 from adaptune.odometry import OdometryError
 from adaptune.odometry.docker import lockstep, played_bag, ros2_system
 from adaptune.odometry.docker.probe import look
@@ -140,7 +141,7 @@ def test_its_manners_are_those_of_ros_1(make, monkeypatch):
 
 
 def test_one_that_works_on_or_stamps_by_a_clock_is_told(make, caplog):
-    lockstep._warn_once.cache_clear()
+    warn_once.cache_clear()
     lockstep._SEEN.clear()
     busy = make(imitate={"background": 5.0})
     on = [busy.prepare(scan) for scan in scans()[:2]]

@@ -6,7 +6,7 @@ from pydantic import ValidationError
 
 from adaptune.odometry import OdometryError
 from adaptune.odometry.docker.ros2_system import DIED, NOISE, Ros2Settings, Ros2System
-from adaptune.odometry.docker.ros_parameters import server_keys, warn_of_unread
+from adaptune.odometry.docker.rustle import server_keys, warn_of_unread
 from adaptune.odometry.template import Template
 
 HELD = {

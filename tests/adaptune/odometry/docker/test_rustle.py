@@ -16,7 +16,7 @@ from rooms import moved
 from adaptune.odometry import OdometryError
 from adaptune.odometry.docker.engine import EngineError
 from adaptune.odometry.docker.played_bag import Drain, PlayedBag, PoseRecorder, check_stamps
-from adaptune.odometry.docker.poses import PoseReader
+from adaptune.odometry.docker.ros_system import PoseReader
 from adaptune.odometry.docker.rustle import Rustle, RustleSettings
 from adaptune.odometry.program import ProgramInput
 from adaptune.recording.pose_messages import usable
