@@ -222,7 +222,7 @@ def main(what: str, n: int, seed: int) -> None:
     if what == "ros2":
         ros2(n)
         return
-    logging.getLogger("adaptune.odometry.docker.rustle").setLevel(logging.INFO)
+    logging.getLogger("adaptune.odometry.docker.ros_system").setLevel(logging.INFO)
     with study_file() as path:
         if what == "cost":
             cost(path, n)

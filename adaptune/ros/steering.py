@@ -1,5 +1,6 @@
 """Parameters of a node that somebody else wrote, set while it runs."""
 
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Any
 
@@ -7,8 +8,9 @@ import numpy as np
 from pydantic import AfterValidator, Field
 
 from adaptune.errors import OdometryError
-from adaptune.ros.link import _log
 from adaptune.space import ParameterSet
+
+_log = logging.getLogger(__name__)
 
 Run = Callable[[list[str]], tuple[int, str]]
 """Runs a command; its exit code, and what it wrote."""
