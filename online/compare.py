@@ -53,7 +53,7 @@ from online.statistics import (
     oracle_row,
 )
 from online.tables import last_rows, tables
-from online.verdict import CALLED, adapts, decided, error_and_cost, remarks, verdict
+from online.verdict import CALLED, adapts, called, decided, error_and_cost, remarks, verdict
 
 
 class ComparedModes(NamedTuple):
@@ -100,13 +100,6 @@ def compared_modes(study: Study) -> ComparedModes:
     return ComparedModes(tuple(finished), compared, unfinished, [words] if told else [])
 
 
-def replayed_by(asked: Sequence[str], mode: str) -> str:
-    """The command that replays a mode, given those on demand that the study asks for."""
-    on_demand = mode in ALSO and mode not in asked
-    option = "--untrained" if mode == UNTRAINED else "-o online.modes=all"
-    return f"`adaptune online{f' {option}' if on_demand else ''}`"
-
-
 SEED = 0
 """Of the resampling."""
 LEAST_STRETCHES = 10
@@ -123,8 +116,7 @@ def pooled(
     known = [one for one in judged if one.rows[0].rte is not None]
     modes = [row.mode for row in known[0].rows]
     made = [_pooled(mode, known) for mode in modes]
-    in_hindsight = [_mean_row(ORACLE, oracles)] if len(oracles) == len(known) else []
-    return [*made, *in_hindsight]
+    return [*made, _mean_row(ORACLE, oracles)] if len(oracles) == len(known) else made
 
 
 def _pooled(mode: str, judged: Sequence[JudgedModes]) -> ComparisonRow:
@@ -144,7 +136,6 @@ def _pooled(mode: str, judged: Sequence[JudgedModes]) -> ComparisonRow:
 
 
 def _mean_row(mode: str, rows: Sequence[ComparisonRow]) -> ComparisonRow:
-    """Means of what was measured, and sums of what was counted."""
     ratios = [row.ratio for row in rows if row.ratio is not None]
     return ComparisonRow(
         ALL,
@@ -211,7 +202,6 @@ def pooled_logs(
 
 
 def _log(errors: NDArray[np.float64]) -> float:
-    """Logarithm of the ratio of two mean errors, from their values of shape (2, n)."""
     mine, others = np.maximum(errors.mean(axis=1), 1e-12)
     return float(np.log(mine / others))
 
@@ -258,16 +248,8 @@ def current_replays(
 ) -> CurrentReplays:
     """Tell replays of another recording, model or configuration from the others.
 
-    Of replays with different models, those with the study's own are current.
-
-    Parameters
-    ----------
-    study
-        The study.
-    names
-        Of the sequences.
-    modes
-        To look at; by default all that were replayed and that the study may have.
+    Of replays with different models, those with the study's own are current. `names` are those of
+    sequences; `modes` are by default all that were replayed and that the study may have.
 
     Raises
     ------
@@ -294,23 +276,25 @@ def current_replays(
             f"run `adaptune online` again, with online.real_time.rate or without"
         )
     shared = {name: study.replay_inputs(name) for name in names}
-    refused: dict[tuple[str, ...], list[str]] = {}
+    refused: dict[tuple[str, str, str], list[str]] = {}
     for (name, mode), summary in made.items():
         if said := _differing(study.sequences, setup, summary.inputs, model, shared[name]):
-            command = replayed_by(setup.also, mode)
+            command = "adaptune online"
+            if mode in ALSO and mode not in setup.also:
+                command += " --untrained" if mode == UNTRAINED else " -o online.modes=all"
             if mode != UNTRAINED and path != own:
-                command = f"{command[:-1]} --model {path}`"
-            refused.setdefault((name, command, *said), []).append(mode)
+                command += f" --model {path}"
+            refused.setdefault((name, command, "; ".join(said)), []).append(mode)
     stale = {mode for those in refused.values() for mode in those}
     current = tuple(dict.fromkeys(mode for _, mode in made if mode not in stale))
-    words = (_refusal(replays / key[0], those, *key[1:]) for key, those in refused.items())
+    words = []
+    for (name, command, differing), those in refused.items():
+        folder = replays / name
+        what = f"{folder}: {', '.join(those)} were" if those[1:] else f"{folder / those[0]}: was"
+        words.append(
+            f"{what} made from other inputs: {differing}; run `{command}` with this study."
+        )
     return CurrentReplays(model, current, tuple(words))
-
-
-def _refusal(folder: Path, modes: Sequence[str], command: str, *differing: str) -> str:
-    """Why replays of a sequence are refused, and the command that makes them again."""
-    what = f"{folder / modes[0]}: was" if len(modes) == 1 else f"{folder}: {', '.join(modes)} were"
-    return f"{what} made from other inputs: {'; '.join(differing)}; run {command} with this study."
 
 
 def _differing(
@@ -365,17 +349,10 @@ class ComparedReplays(NamedTuple):
 
 
 def compare(study: Study) -> ComparedReplays:
-    """Compare the replays that were made, and write tables.
+    """Compare the replays that were made, see `compared_modes`, and write tables.
 
-    A mode is compared if it was replayed on all sequences that are compared, see
-    `compared_modes`. The untrained bank is compared with the baseline alone
-    if only these two were replayed.
-
-    Parameters
-    ----------
-    study
-        The study; ``comparison`` in its folder receives ``comparison.csv`` and ``.json``, and
-        the tables as Markdown (``tables.md``).
+    ``comparison`` in the study's folder receives ``comparison.csv`` and ``.json``, and the tables
+    as Markdown (``tables.md``).
 
     Raises
     ------
@@ -403,8 +380,8 @@ def compare(study: Study) -> ComparedReplays:
         judged.append(of_modes._replace(recording=study.sequences.recorded_in(name)))
         if model is not None:
             errors = oracle_errors(study.archive("oracle"), name, model)
-            row = None if errors is None else oracle_row(judged[-1], errors, model.fixed)
-            oracles += [] if row is None else [row]
+            if errors and (row := oracle_row(judged[-1], errors, model.fixed)):
+                oracles.append(row)
     rows = _rows(judged, oracles)
     obstacle = "" if ADAPTIVE in modes else ReplaySetup.of(study).obstacle(ADAPTIVE, model)
     length, worth = study.config.sub_trajectory, study.config.online.worth
@@ -434,7 +411,7 @@ def _lost(
     known = [row for row in rows if row.rte is not None]
     of_best = [row for row in known if row.mode == best.mode and row.sequence != ALL]
     said = lost_in_words(
-        CALLED[best.mode],
+        called(best.mode),
         {row.sequence: row.rte for row in of_best if row.rte is not None},
         odometry,
         lambda worst: hard_to_track(sequences.open(worst)),
@@ -472,25 +449,21 @@ def _rows(judged: Sequence[JudgedModes], oracles: Sequence[ComparisonRow]) -> li
         last = pooled(judged, oracles)
     else:
         last, rows = [*rows, *oracles], []
-    return [*rows, *(_against(row, known, last) for row in last)]
-
-
-def _against(
-    row: ComparisonRow, judged: Sequence[JudgedModes], rows: Sequence[ComparisonRow]
-) -> ComparisonRow:
-    """Compare a mode that adapts with controls and rivals, too, on the same frames."""
-    if not adapts(row.mode):
-        return row
-    others = [other.mode for other in rows if other.mode in (BASELINE, EVEN, *RIVALS)]
-    return replace(row, against={other: ratio_to(judged, row.mode, other) for other in others})
+    # What adapts is compared with controls and rivals, too, on the same frames.
+    others = [row.mode for row in last if row.mode in (BASELINE, EVEN, *RIVALS)]
+    for row in last:
+        if adapts(row.mode):
+            against = {other: ratio_to(known, row.mode, other) for other in others}
+            row = replace(row, against=against)  # noqa: PLW2901
+        rows.append(row)
+    return rows
 
 
 def _with_fixed_rivals(
     replays: Mapping[str, StoredReplay], model: ErrorModel | None
 ) -> dict[str, StoredReplay]:
     """The replays by mode; a best default that is the fixed set has its replay."""
-    same: dict[str, StoredReplay] = {}
-    if model is not None and "fixed" in replays and model.rivals.get(BEST_DEFAULT) == model.fixed:
-        same[BEST_DEFAULT] = replays["fixed"]
-    every = {**same, **replays}
+    every = dict(replays)
+    if model is not None and "fixed" in every and model.rivals.get(BEST_DEFAULT) == model.fixed:
+        every.setdefault(BEST_DEFAULT, every["fixed"])
     return {mode: every[mode] for mode in in_order(every)}

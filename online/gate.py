@@ -1,7 +1,7 @@
 """The gate: whether one side of the same recordings is worse than another."""
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from functools import reduce
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -156,23 +156,23 @@ def compare_sides(new: Side, old: Side, error: float = 0.05, cost: float = 0.1) 
         rows.append(GateRow(name, RESTARTS, mine, others, said))
     verdict = _overall(rows)
     words = _in_words(new, old, verdict, rows)
-    return Gate(verdict, rows, f"{words} Not compared: {left_out}." if left_out else words)
+    return Gate(verdict, rows, words + (f" Not compared: {left_out}." if left_out else ""))
 
 
 def _pairs(new: Side, old: Side, whole: bool) -> tuple[list[_Pair], str]:
     """The recordings of both sides, and in words those of one side only."""
     sides = new.replays(), old.replays()
-    keys = [{_key(n, replay.summary.inputs): n for n, replay in of.items()} for of in sides]
-    common = [key for key in keys[0] if key in keys[1]]
+    named = [{_key(n, replay.summary.inputs): n for n, replay in side.items()} for side in sides]
+    common = [key for key in named[0] if key in named[1]]
     alone = "; ".join(
-        f"{', '.join(of[key] for key in of if key not in common)} (only in {side.name})"
-        for side, of in zip((new, old), keys, strict=True)
-        if len(of) > len(common)
+        f"{', '.join(names[key] for key in names if key not in common)} (only in {side.name})"
+        for side, names in zip((new, old), named, strict=True)
+        if len(names) > len(common)
     )
     if not common:
         raise AdaptuneError(f"no recording is in both, by content and part: {alone}")
     pairs = []
-    for name, other in ((keys[0][key], keys[1][key]) for key in common):
+    for name, other in ((named[0][key], named[1][key]) for key in common):
         replays = sides[0][name], sides[1][other]
         lacking, n = replays[1].summary.unhealthy.get("no_pose", 0), replays[1].summary.scans
         if lacking >= MAX_SHARE_WITHOUT_POSE * n:
@@ -186,7 +186,6 @@ def _pairs(new: Side, old: Side, whole: bool) -> tuple[list[_Pair], str]:
 
 
 def _settings(name: str, inputs: manifest.Inputs) -> dict[str, Any]:
-    """How a recording was read."""
     return dict(inputs["sequences" if "sequences" in inputs else "courses"][name])
 
 
@@ -202,8 +201,8 @@ def _check_same(
     """Refuse another reading of the same recording, and another reference."""
     both = f"{names[0]}: {sides[0].name} and {sides[1].name}"
     new, old = (
-        {"reader": of["reader"], "settings": _settings(name, of)}
-        for name, of in zip(names, inputs, strict=True)
+        {"reader": made_from["reader"], "settings": _settings(name, made_from)}
+        for name, made_from in zip(names, inputs, strict=True)
     )
     if said := manifest.changes(old, new):
         raise AdaptuneError(f"{both} read it differently: {'; '.join(said)}; replay both alike")
@@ -260,12 +259,13 @@ def _rows(quantity: str, pairs: Sequence[_Pair], bound: float) -> list[GateRow]:
         if why:
             rows.append(GateRow(pair.name, quantity, why=why))
             continue
-        new, old = _both(quantity, values).tolist()
-        one = quantity == COST and values.shape[1] == 1
-        few = "one figure a run" if one else "too short"
+        both = np.percentile(values, 99, axis=1) if quantity == P99 else values.mean(axis=1)
+        new, old = both.tolist()
+        few = "one figure a run" if quantity == COST and values.shape[1] == 1 else "too short"
         row = GateRow(pair.name, quantity, new, old, ratio=new / max(old, 1e-12), why=few)
         same = bool((values[0] == values[1]).all())
-        logs = _resampled(quantity, values, block, rng)
+        resampled = _resampled_p99 if quantity == P99 else resampled_logs
+        logs = resampled(values, block, rng)
         if quantity == ERROR:
             row = row._replace(stretches=_stretches(pair))
             if not same:
@@ -294,28 +294,20 @@ def _over_all(quantity: str, pooled: Sequence[Any], n: int, bound: float) -> Gat
 
 
 def _judged(row: GateRow, ends: Iterable[float], bound: float) -> GateRow:
-    """The row with its interval, from its ends as logarithms, and what it says."""
     low, high = (float(np.exp(end)) for end in ends)
     return row._replace(low=low, high=high, verdict=judged(row.ratio or 0.0, (low, high), bound))
 
 
-def _both(quantity: str, values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The quantity on both sides, of shape (2,)."""
-    found = np.percentile(values, 99, axis=1) if quantity == P99 else values.mean(axis=1)
-    return np.asarray(found)
-
-
-def _resampled(
-    quantity: str, values: NDArray[np.float64], block: int, rng: np.random.Generator
+def _resampled_p99(
+    values: NDArray[np.float64], block: int, rng: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Logarithms of the ratio in resamples of blocks, the same on both sides, (RESAMPLES,)."""
-    if quantity != P99:
-        return resampled_logs(values, block, rng)
+    """As `resampled_logs`, but of the ratio of 99th percentiles."""
     n = values.shape[1]
     block = min(block, n)
     starts = rng.integers(0, n - block + 1, (RESAMPLES, -(-n // block), 1))
     drawn = (starts + np.arange(block)).reshape(RESAMPLES, -1)
-    new, old = np.array([_both(P99, np.maximum(values[:, frames], 1e-12)) for frames in drawn]).T
+    values = np.maximum(values, 1e-12)
+    new, old = np.array([np.percentile(values[:, frames], 99, axis=1) for frames in drawn]).T
     return np.asarray(np.log(new / old))
 
 
@@ -339,16 +331,8 @@ def _overall(rows: Sequence[GateRow]) -> Verdict:
     return "better" if any(row.verdict == "better" for row in over_all) else "equal"
 
 
-_CALLED: Mapping[Verdict, str] = {
-    "better": "Better",
-    "worse": "WORSE",
-    "equal": "Not worse",
-    "unclear": "TOO LITTLE TO TELL",
-}
-
-
 def _in_words(new: Side, old: Side, verdict: Verdict, rows: Sequence[GateRow]) -> str:
-    """The result in one line."""
+    said = {"better": "Better", "worse": "WORSE", "equal": "Not worse"}
     names = list(dict.fromkeys(row.recording for row in rows if row.recording != ALL))
     over_all = [row for row in rows if row.recording == ALL] or rows
     parts = []
@@ -363,7 +347,8 @@ def _in_words(new: Side, old: Side, verdict: Verdict, rows: Sequence[GateRow]) -
     wrong = [f"{r.recording} ({r.quantity})" for r in rows if r.verdict == "worse"]
     where = f" Worse: {', '.join(wrong)}." if wrong else ""
     n = f"{len(names)} recording{'s' * (len(names) > 1)}"
-    return f"{_CALLED[verdict]}: {new.name} against {old.name}, {n}: {'; '.join(parts)}.{where}"
+    first = said.get(verdict, "TOO LITTLE TO TELL")
+    return f"{first}: {new.name} against {old.name}, {n}: {'; '.join(parts)}.{where}"
 
 
 def write_gate(folder: Path, gate: Gate) -> None:

@@ -55,13 +55,6 @@ class LiveScans:
         Scans that may wait; with 0 all do.
     imu
         How to read the IMU, its topic included; None without.
-
-    Attributes
-    ----------
-    frame : str
-        Name of the sensor's frame, by the newest cloud.
-    stopped : bool
-        Whether `stop` was called.
     """
 
     def __init__(
@@ -72,7 +65,7 @@ class LiveScans:
         queue: int = 1,
         imu: ImuConfig | None = None,
     ):
-        self.frame = "sensor"
+        self.frame = "sensor"  # by the newest cloud
         self._link, self._points, self._timing, self._queue = link, points, timing, queue
         self._settings = imu
         # Load compiled code, for which the first scans should not wait.
@@ -195,7 +188,7 @@ class LiveScans:
             while self._measured and (not taken or taken[-1][0] < end):
                 taken.append(self._measured.popleft())
         if before is None:
-            taken = [one for one in taken if one[0] > scan.stamp] or taken[-1:]
+            taken = [pair for pair in taken if pair[0] > scan.stamp] or taken[-1:]
         stamps = np.array([stamp for stamp, _ in taken], np.int64)
         values = np.array([values for _, values in taken], np.float64).reshape(-1, 6)
         imu = self._settings.in_si(Imu(stamps, values[:, :3], values[:, 3:]))
@@ -249,10 +242,7 @@ def placed(T: Poses) -> list[Placed]:
 
 
 class RosMessages:
-    """Makes messages of one ROS.
-
-    `frame` is the name of the odometry's frame.
-    """
+    """Makes messages of one ROS, in the odometry's `frame`."""
 
     def __init__(self, store: Typestore, frame: str):
         self._types, self._frame = store.types, frame
@@ -297,18 +287,12 @@ class RosMessages:
 
     def transform(self, stamp: int, at: Placed, child: str) -> Any:
         """tf2_msgs/TFMessage."""
-        moved = self._make(
-            "geometry_msgs/msg/Transform",
-            translation=self._vector("Vector3", at[0]),
-            rotation=self._vector("Quaternion", at[1]),
+        translation, rotation = self._vector("Vector3", at[0]), self._vector("Quaternion", at[1])
+        transform = self._types["geometry_msgs/msg/Transform"](translation, rotation)
+        stamped = self._types["geometry_msgs/msg/TransformStamped"]
+        return self._make(
+            "tf2_msgs/msg/TFMessage", transforms=[stamped(self.header(stamp), child, transform)]
         )
-        one = self._make(
-            "geometry_msgs/msg/TransformStamped",
-            header=self.header(stamp),
-            child_frame_id=child,
-            transform=moved,
-        )
-        return self._make("tf2_msgs/msg/TFMessage", transforms=[one])
 
     def selection(self, stamp: int, selection: Selection, why_not: str) -> Any:
         """std_msgs/String with JSON: what was selected."""

@@ -42,11 +42,10 @@ MODES = tuple(dict.fromkeys((BASELINE, *RIVALS, FIXED, ADAPTIVE, UNTRAINED, EVEN
 """All modes but rules of the user's, in the order of tables and of lines that lie on each other."""
 WITHOUT_MODEL: tuple[str, ...] = (BASELINE, UNTRAINED)
 """The modes that need neither trials nor a model."""
-
-
 ONE_CORE = 50.0
 """Milliseconds of CPU time a scan up to which a bank runs on one core: of several, each prepares
 every scan again. Most sensors give a scan every 100 ms."""
+_log = logging.getLogger(__name__)
 
 
 class EvenSelector:
@@ -133,8 +132,8 @@ class ReplaySetup:
             return Mode(name, members, True, even, _cost(model, members))
         descriptors = self.config.descriptor
         if self._mechanism(name, model) == "live":
-            one = {model.fixed: model.sets[model.fixed]}
-            return Mode(name, one, False, partial(Selector, model, name, (), descriptors))
+            fixed = {model.fixed: model.sets[model.fixed]}
+            return Mode(name, fixed, False, partial(Selector, model, name, (), descriptors))
         # The bank's reserve joins in by what is measured: only this mode has one.
         members = self._members(model) if name == ADAPTIVE else self._always(model)
         make = partial(Selector, model, name, list(members), descriptors)
@@ -171,12 +170,7 @@ class ReplaySetup:
     def instance(self, mode: Mode, sequence: str | None = None) -> OdometryInstance:
         """Make the odometry of a mode, or the bank.
 
-        Parameters
-        ----------
-        mode
-            What `mode` returned.
-        sequence
-            On which it will run; programs that run whole recordings need it.
+        Programs that run whole recordings need the name of the `sequence`.
         """
         if not mode.bank:
             return self.odometry(mode.sets[mode.fixed], sequence)
@@ -232,10 +226,9 @@ class ReplaySetup:
     def _always(self, model: ErrorModel) -> dict[int, ParameterSet]:
         """The bank's members without its reserve, which joins in by what is measured."""
         reserve = model.bank[len(model.bank) - model.bank_settings.reserve :]
-        return {trial: own for trial, own in self._members(model).items() if trial not in reserve}
+        return {trial: s for trial, s in self._members(model).items() if trial not in reserve}
 
     def _untrained_sets(self) -> ParameterSets:
-        """The members of the bank that needs no model."""
         return untrained_sets(self.odometry.space, self.config.online.switching.size)
 
 
@@ -244,13 +237,7 @@ def _cost(model: ErrorModel, members: Iterable[int]) -> float:
 
 
 def needed(name: str, model: ErrorModel | None) -> ErrorModel:
-    """The model of a mode that cannot do without.
-
-    Raises
-    ------
-    ModeError
-        If there is none.
-    """
+    """The model of a mode that cannot do without; a ModeError if there is none."""
     if model is None:
         raise ModeError(f"{name}: needs an error model; run `adaptune offline`, which fits one")
     return model
@@ -285,25 +272,11 @@ def sequences_without_model(config: StudyConfig) -> tuple[str, ...]:
     return tuple(name for name in parts if not is_part(name))
 
 
-# The online stage: replay the test sequences in every mode.
-
-
-_log = logging.getLogger(__name__)
-
-
-class ReplayError(AdaptuneError):
-    """A study that cannot be replayed."""
-
-
 def run_replays(study: Study, model_path: Path, progress: Progress = unseen) -> int:
     """Replay every test sequence in every mode, unless that was done before.
 
-    ``replays/<sequence>/<mode>`` in the study's folder receives the results.
-
-    Returns
-    -------
-    int
-        Number of replays that were made.
+    ``replays/<sequence>/<mode>`` in the study's folder receives the results. Returned is the number
+    of replays that were made.
 
     Raises
     ------
@@ -315,19 +288,18 @@ def run_replays(study: Study, model_path: Path, progress: Progress = unseen) -> 
     model = study.model(model_path)
     setup.check(model, model_path)
     if not study.config.test:
-        raise ReplayError("test: name at least one sequence to replay")
+        raise AdaptuneError("test: name at least one sequence to replay")
     obstacles = {name: setup.obstacle(name, model) for name in study.config.online.modes}
     for why in dict.fromkeys(filter(None, obstacles.values())):
-        names = " and ".join(name for name, of in obstacles.items() if of == why)
+        names = " and ".join(name for name, obstacle in obstacles.items() if obstacle == why)
         _log.warning("not replayed: %s, because %s", names, why)
     return replay_modes(study, study.config.test, setup.modes(model), progress, (model, model_path))
 
 
 def run_untrained(study: Study, progress: Progress = unseen) -> int:
-    """Replay sequences with the baseline, and with a bank that needs no model.
+    """Replay `sequences_without_model` with the baseline, and with a bank that needs no model.
 
-    Neither trials nor references are needed. The sequences are those of
-    `online.modes.sequences_without_model`; for the rest see `run_replays`.
+    Neither trials nor references are needed. For the rest see `run_replays`.
 
     Raises
     ------
@@ -374,7 +346,7 @@ def replay_modes(
                     what = f"{name}, {mode.name}"
                     record = _replayed(study, recording, odometry, mode, what, progress)
             except DescriptorError as error:
-                raise ReplayError(f"sequences.{name}: {error}") from error
+                raise AdaptuneError(f"sequences.{name}: {error}") from error
             if i == 0:
                 _judge(study, name, recording, record.trajectory)
             write_replay(folder / mode.name, record, inputs, model_path)
@@ -422,7 +394,6 @@ def _replayed(
     what: str,
     progress: Progress,
 ) -> ReplayRecord:
-    """Make a replay."""
     online, make, n = study.config.online, mode.selector, recording.n_messages
 
     def watch(record: ReplayRecord) -> None:

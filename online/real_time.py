@@ -98,11 +98,6 @@ def replay_in_real_time(
 
     While the odometry prepares a scan, the selector's process describes it. A selection that is
     late is dropped. The sensor goes by `clock`; for the rest see `online.replay.replay`.
-
-    Raises
-    ------
-    AdaptuneError
-        If there are no scans.
     """
     record = ReplayRecord(settings.rate)
     drive = RealTimeDrive(odometry, health, settings, selector, record, what, clock)
@@ -119,8 +114,8 @@ def replay_in_real_time(
 class RealTimeDrive:
     """Takes scans as they come, and applies what is selected in time.
 
-    A scan is described while it is prepared. `record` receives what becomes of each scan and each
-    selection; for the rest see `replay_in_real_time`.
+    `record` receives what becomes of each scan and each selection; for the rest see
+    `replay_in_real_time`.
     """
 
     def __init__(
@@ -188,12 +183,10 @@ class RealTimeDrive:
         return prepared if odometry.preparation == preparation else odometry.prepare(scan)
 
     def _take(self, answer: Answer | None, stamp: int, due: float) -> None:
-        """Apply what was selected, if it is there."""
         if answer is None or answer.selection is None:
             self.record.missed += 1
         else:
             self._driver.take(stamp, answer.selection, self._clock.now() - due)
 
     def _left(self, due: float) -> float:
-        """Seconds to the deadline."""
         return max(self._deadline - (self._clock.now() - due), 0.0)

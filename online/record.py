@@ -1,18 +1,19 @@
-"""Replays on disk: trajectory, selections, frames, and what they were made from."""
+"""Replays and drives on disk: trajectory, selections, frames, and what they were made from."""
 
 import csv
+import io
 import itertools
 import logging
 import math
 import os
 import platform
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, Self
+from typing import IO, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,18 +24,16 @@ from adaptune.errors import AdaptuneError
 from adaptune.files import replacing, write_text
 from adaptune.odometry.tracker import RegisteredScan
 from adaptune.strict import ConfigurationError, in_one_line
-from adaptune.trajectory import Trajectory, TrajectoryError, read_tum, write_tum
+from adaptune.trajectory import Trajectory, TrajectoryError, read_tum, tum_lines, write_tum
 from online.replay import Choice, ReplayRecord
 
 _TABLES = ("frames.csv", "selections.csv")
 """Files of a replay besides its trajectory."""
+_log = logging.getLogger(__name__)
 
 
 class StoredReplayError(AdaptuneError):
     """A replay that is missing or damaged."""
-
-
-_log = logging.getLogger(__name__)
 
 
 class ReplaySummary(BaseModel):
@@ -56,11 +55,9 @@ class ReplaySummary(BaseModel):
 
     @classmethod
     def read(cls, folder: Path) -> Self:
-        """Read ``replay.json``. All files of a replay are there, for this one is written last.
+        """Read ``replay.json``, or raise a StoredReplayError.
 
-        Raises
-        ------
-        StoredReplayError
+        All files of a replay are there, for this one is written last.
         """
         path = folder / "replay.json"
         if not path.exists():
@@ -69,14 +66,14 @@ class ReplaySummary(BaseModel):
             )
         try:
             inputs = manifest.recorded(folder / manifest.FILE)
-            found = cls.model_validate_json(path.read_bytes())
+            summary = cls.model_validate_json(path.read_bytes())
         except (OSError, ValidationError, ConfigurationError) as error:
             raise damaged(path, error) from error
         if inputs is None:
             what = "an older adaptune did not record what this replay was made from"
             option = " --untrained" if folder.name == "untrained" else ""
             raise StoredReplayError(f"{folder}: {what}; run `adaptune online{option}` again")
-        return found.model_copy(update={"inputs": inputs})
+        return summary.model_copy(update={"inputs": inputs})
 
 
 def replay_changes(
@@ -132,13 +129,7 @@ class StoredReplay:
 
     @classmethod
     def read(cls, folder: Path) -> Self:
-        """Read what `write_replay` wrote.
-
-        Raises
-        ------
-        StoredReplayError
-            If a file is missing or damaged.
-        """
+        """Read what `write_replay` wrote; a StoredReplayError if it is missing or damaged."""
         summary = ReplaySummary.read(folder)
         try:
             trajectory = read_tum(folder / "trajectory.tum")
@@ -184,7 +175,12 @@ def write_replay(
     `inputs` is what it was made from, `model_file` the model that it was made with, if any.
     """
     write_tum(folder / "trajectory.tum", replay.trajectory)
-    _write_selections(folder / "selections.csv", replay)
+    # Sets of several odometries have other parameters.
+    every = (name for choice in replay.choices for name in choice.selection.parameters)
+    names = list(dict.fromkeys(every))
+    made = sorted([*replay.choices, *replay.rejected], key=lambda choice: choice.stamp)
+    rows = (selection_row(choice, names) for choice in made)
+    _write_csv(folder / "selections.csv", (*SELECTION_COLUMNS, *names), rows)
     columns = FRAME_COLUMNS if replay.rate is not None else FRAME_COLUMNS[:-1]
     late = replay.late if replay.rate is not None else itertools.repeat(math.nan)
     rows = (frame_row(*pair)[: len(columns)] for pair in zip(replay.steps, late, strict=False))
@@ -193,7 +189,7 @@ def write_replay(
         scans=len(replay.steps),
         restarts=int(replay.restarted.sum()),
         unhealthy=replay.unhealthy,
-        poor_scans=int((~replay.registered).sum()),
+        poor_scans=sum(not step.registered for step in replay.steps),
         selections=len(replay.choices),
         lost_seconds=round(_lost_seconds(replay), 3),
         cpu_ms=round(replay.cpu_ms, 3),
@@ -213,18 +209,18 @@ def write_replay(
 @cache
 def machine() -> str:
     """The kind of this machine: costs that were measured on others cannot be compared."""
-    found = None
+    name = None
     with suppress(OSError):
         listed = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
-        found = re.search(r"model name\s*: (.*)", listed)
-    return f"{found[1] if found else platform.machine()}, {os.cpu_count()} cores"
+        name = re.search(r"model name\s*: (.*)", listed)
+    return f"{name[1] if name else platform.machine()}, {os.cpu_count()} cores"
 
 
 def kept_up(replay: ReplayRecord) -> dict[str, float] | None:
     """Counts, and medians and 99th percentiles in milliseconds, of a replay in real time."""
     if replay.rate is None:
         return None
-    found: dict[str, float] = {
+    counts: dict[str, float] = {
         "rate": replay.rate,
         "dropped_scans": replay.dropped,
         "missed_selections": replay.missed,
@@ -237,8 +233,8 @@ def kept_up(replay: ReplayRecord) -> dict[str, float] | None:
     for name, seconds in named.items():
         for q in (50, 99):
             value = 1e3 * float(np.percentile(seconds, q)) if seconds else 0.0
-            found[f"{name}_ms_p{q}"] = round(value, 3)
-    return found
+            counts[f"{name}_ms_p{q}"] = round(value, 3)
+    return counts
 
 
 def _lost_seconds(replay: ReplayRecord) -> float:
@@ -249,37 +245,20 @@ def _lost_seconds(replay: ReplayRecord) -> float:
 
 
 _ESTIMATED = ("estimated_error_percent", "estimated_low_percent", "estimated_high_percent")
-_NUMBERS = (
-    *("trial", "predicted_error_percent", "predicted_fixed_percent", "familiarity"),
-    *(*_ESTIMATED, "lost", "ms"),
-)
-SELECTION_COLUMNS = (*("stamp_ns", *_NUMBERS[:-1], "weights", "ms", "why_not", "fallen_back"),)
+_PREDICTED = ("predicted_error_percent", "predicted_fixed_percent", "familiarity")
+_NUMBERS = ("trial", *_PREDICTED, *_ESTIMATED, "lost", "ms")
+SELECTION_COLUMNS = ("stamp_ns", *_NUMBERS[:-1], "weights", "ms", "why_not", "fallen_back")
 """Columns of ``selections.csv`` before the parameters."""
 FRAME_COLUMNS = ("stamp_ns", "registered", "restarted", "prepare_ms", "register_ms", "late_ms")
 """Columns of ``frames.csv``."""
 
 
-def _write_selections(path: Path, replay: ReplayRecord) -> None:
-    # Sets of several odometries have other parameters.
-    every = (name for choice in replay.choices for name in choice.selection.parameters)
-    names = list(dict.fromkeys(every))
-    made = sorted([*replay.choices, *replay.rejected], key=lambda choice: choice.stamp)
-    rows = (selection_row(choice, names) for choice in made)
-    _write_csv(path, (*SELECTION_COLUMNS, *names), rows)
-
-
 def selection_row(choice: Choice, names: Sequence[str]) -> list[Any]:
     """A row of ``selections.csv``: `SELECTION_COLUMNS`, and the parameters of these names."""
     stamp, selection, seconds, why_not, fallen_back = choice
-    numbers = (
-        selection.predicted_error,
-        selection.predicted_fixed,
-        selection.familiarity,
-        selection.estimated_error,
-        selection.estimated_low,
-        selection.estimated_high,
-    )
-    weights = (selection.weights or {}).items()
+    predicted = selection.predicted_error, selection.predicted_fixed, selection.familiarity
+    measured = selection.estimated_error, selection.estimated_low, selection.estimated_high
+    numbers, weights = (*predicted, *measured), (selection.weights or {}).items()
     return [
         *(stamp, selection.trial, *(f"{x:.4f}" for x in numbers), int(selection.lost)),
         " ".join(f"{trial}:{weight:.3f}" for trial, weight in weights),
@@ -304,7 +283,6 @@ def _write_csv(path: Path, columns: Sequence[str], rows: Any) -> None:
 
 
 def _columns(path: Path) -> dict[str, list[str]]:
-    """Columns of a table of a replay as they are written."""
     with path.open(newline="", encoding="utf-8") as file:
         table = list(csv.reader(file))
     if len(set(map(len, table))) > 1:
@@ -325,7 +303,6 @@ def _applied(columns: Mapping[str, list[str]], n: int) -> dict[str, list[str]]:
 
 
 def _weights(texts: Sequence[str]) -> dict[int, Sequence[float]]:
-    """Read the column of weights."""
     rows = [dict(pair.split(":") for pair in text.split()) for text in texts]
     if any(row.keys() != rows[0].keys() for row in rows):
         raise ValueError("weights of other trials from row to row")
@@ -352,3 +329,66 @@ def damaged(path: Path, error: Exception) -> StoredReplayError:
 
 def _made_again(folder: Path) -> str:
     return f"remove {folder} and run `adaptune online` with this study, which makes it again"
+
+
+class DriveLog:
+    """Writes ``trajectory.tum``, ``frames.csv`` and ``selections.csv``, line by line.
+
+    Where the disk is full, the log ends and the drive goes on; `lost` says why. Where the files
+    cannot be made, it raises an OSError, unless the drive `goes_on`, too. `names` are those of the
+    parameters, columns of ``selections.csv``.
+    """
+
+    def __init__(self, folder: Path, names: list[str], *, goes_on: bool = False):
+        self.folder, self.lost = folder, ""
+        self._names = names
+        self._files: dict[str, IO[str]] = {}
+        try:
+            folder.mkdir(parents=True)
+            for name in ("trajectory.tum", "frames.csv", "selections.csv"):
+                # A line is on disk when it is written: the robot may be switched off.
+                file = (folder / name).open("w", buffering=1, newline="", encoding="utf-8")
+                self._files[name] = file
+        except OSError as error:
+            if not goes_on:
+                raise
+            self._end(error)
+        self._write("frames.csv", _csv(FRAME_COLUMNS))
+        self._write("selections.csv", _csv((*SELECTION_COLUMNS, *names)))
+
+    def scan(self, step: RegisteredScan, late: float) -> None:
+        """Note a scan: its pose, and how late that was in seconds."""
+        stamps = np.array([step.stamp], np.int64)
+        (line,) = tum_lines(stamps, step.T_odom_sensor[None])
+        self._write("trajectory.tum", line)
+        self._write("frames.csv", _csv(frame_row(step, late)))
+
+    def choice(self, choice: Choice) -> None:
+        """Note a selection."""
+        self._write("selections.csv", _csv(selection_row(choice, self._names)))
+
+    def close(self) -> None:
+        """Close the files."""
+        for file in self._files.values():
+            try:
+                file.close()
+            except OSError as error:
+                self._end(error)
+
+    def _write(self, name: str, line: str) -> None:
+        if not self.lost:
+            try:
+                self._files[name].write(line)
+            except OSError as error:
+                self._end(error)
+
+    def _end(self, error: OSError) -> None:
+        if not self.lost:
+            self.lost = in_one_line(error)
+            _log.warning("%s: nothing more is recorded (%s); the drive goes on", self.folder, error)
+
+
+def _csv(row: Iterable[Any]) -> str:
+    text = io.StringIO()
+    csv.writer(text).writerow(row)
+    return text.getvalue()

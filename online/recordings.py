@@ -225,7 +225,6 @@ class _Composer:
 
 
 def _poses(trajectory: Trajectory) -> Iterator[tuple[int, Placed]]:
-    """Stamps, positions and quaternions."""
     return zip(trajectory.stamps.tolist(), placed(trajectory.T_world_sensor), strict=True)
 
 

@@ -43,12 +43,7 @@ def is_reference_of(folder: Path, about: manifest.Inputs) -> bool:
 
 
 def check_reference(folder: Path, about: manifest.Inputs) -> None:
-    """Refuse a reference that was made from something else.
-
-    Raises
-    ------
-    StoredReplayError
-    """
+    """Refuse a reference that was made from something else, by a StoredReplayError."""
     if not is_reference_of(folder, about):
         option = "" if (folder / "fixed").exists() else " --untrained"
         raise StoredReplayError(
@@ -121,10 +116,8 @@ class Reference(NamedTuple):
     @classmethod
     def read(cls, study: Study, name: str) -> "Reference":
         """Read the reference of a replayed sequence, if it has one, from beside its replays."""
-        path, length = (
-            study.folder / "replays" / name / "reference.tum",
-            study.config.sub_trajectory,
-        )
+        path = study.folder / "replays" / name / "reference.tum"
+        length = study.config.sub_trajectory
         trajectory = read_tum(path) if path.exists() else None
         if trajectory is not None:
             # Frames in a gap, and across a jump, have no label in training, and get none here.

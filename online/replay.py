@@ -23,7 +23,9 @@ from adaptune.selector import REMEMBERED, SETTLING, AnySelector, Schedule, used_
 from adaptune.space import Selection
 from adaptune.trajectory import Trajectory
 
-# Applies what is selected, and returns to the fixed set where that or the odometry goes wrong.
+_SAMPLED = 10
+"""Scans from one look at the memory to the next."""
+_log = logging.getLogger(__name__)
 
 
 class Choice(NamedTuple):
@@ -44,18 +46,8 @@ class Driver:
     for `REMEMBERED` seconds; a bank keeps its members. Where the baseline has just taken the place
     of another set, the odometry only restarts: it was lost already.
 
-    Parameters
-    ----------
-    odometry
-        A new instance.
-    health
-        The odometry is restarted where its motion is not healthy.
-    fixed
-        What it returns to; None leaves the odometry as it is, and a failed switch is an error.
-    what
-        What is driven, for the log.
-    note
-        Called with every choice, also with those that are not applied.
+    Without a `fixed` set, the odometry stays as it is, and a failed switch is an error. `what` is
+    driven, for the log. `note` is called with every choice, also with those that are not applied.
     """
 
     def __init__(
@@ -96,7 +88,7 @@ class Driver:
 
     @property
     def motions(self) -> Motions:
-        """Over the last scan, see `Tracker.motions`."""
+        """See `Tracker.motions`."""
         return self._tracker.motions
 
     def register(
@@ -124,7 +116,6 @@ class Driver:
         return self._fall_back(stamp, applied, f"the health check found {what}")
 
     def _fall_back(self, stamp: int, failed: Selection, why: str) -> bool:
-        """Apply the fixed set; whether that worked."""
         fixed = self._fixed
         assert fixed is not None
         if failed.weights is None and failed.trial != fixed.trial:
@@ -155,12 +146,6 @@ class Driver:
             _log.warning(
                 "%s: the %s %s at %.1f s", self._what, who, does, self._seconds(choice.stamp)
             )
-
-
-_SAMPLED = 10
-"""Scans from one look at the memory to the next."""
-
-_log = logging.getLogger(__name__)
 
 
 @dataclass(eq=False, repr=False)
@@ -210,11 +195,6 @@ class ReplayRecord:
         return np.array([step.unhealthy is not None for step in self.steps])
 
     @property
-    def registered(self) -> NDArray[np.bool_]:
-        """False where the scan was too poor and the last motion went on, of shape (n,)."""
-        return np.array([step.registered for step in self.steps])
-
-    @property
     def unhealthy(self) -> dict[str, int]:
         """How often the health check found what."""
         return dict(Counter(s.unhealthy for s in self.steps if s.unhealthy is not None))
@@ -230,7 +210,7 @@ class ReplayRecord:
         self._begun = time.process_time()
 
     def end(self, step: RegisteredScan) -> None:
-        """It is done."""
+        """Note where the odometry is, by the scan that has begun."""
         self._cpu += time.process_time() - self._begun
         if self._n % _SAMPLED == 0:
             self.memory = max(self.memory, resident_megabytes())
@@ -240,10 +220,7 @@ class ReplayRecord:
     def finish(self, usage: Usage, other_cpu: float = 0.0) -> Self:
         """Sum up, with what the odometry used, and what else took CPU seconds.
 
-        Raises
-        ------
-        AdaptuneError
-            If there was no scan.
+        An AdaptuneError says that there was no scan.
         """
         if not self._n:
             raise AdaptuneError("there is no scan to replay; check start and stop")

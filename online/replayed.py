@@ -27,18 +27,10 @@ def scene_spans(
 ) -> Spans:
     """The scenes of a drive, as stretches of its time.
 
-    Metres of the road become time by the path that was driven. It is a little longer than the road,
-    because the vehicle strays and shakes: it is scaled to the road's length.
-
-    Parameters
-    ----------
-    legs
-        Name and metres of each scene, in driving order.
-    driven
-        True poses of the whole drive.
-    stamps
-        Of the scans that are shown, nanoseconds: they may be a part of the drive. Edges are seconds
-        since the first of them.
+    `legs` are the name and metres of each scene, in driving order. These become time by the true
+    poses that were `driven`: their path is a little longer than the road, because the vehicle
+    strays and shakes, and is scaled to the road's length. `stamps`, nanoseconds, are those of the
+    scans that are shown, maybe a part of the drive. Edges are seconds since the first of them.
     """
     along = travelled(driven.T_world_sensor)
     names, metres = zip(*legs, strict=True)
@@ -104,8 +96,7 @@ def read_replays(study: Study, name: str) -> ReplayedSequence:
     AdaptuneError
         If a file is damaged, or if `compare` refuses all of them.
     """
-    folder, length = study.folder / "replays" / name, study.config.sub_trajectory
-    reference = Reference.read(study, name)
+    folder, reference = study.folder / "replays" / name, Reference.read(study, name)
     current = current_replays(study, [name])
     if current.modes:
         check_reference(folder, study.sequences.reference(name))
@@ -115,15 +106,8 @@ def read_replays(study: Study, name: str) -> ReplayedSequence:
     if replays:
         stamps = next(iter(replays.values())).trajectory.stamps
         scenes = scenes_along(study.sequences, name, stamps)
-    return ReplayedSequence(
-        name,
-        length,
-        modes,
-        study.odometry.space,
-        scenes,
-        reference.estimated,
-        current.refused,
-    )
+    about = study.odometry.space, scenes, reference.estimated, current.refused
+    return ReplayedSequence(name, reference.length, modes, *about)
 
 
 def scenes_along(sequences: StudySequences, name: str, stamps: NDArray[np.int64]) -> Spans | None:

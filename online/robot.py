@@ -22,13 +22,13 @@ from adaptune.study.config import RealTimeConfig, RosConfig, StudyConfig
 from adaptune.study.driven import ModeError
 from adaptune.study.sequences import StudySequences
 from adaptune.study.study import Study
-from online.drive_log import DriveLog
 from online.live import LiveScans, RosMessages, Uncertainty, placed
 from online.modes import UNTRAINED, WITHOUT_MODEL, Mode, ReplaySetup, needed
 from online.real_time import RealTimeDrive
+from online.record import DriveLog
 from online.replay import Choice, ReplayRecord, Watch
 from online.selector_process import SelectorProcess
-from online.steered import _KEPT, ODOMETRY, SteeredNode
+from online.steered import KEPT, ODOMETRY, SteeredNode
 
 SELECTION_TOPIC = "adaptune/selection"
 
@@ -46,14 +46,8 @@ class DriveRecord(NamedTuple):
 class RobotDrive:
     """A study's odometry, or somebody else's node, on a robot.
 
-    Parameters
-    ----------
-    study
-        The study; ``drives/<time>`` in its folder receives the drive.
-    mode
-        One of `ReplaySetup.modes`, or `untrained`.
-    model_path
-        The error model; None for `untrained` and `baseline`.
+    ``drives/<time>`` in the study's folder receives each drive. The `mode` is one of
+    `ReplaySetup.modes`, or `untrained`; this one and `baseline` need no model.
 
     Raises
     ------
@@ -99,21 +93,13 @@ class RobotDrive:
             self._mode = setup.mode(mode, model)
 
     def run(self, link: RosLink, watch: Watch = lambda _: None) -> DriveRecord:
-        """Drive until Ctrl-C, or until `stop` is called.
-
-        Where the clock goes back, all begins anew.
-
-        `watch` is called after every scan.
-        """
+        """Drive until Ctrl-C or `stop`; where the clock goes back, all begins anew."""
         done = 0
         with ExitStack() as stack:
-            steered = None
-            if self._ros.steer is not None:
-                steered = SteeredNode(link, self._ros.steer, self._points)
-            selector = None
-            if self._mode.selector is not None:
-                period = self._study.config.online.period
-                selector = SelectorProcess(self._mode.selector, period)
+            steer, make = self._ros.steer, self._mode.selector
+            steered = None if steer is None else SteeredNode(link, steer, self._points)
+            selector = make and SelectorProcess(make, self._study.config.online.period)
+            if selector is not None:
                 stack.enter_context(closing(selector))
             self._scans = scans = self._topics(link)
             publisher = _Publisher(link, self._ros, self._study.config.sub_trajectory, scans)
@@ -163,7 +149,7 @@ class RobotDrive:
                 _log.warning("the fixed set cannot be applied: %s", error)
             record = ReplayRecord(1.0, publisher.choice)
             for name in ("steps", "choices", "rejected", "late", "waited"):
-                setattr(record, name, deque(maxlen=_KEPT))
+                setattr(record, name, deque(maxlen=KEPT))
             health = self._study.config.health
             drive = RealTimeDrive(odometry, health, self._settings, selector, record, "drive")
             if self._stopped:
@@ -237,7 +223,6 @@ def _named(topic: str | None, key: str) -> str:
 
 
 def _new_folder(parent: Path) -> Path:
-    """A folder named by the time, which is not there yet."""
     name = datetime.now(UTC).strftime("%Y-%m-%d_%H-%M-%S")
     numbers = itertools.count(2)
     folder = parent / name

@@ -41,28 +41,10 @@ class Answer(NamedTuple):
 
 
 class SelectorProcess:
-    """Runs a `TimedSelector` in another process.
+    """Runs the `TimedSelector` of what `make` makes in another process.
 
     Nothing waits longer than it is told to: a thread sends the scans. If the process is behind by
     `SLOTS` scans, it does not get the next one, but all of its motion later.
-
-    Parameters
-    ----------
-    make
-        Makes the selector in that process.
-    period
-        Seconds between selections.
-
-    Attributes
-    ----------
-    unseen : int
-        Scans that the process did not get.
-    cpu : float
-        Seconds of CPU time for the scans that it got.
-    alive : bool
-        Whether the process was there when it was last used.
-    fixed : Selection
-        What the selector falls back to.
 
     Raises
     ------
@@ -71,7 +53,10 @@ class SelectorProcess:
     """
 
     def __init__(self, make: Make, period: float):
-        self.period, self.unseen, self.cpu, self.alive = period, 0, 0.0, True
+        self.period = period  # seconds between selections
+        self.unseen = 0  # scans that the process did not get
+        self.cpu = 0.0  # seconds of CPU time for those that it got
+        self.alive = True  # when it was last used
         self._owed = 0  # answers
         self._moved: Motions | None = None  # over the scans that were not shown
         self._stamp = 0  # of the last scan, shown or not
@@ -91,7 +76,7 @@ class SelectorProcess:
         if isinstance(started, str):
             self.close()
             raise AdaptuneError(f"the selector's process: {started}")
-        self.fixed = started
+        self.fixed = started  # what the selector falls back to
 
     def show(self, stamp: int, scan: Scan, motions: Motions, seconds: float = 0.0) -> bool:
         """Show a scan, see `TimedSelector.update`; whether the process gets it.
@@ -101,7 +86,7 @@ class SelectorProcess:
         # Where the clock goes back, another drive begins, see `TimedSelector`.
         before = None if self._stamp - stamp > BACK else self._moved
         self._stamp = stamp
-        moved = motions if before is None else _one_after_the_other(before, motions)
+        moved = motions if before is None else _joined(before, motions)
         self._take_answers()
         if self._owed == SLOTS:
             self._take_answers(seconds)
@@ -161,15 +146,13 @@ class SelectorProcess:
             self._process.join()
 
 
-def _one_after_the_other(first: Motions, second: Motions) -> Motions:
-    """The motion over two scans."""
+def _joined(first: Motions, second: Motions) -> Motions:
     members = {trial: first.members[trial] @ T for trial, T in second.members.items()}
     T_previous_current = first.T_previous_current @ second.T_previous_current
     return Motions(T_previous_current, members, second.starts)
 
 
 def _run(connection: Connection, make: Make, period: float, cores: list[int]) -> None:
-    """Be the other process."""
     os.sched_setaffinity(0, cores)
     with contextlib.suppress(EOFError, OSError, KeyboardInterrupt):
         try:

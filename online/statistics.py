@@ -9,10 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune.metrics import (
-    bootstrap,
-    cap,
-)
+from adaptune.metrics import bootstrap, cap
 from adaptune.study.oracle import OracleErrors
 from adaptune.trajectory import Trajectory
 from online.record import StoredReplay, switched
@@ -174,40 +171,30 @@ def compare_modes(
     Errors are those at the scans that no replay has dropped.
     """
     yardstick = "fixed" if "fixed" in replays else "baseline"
-    empty = [ComparisonRow(name, mode, yardstick=yardstick) for mode in replays]
-    trajectories = {mode: replay.trajectory for mode, replay in replays.items()}
-    common = reduce(np.intersect1d, (odometry.stamps for odometry in trajectories.values()))
-    errors = {
-        mode: reference.errors(odometry)[np.isin(odometry.stamps, common)]
-        for mode, odometry in trajectories.items()
-    }
-    judged = JudgedModes(name, empty, errors, reference.block)
-    rows = (_measured(row, replays[row.mode], reference, common) for row in empty)
+    common = reduce(np.intersect1d, (replay.trajectory.stamps for replay in replays.values()))
+    rows, errors = [], {}
+    for mode, replay in replays.items():
+        odometry = replay.trajectory
+        kept = np.isin(odometry.stamps, common)
+        errors[mode] = reference.errors(odometry)[kept]
+        of_common = Trajectory(odometry.stamps[kept], odometry.T_world_sensor[kept])
+        row = ComparisonRow(name, mode, yardstick=yardstick, standard=reference.standard(of_common))
+        rows.append(_measured(row, replay, reference))
+    judged = JudgedModes(name, rows, errors, reference.block)
     return judged._replace(rows=[_with_errors(row, judged) for row in rows])
 
 
-def _measured(
-    row: ComparisonRow,
-    replay: StoredReplay,
-    reference: Reference,
-    common: NDArray[np.int64],
-) -> ComparisonRow:
-    """Fill in what was measured while driving, and the errors of the whole trajectory.
-
-    The latter are those of the scans with the stamps that all replays have in `common`.
-    """
+def _measured(row: ComparisonRow, replay: StoredReplay, reference: Reference) -> ComparisonRow:
+    """Fill in what was measured while driving."""
     kind = "estimated" if reference.estimated else "given"
     summary, odometry = replay.summary, replay.trajectory
     restarts = (odometry.stamps[replay.restarted] - odometry.stamps[0]) * 1e-9
     estimated, interval = _estimated(replay.estimated)
-    kept = np.isin(odometry.stamps, common)
-    of_common = Trajectory(odometry.stamps[kept], odometry.T_world_sensor[kept])
     return replace(
         row,
         restarts=summary.restarts,
         switches=int(switched(replay.choices).sum()),
         poor_scans=summary.poor_scans,
-        standard=reference.standard(of_common),
         first_restart=float(restarts[0]) if len(restarts) else None,
         unhealthy=tuple(summary.unhealthy),
         estimated=estimated,
@@ -223,7 +210,6 @@ def _measured(
 
 
 def _with_errors(row: ComparisonRow, judged: JudgedModes) -> ComparisonRow:
-    """Fill in errors and intervals, where something is known."""
     mine, others = judged.pair(row.mode)
     if not len(mine):
         return row
@@ -256,14 +242,8 @@ def allowing_for(
     quadrature: taken out, errors become smaller, and ratios lie further from 1. If a mode errs as
     the reference does, as one that averages motions may, that part of its error is not seen.
 
-    Parameters
-    ----------
-    rte, ratio
-        Intervals of a mean error in percent, and of its ratio to that of another mode.
-    other
-        Mean error of that mode in percent, as measured.
-    error
-        Of the reference, percent: any from 0 on up to this is possible.
+    `rte` and `ratio` are intervals of a mean error in percent, and of its ratio to that of another
+    mode, `other`. The reference errs by any percentage up to `error`.
     """
 
     def true(mean: float) -> float:
@@ -298,16 +278,9 @@ def _estimated(estimates: NDArray[np.float64]) -> tuple[float | None, Interval]:
 
 
 def oracle_row(judged: JudgedModes, oracle: OracleErrors, fixed: int) -> ComparisonRow | None:
-    """Row of the best set of the sequence; None where nothing is known.
+    """Row of the best set of the sequence by `oracle`; None where nothing is known.
 
-    Parameters
-    ----------
-    judged
-        The modes on the sequence.
-    oracle
-        Errors of some sets there.
-    fixed
-        Trial number of the fixed set; without its trial, nothing is known.
+    `fixed` is the trial number of the fixed set: without its trial, nothing is known.
     """
     yardstick = judged.rows[0].yardstick
     rte = next(row.rte for row in judged.rows if row.mode == yardstick)

@@ -29,7 +29,7 @@ SILENT = 10
 """Scans of which most have no pose; then the log says so."""
 _COMMAND = 5.0
 """Seconds for a command that sets a parameter."""
-_KEPT = 1000
+KEPT = 1000
 """Poses of a node, and scans of a drive, that are kept."""
 _GAP = 1.0
 """Seconds between poses over which a pose is interpolated."""
@@ -46,7 +46,7 @@ class SteeredNode(OdometryInstance):
         extrinsic = settings.extrinsic
         self._T_base_sensor = np.eye(4) if extrinsic is None else to_pose(extrinsic)
         self._news = threading.Condition()
-        self._poses: deque[tuple[int, Poses]] = deque(maxlen=_KEPT)
+        self._poses: deque[tuple[int, Poses]] = deque(maxlen=KEPT)
         self._begun: tuple[int, Poses] | None = None
         self._T_odom_node: Poses | None = None
         self._steering = Steering(

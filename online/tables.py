@@ -63,7 +63,6 @@ def last_rows(rows: Sequence[ComparisonRow]) -> list[ComparisonRow]:
 
 
 def _of_modes(rows: Sequence[ComparisonRow], length: float) -> Listing:
-    """One row a mode."""
     last = last_rows(rows)
     cells = [row.summary_columns() for row in last]
     # A column in which nothing is known, or nothing happened, tells nothing.
@@ -76,11 +75,12 @@ def _of_modes(rows: Sequence[ComparisonRow], length: float) -> Listing:
 
 
 def _caption(rows: Sequence[ComparisonRow], shown: Mapping[str, Any]) -> str:
-    of, to = rows[0].yardstick, YARDSTICKS[rows[0].yardstick]
+    yardstick = rows[0].yardstick
     said = [
         "Intervals of 95 %: paired block bootstrap, seed 0, where there is enough to draw from; "
         f"with fewer than {MIN_RECORDINGS} test recordings, they speak of these alone.",
-        f"vs {of}: geometric mean of the ratios to the {to}'s RTE." * (rows[-1].sequence == ALL),
+        f"vs {yardstick}: geometric mean of the ratios to the {YARDSTICKS[yardstick]}'s RTE."
+        * (rows[-1].sequence == ALL),
         "Worst tenth: that mean over the worst tenth of the stretches." * ("worst tenth" in shown),
         "Better / worse: sequences on which the error is less or more by 1 %."
         * ("better / worse" in shown),
@@ -101,17 +101,16 @@ def _of_sequences(rows: Sequence[ComparisonRow], length: float) -> Listing:
     judged = len({row.reference for row in rows if row.sequence != ALL}) > 1
     cells = []
     for name in dict.fromkeys(row.sequence for row in rows):
-        of = {row.mode: row for row in rows if row.sequence == name}
+        by_mode = {row.mode: row for row in rows if row.sequence == name}
         line: dict[str, Any] = {"sequence": "average" if name == ALL else name}
-        line |= {mode: of[mode].rte if mode in of else None for mode in modes}
+        line |= {mode: by_mode[mode].rte if mode in by_mode else None for mode in modes}
         if judged:
-            line["reference"] = "" if name == ALL else next(iter(of.values())).reference
+            line["reference"] = "" if name == ALL else next(iter(by_mode.values())).reference
         cells.append(line)
     return Listing(f"RTE [%] over {length:g} m on each sequence", cells)
 
 
 def _standard(rows: Sequence[ComparisonRow]) -> Listing | None:
-    """Errors as evo and KITTI's benchmark define them."""
     last = [row for row in last_rows(rows) if row.standard is not None]
     if not last:
         return None

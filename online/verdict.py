@@ -52,7 +52,6 @@ def decided(rows: Sequence[ComparisonRow], worth: float = WORTH) -> ComparisonRo
 
 
 def _surely_better(row: ComparisonRow, other: ComparisonRow) -> bool:
-    """Whether a mode has less error, by more than chance where that is known."""
     ratio = _to(row, other)
     return ratio.value < 1.0 and (ratio.interval is None or ratio.interval[1] < 1.0)
 
@@ -90,16 +89,8 @@ def verdict(
 ) -> list[str]:
     """What to do, and why, in at most three sentences.
 
-    Parameters
-    ----------
-    rows
-        Those over all sequences come last.
-    length
-        Metres of a sub-trajectory.
-    obstacle
-        Why nothing adapts, if nothing does.
-    worth
-        Share of the error that adapting has to spare.
+    Of the `rows`, those over all sequences come last. `length` is a sub-trajectory's, in metres;
+    `obstacle` says why nothing adapts, if nothing does; for `worth` see `decided`.
     """
     last = {row.mode: row for row in last_rows(rows)}
     if (best := decided(rows, worth)) is None:
@@ -197,7 +188,6 @@ def _why_not(
     obstacle: str,
     worth: float,
 ) -> list[str]:
-    """Why not to adapt."""
     if main is None:
         return [f"Adapting was not tried: {obstacle}."] if obstacle else []
     if _is_yardstick(main):
@@ -217,7 +207,6 @@ def _why_not(
 
 
 def _is_yardstick(row: ComparisonRow) -> bool:
-    """Whether a mode did what the yardstick did."""
     # A bank whose other members rest moves as the fixed set does, but for rounding.
     return row.ratio is not None and abs(row.ratio - 1.0) < ROUNDING and not row.switches
 
@@ -253,21 +242,19 @@ def remarks(rows: Sequence[ComparisonRow]) -> list[str]:
 
 def _rivals(rows: Sequence[ComparisonRow]) -> list[str]:
     """How what adapts compares on the same frames with what costs as much, or chooses nothing."""
-    main, last = adapting(rows), {row.mode: row for row in last_rows(rows)}
-    said = []
-    for mode, ratio in ({} if main is None else main.against).items():
-        if mode in (*RIVALS, EVEN) and main is not None:
-            what, cost = RIVAL_WORDS.get(mode, "the same bank with even weights"), ""
-            other = last.get(mode)
-            if other is not None and other.cpu_ms is not None and main.cpu_ms is not None:
-                cost = f", at {main.cpu_ms:.1f} ms of CPU time a scan against {other.cpu_ms:.1f}"
-            has = f"`{main.mode}` has {ratio.value:.2f} times the error of {what}"
-            said.append(f"{has} ({_interval(ratio)}){cost}.")
+    if (main := adapting(rows)) is None:
+        return []
+    costs, said = {row.mode: row.cpu_ms for row in last_rows(rows)}, []
+    for mode in (mode for mode in main.against if mode in (*RIVALS, EVEN)):
+        what, ratio = RIVAL_WORDS.get(mode, "the same bank with even weights"), main.against[mode]
+        has = f"`{main.mode}` has {ratio.value:.2f} times the error of {what} ({_interval(ratio)})"
+        if main.cpu_ms is not None and (cost := costs.get(mode)) is not None:
+            has += f", at {main.cpu_ms:.1f} ms of CPU time a scan against {cost:.1f}"
+        said.append(f"{has}.")
     return said
 
 
 def _judges(rows: Sequence[ComparisonRow]) -> list[str]:
-    """A sentence about every sequence that an estimated reference judges."""
     judged = {row.sequence: row for row in rows if row.sequence != ALL}
     said = []
     for name, row in judged.items():
@@ -337,7 +324,6 @@ def _kept_up(rows: Sequence[ComparisonRow]) -> list[str]:
 
 
 def _late(rows: Sequence[ComparisonRow]) -> list[str]:
-    """For each sequence a sentence about an odometry that gave its first pose late."""
     late: dict[str, list[float]] = {}
     for row in rows:
         if row.first_pose:
@@ -350,7 +336,6 @@ def _late(rows: Sequence[ComparisonRow]) -> list[str]:
 
 
 def _restarts(rows: Sequence[ComparisonRow]) -> list[str]:
-    """For each sequence a sentence about the modes that the health check restarted."""
     said = []
     for name in dict.fromkeys(row.sequence for row in rows if row.first_restart is not None):
         mine = [row for row in rows if row.sequence == name]

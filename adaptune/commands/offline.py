@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from adaptune.commands.terminal import (
+    BUYS,
     Cluster,
     Folder,
     Override,
@@ -22,10 +23,9 @@ from adaptune.commands.terminal import (
     say_next,
     say_next_of_study,
     say_next_of_trained,
-    say_next_online,
+    show_front,
     show_table,
 )
-from adaptune.commands.trained import BUYS, show_front
 from adaptune.errors import AdaptuneError, Finding
 from adaptune.files import write_text
 from adaptune.tuning.asked import check_no_study
@@ -98,7 +98,8 @@ def offline(
         "Each set is driven as `adaptune online` does it. The drives of the finalists along whole "
         "recordings decide which set is the fixed one.",
     )
-    say_next_of_trained(loaded, bool(model.expected))
+    # Nothing can be left out of a single stretch.
+    say_next_of_trained(loaded, validate=bool(model.expected))
 
 
 def trials(
@@ -149,7 +150,7 @@ def trials(
         if (number := next(same, None)) is not None:
             say(f"The fixed set is trial {number}, as drives along whole recordings decided.")
     if loaded.model_path.exists():
-        say_next_of_trained(loaded, len(names) > 1)
+        say_next_of_trained(loaded, validate=len(names) > 1)
     else:
         say_next_of_study("run the trials that are left, fit", "offline")
 
@@ -181,7 +182,7 @@ def validate(
         "mean over the stretches, what is expected elsewhere.",
     )
     say(f"Tables and picture: {loaded.folder / 'validation'}.*, {loaded.folder / 'stretches'}.*")
-    say_next_online(loaded)
+    say_next_of_trained(loaded, validate=False)
 
 
 def cost(
@@ -253,7 +254,6 @@ def reference(
 
 
 def _say_estimate(stored: "StoredEstimate", unknown: list[Finding], length: float) -> None:
-    """What the estimated reference is worth."""
     say(f"Estimated reference: {stored.metres:.1f} m, {stored.scans:,} scans.")
     error = stored.error(length)
     if math.isnan(error):

@@ -112,17 +112,18 @@ def online(
     if oracle:
         _oracle(loaded, cluster)
     else:
-        from adaptune.tuning.tuned import replay_missing
+        from adaptune.tuning.tuned import alone
+        from online.modes import run_replays, run_untrained
 
-        with progress() as show:
-            made = replay_missing(loaded, model, untrained=untrained, show=show)
+        with progress() as show, alone(loaded):
+            path = model or loaded.model_path
+            made = run_untrained(loaded, show) if untrained else run_replays(loaded, path, show)
         there = f"{made} replays made" if made else "All replays were there already"
         say(f"{there}: {loaded.folder / 'replays'}/")
     say_next_of_study("table and pictures of the modes", "compare")
 
 
 def _oracle(loaded: "OfflineStudy", cluster: str | None) -> None:
-    """Run sets of the model on the test sequences as trials."""
     from offline.train import run_oracle
 
     with progress() as show:
@@ -138,7 +139,6 @@ def _oracle(loaded: "OfflineStudy", cluster: str | None) -> None:
 def _drive(
     loaded: "OfflineStudy", mode: str | None, model: Path | None, *, untrained: bool, ros2: bool
 ) -> None:
-    """Drive on a robot until Ctrl-C."""
     from adaptune.ros.relay import local_ros1
     from adaptune.ros.ros2 import local_ros2
     from adaptune.tuning.tuned import alone
@@ -263,7 +263,6 @@ WORSE = 3
 
 
 def _given(options: Mapping[str, object]) -> str:
-    """The names of options that are given."""
     return ", ".join(name for name, value in options.items() if value)
 
 
@@ -292,7 +291,6 @@ def _gate(
 
 
 def _share_of(text: str, key: str) -> float:
-    """A percentage as a share."""
     with suppress(ValueError):
         if 0.0 <= (share := float(text.removesuffix("%")) / 100.0) < math.inf:
             return share

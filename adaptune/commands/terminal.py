@@ -57,6 +57,32 @@ def show_table(title: str, rows: Sequence[Mapping[str, Any]], caption: str = "")
     console.print(*tables_within(Listing(title, rows, caption), console.width), sep="\n")
 
 
+def show_front(rows: Sequence[Mapping[str, Any]], title: str, caption: str) -> None:
+    """The table of what CPU time buys."""
+    shown = [
+        {
+            "": ("-> " if row["recommended"] else "") + row["what"],
+            **{key: row[key] for key in ("cost [ms]", "99 % [ms]", "memory [MB]") if key in row},
+            "RTE [%]": row["error [%]"],
+            "vs baseline": row["vs baseline"],
+            "95 %": None
+            if row["low"] is None or row["low"] != row["low"]
+            else f"{row['low']:.2f}-{row['high']:.2f}",
+            "parameters": row["parameters"],
+        }
+        for row in rows
+    ]
+    show_table(title, shown, caption)
+
+
+BUYS = (
+    "What CPU time buys, in training",
+    "The arrow marks the fixed set: the best that costs no more than the baseline, or the budget, "
+    "if it is better than the baseline by a standard error (two, for a single recording). RTE is "
+    "that of whole drives, capped where track is lost; a bank's is of parts left out of training.",
+)
+
+
 def begin_work() -> None:
     """From here on, let Ctrl-C raise an exception, so that what is begun is put in order."""
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
@@ -98,19 +124,14 @@ def say_next_of_study(why: str, command: str, first: str = "") -> None:
     say_next(why, command, *_study_words, first=first)
 
 
-def say_next_online(study: "OfflineStudy") -> None:
-    """Name the replay of the test sequences, if there are any."""
+def say_next_of_trained(study: "OfflineStudy", validate: bool) -> None:
+    """Name what follows training: to `validate` it, or to replay the test sequences, if any."""
+    if validate:
+        say_next_of_study("what does adapting gain elsewhere?", "validate")
+        return
     first = f"name sequences for the `test` of {_study_words[0]}; then "
     why = "replay the test sequences in every mode"
     say_next_of_study(why, "online", "" if study.config.test else first)
-
-
-def say_next_of_trained(study: "OfflineStudy", enough: bool) -> None:
-    """Name what follows training: nothing can be left out of a single stretch."""
-    if enough:
-        say_next_of_study("what does adapting gain elsewhere?", "validate")
-    else:
-        say_next_online(study)
 
 
 StudyFile = Annotated[

@@ -1,5 +1,6 @@
 """Commands that begin with recordings: look at one, or tune an odometry on them."""
 
+from collections.abc import Sequence
 from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -8,6 +9,7 @@ import typer
 
 from adaptune.commands.online import Details, say_compared
 from adaptune.commands.terminal import (
+    BUYS,
     As,
     Cluster,
     Given,
@@ -18,15 +20,8 @@ from adaptune.commands.terminal import (
     progress,
     say,
     say_next,
-    show_table,
-)
-from adaptune.commands.trained import (
-    BUYS,
-    say_grown,
-    say_odometries,
-    say_recordings,
-    say_untuned,
     show_front,
+    show_table,
 )
 from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
@@ -34,6 +29,9 @@ from adaptune.tuning.asked import TRIALS, Asked, check_no_study
 
 if TYPE_CHECKING:
     from adaptune.recording.fleet import Reading
+    from adaptune.tuning.tuned import Tuned
+    from offline.config import OfflineStudy
+    from offline.train import Training
 
 
 def inspect(
@@ -234,7 +232,7 @@ def tune(
     when a folder holds more recordings than before.
     Of a ROS 2 system (an image, or `ros2 launch ...`), it writes a study to fill in.
     """
-    from adaptune.tuning.systems import LACKING, proposed_system
+    from adaptune.tuning.studies import LACKING, proposed_system
     from adaptune.tuning.tuned import tune_asked
 
     odometry = odometry or ("gicp" if config is None else "kiss_icp")
@@ -250,13 +248,84 @@ def tune(
         )
         say(f"  adaptune inspect {path}")
         return
-    say_untuned(tuned.study)
+    _say_untuned(tuned.study)
     say_compared(tuned.study, tuned.comparison, tuned.page, details=details)
     for sentence in (tuned.training.elsewhere, *tuned.training.failed):
         say(sentence)
     show_front(tuned.training.front, *BUYS)
     if tuned.more:
-        say_grown(tuned.more, tuned.before, tuned.fixed)
-    say_recordings(tuned)
+        _say_grown(tuned.more, tuned.before, tuned.fixed)
+    _say_recordings(tuned)
     say_odometries(tuned.study, tuned.training)
     say_next("replays to look at in Foxglove", "record", tuned.study.folder)
+
+
+def _say_untuned(study: "OfflineStudy") -> None:
+    """Name the parameters that are not tuned because the user's file does not hold them."""
+    from adaptune.odometry.registry import ODOMETRIES, odometry_class
+
+    for own in study.config.odometries.values():
+        if own.name in ODOMETRIES and (config := own.settings.get("config")):
+            known = odometry_class(own.name).space.names
+            if lacking := [name for name in known if name not in study.odometry.space.names]:
+                say(f"Not tuned, because {config} does not hold them: {', '.join(lacking)}.")
+
+
+def _say_grown(more: Sequence[str], before: Any, now: Any) -> None:
+    """What recordings that were not there before have changed."""
+    from adaptune.space import in_words
+
+    changed = "the recommended set is the same as before"
+    if before is not None and before != now:
+        names = [name for name in now if now[name] != before.get(name)]
+        old, new = (in_words({name: of.get(name, "-") for name in names}) for of in (before, now))
+        changed = f"recommended is {new} instead of {old}"
+    say(f"New in training: {', '.join(more)}; {changed}.")
+
+
+def _say_recordings(tuned: "Tuned") -> None:
+    """What the other recordings recommend for each, the worst first; or what a third would add."""
+    from adaptune.tuning.tuned import left_out_rows
+
+    rows = left_out_rows(tuned.training, tuned.comparison)
+    if len(tuned.training.rows) < 2 or len(rows) < 3:
+        say(
+            "With three recordings, each would also be left out in turn: the table would say "
+            "where the recommended set does worst."
+        )
+        return
+    show_table(
+        "Each recording left out, the worst first",
+        rows,
+        "Recommended is the finalist that the others choose; for the test, the fixed set.",
+    )
+
+
+def say_odometries(study: "OfflineStudy", training: "Training") -> None:
+    """Of several odometries, what each gives with its own parameters and tuned, in training."""
+    from adaptune.space import ODOMETRY
+    from offline.front import COST
+
+    labels = list(study.config.odometries)
+    if len(labels) < 2:
+        return
+    rows = []
+    for label in labels:
+        mine = [row for row in training.trials if row[ODOMETRY] == label]
+        known = [row for row in mine if row["mean"] is not None]
+        best = min(known, key=lambda row: row["mean"], default=None)
+        rows.append(
+            {
+                "odometry": label,
+                "its own parameters [%]": mine[0]["mean"] if mine else None,
+                "tuned [%]": None if best is None else best["mean"],
+                COST: None if best is None else best[COST],
+            }
+        )
+    rows.sort(key=lambda row: row["tuned [%]"] if row["tuned [%]"] is not None else float("inf"))
+    fixed = training.model.sets[training.model.fixed][ODOMETRY]
+    say(
+        f"Best odometry in training: {rows[0]['odometry']}. On the test, the fixed set is "
+        f"{fixed}'s, the baseline {labels[0]}'s; to see another there, name it alone (--odometry)."
+    )
+    show_table("RTE of each odometry in training", rows)

@@ -76,8 +76,9 @@ def recorded(asked: Asked, show: Progress) -> "tuple[dict[str, Inspection], list
     tested, others = (recordings_at(p, asked.reading) for p in (asked.test, asked.recordings))
     kept = {path.resolve() for path in tested}
     paths = [*(path for path in others if path.resolve() not in kept), *tested]
+    resolved = [path.resolve() for path in paths]
     for path in paths:
-        if [one.resolve() for one in paths].count(path.resolve()) > 1:
+        if resolved.count(path.resolve()) > 1:
             raise AdaptuneError(f"{path}: is named twice; the test needs a recording of its own")
     if tested and len(paths) == len(tested):
         raise AdaptuneError("--test: leaves no recording to tune on")
@@ -86,12 +87,12 @@ def recorded(asked: Asked, show: Progress) -> "tuple[dict[str, Inspection], list
             f"--reference {asked.reference}: is a file, and of {len(paths)} recordings each needs "
             f"its own; write a study file, see docs/your-bag.md"
         )
-    found = [usable(path, asked.points, asked.reference, show) for path in paths]
-    check_alike(found)
+    inspections = [usable(path, asked.points, asked.reference, show) for path in paths]
+    check_alike(inspections)
     named: dict[str, Inspection] = {}
-    for one in found:
-        names = chain([one.name], (f"{one.name}_{i}" for i in count(2)))
-        named[next(name for name in names if name not in named)] = one
+    for inspection in inspections:
+        names = chain([inspection.name], (f"{inspection.name}_{i}" for i in count(2)))
+        named[next(name for name in names if name not in named)] = inspection
     return named, list(named)[len(paths) - len(tested) :]
 
 
@@ -105,13 +106,13 @@ def usable(path: Path, points: str | None, reference: str | None, show: Progress
     found = inspect_file(path, False, show)
     clouds = [topic for topic in found.topics.values() if topic.type in CLOUDS]
     if len(clouds) > 1 and points is None:
-        each = ", ".join(f"{one.name} ({one.count:,} of {one.type})" for one in clouds)
+        each = ", ".join(f"{topic.name} ({topic.count:,} of {topic.type})" for topic in clouds)
         raise AdaptuneError(
             f"{path}: has {len(clouds)} topics of point clouds: {each}; name one with --points"
         )
     recording_config(found, points, reference)
     if reference is None and found.missing["offline"]:
-        why = "; ".join(str(one) for one in found.findings if one.of == "reference")
+        why = "; ".join(str(finding) for finding in found.findings if finding.of == "reference")
         _log.warning("%s: its reference does not serve (%s): one is estimated", path, why)
         found.given["reference"] = "estimated"
     return found

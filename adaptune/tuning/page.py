@@ -78,7 +78,6 @@ def _search(study: OfflineStudy) -> PageSection:
 
 
 def _settings(config: OfflineStudyConfig) -> PageSection:
-    """The study's settings, a row each."""
 
     def leaves(value: object, key: str) -> Iterator[tuple[str, object]]:
         if isinstance(value, dict) and value:

@@ -12,7 +12,7 @@ from adaptune.errors import AdaptuneError
 from adaptune.files import plain_name
 from adaptune.progress import Progress
 from adaptune.tuning.asked import Asked, recorded
-from adaptune.tuning.systems import is_image
+from adaptune.tuning.studies import is_image
 from adaptune.tuning.tuned import alone
 from adaptune.yaml12 import Document, YamlError
 
@@ -88,7 +88,6 @@ def _driven(given: Sequence[str], asked: Asked, show: Progress) -> "list[Offline
 
 
 def _entry(given: str, odometry: str) -> dict[str, Any]:
-    """What a study says of the odometry of a side."""
     from adaptune.odometry.base import ToolSettings
     from adaptune.odometry.registry import is_user_class, odometry_class
 
@@ -117,7 +116,6 @@ def _entry(given: str, odometry: str) -> dict[str, Any]:
 
 
 def _named(given: str) -> dict[str, Any]:
-    """An odometry by its name, its command, or its image."""
     words = shlex.split(given)
     if len(words) > 1:
         # It runs in a folder of its own.

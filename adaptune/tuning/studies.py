@@ -1,6 +1,8 @@
-"""A study of recordings alone: what it trains and tests on, over which metres, and how long."""
+"""A study of recordings: what it trains and tests on, over which metres, and how long."""
 
 import logging
+import re
+import shlex
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -10,8 +12,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from adaptune import manifest
-from adaptune.errors import AdaptuneError
-from adaptune.files import write_text
+from adaptune.errors import AdaptuneError, NotInstalledError
+from adaptune.files import plain_name, write_text
 from adaptune.progress import Progress
 from adaptune.tuning.asked import EACH, TRIALS, Asked, odometries_of, recorded
 from adaptune.yaml12 import Document, YamlError, YamlPath, dump
@@ -46,6 +48,8 @@ _COMMENTS: dict[YamlPath, str] = ROLES | {
     ("health", "max_speed"): "m/s: twice the speed of the fastest second.",
     ("offline",): "Parameter sets to try, or the time for it.",
 }
+LACKING = "FILL_IN"
+"""Stands in the study of a ROS system where the user knows more."""
 ASKED = "asked.json"
 """For what the study in a folder was decided."""
 
@@ -78,9 +82,10 @@ def roles(
 
 def undo_motion(recordings: Sequence["Inspection"], odometries: Sequence[str]) -> None:
     """Propose to undo the motion within scans for odometries that do not do so themselves."""
-    for one in recordings if set(odometries) <= DISTORTED else ():
-        if one.scan is not None and one.scan.times is not None and one.scan.times.any():
-            one.given["compensate"] = "constant_velocity"
+    for recording in recordings if set(odometries) <= DISTORTED else ():
+        scan = recording.scan
+        if scan is not None and scan.times is not None and scan.times.any():
+            recording.given["compensate"] = "constant_velocity"
 
 
 def proposed(found: "Inspection", deep: bool, show: Progress) -> tuple[float | None, float, str]:
@@ -139,7 +144,7 @@ def written(asked: Asked, folder: Path, show: Progress) -> tuple[Path, list[str]
         )
     if others := manifest.changes(before, asked.inputs):
         numbered = (folder.with_name(f"{folder.resolve().name}_{n}") for n in count(2))
-        free = next(one for one in numbered if not one.exists())
+        free = next(other for other in numbered if not other.exists())
         raise AdaptuneError(
             f"{path}: another `adaptune tune` made it: {'; '.join(others)}; name the same to "
             f"resume it, or tune in a folder of its own with `--folder {free}`"
@@ -172,7 +177,7 @@ def _decided(asked: Asked, folder: Path, show: Progress) -> dict[str, Any]:
     rest = [name for name in named if name not in test]
 
     def study(length: float, share: float | None = None) -> dict[str, Any]:
-        sequences = {name: dict(one.given) for name, one in named.items()}
+        sequences = {name: dict(recording.given) for name, recording in named.items()}
         return {"sequences": sequences, **roles(rest, length, odometry, share, test)} | spent
 
     def loaded() -> "OfflineStudy":
@@ -192,28 +197,28 @@ def _grown(path: Path, asked: Asked, show: Progress) -> list[str]:
     try:
         document = Document.of_file(path)
         data: Any = document.data
-        known = {str(one.get(key)) for one in data["sequences"].values() for key in SOURCES}
+        known = {str(entry.get(key)) for entry in data["sequences"].values() for key in SOURCES}
         if not all(isinstance(data.get(role) or [], list) for role in ("training", "test")):
             return []
         offline: dict[str, Any] = {} | (data.get("offline") or {})
     except (YamlError, AttributeError, KeyError, TypeError):
         return []  # loading it says what is wrong
-    tested = [one.resolve() for one in recordings_at(asked.test, asked.reading)]
-    others = [one.resolve() for one in recordings_at(asked.recordings, asked.reading)]
+    tested = [bag.resolve() for bag in recordings_at(asked.test, asked.reading)]
+    others = [bag.resolve() for bag in recordings_at(asked.recordings, asked.reading)]
     there = list(dict.fromkeys([*others, *tested]))
-    new = [one for one in there if known.isdisjoint({str(one), str(one.parent)})]
+    new = [bag for bag in there if known.isdisjoint({str(bag), str(bag.parent)})]
     if not new:
         return []
     named, _ = recorded(asked._replace(recordings=there, test=(), reading="one"), show)
     undo_motion([*named.values()], odometries_of(asked.odometry, False))
-    added = {name: one for name, one in named.items() if one.path in new}
+    added = {name: recording for name, recording in named.items() if recording.path in new}
     if taken := [name for name in added if name in data["sequences"]]:
         raise AdaptuneError(
             f"{path}: sequences.{taken[0]} is another recording; rename the new one"
         )
     into: dict[str, list[str]] = {
-        "training": [name for name, one in added.items() if one.path not in tested],
-        "test": [name for name, one in added.items() if one.path in tested],
+        "training": [name for name, recording in added.items() if recording.path not in tested],
+        "test": [name for name, recording in added.items() if recording.path in tested],
     }
     roles_now = {role: list(data.get(role) or ()) for role in into}
     n, before = offline.get("stretches", 12), len(roles_now["training"]) or 1
@@ -221,7 +226,7 @@ def _grown(path: Path, asked: Asked, show: Progress) -> list[str]:
         # As many stretches of each as before: the trials that there are stay.
         each, now = max(4, -(-n // before)), before + len(into["training"])
         data["offline"] = offline | {"stretches": each * now}
-    data["sequences"] |= {name: one.given for name, one in added.items()}
+    data["sequences"] |= {name: recording.given for name, recording in added.items()}
     for role, names in into.items():
         # 00 is a name there.
         data[role] = [
@@ -324,3 +329,65 @@ def _estimate(study: "OfflineStudy", names: Sequence[str], show: Progress) -> No
         if not there:
             shutil.rmtree(study.folder)
         raise AdaptuneError(f"{error}; or give a --reference") from error
+
+
+def _system_of(given: str) -> dict[str, Any] | None:
+    """The image or the launch command of a ROS system, as settings; None if it is none."""
+    words = shlex.split(given)
+    if words[:1] == ["ros2"]:
+        if not any("{parameters}" in word for word in words):
+            words.append(f"{LACKING}:={{parameters}}")
+        return {"command": words}
+    if not is_image(given):
+        return None
+    launch = ["ros2", "launch", LACKING, f"{LACKING}.launch.py", f"{LACKING}:={{parameters}}"]
+    return {"image": given, "command": launch}
+
+
+def is_image(given: str) -> bool:
+    """Whether a name is that of an image, and of no odometry."""
+    from adaptune.odometry import registry
+    from adaptune.odometry.docker.engine import EngineError, image_digest
+
+    of_odometry = given in {*registry.ODOMETRIES, *registry.PROGRAMS, "all"}
+    if of_odometry or not re.fullmatch(r"[a-z0-9][\w./-]*(:[\w.-]+)?", given):
+        return False
+    try:
+        image_digest(given)
+    except (EngineError, NotInstalledError):
+        if "/" in given:  # no name of an odometry
+            raise
+        return False
+    return True
+
+
+def proposed_system(asked: Asked, show: Progress) -> Path | None:
+    """Write a study of a ROS system to fill in; None if the odometry is none."""
+    if (settings := _system_of(asked.odometry)) is None:
+        return None
+    path = Path(f"{plain_name(asked.recordings[0].resolve())}_ros2.yaml")
+    if path.exists():
+        raise AdaptuneError(f"{path}: exists; fill it in, or move it away")
+    named, test = recorded(asked, show)
+    settings |= {
+        "template": str(asked.config.resolve()) if asked.config else LACKING,
+        "odometry": f"/{LACKING}",
+        "points": "/points",
+    }
+    below: YamlPath = ("odometry", "settings")
+    comments: dict[YamlPath, str] = ROLES | {
+        ("odometry", "name"): "Or rustle, for a ROS 1 system, see docs/docker.md.",
+        (*below, "template"): "The parameter file that you use now.",
+        (*below, "odometry"): "The topic of its poses.",
+        (*below, "points"): "The topics that it hears, as imu: /imu",
+        ("odometry", "parameters"): "What to tune.",
+    }
+    if all("imu" in one.given for one in named.values()):
+        settings["imu"] = "/imu"
+    guess = {"type": "float", "low": 0.1, "high": 2.0, "baseline": 0.5}
+    odometry = {"name": "ros2", "settings": settings, "parameters": {LACKING: guess}}
+    sequences = {name: one.given for name, one in named.items()}
+    training = [name for name in named if name not in test]
+    data = {"sequences": sequences} | roles(training, USUAL_LENGTH, odometry, test=test)
+    write_text(path, dump(data, comments))
+    return path

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from adaptune.errors import AdaptuneError
 from adaptune.files import plain_name
-from adaptune.progress import Progress, bars_and_words, unseen
+from adaptune.progress import Progress, bars_and_words
 from adaptune.tuning.asked import Asked, named_odometry
 from adaptune.tuning.studies import written
 
@@ -208,6 +208,7 @@ def tune_asked(
     from offline.config import load_study
     from offline.search import ELAPSED, Clock
     from offline.train import train
+    from online.modes import run_replays
 
     if not asked.recordings:
         raise AdaptuneError("name a recording: the list is empty")
@@ -227,7 +228,8 @@ def tune_asked(
     before = study.fixed
     with closing(study):
         training = train(study, show, cluster, clock)
-        replay_missing(study, show=show)
+        with alone(study):
+            run_replays(study, study.model_path, show)
         return Tuned(study, training, *compared(study), more, before)
 
 
@@ -250,22 +252,6 @@ def alone(study: "OfflineStudy") -> ExitStack:
     # Ask for the number of cores before.
     _ = study.mechanism
     return pin(os.getpid(), alone=True)
-
-
-def replay_missing(
-    study: "OfflineStudy",
-    model: Path | None = None,
-    *,
-    untrained: bool = False,
-    show: Progress = unseen,
-) -> int:
-    """Make the replays that are missing; how many were made."""
-    from online.modes import run_replays, run_untrained
-
-    with alone(study):
-        if untrained:
-            return run_untrained(study, show)
-        return run_replays(study, model or study.model_path, show)
 
 
 def compared(study: "OfflineStudy") -> "tuple[ComparedReplays, Path]":

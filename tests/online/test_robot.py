@@ -24,8 +24,8 @@ from adaptune.study.driven import ModeError
 from adaptune.trajectory import read_tum
 from offline.config import load_study
 from online import robot as robot_drive
-from online.drive_log import DriveLog
 from online.modes import ReplaySetup
+from online.record import DriveLog
 from online.replay import Choice, replay
 from online.robot import RobotDrive
 from online.steered import SteeredNode

@@ -14,6 +14,7 @@ from adaptune.strict import ConfigurationError
 from adaptune.tuning.tuned import compared
 from offline.config import load_study
 from offline.validate import validate
+from online.compare import compare
 from online.modes import run_replays
 from online.record import StoredReplay
 
@@ -55,7 +56,7 @@ def study(study_file, trained_folder, tmp_path, monkeypatch):
     return load_study(study_file, ["online.modes=[my_rules:Cheapest, adaptive]"], folder)
 
 
-def test_it_is_validated_replayed_compared_and_shown(study, study_file, tmp_path):
+def test_it_is_validated_replayed_compared_and_shown(study, study_file, tmp_path, monkeypatch):
     mode = "my_rules:Cheapest"
     found = validate(study)
     assert mode in found.validation.modes
@@ -71,6 +72,8 @@ def test_it_is_validated_replayed_compared_and_shown(study, study_file, tmp_path
 
     rows = compared(study)[0].rows
     assert [row.mode for row in rows] == ["baseline", "fixed", "adaptive", mode]
+    monkeypatch.setattr("online.compare.decided", lambda *_: rows[-1])
+    assert compare(study).advised == mode
     page = (study.folder / "report/report.html").read_text()
     assert "the set that costs least, wherever it is" in page
 

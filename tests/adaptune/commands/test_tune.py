@@ -9,7 +9,7 @@ import drives
 import pytest
 import rec
 
-from adaptune.commands import trained
+from adaptune.commands.tune import say_odometries
 from adaptune.simulation import Course
 from adaptune.simulation.record import record
 from adaptune.tuning import asked, tuned
@@ -151,14 +151,14 @@ def test_the_last_of_several_bags_is_the_test(bag, study_file, tmp_path):
 
 def test_of_several_odometries_the_replayed_one_is_named(monkeypatch):
     said = []
-    monkeypatch.setattr(trained, "say", said.append)
-    monkeypatch.setattr(trained, "show_table", lambda *_: None)
+    monkeypatch.setattr("adaptune.commands.tune.say", said.append)
+    monkeypatch.setattr("adaptune.commands.tune.show_table", lambda *_: None)
     study = SimpleNamespace(config=SimpleNamespace(odometries={"gicp": 0, "ndt": 0}))
     trials = [
         {"odometry": name, "mean": mean, COST: 1.0} for name, mean in (("gicp", 2), ("ndt", 1))
     ]
     model = SimpleNamespace(fixed=7, sets={7: {"odometry": "gicp"}})
-    trained.say_odometries(study, SimpleNamespace(trials=trials, model=model))
+    say_odometries(study, SimpleNamespace(trials=trials, model=model))
     assert said == [
         "Best odometry in training: ndt. On the test, the fixed set is gicp's, the baseline "
         "gicp's; to see another there, name it alone (--odometry)."
