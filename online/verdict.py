@@ -115,7 +115,7 @@ def verdict(
         has = f"{has} ({_interval(_ratio(best))}){cost}{_beside(best, last)}."
         return [f"{said}.", has, *_other_rules(best, main, last)]
     said = f"{said}{_doubt(best, last)}."
-    why = _other_set(best, last) + _why_not(main, best, rows, obstacle, worth)
+    why = _other_set(best, last, worth) + _why_not(main, best, rows, obstacle, worth)
     return [said, *why, *_other_rules(best, main, last)]
 
 
@@ -133,7 +133,7 @@ def _beside(best: ComparisonRow, last: Mapping[str, ComparisonRow]) -> str:
     return f", and {ratio:.2f} times that of the best single set that costs no more ({ms:.1f} ms)"
 
 
-def _other_set(best: ComparisonRow, last: Mapping[str, ComparisonRow]) -> list[str]:
+def _other_set(best: ComparisonRow, last: Mapping[str, ComparisonRow], worth: float) -> list[str]:
     """That another single set does better here: surely, where it costs more."""
     row = last.get(EQUAL_COST)
     if row is None or row.ratio is None or not row.cpu_ms or not best.cpu_ms:
@@ -143,7 +143,7 @@ def _other_set(best: ComparisonRow, last: Mapping[str, ComparisonRow]) -> list[s
     has = f"{ratio.value:.2f} times its error{sure}{_for_cost(row, best)}"
     if costs > best.cpu_ms and ratio.interval and _surely_better(row, best):
         return [f"A single set that costs more has {has}: `--budget {costs:.0f}` allows it."]
-    if costs <= best.cpu_ms and ratio.value <= 1.0 - WORTH:
+    if costs <= best.cpu_ms and ratio.value <= 1.0 - worth:
         sure = "that was not surely better in training " * (best.mode == "baseline")
         more = "drive both on another recording, to know"
         return [f"A set {sure}(`{EQUAL_COST}.yaml`) has {has}: {more}."]
