@@ -499,6 +499,10 @@ class LabelledData(NamedTuple):
         """How a bank may spend the budget; None without a budget."""
         return Spending.of(self.costs, self.budget)
 
+    def can_pay(self, members: Sequence[int]) -> bool:
+        """Whether a bank of these trials stays within the budget, if there is one."""
+        return self.spending is None or self.spending.allows(members)
+
     def vectors(self, members: Sequence[int]) -> NDArray[np.float32]:
         """Error vectors of some sets on the frames of all sequences, of shape (n, n_members, 3)."""
         return np.concatenate(

@@ -375,7 +375,7 @@ def fit(
 
 def tuned(model: ErrorModel, usable: LabelledData, switching: SwitchingConfig) -> ErrorModel:
     """Choose what is driven: the fixed set, or a bank, and the settings of its weights."""
-    chosen = choose(usable, switching.size, fixed=model.fixed)
+    chosen = choose(usable, switching.size)
     members = chosen.members or [model.fixed]
     besides = reserve(members, usable)
     members = [*members, *besides]
