@@ -111,9 +111,9 @@ def surely_worse(blocks: BlockErrors) -> NDArray[np.bool_]:
         more = blocks.errors - blocks.errors[:, [blocks.baseline]]
     worse = np.zeros(len(blocks.trials), bool)
     every = np.ones(len(more), bool)
-    for of in [every, *(blocks.sequence == s for s in np.unique(blocks.sequence))]:
-        if (n := int(of.sum())) > 1:
-            mean, error = mean_and_error(more[of], blocks.sequence[of])
+    for rows in [every, *(blocks.sequence == s for s in np.unique(blocks.sequence))]:
+        if (n := int(rows.sum())) > 1:
+            mean, error = mean_and_error(more[rows], blocks.sequence[rows])
             worse |= mean - stats.t.ppf(SURE, n - 1) * error > 1e-9
     return worse
 
@@ -219,23 +219,23 @@ def affordable(blocks: BlockErrors, budget: float | None) -> NDArray[np.bool_]:
 def front(blocks: BlockErrors) -> list[int]:
     """Trials by rising cost, each with clearly less error than all that cost less."""
     bound, classes = bounds(blocks, sure=False), cost_classes(blocks)
-    found, least = [], np.inf
-    for k in sorted(range(len(bound)), key=lambda k: (classes[k], bound[k])):
+    trials, least = [], np.inf
+    for k in np.lexsort((bound, classes)):
         if np.isfinite(bound[k]) and bound[k] * AS_GOOD < least:
-            found.append(blocks.trials[k])
+            trials.append(blocks.trials[k])
             least = bound[k]
-    return found
+    return trials
 
 
 def finalists(blocks: BlockErrors, budget: float | None = None) -> list[int]:
     """Trials whose sets drive whole recordings, the baseline's and the front's among them."""
-    few, bound = affordable(blocks, budget), _within(blocks, budget)
+    bound = _within(blocks, budget)
     order = [k for k in np.argsort(bound, kind="stable") if np.isfinite(bound[k])]
     best = [blocks.trials[k] for k in order[:FINALISTS]]
-    allowed = dict(zip(blocks.trials, few, strict=True))
-    cheaper, dearer = (
-        [trial for trial in front(blocks) if allowed[trial] == within] for within in (True, False)
-    )
+    allowed = dict(zip(blocks.trials, affordable(blocks, budget), strict=True))
+    ranked = front(blocks)
+    cheaper = [trial for trial in ranked if allowed[trial]]
+    dearer = [trial for trial in ranked if not allowed[trial]]
     return list(dict.fromkeys([BASELINE, *best, *cheaper[-2:], *dearer[:DEARER]]))
 
 

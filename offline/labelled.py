@@ -1,5 +1,6 @@
 """The labelled data set: what the archive holds about every training sequence."""
 
+from collections import defaultdict
 from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, lru_cache, partial
@@ -48,7 +49,7 @@ from offline.choice import (
     choose,
     finalists,
 )
-from offline.config import OfflineConfig, OfflineStudyConfig
+from offline.config import OfflineConfig, OfflineStudy
 from offline.objective import weighted
 
 if TYPE_CHECKING:
@@ -64,8 +65,7 @@ MISFIT_PER_METRE = 0.25
 def error_vectors(T_ref_sensor: Poses, trial: Trial, length: float) -> NDArray[np.float32]:
     """Errors of a trial as vectors, see `sub_trajectory_vectors`.
 
-    Their lengths are the trial's errors. Where a trial was run several times, their directions are
-    those of the first run. The reference is of shape (n_frames, 4, 4), the length in metres.
+    Their lengths are the trial's errors; of several runs, their directions are the first one's.
 
     Returns shape (n_frames, 3).
     """
@@ -131,16 +131,15 @@ class BankSimulation:
     def agreeing(self, votes: MemberWeights) -> NDArray[np.bool_]:
         """Over which scans each member agrees with the others, of shape (n_frames - 1, n_members).
 
-        Members vote with the weights that are given. The reference takes the place of the short
-        registrations: it tells a member that is lost from one that is sound.
+        Members vote with these weights. The reference takes the place of the short registrations.
         """
         T_previous_current = self.motions(votes.members)
         agreement = Agreement(len(votes.members), self.lost_track)
         agreeing = np.zeros(T_previous_current.shape[:2], bool)
-        of_steps = self._of_steps(votes)
+        weights = self._of_steps(votes)
         for i, seconds in enumerate(np.diff(self.stamps) * 1e-9):
             agreeing[i] = agreement.judge(
-                T_previous_current[i], seconds, of_steps[i], partial(self._misplaced, i + 1)
+                T_previous_current[i], seconds, weights[i], partial(self._misplaced, i + 1)
             )
             if agreeing[i].any():
                 agreement.restarted(agreement.due)
@@ -170,10 +169,9 @@ class BankSimulation:
 
         Who agrees is found with the same weights when left out, see `agreeing`.
         """
-        T_previous_current = self.motions(weights.members)
         agreeing = self.agreeing(weights) if agreeing is None else agreeing
         none = np.asarray(~agreeing.any(axis=1))
-        believed = np.where(agreeing[..., None, None], T_previous_current, np.eye(4))
+        believed = np.where(agreeing[..., None, None], self.motions(weights.members), np.eye(4))
         moved = mean_motion(believed, share(self._of_steps(weights), agreeing | none[:, None]))
         T_ref, T_odom = self.T_ref_counted, chained(moved)
         return cap(sub_trajectory_rte(T_ref, T_odom, self.length, ends=self.ends))
@@ -396,28 +394,31 @@ class LabelledData(NamedTuple):
     def folds(
         self, by_recording: bool | None = None
     ) -> list[tuple[LabelledSequence, "LabelledData"]]:
-        """Leave each recording out, or, where there are few, each stretch.
+        """Leave each recording out, or, by default below `MIN_RECORDINGS`, each stretch.
 
         A stretch is not left out if nothing far enough from it remains.
-
-        Recordings are left out where `by_recording`; by default if there are `MIN_RECORDINGS`.
         """
         if by_recording is None:
             by_recording = len(self.recordings) >= MIN_RECORDINGS
         folds = []
-        for one in self.sequences:
-            elsewhere = [s for s in self.sequences if s.recording != one.recording]
+        for whole in self.sequences:
             if by_recording:
-                folds.append((one, elsewhere))
+                folds.append((whole, self.without(whole)))
                 continue
-            for number in np.unique(one.stretch):
-                left = one.frames(one.stretch == number)
+            for number in np.unique(whole.stretch):
+                left = whole.frames(whole.stretch == number)
                 known = [
-                    s if s.recording != one.recording else s.frames(~s.near(left))
+                    s if s.recording != whole.recording else s.frames(~s.near(left))
                     for s in self.sequences
                 ]
-                folds.append((left.part(), [s for s in known if len(s.errors)]))
-        return [(left, self._replace(sequences=others)) for left, others in folds if others]
+                others = self._replace(sequences=[s for s in known if len(s.errors)])
+                folds.append((left.part(), others))
+        return [(left, others) for left, others in folds if others.sequences]
+
+    def without(self, sequence: LabelledSequence) -> "LabelledData":
+        """The other recordings."""
+        others = [s for s in self.sequences if s.recording != sequence.recording]
+        return self._replace(sequences=others)
 
     def stretches(self) -> NDArray[np.intp]:
         """Number of every frame's stretch, of shape (n_frames,)."""
@@ -528,61 +529,48 @@ def measured_costs(
     work, and differs with what else the machine did.
     """
     numbers: dict[Hashable, int] = {}
-    register: dict[int, float] = {}
-    prepare: dict[int, dict[int, float]] = {}  # by number of the preparation
+    costs: dict[int, SetCost] = {}
+    known = defaultdict[int, list[float]](list)  # what each preparation took in trials that worked
     for trial in sets:
         runs = [archive.finished(name)[trial] for name in names]
-        took, prepared = (
-            float(np.mean([one.others.get(key, np.nan) for one in runs]))
+        register, prepare = (
+            float(np.mean([run.others.get(key, np.nan) for run in runs]))
             for key in (REGISTER_MS, PREPARE_MS)
         )
-        register[trial] = np.inf if any(one.failure for one in runs) else took
+        if any(run.failure for run in runs):
+            register = np.inf
         number = numbers.setdefault(odometry(sets[trial]).preparation, len(numbers))
-        prepare.setdefault(number, {})[trial] = prepared
+        costs[trial] = cost = SetCost(register, prepare, number)
+        if np.isfinite(cost.alone):
+            known[number].append(prepare)
+    usual = {number: float(np.median(times)) for number, times in known.items()}
     found = {
-        trial: SetCost(register[trial], _usual(times, register, own), number)
-        for number, times in prepare.items()
-        for trial, own in times.items()
+        trial: cost._replace(prepare=usual.get(cost.preparation, cost.prepare))
+        for trial, cost in sorted(costs.items(), key=lambda item: item[1].preparation)
     }
     every_second = float(np.mean([archive.read_frames(name).evidence_ms for name in names]))
     return Costs(found, USUAL_SHARE * every_second)
 
 
-def _usual(times: Mapping[int, float], register: Mapping[int, float], own: float) -> float:
-    """Median of what preparation took; sets that failed, or did not tell, do not count."""
-    known = [ms for trial, ms in times.items() if np.isfinite([ms, register[trial]]).all()]
-    return float(np.median(known)) if known else own
-
-
-def labelled_data(
-    archive: Archive,
-    names: Sequence[str],
-    sets: ParameterSets,
-    config: OfflineStudyConfig,
-    window: int,
-    recorded_in: Callable[[str], str],
-    odometry: Factory,
-) -> LabelledData:
+def labelled_data(study: OfflineStudy, archive: Archive, sets: ParameterSets) -> LabelledData:
     """Read the labelled data set of a study.
-
-    `window` is the number of descriptors that are averaged, `recorded_in` tells the recording of a
-    sequence.
 
     Raises
     ------
     ModelError
         If a trial is missing.
     """
-    read: dict[str, LabelledSequence] = {}
-    for name in names:
+    sequences = []
+    for name in study.training:
         if missing := set(sets) - set(archive.finished(name)):
             raise ModelError(
                 f"{archive.folder}: lacks trial {min(missing)} on {name}, which the model was "
                 f"fitted to; run `adaptune offline` again"
             )
-        read[name] = _labelled(archive, name, sets, config, window, recorded_in(name))
-    costs, online = measured_costs(archive, names, sets, odometry), config.online
-    return LabelledData(list(read.values()), sets, costs, online.budget, online.worth)
+        sequences.append(_labelled(study, archive, name, sets))
+    costs = measured_costs(archive, study.training, sets, study.odometry)
+    online = study.config.online
+    return LabelledData(sequences, sets, costs, online.budget, online.worth)
 
 
 def with_whole_drives(
@@ -655,15 +643,11 @@ def _eligible(sequences: Sequence[LabelledSequence], sets: ParameterSets) -> set
 
 
 def _labelled(
-    archive: Archive,
-    name: str,
-    sets: ParameterSets,
-    config: OfflineStudyConfig,
-    window: int,
-    recording: str,
+    study: OfflineStudy, archive: Archive, name: str, sets: ParameterSets
 ) -> LabelledSequence:
     """A labelled sequence without error vectors and drives of the whole."""
-    frames, length = archive.read_frames(name), config.sub_trajectory
+    config, frames = study.config, archive.read_frames(name)
+    length, period = config.sub_trajectory, config.online.period
     errors = archive.read_errors(name, list(sets))
     # All trials know the same frames, but for those before an odometry's first pose.
     known = np.flatnonzero(~np.isnan(errors[:, ~np.isnan(errors).all(axis=0)]).any(axis=1))
@@ -681,8 +665,8 @@ def _labelled(
         frames.stamps,
         frames.T_ref_sensor,
         frames.counted,
-        averaged(frames.descriptors, frames.stamps, window, config.online.period),
-        ((frames.stamps - frames.stamps[0]) * 1e-9 // config.online.period).astype(np.int64),
+        averaged(frames.descriptors, frames.stamps, study.window, period),
+        ((frames.stamps - frames.stamps[0]) * 1e-9 // period).astype(np.int64),
         length,
         config.lost_track,
         frames.hops,
@@ -690,7 +674,7 @@ def _labelled(
     )
     return LabelledSequence(
         name,
-        recording,
+        study.sequences.recorded_in(name),
         simulation,
         known,
         stretches(simulation, known),

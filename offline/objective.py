@@ -79,8 +79,8 @@ def weighted(weights: Mapping[Metric, float], metrics: Mapping[str, float]) -> f
     return sum(weight * metrics.get(name, LARGEST_METRIC) for name, weight in weights.items())
 
 
-def told(verdicts: Sequence[Verdict]) -> list[tuple[ParameterSet, float]]:
-    """Parameters and values of trials as samplers are told; the first one is the baseline's."""
+def sampler_results(verdicts: Sequence[Verdict]) -> list[tuple[ParameterSet, float]]:
+    """Parameters and values of trials as samplers get them; the first one is the baseline's."""
     worst = PENALTY * (verdicts[0].value or 1.0) if verdicts else 0.0
     return [(v.parameters, max(v.value, worst if v.failure else 0.0)) for v in verdicts]
 

@@ -40,13 +40,13 @@ from offline.campaign import (
     Schedule,
     WholeDrives,
     drive_whole,
+    forecast,
     read_whole_drives,
     run_baseline,
 )
 from offline.choice import NothingUsableError
 from offline.config import OfflineConfig, OfflineStudy
 from offline.drive import TrialSetup
-from offline.forecast import forecast
 from offline.front import COST, front_rows, left_out_in_words
 from offline.labelled import LabelledData, labelled_data, with_vectors
 from offline.objective import (
@@ -125,9 +125,7 @@ def train(
         finished = {name: {n: archive.finished(name)[n] for n in verdicts} for name in names}
         tried = tuple(verdict.parameters for verdict in verdicts.values())
         every_set = ParameterSets(space, tuple(verdicts), tried)
-        recorded_in = study.sequences.recorded_in
-        about = (names, every_set, study.config, study.window, recorded_in, study.odometry)
-        data = labelled_data(archive, *about)
+        data = labelled_data(study, archive, every_set)
 
         def drive(data: LabelledData) -> None:
             asked = {*data.finalists(), *every_set.defaults}
@@ -167,11 +165,13 @@ def _note_left_out(
     rows: Sequence[dict[str, Any]], usable: LabelledData, whole: WholeDrives
 ) -> None:
     """Add to the row of each sequence the error of the trial that the other recordings choose."""
-    left_out = chosen_elsewhere(usable)
-    for row in rows:
-        chosen = left_out.get(name := row["sequence"])
-        run = None if chosen is None else whole[name].get(chosen)
-        row["_left out"] = run and run.mean_error
+    for row, sequence in zip(rows, usable.sequences, strict=True):
+        row["_left out"] = None
+        if not (others := usable.without(sequence)).sequences:
+            continue
+        with contextlib.suppress(NothingUsableError):
+            run = whole[sequence.name].get(others.fixed())
+            row["_left out"] = run and run.mean_error
 
 
 def _searched(
@@ -185,17 +185,6 @@ def _searched(
     if left > 0 and most > 0.0 and min(left, most) < np.inf:
         _log.info("%s", expected.words(left, most))
     return Campaign(study, archive, workers, progress, clock, expected).run()
-
-
-def chosen_elsewhere(data: LabelledData) -> dict[str, int]:
-    """By sequence, the trial that the other recordings choose, if there are any."""
-    found = {}
-    for one in data.sequences:
-        others = [s for s in data.sequences if s.recording != one.recording]
-        with contextlib.suppress(NothingUsableError):
-            if others:
-                found[one.name] = data._replace(sequences=others).fixed()
-    return found
 
 
 def _ready_archive(study: OfflineStudy, progress: Progress) -> Archive:
@@ -265,8 +254,7 @@ def _fitted(
     config, inputs = study.config, study.model_inputs
     settings = config.offline.model_dump(mode="json", exclude={*BUDGETS, "workers"})
     versions = {"adaptune": __version__, "numpy": np.__version__} | study.odometry.content
-    provenance = {"versions": versions} | settings
-    provenance |= {"inputs": manifest.digest(inputs)}
+    provenance = {"versions": versions} | settings | {"inputs": manifest.digest(inputs)}
     estimates = estimates_of(study.sequences, study.training)
     if judged := estimates_as_data(estimates, config.sub_trajectory):
         provenance |= {"estimated_references": judged}
@@ -279,16 +267,14 @@ def _fitted(
     switching = config.online.switching.model_dump(mode="json", include={"size", "sets"})
     online = (config.online.period, config.online.budget, config.online.worth, switching)
     provenance["evidence"] = manifest.digest((trials, online, fixed))
-    before = None
+    model = None
     with contextlib.suppress(ModelError):
-        before = ErrorModel.load(study.model_path)
-    if before is not None and before.provenance == provenance:
-        manifest.record(study.model_inputs_path, inputs)
-        return before
-    identity, length = study.odometry.identity, config.sub_trajectory
-    model = fit(data, fixed, identity, length, study.window, provenance)
-    model = tuned(model, usable, config.online.switching)
-    model.save(study.model_path)
+        model = ErrorModel.load(study.model_path)
+    if model is None or model.provenance != provenance:
+        identity, length = study.odometry.identity, config.sub_trajectory
+        model = fit(data, fixed, identity, length, study.window, provenance)
+        model = tuned(model, usable, config.online.switching)
+        model.save(study.model_path)
     manifest.record(study.model_inputs_path, inputs)
     return model
 
@@ -385,9 +371,9 @@ def tuned(model: ErrorModel, usable: LabelledData, switching: SwitchingConfig) -
         vectors=usable.vectors(members),
         bank_settings=chosen.bank.model_copy(update={"reserve": len(besides)}),
         # As they are read back, so that the same model is the same file.
-        expected={}
-        if chosen.expected is None
-        else {key: float(value) for key, value in chosen.expected._asdict().items()},
+        expected={key: float(x) for key, x in chosen.expected._asdict().items()}
+        if chosen.expected
+        else {},
         rivals=rivals(usable, driven_cost(usable, chosen, model.fixed)),
     )
 
@@ -399,8 +385,6 @@ def run_oracle(
     cluster: str | None = None,
 ) -> list[dict[str, Any]]:
     """Run some of the model's sets as trials on the test sequences, unless that was done before.
-
-    What was run with another recording, odometry or set is run again.
 
     ``oracle`` in the study's folder receives the trials, which no model is fitted to.
 

@@ -344,9 +344,8 @@ def baseline_in_words(validation: Validation) -> str:
 
 def _labelled(study: OfflineStudy, model: ErrorModel) -> LabelledData:
     """The labelled data set of the sets that did not fail."""
-    archive, of = Archive(study.folder / "trials"), study.sequences.recorded_in
-    about = (model.sequences, model.sets, study.config, study.window, of, study.odometry)
-    data = labelled_data(archive, *about).usable()
+    archive = Archive(study.folder / "trials")
+    data = labelled_data(study, archive, model.sets).usable()
     return with_vectors(in_whole_drives(data, archive, study.config.offline), archive)
 
 
