@@ -398,12 +398,8 @@ def run_baseline(
     """Drive the baseline along every training sequence, all of it, unless that was done before.
 
     Of several odometries, the baseline of each. Nothing is stored before all have done well on all
-    sequences. Where the reference contradicts the motion of one, scans say which of them is wrong.
-
-    Raises
-    ------
-    BaselineError
-        If one fails on one of them.
+    sequences: there is a BaselineError if one fails. Where the reference contradicts the motion of
+    one, scans say which of them is wrong.
     """
     space = study.odometry.space
     there = read_whole_drives(archive, study.training, range(len(space.baselines)))

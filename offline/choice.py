@@ -154,27 +154,19 @@ def choose(blocks: BlockErrors, budget: float | None = None, sure: bool = True) 
     """Trial number of the fixed set.
 
     Of the admissible sets that cost no more than the baseline, or than a `budget` in milliseconds
-    of CPU time a scan, it is the cheapest whose bound is nearly the least, see `bounds`.
-
-    Raises
-    ------
-    AdaptuneError
-        If no set keeps to the budget.
-    NothingUsableError
-        If no set can be chosen.
+    of CPU time a scan, it is the cheapest whose bound is nearly the least, see `bounds`. There is
+    an AdaptuneError if no set keeps to the budget, a NothingUsableError if none can be chosen.
     """
     bound = _within(blocks, budget, sure)
     if not np.isfinite(bound).any():
-        raise NothingUsableError(UNUSABLE.format(n=len(blocks.trials)))
+        raise NothingUsableError(
+            f"odometry: none of {len(blocks.trials)} parameter sets gives poses for nearly all "
+            f"scans of every training sequence, so none can be chosen (`adaptune trials` lists "
+            f"their faults): mend the odometry, or narrow the ranges of the parameters "
+            f"(odometry.parameters)"
+        )
     good, classes = np.flatnonzero(bound <= AS_GOOD * bound.min()), cost_classes(blocks)
     return blocks.trials[int(min(good, key=lambda k: (classes[k], bound[k])))]
-
-
-UNUSABLE = (
-    "odometry: none of {n} parameter sets gives poses for nearly all scans of every training "
-    "sequence, so none can be chosen (`adaptune trials` lists their faults): mend the odometry, or "
-    "narrow the ranges of the parameters (odometry.parameters)"
-)
 
 
 def _within(blocks: BlockErrors, budget: float | None, sure: bool = True) -> NDArray[np.float64]:
@@ -193,12 +185,8 @@ def _within(blocks: BlockErrors, budget: float | None, sure: bool = True) -> NDA
 def affordable(blocks: BlockErrors, budget: float | None) -> NDArray[np.bool_]:
     """Which sets cost no more than a budget, or than the baseline, of shape (n_trials,).
 
-    What takes more than `MOST_OF_PERIOD`, and more than the baseline, may come too late.
-
-    Raises
-    ------
-    AdaptuneError
-        If none does.
+    What takes more than `MOST_OF_PERIOD`, and more than the baseline, may come too late. There is
+    an AdaptuneError if no set keeps to the budget.
     """
     if budget is None:
         return cost_classes(blocks) <= 0.0

@@ -84,13 +84,7 @@ class GridSettings(StrictModel):
 
 
 def optuna_class(name: str) -> type[Any]:
-    """Class of an Optuna sampler.
-
-    Raises
-    ------
-    SamplerError
-        It names the nearest sampler, or says why there is none.
-    """
+    """Class of an Optuna sampler; a SamplerError names the nearest one, or the mistake."""
     if name not in OPTUNA and ":" not in name:
         raise SamplerError(
             f"there is no sampler {name!r}: {nearest(name, NAMES)} (another Optuna sampler is "
@@ -111,13 +105,7 @@ def optuna_class(name: str) -> type[Any]:
 
 
 def optuna_sampler(name: str, settings: Mapping[str, Any], seed: int) -> Any:
-    """Make an Optuna sampler.
-
-    Raises
-    ------
-    SamplerError
-        If it does not take these settings.
-    """
+    """Make an Optuna sampler; there is a SamplerError if it does not take these settings."""
     cls = optuna_class(name)
     keywords = inspect.signature(cls).parameters
     if not any(k.kind is inspect.Parameter.VAR_KEYWORD for k in keywords.values()):
@@ -376,7 +364,7 @@ def _box(parameter: Float | Integer, step: Step) -> tuple[float, float]:
 
 
 Metric = Literal["rte", "kitti", "rpe", "ape", "ms_per_scan", "cpu"]
-"""What a trial can be judged by; `offline.objective` explains each."""
+"""What a trial can be judged by; ``docs/reference-study.md`` explains each."""
 TIMED = ("ms_per_scan", "cpu")
 """Metrics that differ from run to run and from machine to machine."""
 _Weighted = Annotated[dict[Metric, Annotated[float, Field(gt=0, le=1e9)]], Field(min_length=1)]

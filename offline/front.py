@@ -69,12 +69,12 @@ def front_rows(data: LabelledData, model: ErrorModel) -> list[dict[str, Any]]:
 
 def left_out_in_words(data: LabelledData) -> str:
     """What to expect elsewhere of a set that is chosen as the fixed one is."""
-    found = left_out_ratio(data.blocks(), lambda blocks: choose(blocks, data.budget))
-    if found is None:
+    left_out = left_out_ratio(data.blocks(), lambda blocks: choose(blocks, data.budget))
+    if left_out is None:
         return (
             "There is too little data to tell how a chosen set does on other drives: record more."
         )
-    ratio, low, high = found
+    ratio, low, high = left_out
     return (
         f"Sets chosen in the same way, without the part that they are tested on, have {ratio:.2f} "
         f"times the baseline's error there (95 % interval {low:.2f}-{high:.2f})."
@@ -92,16 +92,9 @@ def measured_front(
 
     Each drives alone, with the threads that the study gives it. Errors are those of training.
 
-    Returns
-    -------
-    list of dict
-        A row for each set: mean CPU time and the 99th percentile of the time a scan in
-        milliseconds, memory in megabytes, and which one is recommended.
-
-    Raises
-    ------
-    AdaptuneError
-        If the study has no front yet, or the recording fewer than two scans.
+    Returns a row for each set: mean CPU time and the 99th percentile of the time a scan in
+    milliseconds, memory in megabytes, and which one is recommended. There is an AdaptuneError if
+    the study has no front yet, or the recording fewer than two scans.
     """
     path = study.folder / "front.json"
     if not path.exists():

@@ -308,7 +308,7 @@ class LabelledSequence:
         """The same with some of the frames."""
         if kept.all():
             return self
-        known, whole = self.known[kept], self.whole
+        known, turns, whole = self.known[kept], self.turns, self.whole
         return replace(
             self,
             known=known,
@@ -316,7 +316,7 @@ class LabelledSequence:
             errors=self.errors[kept],
             vectors={trial: vectors[kept] for trial, vectors in self.vectors.items()},
             blocks_of=self.blocks_of[kept],
-            turns=None if self.turns is None else self.turns[kept],
+            turns=None if turns is None else turns[kept],
             whole=whole and whole.frames(np.isin(whole.known, known)),
         )
 
@@ -375,10 +375,7 @@ class LabelledData(NamedTuple):
         return self._replace(sequences=few, sets=self.sets.subset(trials))
 
     def usable(self) -> "LabelledData":
-        """The same with the sets that did not fail.
-
-        There is a NothingUsableError where the baseline is none of them.
-        """
+        """The same with the sets that did not fail; a NothingUsableError if the baseline did."""
         if not self.costs.usable(BASELINE):
             raise NothingUsableError(
                 "the baseline fails where it begins within a recording, though not along a whole "
@@ -422,9 +419,16 @@ class LabelledData(NamedTuple):
 
     def stretches(self) -> NDArray[np.intp]:
         """Number of every frame's stretch, of shape (n_frames,)."""
-        lengths = [len(s.errors) for s in self.sequences]
         cuts = np.concatenate([s.stretch for s in self.sequences])
-        return stretch_numbers(np.repeat(np.arange(len(lengths)), lengths), cuts)
+        return stretch_numbers(self.numbers(), cuts)
+
+    def numbers(self) -> NDArray[np.intp]:
+        """Number of every frame's sequence, of shape (n_frames,)."""
+        return np.repeat(np.arange(len(self.sequences)), [len(s.errors) for s in self.sequences])
+
+    def errors(self) -> NDArray[np.float32]:
+        """Errors on the frames of all sequences, of shape (n_frames, n_sets)."""
+        return np.concatenate([s.errors for s in self.sequences])
 
     def blocks(self) -> BlockErrors:
         """What the trials of all sets say."""
@@ -439,14 +443,9 @@ class LabelledData(NamedTuple):
             np.repeat(np.arange(len(errors)), [len(of) for of in errors]),
             np.array([self.costs.alone(trial) for trial in trials]),
             np.sum([none if s.restarts is None else s.restarts for s in sequences], axis=0),
-            self.period,
+            min(1e-6 * float(np.median(np.diff(s.simulation.stamps))) for s in self.sequences),
             np.concatenate(turns) if len(turns) == len(errors) else None,
         )
-
-    @property
-    def period(self) -> float:
-        """Milliseconds from scan to scan."""
-        return min(1e-6 * float(np.median(np.diff(s.simulation.stamps))) for s in self.sequences)
 
     def whole_blocks(self, trials: Collection[int]) -> BlockErrors:
         """What drives of whole recordings say, of those of some sets that have made them."""
@@ -460,10 +459,7 @@ class LabelledData(NamedTuple):
         return finalists(self.blocks(), self.budget)
 
     def fixed(self) -> int:
-        """Trial number of the fixed set within the study's budget.
-
-        It is chosen among the finalists, by their drives of whole recordings.
-        """
+        """Trial number of the fixed set within the budget, by finalists' whole drives."""
         return self._best(self.budget)
 
     def rival(self, cost: float) -> int:
@@ -487,7 +483,7 @@ class LabelledData(NamedTuple):
         data = TrainingData(
             pca.fit(descriptors).transform(descriptors),
             self.stretches(),
-            np.concatenate([s.errors for s in self.sequences]),
+            self.errors(),
             self.sets,
             fixed := self.fixed(),
             allowed=allowed_sets(self.costs, self.budget, self.sets, fixed),
@@ -512,10 +508,7 @@ class LabelledData(NamedTuple):
 
 
 def periods(period: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """First frame of every period, and number of every frame's period among them.
-
-    `period` has whole periods since the first scan, of shape (n_frames,).
-    """
+    """First frame of every period, and number of every frame's period among them."""
     _, first, number = np.unique(period, return_index=True, return_inverse=True)
     return first, number
 
@@ -553,13 +546,7 @@ def measured_costs(
 
 
 def labelled_data(study: OfflineStudy, archive: Archive, sets: ParameterSets) -> LabelledData:
-    """Read the labelled data set of a study.
-
-    Raises
-    ------
-    ModelError
-        If a trial is missing.
-    """
+    """Read the labelled data set of a study; there is a ModelError if a trial is missing."""
     sequences = []
     for name in study.training:
         if missing := set(sets) - set(archive.finished(name)):
@@ -579,10 +566,7 @@ def with_whole_drives(
     config: OfflineConfig,
     bare: Mapping[str, Collection[int]] = MappingProxyType({}),
 ) -> LabelledData:
-    """The same with the drives of whole recordings that there are of finalists.
-
-    Of those that are named in `bare`, by sequence, without the health check.
-    """
+    """The same with finalists' drives of whole recordings; of those in `bare`, the bare ones."""
     asked = [*data.finalists(), *data.sets.defaults]
     drives = read_whole_drives(archive, [s.name for s in data.sequences], asked)
     if not (known := sorted(set.intersection(*map(set, drives.values())))):
@@ -619,7 +603,12 @@ def _whole(s: LabelledSequence, trials: Sequence[Trial], config: OfflineConfig) 
 
 def with_vectors(data: LabelledData, archive: Archive) -> LabelledData:
     """The same with error vectors of the sets that may be members of a bank."""
-    eligible, sequences = _eligible(data.sequences, data.sets), []
+    sets, means = data.sets, mean_errors(data.errors(), data.numbers())
+    # With a sequence left out, others than now may be among the best. To read the poses of
+    # thousands of trials would take long.
+    best = [sets.trials[c] for c in np.argsort(means, kind="stable")[: 2 * MEMBER_POOL_SIZE]]
+    eligible = {t for t in (BASELINE, *best) if t in sets and np.isfinite(means[sets.column(t)])}
+    sequences = []
     for s in data.sequences:
         T_ref_sensor, length = s.simulation.T_ref_counted, s.simulation.length
         vectors = {
@@ -628,18 +617,6 @@ def with_vectors(data: LabelledData, archive: Archive) -> LabelledData:
         }
         sequences.append(replace(s, vectors=vectors))
     return data._replace(sequences=sequences)
-
-
-def _eligible(sequences: Sequence[LabelledSequence], sets: ParameterSets) -> set[int]:
-    """Trials whose sets may be members of a bank, and so need error vectors.
-
-    With a sequence left out, others than now may be among the best. To read the poses of thousands
-    of trials would take long.
-    """
-    number = np.repeat(np.arange(len(sequences)), [len(s.errors) for s in sequences])
-    means = mean_errors(np.concatenate([s.errors for s in sequences]), number)
-    best = [sets.trials[c] for c in np.argsort(means, kind="stable")[: 2 * MEMBER_POOL_SIZE]]
-    return {t for t in (BASELINE, *best) if t in sets and np.isfinite(means[sets.column(t)])}
 
 
 def _labelled(

@@ -122,7 +122,7 @@ def scenario(study: OfflineStudy) -> Scenario:
         data.stretches(),
         fold,
         np.concatenate([s.descriptors for s in data.sequences]),
-        np.concatenate([s.errors for s in data.sequences]),
+        data.errors(),
         dict(data.sequences[0].blocks),
         sets,
         np.array([data.costs.alone(n) for n in numbers]),

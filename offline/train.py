@@ -190,8 +190,8 @@ def _searched(
 def _ready_archive(study: OfflineStudy, progress: Progress) -> Archive:
     """The archive without trials of other inputs than now; references are there, or estimated."""
     for name in study.config.training:
-        of = study.sequences.recordings.get(name)
-        if of is not None and of.reference == NO_REFERENCE:
+        recording = study.sequences.recordings.get(name)
+        if recording is not None and recording.reference == NO_REFERENCE:
             raise AdaptuneError(
                 f"{study.sequences.key(name)}: training needs a reference trajectory; name its "
                 f"topic or file, or leave `reference` out to have it estimated"
@@ -347,8 +347,8 @@ def fit(
         blocks=dict(sequences[0].blocks),
         window=window,
         descriptors=np.concatenate([s.descriptors for s in sequences]),
-        sequence=np.repeat(np.arange(len(sequences)), [len(s.errors) for s in sequences]),
-        errors=np.concatenate([s.errors for s in sequences]),
+        sequence=data.numbers(),
+        errors=data.errors(),
         elevations=[s.elevation for s in sequences],
         provenance=provenance,
         stretch=np.concatenate([s.stretch for s in sequences]),
@@ -386,17 +386,10 @@ def run_oracle(
 ) -> list[dict[str, Any]]:
     """Run some of the model's sets as trials on the test sequences, unless that was done before.
 
-    ``oracle`` in the study's folder receives the trials, which no model is fitted to.
+    ``oracle`` in the study's folder receives the trials, which no model is fitted to. There is an
+    AdaptuneError if there is no model of the study, or no test sequence has a reference.
 
-    Returns
-    -------
-    list of dict
-        For every test sequence the errors of the fixed set and of the best one, in percent.
-
-    Raises
-    ------
-    AdaptuneError
-        If there is no model, it was fitted to something else, or no test sequence has a reference.
+    Returns for every test sequence the errors of the fixed set and of the best one, in percent.
     """
     model = study.model()
     study.open()
@@ -419,7 +412,7 @@ def run_oracle(
                 schedule.store(*done)
         schedule.close()
     found = {name: oracle_errors(archive, name, model) for name in names}
-    return [_row(name, errors) for name, errors in found.items() if errors is not None]
+    return [_oracle_row(name, errors) for name, errors in found.items() if errors is not None]
 
 
 def oracle_sets(model: ErrorModel, n: int) -> list[int]:
@@ -464,7 +457,7 @@ def _remove_other_sets(archive: Archive, name: str, model: ErrorModel) -> None:
             archive.trial_path(name, number).unlink()
 
 
-def _row(name: str, found: OracleErrors) -> dict[str, Any]:
+def _oracle_row(name: str, found: OracleErrors) -> dict[str, Any]:
     means = np.nanmean(cap(found.errors), axis=0)
     best = int(means.argmin())
     return {

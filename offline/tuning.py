@@ -274,14 +274,10 @@ def bank_errors(
 ) -> Iterator[tuple[NDArray[np.float64], MemberWeights]]:
     """Simulate a bank on what is left out, with one settings after the other.
 
-    They have the same `clip` and `n_frames`.
+    They have the same `clip` and `n_frames`. Its weights are fitted to the others, whose
+    `LabelledData.training_data` is given.
 
-    Its weights are fitted to the others, whose `LabelledData.training_data` is given.
-
-    Yields
-    ------
-    tuple
-        Capped errors on the labelled frames, of shape (n,), and smoothed weights.
+    Yields capped errors on the labelled frames, of shape (n,), and smoothed weights.
     """
     data, pca = fitted
     simulation, members = left_out.simulation, tuple(members)
@@ -315,7 +311,7 @@ def complementary_members(data: LabelledData, fixed: int, size: int) -> list[int
     They are sought among the best sets, see `complementary`. Where another one would lower nothing,
     the best of the others fill the bank.
     """
-    errors, number = np.concatenate([s.errors for s in data.sequences]), data.stretches()
+    errors, number = data.errors(), data.stretches()
     means = mean_errors(errors, number)
     best = [
         data.sets.trials[c]
@@ -341,9 +337,7 @@ MEMBER_CHOOSERS = (cancelling_members, complementary_members)
 def reserve(members: Sequence[int], data: LabelledData) -> list[int]:
     """What a bank has besides, for places that training does not know: the baseline.
 
-    What the odometry's authors chose is the best guess there, and live evidence tells whether it is
-    right. There is none if it is a member already, was not run on every sequence, or costs too
-    much.
+    There is none if it is a member already, was not run on every sequence, or costs too much.
     """
     known = BASELINE in data.sets and all(BASELINE in s.vectors for s in data.sequences)
     if len(members) < 2 or BASELINE in members or not known:
@@ -361,9 +355,8 @@ def rivals(data: LabelledData, cost: float) -> dict[str, int]:
     """Trial numbers of the rivals that there are.
 
     `BEST_DEFAULT` is the odometry that does best with its own parameters, where there are several;
-    `EQUAL_COST` the best of all sets that alone cost no more than what is driven.
-
-    `cost` is in milliseconds of CPU time a scan of what is driven; NaN if it is unknown.
+    `EQUAL_COST` the best of all sets that alone cost no more milliseconds of CPU time a scan than
+    the `cost` of what is driven; NaN if it is unknown.
     """
     found = {}
     if len(data.sets.space.baselines) > 1:

@@ -77,18 +77,17 @@ class LeftOut(NamedTuple):
 
 def joined(parts: Sequence[LeftOut]) -> LeftOut:
     """Stretches of a recording that were left out, as one."""
-    first = parts[0]
     if len(parts) == 1:
-        return first
+        return parts[0]
     n_frames = [len(part.stretch) for part in parts]
 
     def mean(values: Sequence[Mapping[str, float]]) -> dict[str, float]:
         return {
-            mode: float(np.average([of[mode] for of in values], weights=n_frames))
+            mode: float(np.average([of_part[mode] for of_part in values], weights=n_frames))
             for mode in _of_all(values)
         }
 
-    return first._replace(
+    return parts[0]._replace(
         stretch=np.concatenate([part.stretch for part in parts]),
         errors={
             mode: np.concatenate([part.errors[mode] for part in parts])
@@ -193,21 +192,8 @@ def leave_one_out(
     What is driven is chosen anew on the rest, by the loss with which a study chooses it. So the
     figures are those of the choice, and not of what was best in hindsight.
 
-    Parameters
-    ----------
-    data
-        The training sequences.
-    progress
-        Called about every fold.
-    bank
-        Number of a bank's members. No bank is simulated with 0.
-    rules
-        Names of the selection rules, see `adaptune.model.registry`.
-
-    Raises
-    ------
-    ValidationError
-        If there are fewer than two folds.
+    `bank` is the number of a bank's members, 0 for none; `rules` are names, see
+    `adaptune.model.registry`. There is a ValidationError if there are fewer than two folds.
     """
     by_recording = len(data.recordings) >= MIN_RECORDINGS
     folds = data.folds(by_recording)
@@ -223,10 +209,10 @@ def leave_one_out(
     parts: dict[str, list[LeftOut]] = {}
     for i, (left_out, others) in enumerate(folds):
         progress("parts left out", i, len(folds))
-        found = leave_out(left_out, others, bank, by_recording, rules)
-        parts.setdefault(found.name, []).append(found)
+        part = leave_out(left_out, others, bank, by_recording, rules)
+        parts.setdefault(part.name, []).append(part)
     progress("parts left out", len(folds), len(folds))
-    return Validation([joined(of) for of in parts.values()])
+    return Validation([joined(of_recording) for of_recording in parts.values()])
 
 
 def leave_out(
@@ -282,14 +268,8 @@ def validate(study: OfflineStudy, progress: Progress = unseen) -> Validated:
     """Validate the selection rules on a study's training sequences.
 
     The study's folder receives ``validation`` (CSV, JSON and a picture) and ``stretches`` (CSV,
-    JSON).
-
-    Raises
-    ------
-    ModelError
-        If there is no model yet, or it is not this study's.
-    ValidationError
-        If there is only one stretch.
+    JSON). There is a ModelError if there is no model yet, or it is not this study's; a
+    ValidationError if there is only one stretch.
     """
     model = study.model()
     if (study.training, study.window) != (model.sequences, model.window):
@@ -299,9 +279,8 @@ def validate(study: OfflineStudy, progress: Progress = unseen) -> Validated:
         )
     data = _labelled(study, model)
     online = driven(model, study.config.online, study.odometry, study.mechanism)
-    bank = 0
-    if study.mechanism == "bank" and ADAPTIVE in study.rules:
-        bank = study.config.online.switching.size
+    adapts = study.mechanism == "bank" and ADAPTIVE in study.rules
+    bank = study.config.online.switching.size if adapts else 0
     try:
         validation = leave_one_out(data, progress, bank, study.rules)
     except ValidationError as error:
