@@ -146,10 +146,12 @@ def drive_sets(
         )
 
     def n_repeats(parameters: ParameterSet) -> int:
+        of_baseline, repeats = config.offline.baseline_runs, config.offline.repeats
         if bare:
             return 1
-        of_baseline, repeats = config.offline.baseline_runs or 0, config.offline.repeats
-        return max(repeats, of_baseline) if parameters in odometry.space.baselines else repeats
+        if of_baseline is None or parameters not in odometry.space.baselines:
+            return repeats
+        return max(repeats, of_baseline)
 
     drivers = [
         [_Driver(partial(begin, one), stretch, most) for _ in range(n_repeats(one))] for one in sets

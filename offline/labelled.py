@@ -124,7 +124,7 @@ class BankSimulation:
                     float(metres[frame]), float(seconds[frame])
                 )
             )
-            for frame in np.unique(self.period, return_index=True)[1]
+            for frame in periods(self.period)[0]
         ]
         return self._live[members]
 
@@ -149,7 +149,7 @@ class BankSimulation:
 
     def _of_steps(self, weights: MemberWeights) -> NDArray[np.float64]:
         """Weights at every scan but the first, of shape (n_frames - 1, n_members)."""
-        return weights.weights[np.unique(self.period, return_inverse=True)[1][1:]]
+        return weights.weights[periods(self.period)[1][1:]]
 
     def _misplaced(
         self, frame: int, T_then_now: Poses, ago: tuple[int, ...]

@@ -330,37 +330,38 @@ def _labelled(study: OfflineStudy, model: ErrorModel) -> LabelledData:
 
 def _rows(validation: Validation) -> list[dict[str, Any]]:
     """Ratios to the fixed set's error, intervals of the default rule's, and costs."""
-    default = (*validation.modes, ADAPTIVE)[0]
     modes = [mode for mode in validation.ratios if mode != "fixed"]
-    rows: list[dict[str, Any]] = []
 
-    def add(
+    def row(
         name: str,
         fixed: float | None,
-        of: dict[str, float],
+        values: Mapping[str, float],
         interval: tuple[float, float] | None = None,
-    ) -> None:
-        rows.append({"left out": name, "fixed [%]": fixed})
+    ) -> dict[str, Any]:
+        found: dict[str, Any] = {"left out": name, "fixed [%]": fixed}
         for mode in modes:
-            rows[-1][mode] = of[mode]
-            if mode == default:
+            found[mode] = values[mode]
+            if mode == ADAPTIVE:
                 ends = interval and f"{interval[0]:.2f}-{interval[1]:.2f}"
-                rows[-1][f"{mode}, 95 %"] = ends
+                found[f"{mode}, 95 %"] = ends
+        return found
 
+    rows = []
     for i, sequence in enumerate(validation.left_out):
-        of = {mode: float(validation.ratios[mode][i]) for mode in modes}
-        errors, fixed = sequence.errors[default], sequence.errors["fixed"]
+        ratios = {mode: float(validation.ratios[mode][i]) for mode in modes}
+        errors, fixed = sequence.errors[ADAPTIVE], sequence.errors["fixed"]
         # It is about this sequence, and says nothing about other places.
         intervals = bootstrap(errors, fixed, sequence.block)
-        add(sequence.name, fixed.mean(), of, intervals and intervals[1])
+        rows.append(row(sequence.name, fixed.mean(), ratios, intervals and intervals[1]))
     costs = {mode: validation.cost(mode) for mode in ["fixed", *modes]}
     if np.isfinite(list(costs.values())).any():
-        add("cost [ms]", costs["fixed"], costs)
+        rows.append(row("cost [ms]", costs["fixed"], costs))
     summaries = {mode: validation.summary(mode) for mode in modes}
     for key in ("geometric", "arithmetic", "worst_tenth", "worst"):
-        ends = summaries[default]["low"], summaries[default]["high"]
-        of = {mode: summaries[mode][key] for mode in modes}
-        add(key.replace("_", " "), None, of, ends if key == "geometric" else None)
+        values = {mode: summaries[mode][key] for mode in modes}
+        of_mean = key == "geometric"
+        ends = (summaries[ADAPTIVE]["low"], summaries[ADAPTIVE]["high"]) if of_mean else None
+        rows.append(row(key.replace("_", " "), None, values, ends))
     return rows
 
 
