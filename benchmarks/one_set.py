@@ -37,11 +37,10 @@ Counts = dict[str, NDArray[np.float64]]
 
 def read(study: OfflineStudy) -> LabelledData:
     """What the trials say."""
-    archive, of = Archive(study.folder / "trials"), study.sequences.recorded_in
+    archive = Archive(study.folder / "trials")
     known = {number: run.parameters for number, run in archive.known().items()}
     sets = ParameterSets(study.odometry.space, tuple(known), tuple(known.values()))
-    about = (study.training, sets, study.config, study.window, of, study.odometry)
-    return labelled_data(archive, *about).usable()
+    return labelled_data(study, archive, sets).usable()
 
 
 def count_points(study: OfflineStudy, data: LabelledData) -> Counts:

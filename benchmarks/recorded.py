@@ -248,8 +248,7 @@ def driven(given: argparse.Namespace, name: str) -> LabelledData:
         verdicts = Campaign(study, archive, workers).run()
     tried = tuple(verdict.parameters for verdict in verdicts.values())
     sets = ParameterSets(study.odometry.space, tuple(verdicts), tried)
-    about = (sets, study.config, study.window, study.sequences.recorded_in, study.odometry)
-    data = labelled_data(archive, study.training, *about)
+    data = labelled_data(study, archive, sets)
     (one,) = data.sequences
     T_ref_sensor, paths = one.simulation.T_ref_sensor, [archive.read(one.name, n) for n in sets]
     turns = [

@@ -19,18 +19,6 @@ LOST = 0.5
 """Share of the capped error, as the mean of a block, above which track counts as lost there."""
 
 
-def bare_blocks(data: LabelledData, archive: Archive, config: OfflineConfig) -> BlockErrors | None:
-    """Errors of finalists without the health check; None where it helped none of them.
-
-    Where it did not act, a drive is bare as it is.
-    """
-    names, asked = [s.name for s in data.sequences], [*data.finalists(), *data.sets.defaults]
-    bare = read_whole_drives(archive, names, asked, bare=True)
-    if not any(bare.values()):
-        return None
-    return with_whole_drives(data, archive, config, bare).whole_blocks(asked)
-
-
 def in_whole_drives(
     data: LabelledData,
     archive: Archive,
@@ -42,11 +30,17 @@ def in_whole_drives(
     Those that are surely worse than the baseline without the health check, or lose track more
     often, are left out, and others take their place. `drive` makes the drives that are lacking.
     """
+    names = [s.name for s in data.sequences]
     for _ in range(MOST_ROUNDS):
         drive(data)
         driven = with_whole_drives(data, archive, config)
-        blocks = bare_blocks(driven, archive, config)
-        worse = [] if blocks is None else np.array(blocks.trials)[worse_without(blocks)].tolist()
+        asked = [*driven.finalists(), *driven.sets.defaults]
+        bare = read_whole_drives(archive, names, asked, bare=True)
+        if not any(bare.values()):
+            return driven
+        # Where the health check did not act, a drive is bare as it is.
+        blocks = with_whole_drives(driven, archive, config, bare).whole_blocks(asked)
+        worse = np.array(blocks.trials)[worse_without(blocks)].tolist()
         if not worse:
             return driven
         data = data.subset([n for n in data.sets if n not in worse])

@@ -5,16 +5,17 @@ import math
 from collections.abc import Collection, Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from adaptune.archive import REGISTER_MS, Archive, ArchiveError, Frames, Summary, Trial
 from adaptune.errors import AdaptuneError
 from adaptune.model.rules import BASELINE
-from adaptune.progress import Progress, unseen
+from adaptune.progress import Progress, about, unseen
 from adaptune.space import ParameterSet, PooledSpace
 from adaptune.study.references import contradictions_of
+from offline.choice import DEARER, FINALISTS
 from offline.config import OfflineStudy
 from offline.drive import Drive
 from offline.objective import Verdict, label
@@ -216,11 +217,71 @@ class Schedule:
         self._progress(self._what, self.driven, self.total, "")
 
 
-class Campaign:
-    """Runs the search of a study.
+WholeDrives = Mapping[str, Mapping[int, Summary]]
+"""By sequence, drives of whole recordings by trial number."""
 
-    `seconds` are those that a set takes, about, and those of what follows the search.
+
+def read_whole_drives(
+    archive: Archive, names: Sequence[str], numbers: Iterable[int], bare: bool = False
+) -> dict[str, dict[int, Summary]]:
+    """The drives of whole recordings that there are of some trials."""
+    found: dict[str, dict[int, Summary]] = {name: {} for name in names}
+    for name in names:
+        for n in numbers:
+            with suppress(ArchiveError):
+                found[name][n] = archive.summary(name, n, whole=True, bare=bare)
+    return found
+
+
+COST = 1.4
+"""Of a set, over the baseline's, about: 1.1 to 1.6 in the mean of the sets on each of five
+recordings."""
+ALONE = 3
+"""Replays of one set: the baseline, the fixed set, and its rival."""
+FITTING = 10.0
+"""Seconds to fit the model, to compare, and to draw the page, about."""
+
+
+class Forecast(NamedTuple):
+    """Seconds, where all workers are at work."""
+
+    each: float  # to try a set on all training sequences
+    rest: float  # of what follows: finalists' drives of whole recordings, and the replays
+
+    def words(self, left: float, most: float) -> str:
+        """How long it takes to try so many sets and to finish, in at most so many seconds."""
+        n, whole = left, self.each * left + self.rest
+        if whole > most:
+            n, whole = max(0.0, (most - self.rest) / max(self.each, 1e-9)), most
+        return f"it takes {about(whole)}: {n:.0f} parameter sets of {self.each:.1f} s, and the rest"
+
+
+def forecast(study: OfflineStudy, archive: Archive, workers: int, clock: Clock) -> Forecast:
+    """Tell from the baseline's drives how long the search takes, and what follows it.
+
+    Replays count if they do for the clock.
     """
+    baselines = range(len(study.odometry.space.baselines))
+    drives = read_whole_drives(archive, study.training, baselines)
+    costs, each, rest = [], 0.0, 0.0
+    for name, runs in drives.items():
+        frames = archive.read_frames(name)
+        known = [run.ms if np.isnan(run.cost) else run.cost for run in runs.values()]
+        costs.append(1e-3 * float(np.mean(known)))
+        each += COST * costs[-1] * frames.n_driven * study.config.offline.repeats
+        if not archive.is_uncut(name):
+            rest += COST * costs[-1] * len(frames.stamps) * (FINALISTS + DEARER)
+    workers = max(workers, 1)  # those of a cluster may come later
+    rest = FITTING + rest / workers
+    if clock.replays:
+        members = study.config.online.switching.size if study.mechanism == "bank" else 0
+        scans = sum(study.sequences.open(name).n_messages for name in study.config.test)
+        rest += float(np.mean(costs)) * scans * (ALONE + len(study.rules) * (members + 1))
+    return Forecast(each / workers, rest)
+
+
+class Campaign:
+    """Runs the search of a study, in the time that `expected` says its sets take."""
 
     def __init__(
         self,
@@ -229,13 +290,12 @@ class Campaign:
         workers: Pool[Any],
         progress: Progress = unseen,
         clock: Clock | None = None,
-        seconds: tuple[float, float] = (0.0, 0.0),
+        expected: Forecast = Forecast(0.0, 0.0),  # noqa: B008 (a tuple)
     ):
-        self._archive, self._workers, self._progress = archive, workers, progress
+        self._workers, self._progress, self._expected = workers, progress, expected
         self._config, self._names = study.config.offline, study.training
         self._clock, self._resumed = clock or Clock(study.folder / ELAPSED), 0
         self._begun = self._clock.hours
-        self._each, self._rest = seconds
         self._finished = {name: archive.finished(name) for name in self._names}
         space, known = study.odometry.space, archive.known()
         self._search = Search(self._config, space, self._finished, known)
@@ -278,10 +338,10 @@ class Campaign:
         """Hours after which all is done, if one more set begins now."""
         now, n, driven = self._clock.hours, len(self._names), self._schedule.driven
         # What was expected counts as much as the first set.
-        spent = self._each + 3600.0 * (now - self._begun)
+        spent = self._expected.each + 3600.0 * (now - self._begun)
         each = spent / (1.0 + (driven - self._resumed) / n)
         left = (self._schedule.total - driven) / n + 1.0
-        return now + (each * left + self._rest) / 3600.0
+        return now + (each * left + self._expected.rest) / 3600.0
 
     def _show(self, what: str, done: float, of: int, remark: str = "", /) -> None:
         search = self._search
@@ -291,22 +351,6 @@ class Campaign:
                 value = search.done[search.best].value
                 remark = f"best {label(self._config.objective)} {value:.3f} (trial {search.best})"
         self._progress(what, done, of, remark)
-
-
-WholeDrives = Mapping[str, Mapping[int, Summary]]
-"""By sequence, drives of whole recordings by trial number."""
-
-
-def read_whole_drives(
-    archive: Archive, names: Sequence[str], numbers: Iterable[int], bare: bool = False
-) -> dict[str, dict[int, Summary]]:
-    """The drives of whole recordings that there are of some trials."""
-    found: dict[str, dict[int, Summary]] = {name: {} for name in names}
-    for name in names:
-        for n in numbers:
-            with suppress(ArchiveError):
-                found[name][n] = archive.summary(name, n, whole=True, bare=bare)
-    return found
 
 
 def drive_whole(
@@ -322,31 +366,26 @@ def drive_whole(
     the baseline, drive such sequences once more, bare.
     """
     names = study.training
+
+    def drive(schedule: Schedule, on: Mapping[str, Collection[int]], bare: bool = False) -> None:
+        there = read_whole_drives(archive, names, sets, bare)
+        for name, numbers in on.items():
+            for n in numbers:
+                if n not in there[name]:
+                    schedule.add(name, n, sets[n])
+        for done in schedule.run(workers):
+            schedule.store(*done)
+
     schedule = Schedule(study, archive, "whole drives", progress, whole=True)
-    _drive(schedule, workers, read_whole_drives(archive, names, sets), dict.fromkeys(names, sets))
+    drive(schedule, dict.fromkeys(names, sets))
     whole = read_whole_drives(archive, names, sets)
     restarts = {n: sum(of[n].restarts for of in whole.values()) for n in sets}
     helped = [n for n in sets if 0 < restarts[n] <= restarts[BASELINE]]
     if len(helped) < 2:  # none, or the baseline
         return
     schedule = Schedule(study, archive, "drives without health check", progress, bare=True)
-    needed = {name: {n: sets[n] for n in helped if of[n].restarts} for name, of in whole.items()}
-    _drive(schedule, workers, read_whole_drives(archive, names, helped, bare=True), needed)
-
-
-def _drive(
-    schedule: Schedule,
-    workers: Pool[Any],
-    there: WholeDrives,
-    needed: Mapping[str, Mapping[int, ParameterSet]],
-) -> None:
-    """Drive the sets that are needed on each sequence, unless that is there."""
-    for name, sets in needed.items():
-        for n, parameters in sets.items():
-            if n not in there[name]:
-                schedule.add(name, n, parameters)
-    for done in schedule.run(workers):
-        schedule.store(*done)
+    on = {name: [n for n in helped if of[n].restarts] for name, of in whole.items()}
+    drive(schedule, on, bare=True)
 
 
 class BaselineError(AdaptuneError):
@@ -359,12 +398,8 @@ def run_baseline(
     """Drive the baseline along every training sequence, all of it, unless that was done before.
 
     Of several odometries, the baseline of each. Nothing is stored before all have done well on all
-    sequences. Where the reference contradicts the motion of one, scans say which of them is wrong.
-
-    Raises
-    ------
-    BaselineError
-        If one fails on one of them.
+    sequences: there is a BaselineError if one fails. Where the reference contradicts the motion of
+    one, scans say which of them is wrong.
     """
     space = study.odometry.space
     there = read_whole_drives(archive, study.training, range(len(space.baselines)))
@@ -382,19 +417,14 @@ def run_baseline(
         done.append((name, number, trial))
     for name, number, trial in done:
         schedule.store(name, number, replace(trial, source="baseline"))
-        told = contradictions_of(study.sequences, name, trial.T_odom_sensor, trial.mean_error)
-        for what in told:
-            _log.warning("sequences.%s, %s: %s", name, labels[number], what)
+        poses, error = trial.T_odom_sensor, trial.mean_error
+        for contradiction in contradictions_of(study.sequences, name, poses, error):
+            _log.warning("sequences.%s, %s: %s", name, labels[number], contradiction)
     schedule.close()
 
 
 def check_baseline(odometry: str, sequence: str, run: Trial) -> None:
-    """Refuse a baseline that failed; a fault now and then does no harm.
-
-    Raises
-    ------
-    BaselineError
-    """
+    """Refuse a baseline that failed, by a BaselineError; a fault now and then does no harm."""
     if not run.failure:
         return
     last = run.faults[-1] if run.faults else "it gave no pose, and no reason"

@@ -111,9 +111,9 @@ def surely_worse(blocks: BlockErrors) -> NDArray[np.bool_]:
         more = blocks.errors - blocks.errors[:, [blocks.baseline]]
     worse = np.zeros(len(blocks.trials), bool)
     every = np.ones(len(more), bool)
-    for of in [every, *(blocks.sequence == s for s in np.unique(blocks.sequence))]:
-        if (n := int(of.sum())) > 1:
-            mean, error = mean_and_error(more[of], blocks.sequence[of])
+    for rows in [every, *(blocks.sequence == s for s in np.unique(blocks.sequence))]:
+        if (n := int(rows.sum())) > 1:
+            mean, error = mean_and_error(more[rows], blocks.sequence[rows])
             worse |= mean - stats.t.ppf(SURE, n - 1) * error > 1e-9
     return worse
 
@@ -154,27 +154,19 @@ def choose(blocks: BlockErrors, budget: float | None = None, sure: bool = True) 
     """Trial number of the fixed set.
 
     Of the admissible sets that cost no more than the baseline, or than a `budget` in milliseconds
-    of CPU time a scan, it is the cheapest whose bound is nearly the least, see `bounds`.
-
-    Raises
-    ------
-    AdaptuneError
-        If no set keeps to the budget.
-    NothingUsableError
-        If no set can be chosen.
+    of CPU time a scan, it is the cheapest whose bound is nearly the least, see `bounds`. There is
+    an AdaptuneError if no set keeps to the budget, a NothingUsableError if none can be chosen.
     """
     bound = _within(blocks, budget, sure)
     if not np.isfinite(bound).any():
-        raise NothingUsableError(UNUSABLE.format(n=len(blocks.trials)))
+        raise NothingUsableError(
+            f"odometry: none of {len(blocks.trials)} parameter sets gives poses for nearly all "
+            f"scans of every training sequence, so none can be chosen (`adaptune trials` lists "
+            f"their faults): mend the odometry, or narrow the ranges of the parameters "
+            f"(odometry.parameters)"
+        )
     good, classes = np.flatnonzero(bound <= AS_GOOD * bound.min()), cost_classes(blocks)
     return blocks.trials[int(min(good, key=lambda k: (classes[k], bound[k])))]
-
-
-UNUSABLE = (
-    "odometry: none of {n} parameter sets gives poses for nearly all scans of every training "
-    "sequence, so none can be chosen (`adaptune trials` lists their faults): mend the odometry, or "
-    "narrow the ranges of the parameters (odometry.parameters)"
-)
 
 
 def _within(blocks: BlockErrors, budget: float | None, sure: bool = True) -> NDArray[np.float64]:
@@ -193,12 +185,8 @@ def _within(blocks: BlockErrors, budget: float | None, sure: bool = True) -> NDA
 def affordable(blocks: BlockErrors, budget: float | None) -> NDArray[np.bool_]:
     """Which sets cost no more than a budget, or than the baseline, of shape (n_trials,).
 
-    What takes more than `MOST_OF_PERIOD`, and more than the baseline, may come too late.
-
-    Raises
-    ------
-    AdaptuneError
-        If none does.
+    What takes more than `MOST_OF_PERIOD`, and more than the baseline, may come too late. There is
+    an AdaptuneError if no set keeps to the budget.
     """
     if budget is None:
         return cost_classes(blocks) <= 0.0
@@ -219,23 +207,23 @@ def affordable(blocks: BlockErrors, budget: float | None) -> NDArray[np.bool_]:
 def front(blocks: BlockErrors) -> list[int]:
     """Trials by rising cost, each with clearly less error than all that cost less."""
     bound, classes = bounds(blocks, sure=False), cost_classes(blocks)
-    found, least = [], np.inf
-    for k in sorted(range(len(bound)), key=lambda k: (classes[k], bound[k])):
+    trials, least = [], np.inf
+    for k in np.lexsort((bound, classes)):
         if np.isfinite(bound[k]) and bound[k] * AS_GOOD < least:
-            found.append(blocks.trials[k])
+            trials.append(blocks.trials[k])
             least = bound[k]
-    return found
+    return trials
 
 
 def finalists(blocks: BlockErrors, budget: float | None = None) -> list[int]:
     """Trials whose sets drive whole recordings, the baseline's and the front's among them."""
-    few, bound = affordable(blocks, budget), _within(blocks, budget)
+    bound = _within(blocks, budget)
     order = [k for k in np.argsort(bound, kind="stable") if np.isfinite(bound[k])]
     best = [blocks.trials[k] for k in order[:FINALISTS]]
-    allowed = dict(zip(blocks.trials, few, strict=True))
-    cheaper, dearer = (
-        [trial for trial in front(blocks) if allowed[trial] == within] for within in (True, False)
-    )
+    allowed = dict(zip(blocks.trials, affordable(blocks, budget), strict=True))
+    ranked = front(blocks)
+    cheaper = [trial for trial in ranked if allowed[trial]]
+    dearer = [trial for trial in ranked if not allowed[trial]]
     return list(dict.fromkeys([BASELINE, *best, *cheaper[-2:], *dearer[:DEARER]]))
 
 

@@ -35,10 +35,7 @@ class SamplerError(AdaptuneError):
 
 
 class Step(StrictModel):
-    """How far a step of annealing moves a parameter.
-
-    ``docs/reference-study.md`` describes the settings and their defaults.
-    """
+    """How far a step of annealing moves a parameter; see ``docs/reference-study.md``."""
 
     mu: float | None = None
     sigma: float | None = Field(None, ge=0)
@@ -50,10 +47,7 @@ class Step(StrictModel):
 
 
 class AnnealingSettings(StrictModel):
-    """Settings of simulated annealing, with the names they have in RUSTLE.
-
-    ``docs/reference-study.md`` describes them.
-    """
+    """Settings of simulated annealing, named as in RUSTLE; see ``docs/reference-study.md``."""
 
     initial_temperature: float = Field(0.1, gt=0)
     alpha: float = Field(0.9, gt=0, le=1)
@@ -90,13 +84,7 @@ class GridSettings(StrictModel):
 
 
 def optuna_class(name: str) -> type[Any]:
-    """Class of an Optuna sampler.
-
-    Raises
-    ------
-    SamplerError
-        It names the nearest sampler, or says why there is none.
-    """
+    """Class of an Optuna sampler; a SamplerError names the nearest one, or the mistake."""
     if name not in OPTUNA and ":" not in name:
         raise SamplerError(
             f"there is no sampler {name!r}: {nearest(name, NAMES)} (another Optuna sampler is "
@@ -117,13 +105,7 @@ def optuna_class(name: str) -> type[Any]:
 
 
 def optuna_sampler(name: str, settings: Mapping[str, Any], seed: int) -> Any:
-    """Make an Optuna sampler.
-
-    Raises
-    ------
-    SamplerError
-        If it does not take these settings.
-    """
+    """Make an Optuna sampler; there is a SamplerError if it does not take these settings."""
     cls = optuna_class(name)
     keywords = inspect.signature(cls).parameters
     if not any(k.kind is inspect.Parameter.VAR_KEYWORD for k in keywords.values()):
@@ -148,17 +130,11 @@ SETTINGS: dict[str, type[BaseModel]] = {
 
 
 class Grid:
-    """All combinations of the axes' values, in row-major order: the last axis changes fastest.
-
-    Attributes
-    ----------
-    size : int
-        Number of points.
-    """
+    """All combinations of the axes' values, in row-major order: the last axis changes fastest."""
 
     def __init__(self, axes: Mapping[str, Sequence[Value]]):
         self.axes = dict(axes)
-        self.size = math.prod(map(len, self.axes.values()))
+        self.size = math.prod(map(len, self.axes.values()))  # number of points
 
     def __getitem__(self, index: int) -> ParameterSet:
         values: ParameterSet = {}
@@ -290,11 +266,7 @@ def check_grid(
 
 def distribution(parameter: Float | Integer | Categorical) -> Any:
     """A parameter as Optuna describes it."""
-    from optuna.distributions import (
-        CategoricalDistribution,
-        FloatDistribution,
-        IntDistribution,
-    )
+    from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
 
     if isinstance(parameter, Categorical):
         return CategoricalDistribution(parameter.choices)
@@ -330,11 +302,11 @@ def check_sampler(
         steps, start = given.steps, given.start or {}
         yield from _untuned("start", start, space)
         yield from _untuned("steps", steps, space)
-        for parameter, of in space.parameters.items():
-            if parameter in start:
-                yield from _check_start(parameter, of, start[parameter], steps.get(parameter))
-            if parameter in steps:
-                yield from _check_step(parameter, of, steps[parameter])
+        for key, parameter in space.parameters.items():
+            if key in start:
+                yield from _check_start(key, parameter, start[key], steps.get(key))
+            if key in steps:
+                yield from _check_step(key, parameter, steps[key])
     elif name in ("grid", "random"):
         axes = GridSettings.model_validate(settings).grid
         if axes is not None or name == "grid":
@@ -376,8 +348,8 @@ def _check_start(
     name: str, parameter: Float | Integer | Categorical, value: float, step: Step | None
 ) -> Iterable[Finding]:
     if isinstance(parameter, Categorical):
-        what = "is a category, which starts at the baseline; leave it out"
-        yield Finding(("start", name), what)
+        help_ = "is a category, which starts at the baseline; leave it out"
+        yield Finding(("start", name), help_)
         return
     low, high = _box(parameter, step or Step())
     if not (parameter.contains(value) and low <= value <= high):
@@ -392,7 +364,7 @@ def _box(parameter: Float | Integer, step: Step) -> tuple[float, float]:
 
 
 Metric = Literal["rte", "kitti", "rpe", "ape", "ms_per_scan", "cpu"]
-"""What a trial can be judged by; `offline.objective` explains each."""
+"""What a trial can be judged by; ``docs/reference-study.md`` explains each."""
 TIMED = ("ms_per_scan", "cpu")
 """Metrics that differ from run to run and from machine to machine."""
 _Weighted = Annotated[dict[Metric, Annotated[float, Field(gt=0, le=1e9)]], Field(min_length=1)]
@@ -528,11 +500,10 @@ def load_study(
 
     given = Path(study) if isinstance(study, str) else study
     if isinstance(given, Path) and not given.exists():
-        what = "give the YAML of a study, or the folder of one that has begun"
-        raise ConfigurationError(f"{given}: there is no such file or folder; {what}")
+        help_ = "give the YAML of a study, or the folder of one that has begun"
+        raise ConfigurationError(f"{given}: there is no such file or folder; {help_}")
     if isinstance(given, Path) and given.is_dir():
         if not (given / CONFIGURATION).exists():
-            what = "is no study's folder: there is no study.yaml in it"
-            raise ConfigurationError(f"{given}: {what}")
+            raise ConfigurationError(f"{given}: is no study's folder: there is no study.yaml in it")
         given, folder = given / CONFIGURATION, folder or given
     return read_study(given, OfflineStudyConfig, overrides, folder, runs, needed)

@@ -74,7 +74,7 @@ class _Driver:
         drive = self.drive
         try:
             if not drive.exception and not drive.too_slow:
-                self._step(drive, i, scan)
+                self._register(i, scan)
         except (UnavailableError, SequenceError, MachineError, MemoryError):
             raise  # of the machine or the recording, whatever the parameters
         except Exception as error:
@@ -94,10 +94,10 @@ class _Driver:
         if drive.usage.seconds is not None:
             drive.seconds[~np.isnan(drive.seconds)] = drive.usage.seconds
 
-    def _step(self, drive: Drive, i: int, scan: SharedScan) -> None:
+    def _register(self, i: int, scan: SharedScan) -> None:
         if self._tracker is None:
             self._tracker = self._begin()
-        odometry = self._tracker.odometry
+        drive, odometry = self.drive, self._tracker.odometry
         found = self._tracker.register_prepared(self._stamps[i], scan(odometry))
         drive.T_odom_sensor[i], drive.tried[i] = found.T_odom_sensor, True
         lost = not np.isfinite(found.T_odom_sensor).all()

@@ -33,10 +33,7 @@ def describe(
 ) -> Frames:
     """Read a whole sequence, and describe its scans.
 
-    Raises
-    ------
-    AdaptuneError
-        If the sequence cannot be read, or no error can be measured on it.
+    There is an AdaptuneError if it cannot be read, or no error can be measured on it.
     """
     key, scans = sequences.key(name), sequences.open(name)
     reference = scans.reference()
@@ -73,10 +70,7 @@ def reference_poses(
 ) -> Poses:
     """Reference poses at the scans' stamps, of shape (n, 4, 4), NaN where they are not known.
 
-    Raises
-    ------
-    AdaptuneError
-        If no error can be measured on the sequence.
+    There is an AdaptuneError if no error can be measured on the sequence.
     """
     T_ref_sensor = reference.at(stamps)
     whole = (window_ends(T_ref_sensor, config.sub_trajectory) >= 0).any()

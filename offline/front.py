@@ -18,7 +18,6 @@ from adaptune.recording.scan import Recording
 from adaptune.space import in_words
 from offline.choice import (
     MOST_OF_PERIOD,
-    BlockErrors,
     choose,
     front,
     left_out_ratio,
@@ -41,48 +40,41 @@ def front_rows(data: LabelledData, model: ErrorModel) -> list[dict[str, Any]]:
     ratio to the baseline's.
     """
     blocks = data.whole_blocks(data.finalists())
+    base = float(mean_and_error(blocks.errors, blocks.sequence)[0][blocks.baseline])
+
+    def row(
+        what: str, ratio: Sequence[float], cost: float, parameters: str, trial: int | None
+    ) -> dict[str, Any]:
+        value, low, high = ratio
+        found = {"what": what, "error [%]": base * value, COST: cost, "vs baseline": value}
+        found |= {"low": low, "high": high, "recommended": trial == model.fixed}
+        return found | {"parameters": parameters, "trial": trial}
+
     rows = []
     others = [trial for trial in front(blocks) if trial not in (model.fixed, BASELINE)]
     for trial in list(dict.fromkeys([model.fixed, BASELINE, *others]))[: MOST_ROWS - 1]:
         what = "baseline" if trial == BASELINE else f"trial {trial}"
-        ratio = ratio_to_baseline(blocks, trial)
-        rows.append(_front_row(what, data.costs.alone(trial), blocks, ratio))
-        rows[-1] |= {"parameters": in_words(data.sets[trial]), "trial": trial}
+        ratio, cost = ratio_to_baseline(blocks, trial), data.costs.alone(trial)
+        rows.append(row(what, ratio, cost, in_words(data.sets[trial]), trial))
     members = [trial for trial in model.bank if trial not in model.reserve]
     if (of_bank := model.expected) and len(members) > 1:
         by = (of_bank["geometric"], of_bank["low"], of_bank["high"])
-        value, low, high = np.multiply(ratio_to_baseline(blocks, model.fixed), by).tolist()
-        what, cost = f"bank of {len(members)}", data.costs.adaptive(members)
-        rows.append(_front_row(what, cost, blocks, (value, low, high)))
-        rows[-1] |= {"parameters": f"trials {', '.join(map(str, members))}", "trial": None}
-    rows[0]["recommended"] = True
+        ratio = np.multiply(ratio_to_baseline(blocks, model.fixed), by).tolist()
+        trials = f"trials {', '.join(map(str, members))}"
+        rows.append(
+            row(f"bank of {len(members)}", ratio, data.costs.adaptive(members), trials, None)
+        )
     return [rows[0], *sorted(rows[1:], key=lambda row: row[COST])]
-
-
-def _front_row(
-    what: str, cost: float, blocks: BlockErrors, ratio: tuple[float, float, float]
-) -> dict[str, Any]:
-    base = float(mean_and_error(blocks.errors, blocks.sequence)[0][blocks.baseline])
-    value, low, high = ratio
-    return {
-        "what": what,
-        "error [%]": base * value,
-        COST: cost,
-        "vs baseline": value,
-        "low": low,
-        "high": high,
-        "recommended": False,
-    }
 
 
 def left_out_in_words(data: LabelledData) -> str:
     """What to expect elsewhere of a set that is chosen as the fixed one is."""
-    found = left_out_ratio(data.blocks(), lambda blocks: choose(blocks, data.budget))
-    if found is None:
+    left_out = left_out_ratio(data.blocks(), lambda blocks: choose(blocks, data.budget))
+    if left_out is None:
         return (
             "There is too little data to tell how a chosen set does on other drives: record more."
         )
-    ratio, low, high = found
+    ratio, low, high = left_out
     return (
         f"Sets chosen in the same way, without the part that they are tested on, have {ratio:.2f} "
         f"times the baseline's error there (95 % interval {low:.2f}-{high:.2f})."
@@ -100,16 +92,9 @@ def measured_front(
 
     Each drives alone, with the threads that the study gives it. Errors are those of training.
 
-    Returns
-    -------
-    list of dict
-        A row for each set: mean CPU time and the 99th percentile of the time a scan in
-        milliseconds, memory in megabytes, and which one is recommended.
-
-    Raises
-    ------
-    AdaptuneError
-        If the study has no front yet, or the recording fewer than two scans.
+    Returns a row for each set: mean CPU time and the 99th percentile of the time a scan in
+    milliseconds, memory in megabytes, and which one is recommended. There is an AdaptuneError if
+    the study has no front yet, or the recording fewer than two scans.
     """
     path = study.folder / "front.json"
     if not path.exists():

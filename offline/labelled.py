@@ -1,5 +1,6 @@
 """The labelled data set: what the archive holds about every training sequence."""
 
+from collections import defaultdict
 from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, lru_cache, partial
@@ -48,7 +49,7 @@ from offline.choice import (
     choose,
     finalists,
 )
-from offline.config import OfflineConfig, OfflineStudyConfig
+from offline.config import OfflineConfig, OfflineStudy
 from offline.objective import weighted
 
 if TYPE_CHECKING:
@@ -64,8 +65,7 @@ MISFIT_PER_METRE = 0.25
 def error_vectors(T_ref_sensor: Poses, trial: Trial, length: float) -> NDArray[np.float32]:
     """Errors of a trial as vectors, see `sub_trajectory_vectors`.
 
-    Their lengths are the trial's errors. Where a trial was run several times, their directions are
-    those of the first run. The reference is of shape (n_frames, 4, 4), the length in metres.
+    Their lengths are the trial's errors; of several runs, their directions are the first one's.
 
     Returns shape (n_frames, 3).
     """
@@ -124,23 +124,22 @@ class BankSimulation:
                     float(metres[frame]), float(seconds[frame])
                 )
             )
-            for frame in np.unique(self.period, return_index=True)[1]
+            for frame in periods(self.period)[0]
         ]
         return self._live[members]
 
     def agreeing(self, votes: MemberWeights) -> NDArray[np.bool_]:
         """Over which scans each member agrees with the others, of shape (n_frames - 1, n_members).
 
-        Members vote with the weights that are given. The reference takes the place of the short
-        registrations: it tells a member that is lost from one that is sound.
+        Members vote with these weights. The reference takes the place of the short registrations.
         """
         T_previous_current = self.motions(votes.members)
         agreement = Agreement(len(votes.members), self.lost_track)
         agreeing = np.zeros(T_previous_current.shape[:2], bool)
-        of_steps = self._of_steps(votes)
+        weights = self._of_steps(votes)
         for i, seconds in enumerate(np.diff(self.stamps) * 1e-9):
             agreeing[i] = agreement.judge(
-                T_previous_current[i], seconds, of_steps[i], partial(self._misplaced, i + 1)
+                T_previous_current[i], seconds, weights[i], partial(self._misplaced, i + 1)
             )
             if agreeing[i].any():
                 agreement.restarted(agreement.due)
@@ -150,7 +149,7 @@ class BankSimulation:
 
     def _of_steps(self, weights: MemberWeights) -> NDArray[np.float64]:
         """Weights at every scan but the first, of shape (n_frames - 1, n_members)."""
-        return weights.weights[np.unique(self.period, return_inverse=True)[1][1:]]
+        return weights.weights[periods(self.period)[1][1:]]
 
     def _misplaced(
         self, frame: int, T_then_now: Poses, ago: tuple[int, ...]
@@ -170,10 +169,9 @@ class BankSimulation:
 
         Who agrees is found with the same weights when left out, see `agreeing`.
         """
-        T_previous_current = self.motions(weights.members)
         agreeing = self.agreeing(weights) if agreeing is None else agreeing
         none = np.asarray(~agreeing.any(axis=1))
-        believed = np.where(agreeing[..., None, None], T_previous_current, np.eye(4))
+        believed = np.where(agreeing[..., None, None], self.motions(weights.members), np.eye(4))
         moved = mean_motion(believed, share(self._of_steps(weights), agreeing | none[:, None]))
         T_ref, T_odom = self.T_ref_counted, chained(moved)
         return cap(sub_trajectory_rte(T_ref, T_odom, self.length, ends=self.ends))
@@ -310,7 +308,7 @@ class LabelledSequence:
         """The same with some of the frames."""
         if kept.all():
             return self
-        known, whole = self.known[kept], self.whole
+        known, turns, whole = self.known[kept], self.turns, self.whole
         return replace(
             self,
             known=known,
@@ -318,7 +316,7 @@ class LabelledSequence:
             errors=self.errors[kept],
             vectors={trial: vectors[kept] for trial, vectors in self.vectors.items()},
             blocks_of=self.blocks_of[kept],
-            turns=None if self.turns is None else self.turns[kept],
+            turns=None if turns is None else turns[kept],
             whole=whole and whole.frames(np.isin(whole.known, known)),
         )
 
@@ -377,10 +375,7 @@ class LabelledData(NamedTuple):
         return self._replace(sequences=few, sets=self.sets.subset(trials))
 
     def usable(self) -> "LabelledData":
-        """The same with the sets that did not fail.
-
-        There is a NothingUsableError where the baseline is none of them.
-        """
+        """The same with the sets that did not fail; a NothingUsableError if the baseline did."""
         if not self.costs.usable(BASELINE):
             raise NothingUsableError(
                 "the baseline fails where it begins within a recording, though not along a whole "
@@ -396,34 +391,44 @@ class LabelledData(NamedTuple):
     def folds(
         self, by_recording: bool | None = None
     ) -> list[tuple[LabelledSequence, "LabelledData"]]:
-        """Leave each recording out, or, where there are few, each stretch.
+        """Leave each recording out, or, by default below `MIN_RECORDINGS`, each stretch.
 
         A stretch is not left out if nothing far enough from it remains.
-
-        Recordings are left out where `by_recording`; by default if there are `MIN_RECORDINGS`.
         """
         if by_recording is None:
             by_recording = len(self.recordings) >= MIN_RECORDINGS
         folds = []
-        for one in self.sequences:
-            elsewhere = [s for s in self.sequences if s.recording != one.recording]
+        for whole in self.sequences:
             if by_recording:
-                folds.append((one, elsewhere))
+                folds.append((whole, self.without(whole)))
                 continue
-            for number in np.unique(one.stretch):
-                left = one.frames(one.stretch == number)
+            for number in np.unique(whole.stretch):
+                left = whole.frames(whole.stretch == number)
                 known = [
-                    s if s.recording != one.recording else s.frames(~s.near(left))
+                    s if s.recording != whole.recording else s.frames(~s.near(left))
                     for s in self.sequences
                 ]
-                folds.append((left.part(), [s for s in known if len(s.errors)]))
-        return [(left, self._replace(sequences=others)) for left, others in folds if others]
+                others = self._replace(sequences=[s for s in known if len(s.errors)])
+                folds.append((left.part(), others))
+        return [(left, others) for left, others in folds if others.sequences]
+
+    def without(self, sequence: LabelledSequence) -> "LabelledData":
+        """The other recordings."""
+        others = [s for s in self.sequences if s.recording != sequence.recording]
+        return self._replace(sequences=others)
 
     def stretches(self) -> NDArray[np.intp]:
         """Number of every frame's stretch, of shape (n_frames,)."""
-        lengths = [len(s.errors) for s in self.sequences]
         cuts = np.concatenate([s.stretch for s in self.sequences])
-        return stretch_numbers(np.repeat(np.arange(len(lengths)), lengths), cuts)
+        return stretch_numbers(self.numbers(), cuts)
+
+    def numbers(self) -> NDArray[np.intp]:
+        """Number of every frame's sequence, of shape (n_frames,)."""
+        return np.repeat(np.arange(len(self.sequences)), [len(s.errors) for s in self.sequences])
+
+    def errors(self) -> NDArray[np.float32]:
+        """Errors on the frames of all sequences, of shape (n_frames, n_sets)."""
+        return np.concatenate([s.errors for s in self.sequences])
 
     def blocks(self) -> BlockErrors:
         """What the trials of all sets say."""
@@ -438,14 +443,9 @@ class LabelledData(NamedTuple):
             np.repeat(np.arange(len(errors)), [len(of) for of in errors]),
             np.array([self.costs.alone(trial) for trial in trials]),
             np.sum([none if s.restarts is None else s.restarts for s in sequences], axis=0),
-            self.period,
+            min(1e-6 * float(np.median(np.diff(s.simulation.stamps))) for s in self.sequences),
             np.concatenate(turns) if len(turns) == len(errors) else None,
         )
-
-    @property
-    def period(self) -> float:
-        """Milliseconds from scan to scan."""
-        return min(1e-6 * float(np.median(np.diff(s.simulation.stamps))) for s in self.sequences)
 
     def whole_blocks(self, trials: Collection[int]) -> BlockErrors:
         """What drives of whole recordings say, of those of some sets that have made them."""
@@ -459,10 +459,7 @@ class LabelledData(NamedTuple):
         return finalists(self.blocks(), self.budget)
 
     def fixed(self) -> int:
-        """Trial number of the fixed set within the study's budget.
-
-        It is chosen among the finalists, by their drives of whole recordings.
-        """
+        """Trial number of the fixed set within the budget, by finalists' whole drives."""
         return self._best(self.budget)
 
     def rival(self, cost: float) -> int:
@@ -486,7 +483,7 @@ class LabelledData(NamedTuple):
         data = TrainingData(
             pca.fit(descriptors).transform(descriptors),
             self.stretches(),
-            np.concatenate([s.errors for s in self.sequences]),
+            self.errors(),
             self.sets,
             fixed := self.fixed(),
             allowed=allowed_sets(self.costs, self.budget, self.sets, fixed),
@@ -499,6 +496,10 @@ class LabelledData(NamedTuple):
         """How a bank may spend the budget; None without a budget."""
         return Spending.of(self.costs, self.budget)
 
+    def can_pay(self, members: Sequence[int]) -> bool:
+        """Whether a bank of these trials stays within the budget, if there is one."""
+        return self.spending is None or self.spending.allows(members)
+
     def vectors(self, members: Sequence[int]) -> NDArray[np.float32]:
         """Error vectors of some sets on the frames of all sequences, of shape (n, n_members, 3)."""
         return np.concatenate(
@@ -507,10 +508,7 @@ class LabelledData(NamedTuple):
 
 
 def periods(period: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """First frame of every period, and number of every frame's period among them.
-
-    `period` has whole periods since the first scan, of shape (n_frames,).
-    """
+    """First frame of every period, and number of every frame's period among them."""
     _, first, number = np.unique(period, return_index=True, return_inverse=True)
     return first, number
 
@@ -524,61 +522,42 @@ def measured_costs(
     work, and differs with what else the machine did.
     """
     numbers: dict[Hashable, int] = {}
-    register: dict[int, float] = {}
-    prepare: dict[int, dict[int, float]] = {}  # by number of the preparation
+    costs: dict[int, SetCost] = {}
+    known = defaultdict[int, list[float]](list)  # what each preparation took in trials that worked
     for trial in sets:
         runs = [archive.finished(name)[trial] for name in names]
-        took, prepared = (
-            float(np.mean([one.others.get(key, np.nan) for one in runs]))
+        register, prepare = (
+            float(np.mean([run.others.get(key, np.nan) for run in runs]))
             for key in (REGISTER_MS, PREPARE_MS)
         )
-        register[trial] = np.inf if any(one.failure for one in runs) else took
+        if any(run.failure for run in runs):
+            register = np.inf
         number = numbers.setdefault(odometry(sets[trial]).preparation, len(numbers))
-        prepare.setdefault(number, {})[trial] = prepared
+        costs[trial] = cost = SetCost(register, prepare, number)
+        if np.isfinite(cost.alone):
+            known[number].append(prepare)
+    usual = {number: float(np.median(times)) for number, times in known.items()}
     found = {
-        trial: SetCost(register[trial], _usual(times, register, own), number)
-        for number, times in prepare.items()
-        for trial, own in times.items()
+        trial: cost._replace(prepare=usual.get(cost.preparation, cost.prepare))
+        for trial, cost in sorted(costs.items(), key=lambda item: item[1].preparation)
     }
     every_second = float(np.mean([archive.read_frames(name).evidence_ms for name in names]))
     return Costs(found, USUAL_SHARE * every_second)
 
 
-def _usual(times: Mapping[int, float], register: Mapping[int, float], own: float) -> float:
-    """Median of what preparation took; sets that failed, or did not tell, do not count."""
-    known = [ms for trial, ms in times.items() if np.isfinite([ms, register[trial]]).all()]
-    return float(np.median(known)) if known else own
-
-
-def labelled_data(
-    archive: Archive,
-    names: Sequence[str],
-    sets: ParameterSets,
-    config: OfflineStudyConfig,
-    window: int,
-    recorded_in: Callable[[str], str],
-    odometry: Factory,
-) -> LabelledData:
-    """Read the labelled data set of a study.
-
-    `window` is the number of descriptors that are averaged, `recorded_in` tells the recording of a
-    sequence.
-
-    Raises
-    ------
-    ModelError
-        If a trial is missing.
-    """
-    read: dict[str, LabelledSequence] = {}
-    for name in names:
+def labelled_data(study: OfflineStudy, archive: Archive, sets: ParameterSets) -> LabelledData:
+    """Read the labelled data set of a study; there is a ModelError if a trial is missing."""
+    sequences = []
+    for name in study.training:
         if missing := set(sets) - set(archive.finished(name)):
             raise ModelError(
                 f"{archive.folder}: lacks trial {min(missing)} on {name}, which the model was "
                 f"fitted to; run `adaptune offline` again"
             )
-        read[name] = _labelled(archive, name, sets, config, window, recorded_in(name))
-    costs, online = measured_costs(archive, names, sets, odometry), config.online
-    return LabelledData(list(read.values()), sets, costs, online.budget, online.worth)
+        sequences.append(_labelled(study, archive, name, sets))
+    costs = measured_costs(archive, study.training, sets, study.odometry)
+    online = study.config.online
+    return LabelledData(sequences, sets, costs, online.budget, online.worth)
 
 
 def with_whole_drives(
@@ -587,10 +566,7 @@ def with_whole_drives(
     config: OfflineConfig,
     bare: Mapping[str, Collection[int]] = MappingProxyType({}),
 ) -> LabelledData:
-    """The same with the drives of whole recordings that there are of finalists.
-
-    Of those that are named in `bare`, by sequence, without the health check.
-    """
+    """The same with finalists' drives of whole recordings; of those in `bare`, the bare ones."""
     asked = [*data.finalists(), *data.sets.defaults]
     drives = read_whole_drives(archive, [s.name for s in data.sequences], asked)
     if not (known := sorted(set.intersection(*map(set, drives.values())))):
@@ -627,7 +603,12 @@ def _whole(s: LabelledSequence, trials: Sequence[Trial], config: OfflineConfig) 
 
 def with_vectors(data: LabelledData, archive: Archive) -> LabelledData:
     """The same with error vectors of the sets that may be members of a bank."""
-    eligible, sequences = _eligible(data.sequences, data.sets), []
+    sets, means = data.sets, mean_errors(data.errors(), data.numbers())
+    # With a sequence left out, others than now may be among the best. To read the poses of
+    # thousands of trials would take long.
+    best = [sets.trials[c] for c in np.argsort(means, kind="stable")[: 2 * MEMBER_POOL_SIZE]]
+    eligible = {t for t in (BASELINE, *best) if t in sets and np.isfinite(means[sets.column(t)])}
+    sequences = []
     for s in data.sequences:
         T_ref_sensor, length = s.simulation.T_ref_counted, s.simulation.length
         vectors = {
@@ -638,28 +619,12 @@ def with_vectors(data: LabelledData, archive: Archive) -> LabelledData:
     return data._replace(sequences=sequences)
 
 
-def _eligible(sequences: Sequence[LabelledSequence], sets: ParameterSets) -> set[int]:
-    """Trials whose sets may be members of a bank, and so need error vectors.
-
-    With a sequence left out, others than now may be among the best. To read the poses of thousands
-    of trials would take long.
-    """
-    number = np.repeat(np.arange(len(sequences)), [len(s.errors) for s in sequences])
-    means = mean_errors(np.concatenate([s.errors for s in sequences]), number)
-    best = [sets.trials[c] for c in np.argsort(means, kind="stable")[: 2 * MEMBER_POOL_SIZE]]
-    return {t for t in (BASELINE, *best) if t in sets and np.isfinite(means[sets.column(t)])}
-
-
 def _labelled(
-    archive: Archive,
-    name: str,
-    sets: ParameterSets,
-    config: OfflineStudyConfig,
-    window: int,
-    recording: str,
+    study: OfflineStudy, archive: Archive, name: str, sets: ParameterSets
 ) -> LabelledSequence:
     """A labelled sequence without error vectors and drives of the whole."""
-    frames, length = archive.read_frames(name), config.sub_trajectory
+    config, frames = study.config, archive.read_frames(name)
+    length, period = config.sub_trajectory, config.online.period
     errors = archive.read_errors(name, list(sets))
     # All trials know the same frames, but for those before an odometry's first pose.
     known = np.flatnonzero(~np.isnan(errors[:, ~np.isnan(errors).all(axis=0)]).any(axis=1))
@@ -677,8 +642,8 @@ def _labelled(
         frames.stamps,
         frames.T_ref_sensor,
         frames.counted,
-        averaged(frames.descriptors, frames.stamps, window, config.online.period),
-        ((frames.stamps - frames.stamps[0]) * 1e-9 // config.online.period).astype(np.int64),
+        averaged(frames.descriptors, frames.stamps, study.window, period),
+        ((frames.stamps - frames.stamps[0]) * 1e-9 // period).astype(np.int64),
         length,
         config.lost_track,
         frames.hops,
@@ -686,7 +651,7 @@ def _labelled(
     )
     return LabelledSequence(
         name,
-        recording,
+        study.sequences.recorded_in(name),
         simulation,
         known,
         stretches(simulation, known),

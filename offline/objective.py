@@ -1,18 +1,4 @@
-"""How to judge a trial: metrics, and weighted sums of them.
-
-Metrics of one parameter set on one sequence:
-
-===============  ==================================================================================
-``rte``          mean capped error of the sub-trajectories, percent
-``kitti``        translation error of KITTI's benchmark, percent
-``rpe``          relative pose error from scan to scan as evo gives it, metres
-``ape``          absolute pose error after alignment as evo gives it, metres
-``ms_per_scan``  milliseconds that the odometry takes for a prepared scan
-``cpu``          CPU time over the recording's duration, percent of a core
-===============  ==================================================================================
-
-The first four repeat on the same machine, the last two do not.
-"""
+"""Judge a trial by metrics, see ``docs/reference-study.md``, and by weighted sums of them."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -79,8 +65,8 @@ def weighted(weights: Mapping[Metric, float], metrics: Mapping[str, float]) -> f
     return sum(weight * metrics.get(name, LARGEST_METRIC) for name, weight in weights.items())
 
 
-def told(verdicts: Sequence[Verdict]) -> list[tuple[ParameterSet, float]]:
-    """Parameters and values of trials as samplers are told; the first one is the baseline's."""
+def sampler_results(verdicts: Sequence[Verdict]) -> list[tuple[ParameterSet, float]]:
+    """Parameters and values of trials as samplers get them; the first one is the baseline's."""
     worst = PENALTY * (verdicts[0].value or 1.0) if verdicts else 0.0
     return [(v.parameters, max(v.value, worst if v.failure else 0.0)) for v in verdicts]
 
@@ -110,9 +96,9 @@ def baseline_words(config: OfflineConfig, runs: Sequence[Summary]) -> list[str]:
     weights = {name: weight for name, weight in objective.items() if name not in TIMED}
     if not all(run.repeats for run in runs) or not weights:
         return []
-    found = np.mean([[weighted(weights, one) for one in run.repeats] for run in runs], axis=0)
+    values = np.mean([[weighted(weights, m) for m in run.repeats] for run in runs], axis=0)
     return [
-        f"The baseline ran {len(found)} times: {label(objective, units=True)} {found.mean():.4g} "
-        f"in the mean, {found.min():.4g} to {found.max():.4g}, "
-        f"standard deviation {found.std(ddof=1):.2g}."
+        f"The baseline ran {len(values)} times: {label(objective, units=True)} {values.mean():.4g} "
+        f"in the mean, {values.min():.4g} to {values.max():.4g}, "
+        f"standard deviation {values.std(ddof=1):.2g}."
     ]

@@ -111,8 +111,7 @@ def scenario(study: OfflineStudy) -> Scenario:
         raise AdaptuneError(f"{archive.folder}: no trial is finished yet; run `adaptune offline`")
     tried = tuple(archive.finished(names[0])[n].parameters for n in numbers)
     sets = ParameterSets(study.odometry.space, tuple(numbers), tried)
-    about = (study.config, study.window, study.sequences.recorded_in, study.odometry)
-    data = labelled_data(archive, names, sets, *about)
+    data = labelled_data(study, archive, sets)
     recordings = np.concatenate([np.full(len(s.known), s.recording) for s in data.sequences])
     several = len(data.recordings) >= MIN_RECORDINGS
     fold = np.unique(recordings, return_inverse=True)[1] if several else data.stretches()
@@ -123,7 +122,7 @@ def scenario(study: OfflineStudy) -> Scenario:
         data.stretches(),
         fold,
         np.concatenate([s.descriptors for s in data.sequences]),
-        np.concatenate([s.errors for s in data.sequences]),
+        data.errors(),
         dict(data.sequences[0].blocks),
         sets,
         np.array([data.costs.alone(n) for n in numbers]),

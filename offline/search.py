@@ -13,7 +13,7 @@ from adaptune.archive import Summary
 from adaptune.files import write_text
 from adaptune.space import ParameterSet, ParameterSpace
 from offline.config import OfflineConfig
-from offline.objective import Verdict, judge, told
+from offline.objective import Verdict, judge, sampler_results
 
 if TYPE_CHECKING:
     from offline.samplers import Sampler
@@ -128,6 +128,7 @@ class Search:
         return f"none of {since} trials was better than the best before"
 
     def _next(self, order: Sequence[int], seen: Sequence[int], hours: float) -> int | None:
+        """Begin the next trial; None if there is none, for the reason in `end`."""
         number = next(n for n in count() if n not in self.sets)
         if number not in self._known:
             over = self._config.hours is not None and hours >= self._config.hours
@@ -135,10 +136,9 @@ class Search:
             end = TIME_IS_UP if over else self._sampler.end
             proposal = None
             if not over:
-                results = told([self.done[n] for n in seen])
-                proposal = self._sampler.propose(
-                    results, [self.sets[n] for n in order[len(seen) :]]
-                )
+                results = sampler_results([self.done[n] for n in seen])
+                running = [self.sets[n] for n in order[len(seen) :]]
+                proposal = self._sampler.propose(results, running)
             # Of a finite space, later ones may have been run before.
             left = [n for n in self._known if n not in self.sets]
             if proposal is None:

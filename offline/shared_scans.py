@@ -109,13 +109,7 @@ class SharedScans:
 
 
 def _scans_of(stretch: Stretch, scans: Recording) -> Iterator[Scan]:
-    """Read the scans of a stretch.
-
-    Raises
-    ------
-    SequenceError
-        If they cannot be read, or are others than before.
-    """
+    """Read the scans of a stretch; a SequenceError if that fails, or they have changed."""
     again = "run the same command again"
     try:
         read = scans.since(int(stretch.stamps[0]))

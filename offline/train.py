@@ -40,13 +40,13 @@ from offline.campaign import (
     Schedule,
     WholeDrives,
     drive_whole,
+    forecast,
     read_whole_drives,
     run_baseline,
 )
 from offline.choice import NothingUsableError
 from offline.config import OfflineConfig, OfflineStudy
 from offline.drive import TrialSetup
-from offline.forecast import forecast
 from offline.front import COST, front_rows, left_out_in_words
 from offline.labelled import LabelledData, labelled_data, with_vectors
 from offline.objective import (
@@ -125,9 +125,7 @@ def train(
         finished = {name: {n: archive.finished(name)[n] for n in verdicts} for name in names}
         tried = tuple(verdict.parameters for verdict in verdicts.values())
         every_set = ParameterSets(space, tuple(verdicts), tried)
-        recorded_in = study.sequences.recorded_in
-        about = (names, every_set, study.config, study.window, recorded_in, study.odometry)
-        data = labelled_data(archive, *about)
+        data = labelled_data(study, archive, every_set)
 
         def drive(data: LabelledData) -> None:
             asked = {*data.finalists(), *every_set.defaults}
@@ -167,11 +165,13 @@ def _note_left_out(
     rows: Sequence[dict[str, Any]], usable: LabelledData, whole: WholeDrives
 ) -> None:
     """Add to the row of each sequence the error of the trial that the other recordings choose."""
-    left_out = chosen_elsewhere(usable)
-    for row in rows:
-        chosen = left_out.get(name := row["sequence"])
-        run = None if chosen is None else whole[name].get(chosen)
-        row["_left out"] = run and run.mean_error
+    for row, sequence in zip(rows, usable.sequences, strict=True):
+        row["_left out"] = None
+        if not (others := usable.without(sequence)).sequences:
+            continue
+        with contextlib.suppress(NothingUsableError):
+            run = whole[sequence.name].get(others.fixed())
+            row["_left out"] = run and run.mean_error
 
 
 def _searched(
@@ -187,22 +187,11 @@ def _searched(
     return Campaign(study, archive, workers, progress, clock, expected).run()
 
 
-def chosen_elsewhere(data: LabelledData) -> dict[str, int]:
-    """By sequence, the trial that the other recordings choose, if there are any."""
-    found = {}
-    for one in data.sequences:
-        others = [s for s in data.sequences if s.recording != one.recording]
-        with contextlib.suppress(NothingUsableError):
-            if others:
-                found[one.name] = data._replace(sequences=others).fixed()
-    return found
-
-
 def _ready_archive(study: OfflineStudy, progress: Progress) -> Archive:
     """The archive without trials of other inputs than now; references are there, or estimated."""
     for name in study.config.training:
-        of = study.sequences.recordings.get(name)
-        if of is not None and of.reference == NO_REFERENCE:
+        recording = study.sequences.recordings.get(name)
+        if recording is not None and recording.reference == NO_REFERENCE:
             raise AdaptuneError(
                 f"{study.sequences.key(name)}: training needs a reference trajectory; name its "
                 f"topic or file, or leave `reference` out to have it estimated"
@@ -265,8 +254,7 @@ def _fitted(
     config, inputs = study.config, study.model_inputs
     settings = config.offline.model_dump(mode="json", exclude={*BUDGETS, "workers"})
     versions = {"adaptune": __version__, "numpy": np.__version__} | study.odometry.content
-    provenance = {"versions": versions} | settings
-    provenance |= {"inputs": manifest.digest(inputs)}
+    provenance = {"versions": versions} | settings | {"inputs": manifest.digest(inputs)}
     estimates = estimates_of(study.sequences, study.training)
     if judged := estimates_as_data(estimates, config.sub_trajectory):
         provenance |= {"estimated_references": judged}
@@ -279,16 +267,14 @@ def _fitted(
     switching = config.online.switching.model_dump(mode="json", include={"size", "sets"})
     online = (config.online.period, config.online.budget, config.online.worth, switching)
     provenance["evidence"] = manifest.digest((trials, online, fixed))
-    before = None
+    model = None
     with contextlib.suppress(ModelError):
-        before = ErrorModel.load(study.model_path)
-    if before is not None and before.provenance == provenance:
-        manifest.record(study.model_inputs_path, inputs)
-        return before
-    identity, length = study.odometry.identity, config.sub_trajectory
-    model = fit(data, fixed, identity, length, study.window, provenance)
-    model = tuned(model, usable, config.online.switching)
-    model.save(study.model_path)
+        model = ErrorModel.load(study.model_path)
+    if model is None or model.provenance != provenance:
+        identity, length = study.odometry.identity, config.sub_trajectory
+        model = fit(data, fixed, identity, length, study.window, provenance)
+        model = tuned(model, usable, config.online.switching)
+        model.save(study.model_path)
     manifest.record(study.model_inputs_path, inputs)
     return model
 
@@ -361,8 +347,8 @@ def fit(
         blocks=dict(sequences[0].blocks),
         window=window,
         descriptors=np.concatenate([s.descriptors for s in sequences]),
-        sequence=np.repeat(np.arange(len(sequences)), [len(s.errors) for s in sequences]),
-        errors=np.concatenate([s.errors for s in sequences]),
+        sequence=data.numbers(),
+        errors=data.errors(),
         elevations=[s.elevation for s in sequences],
         provenance=provenance,
         stretch=np.concatenate([s.stretch for s in sequences]),
@@ -375,7 +361,7 @@ def fit(
 
 def tuned(model: ErrorModel, usable: LabelledData, switching: SwitchingConfig) -> ErrorModel:
     """Choose what is driven: the fixed set, or a bank, and the settings of its weights."""
-    chosen = choose(usable, switching.size, fixed=model.fixed)
+    chosen = choose(usable, switching.size)
     members = chosen.members or [model.fixed]
     besides = reserve(members, usable)
     members = [*members, *besides]
@@ -385,9 +371,9 @@ def tuned(model: ErrorModel, usable: LabelledData, switching: SwitchingConfig) -
         vectors=usable.vectors(members),
         bank_settings=chosen.bank.model_copy(update={"reserve": len(besides)}),
         # As they are read back, so that the same model is the same file.
-        expected={}
-        if chosen.expected is None
-        else {key: float(value) for key, value in chosen.expected._asdict().items()},
+        expected={key: float(x) for key, x in chosen.expected._asdict().items()}
+        if chosen.expected
+        else {},
         rivals=rivals(usable, driven_cost(usable, chosen, model.fixed)),
     )
 
@@ -400,19 +386,10 @@ def run_oracle(
 ) -> list[dict[str, Any]]:
     """Run some of the model's sets as trials on the test sequences, unless that was done before.
 
-    What was run with another recording, odometry or set is run again.
+    ``oracle`` in the study's folder receives the trials, which no model is fitted to. There is an
+    AdaptuneError if there is no model of the study, or no test sequence has a reference.
 
-    ``oracle`` in the study's folder receives the trials, which no model is fitted to.
-
-    Returns
-    -------
-    list of dict
-        For every test sequence the errors of the fixed set and of the best one, in percent.
-
-    Raises
-    ------
-    AdaptuneError
-        If there is no model, it was fitted to something else, or no test sequence has a reference.
+    Returns for every test sequence the errors of the fixed set and of the best one, in percent.
     """
     model = study.model()
     study.open()
@@ -435,7 +412,7 @@ def run_oracle(
                 schedule.store(*done)
         schedule.close()
     found = {name: oracle_errors(archive, name, model) for name in names}
-    return [_row(name, errors) for name, errors in found.items() if errors is not None]
+    return [_oracle_row(name, errors) for name, errors in found.items() if errors is not None]
 
 
 def oracle_sets(model: ErrorModel, n: int) -> list[int]:
@@ -480,7 +457,7 @@ def _remove_other_sets(archive: Archive, name: str, model: ErrorModel) -> None:
             archive.trial_path(name, number).unlink()
 
 
-def _row(name: str, found: OracleErrors) -> dict[str, Any]:
+def _oracle_row(name: str, found: OracleErrors) -> dict[str, Any]:
     means = np.nanmean(cap(found.errors), axis=0)
     best = int(means.argmin())
     return {

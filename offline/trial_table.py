@@ -102,10 +102,6 @@ FEW = 8
 """With fewer trials, importances mean nothing."""
 
 
-FOREST: Any = {"n_trees": 16, "max_depth": 8, "seed": 0}
-"""Size of the forest, which bounds the time that it takes."""
-
-
 def importances(table: TrialTable) -> dict[str, float]:
     """Share of each parameter in the variance of the error's logarithm, by falling share.
 
@@ -137,6 +133,7 @@ def importances(table: TrialTable) -> dict[str, float]:
         )
         for i, log in enumerate(logs)
     )
-    evaluator = optuna.importance.FanovaImportanceEvaluator(**FOREST)
-    found = optuna.importance.get_param_importances(study, evaluator=evaluator)
-    return {name: float(share) for name, share in found.items()}
+    # The size of the forest bounds the time that it takes.
+    evaluator = optuna.importance.FanovaImportanceEvaluator(n_trees=16, max_depth=8, seed=0)
+    shares = optuna.importance.get_param_importances(study, evaluator=evaluator)
+    return {name: float(share) for name, share in shares.items()}

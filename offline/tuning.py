@@ -3,9 +3,8 @@
 They are compared by their expected loss on evidence that is left out, see `expected_loss`.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -14,7 +13,7 @@ from threadpoolctl import threadpool_limits
 
 from adaptune.metrics import cap, worst_tenth
 from adaptune.model import BankRule, BankSettings, TrainingData
-from adaptune.model.rules import BASELINE, ERROR_FLOOR, Spending, complementary, mean_errors
+from adaptune.model.rules import BASELINE, ERROR_FLOOR, complementary, mean_errors
 from adaptune.model.weights import (
     MEMBER_POOL_SIZE,
     MemberWeights,
@@ -151,9 +150,6 @@ ROUNDING = 1e-6
 """A smaller loss, or gain, is one of rounding."""
 NO_BANK = BankSettings(adapt=False)
 
-Chooser = Callable[[LabelledData, int], list[int]]
-"""Chooses a bank's members on sequences, for a fixed set: trial numbers, the fixed set's first."""
-
 
 class Policy(NamedTuple):
     """What is driven."""
@@ -169,7 +165,6 @@ def choose(
     bank: int,
     by_recording: bool | None = None,
     most: int | None = None,
-    fixed: int | None = None,
 ) -> Policy:
     """Choose what is driven, leaving one recording or stretch after the other out.
 
@@ -183,27 +178,30 @@ def choose(
         See `LabelledData.folds`.
     most
         Number of folds at most, evenly chosen.
-    fixed
-        Trial number of the fixed set, `LabelledData.fixed` by default.
     """
+    if bank < 2:
+        return Policy(NO_BANK, [], None)
     folds = data.folds(by_recording)
     if most is not None and len(folds) > most:
         folds = [folds[i] for i in np.linspace(0, len(folds) - 1, most).round().astype(int)]
-    fixed = data.fixed() if fixed is None else fixed
-    spending = data.spending
-    made = [(make, make(data, fixed)) for make in _choosers(bank, spending)]
-    choosers = [make for make, members in made if len(members) > 1]
-    banks = [members for _, members in made if len(members) > 1]
+    fixed = data.fixed()
+    made = {chooser: chooser(data, fixed, bank) for chooser in MEMBER_CHOOSERS}
+    choosers = [chooser for chooser, members in made.items() if len(members) > 1]
+    if not choosers:
+        return Policy(NO_BANK, [], None)
+    banks = [made[chooser] for chooser in choosers]
     recordings: list[str] = []
     logs: list[NDArray[np.float64]] = []
     # The matrices are small: more threads would mostly wait for each other.
     with threadpool_limits(1, "blas"):
         for left_out, others in folds:
-            logs.append(_logs(left_out, others, choosers))
+            fixed = others.fixed()
+            banks_there = [chooser(others, fixed, bank) for chooser in choosers]
+            logs.append(_logs(left_out, others, banks_there))
             recordings += [left_out.recording] * len(logs[-1])
-    if len(recordings) < 2 or not logs[0].shape[1]:
+    if len(recordings) < 2:
         # The bank rests, and joins in where it measures that the fixed set fails.
-        return Policy(NO_BANK, banks[0] if banks else [], None)
+        return Policy(NO_BANK, banks[0], None)
     return least_loss(np.concatenate(logs), recordings, banks, data.worth)
 
 
@@ -235,26 +233,15 @@ def least_loss(
     return Policy(BANK_SETTINGS[which] if adapts else NO_BANK, banks[way], expected)
 
 
-def _choosers(bank: int, spending: Spending | None) -> list[Chooser]:
-    """The ways to choose a bank's members."""
-    if bank < 2:
-        return []
-    ways = (cancelling_members, complementary_members)
-    return [partial(way, size=bank, spending=spending) for way in ways]
-
-
 def _logs(
-    left_out: LabelledSequence,
-    others: LabelledData,
-    choosers: Sequence[Chooser],
+    left_out: LabelledSequence, others: LabelledData, banks: Sequence[list[int]]
 ) -> NDArray[np.float64]:
     """Logarithms of ratios to the fixed set's error, on a fold.
 
     Returns shape (n_stretches, n_ways, 2): those of each bank with each of `BANK_SETTINGS`, each
     with that of the best set that costs no more.
     """
-    fitted = others.training_data()
-    data, _ = fitted
+    fitted = data, _ = others.training_data()
     capped, stretch = cap(left_out.errors), left_out.stretch
     fixed = capped[:, data.sets.column(data.fixed)]
 
@@ -264,19 +251,16 @@ def _logs(
 
     pairs = []
     known: dict[tuple[int, ...], list[NDArray[np.float64]]] = {}
-    for make in choosers:
-        found = make(others, data.fixed)
+    for bank in banks:
         # Whatever the order of the others is, they are the same bank.
-        members = (*found[:1], *sorted(found[1:]))
+        members = (*bank[:1], *sorted(bank[1:]))
         if members not in known and len(members) < 2:
             known[members] = [fixed] * len(BANK_SETTINGS)
         elif members not in known:
             simulated = bank_errors(left_out, others, fitted, members, BANK_SETTINGS)
             known[members] = [errors for errors, _ in simulated]
-        beside = rival(others.costs.adaptive(found))
+        beside = rival(others.costs.adaptive(bank))
         pairs += [(errors, beside) for errors in known[members]]
-    if not pairs:
-        return np.empty((len(np.unique(stretch)), 0, 2))
     logs = [[log_ratios(one, fixed, stretch) for one in pair] for pair in pairs]
     return np.moveaxis(np.array(logs), -1, 0)
 
@@ -290,14 +274,10 @@ def bank_errors(
 ) -> Iterator[tuple[NDArray[np.float64], MemberWeights]]:
     """Simulate a bank on what is left out, with one settings after the other.
 
-    They have the same `clip` and `n_frames`.
+    They have the same `clip` and `n_frames`. Its weights are fitted to the others, whose
+    `LabelledData.training_data` is given.
 
-    Its weights are fitted to the others, whose `LabelledData.training_data` is given.
-
-    Yields
-    ------
-    tuple
-        Capped errors on the labelled frames, of shape (n,), and smoothed weights.
+    Yields capped errors on the labelled frames, of shape (n,), and smoothed weights.
     """
     data, pca = fitted
     simulation, members = left_out.simulation, tuple(members)
@@ -314,9 +294,7 @@ def bank_errors(
         yield simulation.errors(smoothed, agreeing)[left_out.known], smoothed
 
 
-def cancelling_members(
-    data: LabelledData, fixed: int, size: int, spending: Spending | None = None
-) -> list[int]:
+def cancelling_members(data: LabelledData, fixed: int, size: int) -> list[int]:
     """Choose a bank's members, the fixed set first, whose errors cancel: see `choose_members`."""
     vectors, errors = [], []
     for s in data.sequences:
@@ -324,18 +302,16 @@ def cancelling_members(
             frames = s.stretch == number
             vectors.append({trial: of_trial[frames] for trial, of_trial in s.vectors.items()})
             errors.append(s.errors[frames])
-    return choose_members(vectors, errors, data.sets, fixed, size, spending)
+    return choose_members(vectors, errors, data.sets, fixed, size, data.spending)
 
 
-def complementary_members(
-    data: LabelledData, fixed: int, size: int, spending: Spending | None = None
-) -> list[int]:
+def complementary_members(data: LabelledData, fixed: int, size: int) -> list[int]:
     """Choose a bank's members, the fixed set first, one of which does well at every frame.
 
     They are sought among the best sets, see `complementary`. Where another one would lower nothing,
     the best of the others fill the bank.
     """
-    errors, number = np.concatenate([s.errors for s in data.sequences]), data.stretches()
+    errors, number = data.errors(), data.stretches()
     means = mean_errors(errors, number)
     best = [
         data.sets.trials[c]
@@ -347,48 +323,45 @@ def complementary_members(
     columns = data.sets.columns(few.trials)
     features = np.empty((len(errors), 0))
     of_few = TrainingData(features, number, errors[:, columns], few, fixed)
-    chosen = complementary(of_few, size, spending)
+    chosen = complementary(of_few, size, data.spending)
     for trial in pool:
-        fits = spending is None or spending.allows([*chosen, trial])
-        if len(chosen) < size and trial not in chosen and fits:
+        if len(chosen) < size and trial not in chosen and data.can_pay([*chosen, trial]):
             chosen.append(trial)
     return chosen
+
+
+MEMBER_CHOOSERS = (cancelling_members, complementary_members)
+"""The ways to choose a bank's members."""
 
 
 def reserve(members: Sequence[int], data: LabelledData) -> list[int]:
     """What a bank has besides, for places that training does not know: the baseline.
 
-    What the odometry's authors chose is the best guess there, and live evidence tells whether it is
-    right. There is none if it is a member already, was not run on every sequence, or costs too
-    much.
+    There is none if it is a member already, was not run on every sequence, or costs too much.
     """
     known = BASELINE in data.sets and all(BASELINE in s.vectors for s in data.sequences)
     if len(members) < 2 or BASELINE in members or not known:
         return []
-    spending = data.spending
-    return [BASELINE] if spending is None or spending.allows([*members, BASELINE]) else []
+    return [BASELINE] if data.can_pay([*members, BASELINE]) else []
 
 
 def driven_cost(data: LabelledData, policy: Policy, fixed: int) -> float:
     """Milliseconds of CPU time a scan that a policy costs; NaN if it is unknown."""
-    if policy.bank.adapt:
-        return data.costs.adaptive(policy.members)
-    return data.costs.alone(fixed)
+    adapts = policy.bank.adapt
+    return data.costs.adaptive(policy.members) if adapts else data.costs.alone(fixed)
 
 
 def rivals(data: LabelledData, cost: float) -> dict[str, int]:
     """Trial numbers of the rivals that there are.
 
     `BEST_DEFAULT` is the odometry that does best with its own parameters, where there are several;
-    `EQUAL_COST` the best of all sets that alone cost no more than what is driven.
-
-    `cost` is in milliseconds of CPU time a scan of what is driven; NaN if it is unknown.
+    `EQUAL_COST` the best of all sets that alone cost no more milliseconds of CPU time a scan than
+    the `cost` of what is driven; NaN if it is unknown.
     """
     found = {}
     if len(data.sets.space.baselines) > 1:
-        found[BEST_DEFAULT] = choose_fixed(
-            data.whole_blocks(data.sets.defaults), np.inf, sure=False
-        )
+        defaults = data.whole_blocks(data.sets.defaults)
+        found[BEST_DEFAULT] = choose_fixed(defaults, np.inf, sure=False)
     if np.isfinite(cost):
         found[EQUAL_COST] = data.rival(cost)
     return found

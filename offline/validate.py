@@ -77,18 +77,17 @@ class LeftOut(NamedTuple):
 
 def joined(parts: Sequence[LeftOut]) -> LeftOut:
     """Stretches of a recording that were left out, as one."""
-    first = parts[0]
     if len(parts) == 1:
-        return first
+        return parts[0]
     n_frames = [len(part.stretch) for part in parts]
 
     def mean(values: Sequence[Mapping[str, float]]) -> dict[str, float]:
         return {
-            mode: float(np.average([of[mode] for of in values], weights=n_frames))
+            mode: float(np.average([of_part[mode] for of_part in values], weights=n_frames))
             for mode in _of_all(values)
         }
 
-    return first._replace(
+    return parts[0]._replace(
         stretch=np.concatenate([part.stretch for part in parts]),
         errors={
             mode: np.concatenate([part.errors[mode] for part in parts])
@@ -193,21 +192,8 @@ def leave_one_out(
     What is driven is chosen anew on the rest, by the loss with which a study chooses it. So the
     figures are those of the choice, and not of what was best in hindsight.
 
-    Parameters
-    ----------
-    data
-        The training sequences.
-    progress
-        Called about every fold.
-    bank
-        Number of a bank's members. No bank is simulated with 0.
-    rules
-        Names of the selection rules, see `adaptune.model.registry`.
-
-    Raises
-    ------
-    ValidationError
-        If there are fewer than two folds.
+    `bank` is the number of a bank's members, 0 for none; `rules` are names, see
+    `adaptune.model.registry`. There is a ValidationError if there are fewer than two folds.
     """
     by_recording = len(data.recordings) >= MIN_RECORDINGS
     folds = data.folds(by_recording)
@@ -223,10 +209,10 @@ def leave_one_out(
     parts: dict[str, list[LeftOut]] = {}
     for i, (left_out, others) in enumerate(folds):
         progress("parts left out", i, len(folds))
-        found = leave_out(left_out, others, bank, by_recording, rules)
-        parts.setdefault(found.name, []).append(found)
+        part = leave_out(left_out, others, bank, by_recording, rules)
+        parts.setdefault(part.name, []).append(part)
     progress("parts left out", len(folds), len(folds))
-    return Validation([joined(of) for of in parts.values()])
+    return Validation([joined(of_recording) for of_recording in parts.values()])
 
 
 def leave_out(
@@ -282,14 +268,8 @@ def validate(study: OfflineStudy, progress: Progress = unseen) -> Validated:
     """Validate the selection rules on a study's training sequences.
 
     The study's folder receives ``validation`` (CSV, JSON and a picture) and ``stretches`` (CSV,
-    JSON).
-
-    Raises
-    ------
-    ModelError
-        If there is no model yet, or it is not this study's.
-    ValidationError
-        If there is only one stretch.
+    JSON). There is a ModelError if there is no model yet, or it is not this study's; a
+    ValidationError if there is only one stretch.
     """
     model = study.model()
     if (study.training, study.window) != (model.sequences, model.window):
@@ -299,9 +279,8 @@ def validate(study: OfflineStudy, progress: Progress = unseen) -> Validated:
         )
     data = _labelled(study, model)
     online = driven(model, study.config.online, study.odometry, study.mechanism)
-    bank = 0
-    if study.mechanism == "bank" and ADAPTIVE in study.rules:
-        bank = study.config.online.switching.size
+    adapts = study.mechanism == "bank" and ADAPTIVE in study.rules
+    bank = study.config.online.switching.size if adapts else 0
     try:
         validation = leave_one_out(data, progress, bank, study.rules)
     except ValidationError as error:
@@ -344,45 +323,45 @@ def baseline_in_words(validation: Validation) -> str:
 
 def _labelled(study: OfflineStudy, model: ErrorModel) -> LabelledData:
     """The labelled data set of the sets that did not fail."""
-    archive, of = Archive(study.folder / "trials"), study.sequences.recorded_in
-    about = (model.sequences, model.sets, study.config, study.window, of, study.odometry)
-    data = labelled_data(archive, *about).usable()
+    archive = Archive(study.folder / "trials")
+    data = labelled_data(study, archive, model.sets).usable()
     return with_vectors(in_whole_drives(data, archive, study.config.offline), archive)
 
 
 def _rows(validation: Validation) -> list[dict[str, Any]]:
     """Ratios to the fixed set's error, intervals of the default rule's, and costs."""
-    default = (*validation.modes, ADAPTIVE)[0]
     modes = [mode for mode in validation.ratios if mode != "fixed"]
-    rows: list[dict[str, Any]] = []
 
-    def add(
+    def row(
         name: str,
         fixed: float | None,
-        of: dict[str, float],
+        values: Mapping[str, float],
         interval: tuple[float, float] | None = None,
-    ) -> None:
-        rows.append({"left out": name, "fixed [%]": fixed})
+    ) -> dict[str, Any]:
+        found: dict[str, Any] = {"left out": name, "fixed [%]": fixed}
         for mode in modes:
-            rows[-1][mode] = of[mode]
-            if mode == default:
+            found[mode] = values[mode]
+            if mode == ADAPTIVE:
                 ends = interval and f"{interval[0]:.2f}-{interval[1]:.2f}"
-                rows[-1][f"{mode}, 95 %"] = ends
+                found[f"{mode}, 95 %"] = ends
+        return found
 
+    rows = []
     for i, sequence in enumerate(validation.left_out):
-        of = {mode: float(validation.ratios[mode][i]) for mode in modes}
-        errors, fixed = sequence.errors[default], sequence.errors["fixed"]
+        ratios = {mode: float(validation.ratios[mode][i]) for mode in modes}
+        errors, fixed = sequence.errors[ADAPTIVE], sequence.errors["fixed"]
         # It is about this sequence, and says nothing about other places.
         intervals = bootstrap(errors, fixed, sequence.block)
-        add(sequence.name, fixed.mean(), of, intervals and intervals[1])
+        rows.append(row(sequence.name, fixed.mean(), ratios, intervals and intervals[1]))
     costs = {mode: validation.cost(mode) for mode in ["fixed", *modes]}
     if np.isfinite(list(costs.values())).any():
-        add("cost [ms]", costs["fixed"], costs)
+        rows.append(row("cost [ms]", costs["fixed"], costs))
     summaries = {mode: validation.summary(mode) for mode in modes}
     for key in ("geometric", "arithmetic", "worst_tenth", "worst"):
-        ends = summaries[default]["low"], summaries[default]["high"]
-        of = {mode: summaries[mode][key] for mode in modes}
-        add(key.replace("_", " "), None, of, ends if key == "geometric" else None)
+        values = {mode: summaries[mode][key] for mode in modes}
+        of_mean = key == "geometric"
+        ends = (summaries[ADAPTIVE]["low"], summaries[ADAPTIVE]["high"]) if of_mean else None
+        rows.append(row(key.replace("_", " "), None, values, ends))
     return rows
 
 

@@ -3,9 +3,8 @@ import pytest
 
 from adaptune.archive import Archive
 from offline import campaign
-from offline import forecast as forecasting
+from offline.campaign import ALONE, COST, FITTING, Forecast, forecast
 from offline.config import load_study
-from offline.forecast import ALONE, COST, FITTING, Forecast, forecast
 from offline.search import Clock
 
 
@@ -30,7 +29,7 @@ def test_it_follows_from_the_baseline_s_drives(study, tmp_path):
 def test_finalists_drive_the_rest_of_long_recordings(study, tmp_path, monkeypatch):
     archive = Archive(study.folder / "trials")
     drives = campaign.read_whole_drives(archive, ["one", "two"], [0])
-    monkeypatch.setattr(forecasting, "read_whole_drives", lambda *_: drives)
+    monkeypatch.setattr(campaign, "read_whole_drives", lambda *_: drives)
     monkeypatch.setattr(archive, "is_uncut", lambda _: False)
     found = forecast(study, archive, 1, Clock(tmp_path))
     assert found.rest - FITTING == pytest.approx(6 * found.each)

@@ -11,7 +11,7 @@ from made_trials import Drawn
 from adaptune.archive import Archive, Summary
 from adaptune.space import Categorical, Integer, ParameterSpace
 from offline import search
-from offline.campaign import Campaign
+from offline.campaign import Campaign, Forecast
 from offline.config import OfflineConfig, load_study
 from offline.search import Clock, Search
 from offline.train import train
@@ -218,11 +218,12 @@ def test_no_set_begins_that_would_not_end_in_time(study_of, monkeypatch, expecte
     of_study = Clock(study.folder / "elapsed.json")
     clock.seconds = 100.0  # reading the bags
     given = Archive(study.folder / "trials"), Slow(clock)
-    verdicts = Campaign(study, *given, clock=of_study, seconds=(expected, 300.0)).run()
+    verdicts = Campaign(study, *given, clock=of_study, expected=Forecast(expected, 300.0)).run()
     assert clock.seconds == 100.0 + 30.0 * len(verdicts)
     assert 0.8 * 1500.0 <= clock.seconds + 300.0 <= 1500.0
     # Nor if the same command, again, finds that one more would fit.
-    again = Campaign(study, *given, clock=Clock(study.folder / "elapsed.json"), seconds=(1.0, 1.0))
+    again_clock = Clock(study.folder / "elapsed.json")
+    again = Campaign(study, *given, clock=again_clock, expected=Forecast(1.0, 1.0))
     assert again.run().keys() == verdicts.keys()
 
 

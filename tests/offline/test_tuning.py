@@ -16,7 +16,7 @@ from offline.tuning import (
 
 
 def choose_bank_of(sequences, members, monkeypatch):
-    monkeypatch.setattr(tuning, "_choosers", lambda *_: [lambda *_: members])
+    monkeypatch.setattr(tuning, "MEMBER_CHOOSERS", [lambda *_: members])
     return choose(labelled(sequences), len(members))
 
 

@@ -6,7 +6,7 @@ import pytest
 from adaptune.archive import Archive, Summary
 from adaptune.model.knn import NearestNeighbours
 from offline.config import OfflineConfig, load_study
-from offline.objective import judge, told
+from offline.objective import judge, sampler_results
 from offline.train import train
 from offline.validate import validate
 
@@ -66,6 +66,6 @@ def test_a_set_that_fails_on_one_sequence_is_not_usable(fails):
     good, bad = judge(of, [GOOD, GOOD]), judge(of, [GOOD, fails])
     assert (good.state, bad.state) == ("complete", f"failed: {fails.failure}")
     # Samplers are told that it is bad.
-    (_, own), (_, worse) = told([good, bad])
+    (_, own), (_, worse) = sampler_results([good, bad])
     assert own == 10.0
     assert 100.0 <= worse < 1e6
