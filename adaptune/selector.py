@@ -26,9 +26,7 @@ from adaptune.model.descriptor import (
 from adaptune.model.registry import ADAPTIVE, rule_class
 from adaptune.model.rules import NOVEL_FAMILIARITY, Live
 from adaptune.model.weights import (
-    SMOOTHED_SELECTIONS,
     measured_weights,
-    smooth_weights,
     weighted_selection,
 )
 from adaptune.odometry.base import Motions
@@ -225,7 +223,6 @@ class Selector(_Measuring):
         super().reset()
         self._scan: Scan | None = None
         self._descriptors: deque[NDArray[np.float32]] = deque(maxlen=self._model.window)
-        self._found: deque[Selection] = deque(maxlen=SMOOTHED_SELECTIONS)
         self._current: int | None = None
         self._stamp = self._switched = 0
         self._recent: deque[tuple[int, Poses]] = deque()  # registered scans
@@ -286,7 +283,8 @@ class Selector(_Measuring):
         if self.members and selection.weights is None:
             selection = self._of_those_present(selection)
         if selection.weights is not None:
-            selection = self._smoothed(selection)
+            weights = np.array([selection.weights[member] for member in self.members])
+            selection = _with_weights(selection, self._weighted(weights))
         elif selection.trial != self._current:
             self._live.forget()  # the hops were those of another set
             self._switched = self._stamp
@@ -352,14 +350,6 @@ class Selector(_Measuring):
             return np.zeros(2)
         stamps, poses = zip(*self._recent, strict=True)
         return np.asarray(speed_and_turn_rate(np.array(stamps, np.int64), np.array(poses))[-1])
-
-    def _smoothed(self, selection: Selection) -> Selection:
-        """Replace the weights by the smoothed ones; what is predicted stays as it is."""
-        if selection.resting != self._resting:
-            self._found.clear()
-        self._found.append(selection)
-        weights = np.array([[(s.weights or {})[m] for m in self.members] for s in self._found])
-        return _with_weights(selection, self._weighted(smooth_weights(weights)[-1]))
 
     def _of_those_present(self, selection: Selection) -> Selection:
         """Replace a member that gives no poses by the first one that does."""

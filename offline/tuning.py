@@ -19,7 +19,6 @@ from adaptune.model.weights import (
     MemberWeights,
     bank_weights,
     choose_members,
-    smooth_weights,
 )
 from adaptune.study.driven import BEST_DEFAULT, EQUAL_COST, MIN_RECORDINGS, is_worth
 from offline.choice import choose as choose_fixed
@@ -277,7 +276,7 @@ def bank_errors(
     They have the same `clip` and `n_frames`. Its weights are fitted to the others, whose
     `LabelledData.training_data` is given.
 
-    Yields capped errors on the labelled frames, of shape (n,), and smoothed weights.
+    Yields capped errors on the labelled frames, of shape (n,), and weights.
     """
     data, pca = fitted
     simulation, members = left_out.simulation, tuple(members)
@@ -287,11 +286,10 @@ def bank_errors(
     near, live = BankRule(settings[0]).fit(of_bank).near(scans), simulation.live(members)
     agreeing: NDArray[np.bool_] | None = None
     for one in settings:
-        weights, _ = bank_weights(near, one, live)
-        smoothed = MemberWeights(members, smooth_weights(weights))
+        votes = MemberWeights(members, bank_weights(near, one, live)[0])
         # Who agrees takes long to find, and hangs on the settings but little.
-        agreeing = simulation.agreeing(smoothed) if agreeing is None else agreeing
-        yield simulation.errors(smoothed, agreeing)[left_out.known], smoothed
+        agreeing = simulation.agreeing(votes) if agreeing is None else agreeing
+        yield simulation.errors(votes, agreeing)[left_out.known], votes
 
 
 def cancelling_members(data: LabelledData, fixed: int, size: int) -> list[int]:

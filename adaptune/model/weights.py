@@ -35,8 +35,6 @@ UNFAMILIAR_PRIOR_SHARE = 0.2
 """Share of the prior's windows that remain where a scan is unlike all training."""
 UNTRIED_MEAN_SQUARE = 4.0
 """Mean square of a member that nobody has tried, in that of the first one."""
-SMOOTHED_SELECTIONS = 5
-"""Selections whose weights are averaged: errors cancel each other while weights stay the same."""
 EVEN_SHARE = 0.5
 """Added to the members' mean squares, as a share of their harmonic mean, for weights that are more
 even."""
@@ -94,7 +92,7 @@ class BankRule(Rule):
 
     That is w'Sw while errors are small, where S_jk is the mean product of the errors of members j
     and k (Bates and Granger, Operational Research Quarterly 1969); see "Bank" and "Live evidence"
-    in ``docs/method.md``. Weights are not smoothed here, see `smooth_weights`.
+    in ``docs/method.md``.
     """
 
     sentence = "what adapts with the least expected loss in training, or the fixed set"
@@ -222,19 +220,6 @@ def measured_weights(n_members: int, live: LiveSquares | None) -> NDArray[np.flo
 def _untried(n_members: int) -> NDArray[np.float64]:
     """Mean products of the errors of members of which the training says nothing."""
     return np.diag([1.0, *[UNTRIED_MEAN_SQUARE] * (n_members - 1)])
-
-
-def smooth_weights(weights: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Mean of the weights at each selection and at those before it, `SMOOTHED_SELECTIONS` at most.
-
-    Both are of shape (n_selections, n_members).
-    """
-    total = weights.copy()
-    for k in range(1, SMOOTHED_SELECTIONS):
-        total[k:] += weights[:-k]
-    return np.asarray(
-        total / np.minimum(np.arange(1, len(weights) + 1), SMOOTHED_SELECTIONS)[:, None]
-    )
 
 
 def clip_errors(

@@ -12,14 +12,12 @@ from adaptune.metrics import FAILURE
 from adaptune.model import BankRule, BankSettings, TrainingData
 from adaptune.model.weights import (
     EVEN_SHARE,
-    SMOOTHED_SELECTIONS,
     UNFAMILIAR_PRIOR_SHARE,
     bank_weights,
     choose_members,
     clip_errors,
     measured_weights,
     minimum_variance_weights,
-    smooth_weights,
 )
 
 
@@ -189,17 +187,6 @@ def test_a_bank_is_of_sets_whose_errors_cancel():
     # What was not run everywhere is no member.
     errors[3][:, 2] = np.nan
     assert sorted(choose_members(vectors, errors, sets, 1, 4)) == [0, 1, 3]
-
-
-@given(st.integers(1, 20), st.integers(0, 100))
-def test_smoothed_weights_are_means_of_the_last(n, seed):
-    weights = np.random.default_rng(seed).dirichlet(np.ones(3), n)
-    found = smooth_weights(weights)
-    for i in range(n):
-        np.testing.assert_allclose(
-            found[i], weights[max(0, i + 1 - SMOOTHED_SELECTIONS) : i + 1].mean(axis=0)
-        )
-    assert (smooth_weights(np.eye(2)[[0] * n]) == [1.0, 0.0]).all()
 
 
 def test_members_that_rest_have_no_weight_and_change_nothing():
