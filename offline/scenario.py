@@ -16,12 +16,12 @@ from adaptune.errors import AdaptuneError
 from adaptune.files import replacing, write_text
 from adaptune.metrics import cap
 from adaptune.model import Rule, TrainingData
-from adaptune.model.rules import BASELINE, mean_errors
 from adaptune.report.tables import csv_text
 from adaptune.space import ParameterSets, load_space
 from adaptune.study.driven import MIN_RECORDINGS
+from offline.choice import BlockErrors, choose
 from offline.config import OfflineStudy
-from offline.labelled import labelled_data
+from offline.labelled import block_means, labelled_data
 
 
 class Scenario(NamedTuple):
@@ -48,16 +48,18 @@ class Scenario(NamedTuple):
         return {name: getattr(self, name) for name in _OF_FRAMES} | features | errors
 
     def fixed(self, frames: NDArray[np.bool_]) -> int:
-        """Trial of the least mean error on some frames that costs no more than the baseline."""
-        means = mean_errors(self.performances[frames], self.stretch[frames])
-        allowed = ~(self.cost > self.cost[self.sets.column(BASELINE)])
-        return self.sets.trials[int(np.argmin(np.where(allowed, means, np.inf)))]
+        """Trial number of the fixed set by some frames, with their stretches as blocks."""
+        stretch = self.stretch[frames]
+        _, first = np.unique(stretch, return_index=True)
+        _, sequence = np.unique(self.sequence[frames][first], return_inverse=True)
+        errors, restarts = block_means(self.performances[frames], stretch), np.zeros(len(self.sets))
+        return choose(BlockErrors(self.sets.trials, errors, sequence, self.cost, restarts))
 
     def score(self, rule: Rule) -> NDArray[np.float64]:
         """Capped errors in percent of the sets that a rule selects, of shape (n,).
 
         Each fold is left out in turn, and with it the frames whose sub-trajectories overlap it. The
-        rule is fitted to the rest, with the fixed set that is best there.
+        rule is fitted to the rest, with the fixed set of the rest.
 
         Raises
         ------
