@@ -7,7 +7,8 @@ from functools import partial
 from typing import Any
 
 from adaptune.machine import apart
-from adaptune.odometry.base import OdometryInstance, prepared_bytes
+from adaptune.odometry.base import OdometryInstance
+from adaptune.odometry.prepared import prepared_bytes
 from adaptune.recording.scan import Recording, Scan, SequenceError
 from offline.stretches import Stretch
 

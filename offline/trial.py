@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from adaptune.archive import FIRST_POSE, PREPARE_MS, REGISTER_MS, Frames, Trial
 from adaptune.metrics import cap, sub_trajectory_rte
-from adaptune.odometry.base import MAX_SHARE_WITHOUT_POSE, MOST_FAULTS
+from adaptune.odometry.faults import MAX_SHARE_WITHOUT_POSE, MOST_FAULTS
 from adaptune.space import ParameterSet
 from offline.config import OfflineStudyConfig
 from offline.drive import Drive

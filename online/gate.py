@@ -14,7 +14,7 @@ from adaptune import manifest
 from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
 from adaptune.metrics import MIN_BLOCKS, RESAMPLES
-from adaptune.odometry.base import MAX_SHARE_WITHOUT_POSE
+from adaptune.odometry.faults import MAX_SHARE_WITHOUT_POSE
 from adaptune.report.tables import Listing, markdown
 from adaptune.study.driven import MIN_RECORDINGS, PER_STRETCH
 from adaptune.study.study import Study, is_written_to

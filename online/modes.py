@@ -18,8 +18,8 @@ from adaptune.model.descriptor import DescriptorError
 from adaptune.model.registry import ADAPTIVE, ENTRY_POINTS, RULES
 from adaptune.model.weights import weighted_selection
 from adaptune.odometry.base import Motions, OdometryInstance
+from adaptune.odometry.content import python_content
 from adaptune.odometry.factory import Factory
-from adaptune.odometry.registry import python_content
 from adaptune.progress import Progress, unseen
 from adaptune.recording.config import part_name
 from adaptune.recording.scan import Recording, Scan

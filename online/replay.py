@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from adaptune.errors import AdaptuneError
 from adaptune.machine import resident_megabytes
 from adaptune.model.rules import BASELINE
-from adaptune.odometry.base import MAX_SHARE_WITHOUT_POSE, Motions, OdometryInstance, Usage
+from adaptune.odometry.base import Motions, OdometryInstance, Usage
+from adaptune.odometry.faults import MAX_SHARE_WITHOUT_POSE
 from adaptune.odometry.health import HealthCheck
 from adaptune.odometry.tracker import RegisteredScan, Tracker
 from adaptune.recording.scan import Scan

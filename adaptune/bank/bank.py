@@ -15,15 +15,9 @@ from numpy.typing import NDArray
 from adaptune.bank.members import Agreement, spread
 from adaptune.errors import OdometryError
 from adaptune.geometry import Poses, invert, rectify, squared_ranges
-from adaptune.odometry.base import (
-    LOST,
-    Motions,
-    OdometryInstance,
-    PreparedScan,
-    Registration,
-    Usage,
-)
+from adaptune.odometry.base import LOST, Motions, OdometryInstance, Registration, Usage
 from adaptune.odometry.factory import Factory
+from adaptune.odometry.prepared import PreparedScan
 from adaptune.recording.scan import Scan
 from adaptune.space import ODOMETRY, ParameterSet, Selection
 

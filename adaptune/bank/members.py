@@ -21,8 +21,9 @@ from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses, invert, mean_motion
 from adaptune.machine import other_core
 from adaptune.odometry import wire
-from adaptune.odometry.base import InProcess, OdometryInstance, PreparedScan, Usage
+from adaptune.odometry.base import InProcess, OdometryInstance, Usage
 from adaptune.odometry.factory import Factory, OdometryFactory
+from adaptune.odometry.prepared import PreparedScan
 from adaptune.odometry.registry import make_here, odometry_class
 from adaptune.odometry.remote import Isolated
 from adaptune.recording.scan import Scan

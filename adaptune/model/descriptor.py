@@ -10,7 +10,7 @@ from adaptune import processes, strict
 from adaptune.errors import AdaptuneError
 from adaptune.geometry import Poses, invert, rotation_angle
 from adaptune.odometry import wire
-from adaptune.odometry.registry import python_content
+from adaptune.odometry.content import python_content
 from adaptune.recording.scan import Scan
 
 MOTION = "motion"

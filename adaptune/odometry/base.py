@@ -1,11 +1,8 @@
 """What every odometry offers, and the base class of adapters."""
 
-import logging
-import sys
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Hashable, Iterable, Mapping, Sequence
-from dataclasses import fields, is_dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, NamedTuple, Self
@@ -22,13 +19,6 @@ from adaptune.space import ParameterSet, ParameterSpace, Selection
 from adaptune.strict import StrictModel
 
 MIN_POINTS = 20  # an adapter does not register scans with fewer points in range
-MOST_FAULTS = 10
-"""An instance with so many faults does not start again: the rest of its sequence is lost."""
-MAX_SHARE_WITHOUT_POSE = 0.1
-"""Share of the scans from which an odometry that gives no pose for them has failed."""
-_TOLERANCE = 1e-3  # by how much a rotation times its transpose may differ from the identity
-
-_log = logging.getLogger(__name__)
 
 
 class BaseSettings(StrictModel):
@@ -420,73 +410,3 @@ class InProcess(OdometryInstance):
 
     def apply(self, selection: Selection) -> None:
         self.odometry.configure(selection.parameters)
-
-
-class Faulting(OdometryInstance):
-    """An instance that may go wrong, and notes it."""
-
-    faults: Sequence[str] = ()
-
-    def __init__(self, name: str, parameters: ParameterSet):
-        self.name = name
-        self.parameters = dict(parameters)
-
-    @property
-    def given_up(self) -> bool:
-        return len(self.faults) >= MOST_FAULTS
-
-    def note_fault(self, what: str) -> Registration:
-        """Note a fault and end; the pose of a scan with a fault."""
-        self.close()
-        if what not in self.faults:
-            _log.warning("%s with %s: %s", self.name, self.parameters, what)
-        self.faults = [*self.faults, what]
-        if self.given_up:
-            _log.warning("%s: fault number %d, it does not start again", self.name, MOST_FAULTS)
-        return LOST
-
-
-def pose_fault(T_odom_sensor: Poses) -> str | None:
-    """What is wrong with a pose, if anything."""
-    if T_odom_sensor.shape != (4, 4):
-        return f"of shape {T_odom_sensor.shape}"
-    if not np.isfinite(T_odom_sensor).all():
-        return "that is not finite"
-    R = T_odom_sensor[:3, :3]
-    if np.abs(R @ R.T - np.eye(3)).max() > _TOLERANCE or np.linalg.det(R) < 0:
-        return "that is not rigid"
-    return None
-
-
-class PreparedScan:
-    """A scan that is prepared for several instances, once for all with the same preparation.
-
-    `first` is shared by the scans: the first instance with each preparation, which prepares for all
-    of them. They share what it learned from the first scan's layout.
-    """
-
-    def __init__(self, scan: Scan, first: dict[Hashable, Any]):
-        self.scan, self._first = scan, first
-        self.stamp = scan.stamp
-        self._prepared: dict[Hashable, Any] = {}
-
-    def by(self, instance: OdometryInstance) -> Any:
-        """The scan as an instance takes it; it is prepared where nobody has asked before."""
-        if (key := instance.preparation) not in self._prepared:
-            first = self._first.setdefault(key, instance)
-            self._prepared[key] = first.prepare(self.scan)
-        return self._prepared[key]
-
-
-def prepared_bytes(prepared: Any) -> int:
-    """Memory of a prepared scan, roughly, in bytes; a compiled object counts a megabyte."""
-    if (size := getattr(prepared, "nbytes", None)) is not None:
-        return int(size)
-    if is_dataclass(prepared):
-        prepared = [getattr(prepared, each.name) for each in fields(prepared)]
-    if isinstance(prepared, Mapping):
-        prepared = [*prepared.values()]
-    if isinstance(prepared, tuple | list):
-        return sum(map(prepared_bytes, prepared))
-    plain = prepared is None or isinstance(prepared, int | float | str | bytes)
-    return sys.getsizeof(prepared) if plain else 1_000_000

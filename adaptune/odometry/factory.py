@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from adaptune.odometry import registry
 from adaptune.odometry.base import Description, InProcess, OdometryInstance, OwnFile
+from adaptune.odometry.content import Content, odometry_content
 from adaptune.odometry.guarded import Guarded
 from adaptune.odometry.remote import Isolated, Limits
 from adaptune.space import ParameterSet, ParameterSpace, PooledSpace
@@ -40,9 +41,9 @@ class OdometryFactory:
         return {"name": self.name, "settings": self.settings.model_dump(mode="json")}
 
     @property
-    def content(self) -> registry.Content:
+    def content(self) -> Content:
         """What the poses depend on besides name, settings and parameters."""
-        return registry.odometry_content(self.name, self.settings, self.description.module)
+        return odometry_content(self.name, self.settings, self.description.module)
 
     def changed(self, **changes: Any) -> "OdometryFactory":
         """The same with another `user_code` or `program_input`."""
@@ -132,7 +133,7 @@ class OdometryPool:
         return any(factory.one_by_one for factory in self.factories.values())
 
     @property
-    def content(self) -> registry.Content:
+    def content(self) -> Content:
         """See `OdometryFactory`."""
         return {k: v for factory in self.factories.values() for k, v in factory.content.items()}
 

@@ -14,7 +14,8 @@ from adaptune import processes
 from adaptune.errors import AdaptuneError, in_a_line
 from adaptune.geometry import Poses
 from adaptune.odometry import wire
-from adaptune.odometry.base import LOST, Faulting, Odometry, Registration, Usage, pose_fault
+from adaptune.odometry.base import LOST, Odometry, Registration, Usage
+from adaptune.odometry.faults import Faulting, pose_fault
 from adaptune.odometry.registry import odometry_class
 from adaptune.recording.scan import Scan
 from adaptune.space import ParameterSet, Selection

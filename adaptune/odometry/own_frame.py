@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from adaptune.geometry import Poses, invert, rectify, scale
-from adaptune.odometry.base import Odometry, Registration, pose_fault
+from adaptune.odometry.base import Odometry, Registration
+from adaptune.odometry.faults import pose_fault
 from adaptune.recording.scan import Scan
 
 START, MIDDLE, END = 0.0, 0.5, 1.0  # shares of a scan's duration

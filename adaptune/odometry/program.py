@@ -19,15 +19,8 @@ from adaptune.errors import OdometryError, UnavailableError, nearest
 from adaptune.files import locked, replacing_folder, temporary_folder
 from adaptune.geometry import Poses, invert, nearest_rotation, rotation_angle, to_pose
 from adaptune.metrics import window_ends
-from adaptune.odometry.base import (
-    BaseSettings,
-    Description,
-    Faulting,
-    OwnFile,
-    Registration,
-    Usage,
-    pose_fault,
-)
+from adaptune.odometry.base import BaseSettings, Description, OwnFile, Registration, Usage
+from adaptune.odometry.faults import Faulting, pose_fault
 from adaptune.odometry.remote import Arguments, Limits
 from adaptune.odometry.template import Template, check_names, placeholders, replace
 from adaptune.recording.config import SequenceConfig, Transform, resolve

@@ -2,13 +2,9 @@
 
 import inspect
 import json
-import os
-import shutil
-import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -212,95 +208,3 @@ def describe(name: str) -> processes.Answer:
         }
 
     return answer
-
-
-# What an odometry is, by its content: versions, sources, programs.
-
-Content = dict[str, str]
-"""By what it is of, in words, a version or the hash of a file."""
-
-
-def odometry_content(name: str, settings: Any, module: str = "") -> Content:
-    """What the poses of an odometry depend on besides its name, settings and parameters.
-
-    Nothing of the user's is imported. What a class imports, shared libraries, and a program behind
-    an address are not part of it. The settings name the files of a program. `module` is the one in
-    which a class is written, if another one exports it.
-    """
-    if name in PROGRAMS:
-        return _program(settings)
-    if name in ODOMETRIES:
-        module = ODOMETRIES[name].partition(":")[0]
-        package = PACKAGES.get(name, module.rpartition(".")[2])
-        content = {f"version of {package}": _version(package)}
-        if (config := getattr(settings, "config", None)) is not None:
-            content[config] = _fingerprint(Path(config))
-        return content
-    return python_content(name, ENTRY_POINTS, module)
-
-
-def python_content(name: str, group: str, written_in: str = "") -> Content:
-    """Source of a module, and version of the distribution that it is from.
-
-    `name` is ``module:attribute``, or what a distribution calls it in an entry-point group. The
-    source of `written_in` counts, too.
-    """
-    versions: Content = {}
-    if ":" not in name:
-        for point in metadata.entry_points(group=group, name=name):
-            name = point.value
-            if point.dist is not None:
-                versions[f"version of {point.dist.name}"] = point.dist.version
-    module = name.partition(":")[0]
-    file = module_file(module)
-    if file is None:
-        return versions
-    if not versions and "site-packages" in file.parts:
-        # This takes half a second.
-        for package in metadata.packages_distributions().get(module.partition(".")[0], ()):
-            versions[f"version of {package}"] = _version(package)
-    files = {module: file} | {m: f for m in [written_in] if m and (f := module_file(m))}
-    return versions | {f"module {m}": _fingerprint(f) for m, f in files.items()}
-
-
-def module_file(name: str) -> Path | None:
-    """File of a module, found without importing it or what it is in; None if there is none."""
-    where, origin, parts = None, None, name.split(".")
-    for i in range(len(parts)):
-        full = ".".join(parts[: i + 1])
-        specs = (finder.find_spec(full, where) for finder in sys.meta_path)
-        spec = next((spec for spec in specs if spec is not None), None)
-        if spec is None:
-            return None
-        where, origin = spec.submodule_search_locations, spec.origin
-    return Path(origin) if origin is not None and os.path.isfile(origin) else None  # noqa: PTH113
-
-
-def _program(settings: Any) -> Content:
-    if (image := getattr(settings, "image", None)) is not None:
-        from adaptune.odometry.docker.engine import image_digest
-
-        content = {f"image {image}": image_digest(image)}
-        files: tuple[str | None, ...] = ()
-    else:
-        program, *arguments = settings.command or ("",)
-        content, files = {}, (shutil.which(program), *arguments)
-    for name in (*files, getattr(settings, "template", None)):
-        # Arguments may be anything, also too long for a path.
-        for file in (name or "", *(name or "").split("=", 1)[1:]):
-            if os.path.isfile(file):  # noqa: PTH113
-                content[file] = _fingerprint(Path(file))
-    return content
-
-
-def _fingerprint(file: Path) -> str:
-    from adaptune.recording.cache import fingerprint  # needs what containers do not have
-
-    return fingerprint(file)
-
-
-def _version(package: str) -> str:
-    try:
-        return metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return "unknown"

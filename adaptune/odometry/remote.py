@@ -17,15 +17,8 @@ from adaptune.errors import OdometryError, UnavailableError
 from adaptune.geometry import Poses
 from adaptune.machine import available, next_core
 from adaptune.odometry import wire
-from adaptune.odometry.base import (
-    LOST,
-    BaseSettings,
-    Description,
-    Faulting,
-    Registration,
-    Usage,
-    pose_fault,
-)
+from adaptune.odometry.base import LOST, BaseSettings, Description, Registration, Usage
+from adaptune.odometry.faults import Faulting, pose_fault
 from adaptune.recording.scan import Scan
 from adaptune.space import ParameterSet, Selection
 from adaptune.strict import StrictModel

@@ -126,7 +126,8 @@ def named_odometry(given: "str | type[Odometry] | Odometry") -> tuple[str, dict[
     if isinstance(given, str):
         return given, {}
     from adaptune.odometry import Odometry
-    from adaptune.odometry.registry import ODOMETRIES, module_file
+    from adaptune.odometry.content import module_file
+    from adaptune.odometry.registry import ODOMETRIES
 
     cls = given if isinstance(given, type) else type(given)
     module, main = cls.__module__, getattr(sys.modules["__main__"], "__file__", None)

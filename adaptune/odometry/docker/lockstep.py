@@ -16,9 +16,10 @@ from adaptune import processes
 from adaptune.errors import AdaptuneError, OdometryError, UnavailableError, warn_once
 from adaptune.files import temporary_prefix
 from adaptune.geometry import Poses, invert, rectify, to_pose
-from adaptune.odometry.base import LOST, Faulting, Registration, Usage, pose_fault
+from adaptune.odometry.base import LOST, Registration, Usage
 from adaptune.odometry.docker.played_bag import MAX_SCATTER, OWN_CLOCK
 from adaptune.odometry.docker.ros_system import QUIET, RosSystem, filled, matrix
+from adaptune.odometry.faults import Faulting, pose_fault
 from adaptune.odometry.remote import Limits
 from adaptune.recording.clouds import LIVOX_TYPES
 from adaptune.recording.export import IMU, POINTS, Messages, structured

@@ -9,7 +9,8 @@ from walker import at, makes, x_of, x_on
 
 from adaptune.bank.bank import Bank
 from adaptune.odometry import OdometryError
-from adaptune.odometry.base import MOST_FAULTS, InProcess
+from adaptune.odometry.base import InProcess
+from adaptune.odometry.faults import MOST_FAULTS
 from adaptune.odometry.remote import Isolated, Limits
 from adaptune.space import Selection
 

@@ -31,7 +31,7 @@ from street import (
 from adaptune import machine
 from adaptune.geometry import invert
 from adaptune.odometry import OdometryError
-from adaptune.odometry.base import prepared_bytes
+from adaptune.odometry.prepared import prepared_bytes
 from adaptune.odometry.registry import CONTAINERS, ODOMETRIES, PROGRAMS, odometry_class
 from adaptune.recording import Scan
 from adaptune.space import Selection

@@ -6,9 +6,10 @@ from rooms import moved
 from walker import Walker, at, x_on
 
 from adaptune.odometry import OdometryError
-from adaptune.odometry.base import InProcess, PreparedScan
+from adaptune.odometry.base import InProcess
 from adaptune.odometry.keyframe import KeyframeGicp, KeyframeNdt, KeyframeSettings, KeyframeVgicp
 from adaptune.odometry.own_frame import END, MIDDLE, START, AtStamp, duration_of
+from adaptune.odometry.prepared import PreparedScan
 from adaptune.odometry.registry import odometry_class
 from adaptune.recording.scan import Scan
 from adaptune.space import Selection

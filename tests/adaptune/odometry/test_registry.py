@@ -8,10 +8,11 @@ import pytest
 from adaptune.model.descriptor import descriptor_content
 from adaptune.odometry import OdometryError
 from adaptune.odometry.base import InProcess
+from adaptune.odometry.content import odometry_content
 from adaptune.odometry.factory import OdometryFactory, OdometryPool
 from adaptune.odometry.keyframe import KeyframeGicp, KeyframeNdt, KeyframeSettings
 from adaptune.odometry.program import CommandSettings
-from adaptune.odometry.registry import ODOMETRIES, declare, odometry_class, odometry_content
+from adaptune.odometry.registry import ODOMETRIES, declare, odometry_class
 from adaptune.odometry.remote import Limits, ProcessSettings
 from adaptune.space import ODOMETRY, Float, ParameterSpace, SpaceError
 

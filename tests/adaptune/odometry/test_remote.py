@@ -21,8 +21,9 @@ from street import served
 from adaptune import processes
 from adaptune.archive import Archive
 from adaptune.odometry import OdometryError, wire
-from adaptune.odometry.base import MOST_FAULTS, InProcess
+from adaptune.odometry.base import InProcess
 from adaptune.odometry.factory import OdometryFactory
+from adaptune.odometry.faults import MOST_FAULTS
 from adaptune.odometry.guarded import Guarded
 from adaptune.odometry.health import HealthCheck
 from adaptune.odometry.keyframe import KeyframeGicp
