@@ -176,7 +176,8 @@ def read_scenario(path: Path | str) -> Scenario:
             np.array(costs, float),
         )
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise AdaptuneError(f"{path}: is no table of errors: {error}") from error
+        both = f"{path}, with {_beside(path).name} beside it"
+        raise AdaptuneError(f"{both}: is no table of errors: {error}") from error
 
 
 def _beside(path: Path) -> Path:

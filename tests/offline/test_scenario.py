@@ -131,5 +131,10 @@ def test_mistakes_are_told(study, study_file, tmp_path, monkeypatch):
     for path in ("e.csv", "none.csv"):
         with pytest.raises(AdaptuneError, match="is no table of errors"):
             read_scenario(tmp_path / path)
+    write_scenario(tmp_path / "f.csv", scenario(study))
+    (tmp_path / "f_sets.json").write_text("{")
+    words = r"f\.csv, with f_sets\.json beside it: is no table of errors: "
+    with pytest.raises(AdaptuneError, match=words):
+        read_scenario(tmp_path / "f.csv")
     with pytest.raises(AdaptuneError, match="no trial is finished yet"):
         scenario(load_study(study_file, [], tmp_path / "new"))
