@@ -4,6 +4,7 @@ import os
 import shutil
 import signal
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -116,6 +117,13 @@ def test_what_is_larger_than_the_cap_is_passed_on_and_not_kept(monkeypatch, capl
     assert len(list(cache.tee(scans_of(2), "a", {"name": "a"}))) == 4
     assert cache.find("a") is None
     assert "not kept" in caplog.text
+    # Intensities count, too: 0.9 MB of points and 0.3 MB of these.
+    list(cache.tee(scans_of(0.9), "b", {"name": "b"}))
+    assert cache.find("b") is not None
+    lit = [replace(scan, intensities=np.ones(len(scan), np.float32)) for scan in scans_of(0.9)]
+    list(cache.tee(lit, "c", {"name": "c"}))
+    assert cache.find("c") is None
+    assert cache.find("b") is not None
 
 
 def test_a_damaged_entry_is_made_anew(tmp_path, cache_folder, caplog):
