@@ -106,7 +106,7 @@ def say_fixed(study: "OfflineStudy", advised: bool = True) -> None:
     there = own is not None and own[0].exists()
     more = f"; for the odometry's own tool: {own[0]} ({own[1].use})" if own and there else ""
     what = "The parameters" if advised else "The fixed set, which is not advised here"
-    what += ", no value of which is changed" * (fixed == study.odometry.space.baseline)
+    what += ", all unchanged" * (fixed == study.odometry.space.baseline)
     say(f"{what}: {study.folder / FIXED_SET}{more}.")
 
 

@@ -44,7 +44,7 @@ def test_the_fixed_set_s_odometry_decides(study, capsys):
     assert "which is not advised here" in said(study, capsys, advised=False)
     write(study, "gicp")
     assert sorted(study.folder.glob("fixed*")) == [study.folder / "fixed.yaml", users]
-    none = f"The parameters, no value of which is changed: {study.folder}/fixed.yaml."
+    none = f"The parameters, all unchanged: {study.folder}/fixed.yaml."
     assert said(study, capsys) == none
 
 
