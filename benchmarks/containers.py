@@ -190,8 +190,8 @@ def ros2(n: int) -> None:
         system: Any = odometry._system
         time.sleep(2.0)  # until its node has learnt all of the other
         idle = _idle(system)
-        begin, cpu, carrier = time.monotonic(), time.process_time(), system._node.used().cpu
-        node = system._container.used().cpu
+        carrier, node = system._node.used().cpu, system._container.used().cpu
+        begin, cpu = time.monotonic(), time.process_time()
         for scan in scans[1:]:
             odometry.register(scan)
         took, cpu = time.monotonic() - begin, time.process_time() - cpu
