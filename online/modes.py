@@ -19,7 +19,8 @@ from adaptune.model.registry import ADAPTIVE, ENTRY_POINTS, RULES
 from adaptune.model.weights import weighted_selection
 from adaptune.odometry.base import Motions, OdometryInstance
 from adaptune.odometry.content import python_content
-from adaptune.odometry.factory import Factory
+from adaptune.odometry.factory import Factory, OdometryFactory
+from adaptune.odometry.registry import ROS_SYSTEMS
 from adaptune.progress import Progress, unseen
 from adaptune.recording.config import part_name
 from adaptune.recording.scan import Recording, Scan
@@ -328,7 +329,7 @@ def replay_modes(
     refused = ensure_references(study.sequences, sequences, length, progress, required=False)
     for why in refused.values():
         _log.warning("%s; it is replayed without a reference, and not judged", why)
-    setup, made = ReplaySetup.of(study), 0
+    setup, made, checked = ReplaySetup.of(study), 0, False
     model, model_path = fitted or (None, None)
     digest = "" if model is None else model.digest
     for name in sequences:
@@ -340,6 +341,9 @@ def replay_modes(
         recording = study.sequences.open(name)
         for i, inputs in enumerate(due):
             mode = setup.mode(inputs["mode"], model)
+            if mode.selector is not None and not mode.bank and not checked:
+                _check_live(study.odometry, recording)
+                checked = True
             release_memory()
             try:
                 with closing(setup.instance(mode, name)) as odometry:
@@ -355,6 +359,14 @@ def replay_modes(
             _log.info("%s: the reference has changed; no replay depends on it", name)
         made += len(due)
     return made
+
+
+def _check_live(odometry: Factory, recording: Recording) -> None:
+    """Refuse to adapt a ROS system by parameters that it accepts and does not read again."""
+    if isinstance(odometry, OdometryFactory) and odometry.name in ROS_SYSTEMS:
+        from adaptune.odometry.docker.probe import check_live  # little else needs it
+
+        check_live(odometry, recording)
 
 
 def _judge(study: Study, name: str, recording: Recording, replayed: Trajectory) -> None:

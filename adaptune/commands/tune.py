@@ -120,18 +120,19 @@ def _show_several(path: Path, reading: "Reading | None") -> bool:
     return True
 
 
-_ROS = ("ros2", "rustle")
 _LOOK = 20.0
 """Seconds of a recording on which a ROS system is looked at."""
 
 
 def _look(path: Path) -> bool:
     """Show what the ROS system of a study does; False if it has none."""
+    from adaptune.odometry.registry import ROS_SYSTEMS
+
     loaded = load(path, [], None)
     factory: Any = loaded.odometry
-    if loaded.config.odometries.keys().isdisjoint(_ROS) or len(loaded.config.odometries) > 1:
+    if loaded.config.odometries.keys().isdisjoint(ROS_SYSTEMS) or len(loaded.config.odometries) > 1:
         return False
-    from adaptune.odometry.docker.probe import look
+    from adaptune.odometry.docker.probe import far_ends, look
 
     name = loaded.config.training[0]
     scans = loaded.sequences.open(name)
@@ -139,9 +140,7 @@ def _look(path: Path) -> bool:
     some = takewhile(lambda scan: scan.stamp < first + _LOOK * 1e9, scans)
     say(f"{factory.name} on the first {_LOOK:g} s of {name}, with the baseline's parameters:")
     space = factory.space
-    # The far end of each range.
-    (others,) = space.from_unit((space.to_unit([space.baseline]) < 0.5).astype(float))
-    found = look(factory.settings, space.baseline, factory.limits, some, others)
+    found = look(factory.settings, space.baseline, factory.limits, some, far_ends(space))
     show_table("What it does", [{"": key, "found": value} for key, value in found.items()])
     return True
 

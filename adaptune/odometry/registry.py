@@ -47,7 +47,8 @@ PROGRAMS = {
 }
 """Programs of the user."""
 
-CONTAINERS = ("docker_command", "docker_process", "ros2", "rustle")
+ROS_SYSTEMS = ("ros2", "rustle")
+CONTAINERS = ("docker_command", "docker_process", *ROS_SYSTEMS)
 """Those of them that run in containers, or may."""
 
 PACKAGES = {"gicp": "small_gicp", "kiss_icp": "kiss-icp", "ndt": "open3d", "vgicp": "small_gicp"}

@@ -3,20 +3,22 @@
 import time
 from collections.abc import Iterable, Sequence
 from contextlib import closing, suppress
+from itertools import islice
 from typing import Any
 
 import numpy as np
 
-from adaptune.errors import OdometryError
+from adaptune.errors import OdometryError, warn_once
 from adaptune.geometry import Poses
 from adaptune.odometry.docker.lockstep import OTHER_CLOCK, Lockstep
 from adaptune.odometry.docker.played_bag import MAX_SCATTER
 from adaptune.odometry.docker.ros_system import QUIET
+from adaptune.odometry.factory import OdometryFactory
 from adaptune.odometry.remote import Limits
 from adaptune.odometry.template import Template
 from adaptune.recording.scan import Scan
 from adaptune.ros.link import LinkError
-from adaptune.space import ParameterSet, Selection
+from adaptune.space import ParameterSet, ParameterSpace, Selection
 
 _SHORT = 50  # scans by which it is seen what a parameter changes while the system runs
 _BEFORE = 10  # scans of these before it is set
@@ -43,7 +45,7 @@ def look(
     """Start a system on scans at the pace of the recording, and say what it does, by subject.
 
     Where it works on after its poses, it is driven without waiting, too. Where the settings name a
-    node, it is also driven on the first scans with each of the `others` set on the way.
+    node, it is also driven with each of the `others` set on the way, see `effects`.
     """
     plain = settings.model_copy(update={"play": "lockstep", "rate": 1.0, "node": None})
     system, scans = _Watched(parameters, plain, limits), list(scans)
@@ -80,7 +82,12 @@ def look(
         hurried = _driven(plain.model_copy(update={"rate": 0.0}), parameters, limits, scans)
         report["works on after a pose"] = _apart(path, hurried)
     if settings.node is not None and others and not system.faults:
-        report |= _effects(settings, parameters, limits, scans[:_SHORT], others)
+        live, vain = effects(settings, parameters, limits, scans, others)
+        report["takes effect while it runs"] = ", ".join(live) or "nothing: leave out settings.node"
+        if vain:
+            report["has no effect while it runs"] = (
+                f"{', '.join(vain)}: do not switch live with these among the parameters"
+            )
     return report
 
 
@@ -124,32 +131,59 @@ def _apart(path: Sequence[Poses], hurried: Sequence[Poses]) -> str:
     )
 
 
-def _effects(
+def far_ends(space: ParameterSpace) -> ParameterSet:
+    """For each parameter, the end of its range that is further from the baseline."""
+    (others,) = space.from_unit((space.to_unit([space.baseline]) < 0.5).astype(float))
+    return others
+
+
+def check_live(odometry: OdometryFactory, scans: Iterable[Scan]) -> None:
+    """Warn of parameters that have no effect while a system runs; an `OdometryError` if all."""
+    space, settings = odometry.space, odometry.settings
+    given = settings, space.baseline, odometry.limits
+    live, vain = effects(*given, scans, far_ends(space))
+    if not vain:
+        return
+    what = (
+        f"{settings.node}, set while it runs, changes nothing by {', '.join(vain)} (the first "
+        f"{_SHORT} scans)"
+    )
+    if not live:
+        raise OdometryError(
+            f"{what}, so it cannot adapt live; leave out odometry.settings.node, or set "
+            f"online.switching.mechanism: bank"
+        )
+    warn_once(
+        f"{what}: these keep the value they began with; leave them out of odometry.parameters"
+    )
+
+
+def effects(
     settings: Any,
     parameters: ParameterSet,
     limits: Limits,
-    scans: Sequence[Scan],
+    scans: Iterable[Scan],
     others: ParameterSet,
-) -> dict[str, str]:
-    """Which parameters change the path while the system runs, and which are in vain."""
+) -> tuple[list[str], list[str]]:
+    """Which of the `others` change the path if they are set while the system runs, which do not.
+
+    It is driven on the first scans with each of them, and twice without. Nodes accept values that
+    they never read again.
+    """
     fast = settings.model_copy(update={"play": "lockstep", "rate": 0.0})
-    path, again = (_driven(fast, parameters, limits, scans) for _ in range(2))
+    some = list(islice(scans, _SHORT))
+    path, again = (_driven(fast, parameters, limits, some) for _ in range(2))
     chance = 3.0 * _furthest(path, again) + 1e-6
     live: list[str] = []
     vain: list[str] = []
     for name, value in others.items():
         try:
-            changed = _driven(fast, parameters, limits, scans, {name: value})
+            changed = _driven(fast, parameters, limits, some, {name: value})
         except OdometryError as error:
             vain.append(f"{name} is refused ({error})")
             continue
         (live if _furthest(path, changed) > chance else vain).append(name)
-    effects = {"takes effect while it runs": ", ".join(live) or "nothing: leave out settings.node"}
-    if vain:
-        effects["has no effect while it runs"] = (
-            f"{', '.join(vain)}: do not switch live with these among the parameters"
-        )
-    return effects
+    return live, vain
 
 
 def _topics(system: Any) -> dict[str, str]:

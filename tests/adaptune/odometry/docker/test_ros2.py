@@ -18,11 +18,12 @@ from ros2_reference import ros2
 
 from adaptune.errors import warn_once
 from adaptune.odometry import OdometryError
-from adaptune.odometry.docker import lockstep, played_bag, ros2_system
-from adaptune.odometry.docker.probe import look
+from adaptune.odometry.docker import lockstep, played_bag, probe, ros2_system
+from adaptune.odometry.docker.probe import check_live, look
 from adaptune.odometry.docker.ros2_system import Ros2, Ros2System
+from adaptune.odometry.factory import OdometryFactory
 from adaptune.recording import Imu, Scan
-from adaptune.space import Selection
+from adaptune.space import ParameterSpace, Selection
 
 pytestmark = [
     pytest.mark.services,
@@ -186,6 +187,24 @@ def test_parameters_that_are_accepted_in_vain_are_told(tmp_path):
     assert re.match(r"max_range, icp\.max_iterations is refused \(.*\): do not switch live", vain)
 
 
+def _factory(folder, parameters, **settings):
+    space = ParameterSpace.load(parameters)
+    return OdometryFactory("ros2", ros2(folder / "icp.yaml", **settings), space, LIMITS)
+
+
+def test_a_system_adapts_live_only_by_what_has_an_effect(tmp_path, caplog):
+    given = {"node": "/icp", "patience": 9.0}
+    size = {"type": "float", "low": 0.5, "high": 2.0, "baseline": 0.5}
+    vain = {"max_range": {"type": "float", "low": 3.0, "high": 60.0, "baseline": 60.0}}
+    factory = _factory(tmp_path, vain | {"voxel_size": size}, **given)
+    check_live(factory, scans()[:16])
+    what = "/icp, set while it runs, changes nothing by max_range (the first 50 scans)"
+    assert f"{what}: these keep the value they began with" in caplog.text
+    with pytest.raises(OdometryError, match=r"max_range .*, so it cannot adapt live; leave out"):
+        check_live(_factory(tmp_path, vain, **given), scans()[:16])
+    assert not containers()
+
+
 def test_one_that_works_on_is_driven_without_waiting_too(tmp_path):
     given = ros2(tmp_path / "icp.yaml", imitate={"background": 2.5}, patience=9.0)
     found = look(given, VALUES, LIMITS, scans()[:5])
@@ -300,7 +319,8 @@ def test_a_study_looks_tunes_and_replays_one(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for seed, name in enumerate("ab"):
         drives.write_bag(tmp_path / f"{name}.bag", drives.scans(seed, 60))
-    settings = ros2(tmp_path / "icp.yaml").model_dump(mode="json", exclude_defaults=True)
+    given = ros2(tmp_path / "icp.yaml", node="/icp")
+    settings = given.model_dump(mode="json", exclude_defaults=True)
     study = {
         "sequences": {
             name: {"bag": f"{name}.bag", "points": "/points", "reference": "/truth"}
@@ -317,7 +337,8 @@ def test_a_study_looks_tunes_and_replays_one(tmp_path, monkeypatch):
             },
         },
         "offline": {"trials": 3, "workers": 1},
-        "online": {"modes": ["adaptive"]},
+        # A mode that is a bank whatever the training found.
+        "online": {"modes": ["adaptive", "untrained"], "switching": {"size": 2}},
     }
     (tmp_path / "icp_study.yaml").write_text(json.dumps(study))
     looked = commands.call("inspect", "icp_study.yaml")
@@ -326,7 +347,17 @@ def test_a_study_looks_tunes_and_replays_one(tmp_path, monkeypatch):
     for command in ("offline", "online", "compare"):
         done = commands.call(command, "icp_study.yaml")
         assert done.exit_code == 0, done.output
-    assert (tmp_path / "runs/icp_study/fixed_icp.yaml").exists()
+    runs = tmp_path / "runs/icp_study"
+    assert (runs / "fixed_icp.yaml").exists()
+    bank = runs / "replays/b/untrained"
+    inputs = json.loads((bank / "inputs.json").read_text())["inputs"]
+    assert inputs["switching"]["mechanism"] == "bank"
+    assert json.loads((bank / "replay.json").read_text())["restarts"] == 0
+    checked = []
+    monkeypatch.setattr(probe, "check_live", lambda odometry, _: checked.append(odometry.name))
+    live = commands.call("online", "icp_study.yaml", "-o", "online.switching.mechanism=live")
+    assert live.exit_code == 0, live.output
+    assert checked == ["ros2"]
     assert not containers()
 
 
