@@ -141,8 +141,26 @@ def _look(path: Path) -> bool:
     say(f"{factory.name} on the first {_LOOK:g} s of {name}, with the baseline's parameters:")
     space = factory.space
     found = look(factory.settings, space.baseline, factory.limits, some, far_ends(space))
+    found |= _frames(loaded.sequences.open(name), factory.settings)
     show_table("What it does", [{"": key, "found": value} for key, value in found.items()])
     return True
+
+
+def _frames(recording: Any, given: Any) -> dict[str, str]:
+    """The recording's frames as the settings take them, where they have none."""
+    from adaptune.recording.bag import BagSource
+
+    source = getattr(recording, "source", None)
+    if given.system.ros == 1 or given.play == "bag" or not isinstance(source, BagSource):
+        return {}
+    frame, fixed = source.fixed_frames()
+    if given.transforms or not fixed:
+        return {}
+    every = (f"{child}: [{parent}, {pose}]" for child, (parent, pose) in fixed.items())
+    return {
+        "frames of the recording": f"set odometry.settings.frame: {frame}, and transforms: "
+        f"{{{', '.join(every)}}}, if it needs them"
+    }
 
 
 def _show_model(file: Path) -> None:

@@ -28,6 +28,7 @@ from adaptune.recording.findings import clock_parts, of_clock
 from adaptune.recording.pose_messages import (
     PATH,
     POSES,
+    STATIC,
     TRANSFORMS,
     message_stamp,
     of_frame,
@@ -325,6 +326,22 @@ class BagSource:
         for what in left_out:
             _log.warning("%s: %s: %s; they are left out", self.name, name, what)
         return trajectory
+
+    def fixed_frames(self) -> tuple[str, dict[str, tuple[str, list[float]]]]:
+        """The clouds' frame, and frames of ``/tf_static``, each with its parent and pose in that.
+
+        A pose is x, y, z in metres and a quaternion with its real part last.
+        """
+        with self.open() as reader:
+            clouds = islice(self.read(reader, self.points), 1)
+            frame = next((header_of(data, reader.is2)[1] for _, _, data in clouds), "")
+        fixed = {}
+        static = self.topics.get(STATIC) in TRANSFORMS
+        for stamped in (t for m in self.messages(STATIC) for t in m.transforms) if static else ():
+            p, q = stamped.transform.translation, stamped.transform.rotation
+            pose = [round(float(v), 9) for v in (p.x, p.y, p.z, q.x, q.y, q.z, q.w)]
+            fixed[stamped.child_frame_id] = stamped.header.frame_id, pose
+        return frame, fixed
 
     def imu(self, name: str | None) -> Imu | None:
         """Measurements on a topic, as they were recorded."""

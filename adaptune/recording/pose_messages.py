@@ -44,6 +44,7 @@ POSES: dict[str, Callable[[Any], list[Pose]]] = {
 """Poses in a message, by its type."""
 # Each message of this type repeats all poses of the one before.
 PATH = "nav_msgs/msg/Path"
+STATIC = "/tf_static"
 TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 
 

@@ -1,5 +1,6 @@
 """Bags of a sensor driving through a world of points, small enough to register in no time."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -66,11 +67,13 @@ def cloud(stamp: int, points: NDArray[np.float32], names: str = "xyz") -> Any:
 
 
 def write_bag(
-    path: Path, drive: list[tuple[int, NDArray[np.float32], NDArray[np.float64]]]
+    path: Path,
+    drive: list[tuple[int, NDArray[np.float32], NDArray[np.float64]]],
+    first: Sequence[tuple[str, int, Any]] = (),
 ) -> Path:
     """Write a drive without rotations to a ROS 1 bag with /points and /truth."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    messages = []
+    messages = [*first]
     for stamp, xyz, T in drive:
         position, still = T[:3, 3].tolist(), (0.0, 0.0, 0.0, 1.0)
         messages.append(("/points", stamp, cloud(stamp, xyz)))

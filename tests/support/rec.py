@@ -86,6 +86,16 @@ def bare_pose(position, quaternion, store):
     )
 
 
+def fixed_frame(child, parent, position, store=ROS1):
+    """A frame on /tf_static that is not turned."""
+    types = store.types
+    vector, turned = types["geometry_msgs/msg/Vector3"], types["geometry_msgs/msg/Quaternion"]
+    transform = types["geometry_msgs/msg/Transform"](vector(*position), turned(0, 0, 0, 1))
+    stamped = types["geometry_msgs/msg/TransformStamped"]
+    made = stamped(header(START, parent, store), child, transform)
+    return types["tf2_msgs/msg/TFMessage"]([made])
+
+
 def imu(stamp, rate, force, store=ROS2):
     """Measurements without orientation."""
     types, unknown = store.types, np.zeros(9)

@@ -270,6 +270,8 @@ class Lockstep(Faulting):
             raise OdometryError(f"it gave a pose {wrong}")
         if self._late is None:
             self._late = stamp - self._stamp
+            if other := other_frame(about := self._reader.about, self._settings):
+                warn_once(f"{self.name}: its poses are of {about}; {other}")
         scatter = abs(stamp - self._stamp - self._late)
         if scatter >= MAX_SCATTER or abs(self._late) >= OTHER_CLOCK:
             self._steady = False
@@ -357,3 +359,10 @@ class Lockstep(Faulting):
             raise error
         words = "" if self._system is None else self._system.words()
         return processes.quoting(str(error), words)
+
+
+def other_frame(about: str, settings: Any) -> str:
+    """What to set where poses are of another frame than scans are: `about` begins with theirs."""
+    if not about or settings.extrinsic is not None or about.split(maxsplit=1)[0] == settings.frame:
+        return ""
+    return f"scans are of {settings.frame}: set odometry.settings.extrinsic if it is not there"

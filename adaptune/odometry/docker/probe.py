@@ -10,7 +10,7 @@ import numpy as np
 
 from adaptune.errors import OdometryError, warn_once
 from adaptune.geometry import Poses
-from adaptune.odometry.docker.lockstep import OTHER_CLOCK, Lockstep
+from adaptune.odometry.docker.lockstep import OTHER_CLOCK, Lockstep, other_frame
 from adaptune.odometry.docker.played_bag import MAX_SCATTER
 from adaptune.odometry.docker.ros_system import QUIET
 from adaptune.odometry.factory import OdometryFactory
@@ -69,7 +69,9 @@ def look(
         if (inside := system._system) is not None:
             report |= _topics(inside) | _declared(inside, system._template)
             if about := system._reader.about:
-                report["poses are of"] = about + _extrinsic(about.split()[0], settings)
+                report["poses are of"] = "; ".join(
+                    filter(None, (about, other_frame(about, settings)))
+                )
             works_on = system._works_on(inside)
     seconds = max(1e-9 * (shown[-1][1] - shown[0][1]), 0.1)
     report["time of a start"] = f"{took:.1f} s"
@@ -89,13 +91,6 @@ def look(
                 f"{', '.join(vain)}: do not switch live with these among the parameters"
             )
     return report
-
-
-def _extrinsic(frame: str, settings: Any) -> str:
-    """What to set where poses are of another frame than scans are."""
-    if frame == settings.frame or settings.extrinsic is not None:
-        return ""
-    return f"; scans are of {settings.frame}: set odometry.settings.extrinsic if it is not there"
 
 
 def _driven(

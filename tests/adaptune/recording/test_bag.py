@@ -284,6 +284,25 @@ def test_of_transforms_one_frame_is_taken(tmp_path):
     assert len(opened(bag, reference="/tf", child_frame="base").reference()) == 1
 
 
+@pytest.mark.parametrize("suffix", [".bag", ".mcap"])
+def test_frames_that_do_not_move_are_known(tmp_path, suffix):
+    path = tmp_path / f"a{suffix}"
+    store = rec.store_of(path)
+    (first, second) = (m.transforms[0] for m in poses_of(store)["TFMessage"])
+    first.child_frame_id, second.child_frame_id = "lidar", "imu"
+    first.header.frame_id = second.header.frame_id = "base"
+    static = store.types["tf2_msgs/msg/TFMessage"]([first, second])
+    messages = [("/points", rec.START, one_cloud(store)), ("/tf_static", rec.START, static)]
+    frame, fixed = opened(rec.write_bag(path, messages)).source.fixed_frames()
+    assert frame == "lidar"
+    assert fixed == {
+        "lidar": ("base", [0, 0, 0, 0, 0, 0, 1]),
+        "imu": ("base", [1, 2, 3, 0, 0, 1, 0]),
+    }
+    bare = rec.write_bag(tmp_path / f"b{suffix}", messages[:1])
+    assert opened(bare).source.fixed_frames() == ("lidar", {})
+
+
 @pytest.mark.parametrize("suffix", [".bag", ".mcap", ".sqlite3"])
 @pytest.mark.parametrize("kind", LIVOX_TYPES)
 @pytest.mark.parametrize("n", [0, 1, 2, 50])

@@ -12,6 +12,7 @@ import commands
 import drives
 import numpy as np
 import pytest
+import rec
 from contained import LIMITS, N_SCANS, containers, drive, recording, scans, truth
 from needs import module_of, ros2_image
 from ros2_reference import ros2
@@ -306,6 +307,14 @@ def test_what_a_node_does_that_no_odometry_may_is_told(make, imitate, words):
     assert odometry.ended
 
 
+def test_poses_of_another_frame_are_told(make, caplog):
+    warn_once.cache_clear()
+    odometry = make(frame="os", imitate={"late": 0})
+    odometry.start(scans()[0], np.eye(4))
+    words = "its poses are of lidar in odom; scans are of os: set odometry.settings.extrinsic if"
+    assert words in caplog.text
+
+
 def test_nodes_that_do_not_tell_their_parameters_are_told(tmp_path, monkeypatch, caplog):
     monkeypatch.setattr(ros2_system, "_UNDECLARED", 0.0)
     settings = ros2(tmp_path / "icp.yaml")
@@ -317,8 +326,9 @@ def test_nodes_that_do_not_tell_their_parameters_are_told(tmp_path, monkeypatch,
 
 def test_a_study_looks_tunes_and_replays_one(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    fixed = "/tf_static", drives.FIRST_STAMP, rec.fixed_frame("lidar", "base", (0.0, 0.0, 0.3))
     for seed, name in enumerate("ab"):
-        drives.write_bag(tmp_path / f"{name}.bag", drives.scans(seed, 60))
+        drives.write_bag(tmp_path / f"{name}.bag", drives.scans(seed, 60), [fixed])
     given = ros2(tmp_path / "icp.yaml", node="/icp")
     settings = given.model_dump(mode="json", exclude_defaults=True)
     study = {
@@ -344,6 +354,8 @@ def test_a_study_looks_tunes_and_replays_one(tmp_path, monkeypatch):
     looked = commands.call("inspect", "icp_study.yaml")
     assert looked.exit_code == 0, looked.output
     assert "lockstep" in looked.stdout
+    words = "set odometry.settings.frame: lidar, and transforms: {lidar: [base, [0.0, 0.0, 0.3,"
+    assert words in " ".join(looked.stdout.split())
     for command in ("offline", "online", "compare"):
         done = commands.call(command, "icp_study.yaml")
         assert done.exit_code == 0, done.output
