@@ -17,7 +17,8 @@ def _leave(*_: object) -> None:
 def main() -> None:
     """Run the command line; a user's classes are found in the working folder, after all others."""
     here = os.getcwd()  # noqa: PTH109 - what this imports may not have the name of a file here
-    sys.path[:] = [*(folder for folder in sys.path if folder not in ("", here)), here]
+    if here != __file__.removesuffix("/adaptune/__main__.py"):  # a checkout runs what it holds
+        sys.path[:] = [*(folder for folder in sys.path if folder not in ("", here)), here]
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _leave)
     # A recording may have more parts than the 1024 files that most systems begin with.

@@ -1,9 +1,12 @@
 import os
+import shutil
 import signal
 import subprocess
 import sys
 
 import pytest
+
+import adaptune.__main__
 
 HEAVY = {"scipy", "numba", "open3d", "optuna", "vl_convert", "rosbags", "sklearn", "small_gicp"}
 
@@ -87,3 +90,16 @@ def test_ctrl_c_while_importing_ends_without_a_traceback(study_file, tmp_path, m
     assert said.endswith("interrupted\n")
     assert "Traceback" not in said
     assert not (tmp_path / "runs").exists()
+
+
+def test_a_checkout_runs_its_own_stages(tmp_path):
+    """Another one is installed, as where somebody compares two versions."""
+    for package in ("adaptune", "adaptune/commands", "offline"):
+        (tmp_path / package).mkdir()
+        (tmp_path / package / "__init__.py").touch()
+    shutil.copy(adaptune.__main__.__file__, tmp_path / "adaptune")
+    code = "import offline\n\n\ndef main():\n    print(offline.__file__)\n"
+    (tmp_path / "adaptune/commands/cli.py").write_text(code)
+    command = [sys.executable, "-m", "adaptune"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert done.stdout == f"{tmp_path / 'offline/__init__.py'}\n"
