@@ -436,7 +436,7 @@ def _of_training(model: ErrorModel) -> list[str]:
     if not means.min() <= LOST_ABOVE or not costs[0] > costs[1]:
         return []
     has = f"trial {trial} has {means.min():.2f} % at {costs[0]:.0f} ms a scan"
-    return [f"In training {has}: `--budget {np.ceil(costs[0]):.0f}` allows it."]
+    return [f"In training {has}: `online.budget: {np.ceil(costs[0]):.0f}` allows it."]
 
 
 def _rows(judged: Sequence[JudgedModes], oracles: Sequence[ComparisonRow]) -> list[ComparisonRow]:

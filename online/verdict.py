@@ -1,5 +1,6 @@
 """The verdict of a comparison: what to drive, what that gives and costs, and how sure it is."""
 
+import math
 from collections.abc import Mapping, Sequence
 
 from adaptune.study.config import WORTH
@@ -142,7 +143,8 @@ def _other_set(best: ComparisonRow, last: Mapping[str, ComparisonRow], worth: fl
     sure = "" if ratio.interval is None else f" ({_interval(ratio)})"
     has = f"{ratio.value:.2f} times its error{sure}{_for_cost(row, best)}"
     if costs > best.cpu_ms and ratio.interval and _surely_better(row, best):
-        return [f"A single set that costs more has {has}: `--budget {costs:.0f}` allows it."]
+        budget = f"`online.budget: {math.ceil(costs)}`"
+        return [f"A single set that costs more has {has}: {budget} allows it."]
     if costs <= best.cpu_ms and ratio.value <= 1.0 - worth:
         sure = "that was not surely better in training " * (best.mode == "baseline")
         more = "drive both on another recording, to know"

@@ -5,7 +5,6 @@ import re
 import shlex
 import shutil
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from functools import partial
 from itertools import count
 from pathlib import Path
@@ -253,7 +252,7 @@ def _replace_noisy(
         if not measured.is_noisy(length) or (error := measured.error(length)) is None:
             continue
         before, one.given = one.given, one.given | {"reference": "estimated"}
-        with suppress(AdaptuneError):
+        try:
             study = loaded()
             _estimate(study, [name], show)
             own = study.sequences.estimate(name)
@@ -265,6 +264,8 @@ def _replace_noisy(
                     f"`--reference {before.get('reference', 'FILE')}`"
                 )
                 continue
+        except AdaptuneError as why:
+            _log.warning("%s: its reference is noisy, and none can be estimated: %s", name, why)
         one.given = before
 
 

@@ -213,7 +213,7 @@ def test_a_single_set_that_costs_more_is_told_where_it_is_surely_better():
     dear = [replace(row, cpu_ms=costs.get(row.mode, 5.0)) for row in rows]
     assert verdict(dear, 10.0)[1] == (
         "A single set that costs more has 0.70 times its error (95 % interval 0.68 to 0.72), for "
-        "2.4 times its CPU time (12.0 ms a scan): `--budget 12` allows it."
+        "2.4 times its CPU time (12.0 ms a scan): `online.budget: 12` allows it."
     )
     cheap = [replace(row, cpu_ms=5.0) for row in rows]
     assert verdict(cheap, 10.0)[1] == (
@@ -223,4 +223,4 @@ def test_a_single_set_that_costs_more_is_told_where_it_is_surely_better():
     as_good = [replace(row, cpu_ms=5.0) for row in every(equal_cost=0.95)]
     assert not any("drive both" in said for said in verdict(as_good, 10.0))
     short = [replace(row, ratio_interval=None) for row in dear]
-    assert not any("--budget" in said for said in verdict(short, 10.0))
+    assert not any("budget" in said for said in verdict(short, 10.0))
