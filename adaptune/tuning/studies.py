@@ -154,8 +154,11 @@ def written(asked: Asked, folder: Path, show: Progress) -> tuple[Path, list[str]
 
 def _decided(asked: Asked, folder: Path, show: Progress) -> dict[str, Any]:
     """The study of some recordings; nothing is written but references."""
+    from adaptune.odometry.registry import declare
     from offline.config import load_study
 
+    for name in odometries_of(asked.odometry, True):
+        declare(name, asked.about.get("settings", {}))  # a wrong one is known before all is read
     named, test = recorded(asked, show)
     odometries = odometries_of(asked.odometry, all("imu" in one.given for one in named.values()))
     if asked.config is not None and asked.about:
@@ -182,6 +185,7 @@ def _decided(asked: Asked, folder: Path, show: Progress) -> dict[str, Any]:
     def loaded() -> "OfflineStudy":
         return load_study(study(USUAL_LENGTH), folder=folder)
 
+    loaded()  # or an error, before anything is measured
     if asked.reference is None:
         _replace_noisy(named, loaded, show)
     length, share, speed = _split(loaded(), list(named), show)

@@ -271,6 +271,18 @@ def test_mistakes_are_told_in_a_sentence_and_nothing_is_made(tmp_path, arguments
     assert not (tmp_path / "runs").exists()
 
 
+@pytest.mark.usefixtures("bag")
+def test_a_wrong_odometry_is_told_before_the_recording_is_read(tmp_path, monkeypatch):
+    base = "from adaptune.odometry import Odometry\n\n\n"
+    code = f"{base}class Mine(Odometry):\n    live, space = False, {{}}\n"
+    (tmp_path / "spaceless.py").write_text(code)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr("adaptune.tuning.asked.usable", lambda *_: pytest.fail("it was read"))
+    assert "did you mean 'gicp'" in failed("one.bag", "--odometry", "gicb")
+    words = "its `space` is a dict; write it as space = ParameterSpace("
+    assert words in failed("one.bag", "--odometry", "spaceless:Mine")
+
+
 @pytest.mark.services
 def test_a_fleet_leaves_each_out_and_grows(tmp_path):
     """A recording more runs only what is new, at the same sets."""
