@@ -16,6 +16,7 @@ from adaptune.errors import AdaptuneError
 from adaptune.files import replacing, write_text
 from adaptune.metrics import cap
 from adaptune.model import Rule, TrainingData
+from adaptune.model.rules import Costs, SetCost
 from adaptune.report.tables import csv_text
 from adaptune.space import ParameterSets, load_space
 from adaptune.study.driven import MIN_RECORDINGS
@@ -66,9 +67,12 @@ class Scenario(NamedTuple):
         AdaptuneError
             If nothing is left without a fold, or if the rule weighs the members of a bank.
         """
+        if isinstance(rule, type):
+            raise AdaptuneError(f"{rule.__name__}: is a class; give an object, {rule.__name__}()")
         from adaptune.model.knn import ScaledPCA  # takes long to import
 
         errors = np.empty(len(self.frame))
+        each = {n: SetCost(cost, 0.0, n) for n, cost in zip(self.sets, self.cost, strict=True)}
         for fold in np.unique(self.fold):
             left_out = self.fold == fold
             rest = ~(left_out | self._overlapping(left_out))
@@ -77,7 +81,8 @@ class Scenario(NamedTuple):
             pca = ScaledPCA(self.blocks.values())
             features = pca.fit(self.features[rest]).transform(self.features)
             of_rest = features[rest], self.stretch[rest], self.performances[rest]
-            rule.fit(TrainingData(*of_rest, self.sets, self.fixed(rest)))
+            fixed, costs = self.fixed(rest), Costs(each, 0.0)
+            rule.fit(TrainingData(*of_rest, self.sets, fixed, costs=costs))
             for i in np.flatnonzero(left_out):
                 selection = rule.select(features[i])
                 if selection.weights is not None:

@@ -62,6 +62,12 @@ class Fixed(Baseline):
         return Selection(self.data.fixed, self.data.sets[self.data.fixed])
 
 
+class Cheapest(Baseline):
+    def select(self, feature, live=None):  # noqa: ARG002
+        best = min(self.data.candidates or self.data.sets, key=self.data.costs.alone)
+        return Selection(best, self.data.sets[best])
+
+
 class Best(Baseline):
     """Sees the error of the very frame, which no fold that is left out may show."""
 
@@ -75,6 +81,10 @@ def test_rules_are_scored_without_an_odometry(study):
     baseline, fixed = found.score(Baseline()), found.score(Fixed())
     np.testing.assert_array_equal(baseline, found.performances[:, 0])
     assert not np.array_equal(fixed, baseline)
+    cheapest = found.score(Cheapest())
+    np.testing.assert_array_equal(cheapest, cap(found.performances)[:, found.cost.argmin()])
+    with pytest.raises(AdaptuneError, match=r"Cheapest: is a class; give an object, Cheapest\(\)"):
+        found.score(Cheapest)
     near = found.score(NearestNeighbours(k=3))
     assert near.shape == (42,)
     assert np.isin(near, cap(found.performances)).all()
