@@ -290,7 +290,8 @@ def test_the_notebook_runs_and_so_does_the_readme(folder, monkeypatch):
     assert tuned.study.config.online.budget == 1e6
     assert [f"rte_{n}" for n in tuned.trials["trial"]] == list(tuned.errors.filter(like="rte_"))
     assert '<img style="max-width: 100%" src="data:image/png;base64,' in tuned._repr_html_()
-    assert {"study", "fixed", "model", "page", "trials"} <= set(tuned.files)
+    assert {"study", "fixed", "model", "page", "trials", "comparison"} <= set(tuned.files)
+    assert {"baseline", "fixed"} <= set(tuned.modes["mode"])
 
 
 @pytest.mark.parametrize(("page", "block"), blocks("yaml"), ids=[p for p, _ in blocks("yaml")])

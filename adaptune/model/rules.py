@@ -205,26 +205,41 @@ def allowed_sets(
 
 @dataclass(frozen=True, eq=False)
 class TrainingData:
-    """Errors of parameter sets on the frames of several sequences."""
+    """Errors of parameter sets on the frames of several sequences: what a rule is fitted to.
 
-    features: NDArray[np.float64]  # (n_frames, n_features): descriptors, scaled
-    # (n_frames,): number of each frame's stretch.
+    Attributes
+    ----------
+    features
+        Averaged descriptors, scaled, of shape (n_frames, n_features): what `Rule.select` gets.
+    sequence
+        Number of each frame's stretch, of shape (n_frames,).
+    errors
+        Sub-trajectory RTE in percent, of shape (n_frames, n_sets), infinite where the track was
+        lost, NaN where the set was not run. Take `adaptune.metrics.cap` before a mean.
+    sets
+        Parameters by trial number, in the order of the columns of `errors`.
+    fixed
+        Trial number of the fixed set.
+    candidates
+        Trial numbers of the sets to choose among, the fixed one included; any if None.
+    vectors
+        Errors of the candidates as vectors in the frame of the sub-trajectory's start, of shape
+        (n_frames, n_candidates, 3), not finite where the track was lost.
+    allowed
+        Trial numbers of the usable sets that a budget allows; all if None.
+    costs
+        What the sets cost; None if it was not measured.
+    """
+
+    features: NDArray[np.float64]
     sequence: NDArray[np.intp]
-    # (n_frames, n_sets): sub-trajectory RTE in percent, infinite where the track was lost, NaN
-    # where the set was not run (usually on all frames of a sequence, or on none). Every frame has a
-    # sub-trajectory.
     errors: NDArray[np.float32]
-    sets: ParameterSets  # the columns of `errors`
-    fixed: int  # trial number of the fixed set
-    # Trial numbers of the sets to choose among, the fixed one included; the rule finds them if
-    # None.
+    sets: ParameterSets
+    fixed: int
     candidates: tuple[int, ...] | None = None
-    # (n_frames, n_candidates, 3): errors of the candidates as vectors in the frame of the
-    # sub-trajectory's start, not finite where the track was lost; see `sub_trajectory_vectors`.
     vectors: NDArray[np.float32] | None = None
-    # Trial numbers of the usable sets that a budget allows, the fixed one included; all if None.
     allowed: tuple[int, ...] | None = None
-    costs: Costs | None = None  # what the sets cost; None if it was not measured
+    costs: Costs | None = None
 
     def allows(self) -> NDArray[np.bool_]:
         """Which sets may be chosen, of shape (n_sets,)."""

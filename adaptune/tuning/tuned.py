@@ -4,12 +4,14 @@ import base64
 import logging
 import multiprocessing
 import os
+import sys
 from collections.abc import Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from adaptune import processes
 from adaptune.errors import AdaptuneError
 from adaptune.files import plain_name
 from adaptune.progress import Progress, bars_and_words
@@ -32,7 +34,8 @@ Paths = str | Path | Sequence[str | Path]
 class Tuned:
     """What tuning has found.
 
-    Tables are data frames if pandas is installed, else lists of rows, `errors` has columns.
+    Tables are data frames if pandas is installed; else they are lists of rows, and `errors` is a
+    dict of columns.
     """
 
     study: "OfflineStudy"
@@ -55,7 +58,10 @@ class Tuned:
 
     @property
     def front(self) -> Any:
-        """What CPU time buys: a row for each choice, with its error and its cost."""
+        """What CPU time buys: a row for each choice, with its error and its cost.
+
+        These were driven from end to end; the errors of `trials` are of stretches.
+        """
         return _table(self.training.front)
 
     @property
@@ -71,6 +77,11 @@ class Tuned:
         return _table(scenario(self.study).columns())
 
     @property
+    def modes(self) -> Any:
+        """A row for each mode on each recording of the test, and on all of them."""
+        return _table([row.columns() for row in self.comparison.rows])
+
+    @property
     def left_out(self) -> Any:
         """A row for each recording: what the baseline has there, and what the others recommend."""
         return _table(left_out_rows(self.training, self.comparison))
@@ -83,7 +94,8 @@ class Tuned:
         named = {"study": folder / f"{folder.resolve().name}.yaml", "page": self.page}
         named |= {"fixed": folder / "fixed.yaml", "model": self.study.model_path}
         named |= {"own": own[0]} if own else {}
-        named |= {key: folder / f"{key}.csv" for key in ("trials", "front", "training")}
+        tables = ("trials", "front", "training", "comparison/comparison")
+        named |= {Path(key).name: folder / f"{key}.csv" for key in tables}
         return {key: path for key, path in named.items() if path.exists()}
 
     def __repr__(self) -> str:
@@ -212,7 +224,9 @@ def tune_asked(
 
     if not asked.recordings:
         raise AdaptuneError("name a recording: the list is empty")
-    if getattr(multiprocessing.current_process(), "_inheriting", False):
+    started = getattr(sys.modules["__main__"], "__spec__", None)
+    imported = started is not None and started.name == processes.__name__
+    if imported or getattr(multiprocessing.current_process(), "_inheriting", False):
         raise AdaptuneError(
             'call adaptune.tune below `if __name__ == "__main__":`, because its workers import the '
             "script"

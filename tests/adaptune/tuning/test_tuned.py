@@ -1,6 +1,7 @@
 """`adaptune.tune`: what `tune` does, as a function."""
 
 import logging
+import subprocess
 import sys
 from pathlib import Path
 
@@ -48,6 +49,21 @@ def test_a_class_of_a_session_is_refused_in_a_sentence():
     drives.write_bag(Path("one.bag"), drives.scans(n_scans=60))
     with pytest.raises(AdaptuneError, match="Own lives in this session only; put it into a file"):
         adaptune.tune("one.bag", odometry="__main__:Own")
+
+
+def test_a_script_without_a_guard_is_told_at_once(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    drives.write_bag(tmp_path / "one.bag", drives.scans(n_scans=20))
+    code = (
+        "import adaptune\nfrom adaptune.odometry import Odometry\n\n\n"
+        "class Own(Odometry):\n    live, space = False, {}\n\n\n"
+        "adaptune.tune('one.bag', odometry=Own)\n"
+    )
+    (tmp_path / "unguarded.py").write_text(code)
+    command = [sys.executable, "unguarded.py"]
+    done = subprocess.run(command, check=False, capture_output=True, text=True)
+    last = done.stderr.strip().splitlines()[-1]
+    assert 'call adaptune.tune below `if __name__ == "__main__":`' in last
 
 
 def test_a_session_without_logging_sees_what_is_logged(capsys, monkeypatch):
