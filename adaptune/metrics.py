@@ -1,7 +1,7 @@
 """Errors of an odometry: over sub-trajectories, as KITTI's benchmark and as evo define them."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -235,17 +235,23 @@ def cap(errors: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 def lost_in_words(
-    best: str, errors: Mapping[str, float], odometry: str, find_cause: Callable[[str], str]
+    best: str,
+    errors: Mapping[str, float],
+    odometry: str,
+    find_cause: Callable[[str], str],
+    faults: Iterable[str] = (),
 ) -> list[str]:
     """A sentence where even the best does not track: the likeliest cause, and what to try.
 
     `errors` has by sequence the mean error of the best, in percent; `find_cause` says what is known
-    of the cause on the worst one.
+    of the cause on the worst one; `faults` are what went wrong in the odometry.
     """
     if not (mean := sum(errors.values()) / len(errors)) > LOST_ABOVE:
         return []
     where = ", ".join(name for name, error in errors.items() if error > LOST_ABOVE)
     lost = f"Even with {best} track is lost on {where}: RTE {mean:.1f} %. "
+    if fault := next(filter(None, faults), ""):
+        return [f"{lost}The odometry itself failed there: {fault}. Mend that first."]
     if cause := find_cause(max(errors, key=lambda name: errors[name])):
         help_ = "Drive slower, record more scans a second, or, where there is an IMU, try `rko_lio`"
         return [f"{lost}The likeliest cause: {cause}. {help_}."]

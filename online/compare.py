@@ -415,6 +415,7 @@ def _lost(
         {row.sequence: row.rte for row in of_best if row.rte is not None},
         odometry,
         lambda worst: hard_to_track(sequences.open(worst)),
+        [row.fault for row in of_best if row.rte and row.rte > LOST_ABOVE],
     )
     if said:
         judge = " by an estimated reference" * any(row.reference == "estimated" for row in known)

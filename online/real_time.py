@@ -108,7 +108,7 @@ def replay_in_real_time(
         drive.step(arrival)
         watch(record)
     drive.finish()
-    return record.finish(odometry.usage, 0.0 if selector is None else selector.cpu)
+    return record.finish(odometry, 0.0 if selector is None else selector.cpu)
 
 
 class RealTimeDrive:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from adaptune.errors import AdaptuneError
 from adaptune.machine import resident_megabytes
 from adaptune.model.rules import BASELINE
-from adaptune.odometry.base import Motions, OdometryInstance, Usage
+from adaptune.odometry.base import Motions, OdometryInstance
 from adaptune.odometry.faults import MAX_SHARE_WITHOUT_POSE
 from adaptune.odometry.health import HealthCheck
 from adaptune.odometry.tracker import RegisteredScan, Tracker
@@ -162,6 +162,7 @@ class ReplayRecord:
     cpu_ms: float = math.nan  # milliseconds of CPU time a scan, in all processes, without reading
     memory: float = 0.0  # most megabytes of all processes
     first_pose: float = 0.0  # seconds from the first scan to the odometry's first pose
+    faults: tuple[str, ...] = ()  # of the odometry, as it says them
     # In real time:
     dropped: int = 0  # scans that the odometry did not get
     missed: int = 0  # selections that were not there at their deadline
@@ -218,8 +219,8 @@ class ReplayRecord:
         self._n += 1
         self.steps.append(step)
 
-    def finish(self, usage: Usage, other_cpu: float = 0.0) -> Self:
-        """Sum up, with what the odometry used, and what else took CPU seconds.
+    def finish(self, odometry: OdometryInstance, other_cpu: float = 0.0) -> Self:
+        """Sum up, with what the odometry used and its faults, and what else took CPU seconds.
 
         An AdaptuneError says that there was no scan.
         """
@@ -231,6 +232,7 @@ class ReplayRecord:
             stamps = self.steps[waiting].stamp, self.steps[0].stamp
             self.first_pose = 1e-9 * (stamps[0] - stamps[1])
             del self.steps[:waiting], self.late[:waiting]
+        usage, self.faults = odometry.usage, tuple(odometry.faults)
         self.cpu_ms = 1e3 * (self._cpu + usage.other_cpu + other_cpu) / self._n
         self.memory += usage.memory or 0.0
         return self
@@ -285,4 +287,4 @@ def replay(
                 selector.measure()
         record.end(driver.register(scan))
         watch(record)
-    return record.finish(odometry.usage)
+    return record.finish(odometry)

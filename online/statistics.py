@@ -64,6 +64,7 @@ class ComparisonRow:
     memory_mb: float | None = None  # most megabytes of all processes
     real_time: Mapping[str, float] | None = None  # see `ReplaySummary`
     first_pose: float = 0.0  # seconds from the first scan
+    fault: str = ""  # the last one of the odometry
     # Over all sequences: geometric mean of the ratios over the worst tenth of the stretches, and on
     # how many sequences the mode has less and more error by what counts.
     worst_tenth: float | None = None
@@ -206,6 +207,7 @@ def _measured(row: ComparisonRow, replay: StoredReplay, reference: Reference) ->
         memory_mb=summary.memory_mb,
         real_time=summary.real_time,
         first_pose=summary.first_pose,
+        fault=summary.fault,
     )
 
 

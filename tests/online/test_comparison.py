@@ -52,6 +52,17 @@ def test_where_track_is_lost_it_names_what_kept_it_in_training(replayed, monkeyp
     assert compare(replayed).verdict == found.verdict[:-1]
 
 
+def test_where_track_is_lost_a_fault_of_the_odometry_is_named(own, monkeypatch):
+    monkeypatch.setattr("adaptune.metrics.LOST_ABOVE", -1.0)
+    monkeypatch.setattr("online.compare.LOST_ABOVE", -1.0)
+    for path in (own.folder / "replays/three").glob("*/replay.json"):
+        changed = json.loads(path.read_text()) | {"fault": "ValueError: matrix is singular"}
+        path.write_text(json.dumps(changed))
+    lost = compare(own).verdict[0]
+    words = "The odometry itself failed there: ValueError: matrix is singular. Mend that first."
+    assert lost.endswith(words)
+
+
 @pytest.fixture
 def own(replayed, study_file, tmp_path):
     """A copy of `replayed` that a test may change."""
