@@ -22,7 +22,6 @@ from adaptune.report.charts import (
     charts_of,
     shares,
 )
-from adaptune.report.drawing import plain
 from online.modes import BASELINE, FIXED, WITHOUT_MODEL
 from online.record import switched
 from online.replayed import ModeReplay, ReplayedSequence
@@ -180,7 +179,7 @@ def _parameters(replayed: ReplayedSequence) -> Iterator[Panel]:
 
 def _name(value: Any) -> str:
     """A value among names; the set of another odometry has none."""
-    return value if isinstance(value, str) else "" if np.isnan(value) else plain(value)
+    return value if isinstance(value, str) else "" if np.isnan(value) else f"{value:.6g}"
 
 
 def _place(value: Any, names: tuple[str, ...] | None) -> float:

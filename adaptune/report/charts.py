@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Values = NDArray[Any] | Sequence[Any]
-"""Numbers, or names: along an axis with names, or of points."""
+"""Numbers, or words."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Points:
     x: Values
     y: Values
     name: str  # in the legend; of a mode, the mode's, whose colour and marker they then have
-    colour: Values | None = None  # a number for every point, on a colour bar; by logarithm if > 0
+    colour: Values | None = None  # finite numbers, on a colour bar; by logarithm if all are > 0
     colour_label: str = ""
     texts: Values | None = None  # what is told of each point in a browser
     faint: bool = False
