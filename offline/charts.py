@@ -1,7 +1,7 @@
 """Charts of the offline stage: of trials, and of what was left out."""
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,6 @@ from adaptune.report.charts import (
     Panel,
     Points,
     Words,
-    charts_of,
 )
 from adaptune.space import Categorical, Float, Integer
 from adaptune.space import label as parameter_label
@@ -220,14 +219,11 @@ def _stretch_panel(mode: str, ratios: np.ndarray[Any, Any], recordings: Sequence
 
 
 def charts_of_trials(study: OfflineStudy) -> Charts:
-    """Charts of the finished trials, and what is missing; it reads no trial's frames."""
+    """Charts of the finished trials; it reads no trial's frames."""
     table = read_trials(study)
     if not len(table):
-        return Charts([], ["No trials: run `adaptune offline`."])
-    return charts_of(_of_trials(table))
-
-
-def _of_trials(table: TrialTable) -> Iterator[Chart | str | None]:
+        yield "No trials: run `adaptune offline`."
+        return
     found = {name: importances(of) for name, of in table.odometries().items()}
     yield iteration_chart(table)
     yield importance_chart(found) or (
@@ -245,15 +241,15 @@ def most_important(table: TrialTable, shares: Mapping[str, float]) -> list[str]:
 
 
 def charts_of_validation(folder: Path) -> Charts:
-    """The chart of what `adaptune validate` found, or what is missing.
+    """The chart of what `adaptune validate` found.
 
     An AdaptuneError says that its file is not as `adaptune validate` wrote it.
     """
     path = folder / "stretches.json"
     if not path.exists():
-        return Charts([], ["No validation: run `adaptune validate`."])
+        yield "No validation: run `adaptune validate`."
+        return
     try:
-        rows = json.loads(path.read_text("utf-8"))
-        return charts_of([stretch_chart(rows)])
+        yield stretch_chart(json.loads(path.read_text("utf-8")))
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise AdaptuneError(f"{path}: is damaged ({error!r}); run `adaptune validate`") from error
