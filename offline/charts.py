@@ -1,8 +1,7 @@
 """Charts of the offline stage: of trials, and of what was left out."""
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,6 @@ from adaptune.report.charts import (
     Panel,
     Points,
     Words,
-    charts_of,
 )
 from adaptune.space import Categorical, Float, Integer
 from adaptune.space import label as parameter_label
@@ -34,17 +32,18 @@ _COLOURED = 4.0
 """Colours say errors of up to so many times the least."""
 
 
-def scatter_chart(
-    table: TrialTable, parameters: Sequence[str], sequences: Sequence[str]
-) -> Chart | None:
-    """Two parameters of all trials, coloured by the error: on each sequence, and in the mean."""
+def scatter_chart(table: TrialTable, parameters: Sequence[str], odometry: str) -> Chart | None:
+    """Two parameters of all trials, coloured by the error: on each sequence, and in the mean.
+
+    `odometry` is that of the trials; "" if there is only one.
+    """
     if len(parameters) != 2:
         return None
     x_axis, y_axis = (parameter_axis(name, table.space.parameters[name]) for name in parameters)
     xy = [on_axis(table.column(name), table.space.parameters[name]) for name in parameters]
-    shown = list(sequences)[: MOST_PANELS - 1]
-    values = {name: table.on(name) for name in shown}
-    if len(sequences) > 1:
+    values = {name: table.on(name) for name in table.names[: MOST_PANELS - 1]}
+    left_out = len(table.names) - len(values)
+    if len(table.names) > 1:
         values["mean over all sequences"] = table.values
     panels = []
     for title, of in values.items():
@@ -52,35 +51,31 @@ def scatter_chart(
         if kept.sum() < 2:
             continue
         x, y = xy[0][kept], xy[1][kept]
-        label = table.objective
         log = bool((of[kept] > 0.0).all())
         # The worst would take nearly all colours.
         colour = np.minimum(of[kept], _COLOURED * of[kept].min()) if log else of[kept]
-        drawn: list[Drawn] = [Points(x, y, "trial", colour, label)]
-        best = int(of[kept].argmin())
-        drawn.append(Points(x[[best]], y[[best]], "best trial here", shape="diamond"))
-        drawn += _marked(table, xy[0], xy[1])
+        best = [int(of[kept].argmin())]
+        drawn = [
+            Points(x, y, "trial", colour, table.objective),
+            Points(x[best], y[best], "best trial here", shape="diamond"),
+        ]
+        for mode, number in (("baseline", 0), ("fixed", table.fixed)):
+            at = table.numbers == number
+            drawn += [Points(xy[0][at], xy[1][at], mode)] if at.any() else []
         panels.append(Panel(x_axis, y_axis, tuple(drawn), title))
     if not panels:
         return None
-    left_out = len(sequences) - len(shown)
     more = f" {left_out} more sequences are not shown." if left_out > 0 else ""
+    title = f"Error of the trials over {parameters[0]} and {parameters[1]}"
     return Chart(
-        "parameter-scatter",
-        f"Error of the trials over {parameters[0]} and {parameters[1]}",
+        f"parameter-scatter-{odometry}" if odometry else "parameter-scatter",
+        f"{odometry}: {title}" if odometry else title,
         tuple(panels),
         f"Each point is a trial; its colour is its error, and each panel has colours of its own; "
         f"they end at {_COLOURED:g} times the least error there. "
         "Where the good region lies elsewhere from panel to panel, adapting can gain." + more,
         columns=2 if len(panels) in (2, 4) else min(3, len(panels)),
     )
-
-
-def _marked(table: TrialTable, x: NDArray[Any], y: NDArray[Any]) -> list[Drawn]:
-    """The baseline and the fixed set, where they are known."""
-    numbers = {"baseline": 0, "fixed": table.fixed}
-    places = {mode: np.flatnonzero(table.numbers == n) for mode, n in numbers.items()}
-    return [Points(x[at], y[at], mode) for mode, at in places.items() if len(at)]
 
 
 def iteration_chart(table: TrialTable) -> Chart | None:
@@ -107,43 +102,29 @@ def iteration_chart(table: TrialTable) -> Chart | None:
     )
 
 
-MARKED = ("recommended", "bank", "fixed", "baseline")
-"""What is marked and named on the front: what is recommended, and what is called so."""
-
-
-def front_chart(rows: Sequence[Mapping[str, Any]], label: str = "error [%]") -> Chart | None:
-    """Error over CPU time of all that was tried, and the front: less error only at more cost.
-
-    Rows have ``what`` (a name), ``cost [ms]``, ``error [%]``, its interval as ``low`` and ``high``,
-    which may be None, and ``recommended``. See `MARKED`; `label` is that of the errors.
-    """
-    keys = "cost [ms]", "error [%]", "low", "high"
-    values = np.array([[row[key] for key in keys] for row in rows], float).reshape(-1, 4)
-    kept = (values[:, :2] > 0.0).all(axis=1) & np.isfinite(values[:, :2]).all(axis=1)
-    if kept.sum() < 2:
+def front_chart(table: TrialTable) -> Chart | None:
+    """Error over CPU time of what may be chosen, and the front: less error only at more cost."""
+    table = table.some(t.usable and t.cost > 0.0 and 0.0 < t.value < np.inf for t in table.trials)
+    if len(table) < 2:
         return None
-    rows, values = [rows[i] for i in np.flatnonzero(kept).tolist()], values[kept]
-    costs, errors, low, high = values.T
+    costs, errors = np.array([(trial.cost, trial.value) for trial in table.trials]).T
     order = np.lexsort((errors, costs))
     least = np.minimum.accumulate(errors[order])
     front = order[np.diff(least, prepend=np.inf) < 0.0]
-    kinds = [
-        "recommended" if row["recommended"] else str(row["what"]).partition(" ")[0] for row in rows
-    ]
-    marked = {kind: np.flatnonzero([k == kind for k in kinds]) for kind in MARKED}
-    named = np.concatenate([*marked.values()])
-    texts = np.array([str(row["what"]) for row in rows], object)
+    names = {table.fixed: "fixed", 0: "baseline"}
+    texts = np.array([names.get(n, f"trial {n}") for n in table.numbers.tolist()], object)
+    marked = {
+        mode: at for mode in ("fixed", "baseline") if len(at := np.flatnonzero(texts == mode))
+    }
     drawn: list[Drawn] = [
         Points(costs, errors, "tried", texts=texts, faint=True),
         Line(costs[front], errors[front], "front", steps=True),
     ]
-    if np.isfinite([low[named], high[named]]).any():
-        ends = np.column_stack([low, high, np.full(len(rows), np.nan)])[named]
-        drawn.append(Line(np.repeat(costs[named], 3), ends.ravel(), "95 % interval"))
-    for kind, at in marked.items():
-        drawn += [Points(costs[at], errors[at], kind, texts=texts[at])] if len(at) else []
+    for mode, at in marked.items():
+        drawn.append(Points(costs[at], errors[at], mode, texts=texts[at]))
+    named = np.array([*marked.values()], int).ravel()
     drawn.append(Words(costs[named], errors[named], texts[named]))
-    x, y = Axis("CPU time a scan [ms]", log=True), Axis(label, log=True)
+    x, y = Axis("CPU time a scan [ms]", log=True), Axis(table.objective, log=True)
     return Chart(
         "front",
         "Error over cost of all that was tried",
@@ -151,23 +132,6 @@ def front_chart(rows: Sequence[Mapping[str, Any]], label: str = "error [%]") -> 
         "Nothing that was tried has both less error and less cost than what lies on the front. "
         "Where the front is flat, more CPU time buys nothing.",
     )
-
-
-def front_rows(table: TrialTable) -> list[dict[str, Any]]:
-    """The rows of `front_chart` for the trials that may be chosen, in the mean over sequences."""
-    names = {table.fixed: "fixed", 0: "baseline"}
-    return [
-        {
-            "what": names.get(trial.number, f"trial {trial.number}"),
-            "cost [ms]": trial.cost,
-            "error [%]": trial.value,
-            "recommended": False,
-            "low": None,
-            "high": None,
-        }
-        for trial in table.trials
-        if trial.usable
-    ]
 
 
 Parameter = Float | Integer | Categorical
@@ -238,9 +202,7 @@ def stretch_chart(rows: Sequence[Mapping[str, Any]]) -> Chart | None:
 
 
 def _stretch_panel(mode: str, ratios: np.ndarray[Any, Any], recordings: Sequence[str]) -> Panel:
-    order = np.argsort(ratios, kind="stable")
-    rank = np.empty(len(ratios))
-    rank[order] = np.arange(1, len(ratios) + 1)
+    rank = 1 + np.argsort(np.argsort(ratios, kind="stable"))
     of = figures(np.log(ratios), recordings)
     ends = np.array([0.5, len(ratios) + 0.5])
     drawn: list[Drawn] = []
@@ -257,27 +219,19 @@ def _stretch_panel(mode: str, ratios: np.ndarray[Any, Any], recordings: Sequence
 
 
 def charts_of_trials(study: OfflineStudy) -> Charts:
-    """Charts of the finished trials, and what is missing; it reads no trial's frames."""
+    """Charts of the finished trials; it reads no trial's frames."""
     table = read_trials(study)
     if not len(table):
-        return Charts([], ["No trials: run `adaptune offline`."])
-    return charts_of(_of_trials(table))
-
-
-def _of_trials(table: TrialTable) -> Iterator[Chart | str | None]:
+        yield "No trials: run `adaptune offline`."
+        return
     found = {name: importances(of) for name, of in table.odometries().items()}
     yield iteration_chart(table)
     yield importance_chart(found) or (
         f"No importance of parameters: it takes {FEW} finished trials and two parameters."
     )
     for odometry, of in table.odometries().items():
-        pair = most_important(of, found.get(odometry, {}))
-        chart = scatter_chart(of, pair, table.names)
-        if chart is not None and odometry:
-            key, title = f"{chart.key}-{odometry}", f"{odometry}: {chart.title}"
-            chart = replace(chart, key=key, title=title)
-        yield chart
-    yield front_chart(front_rows(table), table.objective)
+        yield scatter_chart(of, most_important(of, found[odometry]), odometry)
+    yield front_chart(table)
 
 
 def most_important(table: TrialTable, shares: Mapping[str, float]) -> list[str]:
@@ -287,16 +241,15 @@ def most_important(table: TrialTable, shares: Mapping[str, float]) -> list[str]:
 
 
 def charts_of_validation(folder: Path) -> Charts:
-    """The chart of what `adaptune validate` found, or what is missing.
+    """The chart of what `adaptune validate` found.
 
     An AdaptuneError says that its file is not as `adaptune validate` wrote it.
     """
     path = folder / "stretches.json"
     if not path.exists():
-        return Charts([], ["No validation: run `adaptune validate`."])
+        yield "No validation: run `adaptune validate`."
+        return
     try:
-        rows = json.loads(path.read_text("utf-8"))
-        known = [{k: np.nan if v is None else v for k, v in row.items()} for row in rows]
-        return charts_of([stretch_chart(known)])
+        yield stretch_chart(json.loads(path.read_text("utf-8")))
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise AdaptuneError(f"{path}: is damaged ({error!r}); run `adaptune validate`") from error

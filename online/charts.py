@@ -19,10 +19,8 @@ from adaptune.report.charts import (
     Points,
     Spans,
     Words,
-    charts_of,
     shares,
 )
-from adaptune.report.drawing import plain
 from online.modes import BASELINE, FIXED, WITHOUT_MODEL
 from online.record import switched
 from online.replayed import ModeReplay, ReplayedSequence
@@ -78,14 +76,14 @@ _RESTARTED = "restarted by the health check"
 
 
 def charts_of_replays(replayed: ReplayedSequence) -> Charts:
-    """Charts of the replays of a sequence, in all modes that there are, and what is missing."""
-    sequence = replayed.name
-    if not replayed.modes:
-        none = [f"No replays of {sequence}: run `adaptune online`."]
-        return Charts([], [*replayed.refused] or none)
-    no_errors = f"No errors of the replays of {sequence}: it has no reference."
-    of_errors = error_chart(replayed) or no_errors
-    return charts_of((*replayed.refused, of_errors, choice_chart(replayed)))
+    """Charts of the replays of a sequence, in all modes that there are."""
+    yield from replayed.refused
+    if replayed.modes:
+        no_errors = f"No errors of the replays of {replayed.name}: it has no reference."
+        yield error_chart(replayed) or no_errors
+        yield choice_chart(replayed)
+    elif not replayed.refused:
+        yield f"No replays of {replayed.name}: run `adaptune online`."
 
 
 def error_chart(replayed: ReplayedSequence) -> Chart | None:
@@ -114,9 +112,8 @@ def error_chart(replayed: ReplayedSequence) -> Chart | None:
 
 
 def _errors(replayed: ReplayedSequence) -> Panel:
-    drawn: list[Drawn] = _scenes(replayed)
-    for mode, track in replayed.modes.items():
-        drawn.append(Line(track.seconds, track.errors, mode))
+    drawn = _scenes(replayed)
+    drawn += [Line(track.seconds, track.errors, mode) for mode, track in replayed.modes.items()]
     for mode, track in replayed.modes.items():
         if track.restarted.any():
             x, y = track.seconds[track.restarted], track.errors[track.restarted]
@@ -180,7 +177,7 @@ def _parameters(replayed: ReplayedSequence) -> Iterator[Panel]:
 
 def _name(value: Any) -> str:
     """A value among names; the set of another odometry has none."""
-    return value if isinstance(value, str) else "" if np.isnan(value) else plain(value)
+    return value if isinstance(value, str) else "" if np.isnan(value) else f"{value:.6g}"
 
 
 def _place(value: Any, names: tuple[str, ...] | None) -> float:
@@ -211,8 +208,8 @@ def charts_of_comparison(
     rows: Sequence[ComparisonRow], read: Callable[[str], ReplayedSequence]
 ) -> Charts:
     """The picture of a comparison, and the ratios of all modes; `read` is `read_replays`."""
-    none = "No ratios of errors: no sequence has a reference."
-    return charts_of((overview_chart(rows, read), comparison_chart(rows) or none))
+    yield overview_chart(rows, read)
+    yield comparison_chart(rows) or "No ratios of errors: no sequence has a reference."
 
 
 def overview_chart(

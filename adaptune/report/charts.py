@@ -1,14 +1,14 @@
 """A chart as data: what is drawn, and not how; `adaptune.report.drawing` draws it."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 Values = NDArray[Any] | Sequence[Any]
-"""Numbers, or names: along an axis with names, or of points."""
+"""Numbers, or words."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Points:
     x: Values
     y: Values
     name: str  # in the legend; of a mode, the mode's, whose colour and marker they then have
-    colour: Values | None = None  # a number for every point, on a colour bar; by logarithm if > 0
+    colour: Values | None = None  # finite numbers, on a colour bar; by logarithm if all are > 0
     colour_label: str = ""
     texts: Values | None = None  # what is told of each point in a browser
     faint: bool = False
@@ -110,15 +110,5 @@ def shares(x: Values, parts: NDArray[np.float64], names: Iterable[str]) -> list[
     return [Band(x, ends[i], ends[i + 1], name, share=True) for i, name in enumerate(names)]
 
 
-class Charts(NamedTuple):
-    """The charts of a part of a study, and what is not among them."""
-
-    charts: list[Chart]
-    notes: list[str]  # sentences: what is missing, and what to run for it
-
-
-def charts_of(found: Iterable[Chart | str | None]) -> Charts:
-    """Charts and notes, told apart; what is None is left out."""
-    every = list(found)
-    charts = [one for one in every if isinstance(one, Chart)]
-    return Charts(charts, [one for one in every if isinstance(one, str)])
+Charts = Iterator[Chart | str | None]
+"""Charts of a part of a study; of what is missing, a sentence that says what to run, or None."""

@@ -6,7 +6,7 @@ import textwrap
 from collections.abc import Callable, Iterator
 from itertools import chain
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,18 +30,15 @@ _MAP = ("#440154", "#472d7b", "#3b528b", "#2c728e", "#21918c", "#28ae80", "#5ec9
 """A colour map whose lightness rises, without colours too light for a white ground."""
 _TINT = 0.15
 """Opacity of what is shaded."""
-_UNKNOWN = "#bbbbbb"
-"""Colour of points without a number where colours say numbers."""
 _MOST = 1500
 """Most points of a line that are drawn."""
 _MANY, _OUTLINED = 1000, 150
 """Points from which on they are small, and up to which they have outlines."""
-_LAYERS = (Spans, Band, Line, Points, Words)
 
 
 def _layer(item: Drawn) -> float:
     """What a panel shows, from the lowest to the highest."""
-    place = float(_LAYERS.index(type(item)))
+    place = float([*_DRAW].index(type(item)))
     if isinstance(item, Line):
         # Of lines that coincide, one is seen between the dashes of the other.
         return place + 0.5 * item.dashed - 0.6 * item.faint
@@ -49,16 +46,8 @@ def _layer(item: Drawn) -> float:
     return place - 1.5 if behind else place
 
 
-def plain(value: float) -> str:
-    """A number as on an axis: 0.6, and not 6e-1."""
-    return np.format_float_positional(value, precision=6, fractional=False, trim="-")
-
-
 def numbers(values: Values, axis: Axis) -> NDArray[np.float64]:
     """Values along an axis as numbers; NaN for what is not finite, or not on a logarithmic axis."""
-    if axis.names is not None:
-        place = {name: float(i) for i, name in enumerate(axis.names)}
-        values = [place[value] if isinstance(value, str) else value for value in values]
     made = np.array(values, np.float64)
     made[~np.isfinite(made) | ((made <= 0.0) & axis.log)] = np.nan
     return made
@@ -92,7 +81,7 @@ Spec = dict[str, Any]
 _WIDTH, _LETTER, _LINE = 900, 6.5, 14
 """Pixels: width of a chart, width of a letter, about, and height of a line of words."""
 _DARK = "#333333"
-_Extent = tuple[tuple[float, float], tuple[float, float]]
+_Extent = dict[str, tuple[float, float]]
 _OUTLINE: dict[str, Any] = {"stroke": "black", "strokeWidth": 0.5}
 NO_DATA = "no data"
 """What an empty panel says."""
@@ -114,7 +103,6 @@ _CONFIG: Spec = {
     "title": {"anchor": "start", "fontSize": 13, "fontWeight": "normal", "color": _DARK},
     "text": {"fontSize": 12},
     "concat": {"spacing": 18},
-    "scale": {"invalid": {"color": {"value": _UNKNOWN}}},
 }
 
 
@@ -125,20 +113,19 @@ def spec(chart: Chart, titled: bool = True) -> Spec:
     beside = sum(max(map(_beside, chart.panels[c::columns])) for c in range(columns))
     width = round((_WIDTH - beside) / columns)
     usual = 300.0 if len(rows) == 1 else 150.0 if chart.shared_x else 240.0
-    extents = [(_extent(panel, "x"), _extent(panel, "y")) for panel in chart.panels]
+    every = {"": Look(_DARK)} | looks(chart)
     sharing = [chart.shared_x and not panel.equal for panel in chart.panels]
-    if any(sharing):
-        own = [x for (x, _), shares in zip(extents, sharing, strict=True) if shares]
-        across = min(x[0] for x in own), max(x[1] for x in own)
-        extents = [(across if s else x, y) for (x, y), s in zip(extents, sharing, strict=True)]
-    every = looks(chart)
+    own = [_extent(panel, "x") for panel, s in zip(chart.panels, sharing, strict=True) if s]
     panels = []
     for i, panel in enumerate(chart.panels):
         high = round(usual * max(map(_height, rows[i // columns])))
-        below = sharing[i] and i + columns < len(chart.panels)
+        extent = {which: _extent(panel, which) for which in "xy"}
+        if sharing[i]:
+            extent["x"] = min(x[0] for x in own), max(x[1] for x in own)
         if panel.equal:
-            extents[i], high = _equal(extents[i], width, 1.6 * high)
-        panels.append(_Drawing(panel, every, (width, high), extents[i]).spec(below))
+            extent, high = _equal(extent, width, 1.6 * high)
+        below = sharing[i] and i + columns < len(chart.panels)
+        panels.append(_Drawing(panel, every, {"x": width, "y": high}, extent).spec(below))
     resolve = {"scale": {"color": "independent"}}
     row = {"concat": panels, "columns": columns, "resolve": resolve}
     made: Spec = {
@@ -188,18 +175,18 @@ def _coordinates(panel: Panel) -> Iterator[tuple[NDArray[np.float64], NDArray[np
     """X and y of what a panel shows, flat."""
     for item in panel.drawn:
         match item:
-            case Line() | Points():
-                yield numbers(item.x, panel.x), numbers(item.y, panel.y)
-            case Band():
-                x = numbers(item.x, panel.x)
-                yield np.tile(x, 2), np.r_[numbers(item.low, panel.y), numbers(item.high, panel.y)]
+            case Line(x, y) | Points(x, y):
+                yield numbers(x, panel.x), numbers(y, panel.y)
+            case Band(x, low, high):
+                yield numbers(x, panel.x), numbers(low, panel.y)
+                yield numbers(x, panel.x), numbers(high, panel.y)
 
 
 def _is_empty(panel: Panel) -> bool:
     return not any(np.isfinite(x).any() and np.isfinite(y).any() for x, y in _coordinates(panel))
 
 
-def _extent(panel: Panel, which: Literal["x", "y"]) -> tuple[float, float]:
+def _extent(panel: Panel, which: str) -> tuple[float, float]:
     """Where an axis begins and ends."""
     axis = panel.x if which == "x" else panel.y
     if axis.limits is not None:
@@ -225,13 +212,13 @@ def _extent(panel: Panel, which: Literal["x", "y"]) -> tuple[float, float]:
 
 def _equal(extent: _Extent, width: int, most: float) -> tuple[_Extent, int]:
     """Extents on which a metre along x is as long as one along y, and the height for them."""
-    (left, right), (low, high) = extent
+    (left, right), (low, high) = extent.values()
     metre = width / (right - left)
     height = float(np.clip(metre * (high - low), 0.12 * width, most))
     metre = min(metre, height / (high - low))
     x, y = 0.5 * (left + right), 0.5 * (low + high)
     half_x, half_y = 0.5 * width / metre, 0.5 * height / metre
-    return ((x - half_x, x + half_x), (y - half_y, y + half_y)), round(height)
+    return {"x": (x - half_x, x + half_x), "y": (y - half_y, y + half_y)}, round(height)
 
 
 def _table(**columns: Any) -> Spec:
@@ -247,46 +234,36 @@ def _table(**columns: Any) -> Spec:
 
 
 class _Drawing:
-    """A panel, and how large it is."""
+    """A panel; along x and y, `size` is in pixels."""
 
     def __init__(
-        self, panel: Panel, looks_of: dict[str, Look], size: tuple[int, int], extent: _Extent
+        self, panel: Panel, every: dict[str, Look], size: dict[str, int], extent: _Extent
     ) -> None:
-        self._panel, self._looks = panel, looks_of
-        self._width, self._height = size
-        self._extent = {"x": extent[0], "y": extent[1]}
+        self._panel, self._looks, self._size, self._extent = panel, every, size, extent
+        self._axes = {"x": panel.x, "y": panel.y}
 
     def spec(self, below: bool) -> Spec:
         """The panel; `below` is whether one that shares its x axis lies there."""
-        panel = self._panel
-        self._x, self._y = self._channel("x", panel.x, hidden=below), self._channel("y", panel.y)
-        made: Spec = {"width": self._width, "height": self._height}
+        panel, (width, height) = self._panel, self._size.values()
+        self._x, self._y = self._channel("x", hidden=below), self._channel("y")
+        made: Spec = {"width": width, "height": height}
         if panel.title:
-            words = wrapped(panel.title, self._width / _LETTER)
+            words = wrapped(panel.title, width / _LETTER)
             made["title"] = {"text": words, "offset": 6, "frame": "group"}
         if _is_empty(panel):
             for channel in (self._x, self._y):
                 channel["axis"] |= {"values": []}
             empty = self._drawn({"type": "point"}, {"x": [np.nan], "y": [np.nan]})
-            middle = {"x": 0.5 * self._width, "y": 0.5 * self._height}
+            middle = {"x": 0.5 * width, "y": 0.5 * height}
             text = {"type": "text", "text": NO_DATA, "color": "#666666", **middle}
             said = {"data": _table(i=[0]), "mark": text, "encoding": {}}
             return made | {"layer": [empty, said]}
-        draw: dict[type, Callable[[Any], Iterator[Spec]]] = {
-            Line: self._line,
-            Points: self._points,
-            Band: self._band,
-            Spans: self._spans,
-            Words: self._words,
-        }
-        items = sorted(panel.drawn, key=_layer)
-        layers = [layer for item in items for layer in draw[type(item)](item)]
-        names = [self._span_names(item) for item in panel.drawn if isinstance(item, Spans)]
-        return made | {"layer": [*layers, *chain(*names)]}
+        layers = [_DRAW[type(item)](self, item) for item in sorted(panel.drawn, key=_layer)]
+        layers += [self._span_names(item) for item in panel.drawn if isinstance(item, Spans)]
+        return made | {"layer": [*chain(*layers)]}
 
-    def _channel(self, which: Literal["x", "y"], axis: Axis, hidden: bool = False) -> Spec:
-        low, high = self._extent[which]
-        size = self._width if which == "x" else self._height
+    def _channel(self, which: str, hidden: bool = False) -> Spec:
+        axis, size, (low, high) = self._axes[which], self._size[which], self._extent[which]
         drawn: Spec = {"tickCount": max(size // (70 if which == "x" else 36), 2)}
         if axis.names is not None:
             room = size / len(axis.names) / _LETTER if which == "x" else 32
@@ -316,12 +293,9 @@ class _Drawing:
         every = {"x": self._x, "y": self._y} | ends | encoding
         return {"data": _table(**data), "mark": {"clip": True} | mark, "encoding": every}
 
-    def _look(self, name: str) -> Look:
-        return self._looks.get(name, Look(_DARK))
-
     def _line(self, line: Line) -> Iterator[Spec]:
         x, y = numbers(line.x, self._panel.x), numbers(line.y, self._panel.y)
-        kept, look = thinned(x, y), self._look(line.name)
+        kept, look = thinned(x, y), self._looks[line.name]
         mark = {
             "type": "line",
             "strokeJoin": "round",
@@ -336,7 +310,7 @@ class _Drawing:
         yield self._drawn(mark, {"x": x[kept], "y": y[kept]}, order={"value": None})
 
     def _points(self, points: Points) -> Iterator[Spec]:
-        panel, look, many = self._panel, self._look(points.name), len(points.x) > _MANY
+        panel, look, many = self._panel, self._looks[points.name], len(points.x) > _MANY
         columns: dict[str, Any] = {"x": numbers(points.x, panel.x), "y": numbers(points.y, panel.y)}
         shape = points.shape or look.shape
         mark: Spec = {"type": "point", "filled": True, "shape": shape, "color": look.colour}
@@ -346,33 +320,31 @@ class _Drawing:
             mark |= _OUTLINE
         tips = [
             {"field": which, "title": axis.label or which, "format": ".4~g"}
-            for which, axis in (("x", panel.x), ("y", panel.y))
+            for which, axis in self._axes.items()
         ]
         if points.texts is not None:
             columns["text"] = points.texts
             tips.insert(0, {"field": "text", "title": points.name or "point"})
         encoding: Spec = {"tooltip": tips}
-        if points.colour is not None:
-            columns["c"] = numbers(points.colour, Axis(""))
-            mark |= {"color": _UNKNOWN}
-            if (known := np.isfinite(columns["c"])).any():
-                log = bool((columns["c"][known] > 0.0).all())
-                encoding["color"] = self._colour_bar(points.colour_label, log)
+        if points.colour is not None and len(points.colour):
+            columns["c"] = np.array(points.colour, float)
+            log = bool((columns["c"] > 0.0).all())
+            encoding["color"] = self._colour_bar(points.colour_label, log)
         yield self._drawn(mark, columns, **encoding)
 
     def _colour_bar(self, words: str, log: bool) -> Spec:
         legend: Spec = {"title": wrapped(words, 16), "gradientOpacity": 1.0, "tickCount": 5}
-        legend["gradientLength"] = min(self._height - 40, 220)
+        legend["gradientLength"] = min(self._size["y"] - 40, 220)
         if self._panel.equal:
             legend |= {"title": words, "orient": "bottom", "titleOrient": "left"}
-            legend |= {"gradientLength": 0.5 * self._width, "gradientThickness": 10}
+            legend |= {"gradientLength": 0.5 * self._size["x"], "gradientThickness": 10}
         scale: Spec = {"type": "log"} if log else {"type": "linear", "zero": False}
         scale |= {"range": _MAP, "nice": False}
         legend |= {"format": "~r"} if log else {}
         return {"field": "c", "type": "quantitative", "scale": scale, "legend": legend}
 
     def _band(self, band: Band) -> Iterator[Spec]:
-        look, panel = self._look(band.name), self._panel
+        look, panel = self._looks[band.name], self._panel
         x, high = numbers(band.x, panel.x), numbers(band.high, panel.y)
         low = numbers(band.low, panel.y)
         if panel.y.log:
@@ -388,7 +360,7 @@ class _Drawing:
     def _spans(self, spans: Spans) -> Iterator[Spec]:
         for begin, end, name in _shaded(spans):
             mark: Spec = {"type": "rect", "stroke": "white", "tooltip": None, "clip": True}
-            mark |= {"color": self._look(spans.name or name).colour, "fillOpacity": _TINT}
+            mark |= {"color": self._looks[spans.name or name].colour, "fillOpacity": _TINT}
             encoding = {"x": self._x, "x2": {"field": "x2"}}
             yield {"data": _table(x=[begin], x2=[end]), "mark": mark, "encoding": encoding}
 
@@ -396,21 +368,20 @@ class _Drawing:
         """The names of stretches above them, or turned where they are short."""
         low, high = self._extent["x"]
         for begin, end, name in _shaded(spans):
-            pixels, needed = (end - begin) / (high - low) * self._width, _LETTER * len(name)
-            if name == spans.name or (needed > pixels and (pixels < 13 or needed > self._height)):
+            pixels, needed = (end - begin) / (high - low) * self._size["x"], _LETTER * len(name)
+            too_long = needed > pixels and (pixels < 13 or needed > self._size["y"])
+            if too_long or name == spans.name:
                 continue
             words: Spec = {"text": name, "fontSize": 11, "y": -4}
             if needed > pixels:
                 words |= {"y": 4, "angle": -90, "align": "right", "baseline": "middle"}
             yield from _read_anywhere(words, _table(x=[0.5 * (begin + end)]), {"x": self._x})
 
-    def _pixels(self, which: Literal["x", "y"], values: NDArray[np.float64]) -> NDArray[np.float64]:
-        axis = self._panel.x if which == "x" else self._panel.y
-        size = self._width if which == "x" else self._height
+    def _pixels(self, which: str, values: NDArray[np.float64]) -> NDArray[np.float64]:
         ends = np.array(self._extent[which])
-        if axis.log:
+        if self._axes[which].log:
             ends, values = np.log(ends), np.log(values)
-        return np.asarray((values - ends[0]) / (ends[1] - ends[0]) * size)
+        return np.interp(values, ends, [0.0, self._size[which]])
 
     def _words(self, words: Words) -> Iterator[Spec]:
         x, y = numbers(words.x, self._panel.x), numbers(words.y, self._panel.y)
@@ -423,6 +394,16 @@ class _Drawing:
                 shown.append(i)
                 at, encoding = _table(x=x[[i]], y=y[[i]]), {"x": self._x, "y": self._y}
                 yield from _read_anywhere({"text": text, "dy": -8}, at, encoding)
+
+
+_DRAW: dict[type, Callable[[_Drawing, Any], Iterator[Spec]]] = {
+    Spans: _Drawing._spans,
+    Band: _Drawing._band,
+    Line: _Drawing._line,
+    Points: _Drawing._points,
+    Words: _Drawing._words,
+}
+"""What draws each kind of item; the first lies lowest."""
 
 
 def _shaded(spans: Spans) -> list[tuple[float, float, str]]:
@@ -444,11 +425,8 @@ def _legend(chart: Chart, every: dict[str, Look]) -> list[Spec]:
     """The legend above the panels, of a view that shows nothing else: a symbol of each name."""
     items = [item for panel in chart.panels for item in panel.drawn]
     written = {word for item in items if isinstance(item, Words) for word in item.words}
-    symbols: dict[str, tuple[str, str, tuple[float, ...]]] = {}
-    for item in sorted(items, key=_layer):
-        name = getattr(item, "name", "")
-        if name and not (isinstance(item, Line | Points) and not len(item.x)):
-            symbols[name] = _symbol(item, every[name])
+    seen = (item for item in sorted(items, key=_layer) if not isinstance(item, Words))
+    symbols = {item.name: _symbol(item, every[item.name]) for item in seen if item.name}
     names = [name for name in every if name in symbols and name not in written]
     if not names or all(map(_is_empty, chart.panels)):
         return []
@@ -463,7 +441,7 @@ def _legend(chart: Chart, every: dict[str, Look]) -> list[Spec]:
     return [view | {"encoding": encoding}]
 
 
-def _symbol(item: Drawn, look: Look) -> tuple[str, str, tuple[float, ...]]:
+def _symbol(item: Line | Points | Band | Spans, look: Look) -> tuple[str, str, tuple[float, ...]]:
     """Colour, shape and dashes of what stands for an item in the legend."""
     if isinstance(item, Line):
         return look.colour, "stroke", (5, 3) if item.dashed else look.dash

@@ -28,8 +28,6 @@ MODES = {
     "even": Look("#117733", (3, 3), "triangle-right"),
     "paper": Look("#000000", (4, 4), "triangle-up"),
     "oracle, sequence": Look("#009e73", shape="diamond"),
-    "bank": Look("#e69f00", shape="diamond"),
-    "recommended": Look("#0072b2", shape=_STAR),
 }
 """Looks of the modes; the lines of the first lie lowest."""
 _COLOURS = ("#d55e00", "#56b4e9", "#009e73", "#cc79a7", "#888888", "#b8a800")

@@ -8,7 +8,7 @@ from pathlib import Path
 from adaptune import trial_rows
 from adaptune.archive import Archive
 from adaptune.errors import AdaptuneError
-from adaptune.report.charts import Charts
+from adaptune.report.charts import Chart, Charts
 from adaptune.report.page import Page, PageSection, write_page
 from adaptune.report.tables import Listing
 from offline.charts import charts_of_trials, charts_of_validation
@@ -93,7 +93,8 @@ def _settings(config: OfflineStudyConfig) -> PageSection:
 def _of_charts(title: str, make: Callable[[], Charts]) -> PageSection:
     """A section of charts; an error is told in their place."""
     try:
-        charts, notes = make()
+        found = [*make()]
     except AdaptuneError as error:
         return PageSection(title, notes=(f"{error}.",))
-    return PageSection(title, notes=tuple(notes), charts=tuple(charts))
+    notes = tuple(one for one in found if isinstance(one, str))
+    return PageSection(title, notes, tuple(one for one in found if isinstance(one, Chart)))

@@ -14,13 +14,12 @@ from offline.charts import (
     charts_of_trials,
     charts_of_validation,
     front_chart,
-    front_rows,
     iteration_chart,
     scatter_chart,
     stretch_chart,
 )
 from offline.config import OfflineConfig, load_study
-from offline.trial_table import importances, read_trials, trial_table
+from offline.trial_table import TrialTable, TriedSet, importances, read_trials, trial_table
 from offline.tuning import figures
 
 
@@ -36,7 +35,8 @@ def of_kind(panel, kind, name=None):
 
 def test_a_scatter_has_a_panel_for_each_sequence_and_the_mean():
     table = made_table(error, fixed=3)
-    chart = scatter_chart(table, ["distance", "points"], ["one", "two"])
+    chart = scatter_chart(table, ["distance", "points"], "gicp")
+    assert (chart.key, chart.title[:5]) == ("parameter-scatter-gicp", "gicp:")
     assert [panel.title for panel in chart.panels] == ["one", "two", "mean over all sequences"]
     for panel, values in zip(
         chart.panels, [table.on("one"), table.on("two"), table.values], strict=True
@@ -47,7 +47,7 @@ def test_a_scatter_has_a_panel_for_each_sequence_and_the_mean():
         assert list(fixed.x) == [table.column("distance")[3]]
         (trials,) = of_kind(panel, Points, "trial")
         assert min(trials.colour) == values.min()
-    assert scatter_chart(table, ["distance"], ["one"]) is None
+    assert scatter_chart(table, ["distance"], "") is None
 
 
 def test_a_trial_that_failed_is_no_best():
@@ -66,52 +66,44 @@ def test_a_trial_that_failed_is_no_best():
     np.testing.assert_allclose(of_kind(panel, Line)[0].y, [1.0, 0.9, 0.9, 0.7])
 
 
-def tried(what, cost, error, low=None, high=None, recommended=False):
-    row = {"what": what, "cost [ms]": cost, "error [%]": error, "recommended": recommended}
-    return row | {"low": low, "high": high}
+def tried(*trials, fixed=None):
+    """A table of trials, each with its cost and its error."""
+    made = [
+        TriedSet(number, {}, {}, value, True, cost) for number, (cost, value) in enumerate(trials)
+    ]
+    return TrialTable(SPACE, ["one"], made, fixed=fixed)
 
 
 def test_the_front_has_less_error_for_more_time():
-    rows = [
-        tried("bank of 4", 9.0, 1.0, 0.8, 1.3),
-        tried("baseline", 5.0, 3.0),
-        tried("trial 1", 1.0, 9.0),
-        tried("trial 2", 1.0, 8.0),
-        tried("trial 3", 4.0, 4.0, 3.0, 5.0, recommended=True),
-        tried("trial 4", 7.0, 3.0),
-        tried("trial 5", np.nan, 0.1),
-        tried("trial 6", 0.1, None),
-    ]
-    (panel,) = front_chart(rows).panels
-    (front,) = of_kind(panel, Line, "front")
+    table = tried(
+        *((5.0, 3.0), (1.0, 9.0), (1.0, 8.0), (4.0, 4.0), (7.0, 3.0)),
+        *((np.nan, 0.1), (0.1, np.nan), (9.0, 1.0)),
+        fixed=3,
+    )
+    (panel,) = front_chart(table).panels
+    (front,) = of_kind(panel, Line)
     assert [*zip(front.x, front.y, strict=True)] == [(1.0, 8.0), (4.0, 4.0), (5.0, 3.0), (9.0, 1.0)]
     points = {d.name: list(d.x) for d in of_kind(panel, Points)}
     assert len(points.pop("tried")) == 6
-    assert points == {"recommended": [4.0], "bank": [9.0], "baseline": [5.0]}
-    # The baseline has none.
-    (intervals,) = of_kind(panel, Line, "95 % interval")
-    assert [y for y in intervals.y if np.isfinite(y)] == [3.0, 5.0, 0.8, 1.3]
+    assert points == {"fixed": [4.0], "baseline": [5.0]}
     (words,) = of_kind(panel, Words)
-    assert list(words.words) == ["trial 3", "bank of 4", "baseline"]
-    assert (list(words.x), list(words.y)) == ([4.0, 9.0, 5.0], [4.0, 1.0, 3.0])
+    assert list(words.words) == ["fixed", "baseline"]
+    assert (list(words.x), list(words.y)) == ([4.0, 5.0], [4.0, 3.0])
 
 
-@pytest.mark.parametrize("row", [None, tried("trial 3", np.nan, 2.0), tried("trial 3", 1.0, 0.0)])
-def test_one_known_point_is_no_front(row):
-    assert front_chart([tried("baseline", 5.0, 3.0), *([row] if row else [])]) is None
+@pytest.mark.parametrize("more", [[], [(np.nan, 2.0)], [(1.0, 0.0)]])
+def test_one_known_point_is_no_front(more):
+    assert front_chart(tried((5.0, 3.0), *more)) is None
 
 
 def test_trials_that_may_be_chosen_are_on_the_front():
-    table = made_table(error, fixed=3)
+    table = made_table(error)
     failed = table.trials[5]._replace(usable=False)
     table = replace(table, trials=[*table.trials[:5], failed, *table.trials[6:]])
-    rows = front_rows(table)
-    assert len(rows) == len(table) - 1
-    assert [row["what"] for row in rows[:5]] == [
-        *("baseline", "trial 1", "trial 2", "fixed", "trial 4")
-    ]
-    (panel,) = front_chart(rows).panels
-    assert len(of_kind(panel, Points, "fixed")) == 1
+    (panel,) = front_chart(table).panels
+    points = of_kind(panel, Points, "tried")[0].texts
+    assert list(points[:6]) == ["baseline", *(f"trial {i}" for i in (1, 2, 3, 4, 6))]
+    assert len(points) == len(table) - 1
 
 
 def test_a_study_is_read(study_file, tmp_path):
@@ -157,14 +149,13 @@ def study(study_file, tmp_path):
 
 
 def test_trials_have_their_charts(study):
-    assert charts_of_trials(study) == ([], ["No trials: run `adaptune offline`."])
+    assert [*charts_of_trials(study)] == ["No trials: run `adaptune offline`."]
     cost = {"register_ms": 2.0, "prepare_ms": 1.0}
     write_trials(study, lambda _, p: p["keyframe_interval"], 20, usage=cost)
-    charts, notes = charts_of_trials(study)
+    charts = [*charts_of_trials(study)]
     assert [chart.key for chart in charts] == [
         *("iterations", "importance", "parameter-scatter", "front")
     ]
-    assert notes == []
     # The most important one comes first.
     assert charts[2].panels[0].x.label == "keyframe_interval [m]"
 
@@ -173,7 +164,7 @@ def test_each_of_several_odometries_has_a_scatter(tmp_path):
     (tmp_path / "both.yaml").write_text(BOTH, "utf-8")
     study = load_study(tmp_path / "both.yaml", [], tmp_path / "study")
     write_trials(study, lambda _, p: p.get("keyframe_interval", 1.0), 40)
-    charts, _ = charts_of_trials(study)
+    charts = [chart for chart in charts_of_trials(study) if chart]  # there are no costs
     keys = [chart.key for chart in charts]
     assert keys.count("parameter-scatter-gicp") == keys.count("parameter-scatter-ndt") == 1
     assert len(set(keys)) == len(keys)
@@ -182,14 +173,12 @@ def test_each_of_several_odometries_has_a_scatter(tmp_path):
 
 
 def test_validation_is_read_or_missed(study):
-    assert charts_of_validation(study.folder) == ([], ["No validation: run `adaptune validate`."])
+    assert [*charts_of_validation(study.folder)] == ["No validation: run `adaptune validate`."]
     study.folder.mkdir()
     row = {"recording": "one", "fixed [%]": 0.5}
     rows = [row | {"stretch": i, "adaptive": 0.8 + 0.01 * i} for i in range(4)]
     (study.folder / "stretches.json").write_text(json.dumps(rows), "utf-8")
-    charts, notes = charts_of_validation(study.folder)
-    assert [chart.key for chart in charts] == ["stretches"]
-    assert notes == []
+    assert [chart.key for chart in charts_of_validation(study.folder)] == ["stretches"]
 
 
 @pytest.mark.parametrize("text", ["[{", '[{"a": 1}]'])
@@ -197,7 +186,7 @@ def test_a_damaged_validation_is_named(study, text):
     (study.folder).mkdir(exist_ok=True)
     (study.folder / "stretches.json").write_text(text, "utf-8")
     with pytest.raises(AdaptuneError, match=r"stretches\.json: is damaged .*adaptune validate"):
-        charts_of_validation(study.folder)
+        list(charts_of_validation(study.folder))
 
 
 def test_stretches_are_sorted_and_have_the_interval_of_their_mean():

@@ -71,8 +71,7 @@ def test_a_test_recording_that_was_replaced(load, caplog):
     with pytest.raises(StoredReplayError, match=r"three\.bag has other content; run `adaptune on"):
         compare(study)
     # All that is refused for one reason is told at once.
-    charts, (said,) = charts_of_replays(read_replays(study, "three"))
-    assert not charts
+    (said,) = charts_of_replays(read_replays(study, "three"))
     assert said == (
         f"{study.folder / 'replays/three'}: baseline, fixed, adaptive were made from other "
         f"inputs: {study.folder.parent / 'three.bag'} has other content; run `adaptune online` "
@@ -171,9 +170,9 @@ def test_what_is_refused_is_told_and_not_drawn(load):
     with pytest.raises(StoredReplayError, match="made from other inputs: switching") as caught:
         compare(other)
     assert refused == (f"{caught.value}.",)
-    charts, notes = charts_of_replays(read_replays(other, "three"))
-    assert refused[0] in notes
-    lines = {line.name for panel in charts[0].panels for line in panel.drawn}
+    said, of_errors, _ = charts_of_replays(read_replays(other, "three"))
+    assert said == refused[0]
+    lines = {line.name for panel in of_errors.panels for line in panel.drawn}
     assert {"baseline", "fixed"} <= lines
     assert "adaptive" not in lines
     assert run(other) == 1
@@ -196,10 +195,10 @@ def test_replays_of_another_rate_or_reference_are_not_drawn(load):
     folder = study.folder / "replays/three/adaptive"
     rewrite(folder, real_time={"rate": 1.0})
     with pytest.raises(StoredReplayError, match="some were made in real time"):
-        charts_of_replays(read_replays(study, "three"))
+        read_replays(study, "three")
     rewrite(folder, real_time=None)
     with pytest.raises(StoredReplayError, match="judged by another reference"):
-        charts_of_replays(read_replays(load("sequences.three.clock_offset=0.05"), "three"))
+        read_replays(load("sequences.three.clock_offset=0.05"), "three")
 
 
 @pytest.mark.parametrize("note", ["", "[]", "{}", '{"inputs": {}}'])

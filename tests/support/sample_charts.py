@@ -47,11 +47,11 @@ def trials(n: int = 2000) -> Chart:
     """Scatters of trials, with colours, and one with names."""
     rng = np.random.default_rng(1)
     cost, error = rng.lognormal(2.0, 0.5, n), rng.lognormal(0.0, 0.7, n)
-    size = np.where(rng.random(n) < 0.1, np.nan, rng.lognormal(-1.0, 1.0, n))
+    size = rng.lognormal(-1.0, 1.0, n)
     texts = [f"trial {i}: voxel_size {size[i]:.3g}" for i in range(n)]
     points = Points(cost, error, "trials", size, "voxel size [m]", texts=texts)
     kinds = Axis("registration", names=("point to point", "point to plane", "GICP"))
-    named = Points([kinds.names[i % 3] for i in range(60)], error[:60], "trials")
+    named = Points(np.arange(60) % 3, error[:60], "trials")
     return Chart(
         "trials",
         "Trials: error over cost, and over the kind of registration",
