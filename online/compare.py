@@ -17,14 +17,20 @@ from adaptune.metrics import (
     resampled_means,
     worst_tenth,
 )
-from adaptune.model import ErrorModel
+from adaptune.model import ErrorModel, rules
 from adaptune.model.registry import ADAPTIVE
-from adaptune.model.rules import mean_errors
 from adaptune.reference.check import hard_to_track
 from adaptune.report import tables as report
 from adaptune.study.config import ALSO
-from adaptune.study.driven import BEST_DEFAULT, MIN_RECORDINGS, PER_STRETCH, RIVALS
+from adaptune.study.driven import (
+    BEST_DEFAULT,
+    MIN_RECORDINGS,
+    PER_STRETCH,
+    RIVALS,
+    not_compared,
+)
 from adaptune.study.oracle import oracle_errors
+from adaptune.study.references import estimates_of
 from adaptune.study.sequences import StudySequences
 from adaptune.study.study import Study
 from online.modes import (
@@ -101,6 +107,8 @@ def compared_modes(study: Study) -> ComparedModes:
 
 
 SEED = 0
+AS_WRONG = 0.5
+"""Share of the baseline's error in training from which an estimated reference can rank no sets."""
 """Of the resampling."""
 LEAST_STRETCHES = 10
 """With fewer, there is no worst tenth."""
@@ -383,7 +391,9 @@ def compare(study: Study) -> ComparedReplays:
             if errors and (row := oracle_row(judged[-1], errors, model.fixed)):
                 oracles.append(row)
     rows = _rows(judged, oracles)
-    obstacle = "" if ADAPTIVE in modes else ReplaySetup.of(study).obstacle(ADAPTIVE, model)
+    obstacle = ReplaySetup.of(study).obstacle(ADAPTIVE, model) if ADAPTIVE not in modes else ""
+    if ADAPTIVE in modes and model is not None:
+        obstacle = not_compared(model, study.mechanism)
     length, worth = study.config.sub_trajectory, study.config.online.worth
     best = decided(rows, worth)
     said, advised = wrong[:1], "" if best is None else best.mode
@@ -392,6 +402,7 @@ def compare(study: Study) -> ComparedReplays:
         advised = NONE if said else advised
     if advised != NONE:
         said += verdict(rows, length, obstacle, worth)
+        said += [] if model is None else _of_estimates(study, model)
     details = [*wrong, *remarks(rows), *compared.words]
     folder = study.folder / "comparison"
     report.write_rows(folder, "comparison", [row.columns() for row in rows])
@@ -429,9 +440,24 @@ def _lost(
     return said
 
 
+def _of_estimates(study: Study, model: ErrorModel) -> list[str]:
+    """Where the references of training are estimated, and no better than the errors to compare."""
+    estimates = estimates_of(study.sequences, study.training)
+    wrong = [one.error(model.length) for one in estimates.values()]
+    means = dict(zip(model.sets, rules.mean_errors(model.errors, model.sequence), strict=True))
+    error, own = np.mean(wrong) if wrong else np.nan, means.get(rules.BASELINE, np.nan)
+    if not error >= AS_WRONG * own:
+        return []
+    return [
+        f"Doubt this: the estimated reference of training is wrong by {error:.2f} %, where the "
+        f"odometry's own parameters have {own:.2f} %, so it can hardly rank sets; record a longer "
+        f"drive, or name a reference."
+    ]
+
+
 def _of_training(model: ErrorModel) -> list[str]:
     """The best set in training, where it keeps track there and costs more than the fixed one."""
-    means = mean_errors(model.errors, model.sequence)
+    means = rules.mean_errors(model.errors, model.sequence)
     trial = model.sets.trials[int(np.argmin(means))]
     costs = [np.nan if model.costs is None else model.costs.alone(t) for t in (trial, model.fixed)]
     if not means.min() <= LOST_ABOVE or not costs[0] > costs[1]:

@@ -91,7 +91,8 @@ def verdict(
     """What to do, and why, in at most three sentences.
 
     Of the `rows`, those over all sequences come last. `length` is a sub-trajectory's, in metres;
-    `obstacle` says why nothing adapts, if nothing does; for `worth` see `decided`.
+    `obstacle` says why nothing adapts, or was compared with the fixed set in training; for `worth`
+    see `decided`.
     """
     last = {row.mode: row for row in last_rows(rows)}
     if (best := decided(rows, worth)) is None:
@@ -192,6 +193,8 @@ def _why_not(
 ) -> list[str]:
     if main is None:
         return [f"Adapting was not tried: {obstacle}."] if obstacle else []
+    if _is_yardstick(main) and obstacle:
+        return [f"`adaptive` drove the same set: {obstacle}."]
     if _is_yardstick(main):
         return ["Training showed no gain from adapting: `adaptive` drove the same set."]
     ratio = _to(main, best)

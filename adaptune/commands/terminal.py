@@ -77,9 +77,9 @@ def show_front(rows: Sequence[Mapping[str, Any]], title: str, caption: str) -> N
 
 BUYS = (
     "What CPU time buys, in training",
-    "The arrow marks the fixed set: the best that costs no more than the baseline, or the budget, "
-    "if it is better than the baseline by more than chance. RTE is that of whole drives, capped "
-    "where track is lost; a bank's is of parts left out of training.",
+    "The arrow marks the fixed set: of those that cost no more than the baseline, or the budget, "
+    "the best beyond chance, and of equally good ones the cheapest. RTE is that of whole drives, "
+    "capped where track is lost; a bank's is of parts left out of training.",
 )
 
 

@@ -89,7 +89,10 @@ def inspect(
     if study is not None:
         data = {"sequences": {found.name: found.given}} | rest
         write_text(study, dump(data, found.hints | ROLES))
-    say_next("train on a part of it", "offline", path, first=first)
+    if found.reference is None and study is None:
+        say_next("find where it moves, train on a part of it and compare", "tune", file)
+    else:
+        say_next("train on a part of it", "offline", path, first=first)
 
 
 def _show_several(path: Path, reading: "Reading | None") -> bool:

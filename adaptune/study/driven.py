@@ -58,10 +58,6 @@ def driven(
     if ADAPTIVE not in online.rules:
         return f"`online` will drive `{online.rules[0]}`, and not `{ADAPTIVE}` (online.modes)."
     how = mechanism_of(ADAPTIVE, model, mechanism, odometry.description.live)
-    why = (
-        f"there is too little to compare ways to adapt, which takes "
-        f"{2 * PER_STRETCH * model.length:g} m of recordings, or a smaller sub_trajectory"
-    )
     expected = expected_in_words(model.expected) if model.expected else ""
     if how == "bank" and model.bank_adapts:
         trials = always_at_work(switching, model)
@@ -71,13 +67,22 @@ def driven(
             words += f", at {cost:.1f} ms of CPU time a scan"
         why = f", because it is worth that: {expected}" if expected else ""
         return f"{words}{why}."
+    why = f"nothing else is worth its cost; the best alternative is a bank: {expected}"
+    return f"{fixed} as `adaptive`, because {not_compared(model, mechanism) or why}."
+
+
+def not_compared(model: ErrorModel, mechanism: Mechanism | None) -> str:
+    """Why training compared no way to adapt with the fixed set; empty if it did."""
     if mechanism == "bank" and len(model.bank) < 2:
-        why = "no second set may join it in a bank (online.budget, or the others fail)"
-    elif mechanism == "live":
-        why = "choosing one set at a time gains nothing, and there is no bank (online.switching)"
-    elif expected:
-        why = f"nothing else is worth its cost; the best alternative is a bank: {expected}"
-    return f"{fixed} as `adaptive`, because {why}."
+        return "no second set may join it in a bank (online.budget, or the others fail)"
+    if mechanism == "live":
+        return "choosing one set at a time gains nothing, and there is no bank (online.switching)"
+    if model.expected:
+        return ""
+    return (
+        f"there is too little to compare ways to adapt, which takes "
+        f"{2 * PER_STRETCH * model.length:g} m of training recordings, or a smaller sub_trajectory"
+    )
 
 
 def cannot_adapt(odometry: Factory, mechanism: Mechanism | None) -> str:

@@ -69,6 +69,7 @@ def check_no_study(path: Path) -> None:
 
 def recorded(asked: Asked, show: Progress) -> "tuple[dict[str, Inspection], list[str]]":
     """The recordings by the names of their sequences, and the names of those for the test."""
+    from adaptune.recording.config import NO_REFERENCE
     from adaptune.recording.fleet import check_alike, recordings_at
 
     for path in asked.recordings:
@@ -80,6 +81,11 @@ def recorded(asked: Asked, show: Progress) -> "tuple[dict[str, Inspection], list
     for path in paths:
         if resolved.count(path.resolve()) > 1:
             raise AdaptuneError(f"{path}: is named twice; the test needs a recording of its own")
+    if asked.reference == NO_REFERENCE:
+        raise AdaptuneError(
+            "--reference none: errors are measured by a reference; leave it out, and one is "
+            "estimated where the recording has none"
+        )
     if tested and len(paths) == len(tested):
         raise AdaptuneError("--test: leaves no recording to tune on")
     if len(paths) > 1 and asked.reference is not None and Path(asked.reference).is_file():

@@ -38,7 +38,7 @@ USUAL_LENGTH = 5.0
 ROLES: dict[YamlPath, str] = {
     ("training",): "The part for the test is not trained on.",
     ("sub_trajectory",): "Metres over which errors are measured: 10.0 for a path of 200 m or more, "
-    "25.0 for one of 500 m or more.",
+    "25.0 for one of 500 m or more, or for a fast drive.",
 }
 """Comments of what `roles` returns."""
 _COMMENTS: dict[YamlPath, str] = ROLES | {
@@ -119,14 +119,16 @@ def proposed(found: "Inspection", deep: bool, show: Progress) -> tuple[float | N
     return share, length, "; ".join(filter(None, words))
 
 
-def written(asked: Asked, folder: Path, show: Progress) -> tuple[Path, list[str], list[str]]:
-    """Write the study, or add what is new to the one that is there.
+def written(
+    asked: Asked, overrides: Sequence[str], folder: Path, show: Progress
+) -> tuple[Path, list[str], list[str]]:
+    """Write the study, or add what is new to the one that is there; its overrides are checked.
 
     Returns its file, what overrides it, and the names of new recordings.
     """
     path, known = folder / f"{folder.resolve().name}.yaml", folder / ASKED
     if not path.exists():
-        text = dump(_decided(asked, folder, show), _COMMENTS)
+        text = dump(_decided(asked, overrides, folder, show), _COMMENTS)
         try:
             manifest.record(known, asked.inputs)
             write_text(path, text)
@@ -148,11 +150,13 @@ def written(asked: Asked, folder: Path, show: Progress) -> tuple[Path, list[str]
             f"{path}: another `adaptune tune` made it: {'; '.join(others)}; name the same to "
             f"resume it, or tune in a folder of its own with `--folder {free}`"
         )
-    overrides = [f"{key}={value:.10g}" for key, value in asked.limits.items()]
-    return path, overrides, _grown(path, asked, show)
+    limits = [f"{key}={value:.10g}" for key, value in asked.limits.items()]
+    return path, limits, _grown(path, asked, show)
 
 
-def _decided(asked: Asked, folder: Path, show: Progress) -> dict[str, Any]:
+def _decided(
+    asked: Asked, overrides: Sequence[str], folder: Path, show: Progress
+) -> dict[str, Any]:
     """The study of some recordings; nothing is written but references."""
     from adaptune.odometry.registry import declare
     from offline.config import load_study
@@ -185,7 +189,7 @@ def _decided(asked: Asked, folder: Path, show: Progress) -> dict[str, Any]:
     def loaded() -> "OfflineStudy":
         return load_study(study(USUAL_LENGTH), folder=folder)
 
-    loaded()  # or an error, before anything is measured
+    load_study(study(USUAL_LENGTH), overrides, folder)  # or an error, before all is measured
     if asked.reference is None:
         _replace_noisy(named, loaded, show)
     length, share, speed = _split(loaded(), list(named), show)

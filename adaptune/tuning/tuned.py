@@ -236,7 +236,7 @@ def tune_asked(
         asked = asked._replace(reference=str(Path(asked.reference).resolve()))
     folder = folder or Path("runs") / _study_name(asked)
     clock = Clock(folder / ELAPSED, replays=True)
-    path, now, more = written(asked, folder, show)
+    path, now, more = written(asked, overrides, folder, show)
     study = load_study(path, [*overrides, *now], folder)
     _log.info("study: %s", path)
     before = study.fixed

@@ -2,6 +2,7 @@ import csv
 import json
 import shutil
 from dataclasses import replace
+from types import SimpleNamespace
 
 import drives
 import numpy as np
@@ -50,6 +51,17 @@ def test_where_track_is_lost_it_names_what_kept_it_in_training(replayed, monkeyp
     assert found.verdict[-1].startswith(f"In training trial {best} has {means.min():.2f} % at ")
     monkeypatch.setattr("online.compare.LOST_ABOVE", 0.0)
     assert compare(replayed).verdict == found.verdict[:-1]
+
+
+def test_where_references_are_as_wrong_as_sets_the_verdict_is_doubted(replayed, monkeypatch):
+    assert not any("Doubt this" in said for said in compare(replayed).verdict)
+    model = ErrorModel.load(replayed.model_path)
+    own = mean_errors(model.errors, model.sequence)[list(model.sets).index(0)]
+    wrong = SimpleNamespace(error=lambda _: 0.5 * own)
+    monkeypatch.setattr("online.compare.estimates_of", lambda *_: {"one": wrong})
+    said = compare(replayed).verdict[-1]
+    assert said.startswith("Doubt this: the estimated reference of training is wrong by ")
+    assert f" by {0.5 * own:.2f} %, where the odometry's own parameters have {own:.2f} %," in said
 
 
 def test_where_track_is_lost_a_fault_of_the_odometry_is_named(own, monkeypatch):

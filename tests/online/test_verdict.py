@@ -113,6 +113,8 @@ def test_why_nothing_was_adapted_is_told():
     assert verdict(kept, 5.0)[1:] == [
         "Training showed no gain from adapting: `adaptive` drove the same set."
     ]
+    little = "there is too little to compare ways to adapt"
+    assert verdict(kept, 5.0, little)[1:] == [f"`adaptive` drove the same set: {little}."]
 
 
 def test_how_sure_it_is_that_one_set_is_better_is_told():

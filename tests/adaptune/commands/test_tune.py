@@ -262,6 +262,8 @@ def test_of_two_topics_one_is_to_be_named(tmp_path):
         (["one.bag", "--reference", "gt.tum"], "gt.tum"),
         (["one.bag", "--folder", "poses.tum"], "poses.tum: cannot be written to"),
         (["one.bag", "--reference", "/nothing"], "/nothing"),
+        (["one.bag", "--reference", "none"], "leave it out, and one is estimated where"),
+        (["one.bag", "-o", "offline.trails=3"], "unknown key; did you mean 'trials'?"),
     ],
 )
 @pytest.mark.usefixtures("bag")
