@@ -85,10 +85,15 @@ class _Measuring:
     """What selectors of a bank, or of a single odometry, have in common: they measure it."""
 
     def __init__(
-        self, sets: ParameterSets, fixed: int, members: Sequence[int], length: float, weighs: bool
+        self,
+        sets: ParameterSets,
+        fixed: int,
+        members: Sequence[int],
+        length: float,
+        gives_weights: bool,
     ):
         self.fixed, self.members = fixed, tuple(members)
-        self._sets, self._weighs = sets, weighs
+        self._sets, self._gives_weights = sets, gives_weights
         self._always: Sequence[int] = self.members  # those that never rest
         self._usual_spread = -1.0  # of the members in training; any is more where nobody knows it
         self._live = LiveEvidence(self.members, length)
@@ -120,7 +125,7 @@ class _Measuring:
 
         No member of a bank is a better guess than those that agree, see `Agreement`.
         """
-        if not self._weighs:
+        if not self._gives_weights:
             return Selection(self.fixed, self._sets[self.fixed])
         share = 1.0 / len(self._always)
         weights = {member: share * (member in self._always) for member in self.members}
@@ -191,21 +196,21 @@ class Selector(_Measuring):
         model.check_descriptors(descriptors)
         cls = rule_class(rule)
         if members is None:
-            drives_bank = cls.weighs and (model.bank_adapts or model.bank_rests)
+            drives_bank = cls.gives_weights and (model.bank_adapts or model.bank_rests)
             members = model.bank if drives_bank else ()
-        weighs = bool(members) and cls.weighs
+        gives_weights = bool(members) and cls.gives_weights
         fixed = members[0] if members else model.fixed
-        super().__init__(model.sets, fixed, members, model.length, weighs)
+        super().__init__(model.sets, fixed, members, model.length, gives_weights)
         self._model = model
         self._pca = model.pca()
-        self._reserve = frozenset(model.reserve if weighs else ()).intersection(self.members)
+        self._reserve = frozenset(model.reserve if gives_weights else ()).intersection(self.members)
         self._always = [member for member in self.members if member not in self._reserve]
-        if weighs:
+        if gives_weights:
             vectors = model.vectors[:, [model.bank.index(member) for member in self._always]]
             spreads = spread_of(np.where(np.isfinite(vectors), vectors, FAILURE))
             self._usual_spread = float(np.quantile(spreads, UNUSUAL))
         data = model.training_data(self._pca, self.members or None)
-        self._rule = cls.of(model, weighs).fit(data)
+        self._rule = cls.of(model.bank_settings if gives_weights else None).fit(data)
         self._describe = Describer(model.blocks)
         if self._describe.blocks != model.blocks:
             raise DescriptorError(
@@ -274,7 +279,7 @@ class Selector(_Measuring):
         self._descriptors.append(descriptor)
         mean = np.stack(self._descriptors).mean(axis=0, dtype=np.float64, keepdims=True)
         feature = self._pca.transform(mean.astype(np.float32))[0]
-        is_foreign = self._rule.gated and self._is_foreign(self._scan)
+        is_foreign = self._rule.needs_known_sensor and self._is_foreign(self._scan)
         selection = self._choose(feature, is_foreign)
         self._failed = False
         # Where the fixed set does worse than predicted, training's guess is better than none.
@@ -311,7 +316,7 @@ class Selector(_Measuring):
 
     def _in_doubt(self) -> bool:
         """Whether a bank at work is in a new place, or differs by more than in training."""
-        at_work = self._weighs and self._resting != frozenset(self.members[1:])
+        at_work = self._gives_weights and self._resting != frozenset(self.members[1:])
         return at_work and (self._is_new() or super()._in_doubt())
 
     def _is_enough(self, predicted: float) -> bool:

@@ -233,7 +233,7 @@ def leave_out(
     chosen = choose(others, bank, by_recording, MOST_FOLDS)
     alone, costs = others.costs.alone, dict[str, float]()
     for name in (name for name in rules if name != ADAPTIVE):
-        rule = rule_class(name)().fit(data)
+        rule = rule_class(name).of(None).fit(data)
         trials = [rule.select(features[i]).trial for i in first]
         errors[name] = capped[frames, data.sets.columns(trials)[period]]
         adapted[name] = float(np.mean([trial != data.fixed for trial in trials]))

@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import TYPE_CHECKING, ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 from adaptune.live.hops import LiveSquares
 from adaptune.metrics import cap
 from adaptune.space import ParameterSets, Selection
+
+if TYPE_CHECKING:
+    from adaptune.model.weights import BankSettings
 
 NOVEL_FAMILIARITY = 0.1
 """Familiarity below which evidence counts less and less."""
@@ -227,10 +230,12 @@ class TrainingData:
     costs: Costs | None = None  # what the sets cost; None if it was not measured
 
     def allows(self) -> NDArray[np.bool_]:
-        """Which sets may be chosen, of shape (n_sets,)."""
-        if self.allowed is None:
-            return np.ones(len(self.sets), np.bool_)
-        return np.isin(self.sets.trials, self.allowed)
+        """Which sets may be chosen: candidates that the budget allows, of shape (n_sets,)."""
+        allowed = np.ones(len(self.sets), np.bool_)
+        for some in (self.candidates, self.allowed):
+            if some is not None:
+                allowed &= np.isin(self.sets.trials, some)
+        return allowed
 
 
 def mean_errors(errors: NDArray[np.floating], sequence: NDArray[np.intp]) -> NDArray[np.float64]:
@@ -305,13 +310,13 @@ class Rule(ABC):
     # What it selects, in a sentence.
     sentence: ClassVar[str] = "what a rule of the user's selects"
     # Whether the fixed set is kept for scans of another sensor than in training.
-    gated: ClassVar[bool] = False
-    # Whether it weighs the members of a bank where one runs; others choose among them.
-    weighs: ClassVar[bool] = False
+    needs_known_sensor: ClassVar[bool] = False
+    # Whether it gives weights to the members of a bank where one runs; others choose among them.
+    gives_weights: ClassVar[bool] = False
 
     @classmethod
-    def of(cls, model: Any, weighs: bool) -> "Rule":  # noqa: ARG003 - for those that need them
-        """Make the rule for an error model, and for a bank that it `weighs` or one set."""
+    def of(cls, bank: "BankSettings | None") -> "Rule":  # noqa: ARG003 - for those that need it
+        """Make the rule: with settings of a bank if it gives weights to one, else for one set."""
         return cls()
 
     @abstractmethod
@@ -341,7 +346,7 @@ class FixedSet(Rule):
     sequence, and the budget allows it.
     """
 
-    gated = True
+    needs_known_sensor = True
 
     def fit(self, data: TrainingData) -> Self:
         """See `Rule.fit`."""

@@ -1,7 +1,7 @@
 """Weights of the members of a bank, whose motions are averaged."""
 
 from collections.abc import Collection, Mapping, Sequence
-from typing import Annotated, Any, NamedTuple, Self
+from typing import Annotated, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -96,15 +96,13 @@ class BankRule(Rule):
     """
 
     sentence = "what adapts with the least expected loss in training, or the fixed set"
-    gated = weighs = True
+    needs_known_sensor = gives_weights = True
 
     @classmethod
-    def of(cls, model: Any, weighs: bool) -> Rule:
+    def of(cls, bank: BankSettings | None) -> Rule:
         """See `Rule.of`: where no bank runs, the fixed set is kept."""
-        if not weighs:
-            return FixedSet()
-        # A bank that need not always work weighs its members where it does.
-        return cls(model.bank_settings.model_copy(update={"adapt": True}))
+        # Members of a bank that need not always work have weights where they do.
+        return cls(bank.model_copy(update={"adapt": True})) if bank else FixedSet()
 
     def __init__(self, settings: BankSettings | None = None):
         self.settings = settings or BankSettings()
