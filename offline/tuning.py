@@ -13,8 +13,16 @@ from threadpoolctl import threadpool_limits
 
 from adaptune.metrics import cap, worst_tenth
 from adaptune.model import BankRule, BankSettings, TrainingData
-from adaptune.model.rules import BASELINE, ERROR_FLOOR, complementary, mean_errors
+from adaptune.model.rules import (
+    BASELINE,
+    ERROR_FLOOR,
+    N_FRAMES,
+    SHARPNESS,
+    complementary,
+    mean_errors,
+)
 from adaptune.model.weights import (
+    MEMBER_CLIP,
     MEMBER_POOL_SIZE,
     MemberWeights,
     bank_weights,
@@ -130,16 +138,8 @@ def figures(logs: Logs, recordings: Sequence[str]) -> Figures:
     return Figures(loss, geometric, low, high, tenth, worst, len(logs), n_recordings)
 
 
-BANK_FRAMES = 1000
-"""Nearest frames of each stretch in a bank: products of errors need more frames than means do."""
 BANK_SETTINGS = [
-    BankSettings(
-        sharpness=12.0,
-        clip=18.0,
-        min_fixed_share=share,
-        prior_windows=windows,
-        n_frames=BANK_FRAMES,
-    )
+    BankSettings(min_fixed_share=share, prior_windows=windows)
     for share, windows in ((0.0, 3.0), (0.0, 10.0), (0.25, 3.0), (0.75, 10.0))
 ]
 """A bank is driven with one of these; of equally good ones the first."""
@@ -147,7 +147,8 @@ MOST_FOLDS = 12
 """So many folds at most compare ways to adapt where evidence is left out already."""
 ROUNDING = 1e-6
 """A smaller loss, or gain, is one of rounding."""
-NO_BANK = BankSettings(adapt=False)
+NO_BANK = BankSettings(adapt=False, sharpness=SHARPNESS, n_frames=N_FRAMES, clip=MEMBER_CLIP)
+"""The fixed set is driven; the weights of a bank that joins in where that may be wrong."""
 
 
 class Policy(NamedTuple):

@@ -40,6 +40,8 @@ EVEN_SHARE = 0.5
 even."""
 MEMBER_POOL_SIZE = 64
 """A bank's members are searched for among this many of the best sets."""
+MEMBER_CLIP = 6.0
+"""Where members are chosen, `clip_errors` clips at this many times the fixed set's."""
 
 
 class BankSettings(BaseModel):
@@ -50,15 +52,16 @@ class BankSettings(BaseModel):
 
     adapt: bool = True  # if not, the fixed set keeps all the weight
     # How fast a sequence's weight falls with the distance of its nearest frames.
-    sharpness: Annotated[NonNegativeFloat, Field(allow_inf_nan=False)] = 6.0
-    n_frames: PositiveInt = 300  # nearest frames of each sequence
+    sharpness: Annotated[NonNegativeFloat, Field(allow_inf_nan=False)] = 12.0
+    # Nearest frames of each stretch: products of errors need more of them than means do.
+    n_frames: PositiveInt = 1000
     # Minimum share of the weight that the fixed set keeps where nothing was measured.
     min_fixed_share: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
     # How many windows of live evidence the training counts as.
     prior_windows: Annotated[PositiveFloat, Field(allow_inf_nan=False)] = 3.0
     # Errors are clipped at this many times the fixed set's root mean square in the sequence: a
     # member that has lost track is left out of the mean, and does not cost what it would alone.
-    clip: Annotated[PositiveFloat, Field(allow_inf_nan=False)] = 6.0
+    clip: Annotated[PositiveFloat, Field(allow_inf_nan=False)] = 18.0
     # How many of the last members rest where the training knows the place.
     reserve: NonNegativeInt = 0
 
@@ -221,12 +224,12 @@ def _untried(n_members: int) -> NDArray[np.float64]:
 
 
 def clip_errors(
-    vectors: NDArray[np.float32], fixed_at: int, clip: float = BankSettings().clip
+    vectors: NDArray[np.float32], fixed_at: int, clip: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Clip the errors on the frames of a sequence.
 
     Vectors are percent, of shape (n_frames, n_sets, 3), not finite where the track was lost;
-    `fixed_at` is the fixed set's column.
+    `fixed_at` is the fixed set's column, `clip` in times its root mean square.
 
     Returns vectors of the same shape, zero where the track was lost, and what counts there instead,
     in no direction, of shape (n_frames, n_sets), zero elsewhere.
@@ -291,7 +294,7 @@ def choose_members(
     pool = [fixed, *(t for t in best if t != fixed and all(t in known for known in vectors))]
     squares = []
     for known in vectors:
-        few, lost = clip_errors(np.stack([known[trial] for trial in pool], axis=1), 0)
+        few, lost = clip_errors(np.stack([known[trial] for trial in pool], axis=1), 0, MEMBER_CLIP)
         rows = few.transpose(0, 2, 1).reshape(-1, len(pool)).astype(np.float64)
         products = (rows.T @ rows + np.diag((lost.astype(np.float64) ** 2).sum(axis=0))) / len(few)
         squares.append(products / (products[0, 0] + ERROR_FLOOR**2))

@@ -115,7 +115,7 @@ def test_many_windows_overrule_the_training(monkeypatch):
     monkeypatch.setattr("adaptune.model.weights.EVEN_SHARE", 0.0)
     data = places(np.random.default_rng(6))
     rule = BankRule().fit(data)
-    live = LiveSquares(np.diag([100.0, 100.0, 100.0, 1.0]), 0.0, 1000.0)
+    live = LiveSquares(np.diag([100.0, 100.0, 100.0, 1.0]), 0.0, 1e4)
     assert rule.weigh(rule.near(data.features[0][None]), live).weights[3] > 0.9
     assert (
         rule.weigh(rule.near(data.features[0][None]), live._replace(windows=1e-3)).weights[3] < 0.1
@@ -159,7 +159,7 @@ def test_errors_are_clipped():
     vectors = np.zeros((10, 2, 3), np.float32)
     vectors[:, 0, 0] = 1.0
     vectors[:, 1, 1] = [0.5, 5.0, 7.0, 29.0, 31.0, np.inf, np.nan, 0.0, 6.0, 1.0]
-    kept, lost = clip_errors(vectors, 0)
+    kept, lost = clip_errors(vectors, 0, 6.0)
     limit = 6.0 * np.sqrt(1.0 + 0.02**2)
     np.testing.assert_allclose(kept[:, 0], vectors[:, 0])
     expected = [0.5, 5.0, limit, limit, 0.0, 0.0, 0.0, 0.0, 6.0, 1.0]
@@ -171,7 +171,7 @@ def test_errors_are_clipped():
     assert lost.max() == pytest.approx(3.0 * limit)
     # A fixed set that fails itself allows others more.
     vectors[:5, 0] = np.inf
-    _, lost = clip_errors(vectors, 0)
+    _, lost = clip_errors(vectors, 0, 6.0)
     assert lost[0, 0] == pytest.approx(6.0 * np.sqrt((5 * FAILURE**2 + 5) / 10), rel=1e-5)
 
 
