@@ -95,7 +95,7 @@ def constantly(sequence: LabelledSequence, members: Sequence[int]) -> Errors:
     """Errors of a bank whose weights stay the same."""
     simulation = sequence.simulation
     vectors, lost = clip_errors(
-        np.stack([sequence.vectors[m] for m in members], axis=1), 0, MEMBER_CLIP
+        np.stack([sequence.vectors[m] for m in members], axis=1), MEMBER_CLIP
     )
     squares = np.einsum("ijx,ikx->jk", vectors, vectors) + np.diag((lost**2).sum(axis=0))
     modes = {

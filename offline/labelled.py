@@ -32,9 +32,9 @@ from adaptune.model.rules import (
     SetCost,
     Spending,
     allowed_sets,
-    mean_errors,
+    best_sets,
 )
-from adaptune.model.weights import MEMBER_POOL_SIZE, MemberWeights
+from adaptune.model.weights import MemberWeights
 from adaptune.odometry.factory import Factory
 from adaptune.recording.scan import stretch_numbers
 from adaptune.space import ParameterSets
@@ -56,6 +56,8 @@ if TYPE_CHECKING:
     from adaptune.model.knn import ScaledPCA
 
 
+MEMBER_POOL_SIZE = 64
+"""A bank's members are searched for among this many of the best sets."""
 SECONDS_UNTIL_NOTICED = 1.0
 """Seconds until a bank notices that a member has lost track."""
 MISFIT_PER_METRE = 0.25
@@ -496,6 +498,12 @@ class LabelledData(NamedTuple):
         """How a bank may spend the budget; None without a budget."""
         return Spending.of(self.costs, self.budget)
 
+    def member_pool(self, fixed: int) -> list[int]:
+        """Trials that the members of a bank are chosen from, the fixed set's first."""
+        known = set.intersection(*(set(s.vectors) for s in self.sequences))
+        best = best_sets(self.errors(), self.stretches(), self.sets)[:MEMBER_POOL_SIZE]
+        return [fixed, *(trial for trial in best if trial != fixed and trial in known)]
+
     def can_pay(self, members: Sequence[int]) -> bool:
         """Whether a bank of these trials stays within the budget, if there is one."""
         return self.spending is None or self.spending.allows(members)
@@ -603,11 +611,10 @@ def _whole(s: LabelledSequence, trials: Sequence[Trial], config: OfflineConfig) 
 
 def with_vectors(data: LabelledData, archive: Archive) -> LabelledData:
     """The same with error vectors of the sets that may be members of a bank."""
-    sets, means = data.sets, mean_errors(data.errors(), data.numbers())
+    best = best_sets(data.errors(), data.numbers(), data.sets)
     # With a sequence left out, others than now may be among the best. To read the poses of
     # thousands of trials would take long.
-    best = [sets.trials[c] for c in np.argsort(means, kind="stable")[: 2 * MEMBER_POOL_SIZE]]
-    eligible = {t for t in (BASELINE, *best) if t in sets and np.isfinite(means[sets.column(t)])}
+    eligible = {BASELINE, *best[: 2 * MEMBER_POOL_SIZE]}.intersection(best)
     sequences = []
     for s in data.sequences:
         T_ref_sensor, length = s.simulation.T_ref_counted, s.simulation.length

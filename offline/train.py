@@ -16,7 +16,7 @@ from adaptune.files import write_text
 from adaptune.machine import available
 from adaptune.metrics import cap, lost_in_words
 from adaptune.model import ErrorModel, ModelError
-from adaptune.model.rules import complementary, mean_errors
+from adaptune.model.rules import best_sets, complementary
 from adaptune.odometry.registry import ODOMETRIES, PROGRAMS
 from adaptune.progress import Progress, unseen
 from adaptune.recording.config import NO_REFERENCE
@@ -422,8 +422,8 @@ def oracle_sets(model: ErrorModel, n: int) -> list[int]:
     and, where these are too few, those with the least training error.
     """
     data = model.training_data(model.pca())
-    means = np.where(data.allows(), mean_errors(data.errors, data.sequence), np.inf)
-    best = [model.sets.trials[c] for c in np.argsort(means, kind="stable") if means[c] < np.inf]
+    allowed = {trial for trial, may in zip(data.sets, data.allows(), strict=True) if may}
+    best = [t for t in best_sets(data.errors, data.sequence, data.sets) if t in allowed]
     chosen = dict.fromkeys([model.fixed, *model.bank, *complementary(data, n), *best])
     return list(chosen)[:n]
 

@@ -19,11 +19,9 @@ from adaptune.model.rules import (
     N_FRAMES,
     SHARPNESS,
     complementary,
-    mean_errors,
 )
 from adaptune.model.weights import (
     MEMBER_CLIP,
-    MEMBER_POOL_SIZE,
     MemberWeights,
     bank_weights,
     choose_members,
@@ -295,13 +293,8 @@ def bank_errors(
 
 def cancelling_members(data: LabelledData, fixed: int, size: int) -> list[int]:
     """Choose a bank's members, the fixed set first, whose errors cancel: see `choose_members`."""
-    vectors, errors = [], []
-    for s in data.sequences:
-        for number in np.unique(s.stretch):
-            frames = s.stretch == number
-            vectors.append({trial: of_trial[frames] for trial, of_trial in s.vectors.items()})
-            errors.append(s.errors[frames])
-    return choose_members(vectors, errors, data.sets, fixed, size, data.spending)
+    pool = data.member_pool(fixed)
+    return choose_members(data.vectors(pool), data.stretches(), pool, size, data.spending)
 
 
 def complementary_members(data: LabelledData, fixed: int, size: int) -> list[int]:
@@ -310,19 +303,10 @@ def complementary_members(data: LabelledData, fixed: int, size: int) -> list[int
     They are sought among the best sets, see `complementary`. Where another one would lower nothing,
     the best of the others fill the bank.
     """
-    errors, number = data.errors(), data.stretches()
-    means = mean_errors(errors, number)
-    best = [
-        data.sets.trials[c]
-        for c in np.argsort(means, kind="stable")[:MEMBER_POOL_SIZE]
-        if means[c] < np.inf
-    ]
-    pool = [t for t in best if t != fixed and all(t in s.vectors for s in data.sequences)]
-    few = data.sets.subset([fixed, *pool])
-    columns = data.sets.columns(few.trials)
-    features = np.empty((len(errors), 0))
-    of_few = TrainingData(features, number, errors[:, columns], few, fixed)
-    chosen = complementary(of_few, size, data.spending)
+    pool, number = data.member_pool(fixed), data.stretches()
+    errors = data.errors()[:, data.sets.columns(pool)]
+    few = TrainingData(np.empty((len(errors), 0)), number, errors, data.sets.subset(pool), fixed)
+    chosen = complementary(few, size, data.spending)
     for trial in pool:
         if len(chosen) < size and trial not in chosen and data.can_pay([*chosen, trial]):
             chosen.append(trial)

@@ -261,6 +261,14 @@ def mean_errors(errors: NDArray[np.floating], sequence: NDArray[np.intp]) -> NDA
     return np.asarray(np.mean(means, axis=0))
 
 
+def best_sets(
+    errors: NDArray[np.floating], sequence: NDArray[np.intp], sets: ParameterSets
+) -> list[int]:
+    """Trial numbers by rising `mean_errors`, without those that were not run on every sequence."""
+    means = mean_errors(errors, sequence)
+    return [sets.trials[c] for c in np.argsort(means, kind="stable") if means[c] < np.inf]
+
+
 def complementary(data: TrainingData, size: int, spending: Spending | None = None) -> list[int]:
     """Choose sets so that at every training frame one does well: trials, the fixed set's first.
 

@@ -27,7 +27,6 @@ from adaptune.model.rules import (
     Rule,
     Spending,
     TrainingData,
-    mean_errors,
 )
 from adaptune.space import ParameterSets, Selection
 
@@ -38,8 +37,6 @@ UNTRIED_MEAN_SQUARE = 4.0
 EVEN_SHARE = 0.5
 """Added to the members' mean squares, as a share of their harmonic mean, for weights that are more
 even."""
-MEMBER_POOL_SIZE = 64
-"""A bank's members are searched for among this many of the best sets."""
 MEMBER_CLIP = 6.0
 """Where members are chosen, `clip_errors` clips at this many times the fixed set's."""
 
@@ -124,7 +121,7 @@ class BankRule(Rule):
         self.products_ = np.empty((len(data.features), len(members), len(members)), np.float32)
         for s in np.unique(data.sequence):
             frames = data.sequence == s
-            vectors, lost = clip_errors(data.vectors[frames], 0, self.settings.clip)
+            vectors, lost = clip_errors(data.vectors[frames], self.settings.clip)
             self.products_[frames] = np.einsum("ijx,ikx->ijk", vectors, vectors)
             self.products_[frames] += lost[:, :, None] ** 2 * np.eye(len(members))
         self.fixed_squares_ = self.products_[:, 0, 0].astype(np.float64)
@@ -224,19 +221,19 @@ def _untried(n_members: int) -> NDArray[np.float64]:
 
 
 def clip_errors(
-    vectors: NDArray[np.float32], fixed_at: int, clip: float
+    vectors: NDArray[np.float32], clip: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Clip the errors on the frames of a sequence.
 
-    Vectors are percent, of shape (n_frames, n_sets, 3), not finite where the track was lost;
-    `fixed_at` is the fixed set's column, `clip` in times its root mean square.
+    Vectors are percent, of shape (n_frames, n_sets, 3), not finite where the track was lost. `clip`
+    is in times the root mean square of the first set, which is the fixed one.
 
     Returns vectors of the same shape, zero where the track was lost, and what counts there instead,
     in no direction, of shape (n_frames, n_sets), zero elsewhere.
     """
     lengths = np.linalg.norm(vectors, axis=-1)
     lost = ~(lengths <= FAILURE)
-    of_fixed = np.where(lost[:, fixed_at], FAILURE, lengths[:, fixed_at])
+    of_fixed = np.where(lost[:, 0], FAILURE, lengths[:, 0])
     most = clip * np.sqrt((of_fixed**2).mean() + ERROR_FLOOR**2)
     share = np.minimum(1.0, most / np.maximum(lengths, 1e-9))
     kept = np.where(lost[..., None], 0.0, vectors) * np.where(lost, 0.0, share)[..., None]
@@ -266,35 +263,24 @@ def minimum_variance_weights(squares: NDArray[np.float64]) -> NDArray[np.float64
 
 
 def choose_members(
-    vectors: Sequence[Mapping[int, NDArray[np.float32]]],
-    errors: Sequence[NDArray[np.floating]],
-    sets: ParameterSets,
-    fixed: int,
+    vectors: NDArray[np.float32],
+    sequence: NDArray[np.intp],
+    pool: Sequence[int],
     size: int,
     spending: Spending | None = None,
 ) -> list[int]:
     """Choose sets whose errors cancel each other: trial numbers, the fixed set's first.
 
-    The search is greedy and begins with the fixed set. Each next member is the one that most
-    lowers the mean over the sequences of the root mean square of a weighted mean, if the best
-    weights in every sequence were known.
+    The search is greedy and begins with the fixed set, the first of the pool. Each next member is
+    the one that most lowers the mean over the sequences of the root mean square of a weighted mean,
+    if the best weights in every sequence were known.
 
-    `vectors` has for every sequence the error vectors by trial number, each of shape (n_frames,
-    3); a set without them is not chosen. `errors` has for every sequence percent of shape
-    (n_frames, n_sets), NaN where a set was not run; a set that was not run on every sequence is
-    not chosen.
+    `vectors` are the errors of the pool, of shape (n_frames, n_pool, 3); `sequence` has the number
+    of each frame's.
     """
-    number = np.repeat(np.arange(len(errors)), [len(e) for e in errors])
-    means = mean_errors(np.concatenate(errors), number)
-    best = [
-        sets.trials[c]
-        for c in np.argsort(means, kind="stable")[:MEMBER_POOL_SIZE]
-        if means[c] < np.inf
-    ]
-    pool = [fixed, *(t for t in best if t != fixed and all(t in known for known in vectors))]
     squares = []
-    for known in vectors:
-        few, lost = clip_errors(np.stack([known[trial] for trial in pool], axis=1), 0, MEMBER_CLIP)
+    for s in np.unique(sequence):
+        few, lost = clip_errors(vectors[sequence == s], MEMBER_CLIP)
         rows = few.transpose(0, 2, 1).reshape(-1, len(pool)).astype(np.float64)
         products = (rows.T @ rows + np.diag((lost.astype(np.float64) ** 2).sum(axis=0))) / len(few)
         squares.append(products / (products[0, 0] + ERROR_FLOOR**2))

@@ -62,9 +62,8 @@ def members(spending, size=3):
     rng = np.random.default_rng(0)
     x = rng.normal(0.0, 1.0, (50, 3)).astype(np.float32)
     other = rng.normal(0.0, 1.0, (50, 3)).astype(np.float32)
-    vectors = {0: x, 1: -0.5 * x + other, 2: -x + 0.1 * other, 3: x + 0.2 * other}
-    errors = np.stack([np.linalg.norm(v, axis=1) for v in vectors.values()], axis=1)
-    return choose_members([vectors], [errors], sets(4), 0, size, spending)
+    vectors = np.stack([x, -0.5 * x + other, -x + 0.1 * other, x + 0.2 * other], axis=1)
+    return choose_members(vectors, np.zeros(50, np.intp), range(4), size, spending)
 
 
 def costs(*register):
