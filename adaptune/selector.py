@@ -25,10 +25,7 @@ from adaptune.model.descriptor import (
 )
 from adaptune.model.registry import ADAPTIVE, rule_class
 from adaptune.model.rules import NOVEL_FAMILIARITY, Live
-from adaptune.model.weights import (
-    measured_weights,
-    weighted_selection,
-)
+from adaptune.model.weights import measured_weights, weighted_selection
 from adaptune.odometry.base import Motions
 from adaptune.recording.scan import Scan
 from adaptune.space import ODOMETRY, ParameterSets, ParameterSpace, PooledSpace, Selection
@@ -236,7 +233,7 @@ class Selector(_Measuring):
         # By trial, the error in percent that was measured of a set that did worse than predicted,
         # and until when it counts, in seconds.
         self._worse: dict[int, tuple[float, float]] = {}
-        self._at_work = -np.inf  # until when a bank may not rest, in seconds
+        self._all_work_until = -np.inf  # seconds, before which no member of a bank may rest
         self._resting: frozenset[int] = frozenset()
         self._familiar: deque[float] = deque(maxlen=SELECTIONS_TO_JUDGE_PLACE)
         self._starts: int | None = None
@@ -279,36 +276,34 @@ class Selector(_Measuring):
         self._descriptors.append(descriptor)
         mean = np.stack(self._descriptors).mean(axis=0, dtype=np.float64, keepdims=True)
         feature = self._pca.transform(mean.astype(np.float32))[0]
-        is_foreign = self._rule.needs_known_sensor and self._is_foreign(self._scan)
-        selection = self._choose(feature, is_foreign)
+        self._foreign = self._rule.needs_known_sensor and self._is_foreign(self._scan)
+        self._resting = frozenset()
+        live = Live(self._worse_than_predicted, self._live.squares, self._at_work)
+        selection = self._rule.select(feature, live)._replace(resting=self._resting)
         self._failed = False
         # Where the fixed set does worse than predicted, training's guess is better than none.
-        if is_foreign and self.fixed not in self._worse:
+        if self._foreign and self.fixed not in self._worse:
             selection = self._without_training(selection)
         if self.members and selection.weights is None:
             selection = self._of_those_present(selection)
         if selection.weights is not None:
             weights = np.array([selection.weights[member] for member in self.members])
-            selection = _with_weights(selection, self._weighted(weights))
+            trial, parameters, shared, *_ = self._weighted(weights)
+            selection = selection._replace(trial=trial, parameters=parameters, weights=shared)
         elif selection.trial != self._current:
             self._live.forget()  # the hops were those of another set
             self._switched = self._stamp
         self._current, self._predicted = selection.trial, selection.predicted_error
-        self._resting = selection.resting
         return self._live.estimated(selection)
 
-    def _choose(self, feature: NDArray[np.float64], is_foreign: bool) -> Selection:
-        resting: frozenset[int] = frozenset()
-
-        def at_work(members: Sequence[int], familiarity: float, predicted: float) -> Sequence[int]:
-            nonlocal resting
-            self._familiar.append(0.0 if is_foreign else familiarity)
-            if self._reserve and self._is_enough(predicted):
-                resting = self._reserve
-            return [member for member in members if member not in resting]
-
-        live = Live(self._worse_than_predicted, self._live.squares, at_work)
-        return self._rule.select(feature, live)._replace(resting=resting)
+    def _at_work(
+        self, members: Sequence[int], familiarity: float, predicted: float
+    ) -> Sequence[int]:
+        """See `Live.at_work`."""
+        self._familiar.append(0.0 if self._foreign else familiarity)
+        if self._reserve and self._is_enough(predicted):
+            self._resting = self._reserve
+        return [member for member in members if member not in self._resting]
 
     def _is_new(self) -> bool:
         """Whether training does not know the place."""
@@ -330,10 +325,10 @@ class Selector(_Measuring):
         # What was not worth its cost in training is not, either, where a place is new alone.
         is_new = self._model.bank_adapts and self._is_new()
         if is_new or is_worse or self._failed or self._live.lost:
-            self._at_work = seconds + REMEMBERED
+            self._all_work_until = seconds + REMEMBERED
         # Somebody has to go on.
         present = self._live.present()[np.isin(self.members, self._always)]
-        return seconds >= self._at_work and bool(present.any())
+        return seconds >= self._all_work_until and bool(present.any())
 
     def _worse_than_predicted(self) -> Mapping[int, float]:
         """By trial, what was measured of sets that have done worse than predicted, in percent."""
@@ -372,16 +367,13 @@ class Selector(_Measuring):
 
     def _without_training(self, selection: Selection) -> Selection:
         """What to do where the training says nothing."""
-        fixed = selection.predicted_fixed
-        unknown = selection._replace(
+        return selection._replace(
             trial=self.fixed,
             parameters=self._sets[self.fixed],
-            predicted_error=fixed,
+            weights=selection.weights and self._measured().weights,
+            predicted_error=selection.predicted_fixed,
             familiarity=0.0,
         )
-        if not self.members or selection.weights is None:
-            return unknown
-        return _with_weights(unknown, self._measured())
 
     def _is_foreign(self, scan: Scan) -> bool:
         """Whether the scans seen so far come from a sensor that was not trained with."""
@@ -402,12 +394,6 @@ class Selector(_Measuring):
             )
         self._warned = True
         return True
-
-
-def _with_weights(selection: Selection, weighted: Selection) -> Selection:
-    """Replace what is applied; what is predicted stays as it is."""
-    trial, parameters, weights, *_ = weighted
-    return selection._replace(trial=trial, parameters=parameters, weights=weights)
 
 
 # A selector in a loop that must not stop: one call a scan, and a selection when one is due.
