@@ -553,11 +553,11 @@ def untrained_sets(space: ParameterSpace, n: int = 4) -> ParameterSets:
         candidates = space.from_unit(0.5 * (centre + sobol.random(CANDIDATES)))
         # Rounded, so that sets are apart by what they are, not by what they were drawn as.
         unit = space.to_unit(candidates)
-        apart = np.linalg.norm(unit - centre, axis=1)
-        while len(chosen) < n and apart.max() > 0.0:
-            farthest = int(apart.argmax())
+        distance = np.linalg.norm(unit - centre, axis=1)
+        while len(chosen) < n and distance.max() > 0.0:
+            farthest = int(distance.argmax())
             chosen.append(candidates[farthest])
-            apart = np.minimum(apart, np.linalg.norm(unit - unit[farthest], axis=1))
+            distance = np.minimum(distance, np.linalg.norm(unit - unit[farthest], axis=1))
     return ParameterSets(space, tuple(range(len(chosen))), tuple(chosen))
 
 

@@ -160,8 +160,8 @@ class BankSimulation:
         T_ref_now = self.T_ref_sensor[frame]
         T_ref = np.array([invert(self.T_ref_sensor[frame - n]) @ T_ref_now for n in ago])
         T = invert(T_ref)[:, None] @ T_then_now
-        apart = np.linalg.norm(T[..., :3, 3], axis=-1) + LEVER * rotation_angle(T)
-        found = np.minimum(1.0, MISFIT_PER_METRE * apart).mean(axis=0)
+        misplaced = np.linalg.norm(T[..., :3, 3], axis=-1) + LEVER * rotation_angle(T)
+        found = np.minimum(1.0, MISFIT_PER_METRE * misplaced).mean(axis=0)
         return np.asarray(np.where(np.isnan(found), np.inf, found))
 
     def errors(

@@ -257,8 +257,8 @@ def _logs(
         elif members not in known:
             simulated = bank_errors(left_out, others, fitted, members, BANK_SETTINGS)
             known[members] = [errors for errors, _ in simulated]
-        beside = rival(others.costs.adaptive(bank))
-        pairs += [(errors, beside) for errors in known[members]]
+        of_rival = rival(others.costs.adaptive(bank))
+        pairs += [(errors, of_rival) for errors in known[members]]
     logs = [[log_ratios(one, fixed, stretch) for one in pair] for pair in pairs]
     return np.moveaxis(np.array(logs), -1, 0)
 
