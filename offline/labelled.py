@@ -255,11 +255,11 @@ class LabelledSequence:
     blocks: Mapping[str, int]  # by name, in order, the lengths of the descriptors
     # By trial number (n, 3): errors of the best sets as vectors, see `adaptune.model.TrainingData`.
     vectors: Mapping[int, NDArray[np.float32]] = field(default_factory=dict)
-    # (n,): number of each frame's block, see `offline.choice`
-    blocks_of: NDArray[np.intp] = field(default_factory=lambda: np.empty(0, np.intp))
+    # (n,): number of each frame's block, see `offline.choice`.
+    block: NDArray[np.intp] = field(default_factory=lambda: np.empty(0, np.intp))
     # (n_sets,): the objective that chooses the fixed set, unless it is the errors' mean.
     values: NDArray[np.float64] | None = None
-    block: int = 1  # frames of a sub-trajectory
+    span: int = 1  # frames of a sub-trajectory
     elevation: float = np.nan  # degrees, see `adaptune.model.descriptor.lowest_elevation`
     # (n_sets,): how often the health check restarted each set, infinite if it failed
     restarts: NDArray[np.float64] | None = None
@@ -317,7 +317,7 @@ class LabelledSequence:
             stretch=self.stretch[kept],
             errors=self.errors[kept],
             vectors={trial: vectors[kept] for trial, vectors in self.vectors.items()},
-            blocks_of=self.blocks_of[kept],
+            block=self.block[kept],
             turns=None if turns is None else turns[kept],
             whole=whole and whole.frames(np.isin(whole.known, known)),
         )
@@ -326,7 +326,7 @@ class LabelledSequence:
         """Mean capped errors, of shape (n_blocks, n_sets), or the objective, (1, n_sets)."""
         if self.values is not None:
             return self.values[None]
-        return block_means(self.errors, self.blocks_of)
+        return block_means(self.errors, self.block)
 
     def part(self) -> "LabelledSequence":
         """The same with the part of the simulation that its frames take."""
@@ -438,7 +438,7 @@ class LabelledData(NamedTuple):
 
     def _blocks(self, sequences: Sequence[LabelledSequence], trials: Sequence[int]) -> BlockErrors:
         none, errors = np.zeros(len(trials)), [s.in_blocks() for s in sequences]
-        turns = [block_means(s.turns, s.blocks_of) for s in sequences if s.turns is not None]
+        turns = [block_means(s.turns, s.block) for s in sequences if s.turns is not None]
         return BlockErrors(
             trials,
             np.concatenate(errors),
@@ -602,7 +602,7 @@ def _whole(s: LabelledSequence, trials: Sequence[Trial], config: OfflineConfig) 
         stretch=block,
         errors=errors[frames],
         vectors={},
-        blocks_of=block,
+        block=block,
         values=None if s.values is None else np.array(values),
         restarts=np.array([np.inf if drive.failure else drive.restarts for drive in drives]),
         turns=np.stack(turns, axis=1)[frames],
@@ -664,9 +664,9 @@ def _labelled(
         stretches(simulation, known),
         errors[known],
         frames.blocks,
-        blocks_of=stretches(simulation, known, PER_BLOCK),
+        block=stretches(simulation, known, PER_BLOCK),
         values=None if set(objective) == {"rte"} else np.array(values),
-        block=span(frames.counted, length),
+        span=span(frames.counted, length),
         restarts=np.array(restarts),
         elevation=float(np.nanmedian(frames.elevations)),
     )

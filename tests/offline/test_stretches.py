@@ -132,9 +132,9 @@ def test_a_stretch_takes_its_part_of_everything():
     kept = one.stretch == 1
     some = one.frames(kept)
     # What is left of the drives follows from their errors.
-    blocks = np.unique(one.blocks_of[kept])
+    blocks = np.unique(one.block[kept])
     assert some.in_blocks().shape == (len(blocks), 5)
-    expected = errors[kept & (one.blocks_of == blocks[0]), 0].mean()
+    expected = errors[kept & (one.block == blocks[0]), 0].mean()
     np.testing.assert_allclose(some.whole.in_blocks()[0], [expected, 30.0])
     assert len(some.period) == len(some.errors) == len(some.whole.turns) == kept.sum()
     assert {len(of) for of in some.vectors.values()} == {kept.sum()}
