@@ -1,7 +1,7 @@
 """The labelled data set: what the archive holds about every training sequence."""
 
 from collections import defaultdict
-from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, lru_cache, partial
 from types import MappingProxyType
@@ -30,11 +30,9 @@ from adaptune.model.rules import (
     BASELINE,
     Costs,
     SetCost,
-    Spending,
     allowed_sets,
     best_sets,
 )
-from adaptune.model.weights import MemberWeights
 from adaptune.odometry.factory import Factory
 from adaptune.recording.scan import stretch_numbers
 from adaptune.space import ParameterSets
@@ -130,13 +128,14 @@ class BankSimulation:
         ]
         return self._live[members]
 
-    def agreeing(self, votes: MemberWeights) -> NDArray[np.bool_]:
+    def agreeing(self, members: tuple[int, ...], votes: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Over which scans each member agrees with the others, of shape (n_frames - 1, n_members).
 
-        Members vote with these weights. The reference takes the place of the short registrations.
+        Members vote with weights of shape (n_periods, n_members). The reference takes the place of
+        the short registrations.
         """
-        T_previous_current = self.motions(votes.members)
-        agreement = Agreement(len(votes.members), self.lost_track)
+        T_previous_current = self.motions(members)
+        agreement = Agreement(len(members), self.lost_track)
         agreeing = np.zeros(T_previous_current.shape[:2], bool)
         weights = self._of_steps(votes)
         for i, seconds in enumerate(np.diff(self.stamps) * 1e-9):
@@ -149,9 +148,9 @@ class BankSimulation:
                 agreement.start()
         return agreeing
 
-    def _of_steps(self, weights: MemberWeights) -> NDArray[np.float64]:
+    def _of_steps(self, weights: NDArray[np.float64]) -> NDArray[np.float64]:
         """Weights at every scan but the first, of shape (n_frames - 1, n_members)."""
-        return weights.weights[periods(self.period)[1][1:]]
+        return weights[periods(self.period)[1][1:]]
 
     def _misplaced(
         self, frame: int, T_then_now: Poses, ago: tuple[int, ...]
@@ -165,15 +164,19 @@ class BankSimulation:
         return np.asarray(np.where(np.isnan(found), np.inf, found))
 
     def errors(
-        self, weights: MemberWeights, agreeing: NDArray[np.bool_] | None = None
+        self,
+        members: tuple[int, ...],
+        weights: NDArray[np.float64],
+        agreeing: NDArray[np.bool_] | None = None,
     ) -> NDArray[np.float64]:
         """Capped errors of a bank at every frame, NaN without a sub-trajectory.
 
-        Who agrees is found with the same weights when left out, see `agreeing`.
+        Weights are of shape (n_periods, n_members). Who agrees is found with the same weights when
+        left out, see `agreeing`.
         """
-        agreeing = self.agreeing(weights) if agreeing is None else agreeing
+        agreeing = self.agreeing(members, weights) if agreeing is None else agreeing
         none = np.asarray(~agreeing.any(axis=1))
-        believed = np.where(agreeing[..., None, None], self.motions(weights.members), np.eye(4))
+        believed = np.where(agreeing[..., None, None], self.motions(members), np.eye(4))
         moved = mean_motion(believed, share(self._of_steps(weights), agreeing | none[:, None]))
         T_ref, T_odom = self.T_ref_counted, chained(moved)
         return cap(sub_trajectory_rte(T_ref, T_odom, self.length, ends=self.ends))
@@ -493,20 +496,15 @@ class LabelledData(NamedTuple):
         )
         return data, pca
 
-    @property
-    def spending(self) -> Spending | None:
-        """How a bank may spend the budget; None without a budget."""
-        return Spending.of(self.costs, self.budget)
-
     def member_pool(self, fixed: int) -> list[int]:
         """Trials that the members of a bank are chosen from, the fixed set's first."""
         known = set.intersection(*(set(s.vectors) for s in self.sequences))
         best = best_sets(self.errors(), self.stretches(), self.sets)[:MEMBER_POOL_SIZE]
         return [fixed, *(trial for trial in best if trial != fixed and trial in known)]
 
-    def can_pay(self, members: Sequence[int]) -> bool:
+    def can_pay(self, members: Iterable[int]) -> bool:
         """Whether a bank of these trials stays within the budget, if there is one."""
-        return self.spending is None or self.spending.allows(members)
+        return self.costs.allow(members, self.budget)
 
     def vectors(self, members: Sequence[int]) -> NDArray[np.float32]:
         """Error vectors of some sets on the frames of all sequences, of shape (n, n_members, 3)."""

@@ -22,7 +22,6 @@ from adaptune.model.rules import (
 )
 from adaptune.model.weights import (
     MEMBER_CLIP,
-    MemberWeights,
     bank_weights,
     choose_members,
 )
@@ -269,13 +268,13 @@ def bank_errors(
     fitted: tuple[TrainingData, "ScaledPCA"],
     members: Sequence[int],
     settings: Sequence[BankSettings],
-) -> Iterator[tuple[NDArray[np.float64], MemberWeights]]:
+) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64]]]:
     """Simulate a bank on what is left out, with one settings after the other.
 
     They have the same `clip` and `n_frames`. Its weights are fitted to the others, whose
     `LabelledData.training_data` is given.
 
-    Yields capped errors on the labelled frames, of shape (n,), and weights.
+    Yields capped errors on the labelled frames, of shape (n,), and weights (n_periods, n_members).
     """
     data, pca = fitted
     simulation, members = left_out.simulation, tuple(members)
@@ -285,16 +284,16 @@ def bank_errors(
     near, live = BankRule(settings[0]).fit(of_bank).near(scans), simulation.live(members)
     agreeing: NDArray[np.bool_] | None = None
     for one in settings:
-        votes = MemberWeights(members, bank_weights(near, one, live)[0])
+        weights, _ = bank_weights(near, one, live)
         # Who agrees takes long to find, and hangs on the settings but little.
-        agreeing = simulation.agreeing(votes) if agreeing is None else agreeing
-        yield simulation.errors(votes, agreeing)[left_out.known], votes
+        agreeing = simulation.agreeing(members, weights) if agreeing is None else agreeing
+        yield simulation.errors(members, weights, agreeing)[left_out.known], weights
 
 
 def cancelling_members(data: LabelledData, fixed: int, size: int) -> list[int]:
     """Choose a bank's members, the fixed set first, whose errors cancel: see `choose_members`."""
     pool = data.member_pool(fixed)
-    return choose_members(data.vectors(pool), data.stretches(), pool, size, data.spending)
+    return choose_members(data.vectors(pool), data.stretches(), pool, size, data.can_pay)
 
 
 def complementary_members(data: LabelledData, fixed: int, size: int) -> list[int]:
@@ -306,7 +305,7 @@ def complementary_members(data: LabelledData, fixed: int, size: int) -> list[int
     pool, number = data.member_pool(fixed), data.stretches()
     errors = data.errors()[:, data.sets.columns(pool)]
     few = TrainingData(np.empty((len(errors), 0)), number, errors, data.sets.subset(pool), fixed)
-    chosen = complementary(few, size, data.spending)
+    chosen = complementary(few, size, data.can_pay)
     for trial in pool:
         if len(chosen) < size and trial not in chosen and data.can_pay([*chosen, trial]):
             chosen.append(trial)

@@ -242,7 +242,7 @@ def leave_out(
     if chosen.bank.adapt:
         simulated = bank_errors(sequence, others, fitted, chosen.members, [chosen.bank])
         errors[ADAPTIVE], weights = next(simulated)
-        adapted[ADAPTIVE] = float(1.0 - weights.weights[:, 0].mean())
+        adapted[ADAPTIVE] = float(1.0 - weights[:, 0].mean())
     driven = driven_cost(others, chosen, data.fixed)
     of_rivals = rivals(others, driven)
     costs |= {"baseline": alone(0), "fixed": alone(data.fixed), ADAPTIVE: driven}

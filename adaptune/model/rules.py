@@ -178,21 +178,9 @@ class Costs:
             prepare[cost.preparation] = max(cost.prepare, prepare.get(cost.preparation, 0.0))
         return sum(cost.register for cost in known) + sum(prepare.values()) + self.evidence
 
-
-class Spending(NamedTuple):
-    """How a bank may spend a budget."""
-
-    costs: Costs
-    budget: float = np.inf  # milliseconds of CPU time a scan, with all members and live evidence
-
-    @classmethod
-    def of(cls, costs: Costs | None, budget: float | None) -> Self | None:
-        """How a budget may be spent, if there is one and the costs are known."""
-        return None if costs is None or budget is None else cls(costs, budget)
-
-    def allows(self, members: Sequence[int]) -> bool:
-        """Whether a bank of these trials stays within the budget; of unknown cost, none does."""
-        return self.costs.adaptive(members) <= self.budget + ROUNDING
+    def allow(self, members: Iterable[int], budget: float | None) -> bool:
+        """Whether a bank keeps to a budget, if there is one; of unknown cost, none does."""
+        return budget is None or self.adaptive(members) <= budget + ROUNDING
 
 
 def allowed_sets(
@@ -201,9 +189,7 @@ def allowed_sets(
     """The usable sets that a budget allows one at a time, the fixed one included; None for all."""
     if costs is None:
         return None
-    spending = Spending.of(costs, budget)
-    allows = costs.usable if spending is None else lambda trial: spending.allows([trial])
-    return tuple(trial for trial in sets if trial == fixed or allows(trial))
+    return tuple(t for t in sets if t == fixed or (costs.usable(t) and costs.allow([t], budget)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -269,14 +255,16 @@ def best_sets(
     return [sets.trials[c] for c in np.argsort(means, kind="stable") if means[c] < np.inf]
 
 
-def complementary(data: TrainingData, size: int, spending: Spending | None = None) -> list[int]:
+def complementary(
+    data: TrainingData, size: int, allow: Callable[[list[int]], bool] = lambda _: True
+) -> list[int]:
     """Choose sets so that at every training frame one does well: trials, the fixed set's first.
 
     The search is greedy and begins with the fixed set. Each next set is the one that lowers the
     mean error most if the best of the chosen sets were known at every frame.
 
-    `size` sets, or fewer where another one would lower nothing, or would cost too much. A set that
-    was not run on every sequence is not chosen.
+    `size` sets, or fewer where another one would lower nothing, or `allow` refuses them, as they
+    cost too much. A set that was not run on every sequence is not chosen.
     """
     everywhere = np.isfinite(mean_errors(data.errors, data.sequence)) & data.allows()
     capped = np.where(np.isnan(data.errors) | ~everywhere, np.inf, cap(data.errors))
@@ -285,8 +273,7 @@ def complementary(data: TrainingData, size: int, spending: Spending | None = Non
     while len(chosen) < size:
         means = mean_errors(np.minimum(capped, least[:, None]), data.sequence)
         now = means[data.sets.column(data.fixed)]
-        if spending is not None:
-            means = np.where([spending.allows([*chosen, t]) for t in data.sets], means, np.inf)
+        means = np.where([allow([*chosen, trial]) for trial in data.sets], means, np.inf)
         best = int(np.argmin(means))
         # A set that is chosen already lowers nothing.
         if not means[best] < now:

@@ -1,6 +1,6 @@
 """Weights of the members of a bank, whose motions are averaged."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Annotated, NamedTuple, Self
 
 import numpy as np
@@ -25,7 +25,6 @@ from adaptune.model.rules import (
     Live,
     NearestFrames,
     Rule,
-    Spending,
     TrainingData,
 )
 from adaptune.space import ParameterSets, Selection
@@ -61,13 +60,6 @@ class BankSettings(BaseModel):
     clip: Annotated[PositiveFloat, Field(allow_inf_nan=False)] = 18.0
     # How many of the last members rest where the training knows the place.
     reserve: NonNegativeInt = 0
-
-
-class MemberWeights(NamedTuple):
-    """Weights of a bank's members, period after period."""
-
-    members: tuple[int, ...]  # trial numbers, the fixed set's first
-    weights: NDArray[np.float64]  # (n_periods, n_members)
 
 
 class NearProducts(NamedTuple):
@@ -267,7 +259,7 @@ def choose_members(
     sequence: NDArray[np.intp],
     pool: Sequence[int],
     size: int,
-    spending: Spending | None = None,
+    allow: Callable[[list[int]], bool] = lambda _: True,
 ) -> list[int]:
     """Choose sets whose errors cancel each other: trial numbers, the fixed set's first.
 
@@ -276,7 +268,7 @@ def choose_members(
     if the best weights in every sequence were known.
 
     `vectors` are the errors of the pool, of shape (n_frames, n_pool, 3); `sequence` has the number
-    of each frame's.
+    of each frame's, and `allow` says whether a bank may be of some trials.
     """
     squares = []
     for s in np.unique(sequence):
@@ -286,7 +278,7 @@ def choose_members(
         squares.append(products / (products[0, 0] + ERROR_FLOOR**2))
     chosen = [0]
     while len(chosen) < min(size, len(pool)):
-        next_one = _next_member(squares, pool, chosen, spending)
+        next_one = _next_member(squares, pool, chosen, allow)
         if next_one is None:
             break
         chosen.append(next_one)
@@ -297,13 +289,11 @@ def _next_member(
     squares: list[NDArray[np.float64]],
     pool: Sequence[int],
     chosen: Sequence[int],
-    spending: Spending | None,
+    allow: Callable[[list[int]], bool],
 ) -> int | None:
     """Place in `pool` of the set that most lowers the error of those chosen; None if none may."""
-    rest = [j for j in range(len(pool)) if j not in chosen]
     members = [pool[j] for j in chosen]
-    if spending is not None:
-        rest = [j for j in rest if spending.allows([*members, pool[j]])]
+    rest = [j for j in range(len(pool)) if j not in chosen and allow([*members, pool[j]])]
     lowered = {j: _root_mean_square(squares, [*chosen, j]) for j in rest}
     return min(rest, key=lowered.__getitem__, default=None)
 

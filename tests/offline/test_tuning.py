@@ -112,9 +112,9 @@ def test_a_bank_is_simulated_with_the_weights_of_each_period(monkeypatch):
     seen = []
     simulate = BankSimulation.errors
 
-    def errors(self, weights, agreeing):
-        seen.append(weights.weights)
-        return simulate(self, weights, agreeing)
+    def errors(self, members, weights, agreeing):
+        seen.append(weights)
+        return simulate(self, members, weights, agreeing)
 
     def bank_weights(near, _, live):
         assert len(live) == len(near.fixed)
