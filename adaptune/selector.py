@@ -404,7 +404,7 @@ BACK = 10**9
 anew."""
 
 
-class Schedule:
+class Periods:
     """Says when a selection is due: at the first scan, and at the first of every further period.
 
     The period is in the unit of what `due` is asked, such as nanoseconds.
@@ -448,13 +448,13 @@ class TimedSelector:
         if not period > 0:
             raise ValueError("the period must be above 0")
         self._selector = selector
-        self._schedule = Schedule(period * 1e9)
+        self._periods = Periods(period * 1e9)
         self._lock = threading.Lock()
         self._begin()
 
     def _begin(self) -> None:
         self._selector.reset()
-        self._schedule.reset()
+        self._periods.reset()
         self._stamp: int | None = None
         self._unmeasured = self._failing = False
         self._owed: Selection | None = None  # for the next update to return
@@ -507,7 +507,7 @@ class TimedSelector:
     def _selected(self, stamp: int, scan: Scan, motions: Motions) -> Selection | None:
         self._measure()
         self._selector.observe(stamp, scan, motions)
-        if not self._schedule.due(stamp):
+        if not self._periods.due(stamp):
             return None
         selection = self._selector.select()
         self._unmeasured, self._failing = True, False

@@ -56,7 +56,7 @@ from offline.objective import (
     judge,
     label,
 )
-from offline.search import BUDGETS, ELAPSED, Clock, Finished
+from offline.search import BUDGETS, ELAPSED, Finished, Stopwatch
 from offline.tuning import NO_BANK, choose, driven_cost, reserve, rivals
 from offline.workers import Cluster, Pool, Workers, spare_memory
 
@@ -104,7 +104,7 @@ def train(
     study: OfflineStudy,
     progress: Progress = unseen,
     cluster: str | None = None,
-    clock: Clock | None = None,
+    clock: Stopwatch | None = None,
 ) -> Training:
     """Estimate the references that are lacking, run the trials that are, and fit the model.
 
@@ -117,7 +117,7 @@ def train(
     """
     if not any(study.odometry.space.baselines):
         raise AdaptuneError("odometry.parameters: is empty, so there is nothing to tune; name some")
-    clock = clock or Clock(study.folder / ELAPSED)
+    clock = clock or Stopwatch(study.folder / ELAPSED)
     archive = _ready_archive(study, progress)
     config, names, space = study.config.offline, study.training, study.odometry.space
     with trial_workers(study, names, cluster) as workers:
@@ -175,7 +175,7 @@ def _note_left_out(
 
 
 def _searched(
-    study: OfflineStudy, archive: Archive, workers: Pool[Any], progress: Progress, clock: Clock
+    study: OfflineStudy, archive: Archive, workers: Pool[Any], progress: Progress, clock: Stopwatch
 ) -> dict[int, Verdict]:
     """Drive the baseline, say how long the rest takes, and try sets."""
     run_baseline(study, archive, workers, progress)
