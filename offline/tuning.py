@@ -1,6 +1,6 @@
 """Choice of what is driven: the fixed set, or a bank, and with what settings.
 
-They are compared by their expected loss on evidence that is left out, see `expected_loss`.
+They are compared by their expected loss on what is left out, see `expected_loss`.
 """
 
 from collections.abc import Iterator, Sequence
@@ -141,7 +141,7 @@ BANK_SETTINGS = [
 ]
 """A bank is driven with one of these; of equally good ones the first."""
 MOST_FOLDS = 12
-"""So many folds at most compare ways to adapt where evidence is left out already."""
+"""So many folds at most compare ways to adapt where something is left out already."""
 ROUNDING = 1e-6
 """A smaller loss, or gain, is one of rounding."""
 NO_BANK = BankSettings(adapt=False, sharpness=SHARPNESS, n_frames=N_FRAMES, clip=MEMBER_CLIP)

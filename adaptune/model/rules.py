@@ -16,17 +16,17 @@ if TYPE_CHECKING:
     from adaptune.model.weights import BankSettings
 
 NOVEL_FAMILIARITY = 0.1
-"""Familiarity below which evidence counts less and less."""
+"""Familiarity below which the nearest training frames count less and less."""
 _QUANTILES = 10
 """Of the distances of each training sequence's frames from the other sequences."""
 
 
-class Evidence(NamedTuple):
+class NearFrames(NamedTuple):
     """The training frames nearest to some scans."""
 
     # (n_scans, n_near): for each training sequence, numbers of its frames that are nearest to each
     # scan.
-    frames: tuple[NDArray[np.intp], ...]
+    numbers: tuple[NDArray[np.intp], ...]
     squared: NDArray[np.float64]  # (n_scans, n_sequences): mean squared distance of these frames
     # (n_scans,): share of the training frames that are farther from the other sequences than each
     # scan is from all of them; NaN of a single sequence, which has no others.
@@ -34,7 +34,7 @@ class Evidence(NamedTuple):
 
     @property
     def trust(self) -> NDArray[np.float64]:
-        """How far it counts for each scan, from 0 to 1: fully where familiarity is unknown."""
+        """How far they count for each scan, from 0 to 1: fully where familiarity is unknown."""
         return np.asarray(np.fmin(1.0, self.familiarity / NOVEL_FAMILIARITY))
 
     def weights(self, sharpness: float) -> NDArray[np.float64]:
@@ -57,7 +57,7 @@ class Evidence(NamedTuple):
         Returns shape (n_scans, n_sequences, ...).
         """
         means = np.empty((*self.squared.shape, *values.shape[1:]))
-        for s, frames in enumerate(self.frames):
+        for s, frames in enumerate(self.numbers):
             # All frames are near to every scan: the mean is the same.
             same = frames.strides[0] == 0
             near = values[frames[:1]] if same else values[frames]
@@ -66,7 +66,7 @@ class Evidence(NamedTuple):
 
 
 class NearestFrames:
-    """Finds the evidence about scenes."""
+    """Finds the training frames that are nearest to scans."""
 
     def __init__(self, n_frames: int):
         self.n_frames = n_frames
@@ -81,21 +81,21 @@ class NearestFrames:
         self.distances_ = self._distances_between_sequences()
         return self
 
-    def about(self, features: NDArray[np.float64]) -> Evidence:
-        """Find the evidence about scans.
+    def near(self, features: NDArray[np.float64]) -> NearFrames:
+        """Find the frames that are nearest to scans.
 
         Features are of shape (n_scans, n_features).
         """
         squared = np.empty((len(features), len(self.members_)))
-        frames = []
+        numbers = []
         for s, (members, own) in enumerate(zip(self.members_, self.features_, strict=True)):
             squared[:, s], nearest = _nearest(own, features, self.n_frames)
-            frames.append(members[nearest])
+            numbers.append(members[nearest])
         familiarity = np.full(len(features), np.nan)
         if len(self.distances_):
             below = np.searchsorted(self.distances_, squared.min(axis=1), side="left")
             familiarity = 1.0 - below / len(self.distances_)
-        return Evidence(tuple(frames), squared, familiarity)
+        return NearFrames(tuple(numbers), squared, familiarity)
 
     def _distances_between_sequences(self) -> NDArray[np.float64]:
         """Sorted distances of training frames from the other sequences, as many of each."""
@@ -355,12 +355,10 @@ class FixedSet(Rule):
 
     def select(self, feature: NDArray[np.float64], live: Live = NOTHING) -> Selection:
         """See `Rule.select`."""
-        evidence = self.nearest_.about(feature[None])
-        (predicted,) = np.einsum(
-            "qs,qsj->qj", evidence.weights(SHARPNESS), evidence.means(self.errors_)
-        )
+        near = self.nearest_.near(feature[None])
+        (predicted,) = np.einsum("qs,qsj->qj", near.weights(SHARPNESS), near.means(self.errors_))
         fixed = float(predicted[0])
-        predicted = fixed + evidence.trust[0] * (predicted - fixed)
+        predicted = fixed + near.trust[0] * (predicted - fixed)
         errors = dict(zip(self.trials_, predicted.tolist(), strict=True))
         trial, measured = self.data_.fixed, live.worse()
         if trial in measured:
@@ -371,5 +369,5 @@ class FixedSet(Rule):
             self.data_.sets[trial],
             predicted_error=float(predicted[self.trials_.index(trial)]),
             predicted_fixed=fixed,
-            familiarity=float(evidence.familiarity[0]),
+            familiarity=float(near.familiarity[0]),
         )

@@ -20,10 +20,10 @@ from adaptune.metrics import FAILURE
 from adaptune.model.rules import (
     ERROR_FLOOR,
     NOTHING,
-    Evidence,
     FixedSet,
     Live,
     NearestFrames,
+    NearFrames,
     Rule,
     TrainingData,
 )
@@ -66,7 +66,7 @@ class NearProducts(NamedTuple):
     """Products of errors on the training frames nearest to some scans."""
 
     members: tuple[int, ...]  # trial numbers
-    evidence: Evidence
+    frames: NearFrames
     # (n_scans, n_sequences, n_members, n_members): mean products of the members' errors, percent
     # squared.
     products: NDArray[np.float64]
@@ -125,20 +125,20 @@ class BankRule(Rule):
 
         Features are of shape (n_scans, n_features).
         """
-        evidence = self.nearest_.about(features)
-        products, fixed = evidence.means(self.products_), evidence.means(self.fixed_squares_)
-        return NearProducts(self.members_, evidence, products, fixed)
+        frames = self.nearest_.near(features)
+        products, fixed = frames.means(self.products_), frames.means(self.fixed_squares_)
+        return NearProducts(self.members_, frames, products, fixed)
 
     def select(self, feature: NDArray[np.float64], live: Live = NOTHING) -> Selection:
         """See `Rule.select`."""
         near = self.near(feature[None])
-        familiarity = float(near.evidence.familiarity[0])
+        familiarity = float(near.frames.familiarity[0])
         members = live.at_work(self.members_, familiarity, self.predicted_fixed(near))
         return self.weigh(near.of(members), live.squares(members))
 
     def predicted_fixed(self, near: NearProducts) -> float:
         """Root mean square of the fixed set's error that is expected for one scan, in percent."""
-        (of_sequences,) = near.evidence.weights(self.settings.sharpness)
+        (of_sequences,) = near.frames.weights(self.settings.sharpness)
         return float(np.sqrt(of_sequences @ near.fixed[0]))
 
     def weigh(self, near: NearProducts, live: LiveSquares | None) -> Selection:
@@ -153,7 +153,7 @@ class BankRule(Rule):
         return weighted_selection(self.data_.sets, of_members)._replace(
             predicted_error=float(ratio) * fixed,
             predicted_fixed=fixed,
-            familiarity=float(near.evidence.familiarity[0]),
+            familiarity=float(near.frames.familiarity[0]),
         )
 
 
@@ -172,12 +172,12 @@ def bank_weights(
     n_members), ratios to the fixed set's root mean square of shape (n_scans,).
     """
     relative = near.products / (near.fixed + ERROR_FLOOR**2)[..., None, None]
-    of_sequences = near.evidence.weights(settings.sharpness)
-    trust = near.evidence.trust[:, None, None]
+    of_sequences = near.frames.weights(settings.sharpness)
+    trust = near.frames.trust[:, None, None]
     learned = np.einsum("qs,qsjk->qjk", of_sequences, relative)
     learned = trust * learned + (1.0 - trust) * _untried(len(near.members))
     windows = settings.prior_windows * (
-        UNFAMILIAR_PRIOR_SHARE + (1.0 - UNFAMILIAR_PRIOR_SHARE) * near.evidence.trust
+        UNFAMILIAR_PRIOR_SHARE + (1.0 - UNFAMILIAR_PRIOR_SHARE) * near.frames.trust
     )
     squares = np.array([blend(*of_scan) for of_scan in zip(learned, windows, live, strict=True)])
     weights = np.array([minimum_variance_weights(of_scan) for of_scan in squares])

@@ -120,7 +120,7 @@ def test_a_bank_is_simulated_with_the_weights_of_each_period(monkeypatch):
         assert len(live) == len(near.fixed)
         weights = np.zeros((len(near.fixed), near.products.shape[-1]))
         weights[::2, 0] = weights[1::2, 1] = 1.0
-        near.evidence.familiarity[:] = 1.0
+        near.frames.familiarity[:] = 1.0
         return weights, np.ones(len(weights))
 
     monkeypatch.setattr(BankSimulation, "errors", errors)

@@ -95,7 +95,7 @@ def test_in_a_place_unlike_all_others_what_is_measured_counts_for_more(monkeypat
     # The training says 1 and 2; driving says 0.
     live = LiveSquares(np.diag([1.0, 4.0, 4.0, 4.0]), 0.0, 3.0)
     known, new = data.features[5], np.array([500.0, 0.0])
-    (near,) = rule.near(new[None]).evidence.trust
+    (near,) = rule.near(new[None]).frames.trust
     assert near == 0.0
     assert rule.select(new).familiarity == 0.0
     assert (
