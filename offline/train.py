@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from adaptune import __version__, manifest, trial_rows, yaml12
-from adaptune.archive import Archive
+from adaptune.archive import Archive, Summary
 from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
 from adaptune.machine import available
@@ -22,7 +22,7 @@ from adaptune.progress import Progress, unseen
 from adaptune.recording.config import NO_REFERENCE
 from adaptune.reference.check import hard_to_track
 from adaptune.report import tables
-from adaptune.space import ParameterSet, ParameterSets, ParameterSpace, in_words
+from adaptune.space import ParameterSet, ParameterSets, in_words
 from adaptune.study.config import StudyConfig, SwitchingConfig
 from adaptune.study.driven import RIVALS
 from adaptune.study.oracle import OracleErrors, oracle_errors
@@ -143,8 +143,7 @@ def train(
     tables.write_rows(study.folder, "trials", trials)
     estimates = estimates_of(study.sequences, names)
     errors = {name: stored.error(model.length) for name, stored in estimates.items()}
-    rows = _training_rows(config, verdicts, finished, fixed, whole, errors, space)
-    _note_left_out(rows, usable, whole)
+    rows = _training_rows(usable, verdicts, finished, fixed, whole, errors, config)
     tables.write_rows(study.folder, "training", rows)
     said = lost_in_words(
         f"the fixed set, the best of {len(trials)} parameter sets,",
@@ -161,17 +160,12 @@ def train(
     return Training(model, trials, rows, said, failed, rows_of_front, elsewhere)
 
 
-def _note_left_out(
-    rows: Sequence[dict[str, Any]], usable: LabelledData, whole: WholeDrives
-) -> None:
-    """Add to the row of each sequence the error of the trial that the other recordings choose."""
-    for row, sequence in zip(rows, usable.sequences, strict=True):
-        row["_left out"] = None
-        if not (others := usable.without(sequence)).sequences:
-            continue
-        with contextlib.suppress(NothingUsableError):
-            run = whole[sequence.name].get(others.fixed())
-            row["_left out"] = run and run.mean_error
+def _left_out(others: LabelledData, drives: Mapping[int, Summary]) -> float | None:
+    """Error on a sequence, whose drives these are, of the set that other recordings choose."""
+    with contextlib.suppress(NothingUsableError):
+        if others.sequences and (run := drives.get(others.fixed())):
+            return run.mean_error
+    return None
 
 
 def _searched(
@@ -296,19 +290,20 @@ def _trial_rows(
 
 
 def _training_rows(
-    config: OfflineConfig,
+    usable: LabelledData,
     verdicts: Mapping[int, Verdict],
     finished: Finished,
     fixed: int,
     whole: WholeDrives,
     reference_errors: Mapping[str, float],
-    space: ParameterSpace,
+    config: OfflineConfig,
 ) -> list[dict[str, Any]]:
     """A row for every training sequence, with the set that has the least error there."""
     rows = []
-    for name, runs in finished.items():
-        usable = {n: v.value for n, run in runs.items() if not (v := judge(config, [run])).failure}
-        best = min(usable, key=usable.__getitem__)
+    for sequence in usable.sequences:
+        name, runs = sequence.name, finished[sequence.name]
+        values = {n: v.value for n, run in runs.items() if not (v := judge(config, [run])).failure}
+        best = min(values, key=values.__getitem__)
         error = reference_errors.get(name)
         row = {
             "sequence": name,
@@ -323,8 +318,9 @@ def _training_rows(
             "_reference": "given" if error is None else "estimated",
             "_reference_error": error,
         }
-        own = space.row(verdicts[best].parameters)
-        rows.append(row | {f"_own best {key}": value for key, value in own.items()})
+        own = usable.sets.space.row(verdicts[best].parameters)
+        row |= {f"_own best {key}": value for key, value in own.items()}
+        rows.append(row | {"_left out": _left_out(usable.without(sequence), whole[name])})
     return rows
 
 
