@@ -81,27 +81,27 @@ def release_memory() -> None:
 
 
 @contextmanager
-def apart() -> Iterator[None]:
+def freeing_large_arrays() -> Iterator[None]:
     """Let large arrays that are made meanwhile go back to the system as soon as they are free.
 
     By default, the C library keeps them among small ones. Where a process holds many arrays of
     different sizes and replaces them time after time, as prepared scans, the holes between them
     then take several times what they hold. It costs some time for each array.
     """
-    global _apart  # noqa: PLW0603 - the setting is that of the process
+    global _n_blocks  # noqa: PLW0603 - the setting is that of the process
     mallopt = ctypes.CDLL(None).mallopt
-    _apart += 1
+    _n_blocks += 1
     mallopt(_M_MMAP_THRESHOLD, _LARGE)
     try:
         yield
     finally:
-        _apart -= 1
-        if not _apart:
+        _n_blocks -= 1
+        if not _n_blocks:
             mallopt(_M_MMAP_THRESHOLD, _LARGEST)
 
 
 _M_MMAP_THRESHOLD, _LARGE, _LARGEST = -3, 256 * 1024, 32 * 1024**2
 """The number of the setting in malloc.h; bytes of arrays that are kept apart, and to what glibc
 raises that by itself as such arrays become free."""
-_apart = 0
-"""In how many blocks of `apart` this process is."""
+_n_blocks = 0
+"""In how many blocks of `freeing_large_arrays` this process is."""

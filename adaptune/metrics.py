@@ -51,8 +51,8 @@ def travelled(T_world_sensor: Poses) -> NDArray[np.float64]:
 
 def _shaking(positions: NDArray[np.float64]) -> float:
     """Standard deviation in metres, along an axis, of the noise of positions of shape (n, 3)."""
-    apart = np.linalg.norm(np.diff(positions, n=2, axis=0), axis=1)
-    known = apart[np.isfinite(apart)]
+    bends = np.linalg.norm(np.diff(positions, n=2, axis=0), axis=1)
+    known = bends[np.isfinite(bends)]
     # The difference of differences has six times the variance, and its median is 1.54 of it.
     return float(np.median(known)) / (1.54 * 6.0**0.5) if len(known) else 0.0
 

@@ -54,10 +54,10 @@ def bars(console: "Console") -> Iterator[Progress]:
         get_time=time.monotonic,
     )
     tasks: dict[str, TaskID] = {}
-    log, told = logging.getLogger("adaptune"), time.monotonic()
+    log, logged = logging.getLogger("adaptune"), time.monotonic()
 
     def show(what: str, done: float, total: int, remark: str = "", /) -> None:
-        nonlocal told
+        nonlocal logged
         if what not in tasks:
             over = [task.id for task in shown.tasks if task.finished]
             for finished in over[:-MOST_FINISHED]:
@@ -72,8 +72,8 @@ def bars(console: "Console") -> Iterator[Progress]:
         shown.update(task.id, completed=done, total=max(total, done))
         words = ", ".join(filter(None, (_time_left(task), remark)))
         shown.update(task.id, remark=words)
-        if not console.is_terminal and time.monotonic() - told > LOG_EVERY:
-            told = time.monotonic()
+        if not console.is_terminal and time.monotonic() - logged > LOG_EVERY:
+            logged = time.monotonic()
             log.info("%s: %d of %d%s", what, done, total, words and f", {words}")
 
     with shown if console.is_terminal else nullcontext():

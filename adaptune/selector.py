@@ -25,10 +25,7 @@ from adaptune.model.descriptor import (
 )
 from adaptune.model.registry import ADAPTIVE, rule_class
 from adaptune.model.rules import NOVEL_FAMILIARITY, Live
-from adaptune.model.weights import (
-    measured_weights,
-    weighted_selection,
-)
+from adaptune.model.weights import measured_weights, weighted_selection
 from adaptune.odometry.base import Motions
 from adaptune.recording.scan import Scan
 from adaptune.space import ODOMETRY, ParameterSets, ParameterSpace, PooledSpace, Selection
@@ -85,10 +82,15 @@ class _Measuring:
     """What selectors of a bank, or of a single odometry, have in common: they measure it."""
 
     def __init__(
-        self, sets: ParameterSets, fixed: int, members: Sequence[int], length: float, weighs: bool
+        self,
+        sets: ParameterSets,
+        fixed: int,
+        members: Sequence[int],
+        length: float,
+        gives_weights: bool,
     ):
         self.fixed, self.members = fixed, tuple(members)
-        self._sets, self._weighs = sets, weighs
+        self._sets, self._gives_weights = sets, gives_weights
         self._always: Sequence[int] = self.members  # those that never rest
         self._usual_spread = -1.0  # of the members in training; any is more where nobody knows it
         self._live = LiveEvidence(self.members, length)
@@ -120,7 +122,7 @@ class _Measuring:
 
         No member of a bank is a better guess than those that agree, see `Agreement`.
         """
-        if not self._weighs:
+        if not self._gives_weights:
             return Selection(self.fixed, self._sets[self.fixed])
         share = 1.0 / len(self._always)
         weights = {member: share * (member in self._always) for member in self.members}
@@ -191,21 +193,21 @@ class Selector(_Measuring):
         model.check_descriptors(descriptors)
         cls = rule_class(rule)
         if members is None:
-            drives_bank = cls.weighs and (model.bank_adapts or model.bank_rests)
+            drives_bank = cls.gives_weights and (model.bank_adapts or model.bank_rests)
             members = model.bank if drives_bank else ()
-        weighs = bool(members) and cls.weighs
+        gives_weights = bool(members) and cls.gives_weights
         fixed = members[0] if members else model.fixed
-        super().__init__(model.sets, fixed, members, model.length, weighs)
+        super().__init__(model.sets, fixed, members, model.length, gives_weights)
         self._model = model
         self._pca = model.pca()
-        self._reserve = frozenset(model.reserve if weighs else ()).intersection(self.members)
+        self._reserve = frozenset(model.reserve if gives_weights else ()).intersection(self.members)
         self._always = [member for member in self.members if member not in self._reserve]
-        if weighs:
+        if gives_weights:
             vectors = model.vectors[:, [model.bank.index(member) for member in self._always]]
             spreads = spread_of(np.where(np.isfinite(vectors), vectors, FAILURE))
             self._usual_spread = float(np.quantile(spreads, UNUSUAL))
         data = model.training_data(self._pca, self.members or None)
-        self._rule = cls.of(model, weighs).fit(data)
+        self._rule = cls.of(model.bank_settings if gives_weights else None).fit(data)
         self._describe = Describer(model.blocks)
         if self._describe.blocks != model.blocks:
             raise DescriptorError(
@@ -231,7 +233,7 @@ class Selector(_Measuring):
         # By trial, the error in percent that was measured of a set that did worse than predicted,
         # and until when it counts, in seconds.
         self._worse: dict[int, tuple[float, float]] = {}
-        self._at_work = -np.inf  # until when a bank may not rest, in seconds
+        self._all_work_until = -np.inf  # seconds, before which no member of a bank may rest
         self._resting: frozenset[int] = frozenset()
         self._familiar: deque[float] = deque(maxlen=SELECTIONS_TO_JUDGE_PLACE)
         self._starts: int | None = None
@@ -274,36 +276,34 @@ class Selector(_Measuring):
         self._descriptors.append(descriptor)
         mean = np.stack(self._descriptors).mean(axis=0, dtype=np.float64, keepdims=True)
         feature = self._pca.transform(mean.astype(np.float32))[0]
-        is_foreign = self._rule.gated and self._is_foreign(self._scan)
-        selection = self._choose(feature, is_foreign)
+        self._foreign = self._rule.needs_known_sensor and self._is_foreign(self._scan)
+        self._resting = frozenset()
+        live = Live(self._worse_than_predicted, self._live.squares, self._at_work)
+        selection = self._rule.select(feature, live)._replace(resting=self._resting)
         self._failed = False
         # Where the fixed set does worse than predicted, training's guess is better than none.
-        if is_foreign and self.fixed not in self._worse:
+        if self._foreign and self.fixed not in self._worse:
             selection = self._without_training(selection)
         if self.members and selection.weights is None:
             selection = self._of_those_present(selection)
         if selection.weights is not None:
             weights = np.array([selection.weights[member] for member in self.members])
-            selection = _with_weights(selection, self._weighted(weights))
+            trial, parameters, shared, *_ = self._weighted(weights)
+            selection = selection._replace(trial=trial, parameters=parameters, weights=shared)
         elif selection.trial != self._current:
             self._live.forget()  # the hops were those of another set
             self._switched = self._stamp
         self._current, self._predicted = selection.trial, selection.predicted_error
-        self._resting = selection.resting
         return self._live.estimated(selection)
 
-    def _choose(self, feature: NDArray[np.float64], is_foreign: bool) -> Selection:
-        resting: frozenset[int] = frozenset()
-
-        def at_work(members: Sequence[int], familiarity: float, predicted: float) -> Sequence[int]:
-            nonlocal resting
-            self._familiar.append(0.0 if is_foreign else familiarity)
-            if self._reserve and self._is_enough(predicted):
-                resting = self._reserve
-            return [member for member in members if member not in resting]
-
-        live = Live(self._worse_than_predicted, self._live.squares, at_work)
-        return self._rule.select(feature, live)._replace(resting=resting)
+    def _at_work(
+        self, members: Sequence[int], familiarity: float, predicted: float
+    ) -> Sequence[int]:
+        """See `Live.at_work`."""
+        self._familiar.append(0.0 if self._foreign else familiarity)
+        if self._reserve and self._is_enough(predicted):
+            self._resting = self._reserve
+        return [member for member in members if member not in self._resting]
 
     def _is_new(self) -> bool:
         """Whether training does not know the place."""
@@ -311,7 +311,7 @@ class Selector(_Measuring):
 
     def _in_doubt(self) -> bool:
         """Whether a bank at work is in a new place, or differs by more than in training."""
-        at_work = self._weighs and self._resting != frozenset(self.members[1:])
+        at_work = self._gives_weights and self._resting != frozenset(self.members[1:])
         return at_work and (self._is_new() or super()._in_doubt())
 
     def _is_enough(self, predicted: float) -> bool:
@@ -325,10 +325,10 @@ class Selector(_Measuring):
         # What was not worth its cost in training is not, either, where a place is new alone.
         is_new = self._model.bank_adapts and self._is_new()
         if is_new or is_worse or self._failed or self._live.lost:
-            self._at_work = seconds + REMEMBERED
+            self._all_work_until = seconds + REMEMBERED
         # Somebody has to go on.
         present = self._live.present()[np.isin(self.members, self._always)]
-        return seconds >= self._at_work and bool(present.any())
+        return seconds >= self._all_work_until and bool(present.any())
 
     def _worse_than_predicted(self) -> Mapping[int, float]:
         """By trial, what was measured of sets that have done worse than predicted, in percent."""
@@ -367,16 +367,13 @@ class Selector(_Measuring):
 
     def _without_training(self, selection: Selection) -> Selection:
         """What to do where the training says nothing."""
-        fixed = selection.predicted_fixed
-        unknown = selection._replace(
+        return selection._replace(
             trial=self.fixed,
             parameters=self._sets[self.fixed],
-            predicted_error=fixed,
+            weights=selection.weights and self._measured().weights,
+            predicted_error=selection.predicted_fixed,
             familiarity=0.0,
         )
-        if not self.members or selection.weights is None:
-            return unknown
-        return _with_weights(unknown, self._measured())
 
     def _is_foreign(self, scan: Scan) -> bool:
         """Whether the scans seen so far come from a sensor that was not trained with."""
@@ -399,12 +396,6 @@ class Selector(_Measuring):
         return True
 
 
-def _with_weights(selection: Selection, weighted: Selection) -> Selection:
-    """Replace what is applied; what is predicted stays as it is."""
-    trial, parameters, weights, *_ = weighted
-    return selection._replace(trial=trial, parameters=parameters, weights=weights)
-
-
 # A selector in a loop that must not stop: one call a scan, and a selection when one is due.
 
 
@@ -413,7 +404,7 @@ BACK = 10**9
 anew."""
 
 
-class Schedule:
+class Periods:
     """Says when a selection is due: at the first scan, and at the first of every further period.
 
     The period is in the unit of what `due` is asked, such as nanoseconds.
@@ -457,13 +448,13 @@ class TimedSelector:
         if not period > 0:
             raise ValueError("the period must be above 0")
         self._selector = selector
-        self._schedule = Schedule(period * 1e9)
+        self._periods = Periods(period * 1e9)
         self._lock = threading.Lock()
         self._begin()
 
     def _begin(self) -> None:
         self._selector.reset()
-        self._schedule.reset()
+        self._periods.reset()
         self._stamp: int | None = None
         self._unmeasured = self._failing = False
         self._owed: Selection | None = None  # for the next update to return
@@ -516,7 +507,7 @@ class TimedSelector:
     def _selected(self, stamp: int, scan: Scan, motions: Motions) -> Selection | None:
         self._measure()
         self._selector.observe(stamp, scan, motions)
-        if not self._schedule.due(stamp):
+        if not self._periods.due(stamp):
             return None
         selection = self._selector.select()
         self._unmeasured, self._failing = True, False
@@ -562,11 +553,11 @@ def untrained_sets(space: ParameterSpace, n: int = 4) -> ParameterSets:
         candidates = space.from_unit(0.5 * (centre + sobol.random(CANDIDATES)))
         # Rounded, so that sets are apart by what they are, not by what they were drawn as.
         unit = space.to_unit(candidates)
-        apart = np.linalg.norm(unit - centre, axis=1)
-        while len(chosen) < n and apart.max() > 0.0:
-            farthest = int(apart.argmax())
+        distance = np.linalg.norm(unit - centre, axis=1)
+        while len(chosen) < n and distance.max() > 0.0:
+            farthest = int(distance.argmax())
             chosen.append(candidates[farthest])
-            apart = np.minimum(apart, np.linalg.norm(unit - unit[farthest], axis=1))
+            distance = np.minimum(distance, np.linalg.norm(unit - unit[farthest], axis=1))
     return ParameterSets(space, tuple(range(len(chosen))), tuple(chosen))
 
 

@@ -192,8 +192,8 @@ class Document:
             same = value.start_mark.line == key.end_mark.line
             mark = value.end_mark if same else key.end_mark
             rest = lines[mark.line][mark.column :].strip(": ")
-            told = [line.strip() for line in (*reversed(above), rest)]
-            if text := "\n".join(line.lstrip("#").strip() for line in told if line[:1] == "#"):
+            comments = [line.strip() for line in (*reversed(above), rest)]
+            if text := "\n".join(line.lstrip("#").strip() for line in comments if line[:1] == "#"):
                 found.setdefault(path, text)
         return found
 
@@ -251,8 +251,8 @@ def dump(data: Any, comments: Mapping[YamlPath, str] | None = None) -> str:
         return text
     lines = text.split("\n")
     for path, key, _ in reversed([*_keys(Document(text)._node)]):
-        told, indent = comments.get(path, ""), " " * key.start_mark.column
+        comment, indent = comments.get(path, ""), " " * key.start_mark.column
         lines[key.start_mark.line : key.start_mark.line] = [
-            f"{indent}# {line}" for line in told.splitlines()
+            f"{indent}# {line}" for line in comment.splitlines()
         ]
     return "\n".join(lines)

@@ -11,7 +11,8 @@ the bare loop's time with one worker, 1.8 times faster with two, where two bare 
 
 *memory* lets a worker, which may keep 0.4 GB of prepared scans, run a trial on each of four caves,
 ROUNDS (4) times. Each cave makes room for the next one. It prints the worker's memory at the end,
-as a ratio to what it keeps, and its CPU time: as it is, and without `adaptune.machine.apart`.
+as a ratio to what it keeps, and its CPU time: as it is, and without
+`adaptune.machine.freeing_large_arrays`.
 Limit: 2 times what it keeps.
 
 *size* runs a campaign of TRIALS (10,000) whose trials of 600 scans are random numbers, and prints
@@ -134,7 +135,7 @@ def speed(trials: int, scans: int) -> None:
 def rounds(study: OfflineStudy, n: int, as_it_is: bool) -> tuple[float, float]:
     """Memory of a worker's process after some rounds, over what it keeps, and its CPU seconds."""
     if not as_it_is:
-        shared_scans.apart = contextlib.nullcontext  # type: ignore[assignment]
+        shared_scans.freeing_large_arrays = contextlib.nullcontext  # type: ignore[assignment]
     setup = TrialSetup(study.config, study.odometry, study.sequences)
     bench = workers.Bench(setup, 0.4e9)
     frames = {name: describe(study.config, study.sequences, name) for name in study.training}

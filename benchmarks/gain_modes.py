@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from adaptune.live.hops import Hop
 from adaptune.live.own_error import Link, OwnErrors
 from adaptune.metrics import sub_trajectory_rte, travelled, window_ends
-from adaptune.model.weights import MemberWeights, clip_errors, minimum_variance_weights
+from adaptune.model.weights import MEMBER_CLIP, clip_errors, minimum_variance_weights
 from offline.labelled import LabelledData, LabelledSequence, chained, periods
 from offline.tuning import cancelling_members
 from offline.validate import Validation, leave_one_out, leave_out
@@ -94,7 +94,9 @@ def own_errors_on(sequence: LabelledSequence) -> Iterator[tuple[float, float, fl
 def constantly(sequence: LabelledSequence, members: Sequence[int]) -> Errors:
     """Errors of a bank whose weights stay the same."""
     simulation = sequence.simulation
-    vectors, lost = clip_errors(np.stack([sequence.vectors[m] for m in members], axis=1), 0)
+    vectors, lost = clip_errors(
+        np.stack([sequence.vectors[m] for m in members], axis=1), MEMBER_CLIP
+    )
     squares = np.einsum("ijx,ikx->jk", vectors, vectors) + np.diag((lost**2).sum(axis=0))
     modes = {
         "bank, even weights": np.full(len(members), 1.0 / len(members)),
@@ -102,11 +104,11 @@ def constantly(sequence: LabelledSequence, members: Sequence[int]) -> Errors:
         "bank, best weights": minimum_variance_weights(squares),
     }
     n_periods = len(periods(simulation.period)[0])
-    constant = {
-        mode: MemberWeights(tuple(members), np.tile(weights, (n_periods, 1)))
-        for mode, weights in modes.items()
+    constant = {mode: np.tile(weights, (n_periods, 1)) for mode, weights in modes.items()}
+    return {
+        mode: simulation.errors(tuple(members), weights)[sequence.known]
+        for mode, weights in constant.items()
     }
-    return {mode: simulation.errors(of)[sequence.known] for mode, of in constant.items()}
 
 
 def print_summary(validation: Validation, modes: Iterable[str]) -> None:

@@ -81,10 +81,10 @@ def cheapest(
     data, pca = others.training_data()
     first, _ = periods(left_out.simulation.period)
     features = pca.transform(left_out.simulation.descriptors[first])
-    evidence = NearestFrames(N_FRAMES).fit(data.features, data.sequence).about(features)
-    means = evidence.means(cap(data.errors)) + ERROR_FLOOR
+    near = NearestFrames(N_FRAMES).fit(data.features, data.sequence).near(features)
+    means = near.means(cap(data.errors)) + ERROR_FLOOR
     ratios = means / means[..., [fixed]]
-    expected = np.einsum("qs,qsj->qj", evidence.weights(SHARPNESS), ratios)
+    expected = np.einsum("qs,qsj->qj", near.weights(SHARPNESS), ratios)
     return {
         most: np.where(expected <= most + 1e-9, costs, np.inf).argmin(axis=1)
         for most in (1.0, 1.05, 1.1)

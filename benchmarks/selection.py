@@ -30,7 +30,6 @@ from threadpoolctl import threadpool_limits
 from adaptune import machine
 from adaptune.model import (
     BankRule,
-    BankSettings,
     ErrorModel,
     FixedSet,
     Rule,
@@ -40,7 +39,6 @@ from adaptune.model.knn import NearestNeighbours
 from adaptune.report.charts import Axis, Chart, Line, Panel
 from adaptune.report.drawing import draw_chart
 from adaptune.space import Float, ParameterSets, ParameterSpace
-from offline.tuning import BANK_FRAMES
 from offline.validate import BANK_SIZE
 
 LENGTHS = (4541, 1101, 4661, 801, 271, 2761)
@@ -236,7 +234,7 @@ def main(png: Path | None) -> None:
         model = measure_file(kitti_size(0, own_sets=False), Path(folder))
         measure_selection(model, "paper", NearestNeighbours(), "limits: median 1, 99 % 5")
         measure_selection(model, "adaptive", FixedSet(), "limit: median 5")
-        bank = BankRule(BankSettings(n_frames=BANK_FRAMES))
+        bank = BankRule()
         measure_selection(model, "bank", bank, "limit: median 5", model.bank)
     if png is not None:
         print("\nCPU time of a selection against training frames")

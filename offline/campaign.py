@@ -19,7 +19,7 @@ from offline.choice import DEARER, FINALISTS
 from offline.config import OfflineStudy
 from offline.drive import Drive
 from offline.objective import Verdict, label
-from offline.search import ELAPSED, TIME_IS_UP, Clock, Search
+from offline.search import ELAPSED, TIME_IS_UP, Search, Stopwatch
 from offline.stretches import Stretch, stretches_along
 from offline.trial import trial_of
 from offline.workers import Pool, Result, Task, TaskProgress, run
@@ -256,7 +256,7 @@ class Forecast(NamedTuple):
         return f"it takes {about(whole)}: {n:.0f} parameter sets of {self.each:.1f} s, and the rest"
 
 
-def forecast(study: OfflineStudy, archive: Archive, workers: int, clock: Clock) -> Forecast:
+def forecast(study: OfflineStudy, archive: Archive, workers: int, clock: Stopwatch) -> Forecast:
     """Tell from the baseline's drives how long the search takes, and what follows it.
 
     Replays count if they do for the clock.
@@ -289,12 +289,12 @@ class Campaign:
         archive: Archive,
         workers: Pool[Any],
         progress: Progress = unseen,
-        clock: Clock | None = None,
+        clock: Stopwatch | None = None,
         expected: Forecast = Forecast(0.0, 0.0),  # noqa: B008 (a tuple)
     ):
         self._workers, self._progress, self._expected = workers, progress, expected
         self._config, self._names = study.config.offline, study.training
-        self._clock, self._resumed = clock or Clock(study.folder / ELAPSED), 0
+        self._clock, self._resumed = clock or Stopwatch(study.folder / ELAPSED), 0
         self._begun = self._clock.hours
         self._finished = {name: archive.finished(name) for name in self._names}
         space, known = study.odometry.space, archive.known()

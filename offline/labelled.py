@@ -1,7 +1,7 @@
 """The labelled data set: what the archive holds about every training sequence."""
 
 from collections import defaultdict
-from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, lru_cache, partial
 from types import MappingProxyType
@@ -30,11 +30,9 @@ from adaptune.model.rules import (
     BASELINE,
     Costs,
     SetCost,
-    Spending,
     allowed_sets,
-    mean_errors,
+    best_sets,
 )
-from adaptune.model.weights import MEMBER_POOL_SIZE, MemberWeights
 from adaptune.odometry.factory import Factory
 from adaptune.recording.scan import stretch_numbers
 from adaptune.space import ParameterSets
@@ -56,6 +54,8 @@ if TYPE_CHECKING:
     from adaptune.model.knn import ScaledPCA
 
 
+MEMBER_POOL_SIZE = 64
+"""A bank's members are searched for among this many of the best sets."""
 SECONDS_UNTIL_NOTICED = 1.0
 """Seconds until a bank notices that a member has lost track."""
 MISFIT_PER_METRE = 0.25
@@ -128,13 +128,14 @@ class BankSimulation:
         ]
         return self._live[members]
 
-    def agreeing(self, votes: MemberWeights) -> NDArray[np.bool_]:
+    def agreeing(self, members: tuple[int, ...], votes: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Over which scans each member agrees with the others, of shape (n_frames - 1, n_members).
 
-        Members vote with these weights. The reference takes the place of the short registrations.
+        Members vote with weights of shape (n_periods, n_members). The reference takes the place of
+        the short registrations.
         """
-        T_previous_current = self.motions(votes.members)
-        agreement = Agreement(len(votes.members), self.lost_track)
+        T_previous_current = self.motions(members)
+        agreement = Agreement(len(members), self.lost_track)
         agreeing = np.zeros(T_previous_current.shape[:2], bool)
         weights = self._of_steps(votes)
         for i, seconds in enumerate(np.diff(self.stamps) * 1e-9):
@@ -147,9 +148,9 @@ class BankSimulation:
                 agreement.start()
         return agreeing
 
-    def _of_steps(self, weights: MemberWeights) -> NDArray[np.float64]:
+    def _of_steps(self, weights: NDArray[np.float64]) -> NDArray[np.float64]:
         """Weights at every scan but the first, of shape (n_frames - 1, n_members)."""
-        return weights.weights[periods(self.period)[1][1:]]
+        return weights[periods(self.period)[1][1:]]
 
     def _misplaced(
         self, frame: int, T_then_now: Poses, ago: tuple[int, ...]
@@ -158,20 +159,24 @@ class BankSimulation:
         T_ref_now = self.T_ref_sensor[frame]
         T_ref = np.array([invert(self.T_ref_sensor[frame - n]) @ T_ref_now for n in ago])
         T = invert(T_ref)[:, None] @ T_then_now
-        apart = np.linalg.norm(T[..., :3, 3], axis=-1) + LEVER * rotation_angle(T)
-        found = np.minimum(1.0, MISFIT_PER_METRE * apart).mean(axis=0)
+        misplaced = np.linalg.norm(T[..., :3, 3], axis=-1) + LEVER * rotation_angle(T)
+        found = np.minimum(1.0, MISFIT_PER_METRE * misplaced).mean(axis=0)
         return np.asarray(np.where(np.isnan(found), np.inf, found))
 
     def errors(
-        self, weights: MemberWeights, agreeing: NDArray[np.bool_] | None = None
+        self,
+        members: tuple[int, ...],
+        weights: NDArray[np.float64],
+        agreeing: NDArray[np.bool_] | None = None,
     ) -> NDArray[np.float64]:
         """Capped errors of a bank at every frame, NaN without a sub-trajectory.
 
-        Who agrees is found with the same weights when left out, see `agreeing`.
+        Weights are of shape (n_periods, n_members). Who agrees is found with the same weights when
+        left out, see `agreeing`.
         """
-        agreeing = self.agreeing(weights) if agreeing is None else agreeing
+        agreeing = self.agreeing(members, weights) if agreeing is None else agreeing
         none = np.asarray(~agreeing.any(axis=1))
-        believed = np.where(agreeing[..., None, None], self.motions(weights.members), np.eye(4))
+        believed = np.where(agreeing[..., None, None], self.motions(members), np.eye(4))
         moved = mean_motion(believed, share(self._of_steps(weights), agreeing | none[:, None]))
         T_ref, T_odom = self.T_ref_counted, chained(moved)
         return cap(sub_trajectory_rte(T_ref, T_odom, self.length, ends=self.ends))
@@ -253,11 +258,11 @@ class LabelledSequence:
     blocks: Mapping[str, int]  # by name, in order, the lengths of the descriptors
     # By trial number (n, 3): errors of the best sets as vectors, see `adaptune.model.TrainingData`.
     vectors: Mapping[int, NDArray[np.float32]] = field(default_factory=dict)
-    # (n,): number of each frame's block, see `offline.choice`
-    blocks_of: NDArray[np.intp] = field(default_factory=lambda: np.empty(0, np.intp))
+    # (n,): number of each frame's block, see `offline.choice`.
+    block: NDArray[np.intp] = field(default_factory=lambda: np.empty(0, np.intp))
     # (n_sets,): the objective that chooses the fixed set, unless it is the errors' mean.
     values: NDArray[np.float64] | None = None
-    block: int = 1  # frames of a sub-trajectory
+    span: int = 1  # frames of a sub-trajectory
     elevation: float = np.nan  # degrees, see `adaptune.model.descriptor.lowest_elevation`
     # (n_sets,): how often the health check restarted each set, infinite if it failed
     restarts: NDArray[np.float64] | None = None
@@ -315,7 +320,7 @@ class LabelledSequence:
             stretch=self.stretch[kept],
             errors=self.errors[kept],
             vectors={trial: vectors[kept] for trial, vectors in self.vectors.items()},
-            blocks_of=self.blocks_of[kept],
+            block=self.block[kept],
             turns=None if turns is None else turns[kept],
             whole=whole and whole.frames(np.isin(whole.known, known)),
         )
@@ -324,7 +329,7 @@ class LabelledSequence:
         """Mean capped errors, of shape (n_blocks, n_sets), or the objective, (1, n_sets)."""
         if self.values is not None:
             return self.values[None]
-        return block_means(self.errors, self.blocks_of)
+        return block_means(self.errors, self.block)
 
     def part(self) -> "LabelledSequence":
         """The same with the part of the simulation that its frames take."""
@@ -436,7 +441,7 @@ class LabelledData(NamedTuple):
 
     def _blocks(self, sequences: Sequence[LabelledSequence], trials: Sequence[int]) -> BlockErrors:
         none, errors = np.zeros(len(trials)), [s.in_blocks() for s in sequences]
-        turns = [block_means(s.turns, s.blocks_of) for s in sequences if s.turns is not None]
+        turns = [block_means(s.turns, s.block) for s in sequences if s.turns is not None]
         return BlockErrors(
             trials,
             np.concatenate(errors),
@@ -491,14 +496,15 @@ class LabelledData(NamedTuple):
         )
         return data, pca
 
-    @property
-    def spending(self) -> Spending | None:
-        """How a bank may spend the budget; None without a budget."""
-        return Spending.of(self.costs, self.budget)
+    def member_pool(self, fixed: int) -> list[int]:
+        """Trials that the members of a bank are chosen from, the fixed set's first."""
+        known = set.intersection(*(set(s.vectors) for s in self.sequences))
+        best = best_sets(self.errors(), self.stretches(), self.sets)[:MEMBER_POOL_SIZE]
+        return [fixed, *(trial for trial in best if trial != fixed and trial in known)]
 
-    def can_pay(self, members: Sequence[int]) -> bool:
+    def can_pay(self, members: Iterable[int]) -> bool:
         """Whether a bank of these trials stays within the budget, if there is one."""
-        return self.spending is None or self.spending.allows(members)
+        return self.costs.allow(members, self.budget)
 
     def vectors(self, members: Sequence[int]) -> NDArray[np.float32]:
         """Error vectors of some sets on the frames of all sequences, of shape (n, n_members, 3)."""
@@ -594,7 +600,7 @@ def _whole(s: LabelledSequence, trials: Sequence[Trial], config: OfflineConfig) 
         stretch=block,
         errors=errors[frames],
         vectors={},
-        blocks_of=block,
+        block=block,
         values=None if s.values is None else np.array(values),
         restarts=np.array([np.inf if drive.failure else drive.restarts for drive in drives]),
         turns=np.stack(turns, axis=1)[frames],
@@ -603,11 +609,10 @@ def _whole(s: LabelledSequence, trials: Sequence[Trial], config: OfflineConfig) 
 
 def with_vectors(data: LabelledData, archive: Archive) -> LabelledData:
     """The same with error vectors of the sets that may be members of a bank."""
-    sets, means = data.sets, mean_errors(data.errors(), data.numbers())
+    best = best_sets(data.errors(), data.numbers(), data.sets)
     # With a sequence left out, others than now may be among the best. To read the poses of
     # thousands of trials would take long.
-    best = [sets.trials[c] for c in np.argsort(means, kind="stable")[: 2 * MEMBER_POOL_SIZE]]
-    eligible = {t for t in (BASELINE, *best) if t in sets and np.isfinite(means[sets.column(t)])}
+    eligible = {BASELINE, *best[: 2 * MEMBER_POOL_SIZE]}.intersection(best)
     sequences = []
     for s in data.sequences:
         T_ref_sensor, length = s.simulation.T_ref_counted, s.simulation.length
@@ -657,9 +662,9 @@ def _labelled(
         stretches(simulation, known),
         errors[known],
         frames.blocks,
-        blocks_of=stretches(simulation, known, PER_BLOCK),
+        block=stretches(simulation, known, PER_BLOCK),
         values=None if set(objective) == {"rte"} else np.array(values),
-        block=span(frames.counted, length),
+        span=span(frames.counted, length),
         restarts=np.array(restarts),
         elevation=float(np.nanmedian(frames.elevations)),
     )

@@ -153,15 +153,15 @@ def write_scenario(path: Path | str, found: Scenario) -> Path:
         )
     ]
     about = {"blocks": found.blocks, "space": found.sets.space.dump(), "sets": known}
-    write_text(_beside(path), json.dumps(about, indent=1))
-    return _beside(path)
+    write_text(_sets_path(path), json.dumps(about, indent=1))
+    return _sets_path(path)
 
 
 def read_scenario(path: Path | str) -> Scenario:
     """Read what `write_scenario` wrote; an AdaptuneError says that it is no such table."""
     path = Path(path)
     try:
-        columns, about = _columns(path), json.loads(_beside(path).read_text("utf-8"))
+        columns, about = _columns(path), json.loads(_sets_path(path).read_text("utf-8"))
         features, errors = (
             np.stack([of for name, of in columns.items() if name.startswith(kind)], axis=1)
             for kind in ("feature_", "rte_")
@@ -181,11 +181,11 @@ def read_scenario(path: Path | str) -> Scenario:
             np.array(costs, float),
         )
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        both = f"{path}, with {_beside(path).name} beside it"
+        both = f"{path}, with {_sets_path(path).name} beside it"
         raise AdaptuneError(f"{both}: is no table of errors: {error}") from error
 
 
-def _beside(path: Path) -> Path:
+def _sets_path(path: Path) -> Path:
     return path.with_name(f"{path.stem}_sets.json")
 
 

@@ -25,10 +25,10 @@ BUDGETS = ("trials", "hours", "stagnation")
 TIME_IS_UP = "no more sets fit into the time"
 """Why a search ends."""
 ELAPSED = "elapsed.json"
-"""What a `Clock` keeps, in a study's folder."""
+"""What a `Stopwatch` keeps, in a study's folder."""
 
 
-class Clock:
+class Stopwatch:
     """The time that a search took, kept in a file, so that a resumed one continues counting.
 
     What a damaged file says does not count. Of the time that is allowed, also the `replays` of the

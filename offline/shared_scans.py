@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
-from adaptune.machine import apart
+from adaptune.machine import freeing_large_arrays
 from adaptune.odometry.base import OdometryInstance
 from adaptune.odometry.prepared import prepared_bytes
 from adaptune.recording.scan import Recording, Scan, SequenceError
@@ -75,7 +75,7 @@ class SharedScans:
         if preparation in fresh:
             return fresh[preparation]
         # Also those that a pass makes while it runs: a worker once grew to five times its share.
-        with apart():
+        with freeing_large_arrays():
             scan = read()
             begin = time.process_time()
             prepared = instance.prepare(scan)

@@ -10,19 +10,19 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from adaptune import __version__, manifest, trial_rows, yaml12
-from adaptune.archive import Archive
+from adaptune.archive import Archive, Summary
 from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
 from adaptune.machine import available
 from adaptune.metrics import cap, lost_in_words
 from adaptune.model import ErrorModel, ModelError
-from adaptune.model.rules import complementary, mean_errors
+from adaptune.model.rules import best_sets, complementary
 from adaptune.odometry.registry import ODOMETRIES, PROGRAMS
 from adaptune.progress import Progress, unseen
 from adaptune.recording.config import NO_REFERENCE
 from adaptune.reference.check import hard_to_track
 from adaptune.report import tables
-from adaptune.space import ParameterSet, ParameterSets, ParameterSpace, in_words
+from adaptune.space import ParameterSet, ParameterSets, in_words
 from adaptune.study.config import StudyConfig, SwitchingConfig
 from adaptune.study.driven import RIVALS
 from adaptune.study.oracle import OracleErrors, oracle_errors
@@ -56,7 +56,7 @@ from offline.objective import (
     judge,
     label,
 )
-from offline.search import BUDGETS, ELAPSED, Clock, Finished
+from offline.search import BUDGETS, ELAPSED, Finished, Stopwatch
 from offline.tuning import NO_BANK, choose, driven_cost, reserve, rivals
 from offline.workers import Cluster, Pool, Workers, spare_memory
 
@@ -104,7 +104,7 @@ def train(
     study: OfflineStudy,
     progress: Progress = unseen,
     cluster: str | None = None,
-    clock: Clock | None = None,
+    clock: Stopwatch | None = None,
 ) -> Training:
     """Estimate the references that are lacking, run the trials that are, and fit the model.
 
@@ -117,7 +117,7 @@ def train(
     """
     if not any(study.odometry.space.baselines):
         raise AdaptuneError("odometry.parameters: is empty, so there is nothing to tune; name some")
-    clock = clock or Clock(study.folder / ELAPSED)
+    clock = clock or Stopwatch(study.folder / ELAPSED)
     archive = _ready_archive(study, progress)
     config, names, space = study.config.offline, study.training, study.odometry.space
     with trial_workers(study, names, cluster) as workers:
@@ -143,8 +143,7 @@ def train(
     tables.write_rows(study.folder, "trials", trials)
     estimates = estimates_of(study.sequences, names)
     errors = {name: stored.error(model.length) for name, stored in estimates.items()}
-    rows = _training_rows(config, verdicts, finished, fixed, whole, errors, space)
-    _note_left_out(rows, usable, whole)
+    rows = _training_rows(usable, verdicts, finished, fixed, whole, errors, config)
     tables.write_rows(study.folder, "training", rows)
     said = lost_in_words(
         f"the fixed set, the best of {len(trials)} parameter sets,",
@@ -161,21 +160,16 @@ def train(
     return Training(model, trials, rows, said, failed, rows_of_front, elsewhere)
 
 
-def _note_left_out(
-    rows: Sequence[dict[str, Any]], usable: LabelledData, whole: WholeDrives
-) -> None:
-    """Add to the row of each sequence the error of the trial that the other recordings choose."""
-    for row, sequence in zip(rows, usable.sequences, strict=True):
-        row["_left out"] = None
-        if not (others := usable.without(sequence)).sequences:
-            continue
-        with contextlib.suppress(NothingUsableError):
-            run = whole[sequence.name].get(others.fixed())
-            row["_left out"] = run and run.mean_error
+def _left_out(others: LabelledData, drives: Mapping[int, Summary]) -> float | None:
+    """Error on a sequence, whose drives these are, of the set that other recordings choose."""
+    with contextlib.suppress(NothingUsableError):
+        if others.sequences and (run := drives.get(others.fixed())):
+            return run.mean_error
+    return None
 
 
 def _searched(
-    study: OfflineStudy, archive: Archive, workers: Pool[Any], progress: Progress, clock: Clock
+    study: OfflineStudy, archive: Archive, workers: Pool[Any], progress: Progress, clock: Stopwatch
 ) -> dict[int, Verdict]:
     """Drive the baseline, say how long the rest takes, and try sets."""
     run_baseline(study, archive, workers, progress)
@@ -296,19 +290,20 @@ def _trial_rows(
 
 
 def _training_rows(
-    config: OfflineConfig,
+    usable: LabelledData,
     verdicts: Mapping[int, Verdict],
     finished: Finished,
     fixed: int,
     whole: WholeDrives,
     reference_errors: Mapping[str, float],
-    space: ParameterSpace,
+    config: OfflineConfig,
 ) -> list[dict[str, Any]]:
     """A row for every training sequence, with the set that has the least error there."""
     rows = []
-    for name, runs in finished.items():
-        usable = {n: v.value for n, run in runs.items() if not (v := judge(config, [run])).failure}
-        best = min(usable, key=usable.__getitem__)
+    for sequence in usable.sequences:
+        name, runs = sequence.name, finished[sequence.name]
+        values = {n: v.value for n, run in runs.items() if not (v := judge(config, [run])).failure}
+        best = min(values, key=values.__getitem__)
         error = reference_errors.get(name)
         row = {
             "sequence": name,
@@ -323,8 +318,9 @@ def _training_rows(
             "_reference": "given" if error is None else "estimated",
             "_reference_error": error,
         }
-        own = space.row(verdicts[best].parameters)
-        rows.append(row | {f"_own best {key}": value for key, value in own.items()})
+        own = usable.sets.space.row(verdicts[best].parameters)
+        row |= {f"_own best {key}": value for key, value in own.items()}
+        rows.append(row | {"_left out": _left_out(usable.without(sequence), whole[name])})
     return rows
 
 
@@ -422,8 +418,8 @@ def oracle_sets(model: ErrorModel, n: int) -> list[int]:
     and, where these are too few, those with the least training error.
     """
     data = model.training_data(model.pca())
-    means = np.where(data.allows(), mean_errors(data.errors, data.sequence), np.inf)
-    best = [model.sets.trials[c] for c in np.argsort(means, kind="stable") if means[c] < np.inf]
+    allowed = {trial for trial, may in zip(data.sets, data.allows(), strict=True) if may}
+    best = [t for t in best_sets(data.errors, data.sequence, data.sets) if t in allowed]
     chosen = dict.fromkeys([model.fixed, *model.bank, *complementary(data, n), *best])
     return list(chosen)[:n]
 

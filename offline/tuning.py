@@ -1,6 +1,6 @@
 """Choice of what is driven: the fixed set, or a bank, and with what settings.
 
-They are compared by their expected loss on evidence that is left out, see `expected_loss`.
+They are compared by their expected loss on what is left out, see `expected_loss`.
 """
 
 from collections.abc import Iterator, Sequence
@@ -13,10 +13,15 @@ from threadpoolctl import threadpool_limits
 
 from adaptune.metrics import cap, worst_tenth
 from adaptune.model import BankRule, BankSettings, TrainingData
-from adaptune.model.rules import BASELINE, ERROR_FLOOR, complementary, mean_errors
+from adaptune.model.rules import (
+    BASELINE,
+    ERROR_FLOOR,
+    N_FRAMES,
+    SHARPNESS,
+    complementary,
+)
 from adaptune.model.weights import (
-    MEMBER_POOL_SIZE,
-    MemberWeights,
+    MEMBER_CLIP,
     bank_weights,
     choose_members,
 )
@@ -130,24 +135,17 @@ def figures(logs: Logs, recordings: Sequence[str]) -> Figures:
     return Figures(loss, geometric, low, high, tenth, worst, len(logs), n_recordings)
 
 
-BANK_FRAMES = 1000
-"""Nearest frames of each stretch in a bank: products of errors need more frames than means do."""
 BANK_SETTINGS = [
-    BankSettings(
-        sharpness=12.0,
-        clip=18.0,
-        min_fixed_share=share,
-        prior_windows=windows,
-        n_frames=BANK_FRAMES,
-    )
+    BankSettings(min_fixed_share=share, prior_windows=windows)
     for share, windows in ((0.0, 3.0), (0.0, 10.0), (0.25, 3.0), (0.75, 10.0))
 ]
 """A bank is driven with one of these; of equally good ones the first."""
 MOST_FOLDS = 12
-"""So many folds at most compare ways to adapt where evidence is left out already."""
+"""So many folds at most compare ways to adapt where something is left out already."""
 ROUNDING = 1e-6
 """A smaller loss, or gain, is one of rounding."""
-NO_BANK = BankSettings(adapt=False)
+NO_BANK = BankSettings(adapt=False, sharpness=SHARPNESS, n_frames=N_FRAMES, clip=MEMBER_CLIP)
+"""The fixed set is driven; the weights of a bank that joins in where that may be wrong."""
 
 
 class Policy(NamedTuple):
@@ -258,8 +256,8 @@ def _logs(
         elif members not in known:
             simulated = bank_errors(left_out, others, fitted, members, BANK_SETTINGS)
             known[members] = [errors for errors, _ in simulated]
-        beside = rival(others.costs.adaptive(bank))
-        pairs += [(errors, beside) for errors in known[members]]
+        of_rival = rival(others.costs.adaptive(bank))
+        pairs += [(errors, of_rival) for errors in known[members]]
     logs = [[log_ratios(one, fixed, stretch) for one in pair] for pair in pairs]
     return np.moveaxis(np.array(logs), -1, 0)
 
@@ -270,13 +268,13 @@ def bank_errors(
     fitted: tuple[TrainingData, "ScaledPCA"],
     members: Sequence[int],
     settings: Sequence[BankSettings],
-) -> Iterator[tuple[NDArray[np.float64], MemberWeights]]:
+) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64]]]:
     """Simulate a bank on what is left out, with one settings after the other.
 
     They have the same `clip` and `n_frames`. Its weights are fitted to the others, whose
     `LabelledData.training_data` is given.
 
-    Yields capped errors on the labelled frames, of shape (n,), and weights.
+    Yields capped errors on the labelled frames, of shape (n,), and weights (n_periods, n_members).
     """
     data, pca = fitted
     simulation, members = left_out.simulation, tuple(members)
@@ -286,21 +284,16 @@ def bank_errors(
     near, live = BankRule(settings[0]).fit(of_bank).near(scans), simulation.live(members)
     agreeing: NDArray[np.bool_] | None = None
     for one in settings:
-        votes = MemberWeights(members, bank_weights(near, one, live)[0])
+        weights, _ = bank_weights(near, one, live)
         # Who agrees takes long to find, and hangs on the settings but little.
-        agreeing = simulation.agreeing(votes) if agreeing is None else agreeing
-        yield simulation.errors(votes, agreeing)[left_out.known], votes
+        agreeing = simulation.agreeing(members, weights) if agreeing is None else agreeing
+        yield simulation.errors(members, weights, agreeing)[left_out.known], weights
 
 
 def cancelling_members(data: LabelledData, fixed: int, size: int) -> list[int]:
     """Choose a bank's members, the fixed set first, whose errors cancel: see `choose_members`."""
-    vectors, errors = [], []
-    for s in data.sequences:
-        for number in np.unique(s.stretch):
-            frames = s.stretch == number
-            vectors.append({trial: of_trial[frames] for trial, of_trial in s.vectors.items()})
-            errors.append(s.errors[frames])
-    return choose_members(vectors, errors, data.sets, fixed, size, data.spending)
+    pool = data.member_pool(fixed)
+    return choose_members(data.vectors(pool), data.stretches(), pool, size, data.can_pay)
 
 
 def complementary_members(data: LabelledData, fixed: int, size: int) -> list[int]:
@@ -309,19 +302,10 @@ def complementary_members(data: LabelledData, fixed: int, size: int) -> list[int
     They are sought among the best sets, see `complementary`. Where another one would lower nothing,
     the best of the others fill the bank.
     """
-    errors, number = data.errors(), data.stretches()
-    means = mean_errors(errors, number)
-    best = [
-        data.sets.trials[c]
-        for c in np.argsort(means, kind="stable")[:MEMBER_POOL_SIZE]
-        if means[c] < np.inf
-    ]
-    pool = [t for t in best if t != fixed and all(t in s.vectors for s in data.sequences)]
-    few = data.sets.subset([fixed, *pool])
-    columns = data.sets.columns(few.trials)
-    features = np.empty((len(errors), 0))
-    of_few = TrainingData(features, number, errors[:, columns], few, fixed)
-    chosen = complementary(of_few, size, data.spending)
+    pool, number = data.member_pool(fixed), data.stretches()
+    errors = data.errors()[:, data.sets.columns(pool)]
+    few = TrainingData(np.empty((len(errors), 0)), number, errors, data.sets.subset(pool), fixed)
+    chosen = complementary(few, size, data.can_pay)
     for trial in pool:
         if len(chosen) < size and trial not in chosen and data.can_pay([*chosen, trial]):
             chosen.append(trial)

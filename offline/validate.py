@@ -65,7 +65,7 @@ class LeftOut(NamedTuple):
     name: str
     recording: str  # that it is a part of
     stretch: NDArray[np.intp]  # (n,): of each frame
-    block: int  # frames of a sub-trajectory
+    span: int  # frames of a sub-trajectory
     # For every mode the capped error in percent at each frame, of shape (n,).
     errors: dict[str, NDArray[np.float64]]
     # For every rule the share of periods in which it did not choose the fixed set; of a bank, the
@@ -233,7 +233,7 @@ def leave_out(
     chosen = choose(others, bank, by_recording, MOST_FOLDS)
     alone, costs = others.costs.alone, dict[str, float]()
     for name in (name for name in rules if name != ADAPTIVE):
-        rule = rule_class(name)().fit(data)
+        rule = rule_class(name).of(None).fit(data)
         trials = [rule.select(features[i]).trial for i in first]
         errors[name] = capped[frames, data.sets.columns(trials)[period]]
         adapted[name] = float(np.mean([trial != data.fixed for trial in trials]))
@@ -242,7 +242,7 @@ def leave_out(
     if chosen.bank.adapt:
         simulated = bank_errors(sequence, others, fitted, chosen.members, [chosen.bank])
         errors[ADAPTIVE], weights = next(simulated)
-        adapted[ADAPTIVE] = float(1.0 - weights.weights[:, 0].mean())
+        adapted[ADAPTIVE] = float(1.0 - weights[:, 0].mean())
     driven = driven_cost(others, chosen, data.fixed)
     of_rivals = rivals(others, driven)
     costs |= {"baseline": alone(0), "fixed": alone(data.fixed), ADAPTIVE: driven}
@@ -250,7 +250,7 @@ def leave_out(
     errors |= {name: capped[:, data.sets.column(trial)] for name, trial in of_rivals.items()}
     # The best set in hindsight.
     errors["oracle, sequence"] = capped[:, int(np.argmin(capped.mean(axis=0)))]
-    about = (sequence.name, sequence.recording, sequence.stretch, sequence.block)
+    about = (sequence.name, sequence.recording, sequence.stretch, sequence.span)
     return LeftOut(*about, errors, adapted, costs)
 
 
@@ -351,7 +351,7 @@ def _rows(validation: Validation) -> list[dict[str, Any]]:
         ratios = {mode: float(validation.ratios[mode][i]) for mode in modes}
         errors, fixed = sequence.errors[ADAPTIVE], sequence.errors["fixed"]
         # It is about this sequence, and says nothing about other places.
-        intervals = bootstrap(errors, fixed, sequence.block)
+        intervals = bootstrap(errors, fixed, sequence.span)
         rows.append(row(sequence.name, fixed.mean(), ratios, intervals and intervals[1]))
     costs = {mode: validation.cost(mode) for mode in ["fixed", *modes]}
     if np.isfinite(list(costs.values())).any():

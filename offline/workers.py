@@ -53,7 +53,7 @@ class Task(NamedTuple):
     most: float = np.inf  # seconds of CPU time above which a set is stopped
     bare: bool = False  # without the health check
     prepares: Hashable = None  # identifies the scans that the worker then holds prepared
-    apart: bool = False  # run classes of the user in processes of their own, also clean ones
+    isolated: bool = False  # run classes of the user in processes of their own, also clean ones
 
     @property
     def key(self) -> Hashable:
@@ -175,7 +175,7 @@ class _Crew(Generic[W]):
             others = set().union(*(keys for w, keys in self._held.items() if w != worker))
             task = self._again.pop() if self._again else self._work.take(held, others, left)
             # A class that is not as clean as it says then costs its own trials only.
-            task = task._replace(apart=not self._suspects.isdisjoint(task.sets))
+            task = task._replace(isolated=not self._suspects.isdisjoint(task.sets))
             if task.prepares is not None:
                 held.add(task.prepares)
             self._running[worker] = task
@@ -223,7 +223,7 @@ class Bench:
 
     def __init__(self, setup: TrialSetup, memory: float):
         self._setup = setup
-        self._apart = setup._replace(odometry=setup.odometry.changed(user_code=False))
+        self._isolated = setup._replace(odometry=setup.odometry.changed(user_code=False))
         self._memory = min(memory, MOST_PREPARED)
         self._recordings: dict[str, Recording] = {}
         self._shared: dict[bool, SharedScans] = {}
@@ -238,10 +238,10 @@ class Bench:
         scans = self._recordings[task.sequence]
         if task.frames is not None:
             return with_measured_hops(scans, task.frames, progress)
-        setup = self._apart if task.apart else setup
-        if task.apart not in self._shared:  # other instances take scans in another way
-            self._shared = {task.apart: SharedScans(self._memory)}
-        shared, sets = self._shared[task.apart], task.sets
+        setup = self._isolated if task.isolated else setup
+        if task.isolated not in self._shared:  # other instances take scans in another way
+            self._shared = {task.isolated: SharedScans(self._memory)}
+        shared, sets = self._shared[task.isolated], task.sets
         assert stretch is not None
         limits = task.most, task.bare
         drives = drive_sets(setup, shared, scans, stretch, sets.values(), *limits, progress)

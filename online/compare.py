@@ -99,11 +99,11 @@ def compared_modes(study: Study) -> ComparedModes:
     compared = tuple(mode for mode in modes if all(mode in made[n] for n in finished))
     unfinished = tuple(name for name in made if name not in finished)
     missing = {m: [n for n in made if m not in made[n]] for m in asked if m not in RIVALS}
-    told = ", ".join(f"`{mode}` on {' and '.join(on)}" for mode, on in missing.items() if on)
+    where = ", ".join(f"`{mode}` on {' and '.join(on)}" for mode, on in missing.items() if on)
     words = (
-        f"Not compared, because replays are missing: {told}; `adaptune online{option}` makes them."
+        f"Not compared, because replays are missing: {where}; `adaptune online{option}` makes them."
     )
-    return ComparedModes(tuple(finished), compared, unfinished, [words] if told else [])
+    return ComparedModes(tuple(finished), compared, unfinished, [words] if where else [])
 
 
 SEED = 0

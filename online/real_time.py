@@ -13,7 +13,7 @@ from adaptune.odometry.base import OdometryInstance
 from adaptune.odometry.health import HealthCheck
 from adaptune.odometry.tracker import RegisteredScan
 from adaptune.recording.scan import Imu, Scan, joined
-from adaptune.selector import Schedule
+from adaptune.selector import Periods
 from adaptune.study.config import RealTimeConfig
 from online.replay import Driver, ReplayRecord, Watch
 from online.selector_process import Answer, SelectorProcess
@@ -131,7 +131,7 @@ class RealTimeDrive:
         self.record, self._clock = record, clock
         self._odometry, self._selector = odometry, selector
         self._deadline = settings.deadline
-        self._schedule = Schedule(1.0 if selector is None else selector.period * 1e9)
+        self._periods = Periods(1.0 if selector is None else selector.period * 1e9)
         fixed = None if selector is None else selector.fixed
         self._driver = Driver(odometry, health, fixed, what, record.note)
 
@@ -165,7 +165,7 @@ class RealTimeDrive:
         odometry, selector = self._odometry, self._selector
         if selector is None:
             return odometry.prepare(scan)
-        wanted = self._schedule.due(scan.stamp)
+        wanted = self._periods.due(scan.stamp)
         wait = self._left(due) if wanted else 0.0
         shown = selector.show(scan.stamp, scan, self._driver.motions, wait)
         if not wanted:

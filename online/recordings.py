@@ -16,7 +16,7 @@ from adaptune.geometry import invert
 from adaptune.progress import Progress, unseen
 from adaptune.recording.export import Message, Messages
 from adaptune.recording.scan import Recording
-from adaptune.selector import Schedule
+from adaptune.selector import Periods
 from adaptune.study.config import StudyConfig
 from adaptune.study.study import Study
 from adaptune.trajectory import Trajectory
@@ -202,9 +202,9 @@ class _Composer:
         self, scans: Recording, trajectory: Trajectory, name: str, progress: Progress
     ) -> Iterator[tuple[int, Any]]:
         """One scan a second, thinned, in the sensor's frame; none where it has no pose."""
-        schedule, n = Schedule(CLOUD_PERIOD * 1e9), scans.n_messages
+        periods, n = Periods(CLOUD_PERIOD * 1e9), scans.n_messages
         for number, scan in enumerate(scans, start=1):
-            due = schedule.due(scan.stamp)
+            due = periods.due(scan.stamp)
             if due and np.isfinite(trajectory.at(np.array([scan.stamp]))).all():
                 points = np.ascontiguousarray(_thinned(scan.points), "<f4")
                 structured = points.view([(axis, "<f4") for axis in "xyz"]).reshape(-1)

@@ -20,7 +20,7 @@ from adaptune.odometry.faults import MAX_SHARE_WITHOUT_POSE
 from adaptune.odometry.health import HealthCheck
 from adaptune.odometry.tracker import RegisteredScan, Tracker
 from adaptune.recording.scan import Scan
-from adaptune.selector import REMEMBERED, SETTLING, AnySelector, Schedule, used_instead
+from adaptune.selector import REMEMBERED, SETTLING, AnySelector, Periods, used_instead
 from adaptune.space import Selection
 from adaptune.trajectory import Trajectory
 
@@ -254,7 +254,7 @@ def replay(
 ) -> ReplayRecord:
     """Replay a recording, as fast as it goes and always the same way.
 
-    Selections are made as `Schedule` says, from a scan and before it is registered.
+    Selections are made as `Periods` says, from a scan and before it is registered.
 
     Parameters
     ----------
@@ -274,13 +274,13 @@ def replay(
     OdometryError
         If the odometry cannot change its parameters, and there is no `fixed` to return to.
     """
-    record, schedule = ReplayRecord(), Schedule(period * 1e9)
+    record, periods = ReplayRecord(), Periods(period * 1e9)
     driver = Driver(odometry, health, fixed, what, record.note)
     for scan in scans:
         record.begin()
         if selector is not None:
             selector.observe(scan.stamp, scan, driver.motions)
-            if schedule.due(scan.stamp):
+            if periods.due(scan.stamp):
                 t = time.perf_counter()
                 selection = selector.select()
                 driver.take(scan.stamp, selection, time.perf_counter() - t)

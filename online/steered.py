@@ -56,7 +56,7 @@ class SteeredNode(OdometryInstance):
             _run,
         )
         self._silent: deque[bool] = deque(maxlen=SILENT)
-        self._told = False
+        self._warned = False
         link.subscribe(settings.odometry, ODOMETRY, self._take)
 
     def start(
@@ -87,11 +87,11 @@ class SteeredNode(OdometryInstance):
 
     def _tell_of_silence(self) -> None:
         n = sum(self._silent)
-        self._told &= n > 0
+        self._warned &= n > 0
         # A node that loses clouds answers now and then.
-        if n < SILENT - 2 or len(self._silent) < SILENT or self._told:
+        if n < SILENT - 2 or len(self._silent) < SILENT or self._warned:
             return
-        self._told, settings = True, self._settings
+        self._warned, settings = True, self._settings
         try:
             why = self._link.why_unheard(self._points)
         except LinkError as error:

@@ -301,12 +301,12 @@ class Bank(OdometryInstance):
             self._members = [make(parameters) for parameters in given]
         self._T_previous_current = np.tile(np.eye(4), (len(sets), 1, 1))
         # Members in processes of their own register while those of this process do.
-        self._apart_first = sorted(range(len(sets)), key=lambda i: not self._members[i].apart)
+        self._isolated_first = sorted(range(len(sets)), key=lambda i: not self._members[i].isolated)
         self._names = [
             f"trial {trial}" + (f" ({given[ODOMETRY]})" if ODOMETRY in given else "")
             for trial, given in sets.items()
         ]
-        self._told: set[int] = set()
+        self._warned_of: set[int] = set()
         self._known_faults = [0] * len(sets)  # of each member, when it last worked
         self.late = Lateness(self._members, self._names, rate, clock)
         self._rate = rate
@@ -346,8 +346,8 @@ class Bank(OdometryInstance):
 
     @property
     def _present(self) -> list[OdometryInstance]:
-        """Members that take the next scan; those apart come first."""
-        return [self._members[i] for i in self._apart_first if not self.late.absent[i]]
+        """Members that take the next scan; those in other processes come first."""
+        return [self._members[i] for i in self._isolated_first if not self.late.absent[i]]
 
     def apply(self, selection: Selection) -> None:
         # Members without a weight get 0.
@@ -398,7 +398,7 @@ class Bank(OdometryInstance):
     def _collect(self) -> Registration:
         scan, before = self._submitted, self._past[-1]
         seconds = (scan.stamp - before.scan.stamp) * 1e-9
-        registrations = self.late.collect(self._apart_first[::-1], seconds)
+        registrations = self.late.collect(self._isolated_first[::-1], seconds)
         self._tell()
         T_previous_current = self._member_motions(before.T_odom_sensor)
         self._T_previous_current = T_previous_current
@@ -430,7 +430,7 @@ class Bank(OdometryInstance):
         """Restart members at the bank's pose, but for those that have given up or are late."""
         members = members & ~np.array([member.given_up for member in self._members])
         members &= ~self.late.working
-        due = [self._members[i] for i in self._apart_first if members[i]]
+        due = [self._members[i] for i in self._isolated_first if members[i]]
         successors = [Successor(member, self._past) for member in due]
         # Somebody has to go on meanwhile.
         if self._rate is None or (self.late.absent | members).all():
@@ -474,11 +474,11 @@ class Bank(OdometryInstance):
                 continue
             # One that has not begun yet, or that waits for its turn, has not failed.
             new = member.faults[self._known_faults[i] :]
-            if member.ended and new and i not in self._told:
-                self._told.add(i)
+            if member.ended and new and i not in self._warned_of:
+                self._warned_of.add(i)
                 _log.warning("%s ended: %s; the bank goes on without it", name, new[-1])
             elif not member.ended:
                 self._known_faults[i] = len(member.faults)
-                if i in self._told:
-                    self._told.remove(i)
+                if i in self._warned_of:
+                    self._warned_of.remove(i)
                     _log.warning("%s is back", name)

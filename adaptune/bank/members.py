@@ -368,12 +368,12 @@ class Agreement:
         known = np.asarray((np.abs(T_previous_current) < _ENDLESS).all(axis=(1, 2)))
         moved = np.where(known[:, None, None], T_previous_current, np.eye(4))
         self._advance(moved, seconds)
-        near, far, apart = self._near(known, moved, seconds)
+        near, far, departures = self._near(known, moved, seconds)
         agreeing = self._heaviest(near, weights, moved, alignment, lost)
         self._move(T_previous_current, weights, agreeing)
         self.due = np.zeros_like(agreeing)
         if agreeing.any():
-            self._remember(apart, agreeing)
+            self._remember(departures, agreeing)
         if agreeing.any() and not agreeing.all():
             self._begin_anew(~known)
             # A single member may be the only one that is not lost.
@@ -413,11 +413,11 @@ class Agreement:
         way = _vectors(invert(tracks[0]) @ tracks).reshape(len(times), -1)
         span = times[-1] - times[0]
         came = (times * (span / (times @ times)) @ way).reshape(-1, 12)
-        apart = _distances(came)
+        departures = _distances(came)
         scale = max(span, WINDOW)
         near = (_distances(_vectors(moved)) <= self._lost_track * seconds) & known & known[:, None]
         if span < 0.5 * WINDOW:
-            return near, ~near, apart / scale
+            return near, ~near, departures / scale
         ways = np.linalg.norm(came[known, 9:], axis=1).tolist()
         least = max(FLOOR * scale, SHARE * (median_high(ways) if ways else 0.0))
         # As long as nothing is usual, they may differ by the most.
@@ -425,8 +425,8 @@ class Agreement:
         usual = SPREAD * median_high(differed) * scale if differed else np.inf
         bound = min(max(least, usual), MAX_TIMES_LEAST * least)
         most = self._lost_track * span
-        far = ~near | (apart > min(FAR * bound, most))
-        return near & (apart <= min(bound, most)), far, apart / scale
+        far = ~near | (departures > min(FAR * bound, most))
+        return near & (departures <= min(bound, most)), far, departures / scale
 
     def _heaviest(
         self,
@@ -483,11 +483,11 @@ class Agreement:
         self.T_previous_current = mean_motion(T_previous_current[agreeing], shares)
         self._tracks[-1][-1] = self._tracks[-1][-1] @ self.T_previous_current
 
-    def _remember(self, apart: NDArray[np.float64], agreeing: NDArray[np.bool_]) -> None:
+    def _remember(self, departures: NDArray[np.float64], agreeing: NDArray[np.bool_]) -> None:
         """Remember by how much agreeing members differ, once there is a second to tell it from."""
         if agreeing.sum() > 1 and self._times[-1] - self._times[0] > 0.5 * WINDOW:
             # Each pair twice, and each member from itself.
-            differences = sorted(apart[agreeing][:, agreeing].ravel().tolist())
+            differences = sorted(departures[agreeing][:, agreeing].ravel().tolist())
             n = int(agreeing.sum())
             self._usual.append((self._times[-1], differences[(n * n + n) // 2 - 1]))
             while self._times[-1] - self._usual[0][0] > MEMORY:

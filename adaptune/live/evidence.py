@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from adaptune.geometry import Poses, invert, rectify, rotation_angle
 from adaptune.live.hops import (
     LENGTHS,
+    NEW_GUESS,
     SECONDS,
     Hop,
     HopCloud,
@@ -36,7 +37,6 @@ The odometry costs as much a scan, whatever the sensor's rate."""
 USUAL_SHARE = 0.4  # about the share of the seconds in which a bank measures
 HOPS_TO_BE_LOST = 2
 """Hops in a row that must be rejected, or disagree, before an odometry counts as lost."""
-_APART = 0.3  # metres between guesses that are worth a registration each
 _GUESSES = 3
 _TRY_AGAIN = 5  # after so many shorter hops, a long one is tried again
 SHARED = 1.25
@@ -68,8 +68,8 @@ class Measured(NamedTuple):
     def errors(self) -> NDArray[np.float64]:
         """Of the odometry and the members, percent of the hop, of shape (1 + n_members, 3)."""
         moved = invert(self.start.T_odom_sensor) @ self.end.T_odom_sensor
-        apart = (moved[:, :3, 3] - self.hop.T_start_end[:3, 3]) @ self.hop.projection.T
-        return np.asarray(100.0 / (self.end.metres - self.start.metres) * apart)
+        wrong = (moved[:, :3, 3] - self.hop.T_start_end[:3, 3]) @ self.hop.projection.T
+        return np.asarray(100.0 / (self.end.metres - self.start.metres) * wrong)
 
 
 class LiveEvidence:
@@ -243,7 +243,7 @@ class LiveEvidence:
         """The odometry's motion, and those of members that disagree with it."""
         tried: list[Poses] = []
         for T in invert(start.T_odom_sensor) @ end.T_odom_sensor:
-            if all(_apart(T, other) > _APART for other in tried) and len(tried) < _GUESSES:
+            if all(_distance(T, other) > NEW_GUESS for other in tried) and len(tried) < _GUESSES:
                 tried.append(T)
         return tried
 
@@ -349,11 +349,11 @@ def spread_of(vectors: NDArray[np.floating]) -> NDArray[np.float64]:
     """Root mean square distance from their mean of vectors of shape (..., n, 3); 0 of none."""
     if not vectors.shape[-2]:
         return np.zeros(vectors.shape[:-2])
-    apart = vectors - vectors.mean(axis=-2, keepdims=True)
-    return np.asarray(np.sqrt((apart**2).sum(axis=-1).mean(axis=-1)))
+    deviations = vectors - vectors.mean(axis=-2, keepdims=True)
+    return np.asarray(np.sqrt((deviations**2).sum(axis=-1).mean(axis=-1)))
 
 
-def _apart(T: Poses, other: Poses) -> float:
+def _distance(T: Poses, other: Poses) -> float:
     """How far two motions are apart, in metres; a radian counts as much as ten metres."""
     moved = invert(other) @ T
     return float(np.linalg.norm(moved[:3, 3]) + _FULL_TURN * rotation_angle(moved))

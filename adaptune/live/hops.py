@@ -16,6 +16,7 @@ from adaptune.recording.scan import Scan
 
 LENGTHS = (10.0, 5.0)  # metres of a hop: the second where the first is rejected, as in narrow caves
 NOISE = 0.02  # metres by which a registration is wrong, about
+NEW_GUESS = 0.3  # metres between guesses that are worth a registration each
 MIN_INLIERS = 0.35
 """Least share of points near a point of the other scan; a registration with fewer is rejected."""
 DEGENERATE = 0.002
@@ -260,9 +261,9 @@ def clip_to_best(errors: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDAr
     known[missing.all(axis=1)] = 0.0
     best = np.nanargmin(np.linalg.norm(known, axis=-1), axis=1)
     centre = known[np.arange(len(known)), best][:, None]
-    apart = np.where(missing[..., None], 0.0, known - centre)
-    lengths = np.linalg.norm(apart, axis=-1, keepdims=True)
-    return centre + apart * np.minimum(1.0, CLIP / np.maximum(lengths, 1e-9)), missing
+    offsets = np.where(missing[..., None], 0.0, known - centre)
+    lengths = np.linalg.norm(offsets, axis=-1, keepdims=True)
+    return centre + offsets * np.minimum(1.0, CLIP / np.maximum(lengths, 1e-9)), missing
 
 
 def blend(

@@ -206,8 +206,8 @@ class ErrorModel:
 
         `elevation` is the median of their `lowest_elevation`, in degrees.
         """
-        apart = [abs(elevation - known) for known in self.elevations]
-        return bool(apart) and min(apart) > SAME_SENSOR
+        differences = [abs(elevation - known) for known in self.elevations]
+        return bool(differences) and min(differences) > SAME_SENSOR
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
         return {

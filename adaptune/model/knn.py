@@ -85,8 +85,6 @@ class NearestNeighbours(Rule):
         """See `Rule.fit`."""
         self.data_ = data
         self._allowed = data.allows()
-        if data.candidates is not None:
-            self._allowed &= np.isin(data.sets.trials, data.candidates)
         unit = data.sets.unit
         sets = unit / (float(unit.std(axis=0).mean()) or 1.0)
         self._errors = np.ascontiguousarray(np.minimum(data.errors, np.float32(FAILURE)))

@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import TYPE_CHECKING, ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,18 +12,21 @@ from adaptune.live.hops import LiveSquares
 from adaptune.metrics import cap
 from adaptune.space import ParameterSets, Selection
 
+if TYPE_CHECKING:
+    from adaptune.model.weights import BankSettings
+
 NOVEL_FAMILIARITY = 0.1
-"""Familiarity below which evidence counts less and less."""
+"""Familiarity below which the nearest training frames count less and less."""
 _QUANTILES = 10
 """Of the distances of each training sequence's frames from the other sequences."""
 
 
-class Evidence(NamedTuple):
+class NearFrames(NamedTuple):
     """The training frames nearest to some scans."""
 
     # (n_scans, n_near): for each training sequence, numbers of its frames that are nearest to each
     # scan.
-    frames: tuple[NDArray[np.intp], ...]
+    numbers: tuple[NDArray[np.intp], ...]
     squared: NDArray[np.float64]  # (n_scans, n_sequences): mean squared distance of these frames
     # (n_scans,): share of the training frames that are farther from the other sequences than each
     # scan is from all of them; NaN of a single sequence, which has no others.
@@ -31,7 +34,7 @@ class Evidence(NamedTuple):
 
     @property
     def trust(self) -> NDArray[np.float64]:
-        """How far it counts for each scan, from 0 to 1: fully where familiarity is unknown."""
+        """How far they count for each scan, from 0 to 1: fully where familiarity is unknown."""
         return np.asarray(np.fmin(1.0, self.familiarity / NOVEL_FAMILIARITY))
 
     def weights(self, sharpness: float) -> NDArray[np.float64]:
@@ -54,7 +57,7 @@ class Evidence(NamedTuple):
         Returns shape (n_scans, n_sequences, ...).
         """
         means = np.empty((*self.squared.shape, *values.shape[1:]))
-        for s, frames in enumerate(self.frames):
+        for s, frames in enumerate(self.numbers):
             # All frames are near to every scan: the mean is the same.
             same = frames.strides[0] == 0
             near = values[frames[:1]] if same else values[frames]
@@ -63,7 +66,7 @@ class Evidence(NamedTuple):
 
 
 class NearestFrames:
-    """Finds the evidence about scenes."""
+    """Finds the training frames that are nearest to scans."""
 
     def __init__(self, n_frames: int):
         self.n_frames = n_frames
@@ -78,21 +81,21 @@ class NearestFrames:
         self.distances_ = self._distances_between_sequences()
         return self
 
-    def about(self, features: NDArray[np.float64]) -> Evidence:
-        """Find the evidence about scans.
+    def near(self, features: NDArray[np.float64]) -> NearFrames:
+        """Find the frames that are nearest to scans.
 
         Features are of shape (n_scans, n_features).
         """
         squared = np.empty((len(features), len(self.members_)))
-        frames = []
+        numbers = []
         for s, (members, own) in enumerate(zip(self.members_, self.features_, strict=True)):
             squared[:, s], nearest = _nearest(own, features, self.n_frames)
-            frames.append(members[nearest])
+            numbers.append(members[nearest])
         familiarity = np.full(len(features), np.nan)
         if len(self.distances_):
             below = np.searchsorted(self.distances_, squared.min(axis=1), side="left")
             familiarity = 1.0 - below / len(self.distances_)
-        return Evidence(tuple(frames), squared, familiarity)
+        return NearFrames(tuple(numbers), squared, familiarity)
 
     def _distances_between_sequences(self) -> NDArray[np.float64]:
         """Sorted distances of training frames from the other sequences, as many of each."""
@@ -175,21 +178,9 @@ class Costs:
             prepare[cost.preparation] = max(cost.prepare, prepare.get(cost.preparation, 0.0))
         return sum(cost.register for cost in known) + sum(prepare.values()) + self.evidence
 
-
-class Spending(NamedTuple):
-    """How a bank may spend a budget."""
-
-    costs: Costs
-    budget: float = np.inf  # milliseconds of CPU time a scan, with all members and live evidence
-
-    @classmethod
-    def of(cls, costs: Costs | None, budget: float | None) -> Self | None:
-        """How a budget may be spent, if there is one and the costs are known."""
-        return None if costs is None or budget is None else cls(costs, budget)
-
-    def allows(self, members: Sequence[int]) -> bool:
-        """Whether a bank of these trials stays within the budget; of unknown cost, none does."""
-        return self.costs.adaptive(members) <= self.budget + ROUNDING
+    def allow(self, members: Iterable[int], budget: float | None) -> bool:
+        """Whether a bank keeps to a budget, if there is one; of unknown cost, none does."""
+        return budget is None or self.adaptive(members) <= budget + ROUNDING
 
 
 def allowed_sets(
@@ -198,9 +189,7 @@ def allowed_sets(
     """The usable sets that a budget allows one at a time, the fixed one included; None for all."""
     if costs is None:
         return None
-    spending = Spending.of(costs, budget)
-    allows = costs.usable if spending is None else lambda trial: spending.allows([trial])
-    return tuple(trial for trial in sets if trial == fixed or allows(trial))
+    return tuple(t for t in sets if t == fixed or (costs.usable(t) and costs.allow([t], budget)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,10 +231,12 @@ class TrainingData:
     costs: Costs | None = None
 
     def allows(self) -> NDArray[np.bool_]:
-        """Which sets may be chosen, of shape (n_sets,)."""
-        if self.allowed is None:
-            return np.ones(len(self.sets), np.bool_)
-        return np.isin(self.sets.trials, self.allowed)
+        """Which sets may be chosen: candidates that the budget allows, of shape (n_sets,)."""
+        allowed = np.ones(len(self.sets), np.bool_)
+        for some in (self.candidates, self.allowed):
+            if some is not None:
+                allowed &= np.isin(self.sets.trials, some)
+        return allowed
 
 
 def mean_errors(errors: NDArray[np.floating], sequence: NDArray[np.intp]) -> NDArray[np.float64]:
@@ -271,14 +262,24 @@ def mean_errors(errors: NDArray[np.floating], sequence: NDArray[np.intp]) -> NDA
     return np.asarray(np.mean(means, axis=0))
 
 
-def complementary(data: TrainingData, size: int, spending: Spending | None = None) -> list[int]:
+def best_sets(
+    errors: NDArray[np.floating], sequence: NDArray[np.intp], sets: ParameterSets
+) -> list[int]:
+    """Trial numbers by rising `mean_errors`, without those that were not run on every sequence."""
+    means = mean_errors(errors, sequence)
+    return [sets.trials[c] for c in np.argsort(means, kind="stable") if means[c] < np.inf]
+
+
+def complementary(
+    data: TrainingData, size: int, allow: Callable[[list[int]], bool] = lambda _: True
+) -> list[int]:
     """Choose sets so that at every training frame one does well: trials, the fixed set's first.
 
     The search is greedy and begins with the fixed set. Each next set is the one that lowers the
     mean error most if the best of the chosen sets were known at every frame.
 
-    `size` sets, or fewer where another one would lower nothing, or would cost too much. A set that
-    was not run on every sequence is not chosen.
+    `size` sets, or fewer where another one would lower nothing, or `allow` refuses them, as they
+    cost too much. A set that was not run on every sequence is not chosen.
     """
     everywhere = np.isfinite(mean_errors(data.errors, data.sequence)) & data.allows()
     capped = np.where(np.isnan(data.errors) | ~everywhere, np.inf, cap(data.errors))
@@ -287,8 +288,7 @@ def complementary(data: TrainingData, size: int, spending: Spending | None = Non
     while len(chosen) < size:
         means = mean_errors(np.minimum(capped, least[:, None]), data.sequence)
         now = means[data.sets.column(data.fixed)]
-        if spending is not None:
-            means = np.where([spending.allows([*chosen, t]) for t in data.sets], means, np.inf)
+        means = np.where([allow([*chosen, trial]) for trial in data.sets], means, np.inf)
         best = int(np.argmin(means))
         # A set that is chosen already lowers nothing.
         if not means[best] < now:
@@ -320,13 +320,13 @@ class Rule(ABC):
     # What it selects, in a sentence.
     sentence: ClassVar[str] = "what a rule of the user's selects"
     # Whether the fixed set is kept for scans of another sensor than in training.
-    gated: ClassVar[bool] = False
-    # Whether it weighs the members of a bank where one runs; others choose among them.
-    weighs: ClassVar[bool] = False
+    needs_known_sensor: ClassVar[bool] = False
+    # Whether it gives weights to the members of a bank where one runs; others choose among them.
+    gives_weights: ClassVar[bool] = False
 
     @classmethod
-    def of(cls, model: Any, weighs: bool) -> "Rule":  # noqa: ARG003 - for those that need them
-        """Make the rule for an error model, and for a bank that it `weighs` or one set."""
+    def of(cls, bank: "BankSettings | None") -> "Rule":  # noqa: ARG003 - for those that need it
+        """Make the rule: with settings of a bank if it gives weights to one, else for one set."""
         return cls()
 
     @abstractmethod
@@ -356,7 +356,7 @@ class FixedSet(Rule):
     sequence, and the budget allows it.
     """
 
-    gated = True
+    needs_known_sensor = True
 
     def fit(self, data: TrainingData) -> Self:
         """See `Rule.fit`."""
@@ -370,12 +370,10 @@ class FixedSet(Rule):
 
     def select(self, feature: NDArray[np.float64], live: Live = NOTHING) -> Selection:
         """See `Rule.select`."""
-        evidence = self.nearest_.about(feature[None])
-        (predicted,) = np.einsum(
-            "qs,qsj->qj", evidence.weights(SHARPNESS), evidence.means(self.errors_)
-        )
+        near = self.nearest_.near(feature[None])
+        (predicted,) = np.einsum("qs,qsj->qj", near.weights(SHARPNESS), near.means(self.errors_))
         fixed = float(predicted[0])
-        predicted = fixed + evidence.trust[0] * (predicted - fixed)
+        predicted = fixed + near.trust[0] * (predicted - fixed)
         errors = dict(zip(self.trials_, predicted.tolist(), strict=True))
         trial, measured = self.data_.fixed, live.worse()
         if trial in measured:
@@ -386,5 +384,5 @@ class FixedSet(Rule):
             self.data_.sets[trial],
             predicted_error=float(predicted[self.trials_.index(trial)]),
             predicted_fixed=fixed,
-            familiarity=float(evidence.familiarity[0]),
+            familiarity=float(near.familiarity[0]),
         )

@@ -1,7 +1,7 @@
 """Weights of the members of a bank, whose motions are averaged."""
 
-from collections.abc import Collection, Mapping, Sequence
-from typing import Annotated, Any, NamedTuple, Self
+from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import Annotated, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,14 +20,12 @@ from adaptune.metrics import FAILURE
 from adaptune.model.rules import (
     ERROR_FLOOR,
     NOTHING,
-    Evidence,
     FixedSet,
     Live,
     NearestFrames,
+    NearFrames,
     Rule,
-    Spending,
     TrainingData,
-    mean_errors,
 )
 from adaptune.space import ParameterSets, Selection
 
@@ -38,8 +36,8 @@ UNTRIED_MEAN_SQUARE = 4.0
 EVEN_SHARE = 0.5
 """Added to the members' mean squares, as a share of their harmonic mean, for weights that are more
 even."""
-MEMBER_POOL_SIZE = 64
-"""A bank's members are searched for among this many of the best sets."""
+MEMBER_CLIP = 6.0
+"""Where members are chosen, `clip_errors` clips at this many times the fixed set's."""
 
 
 class BankSettings(BaseModel):
@@ -50,31 +48,25 @@ class BankSettings(BaseModel):
 
     adapt: bool = True  # if not, the fixed set keeps all the weight
     # How fast a sequence's weight falls with the distance of its nearest frames.
-    sharpness: Annotated[NonNegativeFloat, Field(allow_inf_nan=False)] = 6.0
-    n_frames: PositiveInt = 300  # nearest frames of each sequence
+    sharpness: Annotated[NonNegativeFloat, Field(allow_inf_nan=False)] = 12.0
+    # Nearest frames of each stretch: products of errors need more of them than means do.
+    n_frames: PositiveInt = 1000
     # Minimum share of the weight that the fixed set keeps where nothing was measured.
     min_fixed_share: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
     # How many windows of live evidence the training counts as.
     prior_windows: Annotated[PositiveFloat, Field(allow_inf_nan=False)] = 3.0
     # Errors are clipped at this many times the fixed set's root mean square in the sequence: a
     # member that has lost track is left out of the mean, and does not cost what it would alone.
-    clip: Annotated[PositiveFloat, Field(allow_inf_nan=False)] = 6.0
+    clip: Annotated[PositiveFloat, Field(allow_inf_nan=False)] = 18.0
     # How many of the last members rest where the training knows the place.
     reserve: NonNegativeInt = 0
-
-
-class MemberWeights(NamedTuple):
-    """Weights of a bank's members, period after period."""
-
-    members: tuple[int, ...]  # trial numbers, the fixed set's first
-    weights: NDArray[np.float64]  # (n_periods, n_members)
 
 
 class NearProducts(NamedTuple):
     """Products of errors on the training frames nearest to some scans."""
 
     members: tuple[int, ...]  # trial numbers
-    evidence: Evidence
+    frames: NearFrames
     # (n_scans, n_sequences, n_members, n_members): mean products of the members' errors, percent
     # squared.
     products: NDArray[np.float64]
@@ -96,15 +88,13 @@ class BankRule(Rule):
     """
 
     sentence = "what adapts with the least expected loss in training, or the fixed set"
-    gated = weighs = True
+    needs_known_sensor = gives_weights = True
 
     @classmethod
-    def of(cls, model: Any, weighs: bool) -> Rule:
+    def of(cls, bank: BankSettings | None) -> Rule:
         """See `Rule.of`: where no bank runs, the fixed set is kept."""
-        if not weighs:
-            return FixedSet()
-        # A bank that need not always work weighs its members where it does.
-        return cls(model.bank_settings.model_copy(update={"adapt": True}))
+        # Members of a bank that need not always work have weights where they do.
+        return cls(bank.model_copy(update={"adapt": True})) if bank else FixedSet()
 
     def __init__(self, settings: BankSettings | None = None):
         self.settings = settings or BankSettings()
@@ -123,7 +113,7 @@ class BankRule(Rule):
         self.products_ = np.empty((len(data.features), len(members), len(members)), np.float32)
         for s in np.unique(data.sequence):
             frames = data.sequence == s
-            vectors, lost = clip_errors(data.vectors[frames], 0, self.settings.clip)
+            vectors, lost = clip_errors(data.vectors[frames], self.settings.clip)
             self.products_[frames] = np.einsum("ijx,ikx->ijk", vectors, vectors)
             self.products_[frames] += lost[:, :, None] ** 2 * np.eye(len(members))
         self.fixed_squares_ = self.products_[:, 0, 0].astype(np.float64)
@@ -135,20 +125,20 @@ class BankRule(Rule):
 
         Features are of shape (n_scans, n_features).
         """
-        evidence = self.nearest_.about(features)
-        products, fixed = evidence.means(self.products_), evidence.means(self.fixed_squares_)
-        return NearProducts(self.members_, evidence, products, fixed)
+        frames = self.nearest_.near(features)
+        products, fixed = frames.means(self.products_), frames.means(self.fixed_squares_)
+        return NearProducts(self.members_, frames, products, fixed)
 
     def select(self, feature: NDArray[np.float64], live: Live = NOTHING) -> Selection:
         """See `Rule.select`."""
         near = self.near(feature[None])
-        familiarity = float(near.evidence.familiarity[0])
+        familiarity = float(near.frames.familiarity[0])
         members = live.at_work(self.members_, familiarity, self.predicted_fixed(near))
         return self.weigh(near.of(members), live.squares(members))
 
     def predicted_fixed(self, near: NearProducts) -> float:
         """Root mean square of the fixed set's error that is expected for one scan, in percent."""
-        (of_sequences,) = near.evidence.weights(self.settings.sharpness)
+        (of_sequences,) = near.frames.weights(self.settings.sharpness)
         return float(np.sqrt(of_sequences @ near.fixed[0]))
 
     def weigh(self, near: NearProducts, live: LiveSquares | None) -> Selection:
@@ -163,7 +153,7 @@ class BankRule(Rule):
         return weighted_selection(self.data_.sets, of_members)._replace(
             predicted_error=float(ratio) * fixed,
             predicted_fixed=fixed,
-            familiarity=float(near.evidence.familiarity[0]),
+            familiarity=float(near.frames.familiarity[0]),
         )
 
 
@@ -182,12 +172,12 @@ def bank_weights(
     n_members), ratios to the fixed set's root mean square of shape (n_scans,).
     """
     relative = near.products / (near.fixed + ERROR_FLOOR**2)[..., None, None]
-    of_sequences = near.evidence.weights(settings.sharpness)
-    trust = near.evidence.trust[:, None, None]
+    of_sequences = near.frames.weights(settings.sharpness)
+    trust = near.frames.trust[:, None, None]
     learned = np.einsum("qs,qsjk->qjk", of_sequences, relative)
     learned = trust * learned + (1.0 - trust) * _untried(len(near.members))
     windows = settings.prior_windows * (
-        UNFAMILIAR_PRIOR_SHARE + (1.0 - UNFAMILIAR_PRIOR_SHARE) * near.evidence.trust
+        UNFAMILIAR_PRIOR_SHARE + (1.0 - UNFAMILIAR_PRIOR_SHARE) * near.frames.trust
     )
     squares = np.array([blend(*of_scan) for of_scan in zip(learned, windows, live, strict=True)])
     weights = np.array([minimum_variance_weights(of_scan) for of_scan in squares])
@@ -223,19 +213,19 @@ def _untried(n_members: int) -> NDArray[np.float64]:
 
 
 def clip_errors(
-    vectors: NDArray[np.float32], fixed_at: int, clip: float = BankSettings().clip
+    vectors: NDArray[np.float32], clip: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Clip the errors on the frames of a sequence.
 
-    Vectors are percent, of shape (n_frames, n_sets, 3), not finite where the track was lost;
-    `fixed_at` is the fixed set's column.
+    Vectors are percent, of shape (n_frames, n_sets, 3), not finite where the track was lost. `clip`
+    is in times the root mean square of the first set, which is the fixed one.
 
     Returns vectors of the same shape, zero where the track was lost, and what counts there instead,
     in no direction, of shape (n_frames, n_sets), zero elsewhere.
     """
     lengths = np.linalg.norm(vectors, axis=-1)
     lost = ~(lengths <= FAILURE)
-    of_fixed = np.where(lost[:, fixed_at], FAILURE, lengths[:, fixed_at])
+    of_fixed = np.where(lost[:, 0], FAILURE, lengths[:, 0])
     most = clip * np.sqrt((of_fixed**2).mean() + ERROR_FLOOR**2)
     share = np.minimum(1.0, most / np.maximum(lengths, 1e-9))
     kept = np.where(lost[..., None], 0.0, vectors) * np.where(lost, 0.0, share)[..., None]
@@ -265,41 +255,30 @@ def minimum_variance_weights(squares: NDArray[np.float64]) -> NDArray[np.float64
 
 
 def choose_members(
-    vectors: Sequence[Mapping[int, NDArray[np.float32]]],
-    errors: Sequence[NDArray[np.floating]],
-    sets: ParameterSets,
-    fixed: int,
+    vectors: NDArray[np.float32],
+    sequence: NDArray[np.intp],
+    pool: Sequence[int],
     size: int,
-    spending: Spending | None = None,
+    allow: Callable[[list[int]], bool] = lambda _: True,
 ) -> list[int]:
     """Choose sets whose errors cancel each other: trial numbers, the fixed set's first.
 
-    The search is greedy and begins with the fixed set. Each next member is the one that most
-    lowers the mean over the sequences of the root mean square of a weighted mean, if the best
-    weights in every sequence were known.
+    The search is greedy and begins with the fixed set, the first of the pool. Each next member is
+    the one that most lowers the mean over the sequences of the root mean square of a weighted mean,
+    if the best weights in every sequence were known.
 
-    `vectors` has for every sequence the error vectors by trial number, each of shape (n_frames,
-    3); a set without them is not chosen. `errors` has for every sequence percent of shape
-    (n_frames, n_sets), NaN where a set was not run; a set that was not run on every sequence is
-    not chosen.
+    `vectors` are the errors of the pool, of shape (n_frames, n_pool, 3); `sequence` has the number
+    of each frame's, and `allow` says whether a bank may be of some trials.
     """
-    number = np.repeat(np.arange(len(errors)), [len(e) for e in errors])
-    means = mean_errors(np.concatenate(errors), number)
-    best = [
-        sets.trials[c]
-        for c in np.argsort(means, kind="stable")[:MEMBER_POOL_SIZE]
-        if means[c] < np.inf
-    ]
-    pool = [fixed, *(t for t in best if t != fixed and all(t in known for known in vectors))]
     squares = []
-    for known in vectors:
-        few, lost = clip_errors(np.stack([known[trial] for trial in pool], axis=1), 0)
+    for s in np.unique(sequence):
+        few, lost = clip_errors(vectors[sequence == s], MEMBER_CLIP)
         rows = few.transpose(0, 2, 1).reshape(-1, len(pool)).astype(np.float64)
         products = (rows.T @ rows + np.diag((lost.astype(np.float64) ** 2).sum(axis=0))) / len(few)
         squares.append(products / (products[0, 0] + ERROR_FLOOR**2))
     chosen = [0]
     while len(chosen) < min(size, len(pool)):
-        next_one = _next_member(squares, pool, chosen, spending)
+        next_one = _next_member(squares, pool, chosen, allow)
         if next_one is None:
             break
         chosen.append(next_one)
@@ -310,13 +289,11 @@ def _next_member(
     squares: list[NDArray[np.float64]],
     pool: Sequence[int],
     chosen: Sequence[int],
-    spending: Spending | None,
+    allow: Callable[[list[int]], bool],
 ) -> int | None:
     """Place in `pool` of the set that most lowers the error of those chosen; None if none may."""
-    rest = [j for j in range(len(pool)) if j not in chosen]
     members = [pool[j] for j in chosen]
-    if spending is not None:
-        rest = [j for j in rest if spending.allows([*members, pool[j]])]
+    rest = [j for j in range(len(pool)) if j not in chosen and allow([*members, pool[j]])]
     lowered = {j: _root_mean_square(squares, [*chosen, j]) for j in rest}
     return min(rest, key=lowered.__getitem__, default=None)
 

@@ -162,7 +162,7 @@ class OdometryInstance(ABC):
     """
 
     # Whether it works in another process, from `submit` on.
-    apart: ClassVar[bool] = False
+    isolated: ClassVar[bool] = False
     # Whether it can be shown scans of the past again.
     rewinds: bool = True
 

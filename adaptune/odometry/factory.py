@@ -50,7 +50,7 @@ class OdometryFactory:
         return replace(self, **changes)
 
     @property
-    def apart(self) -> bool:
+    def isolated(self) -> bool:
         """Whether it runs in processes of their own, which have limits."""
         return not self.description.clean or registry.is_user_class(self.name)
 
@@ -123,9 +123,9 @@ class OdometryPool:
         return {"name": self.name, "settings": settings}
 
     @property
-    def apart(self) -> bool:
+    def isolated(self) -> bool:
         """Whether any of them runs in processes of its own, which have limits."""
-        return any(factory.apart for factory in self.factories.values())
+        return any(factory.isolated for factory in self.factories.values())
 
     @property
     def one_by_one(self) -> bool:

@@ -349,7 +349,7 @@ class FileRun(WholeRun):
         return [replace(argument, values) for argument in self.settings.command]
 
     @property
-    def told_output(self) -> bool:
+    def names_output(self) -> bool:
         """Whether the command says where to write; if so, the folder is there for it."""
         return any("output" in placeholders(argument) for argument in self.settings.command)
 
@@ -371,7 +371,7 @@ class Command(FileRun):
         here = folder / "run"
         output = here / self.settings.output
         here.mkdir()
-        if self.told_output:
+        if self.names_output:
             output.parent.mkdir(parents=True, exist_ok=True)
         paths = {"input": given.path.resolve(), "output": output}
         if (file := self.filled_template(folder)) is not None:

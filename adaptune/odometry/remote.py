@@ -61,7 +61,7 @@ class Isolated(Faulting):
     odometry: it stays from start to start, and is a new one only after a fault.
     """
 
-    apart = True
+    isolated = True
     _checks_poses: ClassVar[bool] = True
 
     def __init__(

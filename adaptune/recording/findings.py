@@ -77,7 +77,7 @@ _GAPS = {
 }
 
 
-def of_topic(topic: Topic, role: str, complete: bool, apart: bool) -> Iterator[Finding]:
+def of_topic(topic: Topic, role: str, complete: bool, separate: bool) -> Iterator[Finding]:
     """What is wrong with the messages of a topic, used as `role`, and with their stamps."""
     where = (topic.name,)
     if role and len(topic.types) > 1:
@@ -94,7 +94,7 @@ def of_topic(topic: Topic, role: str, complete: bool, apart: bool) -> Iterator[F
     if role and topic.count and not topic.n_read and not complete:
         what = f"its {topic.count} messages are not in the sample"
         yield Finding(where, what, "`--deep` reads them", of=role)
-    if topic.stamped and any(topic.stamps) and not apart:
+    if topic.stamped and any(topic.stamps) and not separate:
         yield from _stamps(topic, role)
         if not complete and sum(map(len, topic.stamps)) < topic.count:
             yield from _count(topic, role)

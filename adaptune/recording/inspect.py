@@ -183,15 +183,15 @@ def _inspect_scans(path: Path, kind: str, deep: bool, show: Progress) -> Inspect
         found.findings.append(
             Finding((), str(error), of="reference", lacks="a reference trajectory")
         )
-    _find(found, apart=False, slack=0.0)
+    _find(found, separate=False, slack=0.0)
     return found
 
 
-def _find(found: Inspection, apart: bool, slack: float) -> None:
+def _find(found: Inspection, separate: bool, slack: float) -> None:
     """Add what is wrong with what was read, see `of_topic` and `of_overlap`."""
     roles = {name: key for key, name in found.used.items()}
     for topic in found.topics.values():
-        found.findings += of_topic(topic, roles.get(topic.name, ""), found.complete, apart)
+        found.findings += of_topic(topic, roles.get(topic.name, ""), found.complete, separate)
     scans = found.topics.get(found.used.get("points", ""))
     if scans is not None:
         found.findings += [*of_clouds(scans, found.content), *of_times(scans, found.content)]
@@ -212,7 +212,7 @@ SECONDS = 1.0
 # Bytes read in a second, with BZ2 and without; seconds that a message takes to decode.
 _SLOW, _FAST, _DECODE = 2.5e6, 2e8, 4e-5
 _FEWEST, _MOST, _EACH = 5, 20, 2.5  # parts of a sample, and messages of a topic in each
-_APART = 60.0  # seconds; bags of one drive are not further apart
+_LONGEST_GAP = 60.0  # seconds; bags of one drive are not further apart
 
 
 def _inspect_bags(path: Path, deep: bool, show: Progress) -> Inspection:
@@ -228,12 +228,12 @@ def _inspect_bags(path: Path, deep: bool, show: Progress) -> Inspection:
         source.points = used.get("points", "")
         source.look_at_clock(reader)
         found.findings += source.findings
-        apart = _apart(reader, source.paths)
-        found.findings += apart
+        separate = _separate(reader, source.paths)
+        found.findings += separate
         survey = _Survey(source, reader, found)
         survey.read(0 if deep else survey.n_parts(), show)
         found.reference = survey.trajectory()
-    _find(found, bool(apart), survey.slack)
+    _find(found, bool(separate), survey.slack)
     return found
 
 
@@ -258,14 +258,14 @@ def _used(topics: dict[str, Topic]) -> dict[str, str]:
     return used
 
 
-def _apart(reader: AnyReader, paths: tuple[Path, ...]) -> list[Finding]:
+def _separate(reader: AnyReader, paths: tuple[Path, ...]) -> list[Finding]:
     """Whether bags do not follow each other: the two with the longest time between them."""
     readers: Any = reader.readers
     spans = [(r.start_time, r.end_time, p.name) for r, p in zip(readers, paths, strict=True)]
     spans = sorted(span for span in spans if span[0] < span[1])
     ends = np.maximum.accumulate([end for _, end, _ in spans])
     gaps = [(start - end) * 1e-9 for (start, *_), end in zip(spans[1:], ends, strict=False)]
-    if not gaps or max(gaps) <= _APART:
+    if not gaps or max(gaps) <= _LONGEST_GAP:
         return []
     longest = int(np.argmax(gaps))
     days = f" ({gaps[longest] / 86400.0:,.0f} days)" if gaps[longest] > 2.0 * 86400.0 else ""

@@ -36,8 +36,8 @@ def sound(
     lost = _repeated(reference)
     found = _in_words("repeats a pose while the robot moves", reference, lost, begin)
     reference = _without(reference, lost)
-    if apart := _to_and_fro(reference):
-        what = f"the reference goes to and fro by {apart:.2g} m from pose to pose"
+    if metres := _to_and_fro(reference):
+        what = f"the reference goes to and fro by {metres:.2g} m from pose to pose"
         mend = (
             "it is noise, or two nodes publish it by turns: name the poses of one of them, or use "
             "`reference: estimated`"
@@ -122,11 +122,11 @@ def _jumps(reference: Trajectory) -> tuple[NDArray[np.int64], float]:
     seconds = np.maximum(np.diff(stamps) * 1e-9, 1e-3)
     steps = np.hstack([T[:, :3, 3], Rotation.from_matrix(T[:, :3, :3]).as_rotvec()])
     around = _around(steps / seconds[:, None])
-    apart = np.linalg.norm(steps - around * seconds[:, None], axis=2).min(axis=0)
+    departure = np.linalg.norm(steps - around * seconds[:, None], axis=2).min(axis=0)
     speed = np.linalg.norm(around, axis=2).max(axis=0)
     share, late = _STAMPS
     explained = np.maximum(_ACCELERATION * seconds**2, speed * np.maximum(share * seconds, late))
-    jumps = apart > np.maximum(explained, max(_JUMP, _NOISE * float(np.median(apart))))
+    jumps = departure > np.maximum(explained, max(_JUMP, _NOISE * float(np.median(departure))))
     jumps |= np.linalg.norm(T[:, :3, 3], axis=1) > FASTEST * seconds
     far = np.linalg.norm(steps[jumps], axis=1).max(initial=0.0)
     return np.column_stack([stamps[:-1], stamps[1:]])[jumps], float(far)

@@ -65,8 +65,8 @@ def _stride(stretch: list[Scan]) -> int:
     """Which scans are enough where the sensor moves slowly: every one, second or fourth."""
     *_, (_, T, seconds) = neighbour_motions(stretch[:2])
     T = np.full((4, 4), np.nan) if T is None else T
-    apart = np.array([np.linalg.norm(T[:3, 3]), rotation_angle(T), seconds])
-    return max(n for n in (1, 2, _EACH) if n == 1 or (n * apart < _NEAR).all())
+    moved = np.array([np.linalg.norm(T[:3, 3]), rotation_angle(T), seconds])
+    return max(n for n in (1, 2, _EACH) if n == 1 or (n * moved < _NEAR).all())
 
 
 def _motions_over(stretch: list[Scan]) -> Iterator[tuple[int, int, Hop]]:
@@ -94,8 +94,8 @@ def _motions_over(stretch: list[Scan]) -> Iterator[tuple[int, int, Hop]]:
             ends = clouds[start], clouds[i]
             given = [guess] if metres >= _STANDING else []
             if (hop := register(*ends, given, reaches=OFFLINE_REACHES)) is not None:
-                apart = hop.projection @ (hop.T_start_end - guess)[:3, 3]
-                if np.linalg.norm(apart) < _AGREE:
+                difference = hop.projection @ (hop.T_start_end - guess)[:3, 3]
+                if np.linalg.norm(difference) < _AGREE:
                     yield start * stride, i * stride, hop
             start += _EACH // stride
         if np.linalg.norm(T[i][:3, 3]) > _ENOUGH:
@@ -133,11 +133,11 @@ def mismatch(T_world_sensor: Poses, hops: Hops) -> NDArray[np.float64]:
     the directions that the place shows; NaN where a pose is unknown.
     """
     T = invert(T_world_sensor[hops.start]) @ T_world_sensor[hops.end]
-    apart = invert(hops.T_start_end) @ T
+    T_difference = invert(hops.T_start_end) @ T
     metres = np.linalg.norm(hops.T_start_end[:, :3, 3], axis=1)
     shift = np.einsum("nij,nj->ni", hops.projection, T[:, :3, 3] - hops.T_start_end[:, :3, 3])
     share = np.linalg.norm(shift, axis=1) / np.maximum(metres, 1e-9)
-    return np.asarray(100.0 * np.minimum(np.hypot(share, rotation_angle(apart)), 1.0))
+    return np.asarray(100.0 * np.minimum(np.hypot(share, rotation_angle(T_difference)), 1.0))
 
 
 def _mean(errors: NDArray[np.float64]) -> float:
@@ -270,10 +270,10 @@ def _clock(reference: Trajectory, stamps: NDArray[np.int64], hops: Hops) -> Iter
     def unlike(offset: float) -> float:
         start, end = np.split(shifted(offset, ends), 2)
         other_turned, other_moved = _turned_moved(invert(start) @ end)
-        apart = np.hypot(other_turned - turned, (other_moved - moved) / np.maximum(moved, 1e-9))
-        known = np.isfinite(apart)
+        shares = np.hypot(other_turned - turned, (other_moved - moved) / np.maximum(moved, 1e-9))
+        known = np.isfinite(shares)
         # Where half of it is unknown, an offset explains nothing.
-        return float(np.minimum(apart[known], 1.0).mean()) if known.mean() > 0.5 else np.inf
+        return float(np.minimum(shares[known], 1.0).mean()) if known.mean() > 0.5 else np.inf
 
     step = float(np.clip(0.2 * np.median(seconds), 0.05, 0.5))
     offsets = np.arange(-CLOCK, CLOCK + step / 2, step)

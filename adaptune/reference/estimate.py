@@ -228,11 +228,11 @@ def _steps_of(found: Pass, T_world_sensor: Poses, members: Sequence[int]) -> Pos
     """Mean motions of some members; those far from the reference count only where none is near."""
     whole = steps(T_world_sensor)[:, None]
     theirs = found.T_previous_current[1:, list(members)]
-    apart = np.linalg.norm((theirs - whole)[..., :3, 3], axis=-1)
-    apart += LEVER * rotation_angle(invert(whole) @ theirs)
-    near = apart <= _NEAR
+    distance = np.linalg.norm((theirs - whole)[..., :3, 3], axis=-1)
+    distance += LEVER * rotation_angle(invert(whole) @ theirs)
+    near = distance <= _NEAR
     near |= ~near.any(axis=1, keepdims=True)
-    theirs = np.where(np.isfinite(apart)[..., None, None], theirs, whole)
+    theirs = np.where(np.isfinite(distance)[..., None, None], theirs, whole)
     return mean_motion(theirs, near.astype(np.float64))
 
 

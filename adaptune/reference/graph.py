@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from adaptune.bank.bank import Bank
 from adaptune.geometry import Poses, invert, rectify, rotation_angle, steps
-from adaptune.live.hops import OFFLINE_CLOUD, OFFLINE_REACHES, Hop, HopCloud, register
+from adaptune.live.hops import NEW_GUESS, OFFLINE_CLOUD, OFFLINE_REACHES, Hop, HopCloud, register
 from adaptune.metrics import travelled
 from adaptune.odometry.base import InProcess
 from adaptune.odometry.health import HealthCheck
@@ -81,7 +81,6 @@ than this share of the way."""
 MIN_INLIERS_OFFLINE = 0.3
 """Least share of points near a point of the other scan. Many registrations check each other, so it
 may be lower than while driving."""
-_APART = 0.3  # metres between guesses that are worth a registration each
 
 
 class Guess(NamedTuple):
@@ -211,7 +210,7 @@ class _Registering:
         yield Guess(start.number, end.number, -1, hop)
         tried = [T_start_end[0]]
         for member, T in enumerate(T_start_end[1:]):
-            if hop is None and all(_metres_apart(T, other) > _APART for other in tried):
+            if hop is None and all(_metres_apart(T, other) > NEW_GUESS for other in tried):
                 tried.append(T)
                 yield Guess(start.number, end.number, member, _registered(start, end, T))
 

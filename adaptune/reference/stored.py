@@ -45,9 +45,9 @@ class StoredEstimate(NamedTuple):
 
         There is an `EstimateError` if the file beside it is damaged.
         """
-        beside = path.with_suffix(".json")
+        about = path.with_suffix(".json")
         try:
-            known = json.loads(beside.read_text(encoding="utf-8"))
+            known = json.loads(about.read_text(encoding="utf-8"))
             if "refused" in known:
                 return None
             errors = {float(length): float(e) for length, e in known["error_percent"].items()}
@@ -57,7 +57,7 @@ class StoredEstimate(NamedTuple):
             return None
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise EstimateError(
-                f"{beside}: is damaged ({error}); remove it and {path.name}, and estimate the "
+                f"{about}: is damaged ({error}); remove it and {path.name}, and estimate the "
                 f"reference again"
             ) from error
 

@@ -110,8 +110,8 @@ def spec(chart: Chart, titled: bool = True) -> Spec:
     """A chart as a specification of Vega-Lite 6; `titled` if its title stands above it."""
     columns = max(1, min(chart.columns, len(chart.panels)))
     rows = [chart.panels[i : i + columns] for i in range(0, len(chart.panels), columns)]
-    beside = sum(max(map(_beside, chart.panels[c::columns])) for c in range(columns))
-    width = round((_WIDTH - beside) / columns)
+    legends = sum(max(map(_legend_width, chart.panels[c::columns])) for c in range(columns))
+    width = round((_WIDTH - legends) / columns)
     usual = 300.0 if len(rows) == 1 else 150.0 if chart.shared_x else 240.0
     every = {"": Look(_DARK)} | looks(chart)
     sharing = [chart.shared_x and not panel.equal for panel in chart.panels]
@@ -163,7 +163,7 @@ def _height(panel: Panel) -> float:
     return max(panel.height, 0.3 + 0.09 * len(panel.y.names or ()))
 
 
-def _beside(panel: Panel) -> float:
+def _legend_width(panel: Panel) -> float:
     """Pixels for what stands left and right of a panel."""
     names = [part for name in panel.y.names or () for part in wrapped(name, 32)]
     coloured = (isinstance(item, Points) and item.colour is not None for item in panel.drawn)

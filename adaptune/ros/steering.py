@@ -39,7 +39,7 @@ class Steering:
     ):
         self._node, self._set_parameters = node, set_parameters
         self._command, self._run = command, run
-        self._told: set[str] = set()
+        self._warned_of: set[str] = set()
         self._holds = False
 
     def apply(self, parameters: ParameterSet) -> None:
@@ -64,8 +64,8 @@ class Steering:
             _log.info(what, self._node)
 
     def _warn(self, name: str) -> None:
-        if name not in self._told:
-            self._told.add(name)
+        if name not in self._warned_of:
+            self._warned_of.add(name)
             what = "%s: nobody says whether %s takes effect before the node starts again"
             _log.warning(what, self._node, name)
 

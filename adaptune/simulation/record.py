@@ -48,7 +48,7 @@ class SimulatedScan(Scan):
     T_world_sensor: Poses  # at the scan's stamp, of shape (4, 4)
 
 
-class Drive:
+class SimulatedDrive:
     """A course with its road and the sensor's ride along it."""
 
     def __init__(self, course: Course) -> None:
@@ -108,7 +108,7 @@ class Drive:
 class _Caster:
     """Casts rays into the world nearby, which it builds again for every tile."""
 
-    def __init__(self, drive: Drive, sight: float) -> None:
+    def __init__(self, drive: SimulatedDrive, sight: float) -> None:
         self._road, self._sight = drive.road, sight
         self._world = World(drive.road)
         self._here: int | None = None
@@ -141,7 +141,7 @@ class _Caster:
 
 def simulate(course: Course) -> Iterator[SimulatedScan]:
     """Drive a course and scan it, one scan at a time; stamps always mark a scan's start."""
-    return Drive(course).scans()
+    return SimulatedDrive(course).scans()
 
 
 GRAVITY = 9.80665  # m/s^2, downwards along the world's z axis
@@ -194,7 +194,7 @@ def record(
     for file in (path, truth):
         if file.exists() and not overwrite:
             raise SimulationError(f"{file} exists already; give --overwrite to replace it")
-    drive = Drive(course)
+    drive = SimulatedDrive(course)
     if not len(drive):
         raise SimulationError("the course is over before its first scan is: make it longer")
     ros = Messages(1)
@@ -210,7 +210,7 @@ def record(
 
 
 def _messages(
-    ros: Messages, drive: Drive, progress: Callable[[int, int], None]
+    ros: Messages, drive: SimulatedDrive, progress: Callable[[int, int], None]
 ) -> Iterator[Message]:
     """All messages in the order in which they are sent: a cloud when its scan is over."""
     stamps, course = drive.stamps(), drive.course

@@ -160,7 +160,7 @@ class Study(Generic[C_co]):
         odometry = self.odometry
         parameters = {"parameters": odometry.space.dump()}
         about = {"odometry": odometry.identity | parameters, "content": odometry.content}
-        limits = {"limits": self.config.isolation.model_dump()} if odometry.apart else {}
+        limits = {"limits": self.config.isolation.model_dump()} if odometry.isolated else {}
         inputs: dict[str, Any] = manifest.plain(about | limits)
         return inputs
 

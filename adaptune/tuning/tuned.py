@@ -218,7 +218,7 @@ def tune_asked(
     """Do what `tune` does of what was asked."""
     from adaptune.odometry.registry import forget_user_code
     from offline.config import load_study
-    from offline.search import ELAPSED, Clock
+    from offline.search import ELAPSED, Stopwatch
     from offline.train import train
     from online.modes import run_replays
 
@@ -235,7 +235,7 @@ def tune_asked(
     if asked.reference is not None and Path(asked.reference).is_file():
         asked = asked._replace(reference=str(Path(asked.reference).resolve()))
     folder = folder or Path("runs") / _study_name(asked)
-    clock = Clock(folder / ELAPSED, replays=True)
+    clock = Stopwatch(folder / ELAPSED, replays=True)
     path, now, more = written(asked, overrides, folder, show)
     study = load_study(path, [*overrides, *now], folder)
     _log.info("study: %s", path)

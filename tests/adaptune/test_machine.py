@@ -68,9 +68,9 @@ from adaptune import machine
 before = machine.resident_megabytes()
 np.ones(2**21)  # once it is free, the C library keeps arrays of this size
 large, small = [], []
-with machine.apart() if sys.argv[1] == "apart" else contextlib.nullcontext():
-    if sys.argv[1] == "apart":
-        with machine.apart():
+with machine.freeing_large_arrays() if sys.argv[1] == "freed" else contextlib.nullcontext():
+    if sys.argv[1] == "freed":
+        with machine.freeing_large_arrays():
             pass  # the outer block goes on
     for _ in range(50):
         large.append(np.ones(2**18))
@@ -87,4 +87,4 @@ def test_large_arrays_among_small_ones_leave_no_holes():
         return float(subprocess.run(command, capture_output=True, check=True, text=True).stdout)
 
     assert kept("as ever") > 50.0
-    assert kept("apart") < 10.0
+    assert kept("freed") < 10.0

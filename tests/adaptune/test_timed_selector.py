@@ -14,7 +14,7 @@ from adaptune.model import BankSettings
 from adaptune.odometry.base import InProcess, Motions
 from adaptune.odometry.keyframe import KeyframeGicp
 from adaptune.recording.scan import Scan
-from adaptune.selector import Schedule, Selector, TimedSelector, UntrainedSelector
+from adaptune.selector import Periods, Selector, TimedSelector, UntrainedSelector
 from adaptune.space import ParameterSets, Selection
 
 SCAN = Scan(0, np.zeros((0, 3), np.float32))
@@ -62,9 +62,9 @@ def trials(timed, stamps, motions=None):
 
 @pytest.mark.parametrize("period", [0.1, 0.2, 0.3, 0.7, 1.0])
 def test_no_selection_is_lost_to_rounding(period):
-    schedule = Schedule(period * 1e9)
+    periods = Periods(period * 1e9)
     every = round(period * 10)
-    due = [i for i in range(6000) if schedule.due(i * 10**8)]
+    due = [i for i in range(6000) if periods.due(i * 10**8)]
     assert due == list(range(0, 6000, every))
 
 

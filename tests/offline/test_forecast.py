@@ -5,7 +5,7 @@ from adaptune.archive import Archive
 from offline import campaign
 from offline.campaign import ALONE, COST, FITTING, Forecast, forecast
 from offline.config import load_study
-from offline.search import Clock
+from offline.search import Stopwatch
 
 
 @pytest.fixture
@@ -16,10 +16,10 @@ def study(study_file, trained_folder):
 def test_it_follows_from_the_baseline_s_drives(study, tmp_path):
     archive = Archive(study.folder / "trials")
     costs = [1e-3 * archive.finished(name)[0].cost for name in ("one", "two")]
-    alone = forecast(study, archive, 1, Clock(tmp_path))
+    alone = forecast(study, archive, 1, Stopwatch(tmp_path))
     assert alone.each == pytest.approx(COST * 40 * sum(costs))  # scans of both
     assert alone.rest == FITTING  # trials drove the whole recordings
-    two = forecast(study, archive, 2, Clock(tmp_path, replays=True))
+    two = forecast(study, archive, 2, Stopwatch(tmp_path, replays=True))
     assert two.each == alone.each / 2
     members = 5 if study.mechanism == "bank" else 1
     replays = ALONE + members * len(study.rules)
@@ -31,7 +31,7 @@ def test_finalists_drive_the_rest_of_long_recordings(study, tmp_path, monkeypatc
     drives = campaign.read_whole_drives(archive, ["one", "two"], [0])
     monkeypatch.setattr(campaign, "read_whole_drives", lambda *_: drives)
     monkeypatch.setattr(archive, "is_uncut", lambda _: False)
-    found = forecast(study, archive, 1, Clock(tmp_path))
+    found = forecast(study, archive, 1, Stopwatch(tmp_path))
     assert found.rest - FITTING == pytest.approx(6 * found.each)
 
 

@@ -37,6 +37,18 @@ def in_whole(data, *of_sequences):
     return data._replace(sequences=sequences, driven=list(of_sequences[0]))
 
 
+def test_members_come_from_the_best_sets_that_were_run_everywhere():
+    data, known = labelled([3.0, 2.0, 1.0], [3.0, 2.0, 1.0]), dict.fromkeys((0, 2, 5))
+    there = data._replace(sequences=[replace(s, vectors=known) for s in data.sequences])
+    assert there.member_pool(0) == [0, 5, 2]
+    assert there.member_pool(2) == [2, 5, 0]
+    first, second = there.sequences
+    errors = second.errors.copy()
+    errors[:, 1] = np.nan
+    for other in (replace(second, errors=errors), replace(second, vectors={0: None, 5: None})):
+        assert there._replace(sequences=[first, other]).member_pool(0) == [0, 5]
+
+
 def test_drives_of_whole_recordings_decide_where_there_are_some():
     data = labelled([3.0, 2.0, 1.0], [3.0, 2.0, 1.0])
     assert data.fixed() == data.training_data()[0].fixed == 5

@@ -103,7 +103,7 @@ def test_validates_a_study(study_file, trained_folder, tmp_path):
     assert rows[0]["adaptive, 95 %"] is None
     summary = validation.summary("adaptive")
     assert rows[3]["adaptive, 95 %"] == f"{summary['low']:.2f}-{summary['high']:.2f}"
-    assert validation.left_out[0].block > 1
+    assert validation.left_out[0].span > 1
     for name in ("validation.csv", "validation.svg", "stretches.csv"):
         assert (study.folder / name).exists()
     other_range = "odometry.parameters.keyframe_interval.high=20"

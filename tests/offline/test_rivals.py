@@ -69,7 +69,8 @@ def test_a_budget_bounds_the_fixed_set_and_what_is_selected():
     # Live evidence does not fit beside the second one.
     frugal = data(places, budget=12.0)
     assert allowed_sets(frugal.costs, frugal.budget, frugal.sets, TRIALS[1]) == TRIALS[:2]
-    assert data(places).spending is None
+    assert data(places).can_pay(TRIALS)
+    assert not frugal.can_pay(TRIALS[:2])
 
 
 @pytest.fixture(scope="module")

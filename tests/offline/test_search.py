@@ -13,7 +13,7 @@ from adaptune.space import Categorical, Integer, ParameterSpace
 from offline import search
 from offline.campaign import Campaign, Forecast
 from offline.config import OfflineConfig, load_study
-from offline.search import Clock, Search
+from offline.search import Search, Stopwatch
 from offline.train import train
 
 NAMES = ["one", "two", "three"]
@@ -188,14 +188,14 @@ def test_a_default_study_asks_its_sampler(name, trials):
 
 def test_the_clock_goes_on_counting(tmp_path):
     path = tmp_path / "elapsed.json"
-    clock = Clock(path)
+    clock = Stopwatch(path)
     clock.save()
-    assert 0.0 < Clock(path).hours < 0.1
+    assert 0.0 < Stopwatch(path).hours < 0.1
     # By batch, as earlier versions kept it.
     path.write_text('{"0": 3600, "1": 1800.0}')
-    assert 1.5 <= Clock(path).hours < 1.6
+    assert 1.5 <= Stopwatch(path).hours < 1.6
     path.write_text("damaged")
-    assert Clock(path).hours < 0.1
+    assert Stopwatch(path).hours < 0.1
 
 
 class Slow(Drawn):
@@ -215,14 +215,14 @@ def test_no_set_begins_that_would_not_end_in_time(study_of, monkeypatch, expecte
     clock = SteppedClock()
     monkeypatch.setattr(search, "time", SimpleNamespace(monotonic=clock.now))
     study = study_of(trials="", hours=1500 / 3600)
-    of_study = Clock(study.folder / "elapsed.json")
+    of_study = Stopwatch(study.folder / "elapsed.json")
     clock.seconds = 100.0  # reading the bags
     given = Archive(study.folder / "trials"), Slow(clock)
     verdicts = Campaign(study, *given, clock=of_study, expected=Forecast(expected, 300.0)).run()
     assert clock.seconds == 100.0 + 30.0 * len(verdicts)
     assert 0.8 * 1500.0 <= clock.seconds + 300.0 <= 1500.0
     # Nor if the same command, again, finds that one more would fit.
-    again_clock = Clock(study.folder / "elapsed.json")
+    again_clock = Stopwatch(study.folder / "elapsed.json")
     again = Campaign(study, *given, clock=again_clock, expected=Forecast(1.0, 1.0))
     assert again.run().keys() == verdicts.keys()
 

@@ -12,7 +12,6 @@ from adaptune.archive import Frames, Trial
 from adaptune.bank.bank import Bank
 from adaptune.live.hops import CLIP, Hop, Hops
 from adaptune.metrics import sub_trajectory_rte, travelled, window_ends
-from adaptune.model.weights import MemberWeights
 from adaptune.space import Selection
 from adaptune.study.driven import PER_STRETCH
 from offline.labelled import BankSimulation, error_vectors, recorded_motions
@@ -132,9 +131,9 @@ def test_a_stretch_takes_its_part_of_everything():
     kept = one.stretch == 1
     some = one.frames(kept)
     # What is left of the drives follows from their errors.
-    blocks = np.unique(one.blocks_of[kept])
+    blocks = np.unique(one.block[kept])
     assert some.in_blocks().shape == (len(blocks), 5)
-    expected = errors[kept & (one.blocks_of == blocks[0]), 0].mean()
+    expected = errors[kept & (one.block == blocks[0]), 0].mean()
     np.testing.assert_allclose(some.whole.in_blocks()[0], [expected, 30.0])
     assert len(some.period) == len(some.errors) == len(some.whole.turns) == kept.sum()
     assert {len(of) for of in some.vectors.values()} == {kept.sum()}
@@ -198,7 +197,7 @@ def simulation_of(trials, weights, lost_track=3.0, hops=NOTHING):
         lambda members: motions[:, list(members)],
     )
     members = tuple(range(len(trials)))
-    return simulation, simulation.errors(MemberWeights(members, np.tile(weights, (6, 1))))
+    return simulation, simulation.errors(members, np.tile(weights, (6, 1)))
 
 
 def test_errors_are_vectors_as_long_as_they_say():
@@ -224,7 +223,7 @@ def test_members_that_err_in_opposite_directions_make_up_for_it():
 def test_a_member_that_lost_track_is_left_out():
     sound, lost = trial(straight(0.31)), lost_at(20, 0.29)
     simulation, errors = simulation_of([sound, sound, lost], [0.3, 0.3, 0.4])
-    agreeing = simulation.agreeing(MemberWeights((0, 1, 2), np.tile([0.3, 0.3, 0.4], (6, 1))))
+    agreeing = simulation.agreeing((0, 1, 2), np.tile([0.3, 0.3, 0.4], (6, 1)))
     assert agreeing[:, :2].all()
     assert not agreeing[25:28, 2].any()
     assert agreeing[:19, 2].all()
@@ -245,9 +244,9 @@ def test_members_vote_with_their_weights_and_the_reference_judges():
     _, errors = simulation_of([sound, wrong, wrong], [0.2, 0.4, 0.4])
     assert errors[known].min() > 20.0
     # Other weights than those that vote: the mean of the members that agree.
-    votes = MemberWeights((0, 1, 2), np.tile([0.8, 0.1, 0.1], (6, 1)))
-    even = MemberWeights((0, 1, 2), np.full((6, 3), 1.0 / 3.0))
-    assert simulation.errors(even, simulation.agreeing(votes))[known].max() < 12.0
+    members, votes, even = (0, 1, 2), np.tile([0.8, 0.1, 0.1], (6, 1)), np.full((6, 3), 1.0 / 3.0)
+    agreeing = simulation.agreeing(members, votes)
+    assert simulation.errors(members, even, agreeing)[known].max() < 12.0
 
 
 def test_a_member_that_lost_track_stands_still_until_it_is_noticed():
@@ -316,6 +315,4 @@ def test_it_is_what_a_bank_does():
             poses.append(bank.register(prepared).T_odom_sensor)
     expected = sub_trajectory_rte(frames().T_ref_sensor, np.array(poses), SHORT)
     alone = replace(simulation, lost_track=1e9)
-    np.testing.assert_allclose(
-        alone.errors(MemberWeights((0, 1, 2), weights)), np.minimum(expected, 30.0)
-    )
+    np.testing.assert_allclose(alone.errors((0, 1, 2), weights), np.minimum(expected, 30.0))

@@ -112,15 +112,15 @@ def test_a_bank_is_simulated_with_the_weights_of_each_period(monkeypatch):
     seen = []
     simulate = BankSimulation.errors
 
-    def errors(self, weights, agreeing):
-        seen.append(weights.weights)
-        return simulate(self, weights, agreeing)
+    def errors(self, members, weights, agreeing):
+        seen.append(weights)
+        return simulate(self, members, weights, agreeing)
 
     def bank_weights(near, _, live):
         assert len(live) == len(near.fixed)
         weights = np.zeros((len(near.fixed), near.products.shape[-1]))
         weights[::2, 0] = weights[1::2, 1] = 1.0
-        near.evidence.familiarity[:] = 1.0
+        near.frames.familiarity[:] = 1.0
         return weights, np.ones(len(weights))
 
     monkeypatch.setattr(BankSimulation, "errors", errors)

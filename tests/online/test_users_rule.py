@@ -5,6 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
+import users_rule
 
 from adaptune import manifest
 from adaptune.model import ErrorModel, ModelError
@@ -18,39 +19,10 @@ from online.compare import compare
 from online.modes import run_replays
 from online.record import StoredReplay
 
-RULE = """
-from adaptune.model import Rule
-from adaptune.model.rules import NOTHING
-from adaptune.space import Selection
-
-
-class Cheapest(Rule):
-    sentence = "the set that costs least, wherever it is"
-
-    def fit(self, data):
-        self.sets, costs = data.sets, data.costs
-        self.best = min(data.candidates or data.sets, key=costs.alone)
-        return self
-
-    def select(self, feature, live=NOTHING):
-        return Selection(self.best, self.sets[self.best], predicted_error=1.0)
-
-
-class Outside(Cheapest):
-    def fit(self, data):
-        super().fit(data)
-        self.best = next(trial for trial in data.sets if trial not in data.candidates)
-        return self
-
-
-class Other:
-    pass
-"""
-
 
 @pytest.fixture
 def study(study_file, trained_folder, tmp_path, monkeypatch):
-    (tmp_path / "my_rules.py").write_text(RULE)
+    shutil.copy(users_rule.__file__, tmp_path / "my_rules.py")
     monkeypatch.syspath_prepend(tmp_path)
     folder = shutil.copytree(trained_folder, tmp_path / "study")
     return load_study(study_file, ["online.modes=[my_rules:Cheapest, adaptive]"], folder)

@@ -51,7 +51,7 @@ def in_place(name, simulation, known, errors, **more):
     """A sequence with errors on its known frames."""
     frames = np.flatnonzero(known)
     place = (name, name, simulation, frames, stretches(simulation, frames))
-    more |= {"blocks_of": stretches(simulation, frames, 2.0)}
+    more |= {"block": stretches(simulation, frames, 2.0)}
     return LabelledSequence(*place, errors, {"ndt": 90}, **more)
 
 

@@ -191,8 +191,8 @@ class Container:
     of the host but its mounts. There is an `OdometryError` if it cannot be started.
 
     Memory is in gigabytes. The command is the image's own if it is empty; a bare one takes the
-    place of the image's entry point, too. A bare one, and one beside another, may use all cores
-    until `hold_to_cores`.
+    place of the image's entry point, too. A bare one, and one in the network of another, may use
+    all cores until `hold_to_cores`.
     """
 
     def __init__(
@@ -205,7 +205,7 @@ class Container:
         user: str,
         environment: Mapping[str, str] | None = None,
         bare: bool = False,
-        beside: "Container | None" = None,
+        network_of: "Container | None" = None,
     ):
         from docker.types import LogConfig, Ulimit
         from docker.types import Mount as Bind
@@ -222,11 +222,11 @@ class Container:
         home = {"HOME": "/tmp"} if nameless else {}
         host = client.api.create_host_config(
             mounts=binds,
-            network_mode="none" if beside is None else f"container:{beside.id}",
+            network_mode="none" if network_of is None else f"container:{network_of.id}",
             mem_limit=limit,
             memswap_limit=limit,
             cpu_period=_PERIOD,
-            cpu_quota=-1 if bare or beside else int(settings.cpus * _PERIOD),
+            cpu_quota=-1 if bare or network_of else int(settings.cpus * _PERIOD),
             cpu_shares=min(max(int(settings.cpus * _WEIGHT), 2), 262_144),
             pids_limit=settings.pids,
             cap_drop=["ALL"],

@@ -53,7 +53,7 @@ class Lockstep(Faulting):
     `rate`, a scan waits until as much time has passed since the one before as in the recording.
     """
 
-    apart = True
+    isolated = True
 
     def __init__(self, parameters: ParameterSet, settings: Any, limits: Limits):
         super().__init__(settings.image or settings.command[0], parameters)
@@ -107,7 +107,7 @@ class Lockstep(Faulting):
             self._show(prepared)
             self._correct()
         except (OdometryError, LinkError) as error:
-            fault = self._told(error)
+            fault = self._quoting(error)
             # One that has run can be gone for good.
             if not self._has_run:
                 self.close()
@@ -120,7 +120,7 @@ class Lockstep(Faulting):
             try:
                 self._show(prepared)
             except (OdometryError, LinkError) as error:
-                self.note_fault(self._told(error))
+                self.note_fault(self._quoting(error))
 
     def _collect(self) -> Registration:
         self._waiting = False
@@ -131,7 +131,7 @@ class Lockstep(Faulting):
         try:
             registered = self._correct()
         except (OdometryError, LinkError) as error:
-            return self.note_fault(self._told(error))
+            return self.note_fault(self._quoting(error))
         if registered:
             self._T_step = rectify(invert(T_before) @ self._T_odom_sensor)
         return Registration(self._T_odom_sensor.copy(), registered)
@@ -353,7 +353,7 @@ class Lockstep(Faulting):
             self._poses = [(stamp, matrix(p, q)) for stamp, _, p, q in poses] or self._poses
             self._news.notify_all()
 
-    def _told(self, error: Exception) -> str:
+    def _quoting(self, error: Exception) -> str:
         """An error, and the last lines that the system wrote; no engine is no fault of a trial."""
         if isinstance(error, UnavailableError):
             raise error

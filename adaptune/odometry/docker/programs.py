@@ -57,7 +57,7 @@ class DockerCommand(FileRun):
         shared = engine.make_shared(folder / "shared")
         output = engine.make_shared(shared / "output")
         nested = output
-        for part in Path(self.settings.output).parts[:-1] if self.told_output else ():
+        for part in Path(self.settings.output).parts[:-1] if self.names_output else ():
             nested = engine.make_shared(nested / part)
         source = given.path.resolve()
         inside = "/data" if source.is_dir() else f"/data/{source.name}"

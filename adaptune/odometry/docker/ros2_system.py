@@ -132,7 +132,7 @@ class Ros2System(RosSystem):
             mounts,
             user=user,
             environment=environment,
-            beside=self._node,
+            network_of=self._node,
         )
 
     def _linked(self, connection: socket.socket) -> Ros2Relay:

@@ -196,7 +196,7 @@ def test_a_member_that_has_rested_since_the_start_has_not_ended(caplog):
     bank.apply(Selection(7, {}, {7: 1.0}, resting=frozenset({3})))
     np.testing.assert_allclose(steps_of(bank, 5), 0.1)
     bank.apply(Selection(7, {}, {7: 0.5, 3: 0.5}))
-    assert all(member.ended for member in bank._members if member.apart)
+    assert all(member.ended for member in bank._members if member.isolated)
     np.testing.assert_allclose(np.diff(x_on(bank, range(5, 9))), 0.1)
     assert not any(member.ended for member in bank._members)
     assert not [r for r in caplog.records if r.name == "adaptune.bank.bank"]
@@ -220,16 +220,16 @@ def test_other_processes_work_while_members_of_this_one_do():
 
     class Noted(InProcess):
         def submit(self, prepared):
-            calls.append(("submit", self.apart))
+            calls.append(("submit", self.isolated))
             super().submit(prepared)
 
         def collect(self):
-            calls.append(("collect", self.apart))
+            calls.append(("collect", self.isolated))
             return super().collect()
 
     def make(parameters):
         one = Noted(walkers(parameters).odometry)
-        one.apart = parameters["speed"] > 1.0
+        one.isolated = parameters["speed"] > 1.0
         return one
 
     bank = Bank(make, {7: {"speed": 1.0}, 3: {"speed": 1.02}}, 2.0, 0.1)

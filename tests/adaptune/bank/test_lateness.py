@@ -34,7 +34,7 @@ def scan(i):
 class Slow(OdometryInstance):
     """A member of another process that needs its time."""
 
-    apart = True
+    isolated = True
 
     def __init__(self, clock, seconds=0.0):
         self.clock, self.seconds, self.done, self.n = clock, seconds, 0.0, 0

@@ -95,7 +95,7 @@ def test_in_a_place_unlike_all_others_what_is_measured_counts_for_more(monkeypat
     # The training says 1 and 2; driving says 0.
     live = LiveSquares(np.diag([1.0, 4.0, 4.0, 4.0]), 0.0, 3.0)
     known, new = data.features[5], np.array([500.0, 0.0])
-    (near,) = rule.near(new[None]).evidence.trust
+    (near,) = rule.near(new[None]).frames.trust
     assert near == 0.0
     assert rule.select(new).familiarity == 0.0
     assert (
@@ -115,7 +115,7 @@ def test_many_windows_overrule_the_training(monkeypatch):
     monkeypatch.setattr("adaptune.model.weights.EVEN_SHARE", 0.0)
     data = places(np.random.default_rng(6))
     rule = BankRule().fit(data)
-    live = LiveSquares(np.diag([100.0, 100.0, 100.0, 1.0]), 0.0, 1000.0)
+    live = LiveSquares(np.diag([100.0, 100.0, 100.0, 1.0]), 0.0, 1e4)
     assert rule.weigh(rule.near(data.features[0][None]), live).weights[3] > 0.9
     assert (
         rule.weigh(rule.near(data.features[0][None]), live._replace(windows=1e-3)).weights[3] < 0.1
@@ -159,34 +159,27 @@ def test_errors_are_clipped():
     vectors = np.zeros((10, 2, 3), np.float32)
     vectors[:, 0, 0] = 1.0
     vectors[:, 1, 1] = [0.5, 5.0, 7.0, 29.0, 31.0, np.inf, np.nan, 0.0, 6.0, 1.0]
-    kept, lost = clip_errors(vectors, 0)
+    kept, lost = clip_errors(vectors, 6.0)
     limit = 6.0 * np.sqrt(1.0 + 0.02**2)
     np.testing.assert_allclose(kept[:, 0], vectors[:, 0])
     expected = [0.5, 5.0, limit, limit, 0.0, 0.0, 0.0, 0.0, 6.0, 1.0]
     np.testing.assert_allclose(kept[:, 1, 1], expected, rtol=1e-6)
     np.testing.assert_allclose(lost[:, 1], [0, 0, 0, 0, limit, limit, limit, 0, 0, 0], rtol=1e-6)
-    kept, lost = clip_errors(vectors, 0, 18.0)
+    kept, lost = clip_errors(vectors, 18.0)
     expected = [0.5, 5.0, 7.0, 3.0 * limit, 0.0, 0.0, 0.0, 0.0, 6.0, 1.0]
     np.testing.assert_allclose(kept[:, 1, 1], expected, rtol=1e-6)
     assert lost.max() == pytest.approx(3.0 * limit)
     # A fixed set that fails itself allows others more.
     vectors[:5, 0] = np.inf
-    _, lost = clip_errors(vectors, 0)
+    _, lost = clip_errors(vectors, 6.0)
     assert lost[0, 0] == pytest.approx(6.0 * np.sqrt((5 * FAILURE**2 + 5) / 10), rel=1e-5)
 
 
 def test_a_bank_is_of_sets_whose_errors_cancel():
     data = places(np.random.default_rng(5))
-    vectors = [
-        dict(enumerate(np.moveaxis(data.vectors[data.sequence == s], 1, 0))) for s in range(6)
-    ]
-    errors = [data.errors[data.sequence == s] for s in range(6)]
-    sets = data.sets
-    assert sorted(choose_members(vectors, errors, sets, 1, 2)) == [1, 2]
-    assert len(choose_members(vectors, errors, sets, 1, 9)) == 4
-    # What was not run everywhere is no member.
-    errors[3][:, 2] = np.nan
-    assert sorted(choose_members(vectors, errors, sets, 1, 4)) == [0, 1, 3]
+    vectors = data.vectors[:, [1, 0, 2, 3]]
+    assert choose_members(vectors, data.sequence, [1, 0, 2, 3], 2) == [1, 2]
+    assert len(choose_members(vectors, data.sequence, [1, 0, 2, 3], 9)) == 4
 
 
 def test_members_that_rest_have_no_weight_and_change_nothing():

@@ -64,13 +64,13 @@ def plain_familiarity(data, distance, m):
     return sum(f >= distance for f in far) / len(far)
 
 
-def plain_predicted(data, feature, m, tau):
+def plain_predicted(data, feature, m, sharpness):
     """Expected errors of the fixed set and of the baseline, in loops."""
     names = sorted(set(data.sequence.tolist()))
     distances, means, fixed = plain_evidence(data, feature, m, names)
     # In the very same place as most sequences, distances count as they are.
     middle = statistics.median(distances) or 1.0
-    weights = [math.exp(-tau * (a - min(distances)) / middle) for a in distances]
+    weights = [math.exp(-sharpness * (a - min(distances)) / middle) for a in distances]
     expected = sum(w * f for w, f in zip(weights, fixed, strict=True)) / sum(weights)
     baseline = sum(w * of[0] for w, of in zip(weights, means, strict=True)) / sum(weights)
     familiar = min(1.0, plain_familiarity(data, min(distances), m) / 0.1)

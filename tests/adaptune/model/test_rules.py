@@ -1,7 +1,7 @@
 import numpy as np
 from tables import table
 
-from adaptune.model.rules import Costs, SetCost, Spending, TrainingData, complementary
+from adaptune.model.rules import Costs, SetCost, TrainingData, complementary
 from adaptune.model.weights import choose_members
 from adaptune.space import ParameterSets, ParameterSpace
 
@@ -52,34 +52,35 @@ def test_costs_are_of_all_that_is_driven():
     assert COSTS.alone(4) == 9.0
     assert [COSTS.adaptive(of) for of in ([4], [0, 4], [0, 4, 7, 9])] == [11.5, 14.5, 55.5]
     assert np.isnan([COSTS.alone(5), COSTS.adaptive([0, 5])]).all()
-    assert Spending(COSTS, 14.5).allows([0, 4])
-    assert not Spending(COSTS, 14.4).allows([0, 4])
-    assert not Spending(COSTS).allows([0, 5])  # of unknown cost
+    assert COSTS.allow([0, 4], 14.5)
+    assert not COSTS.allow([0, 4], 14.4)
+    assert not COSTS.allow([0, 5], np.inf)  # of unknown cost
+    assert COSTS.allow([0, 5], None)
 
 
-def members(spending, size=3):
+def members(size=3, **allow):
     """Of four sets, the third cancels the first's error, and the second a half of it."""
     rng = np.random.default_rng(0)
     x = rng.normal(0.0, 1.0, (50, 3)).astype(np.float32)
     other = rng.normal(0.0, 1.0, (50, 3)).astype(np.float32)
-    vectors = {0: x, 1: -0.5 * x + other, 2: -x + 0.1 * other, 3: x + 0.2 * other}
-    errors = np.stack([np.linalg.norm(v, axis=1) for v in vectors.values()], axis=1)
-    return choose_members([vectors], [errors], sets(4), 0, size, spending)
+    vectors = np.stack([x, -0.5 * x + other, -x + 0.1 * other, x + 0.2 * other], axis=1)
+    return choose_members(vectors, np.zeros(50, np.intp), range(4), size, **allow)
 
 
-def costs(*register):
-    return Costs({i: SetCost(ms, 0.0, i) for i, ms in enumerate(register)}, 0.0)
+def within(budget, *register):
+    costs = Costs({i: SetCost(ms, 0.0, i) for i, ms in enumerate(register)}, 0.0)
+    return {"allow": lambda trials: costs.allow(trials, budget)}
 
 
 def test_members_stay_within_a_budget():
-    assert members(None)[:2] == [0, 2]
-    assert members(Spending(costs(1.0, 1.0, 9.0, 1.0), 5.0))[:2] == [0, 1]
-    assert members(Spending(costs(1.0, 9.0, 9.0, 9.0), 5.0)) == [0]
+    assert members()[:2] == [0, 2]
+    assert members(**within(5.0, 1.0, 1.0, 9.0, 1.0))[:2] == [0, 1]
+    assert members(**within(5.0, 1.0, 9.0, 9.0, 9.0)) == [0]
 
 
 def test_complementary_sets_stay_within_a_budget():
     errors = np.array([[2.0, 1.0, 1.2], [2.0, 3.0, 3.0]], np.float32)
     data = TrainingData(np.empty((2, 0)), np.zeros(2, np.intp), errors, sets(3), 0)
     assert complementary(data, 2) == [0, 1]
-    assert complementary(data, 2, Spending(costs(1.0, 9.0, 2.0), 4.0)) == [0, 2]
-    assert complementary(data, 2, Spending(costs(1.0, 9.0, 9.0), 4.0)) == [0]
+    assert complementary(data, 2, **within(4.0, 1.0, 9.0, 2.0)) == [0, 2]
+    assert complementary(data, 2, **within(4.0, 1.0, 9.0, 9.0)) == [0]

@@ -5,7 +5,7 @@ from rosbags.highlevel import AnyReader
 from adaptune.recording.config import SequenceConfig
 from adaptune.recording.recording import open_sequence
 from adaptune.simulation import Course, SimulationError
-from adaptune.simulation.record import Drive, record, simulate
+from adaptune.simulation.record import SimulatedDrive, record, simulate
 from adaptune.trajectory import read_tum
 
 COURSE = Course(
@@ -106,7 +106,7 @@ def test_what_is_there_is_not_touched_unasked(tmp_path):
 
 def test_nothing_is_left_of_an_interrupted_recording(tmp_path):
     def interrupt(name, done, total):
-        assert (name, total) == ("run", len(Drive(COURSE)))
+        assert (name, total) == ("run", len(SimulatedDrive(COURSE)))
         if done == 3:
             raise KeyboardInterrupt
 

@@ -8,7 +8,7 @@ from adaptune.metrics import sub_trajectory_rte
 from adaptune.odometry.registry import odometry_class
 from adaptune.simulation import SCENES, SENSORS, Course
 from adaptune.simulation.mesh import fractal
-from adaptune.simulation.record import EPOCH, Drive, simulate
+from adaptune.simulation.record import EPOCH, SimulatedDrive, simulate
 from adaptune.simulation.world import World
 
 
@@ -44,7 +44,7 @@ def test_the_same_seed_gives_the_same_bytes():
 def test_scans_say_what_they_hold():
     given = course("street", rate=20.0)
     scans = list(simulate(given))
-    assert len(scans) == len(Drive(given))
+    assert len(scans) == len(SimulatedDrive(given))
     for number, scan in enumerate(scans):
         assert scan.stamp == EPOCH + number * 50_000_000
         n = len(scan)
@@ -62,7 +62,7 @@ def test_scans_say_what_they_hold():
 
 
 def test_every_column_is_seen_from_its_own_pose():
-    drive = Drive(course("street", motion="car"))
+    drive = SimulatedDrive(course("street", motion="car"))
     to_surface = surface(drive, 0.0, 150.0)
     *_, scan = itertools.islice(drive.scans(), 4)
     T = drive.ride.poses((scan.stamp - EPOCH) * 1e-9 + scan.times)
@@ -95,7 +95,7 @@ def test_a_robot_can_drive_through_every_scene_into_every_other(seed):
         for _ in range(len(names)):
             i = (i + step) % len(names)
             order.append(names[i])
-    drive = Drive(Course(scenes=tuple(order), length=15.0, seed=seed))
+    drive = SimulatedDrive(Course(scenes=tuple(order), length=15.0, seed=seed))
     to_surface = surface(drive, drive.road.length / 2.0, drive.road.length)
     t = np.arange(0.0, drive.ride.duration, 0.1)
     T = drive.ride.poses(t)

@@ -1,0 +1,28 @@
+"""Selection rules as a user may write them; the first is that of docs/validate-and-compare.md."""
+
+from adaptune.model import Rule
+from adaptune.model.rules import NOTHING
+from adaptune.space import Selection
+
+
+class Cheapest(Rule):
+    sentence = "the set that costs least, wherever it is"
+
+    def fit(self, data):
+        self.sets, costs = data.sets, data.costs
+        self.best = min(data.candidates or data.sets, key=costs.alone)
+        return self
+
+    def select(self, feature, live=NOTHING):  # noqa: ARG002
+        return Selection(self.best, self.sets[self.best], predicted_error=1.0)
+
+
+class Outside(Cheapest):
+    def fit(self, data):
+        super().fit(data)
+        self.best = next(trial for trial in data.sets if trial not in data.candidates)
+        return self
+
+
+class Other:
+    pass
