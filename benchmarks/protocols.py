@@ -34,7 +34,7 @@ from adaptune.recording.folder import ELEVATION, turn_up
 from adaptune.recording.recording import open_sequence
 from adaptune.recording.scan import Scan
 from adaptune.simulation import Course
-from adaptune.simulation.record import Drive, SimulatedScan, record
+from adaptune.simulation.record import SimulatedDrive, SimulatedScan, record
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 
@@ -87,13 +87,13 @@ def courses(metres: float) -> dict[str, Course]:
 def simulate_kitti(root: Path, metres: float = 150.0) -> None:
     """Eleven short sequences; their rays are too low, as those of KITTI's LiDAR."""
     for name, course in courses(metres).items():
-        drive = Drive(course)
+        drive = SimulatedDrive(course)
         scans = ((standing(drive, scan), scan.T_world_sensor) for scan in drive.scans())
         lowered = ((replace(scan, points=turn_up(scan.points, -ELEVATION)), T) for scan, T in scans)
         write_sequence(root, name, lowered)
 
 
-def standing(drive: Drive, scan: SimulatedScan) -> Scan:
+def standing(drive: SimulatedDrive, scan: SimulatedScan) -> Scan:
     """A scan as KITTI has it: undistorted to the scan's start, intensities from 0 to 1."""
     assert scan.times is not None
     times, column = np.unique(scan.times, return_inverse=True)

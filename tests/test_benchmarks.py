@@ -13,7 +13,7 @@ from adaptune.geometry import invert
 from adaptune.odometry.docker import rustle
 from adaptune.recording.config import SequenceConfig
 from adaptune.recording.recording import open_sequence
-from adaptune.simulation.record import Drive
+from adaptune.simulation.record import SimulatedDrive
 from offline.config import load_study
 
 pytestmark = pytest.mark.services
@@ -56,7 +56,7 @@ def test_simulated_kitti_is_read_as_it_was_driven(tmp_path, monkeypatch):
     monkeypatch.setattr(module, "ROADS", {"07": ["street"]})
     module.simulate_kitti(tmp_path, metres=10.0)
     sequence = open_sequence(SequenceConfig(kitti=str(tmp_path / "sequences" / "07")))
-    drive = Drive(module.courses(10.0)["07"])
+    drive = SimulatedDrive(module.courses(10.0)["07"])
     truth = [(module.standing(drive, scan), scan.T_world_sensor) for scan in drive.scans()]
     # What adaptune corrects in KITTI's rays is in the files.
     for read, (scan, _) in zip(sequence, truth, strict=True):
