@@ -264,6 +264,7 @@ def path_of(name: str, kind: str, ours: Mapping[str, str], group: str, sort: str
         raise PluginError(f"{name}: {own} lives in this session only; {help_}")
     if not all(map(str.isidentifier, module.split("."))):
         help_ = f"write it as Python imports it, as in my_package.my_module:{sort}"
+        help_ += "; of images, `docker images` has none of this name" * (kind == "odometry")
         raise PluginError(f"{name}: {module!r} is not the name of a module; {help_}")
     return path
 

@@ -1,5 +1,6 @@
 """Judge a trial by metrics, see ``docs/reference-study.md``, and by weighted sums of them."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -81,11 +82,14 @@ def label(weights: Mapping[Metric, float], units: bool = False) -> str:
 
 def failed_in_words(verdicts: Mapping[int, Verdict]) -> list[str]:
     """A sentence about the sets that are not usable, if there are any."""
-    if not (failed := sum(bool(verdict.failure) for verdict in verdicts.values())):
+    failures = Counter(verdict.failure for verdict in verdicts.values() if verdict.failure)
+    if not failures:
         return []
+    (why, n), *others = failures.most_common()
+    often = f" ({n} of them)" * bool(others)
     return [
-        f"{failed} of {len(verdicts)} parameter sets failed and are never chosen (`adaptune "
-        f"trials` says why)."
+        f"{failures.total()} of {len(verdicts)} parameter sets failed and are never chosen: "
+        f"{why}{often}; the log of the trials says more."
     ]
 
 

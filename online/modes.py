@@ -339,6 +339,8 @@ def replay_modes(
         if not due and is_reference_of(folder, study.sequences.reference(name)):
             continue
         recording = study.sequences.open(name)
+        if due and study.odometry.description.whole:
+            study.sequences.program_input(name)  # may be written, which costs no mode
         for i, inputs in enumerate(due):
             mode = setup.mode(inputs["mode"], model)
             if mode.selector is not None and not mode.bank and not checked:

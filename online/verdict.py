@@ -96,8 +96,13 @@ def verdict(
     """
     last = {row.mode: row for row in last_rows(rows)}
     if (best := decided(rows, worth)) is None:
-        nobody = "No test sequence has a reference: nobody can say what was gained."
-        return [nobody, *_estimates(rows)[:2]]
+        nobody = "No test sequence has a reference"
+        if judged := dict.fromkeys(row.sequence for row in rows if row.reference != "none"):
+            nobody = (
+                f"No sub-trajectory of {length:g} m fits into what is known of "
+                f"{' and '.join(judged)} (test a longer part, or lower sub_trajectory)"
+            )
+        return [f"{nobody}: nobody can say what was gained.", *_estimates(rows)[:2]]
     main = adapting(rows)
     others = [m for m in ("fixed", "baseline") if m in last and m != best.mode]
     instead = " and ".join(

@@ -130,7 +130,11 @@ _LOOK = 20.0
 def _look(path: Path) -> bool:
     """Show what the ROS system of a study does; False if it has none."""
     from adaptune.odometry.registry import ROS_SYSTEMS
+    from adaptune.tuning.studies import LACKING
 
+    lines = path.read_text("utf-8").splitlines() if path.is_file() else []
+    if lacking := [str(n) for n, line in enumerate(lines, 1) if LACKING in line.partition("#")[0]]:
+        raise AdaptuneError(f"{path}, line {', '.join(lacking)}: fill in what stands as {LACKING}")
     loaded = load(path, [], None)
     factory: Any = loaded.odometry
     if loaded.config.odometries.keys().isdisjoint(ROS_SYSTEMS) or len(loaded.config.odometries) > 1:
@@ -146,6 +150,8 @@ def _look(path: Path) -> bool:
     found = look(factory.settings, space.baseline, factory.limits, some, far_ends(space))
     found |= _frames(loaded.sequences.open(name), factory.settings)
     show_table("What it does", [{"": key, "found": value} for key, value in found.items()])
+    if "went wrong" not in found:
+        say_next("run the trials", "offline", path)
     return True
 
 
@@ -263,7 +269,7 @@ def tune(
             tuned = tune_asked(asked, override, folder, cluster, show)
     if path is not None:
         say(
-            f"{path}: is a study of this system. Fill in what stands there as {LACKING}, as "
+            f"{path} is a study of this system. Fill in what stands there as {LACKING}, as "
             f"docs/docker.md#a-ros-2-system says. Then look at what the system does:"
         )
         say(f"  adaptune inspect {path}")

@@ -60,8 +60,9 @@ class Template:
 
     def ros2_name(self, name: str) -> str:
         """Name of a value as ROS 2 has it: its keys below the node, with points between them."""
-        place = self._find(name)
-        keys = [] if place is None else [str(key) for key in place[-1]]
+        if (place := self._find(name)) is None:
+            return name
+        keys = [str(key) for key in place[-1]]
         return ".".join(keys[keys.index(_ROS2) + 1 if _ROS2 in keys else 0 :])
 
     @property

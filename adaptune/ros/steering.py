@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
+from functools import cache
 from typing import Annotated, Any
 
 import numpy as np
@@ -40,7 +41,6 @@ class Steering:
         self._node, self._set_parameters = node, set_parameters
         self._command, self._run = command, run
         self._warned_of: set[str] = set()
-        self._holds = False
 
     def apply(self, parameters: ParameterSet) -> None:
         """Set the parameters, and make sure that the node holds them where it tells.
@@ -58,10 +58,8 @@ class Steering:
                 self._warn(name)
             elif not equal_values(value, held[name]):
                 raise OdometryError(f"{self._node} holds {name} = {held[name]}")
-        if held and not self._holds:
-            self._holds = True
-            what = "%s holds what is set; a node that reads it only at its start does not tell"
-            _log.info(what, self._node)
+        if held:
+            _say_that_it_holds(self._node)
 
     def _warn(self, name: str) -> None:
         if name not in self._warned_of:
@@ -80,6 +78,11 @@ class Steering:
         if code:
             words = " | ".join(written.split("\n")[-4:]).strip(" |")
             raise OdometryError(f"{' '.join(arguments)}: exit code {code}: {words}")
+
+
+@cache
+def _say_that_it_holds(node: str) -> None:
+    _log.info("%s holds what is set; a node that reads it only at its start does not tell", node)
 
 
 def equal_values(wanted: Any, held: Any) -> bool:

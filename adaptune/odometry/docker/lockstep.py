@@ -1,6 +1,7 @@
 """A ROS system that receives scan after scan, and can change its parameters."""
 
 import contextlib
+import logging
 import shutil
 import tempfile
 import threading
@@ -13,7 +14,13 @@ from typing import Any
 import numpy as np
 
 from adaptune import processes
-from adaptune.errors import AdaptuneError, OdometryError, UnavailableError, warn_once
+from adaptune.errors import (
+    AdaptuneError,
+    OdometryError,
+    UnavailableError,
+    nearest,
+    warn_once,
+)
 from adaptune.files import temporary_prefix
 from adaptune.geometry import Poses, invert, rectify, to_pose
 from adaptune.odometry.base import LOST, Registration, Usage
@@ -30,6 +37,7 @@ from adaptune.trajectory import Trajectory
 
 _IMU = "sensor_msgs/msg/Imu"
 
+_log = logging.getLogger(__name__)
 _MOST_SILENT = 30  # scans in a row without a pose that are a fault
 _LEAST_ANSWERED = 0.75  # least share of scans with a pose, of so many or more since the first one
 _BETWEEN_LOOKS = 1.0  # seconds between looks at what the system has used
@@ -70,6 +78,8 @@ class Lockstep(Faulting):
         self._patience = min(settings.patience, limits.seconds)
         # Scans since the first pose after each start, and those that got a pose.
         self._n_shown = self._n_answered = 0
+        self._missed: list[int] = []  # stamps of scans that got none in time
+        self._n_too_late = 0  # poses of these that came after all
 
     @property
     def ended(self) -> bool:
@@ -97,7 +107,7 @@ class Lockstep(Faulting):
         self._T_odom_sensor = np.array(T_odom_sensor)
         self._T_step = np.eye(4) if T_previous_current is None else np.array(T_previous_current)
         self._T_odom_own: Poses | None = None
-        self._silent, self._stamp, self._poses = 0, prepared.stamp, []
+        self._silent, self._stamp, self._poses, self._missed = 0, prepared.stamp, [], []
         self._shown = (prepared.stamp, -np.inf)
         self._late: int | None = None
         self._steady = True  # whether all poses are as late as the first one
@@ -159,6 +169,8 @@ class Lockstep(Faulting):
         if self._system is not None:
             self._look(self._system)
             self._warn_of_background(self._system)
+            if too_late := self._of_patience():
+                _log.warning("%s: %s; these scans count as without a pose", self.name, too_late)
             if self._has_run:
                 with contextlib.suppress(OdometryError, LinkError):
                     self._system.warn_of_unread()
@@ -167,6 +179,15 @@ class Lockstep(Faulting):
             self._system = None
             self._used_before = Usage(self.usage.cpu, self.usage.memory)
             self._used = Usage(0.0, 0.0)
+
+    def _of_patience(self) -> str:
+        """What to do where poses come too late; empty where they do not."""
+        if not self._n_too_late:
+            return ""
+        return (
+            f"{self._n_too_late} poses came later than odometry.settings.patience "
+            f"({self._patience:g} s): raise it, or set offline.workers: 1"
+        )
 
     def _warn_of_background(self, system: RosSystem) -> None:
         """Log, once, where the system works on after its last pose, though nothing waits for it."""
@@ -290,6 +311,7 @@ class Lockstep(Faulting):
 
     def _check_silent(self, system: RosSystem) -> None:
         """Raise an `OdometryError` where a scan without a pose is one too many."""
+        self._missed.append(self._stamp)
         try:
             system.state()
         except OdometryError as error:
@@ -299,10 +321,13 @@ class Lockstep(Faulting):
             raise OdometryError(f"{error} before its first pose; {help_}") from error
         if self._silent >= _MOST_SILENT:
             published = system.link.topics().keys() - {*QUIET, *self._topics}
+            near = nearest(self._settings.odometry, published)
             needs = "" if self._settings.imu else "an IMU (odometry.settings.imu), or "
             why = (
                 self._reader.lacking
+                or self._of_patience()
                 or system.link.why_unheard(self._topics[0])
+                or near * near.startswith("did you mean")
                 or (f"does it need {needs}all that the bag holds (play: bag)?")
             )
             raise OdometryError(
@@ -312,7 +337,11 @@ class Lockstep(Faulting):
             )
         n, answered = self._n_shown, self._n_answered
         if n >= _MOST_SILENT and answered < _LEAST_ANSWERED * n:
-            why = system.link.why_unheard(self._topics[0]) or "set odometry.settings.play: bag"
+            why = (
+                self._of_patience()
+                or system.link.why_unheard(self._topics[0])
+                or "set odometry.settings.play: bag"
+            )
             raise OdometryError(
                 f"it gave poses for {answered} of {n} scans, and lockstep needs one for each; {why}"
             )
@@ -350,6 +379,11 @@ class Lockstep(Faulting):
             return
         poses = [] if self._reader.fault else self._reader.read(kind, data)[-1:]
         with self._news:
+            for stamp, *_ in poses if self._missed else ():
+                later = self._late or 0
+                late = [s for s in self._missed if abs(stamp - s - later) < MAX_SCATTER]
+                self._n_too_late += len(late)
+                self._missed = [s for s in self._missed if s not in late]
             self._poses = [(stamp, matrix(p, q)) for stamp, _, p, q in poses] or self._poses
             self._news.notify_all()
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from adaptune.errors import OdometryError, warn_once
+from adaptune.errors import OdometryError
 from adaptune.geometry import Poses
 from adaptune.odometry.docker.lockstep import OTHER_CLOCK, Lockstep, other_frame
 from adaptune.odometry.docker.played_bag import MAX_SCATTER
@@ -133,24 +133,15 @@ def far_ends(space: ParameterSpace) -> ParameterSet:
 
 
 def check_live(odometry: OdometryFactory, scans: Iterable[Scan]) -> None:
-    """Warn of parameters that have no effect while a system runs; an `OdometryError` if all."""
+    """Refuse to adapt a system live by parameters that have no effect while it runs."""
     space, settings = odometry.space, odometry.settings
-    given = settings, space.baseline, odometry.limits
-    live, vain = effects(*given, scans, far_ends(space))
-    if not vain:
-        return
-    what = (
-        f"{settings.node}, set while it runs, changes nothing by {', '.join(vain)} (the first "
-        f"{_SHORT} scans)"
-    )
-    if not live:
+    _, vain = effects(settings, space.baseline, odometry.limits, scans, far_ends(space))
+    if vain:
         raise OdometryError(
-            f"{what}, so it cannot adapt live; leave out odometry.settings.node, or set "
-            f"online.switching.mechanism: bank"
+            f"{settings.node}, set while it runs, changes nothing by {', '.join(vain)} (the first "
+            f"{_SHORT} scans): it cannot adapt live by odometry.parameters.{vain[0].split()[0]}; "
+            f"leave that out, or set online.switching.mechanism: bank"
         )
-    warn_once(
-        f"{what}: these keep the value they began with; leave them out of odometry.parameters"
-    )
 
 
 def effects(
