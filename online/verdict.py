@@ -97,7 +97,8 @@ def verdict(
     last = {row.mode: row for row in last_rows(rows)}
     if (best := decided(rows, worth)) is None:
         nobody = "No test sequence has a reference"
-        if judged := dict.fromkeys(row.sequence for row in rows if row.reference != "none"):
+        known = [row for row in rows if row.reference != "none" and row.sequence != ALL]
+        if judged := dict.fromkeys(row.sequence for row in known):
             nobody = (
                 f"No sub-trajectory of {length:g} m fits into what is known of "
                 f"{' and '.join(judged)} (test a longer part, or lower sub_trajectory)"

@@ -168,7 +168,7 @@ def test_validate_judges_what_online_drives(study_file, tmp_path, monkeypatch):
     assert "what is left out, over 6 stretches (" in found.verdicts[2]
     # Where it cannot be judged it says what is driven.
     alone = labelled(six.sequences[:1])
-    for mechanism, why in (("bank", "too little .* takes 80 m of rec"), ("live", "no bank")):
+    for mechanism, why in (("bank", "too little .* takes 80 m of tra"), ("live", "no bank")):
         given = [f"online.switching.mechanism={mechanism}", "online.switching.size=3"]
         study = load_study(study_file, given, tmp_path)
         match = f"one stretch only, .* drive the fixed set .* {why}"

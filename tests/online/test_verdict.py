@@ -184,9 +184,15 @@ def test_a_late_first_pose_is_told():
 
 
 def test_nothing_is_said_where_nothing_is_known():
-    rows = [replace(row, rte=None, ratio=None) for row in rows_of("a", adaptive=0.5)]
+    rows = [
+        replace(row, rte=None, ratio=None, reference="none") for row in rows_of("a", adaptive=0.5)
+    ]
     nobody = "No test sequence has a reference: nobody can say what was gained."
     assert verdict(rows, 10.0) == [nobody]
+    short = [replace(row, reference="given") for row in rows]
+    assert verdict(short, 10.0)[0].startswith(
+        "No sub-trajectory of 10 m fits into what is known of a (test a longer part, or lower"
+    )
     assert remarks(rows) == []
     assert decided(rows) is None
     oracle = ComparisonRow(ALL, ORACLE, 0.5, 0.5, 0, 0, 0)
