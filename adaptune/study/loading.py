@@ -235,7 +235,8 @@ def read_study(
 
 def _read(path: Path) -> yaml12.Document:
     if path.exists() and not (path.is_file() and path.stat().st_size <= _MOST_BYTES):
-        raise ConfigurationError(f"{path}: a study is a file of YAML, of 1 MB at most")
+        what = "a study is a file of YAML, of 1 MB at most"
+        raise ConfigurationError(f"{path}: {what}; with a recording, begin by `adaptune tune`")
     try:
         document = yaml12.Document.of_file(path)
     except yaml12.YamlError as error:

@@ -321,7 +321,8 @@ class Lockstep(Faulting):
             raise OdometryError(f"{error} before its first pose; {help_}") from error
         if self._silent >= _MOST_SILENT:
             published = system.link.topics().keys() - {*QUIET, *self._topics}
-            near = nearest(self._settings.odometry, published)
+            topic = self._settings.odometry
+            near = "" if topic in published else nearest(topic, published)
             needs = "" if self._settings.imu else "an IMU (odometry.settings.imu), or "
             why = (
                 self._reader.lacking
