@@ -112,7 +112,7 @@ def test_a_wrong_size_of_the_cache_is_told_once(study_file, monkeypatch, given):
 @pytest.mark.parametrize("kind", ["folder", "device", "large"])
 def test_what_cannot_be_a_study_is_not_read(tmp_path, kind):
     path = tmp_path / "study.yaml"
-    told = "a study is a file of YAML, of 1 MB at most"
+    told = "a study is a file of YAML, of 1 MB at most; with a recording, begin by `adaptune tune`"
     if kind == "folder":
         path.mkdir()
         told = "is no study's folder: there is no study.yaml in it"
