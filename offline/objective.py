@@ -89,7 +89,7 @@ def failed_in_words(verdicts: Mapping[int, Verdict]) -> list[str]:
     often = f" ({n} of them)" * bool(others)
     return [
         f"{failures.total()} of {len(verdicts)} parameter sets failed and are never chosen: "
-        f"{why}{often}; the log of the trials says more."
+        f"{why}{often}; `trials.csv` has all reasons."
     ]
 
 

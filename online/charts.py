@@ -177,7 +177,13 @@ def _parameters(replayed: ReplayedSequence) -> Iterator[Panel]:
 
 def _name(value: Any) -> str:
     """A value among names; the set of another odometry has none."""
-    return value if isinstance(value, str) else "" if np.isnan(value) else f"{value:.6g}"
+    return (
+        value
+        if isinstance(value, str)
+        else ""
+        if np.isnan(value)
+        else np.format_float_positional(value, 6, fractional=False, trim="-")
+    )
 
 
 def _place(value: Any, names: tuple[str, ...] | None) -> float:

@@ -106,9 +106,9 @@ def compared_modes(study: Study) -> ComparedModes:
     return ComparedModes(tuple(finished), compared, unfinished, [words] if where else [])
 
 
-SEED = 0
 AS_WRONG = 0.5
 """Share of the baseline's error in training from which an estimated reference can rank no sets."""
+SEED = 0
 """Of the resampling."""
 LEAST_STRETCHES = 10
 """With fewer, there is no worst tenth."""
@@ -445,7 +445,9 @@ def _of_estimates(study: Study, model: ErrorModel) -> list[str]:
     estimates = estimates_of(study.sequences, study.training)
     wrong = [one.error(model.length) for one in estimates.values()]
     means = dict(zip(model.sets, rules.mean_errors(model.errors, model.sequence), strict=True))
-    error, own = np.mean(wrong) if wrong else np.nan, means.get(rules.BASELINE, np.nan)
+    if len(wrong) < len(study.training):
+        return []  # the others rank them
+    error, own = np.mean(wrong), means.get(rules.BASELINE, np.nan)
     if not error >= AS_WRONG * own:
         return []
     return [

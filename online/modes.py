@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, Self
 
 from adaptune import manifest
 from adaptune.bank.bank import WARM_UP, Bank
-from adaptune.errors import AdaptuneError, Finding
+from adaptune.errors import AdaptuneError, Finding, OdometryError
 from adaptune.machine import release_memory, shared_cores
 from adaptune.model import ErrorModel
 from adaptune.model.descriptor import DescriptorError
@@ -329,7 +329,7 @@ def replay_modes(
     refused = ensure_references(study.sequences, sequences, length, progress, required=False)
     for why in refused.values():
         _log.warning("%s; it is replayed without a reference, and not judged", why)
-    setup, made, checked = ReplaySetup.of(study), 0, False
+    setup, made = ReplaySetup.of(study), 0
     model, model_path = fitted or (None, None)
     digest = "" if model is None else model.digest
     for name in sequences:
@@ -343,9 +343,10 @@ def replay_modes(
             study.sequences.program_input(name)  # may be written, which costs no mode
         for i, inputs in enumerate(due):
             mode = setup.mode(inputs["mode"], model)
-            if mode.selector is not None and not mode.bank and not checked:
-                _check_live(study.odometry, recording)
-                checked = True
+            live = mode.selector is not None and not mode.bank
+            if why := _in_vain(study.odometry, recording) if live else "":
+                _log.warning("%s is not replayed on %s: %s", mode.name, name, why)
+                continue
             release_memory()
             try:
                 with closing(setup.instance(mode, name)) as odometry:
@@ -356,19 +357,31 @@ def replay_modes(
             if i == 0:
                 _judge(study, name, recording, record.trajectory)
             write_replay(folder / mode.name, record, inputs, model_path)
+            made += 1
         if not due:
             _judge(study, name, recording, StoredReplay.read(folder / modes[0]).trajectory)
             _log.info("%s: the reference has changed; no replay depends on it", name)
-        made += len(due)
     return made
 
 
-def _check_live(odometry: Factory, recording: Recording) -> None:
-    """Refuse to adapt a ROS system by parameters that it accepts and does not read again."""
-    if isinstance(odometry, OdometryFactory) and odometry.name in ROS_SYSTEMS:
-        from adaptune.odometry.docker.probe import check_live  # little else needs it
+_known_in_vain: dict[str, str] = {}
+"""What `_in_vain` has found, by the odometry."""
 
-        check_live(odometry, recording)
+
+def _in_vain(odometry: Factory, recording: Recording) -> str:
+    """Why a ROS system cannot adapt live: it accepts parameters, and does not read them again."""
+    if not isinstance(odometry, OdometryFactory) or odometry.name not in ROS_SYSTEMS:
+        return ""
+    from adaptune.odometry.docker.probe import check_live  # little else needs it
+
+    key = manifest.digest(odometry.identity | {"parameters": odometry.space.dump()})
+    if key not in _known_in_vain:
+        _known_in_vain[key] = ""
+        try:
+            check_live(odometry, recording)
+        except OdometryError as error:
+            _known_in_vain[key] = str(error)
+    return _known_in_vain[key]
 
 
 def _judge(study: Study, name: str, recording: Recording, replayed: Trajectory) -> None:

@@ -167,8 +167,9 @@ def _frames(recording: Any, given: Any) -> dict[str, str]:
         return {}
     every = (f"{child}: [{parent}, {pose}]" for child, (parent, pose) in fixed.items())
     return {
-        "frames of the recording": f"set odometry.settings.frame: {frame}, and transforms: "
-        f"{{{', '.join(every)}}}, if it needs them"
+        "frames of the recording": "if it needs them, set odometry.settings."
+        + f"frame: {frame}, and " * bool(frame)
+        + f"transforms: {{{', '.join(every)}}}"
     }
 
 

@@ -459,6 +459,7 @@ def _configuration() -> str:
         faces = f'<Interfaces>{other}<NetworkInterface name="lo"/></Interfaces>'
         # Within a machine a datagram may be as large as it can; that saves both sides time.
         large = "<MaxMessageSize>65500 B</MaxMessageSize><FragmentSize>65000 B</FragmentSize>"
+        large *= len(peers) == 1
         parts.append(f"<General><AllowMulticast>false</AllowMulticast>{faces}{large}</General>")
     if reach != "SYSTEM_DEFAULT":
         parts.append(

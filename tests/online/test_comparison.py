@@ -58,7 +58,7 @@ def test_where_references_are_as_wrong_as_sets_the_verdict_is_doubted(replayed, 
     model = ErrorModel.load(replayed.model_path)
     own = mean_errors(model.errors, model.sequence)[list(model.sets).index(0)]
     wrong = SimpleNamespace(error=lambda _: 0.5 * own)
-    monkeypatch.setattr("online.compare.estimates_of", lambda *_: {"one": wrong})
+    monkeypatch.setattr("online.compare.estimates_of", lambda *_: {"one": wrong, "two": wrong})
     said = compare(replayed).verdict[-1]
     assert said.startswith("Doubt this: the estimated reference of training is wrong by ")
     assert f" by {0.5 * own:.2f} %, where the odometry's own parameters have {own:.2f} %," in said

@@ -108,6 +108,7 @@ class Lockstep(Faulting):
         self._T_step = np.eye(4) if T_previous_current is None else np.array(T_previous_current)
         self._T_odom_own: Poses | None = None
         self._silent, self._stamp, self._poses, self._missed = 0, prepared.stamp, [], []
+        self._n_too_late = 0
         self._shown = (prepared.stamp, -np.inf)
         self._late: int | None = None
         self._steady = True  # whether all poses are as late as the first one
@@ -182,11 +183,11 @@ class Lockstep(Faulting):
 
     def _of_patience(self) -> str:
         """What to do where poses come too late; empty where they do not."""
-        if not self._n_too_late:
+        if self._n_too_late <= len(self._missed):  # most did not come at all
             return ""
         return (
             f"{self._n_too_late} poses came later than odometry.settings.patience "
-            f"({self._patience:g} s): raise it, or set offline.workers: 1"
+            f"({self._patience:g} s): raise it, or let fewer programs run (offline.workers: 1)"
         )
 
     def _warn_of_background(self, system: RosSystem) -> None:
@@ -398,6 +399,10 @@ class Lockstep(Faulting):
 
 def other_frame(about: str, settings: Any) -> str:
     """What to set where poses are of another frame than scans are: `about` begins with theirs."""
-    if not about or settings.extrinsic is not None or about.split(maxsplit=1)[0] == settings.frame:
+    if (
+        not about
+        or settings.extrinsic is not None
+        or about.split(maxsplit=1)[0].lstrip("/") == settings.frame.lstrip("/")
+    ):
         return ""
     return f"scans are of {settings.frame}: set odometry.settings.extrinsic if it is not there"

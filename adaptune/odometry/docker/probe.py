@@ -22,6 +22,7 @@ from adaptune.space import ParameterSet, ParameterSpace, Selection
 
 _SHORT = 50  # scans by which it is seen what a parameter changes while the system runs
 _BEFORE = 10  # scans of these before it is set
+_LEAST_WAY = 0.5  # metres that it has to move from then on
 
 
 class _Watched(Lockstep):
@@ -85,7 +86,8 @@ def look(
         report["works on after a pose"] = _apart(path, hurried)
     if settings.node is not None and others and not system.faults:
         live, vain = effects(settings, parameters, limits, scans, others)
-        report["takes effect while it runs"] = ", ".join(live) or "nothing: leave out settings.node"
+        nothing = "nothing: leave out settings.node" if vain else "not known: it hardly moves here"
+        report["takes effect while it runs"] = ", ".join(live) or nothing
         if vain:
             report["has no effect while it runs"] = (
                 f"{', '.join(vain)}: do not switch live with these among the parameters"
@@ -140,7 +142,7 @@ def check_live(odometry: OdometryFactory, scans: Iterable[Scan]) -> None:
         raise OdometryError(
             f"{settings.node}, set while it runs, changes nothing by {', '.join(vain)} (the first "
             f"{_SHORT} scans): it cannot adapt live by odometry.parameters.{vain[0].split()[0]}; "
-            f"leave that out, or set online.switching.mechanism: bank"
+            f"leave that out, or odometry.settings.node, and a bank adapts"
         )
 
 
@@ -154,12 +156,15 @@ def effects(
     """Which of the `others` change the path if they are set while the system runs, which do not.
 
     It is driven on the first scans with each of them, and twice without. Nodes accept values that
-    they never read again.
+    they never read again. Where it has not moved, or was lost, nothing is known: both are empty.
     """
     fast = settings.model_copy(update={"play": "lockstep", "rate": 0.0})
     some = list(islice(scans, _SHORT))
     path, again = (_driven(fast, parameters, limits, some) for _ in range(2))
     chance = 3.0 * _furthest(path, again) + 1e-6
+    way = np.linalg.norm(np.diff(np.array(path)[_BEFORE:, :3, 3], axis=0), axis=1).sum()
+    if not (way > _LEAST_WAY and np.isfinite(chance)):
+        return [], []
     live: list[str] = []
     vain: list[str] = []
     for name, value in others.items():
