@@ -5,7 +5,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
@@ -83,6 +83,11 @@ class Mode(NamedTuple):
     bank: bool = False
     selector: Callable[[], AnySelector] | None = None  # makes it; pickles
     cost: float = math.nan  # of a bank, milliseconds of CPU time a scan in training, if known
+
+    @property
+    def live(self) -> bool:
+        """Whether one instance changes its parameters while it runs."""
+        return self.selector is not None and not self.bank
 
     @property
     def fixed(self) -> int:
@@ -330,12 +335,17 @@ def replay_modes(
     for why in refused.values():
         _log.warning("%s; it is replayed without a reference, and not judged", why)
     setup, made = ReplaySetup.of(study), 0
+    in_vain = cache(lambda: _in_vain(study.odometry, study.sequences.open(sequences[0])))
     model, model_path = fitted or (None, None)
     digest = "" if model is None else model.digest
     for name in sequences:
         folder, shared = study.folder / "replays" / name, study.replay_inputs(name)
         every = [manifest.plain(setup.identity(mode, model, digest) | shared) for mode in modes]
         due = [inputs for inputs in every if _is_due(study, name, inputs)]
+        live = [i["mode"] for i in due if setup.mode(i["mode"], model).live]
+        if live and (why := in_vain()):
+            _log.warning("%s is not replayed on %s: %s", " and ".join(live), name, why)
+            due = [inputs for inputs in due if inputs["mode"] not in live]
         if not due and is_reference_of(folder, study.sequences.reference(name)):
             continue
         recording = study.sequences.open(name)
@@ -343,10 +353,6 @@ def replay_modes(
             study.sequences.program_input(name)  # may be written, which costs no mode
         for i, inputs in enumerate(due):
             mode = setup.mode(inputs["mode"], model)
-            live = mode.selector is not None and not mode.bank
-            if why := _in_vain(study.odometry, recording) if live else "":
-                _log.warning("%s is not replayed on %s: %s", mode.name, name, why)
-                continue
             release_memory()
             try:
                 with closing(setup.instance(mode, name)) as odometry:
@@ -357,15 +363,11 @@ def replay_modes(
             if i == 0:
                 _judge(study, name, recording, record.trajectory)
             write_replay(folder / mode.name, record, inputs, model_path)
-            made += 1
         if not due:
             _judge(study, name, recording, StoredReplay.read(folder / modes[0]).trajectory)
             _log.info("%s: the reference has changed; no replay depends on it", name)
+        made += len(due)
     return made
-
-
-_known_in_vain: dict[str, str] = {}
-"""What `_in_vain` has found, by the odometry."""
 
 
 def _in_vain(odometry: Factory, recording: Recording) -> str:
@@ -374,14 +376,11 @@ def _in_vain(odometry: Factory, recording: Recording) -> str:
         return ""
     from adaptune.odometry.docker.probe import check_live  # little else needs it
 
-    key = manifest.digest(odometry.identity | {"parameters": odometry.space.dump()})
-    if key not in _known_in_vain:
-        _known_in_vain[key] = ""
-        try:
-            check_live(odometry, recording)
-        except OdometryError as error:
-            _known_in_vain[key] = str(error)
-    return _known_in_vain[key]
+    try:
+        check_live(odometry, recording)
+    except OdometryError as error:
+        return str(error)
+    return ""
 
 
 def _judge(study: Study, name: str, recording: Recording, replayed: Trajectory) -> None:

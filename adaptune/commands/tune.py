@@ -132,13 +132,13 @@ def _look(path: Path) -> bool:
     from adaptune.odometry.registry import ROS_SYSTEMS
     from adaptune.tuning.studies import LACKING
 
-    lines = path.read_text("utf-8").splitlines() if path.is_file() else []
-    if lacking := [str(n) for n, line in enumerate(lines, 1) if LACKING in line.partition("#")[0]]:
-        raise AdaptuneError(f"{path}, line {', '.join(lacking)}: fill in what stands as {LACKING}")
     loaded = load(path, [], None)
     factory: Any = loaded.odometry
     if loaded.config.odometries.keys().isdisjoint(ROS_SYSTEMS) or len(loaded.config.odometries) > 1:
         return False
+    lines = enumerate(path.read_text("utf-8").splitlines(), 1)
+    if lacking := [str(n) for n, line in lines if LACKING in line.partition("#")[0]]:
+        raise AdaptuneError(f"{path}, line {', '.join(lacking)}: fill in what stands as {LACKING}")
     from adaptune.odometry.docker.probe import far_ends, look
 
     name = loaded.config.training[0]
@@ -148,7 +148,7 @@ def _look(path: Path) -> bool:
     say(f"{factory.name} on the first {_LOOK:g} s of {name}, with the baseline's parameters:")
     space = factory.space
     found = look(factory.settings, space.baseline, factory.limits, some, far_ends(space))
-    found |= _frames(loaded.sequences.open(name), factory.settings)
+    found |= _frames(scans, factory.settings)
     show_table("What it does", [{"": key, "found": value} for key, value in found.items()])
     if "went wrong" not in found:
         say_next("run the trials", "offline", path)

@@ -335,9 +335,10 @@ class BagSource:
         with self.open() as reader:
             clouds = islice(self.read(reader, self.points), 1)
             frame = next((header_of(data, reader.is2)[1] for _, _, data in clouds), "")
-        fixed = {}
-        static = self.topics.get(STATIC) in TRANSFORMS
-        for stamped in (t for m in self.messages(STATIC) for t in m.transforms) if static else ():
+        fixed: dict[str, tuple[str, list[float]]] = {}
+        if self.topics.get(STATIC) not in TRANSFORMS:
+            return frame, fixed
+        for stamped in (t for message in self.messages(STATIC) for t in message.transforms):
             p, q = stamped.transform.translation, stamped.transform.rotation
             pose = [round(float(v), 9) for v in (p.x, p.y, p.z, q.x, q.y, q.z, q.w)]
             fixed[stamped.child_frame_id] = stamped.header.frame_id, pose

@@ -14,13 +14,7 @@ from typing import Any
 import numpy as np
 
 from adaptune import processes
-from adaptune.errors import (
-    AdaptuneError,
-    OdometryError,
-    UnavailableError,
-    nearest,
-    warn_once,
-)
+from adaptune.errors import AdaptuneError, OdometryError, UnavailableError, nearest, warn_once
 from adaptune.files import temporary_prefix
 from adaptune.geometry import Poses, invert, rectify, to_pose
 from adaptune.odometry.base import LOST, Registration, Usage
@@ -312,7 +306,8 @@ class Lockstep(Faulting):
 
     def _check_silent(self, system: RosSystem) -> None:
         """Raise an `OdometryError` where a scan without a pose is one too many."""
-        self._missed.append(self._stamp)
+        with self._news:
+            self._missed.append(self._stamp)
         try:
             system.state()
         except OdometryError as error:
@@ -381,11 +376,11 @@ class Lockstep(Faulting):
             return
         poses = [] if self._reader.fault else self._reader.read(kind, data)[-1:]
         with self._news:
-            for stamp, *_ in poses if self._missed else ():
-                later = self._late or 0
-                late = [s for s in self._missed if abs(stamp - s - later) < MAX_SCATTER]
-                self._n_too_late += len(late)
-                self._missed = [s for s in self._missed if s not in late]
+            if poses:
+                of_scan = poses[-1][0] - (self._late or 0)
+                missed = [stamp for stamp in self._missed if abs(of_scan - stamp) >= MAX_SCATTER]
+                self._n_too_late += len(self._missed) - len(missed)
+                self._missed = missed
             self._poses = [(stamp, matrix(p, q)) for stamp, _, p, q in poses] or self._poses
             self._news.notify_all()
 

@@ -182,6 +182,11 @@ def test_of_a_launch_command_a_study_is_written_to_fill_in(bag):
     assert "adaptune inspect one_ros2.yaml" in done.output
     text = Path("one_ros2.yaml").read_text()
     assert "- odometry.launch.py\n    - topic:=/points\n    - FILL_IN:={parameters}\n" in text
+    looked = commands.refused("inspect", "one_ros2.yaml")
+    lines = [str(n) for n, line in enumerate(text.splitlines(), 1) if "FILL_IN" in line]
+    assert len(lines) > 3
+    words = f"one_ros2.yaml, line {', '.join(lines)}: fill in what stands as FILL_IN"
+    assert words in looked
     # Once it is filled in, it is a study.
     Path("p.yaml").write_text("voxel: 1.0\n")
     Path("one_ros2.yaml").write_text(
