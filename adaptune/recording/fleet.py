@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 Reading = Literal["one", "several"]
 """How the bags of a folder are read."""
-_OVERLAP, _NEXT, _LONGEST_GAP = -0.5, 2.0, 60.0
+_OVERLAP, _NEXT, LONGEST_GAP = -0.5, 2.0, 60.0
 """Seconds. Between parts of one recording lies no less and no more than the first two, between
 separate ones less than the first or more than the last."""
 _RATES = 1.25  # rates that differ by a larger factor are those of different sensors
@@ -53,7 +53,7 @@ def read_folder(path: Path) -> FolderReading:
     names = {re.sub(r"[\d_.-]+$", "", bag.stem) for bag in bags}
     what = f"{gaps.min():,.1f} to {gaps.max():,.1f} s lie between them"
     reading: Reading | None = None
-    if (gaps > _LONGEST_GAP).all() or (gaps < _OVERLAP).any():
+    if (gaps > LONGEST_GAP).all() or (gaps < _OVERLAP).any():
         reading = "several"
     elif (gaps <= _NEXT).all() and len(names) == 1:
         reading = "one"

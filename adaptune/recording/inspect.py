@@ -30,6 +30,7 @@ from adaptune.recording.findings import (
     of_times,
     of_topic,
 )
+from adaptune.recording.fleet import LONGEST_GAP
 from adaptune.recording.folder import kitti, scan_folder
 from adaptune.recording.pose_messages import PATH, POSES, Pose, untimed, usable
 from adaptune.trajectory import Trajectory, is_kitti, read_kitti, read_trajectory
@@ -212,7 +213,6 @@ SECONDS = 1.0
 # Bytes read in a second, with BZ2 and without; seconds that a message takes to decode.
 _SLOW, _FAST, _DECODE = 2.5e6, 2e8, 4e-5
 _FEWEST, _MOST, _EACH = 5, 20, 2.5  # parts of a sample, and messages of a topic in each
-_LONGEST_GAP = 60.0  # seconds; bags of one drive are not further apart
 
 
 def _inspect_bags(path: Path, deep: bool, show: Progress) -> Inspection:
@@ -265,7 +265,7 @@ def _separate(reader: AnyReader, paths: tuple[Path, ...]) -> list[Finding]:
     spans = sorted(span for span in spans if span[0] < span[1])
     ends = np.maximum.accumulate([end for _, end, _ in spans])
     gaps = [(start - end) * 1e-9 for (start, *_), end in zip(spans[1:], ends, strict=False)]
-    if not gaps or max(gaps) <= _LONGEST_GAP:
+    if not gaps or max(gaps) <= LONGEST_GAP:
         return []
     longest = int(np.argmax(gaps))
     days = f" ({gaps[longest] / 86400.0:,.0f} days)" if gaps[longest] > 2.0 * 86400.0 else ""
