@@ -15,7 +15,7 @@ from adaptune.study.config import ALSO
 from adaptune.study.driven import RIVALS
 from offline.config import load_study
 from online.compare import compare, compared_modes
-from online.modes import MODES, run_replays, run_untrained
+from online.modes import MODES, replayed_modes, run_replays, run_untrained
 from online.record import StoredReplayError
 
 EVERY = [mode for mode in MODES if mode not in RIVALS]
@@ -91,6 +91,17 @@ def test_they_are_made_once_and_again_for_another_model(own):
         compare(plain)
     assert run_replays(study, study.model_path) == 1
     assert {row.mode for row in compare(plain).rows} == set(EVERY)
+
+
+def test_where_live_changes_are_in_vain_the_other_modes_are_replayed(own, monkeypatch, caplog):
+    study = own("online.modes=[paper, untrained]", "online.switching.mechanism=live")
+    shutil.rmtree(study.folder / "replays")
+    asked = []
+    monkeypatch.setattr("online.modes._in_vain", lambda *_: asked.append(1) or "it never reads x")
+    run_replays(study, study.model_path)
+    assert replayed_modes(study.folder / "replays/three") == ("baseline", "fixed", "untrained")
+    assert "paper is not replayed on three: it never reads x" in caplog.text
+    assert len(asked) == 1
 
 
 def test_what_is_missing_somewhere_is_told_and_left_out(own, tmp_path):

@@ -1,5 +1,6 @@
 import json
 import re
+import shutil
 import sys
 from pathlib import Path
 
@@ -21,6 +22,7 @@ from offline.config import load_study
 from offline.train import train
 from online.compare import compare
 from online.modes import run_replays
+from online.replay import ReplayRecord
 
 STUDY = """\
 odometry:
@@ -324,6 +326,22 @@ def test_the_whole_way(make, caplog):
     train(study)
     assert "2 trials are run again: " in caplog.text
     assert "file.json has other content" in caplog.text
+
+
+def test_no_mode_pays_for_writing_a_part(make, monkeypatch):
+    study = make("pretend", "offline.trials=2")
+    train(study)
+    shutil.rmtree(study.folder / "inputs")
+    monkeypatch.setattr("adaptune.study.sequences._inputs", {})
+    begin, written = ReplayRecord.begin, []
+
+    def note(record):
+        written.append(any((study.folder / "inputs").rglob("stamps.npy")))
+        begin(record)
+
+    monkeypatch.setattr(ReplayRecord, "begin", note)
+    run_replays(study, study.model_path)
+    assert written[0]
 
 
 @pytest.mark.parametrize(

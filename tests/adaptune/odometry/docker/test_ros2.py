@@ -209,6 +209,10 @@ def test_a_system_adapts_live_only_by_what_has_an_effect(tmp_path):
     what = "/icp, set while it runs, changes nothing by max_range (the first 50 scans): it cannot "
     with pytest.raises(OdometryError, match=re.escape(what)):
         check_live(_factory(tmp_path, vain | size, **given), scans()[:16])
+    # Of a system at rest nothing is known.
+    points = scans()[0].points
+    at_rest = [Scan(scan.stamp, points) for scan in scans()[:16]]
+    check_live(_factory(tmp_path, vain, **given), at_rest)
     assert not containers()
 
 
