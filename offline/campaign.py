@@ -270,7 +270,7 @@ def forecast(study: OfflineStudy, archive: Archive, workers: int, clock: Stopwat
         costs.append(1e-3 * float(np.mean(known)))
         each += COST * costs[-1] * frames.n_driven * study.config.offline.repeats
         if not archive.is_uncut(name):
-            rest += COST * costs[-1] * len(frames.stamps) * (FINALISTS + DEARER)
+            rest += COST * costs[-1] * len(frames.stamps) * (1 + FINALISTS + DEARER)
     workers = max(workers, 1)  # those of a cluster may come later
     rest = FITTING + rest / workers
     if clock.replays:
@@ -362,17 +362,19 @@ def drive_whole(
 ) -> None:
     """Drive sets along whole training sequences, unless that was done before.
 
+    Baselines drive along each time, so that costs compare that were measured side by side.
     Where the health check acts, it may hide that a set fails without it. So admissible sets, and
     the baseline, drive such sequences once more, bare.
     """
-    names = study.training
+    names, baselines = study.training, range(len(study.odometry.space.baselines))
 
     def drive(schedule: Schedule, on: Mapping[str, Collection[int]], bare: bool = False) -> None:
         there = read_whole_drives(archive, names, sets, bare)
         for name, numbers in on.items():
-            for n in numbers:
-                if n not in there[name]:
-                    schedule.add(name, n, sets[n])
+            if {*numbers} - {*there[name]}:
+                for n in numbers:
+                    if n in baselines or n not in there[name]:
+                        schedule.add(name, n, sets[n])
         for done in schedule.run(workers):
             schedule.store(*done)
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune.archive import PREPARE_MS, REGISTER_MS, Archive, Frames, Trial, summarise
+from adaptune.archive import PREPARE_MS, REGISTER_MS, Archive, Frames, Summary, Trial, summarise
 from adaptune.bank.members import LEVER, Agreement, share
 from adaptune.geometry import Poses, invert, mean_motion, rectify, rotation_angle, steps
 from adaptune.live.evidence import SPACING, USUAL_SHARE
@@ -40,6 +40,7 @@ from adaptune.study.config import WORTH
 from adaptune.study.driven import MIN_RECORDINGS, PER_STRETCH
 from offline.campaign import read_whole_drives
 from offline.choice import (
+    LEAST_COST,
     PER_BLOCK,
     BlockErrors,
     NothingUsableError,
@@ -519,6 +520,16 @@ def periods(period: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArray[np.int
     return first, number
 
 
+def mean_cost(runs: Sequence[Summary], preparation: int) -> SetCost:
+    """Mean cost of a set over the sequences that it was run on; infinite if it failed."""
+    register, prepare = (
+        float(np.mean([run.others.get(key, np.nan) for run in runs]))
+        for key in (REGISTER_MS, PREPARE_MS)
+    )
+    failed = any(run.failure for run in runs)
+    return SetCost(np.inf if failed else register, prepare, preparation)
+
+
 def measured_costs(
     archive: Archive, names: Sequence[str], sets: ParameterSets, odometry: Factory
 ) -> Costs:
@@ -532,16 +543,10 @@ def measured_costs(
     known = defaultdict[int, list[float]](list)  # what each preparation took in trials that worked
     for trial in sets:
         runs = [archive.finished(name)[trial] for name in names]
-        register, prepare = (
-            float(np.mean([run.others.get(key, np.nan) for run in runs]))
-            for key in (REGISTER_MS, PREPARE_MS)
-        )
-        if any(run.failure for run in runs):
-            register = np.inf
         number = numbers.setdefault(odometry(sets[trial]).preparation, len(numbers))
-        costs[trial] = cost = SetCost(register, prepare, number)
+        costs[trial] = cost = mean_cost(runs, number)
         if np.isfinite(cost.alone):
-            known[number].append(prepare)
+            known[number].append(cost.prepare)
     usual = {number: float(np.median(times)) for number, times in known.items()}
     found = {
         trial: cost._replace(prepare=usual.get(cost.preparation, cost.prepare))
@@ -572,7 +577,10 @@ def with_whole_drives(
     config: OfflineConfig,
     bare: Mapping[str, Collection[int]] = MappingProxyType({}),
 ) -> LabelledData:
-    """The same with finalists' drives of whole recordings; of those in `bare`, the bare ones."""
+    """The same with finalists' drives of whole recordings; of those in `bare`, the bare ones.
+
+    What finalists cost over the baseline is what they cost side by side in these drives.
+    """
     asked = [*data.finalists(), *data.sets.defaults]
     drives = read_whole_drives(archive, [s.name for s in data.sequences], asked)
     if not (known := sorted(set.intersection(*map(set, drives.values())))):
@@ -582,7 +590,24 @@ def with_whole_drives(
         without = bare.get(s.name, ())
         trials = [archive.read(s.name, n, whole=True, bare=n in without) for n in known]
         sequences.append(replace(s, whole=_whole(s, trials, config)))
+    if not all(archive.is_uncut(s.name) for s in sequences):
+        runs = {n: [of[n] for of in drives.values()] for n in known}
+        data = data._replace(costs=side_by_side(data.costs, runs))
     return data._replace(sequences=sequences, driven=known)
+
+
+def side_by_side(costs: Costs, runs: Mapping[int, Sequence[Summary]]) -> Costs:
+    """The same, where some sets cost as much more than the baseline as in these runs beside it.
+
+    In the trials, the machine may have been busier with one set than with another.
+    """
+    beside = {n: mean_cost(of, costs.sets[n].preparation) for n, of in runs.items()}
+    scale = costs.alone(BASELINE) / max(beside[BASELINE].alone, LEAST_COST)
+    found = {
+        n: SetCost(scale * c.register, scale * c.prepare, c.preparation) for n, c in beside.items()
+    }
+    known = {n: cost for n, cost in found.items() if np.isfinite(cost.alone) and scale > 0.0}
+    return replace(costs, sets={**costs.sets, **known})
 
 
 def _whole(s: LabelledSequence, trials: Sequence[Trial], config: OfflineConfig) -> LabelledSequence:

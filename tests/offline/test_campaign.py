@@ -55,6 +55,12 @@ def test_finalists_are_driven_along_the_whole_of_long_recordings(study_file, tmp
     again = {path: path.stat().st_mtime_ns for path in files}
     train(study)
     assert {path: path.stat().st_mtime_ns for path in files} == again
+    # The baseline drives beside one that is lacking, so that their costs compare.
+    fixed = archive.trial_path("one", training.model.fixed, whole=True)
+    fixed.unlink()
+    train(study)
+    renewed = {path for path in files if path.stat().st_mtime_ns != again[path]}
+    assert renewed == {fixed, archive.trial_path("one", 0, whole=True)}
 
 
 def test_another_health_check_makes_other_trials(trained, study_file, tmp_path):

@@ -7,8 +7,8 @@ from labelled_places import of_errors
 from tables import table
 
 from adaptune.archive import Summary
-from adaptune.model.rules import ERROR_FLOOR
-from offline.labelled import LabelledData, measured_costs
+from adaptune.model.rules import ERROR_FLOOR, Costs, SetCost
+from offline.labelled import LabelledData, measured_costs, side_by_side
 from offline.tuning import expected_loss, interval_of, log_ratios, standard_error, worst_tenth
 
 
@@ -64,11 +64,13 @@ def test_drives_of_whole_recordings_decide_where_there_are_some():
     assert (without_first.fixed(), without_second.fixed()) == (5, 2)
 
 
-def test_what_failed_tells_nothing_of_preparing():
-    def run(register, prepare, failure=""):
-        others = {"register_ms": register, "prepare_ms": prepare}
-        return Summary({}, 1.0, 0, 0, 1.0, others, failure=failure)
+def run(register, prepare, failure=""):
+    """A trial with these milliseconds."""
+    others = {"register_ms": register, "prepare_ms": prepare}
+    return Summary({}, 1.0, 0, 0, 1.0, others, failure=failure)
 
+
+def test_what_failed_tells_nothing_of_preparing():
     runs = {0: run(4.0, 5.0), 2: run(3.0, 0.0, "no pose"), 5: run(2.0, np.nan), 7: run(3.0, 6.0)}
     archive = SimpleNamespace(
         finished=lambda _: runs, read_frames=lambda _: SimpleNamespace(evidence_ms=0.0)
@@ -78,6 +80,24 @@ def test_what_failed_tells_nothing_of_preparing():
     costs = measured_costs(archive, ["s"], sets, lambda _: alike)
     assert [costs.alone(trial) for trial in (0, 5, 7)] == [9.5, 7.5, 8.5]
     assert not costs.usable(2)
+
+
+def test_costs_of_finalists_are_those_of_drives_side_by_side():
+    """A machine that is busy in the trials of one set alone does not make that set dear."""
+    sets = {n: SetCost(ms, 2.0, 0) for n, ms in {0: 6.0, 2: 9.0, 5: 6.0, 7: 1.0, 9: 2.0}.items()}
+    costs = Costs(sets, evidence=1.0)
+    runs = {
+        0: [run(10.0, 4.0), run(14.0, 4.0)],  # twice the baseline's cost in the trials
+        2: [run(12.0, 4.0), run(12.0, 4.0)],
+        5: [run(20.0, 4.0), run(20.0, 4.0)],
+        7: [run(1.0, 1.0), run(1.0, 1.0, "no pose")],
+    }
+    found = side_by_side(costs, runs)
+    assert [found.alone(n) for n in (0, 2, 5, 7, 9)] == pytest.approx([8.0, 8.0, 12.0, 3.0, 4.0])
+    assert found.evidence == 1.0
+    # Where the baseline's is unknown, or it failed, nothing compares.
+    for unknown in (run(np.nan, 4.0), run(10.0, 4.0, "no pose")):
+        assert side_by_side(costs, runs | {0: [unknown]}).sets == sets
 
 
 def test_restarts_of_all_sequences_count():
