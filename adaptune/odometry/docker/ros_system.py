@@ -57,6 +57,9 @@ Topic = Annotated[str, AfterValidator(_topic)]
 class RosSettings(engine.ContainerSettings, WholeSettings):
     """What ROS systems may set; ``docs/docker.md`` describes it and its defaults."""
 
+    steering: ClassVar[tuple[str, ...]] = ("node",)
+    """Settings that only say how parameters change while it runs."""
+
     template: Annotated[str, AfterValidator(resolve)]
     odometry: Topic
     frame: str = "lidar"
