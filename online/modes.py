@@ -203,7 +203,8 @@ class ReplaySetup:
         if name not in MODES:
             about |= {"rule": python_content(name, ENTRY_POINTS)}
         if name != EVEN and self._mechanism(name, needed(name, model)) != "bank":
-            return about | {"model": digest, "switching": {"mechanism": "live"}}
+            live = {"mechanism": "live"} | self.odometry.steering
+            return about | {"model": digest, "switching": live}
         named = self.config.online.switching.model_dump(mode="json", include={"size", "sets"})
         return about | {"model": digest, "switching": switching | named}
 

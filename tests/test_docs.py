@@ -1,5 +1,6 @@
 """The documentation leads where it says, and what it says to type works: commands, Python, YAML."""
 
+import inspect
 import json
 import re
 import shlex
@@ -24,6 +25,7 @@ from needs import module_of
 from setups import setup_of
 from typer.main import get_command
 
+import adaptune
 from adaptune import yaml12
 from adaptune.commands.cli import app
 from adaptune.model import BankSettings, FixedSet
@@ -113,6 +115,14 @@ def test_the_site_lists_all_keys_commands_and_objects():
     for name in get_command(app).commands:
         assert f"### {name}\n" in made["<!-- commands -->"]
     assert "autoclass:: adaptune.selector.Selector\n" in made["<!-- python -->"]
+
+
+def test_the_options_of_the_command_are_arguments_in_python():
+    pages = ((ROOT / "docs" / name).read_text("utf-8") for name in ("python.md", "quickstart.md"))
+    page, quickstart = pages
+    options = set(re.findall(r"(?m)^\| `--(\w+) ", quickstart))
+    assert {"reference"} == set(re.findall(r"`(\w+)=`", page)) <= options
+    assert options <= set(inspect.signature(adaptune.tune).parameters)
 
 
 def test_the_tables_of_settings_are_those_of_the_code():

@@ -38,7 +38,14 @@ class OdometryFactory:
     @property
     def identity(self) -> dict[str, Any]:
         """Name and settings, by which a model knows the odometry that it was made for."""
-        return {"name": self.name, "settings": self.settings.model_dump(mode="json")}
+        settings = self.settings.model_dump(mode="json") | dict.fromkeys(self.steering)
+        return {"name": self.name, "settings": settings}
+
+    @property
+    def steering(self) -> dict[str, Any]:
+        """Settings that only say how parameters change while it runs: trials do not need them."""
+        given = {key: getattr(self.settings, key) for key in getattr(self.settings, "steering", ())}
+        return {key: value for key, value in given.items() if value is not None}
 
     @property
     def content(self) -> Content:
@@ -121,6 +128,11 @@ class OdometryPool:
         """The labels, and by label name and settings, by which a model knows what it is of."""
         settings = {label: factory.identity for label, factory in self.factories.items()}
         return {"name": self.name, "settings": settings}
+
+    @property
+    def steering(self) -> dict[str, Any]:
+        """See `OdometryFactory`; several do not change live."""
+        return {}
 
     @property
     def isolated(self) -> bool:

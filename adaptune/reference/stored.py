@@ -2,14 +2,15 @@
 
 import json
 import math
+from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from adaptune.files import write_text
-from adaptune.reference.estimated import EstimatedReference, EstimateError
+from adaptune.files import DAMAGED_NPZ, replacing, write_text
+from adaptune.reference.estimated import EstimatedReference, EstimateError, Registrations
 from adaptune.report.charts import Axis, Chart, Drawn, Line, Panel, Points, Spans
 from adaptune.report.drawing import draw_chart
 from adaptune.trajectory import write_tum
@@ -80,6 +81,25 @@ def write_estimate(path: Path, found: EstimatedReference, about: dict[str, Any])
     del known["path"], known["errors"]
     write_text(path.with_suffix(".json"), json.dumps(known, indent=1) + "\n")
     return stored
+
+
+def keep(path: Path, found: EstimatedReference) -> None:
+    """Write all of an estimate to a ``.npz`` file, where that is possible."""
+    arrays = vars(found) | found.registrations._asdict()
+    del arrays["registrations"]
+    with suppress(OSError), replacing(path) as temporary:
+        np.savez_compressed(temporary, **arrays)
+
+
+def kept(path: Path) -> EstimatedReference | None:
+    """The estimate in a ``.npz`` file; None if there is none, or it is damaged."""
+    try:
+        with np.load(path) as file:
+            arrays = dict(file)
+        registrations = Registrations(*map(arrays.pop, Registrations._fields))
+        return EstimatedReference(**arrays, registrations=registrations)
+    except (*DAMAGED_NPZ, KeyError):
+        return None
 
 
 def check_writable(path: Path) -> None:

@@ -12,13 +12,13 @@ from adaptune import manifest
 from adaptune.errors import Finding
 from adaptune.geometry import Poses, to_pose
 from adaptune.machine import pin
-from adaptune.recording.cache import fingerprints
+from adaptune.recording import cache
 from adaptune.recording.config import Fractions, SequenceConfig
 from adaptune.recording.recording import RecordedSequence, wants_estimate
 from adaptune.reference import estimate
 from adaptune.reference.diagnosis import SUSPICIOUS, contradictions
 from adaptune.reference.estimated import EstimatedReference, EstimateError
-from adaptune.reference.stored import Refusal, StoredEstimate, write_estimate
+from adaptune.reference.stored import Refusal, StoredEstimate, keep, kept, write_estimate
 from adaptune.study.sequences import StudySequences
 
 _OF_CHANGES = ("compensate", "imu")
@@ -29,8 +29,10 @@ _AS_RECORDED = {"compensate": None}
 _WHOLE = {"part": None}
 _MOST = 0.5
 """Parts that are a larger share of a recording take theirs from that of the whole."""
-_newest: dict[tuple[str, ...], EstimatedReference | str] = {}
+_newest: dict[str, EstimatedReference | str] = {}
 """The last estimate of a whole recording, or why there is none."""
+KEPT = "references"
+"""Folder of the cache that keeps estimates for other studies of the same recordings."""
 
 _log = logging.getLogger(__name__)
 
@@ -147,24 +149,32 @@ def _estimated(
     config: SequenceConfig,
     advance: Callable[[int, int], None],
 ) -> EstimatedReference | str:
-    """The same of scans that are read in some way; that of the last whole recording is kept."""
-    scans = RecordedSequence(config)
-    # GTSAM's sums may depend on its threads: only on one core do results repeat bit by bit.
-    found: EstimatedReference | str
-    try:
-        with pin(os.getpid()):
-            found = estimate.estimate_reference(scans, advance)
-    except EstimateError as error:
-        found = str(error) if scans.name in str(error) else f"{scans.name}: {error}"
+    """The same of scans that are read in some way, unless the cache keeps it."""
+    scans, key = RecordedSequence(config), _key(sequences, name, config)
+    path = cache.folder() / KEPT / f"{key}.npz"
+    found: EstimatedReference | str | None = kept(path)
+    if found is not None:
+        _log.info("%s: its reference was estimated before (%s)", name, path)
+    else:
+        # GTSAM's sums may depend on its threads: only on one core do results repeat bit by bit.
+        try:
+            with pin(os.getpid()):
+                found = estimate.estimate_reference(scans, advance)
+            if cache.cap():
+                keep(path, found)
+        except EstimateError as error:
+            found = str(error) if scans.name in str(error) else f"{scans.name}: {error}"
     if config.part is None:
         _newest.clear()
-        _newest[_key(sequences, name, config)] = found
+        _newest[key] = found
     return found
 
 
-def _key(sequences: StudySequences, name: str, config: SequenceConfig) -> tuple[str, ...]:
-    """All that the estimated reference of a recording depends on."""
-    return config.model_dump_json(), *fingerprints(sequences.files(name).recording)
+def _key(sequences: StudySequences, name: str, config: SequenceConfig) -> str:
+    """Digest of all that the estimated reference of a recording depends on, not of its name."""
+    about = _about(sequences, name)
+    scans = about["sequences"][name] | {"part": config.part}
+    return manifest.digest([about["estimator"], about["reader"], about["recording"][name], scans])
 
 
 def _others_of_newest(sequences: StudySequences) -> Iterator[str]:

@@ -1,13 +1,16 @@
 import os
+import shutil
 
 import drives
 import estimates
 import numpy as np
 import pytest
 
+from adaptune.recording import cache
 from adaptune.recording.config import SequenceConfig
 from adaptune.recording.recording import RecordedSequence, open_sequence, wants_estimate
 from adaptune.reference.estimated import EstimateError
+from adaptune.study import references
 from adaptune.study.references import ensure_references, estimates_as_data, estimates_of
 from adaptune.trajectory import read_trajectory
 from offline.config import load_study
@@ -116,10 +119,48 @@ def test_it_is_estimated_again_when_something_has_changed(estimator, load, monke
         words = f"one: its reference is estimated again: sequences.one.{change}"
         assert caplog.messages[0].startswith(words)
         ensure(load(*overrides), ["one"])
-    assert len(estimator.asked) == 3
+    assert len(estimator.asked) == 2  # the first one was kept
     monkeypatch.setattr("adaptune.reference.estimate.VERSION", 0)
     ensure(load(LEFT_OUT), ["one"])
+    assert len(estimator.asked) == 3
     assert "again: estimator changed from 1 to 0" in caplog.text
+
+
+def test_another_study_of_the_same_recording_takes_what_is_kept(
+    estimator, study_file, tmp_path, monkeypatch, caplog
+):
+    caplog.set_level("INFO")
+    copy = shutil.copy(study_file.parent / "one.bag", tmp_path / "copy.bag")
+    paths = []
+
+    def estimated(*overrides):
+        number = len(paths)
+        study = load_study(study_file, [LEFT_OUT, *overrides], tmp_path / str(number))
+        ensure(study, ["one"])
+        paths.append(study.sequences.estimate_path("one"))
+        return len(estimator.asked)
+
+    assert estimated() == 1
+    # The same content under another path, with what is said of the reference alone.
+    assert estimated(f"sequences.one.bag={copy}", "sequences.one.max_gap=9") == 1
+    (kept,) = (cache.folder() / references.KEPT).iterdir()
+    assert f"one: its reference was estimated before ({kept})" in caplog.messages
+    for suffix in (".tum", ".json"):
+        one, two = (path.with_suffix(suffix).read_text() for path in paths)
+        assert one == two
+    assert estimated("sequences.one.stride=2") == 2
+    assert estimated(f"sequences.one.bag={study_file.parent / 'two.bag'}") == 3
+    for damaged in (b"", kept.read_bytes()[:-200], b"x" * 500):
+        kept.write_bytes(damaged)
+        asked = len(estimator.asked)
+        assert estimated() == asked + 1
+        assert estimated() == asked + 1
+    # Nothing is left of the writing, and nothing is kept where the cache is off.
+    assert len(list(kept.parent.iterdir())) == 3
+    kept.unlink()
+    monkeypatch.setenv("ADAPTUNE_CACHE_GB", "0")
+    asked = len(estimator.asked)
+    assert [estimated(), estimated()] == [asked + 1, asked + 2]
 
 
 def test_a_recording_with_poses_of_its_own_keeps_them(tmp_path):
@@ -167,13 +208,8 @@ def test_a_recording_that_allows_none_is_named_and_not_tried_again(estimator, lo
     assert study.sequences.estimate("one") is not None
 
 
-def other_than_before(number):
-    """A process remembers the last estimate of a recording that is read as before."""
-    return (f"sequences.one.max_gap={9 + number}",)
-
-
 def test_parts_of_a_recording_take_theirs_from_the_whole(estimator, load, monkeypatch):
-    halves = load(LEFT_OUT, "training=[one: 0-50%]", "test=[one: 50-100%]", *other_than_before(1))
+    halves = load(LEFT_OUT, "training=[one: 0-50%]", "test=[one: 50-100%]")
     monkeypatch.setattr("adaptune.reference.estimate.SHORTEST", 3.0)
     ensure(halves, ["one_0-50"])
     for name in ("one_0-50", "one_50-100"):
@@ -184,7 +220,7 @@ def test_parts_of_a_recording_take_theirs_from_the_whole(estimator, load, monkey
     ensure(halves, ["one_50-100"])
     assert len(estimator.asked) == 1
     # Each by itself before, it is estimated anew.
-    alone = load(LEFT_OUT, "training=[one: 0-50%]", "test=[three]", *other_than_before(1))
+    alone = load(LEFT_OUT, "training=[one: 0-50%]", "test=[three]")
     ensure(alone, ["one_0-50"])
     assert len(estimator.asked) == 2
 
@@ -192,7 +228,7 @@ def test_parts_of_a_recording_take_theirs_from_the_whole(estimator, load, monkey
 def test_parts_of_two_recordings_take_one_pass_of_each(estimator, load, monkeypatch):
     monkeypatch.setattr("adaptune.reference.estimate.SHORTEST", 3.0)
     roles = ("training=[one: 0-50%, two: 0-50%]", "test=[one: 50-100%, two: 50-100%]")
-    study = load(LEFT_OUT, "sequences.two.reference=", *roles, *other_than_before(3))
+    study = load(LEFT_OUT, "sequences.two.reference=", *roles)
     ensure(study, study.training)
     ensure(study, study.config.test)
     assert estimator.names == ["one.bag", "two.bag"]
@@ -213,7 +249,7 @@ def test_a_part_that_is_little_or_does_not_serve_is_estimated_by_itself(estimato
     few = load(LEFT_OUT, "training=[one: 0-30%]", "test=[three]")
     ensure(few, ["one_0-30"])
     assert len(estimator.asked) == 1
-    short = load(LEFT_OUT, "training=[one: 0-50%]", "test=[one: 50-100%]", *other_than_before(2))
+    short = load(LEFT_OUT, "training=[one: 0-50%]", "test=[one: 50-100%]")
     ensure(short, ["one_50-100"])
     assert len(estimator.asked) == 3
 

@@ -1,9 +1,12 @@
 """Estimated references that are made up, without an estimation."""
 
+import secrets
+
 import numpy as np
 from rooms import along_x
 
 from adaptune.reference.estimated import EstimatedReference, Registrations
+from adaptune.study import references
 
 STEP = 0.3
 
@@ -42,7 +45,9 @@ class Estimator:
 
 
 def install(monkeypatch, untrusted=()):
-    """Let all references be estimated in this way."""
+    """Let all references be estimated in this way, whatever was estimated before."""
+    monkeypatch.setattr(references, "KEPT", f"references-{secrets.token_hex(4)}")
+    monkeypatch.setattr(references, "_newest", {})
     estimator = Estimator(untrusted)
     monkeypatch.setattr("adaptune.reference.estimate.estimate_reference", estimator)
     return estimator

@@ -181,9 +181,11 @@ class Ros2System(RosSystem):
 
     def cloud_type(self, topic: str) -> str:
         while time.monotonic() - self._begun < self._settings.ready:
-            if kinds := self.state()["subscribed"].get(topic):
+            heard = self.state()["subscribed"]
+            if kinds := heard.get(topic):
                 livox = [kind for kind in kinds if kind in LIVOX_TYPES]
                 return str(livox[0]) if livox else super().cloud_type(topic)
+            self._tell(topic, heard.keys())
             time.sleep(_BETWEEN_STATES)
         return super().cloud_type(topic)  # what waits for it says what is wrong
 

@@ -43,6 +43,7 @@ _FLOOD = 2000  # messages of a second that are too many
 _log = logging.getLogger(__name__)
 
 START = 30.0  # seconds in which adaptune's node must be there
+LONG = 5.0  # seconds without a node that subscribes to the clouds, after which that is told
 
 
 def _topic(name: str) -> str:
@@ -56,6 +57,9 @@ Topic = Annotated[str, AfterValidator(_topic)]
 
 class RosSettings(engine.ContainerSettings, WholeSettings):
     """What ROS systems may set; ``docs/docker.md`` describes it and its defaults."""
+
+    steering: ClassVar[tuple[str, ...]] = ("node",)
+    """Settings that only say how parameters change while it runs."""
 
     template: Annotated[str, AfterValidator(resolve)]
     odometry: Topic
@@ -93,6 +97,7 @@ class RosSystem(ABC):
     """Lines of it that say nothing."""
     _container: Any = None
     _user: str  # in a container
+    _told = False
 
     def __init__(
         self,
@@ -193,6 +198,7 @@ class RosSystem(ABC):
             late = time.monotonic() - self._begun > self._settings.ready
             state = self.state()
             heard = state["subscribed"].keys() - {"/clock"}
+            self._tell(topic, heard)
             # A node subscribes to one after the other.
             if heard != before:
                 before = heard
@@ -202,12 +208,19 @@ class RosSystem(ABC):
             time.sleep(_BETWEEN_LOOKS)
         if topic in before and (why := self.link.why_unheard(topic)):
             raise OdometryError(why)
-        others = ", ".join(sorted(before)) or "none"
         raise OdometryError(
             f"no node subscribed to the clouds' topic {topic} in {self._settings.ready:g} s "
-            f"(topics with subscribers: {others}); name the topic that the system hears as "
+            f"({_heard(before)}); name the topic that the system hears as "
             f"odometry.settings.points, or change it in the template"
         )
+
+    def _tell(self, topic: str, heard: AbstractSet[str]) -> None:
+        """Log, once, what is waited for: nodes may take long, as while they load a map."""
+        if not self._told and topic not in heard and time.monotonic() - self._begun > LONG:
+            self._told = True
+            what = "%s: waits up to %g s for a node to subscribe to the clouds' topic %s (%s)"
+            name = self._settings.image or self._settings.command[0]
+            _log.info(what, name, self._settings.ready, topic, _heard(heard))
 
     def reader(self) -> "PoseReader":
         """What reads the system's poses."""
@@ -267,6 +280,10 @@ class RosSystem(ABC):
         self.link.close()
         if (image := self._settings.image) is not None:
             engine.remove_shared(self.folder, image, self._user)
+
+
+def _heard(topics: AbstractSet[str]) -> str:
+    return f"topics with subscribers: {', '.join(sorted(topics - QUIET)) or 'none'}"
 
 
 class PoseReader:

@@ -245,6 +245,7 @@ class RustleSettings(RosSettings):
     """An image in RUSTLE's layout; ``docs/docker.md`` describes the settings and their defaults."""
 
     system: ClassVar[type[RosSystem]] = Ros1System
+    steering: ClassVar[tuple[str, ...]] = ("node", "set_parameter")
 
     package: str | None = Field(None, pattern=r"^[\w-]+$")
     arguments: tuple[Annotated[str, Field(pattern=r"^[\w:=./-]+$")], ...] = ()

@@ -1,4 +1,5 @@
 import logging
+from pathlib import Path
 
 import faulty
 import numpy as np
@@ -7,12 +8,14 @@ import turns
 from rooms import moved
 from walker import at, makes, x_of, x_on
 
-from adaptune.bank.bank import Bank
+from adaptune.bank.bank import CATCH_UP, WARM_UP, Bank
 from adaptune.odometry import OdometryError
 from adaptune.odometry.base import InProcess
 from adaptune.odometry.faults import MOST_FAULTS
 from adaptune.odometry.remote import Isolated, Limits
 from adaptune.space import Selection
+
+METHOD = Path(__file__).parents[3] / "docs/method.md"
 
 
 def weigh(bank, *weights):
@@ -63,6 +66,21 @@ def test_a_member_restarts_once_a_second_at_most():
     # It is lost all the time.
     np.testing.assert_allclose(steps_of(odometry, 41), 1.0)
     assert odometry.restarts == len(made[1].starts) - 1 == 4
+
+
+def test_the_method_says_what_restarts_cost():
+    make, made = makes({1.02: dict.fromkeys(range(200), 4.0)})
+    odometry = Bank(make, {7: {"speed": 1.0}, 3: {"speed": 1.02}, 5: {"speed": 1.06}})
+    steps_of(odometry, 131)
+    before = [len(member.seen) - len(member.starts) for member in made]
+    x_on(odometry, np.arange(13.1, 15.0, 0.1))
+    registered = [len(m.seen) - len(m.starts) - n for m, n in zip(made, before, strict=True)]
+    text = " ".join(METHOD.read_text("utf-8").split())
+    assert f"the scans of the last {WARM_UP:g} s again" in text
+    times = registered[1] / registered[0]
+    assert f"takes {times:.0f} times its usual CPU time at 10 Hz" in text
+    assert CATCH_UP == 3
+    assert "at most three of these scans with each new one" in text
 
 
 @pytest.mark.parametrize("place", range(4))

@@ -1,12 +1,20 @@
 import re
+import socket
 
+import local_link
 import pytest
 import yaml
 from pydantic import ValidationError
 
 from adaptune.odometry import OdometryError
+from adaptune.odometry.docker import ros_system
 from adaptune.odometry.docker.ros2_system import DIED, NOISE, Ros2Settings, Ros2System
-from adaptune.odometry.docker.rustle import server_keys, warn_of_unread
+from adaptune.odometry.docker.rustle import (
+    Ros1System,
+    RustleSettings,
+    server_keys,
+    warn_of_unread,
+)
 from adaptune.odometry.template import Template
 
 HELD = {
@@ -153,3 +161,40 @@ def test_a_node_that_dies_under_ros2_launch_is_known_by_what_that_writes():
     found = DIED.search(b"[INFO] [launch]: All log files can be found below /x\n" + line)
     assert (found[1], found[2]) == (b"kiss_icp_node", b"-11")
     assert NOISE.fullmatch(b"[INFO] [kiss_icp_node-1]: process started with pid [53]")
+
+
+class Elsewhere:
+    """A system without a container, whose node subscribes to other clouds."""
+
+    def _begin(self):
+        self._connected = socket.socket(socket.AF_UNIX)
+        self._connected.connect(str(self.folder / "link"))
+
+    def _linked(self, connection):
+        connection.close()
+        return local_link.LocalLink()
+
+    def state(self):
+        return {"subscribed": {"/velodyne": ["a"], "/clock": ["b"]}, "sending": {}}
+
+    def stop(self):
+        self._connected.close()
+
+
+@pytest.mark.parametrize("base", [Ros1System, Ros2System])
+def test_what_is_waited_for_is_told_once(base, tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr(ros_system, "LONG", 0.1)
+    caplog.set_level("INFO")
+    common = {"template": "p.yaml", "odometry": "/o", "ready": 0.3, "image": "x"}
+    one, two = RustleSettings(**common), Ros2Settings(**common, command=("x", "{parameters}"))
+    given = one if base is Ros1System else two
+    system = type("Elsewhere", (Elsewhere, base), {})(given, 1.0, "", tmp_path)
+    system.cloud_type("/points")
+    heard = r"\(topics with subscribers: /velodyne\)"
+    words = f"no node subscribed to the clouds' topic /points in 0.3 s {heard}; name the topic"
+    with pytest.raises(OdometryError, match=words):
+        system.wait("/points")
+    system.stop()
+    (said,) = caplog.messages
+    words = f"x: waits up to 0.3 s for a node to subscribe to the clouds' topic /points {heard}"
+    assert re.fullmatch(words, said)

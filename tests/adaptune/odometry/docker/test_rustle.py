@@ -11,6 +11,7 @@ from contained import template
 from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
+from random_models import random_model
 from rooms import moved
 
 from adaptune.odometry import OdometryError
@@ -18,8 +19,13 @@ from adaptune.odometry.docker.engine import EngineError
 from adaptune.odometry.docker.played_bag import Drain, PlayedBag, PoseRecorder, check_stamps
 from adaptune.odometry.docker.ros_system import PoseReader
 from adaptune.odometry.docker.rustle import Rustle, RustleSettings
+from adaptune.odometry.factory import OdometryFactory
 from adaptune.odometry.program import ProgramInput
+from adaptune.odometry.remote import Limits
 from adaptune.recording.pose_messages import usable
+from adaptune.space import ParameterSpace
+from adaptune.study.config import StudyConfig
+from online.modes import ReplaySetup
 
 PERIOD = 10**8
 SCANS = 1_700_000_000_123_456_789 + PERIOD * np.arange(40)
@@ -261,6 +267,23 @@ def test_what_it_says_of_itself():
         assert (described.live, described.needs_imu, described.whole) == (live, needs_imu, whole)
     assert settings().packages == ("rustle-ros", "rustle")
     assert settings(package="own").packages == ("own",)
+
+
+def test_trials_do_not_depend_on_how_parameters_are_set_while_it_runs():
+    def made(**told):
+        given = settings(play="lockstep", **told).model_dump()
+        return OdometryFactory("rustle", given, ParameterSpace({}), Limits())
+
+    one, steered = made(), made(node="/n", set_parameter=("x", "{name}", "{value}"))
+    assert one.identity == steered.identity != made(imu="/imu").identity
+    assert one.steering == {}
+    assert steered.steering == {"node": "/n", "set_parameter": ("x", "{name}", "{value}")}
+    config = StudyConfig(odometry={"name": "rustle"}, training=("a",))
+    replays = [
+        ReplaySetup(config, factory, "live", ()).identity("adaptive", random_model())["switching"]
+        for factory in (one, steered)
+    ]
+    assert replays == [{"mechanism": "live"}, {"mechanism": "live"} | steered.steering]
 
 
 def test_what_is_checked_before_a_campaign(tmp_path, monkeypatch):
