@@ -55,6 +55,7 @@ class Figures(NamedTuple):
     worst: float
     n_stretches: int
     n_recordings: int
+    equal_cost: float = np.nan  # the geometric mean, to the best single set that costs no more
 
 
 def log_ratios(
@@ -227,6 +228,7 @@ def least_loss(
     adapts = losses[best] < 0.0 and all(
         is_worth(one.geometric, one.high, worth) for one in (rival, expected)
     )
+    expected = expected._replace(equal_cost=rival.geometric)
     return Policy(BANK_SETTINGS[which] if adapts else NO_BANK, banks[way], expected)
 
 

@@ -118,6 +118,9 @@ def expected_in_words(expected: Mapping[str, float]) -> str:
     interval = (
         f"95 % interval {low:.0f} to {high:.0f} %" if low >= -1000.0 else "no interval: too few"
     )
+    equal = expected.get("equal_cost", math.nan)
+    if math.isfinite(equal) and equal != expected["geometric"]:
+        interval += f"; {100.0 * (1.0 - equal):.0f} % to the best single set that costs no more"
     return (
         f"expected gain {gain:.0f} % ({interval}), in the worst tenth "
         f"{expected['worst_tenth']:.2f} times the fixed set's error, {reach} "

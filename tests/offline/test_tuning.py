@@ -4,6 +4,7 @@ import numpy as np
 from labelled_places import TRIALS, labelled, with_motions
 
 from adaptune.model.rules import Costs, SetCost
+from adaptune.study.driven import expected_in_words
 from offline import tuning
 from offline.labelled import BankSimulation, LabelledData
 from offline.tuning import (
@@ -82,7 +83,11 @@ def test_the_least_loss_wins():
     assert best().bank.adapt
     rivals[:, third] = -0.25
     assert not best().bank.adapt
+    gain = "expected gain 26 % (95 % interval 26 to 26 %"
+    said = expected_in_words(best().expected._asdict())
+    assert said.startswith(f"{gain}; 5 % to the best single set that costs no more), in the worst")
     rivals[:] = 0.0
+    assert expected_in_words(best().expected._asdict()).startswith(f"{gain}), in the worst")
     # What rounding gains is no gain.
     logs[:] = 0.0
     logs[:, third] = -1e-9
