@@ -246,7 +246,10 @@ def compare(
     found, page = compared(loaded)
     say_compared(loaded, found, page, details=details)
     if found.rows[0].yardstick == "baseline":
-        say_next_of_study("look for better sets", "offline")
+        sequences = loaded.sequences
+        keys = " and ".join(map(sequences.key, sequences.unjudged(loaded.training)))
+        first = f"leave `reference: none` out of {keys}; then " if keys else ""
+        say_next_of_study("look for better sets", "offline", first)
     elif found.unfinished:
         say_next_of_study("replay what is missing", "online")
     elif {*loaded.config.training, *loaded.config.test} <= loaded.config.courses.keys():
