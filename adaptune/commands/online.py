@@ -238,13 +238,18 @@ def compare(
         return
     if any(of_bags.values()):
         raise AdaptuneError(f"{_given(of_bags)}: goes with --against, which names the other side")
-    from adaptune.study.driven import MIN_RECORDINGS
     from adaptune.tuning.tuned import compared
 
     loaded = load(Path(study), override, folder)
     begin_work()
     found, page = compared(loaded)
     say_compared(loaded, found, page, details=details)
+    _say_next(loaded, found)
+
+
+def _say_next(loaded: "OfflineStudy", found: "ComparedReplays") -> None:
+    from adaptune.study.driven import MIN_RECORDINGS
+
     if found.rows[0].yardstick == "baseline":
         sequences = loaded.sequences
         keys = " and ".join(map(sequences.key, sequences.unjudged(loaded.training)))
