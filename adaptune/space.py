@@ -9,10 +9,10 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, TypeAdapter, model_validator
+from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
 from adaptune.errors import AdaptuneError, nearest
-from adaptune.strict import StrictModel
+from adaptune.strict import ConfigurationError, StrictModel, in_one_line
 
 Value = float | int | str | bool
 ParameterSet = dict[str, Value]
@@ -23,7 +23,21 @@ class SpaceError(AdaptuneError):
     """A parameter set that does not fit its space."""
 
 
-class _Range(StrictModel):
+class _Told(StrictModel):
+    """Says in a sentence what is wrong with a parameter that code makes."""
+
+    def __new__(cls, *_: Any, **named: Any) -> Self:
+        try:
+            if named:  # where data are validated, pydantic gives none
+                cls.model_validate(named)
+        except ValidationError as error:
+            given = ", ".join(f"{key}={value!r}" for key, value in named.items())
+            said = in_one_line(error, named)
+            raise ConfigurationError(f"{cls.__name__}({given}): {said}") from None
+        return super().__new__(cls)
+
+
+class _Range(_Told):
     """Bounds, scale and unit of a real or whole number."""
 
     _types: ClassVar[tuple[type, ...]] = (int,)
@@ -103,7 +117,7 @@ class Integer(_Range):
         return self._scale(self.low - 0.5), self._scale(self.high + 0.5)
 
 
-class Categorical(StrictModel):
+class Categorical(_Told):
     """One of a list of values, without an order."""
 
     type: Literal["categorical"] = "categorical"

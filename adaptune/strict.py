@@ -188,7 +188,7 @@ M = TypeVar("M", bound=BaseModel)
 
 
 class ConfigurationError(AdaptuneError):
-    """One or more mistakes in a study's YAML, a line each."""
+    """One or more mistakes in a study's YAML, or in a parameter, a line each."""
 
 
 def validated(
@@ -277,8 +277,7 @@ def load(name: str, path: str, sort: str) -> Any:
     except ImportError as error:
         help_ = "install it, or name its folder in PYTHONPATH"
         raise PluginError(f"{name}: cannot import {module} ({error}); {help_}") from error
-    except ValidationError as error:
-        what = f"{error.title}: {in_one_line(error)}"
-        raise PluginError(f"{name}: cannot import {module} ({what})") from error
+    except (ConfigurationError, ValidationError) as error:
+        raise PluginError(f"{name}: cannot import {module} ({in_one_line(error)})") from error
     except AttributeError as error:
         raise PluginError(f"{name}: {module} has no {attribute or sort}") from error

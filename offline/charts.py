@@ -51,12 +51,12 @@ def scatter_chart(table: TrialTable, parameters: Sequence[str], odometry: str) -
         if kept.sum() < 2:
             continue
         x, y = xy[0][kept], xy[1][kept]
-        log = bool((of[kept] > 0.0).all())
         # The worst would take nearly all colours.
-        colour = np.minimum(of[kept], _COLOURED * of[kept].min()) if log else of[kept]
+        most = _COLOURED * of[kept].min() if (of[kept] > 0.0).all() else np.inf
+        top = f"\ntop: ≥ {most:.3g}" * bool((of[kept] > most).any())
         best = [int(of[kept].argmin())]
         drawn = [
-            Points(x, y, "trial", colour, table.objective),
+            Points(x, y, "trial", np.minimum(of[kept], most), table.objective + top),
             Points(x[best], y[best], "best trial here", shape="diamond"),
         ]
         for mode, number in (("baseline", 0), ("fixed", table.fixed)):

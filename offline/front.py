@@ -71,9 +71,7 @@ def left_out_in_words(data: LabelledData) -> str:
     """What to expect elsewhere of a set that is chosen as the fixed one is."""
     left_out = left_out_ratio(data.blocks(), lambda blocks: choose(blocks, data.budget))
     if left_out is None:
-        return (
-            "There is too little data to tell how a chosen set does on other drives: record more."
-        )
+        return "To tell how a chosen set does on other drives, train on longer recordings, or more."
     ratio, low, high = left_out
     return (
         f"Sets chosen in the same way, without the part that they are tested on, have {ratio:.2f} "

@@ -19,7 +19,6 @@ from adaptune.model import ErrorModel, ModelError
 from adaptune.model.rules import best_sets, complementary
 from adaptune.odometry.registry import ODOMETRIES, PROGRAMS
 from adaptune.progress import Progress, unseen
-from adaptune.recording.config import NO_REFERENCE
 from adaptune.reference.check import hard_to_track
 from adaptune.report import tables
 from adaptune.space import ParameterSet, ParameterSets, in_words
@@ -183,13 +182,11 @@ def _searched(
 
 def _ready_archive(study: OfflineStudy, progress: Progress) -> Archive:
     """The archive without trials of other inputs than now; references are there, or estimated."""
-    for name in study.config.training:
-        recording = study.sequences.recordings.get(name)
-        if recording is not None and recording.reference == NO_REFERENCE:
-            raise AdaptuneError(
-                f"{study.sequences.key(name)}: training needs a reference trajectory; name its "
-                f"topic or file, or leave `reference` out to have it estimated"
-            )
+    if unjudged := study.sequences.unjudged(study.training):
+        raise AdaptuneError(
+            f"{study.sequences.key(unjudged[0])}: training needs a reference trajectory; name its "
+            f"topic or file, or leave `reference` out to have it estimated"
+        )
     study.open()
     length = study.config.sub_trajectory
     ensure_references(study.sequences, study.training, length, progress)
@@ -430,13 +427,8 @@ def _judged(config: StudyConfig, sequences: StudySequences, progress: Progress) 
     refused = ensure_references(sequences, config.test, length, progress, required=False)
     for name, said in refused.items():
         _log.warning("%s; so %s is left out", said, name)
-    recordings = sequences.recordings
-    names = [
-        name
-        for name in config.test
-        if name not in refused
-        and (name not in recordings or recordings[name].reference != NO_REFERENCE)
-    ]
+    without = {*refused, *sequences.unjudged(config.test)}
+    names = [name for name in config.test if name not in without]
     if not names:
         raise AdaptuneError(
             "test: name at least one sequence with a reference; without one, nobody knows which "

@@ -238,15 +238,23 @@ def compare(
         return
     if any(of_bags.values()):
         raise AdaptuneError(f"{_given(of_bags)}: goes with --against, which names the other side")
-    from adaptune.study.driven import MIN_RECORDINGS
     from adaptune.tuning.tuned import compared
 
     loaded = load(Path(study), override, folder)
     begin_work()
     found, page = compared(loaded)
     say_compared(loaded, found, page, details=details)
+    _say_next(loaded, found)
+
+
+def _say_next(loaded: "OfflineStudy", found: "ComparedReplays") -> None:
+    from adaptune.study.driven import MIN_RECORDINGS
+
     if found.rows[0].yardstick == "baseline":
-        say_next_of_study("look for better sets", "offline")
+        sequences = loaded.sequences
+        keys = " and ".join(map(sequences.key, sequences.unjudged(loaded.training)))
+        first = f"leave `reference: none` out of {keys}; then " if keys else ""
+        say_next_of_study("look for better sets", "offline", first)
     elif found.unfinished:
         say_next_of_study("replay what is missing", "online")
     elif {*loaded.config.training, *loaded.config.test} <= loaded.config.courses.keys():

@@ -7,7 +7,6 @@ from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-import numpy as np
 from pydantic import BaseModel
 
 from adaptune import processes
@@ -74,11 +73,10 @@ class Guarded(Faulting):
 
     def _collect(self) -> Registration:
         def register(odometry: Odometry) -> Registration:
-            T_odom_sensor, registered = wire.unpacked(odometry.register(self._submitted))
-            T_odom_sensor = np.array(T_odom_sensor, np.float64)
-            if wrong := pose_fault(T_odom_sensor):
+            found = wire.unpacked(odometry.register, odometry.register(self._submitted))
+            if wrong := pose_fault(found.T_odom_sensor):
                 raise processes.HostError(f"it gave a pose {wrong}")
-            return Registration(T_odom_sensor, bool(registered))
+            return found
 
         if not self._running:
             return LOST

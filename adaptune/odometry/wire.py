@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from adaptune.errors import OdometryError
-from adaptune.geometry import Poses
 from adaptune.odometry.base import Description, Registration
-from adaptune.processes import Answer, Message
+from adaptune.processes import Answer, HostError, Message
 from adaptune.recording.scan import Imu, ImuNoise, Scan
 from adaptune.space import ParameterSet, ParameterSpace
 from adaptune.strict import in_one_line
@@ -91,14 +90,20 @@ def about(described: Description) -> dict[str, Any]:
     return {"live": described.live, "needs_imu": described.needs_imu, "space": space}
 
 
-def unpacked(returned: Any) -> Registration:
-    """What `Odometry.register` returned; a TypeError that says so if it is no registration."""
+def unpacked(register: Any, returned: Any) -> Registration:
+    """What an odometry's `register` returned; a HostError names it if that is no registration."""
     try:
-        return Registration(*returned)
-    except TypeError as error:
+        T_odom_sensor, registered = Registration(*returned)
+        return Registration(np.array(T_odom_sensor, np.float64), bool(registered))
+    except (TypeError, ValueError) as error:
         is_array = isinstance(returned, np.ndarray)
         what = f"an array of shape {returned.shape}" if is_array else f"{returned!r:.60}"
-        raise TypeError(f"register returned {what}, not a Registration(pose)") from error
+        code = getattr(register, "__code__", None)  # compiled methods have none
+        where = f" ({code.co_filename}, line {code.co_firstlineno})" if code else ""
+        raise HostError(
+            f"{register.__qualname__}{where} returned {what}; let it return Registration(pose), "
+            f"whose pose is an array of shape (4, 4)"
+        ) from error
 
 
 def answered(odometry: Any, message: Message, prepared: Any = None) -> dict[str, Any]:
@@ -114,9 +119,11 @@ def answered(odometry: Any, message: Message, prepared: Any = None) -> dict[str,
         motion = arrays["motion"].copy() if "motion" in arrays else None
         odometry.start(prepared, arrays["pose"].copy(), motion)
         return {}
-    T_odom_sensor, registered = unpacked(odometry.register(prepared))
-    pose: Poses = np.asarray(T_odom_sensor, np.float64)
-    answer = {"type": "pose", "stamp": header["stamp"], "registered": bool(registered)}
+    try:
+        pose, registered = unpacked(odometry.register, odometry.register(prepared))
+    except HostError as error:
+        return {"type": "fault", "message": str(error)}
+    answer = {"type": "pose", "stamp": header["stamp"], "registered": registered}
     return answer | used() | {"pose": pose}
 
 

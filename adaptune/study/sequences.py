@@ -10,7 +10,13 @@ from typing import Any
 from adaptune.manifest import merged
 from adaptune.odometry.program import ProgramInput, program_input
 from adaptune.recording.cache import fingerprints
-from adaptune.recording.config import REFERENCE_FILES, SOURCES, SequenceConfig, part_name
+from adaptune.recording.config import (
+    NO_REFERENCE,
+    REFERENCE_FILES,
+    SOURCES,
+    SequenceConfig,
+    part_name,
+)
 from adaptune.recording.export import Layout
 from adaptune.recording.recording import (
     SequenceFiles,
@@ -100,6 +106,11 @@ class StudySequences:
         if part is None or whole == name:
             return f"sequences.{name}"
         return f"[{whole}: {100.0 * part[0]:.10g}-{100.0 * part[1]:.10g}%]"
+
+    def unjudged(self, names: Sequence[str]) -> list[str]:
+        """Those of some sequences that are to have no reference, not even an estimated one."""
+        every = self.recordings
+        return [name for name in names if name in every and every[name].reference == NO_REFERENCE]
 
     def recorded_in(self, name: str) -> str:
         """What a sequence was recorded in: parts of a recording share it."""

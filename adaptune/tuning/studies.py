@@ -29,6 +29,8 @@ DISTORTED = {"gicp", "vgicp", "ndt"}
 UNEVEN = 0.2
 """By how much the share of the path may differ from that of the duration, before the split goes by
 the path."""
+LEAST_SHARE = 0.01
+"""Of a recording's duration, for training and for the test."""
 LEAST_SPEED = 2.0
 """Metres a second below which no step is called impossible."""
 LEAST_PATH = 2.0
@@ -189,11 +191,15 @@ def _decided(
     def loaded() -> "OfflineStudy":
         return load_study(study(USUAL_LENGTH), folder=folder)
 
-    load_study(study(USUAL_LENGTH), overrides, folder)  # or an error, before all is measured
+    # An error comes before all is measured: what is wrong with the least parts is so with all.
+    least = study(USUAL_LENGTH, LEAST_SHARE), study(USUAL_LENGTH, 1.0 - LEAST_SHARE)
+    load_study(least[0] | {"test": least[1]["test"]}, overrides, folder)
     if asked.reference is None:
         _replace_noisy(named, loaded, show)
     length, share, speed = _split(loaded(), list(named), show)
-    return study(length, share) | {"health": {"max_speed": speed}}
+    made = study(length, share) | {"health": {"max_speed": speed}}
+    load_study(made, overrides, folder)
+    return made
 
 
 def _grown(path: Path, asked: Asked, show: Progress) -> list[str]:
@@ -323,7 +329,8 @@ def share_of(reference: "Trajectory") -> float:
     of_path = float(np.interp(TRAINING, time, metres / max(float(metres[-1]), 1e-9)))
     if abs(of_path - TRAINING) <= UNEVEN:
         return TRAINING
-    return round(float(np.interp(TRAINING * metres[-1], metres, time).clip(0.01, 0.99)), 2)
+    share = np.interp(TRAINING * metres[-1], metres, time)
+    return round(float(np.clip(share, LEAST_SHARE, 1.0 - LEAST_SHARE)), 2)
 
 
 def _estimate(study: "OfflineStudy", names: Sequence[str], show: Progress) -> None:

@@ -55,6 +55,7 @@ def test_parts_of_a_course_share_its_recording(study_file, tmp_path):
         ({"training": [{"one": "60-0%"}]}, "training.0", "60-0% of one is no part"),
         ({"training": [{"one": "0-60%", "two": "0-60%"}]}, "training.0", "an entry of its own"),
         ({"training": [{"one": "0-60%"}] * 2}, "training.1", "named twice"),
+        ({"training": ["one_0-60"]}, "training.0", "'one_0-60': write the part as one: 0-60%"),
         (
             {"training": [{"one": "0-60%"}, {"one": "50-100%"}]},
             "training.1",

@@ -10,6 +10,7 @@ from pydantic import ValidationError
 from tables import table
 
 from adaptune import yaml12
+from adaptune.errors import AdaptuneError
 from adaptune.space import (
     ODOMETRY,
     Categorical,
@@ -120,6 +121,30 @@ def test_contains(parameter, good, bad):
 def test_bad_parameters_are_refused(data, message):
     with pytest.raises(ValidationError, match=message):
         ParameterSpace.load({"p": data})
+
+
+@pytest.mark.parametrize(
+    ("make", "told"),
+    [
+        (
+            lambda: Float(low=0.1, high=1.0, baseline=5.0),
+            "Float(low=0.1, high=1.0, baseline=5.0): baseline (5) must lie between low (0.1) and "
+            "high (1)",
+        ),
+        (
+            lambda: Integer(low=1, high=2.5, baseline=1),
+            "Integer(low=1, high=2.5, baseline=1): high: give a whole number, not 2.5",
+        ),
+        (
+            lambda: Categorical(choices=("a", "b"), baseline="c"),
+            "Categorical(choices=('a', 'b'), baseline='c'): baseline 'c' is not one of the choices",
+        ),
+    ],
+)
+def test_bad_parameters_of_code_are_told_in_a_sentence(make, told):
+    with pytest.raises(AdaptuneError) as caught:
+        make()
+    assert str(caught.value) == told
 
 
 @pytest.mark.parametrize(

@@ -47,6 +47,11 @@ def test_a_scatter_has_a_panel_for_each_sequence_and_the_mean():
         assert list(fixed.x) == [table.column("distance")[3]]
         (trials,) = of_kind(panel, Points, "trial")
         assert min(trials.colour) == values.min()
+        # Where colours end below the worst, the colour bar says so.
+        ends = np.max(trials.colour) < np.max(values)
+        top = f"\ntop: ≥ {4.0 * values.min():.3g}" if ends else ""
+        assert trials.colour_label == table.objective + top
+        assert ends == (panel.title != "mean over all sequences")
     assert scatter_chart(table, ["distance"], "") is None
 
 

@@ -2,12 +2,13 @@
 
 import json
 import shutil
+from types import SimpleNamespace
 
 import pytest
 
 from adaptune.errors import AdaptuneError
 from offline.config import load_study
-from offline.front import COST, measured_front, recommended
+from offline.front import COST, left_out_in_words, measured_front, recommended
 
 
 @pytest.fixture
@@ -37,6 +38,13 @@ def test_the_front_is_measured_on_another_recording(study):
     (study.folder / "front.json").unlink()
     with pytest.raises(AdaptuneError, match=r"front.json: there is no such file; run .* offline"):
         measured_front(study, scans)
+
+
+def test_more_data_are_not_asked_for_in_the_name_of_a_command():
+    blocks = SimpleNamespace(errors=[])
+    said = left_out_in_words(SimpleNamespace(blocks=lambda: blocks, budget=None))
+    assert said.endswith("on other drives, train on longer recordings, or more.")
+    assert "record" not in said.split()
 
 
 def test_a_budget_decides_also_below_what_the_baseline_costs():

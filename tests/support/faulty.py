@@ -10,8 +10,10 @@ import numpy as np
 from adaptune.odometry import BaseSettings, Odometry, Registration
 from adaptune.space import Float, ParameterSpace
 
-ELSEWHERE = ("init", "prepare", "start", "nothing", "hangs in init")
-"""Faults that do not happen at the scan, and a registration that returns nothing."""
+WRONG = {"nothing": None, "text": ("left", 1)}
+"""What is no registration."""
+ELSEWHERE = ("init", "prepare", "start", *WRONG, "hangs in init")
+"""Faults that do not happen at the scan."""
 n_instances = 0
 
 
@@ -60,8 +62,8 @@ class Faulty(Odometry):
         if prepared.stamp == self.settings.at:
             os.write(1, b"about to go wrong\n")
             self.go_wrong(T)
-        if self.settings.fault == "nothing":
-            return None
+        if self.settings.fault in WRONG:
+            return WRONG[self.settings.fault]
         if self.settings.fault == "shape":
             T = T[:3]
         return Registration(T, n_instances == 1)

@@ -213,7 +213,11 @@ def test_a_recording_that_stands_for_long_is_split_by_its_path(tmp_path):
     first, points, T = moving[0]
     standing = [(first - i * 100_000_000, points, T) for i in range(90, 0, -1)]
     late = drives.write_bag(tmp_path / "late.bag", standing + moving)
-    failed(late)
+    # Before it is measured, nobody knows which parts overlap.
+    said = failed(late, "-o", "training=[{late: 0-90%}]")
+    assert "late_84-100 overlaps late_0-90 of training" in said
+    assert not (tmp_path / "runs").exists()
+    failed(late, "-o", "training=[{late: 10-84%}]")
     study = study_in("runs/late/late.yaml")
     # It stands for 9 s of 15; 60 % of the way are over after 12.5 s.
     assert study.config.test == ("late_84-100",)
