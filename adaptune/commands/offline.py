@@ -2,7 +2,6 @@
 
 import logging
 import math
-import os
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -231,7 +230,6 @@ def reference(
     It writes the poses (TUM), what is known of their error (JSON), and a picture. Of a study,
     `adaptune offline` and `online` estimate the references that are lacking.
     """
-    from adaptune.machine import pin
     from adaptune.recording.inspect import inspect
     from adaptune.recording.recording import open_sequence
     from adaptune.reference import estimate, stored
@@ -242,8 +240,7 @@ def reference(
     path = out / f"{recording.resolve().stem}_reference.tum"
     # What can fail is found before the estimate, which takes minutes.
     stored.check_writable(path)
-    # Only on one core do results repeat bit by bit.
-    with pin(os.getpid()), progress() as show:
+    with progress() as show:
         found = estimate.estimate_reference(open_sequence(config), partial(show, "estimating"))
         about = {"recording": str(recording.resolve()), "points": config.points}
         written = stored.write_estimate(path, found, about)

@@ -4,6 +4,7 @@ Several odometries run side by side; their consensus gives the motion from scan 
 also registered directly to scans some metres before. A pose graph brings both to agree.
 """
 
+import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import numpy as np
@@ -12,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from adaptune.bank.members import LEVER
 from adaptune.errors import import_extra
 from adaptune.geometry import Poses, invert, mean_motion, rectify, rotation_angle, steps
+from adaptune.machine import pin
 from adaptune.recording.config import SequenceConfig
 from adaptune.recording.inspect import Inspection
 from adaptune.recording.scan import Recording, Scan
@@ -52,7 +54,9 @@ def estimate_reference(scans: Recording, advance: Advance = lambda *_: None) -> 
     import_extra("reference", "gtsam")
     n = scans.n_messages
     found = pass_over(scans, lambda done: advance(done, round(1.05 * max(n, done))))
-    return estimated(scans.name, found, scans)
+    # GTSAM's sums may depend on its threads: only on one core do results repeat bit by bit.
+    with pin(os.getpid()):
+        return estimated(scans.name, found, scans)
 
 
 def estimated(name: str, found: Pass, scans: Iterable[Scan] = ()) -> EstimatedReference:

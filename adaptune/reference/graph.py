@@ -5,13 +5,16 @@ Solved by GTSAM (Dellaert and Kaess, *Factor Graphs for Robot Perception*, 2017)
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from adaptune.bank.bank import Bank
+from adaptune.forking import processes
 from adaptune.geometry import Poses, invert, rectify, rotation_angle, steps
 from adaptune.live.hops import NEW_GUESS, OFFLINE_CLOUD, OFFLINE_REACHES, Hop, HopCloud, register
 from adaptune.metrics import travelled
@@ -110,38 +113,62 @@ class _Anchor(NamedTuple):
     T_odom_sensor: Poses  # (1 + n_members, 4, 4): of the consensus, then of its members
 
 
+_AHEAD = 8
+"""Scans by which the consensus may be ahead of what is registered directly."""
+
+
 def pass_over(scans: Iterable[Scan], advance: Callable[[int], None] = lambda _: None) -> Pass:
     """Run the consensus along a recording, and register scans directly to those before them.
 
-    Only the scans of the last metres and seconds are kept. `advance` gets how many are done.
+    Only the scans of the last metres and seconds are kept. `advance` gets how many are done. Scans
+    are registered directly in a process beside this one: that takes as long as the consensus.
     """
-    consensus, registering = Consensus(), _Registering(Consensus.n_members)
+    consensus = Consensus()
     stamps: list[int] = []
     poses: list[Poses] = []
     motions: list[Poses] = []
-    for scan in scans:
-        T_odom_sensor, T_previous_current = consensus.register(scan)
-        registering.add(scan, T_odom_sensor, T_previous_current)
-        stamps.append(scan.stamp)
-        poses.append(T_odom_sensor)
-        motions.append(T_previous_current)
-        advance(len(stamps))
-    registering.end()
+    waiting: deque[Future[None]] = deque()
+    with processes(1, [__name__]) as beside:
+        for scan in scans:
+            T_odom_sensor, T_previous_current = consensus.register(scan)
+            waiting.append(beside.submit(_add, scan, T_odom_sensor, T_previous_current))
+            stamps.append(scan.stamp)
+            poses.append(T_odom_sensor)
+            motions.append(T_previous_current)
+            if len(waiting) > _AHEAD:
+                waiting.popleft().result()
+            advance(len(stamps))
+        guesses = beside.submit(_guesses).result()
     return Pass(
         np.array(stamps, np.int64),
         np.array(poses).reshape(-1, 4, 4),
         np.array(motions).reshape(-1, Consensus.n_members, 4, 4),
-        registering.guesses,
+        guesses,
     )
+
+
+@cache
+def _registering() -> "_Registering":
+    """Of the process that registers, which ends with the pass."""
+    return _Registering()
+
+
+def _add(scan: Scan, T_odom_sensor: Poses, T_previous_current: Poses) -> None:
+    _registering().add(scan, T_odom_sensor, T_previous_current)
+
+
+def _guesses() -> list[Guess]:
+    _registering().end()
+    return _registering().guesses
 
 
 class _Registering:
     """Registers every few scans to those some metres before."""
 
-    def __init__(self, n_members: int):
+    def __init__(self) -> None:
         self.guesses: list[Guess] = []
         self._anchors: deque[_Anchor] = deque()
-        self._tracks = np.tile(np.eye(4), (1 + n_members, 1, 1))
+        self._tracks = np.eye(4)[None]  # (1 + n_members, 4, 4): of the consensus, then of members
         self._newest: tuple[int, Scan] | None = None
         self._T_last, self._seconds = np.eye(4), 0.0  # the last motion, and how long it took
         self._n_to_first = 0  # registrations to the first scan
@@ -149,7 +176,7 @@ class _Registering:
     def add(self, scan: Scan, T_odom_sensor: Poses, T_previous_current: Poses) -> None:
         """Take the next scan, with the pose of the consensus and the motions of its members."""
         if self._newest is None:
-            self._tracks = np.tile(T_odom_sensor, (len(self._tracks), 1, 1))
+            self._tracks = np.tile(T_odom_sensor, (1 + len(T_previous_current), 1, 1))
             self._newest = 0, scan
             return
         number, before = self._newest

@@ -2,7 +2,6 @@
 
 import logging
 import math
-import os
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
 from functools import partial
@@ -11,7 +10,6 @@ from typing import Any
 from adaptune import manifest
 from adaptune.errors import Finding
 from adaptune.geometry import Poses, to_pose
-from adaptune.machine import pin
 from adaptune.recording import cache
 from adaptune.recording.config import Fractions, SequenceConfig
 from adaptune.recording.recording import RecordedSequence, wants_estimate
@@ -156,10 +154,8 @@ def _estimated(
     if found is not None:
         _log.info("%s: its reference was estimated before (%s)", name, path)
     else:
-        # GTSAM's sums may depend on its threads: only on one core do results repeat bit by bit.
         try:
-            with pin(os.getpid()):
-                found = estimate.estimate_reference(scans, advance)
+            found = estimate.estimate_reference(scans, advance)
             if cache.cap():
                 keep(path, found)
         except EstimateError as error:

@@ -1,3 +1,4 @@
+import os
 import sys
 from types import SimpleNamespace
 
@@ -56,6 +57,18 @@ def later(scans, first, seconds):
         Scan(s.stamp + (i >= first) * round(seconds * 1e9), s.points, s.times)
         for i, s in enumerate(scans)
     ]
+
+
+def test_pose_graphs_are_solved_on_one_core(monkeypatch):
+    cores = []
+    monkeypatch.setattr(estimate, "pass_over", lambda *_: None)
+    monkeypatch.setattr(
+        estimate, "estimated", lambda *_: cores.append(len(os.sched_getaffinity(0)))
+    )
+    before = os.sched_getaffinity(0)
+    estimate_reference(Recorded())
+    assert cores == [1]
+    assert os.sched_getaffinity(0) == before
 
 
 class TestOfACourse:

@@ -1,4 +1,6 @@
 import weakref
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import partial
 from itertools import pairwise
 
@@ -47,6 +49,7 @@ class Made:
         monkeypatch.setattr(graph, "Consensus", Along)
         monkeypatch.setattr(graph, "HopCloud", self._cloud)
         monkeypatch.setattr(graph, "register", self._register)
+        monkeypatch.setattr(graph, "processes", self._here)
 
     def drive(self):
         points = np.zeros((0, 3), np.float32)
@@ -55,6 +58,13 @@ class Made:
 
     def pairs(self):
         return [(guess.start, guess.end) for guess in self.drive()]
+
+    @contextmanager
+    def _here(self, *_):
+        """In this process, where what stands for registering is known."""
+        vars(graph)["_registering"].cache_clear()
+        with ThreadPoolExecutor(1) as pool:
+            yield pool
 
     def _cloud(self, *given):
         cloud = HopCloud(*given)
@@ -134,7 +144,7 @@ def test_few_scans_are_in_memory(made):
         drive = made(straight(n))
         drive.drive()
         most.append(drive.most)
-    assert most[0] == most[1] < 20
+    assert 1 < most[0] == most[1] < 20
 
 
 @pytest.mark.parametrize("n", [0, 1, 2])
