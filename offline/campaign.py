@@ -240,6 +240,8 @@ ALONE = 3
 """Replays of one set: the baseline, the fixed set, and its rival."""
 FITTING = 10.0
 """Seconds to fit the model, to compare, and to draw the page, about."""
+FOR_BANKS = 0.5
+"""Share of the time that is allowed, of which replays of banks take none."""
 
 
 class Forecast(NamedTuple):
@@ -252,14 +254,15 @@ class Forecast(NamedTuple):
         """How long it takes to try so many sets and to finish, in at most so many seconds."""
         n, whole = left, self.each * left + self.rest
         if whole > most:
-            n, whole = max(0.0, (most - self.rest) / max(self.each, 1e-9)), most
+            n, whole = max(0.0, (most - self.rest) // max(self.each, 1e-9)), most
         return f"it takes {about(whole)}: {n:.0f} parameter sets of {self.each:.1f} s, and the rest"
 
 
 def forecast(study: OfflineStudy, archive: Archive, workers: int, clock: Stopwatch) -> Forecast:
     """Tell from the baseline's drives how long the search takes, and what follows it.
 
-    Replays count if they do for the clock.
+    Replays count if they do for the clock, those of banks as far as they leave the search half of
+    the time: sets that were never tried cannot be in a bank.
     """
     baselines = range(len(study.odometry.space.baselines))
     drives = read_whole_drives(archive, study.training, baselines)
@@ -276,7 +279,10 @@ def forecast(study: OfflineStudy, archive: Archive, workers: int, clock: Stopwat
     if clock.replays:
         members = study.config.online.switching.size if study.mechanism == "bank" else 0
         scans = sum(study.sequences.open(name).n_messages for name in study.config.test)
-        rest += float(np.mean(costs)) * scans * (ALONE + len(study.rules) * (members + 1))
+        replay = float(np.mean(costs)) * scans
+        rest += replay * ALONE
+        free = FOR_BANKS * 3600.0 * (study.config.offline.hours or np.inf) - rest
+        rest += min(replay * len(study.rules) * (members + 1), max(free, 0.0))
     return Forecast(each / workers, rest)
 
 
@@ -300,7 +306,8 @@ class Campaign:
         space, known = study.odometry.space, archive.known()
         self._search = Search(self._config, space, self._finished, known)
         self._schedule = Schedule(study, archive, "runs", self._show)
-        baselines = range(len(space.baselines))
+        baselines = range(n := len(space.baselines))
+        self._n_baselines = n
         self._schedule.most_ms = {
             name: SLOW * max(drive.others.get(REGISTER_MS, np.inf) for drive in drives.values())
             for name, drives in read_whole_drives(archive, self._names, baselines).items()
@@ -319,6 +326,8 @@ class Campaign:
         if search.end == TIME_IS_UP:
             # The same command again begins no more.
             self._clock.save(self._config.hours or 0.0)
+            if len(search.sets) <= self._n_baselines:
+                _log.warning("no other set than the baseline was tried: allow more time")
         _log.info("the search ends: %s", search.end)
         self._show("runs", search.total * len(self._names), 0)
         return dict(sorted(search.done.items()))

@@ -1,9 +1,11 @@
 """A study of recordings: what it trains and tests on, over which metres, and how long."""
 
 import logging
+import math
 import re
 import shlex
 import shutil
+import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from itertools import count
@@ -13,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from adaptune import manifest
 from adaptune.errors import AdaptuneError, NotInstalledError
 from adaptune.files import plain_name, write_text
-from adaptune.progress import Progress
+from adaptune.progress import Progress, about
 from adaptune.tuning.asked import EACH, TRIALS, Asked, odometries_of, recorded
 from adaptune.yaml12 import Document, YamlError, YamlPath, dump
 
@@ -31,6 +33,8 @@ UNEVEN = 0.2
 the path."""
 LEAST_SHARE = 0.01
 """Of a recording's duration, for training and for the test."""
+TOLD = 10.0
+"""Seconds after which it is known how long a reference takes."""
 LEAST_SPEED = 2.0
 """Metres a second below which no step is called impossible."""
 LEAST_PATH = 2.0
@@ -189,14 +193,15 @@ def _decided(
         return {"sequences": sequences, **roles(rest, length, odometry, share, test)} | spent
 
     def loaded() -> "OfflineStudy":
-        return load_study(study(USUAL_LENGTH), folder=folder)
+        of_recordings = [given for given in overrides if given.startswith("sequences.")]
+        return load_study(study(USUAL_LENGTH), of_recordings, folder)
 
     # An error comes before all is measured: what is wrong with the least parts is so with all.
     least = study(USUAL_LENGTH, LEAST_SHARE), study(USUAL_LENGTH, 1.0 - LEAST_SHARE)
     load_study(least[0] | {"test": least[1]["test"]}, overrides, folder)
     if asked.reference is None:
         _replace_noisy(named, loaded, show)
-    length, share, speed = _split(loaded(), list(named), show)
+    length, share, speed = _split(loaded(), list(named), _in_time(show, asked.minutes))
     made = study(length, share) | {"health": {"max_speed": speed}}
     load_study(made, overrides, folder)
     return made
@@ -331,6 +336,25 @@ def share_of(reference: "Trajectory") -> float:
         return TRAINING
     share = np.interp(TRAINING * metres[-1], metres, time)
     return round(float(np.clip(share, LEAST_SHARE, 1.0 - LEAST_SHARE)), 2)
+
+
+def _in_time(show: Progress, minutes: float | None) -> Progress:
+    """The same of references, with an AdaptuneError where one alone takes longer than allowed."""
+    begun: dict[str, float] = {}
+
+    def shown(text: str, done: float, of: int, remark: str = "", /) -> None:
+        show(text, done, of, remark)
+        now = time.monotonic()
+        spent = now - begun.setdefault(text, now)
+        if spent > TOLD and of * spent > 60.0 * (minutes or math.inf) * done:
+            name, takes = text.partition(",")[0], about(of * spent / done)
+            raise AdaptuneError(
+                f"{name}: estimating its reference alone takes {takes}, and --minutes is "
+                f"{minutes:g}: allow twice as long at least, tune on a part "
+                f"(`-o sequences.{name}.stop=SECONDS`)"
+            )
+
+    return shown
 
 
 def _estimate(study: "OfflineStudy", names: Sequence[str], show: Progress) -> None:

@@ -26,13 +26,24 @@ def test_it_follows_from_the_baseline_s_drives(study, tmp_path):
     assert two.rest - FITTING == pytest.approx(40 * np.mean(costs) * replays)
 
 
+def test_banks_leave_the_search_half_of_the_time(study_file, trained_folder, tmp_path):
+    def rest(hours):
+        few = load_study(study_file, [f"offline.hours={hours!r}"], trained_folder)
+        return forecast(few, Archive(few.folder / "trials"), 1, Stopwatch(tmp_path, True)).rest
+
+    whole = rest(1.0)
+    of_banks = whole - FITTING - rest(1e-9) + FITTING
+    assert of_banks > 0.0
+    assert rest((2.0 * whole - of_banks) / 3600.0) == pytest.approx(whole - 0.5 * of_banks)
+
+
 def test_finalists_drive_the_rest_of_long_recordings(study, tmp_path, monkeypatch):
     archive = Archive(study.folder / "trials")
     drives = campaign.read_whole_drives(archive, ["one", "two"], [0])
     monkeypatch.setattr(campaign, "read_whole_drives", lambda *_: drives)
     monkeypatch.setattr(archive, "is_uncut", lambda _: False)
     found = forecast(study, archive, 1, Stopwatch(tmp_path))
-    assert found.rest - FITTING == pytest.approx(6 * found.each)
+    assert found.rest - FITTING == pytest.approx(7 * found.each)
 
 
 @pytest.mark.parametrize(

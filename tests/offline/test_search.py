@@ -233,6 +233,7 @@ def test_however_short_the_time_the_baseline_is_driven(study_file, tmp_path, cap
     training = train(study)
     assert [row["trial"] for row in training.trials] == [training.model.fixed] == [0]
     assert "the search ends: no more sets fit into the time" in caplog.text
+    assert "no other set than the baseline was tried: allow more time" in caplog.messages
 
 
 def trials(folder):

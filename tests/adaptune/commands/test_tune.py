@@ -1,6 +1,7 @@
 """Tuning from recordings alone, with no study file."""
 
 import shutil
+from itertools import count
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -226,6 +227,27 @@ def test_a_recording_that_stands_for_long_is_split_by_its_path(tmp_path):
     proposed = study_in("proposed.yaml")
     for key in ("training", "test", "sub_trajectory", "sequences"):
         assert getattr(proposed.config, key) == getattr(study.config, key), key
+
+
+@pytest.mark.usefixtures("decided")
+def test_a_reference_that_takes_too_long_is_refused_soon(bag, tmp_path, monkeypatch):
+    shown = []
+
+    def estimate(scans, advance):
+        shown.append(scans.n_messages)
+        for done in range(1, 21):
+            advance(done, 40)
+        raise AssertionError("it goes on")
+
+    monkeypatch.setattr("adaptune.reference.estimate.estimate_reference", estimate)
+    clock = SimpleNamespace(monotonic=count(0.0, 8.0).__next__)
+    monkeypatch.setattr("adaptune.tuning.studies.time", clock)
+    given = ("--reference", "estimated", "--minutes", 5, "-o", "sequences.one.stop=2")
+    said = failed(bag, *given)
+    assert "one: estimating its reference alone takes about 5 min, and --minutes is 5:" in said
+    assert said.endswith("(`-o sequences.one.stop=SECONDS`); or give a --reference")
+    assert shown == [21]  # of 2 s
+    assert not list((tmp_path / "runs").iterdir())
 
 
 @pytest.mark.usefixtures("decided")
