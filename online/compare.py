@@ -59,7 +59,16 @@ from online.statistics import (
     oracle_row,
 )
 from online.tables import last_rows, tables
-from online.verdict import CALLED, adapts, called, decided, error_and_cost, remarks, verdict
+from online.verdict import (
+    CALLED,
+    adapts,
+    called,
+    decided,
+    error_and_cost,
+    late,
+    remarks,
+    verdict,
+)
 
 
 class ComparedModes(NamedTuple):
@@ -378,10 +387,13 @@ def compare(study: Study) -> ComparedReplays:
     judged: list[JudgedModes] = []
     oracles: list[ComparisonRow] = []
     wrong: list[str] = []
+    period = np.inf  # milliseconds from scan to scan
     for name in names:
         folder = study.folder / "replays" / name
         replays = {mode: StoredReplay.read(folder / mode) for mode in modes}
         reference = Reference.read(study, name)
+        stamps = next(iter(replays.values())).trajectory.stamps
+        period = min(period, 1e-6 * float(np.median(np.diff(stamps))))
         every = _with_fixed_rivals(replays, model)
         wrong += [f"On {name}, {what}." for what in read_contradictions(folder)]
         of_modes = compare_modes(name, every, reference)
@@ -402,6 +414,7 @@ def compare(study: Study) -> ComparedReplays:
         advised = NONE if said else advised
     if advised != NONE:
         said += verdict(rows, length, obstacle, worth)
+        said += [] if best is None else late(best, period)
         said += [] if model is None else _of_estimates(study, model)
     details = [*wrong, *remarks(rows), *compared.words]
     folder = study.folder / "comparison"

@@ -11,6 +11,9 @@ from online.tables import YARDSTICKS, last_rows
 
 ROUNDING = 1e-6
 """A ratio that differs less from 1 is 1."""
+CLEARLY = 0.8
+"""Ratio to the error of what training chose, below which another set does better on a test that is
+too short for an interval."""
 CALLED = {
     "baseline": "the odometry's own parameters",
     "fixed": "the fixed set",
@@ -54,7 +57,7 @@ def decided(rows: Sequence[ComparisonRow], worth: float = WORTH) -> ComparisonRo
 
 def _surely_better(row: ComparisonRow, other: ComparisonRow) -> bool:
     ratio = _to(row, other)
-    return ratio.value < 1.0 and (ratio.interval is None or ratio.interval[1] < 1.0)
+    return ratio.value < CLEARLY if ratio.interval is None else ratio.interval[1] < 1.0
 
 
 def _to(row: ComparisonRow, one: ComparisonRow) -> Ratio:
@@ -125,6 +128,13 @@ def verdict(
     said = f"{said}{_doubt(best, last)}."
     why = _other_set(best, last, worth) + _why_not(main, best, rows, obstacle, worth)
     return [said, *why, *_other_rules(best, main, last)]
+
+
+def late(best: ComparisonRow, period: float) -> list[str]:
+    """That what is advised takes longer than the milliseconds from scan to scan, in a sentence."""
+    if best.cpu_ms is None or best.cpu_ms <= period:
+        return []
+    return [f"Scans come every {period:.0f} ms: on one core like this, that is too slow."]
 
 
 def error_and_cost(row: ComparisonRow) -> str:

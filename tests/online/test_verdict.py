@@ -3,7 +3,7 @@ from dataclasses import replace
 import pytest
 
 from online.statistics import ALL, ORACLE, ComparisonRow, Ratio
-from online.verdict import decided, remarks, verdict
+from online.verdict import decided, late, remarks, verdict
 
 
 def rows_of(sequence=ALL, **ratios):
@@ -132,6 +132,12 @@ def test_how_sure_it_is_that_one_set_is_better_is_told():
         rows = [replace(row, ratio_interval=interval) for row in every(baseline=ratio)]
         (said,) = verdict(rows, 5.0)
         assert sure in said, (ratio, interval)
+    # Where the test is too short, training counts unless the test clearly says another thing.
+    for ratio, mode in ((0.75, "baseline"), (0.85, "fixed")):
+        rows = [replace(row, ratio_interval=None) for row in every(baseline=ratio)]
+        best = decided(rows)
+        assert best is not None
+        assert best.mode == mode
     same = [replace(row, ratio=1.0, rte=1.0, switches=0) for row in every()]
     assert verdict(same, 5.0) == [
         "Keep the odometry's own parameters: 1.000 %, RTE over 5 m, on 12 test sequences. "
@@ -139,6 +145,17 @@ def test_how_sure_it_is_that_one_set_is_better_is_told():
     ]
     estimated = [replace(row, reference="estimated") for row in every()]
     assert ", on 12 test sequences by an estimated reference" in verdict(estimated, 5.0)[0]
+
+
+def test_it_is_told_where_what_is_advised_comes_too_late():
+    best = decided([replace(row, cpu_ms=120.0) for row in every()])
+    assert best is not None
+    (said,) = late(best, 100.0)
+    assert (
+        said == "Scans come every 100 ms: on one core like this, the fixed set would be too late."
+    )
+    assert not late(best, 120.0)
+    assert not late(replace(best, cpu_ms=None), 100.0)
 
 
 def test_a_rival_is_compared_once_in_error_and_cost_also_where_the_fixed_set_is_kept():
