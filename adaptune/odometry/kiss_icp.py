@@ -35,7 +35,10 @@ _SECTION = {
     for name in getattr(field.annotation, "model_fields", ())
 }
 """By value, the section of KISS-ICP's configuration that holds it."""
-_KNOWN = {f"{section}.{name}" for name, section in _SECTION.items()} | {"out_dir"}
+_KNOWN = {f"{section}.{name}" for name, section in _SECTION.items()} | {
+    "out_dir",
+    "data.preprocess",  # of older versions
+}
 
 
 class KissScan(NamedTuple):
