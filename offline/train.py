@@ -23,7 +23,7 @@ from adaptune.reference.check import hard_to_track
 from adaptune.report import tables
 from adaptune.space import ParameterSet, ParameterSets, in_words
 from adaptune.study.config import StudyConfig, SwitchingConfig
-from adaptune.study.driven import RIVALS
+from adaptune.study.driven import EQUAL_COST, RIVALS
 from adaptune.study.oracle import OracleErrors, oracle_errors
 from adaptune.study.references import (
     ensure_references,
@@ -207,7 +207,7 @@ def write_sets(
     """Write the fixed set (``fixed.yaml``), and again as its odometry's own tool reads it, if any.
 
     The latter is ``fixed_<odometry>``, with a suffix. That of another odometry is removed. Rivals
-    are written, too, as ``equal_cost.yaml``.
+    are written, too, as ``equal_cost.yaml``, which is left out where it is the fixed set.
     """
     own = study.own_file(fixed)
     ours = {f"fixed_{name}" for name in (*ODOMETRIES, *PROGRAMS)}
@@ -219,7 +219,7 @@ def write_sets(
         write_text(own[0], own[1].text)
     for name in RIVALS:
         path = study.folder / f"{name}.yaml"
-        if name in rivals:
+        if name in rivals and (name != EQUAL_COST or rivals[name] != fixed):
             write_text(path, yaml12.dump(rivals[name]))
         else:
             path.unlink(missing_ok=True)

@@ -234,6 +234,8 @@ def overview_chart(
         return None
     name = max(ratios, key=lambda name: ratios[name])
     replayed = read(name)
+    if errors[name].keys() - replayed.modes.keys():
+        return None  # in a copy of a folder, replays of another model may hide these
     replayed = replace(replayed, modes={mode: replayed.modes[mode] for mode in errors[name]})
     places = _turned([*replayed.modes.values()][-1].places)
     panels = _path(replayed, places), _errors_around(replayed), *_chosen(replayed)

@@ -18,6 +18,7 @@ from adaptune.geometry import Poses, count_within
 from adaptune.odometry.base import (
     MIN_POINTS,
     BaseSettings,
+    Description,
     Odometry,
     OwnFile,
     Registration,
@@ -34,6 +35,10 @@ _SECTION = {
     for name in getattr(field.annotation, "model_fields", ())
 }
 """By value, the section of KISS-ICP's configuration that holds it."""
+_KNOWN = {f"{section}.{name}" for name, section in _SECTION.items()} | {
+    "out_dir",
+    "data.preprocess",  # of older versions
+}
 
 
 class KissScan(NamedTuple):
@@ -79,6 +84,12 @@ class Kiss(Odometry):
         if template is not None:
             self._untuned = template.held(_SECTION)
             self.settings = self.settings.model_copy(update=dict(self._config().data))
+
+    @classmethod
+    def describe(cls, settings: Any) -> Description:
+        if settings is not None and (template := settings.template) is not None:
+            template.check_known(_KNOWN, "KISS-ICP")
+        return super().describe(settings)
 
     def _config(self) -> Any:
         values = self._untuned | self.parameters | {"max_num_threads": 1}

@@ -95,6 +95,24 @@ class Template:
             raise OdometryError(f"{self.path.name} has no such value; {known}")
         return place[1][place[2]]
 
+    def check_known(self, known: Collection[str], tool: str) -> None:
+        """Refuse names that are not `known` to a tool, and warn of those outside its sections.
+
+        A file without these sections, or in ROS 2's layout, may hold anything.
+        """
+        sections = {name.partition(".")[0] for name in known}
+        inside = [not sections.isdisjoint(path[:1]) for path, *_ in self._places]
+        if self.ros2 or not any(inside):
+            return
+        for name, own, (*_, keys) in zip(self.names, inside, self._places, strict=True):
+            if name in known or name in sections:
+                continue
+            where = self._document.where(self.path, keys)
+            what = f"{where}: {name}: {tool} has no such value; {nearest(name, known)}"
+            if own:
+                raise OdometryError(what)
+            warn_once(what)
+
     def held(self, names: Iterable[str], under: str = "") -> dict[str, Any]:
         """The values of those names that the file has and that are not null, `under` a path."""
         return {

@@ -5,6 +5,7 @@ settings. It is written to a temporary folder and renamed when whole. A killed w
 folder whose name begins with a dot, which the next writer removes.
 """
 
+import fcntl
 import hashlib
 import json
 import logging
@@ -31,8 +32,8 @@ _NOT_KEPT = "%s: not kept in the cache (%s)"
 
 _VERSION = 8
 _CAP_GB, _MOST_GB = 50.0, 1e9
-# Seconds. A writer that has not written for this long is dead.
-_DEAD = 3600.0
+# Seconds. A writer that has not written for this long is dead; sooner if it has no lock any more.
+_DEAD, _UNLOCKED = 3600.0, 10.0
 _INDEX, _ABOUT = "index.npy", "about.json"
 # Files of an entry: what they hold of scans one after the other, and in how many columns.
 _ARRAYS = {
@@ -145,6 +146,8 @@ class _Writer:
         self._folder = root / f".writing-{secrets.token_hex(4)}"
         self._folder.mkdir()
         self._files = {name: (self._folder / name).open("wb") for name in _ARRAYS}
+        with suppress(OSError):  # a disk without locks
+            fcntl.flock(self._files["points"], fcntl.LOCK_EX | fcntl.LOCK_NB)
         self._index: list[list[int]] = []
 
     def append(self, scan: Scan) -> None:
@@ -232,8 +235,15 @@ def _sweep(root: Path) -> None:
             newest = max(p.stat().st_mtime for p in (path, *path.iterdir()))
         except OSError:
             continue
-        if time.time() - newest > _DEAD:
+        if time.time() - newest > (_UNLOCKED if _unlocked(path) else _DEAD):
             shutil.rmtree(path, ignore_errors=True)
+
+
+def _unlocked(path: Path) -> bool:
+    with suppress(OSError), (path / "points").open("rb+") as file:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        return True
+    return False
 
 
 def _size(path: Path) -> int:

@@ -53,5 +53,7 @@ def test_rivals_are_written_and_go(study):
     write_sets(study, fixed, {"equal_cost": {"odometry": "gicp", "downsampling": 0.1}})
     path = study.folder / "equal_cost.yaml"
     assert yaml12.Document.of_file(path).data == {"odometry": "gicp", "downsampling": 0.1}
-    write_sets(study, fixed)
+    # The fixed set itself is left out, but as the best default.
+    write_sets(study, fixed, {"equal_cost": fixed, "best_default": fixed})
     assert not path.exists()
+    assert path.with_stem("best_default").exists()

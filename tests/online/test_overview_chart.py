@@ -48,6 +48,10 @@ def test_the_sequence_is_shown_on_which_the_main_modes_differ_most():
     assert len(of_kind(chosen, Line)) == 1
 
 
+def test_nothing_is_shown_where_a_mode_is_hidden():
+    assert overview(sequence(baseline=replay(), paper=replay())) is None
+
+
 def test_the_path_lies_along_x():
     steep = np.column_stack([-SECONDS, 2.0 * SECONDS])
     cave, _ = of_kind(overview(sequence(**modes(adaptive=bank(places=steep)))).panels[0], Line)

@@ -174,6 +174,12 @@ def test_kiss_icp_drives_what_its_own_tool_would(tmp_path):
         ("kiss_icp", "mapping:\n  voxel_size: big\n", "line 2: voxel_size: 'big' is no number"),
         ("kiss_icp", "a: 1\n", "holds none of voxel_size"),
         ("kiss_icp", "mapping: {voxel_size: 1.0}\ndata: {deskew: x}\n", "data.deskew"),
+        (
+            "kiss_icp",
+            USERS.replace("voxel_size", "voxelsize"),
+            "line 5: mapping.voxelsize: KISS-ICP has no such value; did you mean 'mapping.voxel_",
+        ),
+        ("kiss_icp", "data: {voxel_size: 1.0}\n", "did you mean 'mapping.voxel_size'?"),
         ("genz_icp", EVALIO, "is to hold one pipeline 'genz'; there is kiss"),
         ("kiss_icp", None, "there is no such file"),
     ],
@@ -185,6 +191,19 @@ def test_a_file_of_something_else_is_refused(tmp_path, name, text, words):
     with pytest.raises(OdometryError, match=r"users\.yaml") as caught:
         declare(name, {"config": str(path)})
     assert words in str(caught.value)
+
+
+def test_kiss_icp_s_file_may_hold_all_that_it_knows_and_unknown_sections_are_told(tmp_path, caplog):
+    from kiss_icp.config import KISSConfig
+
+    path = tmp_path / "users.yaml"
+    path.write_text(yaml.dump(KISSConfig(mapping={"voxel_size": 0.8}).model_dump()))
+    given = {"config": str(path)}
+    assert declare("kiss_icp", given).mistakes == []
+    assert not caplog.records
+    path.write_text(path.read_text() + "robot:\n  voxelsize: 0.5\n")
+    assert declare("kiss_icp", given).mistakes == []
+    assert "robot.voxelsize: KISS-ICP has no such value; did you mean" in caplog.text
 
 
 def test_what_the_file_gives_is_not_given_twice(tmp_path):

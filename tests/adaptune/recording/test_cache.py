@@ -161,14 +161,17 @@ def test_a_killed_writer_leaves_no_half_entry(cache_folder):
     process.start()
     assert ready.wait(20)
     assert process.pid is not None
+    (left,) = cache_folder.iterdir()
+    for path in (left, *left.iterdir()):
+        os.utime(path, (time.time() - 60,) * 2)
+    # It stays while its writer waits for the next scan.
+    list(cache.tee(scans_of(1), "b", {"name": "b"}))
+    assert left.exists()
     os.kill(process.pid, signal.SIGKILL)
     process.join()
     assert cache.find("a") is None
-    (left,) = cache_folder.iterdir()
-    for path in (left, *left.iterdir()):
-        os.utime(path, (0, 0))
-    list(cache.tee(scans_of(1), "b", {"name": "b"}))
-    assert entries(cache_folder) == ["b"]
+    list(cache.tee(scans_of(1), "c", {"name": "c"}))
+    assert entries(cache_folder) == ["b", "c"]
 
 
 def test_two_writers_of_the_same_do_not_meet(cache_folder):
