@@ -70,6 +70,9 @@ def processes(most: int, preload: Sequence[str] = ()) -> Iterator[Executor]:
     try:
         yield pool
     except BrokenProcessPool as error:
-        raise AdaptuneError("a process was ended from outside; was the memory full?") from error
+        raise AdaptuneError(
+            "a process was ended from outside (was the memory full?), or a script lacks "
+            '`if __name__ == "__main__":`'
+        ) from error
     finally:
         pool.shutdown(cancel_futures=True)

@@ -241,7 +241,7 @@ ALONE = 3
 FITTING = 10.0
 """Seconds to fit the model, to compare, and to draw the page, about."""
 FOR_BANKS = 0.5
-"""Share of the time that is allowed, of which replays of banks take none."""
+"""Share of the time that is allowed, which replays of banks leave for the rest."""
 
 
 class Forecast(NamedTuple):
@@ -249,31 +249,32 @@ class Forecast(NamedTuple):
 
     each: float  # to try a set on all training sequences
     rest: float  # of what follows: finalists' drives of whole recordings, and the replays
+    over: float = 0.0  # for banks, beyond the time that is allowed
 
     def words(self, left: float, most: float) -> str:
         """How long it takes to try so many sets and to finish, in at most so many seconds."""
         n, whole = left, self.each * left + self.rest
         if whole > most:
-            n, whole = max(0.0, (most - self.rest) // max(self.each, 1e-9)), most
+            n, whole = max(0.0, (most - self.rest) // max(self.each, 1e-9)), most + self.over
         return f"it takes {about(whole)}: {n:.0f} parameter sets of {self.each:.1f} s, and the rest"
 
 
 def forecast(study: OfflineStudy, archive: Archive, workers: int, clock: Stopwatch) -> Forecast:
     """Tell from the baseline's drives how long the search takes, and what follows it.
 
-    Replays count if they do for the clock, those of banks as far as they leave the search half of
-    the time: sets that were never tried cannot be in a bank.
+    Replays count if they do for the clock. Those of banks leave half of the time to the search:
+    sets that were never tried cannot be in a bank.
     """
     baselines = range(len(study.odometry.space.baselines))
     drives = read_whole_drives(archive, study.training, baselines)
-    costs, each, rest = [], 0.0, 0.0
+    costs, each, rest, over = [], 0.0, 0.0, 0.0
     for name, runs in drives.items():
         frames = archive.read_frames(name)
         known = [run.ms if np.isnan(run.cost) else run.cost for run in runs.values()]
         costs.append(1e-3 * float(np.mean(known)))
         each += COST * costs[-1] * frames.n_driven * study.config.offline.repeats
         if not archive.is_uncut(name):
-            rest += COST * costs[-1] * len(frames.stamps) * (1 + FINALISTS + DEARER)
+            rest += COST * costs[-1] * len(frames.stamps) * (len(baselines) + FINALISTS + DEARER)
     workers = max(workers, 1)  # those of a cluster may come later
     rest = FITTING + rest / workers
     if clock.replays:
@@ -282,8 +283,9 @@ def forecast(study: OfflineStudy, archive: Archive, workers: int, clock: Stopwat
         replay = float(np.mean(costs)) * scans
         rest += replay * ALONE
         free = FOR_BANKS * 3600.0 * (study.config.offline.hours or np.inf) - rest
-        rest += min(replay * len(study.rules) * (members + 1), max(free, 0.0))
-    return Forecast(each / workers, rest)
+        over = max(replay * len(study.rules) * (members + 1) - max(free, 0.0), 0.0)
+        rest += replay * len(study.rules) * (members + 1) - over
+    return Forecast(each / workers, rest, over)
 
 
 class Campaign:
@@ -382,10 +384,12 @@ def drive_whole(
         for name, numbers in on.items():
             if {*numbers} - {*there[name]}:
                 for n in numbers:
-                    if n in baselines or n not in there[name]:
+                    if (n in baselines and not bare) or n not in there[name]:
                         schedule.add(name, n, sets[n])
-        for done in schedule.run(workers):
-            schedule.store(*done)
+        for name, n, trial in schedule.run(workers):
+            if n in baselines and not bare:
+                check_baseline(study.odometry.name, name, trial)
+            schedule.store(name, n, trial)
 
     schedule = Schedule(study, archive, "whole drives", progress, whole=True)
     drive(schedule, dict.fromkeys(names, sets))

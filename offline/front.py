@@ -54,7 +54,7 @@ def front_rows(data: LabelledData, model: ErrorModel) -> list[dict[str, Any]]:
     others = [trial for trial in front(blocks) if trial not in (model.fixed, BASELINE)]
     for trial in list(dict.fromkeys([model.fixed, BASELINE, *others]))[: MOST_ROWS - 1]:
         what = "baseline" if trial == BASELINE else f"trial {trial}"
-        ratio, cost = ratio_to_baseline(blocks, trial), data.costs.alone(trial)
+        ratio, cost = ratio_to_baseline(blocks, trial), (data.beside or data.costs).alone(trial)
         rows.append(row(what, ratio, cost, in_words(data.sets[trial]), trial))
     members = [trial for trial in model.bank if trial not in model.reserve]
     if (of_bank := model.expected) and len(members) > 1:

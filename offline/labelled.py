@@ -40,7 +40,6 @@ from adaptune.study.config import WORTH
 from adaptune.study.driven import MIN_RECORDINGS, PER_STRETCH
 from offline.campaign import read_whole_drives
 from offline.choice import (
-    LEAST_COST,
     PER_BLOCK,
     BlockErrors,
     NothingUsableError,
@@ -373,6 +372,7 @@ class LabelledData(NamedTuple):
     budget: float | None = None
     worth: float = WORTH  # share of the error that a bank has to spare
     driven: Sequence[int] = ()  # finalists: trial numbers, the columns of drives of the whole
+    beside: Costs | None = None  # as they were measured side by side in these drives
 
     def subset(self, trials: Sequence[int]) -> "LabelledData":
         """The same with some of the sets."""
@@ -438,16 +438,18 @@ class LabelledData(NamedTuple):
 
     def blocks(self) -> BlockErrors:
         """What the trials of all sets say."""
-        return self._blocks(self.sequences, list(self.sets))
+        return self._blocks(self.sequences, list(self.sets), self.costs)
 
-    def _blocks(self, sequences: Sequence[LabelledSequence], trials: Sequence[int]) -> BlockErrors:
+    def _blocks(
+        self, sequences: Sequence[LabelledSequence], trials: Sequence[int], costs: Costs
+    ) -> BlockErrors:
         none, errors = np.zeros(len(trials)), [s.in_blocks() for s in sequences]
         turns = [block_means(s.turns, s.block) for s in sequences if s.turns is not None]
         return BlockErrors(
             trials,
             np.concatenate(errors),
             np.repeat(np.arange(len(errors)), [len(of) for of in errors]),
-            np.array([self.costs.alone(trial) for trial in trials]),
+            np.array([costs.alone(trial) for trial in trials]),
             np.sum([none if s.restarts is None else s.restarts for s in sequences], axis=0),
             min(1e-6 * float(np.median(np.diff(s.simulation.stamps))) for s in self.sequences),
             np.concatenate(turns) if len(turns) == len(errors) else None,
@@ -458,7 +460,7 @@ class LabelledData(NamedTuple):
         whole = [s.whole for s in self.sequences if s.whole is not None]
         if not (known := [n for n in self.driven if n in trials and n in self.sets]):
             return self.blocks().some(list(trials))
-        return self._blocks(whole, self.driven).some(known)
+        return self._blocks(whole, self.driven, self.beside or self.costs).some(known)
 
     def finalists(self) -> list[int]:
         """Trials whose sets drive whole recordings, see `offline.choice.finalists`."""
@@ -476,6 +478,8 @@ class LabelledData(NamedTuple):
         blocks = self.blocks()
         few = finalists(blocks, budget)
         driven, cheap = self.whole_blocks(few), affordable(blocks, budget)
+        if budget is not None and not (driven.costs <= budget).any():
+            driven = self._replace(beside=None).whole_blocks(few)
         if not cheap[[blocks.trials.index(trial) for trial in driven.trials]].any():
             driven = blocks.some(few)  # with something left out, others may be finalists
         return choose(driven, budget, sure)
@@ -592,7 +596,7 @@ def with_whole_drives(
         sequences.append(replace(s, whole=_whole(s, trials, config)))
     if not all(archive.is_uncut(s.name) for s in sequences):
         runs = {n: [of[n] for of in drives.values()] for n in known}
-        data = data._replace(costs=side_by_side(data.costs, runs))
+        data = data._replace(beside=side_by_side(data.costs, runs))
     return data._replace(sequences=sequences, driven=known)
 
 
@@ -602,7 +606,8 @@ def side_by_side(costs: Costs, runs: Mapping[int, Sequence[Summary]]) -> Costs:
     In the trials, the machine may have been busier with one set than with another.
     """
     beside = {n: mean_cost(of, costs.sets[n].preparation) for n, of in runs.items()}
-    scale = costs.alone(BASELINE) / max(beside[BASELINE].alone, LEAST_COST)
+    own = beside[BASELINE].alone if BASELINE in beside else np.nan
+    scale = costs.alone(BASELINE) / own if own > 0.0 else np.nan
     found = {
         n: SetCost(scale * c.register, scale * c.prepare, c.preparation) for n, c in beside.items()
     }

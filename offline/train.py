@@ -135,7 +135,7 @@ def train(
     whole = read_whole_drives(archive, names, [*usable.finalists(), *every_set.defaults])
     fixed = usable.fixed()
     dropped = sorted({*data.usable().sets} - {*usable.sets})
-    data = data._replace(costs=usable.costs.without(dropped))
+    data = data._replace(costs=(usable.beside or data.costs).without(dropped))
     model = _fitted(study, data, with_vectors(usable, archive), finished, fixed)
     write_sets(study, every_set[fixed], {n: every_set[t] for n, t in model.rivals.items()})
     trials = _trial_rows(config, trial_rows.rows(archive, names), verdicts)

@@ -387,13 +387,14 @@ def compare(study: Study) -> ComparedReplays:
     judged: list[JudgedModes] = []
     oracles: list[ComparisonRow] = []
     wrong: list[str] = []
-    period = np.inf  # milliseconds from scan to scan
+    periods: dict[str, float] = {}  # milliseconds from scan to scan
     for name in names:
         folder = study.folder / "replays" / name
         replays = {mode: StoredReplay.read(folder / mode) for mode in modes}
         reference = Reference.read(study, name)
         stamps = next(iter(replays.values())).trajectory.stamps
-        period = min(period, 1e-6 * float(np.median(np.diff(stamps))))
+        if len(stamps) > 1 and not any(replay.summary.real_time for replay in replays.values()):
+            periods[name] = 1e-6 * float(np.median(np.diff(stamps)))
         every = _with_fixed_rivals(replays, model)
         wrong += [f"On {name}, {what}." for what in read_contradictions(folder)]
         of_modes = compare_modes(name, every, reference)
@@ -414,7 +415,7 @@ def compare(study: Study) -> ComparedReplays:
         advised = NONE if said else advised
     if advised != NONE:
         said += verdict(rows, length, obstacle, worth)
-        said += [] if best is None else late(best, period)
+        said += [] if best is None else late(rows, best.mode, periods)
         said += [] if model is None else _of_estimates(study, model)
     details = [*wrong, *remarks(rows), *compared.words]
     folder = study.folder / "comparison"

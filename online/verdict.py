@@ -130,11 +130,14 @@ def verdict(
     return [said, *why, *_other_rules(best, main, last)]
 
 
-def late(best: ComparisonRow, period: float) -> list[str]:
-    """That what is advised takes longer than the milliseconds from scan to scan, in a sentence."""
-    if best.cpu_ms is None or best.cpu_ms <= period:
-        return []
-    return [f"Scans come every {period:.0f} ms: on one core like this, that is too slow."]
+def late(rows: Sequence[ComparisonRow], mode: str, periods: Mapping[str, float]) -> list[str]:
+    """Where a mode takes longer than the milliseconds from scan to scan, in a sentence."""
+    for row in rows:
+        period = periods.get(row.sequence, math.inf)
+        if row.mode == mode and row.cpu_ms is not None and row.cpu_ms > period:
+            every = f"On {row.sequence}, scans come every {period:.0f} ms"
+            return [f"{every}: {row.cpu_ms:.0f} ms of CPU time a scan take several cores."]
+    return []
 
 
 def error_and_cost(row: ComparisonRow) -> str:

@@ -252,8 +252,9 @@ def _say_next(loaded: "OfflineStudy", found: "ComparedReplays") -> None:
 
     if found.rows[0].yardstick == "baseline":
         sequences = loaded.sequences
-        keys = " and ".join(map(sequences.key, sequences.unjudged(loaded.training)))
-        first = f"leave `reference: none` out of {keys}; then " if keys else ""
+        unjudged = sequences.unjudged(loaded.training)
+        keys = " and ".join(dict.fromkeys(sequences.recorded_in(name) for name in unjudged))
+        first = f"leave out `reference: none` of {keys}; then " if keys else ""
         say_next_of_study("look for better sets", "offline", first)
     elif found.unfinished:
         say_next_of_study("replay what is missing", "online")

@@ -100,8 +100,9 @@ def unpacked(register: Any, returned: Any) -> Registration:
         what = f"an array of shape {returned.shape}" if is_array else f"{returned!r:.60}"
         code = getattr(register, "__code__", None)  # compiled methods have none
         where = f" ({code.co_filename}, line {code.co_firstlineno})" if code else ""
+        name = getattr(register, "__qualname__", "register")
         raise HostError(
-            f"{register.__qualname__}{where} returned {what}; let it return Registration(pose), "
+            f"{name}{where} returned {what}; let it return Registration(pose), "
             f"whose pose is an array of shape (4, 4)"
         ) from error
 

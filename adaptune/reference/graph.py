@@ -138,6 +138,8 @@ def pass_over(scans: Iterable[Scan], advance: Callable[[int], None] = lambda _: 
             if len(waiting) > _AHEAD:
                 waiting.popleft().result()
             advance(len(stamps))
+        for one in waiting:
+            one.result()
         guesses = beside.submit(_guesses).result()
     return Pass(
         np.array(stamps, np.int64),

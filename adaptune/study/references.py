@@ -5,6 +5,7 @@ import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
 from functools import partial
+from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 from adaptune import manifest
@@ -150,7 +151,7 @@ def _estimated(
     """The same of scans that are read in some way, unless the cache keeps it."""
     scans, key = RecordedSequence(config), _key(sequences, name, config)
     path = cache.folder() / KEPT / f"{key}.npz"
-    found: EstimatedReference | str | None = kept(path)
+    found: EstimatedReference | str | None = kept(path) if cache.cap() else None
     if found is not None:
         _log.info("%s: its reference was estimated before (%s)", name, path)
     else:
@@ -170,7 +171,14 @@ def _key(sequences: StudySequences, name: str, config: SequenceConfig) -> str:
     """Digest of all that the estimated reference of a recording depends on, not of its name."""
     about = _about(sequences, name)
     scans = about["sequences"][name] | {"part": config.part}
-    return manifest.digest([about["estimator"], about["reader"], about["recording"][name], scans])
+    by = [about["estimator"], about["reader"], *map(_version, ("small_gicp", "gtsam"))]
+    return manifest.digest([*by, about["recording"][name], scans])
+
+
+def _version(package: str) -> str:
+    with suppress(PackageNotFoundError):
+        return version(package)
+    return ""
 
 
 def _others_of_newest(sequences: StudySequences) -> Iterator[str]:

@@ -1,7 +1,6 @@
 """A study of recordings: what it trains and tests on, over which metres, and how long."""
 
 import logging
-import math
 import re
 import shlex
 import shutil
@@ -33,8 +32,8 @@ UNEVEN = 0.2
 the path."""
 LEAST_SHARE = 0.01
 """Of a recording's duration, for training and for the test."""
-TOLD = 10.0
-"""Seconds after which it is known how long a reference takes."""
+TOLD = (10.0, 20)
+"""Seconds and scans after which it is known how long a reference takes; processes start first."""
 LEAST_SPEED = 2.0
 """Metres a second below which no step is called impossible."""
 LEAST_PATH = 2.0
@@ -339,15 +338,18 @@ def share_of(reference: "Trajectory") -> float:
 
 
 def _in_time(show: Progress, minutes: float | None) -> Progress:
-    """The same of references, with an AdaptuneError where one alone takes longer than allowed."""
-    begun: dict[str, float] = {}
+    """Progress of references, with an AdaptuneError where one alone takes longer than allowed."""
+    begun: dict[str, tuple[float, float]] = {}
 
     def shown(text: str, done: float, of: int, remark: str = "", /) -> None:
         show(text, done, of, remark)
+        if minutes is None or done < TOLD[1]:
+            return
         now = time.monotonic()
-        spent = now - begun.setdefault(text, now)
-        if spent > TOLD and of * spent > 60.0 * (minutes or math.inf) * done:
-            name, takes = text.partition(",")[0], about(of * spent / done)
+        first, there = begun.setdefault(text, (now, done))
+        spent, new = now - first, done - there
+        if spent > TOLD[0] and new >= TOLD[1] and of * spent > 60.0 * minutes * new:
+            name, takes = text.partition(",")[0], about(of * spent / new)
             raise AdaptuneError(
                 f"{name}: estimating its reference alone takes {takes}, and --minutes is "
                 f"{minutes:g}: allow twice as long at least, tune on a part "

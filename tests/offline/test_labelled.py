@@ -58,6 +58,16 @@ def test_drives_of_whole_recordings_decide_where_there_are_some():
     # Nor are those that are no more among the sets.
     all_driven = in_whole(data, {0: 3.0, 2: 1.0, 5: 2.0}, {0: 3.0, 2: 1.0, 5: 2.0})
     assert (all_driven.fixed(), all_driven.subset([0, 5]).fixed()) == (2, 5)
+    # What they cost side by side counts, unless then none of them keeps to the budget.
+    dear = {n: SetCost(ms, 0.0, 0) for n, ms in {0: 5.0, 2: 9.0, 5: 4.0}.items()}
+    means = {0: 3.0, 2: 1.0, 5: 2.0}
+    best_is_dear = in_whole(labelled([3.0, 1.0, 2.0], [3.0, 1.0, 2.0]), means, means)
+    beside = best_is_dear._replace(
+        costs=Costs(dear, 0.0), beside=Costs(dear | {2: SetCost(5.0, 0.0, 0)}, 0.0)
+    )
+    assert (beside.fixed(), beside._replace(beside=None).fixed()) == (2, 5)
+    none = Costs(dict.fromkeys(dear, SetCost(9.0, 0.0, 0)), 0.0)
+    assert beside._replace(beside=none, budget=4.5).fixed() == 5
     # With a sequence left out, the drives on the others decide.
     both = in_whole(data, {0: 3.0, 2: 1.0, 5: 3.0}, {0: 3.0, 2: 2.0, 5: 1.0})
     (_, without_first), (_, without_second) = both.folds(by_recording=True)
@@ -95,6 +105,11 @@ def test_costs_of_finalists_are_those_of_drives_side_by_side():
     found = side_by_side(costs, runs)
     assert [found.alone(n) for n in (0, 2, 5, 7, 9)] == pytest.approx([8.0, 8.0, 12.0, 3.0, 4.0])
     assert found.evidence == 1.0
+    cheap = {0: SetCost(0.4, 0.1, 0), 2: SetCost(0.4, 0.1, 0)}
+    both = {0: [run(0.4, 0.1)], 2: [run(0.8, 0.2)]}
+    found = side_by_side(Costs(cheap, 0.0), both)
+    assert [found.alone(n) for n in (0, 2)] == pytest.approx([0.5, 1.0])
+    assert side_by_side(costs, {2: runs[2]}).sets == sets
     # Where the baseline's is unknown, or it failed, nothing compares.
     for unknown in (run(np.nan, 4.0), run(10.0, 4.0, "no pose")):
         assert side_by_side(costs, runs | {0: [unknown]}).sets == sets

@@ -148,12 +148,12 @@ def test_how_sure_it_is_that_one_set_is_better_is_told():
 
 
 def test_it_is_told_where_what_is_advised_comes_too_late():
-    best = decided([replace(row, cpu_ms=120.0) for row in every()])
-    assert best is not None
-    said = "Scans come every 100 ms: on one core like this, that is too slow."
-    assert late(best, 100.0) == [said]
-    assert not late(best, 120.0)
-    assert not late(replace(best, cpu_ms=None), 100.0)
+    rows = [replace(row, cpu_ms=120.0) for row in rows_of("slow", fixed=1.0, adaptive=0.9)]
+    rows += [replace(row, cpu_ms=20.0) for row in rows_of("fast", fixed=1.0, adaptive=0.9)]
+    said = "On slow, scans come every 100 ms: 120 ms of CPU time a scan take several cores."
+    assert late(rows, "fixed", {"slow": 100.0, "fast": 50.0}) == [said]
+    assert not late(rows, "fixed", {"slow": 120.0, "fast": 50.0})
+    assert not late([replace(row, cpu_ms=None) for row in rows], "fixed", {"slow": 100.0})
 
 
 def test_a_rival_is_compared_once_in_error_and_cost_also_where_the_fixed_set_is_kept():
