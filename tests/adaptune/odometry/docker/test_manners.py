@@ -86,6 +86,8 @@ def test_a_manner(trials, polite, manner, way):
         assert re.match(words, found.faults[0]), found.faults
         return
     assert not found.faults
-    # Who is late makes the first keyframe two scans later, in a recording of forty.
-    assert found.mean_error == pytest.approx(polite, rel=0.15 if manner == "late" else 0.1)
+    # Who is late makes the first keyframe two scans later, in a recording of forty. What works in
+    # the background leaves out scans of a bag that plays, where the machine is busy.
+    wrong = {"late": 0.15, "background": 0.5 if way == "bag" else 0.1}.get(manner, 0.1)
+    assert found.mean_error == pytest.approx(polite, rel=wrong)
     assert manner != "late" or "first_pose" in found.usage
