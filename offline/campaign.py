@@ -240,8 +240,8 @@ ALONE = 3
 """Replays of one set: the baseline, the fixed set, and its rival."""
 FITTING = 10.0
 """Seconds to fit the model, to compare, and to draw the page, about."""
-FOR_BANKS = 0.5
-"""Share of the time that is allowed, which replays of banks leave for the rest."""
+LEFT_BY_BANKS = 0.5
+"""Share of the time that is allowed, which replays of banks leave to all else."""
 
 
 class Forecast(NamedTuple):
@@ -267,7 +267,7 @@ def forecast(study: OfflineStudy, archive: Archive, workers: int, clock: Stopwat
     """
     baselines = range(len(study.odometry.space.baselines))
     drives = read_whole_drives(archive, study.training, baselines)
-    costs, each, rest, over = [], 0.0, 0.0, 0.0
+    costs, each, rest = [], 0.0, 0.0
     for name, runs in drives.items():
         frames = archive.read_frames(name)
         known = [run.ms if np.isnan(run.cost) else run.cost for run in runs.values()]
@@ -276,15 +276,16 @@ def forecast(study: OfflineStudy, archive: Archive, workers: int, clock: Stopwat
         if not archive.is_uncut(name):
             rest += COST * costs[-1] * len(frames.stamps) * (len(baselines) + FINALISTS + DEARER)
     workers = max(workers, 1)  # those of a cluster may come later
-    rest = FITTING + rest / workers
+    rest, over = FITTING + rest / workers, 0.0
     if clock.replays:
         members = study.config.online.switching.size if study.mechanism == "bank" else 0
         scans = sum(study.sequences.open(name).n_messages for name in study.config.test)
         replay = float(np.mean(costs)) * scans
         rest += replay * ALONE
-        free = FOR_BANKS * 3600.0 * (study.config.offline.hours or np.inf) - rest
-        over = max(replay * len(study.rules) * (members + 1) - max(free, 0.0), 0.0)
-        rest += replay * len(study.rules) * (members + 1) - over
+        free = LEFT_BY_BANKS * 3600.0 * (study.config.offline.hours or np.inf) - rest
+        banks = replay * len(study.rules) * (members + 1)
+        over = max(banks - max(free, 0.0), 0.0)
+        rest += banks - over
     return Forecast(each / workers, rest, over)
 
 
@@ -308,11 +309,10 @@ class Campaign:
         space, known = study.odometry.space, archive.known()
         self._search = Search(self._config, space, self._finished, known)
         self._schedule = Schedule(study, archive, "runs", self._show)
-        baselines = range(n := len(space.baselines))
-        self._n_baselines = n
+        self._baselines = range(len(space.baselines))
         self._schedule.most_ms = {
             name: SLOW * max(drive.others.get(REGISTER_MS, np.inf) for drive in drives.values())
-            for name, drives in read_whole_drives(archive, self._names, baselines).items()
+            for name, drives in read_whole_drives(archive, self._names, self._baselines).items()
             if drives
         }
 
@@ -328,7 +328,7 @@ class Campaign:
         if search.end == TIME_IS_UP:
             # The same command again begins no more.
             self._clock.save(self._config.hours or 0.0)
-            if len(search.sets) <= self._n_baselines:
+            if len(search.sets) <= len(self._baselines):
                 _log.warning("no other set than the baseline was tried: allow more time")
         _log.info("the search ends: %s", search.end)
         self._show("runs", search.total * len(self._names), 0)
@@ -377,18 +377,18 @@ def drive_whole(
     Where the health check acts, it may hide that a set fails without it. So admissible sets, and
     the baseline, drive such sequences once more, bare.
     """
-    names, baselines = study.training, range(len(study.odometry.space.baselines))
+    names, labels = study.training, _labels(study)
 
     def drive(schedule: Schedule, on: Mapping[str, Collection[int]], bare: bool = False) -> None:
         there = read_whole_drives(archive, names, sets, bare)
         for name, numbers in on.items():
             if {*numbers} - {*there[name]}:
                 for n in numbers:
-                    if (n in baselines and not bare) or n not in there[name]:
+                    if (n < len(labels) and not bare) or n not in there[name]:
                         schedule.add(name, n, sets[n])
         for name, n, trial in schedule.run(workers):
-            if n in baselines and not bare:
-                check_baseline(study.odometry.name, name, trial)
+            if n < len(labels) and not bare:
+                check_baseline(labels[n], name, trial)
             schedule.store(name, n, trial)
 
     schedule = Schedule(study, archive, "whole drives", progress, whole=True)
@@ -407,6 +407,12 @@ class BaselineError(AdaptuneError):
     """An odometry that fails with its own parameters."""
 
 
+def _labels(study: OfflineStudy) -> list[str]:
+    """What a study calls its odometries, in the order of their baselines' trials."""
+    space = study.odometry.space
+    return list(space.spaces) if isinstance(space, PooledSpace) else [study.odometry.name]
+
+
 def run_baseline(
     study: OfflineStudy, archive: Archive, workers: Pool[Any], progress: Progress
 ) -> None:
@@ -418,8 +424,7 @@ def run_baseline(
     """
     space = study.odometry.space
     there = read_whole_drives(archive, study.training, range(len(space.baselines)))
-    # What the study calls its odometries, in the order of their baselines' trials.
-    labels = list(space.spaces) if isinstance(space, PooledSpace) else [study.odometry.name]
+    labels = _labels(study)
     schedule = Schedule(study, archive, "baseline", progress, whole=True)
     for name in study.training:
         schedule.need(name)

@@ -41,7 +41,9 @@ class Commands(TyperGroup):
             errors.print(f"error: {str(error) or OUT_OF_MEMORY}", style="red", soft_wrap=True)
             raise typer.Exit(getattr(error, "exit_code", 2)) from error
         except KeyboardInterrupt as error:
-            errors.print("interrupted; run it again: what is finished is kept", style="yellow")
+            errors.print(
+                "interrupted; run the same command again: what is finished is kept", style="yellow"
+            )
             raise typer.Exit(130) from error
 
 

@@ -25,7 +25,7 @@ def odometry_content(name: str, settings: Any, module: str = "") -> Content:
     if name in ODOMETRIES:
         module = ODOMETRIES[name].partition(":")[0]
         package = PACKAGES.get(name, module.rpartition(".")[2])
-        content = {f"version of {package}": _version(package)}
+        content = {f"version of {package}": package_version(package)}
         if (config := getattr(settings, "config", None)) is not None:
             content[config] = _fingerprint(Path(config))
         return content
@@ -51,7 +51,7 @@ def python_content(name: str, group: str, written_in: str = "") -> Content:
     if not versions and "site-packages" in file.parts:
         # This takes half a second.
         for package in metadata.packages_distributions().get(module.partition(".")[0], ()):
-            versions[f"version of {package}"] = _version(package)
+            versions[f"version of {package}"] = package_version(package)
     files = {module: file} | {m: f for m in [written_in] if m and (f := module_file(m))}
     return versions | {f"module {m}": _fingerprint(f) for m, f in files.items()}
 
@@ -92,7 +92,8 @@ def _fingerprint(file: Path) -> str:
     return fingerprint(file)
 
 
-def _version(package: str) -> str:
+def package_version(package: str) -> str:
+    """Version of an installed package."""
     try:
         return metadata.version(package)
     except metadata.PackageNotFoundError:

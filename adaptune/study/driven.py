@@ -120,7 +120,7 @@ def expected_in_words(expected: Mapping[str, float]) -> str:
     )
     equal = expected.get("equal_cost", math.nan)
     if math.isfinite(equal) and equal != expected["geometric"]:
-        interval += f"; {100.0 * (1.0 - equal):.0f} % to the best single set that costs no more"
+        interval += f"; {100.0 * (1.0 - equal):.0f} % over the best single set that costs no more"
     return (
         f"expected gain {gain:.0f} % ({interval}), in the worst tenth "
         f"{expected['worst_tenth']:.2f} times the fixed set's error, {reach} "

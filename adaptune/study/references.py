@@ -5,12 +5,12 @@ import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
 from functools import partial
-from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 from adaptune import manifest
 from adaptune.errors import Finding
 from adaptune.geometry import Poses, to_pose
+from adaptune.odometry.content import package_version
 from adaptune.recording import cache
 from adaptune.recording.config import Fractions, SequenceConfig
 from adaptune.recording.recording import RecordedSequence, wants_estimate
@@ -171,14 +171,8 @@ def _key(sequences: StudySequences, name: str, config: SequenceConfig) -> str:
     """Digest of all that the estimated reference of a recording depends on, not of its name."""
     about = _about(sequences, name)
     scans = about["sequences"][name] | {"part": config.part}
-    by = [about["estimator"], about["reader"], *map(_version, ("small_gicp", "gtsam"))]
+    by = [about["estimator"], about["reader"], *map(package_version, ("small_gicp", "gtsam"))]
     return manifest.digest([*by, about["recording"][name], scans])
-
-
-def _version(package: str) -> str:
-    with suppress(PackageNotFoundError):
-        return version(package)
-    return ""
 
 
 def _others_of_newest(sequences: StudySequences) -> Iterator[str]:

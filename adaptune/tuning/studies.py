@@ -200,7 +200,7 @@ def _decided(
     load_study(least[0] | {"test": least[1]["test"]}, overrides, folder)
     if asked.reference is None:
         _replace_noisy(named, loaded, show)
-    length, share, speed = _split(loaded(), list(named), _in_time(show, asked.minutes))
+    length, share, speed = _split(loaded(), list(named), show)
     made = study(length, share) | {"health": {"max_speed": speed}}
     load_study(made, overrides, folder)
     return made
@@ -337,22 +337,24 @@ def share_of(reference: "Trajectory") -> float:
     return round(float(np.clip(share, LEAST_SHARE, 1.0 - LEAST_SHARE)), 2)
 
 
-def _in_time(show: Progress, minutes: float | None) -> Progress:
+def _in_time(show: Progress, hours: float | None) -> Progress:
     """Progress of references, with an AdaptuneError where one alone takes longer than allowed."""
+    if hours is None:
+        return show
     begun: dict[str, tuple[float, float]] = {}
 
     def shown(text: str, done: float, of: int, remark: str = "", /) -> None:
         show(text, done, of, remark)
-        if minutes is None or done < TOLD[1]:
+        if done < TOLD[1]:
             return
         now = time.monotonic()
         first, there = begun.setdefault(text, (now, done))
         spent, new = now - first, done - there
-        if spent > TOLD[0] and new >= TOLD[1] and of * spent > 60.0 * minutes * new:
+        if spent > TOLD[0] and new >= TOLD[1] and of * spent > 3600.0 * hours * new:
             name, takes = text.partition(",")[0], about(of * spent / new)
             raise AdaptuneError(
                 f"{name}: estimating its reference alone takes {takes}, and --minutes is "
-                f"{minutes:g}: allow twice as long at least, tune on a part "
+                f"{60.0 * hours:g}: allow twice as long at least, tune on a part "
                 f"(`-o sequences.{name}.stop=SECONDS`)"
             )
 
@@ -366,7 +368,7 @@ def _estimate(study: "OfflineStudy", names: Sequence[str], show: Progress) -> No
     there = study.folder.exists()
     study.open()
     try:
-        ensure_references(study.sequences, names, 5.0, show)
+        ensure_references(study.sequences, names, 5.0, _in_time(show, study.config.offline.hours))
     except AdaptuneError as error:
         if not there:
             shutil.rmtree(study.folder)

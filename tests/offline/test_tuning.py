@@ -85,7 +85,9 @@ def test_the_least_loss_wins():
     assert not best().bank.adapt
     gain = "expected gain 26 % (95 % interval 26 to 26 %"
     said = expected_in_words(best().expected._asdict())
-    assert said.startswith(f"{gain}; 5 % to the best single set that costs no more), in the worst")
+    assert said.startswith(
+        f"{gain}; 5 % over the best single set that costs no more), in the worst"
+    )
     rivals[:] = 0.0
     assert expected_in_words(best().expected._asdict()).startswith(f"{gain}), in the worst")
     # What rounding gains is no gain.

@@ -93,6 +93,15 @@ def test_they_are_made_once_and_again_for_another_model(own):
     assert {row.mode for row in compare(plain).rows} == set(EVERY)
 
 
+def test_what_a_scan_takes_is_compared_with_the_time_to_the_next(own, monkeypatch):
+    study, asked = own(), []
+    monkeypatch.setattr("online.compare.late", lambda *given: asked.append(given) or ["it is late"])
+    assert "it is late" in compare(study).verdict
+    ((rows, mode, periods),) = asked
+    assert {row.mode for row in rows} >= {mode}
+    assert periods == pytest.approx({"three": 100.0})
+
+
 def test_where_live_changes_are_in_vain_the_other_modes_are_replayed(own, monkeypatch, caplog):
     study = own("online.modes=[paper, untrained]", "online.switching.mechanism=live")
     shutil.rmtree(study.folder / "replays")

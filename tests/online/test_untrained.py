@@ -83,8 +83,8 @@ def test_nothing_but_a_recording_is_needed(load, caplog):
     assert f"Next: adaptune offline {study.folder}" in said
     blind = ("-o", BLIND, "-o", "sequences.one.reference=none")
     said = succeeded("compare", study.folder, *blind).stdout
-    assert "Next: leave out `reference: none` of " in said
-    assert "one.bag; then adaptune offline" in said
+    first = f"leave out `reference: none` of {study.sequences.recorded_in('one')}; then"
+    assert f"Next: {first} adaptune offline {study.folder}" in said
     # An estimate is told as one.
     assert rows[0].estimated is None
     assert (rows[1].estimated, rows[1].estimated_interval) == (6.0, (5.0, 9.0))

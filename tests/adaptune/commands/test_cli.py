@@ -138,7 +138,7 @@ def test_ctrl_c_leaves_a_study_that_resumes(adaptune, study_file, tmp_path):
     os.killpg(campaign.pid, signal.SIGINT)
     _, said = campaign.communicate(timeout=30)
     assert campaign.returncode == 130
-    assert "run it again: what is finished is kept" in said
+    assert "run the same command again: what is finished is kept" in said
     assert "Traceback" not in said
     # Lines of a log are as long as what they say.
     *log, _ = said.splitlines()

@@ -78,7 +78,7 @@ def test_names_that_do_not_do(name, message):
 def test_a_parameter_without_its_baseline_is_named(tmp_path, monkeypatch):
     (tmp_path / "my_lacking.py").write_text(MINE.replace(", baseline=0.5", ""))
     monkeypatch.syspath_prepend(str(tmp_path))
-    told = r"cannot import my_lacking \(Float\(low=.*\): baseline: this key is missing\)"
+    told = r"my_lacking:Mine: cannot import my_lacking \(Float\(.*\): baseline: this key is miss"
     with pytest.raises(OdometryError, match=told):
         odometry_class("my_lacking:Mine")
 

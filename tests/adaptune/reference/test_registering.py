@@ -138,6 +138,19 @@ def test_enough_registrations_begin_at_the_first_scan(made):
     assert len(set(pairs)) == len(pairs)
 
 
+def test_no_error_of_the_last_scans_is_lost(made):
+    drive, errors = made(straight(12, 1.2)), [OSError("the disk is full")]
+
+    def fail_once(guess):
+        if errors:
+            raise errors.pop()
+        return Hop(guess, np.eye(3))
+
+    drive.answer = fail_once
+    with pytest.raises(OSError, match="the disk is full"):
+        drive.drive()
+
+
 def test_few_scans_are_in_memory(made):
     most = []
     for n in (200, 1500):

@@ -36,7 +36,8 @@ PARAMETERS = f"odometry.parameters={{{', '.join(RANGES)}}}"
 
 def trial(study_file, folder, imitate, way, patience=60.0):
     folder.mkdir()
-    rate = 1 if "background" in imitate else 4
+    # What works in the background leaves out scans that come too soon, as on a busy machine.
+    rate = 0.25 if "background" in imitate else 4
     settings = f"image: {reference_image()}, template: {template(folder / 'p.yaml', **imitate)}"
     name = "rustle"
     if way == "command":
@@ -86,8 +87,6 @@ def test_a_manner(trials, polite, manner, way):
         assert re.match(words, found.faults[0]), found.faults
         return
     assert not found.faults
-    # Who is late makes the first keyframe two scans later, in a recording of forty. What works in
-    # the background leaves out scans of a bag that plays, where the machine is busy.
-    wrong = {"late": 0.15, "background": 0.5 if way == "bag" else 0.1}.get(manner, 0.1)
-    assert found.mean_error == pytest.approx(polite, rel=wrong)
+    # Who is late makes the first keyframe two scans later, in a recording of forty.
+    assert found.mean_error == pytest.approx(polite, rel=0.15 if manner == "late" else 0.1)
     assert manner != "late" or "first_pose" in found.usage
