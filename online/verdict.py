@@ -220,8 +220,15 @@ def _why_not(
     sure = "" if ratio.interval is None else f" ({_interval(ratio)})"
     has = f"{ratio.value:.2f} times its error{sure}{_for_cost(main, best)}"
     if ratio.value <= 1.0 - worth:
+        doubt = "that may be chance"
+        if ratio.interval is not None and ratio.interval[1] < 1.0:
+            rival = _to(main, _judged(rows)[EQUAL_COST])
+            doubt = (
+                f"to the best single set that costs no more it is {rival.value:.2f} "
+                f"({_interval(rival)})"
+            )
         more = "drive more test recordings, or longer ones, to know"
-        return [f"Adapting had {has}; that may be chance: {more}."]
+        return [f"Adapting had {has}; {doubt}: {more}."]
     if ratio.value <= 1.0:
         what = "is not worth its cost"
     else:

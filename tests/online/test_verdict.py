@@ -68,6 +68,18 @@ def test_a_gain_that_may_be_chance_is_not_advised(interval):
     )
 
 
+def test_a_gain_over_the_best_set_of_its_cost_may_be_chance():
+    rows = cheap(adaptive=0.87, equal_cost=0.93)
+    assert verdict(rows, 10.0)[0].startswith("Drive the fixed set")
+    doubtful = {"equal_cost": Ratio(0.94, (0.8, 1.1))}
+    rows = [replace(r, against=doubtful) if r.mode == "adaptive" else r for r in rows]
+    assert verdict(rows, 10.0)[1] == (
+        "Adapting had 0.87 times its error (95 % interval 0.84 to 0.90), for 4.0 times its CPU "
+        "time (20.0 ms a scan); to the best single set that costs no more it is 0.94 (95 % "
+        "interval 0.80 to 1.10): drive more test recordings, or longer ones, to know."
+    )
+
+
 def test_own_parameters_are_kept_where_they_do_best():
     against = {"baseline": Ratio(1.2, (1.1, 1.3))}
     rows = [replace(row, against=against) for row in cheap(baseline=0.8, adaptive=0.96)]
