@@ -411,11 +411,11 @@ def compare(study: Study) -> ComparedReplays:
     best = decided(rows, worth)
     said, advised = wrong[:1], "" if best is None else best.mode
     if not said and best is not None:
-        said = _lost(study.odometry.name, study.sequences, rows, best, length, model)
+        said = _lost(study, rows, best, model)
         advised = NONE if said else advised
     if advised != NONE:
         said += verdict(rows, length, obstacle, worth)
-        said += [] if best is None else late(rows, best.mode, periods)
+        said += late(rows, advised, periods)
         said += [] if model is None else _of_estimates(study, model)
     details = [*wrong, *remarks(rows), *compared.words]
     folder = study.folder / "comparison"
@@ -425,12 +425,7 @@ def compare(study: Study) -> ComparedReplays:
 
 
 def _lost(
-    odometry: str,
-    sequences: StudySequences,
-    rows: Sequence[ComparisonRow],
-    best: ComparisonRow,
-    length: float,
-    model: ErrorModel | None,
+    study: Study, rows: Sequence[ComparisonRow], best: ComparisonRow, model: ErrorModel | None
 ) -> list[str]:
     """Where what is advised has lost its way, the likeliest cause, and what errs least."""
     known = [row for row in rows if row.rte is not None]
@@ -438,8 +433,8 @@ def _lost(
     said = lost_in_words(
         called(best.mode),
         {row.sequence: row.rte for row in of_best if row.rte is not None},
-        odometry,
-        lambda worst: hard_to_track(sequences.open(worst)),
+        study.odometry.name,
+        lambda worst: hard_to_track(study.sequences.open(worst)),
         [row.fault for row in of_best if row.rte and row.rte > LOST_ABOVE],
     )
     if said:
@@ -449,7 +444,8 @@ def _lost(
             f"{CALLED[row.mode]} {error_and_cost(row)}"
             for row in sorted(tried, key=lambda row: row.rte or 0.0)
         ]
-        said.append(f"Until then, rely on none: RTE over {length:g} m{judge}, {', '.join(each)}.")
+        length = f"{study.config.sub_trajectory:g} m"
+        said.append(f"Until then, rely on none: RTE over {length}{judge}, {', '.join(each)}.")
         said += [] if model is None else _of_training(model)
     return said
 
