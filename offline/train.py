@@ -22,7 +22,7 @@ from adaptune.progress import Progress, unseen
 from adaptune.reference.check import hard_to_track
 from adaptune.report import tables
 from adaptune.space import ParameterSet, ParameterSets, in_words
-from adaptune.study.config import StudyConfig, SwitchingConfig
+from adaptune.study.config import SwitchingConfig
 from adaptune.study.driven import EQUAL_COST, RIVALS
 from adaptune.study.oracle import OracleErrors, oracle_errors
 from adaptune.study.references import (
@@ -31,7 +31,6 @@ from adaptune.study.references import (
     estimates_in_words,
     estimates_of,
 )
-from adaptune.study.sequences import StudySequences
 from adaptune.study.study import FIXED_SET
 from offline.bare import bare_in_words, in_whole_drives
 from offline.campaign import (
@@ -382,7 +381,7 @@ def run_oracle(
     """
     model = study.model()
     study.open()
-    names = _judged(study.config, study.sequences, progress)
+    names = _judged(study, progress)
     numbers = oracle_sets(model, n_sets)
     archive = study.archive("oracle")
     archive.renew(names)
@@ -417,14 +416,14 @@ def oracle_sets(model: ErrorModel, n: int) -> list[int]:
     return list(chosen)[:n]
 
 
-def _judged(config: StudyConfig, sequences: StudySequences, progress: Progress) -> list[str]:
+def _judged(study: OfflineStudy, progress: Progress) -> list[str]:
     """The test sequences that have a reference, or get an estimated one."""
-    length = config.sub_trajectory
-    refused = ensure_references(sequences, config.test, length, progress, required=False)
+    test, length = study.config.test, study.config.sub_trajectory
+    refused = ensure_references(study.sequences, test, length, progress, required=False)
     for name, said in refused.items():
         _log.warning("%s; so %s is left out", said, name)
-    without = {*refused, *sequences.unjudged(config.test)}
-    names = [name for name in config.test if name not in without]
+    without = {*refused, *study.sequences.unjudged(test)}
+    names = [name for name in test if name not in without]
     if not names:
         raise AdaptuneError(
             "test: name at least one sequence with a reference; without one, nobody knows which "

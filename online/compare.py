@@ -31,7 +31,6 @@ from adaptune.study.driven import (
 )
 from adaptune.study.oracle import oracle_errors
 from adaptune.study.references import estimates_of
-from adaptune.study.sequences import StudySequences
 from adaptune.study.study import Study
 from online.modes import (
     BASELINE,
@@ -295,7 +294,7 @@ def current_replays(
     shared = {name: study.replay_inputs(name) for name in names}
     refused: dict[tuple[str, str, str], list[str]] = {}
     for (name, mode), summary in made.items():
-        if said := _differing(study.sequences, setup, summary.inputs, model, shared[name]):
+        if said := _differing(study, setup, summary.inputs, model, shared[name]):
             command = "adaptune online"
             if mode in ALSO and mode not in setup.also:
                 command += " --untrained" if mode == UNTRAINED else " -o online.modes=all"
@@ -315,7 +314,7 @@ def current_replays(
 
 
 def _differing(
-    sequences: StudySequences,
+    study: Study,
     setup: ReplaySetup,
     inputs: manifest.Inputs,
     model: ErrorModel | None,
@@ -332,7 +331,7 @@ def _differing(
         # Another machine would choose another mechanism.
         if not automatic or both[0]["mechanism"] == both[1]["mechanism"]:
             now["switching"] = own["switching"]
-    files = sequences.sources(next(iter(shared["recording"])))
+    files = study.sequences.sources(next(iter(shared["recording"])))
     return manifest.changes({key: inputs.get(key) for key in now}, now, files)
 
 

@@ -279,9 +279,7 @@ def frame_row(step: RegisteredScan, late: float) -> list[Any]:
 
 def _write_csv(path: Path, columns: Sequence[str], rows: Any) -> None:
     with replacing(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(columns)
-        writer.writerows(rows)
+        csv.writer(file).writerows(itertools.chain([columns], rows))
 
 
 def _columns(path: Path) -> dict[str, list[str]]:
