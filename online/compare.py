@@ -180,18 +180,15 @@ def ratio_to(judged: Sequence[JudgedModes], mode: str, other: str | None = None)
     Means of few recordings vary too little in a bootstrap, hence the factor. What an estimated
     reference errs is allowed for as on a sequence. `other` is by default the yardstick.
     """
-    pairs = [(one.pair(mode, other), one.block) for one in judged]
-    value = float(np.exp(np.mean([_log(errors) for errors, _ in pairs])))
+    known = [(one.pair(mode, other), one.block, one.rows[0].reference_error) for one in judged]
+    value = float(np.exp(np.mean([_log(errors) for errors, *_ in known])))
     place = np.unique([one.recording or one.name for one in judged], return_inverse=True)[1]
     n, rng = int(place.max()) + 1, np.random.default_rng(SEED)
-    if n < MIN_RECORDINGS and any(e.shape[1] < MIN_BLOCKS * block for e, block in pairs):
+    if n < MIN_RECORDINGS and any(e.shape[1] < MIN_BLOCKS * block for e, block, _ in known):
         return Ratio(value)
-    logs = np.array([resampled_logs(errors, block, rng) for errors, block in pairs])
+    logs = np.array([resampled_logs(errors, block, rng) for errors, block, _ in known])
     low, high = pooled_logs(logs, place, rng)
-    reference_errors = [one.rows[0].reference_error for one in judged]
-    wider = np.mean(
-        [allowed(errors, own) for (errors, _), own in zip(pairs, reference_errors, strict=True)], 0
-    )
+    wider = np.mean([allowed(errors, own) for errors, _, own in known], axis=0)
     return Ratio(value, (float(np.exp(low + wider[0])), float(np.exp(high + wider[1]))))
 
 
