@@ -33,10 +33,6 @@ CHANGE = 0.3
 """Probability that a category changes."""
 
 
-_Trial = tuple[int, dict[str, Any], float]
-"""Number, parameters and energy of a finished trial."""
-
-
 class Chain:
     """One chain of annealing."""
 
@@ -175,24 +171,19 @@ class AnnealingSampler(BaseSampler):
             for t in sorted(finished, key=lambda t: t.number)
         ]
         startup = [trial for trial in trials if trial[0] < self.n_startup_trials]
-        chains = self._started(startup)
+        chains = [Chain(self.settings) for _ in range(self.settings.chains)]
+        best, given = sorted(startup, key=itemgetter(2))[: len(chains)], self.settings.start
+        for k, chain in enumerate(chains):
+            if best:
+                _, params, energy = best[k % len(best)]
+                # The error at a given start is unknown: the first step from it is accepted.
+                chain.start(params | (given or {}), energy if given is None else math.inf)
         scale = self.settings.energy_scale or next(
             (abs(energy) for *_, energy in trials if energy and math.isfinite(energy)), 1.0
         )
         for number, params, energy in trials[len(startup) :]:
             u = self._rng(number).random()
             chains[number % len(chains)].step(params, energy, scale, u)
-        return chains
-
-    def _started(self, startup: list[_Trial]) -> list[Chain]:
-        chains = [Chain(self.settings) for _ in range(self.settings.chains)]
-        best = sorted(startup, key=itemgetter(2))[: len(chains)]
-        given = self.settings.start
-        for k, chain in enumerate(chains):
-            if best:
-                _, params, energy = best[k % len(best)]
-                # The error at a given start is unknown: the first step from it is accepted.
-                chain.start(params | (given or {}), energy if given is None else math.inf)
         return chains
 
     def _rng(self, number: int) -> np.random.Generator:

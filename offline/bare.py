@@ -8,10 +8,11 @@ from numpy.typing import NDArray
 from adaptune.archive import Archive
 from adaptune.metrics import FAILURE
 from adaptune.model.rules import BASELINE
-from offline.campaign import WholeDrives, read_whole_drives
+from offline.campaign import read_whole_drives
 from offline.choice import BlockErrors, surely_worse
 from offline.config import OfflineConfig
 from offline.labelled import LabelledData, with_whole_drives
+from offline.search import Finished
 
 MOST_ROUNDS = 3
 """How often other finalists take the place of those that fail without the health check."""
@@ -56,7 +57,7 @@ def worse_without(blocks: BlockErrors) -> NDArray[np.bool_]:
 
 
 def bare_in_words(
-    archive: Archive, whole: WholeDrives, fixed: int, dropped: Sequence[int]
+    archive: Archive, whole: Finished, fixed: int, dropped: Sequence[int]
 ) -> list[str]:
     """What fixed set and baseline do without the health check, if that is another thing."""
     bare = read_whole_drives(archive, list(whole), [BASELINE, fixed, *dropped], bare=True)

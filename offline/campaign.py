@@ -217,14 +217,10 @@ class Schedule:
         self._progress(self._what, self.driven, self.total, "")
 
 
-WholeDrives = Mapping[str, Mapping[int, Summary]]
-"""By sequence, drives of whole recordings by trial number."""
-
-
 def read_whole_drives(
     archive: Archive, names: Sequence[str], numbers: Iterable[int], bare: bool = False
 ) -> dict[str, dict[int, Summary]]:
-    """The drives of whole recordings that there are of some trials."""
+    """By sequence, the drives of whole recordings that there are of some trials, by number."""
     found: dict[str, dict[int, Summary]] = {name: {} for name in names}
     for name in names:
         for n in numbers:
@@ -379,28 +375,27 @@ def drive_whole(
     """
     names, labels = study.training, _labels(study)
 
-    def drive(schedule: Schedule, on: Mapping[str, Collection[int]], bare: bool = False) -> None:
-        there = read_whole_drives(archive, names, sets, bare)
+    def drive(on: Mapping[str, Collection[int]], what: str, bare: bool = False) -> None:
+        schedule = Schedule(study, archive, what, progress, whole=True, bare=bare)
+        there, again = read_whole_drives(archive, names, sets, bare), 0 if bare else len(labels)
         for name, numbers in on.items():
             if {*numbers} - {*there[name]}:
                 for n in numbers:
-                    if (n < len(labels) and not bare) or n not in there[name]:
+                    if n < again or n not in there[name]:
                         schedule.add(name, n, sets[n])
         for name, n, trial in schedule.run(workers):
-            if n < len(labels) and not bare:
+            if n < again:
                 check_baseline(labels[n], name, trial)
             schedule.store(name, n, trial)
 
-    schedule = Schedule(study, archive, "whole drives", progress, whole=True)
-    drive(schedule, dict.fromkeys(names, sets))
+    drive(dict.fromkeys(names, sets), "whole drives")
     whole = read_whole_drives(archive, names, sets)
     restarts = {n: sum(of[n].restarts for of in whole.values()) for n in sets}
     helped = [n for n in sets if 0 < restarts[n] <= restarts[BASELINE]]
     if len(helped) < 2:  # none, or the baseline
         return
-    schedule = Schedule(study, archive, "drives without health check", progress, bare=True)
     on = {name: [n for n in helped if of[n].restarts] for name, of in whole.items()}
-    drive(schedule, on, bare=True)
+    drive(on, "drives without health check", bare=True)
 
 
 class BaselineError(AdaptuneError):

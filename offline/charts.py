@@ -20,7 +20,7 @@ from adaptune.report.charts import (
     Points,
     Words,
 )
-from adaptune.space import Categorical, Float, Integer
+from adaptune.space import Categorical, Parameter
 from adaptune.space import label as parameter_label
 from offline.config import OfflineStudy
 from offline.trial_table import FEW, TrialTable, importances, read_trials
@@ -134,9 +134,6 @@ def front_chart(table: TrialTable) -> Chart | None:
     )
 
 
-Parameter = Float | Integer | Categorical
-
-
 def parameter_axis(name: str, parameter: Parameter) -> Axis:
     """The axis of a parameter: logarithmic as its range is, or with the names of its choices."""
     if isinstance(parameter, Categorical):
@@ -174,7 +171,6 @@ def importance_chart(by_odometry: Mapping[str, Mapping[str, float]]) -> Chart | 
     )
 
 
-RATIO = "error over the fixed set's [-]"
 _FACTS = ("recording", "stretch", "fixed [%]")
 
 
@@ -215,7 +211,7 @@ def _stretch_panel(mode: str, ratios: np.ndarray[Any, Any], recordings: Sequence
     drawn.append(Points(rank, ratios, "stretch", texts=recordings))
     title = f"{mode}: {of.geometric:.2f} ({of.low:.2f}-{of.high:.2f})"
     x = Axis("stretch, by rising ratio [-]", limits=(0.5, float(ends[1])))
-    return Panel(x, Axis(RATIO, log=True), tuple(drawn), title)
+    return Panel(x, Axis("error over the fixed set's [-]", log=True), tuple(drawn), title)
 
 
 def charts_of_trials(study: OfflineStudy) -> Charts:

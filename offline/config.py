@@ -16,6 +16,7 @@ from adaptune.space import (
     Categorical,
     Float,
     Integer,
+    Parameter,
     ParameterSet,
     ParameterSpace,
     Value,
@@ -178,9 +179,7 @@ def make_grid(space: ParameterSpace, grid: Mapping[str, Span | Sequence[Value]])
     return Grid({name: _axis(p, grid.get(name)) for name, p in space.parameters.items()})
 
 
-def _axis(
-    parameter: Float | Integer | Categorical, given: Span | Sequence[Value] | None
-) -> Sequence[Value]:
+def _axis(parameter: Parameter, given: Span | Sequence[Value] | None) -> Sequence[Value]:
     """The values of a parameter; a ValueError says what is wrong with them."""
     if isinstance(parameter, Categorical):
         return _choices(parameter, parameter.choices if given is None else given)
@@ -264,7 +263,7 @@ def check_grid(
         yield Finding(("grid",), "has more points than can be numbered; give a coarser one")
 
 
-def distribution(parameter: Float | Integer | Categorical) -> Any:
+def distribution(parameter: Parameter) -> Any:
     """A parameter as Optuna describes it."""
     from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
 
@@ -281,7 +280,6 @@ _NOT_SET = {
     "constraints_func": "is a function, which a study cannot give; leave it out",
 }
 """Settings of Optuna's samplers that a study does not have, and why."""
-_BOX = ("low", "high")
 
 
 def check_sampler(
@@ -324,14 +322,12 @@ def _check_optuna(name: str, settings: Mapping[str, Any]) -> Iterable[Finding]:
         yield Finding((key,), rest) if key in settings else Finding((), str(error))
 
 
-def _check_step(
-    name: str, parameter: Float | Integer | Categorical, step: Step
-) -> Iterable[Finding]:
+def _check_step(name: str, parameter: Parameter, step: Step) -> Iterable[Finding]:
     key, given = ("steps", name), step.model_dump(exclude_none=True)
     allowed: tuple[str, ...] = ("change",)
     if not isinstance(parameter, Categorical):
         linear = isinstance(parameter, Integer) and not parameter.log
-        allowed = (*(("delta_max",) if linear else ("mu", "sigma")), *_BOX)
+        allowed = (*(("delta_max",) if linear else ("mu", "sigma")), "low", "high")
     for setting in given:
         if setting not in allowed:
             kind = "log " * getattr(parameter, "log", False) + parameter.type
@@ -345,7 +341,7 @@ def _check_step(
 
 
 def _check_start(
-    name: str, parameter: Float | Integer | Categorical, value: float, step: Step | None
+    name: str, parameter: Parameter, value: float, step: Step | None
 ) -> Iterable[Finding]:
     if isinstance(parameter, Categorical):
         help_ = "is a category, which starts at the baseline; leave it out"

@@ -147,10 +147,8 @@ def write_scenario(path: Path | str, found: Scenario) -> Path:
         rows = zip(*columns.values(), strict=True)
         write_text(path, csv_text([dict(zip(columns, row, strict=True)) for row in rows]))
     known = [
-        {"trial": trial, "cost": cost if np.isfinite(cost) else None, "parameters": parameters}
-        for trial, cost, parameters in zip(
-            found.sets, found.cost, found.sets.parameters, strict=True
-        )
+        {"trial": n, "cost": cost if np.isfinite(cost) else None, "parameters": found.sets[n]}
+        for n, cost in zip(found.sets, found.cost, strict=True)
     ]
     about = {"blocks": found.blocks, "space": found.sets.space.dump(), "sets": known}
     write_text(_sets_path(path), json.dumps(about, indent=1))

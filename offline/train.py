@@ -22,7 +22,7 @@ from adaptune.progress import Progress, unseen
 from adaptune.reference.check import hard_to_track
 from adaptune.report import tables
 from adaptune.space import ParameterSet, ParameterSets, in_words
-from adaptune.study.config import StudyConfig, SwitchingConfig
+from adaptune.study.config import SwitchingConfig
 from adaptune.study.driven import EQUAL_COST, RIVALS
 from adaptune.study.oracle import OracleErrors, oracle_errors
 from adaptune.study.references import (
@@ -31,13 +31,11 @@ from adaptune.study.references import (
     estimates_in_words,
     estimates_of,
 )
-from adaptune.study.sequences import StudySequences
 from adaptune.study.study import FIXED_SET
 from offline.bare import bare_in_words, in_whole_drives
 from offline.campaign import (
     Campaign,
     Schedule,
-    WholeDrives,
     drive_whole,
     forecast,
     read_whole_drives,
@@ -127,8 +125,7 @@ def train(
         data = labelled_data(study, archive, every_set)
 
         def drive(data: LabelledData) -> None:
-            asked = {*data.finalists(), *every_set.defaults}
-            sets = {n: verdicts[n].parameters for n in sorted(asked)}
+            sets = {n: every_set[n] for n in sorted({*data.finalists(), *every_set.defaults})}
             drive_whole(study, sets, archive, workers, progress)
 
         usable = in_whole_drives(data.usable(), archive, config, drive)
@@ -142,7 +139,7 @@ def train(
     tables.write_rows(study.folder, "trials", trials)
     estimates = estimates_of(study.sequences, names)
     errors = {name: stored.error(model.length) for name, stored in estimates.items()}
-    rows = _training_rows(usable, verdicts, finished, fixed, whole, errors, config)
+    rows = _training_rows(usable, finished, fixed, whole, errors, config)
     tables.write_rows(study.folder, "training", rows)
     said = lost_in_words(
         f"the fixed set, the best of {len(trials)} parameter sets,",
@@ -288,10 +285,9 @@ def _trial_rows(
 
 def _training_rows(
     usable: LabelledData,
-    verdicts: Mapping[int, Verdict],
     finished: Finished,
     fixed: int,
-    whole: WholeDrives,
+    whole: Finished,
     reference_errors: Mapping[str, float],
     config: OfflineConfig,
 ) -> list[dict[str, Any]]:
@@ -315,7 +311,7 @@ def _training_rows(
             "_reference": "given" if error is None else "estimated",
             "_reference_error": error,
         }
-        own = usable.sets.space.row(verdicts[best].parameters)
+        own = usable.sets.space.row(runs[best].parameters)
         row |= {f"_own best {key}": value for key, value in own.items()}
         rows.append(row | {"_left out": _left_out(usable.without(sequence), whole[name])})
     return rows
@@ -357,6 +353,7 @@ def tuned(model: ErrorModel, usable: LabelledData, switching: SwitchingConfig) -
     chosen = choose(usable, switching.size)
     members = chosen.members or [model.fixed]
     besides = reserve(members, usable)
+    expected = {} if chosen.expected is None else chosen.expected._asdict()
     members = [*members, *besides]
     return replace(
         model,
@@ -364,9 +361,7 @@ def tuned(model: ErrorModel, usable: LabelledData, switching: SwitchingConfig) -
         vectors=usable.vectors(members),
         bank_settings=chosen.bank.model_copy(update={"reserve": len(besides)}),
         # As they are read back, so that the same model is the same file.
-        expected={key: float(x) for key, x in chosen.expected._asdict().items()}
-        if chosen.expected
-        else {},
+        expected={key: float(x) for key, x in expected.items()},
         rivals=rivals(usable, driven_cost(usable, chosen, model.fixed)),
     )
 
@@ -386,7 +381,7 @@ def run_oracle(
     """
     model = study.model()
     study.open()
-    names = _judged(study.config, study.sequences, progress)
+    names = _judged(study, progress)
     numbers = oracle_sets(model, n_sets)
     archive = study.archive("oracle")
     archive.renew(names)
@@ -421,14 +416,14 @@ def oracle_sets(model: ErrorModel, n: int) -> list[int]:
     return list(chosen)[:n]
 
 
-def _judged(config: StudyConfig, sequences: StudySequences, progress: Progress) -> list[str]:
+def _judged(study: OfflineStudy, progress: Progress) -> list[str]:
     """The test sequences that have a reference, or get an estimated one."""
-    length = config.sub_trajectory
-    refused = ensure_references(sequences, config.test, length, progress, required=False)
+    test, length = study.config.test, study.config.sub_trajectory
+    refused = ensure_references(study.sequences, test, length, progress, required=False)
     for name, said in refused.items():
         _log.warning("%s; so %s is left out", said, name)
-    without = {*refused, *sequences.unjudged(config.test)}
-    names = [name for name in config.test if name not in without]
+    without = {*refused, *study.sequences.unjudged(test)}
+    names = [name for name in test if name not in without]
     if not names:
         raise AdaptuneError(
             "test: name at least one sequence with a reference; without one, nobody knows which "

@@ -110,20 +110,19 @@ def importances(table: TrialTable) -> dict[str, float]:
     fewer than `FEW` finished trials, one parameter, or equal errors.
     """
     known = table.some(np.isfinite(table.values) & (table.values > 0.0))
-    parameters = {
-        name: p
-        for name, p in table.space.parameters.items()
-        if all(value is not None for value in known.column(name))
-        and len(set(map(repr, known.column(name)))) > 1
+    columns = {name: known.column(name) for name in table.space.parameters}
+    columns = {
+        name: values
+        for name, values in columns.items()
+        if None not in values and len(set(map(repr, values))) > 1
     }
     logs = np.log(known.values)
-    if len(known) < FEW or len(parameters) < 2 or np.ptp(logs) < 1e-9:
+    if len(known) < FEW or len(columns) < 2 or np.ptp(logs) < 1e-9:
         return {}
     import optuna
 
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    distributions = {name: distribution(p) for name, p in parameters.items()}
-    columns = {name: known.column(name) for name in parameters}
+    distributions = {name: distribution(table.space.parameters[name]) for name in columns}
     study = optuna.create_study()
     study.add_trials(
         optuna.trial.create_trial(

@@ -243,11 +243,6 @@ def _logs(
     fitted = data, _ = others.training_data()
     capped, stretch = cap(left_out.errors), left_out.stretch
     fixed = capped[:, data.sets.column(data.fixed)]
-
-    def rival(cost: float) -> NDArray[np.float64]:
-        trial = others.rival(cost) if np.isfinite(cost) else data.fixed
-        return capped[:, data.sets.column(trial)]
-
     pairs = []
     known: dict[tuple[int, ...], list[NDArray[np.float64]]] = {}
     for bank in banks:
@@ -258,7 +253,9 @@ def _logs(
         elif members not in known:
             simulated = bank_errors(left_out, others, fitted, members, BANK_SETTINGS)
             known[members] = [errors for errors, _ in simulated]
-        of_rival = rival(others.costs.adaptive(bank))
+        cost = others.costs.adaptive(bank)
+        rival = others.rival(cost) if np.isfinite(cost) else data.fixed
+        of_rival = capped[:, data.sets.column(rival)]
         pairs += [(errors, of_rival) for errors in known[members]]
     logs = [[log_ratios(one, fixed, stretch) for one in pair] for pair in pairs]
     return np.moveaxis(np.array(logs), -1, 0)

@@ -342,8 +342,7 @@ def _rows(validation: Validation) -> list[dict[str, Any]]:
         for mode in modes:
             found[mode] = values[mode]
             if mode == ADAPTIVE:
-                ends = interval and f"{interval[0]:.2f}-{interval[1]:.2f}"
-                found[f"{mode}, 95 %"] = ends
+                found[f"{mode}, 95 %"] = interval and f"{interval[0]:.2f}-{interval[1]:.2f}"
         return found
 
     rows = []

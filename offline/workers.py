@@ -377,8 +377,12 @@ class Cluster:
             raise ClusterError("--cluster needs Dask: pip install 'adaptune[dask]'") from error
         self._killed = distributed.KilledWorker
         self._address = address
-        self._setup = _elsewhere(setup)
-        self._files = {name: contents(self._setup.sequences, name) for name in names}
+        # Workers run in other folders.
+        sequences = dataclasses.replace(setup.sequences, folder=setup.sequences.folder.absolute())
+        # Alarms need a main thread, and Dask runs tasks in others: processes end what hangs.
+        odometry = setup.odometry.changed(user_code=False, program_input=sequences.program_input)
+        self._setup = setup._replace(odometry=odometry, sequences=sequences)
+        self._files = {name: contents(sequences, name) for name in names}
         # Distinguishes this campaign from others on the same workers.
         self._token = uuid4().hex
         self._hosts: dict[str, str] = {}  # of every worker
@@ -443,10 +447,9 @@ class Cluster:
         hosts = self._found()
         outcomes = []
         for worker, future in list(self._futures.items()):
-            if not future.done() and worker in hosts:
-                continue
-            del self._futures[worker]
-            outcomes.append((worker, self._outcome(worker, future, hosts)))
+            if future.done() or worker not in hosts:
+                del self._futures[worker]
+                outcomes.append((worker, self._outcome(worker, future, hosts)))
         return outcomes
 
     def _outcome(self, worker: str, future: Any, hosts: Collection[str]) -> Outcome:
@@ -493,14 +496,6 @@ class Cluster:
                     f"--cluster {self._address}: worker {worker} has {what}, and this is "
                     f"{__version__}; install the same version there"
                 )
-
-
-def _elsewhere(setup: TrialSetup) -> TrialSetup:
-    """The setup for workers, which run in other folders."""
-    sequences = dataclasses.replace(setup.sequences, folder=setup.sequences.folder.absolute())
-    # Alarms need a main thread, and Dask runs tasks in others: processes end what hangs.
-    odometry = setup.odometry.changed(user_code=False, program_input=sequences.program_input)
-    return setup._replace(odometry=odometry, sequences=sequences)
 
 
 def contents(sequences: StudySequences, name: str) -> dict[Path, str]:

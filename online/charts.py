@@ -177,13 +177,10 @@ def _parameters(replayed: ReplayedSequence) -> Iterator[Panel]:
 
 def _name(value: Any) -> str:
     """A value among names; the set of another odometry has none."""
-    return (
-        value
-        if isinstance(value, str)
-        else ""
-        if np.isnan(value)
-        else np.format_float_positional(value, 6, fractional=False, trim="-")
-    )
+    if isinstance(value, str):
+        return value
+    number = np.format_float_positional(value, 6, fractional=False, trim="-")
+    return "" if np.isnan(value) else number
 
 
 def _place(value: Any, names: tuple[str, ...] | None) -> float:

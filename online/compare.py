@@ -31,7 +31,6 @@ from adaptune.study.driven import (
 )
 from adaptune.study.oracle import oracle_errors
 from adaptune.study.references import estimates_of
-from adaptune.study.sequences import StudySequences
 from adaptune.study.study import Study
 from online.modes import (
     BASELINE,
@@ -181,18 +180,15 @@ def ratio_to(judged: Sequence[JudgedModes], mode: str, other: str | None = None)
     Means of few recordings vary too little in a bootstrap, hence the factor. What an estimated
     reference errs is allowed for as on a sequence. `other` is by default the yardstick.
     """
-    pairs = [(one.pair(mode, other), one.block) for one in judged]
-    value = float(np.exp(np.mean([_log(errors) for errors, _ in pairs])))
+    known = [(one.pair(mode, other), one.block, one.rows[0].reference_error) for one in judged]
+    value = float(np.exp(np.mean([_log(errors) for errors, *_ in known])))
     place = np.unique([one.recording or one.name for one in judged], return_inverse=True)[1]
     n, rng = int(place.max()) + 1, np.random.default_rng(SEED)
-    if n < MIN_RECORDINGS and any(e.shape[1] < MIN_BLOCKS * block for e, block in pairs):
+    if n < MIN_RECORDINGS and any(e.shape[1] < MIN_BLOCKS * block for e, block, _ in known):
         return Ratio(value)
-    logs = np.array([resampled_logs(errors, block, rng) for errors, block in pairs])
+    logs = np.array([resampled_logs(errors, block, rng) for errors, block, _ in known])
     low, high = pooled_logs(logs, place, rng)
-    reference_errors = [one.rows[0].reference_error for one in judged]
-    wider = np.mean(
-        [allowed(errors, own) for (errors, _), own in zip(pairs, reference_errors, strict=True)], 0
-    )
+    wider = np.mean([allowed(errors, own) for errors, _, own in known], axis=0)
     return Ratio(value, (float(np.exp(low + wider[0])), float(np.exp(high + wider[1]))))
 
 
@@ -295,7 +291,7 @@ def current_replays(
     shared = {name: study.replay_inputs(name) for name in names}
     refused: dict[tuple[str, str, str], list[str]] = {}
     for (name, mode), summary in made.items():
-        if said := _differing(study.sequences, setup, summary.inputs, model, shared[name]):
+        if said := _differing(study, setup, summary.inputs, model, shared[name]):
             command = "adaptune online"
             if mode in ALSO and mode not in setup.also:
                 command += " --untrained" if mode == UNTRAINED else " -o online.modes=all"
@@ -315,7 +311,7 @@ def current_replays(
 
 
 def _differing(
-    sequences: StudySequences,
+    study: Study,
     setup: ReplaySetup,
     inputs: manifest.Inputs,
     model: ErrorModel | None,
@@ -332,7 +328,7 @@ def _differing(
         # Another machine would choose another mechanism.
         if not automatic or both[0]["mechanism"] == both[1]["mechanism"]:
             now["switching"] = own["switching"]
-    files = sequences.sources(next(iter(shared["recording"])))
+    files = study.sequences.sources(next(iter(shared["recording"])))
     return manifest.changes({key: inputs.get(key) for key in now}, now, files)
 
 
@@ -411,11 +407,11 @@ def compare(study: Study) -> ComparedReplays:
     best = decided(rows, worth)
     said, advised = wrong[:1], "" if best is None else best.mode
     if not said and best is not None:
-        said = _lost(study.odometry.name, study.sequences, rows, best, length, model)
+        said = _lost(study, rows, best, model)
         advised = NONE if said else advised
     if advised != NONE:
         said += verdict(rows, length, obstacle, worth)
-        said += [] if best is None else late(rows, best.mode, periods)
+        said += late(rows, advised, periods)
         said += [] if model is None else _of_estimates(study, model)
     details = [*wrong, *remarks(rows), *compared.words]
     folder = study.folder / "comparison"
@@ -425,12 +421,7 @@ def compare(study: Study) -> ComparedReplays:
 
 
 def _lost(
-    odometry: str,
-    sequences: StudySequences,
-    rows: Sequence[ComparisonRow],
-    best: ComparisonRow,
-    length: float,
-    model: ErrorModel | None,
+    study: Study, rows: Sequence[ComparisonRow], best: ComparisonRow, model: ErrorModel | None
 ) -> list[str]:
     """Where what is advised has lost its way, the likeliest cause, and what errs least."""
     known = [row for row in rows if row.rte is not None]
@@ -438,8 +429,8 @@ def _lost(
     said = lost_in_words(
         called(best.mode),
         {row.sequence: row.rte for row in of_best if row.rte is not None},
-        odometry,
-        lambda worst: hard_to_track(sequences.open(worst)),
+        study.odometry.name,
+        lambda worst: hard_to_track(study.sequences.open(worst)),
         [row.fault for row in of_best if row.rte and row.rte > LOST_ABOVE],
     )
     if said:
@@ -449,7 +440,8 @@ def _lost(
             f"{CALLED[row.mode]} {error_and_cost(row)}"
             for row in sorted(tried, key=lambda row: row.rte or 0.0)
         ]
-        said.append(f"Until then, rely on none: RTE over {length:g} m{judge}, {', '.join(each)}.")
+        length = f"{study.config.sub_trajectory:g} m"
+        said.append(f"Until then, rely on none: RTE over {length}{judge}, {', '.join(each)}.")
         said += [] if model is None else _of_training(model)
     return said
 

@@ -247,9 +247,6 @@ class RosMessages:
     def __init__(self, store: Typestore, frame: str):
         self._types, self._frame = store.types, frame
 
-    def _make(self, kind: str, **fields: Any) -> Any:
-        return self._types[kind](**fields)
-
     def header(self, stamp: int, frame: str | None = None) -> Any:
         """A header in a frame, by default the odometry's."""
         time = self._types["builtin_interfaces/msg/Time"](*divmod(stamp, 10**9))
@@ -264,25 +261,24 @@ class RosMessages:
     def pose(self, at: Placed) -> Any:
         """geometry_msgs/Pose."""
         position, orientation = self._vector("Point", at[0]), self._vector("Quaternion", at[1])
-        return self._make("geometry_msgs/msg/Pose", position=position, orientation=orientation)
+        return self._types["geometry_msgs/msg/Pose"](position=position, orientation=orientation)
 
     def odometry(
         self, stamp: int, at: Placed, child: str, variances: tuple[float, float] = (0.0, 0.0)
     ) -> Any:
         """nav_msgs/Odometry with variances of position and rotation; the twist is not known."""
         zero = self._vector("Vector3", (0.0, 0.0, 0.0))
-        twist = self._make("geometry_msgs/msg/Twist", linear=zero, angular=zero)
+        twist = self._types["geometry_msgs/msg/Twist"](linear=zero, angular=zero)
         # By convention -1 says that a value is not known.
         unknown = np.zeros(36)
         unknown[0] = -1.0
         certain = np.diag(np.repeat(variances, 3)).ravel()
         with_covariance = "geometry_msgs/msg/{}WithCovariance".format
-        return self._make(
-            "nav_msgs/msg/Odometry",
+        return self._types["nav_msgs/msg/Odometry"](
             header=self.header(stamp),
             child_frame_id=child,
-            pose=self._make(with_covariance("Pose"), pose=self.pose(at), covariance=certain),
-            twist=self._make(with_covariance("Twist"), twist=twist, covariance=unknown),
+            pose=self._types[with_covariance("Pose")](pose=self.pose(at), covariance=certain),
+            twist=self._types[with_covariance("Twist")](twist=twist, covariance=unknown),
         )
 
     def transform(self, stamp: int, at: Placed, child: str) -> Any:
@@ -290,8 +286,8 @@ class RosMessages:
         translation, rotation = self._vector("Vector3", at[0]), self._vector("Quaternion", at[1])
         transform = self._types["geometry_msgs/msg/Transform"](translation, rotation)
         stamped = self._types["geometry_msgs/msg/TransformStamped"]
-        return self._make(
-            "tf2_msgs/msg/TFMessage", transforms=[stamped(self.header(stamp), child, transform)]
+        return self._types["tf2_msgs/msg/TFMessage"](
+            transforms=[stamped(self.header(stamp), child, transform)]
         )
 
     def selection(self, stamp: int, selection: Selection, why_not: str) -> Any:
@@ -307,7 +303,7 @@ class RosMessages:
             "lost": selection.lost,
             "why_not": why_not or None,
         }
-        return self._make("std_msgs/msg/String", data=json.dumps(found))
+        return self._types["std_msgs/msg/String"](data=json.dumps(found))
 
 
 def _number(value: float) -> float | None:

@@ -27,8 +27,6 @@ from adaptune.strict import ConfigurationError, in_one_line
 from adaptune.trajectory import Trajectory, TrajectoryError, read_tum, tum_lines, write_tum
 from online.replay import Choice, ReplayRecord
 
-_TABLES = ("frames.csv", "selections.csv")
-"""Files of a replay besides its trajectory."""
 _log = logging.getLogger(__name__)
 
 
@@ -81,7 +79,8 @@ def replay_changes(
     folder: Path, inputs: manifest.Inputs, files: Mapping[str, Sequence[Path]] | None = None
 ) -> list[str] | None:
     """In what a stored replay's inputs differ from others, in words; None if it is not complete."""
-    if not all((folder / name).exists() for name in ("replay.json", "trajectory.tum", *_TABLES)):
+    files_of_replay = ("replay.json", "trajectory.tum", "frames.csv", "selections.csv")
+    if not all((folder / name).exists() for name in files_of_replay):
         return None
     try:
         before = manifest.recorded(folder / manifest.FILE)
@@ -279,9 +278,7 @@ def frame_row(step: RegisteredScan, late: float) -> list[Any]:
 
 def _write_csv(path: Path, columns: Sequence[str], rows: Any) -> None:
     with replacing(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(columns)
-        writer.writerows(rows)
+        csv.writer(file).writerows(itertools.chain([columns], rows))
 
 
 def _columns(path: Path) -> dict[str, list[str]]:

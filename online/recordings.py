@@ -48,11 +48,7 @@ _OF_SELECTIONS = {
 """Topics of a mode by column of ``selections.csv``."""
 _TIMES = ("prepare_ms", "register_ms", "late_ms")
 """Columns of ``frames.csv`` that are topics."""
-_CLOUD = "sensor_msgs/msg/PointCloud2"
-_TRANSFORM = "tf2_msgs/msg/TFMessage"
 _PATH = "nav_msgs/msg/Path"
-_NUMBER = "std_msgs/msg/Float64"
-_TEXT = "std_msgs/msg/String"
 
 
 def replayed_sequences(replays: Path, config: StudyConfig, wanted: Sequence[str] = ()) -> list[str]:
@@ -106,8 +102,8 @@ def record_replays(study: Study, name: str, progress: Progress = unseen) -> Path
     start = min(int(trajectory.stamps[0]) for trajectory in paths.values())
     composer = _Composer()
     clouds = composer.clouds(study.sequences.open(name), paths[placing], name, progress)
-    composer.add(POINTS, _CLOUD, clouds)
-    composer.add(TF, _TRANSFORM, composer.transforms(paths[placing]))
+    composer.add(POINTS, "sensor_msgs/msg/PointCloud2", clouds)
+    composer.add(TF, "tf2_msgs/msg/TFMessage", composer.transforms(paths[placing]))
     if known is not None:
         first = Trajectory(known.stamps, invert(known.T_world_sensor[0]) @ known.T_world_sensor)
         composer.add(REFERENCE, _PATH, composer.path(first, start))
@@ -172,7 +168,7 @@ class _Composer:
         for name, chosen in replay.choices.items():
             if any(isinstance(value, str) for value in chosen):
                 texts = list(map(str, chosen))
-                self._add_data(topic(mode, "parameters", name), _TEXT, made, texts)
+                self._add_data(topic(mode, "parameters", name), "std_msgs/msg/String", made, texts)
             else:
                 self._numbers(topic(mode, "parameters", name), made, chosen, end)
 
@@ -189,7 +185,7 @@ class _Composer:
             stamps, values = np.append(stamps, end), np.append(values, values[-1])
         known = np.isfinite(values)
         if known.any():
-            self._add_data(name, _NUMBER, stamps[known], values[known].tolist())
+            self._add_data(name, "std_msgs/msg/Float64", stamps[known], values[known].tolist())
 
     def _add_data(
         self, name: str, kind: str, stamps: NDArray[np.int64], values: Sequence[Any]

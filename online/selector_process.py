@@ -110,10 +110,7 @@ class SelectorProcess:
         Answers to earlier scans are dropped.
         """
         end = time.perf_counter() + seconds
-        while self.alive:
-            answers = self._take_answers(max(end - time.perf_counter(), 0.0))
-            if not answers:
-                break
+        while answers := self._take_answers(max(end - time.perf_counter(), 0.0)):
             if answers[-1].stamp == stamp:
                 return answers[-1]
         return None

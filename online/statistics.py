@@ -17,10 +17,6 @@ from online.reference import Reference, StandardErrors
 
 ALL = "all"
 """In place of a sequence, all of them."""
-ESTIMATED, LOST = "estimated [%]", "lost [s]"
-"""Columns of what a bank has measured of itself."""
-REFERENCE = "reference"
-"""Column of the kind of reference."""
 NO_DIFFERENCE = 0.01
 """Share of the yardstick's error by which others may differ without it being told."""
 ORACLE = "oracle, sequence"
@@ -90,13 +86,13 @@ class ComparisonRow:
             "RTE [%]": self.rte,
             f"vs {self.yardstick}": self.ratio,
             "95 %": None if ends is None else f"{ends[0]:.2f}-{ends[1]:.2f}",
-            ESTIMATED: self.estimated,
-            LOST: self.lost_seconds,
+            "estimated [%]": self.estimated,
+            "lost [s]": self.lost_seconds,
             "restarts": self.restarts,
             "switches": self.switches,
             "cost [ms]": self.cpu_ms,
             "memory [MB]": self.memory_mb,
-            REFERENCE: self.reference,
+            "reference": self.reference,
         }
 
     def _standard(self) -> dict[str, Any]:
@@ -132,10 +128,10 @@ class ComparisonRow:
             "better / worse": None if self.better is None else f"{self.better} / {self.worse}",
         }
         changed = {
-            LOST: self.lost_seconds or None,
+            "lost [s]": self.lost_seconds or None,
             "restarts": self.restarts if driven else None,
             "switches": self.switches if driven else None,
-            REFERENCE: None if self.reference == "given" else self.reference,
+            "reference": None if self.reference == "given" else self.reference,
         }
         return head | over_all | shown | changed
 

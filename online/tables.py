@@ -8,7 +8,6 @@ from adaptune.report.tables import Listing
 from adaptune.study.driven import MIN_RECORDINGS
 from online.statistics import ALL, ERROR_FACTOR, ORACLE, ComparisonRow
 
-_COUNTS = ("restarts", "switches")
 YARDSTICKS = {"fixed": "fixed set", "baseline": "baseline"}
 
 
@@ -20,17 +19,13 @@ def tables(rows: Sequence[ComparisonRow], length: float) -> list[Listing]:
     made = [_of_modes(rows, length)]
     if rows[-1].sequence == ALL:
         made.append(_of_sequences(rows, length))
-    standard = _standard(rows)
-    return made if standard is None else [*made, standard]
-
-
-_DECIDES = ("mode", "RTE [%]", "95 %", "worst tenth", "restarts", "cost [ms]")
+    return [*made, *_standard(rows)]
 
 
 def decision_table(rows: Sequence[ComparisonRow], length: float) -> Listing:
     """What a decision needs: a row a mode with its error, its ratio with interval, and its cost."""
-    whole = _of_modes(rows, length)
-    kept = (*_DECIDES, f"vs {rows[0].yardstick}")
+    whole, ratio = _of_modes(rows, length), f"vs {rows[0].yardstick}"
+    kept = ("mode", "RTE [%]", ratio, "95 %", "worst tenth", "restarts", "cost [ms]")
     cells = [{k: v for k, v in row.items() if k in kept} for row in whole.rows]
     return Listing(whole.title, cells)
 
@@ -67,7 +62,7 @@ def _of_modes(rows: Sequence[ComparisonRow], length: float) -> Listing:
     cells = [row.summary_columns() for row in last]
     # A column in which nothing is known, or nothing happened, tells nothing.
     empty = {k for k in cells[0] if all(row[k] is None for row in cells)} - {"RTE [%]"}
-    empty |= {k for k in _COUNTS if not any(row[k] for row in cells)}
+    empty |= {k for k in ("restarts", "switches") if not any(row[k] for row in cells)}
     cells = [{k: v for k, v in row.items() if k not in empty} for row in cells]
     n = len({row.sequence for row in rows if row.rte is not None} - {ALL})
     where = f"on {n} sequences" if last[0].sequence == ALL else f"on {last[0].sequence}"
@@ -110,10 +105,10 @@ def _of_sequences(rows: Sequence[ComparisonRow], length: float) -> Listing:
     return Listing(f"RTE [%] over {length:g} m on each sequence", cells)
 
 
-def _standard(rows: Sequence[ComparisonRow]) -> Listing | None:
+def _standard(rows: Sequence[ComparisonRow]) -> list[Listing]:
     last = [row for row in last_rows(rows) if row.standard is not None]
     if not last:
-        return None
+        return []
     kitti = any(row.standard is not None and bool(row.standard.kitti.lengths) for row in last)
     title = "Errors as evo" + (" and KITTI's benchmark define them" if kitti else " defines them")
     of_all, judged = last[0].sequence == ALL, any(row.reference == "estimated" for row in rows)
@@ -127,4 +122,4 @@ def _standard(rows: Sequence[ComparisonRow]) -> Listing | None:
         + "." * of_all
     )
     cells = [row.standard_columns(kitti) for row in last]
-    return Listing(title, cells, caption)
+    return [Listing(title, cells, caption)]
