@@ -59,6 +59,8 @@ def simulate(
     with progress() as show:
         courses = {name: c for name, c in loaded.config.courses.items() if c.of is None}
         due = [n for n in courses if overwrite or not sequences.recording(n).exists()]
+        for name in courses.keys() - due:
+            sequences.check_recorded(name)
         for name in due:
             record(courses[name], sequences.recording(name), overwrite=overwrite, progress=show)
     say(f"Recorded {len(due)} of {len(courses)} courses: {loaded.folder / 'recordings'}/")

@@ -164,6 +164,10 @@ class Course(StrictModel):
             raise ValueError(f"a course is at most {LONGEST:g} m long")
         return self
 
+    def recorded(self) -> dict[str, Any]:
+        """What its recording depends on, as plain data, without how that is read."""
+        return self.model_dump(mode="json", exclude={"compensate", "of", "part"})
+
     @property
     def legs(self) -> list[tuple[str, float]]:
         """Name and metres of each scene in driving order."""

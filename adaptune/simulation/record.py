@@ -1,6 +1,7 @@
 """Recordings of simulated courses: ROS 1 bags with their ground truth."""
 
 import heapq
+import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
@@ -12,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptune import geometry, open3d
-from adaptune.files import replacing
+from adaptune.files import replacing, write_text
 from adaptune.geometry import Poses, invert
 from adaptune.progress import Progress, unseen
 from adaptune.recording.export import Message, Messages, measurements, structured
@@ -185,10 +186,10 @@ _GEOMETRY = ("Point", "Quaternion", "Pose", "PoseStamped")
 def record(
     course: Course, path: Path, *, overwrite: bool = False, progress: Progress = unseen
 ) -> None:
-    """Simulate a course and write a ROS 1 bag, and its ground truth in the TUM format beside it.
+    """Simulate a course and write a ROS 1 bag; beside it its ground truth (TUM), and the course.
 
-    Both are written whole or not at all; `overwrite` replaces files that are there. `progress`
-    notes every scan, under the bag's name.
+    All are written whole or not at all; `overwrite` replaces files that are there. `progress` notes
+    every scan, under the bag's name.
     """
     truth = path.with_suffix(".tum")
     for file in (path, truth):
@@ -207,6 +208,7 @@ def record(
         ros.write(new, topics, _messages(ros, drive, partial(progress, path.stem)))
         stamps = drive.stamps()
         write_tum(new_truth, Trajectory(stamps, drive.ride.poses(drive.seconds(stamps))))
+        write_text(path.with_suffix(".json"), json.dumps(course.recorded()) + "\n")
 
 
 def _messages(

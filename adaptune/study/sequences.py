@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from adaptune.manifest import merged
+from adaptune.manifest import differences, merged
 from adaptune.odometry.program import ProgramInput, program_input
 from adaptune.recording.cache import fingerprints
 from adaptune.recording.config import (
@@ -123,19 +123,30 @@ class StudySequences:
         A SequenceError says that it cannot be opened, a ConfigurationError that the course has not
         been recorded.
         """
-        self._check_recorded(name)
+        self.check_recorded(name)
         return open_sequence(self.config(name), self.with_imu)
 
-    def _check_recorded(self, name: str) -> None:
-        if name in self.courses and not self.recording(name).exists():
+    def check_recorded(self, name: str) -> None:
+        """Raise a ConfigurationError for a course that is not recorded, or as another one."""
+        if name not in self.courses:
+            return
+        bag, course = self.recording(name), self.courses[name]
+        if not bag.exists():
             raise ConfigurationError(
-                f"{self.recording(name)}: the course {name} is not recorded yet; run "
-                f"`adaptune simulate` with this study first"
+                f"{bag}: the course {name} is not recorded yet; run `adaptune simulate` with this "
+                f"study first"
             )
+        if (file := bag.with_suffix(".json")).exists():
+            made = Course.model_validate_json(file.read_text(encoding="utf-8")).recorded()
+            for key, was, now in differences(made, course.recorded()):
+                raise ConfigurationError(
+                    f"{bag} is of another course: {key} is {was} there, and {now} in the study; "
+                    f"run `adaptune simulate` with --overwrite, or name another --folder"
+                )
 
     def files(self, name: str) -> SequenceFiles:
         """The files that a sequence is read from; errors as of `open`."""
-        self._check_recorded(name)
+        self.check_recorded(name)
         return sequence_files(self.config(name))
 
     def inputs(self, name: str) -> dict[str, Any]:

@@ -223,6 +223,20 @@ odometry:
 """
 
 
+def test_a_recording_of_another_course_is_refused(adaptune, tmp_path):
+    (study := tmp_path / "one.yaml").write_text("odometry: gicp\n" + COURSE)
+    adaptune("simulate", study)
+    for command in (["simulate", study], ["offline", study]):
+        refused = adaptune(*command, "-o", "courses.c.seed=9")
+        assert refused.exit_code == 2
+        told = " ".join(refused.stderr.split())
+        assert "c.bag is of another course: seed is 0 there, and 9 in the study; run" in told
+    reads = ("-o", "courses.c.compensate=constant_velocity")
+    assert "Recorded 0 of 1" in adaptune("simulate", study, *reads).stdout
+    again = adaptune("simulate", study, "-o", "courses.c.seed=9", "--overwrite")
+    assert "Recorded 1 of 1" in again.stdout
+
+
 @pytest.mark.parametrize(
     ("odometry", "lacking"),
     [
@@ -242,6 +256,7 @@ def test_only_what_runs_an_odometry_needs_it(adaptune, tmp_path, monkeypatch, od
     settings = "template: p.yaml, odometry: /odom" if "rustle" in odometry else "command: [slam]"
     study.write_text(odometry.replace("SETTINGS", settings) + COURSE)
     assert "Recorded 1 of 1 courses" in adaptune("simulate", study).stdout
+    assert "Recorded 0 of 1 courses" in adaptune("simulate", study).stdout
     unfinished = adaptune("trials", study)
     assert "no trial is finished yet" in unfinished.stderr
     told = " ".join(adaptune("offline", study).stderr.split())
