@@ -55,6 +55,7 @@ def read_folder(path: Path) -> FolderReading:
     reading: Reading | None = None
     if (gaps > LONGEST_GAP).all() or (gaps < _OVERLAP).any():
         reading = "several"
+        what = what if (gaps >= 0.0).all() else "some overlap"
     elif (gaps <= _NEXT).all() and len(names) == 1:
         reading = "one"
     return FolderReading(tuple(bag for *_, bag in spans), reading, what)

@@ -31,6 +31,10 @@ def test_times_and_names_tell(tmp_path, starts, reading):
     assert read_folder(write(tmp_path, **starts)).reading == reading
 
 
+def test_no_time_between_those_that_overlap_is_told(tmp_path):
+    assert read_folder(write(tmp_path, street=0.0, park=0.0)).why == "some overlap"
+
+
 def test_where_it_is_not_clear_an_option_chooses(tmp_path):
     write(tmp_path, park=0.0, street=1.0)
     with pytest.raises(SequenceError, match=r"in 2 parts, or 2 recordings: .* `--as one` or"):
