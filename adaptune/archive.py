@@ -169,8 +169,7 @@ class Sources(NamedTuple):
 
     def inputs(self, sequence: str) -> dict[str, Any]:
         """All that trials on a sequence depend on."""
-        inputs: dict[str, Any] = manifest.plain({**self.shared, **self.of_sequence(sequence)})
-        return inputs
+        return dict(manifest.plain({**self.shared, **self.of_sequence(sequence)}))
 
     def statuses(self, sequence: str) -> dict[Path, str]:
         """By file of a sequence, what shows that it is the same as before."""

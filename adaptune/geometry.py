@@ -134,8 +134,7 @@ def to_pose(given: Any) -> Poses:
     if values.shape == (7,):
         if not 0.99 < np.linalg.norm(values[3:]) < 1.01:
             raise ValueError("its quaternion (qx qy qz qw, the last four) has not length 1")
-        pose: Poses = from_quaternions(values[None, :3], values[None, 3:])[0]
-        return pose
+        return np.asarray(from_quaternions(values[None, :3], values[None, 3:])[0])
     R = values[:3, :3]
     if np.abs(R @ R.T - np.eye(3)).max() > 1e-2 or np.linalg.det(R) < 0:
         raise ValueError("its first three columns and rows are not a rotation")

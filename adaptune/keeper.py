@@ -18,9 +18,6 @@ _BETWEEN_SAMPLES = 200
 """Milliseconds."""
 _UNTIL_DEAD = 0.001
 """Seconds between looks for processes that have not ended yet."""
-_SUBREAPER = 36
-"""Linux's PR_SET_CHILD_SUBREAPER."""
-_HANG_UP = select.POLLHUP | select.POLLRDHUP
 
 
 class Ended(NamedTuple):
@@ -33,7 +30,7 @@ class Ended(NamedTuple):
 
 def adopt_orphans() -> None:
     """Let this process be the parent of what its descendants leave behind."""
-    ctypes.CDLL(None).prctl(_SUBREAPER, 1, 0, 0, 0)
+    ctypes.CDLL(None).prctl(36, 1, 0, 0, 0)  # Linux's PR_SET_CHILD_SUBREAPER
 
 
 def keep(child: int, connection: int, sampled: bool = False) -> Ended:
@@ -48,7 +45,7 @@ def keep(child: int, connection: int, sampled: bool = False) -> Ended:
     signal.set_wakeup_fd(wake, warn_on_full_buffer=False)
     poll = select.poll()
     poll.register(woken, select.POLLIN)
-    poll.register(connection, _HANG_UP)
+    poll.register(connection, select.POLLHUP | select.POLLRDHUP)
     peak, pid, status = 0.0, 0, 0
     while not pid:
         if sampled:

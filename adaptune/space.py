@@ -106,7 +106,6 @@ class Integer(_Range):
     low: _Whole
     high: _Whole
     baseline: _Whole
-    log: bool = False
 
     def from_unit(self, unit: float) -> int:
         """Map from [0, 1] to the value whose share it falls in."""

@@ -214,11 +214,6 @@ def _keys(node: Any, path: YamlPath = ()) -> Iterator[tuple[YamlPath, Any, Any]]
             yield from _keys(value, (*path, i))
 
 
-def scalar(text: str) -> Any:
-    """Value of one line of YAML from the command line."""
-    return Document(text).data
-
-
 class _Dumper(yaml.SafeDumper):
     """Quotes what YAML 1.1 or 1.2 does not read back as a string, and repeats lists."""
 

@@ -23,9 +23,6 @@ from adaptune.space import ODOMETRY, ParameterSet, Selection
 
 WARM_UP = 12.0  # seconds of the last scans that a member sees when it restarts
 
-Make = Callable[[ParameterSet], OdometryInstance]
-"""Makes a new instance with these parameters."""
-
 
 class PastScan(NamedTuple):
     """A scan with its pose and its motion."""
@@ -284,7 +281,7 @@ class Bank(OdometryInstance):
 
     def __init__(
         self,
-        make: Make,
+        make: Callable[[ParameterSet], OdometryInstance],
         sets: Mapping[int, ParameterSet],
         warm_up: float = WARM_UP,
         lost_track: float = 3.0,

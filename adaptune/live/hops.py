@@ -53,12 +53,8 @@ class Hops(NamedTuple):
     def part(self, first: int, stop: int) -> "Hops":
         """Those between the frames from `first` to before `stop`, whose numbers begin anew."""
         inside = (self.start >= first) & (self.end < stop)
-        return Hops(
-            self.start[inside] - first,
-            self.end[inside] - first,
-            self.T_start_end[inside],
-            self.projection[inside],
-        )
+        kept = Hops._make(array[inside] for array in self)
+        return kept._replace(start=kept.start - first, end=kept.end - first)
 
     @classmethod
     def of(cls, hops: Sequence[tuple[int, int, Hop]]) -> "Hops":

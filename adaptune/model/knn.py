@@ -162,12 +162,9 @@ def _nearest_of_groups(
     earlier row comes first.
     """
     n_groups = len(bounds) - 1
-    size = 0
-    for g in range(n_groups):
-        size += min(k, bounds[g + 1] - bounds[g])
-    squared = np.empty(size)
-    rows = np.empty(size, np.intp)
-    group = np.empty(size, np.intp)
+    squared = np.empty(n_groups * k)
+    rows = np.empty(n_groups * k, np.intp)
+    group = np.empty(n_groups * k, np.intp)
     first = 0
     for g in range(n_groups):
         last = first + min(k, bounds[g + 1] - bounds[g])
@@ -189,7 +186,7 @@ def _nearest_of_groups(
             squared[at], rows[at] = distance, row
         group[first:last] = g
         first = last
-    return squared, rows, group
+    return squared[:first], rows[:first], group[:first]
 
 
 @compiled

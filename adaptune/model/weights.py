@@ -278,24 +278,13 @@ def choose_members(
         squares.append(products / (products[0, 0] + ERROR_FLOOR**2))
     chosen = [0]
     while len(chosen) < min(size, len(pool)):
-        next_one = _next_member(squares, pool, chosen, allow)
-        if next_one is None:
+        members = [pool[j] for j in chosen]
+        rest = [j for j in range(len(pool)) if j not in chosen and allow([*members, pool[j]])]
+        if not rest:
             break
-        chosen.append(next_one)
+        lowered = {j: _root_mean_square(squares, [*chosen, j]) for j in rest}
+        chosen.append(min(lowered, key=lowered.__getitem__))
     return [pool[j] for j in chosen]
-
-
-def _next_member(
-    squares: list[NDArray[np.float64]],
-    pool: Sequence[int],
-    chosen: Sequence[int],
-    allow: Callable[[list[int]], bool],
-) -> int | None:
-    """Place in `pool` of the set that most lowers the error of those chosen; None if none may."""
-    members = [pool[j] for j in chosen]
-    rest = [j for j in range(len(pool)) if j not in chosen and allow([*members, pool[j]])]
-    lowered = {j: _root_mean_square(squares, [*chosen, j]) for j in rest}
-    return min(rest, key=lowered.__getitem__, default=None)
 
 
 def _root_mean_square(squares: list[NDArray[np.float64]], members: list[int]) -> float:

@@ -87,9 +87,9 @@ def _program(settings: Any) -> Content:
 
 
 def _fingerprint(file: Path) -> str:
-    from adaptune.recording.cache import fingerprint  # needs what containers do not have
+    from adaptune.recording.cache import fingerprints  # needs what containers do not have
 
-    return fingerprint(file)
+    return fingerprints([file])[0]
 
 
 def package_version(package: str) -> str:

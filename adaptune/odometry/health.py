@@ -137,10 +137,7 @@ class Guard:
         else:
             self._healthy, self._healthy_noise, self._since = way, noise, 0.0
             self._recent.append(way)
-            while (
-                sum(step_seconds for _, step_seconds in self._recent) - self._recent[0][1]
-                >= _RECENT
-            ):
+            while sum(took for _, took in self._recent) - self._recent[0][1] >= _RECENT:
                 self._recent.popleft()
             self._doubtful = np.eye(4), 0.0
         return None

@@ -36,8 +36,7 @@ class KeyframeSettings(BaseSettings):
     @property
     def kept(self) -> ParameterSet:
         """Parameters that are set, and not tuned."""
-        given = {"downsampling": self.downsampling, "iterations": self.iterations}
-        return {name: value for name, value in given.items() if value is not None}
+        return self.model_dump(include={"downsampling", "iterations"}, exclude_none=True)
 
 
 class PreparedCloud(NamedTuple):

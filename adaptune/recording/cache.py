@@ -283,11 +283,6 @@ def fingerprints(files: Sequence[Path]) -> list[str]:
     return [hashlib.blake2b("".join(found).encode(), digest_size=_SIZE).hexdigest()]
 
 
-def fingerprint(file: Path) -> str:
-    """Hash the content of one file, see `fingerprints`."""
-    return fingerprints([file])[0]
-
-
 def status_key(file: Path) -> str:
     """Hash of all by which a file shows that it is the same as before."""
     status, path = file.stat(), os.fsencode(file.absolute())

@@ -5,7 +5,7 @@ also registered directly to scans some metres before. A pose graph brings both t
 """
 
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -114,7 +114,9 @@ def _revised(found: Pass) -> tuple[Poses, list[Edge]]:
     motions = steps(found.T_odom_sensor)
     weak = _support(len(found.stamps), edges) < FEWEST
     of_members = [_edges(found.guesses, m) for m in range(found.T_previous_current.shape[1])]
-    for first, stop in _runs(weak):
+    # First number, and number after the last one, of every run of weak motions.
+    runs = np.flatnonzero(np.diff(weak, prepend=False, append=False)).reshape(-1, 2)
+    for first, stop in runs.tolist():
         near = [
             [e for e in member_edges if e.start < stop and e.end > first]
             for member_edges in of_members
@@ -151,12 +153,6 @@ def _spanning(n: int, start: ArrayLike, end: ArrayLike) -> NDArray[np.intp]:
     np.add.at(changes, np.asarray(start, np.intp), 1)
     np.add.at(changes, np.asarray(end, np.intp), -1)
     return np.asarray(np.cumsum(changes)[:-1])
-
-
-def _runs(mask: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
-    """First number, and number after the last one, of every run of True."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(int)))
-    yield from zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)
 
 
 def _chained(first: Poses, motions: Poses) -> Poses:

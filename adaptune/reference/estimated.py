@@ -48,6 +48,7 @@ class EstimatedReference:
         first, last = np.flatnonzero(within)[[0, -1]].tolist()
         of_part, found = slice(first, last + 1), self.registrations
         inside = (found.start >= first) & (found.end <= last)
+        kept = Registrations._make(array[inside] for array in found)
         T_first_world = np.linalg.inv(self.T_world_sensor[first])
         T_first_halves = np.linalg.inv(self.halves[:, first])
         return EstimatedReference(
@@ -55,12 +56,7 @@ class EstimatedReference:
             T_first_world @ self.T_world_sensor[of_part],
             self.trusted[first:last],
             T_first_halves[:, None] @ self.halves[:, of_part],
-            Registrations(
-                found.start[inside] - first,
-                found.end[inside] - first,
-                found.accepted[inside],
-                found.residual[inside],
-            ),
+            kept._replace(start=kept.start - first, end=kept.end - first),
         )
 
     @property
@@ -91,13 +87,11 @@ class EstimatedReference:
         breaks = np.diff(self.stamps[first : last + 1]) * 1e-9
         if breaks.max(initial=0.0) > BREAK + 2.0 * float(np.median(np.diff(self.stamps)) * 1e-9):
             return f"no scans for {breaks.max():.1f} s"
-        registrations = self.registrations
-        across = (
-            (registrations.start < last) & (registrations.end > first) & ~registrations.accepted
-        )
+        found = self.registrations
+        across = (found.start < last) & (found.end > first) & ~found.accepted
         if not across.any():
             return "too few registrations"
-        differ = np.isfinite(registrations.residual[across]).mean()
+        differ = np.isfinite(found.residual[across]).mean()
         return "registrations contradict each other" if differ > 0.5 else "registrations fail"
 
     def trajectory(self) -> Trajectory:

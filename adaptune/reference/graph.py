@@ -295,11 +295,10 @@ def optimised(
     for i, T in enumerate(T_odom_sensor if T_first_guess is None else T_first_guess):
         values.insert(i, gtsam.Pose3(T))
     motions = steps(T_odom_sensor)
-    metres, radians = np.linalg.norm(motions[:, :3, 3], axis=1), rotation_angle(motions)
+    metres = _OF_A_STEP[0] + _SHARE[0] * np.linalg.norm(motions[:, :3, 3], axis=1)
+    radians = _OF_A_STEP[1] + _SHARE[1] * rotation_angle(motions)
     for i, T in enumerate(motions):
-        noise = _sigmas(
-            _OF_A_STEP[0] + _SHARE[0] * metres[i], _OF_A_STEP[1] + _SHARE[1] * radians[i]
-        )
+        noise = _sigmas(metres[i], radians[i])
         graph.add(gtsam.BetweenFactorPose3(i, i + 1, gtsam.Pose3(T), _robust(noise)))
     for edge in edges:
         motion = gtsam.Pose3(edge.hop.T_start_end)

@@ -28,8 +28,6 @@ from adaptune.report.looks import Look, looks
 
 _MAP = ("#440154", "#472d7b", "#3b528b", "#2c728e", "#21918c", "#28ae80", "#5ec962", "#9bd93c")
 """A colour map whose lightness rises, without colours too light for a white ground."""
-_TINT = 0.15
-"""Opacity of what is shaded."""
 _MOST = 1500
 """Most points of a line that are drawn."""
 _MANY, _OUTLINED = 1000, 150
@@ -82,9 +80,6 @@ _WIDTH, _LETTER, _LINE = 900, 6.5, 14
 """Pixels: width of a chart, width of a letter, about, and height of a line of words."""
 _DARK = "#333333"
 _Extent = dict[str, tuple[float, float]]
-_OUTLINE: dict[str, Any] = {"stroke": "black", "strokeWidth": 0.5}
-NO_DATA = "no data"
-"""What an empty panel says."""
 _CONFIG: Spec = {
     "font": "Liberation Sans, Arial, Helvetica, sans-serif",
     "view": {"stroke": None},
@@ -255,7 +250,7 @@ class _Drawing:
                 channel["axis"] |= {"values": []}
             empty = self._drawn({"type": "point"}, {"x": [np.nan], "y": [np.nan]})
             middle = {"x": 0.5 * width, "y": 0.5 * height}
-            text = {"type": "text", "text": NO_DATA, "color": "#666666", **middle}
+            text = {"type": "text", "text": "no data", "color": "#666666", **middle}
             said = {"data": _table(i=[0]), "mark": text, "encoding": {}}
             return made | {"layer": [empty, said]}
         layers = [_DRAW[type(item)](self, item) for item in sorted(panel.drawn, key=_layer)]
@@ -317,7 +312,7 @@ class _Drawing:
         mark["size"] = 12 if many else 60 if shape.startswith("M") else 45
         mark["opacity"] = 0.35 if points.faint else 0.7 if many else 1.0
         if not points.faint and len(points.x) <= _OUTLINED:
-            mark |= _OUTLINE
+            mark |= {"stroke": "black", "strokeWidth": 0.5}
         tips = [
             {"field": which, "title": axis.label or which, "format": ".4~g"}
             for which, axis in self._axes.items()
@@ -360,7 +355,7 @@ class _Drawing:
     def _spans(self, spans: Spans) -> Iterator[Spec]:
         for begin, end, name in _shaded(spans):
             mark: Spec = {"type": "rect", "stroke": "white", "tooltip": None, "clip": True}
-            mark |= {"color": self._looks[spans.name or name].colour, "fillOpacity": _TINT}
+            mark |= {"color": self._looks[spans.name or name].colour, "fillOpacity": 0.15}
             encoding = {"x": self._x, "x2": {"field": "x2"}}
             yield {"data": _table(x=[begin], x2=[end]), "mark": mark, "encoding": encoding}
 

@@ -18,8 +18,6 @@ from rich.text import Text
 from adaptune.files import write_text
 
 _FEW, _MANY = 0.1, 10.0
-_WIDEST = 10_000
-"""Letters of width that have room for any table."""
 
 
 class Listing(NamedTuple):
@@ -68,7 +66,8 @@ def tables_within(listing: Listing, width: int) -> list[Table | Text]:
     Where the columns have no room, they go on in a next table, below the first column again.
     """
     whole = table(*listing)
-    if Console(width=_WIDEST).measure(whole).maximum <= width:
+    roomy = Console(width=10_000)  # has room for any table
+    if roomy.measure(whole).maximum <= width:
         return [whole]
     headings, needed = {}, {}
     for key in listing.keys:

@@ -78,10 +78,6 @@ Descriptors = Annotated[
 """How scans are described."""
 
 
-MOST_MEMBERS = 6
-"""Of a bank."""
-
-
 class SwitchingConfig(StrictModel):
     """How the odometry changes its parameters during a replay.
 
@@ -91,7 +87,7 @@ class SwitchingConfig(StrictModel):
     """
 
     mechanism: Literal["auto", "live", "bank"] = "auto"
-    size: int = Field(4, ge=2, le=MOST_MEMBERS)
+    size: int = Field(4, ge=2, le=6)  # members of a bank
 
 
 class RealTimeConfig(StrictModel):

@@ -50,7 +50,6 @@ def driven(
     """
     fixed = f"`online` will drive the fixed set (trial {named(model, model.fixed)}"
     fixed += ")" if model.fixed else ", the baseline)"
-    switching = online.switching
     if mechanism is None:
         return f"{fixed} only, because {cannot_adapt(odometry, None)}."
     if not online.rules:
@@ -60,7 +59,8 @@ def driven(
     how = mechanism_of(ADAPTIVE, model, mechanism, odometry.description.live)
     expected = expected_in_words(model.expected) if model.expected else ""
     if how == "bank" and model.bank_adapts:
-        trials = always_at_work(switching, model)
+        bank = bank_members(online.switching, model)
+        trials = [trial for trial in bank if trial not in model.reserve]  # work everywhere
         members = ", ".join(named(model, trial) for trial in trials)
         words = f"`online` will drive the bank of trials {members} as `adaptive`"
         if model.costs is not None and math.isfinite(cost := model.costs.adaptive(trials)):
@@ -161,8 +161,3 @@ def bank_members(switching: SwitchingConfig, model: ErrorModel) -> dict[int, Par
         )
     chosen = (*model.bank[:n][: switching.size], *model.bank[n:])
     return {trial: model.sets[trial] for trial in chosen}
-
-
-def always_at_work(switching: SwitchingConfig, model: ErrorModel) -> list[int]:
-    """The members of the study's bank that work everywhere; see `ErrorModel.reserve`."""
-    return [trial for trial in bank_members(switching, model) if trial not in model.reserve]

@@ -189,8 +189,6 @@ def _overlaps(config: StudyConfig, opened: dict[str, RecordedSequence]) -> Itera
             yield Finding(("test", i), message)
 
 
-_MOST_BYTES = 10**6
-
 C = TypeVar("C", bound=StudyConfig)
 
 
@@ -234,7 +232,7 @@ def read_study(
 
 
 def _read(path: Path) -> yaml12.Document:
-    if path.exists() and not (path.is_file() and path.stat().st_size <= _MOST_BYTES):
+    if path.exists() and not (path.is_file() and path.stat().st_size <= 10**6):
         what = "a study is a file of YAML, of 1 MB at most"
         raise ConfigurationError(f"{path}: {what}; with a recording, begin by `adaptune tune`")
     try:
@@ -259,7 +257,7 @@ def _override(data: dict[str, Any], text: str) -> Key:
         if not isinstance(data, dict):
             raise ConfigurationError(f"-o {text}: {part} has no keys below it")
     try:
-        data[last] = yaml12.scalar(value)
+        data[last] = yaml12.Document(value).data
     except yaml12.YamlError as error:
         raise ConfigurationError(f"-o {text}: {error}") from error
     return path

@@ -161,8 +161,7 @@ class Study(Generic[C_co]):
         parameters = {"parameters": odometry.space.dump()}
         about = {"odometry": odometry.identity | parameters, "content": odometry.content}
         limits = {"limits": self.config.isolation.model_dump()} if odometry.isolated else {}
-        inputs: dict[str, Any] = manifest.plain(about | limits)
-        return inputs
+        return dict(manifest.plain(about | limits))
 
     def replay_inputs(self, name: str) -> dict[str, Any]:
         """What the replays of a sequence depend on in all modes, as plain data."""

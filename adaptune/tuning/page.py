@@ -19,9 +19,6 @@ from online.modes import sequences_without_model
 from online.replayed import ReplayedSequence, read_replays
 from online.tables import modes_in_words, tables
 
-_BEST = 50
-"""Trials of the page's table: the best ones."""
-
 
 def write_study_page(study: OfflineStudy, found: ComparedReplays | str) -> Path:
     """Write all that is known of a study as one page; `found` may be why nothing is compared."""
@@ -71,7 +68,7 @@ def _search(study: OfflineStudy) -> PageSection:
         return replace(section, notes=(*section.notes, f"{error}."))
     if not finished:
         return section
-    best = trial_rows.select([row for row in finished if row["mean"] is not None], "mean", _BEST)
+    best = trial_rows.select([row for row in finished if row["mean"] is not None], "mean", top=50)
     title = f"The best {len(best)} of {len(finished)} trials, in training"
     listed = trial_rows.with_units(best, study.training, study.odometry.space.labels)
     return replace(section, tables=(Listing(title, listed),))

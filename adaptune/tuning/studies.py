@@ -80,8 +80,7 @@ def roles(
     elif not test:
         *training, last = names
         tested = [last]
-    judged = {"training": training, "test": tested, "sub_trajectory": length}
-    return judged | {"odometry": odometry}
+    return {"training": training, "test": tested, "sub_trajectory": length, "odometry": odometry}
 
 
 def undo_motion(recordings: Sequence["Inspection"], odometries: Sequence[str]) -> None:

@@ -5,7 +5,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from adaptune.errors import AdaptuneError
-from adaptune.yaml12 import Document, YamlError, dump, scalar
+from adaptune.yaml12 import Document, YamlError, dump
 
 modest = settings(max_examples=80, deadline=None)
 
@@ -54,7 +54,7 @@ plain = st.recursive(
     ],
 )
 def test_scalars(text, value):
-    got = scalar(text)
+    got = Document(text).data
     assert got == value
     assert type(got) is type(value)
 

@@ -32,7 +32,6 @@ from adaptune.odometry.docker import remover
 
 OWNER = "adaptune.owner"  # label of every container: the process that has started it
 _NOBODY = 65534
-_SIGNALS = set(map(int, signal.Signals))
 _PERIOD = 100_000  # microseconds over which the use of cores is counted
 _WEIGHT = 10 * 1024
 """Of a core against other processes: at any load, a system has the cores that it may use."""
@@ -271,7 +270,7 @@ class Container:
         if state["Running"]:
             return None
         code = int(state["ExitCode"])
-        return 128 - code if code - 128 in _SIGNALS else code
+        return 128 - code if code - 128 in set(signal.Signals) else code
 
     def wait(self, seconds: float) -> int | None:
         """Wait for the end, at most so long, and say how it `ended`."""
@@ -326,8 +325,7 @@ class Container:
     def log(self, lines: int | Literal["all"] = "all") -> bytes:
         """What it wrote."""
         with contextlib.suppress(OdometryError), _telling(self.image):
-            written: bytes = engine().api.logs(self.id, tail=lines)
-            return written
+            return bytes(engine().api.logs(self.id, tail=lines))
         return b""
 
     def close(self) -> None:

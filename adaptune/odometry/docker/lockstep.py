@@ -23,7 +23,7 @@ from adaptune.odometry.docker.ros_system import QUIET, RosSystem, filled, matrix
 from adaptune.odometry.faults import Faulting, pose_fault
 from adaptune.odometry.remote import Limits
 from adaptune.recording.clouds import LIVOX_TYPES
-from adaptune.recording.export import IMU, POINTS, Messages, structured
+from adaptune.recording.export import IMU, POINTS, Messages, measurements, structured
 from adaptune.recording.scan import Scan
 from adaptune.ros.link import LinkError
 from adaptune.space import ParameterSet, Selection
@@ -250,12 +250,9 @@ class Lockstep(Faulting):
         assert self._system is not None
         messages, (points, imu_topic) = self._messages, self._topics
         if scan.imu is not None and self._send_imu is not None:
-            imu = scan.imu
-            measured = zip(imu.stamps.tolist(), imu.angular_velocity, imu.acceleration, strict=True)
-            for stamp, gyro, acceleration in measured:
+            for _, stamp, measured in measurements(messages, scan.imu, imu_topic):
                 self._clock.reach(stamp)
-                header = messages.header(imu_topic, stamp, "imu")
-                self._send_imu(messages.imu(header, gyro, acceleration))
+                self._send_imu(measured)
         self._clock.reach(scan.stamp + max(scan.span, 0))
         header = messages.header(points, scan.stamp, self._settings.frame)
         if self._kind in LIVOX_TYPES:
@@ -350,8 +347,7 @@ class Lockstep(Faulting):
         if before is None or not before[0] <= self._stamp < stamp or not self._steady:
             return T_own_sensor
         both = Trajectory(np.array([before[0], stamp]), np.stack([before[1], T_own_sensor]))
-        T: Poses = both.at(np.array([self._stamp], np.int64), 1e9)[0]
-        return T
+        return np.asarray(both.at(np.array([self._stamp], np.int64), 1e9)[0])
 
     def _pose(self, seconds: float) -> tuple[int, Poses] | None:
         """The system's pose of the scan that was published last; None if it does not come.

@@ -70,9 +70,8 @@ def look(
         if (inside := system._system) is not None:
             report |= _topics(inside) | _declared(inside, system._template)
             if about := system._reader.about:
-                report["poses are of"] = "; ".join(
-                    filter(None, (about, other_frame(about, settings)))
-                )
+                said = filter(None, (about, other_frame(about, settings)))
+                report["poses are of"] = "; ".join(said)
             works_on = system._works_on(inside)
     seconds = max(1e-9 * (shown[-1][1] - shown[0][1]), 0.1)
     report["time of a start"] = f"{took:.1f} s"

@@ -384,10 +384,9 @@ class PoseReader:
 def matrix(p: Any, q: Any) -> Poses:
     """A pose of shape (4, 4) from a position and a quaternion, NaN where they are none."""
     try:
-        T: Poses = to_pose((p.x, p.y, p.z, q.x, q.y, q.z, q.w))
+        return to_pose((p.x, p.y, p.z, q.x, q.y, q.z, q.w))
     except ValueError:
         return np.full((4, 4), np.nan)
-    return T
 
 
 class SimClock:
