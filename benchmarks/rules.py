@@ -1,6 +1,6 @@
 """What rules that select single sets give, on a table of errors: nothing is driven.
 
-    adaptune trials runs/paper --errors errors.csv
+    adaptune trials runs/toy_gicp --errors errors.csv
     python benchmarks/rules.py errors.csv [--seed 0]
 
 Each fold of the table, a recording or a stretch of one, is left out in turn. The script prints for

@@ -514,8 +514,11 @@ def check_files(sequences: StudySequences, name: str, there: Mapping[Path, str])
     A ClusterError names a file that is missing here, or has another content.
     """
     here: dict[Path, str] = {}
-    with contextlib.suppress(AdaptuneError):
+    try:
         here = contents(sequences, name)
+    except AdaptuneError as error:
+        if all(path.exists() for path in there):
+            raise ClusterError(str(error)) from error
     for path in {**there, **here}:
         if here.get(path) != there.get(path):
             what = "has another content than where you run this" if path.exists() else "is missing"

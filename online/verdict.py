@@ -220,15 +220,16 @@ def _why_not(
     sure = "" if ratio.interval is None else f" ({_interval(ratio)})"
     has = f"{ratio.value:.2f} times its error{sure}{_for_cost(main, best)}"
     if ratio.value <= 1.0 - worth:
-        doubt = "that may be chance"
-        if ratio.interval is not None and ratio.interval[1] < 1.0:
-            rival = _to(main, _judged(rows)[EQUAL_COST])
+        doubt, more = "that may be chance", ": drive more test recordings, or longer ones, to know"
+        row = _judged(rows).get(EQUAL_COST)
+        if row is not None and ratio.interval is not None and ratio.interval[1] < 1.0:
+            rival = _to(main, row)
             doubt = (
-                f"to the best single set that costs no more it is {rival.value:.2f} "
-                f"({_interval(rival)})"
+                f"that is {rival.value:.2f} times the error of the best single set that costs no "
+                f"more than adapting ({_interval(rival)})"
             )
-        more = "drive more test recordings, or longer ones, to know"
-        return [f"Adapting had {has}; {doubt}: {more}."]
+            more *= rival.interval is None or rival.interval[0] < 1.0
+        return [f"Adapting had {has}; {doubt}{more}."]
     if ratio.value <= 1.0:
         what = "is not worth its cost"
     else:

@@ -44,7 +44,7 @@ def simulate(
     """Record the study's simulated courses as bags with ground truth.
 
     Each course under `courses:` becomes a bag in the BotanicGarden layout, with a TUM file of its
-    ground truth.
+    ground truth. What is recorded already is kept, and refused if it is of another course.
     """
     loaded = load(study, override, folder)
     from adaptune.simulation.record import record
@@ -59,8 +59,9 @@ def simulate(
     with progress() as show:
         courses = {name: c for name, c in loaded.config.courses.items() if c.of is None}
         due = [n for n in courses if overwrite or not sequences.recording(n).exists()]
-        for name in courses.keys() - due:
-            sequences.check_recorded(name)
+        for name in courses:
+            if name not in due:
+                sequences.check_recorded(name)
         for name in due:
             record(courses[name], sequences.recording(name), overwrite=overwrite, progress=show)
     say(f"Recorded {len(due)} of {len(courses)} courses: {loaded.folder / 'recordings'}/")

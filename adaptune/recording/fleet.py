@@ -51,7 +51,7 @@ def read_folder(path: Path) -> FolderReading:
     ends = np.maximum.accumulate([end for _, end, _ in spans])
     gaps = np.array([spans[i + 1][0] - ends[i] for i in range(len(spans) - 1)]) * 1e-9
     names = {re.sub(r"[\d_.-]+$", "", bag.stem) for bag in bags}
-    what = f"{gaps.min():,.1f} to {gaps.max():,.1f} s lie between them"
+    what = f"{max(gaps.min(), 0.0):,.1f} to {gaps.max():,.1f} s lie between them"
     reading: Reading | None = None
     if (gaps > LONGEST_GAP).all() or (gaps < _OVERLAP).any():
         reading = "several"

@@ -166,7 +166,9 @@ class Course(StrictModel):
 
     def recorded(self) -> dict[str, Any]:
         """What its recording depends on, as plain data, without how that is read."""
-        return self.model_dump(mode="json", exclude={"compensate", "of", "part"})
+        columns = self.columns or SENSORS[self.sensor].columns
+        about = self.model_dump(mode="json", exclude={"compensate", "of", "part"})
+        return about | {"rate": self.turns, "columns": columns}
 
     @property
     def legs(self) -> list[tuple[str, float]]:

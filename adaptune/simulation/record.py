@@ -191,8 +191,8 @@ def record(
     All are written whole or not at all; `overwrite` replaces files that are there. `progress` notes
     every scan, under the bag's name.
     """
-    truth = path.with_suffix(".tum")
-    for file in (path, truth):
+    truth, about = path.with_suffix(".tum"), path.with_suffix(".json")
+    for file in (path, truth, about):
         if file.exists() and not overwrite:
             raise SimulationError(f"{file} exists already; give --overwrite to replace it")
     drive = SimulatedDrive(course)
@@ -208,7 +208,8 @@ def record(
         ros.write(new, topics, _messages(ros, drive, partial(progress, path.stem)))
         stamps = drive.stamps()
         write_tum(new_truth, Trajectory(stamps, drive.ride.poses(drive.seconds(stamps))))
-        write_text(path.with_suffix(".json"), json.dumps(course.recorded()) + "\n")
+    # At last: with an old bag it would hide that this is of another course.
+    write_text(about, json.dumps(course.recorded()) + "\n")
 
 
 def _messages(

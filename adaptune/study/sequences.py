@@ -121,7 +121,7 @@ class StudySequences:
         """Open a sequence, or a recorded course.
 
         A SequenceError says that it cannot be opened, a ConfigurationError that the course has not
-        been recorded.
+        been recorded, or as another one.
         """
         self.check_recorded(name)
         return open_sequence(self.config(name), self.with_imu)
@@ -136,13 +136,19 @@ class StudySequences:
                 f"{bag}: the course {name} is not recorded yet; run `adaptune simulate` with this "
                 f"study first"
             )
-        if (file := bag.with_suffix(".json")).exists():
-            made = Course.model_validate_json(file.read_text(encoding="utf-8")).recorded()
-            for key, was, now in differences(made, course.recorded()):
-                raise ConfigurationError(
-                    f"{bag} is of another course: {key} is {was} there, and {now} in the study; "
-                    f"run `adaptune simulate` with --overwrite, or name another --folder"
-                )
+        if not (file := bag.with_suffix(".json")).exists():  # of an older adaptune
+            return
+        mend = "remove its .bag, .tum and .json, then run `adaptune simulate`"
+        try:
+            made = Course.model_validate_json(file.read_bytes()).recorded()
+        except ValueError as error:
+            what = "is damaged, or of another adaptune"
+            raise ConfigurationError(f"{file}: {what}; {mend}") from error
+        for key, was, now in differences(made, course.recorded()):
+            raise ConfigurationError(
+                f"{bag} is of another course: {key} is {was} there, and {now} in the study; "
+                f"{mend}, or name another --folder"
+            )
 
     def files(self, name: str) -> SequenceFiles:
         """The files that a sequence is read from; errors as of `open`."""

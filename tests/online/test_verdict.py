@@ -75,9 +75,13 @@ def test_a_gain_over_the_best_set_of_its_cost_may_be_chance():
     rows = [replace(r, against=doubtful) if r.mode == "adaptive" else r for r in rows]
     assert verdict(rows, 10.0)[1] == (
         "Adapting had 0.87 times its error (95 % interval 0.84 to 0.90), for 4.0 times its CPU "
-        "time (20.0 ms a scan); to the best single set that costs no more it is 0.94 (95 % "
-        "interval 0.80 to 1.10): drive more test recordings, or longer ones, to know."
+        "time (20.0 ms a scan); that is 0.94 times the error of the best single set that costs no "
+        "more than adapting (95 % interval 0.80 to 1.10): drive more test recordings, or longer "
+        "ones, to know."
     )
+    worse = {"equal_cost": Ratio(1.2, (1.1, 1.3))}
+    rows = [replace(r, against=worse) if r.mode == "adaptive" else r for r in rows]
+    assert verdict(rows, 10.0)[1].endswith("than adapting (95 % interval 1.10 to 1.30).")
 
 
 def test_own_parameters_are_kept_where_they_do_best():

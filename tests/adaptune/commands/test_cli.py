@@ -230,11 +230,17 @@ def test_a_recording_of_another_course_is_refused(adaptune, tmp_path):
         refused = adaptune(*command, "-o", "courses.c.seed=9")
         assert refused.exit_code == 2
         told = " ".join(refused.stderr.split())
-        assert "c.bag is of another course: seed is 0 there, and 9 in the study; run" in told
+        assert "c.bag is of another course: seed is 0 there, and 9 in the study; remove" in told
+    same = ("-o", "courses.c.rate=10")
+    assert "Recorded 0 of 1" in adaptune("simulate", study, *same).stdout
     reads = ("-o", "courses.c.compensate=constant_velocity")
     assert "Recorded 0 of 1" in adaptune("simulate", study, *reads).stdout
     again = adaptune("simulate", study, "-o", "courses.c.seed=9", "--overwrite")
     assert "Recorded 1 of 1" in again.stdout
+    (damaged := tmp_path / "runs/one/recordings/c.json").write_text("{")
+    refused = adaptune("simulate", study)
+    assert refused.exit_code == 2
+    assert f"{damaged.name}: is damaged, or of another adaptune; remove" in refused.stderr
 
 
 @pytest.mark.parametrize(

@@ -93,7 +93,7 @@ def test_the_reader_of_sequences_takes_it(tmp_path, scans, stamp):
 
 def test_what_is_there_is_not_touched_unasked(tmp_path):
     path = tmp_path / "run.bag"
-    for name in ("run.bag", "run.tum"):
+    for name in ("run.bag", "run.tum", "run.json"):
         (tmp_path / name).write_text("mine")
         with pytest.raises(SimulationError, match=f"{name} exists already; give --overwrite"):
             record(COURSE, path)
