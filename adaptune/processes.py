@@ -285,6 +285,12 @@ servers: dict[tuple[str, str], Server] = {}
 """By service and name; each ends with this process, or where it is dropped."""
 
 
+def forget_servers() -> None:
+    """Import user code anew from here on."""
+    while servers:
+        servers.popitem()[1].control.close()
+
+
 def server(service: str, name: str) -> Server:
     """Server of a piece of user code, started at the first call, and again where it has ended.
 

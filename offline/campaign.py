@@ -377,7 +377,8 @@ def drive_whole(
 
     def drive(on: Mapping[str, Collection[int]], what: str, bare: bool = False) -> None:
         schedule = Schedule(study, archive, what, progress, whole=True, bare=bare)
-        there, again = read_whole_drives(archive, names, sets, bare), 0 if bare else len(labels)
+        there = read_whole_drives(archive, names, sets, bare)
+        again = 0 if bare else len(labels)  # trials below this, the baselines, drive along
         for name, numbers in on.items():
             if {*numbers} - {*there[name]}:
                 for n in numbers:

@@ -166,8 +166,7 @@ def declare_here(name: str, settings: Any, folder: Path | None = None) -> Declar
 
 def forget_user_code() -> None:
     """Import it anew from here on: in one session, it may have been edited."""
-    while processes.servers:
-        processes.servers.popitem()[1].control.close()
+    processes.forget_servers()
     _ask.cache_clear()
 
 

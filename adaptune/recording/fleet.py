@@ -51,14 +51,14 @@ def read_folder(path: Path) -> FolderReading:
     ends = np.maximum.accumulate([end for _, end, _ in spans])
     gaps = np.array([spans[i + 1][0] - ends[i] for i in range(len(spans) - 1)]) * 1e-9
     names = {re.sub(r"[\d_.-]+$", "", bag.stem) for bag in bags}
-    what = f"{max(gaps.min(), 0.0):,.1f} to {gaps.max():,.1f} s lie between them"
+    apart = f"{gaps.min():,.1f} to {gaps.max():,.1f} s lie between them"
     reading: Reading | None = None
     if (gaps > LONGEST_GAP).all() or (gaps < _OVERLAP).any():
         reading = "several"
-        what = what if (gaps >= 0.0).all() else "some overlap"
     elif (gaps <= _NEXT).all() and len(names) == 1:
         reading = "one"
-    return FolderReading(tuple(bag for *_, bag in spans), reading, what)
+    why = "some overlap" if (gaps < 0.0).any() else apart
+    return FolderReading(tuple(bag for *_, bag in spans), reading, why)
 
 
 def _is_recording(path: Path) -> bool:

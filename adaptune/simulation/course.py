@@ -166,9 +166,8 @@ class Course(StrictModel):
 
     def recorded(self) -> dict[str, Any]:
         """What its recording depends on, as plain data, without how that is read."""
-        columns = self.columns or SENSORS[self.sensor].columns
         about = self.model_dump(mode="json", exclude={"compensate", "of", "part"})
-        return about | {"rate": self.turns, "columns": columns}
+        return about | {"rate": self.turns, "columns": self.firings}
 
     @property
     def legs(self) -> list[tuple[str, float]]:
@@ -179,6 +178,11 @@ class Course(StrictModel):
     def turns(self) -> float:
         """Scans a second."""
         return SENSORS[self.sensor].rate if self.rate is None else self.rate
+
+    @property
+    def firings(self) -> int:
+        """Firings a turn."""
+        return SENSORS[self.sensor].columns if self.columns is None else self.columns
 
 
 POINTS, POSES, IMU = "/velodyne_points", "/gt_poses", "/imu/data"

@@ -74,7 +74,7 @@ class SimulatedDrive:
     def scans(self) -> Iterator[SimulatedScan]:
         """Scan the world from one end of the drive to the other."""
         course, sensor = self.course, SENSORS[self.course.sensor]
-        columns = course.columns or sensor.columns
+        columns = course.firings
         looks = directions(course.sensor, columns)
         n_rings = looks.shape[1]
         rings = np.tile(np.arange(n_rings, dtype=np.uint16), columns)
@@ -208,7 +208,7 @@ def record(
         ros.write(new, topics, _messages(ros, drive, partial(progress, path.stem)))
         stamps = drive.stamps()
         write_tum(new_truth, Trajectory(stamps, drive.ride.poses(drive.seconds(stamps))))
-    # At last: with an old bag it would hide that this is of another course.
+    # Written last: beside an older bag, it would hide that this is of another course.
     write_text(about, json.dumps(course.recorded()) + "\n")
 
 

@@ -1,3 +1,4 @@
+import json
 import os
 import signal
 import subprocess
@@ -13,6 +14,8 @@ from made_drives import Tasks, task_of
 from setups import setup_of
 
 from adaptune.odometry.remote import Limits
+from adaptune.simulation import Course
+from adaptune.study.sequences import StudySequences
 from offline import workers as cluster
 from offline.config import load_study
 from offline.train import train
@@ -202,3 +205,17 @@ def test_workers_of_another_version_are_refused(study_file, tmp_path, scheduler)
         train(study, cluster=address)
     assert not list((study.folder / "trials").glob("*/*"))
     other.kill()
+
+
+def test_a_worker_says_that_its_recording_is_of_another_course(tmp_path):
+    sequences = StudySequences({}, {"c": Course(scenes=("corridor",), length=10)}, tmp_path)
+    bag = sequences.recording("c")
+    bag.parent.mkdir()
+    bag.write_bytes(b"")
+    of_another = Course(scenes=("corridor",), length=10, seed=9).recorded()
+    bag.with_suffix(".json").write_text(json.dumps(of_another))
+    with pytest.raises(ClusterError, match=r"c\.bag is of another course: seed is 9 there, and 0"):
+        cluster.check_files(sequences, "c", {bag: "its content"})
+    bag.unlink()
+    with pytest.raises(ClusterError, match=r"c\.bag: is missing; copy it there"):
+        cluster.check_files(sequences, "c", {bag: "its content"})
