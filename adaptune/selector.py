@@ -23,7 +23,7 @@ from adaptune.model.descriptor import (
     lowest_elevation,
     speed_and_turn_rate,
 )
-from adaptune.model.registry import ADAPTIVE, rule_class
+from adaptune.model.registry import ADAPTIVE, STANDBY, rule_class
 from adaptune.model.rules import NOVEL_FAMILIARITY, Live
 from adaptune.model.weights import measured_weights, weighted_selection
 from adaptune.odometry.base import Motions
@@ -151,8 +151,9 @@ class Selector(_Measuring):
     metres, and that of each member of a bank, with a direct registration, see `adaptune.live`. What
     is measured counts from the next selection on. The selector reads no clock and no file.
 
-    With `adaptive` and a bank, the selections are weights of the bank's members; a single odometry
-    keeps the fixed set, or leaves it for the baseline. ``docs/method.md`` says when, and when
+    With `adaptive`, the selections are weights of the bank's members; with `standby`, the others
+    join the fixed set where it is measured to be wrong. A single odometry keeps the fixed set, or
+    leaves it for the baseline. ``docs/method.md`` says when, and when
     members rest, and what becomes of scans of another sensor.
 
     Parameters
@@ -162,9 +163,9 @@ class Selector(_Measuring):
     rule
         Its name, see `adaptune.model.registry`.
     members
-        Trial numbers of the members of the bank that runs, the fixed set first: `adaptive`
-        weighs them, others choose among them. None takes the model's bank for `adaptive` if
-        that is what is driven; an empty one is for a single odometry.
+        Trial numbers of the members of the bank that runs, the fixed set first: `adaptive` and
+        `standby` weigh them, others choose among them. None takes the model's bank for these two;
+        an empty one is for a single odometry.
     descriptors
         Descriptors besides adaptune's own that may be used: a model that names another is refused.
 
@@ -193,14 +194,15 @@ class Selector(_Measuring):
         model.check_descriptors(descriptors)
         cls = rule_class(rule)
         if members is None:
-            drives_bank = cls.gives_weights and (model.bank_adapts or model.bank_rests)
-            members = model.bank if drives_bank else ()
+            members = model.bank if cls.gives_weights and len(model.bank) > 1 else ()
         gives_weights = bool(members) and cls.gives_weights
         fixed = members[0] if members else model.fixed
         super().__init__(model.sets, fixed, members, model.length, gives_weights)
         self._model = model
         self._pca = model.pca()
-        self._reserve = frozenset(model.reserve if gives_weights else ()).intersection(self.members)
+        self._stands_by = rule == STANDBY
+        rest = self.members[1:] if self._stands_by else model.reserve
+        self._reserve = frozenset(rest if gives_weights else ()).intersection(self.members)
         self._always = [member for member in self.members if member not in self._reserve]
         if gives_weights:
             vectors = model.vectors[:, [model.bank.index(member) for member in self._always]]
@@ -322,8 +324,8 @@ class Selector(_Measuring):
         seconds = self._stamp * 1e-9
         error = self._live.own_error()
         is_worse = error is not None and error.low > MAX_TIMES_PREDICTED * predicted
-        # What was not worth its cost in training is not, either, where a place is new alone.
-        is_new = self._model.bank_adapts and self._is_new()
+        # A fixed set is not left because a place is new alone.
+        is_new = not self._stands_by and self._is_new()
         if is_new or is_worse or self._failed or self._live.lost:
             self._all_work_until = seconds + REMEMBERED
         # Somebody has to go on.

@@ -9,15 +9,13 @@ from adaptune.archive import Archive
 from adaptune.metrics import FAILURE
 from adaptune.model.rules import BASELINE
 from offline.campaign import read_whole_drives
-from offline.choice import BlockErrors, surely_worse
+from offline.choice import LOST, BlockErrors, surely_worse
 from offline.config import OfflineConfig
 from offline.labelled import LabelledData, with_whole_drives
 from offline.search import Finished
 
 MOST_ROUNDS = 3
 """How often other finalists take the place of those that fail without the health check."""
-LOST = 0.5
-"""Share of the capped error, as the mean of a block, above which track counts as lost there."""
 
 
 def in_whole_drives(

@@ -15,7 +15,7 @@ from adaptune.model.rules import BASELINE
 from adaptune.progress import Progress, about, unseen
 from adaptune.space import ParameterSet, PooledSpace
 from adaptune.study.references import contradictions_of
-from offline.choice import DEARER, FINALISTS
+from offline.choice import FINALISTS, OTHERS
 from offline.config import OfflineStudy
 from offline.drive import Drive
 from offline.objective import Verdict, label
@@ -232,8 +232,8 @@ def read_whole_drives(
 COST = 1.4
 """Of a set, over the baseline's, about: 1.1 to 1.6 in the mean of the sets on each of five
 recordings."""
-ALONE = 3
-"""Replays of one set: the baseline, the fixed set, and its rival."""
+ALONE = 2
+"""Replays of one set: the baseline and the fixed set."""
 FITTING = 10.0
 """Seconds to fit the model, to compare, and to draw the page, about."""
 LEFT_BY_BANKS = 0.5
@@ -270,7 +270,8 @@ def forecast(study: OfflineStudy, archive: Archive, workers: int, clock: Stopwat
         costs.append(1e-3 * float(np.mean(known)))
         each += COST * costs[-1] * frames.n_driven * study.config.offline.repeats
         if not archive.is_uncut(name):
-            rest += COST * costs[-1] * len(frames.stamps) * (len(baselines) + FINALISTS + DEARER)
+            n_sets = len(baselines) + FINALISTS + 2 * OTHERS
+            rest += COST * costs[-1] * len(frames.stamps) * n_sets
     workers = max(workers, 1)  # those of a cluster may come later
     rest, over = FITTING + rest / workers, 0.0
     if clock.replays:
@@ -370,8 +371,8 @@ def drive_whole(
     """Drive sets along whole training sequences, unless that was done before.
 
     Baselines drive along each time, so that costs compare that were measured side by side.
-    Where the health check acts, it may hide that a set fails without it. So admissible sets, and
-    the baseline, drive such sequences once more, bare.
+    Where the health check acts, it may hide that a set fails without it. So those sets, and the
+    baseline, drive such sequences once more, bare.
     """
     names, labels = study.training, _labels(study)
 
@@ -392,8 +393,8 @@ def drive_whole(
     drive(dict.fromkeys(names, sets), "whole drives")
     whole = read_whole_drives(archive, names, sets)
     restarts = {n: sum(of[n].restarts for of in whole.values()) for n in sets}
-    helped = [n for n in sets if 0 < restarts[n] <= restarts[BASELINE]]
-    if len(helped) < 2:  # none, or the baseline
+    helped = [n for n in sets if restarts[n] > 0]
+    if not {*helped} - {BASELINE}:
         return
     on = {name: [n for n in helped if of[n].restarts] for name, of in whole.items()}
     drive(on, "drives without health check", bare=True)

@@ -1,41 +1,44 @@
-"""Choice of the fixed set: not shown to be worse than the baseline, then good, then cheap.
+"""Choice of the fixed set: the least bound of its error within a budget of CPU time.
 
-All sets are compared with the baseline, which is trial 0, in pairs: by their mean errors over
-blocks of `PER_BLOCK` sub-trajectories.
+All sets are compared with the baseline in pairs: by their mean errors over blocks of `PER_BLOCK`
+sub-trajectories. `docs/research/price.md` has what other rules give.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from adaptune.errors import AdaptuneError
-from adaptune.metrics import resampled_means
-from adaptune.model.rules import BASELINE, ROUNDING
+from adaptune.metrics import FAILURE
+from adaptune.model.rules import ROUNDING
 
 PER_BLOCK = 2.0
 """Sub-trajectories in a block: errors of neighbouring frames share most of theirs."""
 SURE = 0.95
 """Confidence, on one side, with which a set is worse than the baseline."""
-STANDARD_ERRORS = 1.0
-"""Of the logarithm of the ratio to the baseline's error, by which a set has to be better."""
-ONE_RECORDING = 2.0
-"""The same where there is one recording: it says little of others."""
+STANDARD_ERRORS = 2.0
+"""Of the logarithm of the ratio to the baseline's error, from its mean to the bound."""
+ONE_BLOCK = 0.3
+"""Standard error of that logarithm where there is one block."""
 FLOOR = 0.05
 """Share of the baseline's mean error that is added to both errors of a ratio."""
-COST_CLASS = 1.1
-"""Costs that differ by no larger factor, about, are the same: the machine's load makes as much."""
+USUAL_BUDGET = 2.0
+"""Times the baseline's cost that a set may cost where the user names no budget."""
+EDGE = 1.1
+"""A bound of the cost that no user named is soft: what exceeds it by no larger factor is within,
+because the machine's load makes as much."""
 MOST_OF_PERIOD = 0.5
 """Share of the time from scan to scan that a scan may take: some take more than the mean."""
 LEAST_COST = 1.0
 """Milliseconds of CPU time a scan; less is nothing, and mostly noise."""
-AS_GOOD = 1.03
-"""Sets whose bounds differ by no larger factor are as good as each other."""
 FINALISTS = 4
-"""Sets at no more than the baseline's cost that drive whole recordings."""
-DEARER = 2
-"""Sets at more than that, each better than all cheaper ones, that do so, too."""
+"""Sets within the budget that drive whole recordings."""
+OTHERS = 2
+"""Sets at no more than the baseline's cost, and at any, that do so, too."""
+LOST = 0.5
+"""Share of the capped error, as the mean of a block, above which track counts as lost there."""
 
 
 class NothingUsableError(AdaptuneError):
@@ -47,7 +50,7 @@ class NothingUsableError(AdaptuneError):
 class BlockErrors(NamedTuple):
     """What is known of some sets: errors in blocks, costs, and restarts by the health check."""
 
-    trials: Sequence[int]  # their numbers; the baseline is among them
+    trials: Sequence[int]  # their numbers; a baseline is among them
     # (n_blocks, n_trials): mean capped error in percent, or another objective over a recording
     errors: NDArray[np.float64]
     sequence: NDArray[np.intp]  # (n_blocks,): number of each block's recording
@@ -57,11 +60,18 @@ class BlockErrors(NamedTuple):
     # (n_blocks, n_trials): mean rotation errors, where they are known: a short sub-trajectory hides
     # a heading that drifts.
     turns: NDArray[np.float64] | None = None
+    n_baselines: int = 1  # of so many odometries; the first trials are their own parameters
 
     @property
     def baseline(self) -> int:
-        """Column of the baseline."""
-        return list(self.trials).index(BASELINE)
+        """Column of the baseline; of several odometries', that with the least error in time."""
+        own = [k for k, trial in enumerate(self.trials) if trial < self.n_baselines]
+        if len(own) < 2:
+            return own[0]
+        means, _ = mean_and_error(self.errors[:, own], self.sequence)
+        late = self.costs[own] > MOST_OF_PERIOD * self.period
+        rank = np.lexsort((means, late, ~np.isfinite(self.restarts[own])))
+        return own[int(rank[0])]
 
     def some(self, trials: Sequence[int]) -> Self:
         """The same of some trials."""
@@ -74,11 +84,12 @@ class BlockErrors(NamedTuple):
             turns=None if self.turns is None else self.turns[:, columns],
         )
 
-    def without(self, block: int) -> Self:
-        """The same without a block."""
-        kept = np.arange(len(self.errors)) != block
-        turns = None if self.turns is None else self.turns[kept]
-        return self._replace(errors=self.errors[kept], sequence=self.sequence[kept], turns=turns)
+    def logs(self) -> NDArray[np.float64]:
+        """Logarithms of the ratio to the baseline's error in blocks, of shape `errors`."""
+        base = self.errors[:, [self.baseline]]
+        floor = max(FLOOR * float(mean_and_error(base, self.sequence)[0][0]), 1e-9)
+        with np.errstate(invalid="ignore"):  # a set that failed may have an infinite objective
+            return np.asarray(np.log(self.errors + floor) - np.log(base + floor))
 
 
 def mean_and_error(
@@ -95,7 +106,7 @@ def mean_and_error(
     mean, n = weights @ values, len(values)
     if n < 2:
         return mean, np.full(values.shape[1], np.inf)
-    with np.errstate(invalid="ignore"):  # a set that failed may have an infinite objective
+    with np.errstate(invalid="ignore"):
         squares = weights[:, None] ** 2 * (values - mean) ** 2
     return mean, np.sqrt(squares.sum(axis=0) * n / (n - 1))
 
@@ -118,46 +129,53 @@ def surely_worse(blocks: BlockErrors) -> NDArray[np.bool_]:
     return worse
 
 
-def bounds(blocks: BlockErrors, sure: bool = True) -> NDArray[np.float64]:
-    """Upper bound of the error of each set in percent, of shape (n_trials,).
+def surely_restarted(blocks: BlockErrors) -> NDArray[np.bool_]:
+    """Which sets the health check surely restarts more often than the baseline; or that failed.
 
-    It is the baseline's mean error times the geometric mean of the ratios to it in blocks, and if
-    it is to be `sure`, a standard error above. It is infinite for sets that are not admissible:
-    they failed, were restarted more often than the baseline (whoever takes its parameters elsewhere
-    has no health check), or are surely worse, also in rotation.
+    Of so many restarts of both, each is either's with the same chance. Returns shape (n_trials,).
     """
-    n_errors = 0.0
-    if sure:
-        n_errors = ONE_RECORDING if len(np.unique(blocks.sequence)) == 1 else STANDARD_ERRORS
-    base = blocks.errors[:, [blocks.baseline]]
-    (mean,), _ = mean_and_error(base, blocks.sequence)
-    with np.errstate(invalid="ignore"):
-        floor = max(FLOOR * mean, 1e-9)
-        logs = np.log(blocks.errors + floor) - np.log(base + floor)
-        log, error = mean_and_error(logs, blocks.sequence)
-        bound = mean * np.exp(log + n_errors * np.where(np.isfinite(error), error, 0.0))
-    usable = np.isfinite(blocks.restarts) & np.isfinite(bound)
-    usable &= blocks.restarts <= blocks.restarts[blocks.baseline]
-    usable &= ~surely_worse(blocks)
+    from scipy import stats  # slow to import
+
+    usable = np.isfinite(blocks.restarts)
+    n, base = np.where(usable, blocks.restarts, 0.0), blocks.restarts[blocks.baseline]
+    if not np.isfinite(base):
+        return ~usable
+    chance = stats.binom.sf(np.round(n) - 1, np.round(n + base), 0.5)
+    return np.asarray(~usable | ((n > base) & (chance < 1.0 - SURE)))
+
+
+def bounds(blocks: BlockErrors) -> NDArray[np.float64]:
+    """Upper bound of the ratio of each set's error to the baseline's, of shape (n_trials,).
+
+    It is the geometric mean over blocks, and `STANDARD_ERRORS` above. Recordings count the same,
+    and may differ: of several, the standard error is theirs, unless that of blocks is larger. It is
+    infinite for sets that are not admissible: they failed, were surely restarted more often than
+    the baseline (whoever takes their parameters elsewhere has no health check), or are surely
+    worse, also in rotation.
+    """
+    mean, error = mean_and_error(logs := blocks.logs(), blocks.sequence)
+    error[~np.isfinite(error)] = ONE_BLOCK
+    numbers = np.unique(blocks.sequence)
+    if len(numbers) > 1:
+        means = np.array([logs[blocks.sequence == s].mean(axis=0) for s in numbers])
+        with np.errstate(invalid="ignore"):
+            error = np.fmax(error, means.std(axis=0, ddof=1) / np.sqrt(len(numbers)))
+    error[blocks.baseline] = 0.0
+    with np.errstate(invalid="ignore", over="ignore"):
+        bound = np.exp(mean + STANDARD_ERRORS * error)
+    usable = np.isfinite(bound) & ~surely_restarted(blocks) & ~surely_worse(blocks)
     if blocks.turns is not None:
         usable &= ~surely_worse(blocks._replace(errors=blocks.turns))
     return np.where(usable, bound, np.inf)
 
 
-def cost_classes(blocks: BlockErrors) -> NDArray[np.float64]:
-    """Classes of costs, of shape (n_trials,): 0 for the baseline's; unknown costs count so."""
-    classes = np.log(np.maximum(blocks.costs, LEAST_COST)) / np.log(COST_CLASS)
-    return np.asarray(np.nan_to_num(np.round(classes - classes[blocks.baseline]), nan=0.0))
+def choose(blocks: BlockErrors, budget: float | None = None) -> int:
+    """Trial number of the fixed set: that with the least bound within a budget, see `affordable`.
 
-
-def choose(blocks: BlockErrors, budget: float | None = None, sure: bool = True) -> int:
-    """Trial number of the fixed set.
-
-    Of the admissible sets that cost no more than the baseline, or than a `budget` in milliseconds
-    of CPU time a scan, it is the cheapest whose bound is nearly the least, see `bounds`. There is
-    an AdaptuneError if no set keeps to the budget, a NothingUsableError if none can be chosen.
+    There is an AdaptuneError if no set keeps to the budget, a NothingUsableError if none can be
+    chosen.
     """
-    bound = _within(blocks, budget, sure)
+    bound = _within(blocks, budget)
     if not np.isfinite(bound).any():
         raise NothingUsableError(
             f"odometry: none of {len(blocks.trials)} parameter sets gives poses for nearly all "
@@ -165,34 +183,40 @@ def choose(blocks: BlockErrors, budget: float | None = None, sure: bool = True) 
             f"their faults): mend the odometry, or narrow the ranges of the parameters "
             f"(odometry.parameters)"
         )
-    good, classes = np.flatnonzero(bound <= AS_GOOD * bound.min()), cost_classes(blocks)
-    return blocks.trials[int(min(good, key=lambda k: (classes[k], bound[k])))]
+    return blocks.trials[int(np.argmin(bound))]
 
 
-def _within(blocks: BlockErrors, budget: float | None, sure: bool = True) -> NDArray[np.float64]:
+def _within(blocks: BlockErrors, budget: float | None) -> NDArray[np.float64]:
     """The bounds of sets within a budget, of shape (n_trials,), infinite for others.
 
-    Where the budget allows none that is admissible, those that are usable count by their error.
+    Where it allows none that is admissible, or nothing tracks, those that are usable count by
+    their error.
     """
     few = affordable(blocks, budget)
-    bound = np.where(few, bounds(blocks, sure), np.inf)
-    if np.isfinite(bound).any():
+    bound = np.where(few, bounds(blocks), np.inf)
+    if np.isfinite(bound).any() and tracks(blocks):
         return bound
     mean, _ = mean_and_error(blocks.errors, blocks.sequence)
     return np.where(few & np.isfinite(blocks.restarts), mean, np.inf)
 
 
-def affordable(blocks: BlockErrors, budget: float | None) -> NDArray[np.bool_]:
-    """Which sets cost no more than a budget, or than the baseline, of shape (n_trials,).
+def tracks(blocks: BlockErrors) -> bool:
+    """Whether any set keeps track in at least half of the blocks."""
+    return bool(((blocks.errors >= LOST * FAILURE).mean(axis=0) <= 0.5).any())
 
-    What takes more than `MOST_OF_PERIOD`, and more than the baseline, may come too late. There is
-    an AdaptuneError if no set keeps to the budget.
+
+def affordable(blocks: BlockErrors, budget: float | None) -> NDArray[np.bool_]:
+    """Which sets cost no more than a budget in milliseconds of CPU time a scan.
+
+    Without one, `USUAL_BUDGET` times the baseline's cost. What takes more than `MOST_OF_PERIOD`,
+    and more than the baseline, may come too late. Unknown costs are within. There is an
+    AdaptuneError if no set keeps to the budget.
+
+    Returns shape (n_trials,).
     """
-    if budget is None:
-        return cost_classes(blocks) <= 0.0
-    in_time = max(MOST_OF_PERIOD * blocks.period, float(blocks.costs[blocks.baseline]))
-    budget = min(budget, in_time)
-    few = ~(blocks.costs > max(budget + ROUNDING, LEAST_COST))
+    base = max(float(blocks.costs[blocks.baseline]), LEAST_COST)
+    most = EDGE * USUAL_BUDGET * base if budget is None else max(budget, LEAST_COST)
+    few = ~(blocks.costs > min(most, max(MOST_OF_PERIOD * blocks.period, base)) + ROUNDING)
     if not few.any():
         cheapest = int(np.argmin(blocks.costs))
         raise AdaptuneError(
@@ -204,60 +228,67 @@ def affordable(blocks: BlockErrors, budget: float | None) -> NDArray[np.bool_]:
     return np.asarray(few)
 
 
-def front(blocks: BlockErrors) -> list[int]:
-    """Trials by rising cost, each with clearly less error than all that cost less."""
-    bound, classes = bounds(blocks, sure=False), cost_classes(blocks)
-    trials, least = [], np.inf
-    for k in np.lexsort((bound, classes)):
-        if np.isfinite(bound[k]) and bound[k] * AS_GOOD < least:
-            trials.append(blocks.trials[k])
-            least = bound[k]
-    return trials
+class Front(NamedTuple):
+    """What CPU time buys: trial numbers."""
+
+    own: int  # the baseline
+    equal_cost: int  # the best at no more than its cost
+    fixed: int  # the best within the budget
+    below: int  # the best where the soft edge of the budget lies as much below it
+    best: int  # the best at any cost that keeps up
+
+
+def front(blocks: BlockErrors, budget: float | None) -> Front:
+    """The sets to choose among, each with the least bound within another budget."""
+    base = float(blocks.costs[blocks.baseline])
+    fixed, best = choose(blocks, budget), choose(blocks, np.inf)
+    known = np.isfinite(base)
+    equal = choose(blocks, EDGE * base) if known else fixed
+    below = choose(blocks, USUAL_BUDGET * base / EDGE) if known and budget is None else fixed
+    return Front(blocks.trials[blocks.baseline], equal, fixed, below, best)
 
 
 def finalists(blocks: BlockErrors, budget: float | None = None) -> list[int]:
-    """Trials whose sets drive whole recordings, the baseline's and the front's among them."""
-    bound = _within(blocks, budget)
-    order = [k for k in np.argsort(bound, kind="stable") if np.isfinite(bound[k])]
-    best = [blocks.trials[k] for k in order[:FINALISTS]]
-    allowed = dict(zip(blocks.trials, affordable(blocks, budget), strict=True))
-    ranked = front(blocks)
-    cheaper = [trial for trial in ranked if allowed[trial]]
-    dearer = [trial for trial in ranked if not allowed[trial]]
-    return list(dict.fromkeys([BASELINE, *best, *cheaper[-2:], *dearer[:DEARER]]))
+    """Trials whose sets drive whole recordings, the baseline among them."""
+    base = float(blocks.costs[blocks.baseline])
+    found = [blocks.trials[blocks.baseline]]
+    for most, n in ((budget, FINALISTS), (EDGE * base, OTHERS), (np.inf, OTHERS)):
+        if np.isnan(most or 0.0):
+            continue
+        bound = _within(blocks, most)
+        order = [k for k in np.argsort(bound, kind="stable") if np.isfinite(bound[k])]
+        found += [blocks.trials[k] for k in order[:n]]
+    return list(dict.fromkeys(found))
 
 
-def ratio_to_baseline(blocks: BlockErrors, trial: int) -> tuple[float, float, float]:
-    """Ratio of a set's mean error to the baseline's, and the ends of its 95 % interval."""
+SPREAD = 0.35
+"""Standard deviation of the logarithm of a ratio from drive to drive with one robot, about."""
+KNOWN_DRIVES = 3.0
+"""Drives that this counts as where a study's own are few."""
+
+
+class Elsewhere(NamedTuple):
+    """Ratio of a set's error to the baseline's on another drive with this robot."""
+
+    ratio: float
+    low: float  # ends of the 95 % interval
+    high: float
+
+
+def elsewhere(blocks: BlockErrors, trial: int) -> Elsewhere:
+    """What to expect of a set on another drive with this robot.
+
+    How much drives differ is learned from the recordings, as far as there are several.
+    """
     from scipy import stats  # slow to import
 
-    column = list(blocks.trials).index(trial)
-    more = blocks.errors[:, [column]] - blocks.errors[:, [blocks.baseline]]
-    (mean,), (error,) = mean_and_error(more, blocks.sequence)
-    base = mean_and_error(blocks.errors, blocks.sequence)[0][blocks.baseline]
-    if len(more) < 2 or not base:
-        return float(1.0 + mean / max(base, 1e-12)), np.nan, np.nan
-    margin = float(stats.t.ppf(0.975, len(more) - 1) * error)
-    low, value, high = (1.0 + (mean + by) / base for by in (-margin, 0.0, margin))
-    return float(value), max(float(low), 0.0), float(high)
-
-
-def left_out_ratio(
-    blocks: BlockErrors, rule: Callable[[BlockErrors], int]
-) -> tuple[float, float, float] | None:
-    """Error of sets that a rule chooses without the block that they are tested on.
-
-    Returns its ratio to the baseline's, and the ends of its 95 % interval; None of few blocks.
-    """
-    n = len(blocks.errors)
-    if n < LEAST_BLOCKS:
-        return None
-    columns = [blocks.trials.index(rule(blocks.without(block))) for block in range(n)]
-    chosen, base = blocks.errors[range(n), columns], blocks.errors[:, blocks.baseline]
-    means = resampled_means(np.stack([chosen, base]), 1, np.random.default_rng(0))
-    low, high = np.percentile(means[0] / np.maximum(means[1], 1e-12), [2.5, 97.5])
-    return float(chosen.mean() / max(base.mean(), 1e-12)), float(low), float(high)
-
-
-LEAST_BLOCKS = 6
-"""With fewer, nothing is said of what is left out."""
+    logs = blocks.logs()[:, [list(blocks.trials).index(trial)]]
+    if trial == blocks.trials[blocks.baseline]:
+        return Elsewhere(1.0, 1.0, 1.0)
+    (mean,), (error,) = mean_and_error(logs, blocks.sequence)
+    error = error if np.isfinite(error) else ONE_BLOCK
+    of = np.array([logs[blocks.sequence == s].mean() for s in np.unique(blocks.sequence)])
+    freedom = KNOWN_DRIVES + len(of) - 1
+    variance = (KNOWN_DRIVES * SPREAD**2 + ((of - mean) ** 2).sum()) / freedom
+    margin = stats.t.ppf(0.975, freedom) * np.sqrt(variance + error**2)
+    return Elsewhere(*(float(np.exp(mean + by)) for by in (0.0, -margin, margin)))

@@ -11,72 +11,75 @@ import numpy as np
 from adaptune.errors import AdaptuneError
 from adaptune.machine import resident_megabytes
 from adaptune.model import ErrorModel
-from adaptune.model.rules import BASELINE
 from adaptune.odometry.tracker import Tracker
 from adaptune.progress import Progress, unseen
 from adaptune.recording.scan import Recording
 from adaptune.space import in_words
 from offline.choice import (
+    EDGE,
     MOST_OF_PERIOD,
-    choose,
-    front,
-    left_out_ratio,
+    USUAL_BUDGET,
+    Elsewhere,
+    bounds,
+    elsewhere,
     mean_and_error,
-    ratio_to_baseline,
 )
 from offline.config import OfflineStudy
 from offline.labelled import LabelledData
 
 COST = "cost [ms]"
 """Column of CPU time a scan, preparation included."""
-MOST_ROWS = 5
-"""Rows of the front, the baseline's included."""
+OWN, EQUAL, FIXED = "own parameters", "no more CPU time", "within the budget"
+"""What rows of the front are; one set may be several of them."""
+BELOW, ANY, BANK = "just below the budget", "any CPU time", "adaptive"
 
 
 def front_rows(data: LabelledData, model: ErrorModel) -> list[dict[str, Any]]:
-    """Error over cost: the fixed set, the baseline, what costs more and errs less, and the bank.
+    """Error over cost, by rising cost: the baseline, the best sets at several costs, and the bank.
 
-    Errors are those of drives of whole recordings in training, with intervals of 95 % of their
-    ratio to the baseline's.
+    Errors are those of drives of whole recordings in training. Ratios to the baseline's are those
+    to expect on another drive, with intervals of 95 %.
     """
-    blocks = data.whole_blocks(data.finalists())
-    base = float(mean_and_error(blocks.errors, blocks.sequence)[0][blocks.baseline])
-
-    def row(
-        what: str, ratio: Sequence[float], cost: float, parameters: str, trial: int | None
-    ) -> dict[str, Any]:
-        value, low, high = ratio
-        found = {"what": what, "error [%]": base * value, COST: cost, "vs baseline": value}
-        found |= {"low": low, "high": high, "recommended": trial == model.fixed}
-        return found | {"parameters": parameters, "trial": trial}
-
+    blocks, front = data.driven_blocks(), data.front()
+    means, _ = mean_and_error(blocks.errors, blocks.sequence)
+    of_bounds = dict(zip(blocks.trials, bounds(blocks).tolist(), strict=True))
+    costs = data.beside or data.costs
+    roles: dict[int, list[str]] = {}
+    for what, trial in zip((OWN, EQUAL, FIXED, BELOW, ANY), front, strict=True):
+        if what != BELOW or trial not in roles:
+            roles.setdefault(trial, []).append(what)
     rows = []
-    others = [trial for trial in front(blocks) if trial not in (model.fixed, BASELINE)]
-    for trial in list(dict.fromkeys([model.fixed, BASELINE, *others]))[: MOST_ROWS - 1]:
-        what = "baseline" if trial == BASELINE else f"trial {trial}"
-        ratio, cost = ratio_to_baseline(blocks, trial), (data.beside or data.costs).alone(trial)
-        rows.append(row(what, ratio, cost, in_words(data.sets[trial]), trial))
+    for trial, names in roles.items():
+        error, ratio = means[list(blocks.trials).index(trial)], elsewhere(blocks, trial)
+        row = _row(", ".join(names), error, costs.alone(trial), ratio) | {
+            "recommended": trial == model.fixed and model.recommended != BANK,
+            "parameters": in_words(data.sets[trial]),
+        }
+        rows.append(row | {"trial": trial, "_bound": of_bounds[trial]})
     members = [trial for trial in model.bank if trial not in model.reserve]
     if (of_bank := model.expected) and len(members) > 1:
-        by = (of_bank["geometric"], of_bank["low"], of_bank["high"])
-        ratio = np.multiply(ratio_to_baseline(blocks, model.fixed), by).tolist()
+        fixed, by = elsewhere(blocks, model.fixed), of_bank["geometric"]
+        error = by * means[list(blocks.trials).index(model.fixed)]
+        wider = np.log(np.array([of_bank["low"], of_bank["high"]]) / by)
+        ends = np.hypot(np.log(np.array(fixed[1:]) / fixed.ratio), wider) * (-1.0, 1.0)
+        ratio = Elsewhere(by * fixed.ratio, *(by * fixed.ratio * np.exp(ends)).tolist())
+        row = _row(BANK, error, costs.adaptive(members), ratio)
+        row |= {"recommended": model.recommended == BANK}
         trials = f"trials {', '.join(map(str, members))}"
-        rows.append(
-            row(f"bank of {len(members)}", ratio, data.costs.adaptive(members), trials, None)
-        )
-    return [rows[0], *sorted(rows[1:], key=lambda row: row[COST])]
+        rows.append(row | {"parameters": trials, "trial": None, "_bound": None})
+    return sorted(rows, key=lambda row: row[COST])
 
 
-def left_out_in_words(data: LabelledData) -> str:
-    """What to expect elsewhere of a set that is chosen as the fixed one is."""
-    left_out = left_out_ratio(data.blocks(), lambda blocks: choose(blocks, data.budget))
-    if left_out is None:
-        return "To tell how a chosen set does on other drives, train on longer recordings, or more."
-    ratio, low, high = left_out
-    return (
-        f"Sets chosen in the same way, without the part that they are tested on, have {ratio:.2f} "
-        f"times the baseline's error there (95 % interval {low:.2f}-{high:.2f})."
-    )
+def _row(what: str, error: float, cost: float, ratio: Elsewhere) -> dict[str, Any]:
+    row = {"what": what, "error [%]": float(error), COST: cost, "vs baseline": ratio.ratio}
+    return row | {"low": ratio.low, "high": ratio.high}
+
+
+def elsewhere_in_words(rows: Sequence[dict[str, Any]]) -> str:
+    """What to expect of the fixed set on another drive."""
+    row = next(row for row in rows if FIXED in row["what"])
+    ratio, ends = f"{row['vs baseline']:.2f} times", f"{row['low']:.2f} to {row['high']:.2f}"
+    return f"On another drive, expect {ratio} the baseline's error (95 % interval {ends})."
 
 
 SECONDS = 60.0
@@ -123,18 +126,22 @@ def measured_front(
         row[COST] = 1e3 * (prepared + used.cpu) / len(took)
         row["99 % [ms]"] = 1e3 * float(np.percentile(took, 99.0))
         row["memory [MB]"] = used.memory or resident_megabytes()
-    best = recommended(rows, study.config.online.budget, period)
+    best = recommended(rows, study.config.online.milliseconds(own_cost(rows)), period)
     return [row | {"recommended": row is best} for row in sorted(rows, key=lambda row: row[COST])]
+
+
+def own_cost(rows: Sequence[dict[str, Any]]) -> float:
+    """What the odometry's own parameters cost."""
+    return float(next(row[COST] for row in rows if OWN in row["what"]))
 
 
 def recommended(
     rows: Sequence[dict[str, Any]], budget: float | None, period: float
 ) -> dict[str, Any]:
-    """The row with the least error within a budget, or what the baseline costs, that is in time.
+    """The row with the least bound of its error within a budget that is in time.
 
     Budget and the time from scan to scan are in milliseconds. Where there is none, the cheapest.
     """
-    base = next(row[COST] for row in rows if row["trial"] == BASELINE)
-    most = base if budget is None else budget
+    most = EDGE * USUAL_BUDGET * own_cost(rows) if budget is None else budget
     few = [r for r in rows if r[COST] <= most and r["99 % [ms]"] <= MOST_OF_PERIOD * period]
-    return min(few or rows, key=lambda row: row["error [%]"] if few else row[COST])
+    return min(few or rows, key=lambda row: row["_bound"] if few else row[COST])

@@ -15,6 +15,7 @@ from adaptune.bank.members import LEVER, Agreement, share
 from adaptune.geometry import Poses, invert, mean_motion, rectify, rotation_angle, steps
 from adaptune.live.evidence import SPACING, USUAL_SHARE
 from adaptune.live.hops import HopErrors, Hops, LiveSquares, live_squares
+from adaptune.machine import shared_cores
 from adaptune.metrics import (
     cap,
     span,
@@ -28,6 +29,7 @@ from adaptune.model import ModelError, TrainingData
 from adaptune.model.descriptor import averaged
 from adaptune.model.rules import (
     BASELINE,
+    ROUNDING,
     Costs,
     SetCost,
     allowed_sets,
@@ -36,16 +38,18 @@ from adaptune.model.rules import (
 from adaptune.odometry.factory import Factory
 from adaptune.recording.scan import stretch_numbers
 from adaptune.space import ParameterSets
-from adaptune.study.config import WORTH
 from adaptune.study.driven import MIN_RECORDINGS, PER_STRETCH
 from offline.campaign import read_whole_drives
 from offline.choice import (
+    MOST_OF_PERIOD,
     PER_BLOCK,
     BlockErrors,
+    Front,
     NothingUsableError,
     affordable,
     choose,
     finalists,
+    front,
 )
 from offline.config import OfflineConfig, OfflineStudy
 from offline.objective import weighted
@@ -370,7 +374,7 @@ class LabelledData(NamedTuple):
     costs: Costs = Costs({}, np.nan)  # of the sets, as far as they are known
     # Milliseconds of CPU time a scan that may be spent, live evidence included.
     budget: float | None = None
-    worth: float = WORTH  # share of the error that a bank has to spare
+    cores: int = 1  # that a bank may use
     driven: Sequence[int] = ()  # finalists: trial numbers, the columns of drives of the whole
     beside: Costs | None = None  # as they were measured side by side in these drives
 
@@ -451,8 +455,9 @@ class LabelledData(NamedTuple):
             np.repeat(np.arange(len(errors)), [len(of) for of in errors]),
             np.array([costs.alone(trial) for trial in trials]),
             np.sum([none if s.restarts is None else s.restarts for s in sequences], axis=0),
-            min(1e-6 * float(np.median(np.diff(s.simulation.stamps))) for s in self.sequences),
+            self.period,
             np.concatenate(turns) if len(turns) == len(errors) else None,
+            len(self.sets.space.baselines),
         )
 
     def whole_blocks(self, trials: Collection[int]) -> BlockErrors:
@@ -468,21 +473,22 @@ class LabelledData(NamedTuple):
 
     def fixed(self) -> int:
         """Trial number of the fixed set within the budget, by finalists' whole drives."""
-        return self._best(self.budget)
+        return choose(self.driven_blocks(), self.budget)
 
-    def rival(self, cost: float) -> int:
-        """Trial number of the set with the least error that costs no more milliseconds a scan."""
-        return self._best(cost, sure=False)
+    def front(self) -> Front:
+        """What CPU time buys, by finalists' whole drives."""
+        return front(self.driven_blocks(), self.budget)
 
-    def _best(self, budget: float | None, sure: bool = True) -> int:
+    def driven_blocks(self) -> BlockErrors:
+        """What finalists' whole drives say, or all trials where none of them is affordable."""
         blocks = self.blocks()
-        few = finalists(blocks, budget)
-        driven, cheap = self.whole_blocks(few), affordable(blocks, budget)
-        if budget is not None and not (driven.costs <= budget).any():
+        few = finalists(blocks, self.budget)
+        driven, cheap = self.whole_blocks(few), affordable(blocks, self.budget)
+        if self.budget is not None and not (driven.costs <= self.budget).any():
             driven = self._replace(beside=None).whole_blocks(few)
         if not cheap[[blocks.trials.index(trial) for trial in driven.trials]].any():
             driven = blocks.some(few)  # with something left out, others may be finalists
-        return choose(driven, budget, sure)
+        return driven
 
     def training_data(self) -> tuple[TrainingData, "ScaledPCA"]:
         """What selection rules are fitted to, and the transformation of descriptors for them."""
@@ -508,8 +514,15 @@ class LabelledData(NamedTuple):
         return [fixed, *(trial for trial in best if trial != fixed and trial in known)]
 
     def can_pay(self, members: Iterable[int]) -> bool:
-        """Whether a bank of these trials stays within the budget, if there is one."""
-        return self.costs.allow(members, self.budget)
+        """Whether a bank of these trials stays within the budget, or without one, is in time."""
+        most = self.cores * MOST_OF_PERIOD * self.period if self.budget is None else self.budget
+        cost = self.costs.adaptive(members)
+        return cost <= most + ROUNDING or (self.budget is None and np.isnan(cost))
+
+    @property
+    def period(self) -> float:
+        """Milliseconds from scan to scan, the shortest of all recordings."""
+        return min(1e-6 * float(np.median(np.diff(s.simulation.stamps))) for s in self.sequences)
 
     def vectors(self, members: Sequence[int]) -> NDArray[np.float32]:
         """Error vectors of some sets on the frames of all sequences, of shape (n, n_members, 3)."""
@@ -572,7 +585,8 @@ def labelled_data(study: OfflineStudy, archive: Archive, sets: ParameterSets) ->
         sequences.append(_labelled(study, archive, name, sets))
     costs = measured_costs(archive, study.training, sets, study.odometry)
     online = study.config.online
-    return LabelledData(sequences, sets, costs, online.budget, online.worth)
+    budget = online.milliseconds(costs.alone(BASELINE))
+    return LabelledData(sequences, sets, costs, budget, len(shared_cores()))
 
 
 def with_whole_drives(

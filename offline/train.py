@@ -4,7 +4,6 @@ import contextlib
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,6 +15,7 @@ from adaptune.files import write_text
 from adaptune.machine import available
 from adaptune.metrics import cap, lost_in_words
 from adaptune.model import ErrorModel, ModelError
+from adaptune.model.registry import ADAPTIVE
 from adaptune.model.rules import best_sets, complementary
 from adaptune.odometry.registry import ODOMETRIES, PROGRAMS
 from adaptune.progress import Progress, unseen
@@ -23,7 +23,7 @@ from adaptune.reference.check import hard_to_track
 from adaptune.report import tables
 from adaptune.space import ParameterSet, ParameterSets, in_words
 from adaptune.study.config import SwitchingConfig
-from adaptune.study.driven import EQUAL_COST, RIVALS
+from adaptune.study.driven import EQUAL_COST
 from adaptune.study.oracle import OracleErrors, oracle_errors
 from adaptune.study.references import (
     ensure_references,
@@ -44,7 +44,7 @@ from offline.campaign import (
 from offline.choice import NothingUsableError
 from offline.config import OfflineConfig, OfflineStudy
 from offline.drive import TrialSetup
-from offline.front import COST, front_rows, left_out_in_words
+from offline.front import COST, elsewhere_in_words, front_rows
 from offline.labelled import LabelledData, labelled_data, with_vectors
 from offline.objective import (
     Verdict,
@@ -54,7 +54,7 @@ from offline.objective import (
     label,
 )
 from offline.search import BUDGETS, ELAPSED, Finished, Stopwatch
-from offline.tuning import NO_BANK, choose, driven_cost, reserve, rivals
+from offline.tuning import choose, recommends_bank, reserve
 from offline.workers import Cluster, Pool, Workers, spare_memory
 
 _log = logging.getLogger(__name__)
@@ -71,7 +71,6 @@ class Training(NamedTuple):
     failed: Sequence[str] = ()  # a sentence if some sets failed
     # What error costs, a row for each choice, that which is recommended first.
     front: Sequence[dict[str, Any]] = ()
-    elsewhere: str = ""  # what to expect of such a choice elsewhere
 
     @property
     def words(self) -> list[str]:
@@ -85,13 +84,13 @@ class Training(NamedTuple):
         own_ms, ms = (np.nan if costs is None else costs.alone(trial) for trial in (0, fixed))
         baseline = f"Parameters of the baseline: {in_words(sets.space.baseline)}"
         if fixed == 0:
-            least = f"No set that costs no more surely beat the baseline's {own:.3f} % {where}"
-            return [*said, f"{least}; the fixed set is the baseline.", baseline]
+            least = f"No set within the budget is safely better than the baseline's {own:.3f} %"
+            return [*said, f"{least} {where}; the fixed set is the baseline.", baseline]
         return [
             *said,
             f"Fixed: {of_fixed:.3f} % against the baseline's {own:.3f} % {where}, at {ms:.1f} "
             f"instead of {own_ms:.1f} ms of CPU time a scan.",
-            self.elsewhere,
+            elsewhere_in_words(self.front),
             f"Parameters of the fixed set: {in_words(sets[fixed])}",
             baseline,
         ]
@@ -134,7 +133,7 @@ def train(
     dropped = sorted({*data.usable().sets} - {*usable.sets})
     data = data._replace(costs=(usable.beside or data.costs).without(dropped))
     model = _fitted(study, data, with_vectors(usable, archive), finished, fixed)
-    write_sets(study, every_set[fixed], {n: every_set[t] for n, t in model.rivals.items()})
+    write_sets(study, every_set[fixed], every_set[usable.front().equal_cost])
     trials = _trial_rows(config, trial_rows.rows(archive, names), verdicts)
     tables.write_rows(study.folder, "trials", trials)
     estimates = estimates_of(study.sequences, names)
@@ -152,8 +151,7 @@ def train(
     said += bare_in_words(archive, whole, fixed, dropped)
     rows_of_front = front_rows(usable, model)
     tables.write_rows(study.folder, "front", rows_of_front)
-    failed, elsewhere = failed_in_words(verdicts), left_out_in_words(usable)
-    return Training(model, trials, rows, said, failed, rows_of_front, elsewhere)
+    return Training(model, trials, rows, said, failed_in_words(verdicts), rows_of_front)
 
 
 def _left_out(others: LabelledData, drives: Mapping[int, Summary]) -> float | None:
@@ -197,14 +195,12 @@ def _ready_archive(study: OfflineStudy, progress: Progress) -> Archive:
 
 
 def write_sets(
-    study: OfflineStudy,
-    fixed: ParameterSet,
-    rivals: Mapping[str, ParameterSet] = MappingProxyType({}),
+    study: OfflineStudy, fixed: ParameterSet, equal_cost: ParameterSet | None = None
 ) -> None:
     """Write the fixed set (``fixed.yaml``), and again as its odometry's own tool reads it, if any.
 
-    The latter is ``fixed_<odometry>``, with a suffix. That of another odometry is removed. Rivals
-    are written, too, as ``equal_cost.yaml``, which is left out where it is the fixed set.
+    The latter is ``fixed_<odometry>``, with a suffix. That of another odometry is removed. The best
+    set that costs no more than the baseline is ``equal_cost.yaml``, unless it is the fixed set.
     """
     own = study.own_file(fixed)
     ours = {f"fixed_{name}" for name in (*ODOMETRIES, *PROGRAMS)}
@@ -214,12 +210,11 @@ def write_sets(
     write_text(study.folder / FIXED_SET, yaml12.dump(fixed))
     if own is not None:
         write_text(own[0], own[1].text)
-    for name in RIVALS:
-        path = study.folder / f"{name}.yaml"
-        if name in rivals and (name != EQUAL_COST or rivals[name] != fixed):
-            write_text(path, yaml12.dump(rivals[name]))
-        else:
-            path.unlink(missing_ok=True)
+    path = study.folder / f"{EQUAL_COST}.yaml"
+    if equal_cost is not None and equal_cost != fixed:
+        write_text(path, yaml12.dump(equal_cost))
+    else:
+        path.unlink(missing_ok=True)
 
 
 def trial_workers(
@@ -253,7 +248,7 @@ def _fitted(
         for name, of in finished.items()
     }
     switching = config.online.switching.model_dump(mode="json", include={"size", "sets"})
-    online = (config.online.period, config.online.budget, config.online.worth, switching)
+    online = (config.online.period, config.online.budget, data.cores, switching)
     provenance["evidence"] = manifest.digest((trials, online, fixed))
     model = None
     with contextlib.suppress(ModelError):
@@ -261,7 +256,7 @@ def _fitted(
     if model is None or model.provenance != provenance:
         identity, length = study.odometry.identity, config.sub_trajectory
         model = fit(data, fixed, identity, length, study.window, provenance)
-        model = tuned(model, usable, config.online.switching)
+        model = tuned(replace(model, budget=config.online.budget), usable, config.online.switching)
         model.save(study.model_path)
     manifest.record(study.model_inputs_path, inputs)
     return model
@@ -341,15 +336,12 @@ def fit(
         elevations=[s.elevation for s in sequences],
         provenance=provenance,
         stretch=np.concatenate([s.stretch for s in sequences]),
-        bank_settings=NO_BANK,
-        budget=data.budget,
-        worth=data.worth,
         costs=data.costs,
     )
 
 
 def tuned(model: ErrorModel, usable: LabelledData, switching: SwitchingConfig) -> ErrorModel:
-    """Choose what is driven: the fixed set, or a bank, and the settings of its weights."""
+    """Choose the bank and the settings of its weights, and whether it is recommended."""
     chosen = choose(usable, switching.size)
     members = chosen.members or [model.fixed]
     besides = reserve(members, usable)
@@ -358,11 +350,12 @@ def tuned(model: ErrorModel, usable: LabelledData, switching: SwitchingConfig) -
     return replace(
         model,
         bank=members,
+        bank_size=switching.size,
         vectors=usable.vectors(members),
         bank_settings=chosen.bank.model_copy(update={"reserve": len(besides)}),
         # As they are read back, so that the same model is the same file.
         expected={key: float(x) for key, x in expected.items()},
-        rivals=rivals(usable, driven_cost(usable, chosen, model.fixed)),
+        recommended=ADAPTIVE if recommends_bank(usable, chosen, model.fixed) else "fixed",
     )
 
 

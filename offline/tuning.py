@@ -1,6 +1,6 @@
-"""Choice of what is driven: the fixed set, or a bank, and with what settings.
+"""Choice of a bank: its members, and the settings of its weights.
 
-They are compared by their expected loss on what is left out, see `expected_loss`.
+Banks are compared by their expected loss on what is left out, see `expected_loss`.
 """
 
 from collections.abc import Iterator, Sequence
@@ -13,20 +13,10 @@ from threadpoolctl import threadpool_limits
 
 from adaptune.metrics import cap, worst_tenth
 from adaptune.model import BankRule, BankSettings, TrainingData
-from adaptune.model.rules import (
-    BASELINE,
-    ERROR_FLOOR,
-    N_FRAMES,
-    SHARPNESS,
-    complementary,
-)
-from adaptune.model.weights import (
-    MEMBER_CLIP,
-    bank_weights,
-    choose_members,
-)
-from adaptune.study.driven import BEST_DEFAULT, EQUAL_COST, MIN_RECORDINGS, is_worth
-from offline.choice import choose as choose_fixed
+from adaptune.model.rules import BASELINE, ERROR_FLOOR, complementary
+from adaptune.model.weights import bank_weights, choose_members
+from adaptune.study.driven import MIN_RECORDINGS
+from offline.choice import EDGE, USUAL_BUDGET
 from offline.labelled import LabelledData, LabelledSequence, periods
 
 if TYPE_CHECKING:
@@ -55,7 +45,6 @@ class Figures(NamedTuple):
     worst: float
     n_stretches: int
     n_recordings: int
-    equal_cost: float = np.nan  # the geometric mean, to the best single set that costs no more
 
 
 def log_ratios(
@@ -145,16 +134,14 @@ MOST_FOLDS = 12
 """So many folds at most compare ways to adapt where something is left out already."""
 ROUNDING = 1e-6
 """A smaller loss, or gain, is one of rounding."""
-NO_BANK = BankSettings(adapt=False, sharpness=SHARPNESS, n_frames=N_FRAMES, clip=MEMBER_CLIP)
-"""The fixed set is driven; the weights of a bank that joins in where that may be wrong."""
 
 
 class Policy(NamedTuple):
-    """What is driven."""
+    """A bank."""
 
-    bank: BankSettings  # adapts if that has less expected loss, and is worth its cost
-    members: list[int]  # of the bank; trial numbers, the fixed set's first
-    # What is expected of a bank with the best settings; None where there is too little to compare.
+    bank: BankSettings
+    members: list[int]  # trial numbers, the fixed set's first; none where no bank is possible
+    # What is expected of it; None where there is too little to compare.
     expected: Figures | None
 
 
@@ -164,7 +151,7 @@ def choose(
     by_recording: bool | None = None,
     most: int | None = None,
 ) -> Policy:
-    """Choose what is driven, leaving one recording or stretch after the other out.
+    """Choose a bank, leaving one recording or stretch after the other out.
 
     Parameters
     ----------
@@ -178,7 +165,7 @@ def choose(
         Number of folds at most, evenly chosen.
     """
     if bank < 2:
-        return Policy(NO_BANK, [], None)
+        return Policy(BANK_SETTINGS[0], [], None)
     folds = data.folds(by_recording)
     if most is not None and len(folds) > most:
         folds = [folds[i] for i in np.linspace(0, len(folds) - 1, most).round().astype(int)]
@@ -186,7 +173,7 @@ def choose(
     made = {chooser: chooser(data, fixed, bank) for chooser in MEMBER_CHOOSERS}
     choosers = [chooser for chooser, members in made.items() if len(members) > 1]
     if not choosers:
-        return Policy(NO_BANK, [], None)
+        return Policy(BANK_SETTINGS[0], [], None)
     banks = [made[chooser] for chooser in choosers]
     recordings: list[str] = []
     logs: list[NDArray[np.float64]] = []
@@ -198,38 +185,23 @@ def choose(
             logs.append(_logs(left_out, others, banks_there))
             recordings += [left_out.recording] * len(logs[-1])
     if len(recordings) < 2:
-        # The bank rests, and joins in where it measures that the fixed set fails.
-        return Policy(NO_BANK, banks[0], None)
-    return least_loss(np.concatenate(logs), recordings, banks, data.worth)
+        return Policy(BANK_SETTINGS[0], banks[0], None)
+    return least_loss(np.concatenate(logs), recordings, banks)
 
 
 def least_loss(
-    logs: NDArray[np.float64], recordings: Sequence[str], banks: Sequence[list[int]], worth: float
+    logs: NDArray[np.float64], recordings: Sequence[str], banks: Sequence[list[int]]
 ) -> Policy:
     """The bank, and its settings, with the least loss.
 
-    `logs` is of shape (n_stretches, len(banks) * len(BANK_SETTINGS), 2): of each bank, and of the
-    best set that costs no more. `banks` has the members of each, `worth` the share of the error
-    that a bank has to spare of what such a set has.
+    `logs` is of shape (n_stretches, len(banks) * len(BANK_SETTINGS)): those of each bank.
+    `banks` has the members of each.
     """
-    logs, of_rivals = logs[..., 0], logs[..., 1]
-    # What does not beat the set that costs as much has no merit.
-    losses = np.array(
-        [
-            max(expected_loss(own, recordings), expected_loss(own - rival, recordings))
-            for own, rival in zip(logs.T, of_rivals.T, strict=True)
-        ]
-    )
+    losses = np.array([expected_loss(own, recordings) for own in logs.T])
     losses[~(np.abs(losses) > ROUNDING)] = 0.0
     best = int(np.argmin(losses))
     way, which = divmod(best, len(BANK_SETTINGS))
-    expected = figures(logs[:, best], recordings)
-    rival = figures(logs[:, best] - of_rivals[:, best], recordings)
-    adapts = losses[best] < 0.0 and all(
-        is_worth(one.geometric, one.high, worth) for one in (rival, expected)
-    )
-    expected = expected._replace(equal_cost=rival.geometric)
-    return Policy(BANK_SETTINGS[which] if adapts else NO_BANK, banks[way], expected)
+    return Policy(BANK_SETTINGS[which], banks[way], figures(logs[:, best], recordings))
 
 
 def _logs(
@@ -237,13 +209,12 @@ def _logs(
 ) -> NDArray[np.float64]:
     """Logarithms of ratios to the fixed set's error, on a fold.
 
-    Returns shape (n_stretches, n_ways, 2): those of each bank with each of `BANK_SETTINGS`, each
-    with that of the best set that costs no more.
+    Returns shape (n_stretches, n_ways): those of each bank with each of `BANK_SETTINGS`.
     """
     fitted = data, _ = others.training_data()
     capped, stretch = cap(left_out.errors), left_out.stretch
     fixed = capped[:, data.sets.column(data.fixed)]
-    pairs = []
+    errors = []
     known: dict[tuple[int, ...], list[NDArray[np.float64]]] = {}
     for bank in banks:
         # Whatever the order of the others is, they are the same bank.
@@ -252,13 +223,9 @@ def _logs(
             known[members] = [fixed] * len(BANK_SETTINGS)
         elif members not in known:
             simulated = bank_errors(left_out, others, fitted, members, BANK_SETTINGS)
-            known[members] = [errors for errors, _ in simulated]
-        cost = others.costs.adaptive(bank)
-        rival = others.rival(cost) if np.isfinite(cost) else data.fixed
-        of_rival = capped[:, data.sets.column(rival)]
-        pairs += [(errors, of_rival) for errors in known[members]]
-    logs = [[log_ratios(one, fixed, stretch) for one in pair] for pair in pairs]
-    return np.moveaxis(np.array(logs), -1, 0)
+            known[members] = [of_bank for of_bank, _ in simulated]
+        errors += known[members]
+    return np.array([log_ratios(one, fixed, stretch) for one in errors]).T
 
 
 def bank_errors(
@@ -326,23 +293,15 @@ def reserve(members: Sequence[int], data: LabelledData) -> list[int]:
     return [BASELINE] if data.can_pay([*members, BASELINE]) else []
 
 
-def driven_cost(data: LabelledData, policy: Policy, fixed: int) -> float:
-    """Milliseconds of CPU time a scan that a policy costs; NaN if it is unknown."""
-    adapts = policy.bank.adapt
-    return data.costs.adaptive(policy.members) if adapts else data.costs.alone(fixed)
+def recommends_bank(data: LabelledData, chosen: Policy, fixed: int) -> bool:
+    """Whether a bank is recommended, and not the fixed set.
 
-
-def rivals(data: LabelledData, cost: float) -> dict[str, int]:
-    """Trial numbers of the rivals that there are.
-
-    `BEST_DEFAULT` is the odometry that does best with its own parameters, where there are several;
-    `EQUAL_COST` the best of all sets that alone cost no more milliseconds of CPU time a scan than
-    the `cost` of what is driven; NaN if it is unknown.
+    It is where it has less expected loss, and is within the budget of a set; or where the fixed
+    set is restarted along its whole drives, whatever the bank costs.
     """
-    found = {}
-    if len(data.sets.space.baselines) > 1:
-        defaults = data.whole_blocks(data.sets.defaults)
-        found[BEST_DEFAULT] = choose_fixed(defaults, np.inf, sure=False)
-    if np.isfinite(cost):
-        found[EQUAL_COST] = data.rival(cost)
-    return found
+    if chosen.expected is None or len(chosen.members) < 2 or not chosen.expected.loss < 0.0:
+        return False
+    blocks = data.driven_blocks()
+    most = data.budget or USUAL_BUDGET * EDGE * float(blocks.costs[blocks.baseline])
+    restarts = blocks.restarts[list(blocks.trials).index(fixed)]
+    return data.costs.adaptive(chosen.members) <= most or bool(restarts > 0.0)

@@ -16,19 +16,12 @@ from adaptune.archive import Archive
 from adaptune.errors import AdaptuneError
 from adaptune.metrics import bootstrap, cap
 from adaptune.model import ErrorModel, ModelError
-from adaptune.model.registry import ADAPTIVE, RULES, rule_class
+from adaptune.model.registry import ADAPTIVE, RULES, STANDBY, rule_class
 from adaptune.model.rules import BASELINE, ERROR_FLOOR
 from adaptune.progress import Progress, unseen
 from adaptune.report import tables
 from adaptune.report.drawing import draw_chart
-from adaptune.study.driven import (
-    MIN_RECORDINGS,
-    PER_STRETCH,
-    RIVAL_WORDS,
-    RIVALS,
-    driven,
-    expected_in_words,
-)
+from adaptune.study.driven import MIN_RECORDINGS, PER_STRETCH, driven, expected_in_words
 from adaptune.study.references import estimates_in_words, estimates_of
 from offline.bare import in_whole_drives
 from offline.charts import stretch_chart
@@ -45,10 +38,8 @@ from offline.tuning import (
     Figures,
     bank_errors,
     choose,
-    driven_cost,
     figures,
     log_ratios,
-    rivals,
 )
 
 BANK_SIZE = 4
@@ -99,10 +90,7 @@ def joined(parts: Sequence[LeftOut]) -> LeftOut:
 
 
 def _of_all(parts: Sequence[Mapping[str, object]]) -> list[str]:
-    """The modes that are known of every part, in the order of the first.
-
-    A rival may be unknown where something is left out, if its cost was measured elsewhere only.
-    """
+    """The modes that are known of every part, in the order of the first."""
     return [mode for mode in parts[0] if all(mode in one for one in parts)]
 
 
@@ -161,24 +149,13 @@ class Validation:
         share = 100 * np.mean([left_out.adapted.get(rule, 0.0) for left_out in self.left_out])
         if not share:
             return (
-                f"`{rule}` kept the fixed set on each part that was left out, because it promised "
-                f"no gain on the others. So there is no estimate of its gain."
+                f"`{rule}` kept the fixed set on each part that was left out. So there is no "
+                f"estimate of its gain."
             )
         how = f"adapting {share:.0f} % of the time"
         if rule == ADAPTIVE:
             how = f"with {share:.0f} % of the weight on other sets than fixed"
         return f"`{rule}`: {expected}, {how}."
-
-    def against_rivals(self) -> list[str]:
-        """How `ADAPTIVE` compares with its rivals, a sentence for each."""
-        return [
-            f"Compared with {RIVAL_WORDS[rival]}, `{ADAPTIVE}` has {f.geometric:.2f} times its "
-            f"error (95 % interval {f.low:.2f}-{f.high:.2f}), at {self.cost(ADAPTIVE):.1f} ms of "
-            f"CPU time a scan against {self.cost(rival):.1f}."
-            for rival in RIVALS
-            if rival in self.logs and ADAPTIVE in self.logs
-            for f in [self.figures(ADAPTIVE, rival)]
-        ]
 
 
 def leave_one_out(
@@ -232,22 +209,19 @@ def leave_out(
     errors, adapted = {"baseline": capped[:, data.sets.column(BASELINE)], "fixed": fixed}, {}
     chosen = choose(others, bank, by_recording, MOST_FOLDS)
     alone, costs = others.costs.alone, dict[str, float]()
-    for name in (name for name in rules if name != ADAPTIVE):
+    for name in (name for name in rules if name not in (ADAPTIVE, STANDBY)):
         rule = rule_class(name).of(None).fit(data)
         trials = [rule.select(features[i]).trial for i in first]
         errors[name] = capped[frames, data.sets.columns(trials)[period]]
         adapted[name] = float(np.mean([trial != data.fixed for trial in trials]))
         costs[name] = float(np.mean([alone(trial) for trial in trials]))
+    costs |= {"baseline": alone(0), "fixed": alone(data.fixed), ADAPTIVE: alone(data.fixed)}
     errors[ADAPTIVE], adapted[ADAPTIVE] = fixed, 0.0
-    if chosen.bank.adapt:
+    if len(chosen.members) > 1:
         simulated = bank_errors(sequence, others, fitted, chosen.members, [chosen.bank])
         errors[ADAPTIVE], weights = next(simulated)
         adapted[ADAPTIVE] = float(1.0 - weights[:, 0].mean())
-    driven = driven_cost(others, chosen, data.fixed)
-    of_rivals = rivals(others, driven)
-    costs |= {"baseline": alone(0), "fixed": alone(data.fixed), ADAPTIVE: driven}
-    costs |= {name: alone(trial) for name, trial in of_rivals.items()}
-    errors |= {name: capped[:, data.sets.column(trial)] for name, trial in of_rivals.items()}
+        costs[ADAPTIVE] = others.costs.adaptive(chosen.members)
     # The best set in hindsight.
     errors["oracle, sequence"] = capped[:, int(np.argmin(capped.mean(axis=0)))]
     about = (sequence.name, sequence.recording, sequence.stretch, sequence.span)
@@ -301,9 +275,9 @@ def _verdicts(rules: Collection[str], bank: bool, validation: Validation) -> lis
     """The estimate for what `adaptune online` will drive, then for what else it drives."""
     said = []
     if bank and ADAPTIVE in rules:
-        said += [validation.verdict(ADAPTIVE), *validation.against_rivals()]
+        said.append(validation.verdict(ADAPTIVE))
     said.append(baseline_in_words(validation))
-    others = [name for name in rules if name != ADAPTIVE]
+    others = [name for name in rules if name not in (ADAPTIVE, STANDBY)]
     if bank and others:
         why = "`online` lets it choose among the bank's members, here it chooses among all sets"
         return [*said, *(f"`{name}` has no verdict: {why}." for name in others)]

@@ -1,9 +1,10 @@
 """The comparison of baseline, fixed and adaptive on the replayed sequences."""
 
-from collections.abc import Collection, Mapping, Sequence
+import json
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,13 +23,7 @@ from adaptune.model.registry import ADAPTIVE
 from adaptune.reference.check import hard_to_track
 from adaptune.report import tables as report
 from adaptune.study.config import ALSO
-from adaptune.study.driven import (
-    BEST_DEFAULT,
-    MIN_RECORDINGS,
-    PER_STRETCH,
-    RIVALS,
-    not_compared,
-)
+from adaptune.study.driven import MIN_RECORDINGS, PER_STRETCH
 from adaptune.study.oracle import oracle_errors
 from adaptune.study.references import estimates_of
 from adaptune.study.study import Study
@@ -38,7 +33,6 @@ from online.modes import (
     UNTRAINED,
     WITHOUT_MODEL,
     ReplaySetup,
-    in_order,
     replayed_modes,
     sequences_without_model,
 )
@@ -106,7 +100,7 @@ def compared_modes(study: Study) -> ComparedModes:
         ReplaySummary.read(replays / names[0] / "fixed")
     compared = tuple(mode for mode in modes if all(mode in made[n] for n in finished))
     unfinished = tuple(name for name in made if name not in finished)
-    missing = {m: [n for n in made if m not in made[n]] for m in asked if m not in RIVALS}
+    missing = {m: [n for n in made if m not in made[n]] for m in asked}
     where = ", ".join(f"`{mode}` on {' and '.join(on)}" for mode, on in missing.items() if on)
     words = (
         f"Not compared, because replays are missing: {where}; `adaptune online{option}` makes them."
@@ -391,9 +385,8 @@ def compare(study: Study) -> ComparedReplays:
         stamps = next(iter(replays.values())).trajectory.stamps
         if len(stamps) > 1 and not any(replay.summary.real_time for replay in replays.values()):
             periods[name] = 1e-6 * float(np.median(np.diff(stamps)))
-        every = _with_fixed_rivals(replays, model)
         wrong += [f"On {name}, {what}." for what in read_contradictions(folder)]
-        of_modes = compare_modes(name, every, reference)
+        of_modes = compare_modes(name, replays, reference)
         judged.append(of_modes._replace(recording=study.sequences.recorded_in(name)))
         if model is not None:
             errors = oracle_errors(study.archive("oracle"), name, model)
@@ -401,16 +394,17 @@ def compare(study: Study) -> ComparedReplays:
                 oracles.append(row)
     rows = _rows(judged, oracles)
     obstacle = ReplaySetup.of(study).obstacle(ADAPTIVE, model) if ADAPTIVE not in modes else ""
-    if ADAPTIVE in modes and model is not None:
-        obstacle = not_compared(model, study.mechanism)
-    length, worth = study.config.sub_trajectory, study.config.online.worth
-    best = decided(rows, worth)
+    length, recommended = (
+        study.config.sub_trajectory,
+        "fixed" if model is None else model.recommended,
+    )
+    best = decided(rows, recommended)
     said, advised = wrong[:1], "" if best is None else best.mode
     if not said and best is not None:
         said = _lost(study, rows, best, model)
         advised = NONE if said else advised
     if advised != NONE:
-        said += verdict(rows, length, obstacle, worth)
+        said += verdict(rows, length, recommended, _front(study, model), obstacle)
         said += late(rows, advised, periods)
         said += [] if model is None else _of_estimates(study, model)
     details = [*wrong, *remarks(rows), *compared.words]
@@ -463,6 +457,16 @@ def _of_estimates(study: Study, model: ErrorModel) -> list[str]:
     ]
 
 
+def _front(study: Study, model: ErrorModel | None) -> list[dict[str, Any]]:
+    """What CPU time buys in the training of this model; nothing where that is not known."""
+    path = study.folder / "front.json"
+    if model is None or not path.exists():
+        return []
+    rows: list[dict[str, Any]] = json.loads(path.read_text("utf-8"))
+    known = all({"what", "trial", "recommended", "low", "high"} <= row.keys() for row in rows)
+    return rows if known else []
+
+
 def _of_training(model: ErrorModel) -> list[str]:
     """The best set in training, where it keeps track there and costs more than the fixed one."""
     means = rules.mean_errors(model.errors, model.sequence)
@@ -484,21 +488,10 @@ def _rows(judged: Sequence[JudgedModes], oracles: Sequence[ComparisonRow]) -> li
         last = pooled(judged, oracles)
     else:
         last, rows = [*rows, *oracles], []
-    # What adapts is compared with controls and rivals, too, on the same frames.
-    others = [row.mode for row in last if row.mode in (BASELINE, EVEN, *RIVALS)]
+    # All are compared with the baseline, and what adapts with even weights, on the same frames.
+    modes = {row.mode for row in last}
     for row in last:
-        if adapts(row.mode):
-            against = {other: ratio_to(known, row.mode, other) for other in others}
-            row = replace(row, against=against)  # noqa: PLW2901
-        rows.append(row)
+        others = [BASELINE, *[EVEN] * adapts(row.mode)] if row.mode in judged[0].errors else []
+        of = {other: ratio_to(known, row.mode, other) for other in others if other in modes}
+        rows.append(replace(row, against=of))
     return rows
-
-
-def _with_fixed_rivals(
-    replays: Mapping[str, StoredReplay], model: ErrorModel | None
-) -> dict[str, StoredReplay]:
-    """The replays by mode; a best default that is the fixed set has its replay."""
-    every = dict(replays)
-    if model is not None and "fixed" in every and model.rivals.get(BEST_DEFAULT) == model.fixed:
-        every.setdefault(BEST_DEFAULT, every["fixed"])
-    return {mode: every[mode] for mode in in_order(every)}

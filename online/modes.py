@@ -15,7 +15,7 @@ from adaptune.errors import AdaptuneError, Finding, OdometryError
 from adaptune.machine import release_memory, shared_cores
 from adaptune.model import ErrorModel
 from adaptune.model.descriptor import DescriptorError
-from adaptune.model.registry import ADAPTIVE, ENTRY_POINTS, RULES
+from adaptune.model.registry import ADAPTIVE, ENTRY_POINTS, RULES, STANDBY
 from adaptune.model.weights import weighted_selection
 from adaptune.odometry.base import Motions, OdometryInstance
 from adaptune.odometry.content import python_content
@@ -28,7 +28,7 @@ from adaptune.reference.check import mean_difference
 from adaptune.selector import AnySelector, Selector, UntrainedSelector, untrained_sets
 from adaptune.space import ParameterSet, ParameterSets, Selection
 from adaptune.study.config import StudyConfig
-from adaptune.study.driven import RIVALS, ModeError, bank_members, cannot_adapt, mechanism_of
+from adaptune.study.driven import ModeError, bank_members, mechanism_of, no_bank
 from adaptune.study.references import contradictions_of, ensure_references
 from adaptune.study.study import Mechanism, Study
 from adaptune.trajectory import Trajectory
@@ -39,7 +39,7 @@ from online.replay import ReplayRecord, replay
 from online.selector_process import SelectorProcess
 
 BASELINE, FIXED, EVEN, UNTRAINED = "baseline", "fixed", "even", "untrained"
-MODES = tuple(dict.fromkeys((BASELINE, *RIVALS, FIXED, ADAPTIVE, UNTRAINED, EVEN, *RULES)))
+MODES = tuple(dict.fromkeys((BASELINE, FIXED, ADAPTIVE, STANDBY, UNTRAINED, EVEN, *RULES)))
 """All modes but rules of the user's, in the order of tables and of lines that lie on each other."""
 WITHOUT_MODEL: tuple[str, ...] = (BASELINE, UNTRAINED)
 """The modes that need neither trials nor a model."""
@@ -129,9 +129,8 @@ class ReplaySetup:
             untrained = partial(UntrainedSelector, sets, self.config.sub_trajectory)
             return Mode(name, members, True, untrained)
         model = needed(name, model)
-        if name in (FIXED, *RIVALS):
-            trial = model.rivals.get(name, model.fixed)
-            return Mode(name, {trial: model.sets[trial]})
+        if name == FIXED:
+            return Mode(name, {model.fixed: model.sets[model.fixed]})
         if name == EVEN:
             members = self._always(model)
             even = partial(EvenSelector, model.sets, list(members))
@@ -140,17 +139,18 @@ class ReplaySetup:
         if self._mechanism(name, model) == "live":
             fixed = {model.fixed: model.sets[model.fixed]}
             return Mode(name, fixed, False, partial(Selector, model, name, (), descriptors))
-        # The bank's reserve joins in by what is measured: only this mode has one.
-        members = self._members(model) if name == ADAPTIVE else self._always(model)
+        # The bank's reserve joins in by what is measured: only these modes have one.
+        joins = name in (ADAPTIVE, STANDBY)
+        members = self._members(model) if joins else self._always(model)
         make = partial(Selector, model, name, list(members), descriptors)
         return Mode(name, members, True, make, _cost(model, members))
 
     def obstacle(self, name: str, model: ErrorModel | None = None) -> str:
         """Why a mode is not possible; empty if it is, as far as is known without a model."""
-        if name in (BASELINE, FIXED, *RIVALS):
+        if name in (BASELINE, FIXED):
             return ""
         if self.odometry.description.whole:
-            return cannot_adapt(self.odometry, None)
+            return "a program that runs whole recordings cannot change its parameters"
         if name == UNTRAINED:
             differ = len(self._untrained_sets()) > 1
             why = "no parameters by which the members of a bank would differ (odometry.parameters)"
@@ -159,19 +159,23 @@ class ReplaySetup:
             alone = len(model.bank) < 2
             return "the model's bank has no other member than the fixed set" if alone else ""
         if model is not None and self._mechanism(name, model) is None:
-            return cannot_adapt(self.odometry, self.mechanism)
+            return no_bank(self.mechanism, self.odometry)
         return ""
 
     def modes(self, model: ErrorModel | None) -> tuple[str, ...]:
         """What is replayed with a model, in the order of `MODES`: what is possible of all modes.
 
-        A rival that is the fixed set is not replayed again. Without the model, all is possible that
-        is with any.
+        Without the model, all is possible that is with any.
         """
-        modes = {BASELINE, *RIVALS, FIXED, *self.rules, *self.also}
-        if model is not None:
-            modes -= {r for r in RIVALS if model.rivals.get(r, model.fixed) == model.fixed}
+        modes = {BASELINE, FIXED, *self.rules, *self.also}
+        modes |= set() if model is None else {model.recommended}
         return in_order(name for name in modes if not self.obstacle(name, model))
+
+    def default(self, model: ErrorModel, steered: bool = False) -> str:
+        """The mode that a robot drives: what is recommended; of a single set, with a stand-by."""
+        if model.recommended == ADAPTIVE and not steered and not self.obstacle(ADAPTIVE, model):
+            return ADAPTIVE
+        return STANDBY if steered or not self.obstacle(STANDBY, model) else FIXED
 
     def instance(self, mode: Mode, sequence: str | None = None) -> OdometryInstance:
         """Make the odometry of a mode, or the bank.
@@ -193,7 +197,7 @@ class ReplaySetup:
         """What a mode depends on, as plain data; `digest` is the model's."""
         about: dict[str, Any] = dict.fromkeys(("parameters", "model", "switching"))
         about["mode"] = name
-        if name in (BASELINE, FIXED, *RIVALS):
+        if name in (BASELINE, FIXED):
             mode = self.mode(name, model)
             return about | {"parameters": mode.sets[mode.fixed]}
         switching: dict[str, Any] = {"mechanism": "bank", "warm_up": WARM_UP}
@@ -212,13 +216,9 @@ class ReplaySetup:
         """Refuse a model for another bank, or with a descriptor of somebody else's, from `path`."""
         model.check_descriptors(self.config.descriptor, path)
         online = self.config.online
-        same = {
-            "budget": model.budget == online.budget,
-            "worth": model.worth in (None, online.worth),
-        }
-        if others := [key for key, is_same in same.items() if not is_same]:
+        if model.budget != online.budget:
             raise ModeError(
-                f"online.{others[0]}: {path} was fitted for another one; run `adaptune offline` "
+                f"online.budget: {path} was fitted for another one; run `adaptune offline` "
                 f"again, which fits it to the finished trials"
             )
         if self.mechanism == "bank" or (EVEN in self.also and not self.obstacle(EVEN, model)):

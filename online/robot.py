@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 from adaptune.errors import AdaptuneError, nearest
 from adaptune.geometry import invert
+from adaptune.model.registry import ADAPTIVE, STANDBY
 from adaptune.odometry.base import OdometryInstance
 from adaptune.odometry.tracker import RegisteredScan
 from adaptune.recording.config import ImuConfig, SequenceConfig
@@ -47,7 +48,8 @@ class RobotDrive:
     """A study's odometry, or somebody else's node, on a robot.
 
     ``drives/<time>`` in the study's folder receives each drive. The `mode` is one of
-    `ReplaySetup.modes`, or `untrained`; this one and `baseline` need no model.
+    `ReplaySetup.modes`, or `untrained`; this one and `baseline` need no model. By default it is
+    what is recommended; of a single set, `standby` where that is possible.
 
     Raises
     ------
@@ -55,7 +57,7 @@ class RobotDrive:
         If the mode, the model and the study do not go together.
     """
 
-    def __init__(self, study: Study, mode: str, model_path: Path | None):
+    def __init__(self, study: Study, mode: str | None, model_path: Path | None):
         config = study.config
         real_time = (config.online.real_time or RealTimeConfig()).model_copy(update={"rate": 1.0})
         online = config.online.model_copy(update={"real_time": real_time})
@@ -68,16 +70,21 @@ class RobotDrive:
         self._points = _named(self._ros.points or self._like.points, "online.ros.points")
         self._scans: LiveScans | None = None
         self._stopped = False
-        model = None if model_path is None else study.model(model_path)
-        modes = WITHOUT_MODEL
-        if model is not None and model_path is not None:
+        model, modes = None, WITHOUT_MODEL
+        if model_path is not None:
+            model = study.model(model_path)
             setup.check(model, model_path)
-            rules = () if self._ros.steer is None else config.online.rules
-            modes = (*dict.fromkeys((*setup.modes(model), *rules)), UNTRAINED)
-        if mode not in modes:
-            raise ModeError(f"--mode: there is no mode {mode!r}; {nearest(mode, modes)}")
+            mode = mode or setup.default(model, steered=self._ros.steer is not None)
+            modes = (*dict.fromkeys((*setup.modes(model), ADAPTIVE, STANDBY)), UNTRAINED)
+        if mode is None or mode not in modes:
+            raise ModeError(f"--mode: there is no mode {mode!r}; {nearest(str(mode), modes)}")
         if self._ros.steer is not None:
-            if mode not in config.online.rules:
+            if mode == ADAPTIVE:
+                raise ModeError(
+                    "online.ros.steer: a node drives one set at a time, and `adaptive` is a bank; "
+                    "leave out --mode, or give --mode standby"
+                )
+            if mode not in (STANDBY, *config.online.rules):
                 raise ModeError(f"online.ros.steer: in the mode {mode} nothing is selected")
             model = needed(mode, model)
             fixed = {model.fixed: model.sets[model.fixed]}
@@ -91,6 +98,11 @@ class RobotDrive:
             )
         else:
             self._mode = setup.mode(mode, model)
+
+    @property
+    def mode(self) -> str:
+        """What it drives."""
+        return self._mode.name
 
     def run(self, link: RosLink, watch: Watch = lambda _: None) -> DriveRecord:
         """Drive until Ctrl-C or `stop`; where the clock goes back, all begins anew."""

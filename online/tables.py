@@ -32,9 +32,7 @@ def decision_table(rows: Sequence[ComparisonRow], length: float) -> Listing:
 
 _DRIVEN = {
     "baseline": "the odometry with its own parameters",
-    "best_default": "of several odometries, the one that does best with its own parameters",
-    "equal_cost": "the best set in training that costs no more than what is driven",
-    "fixed": "the one set that is best in training",
+    "fixed": "the one set that is best in training within the budget",
     "untrained": "a bank without a model: sets around the baseline, weighed while driving",
     "even": "the bank with even weights: a control, which chooses nothing",
     ORACLE: "the best set of each sequence, known in hindsight only",

@@ -2,27 +2,18 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any
 
-from adaptune.study.config import WORTH
-from adaptune.study.driven import EQUAL_COST, RIVAL_WORDS, RIVALS, is_worth
-from online.modes import EVEN, MODES
+from online.modes import BASELINE, EVEN, FIXED, MODES, UNTRAINED
 from online.statistics import ALL, ORACLE, ComparisonRow, Ratio
 from online.tables import YARDSTICKS, last_rows
 
-ROUNDING = 1e-6
-"""A ratio that differs less from 1 is 1."""
-CLEARLY = 0.8
-"""Ratio to the error of what training chose, below which another set does better on a test that is
-too short for an interval."""
 CALLED = {
     "baseline": "the odometry's own parameters",
     "fixed": "the fixed set",
     "adaptive": "adaptive",
     "untrained": "the untrained bank",
-    **RIVAL_WORDS,
 }
-_ONE_SET = ("baseline", "fixed", "best_default")
-"""Modes that drive one set; those that cost less first."""
 
 
 def _judged(rows: Sequence[ComparisonRow]) -> dict[str, ComparisonRow]:
@@ -30,41 +21,28 @@ def _judged(rows: Sequence[ComparisonRow]) -> dict[str, ComparisonRow]:
     return {row.mode: row for row in last_rows(rows) if row.ratio is not None}
 
 
-def decided(rows: Sequence[ComparisonRow], worth: float = WORTH) -> ComparisonRow | None:
-    """What to drive: the fixed set, unless another one is surely better, or what is worth its cost.
+def decided(rows: Sequence[ComparisonRow], recommended: str = FIXED) -> ComparisonRow | None:
+    """What to drive: what training recommends, unless it is surely worse than the baseline here.
 
-    Adapting has to spare the share `worth` of the error, and to beat the best set that costs as
-    much. The rows over all sequences come last. None if no test sequence has a reference.
+    Without training, the untrained bank where it is surely better. The rows over all sequences come
+    last. None if no test sequence has a reference.
     """
     last = _judged(rows)
     if not last:
         return None
-    one = next(last[mode] for mode in _ONE_SET if mode in last)
-    if "fixed" in last:
-        same = "baseline" in last and abs(_ratio(last["baseline"]).value - 1.0) < ROUNDING
-        one = last["baseline" if same else "fixed"]
-    for mode in _ONE_SET:
-        if mode in last and _surely_better(last[mode], one):
-            one = last[mode]
-    candidates = [one]
-    for row in _adapting(last):
-        ratio, rival = _to(row, one), last.get(EQUAL_COST)
-        beats = rival is None or _surely_better(row, rival)
-        spares = ratio.interval is not None and is_worth(ratio.value, ratio.interval[1], worth)
-        candidates += [row] if spares and beats else []
-    return min(candidates, key=lambda row: _ratio(row).value)
+    base = last.get(BASELINE)
+    one = next((last[mode] for mode in (recommended, FIXED) if mode in last), base)
+    if one is None or base is None or one is base:
+        bank = last.get(UNTRAINED)
+        better = bank is not None and FIXED not in last and _to_baseline(bank).interval
+        return bank if better and better[1] < 1.0 else one or base
+    ends = _to_baseline(one).interval
+    return base if ends is not None and ends[0] > 1.0 else one
 
 
-def _surely_better(row: ComparisonRow, other: ComparisonRow) -> bool:
-    ratio = _to(row, other)
-    return ratio.value < CLEARLY if ratio.interval is None else ratio.interval[1] < 1.0
-
-
-def _to(row: ComparisonRow, one: ComparisonRow) -> Ratio:
-    """Ratio of two modes' errors, with its interval where that is known."""
-    if one.mode == row.yardstick:
-        return _ratio(row)
-    return row.against.get(one.mode, Ratio(_ratio(row).value / max(_ratio(one).value, 1e-12)))
+def _to_baseline(row: ComparisonRow) -> Ratio:
+    """Ratio of a mode's error to the baseline's."""
+    return row.against.get(BASELINE, _ratio(row) if row.yardstick == BASELINE else Ratio(math.nan))
 
 
 def adapts(mode: str) -> bool:
@@ -89,16 +67,20 @@ def called(mode: str) -> str:
 
 
 def verdict(
-    rows: Sequence[ComparisonRow], length: float, obstacle: str = "", worth: float = WORTH
+    rows: Sequence[ComparisonRow],
+    length: float,
+    recommended: str = FIXED,
+    front: Sequence[Mapping[str, Any]] = (),
+    obstacle: str = "",
 ) -> list[str]:
-    """What to do, and why, in at most three sentences.
+    """What to do, and why, in at most five sentences.
 
-    Of the `rows`, those over all sequences come last. `length` is a sub-trajectory's, in metres;
-    `obstacle` says why nothing adapts, or was compared with the fixed set in training; for `worth`
-    see `decided`.
+    Of the `rows`, those over all sequences come last. `length` is a sub-trajectory's, in metres.
+    Training recommends a mode, and knows the `front`, see `offline.front.front_rows`; `obstacle`
+    says why nothing adapts.
     """
-    last = {row.mode: row for row in last_rows(rows)}
-    if (best := decided(rows, worth)) is None:
+    last = _judged(rows)
+    if (best := decided(rows, recommended)) is None:
         nobody = "No test sequence has a reference"
         known = [row for row in rows if row.reference != "none" and row.sequence != ALL]
         if judged := dict.fromkeys(row.sequence for row in known):
@@ -107,27 +89,98 @@ def verdict(
                 f"{' and '.join(judged)} (test a longer part, or lower sub_trajectory)"
             )
         return [f"{nobody}: nobody can say what was gained.", *_estimates(rows)[:2]]
-    main = adapting(rows)
-    others = [m for m in ("fixed", "baseline") if m in last and m != best.mode]
-    instead = " and ".join(
-        f"{error_and_cost(last[m])} with {called(m)}" for m in others if last[m].rte
-    )
     judge = " by an estimated reference" * any(row.reference == "estimated" for row in rows)
     where = f"RTE over {length:g} m, {_where(rows)}{judge}"
-    said = "Keep " if best.mode == "baseline" else "Drive "
-    said += f"{called(best.mode)}: {error_and_cost(best)}"
-    if best.mode == "baseline" and "fixed" in last and _is_yardstick(best):
-        said += f", {where}. No set that was tried did surely better in training"
-    else:
-        said += f"{f' instead of {instead}' * bool(instead)}, {where}"
-    if best.mode not in _ONE_SET:
-        has = f"It has {best.ratio:.2f} times the {YARDSTICKS[best.yardstick]}'s error"
-        cost = _for_cost(best, last[best.yardstick])
-        has = f"{has} ({_interval(_ratio(best))}){cost}{_beside(best, last)}."
-        return [f"{said}.", has, *_other_rules(best, main, last)]
-    said = f"{said}{_doubt(best, last)}."
-    why = _other_set(best, last, worth) + _why_not(main, best, rows, obstacle, worth)
-    return [said, *why, *_other_rules(best, main, last)]
+    own = next((row for row in front if row["trial"] is not None and row["recommended"]), None)
+    base = last.get(BASELINE)
+    said = [f"{_drive(best, base, own)}, {where}{_sure(best, base, front)}."]
+    said += _instead(best, last, recommended, own)
+    said += _bought(best, front)
+    main = last.get("adaptive")
+    if main is not None and main is not best:
+        against = f": {_ratio(main).value:.2f} times the {YARDSTICKS[main.yardstick]}'s error"
+        interval = f" ({_interval(_ratio(main))})"
+        said.append(f"With cores to spare: adaptive, {error_and_cost(main)}{against}{interval}.")
+    elif main is None and obstacle:
+        said.append(f"Nothing adapts: {obstacle}.")
+    return [*said, *_other_rules(best, last)]
+
+
+def _drive(best: ComparisonRow, base: ComparisonRow | None, own: Mapping[str, Any] | None) -> str:
+    """What to drive, and its error and cost beside the baseline's."""
+    what = called(best.mode)
+    if best.mode == FIXED and own is not None:
+        what += f" (trial {own['trial']})" if own["trial"] else ", which is the odometry's own"
+    said = f"Drive {what}: " if best is not base and not _is(own, 0, best) else ""
+    said = said or f"Keep {CALLED[BASELINE]}: "
+    said += error_and_cost(best)
+    if base is None or best is base or _is(own, 0, best):
+        return said
+    return f"{said} instead of {error_and_cost(base)} with {CALLED[BASELINE]}"
+
+
+def _is(own: Mapping[str, Any] | None, trial: int, best: ComparisonRow) -> bool:
+    return best.mode == FIXED and own is not None and own["trial"] == trial
+
+
+def _sure(
+    best: ComparisonRow, base: ComparisonRow | None, front: Sequence[Mapping[str, Any]]
+) -> str:
+    """How sure the ratio to the baseline is, and what to expect on another drive."""
+    if base is None or best is base or abs(_to_baseline(best).value - 1.0) < ROUNDING:
+        return ""
+    ratio = _to_baseline(best)
+    said = f": {ratio.value:.2f} times its error ({_interval(ratio)})"
+    for row in front:
+        if row["recommended"]:
+            said += f"; on another drive, {_end(row['low'])} to {_end(row['high'])} times"
+    return said
+
+
+def _instead(
+    best: ComparisonRow,
+    last: Mapping[str, ComparisonRow],
+    recommended: str,
+    own: Mapping[str, Any] | None,
+) -> list[str]:
+    """Why the odometry's own parameters are kept."""
+    if best.mode not in (BASELINE, FIXED) or not (best.mode == BASELINE or _is(own, 0, best)):
+        return []
+    other = last.get(recommended)
+    if other is None or _is(own, 0, other):
+        return ["In training, no set within the budget was safely better."] * (FIXED in last)
+    ratio = _to_baseline(other)
+    if abs(ratio.value - 1.0) < ROUNDING:
+        return ["In training, no set within the budget was safely better."]
+    return [
+        f"{called(recommended).capitalize()}, which training recommends, is surely worse here: "
+        f"{ratio.value:.2f} times its error ({_interval(ratio)})."
+    ]
+
+
+def _bought(best: ComparisonRow, front: Sequence[Mapping[str, Any]]) -> list[str]:
+    """What less and more CPU time than that of what is advised buys, by training."""
+    said = []
+    for what, words in _BUDGETS.items():
+        row = next((row for row in front if what in row["what"]), None)
+        if row is None or row["trial"] is None or row["recommended"] or not row["trial"]:
+            continue
+        ends = f"{_end(row['low'])} to {_end(row['high'])}"
+        said.append(
+            f"{words}: trial {row['trial']}, {row['error [%]']:.3f} % at {row['cost [ms]']:.1f} ms "
+            f"in training, on another drive {ends} times the error of {CALLED[BASELINE]}."
+        )
+    return said[: 2 if best.mode != "adaptive" else 1]
+
+
+_BUDGETS = {
+    "no more CPU time": "At no more CPU time",
+    "within the budget": "Of single sets",
+    "any CPU time": "At any CPU time",
+}
+"""What rows of the front are, and how a sentence on them begins."""
+ROUNDING = 1e-6
+"""A ratio that differs less from 1 is 1."""
 
 
 def late(rows: Sequence[ComparisonRow], mode: str, periods: Mapping[str, float]) -> list[str]:
@@ -145,102 +198,21 @@ def error_and_cost(row: ComparisonRow) -> str:
     return f"{row.rte:.3f} %" + (f" at {row.cpu_ms:.1f} ms a scan" if row.cpu_ms else "")
 
 
-def _beside(best: ComparisonRow, last: Mapping[str, ComparisonRow]) -> str:
-    """How what adapts compares with the best single set that costs no more."""
-    rival = last.get(EQUAL_COST)
-    if rival is None or rival.ratio is None or rival.cpu_ms is None:
-        return ""
-    ratio, ms = _to(best, rival).value, rival.cpu_ms
-    return f", and {ratio:.2f} times that of the best single set that costs no more ({ms:.1f} ms)"
-
-
-def _other_set(best: ComparisonRow, last: Mapping[str, ComparisonRow], worth: float) -> list[str]:
-    """That another single set does better here: surely, where it costs more."""
-    row = last.get(EQUAL_COST)
-    if row is None or row.ratio is None or not row.cpu_ms or not best.cpu_ms:
-        return []
-    ratio, costs = _to(row, best), row.cpu_ms
-    sure = "" if ratio.interval is None else f" ({_interval(ratio)})"
-    has = f"{ratio.value:.2f} times its error{sure}{_for_cost(row, best)}"
-    if costs > best.cpu_ms and ratio.interval and _surely_better(row, best):
-        budget = f"`online.budget: {math.ceil(costs)}`"
-        return [f"A single set that costs more has {has}: {budget} allows it."]
-    if costs <= best.cpu_ms and ratio.value <= 1.0 - worth:
-        sure = "that was not surely better in training " * (best.mode == "baseline")
-        more = "drive both on another recording, to know"
-        return [f"A set {sure}(`{EQUAL_COST}.yaml`) has {has}: {more}."]
-    return []
-
-
-def _other_rules(
-    best: ComparisonRow, main: ComparisonRow | None, last: Mapping[str, ComparisonRow]
-) -> list[str]:
-    """How those rules did of which nothing else is said, as the user's."""
+def _other_rules(best: ComparisonRow, last: Mapping[str, ComparisonRow]) -> list[str]:
+    """How rules of the user's did."""
     return [
         f"`{row.mode}` had {_ratio(row).value:.2f} times the "
         f"{YARDSTICKS[row.yardstick]}'s error ({_interval(_ratio(row))})"
         f"{_for_cost(row, last[row.yardstick])}."
         for row in _adapting(last)
-        if row is not best and (row is not main or best.mode not in _ONE_SET) and row.ratio
+        if row is not best and row.mode != "adaptive"
     ]
-
-
-def _doubt(best: ComparisonRow, last: Mapping[str, ComparisonRow]) -> str:
-    """How sure it is that the fixed set and the baseline differ."""
-    row = last.get("baseline")
-    if best.mode == "best_default" or row is None or "fixed" not in last or _is_yardstick(row):
-        return ""
-    if (ends := row.ratio_interval) is None:
-        return "; the test is too short to tell whether the two differ by chance"
-    chance = "the two may differ by chance: " * (ends[0] <= 1.0 <= ends[1])
-    ratio = f"{row.ratio:.2f} times the fixed set's error ({_interval(_ratio(row))})"
-    return f"; {chance}{CALLED['baseline']} have {ratio}"
 
 
 def _for_cost(main: ComparisonRow, one: ComparisonRow) -> str:
     if main.cpu_ms is None or not one.cpu_ms:
         return ""
     return f", for {main.cpu_ms / one.cpu_ms:.1f} times its CPU time ({main.cpu_ms:.1f} ms a scan)"
-
-
-def _why_not(
-    main: ComparisonRow | None,
-    best: ComparisonRow,
-    rows: Sequence[ComparisonRow],
-    obstacle: str,
-    worth: float,
-) -> list[str]:
-    if main is None:
-        return [f"Adapting was not tried: {obstacle}."] if obstacle else []
-    if _is_yardstick(main) and obstacle:
-        return [f"`adaptive` drove the same set: {obstacle}."]
-    if _is_yardstick(main):
-        return ["Training showed no gain from adapting: `adaptive` drove the same set."]
-    ratio = _to(main, best)
-    sure = "" if ratio.interval is None else f" ({_interval(ratio)})"
-    has = f"{ratio.value:.2f} times its error{sure}{_for_cost(main, best)}"
-    if ratio.value <= 1.0 - worth:
-        doubt, more = "that may be chance", ": drive more test recordings, or longer ones, to know"
-        row = _judged(rows).get(EQUAL_COST)
-        if row is not None and ratio.interval is not None and ratio.interval[1] < 1.0:
-            rival = _to(main, row)
-            doubt = (
-                f"that is {rival.value:.2f} times the error of the best single set that costs no "
-                f"more than adapting ({_interval(rival)})"
-            )
-            more *= rival.interval is None or rival.interval[0] < 1.0
-        return [f"Adapting had {has}; {doubt}{more}."]
-    if ratio.value <= 1.0:
-        what = "is not worth its cost"
-    else:
-        surely = ratio.interval is not None and ratio.interval[0] > 1.0
-        what = "did worse" if surely else "did no better"
-    return [f"Adapting {what} {_where(rows)}: {has}."]
-
-
-def _is_yardstick(row: ComparisonRow) -> bool:
-    # A bank whose other members rest moves as the fixed set does, but for rounding.
-    return row.ratio is not None and abs(row.ratio - 1.0) < ROUNDING and not row.switches
 
 
 def _where(rows: Sequence[ComparisonRow]) -> str:
@@ -267,23 +239,22 @@ def _ratio(row: ComparisonRow) -> Ratio:
 
 
 def remarks(rows: Sequence[ComparisonRow]) -> list[str]:
-    """How what adapts compares with rivals and controls, and what must be known to trust it."""
+    """How what adapts compares with controls, and what must be known to trust it."""
     of_drives = _kept_up(rows) + _late(rows) + _restarts(rows)
-    return _rivals(rows) + _judges(rows) + _estimates(rows) + of_drives
+    return _controls(rows) + _judges(rows) + _estimates(rows) + of_drives
 
 
-def _rivals(rows: Sequence[ComparisonRow]) -> list[str]:
-    """How what adapts compares on the same frames with what costs as much, or chooses nothing."""
-    if (main := adapting(rows)) is None:
+def _controls(rows: Sequence[ComparisonRow]) -> list[str]:
+    """How what adapts compares on the same frames with what chooses nothing."""
+    main = adapting(rows)
+    if main is None or EVEN not in main.against:
         return []
-    costs, said = {row.mode: row.cpu_ms for row in last_rows(rows)}, []
-    for mode in (mode for mode in main.against if mode in (*RIVALS, EVEN)):
-        what, ratio = RIVAL_WORDS.get(mode, "the same bank with even weights"), main.against[mode]
-        has = f"`{main.mode}` has {ratio.value:.2f} times the error of {what} ({_interval(ratio)})"
-        if main.cpu_ms is not None and (cost := costs.get(mode)) is not None:
-            has += f", at {main.cpu_ms:.1f} ms of CPU time a scan against {cost:.1f}"
-        said.append(f"{has}.")
-    return said
+    ratio, cost = main.against[EVEN], {row.mode: row.cpu_ms for row in last_rows(rows)}[EVEN]
+    has = f"`{main.mode}` has {ratio.value:.2f} times the error of the same bank with even weights"
+    has += f" ({_interval(ratio)})"
+    if main.cpu_ms is not None and cost is not None:
+        has += f", at {main.cpu_ms:.1f} ms of CPU time a scan against {cost:.1f}"
+    return [f"{has}."]
 
 
 def _judges(rows: Sequence[ComparisonRow]) -> list[str]:

@@ -43,8 +43,8 @@ ORACLE_SETS = 16
 Mode = Annotated[
     str | None,
     typer.Option(
-        help="On a robot, what to drive: baseline, fixed, adaptive or paper.",
-        show_default="adaptive, or the first of online.modes",
+        help="On a robot, what to drive: baseline, fixed, standby, adaptive or paper.",
+        show_default="what is recommended",
     ),
 ]
 Model = Annotated[
@@ -145,12 +145,12 @@ def _drive(
     from online.modes import UNTRAINED, WITHOUT_MODEL
     from online.robot import RobotDrive
 
-    mode = UNTRAINED if untrained else mode or next(iter(loaded.config.online.rules), "adaptive")
+    mode = UNTRAINED if untrained else mode
     path = None if mode in WITHOUT_MODEL else model or loaded.model_path
     drive = RobotDrive(loaded, mode, path)
     link = local_ros2() if ros2 else local_ros1()
     with closing(link), alone(loaded), progress() as show:
-        log.info("drive, %s: Ctrl-C ends it", mode)
+        log.info("drive, %s: Ctrl-C ends it", drive.mode)
         driven = drive.run(link, lambda of: show("drive", of.done, of.done, now(of)))
     dropped = f", {driven.record.dropped} of them dropped" if driven.record.dropped else ""
     say(f"{driven.scans} scans{dropped}: {driven.folder}/")

@@ -66,7 +66,7 @@ def show_front(rows: Sequence[Mapping[str, Any]], title: str, caption: str) -> N
             "": ("-> " if row["recommended"] else "") + row["what"],
             **{key: row[key] for key in ("cost [ms]", "99 % [ms]", "memory [MB]") if key in row},
             "RTE [%]": row["error [%]"],
-            "vs baseline": row["vs baseline"],
+            "on another drive": row["vs baseline"],
             "95 %": None
             if row["low"] is None or row["low"] != row["low"]
             else f"{row['low']:.2f}-{row['high']:.2f}",
@@ -79,9 +79,10 @@ def show_front(rows: Sequence[Mapping[str, Any]], title: str, caption: str) -> N
 
 BUYS = (
     "What CPU time buys, in training",
-    "The arrow marks the fixed set: of those that cost no more than the baseline, or the budget, "
-    "the best beyond chance, and of equally good ones the cheapest. RTE is that of whole drives, "
-    "capped where track is lost; a bank's is of parts left out of training.",
+    "The arrow marks what is recommended: the least bound of the error within the budget (twice "
+    "what the odometry's own parameters take, unless --budget says otherwise). RTE is of whole "
+    "drives, capped where track is lost; a bank's is of parts left out of training. On another "
+    "drive: the ratio to expect there, and its 95 % interval.",
 )
 
 

@@ -193,11 +193,12 @@ Minutes = Annotated[
     float | None, typer.Option(help="Time for all of it; without, all sets are tried.", min=0.01)
 ]
 Budget = Annotated[
-    float | None,
+    str | None,
     typer.Option(
-        help="Milliseconds of CPU time a scan that may be spent.",
-        min=1e-3,
-        show_default="what the odometry's own parameters take",
+        metavar="MS|TIMES",
+        help="CPU time a scan that may be spent: milliseconds, or times what the odometry's own "
+        "parameters take, as in 3x.",
+        show_default="2x for one set, more for a bank",
     ),
 ]
 
@@ -277,7 +278,7 @@ def tune(
         return
     _say_untuned(tuned.study)
     say_compared(tuned.study, tuned.comparison, tuned.page, details=details)
-    for sentence in (tuned.training.elsewhere, *tuned.training.failed):
+    for sentence in tuned.training.failed:
         say(sentence)
     show_front(tuned.training.front, *BUYS)
     if tuned.more:

@@ -21,7 +21,7 @@ from adaptune.archive import compact
 from adaptune.errors import AdaptuneError
 from adaptune.files import replacing
 from adaptune.model.descriptor import DESCRIPTORS
-from adaptune.model.rules import Costs, TrainingData, allowed_sets, mean_errors
+from adaptune.model.rules import BASELINE, Costs, TrainingData, allowed_sets, mean_errors
 from adaptune.model.weights import BankSettings
 from adaptune.recording.scan import stretch_numbers
 from adaptune.report import tables
@@ -31,7 +31,7 @@ from adaptune.strict import in_one_line
 if TYPE_CHECKING:
     from adaptune.model.knn import ScaledPCA
 
-FORMAT = 8
+FORMAT = 9
 """Raised whenever an older adaptune could not read the file, or would read it wrongly."""
 
 
@@ -106,6 +106,7 @@ class ErrorModel:
     # default each recording is one stretch.
     stretch: NDArray[np.intp] = field(default_factory=lambda: np.empty(0, np.intp))
     bank: list[int] = field(default_factory=list)  # its members' trials, the fixed set's first
+    bank_size: int = 0  # members that were asked for; costs may allow fewer
     # (n_frames, len(bank), 3): their errors as vectors, see `TrainingData`.
     vectors: NDArray[np.float32] = field(default_factory=lambda: np.empty((0, 0, 3), np.float32))
     # For each training sequence, degrees at which its scans' lowest points lie, see
@@ -116,11 +117,8 @@ class ErrorModel:
     # What was expected of a bank with these settings, see `offline.tuning.Figures`; empty where too
     # little is known to compare.
     expected: dict[str, float] = field(default_factory=dict)
-    budget: float | None = None  # milliseconds of CPU time a scan, live evidence included
-    # Share of the error that a bank had to spare to be driven; None if nobody asked.
-    worth: float | None = None
-    # By name, trial numbers of what could be driven instead, see `offline.tuning.rivals`.
-    rivals: dict[str, int] = field(default_factory=dict)
+    recommended: str = "fixed"  # the mode to drive
+    budget: float | str | None = None  # the study's, see `OnlineConfig`
     costs: Costs | None = None  # what the sets cost; None if it was not measured
 
     def __post_init__(self) -> None:
@@ -132,20 +130,9 @@ class ErrorModel:
         return f"<ErrorModel of {self.odometry['name']}: {what}; fixed: {self.fixed}>"
 
     @property
-    def bank_adapts(self) -> bool:
-        """Whether there is a bank, and it is what is driven."""
-        return bool(self.bank) and self.bank_settings.adapt
-
-    @property
     def reserve(self) -> list[int]:
         """The members of the bank that rest where the training knows the place."""
-        n = len(self.bank) - self.bank_settings.reserve
-        return self.bank[n if self.bank_settings.adapt else 1 :]
-
-    @property
-    def bank_rests(self) -> bool:
-        """Whether the fixed set is driven, and the bank only where that may be wrong."""
-        return len(self.bank) > 1 and not self.bank_adapts
+        return self.bank[len(self.bank) - self.bank_settings.reserve :]
 
     def pca(self) -> "ScaledPCA":
         """Principal components of the training frames' descriptors."""
@@ -184,7 +171,15 @@ class ErrorModel:
 
     def allowed(self) -> tuple[int, ...] | None:
         """See `allowed_sets`."""
-        return allowed_sets(self.costs, self.budget, self.sets, self.fixed)
+        return allowed_sets(self.costs, self.milliseconds, self.sets, self.fixed)
+
+    @property
+    def milliseconds(self) -> float | None:
+        """The budget of a scan."""
+        if isinstance(self.budget, str):
+            own = np.nan if self.costs is None else self.costs.alone(BASELINE)
+            return float(self.budget[:-1]) * own
+        return self.budget
 
     def check_descriptors(
         self, descriptors: Collection[str], where: Path | str = "the model"
@@ -220,13 +215,16 @@ class ErrorModel:
 
     def _header(self) -> dict[str, Any]:
         """All that selections depend on, besides the arrays."""
-        plain = ("odometry", "fixed", "length", "sequences", "blocks", "window", "elevations")
+        plain = (
+            *("odometry", "fixed", "length", "sequences", "blocks", "window", "elevations"),
+            *("bank", "bank_size", "budget", "recommended"),
+        )
         return {
             "space": self.sets.space.definition(),
             "trials": self.sets.trials,
             "sets": self.sets.parameters,
             "bank_settings": self.bank_settings.model_dump(),
-        } | {name: getattr(self, name) for name in (*plain, "bank", "budget", "worth")}
+        } | {name: getattr(self, name) for name in plain}
 
     @property
     def digest(self) -> str:
@@ -236,9 +234,7 @@ class ErrorModel:
     def save(self, path: Path | str) -> None:
         """Write the model to one file, in the safetensors format. Numbers keep all their bits."""
         header, arrays = self._header(), self._arrays()
-        header |= {
-            name: getattr(self, name) for name in ("provenance", "expected", "rivals", "costs")
-        }
+        header |= {"provenance": self.provenance, "expected": self.expected}
         header["costs"] = None if self.costs is None else asdict(self.costs)
         # Through JSON, so that the digest is of what is read.
         header = json.loads(json.dumps(header))
@@ -296,13 +292,11 @@ class ErrorModel:
             raise ValueError("a frame has no error at all")
 
     def _check_sets(self) -> None:
-        """Refuse a bank or rivals that are no sets of the model, or sets of another space."""
+        """Refuse a bank that is of no sets of the model, or sets of another space."""
         if self.bank and self.bank_settings.reserve >= len(self.bank):
             raise ValueError("all members of the bank rest")
         if set(self.bank) - set(self.sets) or len(set(self.bank)) != len(self.bank):
             raise ValueError("the bank holds unknown sets, or one twice")
-        if set(self.rivals.values()) - set(self.sets):
-            raise ValueError("a rival is no set of the model")
         for parameters in self.sets.parameters:
             self.sets.space.check(parameters)
 
@@ -322,7 +316,7 @@ def _header_model() -> type[BaseModel]:
 
 
 N_BEST = 5
-"""Sets to show, besides the fixed one, the bank's and the rivals."""
+"""Sets to show, besides the fixed one and the bank's."""
 
 
 def render(model: ErrorModel, path: Path) -> RenderableType:
@@ -345,23 +339,21 @@ def render(model: ErrorModel, path: Path) -> RenderableType:
 
 def _driven(model: ErrorModel) -> Iterator[str]:
     """What is selected along the way."""
-    if model.bank_adapts:
-        yield f"Driven: the bank of trials {', '.join(map(str, model.bank))}."
-    else:
-        yield "Driven: the fixed set."
-    if (model.bank_adapts or model.bank_rests) and model.reserve:
+    yield f"Recommended: {model.recommended}."
+    if len(model.bank) > 1:
+        yield f"The bank of `adaptive`: trials {', '.join(map(str, model.bank))}."
+    if model.reserve:
         reserve = ", ".join(map(str, model.reserve))
         yield f"Members that work only in new places and after failures: {reserve}."
 
 
 def _sets(model: ErrorModel) -> list[dict[str, Any]]:
-    """The fixed set, the bank's, the rivals, and the best."""
+    """The fixed set, the bank's, and the best."""
     means = mean_errors(model.errors, model.sequence)
     best = [model.sets.trials[c] for c in np.argsort(means, kind="stable")[:N_BEST]]
     roles = {model.fixed: ["fixed"]}
-    for name, trials in (("bank", model.bank), *((k, [n]) for k, n in model.rivals.items())):
-        for trial in trials:
-            roles.setdefault(trial, []).append(name)
+    for trial in model.bank:
+        roles.setdefault(trial, []).append("bank")
     return [
         {"set": ", ".join((str(n), *roles.get(n, ())))}
         | {"mean [%]": float(means[model.sets.column(n)])}

@@ -8,10 +8,11 @@ from adaptune.model.rules import Rule
 
 RULES = {
     "adaptive": "adaptune.model.weights:BankRule",
+    "standby": "adaptune.model.weights:StandbyRule",
     "paper": "adaptune.model.knn:NearestNeighbours",
 }
 """Where the classes are, as ``module:Class``; the first is the default."""
-ADAPTIVE = next(iter(RULES))
+ADAPTIVE, STANDBY = tuple(RULES)[:2]
 ENTRY_POINTS = "adaptune.rules"
 """Group in which other packages announce their rules, each by its name."""
 

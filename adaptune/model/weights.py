@@ -19,7 +19,9 @@ from adaptune.live.hops import LiveSquares, blend
 from adaptune.metrics import FAILURE
 from adaptune.model.rules import (
     ERROR_FLOOR,
+    N_FRAMES,
     NOTHING,
+    SHARPNESS,
     FixedSet,
     Live,
     NearestFrames,
@@ -46,7 +48,6 @@ class BankSettings(BaseModel):
     # A file of another version may hold more.
     model_config = ConfigDict(extra="ignore", frozen=True)
 
-    adapt: bool = True  # if not, the fixed set keeps all the weight
     # How fast a sequence's weight falls with the distance of its nearest frames.
     sharpness: Annotated[NonNegativeFloat, Field(allow_inf_nan=False)] = 12.0
     # Nearest frames of each stretch: products of errors need more of them than means do.
@@ -87,14 +88,13 @@ class BankRule(Rule):
     in ``docs/method.md``.
     """
 
-    sentence = "what adapts with the least expected loss in training, or the fixed set"
+    sentence = "a bank, whose members are weighed once a second"
     needs_known_sensor = gives_weights = True
 
     @classmethod
     def of(cls, bank: BankSettings | None) -> Rule:
         """See `Rule.of`: where no bank runs, the fixed set is kept."""
-        # Members of a bank that need not always work have weights where they do.
-        return cls(bank.model_copy(update={"adapt": True})) if bank else FixedSet()
+        return cls(bank) if bank else FixedSet()
 
     def __init__(self, settings: BankSettings | None = None):
         self.settings = settings or BankSettings()
@@ -157,6 +157,21 @@ class BankRule(Rule):
         )
 
 
+class StandbyRule(BankRule):
+    """The fixed set, whose bank joins in where something is measured to be wrong.
+
+    While the other members rest, the weights are the fixed set's.
+    """
+
+    sentence = "the fixed set; where it does worse than predicted, a bank joins in"
+
+    @classmethod
+    def of(cls, bank: BankSettings | None) -> Rule:
+        """See `Rule.of`: a bank that joins in counts near training frames as a single set does."""
+        few = BankSettings(sharpness=SHARPNESS, n_frames=N_FRAMES, clip=MEMBER_CLIP)
+        return cls(few) if bank else FixedSet()
+
+
 def weighted_selection(sets: ParameterSets, weights: Mapping[int, float]) -> Selection:
     """A selection of a bank's weights; its set is that of the heaviest member."""
     heaviest = max(weights, key=weights.__getitem__)
@@ -185,8 +200,6 @@ def bank_weights(
     kept = settings.min_fixed_share * windows / (windows + measured)
     weights *= (1.0 - kept)[:, None]
     weights[:, 0] += kept
-    if not settings.adapt:
-        weights[:] = np.eye(len(near.members))[0]
     mean_square = np.einsum("qj,qjk,qk->q", weights, squares, weights)
     # Where the fixed set has no error, there is none to be gained on.
     of_fixed = np.maximum(squares[:, 0, 0], 1e-12)

@@ -20,9 +20,8 @@ _TIMES = "M-1,-.7 L-.7,-1 L0,-.3 L.7,-1 L1,-.7 L.3,0 L1,.7 L.7,1 L0,.3 L-.7,1 L-
 # Colours that the colour-blind tell apart, most of them Okabe and Ito's.
 MODES = {
     "baseline": Look("#999999", shape="square"),
-    "best_default": Look("#882255", shape="triangle-down"),
-    "equal_cost": Look("#56c8a0", shape="cross"),
     "fixed": Look("#0072b2", shape=_STAR),
+    "standby": Look("#882255", shape="triangle-down"),
     "adaptive": Look("#e69f00"),
     "untrained": Look("#7b3294", shape="triangle-left"),
     "even": Look("#117733", (3, 3), "triangle-right"),

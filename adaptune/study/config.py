@@ -1,7 +1,10 @@
 """The configuration of a study: the settings that both stages share."""
 
+import logging
 import re
 from collections.abc import Iterable
+from contextlib import suppress
+from functools import cache
 from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
@@ -15,6 +18,8 @@ from adaptune.simulation.course import Course
 from adaptune.space import ParameterSpace
 from adaptune.strict import StrictModel
 
+_log = logging.getLogger(__name__)
+
 
 def _file_name(name: str) -> str:
     if not re.fullmatch(r"\w[\w.-]*", name) or len(name.encode()) > 100:
@@ -26,8 +31,6 @@ def _file_name(name: str) -> str:
 
 Name = Annotated[str, AfterValidator(_file_name)]
 """Becomes the name of a file."""
-WORTH = 0.1
-"""Share of the error that a bank has to spare, surely, to be worth its CPU time."""
 
 
 class OdometryConfig(StrictModel):
@@ -151,12 +154,29 @@ def _known_mode(name: str) -> str:
     return name
 
 
+@cache
+def _say_worth() -> None:
+    _log.warning("online.worth: is ignored; what a bank may cost is online.budget")
+
+
+def read_budget(given: Any) -> float | str | None:
+    """A budget in milliseconds, or as ``3x`` in times the baseline's; or a ValueError."""
+    with suppress(ValueError, TypeError):
+        times = isinstance(given, str) and given.endswith("x")
+        number = float(given[:-1] if times else given)
+        if not isinstance(given, bool) and 0.0 < number <= 1e6:
+            return str(given) if times else number
+    if given is None:
+        return None
+    raise ValueError("give milliseconds of CPU time a scan, or times the baseline's, as 3x")
+
+
 class OnlineConfig(StrictModel):
     """How to replay: seconds between selections, modes, switching, and what it may cost.
 
-    `modes` are replayed besides baseline, fixed set and rivals; `all` of them is a choice, too.
-    The budget is in milliseconds of CPU time a scan, all members and live evidence together; a
-    bank has to spare the share `worth` of the error to be driven.
+    `modes` are replayed besides baseline and fixed set; `all` of them is a choice, too. The budget
+    is in milliseconds of CPU time a scan, all members and live evidence together, or as ``3x`` in
+    times the baseline's.
     Without `real_time`, a replay is as fast as it goes and always the same.
     """
 
@@ -167,10 +187,23 @@ class OnlineConfig(StrictModel):
         AfterValidator(_once),
     ] = ("adaptive", "paper")
     switching: SwitchingConfig = SwitchingConfig()
-    budget: float | None = Field(None, gt=0, le=1e6)
-    worth: float = Field(WORTH, ge=0, le=1)
+    budget: Annotated[float | str | None, BeforeValidator(read_budget)] = None
     real_time: RealTimeConfig | None = None
     ros: RosConfig = RosConfig()
+
+    def milliseconds(self, baseline: float) -> float | None:
+        """The budget of a scan, given what the baseline's scans take."""
+        if isinstance(self.budget, str):
+            return float(self.budget[:-1]) * baseline
+        return self.budget
+
+    @model_validator(mode="before")
+    @classmethod
+    def _without_worth(cls, data: Any) -> Any:
+        if isinstance(data, dict) and "worth" in data:
+            _say_worth()
+            data = {key: value for key, value in data.items() if key != "worth"}
+        return data
 
     @property
     def rules(self) -> tuple[str, ...]:

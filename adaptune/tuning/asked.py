@@ -34,15 +34,20 @@ class Asked(NamedTuple):
     about: Mapping[str, Any] = {}  # of the odometry: its settings and parameters, if given
     trials: int | None = None
     minutes: float | None = None
-    budget: float | None = None
+    budget: float | str | None = None
 
     @property
-    def limits(self) -> dict[str, float]:
+    def limits(self) -> dict[str, float | str]:
         """What may be spent, by its keys in a study."""
         hours = None if self.minutes is None else self.minutes / 60.0
-        limits = {"offline.trials": self.trials, "offline.hours": hours}
-        limits |= {"online.budget": self.budget}
+        limits: dict[str, Any] = {"offline.trials": self.trials, "offline.hours": hours}
         from adaptune.manifest import plain
+        from adaptune.study.config import read_budget
+
+        try:
+            limits |= {"online.budget": read_budget(self.budget)}
+        except ValueError as error:
+            raise AdaptuneError(f"--budget {self.budget}: {error}") from error
 
         return dict(plain({key: v for key, v in limits.items() if v is not None}))
 

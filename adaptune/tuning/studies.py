@@ -154,7 +154,7 @@ def written(
             f"{path}: another `adaptune tune` made it: {'; '.join(others)}; name the same to "
             f"resume it, or tune in a folder of its own with `--folder {free}`"
         )
-    limits = [f"{key}={value:.10g}" for key, value in asked.limits.items()]
+    limits = [f"{key}={value}" for key, value in asked.limits.items()]
     return path, limits, _grown(path, asked, show)
 
 

@@ -163,7 +163,7 @@ def tune(
     reference: str | Path | None = None,
     trials: int | None = None,
     minutes: float | None = None,
-    budget: float | None = None,
+    budget: float | str | None = None,
     overrides: Sequence[str] = (),
     folder: str | Path | None = None,
     cluster: str | None = None,
@@ -188,8 +188,8 @@ def tune(
     points, reference
         Topics, where not the recording's own; or a reference's file, or ``"estimated"``.
     trials, minutes, budget
-        Parameter sets to try, time for all of it, and milliseconds of CPU time a scan that may be
-        spent, by default what the baseline takes.
+        Parameter sets to try, time for all of it, and the CPU time a scan that may be spent:
+        milliseconds, or ``"3x"``, times what the baseline takes; by default twice as much.
     overrides, folder
         Values of the study, as in ``["offline.seed=1"]``, and where all results go.
     cluster
