@@ -36,9 +36,10 @@ from adaptune.model.rules import (
     best_sets,
 )
 from adaptune.odometry.factory import Factory
+from adaptune.paired import MIN_RECORDINGS
 from adaptune.recording.scan import stretch_numbers
 from adaptune.space import ParameterSets
-from adaptune.study.driven import MIN_RECORDINGS, PER_STRETCH
+from adaptune.study.driven import PER_STRETCH
 from offline.campaign import read_whole_drives
 from offline.choice import (
     MOST_OF_PERIOD,

@@ -17,9 +17,9 @@ from adaptune.files import replacing, write_text
 from adaptune.metrics import cap
 from adaptune.model import Rule, TrainingData
 from adaptune.model.rules import Costs, SetCost
+from adaptune.paired import MIN_RECORDINGS
 from adaptune.report.tables import csv_text
 from adaptune.space import ParameterSets, load_space
-from adaptune.study.driven import MIN_RECORDINGS
 from offline.choice import BlockErrors, choose
 from offline.config import OfflineStudy
 from offline.labelled import block_means, labelled_data

@@ -15,7 +15,7 @@ from adaptune.metrics import cap, worst_tenth
 from adaptune.model import BankRule, BankSettings, TrainingData
 from adaptune.model.rules import BASELINE, ERROR_FLOOR, complementary
 from adaptune.model.weights import bank_weights, choose_members
-from adaptune.study.driven import MIN_RECORDINGS
+from adaptune.paired import MIN_RECORDINGS
 from offline.choice import EDGE, USUAL_BUDGET
 from offline.labelled import LabelledData, LabelledSequence, periods
 

@@ -4,8 +4,9 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from adaptune.paired import Ratio
 from online.modes import BASELINE, EVEN, FIXED, MODES, UNTRAINED
-from online.statistics import ALL, ORACLE, ComparisonRow, Ratio
+from online.statistics import ALL, ORACLE, ComparisonRow
 from online.tables import YARDSTICKS, last_rows
 
 CALLED = {

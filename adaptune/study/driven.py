@@ -7,14 +7,13 @@ from adaptune.errors import AdaptuneError
 from adaptune.model import ErrorModel
 from adaptune.model.registry import ADAPTIVE, STANDBY
 from adaptune.odometry.factory import Factory
+from adaptune.paired import MIN_RECORDINGS
 from adaptune.space import ODOMETRY, ParameterSet
 from adaptune.study.config import OnlineConfig, SwitchingConfig
 from adaptune.study.study import Mechanism
 
 PER_STRETCH = 4
 """Sub-trajectories of a stretch, the unit of evidence."""
-MIN_RECORDINGS = 6
-"""With as many, whole recordings are left out; with fewer, stretches of them."""
 
 
 EQUAL_COST = "equal_cost"
