@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from adaptune.geometry import Poses, invert, nearest_rotation, rotation_angle, steps
 
-RESAMPLES = 2000  # resamples of a bootstrap
 WORST = 0.1  # share of the stretches that are the worst
 KITTI_LENGTHS = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 JITTER = 0.1
@@ -260,18 +259,6 @@ def lost_in_words(
         f"points' times, motion compensation, the range settings or the reference are wrong "
         f"(`adaptune inspect --deep` checks the recording)."
     ]
-
-
-def resampled_means(
-    values: NDArray[np.float64], block: int, rng: np.random.Generator
-) -> NDArray[np.float64]:
-    """Means of the resamples of a moving-block bootstrap of values (k, n): (k, RESAMPLES)."""
-    n = values.shape[1]
-    n_blocks = -(-n // block)
-    starts = rng.integers(0, n - block + 1, (RESAMPLES, n_blocks))
-    sums = np.concatenate([np.zeros((len(values), 1)), np.cumsum(values, axis=1)], axis=1)
-    means = (sums[:, starts + block] - sums[:, starts]).sum(axis=2) / (n_blocks * block)
-    return np.asarray(means)
 
 
 def worst_tenth(logs: NDArray[np.float64]) -> float:

@@ -15,7 +15,7 @@ from adaptune.metrics import cap, worst_tenth
 from adaptune.model import BankRule, BankSettings, TrainingData
 from adaptune.model.rules import BASELINE, ERROR_FLOOR, complementary
 from adaptune.model.weights import bank_weights, choose_members
-from adaptune.paired import MIN_RECORDINGS
+from adaptune.paired import of_stretches
 from offline.choice import EDGE, USUAL_BUDGET
 from offline.labelled import LabelledData, LabelledSequence, periods
 
@@ -25,10 +25,6 @@ if TYPE_CHECKING:
 
 WORST_TENTH_WEIGHT = 0.5
 """Weight of the worst tenth."""
-BLOCK_STRETCHES = 2
-"""Consecutive stretches that a bootstrap draws together."""
-RESAMPLES = 500
-"""Of a bootstrap."""
 
 Logs = NDArray[np.float64]
 """Logarithms of the ratio to the fixed set's error, a number for each stretch."""
@@ -71,58 +67,15 @@ def expected_loss(logs: Logs, recordings: Sequence[str]) -> float:
     if not logs.any():
         return 0.0
     risk = WORST_TENTH_WEIGHT * max(0.0, worst_tenth(logs))
-    return float(logs.mean() + risk + standard_error(logs, recordings))
-
-
-def standard_error(logs: Logs, recordings: Sequence[str]) -> float:
-    """Of the mean: clustered by recording, or of a block bootstrap where recordings are few."""
-    if len(logs) < 2:
-        return np.inf
-    _, number = np.unique(np.asarray(recordings), return_inverse=True)
-    n = int(number.max()) + 1
-    if n >= MIN_RECORDINGS:
-        sums = np.bincount(number, logs - logs.mean())
-        return float(np.sqrt(sums @ sums * n / (n - 1)) / len(logs))
-    # Means of few vary too little.
-    scale = np.sqrt(len(logs) / (len(logs) - 1))
-    # Of two or three stretches, nearly all resamples are alike.
-    independent = float(logs.std(ddof=1) / np.sqrt(len(logs)))
-    return max(independent, float(scale * _resampled_means(logs, number).std()))
-
-
-def _resampled_means(logs: Logs, number: NDArray[np.intp]) -> NDArray[np.float64]:
-    """Means of a circular block bootstrap, whose blocks are of one recording."""
-    following = np.arange(1, len(logs) + 1)
-    for recording in np.unique(number):
-        of = np.flatnonzero(number == recording)
-        following[of] = np.roll(of, -1)
-    n_blocks = -(-len(logs) // BLOCK_STRETCHES)
-    drawn = np.random.default_rng(0).integers(0, len(logs), (RESAMPLES, n_blocks))
-    return np.asarray((logs[drawn] + logs[following[drawn]]).mean(axis=1) / BLOCK_STRETCHES)
-
-
-def interval_of(logs: Logs, recordings: Sequence[str]) -> tuple[float, float]:
-    """95 % interval of the mean: Student's, with as many degrees of freedom as there are units.
-
-    A unit is a recording where there are enough of them, else a stretch.
-    """
-    if len(logs) < 2:
-        return -np.inf, np.inf
-    from scipy import stats
-
-    n_recordings = len(set(recordings))
-    units = n_recordings if n_recordings >= MIN_RECORDINGS else len(logs)
-    margin = stats.t.ppf(0.975, units - 1) * standard_error(logs, recordings)
-    return float(logs.mean() - margin), float(logs.mean() + margin)
+    return float(logs.mean() + risk + of_stretches(logs, recordings).error)
 
 
 def figures(logs: Logs, recordings: Sequence[str]) -> Figures:
     """All that is said of a way to adapt."""
-    low, high = interval_of(logs, recordings)
-    ratios = (logs.mean(), low, high, worst_tenth(logs), logs.max())
-    geometric, low, high, tenth, worst = (float(np.exp(ratio)) for ratio in ratios)
+    geometric, ends, _ = of_stretches(logs, recordings)
+    tenth, worst = (float(np.exp(ratio)) for ratio in (worst_tenth(logs), logs.max()))
     loss, n_recordings = expected_loss(logs, recordings), len(set(recordings))
-    return Figures(loss, geometric, low, high, tenth, worst, len(logs), n_recordings)
+    return Figures(loss, geometric, *(ends or (0.0, np.inf)), tenth, worst, len(logs), n_recordings)
 
 
 BANK_SETTINGS = [
@@ -299,7 +252,7 @@ def recommends_bank(data: LabelledData, chosen: Policy, fixed: int) -> bool:
     It is where it has less expected loss, and is within the budget of a set; or where the fixed
     set is restarted along its whole drives, whatever the bank costs.
     """
-    if chosen.expected is None or len(chosen.members) < 2 or not chosen.expected.loss < 0.0:
+    if chosen.expected is None or len(chosen.members) < 2 or not chosen.expected.loss < -ROUNDING:
         return False
     blocks = data.driven_blocks()
     most = data.budget or USUAL_BUDGET * EDGE * float(blocks.costs[blocks.baseline])

@@ -1,4 +1,4 @@
-"""The fixed set: not shown to be worse than the baseline, then good, then cheap."""
+"""The fixed set: the least bound of the error within a budget."""
 
 import numpy as np
 import pytest
@@ -10,13 +10,15 @@ from offline.choice import (
     BlockErrors,
     NothingUsableError,
     affordable,
+    bounds,
     choose,
+    elsewhere,
     finalists,
     front,
-    left_out_ratio,
     mean_and_error,
-    ratio_to_baseline,
+    surely_restarted,
     surely_worse,
+    tracks,
 )
 
 
@@ -38,15 +40,40 @@ def noisy(means, n=12, seed=0, spread=0.05):
     return np.array(means) * rng.uniform(0.8, 1.2, (n, 1)) + rng.normal(0, spread, (n, len(means)))
 
 
-def test_the_best_that_costs_no_more_is_chosen():
+def test_the_best_within_the_budget_is_chosen():
     errors = noisy([1.0, 0.7, 0.4])
     assert choose(blocks(errors)) == 2
-    assert choose(blocks(errors, [10.0, 10.4, 30.0])) == 1  # the noise of a measurement is no cost
-    assert choose(blocks(errors, [10.0, 12.0, 30.0])) == 0
-    assert choose(blocks(errors, [10.0, 12.0, 30.0]), budget=12.0) == 1
+    # Twice the baseline's cost; its edge is soft, that of a user's budget is hard.
+    assert choose(blocks(errors, [10.0, 15.0, 21.9])) == 2
+    assert choose(blocks(errors, [10.0, 15.0, 22.1])) == 1
+    assert choose(blocks(errors, [10.0, 15.0, 20.1]), budget=20.0) == 1
     assert choose(blocks(errors, [10.0, 12.0, 30.0]), budget=np.inf) == 2
     with pytest.raises(AdaptuneError, match=r"online.budget: 5 ms .* 10.0 ms \(trial 0\)"):
         choose(blocks(errors, [10.0, 12.0, 30.0]), budget=5.0)
+
+
+def test_cheapness_earns_nothing():
+    errors = noisy([1.0, 0.7, 0.69])
+    assert choose(blocks(errors, [10.0, 2.0, 19.0])) == 2
+    same = np.repeat(noisy([1.0]), 3, axis=1)
+    assert choose(blocks(same, [10.0, 5.0, 9.0])) == 0
+
+
+def test_what_may_be_chance_is_not_chosen():
+    errors = noisy([1.0, 0.9], 8, spread=0.3)
+    assert choose(blocks(errors)) == 0
+    assert choose(blocks(noisy([1.0, 0.9], 100, spread=0.05))) == 1
+    # One block has a standard error, too: of 0.3.
+    assert choose(blocks([[1.0, 0.6]])) == 0
+    assert choose(blocks([[1.0, 0.4]])) == 1
+
+
+def test_recordings_that_disagree_are_doubted():
+    errors, places = np.ones((24, 2)), np.repeat([0, 1, 2], 8)
+    errors[:, 1] = np.repeat([0.3, 0.9, 1.0], 8)
+    assert choose(blocks(errors)) == 1
+    assert choose(blocks(errors, sequence=places)) == 0
+    assert bounds(blocks(errors, sequence=places))[1] > bounds(blocks(errors))[1]
 
 
 def test_a_budget_below_the_baseline_may_take_what_is_worse():
@@ -54,6 +81,16 @@ def test_a_budget_below_the_baseline_may_take_what_is_worse():
     assert choose(found) == 0
     assert choose(found, budget=5.0) == 1
     assert finalists(found, 5.0)[:2] == [0, 1]
+
+
+def test_where_nothing_tracks_the_least_error_is_chosen():
+    errors = np.array([[30.0, 30.0, 20.0], [30.0, 30.0, 16.0], [30.0, 12.0, 30.0], [16, 16, 16.0]])
+    found = blocks(errors, restarts=[3, 3, 3])
+    assert not tracks(found)
+    assert choose(found) == 2
+    errors[:, 0] = 5.0
+    assert tracks(blocks(errors))
+    assert choose(blocks(errors)) == 0
 
 
 def test_what_comes_too_late_is_not_chosen():
@@ -64,17 +101,13 @@ def test_what_comes_too_late_is_not_chosen():
     assert choose(found._replace(period=10.0), budget=100.0) == 0
 
 
-def test_of_equally_good_sets_the_cheapest_is_chosen():
-    same = np.repeat(noisy([1.0]), 3, axis=1)
-    assert choose(blocks(same, [10.0, 5.0, 9.0])) == 1
-    # A cheaper one that is surely worse is none of them.
-    same[:, 1] += 0.3
-    assert choose(blocks(same, [10.0, 5.0, 8.0])) == 2
-
-
 def test_who_is_restarted_more_often_than_the_baseline_is_not_chosen():
     errors = noisy([1.0, 0.5, 0.6, 0.1])
-    assert choose(blocks(errors, restarts=[2, 3, 2, np.inf])) == 2
+    assert choose(blocks(errors, restarts=[2, 20, 2, np.inf])) == 2
+    # A restart more may be chance.
+    assert choose(blocks(errors, restarts=[2, 3, 2, np.inf])) == 1
+    often = blocks(errors, restarts=[0, 5, 4, np.inf])
+    assert surely_restarted(often).tolist() == [False, True, False, True]
     with pytest.raises(NothingUsableError, match=r"none of 2 parameter sets gives poses .*: mend"):
         choose(blocks(errors[:, :2], restarts=[np.inf, np.inf]))
 
@@ -83,7 +116,7 @@ def test_a_set_whose_heading_drifts_is_not_chosen():
     errors = noisy([1.0, 0.5])
     assert choose(blocks(errors)._replace(turns=np.repeat(noisy([1.0]), 2, axis=1))) == 1
     drifting = blocks(errors)._replace(turns=noisy([1.0, 3.0]))
-    assert choose(drifting) == choose(drifting.some([1, 0])) == choose(drifting.without(0)) == 0
+    assert choose(drifting) == choose(drifting.some([1, 0])) == 0
 
 
 def test_a_set_that_is_surely_worse_on_one_recording_is_not_chosen():
@@ -98,12 +131,28 @@ def test_a_set_that_is_surely_worse_on_one_recording_is_not_chosen():
     assert not surely_worse(blocks(errors, sequence=places)).any()
 
 
-def test_the_front_rises_in_cost_and_falls_in_error():
-    errors = noisy([1.0, 0.8, 0.79, 0.9, 0.5, 3.0])
-    found = blocks(errors, [10, 20, 40, 5, 30, 1])
-    assert front(found) == [3, 1, 4]  # trial 0 costs more than 3, and is worse; 5 is surely worse
-    assert finalists(found) == [0, 3, 1, 4]
-    assert affordable(found, None).tolist() == [True, False, False, True, False, True]
+def test_the_front_has_a_set_for_each_budget():
+    errors = noisy([1.0, 0.8, 0.6, 0.9, 0.5, 3.0, 0.4])
+    found = blocks(errors, [10, 10.9, 17, 5, 21, 1, 40])
+    assert front(found, None) == (0, 1, 4, 2, 6)
+    assert front(found, 18.0) == (0, 1, 2, 2, 6)
+    assert front(found._replace(period=60.0), None).best == 4  # the dearest may come too late
+    assert {0, 1, 2, 4, 6} <= set(finalists(found))
+    assert affordable(found, None).tolist() == [True, True, True, True, True, True, False]
+
+
+def test_the_best_odometry_with_its_own_parameters_is_the_baseline():
+    errors = noisy([2.0, 1.0, 1.1, 0.4])
+    several = blocks(errors, [10, 60, 20, 30])._replace(n_baselines=3, period=100.0)
+    assert several.baseline == 2  # the second takes more than half of the time
+    assert several._replace(period=np.inf).baseline == 1
+    # The order of names changes nothing.
+    order = [2, 0, 1, 3]
+    swapped = several._replace(
+        errors=errors[:, order], costs=several.costs[order], restarts=several.restarts[order]
+    )
+    assert order[choose(swapped)] == choose(several) == 3
+    assert swapped.baseline == 0
 
 
 def test_recordings_have_equal_weights():
@@ -125,16 +174,20 @@ def test_what_is_chosen_may_be_chosen(n, n_blocks, seed):
     )
     chosen = choose(found)
     assert affordable(found, None)[chosen]
-    assert found.restarts[chosen] <= found.restarts[0]
+    assert not surely_restarted(found)[chosen]
     assert not surely_worse(found)[chosen]
-    assert {0, *front(found)[-2:]} <= set(finalists(found, np.inf))
-    assert ratio_to_baseline(found, 0)[0] == pytest.approx(1.0)
+    assert {0, chosen, *front(found, None)} <= set(finalists(found))
+    assert elsewhere(found, 0) == (1.0, 1.0, 1.0)
 
 
-def test_what_is_left_out_tells_how_a_choice_does_elsewhere():
-    # All sets are alike: the least of many errors is chance, and gone where it was not chosen.
-    errors = np.random.default_rng(1).exponential(1.0, (30, 20))
-    ratio, low, high = left_out_ratio(blocks(errors), lambda of: choose(of, sure=False))
-    assert low < 1.0 < high
-    assert ratio > errors.mean(axis=0).min() / errors[:, 0].mean()
-    assert left_out_ratio(blocks(errors[:3]), choose) is None
+def test_another_drive_is_less_sure_than_this_one():
+    errors = noisy([1.0, 0.5], 40)
+    ratio, low, high = elsewhere(blocks(errors), 1)
+    assert low < 0.4 < ratio < 0.6 < high < 3.0
+    # Several drives that agree say more, and those that disagree less.
+    places = np.repeat(np.arange(8), 5)
+    agree = elsewhere(blocks(errors, sequence=places), 1)
+    assert agree.high / agree.low < high / low
+    errors[:, 1] *= np.repeat([0.2, 3.0] * 4, 5)
+    apart = elsewhere(blocks(errors, sequence=places), 1)
+    assert apart.high / apart.low > high / low
