@@ -14,6 +14,7 @@ from adaptune.live.own_error import OwnError
 from adaptune.model import BankRule, BankSettings, ErrorModel
 from adaptune.model.descriptor import speed_and_turn_rate
 from adaptune.model.ndt import describe
+from adaptune.model.registry import ADAPTIVE, STANDBY
 from adaptune.model.weights import measured_weights
 from adaptune.odometry.base import Motions
 from adaptune.recording.scan import Scan
@@ -264,20 +265,16 @@ def test_where_the_fixed_set_does_worse_than_predicted_the_baseline_takes_its_pl
     assert chosen(scans[0], None, 9.0) == [5, 5]
 
 
-def test_a_bank_rests_where_training_knows_the_place_and_the_fixed_set_does_as_predicted(
+def test_a_bank_stands_by_while_the_fixed_set_does_as_predicted(
     monkeypatch,
 ):
     told = Told(monkeypatch)
     model = of_two_caves()
     keeps = replace(
         model,
-        bank_settings=BankSettings(adapt=False),
         vectors=np.tile(np.float32([[1.0, 0.0, 0.0], [0.0, 0.1, 0.0]]), (len(model.errors), 1, 1)),
     )
-    assert keeps.bank_rests
-    assert not model.bank_rests
-    assert not replace(keeps, bank=[3], vectors=keeps.vectors[:, :1]).bank_rests
-    selector = Selector(keeps)
+    selector = Selector(keeps, STANDBY)
     assert selector.members == (3, 5)
     known, new = drive_cave("hdl32e", 1)[0], drive_cave("vlp16", 1)[0]
     resting, absent = np.eye(4), np.full((4, 4), np.nan)
@@ -308,7 +305,7 @@ def test_a_bank_rests_where_training_knows_the_place_and_the_fixed_set_does_as_p
     assert rests(182.0, starts=3)
     # Where the fixed set gives no pose, somebody has to go on.
     assert not rests(183.0, starts=3, fixed=absent)
-    # What was not worth its cost in training is not where a place is new, either.
+    # That a place is new is no reason to leave it.
     selector.reset()
     told.error = None
     assert rests(0.0, new)
@@ -318,7 +315,7 @@ def test_a_bank_rests_where_training_knows_the_place_and_the_fixed_set_does_as_p
         selector.observe(i * 10**9, known, Motions(np.eye(4), {3: resting, 5: resting}))
         one = selector.select()
     assert one.weights[5] > 0.8
-    assert Selector(keeps, members=()).members == ()  # a single odometry
+    assert Selector(keeps, STANDBY, ()).members == ()  # a single odometry
 
 
 def test_the_reserve_of_a_bank_joins_in_where_training_knows_nothing(monkeypatch):
@@ -334,7 +331,7 @@ def test_the_reserve_of_a_bank_joins_in_where_training_knows_nothing(monkeypatch
         vectors=vectors,
         bank_settings=BankSettings(reserve=1),
     )
-    assert (model.reserve, model.bank_adapts, model.bank_rests) == ([0], True, False)
+    assert model.reserve == [0]
     selector = Selector(model)
     motions = Motions(np.eye(4), dict.fromkeys((3, 5, 0), np.eye(4)), 1)
     shares = []
@@ -380,9 +377,9 @@ def test_a_bank_measures_where_members_differ_by_more_than_in_training(monkeypat
     assert measures(1.0, 1.021)
 
 
-@pytest.mark.parametrize("settings", [BankSettings(), BankSettings(adapt=False)])
-def test_a_member_without_a_pose_gets_no_weight(settings):
-    selector = Selector(replace(of_two_caves(), bank_settings=settings), members=(3, 5))
+@pytest.mark.parametrize("rule", [ADAPTIVE, STANDBY])
+def test_a_member_without_a_pose_gets_no_weight(rule):
+    selector = Selector(of_two_caves(), rule, (3, 5))
     scans, nothing = drive_cave("hdl32e", 3), np.full((4, 4), np.nan)
     for member, other in ((3, 5), (5, 3)):
         selector.reset()

@@ -8,8 +8,9 @@ from tables import table
 
 from adaptune.archive import Summary
 from adaptune.model.rules import ERROR_FLOOR, Costs, SetCost
+from adaptune.paired import of_stretches
 from offline.labelled import LabelledData, measured_costs, side_by_side
-from offline.tuning import expected_loss, interval_of, log_ratios, standard_error, worst_tenth
+from offline.tuning import expected_loss, log_ratios, worst_tenth
 
 
 def labelled(*of_sequences):
@@ -147,26 +148,15 @@ def test_stretches_of_a_recording_are_not_taken_for_independent():
     # Six recordings, each of whose stretches are alike.
     of_recordings = np.array([-0.5, -0.2, -0.4, 0.1, -0.3, -0.1])
     names = [str(i) for i in range(6)]
-    one = standard_error(of_recordings, names)
-    assert one == pytest.approx(of_recordings.std(ddof=1) / np.sqrt(6))
-    repeated = np.repeat(of_recordings, 4), np.repeat(names, 4).tolist()
-    assert standard_error(*repeated) == pytest.approx(one)
-    assert interval_of(*repeated) == pytest.approx(interval_of(of_recordings, names))
-
-
-def test_few_recordings_are_resampled_in_blocks():
-    rng = np.random.default_rng(0)
-    drawn = [rng.normal(0.0, 1.0, 8) for _ in range(200)]
-    errors = [standard_error(values, ["a"] * 4 + ["b"] * 4) for values in drawn]
-    # On average it is that of the mean of eight independent values.
-    assert np.mean(errors) == pytest.approx(1.0 / np.sqrt(8), rel=0.2)
-    # Neighbours that agree count as less.
-    alike = np.repeat([1.0, -1.0, 1.0, -1.0], 2)
-    apart = np.tile([1.0, -1.0], 4)
-    assert standard_error(alike, ["a"] * 8) > standard_error(apart, ["a"] * 8)
-    # Two stretches are one block, which does not make them sure.
-    assert standard_error(np.array([0.1, 0.3]), ["a"] * 2) == pytest.approx(0.1)
-    assert standard_error(alike, ["a"] * 8) == standard_error(alike, ["a"] * 8)
+    one = of_stretches(of_recordings, names)
+    repeated = of_stretches(np.repeat(of_recordings, 2), list(np.repeat(names, 2)))
+    assert one.error == pytest.approx(of_recordings.std(ddof=1) / np.sqrt(6))
+    assert repeated.error == pytest.approx(one.error)
+    assert repeated.interval == pytest.approx(one.interval)
+    # Of few recordings, each stretch counts.
+    few = of_stretches(np.array([0.1, 0.3, 0.2]), ["a", "a", "b"])
+    assert few.error == pytest.approx(0.1 / np.sqrt(3.0))
+    assert of_stretches(np.array([0.1]), ["a"]).interval is None
 
 
 def test_ratios_are_of_mean_errors_on_each_stretch():

@@ -17,7 +17,6 @@ from offline import tuning
 from offline import validate as validation
 from offline.config import load_study
 from offline.train import fit, tuned
-from offline.tuning import NO_BANK
 from offline.validate import (
     LeftOut,
     Validation,
@@ -150,28 +149,27 @@ def test_validate_judges_what_online_drives(study_file, tmp_path, monkeypatch):
     given = ["online.switching.mechanism=bank", "online.switching.size=3"]
     study = load_study(study_file, given, tmp_path)
     model, found = judged(six, study, monkeypatch)
-    assert model.bank_adapts
+    assert model.recommended == "adaptive"
     assert model.expected["geometric"] < 1.0
     bank = ", ".join(map(str, model.bank))
-    said = f"`online` will drive the bank of trials {bank} as `adaptive`, because it is worth that"
+    said = f"Recommended: adaptive, the bank of trials {bank}: expected gain"
     assert found.verdicts[0].startswith(said)
     assert found.verdicts[0] == driven(model, study.config.online, study.odometry, study.mechanism)
     expected = "`adaptive`: expected gain "
     assert found.verdicts[1].startswith(expected)
     assert found.validation.modes == list(RULES)
     assert "adaptive" in found.rows[0]
-    # The same model where the bank rests.
-    fixed = replace(model, bank_settings=NO_BANK)
+    fixed = replace(model, recommended="fixed")
     said = driven(fixed, study.config.online, study.odometry, study.mechanism)
-    assert said.startswith("`online` will drive the fixed set (trial ")
-    assert "the best alternative is a bank: expected gain" in said
+    assert said.startswith(f"Recommended: trial {model.fixed}")
+    assert f"With cores to spare: adaptive, the bank of trials {bank}: expected gain" in said
     assert "what is left out, over 6 stretches (" in found.verdicts[2]
     # Where it cannot be judged it says what is driven.
     alone = labelled(six.sequences[:1])
-    for mechanism, why in (("bank", "too little .* takes 80 m of tra"), ("live", "no bank")):
+    for mechanism, why in (("bank", "With cores to spare: ad"), ("live", "names no bank")):
         given = [f"online.switching.mechanism={mechanism}", "online.switching.size=3"]
         study = load_study(study_file, given, tmp_path)
-        match = f"one stretch only, .* drive the fixed set .* {why}"
+        match = f"one stretch only, .* Recommended: trial .* {why}"
         with pytest.raises(ValidationError, match=match):
             judged(alone, study, monkeypatch)
 

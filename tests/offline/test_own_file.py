@@ -48,12 +48,10 @@ def test_the_fixed_set_s_odometry_decides(study, capsys):
     assert said(study, capsys) == none
 
 
-def test_rivals_are_written_and_go(study):
+def test_the_best_at_no_more_cost_is_written_and_goes(study):
     fixed = study.odometry.space.baseline
-    write_sets(study, fixed, {"equal_cost": {"odometry": "gicp", "downsampling": 0.1}})
+    write_sets(study, fixed, {"odometry": "gicp", "downsampling": 0.1})
     path = study.folder / "equal_cost.yaml"
     assert yaml12.Document.of_file(path).data == {"odometry": "gicp", "downsampling": 0.1}
-    # The fixed set itself is left out, but as the best default.
-    write_sets(study, fixed, {"equal_cost": fixed, "best_default": fixed})
+    write_sets(study, fixed, fixed)
     assert not path.exists()
-    assert path.with_stem("best_default").exists()

@@ -12,13 +12,12 @@ from typer.testing import CliRunner
 from adaptune.commands.cli import app
 from adaptune.model import BankSettings, ErrorModel
 from adaptune.study.config import ALSO
-from adaptune.study.driven import RIVALS
 from offline.config import load_study
 from online.compare import compare, compared_modes
 from online.modes import MODES, replayed_modes, run_replays, run_untrained
 from online.record import StoredReplayError
 
-EVERY = [mode for mode in MODES if mode not in RIVALS]
+EVERY = list(MODES)
 
 
 @pytest.fixture(scope="module")

@@ -7,6 +7,7 @@ import pytest
 from random_models import random_model
 
 from adaptune.model import BankSettings
+from adaptune.model.registry import RULES
 from adaptune.model.rules import Costs, SetCost
 from adaptune.odometry.factory import OdometryFactory, OdometryPool
 from adaptune.odometry.registry import odometry_class
@@ -25,33 +26,41 @@ def setup(mechanism="live", size=4, **online):
     return ReplaySetup(config, factory, mechanism, ("adaptive", "paper"))
 
 
-def test_rivals_are_driven_where_the_model_has_some():
-    model = random_model()
-    assert setup().modes(model) == ("baseline", "fixed", "adaptive", "paper")
-    one = replace(model, rivals={"equal_cost": 6})
-    assert setup().modes(one) == ("baseline", "equal_cost", "fixed", "adaptive", "paper")
-    both = replace(model, rivals={"equal_cost": 6, "best_default": 2})
-    assert setup().modes(both)[:4] == ("baseline", "best_default", "equal_cost", "fixed")
-    # One that is the fixed set is not replayed again.
-    same = replace(model, rivals={"equal_cost": model.fixed, "best_default": 2})
-    assert setup().modes(same)[:3] == ("baseline", "best_default", "fixed")
-    for mode, trial in {"equal_cost": 6, "best_default": 2, "fixed": 4}.items():
-        assert setup().mode(mode, both)[1:4] == ({trial: both.sets[trial]}, False, None)
-    identity = setup().identity("equal_cost", both, "digest")
-    assert identity["parameters"] == both.sets[6]
-    # Another model with the same rival replays the same.
-    assert identity["model"] is None
+def test_what_is_recommended_is_replayed():
+    model = replace(random_model(), bank_size=2)
+    bank = replace(setup("bank", size=2), rules=("paper",))
+    assert bank.modes(model) == ("baseline", "fixed", "paper")
+    recommended = replace(model, recommended="adaptive")
+    assert bank.modes(recommended) == ("baseline", "fixed", "adaptive", "paper")
+    assert setup().modes(recommended) == ("baseline", "fixed", "paper")  # there is no bank
+    fixed = bank.mode("fixed", model)
+    assert fixed[1:4] == ({4: model.sets[4]}, False, None)
+    # Another model with the same set replays the same.
+    identity = bank.identity("fixed", model, "digest")
+    assert (identity["parameters"], identity["model"]) == (model.sets[4], None)
 
 
-def test_a_rival_keeps_its_parameters():
+def test_a_robot_drives_what_is_recommended():
+    model, bank = replace(random_model(), bank_size=2), setup("bank", size=2)
+    assert bank.default(model) == "standby"
+    better = replace(model, recommended="adaptive")
+    assert bank.default(better) == "adaptive"
+    # A node that is steered has one set, as an odometry without a bank.
+    assert bank.default(better, steered=True) == setup().default(better) == "standby"
+    alone = replace(model, bank=[4], vectors=np.zeros((50, 1, 3), np.float32))
+    stiff = replace(bank, odometry=OdometryPool({"a": bank.odometry, "b": bank.odometry}))
+    assert stiff.default(alone) == "fixed"
+
+
+def test_the_fixed_set_keeps_its_parameters():
     model = random_model()
     gicp = odometry_class("gicp").space
     rng = np.random.default_rng(0)
     own = tuple(gicp.from_unit(rng.random((len(model.sets), len(gicp)))))
     sets = replace(model.sets, space=gicp, parameters=own)
-    mode = setup().mode("equal_cost", replace(model, sets=sets, rivals={"equal_cost": 6}))
+    mode = setup().mode("fixed", replace(model, sets=sets))
     assert mode.selector is None
-    assert setup().instance(mode).odometry.parameters == sets[6]
+    assert setup().instance(mode).odometry.parameters == sets[4]
 
 
 def test_a_model_for_another_budget_is_refused(tmp_path):
@@ -61,37 +70,36 @@ def test_a_model_for_another_budget_is_refused(tmp_path):
     for given, fitted in ((9.0, None), (None, 9.0), (9.0, 8.0)):
         with pytest.raises(ModeError, match=r"online\.budget: .* run `adaptune offline` again"):
             setup(budget=given).check(replace(model, budget=fitted), tmp_path)
-    setup().check(replace(model, worth=0.1), tmp_path)
-    with pytest.raises(ModeError, match=r"online\.worth: .* run `adaptune offline` again"):
-        setup().check(replace(model, worth=0.2), tmp_path)
 
 
 def test_a_mode_is_replayed_where_it_is_possible():
-    model = random_model()
-    asked = replace(setup(), also=ALSO)
-    every = ("baseline", "fixed", "adaptive", "untrained", "even", "paper")
-    odometry = asked.odometry
+    model = replace(random_model(), bank_size=4)
+    asked = replace(setup("bank"), also=ALSO, rules=(*RULES,))
+    every = ("baseline", "fixed", "adaptive", "standby", "untrained", "even", "paper")
     assert asked.modes(model) == every
     # A bank of one member, and an odometry that cannot change its set.
     alone = replace(model, bank=[4], vectors=np.zeros((50, 1, 3), np.float32))
-    assert asked.modes(alone) == tuple(mode for mode in every if mode != "even")
+    assert asked.modes(alone) == ("baseline", "fixed", "standby", "untrained", "paper")
     assert "no other member" in asked.obstacle("even", alone)
-    stiff = replace(asked, odometry=OdometryPool({"a": odometry, "b": odometry}), mechanism="bank")
-    unpaying = replace(alone, bank_settings=BankSettings(adapt=False))
-    assert "cannot change its parameters between scans" in stiff.obstacle("adaptive", unpaying)
-    assert "adaptive" in stiff.modes(model)
+    assert "no second set may join" in asked.obstacle("adaptive", alone)
+    odometry = asked.odometry
+    stiff = replace(asked, odometry=OdometryPool({"a": odometry, "b": odometry}))
+    assert stiff.modes(alone) == ("baseline", "fixed", "untrained")
+    # Without a bank, one instance changes its set.
+    live = replace(asked, mechanism="live")
+    assert "names no bank" in live.obstacle("adaptive", model)
+    assert {"standby", "paper"} <= set(live.modes(model))
 
 
 def test_what_each_mode_drives():
-    model = replace(random_model(), rivals={"equal_cost": 6})
+    model = replace(random_model(), bank_size=2)
     live, bank = (setup(mechanism, size=2) for mechanism in ("live", "bank"))
-    assert list(live.mode("adaptive", model).sets) == [model.fixed]
-    assert live.identity("adaptive", model, "of it")["switching"] == {"mechanism": "live"}
-    assert bank.identity("adaptive", model, "of it")["switching"]["mechanism"] == "bank"
-    # The bank that is driven may rest.
-    rests = replace(model, bank_settings=BankSettings(adapt=False))
-    assert bank.mode("adaptive", rests).bank
-    # Only `adaptive` has a reserve.
+    assert list(live.mode("standby", model).sets) == [model.fixed]
+    assert live.identity("standby", model, "of it")["switching"] == {"mechanism": "live"}
+    for mode in ("adaptive", "standby"):
+        assert bank.identity(mode, model, "of it")["switching"]["mechanism"] == "bank"
+        assert bank.mode(mode, model).bank
+    # Only these two have a reserve.
     vectors = np.zeros((len(model.errors), 3, 3), np.float32)
     members = [*model.bank, 0]
     reserve = replace(model, bank=members, vectors=vectors, bank_settings=BankSettings(reserve=1))
@@ -116,7 +124,7 @@ def test_a_cheap_bank_runs_on_one_core(monkeypatch):
     monkeypatch.setattr("online.modes.shared_cores", lambda: {0, 1, 2})
     made = []
     monkeypatch.setattr("online.modes.Bank", lambda *given: made.append(given[4]))
-    model = random_model()
+    model = replace(random_model(), bank_size=2)
     # Two members, which share what they prepare, and live evidence.
     for register, pace, cores in ((5.0, None, 1), (5.0, 3.0, 1), (5.0, 4.0, 3), (25.0, None, 3)):
         costs = Costs({trial: SetCost(register, 4.0, 0) for trial in model.sets}, 1.0)
@@ -129,10 +137,8 @@ def test_a_cheap_bank_runs_on_one_core(monkeypatch):
     assert made == [3]
 
 
-def test_sets_that_fail_are_missing_in_no_bank():
-    model, four = random_model(), setup("bank", size=4)  # fitted for two
-    given = {trial: SetCost(5.0 if trial in model.bank else np.inf, 4.0, 0) for trial in model.sets}
-    failing = replace(model, costs=Costs(given, 1.0))
-    assert list(four.mode("adaptive", failing).sets) == model.bank
+def test_a_larger_bank_than_was_fitted_is_refused():
+    model, four = replace(random_model(), bank_size=4), setup("bank", size=4)
+    assert list(four.mode("adaptive", model).sets) == model.bank  # costs allow no more
     with pytest.raises(ModeError, match="another bank"):
-        four.mode("adaptive", model)
+        four.mode("adaptive", replace(model, bank_size=2))

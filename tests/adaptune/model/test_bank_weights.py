@@ -71,7 +71,6 @@ def test_weights_are_of_the_places_that_are_near():
     [
         (BankSettings(min_fixed_share=0.5), 0.5),
         (BankSettings(min_fixed_share=1.0), 1.0),
-        (BankSettings(adapt=False), 1.0),
     ],
 )
 def test_the_fixed_set_keeps_its_minimum_share(of, kept, monkeypatch):
@@ -81,11 +80,10 @@ def test_the_fixed_set_keeps_its_minimum_share(of, kept, monkeypatch):
     weights = rule.select(data.features[0]).weights
     assert sum(weights.values()) == pytest.approx(1.0)
     assert weights[0] == pytest.approx(kept, abs=0.05)
-    if of.adapt:
-        # What is measured takes its place: 9 windows next to the prior's 3.
-        live = LiveSquares(np.diag([100.0, 1.0, 1.0, 100.0]), 0.0, 9.0)
-        weights = rule.weigh(rule.near(data.features[0][None]), live).weights
-        assert weights[0] == pytest.approx(kept / 4.0, abs=0.05)
+    # What is measured takes its place: 9 windows next to the prior's 3.
+    live = LiveSquares(np.diag([100.0, 1.0, 1.0, 100.0]), 0.0, 9.0)
+    weights = rule.weigh(rule.near(data.features[0][None]), live).weights
+    assert weights[0] == pytest.approx(kept / 4.0, abs=0.05)
 
 
 def test_in_a_place_unlike_all_others_what_is_measured_counts_for_more(monkeypatch):

@@ -109,7 +109,6 @@ def test_another_format_is_refused_by_name(tmp_path, other, word):
         {"window": 0},
         {"costs": {"evidence": 0.0}},
         {"costs": {"evidence": 0.0, "sets": {"0": [1.0]}}},
-        {"rivals": {"equal_cost": 99}},
         *(
             {"arrays": arrays}
             for arrays in (
@@ -211,16 +210,20 @@ def test_any_header_is_understood_or_refused(tmp_path, data):
     assert str(path) in message
 
 
-def test_costs_rivals_and_a_budget_survive(tmp_path):
+def test_costs_a_budget_and_what_is_recommended_survive(tmp_path):
     model = random_model()
     costs = Costs({n: SetCost(n + 0.1, 2.5, n % 2) for n in model.sets}, 0.25)
-    given = {"costs": costs, "rivals": {"equal_cost": 6, "best_default": 2}, "budget": 9.0}
+    given = {"costs": costs, "recommended": "adaptive", "bank_size": 4, "budget": 9.0}
     path = saved(tmp_path, **given)
     loaded = ErrorModel.load(path)
     assert_same(loaded, dataclasses.replace(model, **given))
     # Live evidence included, but for the fixed set.
     assert loaded.allowed() == (0, 2, 4, 6)
     assert loaded.training_data(loaded.pca()).allowed == (0, 2, 4, 6)
+    # In times what the baseline costs, which is 2.6 ms.
+    times = dataclasses.replace(loaded, budget="3x")
+    assert times.milliseconds == pytest.approx(7.8)
+    assert times.allowed() == (0, 2, 4)
 
 
 def test_evidence_is_of_stretches():

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from commands import succeeded
 
-from adaptune.model import BankSettings, ErrorModel
+from adaptune.model import ErrorModel
 from adaptune.model.rules import Costs, SetCost
 from adaptune.space import Categorical, Float, ParameterSets, ParameterSpace
 
@@ -64,17 +64,13 @@ def test_text_of_a_file_is_shown_literally(model, tmp_path):
     assert shown(strange, tmp_path).count(name) == 2
 
 
-def test_a_bank_its_costs_and_rivals_are_shown(model, tmp_path):
+def test_a_bank_and_its_costs_are_shown(model, tmp_path):
     costs = Costs({0: SetCost(2.0, 3.0, 0), 1: SetCost(4.0, 3.0, 0)}, 0.5)
     vectors = np.zeros((4, 2, 3), np.float32)
-    known = dataclasses.replace(
-        model, costs=costs, rivals={"equal_cost": 1}, bank=[0, 1], vectors=vectors
-    )
+    known = dataclasses.replace(model, costs=costs, bank=[0, 1], vectors=vectors)
     text = shown(known, tmp_path)
     assert "0, fixed, bank 3.000 5.000 distance 4" in text
-    assert "1, bank, equal_cost 3.000 7.000 distance 2" in text
+    assert "1, bank 3.000 7.000 distance 2" in text
     assert "2 11.8 - distance 9" in text  # of unknown cost
-    assert "Driven: the bank of trials 0, 1." in text
-    resting = dataclasses.replace(known, bank_settings=BankSettings(adapt=False))
-    assert "Driven: the fixed set." in shown(resting, tmp_path)
+    assert "Recommended: fixed. The bank of `adaptive`: trials 0, 1." in text
     assert "cost [ms]" not in shown(model, tmp_path)
