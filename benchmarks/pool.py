@@ -1,4 +1,4 @@
-"""What several odometries gain in one bank, against rivals of equal cost.
+"""What several odometries gain in one bank.
 
     python benchmarks/pool.py runs/pool --seeds 61 62            # left out
     python benchmarks/pool.py runs/pool --seeds 61 --driven      # replays of eight other courses
@@ -7,7 +7,7 @@ On the 24 courses of `gain.py` (of 60 m) six odometries run the sets of `pool_da
 and NDT with their downsampling and iterations tuned, KISS-ICP, GenZ-ICP and MAD-ICP. It takes two
 hours a world on one core, and resumes. `more-SEED.json` in the folder may hold further sets.
 
-Left out: one course after the other; fixed set, bank and rivals are chosen on the other 23. Driven:
+Left out: one course after the other; fixed set and bank are chosen on the other 23. Driven:
 chosen on all 24, and replayed on mixed courses of other worlds, with the health check. The script
 prints ratios of mean errors over 25 m, and what each mode costs. With `--budget`, what is driven
 costs that many milliseconds of CPU time a scan at most; `fixed` is what the fixed set costs. With
@@ -40,7 +40,7 @@ from adaptune.selector import Selector
 from adaptune.simulation import Course
 from adaptune.simulation.record import SimulatedScan, simulate
 from adaptune.study.config import SwitchingConfig
-from adaptune.study.driven import BEST_DEFAULT, EQUAL_COST, RIVALS, named
+from adaptune.study.driven import named
 from offline.labelled import LabelledData
 from offline.train import fit, tuned
 from offline.tuning import figures
@@ -65,15 +65,15 @@ def left_out(data: LabelledData) -> None:
 
 
 def print_left_out(validation: Validation) -> None:
-    """Print ratios to the rivals and the fixed set, over all courses and by their kind."""
+    """Print ratios to baseline and fixed set, over all courses and by their kind."""
     means = {
         mode: np.array([one.errors[mode].mean() for one in validation.left_out])
-        for mode in ("baseline", *RIVALS, "fixed", ADAPTIVE)
+        for mode in ("baseline", "fixed", ADAPTIVE)
     }
     for mode, of in means.items():
         print(f"{mode:14} {np.exp(np.log(of).mean()):.3f} % at {validation.cost(mode):6.1f} ms")
     kinds = [one.name.rstrip("0123456789") for one in validation.left_out]
-    for rival in (BEST_DEFAULT, EQUAL_COST, "fixed"):
+    for rival in ("baseline", "fixed"):
         ratio = means[ADAPTIVE] / means[rival]
         found = figures(np.log(ratio), kinds and [one.name for one in validation.left_out])
         by_kind = {
@@ -84,8 +84,8 @@ def print_left_out(validation: Validation) -> None:
             f"adaptive / {rival:13} {_words(ratio)}, 95 % {found.low:.2f}-{found.high:.2f}; "
             + ", ".join(f"{kind} {value:.2f}" for kind, value in by_kind.items())
         )
-    each = zip(validation.left_out, means[ADAPTIVE] / means[BEST_DEFAULT], strict=True)
-    print("each / best_default: " + ", ".join(f"{one.name} {ratio:.2f}" for one, ratio in each))
+    each = zip(validation.left_out, means[ADAPTIVE] / means["baseline"], strict=True)
+    print("each / baseline: " + ", ".join(f"{one.name} {ratio:.2f}" for one, ratio in each))
     print(flush=True)
 
 
@@ -94,7 +94,7 @@ def _words(ratio: NDArray[np.float64]) -> str:
 
 
 def model_of(data: LabelledData) -> ErrorModel:
-    """The error model with what is driven and its rivals."""
+    """The error model with its bank."""
     model = fit(data, data.fixed(), pool().identity, 25.0, WINDOW, {})
     return tuned(model, data, SwitchingConfig())
 
@@ -102,7 +102,7 @@ def model_of(data: LabelledData) -> ErrorModel:
 def drive(model: ErrorModel, course: Course) -> dict[str, tuple[float, ReplayRecord]]:
     """Replay a course in all modes; the mean error in percent and the replay of each."""
     scans, make = list(simulate(course)), pool()
-    trials = {"baseline": 0, **model.rivals, "fixed": model.fixed}
+    trials = {"baseline": 0, "fixed": model.fixed}
     found = {}
     for mode in [*trials, ADAPTIVE]:
         if mode == ADAPTIVE:
@@ -152,9 +152,8 @@ def driven(data: LabelledData, seed: int, every: slice, kill: str | None) -> Non
     """Replay courses of other worlds."""
     model = model_of(data)
     members = ", ".join(named(model, trial) for trial in model.bank)
-    rivals = {name: named(model, trial) for name, trial in model.rivals.items()}
     print(f"bank {members}: {model.bank_settings}")
-    print(f"fixed {named(model, model.fixed)}, rivals {rivals}", flush=True)
+    print(f"fixed {named(model, model.fixed)}", flush=True)
     for i in range(len(ORDERS))[every]:
         course = Course(scenes=ORDERS[i], length=DRIVEN_LENGTH, seed=1000 * seed + 500 + i)
         if kill:

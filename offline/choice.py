@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptune.errors import AdaptuneError
-from adaptune.metrics import FAILURE
+from adaptune.metrics import LOST_ABOVE
 from adaptune.model.rules import ROUNDING
 
 PER_BLOCK = 2.0
@@ -61,6 +61,7 @@ class BlockErrors(NamedTuple):
     # a heading that drifts.
     turns: NDArray[np.float64] | None = None
     n_baselines: int = 1  # of so many odometries; the first trials are their own parameters
+    lost_above: float = LOST_ABOVE  # mean error of a set that does not keep track
 
     @property
     def baseline(self) -> int:
@@ -83,6 +84,14 @@ class BlockErrors(NamedTuple):
             restarts=self.restarts[columns],
             turns=None if self.turns is None else self.turns[:, columns],
         )
+
+    def tracked(self) -> Self:
+        """The same of recordings on which some set keeps track."""
+        of = self.sequence
+        least = {s: self.errors[of == s].mean(axis=0).min() for s in np.unique(of)}
+        kept = np.array([least[s] <= self.lost_above for s in of], bool)
+        turns = None if self.turns is None else self.turns[kept]
+        return self._replace(errors=self.errors[kept], sequence=of[kept], turns=turns)
 
     def logs(self) -> NDArray[np.float64]:
         """Logarithms of the ratio to the baseline's error in blocks, of shape `errors`."""
@@ -189,20 +198,21 @@ def choose(blocks: BlockErrors, budget: float | None = None) -> int:
 def _within(blocks: BlockErrors, budget: float | None) -> NDArray[np.float64]:
     """The bounds of sets within a budget, of shape (n_trials,), infinite for others.
 
-    Where it allows none that is admissible, or nothing tracks, those that are usable count by
-    their error.
+    Where it allows none that is admissible, those that are usable count by their error. Where no
+    set keeps track, errors say little of sets: such recordings do not count, and if there are no
+    others, the baseline is kept.
     """
-    few = affordable(blocks, budget)
-    bound = np.where(few, bounds(blocks), np.inf)
-    if np.isfinite(bound).any() and tracks(blocks):
+    few, tracked = affordable(blocks, budget), blocks.tracked()
+    usable, own = few & np.isfinite(blocks.restarts), blocks.baseline
+    if not len(tracked.errors) and usable[own]:
+        return np.where(np.arange(len(few)) == own, 1.0, np.inf)
+    bound = np.full(len(few), np.inf)
+    if len(tracked.errors):
+        bound = np.where(few, bounds(tracked), np.inf)
+    if np.isfinite(bound).any():
         return bound
     mean, _ = mean_and_error(blocks.errors, blocks.sequence)
-    return np.where(few & np.isfinite(blocks.restarts), mean, np.inf)
-
-
-def tracks(blocks: BlockErrors) -> bool:
-    """Whether any set keeps track in at least half of the blocks."""
-    return bool(((blocks.errors >= LOST * FAILURE).mean(axis=0) <= 0.5).any())
+    return np.where(usable, mean, np.inf)
 
 
 def affordable(blocks: BlockErrors, budget: float | None) -> NDArray[np.bool_]:

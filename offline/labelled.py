@@ -17,6 +17,7 @@ from adaptune.live.evidence import SPACING, USUAL_SHARE
 from adaptune.live.hops import HopErrors, Hops, LiveSquares, live_squares
 from adaptune.machine import shared_cores
 from adaptune.metrics import (
+    LOST_ABOVE,
     cap,
     span,
     sub_trajectory_rte,
@@ -459,6 +460,8 @@ class LabelledData(NamedTuple):
             self.period,
             np.concatenate(turns) if len(turns) == len(errors) else None,
             len(self.sets.space.baselines),
+            # Another objective is no error in percent.
+            LOST_ABOVE if all(s.values is None for s in sequences) else np.inf,
         )
 
     def whole_blocks(self, trials: Collection[int]) -> BlockErrors:

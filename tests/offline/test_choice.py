@@ -18,7 +18,6 @@ from offline.choice import (
     mean_and_error,
     surely_restarted,
     surely_worse,
-    tracks,
 )
 
 
@@ -83,14 +82,17 @@ def test_a_budget_below_the_baseline_may_take_what_is_worse():
     assert finalists(found, 5.0)[:2] == [0, 1]
 
 
-def test_where_nothing_tracks_the_least_error_is_chosen():
-    errors = np.array([[30.0, 30.0, 20.0], [30.0, 30.0, 16.0], [30.0, 12.0, 30.0], [16, 16, 16.0]])
-    found = blocks(errors, restarts=[3, 3, 3])
-    assert not tracks(found)
-    assert choose(found) == 2
-    errors[:, 0] = 5.0
-    assert tracks(blocks(errors))
+def test_where_nothing_keeps_track_the_baseline_is_kept():
+    errors = noisy([20.0, 10.0])
     assert choose(blocks(errors)) == 0
+    assert choose(blocks(errors)._replace(lost_above=np.inf)) == 1
+    assert choose(blocks(noisy([20.0, 4.0]))) == 1
+    assert choose(blocks(errors, [10.0, 5.0]), budget=6.0) == 1  # the baseline costs too much
+    # Other recordings count.
+    both = np.concatenate([errors, noisy([1.0, 0.5])])
+    assert choose(blocks(both, sequence=np.repeat([0, 1], 12))) == 1
+    both[:12] = noisy([10.0, 20.0])
+    assert choose(blocks(both, sequence=np.repeat([0, 1], 12))) == 1
 
 
 def test_what_comes_too_late_is_not_chosen():

@@ -22,13 +22,13 @@ EVERY = list(MODES)
 
 @pytest.fixture(scope="module")
 def load(study_file, trained_folder, tmp_path_factory):
-    """Loads a study whose model knows a better set, and keeps the fixed one all the same."""
+    """Loads a study whose model knows a better set than the fixed one."""
     folder = shutil.copytree(trained_folder, tmp_path_factory.mktemp("on_demand") / "study")
     path = folder / "model.safetensors"
     model = ErrorModel.load(path)
     errors = model.errors.copy()
     errors[:, model.sets.column(model.bank[1])] *= 0.1
-    replace(model, errors=errors, bank_settings=BankSettings(adapt=False)).save(path)
+    replace(model, errors=errors).save(path)
     return lambda *overrides, at=folder: load_study(study_file, overrides, at)
 
 
@@ -66,8 +66,11 @@ def test_all_are_compared_in_the_order_of_their_lines(replayed):
 
 def test_they_do_what_their_names_say(replayed):
     model = ErrorModel.load(replayed.model_path)
-    trials = {int(row["trial"]) for row in selections(replayed, "adaptive")}
+    trials = {int(row["trial"]) for row in selections(replayed, "standby")}
     assert trials == {model.fixed}
+    weights = {row["weights"] for row in selections(replayed, "adaptive")}
+    assert len(weights) > 1
+    assert about(replayed, "adaptive")["switching"]["mechanism"] == "bank"
     members = model.bank[:4]  # without the reserve
     even = " ".join(f"{member}:{1 / len(members):.3f}" for member in members)
     assert {row["weights"] for row in selections(replayed, "even")} == {even}
@@ -82,13 +85,13 @@ def test_they_are_made_once_and_again_for_another_model(own):
     assert run_replays(study, study.model_path) == 1
     assert [r["trial"] for r in selections(study, "adaptive")] == [r["trial"] for r in before]
     # Without being asked for, they are compared if they are there, and renewed by a command.
-    settings = BankSettings(adapt=False, sharpness=7.0)
+    settings = BankSettings(sharpness=7.0)
     replace(ErrorModel.load(study.model_path), bank_settings=settings).save(study.model_path)
     plain = own()
     assert run_replays(plain, plain.model_path) == 2
-    with pytest.raises(StoredReplayError, match=r"even: was .* -o online.modes=all` with"):
+    with pytest.raises(StoredReplayError, match=r"standby, even were .* -o online.modes=all` with"):
         compare(plain)
-    assert run_replays(study, study.model_path) == 1
+    assert run_replays(study, study.model_path) == 2
     assert {row.mode for row in compare(plain).rows} == set(EVERY)
 
 

@@ -53,7 +53,7 @@ def test_a_model_is_explained(model, tmp_path):
         "ndt (90 numbers), as a mean over 3 selections in a row",
         "0, fixed 3.000 distance 4, kernel none",
         "1 3.000 distance 2, kernel [huber]",
-        "Driven: the fixed set.",
+        "Recommended: fixed.",
     ):
         assert said in text, (said, text)
 
