@@ -271,9 +271,9 @@ def finalists(blocks: BlockErrors, budget: float | None = None) -> list[int]:
     return list(dict.fromkeys(found))
 
 
-SPREAD = 0.35
+SPREAD = 0.45
 """Standard deviation of the logarithm of a ratio from drive to drive with one robot, about."""
-KNOWN_DRIVES = 3.0
+KNOWN_DRIVES = 8.0
 """Drives that this counts as where a study's own are few."""
 
 

@@ -144,4 +144,4 @@ def recommended(
     """
     most = EDGE * USUAL_BUDGET * own_cost(rows) if budget is None else budget
     few = [r for r in rows if r[COST] <= most and r["99 % [ms]"] <= MOST_OF_PERIOD * period]
-    return min(few or rows, key=lambda row: row["_bound"] if few else row[COST])
+    return min(few or rows, key=lambda row: row["bound"] if few else row[COST])

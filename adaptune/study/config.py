@@ -133,14 +133,14 @@ class RosConfig(StrictModel):
     steer: SteerConfig | None = None
 
 
-ALSO = ("even", "untrained")
+ALSO = ("even", "standby", "untrained")
 """Modes that are replayed only on demand, to compare with; the others are selection rules."""
 
 
 def _modes(given: Any) -> Any:
     from adaptune.model.registry import RULES
 
-    return (*RULES, *ALSO) if given == "all" else given
+    return tuple(dict.fromkeys((*RULES, *ALSO))) if given == "all" else given
 
 
 def _known_mode(name: str) -> str:

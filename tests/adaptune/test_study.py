@@ -6,6 +6,7 @@ from setups import failure
 
 from adaptune.errors import import_extra
 from adaptune.strict import ConfigurationError
+from adaptune.study import config
 from offline.config import load_study
 
 STIFF = ["odometry.name=mad_icp", "odometry.parameters=", "odometry.settings={}"]
@@ -36,6 +37,23 @@ def test_a_bank_has_a_budget(study_file, monkeypatch):
         ("isolation.memory=5", None),
     ):
         assert load_study(study_file, [*STIFF, given]).mechanism == mechanism
+
+
+def test_a_budget_is_in_milliseconds_or_in_times_of_the_baseline(study_file):
+    for given, milliseconds in (("15", 15.0), ("3x", 24.0), ("0.5x", 4.0), ("", None)):
+        online = load_study(study_file, [f"online.budget={given}"]).config.online
+        assert online.milliseconds(8.0) == milliseconds
+    for wrong in ("0", "-3x", "x", "much", "true", "nanx"):
+        text = failure(study_file, f"online.budget={wrong}")
+        assert "online.budget" in text
+        assert "give milliseconds of CPU time a scan, or times the baseline's, as 3x" in text
+
+
+def test_a_minimum_gain_is_ignored_with_a_sentence(study_file, caplog):
+    config._say_worth.cache_clear()
+    online = load_study(study_file, ["online.worth=0.3"]).config.online
+    assert not hasattr(online, "worth")
+    assert caplog.text.count("online.worth: is ignored") == 1
 
 
 def test_an_odometry_that_needs_an_imu(study_file):

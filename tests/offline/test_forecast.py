@@ -43,7 +43,7 @@ def test_finalists_drive_the_rest_of_long_recordings(study, tmp_path, monkeypatc
     monkeypatch.setattr(campaign, "read_whole_drives", lambda *_: drives)
     monkeypatch.setattr(archive, "is_uncut", lambda _: False)
     found = forecast(study, archive, 1, Stopwatch(tmp_path))
-    assert found.rest - FITTING == pytest.approx(7 * found.each)
+    assert found.rest - FITTING == pytest.approx(9 * found.each)
 
 
 @pytest.mark.parametrize(

@@ -42,7 +42,7 @@ def test_the_front_is_measured_on_another_recording(study):
 
 def test_a_budget_decides_also_below_what_the_baseline_costs():
     rows = [
-        {"what": what, "trial": trial, COST: cost, "99 % [ms]": 2.0 * cost, "_bound": bound}
+        {"what": what, "trial": trial, COST: cost, "99 % [ms]": 2.0 * cost, "bound": bound}
         for what, trial, cost, bound in (
             (OWN, 0, 10.0, 1.0),
             ("", 1, 19.0, 0.5),
