@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from adaptune.errors import AdaptuneError
 from adaptune.metrics import LOST_ABOVE
-from adaptune.model.rules import ROUNDING
+from adaptune.model.rules import BASELINE, ROUNDING
 
 PER_BLOCK = 2.0
 """Sub-trajectories in a block: errors of neighbouring frames share most of theirs."""
@@ -60,13 +60,13 @@ class BlockErrors(NamedTuple):
     # (n_blocks, n_trials): mean rotation errors, where they are known: a short sub-trajectory hides
     # a heading that drifts.
     turns: NDArray[np.float64] | None = None
-    n_baselines: int = 1  # of so many odometries; the first trials are their own parameters
+    defaults: Sequence[int] = (BASELINE,)  # trials of the odometries' own parameters
     lost_above: float = LOST_ABOVE  # mean error of a set that does not keep track
 
     @property
     def baseline(self) -> int:
         """Column of the baseline; of several odometries', that with the least error in time."""
-        own = [k for k, trial in enumerate(self.trials) if trial < self.n_baselines]
+        own = [k for k, trial in enumerate(self.trials) if trial in self.defaults]
         if len(own) < 2:
             return own[0]
         means, _ = mean_and_error(self.errors[:, own], self.sequence)

@@ -459,7 +459,7 @@ class LabelledData(NamedTuple):
             np.sum([none if s.restarts is None else s.restarts for s in sequences], axis=0),
             self.period,
             np.concatenate(turns) if len(turns) == len(errors) else None,
-            len(self.sets.space.baselines),
+            self.sets.defaults if len(self.sets.space.baselines) > 1 else (BASELINE,),
             # Another objective is no error in percent.
             LOST_ABOVE if all(s.values is None for s in sequences) else np.inf,
         )

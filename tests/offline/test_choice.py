@@ -145,7 +145,7 @@ def test_the_front_has_a_set_for_each_budget():
 
 def test_the_best_odometry_with_its_own_parameters_is_the_baseline():
     errors = noisy([2.0, 1.0, 1.1, 0.4])
-    several = blocks(errors, [10, 60, 20, 30])._replace(n_baselines=3, period=100.0)
+    several = blocks(errors, [10, 60, 20, 30])._replace(defaults=(0, 1, 2), period=100.0)
     assert several.baseline == 2  # the second takes more than half of the time
     assert several._replace(period=np.inf).baseline == 1
     # The order of names changes nothing.
