@@ -112,7 +112,7 @@ def run(path: Path, course: Course, odometry: str, seed: int) -> None:
     trials = trials_of(setup, sets, path.stem, frames, read, memory=MEMORY)
     length = DEFAULTS.sub_trajectory
     vectors = [error_vectors(frames.T_ref_sensor, trial, length) for trial in trials]
-    motions = recorded_motions(frames, trials)[..., :3, :]
+    motions = recorded_motions(trials)[..., :3, :]
     with replacing(path) as temporary, temporary.open("wb") as file:
         np.savez_compressed(
             file,
