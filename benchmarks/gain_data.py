@@ -1,7 +1,7 @@
 """The courses of `gain.py`, and what odometries do on them with several parameter sets."""
 
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -95,9 +95,16 @@ class Simulated:
         return iter(self.scans)
 
 
-def run(path: Path, course: Course, odometry: str, seed: int) -> None:
+def run(
+    path: Path,
+    course: Course,
+    odometry: str,
+    seed: int,
+    config: OfflineStudyConfig = DEFAULTS,
+    read_as: Callable[[Iterator[Scan]], Iterator[Scan]] = iter,
+) -> None:
     """Run all sets of an odometry on a course, and keep the errors."""
-    scans = list(simulate(course))
+    scans: Any = list(read_as(simulate(course)))
     frames = Frames(
         np.array([scan.stamp for scan in scans]),
         np.array([scan.T_world_sensor for scan in scans]),
@@ -108,11 +115,11 @@ def run(path: Path, course: Course, odometry: str, seed: int) -> None:
     factory = factory_of(odometry)
     sets = [factory.space.baseline, *sobol_points(factory.space, seed, range(1, N_SETS))]
     frames, read = with_measured_hops(scans, frames), Simulated(path.stem, scans)
-    setup = TrialSetup(DEFAULTS, factory, NO_SEQUENCES)
+    setup = TrialSetup(config, factory, NO_SEQUENCES)
     trials = trials_of(setup, sets, path.stem, frames, read, memory=MEMORY)
-    length = DEFAULTS.sub_trajectory
+    length = config.sub_trajectory
     vectors = [error_vectors(frames.T_ref_sensor, trial, length) for trial in trials]
-    motions = recorded_motions(frames, trials)[..., :3, :]
+    motions = recorded_motions(trials)[..., :3, :]
     with replacing(path) as temporary, temporary.open("wb") as file:
         np.savez_compressed(
             file,
@@ -157,7 +164,9 @@ def labelled(paths: list[Path], space: ParameterSpace) -> LabelledData:
     return LabelledData(sequences, sets)
 
 
-def labelled_sequence(name: str, found: Any) -> LabelledSequence:
+def labelled_sequence(
+    name: str, found: Any, config: OfflineStudyConfig = DEFAULTS
+) -> LabelledSequence:
     """A sequence of the labelled data set, from the arrays in its file."""
     errors, stamps, few = found["errors"], found["stamps"], found["motions"]
     known = ~np.isnan(errors).any(axis=1)
@@ -171,10 +180,11 @@ def labelled_sequence(name: str, found: Any) -> LabelledSequence:
         found["T_world_sensor"],
         described,
         period,
-        DEFAULTS.sub_trajectory,
+        config.sub_trajectory,
         LOST_TRACK,
         Hops(*(found[f"hops_{name}"] for name in Hops._fields)),
         partial(np.take, motions, axis=1),
+        health=config.health,
     )
     return in_place(name, simulation, errors[known], found["vectors"][known], known)
 

@@ -75,7 +75,7 @@ def own_errors_on(sequence: LabelledSequence) -> Iterator[tuple[float, float, fl
     metres, ends = travelled(T_ref), window_ends(T_ref, length)
     seconds = (simulation.stamps - simulation.stamps[0]) * 1e-9
     for trial in sequence.vectors:
-        T_odom = chained(simulation.motions((trial,))[:, 0])
+        T_odom = chained(simulation.healthy(simulation.motions((trial,))[:, 0]))
         true = sub_trajectory_rte(T_ref, T_odom, length)
         if not np.nanmean(true) <= 10.0:
             continue

@@ -118,7 +118,7 @@ def _write(
     trials = trials_of(setup, sets, read.name, frames, read, memory=MEMORY)
     T_ref_sensor, length = frames.T_ref_sensor, DEFAULTS.sub_trajectory
     vectors = [error_vectors(T_ref_sensor, trial, length) for trial in trials]
-    motions = recorded_motions(frames, trials)[..., :3, :]
+    motions = recorded_motions(trials)[..., :3, :]
     with replacing(path) as temporary, temporary.open("wb") as file:
         np.savez_compressed(
             file,

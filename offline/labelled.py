@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune.archive import PREPARE_MS, REGISTER_MS, Archive, Frames, Summary, Trial, summarise
-from adaptune.bank.members import LEVER, Agreement, share
+from adaptune.archive import PREPARE_MS, REGISTER_MS, Archive, Summary, Trial, summarise
+from adaptune.bank.members import LEVER, RESTART, Agreement, share
 from adaptune.geometry import Poses, invert, mean_motion, rectify, rotation_angle, steps
 from adaptune.live.evidence import SPACING, USUAL_SHARE
 from adaptune.live.hops import HopErrors, Hops, LiveSquares, live_squares
@@ -37,6 +37,7 @@ from adaptune.model.rules import (
     best_sets,
 )
 from adaptune.odometry.factory import Factory
+from adaptune.odometry.health import Guard, HealthCheck
 from adaptune.paired import MIN_RECORDINGS
 from adaptune.recording.scan import stretch_numbers
 from adaptune.space import ParameterSets
@@ -62,8 +63,6 @@ if TYPE_CHECKING:
 
 MEMBER_POOL_SIZE = 64
 """A bank's members are searched for among this many of the best sets."""
-SECONDS_UNTIL_NOTICED = 1.0
-"""Seconds until a bank notices that a member has lost track."""
 MISFIT_PER_METRE = 0.25
 """By how much farther a scan is from the one before, about, in a metre by which it is misplaced."""
 
@@ -99,6 +98,7 @@ class BankSimulation:
     # - 1, n_sets, 4, 4), see `recorded_motions`.
     motions: Callable[[tuple[int, ...]], Poses]
     ends_of_whole: NDArray[np.intp] | None = None  # `ends`, where it is a part of a simulation
+    health: HealthCheck = field(default_factory=HealthCheck)  # of the bank as a whole
     _live: dict[tuple[int, ...], list[LiveSquares | None]] = field(default_factory=dict, init=False)
 
     @cached_property
@@ -138,21 +138,39 @@ class BankSimulation:
         """Over which scans each member agrees with the others, of shape (n_frames - 1, n_members).
 
         Members vote with weights of shape (n_periods, n_members). The reference takes the place of
-        the short registrations.
+        the short registrations. A bank restarts a member that was lost, where it may be lost again:
+        it is away until it may restart once more, or the health check restarts the whole bank.
         """
         T_previous_current = self.motions(members)
-        agreement = Agreement(len(members), self.lost_track)
+        agreement, guard = Agreement(len(members), self.lost_track), Guard(self.health)
         agreeing = np.zeros(T_previous_current.shape[:2], bool)
-        weights = self._of_steps(votes)
+        weights, now = self._of_steps(votes), 0.0
+        back = np.full(len(members), -np.inf)  # when members that were lost are back
         for i, seconds in enumerate(np.diff(self.stamps) * 1e-9):
-            agreeing[i] = agreement.judge(
-                T_previous_current[i], seconds, weights[i], partial(self._misplaced, i + 1)
-            )
-            if agreeing[i].any():
+            now += seconds
+            lost = np.isnan(T_previous_current[i, :, 0, 0])
+            back[lost & (back <= now)] = now + RESTART
+            T = np.where((back > now)[:, None, None], np.nan, T_previous_current[i])
+            alignment = partial(self._misplaced, i + 1)
+            agreeing[i] = agreement.judge(T, seconds, weights[i], alignment)
+            if guard.check(agreement.T_previous_current, seconds) is None:
                 agreement.restarted(agreement.due)
             else:
                 agreement.start()
+                back[:] = -np.inf
         return agreeing
+
+    def healthy(self, T_previous_current: Poses) -> Poses:
+        """Motions of shape (n_frames - 1, 4, 4) as the health check lets them be, see `Tracker`.
+
+        Where there is none (NaN), or an impossible one, the last healthy motion goes on.
+        """
+        guard, found = Guard(self.health), T_previous_current.copy()
+        for i, seconds in enumerate(np.diff(self.stamps) * 1e-9):
+            if guard.check(found[i], seconds) is not None:
+                T_previous_healthy, T_healthy = guard.go_on(seconds)
+                found[i] = T_previous_healthy @ T_healthy
+        return found
 
     def _of_steps(self, weights: NDArray[np.float64]) -> NDArray[np.float64]:
         """Weights at every scan but the first, of shape (n_frames - 1, n_members)."""
@@ -184,7 +202,8 @@ class BankSimulation:
         none = np.asarray(~agreeing.any(axis=1))
         believed = np.where(agreeing[..., None, None], self.motions(members), np.eye(4))
         moved = mean_motion(believed, share(self._of_steps(weights), agreeing | none[:, None]))
-        T_ref, T_odom = self.T_ref_counted, chained(moved)
+        moved[none] = np.nan
+        T_ref, T_odom = self.T_ref_counted, chained(self.healthy(moved))
         return cap(sub_trajectory_rte(T_ref, T_odom, self.length, ends=self.ends))
 
 
@@ -197,22 +216,15 @@ def chained(T_previous_current: Poses) -> Poses:
     return T
 
 
-def recorded_motions(frames: Frames, trials: Sequence[Trial]) -> Poses:
+def recorded_motions(trials: Sequence[Trial]) -> Poses:
     """Motions over every scan but the first, as the trials recorded them.
 
-    Where the health check restarted a set, it went on as before. A bank does not notice at once:
-    here the member stands still for `SECONDS_UNTIL_NOTICED`, as all others do that are restarted
-    there, and then goes on.
+    Where the health check restarted a set, its motion was impossible, and is not known.
 
-    Returns shape (n_frames - 1, n_trials, 4, 4), NaN where nothing is driven.
+    Returns shape (n_frames - 1, n_trials, 4, 4), NaN there, and where nothing is driven.
     """
-    motions = np.empty((len(frames.stamps) - 1, len(trials), 4, 4))
-    begins = frames.stamps[:-1]
-    for k, trial in enumerate(trials):
-        motions[:, k] = steps(trial.T_odom_sensor)
-        lost = np.where(trial.restarted[1:] > 0, begins, np.iinfo(np.int64).min // 2)
-        since = begins - np.maximum.accumulate(lost)  # the last step that was lost began
-        motions[since < SECONDS_UNTIL_NOTICED * 1e9, k] = np.eye(4)
+    motions = np.stack([steps(trial.T_odom_sensor) for trial in trials], axis=1)
+    motions[np.stack([trial.restarted[1:] > 0 for trial in trials], axis=1)] = np.nan
     return motions
 
 
@@ -689,7 +701,7 @@ def _labelled(
 
     @lru_cache(maxsize=1)  # one bank after the other is asked for, each many times
     def motions(trials: tuple[int, ...]) -> Poses:
-        return recorded_motions(frames, [read(trial) for trial in trials])
+        return recorded_motions([read(trial) for trial in trials])
 
     simulation = BankSimulation(
         frames.stamps,
@@ -701,6 +713,7 @@ def _labelled(
         config.lost_track,
         frames.hops,
         motions,
+        health=config.health,
     )
     return LabelledSequence(
         name,
