@@ -79,7 +79,8 @@ def offline(
     Training sequences without a reference get one that is estimated from their scans, before.
 
     The table shows the *baseline* (the odometry's own parameters), the *fixed* set (the best over
-    all sequences within the budget), and each sequence's best. Stop it with Ctrl-C, and run it again to resume.
+    all sequences within the budget), and each sequence's best. Stop it with Ctrl-C, and run it
+    again to resume.
     """
     loaded = load(study, override, folder, runs=True)
     from adaptune.study.driven import driven
