@@ -600,9 +600,10 @@ def labelled_data(study: OfflineStudy, archive: Archive, sets: ParameterSets) ->
             )
         sequences.append(_labelled(study, archive, name, sets))
     costs = measured_costs(archive, study.training, sets, study.odometry)
-    online = study.config.online
-    budget = online.milliseconds(costs.alone(BASELINE))
-    return LabelledData(sequences, sets, costs, budget, len(shared_cores()))
+    data = LabelledData(sequences, sets, costs, cores=len(shared_cores()))
+    blocks = data.blocks()
+    own = float(blocks.costs[blocks.baseline])
+    return data._replace(budget=study.config.online.milliseconds(own))
 
 
 def with_whole_drives(

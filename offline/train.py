@@ -256,7 +256,8 @@ def _fitted(
     if model is None or model.provenance != provenance:
         identity, length = study.odometry.identity, config.sub_trajectory
         model = fit(data, fixed, identity, length, study.window, provenance)
-        model = tuned(replace(model, budget=config.online.budget), usable, config.online.switching)
+        model = replace(model, budget=config.online.budget, milliseconds=data.budget)
+        model = tuned(model, usable, config.online.switching)
         model.save(study.model_path)
     manifest.record(study.model_inputs_path, inputs)
     return model

@@ -247,7 +247,7 @@ def test_the_loop_on_a_robot_is_what_adaptune_online_does(folder):
     assert last in text
     model = None
     for mechanism in ("bank", "live"):
-        overrides = [f"online.switching.mechanism={mechanism}"]
+        overrides = [f"online.switching.mechanism={mechanism}", "online.modes=[standby]"]
         study = load_study(folder / "my.yaml", overrides)
         model = model or train(study).model
         replace(model, bank_settings=BankSettings()).save(study.model_path)
@@ -255,7 +255,7 @@ def test_the_loop_on_a_robot_is_what_adaptune_online_does(folder):
         poses = []
         example = text.replace('"my.yaml"', f'"my.yaml", {overrides}')
         exec(example.replace(last, last + "    poses.append(T_odom_sensor)\n"), {"poses": poses})
-        replays = study.folder / "replays/home/adaptive"
+        replays = study.folder / "replays/home/standby"
         replayed = read_tum(replays / "trajectory.tum")
         np.testing.assert_allclose(replayed.T_world_sensor, poses, atol=1e-8)
         assert (":" in (replays / "selections.csv").read_text()) is (mechanism == "bank")

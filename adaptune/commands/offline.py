@@ -79,7 +79,8 @@ def offline(
     Training sequences without a reference get one that is estimated from their scans, before.
 
     The table shows the *baseline* (the odometry's own parameters), the *fixed* set (the best over
-    all sequences), and each sequence's best. Stop it with Ctrl-C, and run it again to resume.
+    all sequences within the budget), and each sequence's best. Stop it with Ctrl-C, and run it
+    again to resume.
     """
     loaded = load(study, override, folder, runs=True)
     from adaptune.study.driven import driven
@@ -196,10 +197,11 @@ def cost(
     folder: Folder = None,
     points: Points = None,
 ) -> None:
-    """Measure on this machine what the rows of a study's front cost, and rank them again.
+    """Measure on this machine what the rows of a study's front cost, and say which to drive.
 
-    Run it on the robot, with nothing else running: it drives each over a minute of a recording. A
-    row whose 99th percentile takes more than half of the time from scan to scan is not recommended.
+    Run it on the robot, with nothing else running: it drives each over a minute of a recording.
+    Recommended is the least bound of the error within the budget, as `offline` chooses. A row whose
+    99th percentile takes more than half of the time from scan to scan is not recommended.
     """
     from adaptune.recording.inspect import inspect
     from adaptune.recording.recording import open_sequence

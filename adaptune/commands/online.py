@@ -73,7 +73,7 @@ def online(
     oracle: Oracle = False,
     cluster: Cluster = None,
 ) -> None:
-    """Replay the test sequences: baseline, fixed, and adaptive by every rule.
+    """Replay the test sequences: baseline, fixed, what is recommended, and `online.modes`.
 
     Once a second, an adaptive replay describes the newest scan and selects a parameter set with the
     error model. Each replay writes its trajectory (TUM), every selection with its predicted error,
@@ -82,13 +82,14 @@ def online(
     With `--untrained`, it needs no trials, no model and no ground truth. It replays all sequences
     if the study names no test.
 
-    With `-o online.modes=all`, it replays all modes to compare with, too: the bank with even
-    weights, and the untrained bank.
+    With `-o online.modes=all`, it replays all modes: the fixed set with a bank that stands by, the
+    bank with even weights, and the untrained bank, too.
 
     With `-o online.real_time.rate=1`, scans come when the sensor gave them. A selection that is
     late is dropped, and so are scans that wait too long.
 
-    With `--ros` or `--ros2`, scans come from a topic of a robot, until Ctrl-C.
+    With `--ros` or `--ros2`, scans come from a topic of a robot, until Ctrl-C. Without `--mode`, it
+    drives what is recommended; of a single set, `standby` where that is possible.
 
     With `--oracle`, it replays nothing. It runs sets of the model on the test sequences as trials,
     to know the best choice in hindsight: the fixed set, the members of the bank, and those that

@@ -21,7 +21,7 @@ from adaptune.archive import compact
 from adaptune.errors import AdaptuneError
 from adaptune.files import replacing
 from adaptune.model.descriptor import DESCRIPTORS
-from adaptune.model.rules import BASELINE, Costs, TrainingData, allowed_sets, mean_errors
+from adaptune.model.rules import Costs, TrainingData, allowed_sets, mean_errors
 from adaptune.model.weights import BankSettings
 from adaptune.recording.scan import stretch_numbers
 from adaptune.report import tables
@@ -119,6 +119,7 @@ class ErrorModel:
     expected: dict[str, float] = field(default_factory=dict)
     recommended: str = "fixed"  # the mode to drive
     budget: float | str | None = None  # the study's, see `OnlineConfig`
+    milliseconds: float | None = None  # what that is of CPU time a scan
     costs: Costs | None = None  # what the sets cost; None if it was not measured
 
     def __post_init__(self) -> None:
@@ -173,14 +174,6 @@ class ErrorModel:
         """See `allowed_sets`."""
         return allowed_sets(self.costs, self.milliseconds, self.sets, self.fixed)
 
-    @property
-    def milliseconds(self) -> float | None:
-        """The budget of a scan."""
-        if isinstance(self.budget, str):
-            own = np.nan if self.costs is None else self.costs.alone(BASELINE)
-            return float(self.budget[:-1]) * own
-        return self.budget
-
     def check_descriptors(
         self, descriptors: Collection[str], where: Path | str = "the model"
     ) -> None:
@@ -217,7 +210,7 @@ class ErrorModel:
         """All that selections depend on, besides the arrays."""
         plain = (
             *("odometry", "fixed", "length", "sequences", "blocks", "window", "elevations"),
-            *("bank", "bank_size", "budget", "recommended"),
+            *("bank", "bank_size", "budget", "milliseconds", "recommended"),
         )
         return {
             "space": self.sets.space.definition(),

@@ -121,21 +121,23 @@ def test_values_that_stay_read_as_those_that_change(own):
 def test_one_set_is_driven_where_there_is_no_bank(own, study_file):
     model = ErrorModel.load(own.folder / "model.safetensors")
     given = ["online.switching.mechanism=live"]
-    study = load_study(study_file, [*given, "online.period=0.5"], own.folder)
     path = own.folder / "alone.safetensors"
-    replace(model, bank_settings=BankSettings(adapt=False)).save(path)
+    model.save(path)
+    study = load_study(
+        study_file, [*given, "online.period=0.5", "online.modes=[standby, paper]"], own.folder
+    )
     assert run_replays(study, path) == 4
-    row = next(row for row in compare(study).rows if row.mode == "adaptive")
+    row = next(row for row in compare(study).rows if row.mode == "standby")
     assert row.rte < 3.0
-    folder = study.folder / "replays/three/adaptive"
+    folder = study.folder / "replays/three/standby"
     about = {
         mode: json.loads((folder.with_name(mode) / "inputs.json").read_text())["inputs"][
             "switching"
         ]
-        for mode in ("adaptive", "paper")
+        for mode in ("standby", "paper")
     }
     # Also the paper's rule has one instance, and all sets to choose from.
-    assert about["paper"]["mechanism"] == about["adaptive"]["mechanism"] == "live"
+    assert about["paper"]["mechanism"] == about["standby"]["mechanism"] == "live"
     with (folder / "selections.csv").open() as file:
         rows = list(csv.DictReader(file))
     for row in rows:
@@ -170,7 +172,7 @@ def test_a_bank_that_pays_is_weighed(own, study_file):
     assert next(row.rte for row in compare(study).rows if row.mode == "adaptive") < 3.0
     more = load_study(study_file, ["online.switching.mechanism=bank"], own.folder)
     with pytest.raises(ModeError, match=r"switching\.size: the model was fitted for another"):
-        bank_members(more.config.online.switching, replace(model, bank=model.bank[:3]))
+        bank_members(more.config.online.switching, replace(model, bank_size=3))
 
 
 def test_replays_are_made_once(replayed, study_file):

@@ -158,7 +158,7 @@ def test_a_node_is_steered(make):
 
     study = make(STEER)
     model = ErrorModel.load(study.model_path)
-    found, link, held = drive(study, "adaptive", played(), len(SCANS))
+    found, link, held = drive(study, None, played(), len(SCANS))
     # It begins with the fixed set, and holds what was selected last.
     chosen = [json.loads(one.data) for one in link.published["adaptune/selection"]]
     assert len(chosen) == 3
@@ -172,7 +172,7 @@ def test_a_node_is_steered(make):
 
 def test_the_log_says_once_that_the_odometry_restarts(make, monkeypatch, caplog):
     monkeypatch.setattr("online.steered.PATIENCE", 0.01)
-    drive(make(STEER), "adaptive", clouds(), 5)  # the node is silent
+    drive(make(STEER), "standby", clouds(), 5)  # the node is silent
     said = "the odometry restarts: the health check found no_pose"
     assert caplog.messages.count(said) == 1
 
@@ -182,6 +182,8 @@ def test_what_does_not_go_together_is_refused(make):
         RobotDrive(make(), "fxed", make().model_path)
     with pytest.raises(ModeError, match=r"online\.ros\.steer: in the mode fixed nothing is select"):
         RobotDrive(make(STEER), "fixed", make().model_path)
+    with pytest.raises(ModeError, match=r"ros\.steer: a node drives one set .* --mode standby"):
+        RobotDrive(make(STEER), "adaptive", make().model_path)
     with pytest.raises(AdaptuneError, match=r"online\.ros\.like: no sequence 'tree'.*three"):
         RobotDrive(make("online.ros.like=tree"), "baseline", None)
     other = make("odometry.settings.min_range=0.9")

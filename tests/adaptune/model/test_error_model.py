@@ -213,17 +213,14 @@ def test_any_header_is_understood_or_refused(tmp_path, data):
 def test_costs_a_budget_and_what_is_recommended_survive(tmp_path):
     model = random_model()
     costs = Costs({n: SetCost(n + 0.1, 2.5, n % 2) for n in model.sets}, 0.25)
-    given = {"costs": costs, "recommended": "adaptive", "bank_size": 4, "budget": 9.0}
+    given = {"costs": costs, "recommended": "adaptive", "bank_size": 4, "budget": "3x"}
+    given["milliseconds"] = 9.0
     path = saved(tmp_path, **given)
     loaded = ErrorModel.load(path)
     assert_same(loaded, dataclasses.replace(model, **given))
     # Live evidence included, but for the fixed set.
     assert loaded.allowed() == (0, 2, 4, 6)
     assert loaded.training_data(loaded.pca()).allowed == (0, 2, 4, 6)
-    # In times what the baseline costs, which is 2.6 ms.
-    times = dataclasses.replace(loaded, budget="3x")
-    assert times.milliseconds == pytest.approx(7.8)
-    assert times.allowed() == (0, 2, 4)
 
 
 def test_evidence_is_of_stretches():
