@@ -15,7 +15,7 @@ from multiprocessing.context import ForkServerContext
 from multiprocessing.util import get_temp_dir
 
 from adaptune.errors import AdaptuneError
-from adaptune.machine import available
+from adaptune.machine import available, shared_cores
 
 
 def end_with_parent() -> None:
@@ -41,8 +41,14 @@ def fork_server(*preload: str) -> ForkServerContext:
     _name_sockets()
     # A fresh Python looks for modules where it begins, before it looks among its own. Processes
     # have the folder and the path of this one again.
-    with contextlib.chdir("/"):
-        forkserver.ensure_running()
+    # Nor are they pinned where this one is.
+    own = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, shared_cores())
+    try:
+        with contextlib.chdir("/"):
+            forkserver.ensure_running()
+    finally:
+        os.sched_setaffinity(0, own)
     return context
 
 

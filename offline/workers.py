@@ -21,7 +21,7 @@ from adaptune import __version__
 from adaptune.archive import Frames
 from adaptune.errors import OUT_OF_MEMORY, AdaptuneError, MachineError, in_a_line, lacking
 from adaptune.forking import end_with_parent, fork_server
-from adaptune.machine import pin
+from adaptune.machine import allowed_memory, pin
 from adaptune.processes import how_it_ended
 from adaptune.progress import Progress, unseen
 from adaptune.recording.cache import fingerprints
@@ -215,7 +215,7 @@ MOST_PREPARED = 1.5e9
 
 def spare_memory() -> float:
     """Bytes of this machine that all its workers together may take for prepared scans."""
-    return 0.25 * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    return 0.25 * allowed_memory()
 
 
 class Bench:
