@@ -1,5 +1,6 @@
 """Processes that drive, and keep the scans that they have prepared."""
 
+import asyncio
 import contextlib
 import dataclasses
 import logging
@@ -9,6 +10,7 @@ import time
 import traceback
 from collections import Counter
 from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerProcess
 from pathlib import Path
@@ -389,8 +391,15 @@ class Cluster:
         self._futures: dict[str, Any] = {}
         self._done = threading.Event()
         try:
+            with ThreadPoolExecutor(1) as beside:  # a notebook's own thread has a loop that runs
+                kind = beside.submit(lambda: asyncio.run(_what_answers(address))).result()
+            if kind != "Scheduler":
+                raise ClusterError(
+                    f"--cluster {address}: {kind} answers there, and no scheduler; name the "
+                    f"address that `dask scheduler` says (its dashboard has another port)"
+                )
             self._client = distributed.Client(address, timeout=_TIMEOUT, set_as_default=False)
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, TypeError) as error:
             raise ClusterError(
                 f"--cluster {address}: cannot be reached ({error}); start a scheduler there "
                 f"(`dask scheduler`), or leave --cluster out"
@@ -496,6 +505,18 @@ class Cluster:
                     f"--cluster {self._address}: worker {worker} has {what}, and this is "
                     f"{__version__}; install the same version there"
                 )
+
+
+async def _what_answers(address: str) -> str:
+    """What listens at an address: Scheduler, Worker, Nanny, or something that is not Dask's."""
+    from distributed import Security, rpc
+
+    secured = Security().get_connection_args("client")
+    async with rpc(address, timeout=_TIMEOUT, connection_args=secured) as there:
+        # Dask itself waits without a limit for something else to introduce itself.
+        with contextlib.suppress(TimeoutError, MemoryError):
+            return str((await asyncio.wait_for(there.identity(), _TIMEOUT + 1.0))["type"])
+    return "something else"
 
 
 def contents(sequences: StudySequences, name: str) -> dict[Path, str]:
