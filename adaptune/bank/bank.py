@@ -167,13 +167,6 @@ class Lateness:
         # The bank's pose at the last scan that each member was given.
         self._T_odom_given = np.tile(np.eye(4), (n, 1, 1))
 
-    def settle(self) -> None:
-        """Wait for all that is owed, as before everybody starts again."""
-        for i in np.flatnonzero(self._owing & ~self.removed).tolist():
-            self._members[i].collect()
-        self._owing[:] = self.away[:] = False
-        self.absent = self.removed | self.resting
-
     def begin(self) -> None:
         """A scan is there: take what came late. Members that still work are absent."""
         self._begun = self._clock.now()
@@ -365,8 +358,9 @@ class Bank(OdometryInstance):
         self, prepared: PreparedScan, T_odom_sensor: Poses, T_previous_current: Poses | None = None
     ) -> None:
         self.late.resting = self._resting
-        self.late.settle()
         self._returning.clear()
+        self.late.away[:] = False
+        self.late.begin()
         for member in self._present:
             member.start(prepared.by(member), T_odom_sensor, T_previous_current)
         self.late.given(T_odom_sensor)
@@ -375,7 +369,9 @@ class Bank(OdometryInstance):
         self._short.start(prepared.stamp, prepared.scan.points)
         self._past = deque([PastScan(prepared, T_odom_sensor, T_previous_current)])
         self._last_motion.start(T_odom_sensor, T_previous_current)
-        self._asked[:] = self._waking[:] = False
+        self._asked[:] = False
+        # Those that still work on a scan begin when they are done.
+        self._waking = self.late.absent & ~self._resting
         self._tell()
 
     def submit(self, prepared: PreparedScan) -> None:
