@@ -34,7 +34,7 @@ from adaptune.errors import AdaptuneError, in_a_line
 from adaptune.keeper import Ended, adopt_orphans, keep
 
 _LENGTH = struct.Struct("<I")
-_LONGEST_HEADER = 1 << 24
+_LONGEST_HEADER, _LARGEST_ARRAY = 1 << 24, 1 << 30  # bytes
 
 
 class SocketStream:
@@ -122,9 +122,10 @@ def receive(stream: "BinaryIO | SocketStream | _Timed") -> Message | None:
         header = json.loads(_exactly(stream, length))
         arrays = {}
         for name, kind, shape in header.pop("arrays"):
-            data = _exactly(stream, int(np.prod(shape)) * np.dtype(kind).itemsize)
-            arrays[name] = np.frombuffer(data, kind).reshape(shape)
-    except (struct.error, ValueError, KeyError, TypeError, SyntaxError) as error:
+            if not 0 <= (size := math.prod(shape) * np.dtype(kind).itemsize) <= _LARGEST_ARRAY:
+                raise WireError(f"the stream holds no message of adaptune's ({name}: {shape})")
+            arrays[name] = np.frombuffer(_exactly(stream, size), kind).reshape(shape)
+    except (struct.error, ValueError, LookupError, TypeError, SyntaxError, AttributeError) as error:
         raise WireError(f"the stream holds no message of adaptune's ({error})") from error
     return Message(header, arrays)
 
@@ -435,7 +436,7 @@ class Conversation:
             what = str(error)
         if answer is not None and answer.header.get("type") != "fault":
             return answer
-        what = self.transport.why(what) if answer is None else str(answer.header["message"])
+        what = self.transport.why(what) if answer is None else _words(answer)
         self.close()
         raise HostError(what)
 
@@ -465,8 +466,12 @@ class Conversation:
 def accepted(answer: Message) -> Message:
     """An answer; a `RefusedError` if it says that it cannot be done."""
     if answer.header.get("type") == "refused":
-        raise RefusedError(str(answer.header["message"]))
+        raise RefusedError(_words(answer))
     return answer
+
+
+def _words(answer: Message) -> str:
+    return str(answer.header.get("message", "it does not say why"))
 
 
 Answer = Callable[[Message], Mapping[str, Any] | None]

@@ -248,14 +248,24 @@ def test_what_a_server_refuses(first, message):
     assert "https://" not in answer.header["message"]
 
 
-NO_NUMBERS = b'{"arrays": [["pose", ",", [4, 4]]]}'
+def with_length(header):
+    return struct.pack("<I", len(header)) + header
 
 
 @pytest.mark.parametrize(
     "data",
     [
         *(b"Hello, world!", b"\x02\0\0\0{}", b"\x05\0\0\0{}", b"\x01", b"\x03\0\0\0[1]"),
-        struct.pack("<I", len(NO_NUMBERS)) + NO_NUMBERS,
+        with_length(b'"words"'),
+        with_length(b"7"),
+        with_length(b'{"arrays": [["pose", ",", [4, 4]]]}'),
+        with_length(b'{"arrays": [["pose", "<f8", 16]]}'),
+        with_length(b'{"arrays": [["pose", "<f8", ["4", "4"]]]}'),
+        with_length(b'{"arrays": [["pose", "<f8", [-4, 4]]]}') + bytes(128),
+        # Not allocated.
+        with_length(b'{"arrays": [["pose", "<f8", [4, 4000000000000]]]}'),
+        with_length(b'{"arrays": [["pose", "<f8", [4294967296, 4294967296]]]}'),
+        with_length(b'{"arrays": [["pose", "<U1000000000", [4, 4]]]}'),
     ],
 )
 def test_what_is_no_message(data):
@@ -277,6 +287,8 @@ TOLD_BY_PROGRAMS = {
     "backwards": r"a pose of another time, -0\.200 s from the scan's",
     "no pose": "an answer without 'pose'",
     "types": "an answer of other types",
+    "shape": r"the stream holds no message of adaptune's \(pose: \[4, 4000000000000\]\)",
+    "fault": "it does not say why",
 }
 
 
