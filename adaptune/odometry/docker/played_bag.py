@@ -101,9 +101,10 @@ class PlayedBag(WholeRun):
         template, text = filled(self.settings, self.parameters)
         memory = self._limits.memory
         system = self.settings.system(self.settings, memory, text, folder, given)
-        recorder, fault = PoseRecorder(system.reader()), ""
+        fault = ""
         with closing(system):
             try:
+                recorder = PoseRecorder(system.reader())
                 points = self._renamed(given).get(given.points, given.points)
                 system.wait(points)
                 system.check(template, self.parameters)
