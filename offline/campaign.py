@@ -446,6 +446,6 @@ def check_baseline(odometry: str, sequence: str, run: Trial) -> None:
     last = run.faults[-1] if run.faults else "it gave no pose, and no reason"
     raise BaselineError(
         f"sequences.{sequence}: {odometry} fails with its own parameters, the baseline: "
-        f"{run.failure}; {last}; nothing of it is stored: mend the odometry (odometry "
-        f"in the study), or leave the sequence out, and run the same command again"
+        f"{run.failure}; {last}: mend the odometry (odometry in the study), or leave the sequence "
+        f"out, and run the same command again"
     )

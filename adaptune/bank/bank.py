@@ -296,7 +296,7 @@ class Bank(OdometryInstance):
             f"trial {trial}" + (f" ({given[ODOMETRY]})" if ODOMETRY in given else "")
             for trial, given in sets.items()
         ]
-        self._warned_of: set[int] = set()
+        self._warned_of: dict[int, None] = {}  # in the order in which they ended
         self._known_faults = [0] * len(sets)  # of each member, when it last worked
         self.late = Lateness(self._members, self._names, rate, clock)
         self._rate = rate
@@ -314,7 +314,9 @@ class Bank(OdometryInstance):
 
     @property
     def faults(self) -> list[str]:
-        return [fault for member in self._members for fault in member.faults]
+        # Those of members that the bank goes on without explain nothing, unless none is left.
+        left = [i for i in range(len(self._members)) if i not in self._warned_of]
+        return [f for i in left or self._warned_of for f in self._members[i].faults]
 
     @property
     def usage(self) -> Usage:
@@ -468,10 +470,10 @@ class Bank(OdometryInstance):
             # One that has not begun yet, or that waits for its turn, has not failed.
             new = member.faults[self._known_faults[i] :]
             if member.ended and new and i not in self._warned_of:
-                self._warned_of.add(i)
+                self._warned_of[i] = None
                 _log.warning("%s ended: %s; the bank goes on without it", name, new[-1])
             elif not member.ended:
                 self._known_faults[i] = len(member.faults)
                 if i in self._warned_of:
-                    self._warned_of.remove(i)
+                    del self._warned_of[i]
                     _log.warning("%s is back", name)

@@ -170,7 +170,7 @@ def test_a_single_fault_does_no_harm():
     run = Trial({}, np.tile(np.eye(4), (n, 1, 1)), *np.zeros((4, n)), ("hm",))
     check_baseline("mine", "one", replace(run, unhealthy={"no_pose": 3}))
     failed = replace(run, failure="no pose for 4 of 40 scans")
-    with pytest.raises(BaselineError, match=r"sequences\.one: mine fails .*: no pose .*; hm; noth"):
+    with pytest.raises(BaselineError, match=r"sequences\.one: mine fails .*: no pose .*; hm: mend"):
         check_baseline("mine", "one", failed)
 
 
