@@ -369,7 +369,7 @@ def drive_whole(
 ) -> None:
     """Drive sets along whole training sequences, unless that was done before.
 
-    Baselines drive along each time, so that costs compare that were measured side by side.
+    Where one is lacking, all drive again: costs compare where they were measured side by side.
     Where the health check acts, it may hide that a set fails without it. So admissible sets, and
     the baseline, drive such sequences once more, bare.
     """
@@ -378,14 +378,15 @@ def drive_whole(
     def drive(on: Mapping[str, Collection[int]], what: str, bare: bool = False) -> None:
         schedule = Schedule(study, archive, what, progress, whole=True, bare=bare)
         there = read_whole_drives(archive, names, sets, bare)
-        again = 0 if bare else len(labels)  # trials below this, the baselines, drive along
         for name, numbers in on.items():
             if {*numbers} - {*there[name]}:
                 for n in numbers:
-                    if n < again or n not in there[name]:
+                    if not bare:
+                        archive.trial_path(name, n, whole=True).unlink(missing_ok=True)
+                    if not bare or n not in there[name]:
                         schedule.add(name, n, sets[n])
         for name, n, trial in schedule.run(workers):
-            if n < again:
+            if n < len(labels) and not bare:
                 check_baseline(labels[n], name, trial)
             schedule.store(name, n, trial)
 
