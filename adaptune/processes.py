@@ -433,7 +433,7 @@ class Conversation:
         except OSError:
             pass
         except WireError as error:
-            what = str(error)
+            what = str(error).replace("stream", f"stream of {self.transport.name}", 1)
         if answer is not None and answer.header.get("type") != "fault":
             return answer
         what = self.transport.why(what) if answer is None else _words(answer)

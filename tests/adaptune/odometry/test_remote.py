@@ -283,11 +283,11 @@ def program(fault="none"):
 TOLD_BY_PROGRAMS = {
     "exit": "its process ended with code 3: about to go wrong",
     "hang": r"a scan took longer than isolation\.seconds = 0\.5: about to go wrong",
-    "words": r"the stream holds no message of adaptune's.*: about to go wrong",
+    "words": r"the stream of \S+python\S* holds no message of adaptune's.*: about to go wrong",
     "backwards": r"a pose of another time, -0\.200 s from the scan's",
     "no pose": "an answer without 'pose'",
     "types": "an answer of other types",
-    "shape": r"the stream holds no message of adaptune's \(pose: \[4, 4000000000000\]\)",
+    "shape": r"stream of \S+ holds no message of adaptune's \(pose: \[4, 4000000000000\]\)",
     "fault": "it does not say why",
 }
 
