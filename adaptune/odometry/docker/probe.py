@@ -75,7 +75,7 @@ def look(
             works_on = system._works_on(inside)
     seconds = max(1e-9 * (shown[-1][1] - shown[0][1]), 0.1)
     report["time of a start"] = f"{took:.1f} s"
-    report |= _poses(system.came, shown)
+    report |= about_poses(system.came, shown)
     report["CPU of a second"] = f"{system.usage.cpu / seconds:.2f} s"
     report["memory"] = f"{system.usage.memory or 0.0:.0f} MB"
     for fault in system.faults:
@@ -209,7 +209,7 @@ def _declared(system: Any, template: Template) -> dict[str, str]:
     return {"declared, not in the template": ", ".join(own)} if own else {}
 
 
-def _poses(came: list[tuple[float, int]], shown: list[tuple[float, int]]) -> dict[str, str]:
+def about_poses(came: list[tuple[float, int]], shown: list[tuple[float, int]]) -> dict[str, str]:
     """What is known of poses, which came at a time with a stamp, from scans that were shown."""
     n, came = len(came), [(t, stamp) for t, stamp in came if t >= shown[0][0]]
     early = {"poses before the first scan": str(n - len(came))} if len(came) < n else {}
