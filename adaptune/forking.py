@@ -41,14 +41,10 @@ def fork_server(*preload: str) -> ForkServerContext:
     _name_sockets()
     # A fresh Python looks for modules where it begins, before it looks among its own. Processes
     # have the folder and the path of this one again.
-    # Nor are they pinned where this one is.
-    own = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, shared_cores())
-    try:
-        with contextlib.chdir("/"):
-            forkserver.ensure_running()
-    finally:
-        os.sched_setaffinity(0, own)
+    with contextlib.chdir("/"), contextlib.ExitStack() as undo:
+        undo.callback(os.sched_setaffinity, 0, os.sched_getaffinity(0))
+        os.sched_setaffinity(0, shared_cores())  # all, where this process is pinned
+        forkserver.ensure_running()
     return context
 
 

@@ -17,19 +17,15 @@ _numbers = itertools.count(1)
 
 def available() -> int:
     """Number of cores whose time this process and those that work beside it may use."""
-    n = len(shared_cores())
-    files = ["cpu.max"], ["cpu.cfs_quota_us", "cpu.cfs_period_us"]
-    for quota, period in _granted("cpu", *files):
-        if quota > 0.0:
-            n = min(n, math.ceil(quota / period))
-    return n
+    quotas = _granted("cpu", ["cpu.max"], ["cpu.cfs_quota_us", "cpu.cfs_period_us"])
+    return min([len(shared_cores()), *(math.ceil(q / period) for q, period in quotas if q > 0)])
 
 
-def allowed_memory() -> float:
-    """Bytes of memory that this process and those that work beside it may take."""
-    bytes_ = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+def spare_memory() -> float:
+    """Bytes that all workers here together may take for prepared scans."""
+    whole = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     limits = _granted("memory", ["memory.max"], ["memory.limit_in_bytes"])
-    return min([bytes_, *(limit for (limit,) in limits)])
+    return 0.25 * min([whole, *(limit for (limit,) in limits)])
 
 
 def _granted(controller: str, *versions: Sequence[str]) -> Iterator[list[float]]:

@@ -436,7 +436,8 @@ class Conversation:
             what = str(error).replace("stream", f"stream of {self.transport.name}", 1)
         if answer is not None and answer.header.get("type") != "fault":
             return answer
-        what = self.transport.why(what) if answer is None else _words(answer)
+        said = "" if answer is None else answer.header.get("message", "it does not say why")
+        what = self.transport.why(what) if answer is None else str(said)
         self.close()
         raise HostError(what)
 
@@ -466,12 +467,8 @@ class Conversation:
 def accepted(answer: Message) -> Message:
     """An answer; a `RefusedError` if it says that it cannot be done."""
     if answer.header.get("type") == "refused":
-        raise RefusedError(_words(answer))
+        raise RefusedError(str(answer.header.get("message", "it does not say why")))
     return answer
-
-
-def _words(answer: Message) -> str:
-    return str(answer.header.get("message", "it does not say why"))
 
 
 Answer = Callable[[Message], Mapping[str, Any] | None]

@@ -379,12 +379,10 @@ def drive_whole(
         schedule = Schedule(study, archive, what, progress, whole=True, bare=bare)
         there = read_whole_drives(archive, names, sets, bare)
         for name, numbers in on.items():
-            if {*numbers} - {*there[name]}:
-                for n in numbers:
-                    if not bare:
-                        archive.trial_path(name, n, whole=True).unlink(missing_ok=True)
-                    if not bare or n not in there[name]:
-                        schedule.add(name, n, sets[n])
+            if lacking := {*numbers} - {*there[name]}:
+                for n in sorted(lacking) if bare else numbers:
+                    archive.trial_path(name, n, True, bare).unlink(missing_ok=True)
+                    schedule.add(name, n, sets[n])
         for name, n, trial in schedule.run(workers):
             if n < len(labels) and not bare:
                 check_baseline(labels[n], name, trial)

@@ -23,7 +23,7 @@ from adaptune import __version__
 from adaptune.archive import Frames
 from adaptune.errors import OUT_OF_MEMORY, AdaptuneError, MachineError, in_a_line, lacking
 from adaptune.forking import end_with_parent, fork_server
-from adaptune.machine import allowed_memory, pin
+from adaptune.machine import pin, spare_memory
 from adaptune.processes import how_it_ended
 from adaptune.progress import Progress, unseen
 from adaptune.recording.cache import fingerprints
@@ -213,11 +213,6 @@ class _Crew(Generic[W]):
 
 MOST_PREPARED = 1.5e9
 """Bytes of prepared scans that a worker keeps; others are prepared again on each pass."""
-
-
-def spare_memory() -> float:
-    """Bytes of this machine that all its workers together may take for prepared scans."""
-    return 0.25 * allowed_memory()
 
 
 class Bench:
@@ -508,12 +503,11 @@ class Cluster:
 
 
 async def _what_answers(address: str) -> str:
-    """What listens at an address: Scheduler, Worker, Nanny, or something that is not Dask's."""
+    """What listens at an address, as Scheduler; Dask waits for an introduction without a limit."""
     from distributed import Security, rpc
 
     secured = Security().get_connection_args("client")
     async with rpc(address, timeout=_TIMEOUT, connection_args=secured) as there:
-        # Dask itself waits without a limit for something else to introduce itself.
         with contextlib.suppress(TimeoutError, MemoryError):
             return str((await asyncio.wait_for(there.identity(), _TIMEOUT + 1.0))["type"])
     return "something else"

@@ -214,10 +214,7 @@ def tee(scans: Iterable[Scan], key: str, about: dict[str, Any]) -> Iterator[Scan
 
 
 def make_room(size: int = 0) -> None:
-    """Remove what was used least recently, so that another entry of this size has room.
-
-    What is kept besides, as estimated references, are files ``.npz`` in folders.
-    """
+    """Remove entries, and kept references, that were used least recently, so that this has room."""
     entries = []
     for used in (*folder().glob(f"[!.]*/{_ABOUT}"), *folder().glob("*/[!.]*.npz")):
         with suppress(OSError):  # another process may remove it

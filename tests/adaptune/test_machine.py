@@ -113,7 +113,7 @@ def test_what_a_container_may_use_counts(tmp_path, monkeypatch, own, files, core
     monkeypatch.setattr(machine, "_GROUPS", tmp_path / "groups")
     whole = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     assert machine.available() == cores
-    assert machine.allowed_memory() == (most or whole)
+    assert machine.spare_memory() == 0.25 * (most or whole)
 
 
 def test_mapped_files_are_no_memory_of_the_process(tmp_path):
