@@ -15,7 +15,7 @@ from multiprocessing.context import ForkServerContext
 from multiprocessing.util import get_temp_dir
 
 from adaptune.errors import AdaptuneError
-from adaptune.machine import available
+from adaptune.machine import available, shared_cores
 
 
 def end_with_parent() -> None:
@@ -41,7 +41,9 @@ def fork_server(*preload: str) -> ForkServerContext:
     _name_sockets()
     # A fresh Python looks for modules where it begins, before it looks among its own. Processes
     # have the folder and the path of this one again.
-    with contextlib.chdir("/"):
+    with contextlib.chdir("/"), contextlib.ExitStack() as undo:
+        undo.callback(os.sched_setaffinity, 0, os.sched_getaffinity(0))
+        os.sched_setaffinity(0, shared_cores())  # all, where this process is pinned
         forkserver.ensure_running()
     return context
 

@@ -3,19 +3,43 @@
 import ctypes
 import gc
 import itertools
+import math
 import os
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 _before: set[int] | None = None
 """Cores that this process had before it was pinned alone."""
+_OWN_GROUPS, _GROUPS = Path("/proc/self/cgroup"), Path("/sys/fs/cgroup")
 _numbers = itertools.count(1)
 
 
 def available() -> int:
-    """Number of cores that this process may use."""
-    return len(os.sched_getaffinity(0))
+    """Number of cores whose time this process and those that work beside it may use."""
+    quotas = _granted("cpu", ["cpu.max"], ["cpu.cfs_quota_us", "cpu.cfs_period_us"])
+    return min([len(shared_cores()), *(math.ceil(q / period) for q, period in quotas if q > 0)])
+
+
+def spare_memory() -> float:
+    """Bytes that all workers here together may take for prepared scans."""
+    whole = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    limits = _granted("memory", ["memory.max"], ["memory.limit_in_bytes"])
+    return 0.25 * min([whole, *(limit for (limit,) in limits)])
+
+
+def _granted(controller: str, *versions: Sequence[str]) -> Iterator[list[float]]:
+    """What the control groups of this process, as a container's, say in files of either version."""
+    lines = _OWN_GROUPS.read_text(encoding="utf-8").splitlines() if _OWN_GROUPS.exists() else ()
+    for _, controllers, name in (line.split(":", 2) for line in lines):
+        if controllers and controller not in controllers.split(","):
+            continue
+        group = _GROUPS / (controllers and controller) / name.lstrip("/")
+        # A container sees its own group as the root.
+        for folder, files in itertools.product((group, *group.parents), versions):
+            with suppress(OSError, ValueError):  # there is none, or it says "max"
+                said = " ".join((folder / file).read_text(encoding="ascii") for file in files)
+                yield [float(word) for word in said.split()]
 
 
 def shared_cores() -> set[int]:
@@ -29,18 +53,18 @@ def pin(core: int, alone: bool = False) -> ExitStack:
     Open3D sums in an order that depends on its threads. Only on one core do its results repeat bit
     by bit. Running threads keep their cores: call this before the first use of Open3D. Numbers
     beyond the last core restart at the first. `alone` says that this process is the only one at
-    work: then `next_core` gives others the rest.
+    work, also where it is pinned again meanwhile: then `next_core` gives others the rest.
     """
     global _before  # noqa: PLW0603 - the cores are those of the process
     pinned = ExitStack()
-    cores = os.sched_getaffinity(0)
+    cores, outer = os.sched_getaffinity(0), _before
     os.sched_setaffinity(0, {sorted(cores)[core % len(cores)]})
-    _before = cores if alone else None
+    _before = outer or (cores if alone else None)
 
     def unpin() -> None:
         global _before  # noqa: PLW0603
         os.sched_setaffinity(0, cores)
-        _before = None
+        _before = outer
 
     pinned.callback(unpin)
     return pinned

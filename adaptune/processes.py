@@ -34,7 +34,7 @@ from adaptune.errors import AdaptuneError, in_a_line
 from adaptune.keeper import Ended, adopt_orphans, keep
 
 _LENGTH = struct.Struct("<I")
-_LONGEST_HEADER = 1 << 24
+_LONGEST_HEADER, _LARGEST_ARRAY = 1 << 24, 1 << 30  # bytes
 
 
 class SocketStream:
@@ -122,9 +122,10 @@ def receive(stream: "BinaryIO | SocketStream | _Timed") -> Message | None:
         header = json.loads(_exactly(stream, length))
         arrays = {}
         for name, kind, shape in header.pop("arrays"):
-            data = _exactly(stream, int(np.prod(shape)) * np.dtype(kind).itemsize)
-            arrays[name] = np.frombuffer(data, kind).reshape(shape)
-    except (struct.error, ValueError, KeyError, TypeError, SyntaxError) as error:
+            if not 0 <= (size := math.prod(shape) * np.dtype(kind).itemsize) <= _LARGEST_ARRAY:
+                raise WireError(f"the stream holds no message of adaptune's ({name}: {shape})")
+            arrays[name] = np.frombuffer(_exactly(stream, size), kind).reshape(shape)
+    except (struct.error, ValueError, LookupError, TypeError, SyntaxError, AttributeError) as error:
         raise WireError(f"the stream holds no message of adaptune's ({error})") from error
     return Message(header, arrays)
 
@@ -432,10 +433,11 @@ class Conversation:
         except OSError:
             pass
         except WireError as error:
-            what = str(error)
+            what = str(error).replace("stream", f"stream of {self.transport.name}", 1)
         if answer is not None and answer.header.get("type") != "fault":
             return answer
-        what = self.transport.why(what) if answer is None else str(answer.header["message"])
+        said = "" if answer is None else answer.header.get("message", "it does not say why")
+        what = self.transport.why(what) if answer is None else str(said)
         self.close()
         raise HostError(what)
 
@@ -465,7 +467,7 @@ class Conversation:
 def accepted(answer: Message) -> Message:
     """An answer; a `RefusedError` if it says that it cannot be done."""
     if answer.header.get("type") == "refused":
-        raise RefusedError(str(answer.header["message"]))
+        raise RefusedError(str(answer.header.get("message", "it does not say why")))
     return answer
 
 

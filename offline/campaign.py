@@ -370,7 +370,7 @@ def drive_whole(
 ) -> None:
     """Drive sets along whole training sequences, unless that was done before.
 
-    Baselines drive along each time, so that costs compare that were measured side by side.
+    Where one is lacking, all drive again: costs compare where they were measured side by side.
     Where the health check acts, it may hide that a set fails without it. So those sets, and the
     baseline, drive such sequences once more, bare.
     """
@@ -379,14 +379,13 @@ def drive_whole(
     def drive(on: Mapping[str, Collection[int]], what: str, bare: bool = False) -> None:
         schedule = Schedule(study, archive, what, progress, whole=True, bare=bare)
         there = read_whole_drives(archive, names, sets, bare)
-        again = 0 if bare else len(labels)  # trials below this, the baselines, drive along
         for name, numbers in on.items():
-            if {*numbers} - {*there[name]}:
-                for n in numbers:
-                    if n < again or n not in there[name]:
-                        schedule.add(name, n, sets[n])
+            if lacking := {*numbers} - {*there[name]}:
+                for n in sorted(lacking) if bare else numbers:
+                    archive.trial_path(name, n, True, bare).unlink(missing_ok=True)
+                    schedule.add(name, n, sets[n])
         for name, n, trial in schedule.run(workers):
-            if n < again:
+            if n < len(labels) and not bare:
                 check_baseline(labels[n], name, trial)
             schedule.store(name, n, trial)
 
@@ -447,6 +446,6 @@ def check_baseline(odometry: str, sequence: str, run: Trial) -> None:
     last = run.faults[-1] if run.faults else "it gave no pose, and no reason"
     raise BaselineError(
         f"sequences.{sequence}: {odometry} fails with its own parameters, the baseline: "
-        f"{run.failure}; {last}; nothing of it is stored: mend the odometry (odometry "
-        f"in the study), or leave the sequence out, and run the same command again"
+        f"{run.failure}; {last}: mend the odometry (odometry in the study), or leave the sequence "
+        f"out, and run the same command again"
     )

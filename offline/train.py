@@ -12,7 +12,7 @@ from adaptune import __version__, manifest, trial_rows, yaml12
 from adaptune.archive import Archive, Summary
 from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
-from adaptune.machine import available
+from adaptune.machine import available, spare_memory
 from adaptune.metrics import cap, lost_in_words
 from adaptune.model import ErrorModel, ModelError
 from adaptune.model.registry import ADAPTIVE
@@ -55,7 +55,7 @@ from offline.objective import (
 )
 from offline.search import BUDGETS, ELAPSED, Finished, Stopwatch
 from offline.tuning import choose, recommends_bank, reserve
-from offline.workers import Cluster, Pool, Workers, spare_memory
+from offline.workers import Cluster, Pool, Workers
 
 _log = logging.getLogger(__name__)
 

@@ -1,5 +1,6 @@
 """Processes that drive, and keep the scans that they have prepared."""
 
+import asyncio
 import contextlib
 import dataclasses
 import logging
@@ -9,6 +10,7 @@ import time
 import traceback
 from collections import Counter
 from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerProcess
 from pathlib import Path
@@ -21,7 +23,7 @@ from adaptune import __version__
 from adaptune.archive import Frames
 from adaptune.errors import OUT_OF_MEMORY, AdaptuneError, MachineError, in_a_line, lacking
 from adaptune.forking import end_with_parent, fork_server
-from adaptune.machine import pin
+from adaptune.machine import pin, spare_memory
 from adaptune.processes import how_it_ended
 from adaptune.progress import Progress, unseen
 from adaptune.recording.cache import fingerprints
@@ -213,11 +215,6 @@ MOST_PREPARED = 1.5e9
 """Bytes of prepared scans that a worker keeps; others are prepared again on each pass."""
 
 
-def spare_memory() -> float:
-    """Bytes of this machine that all its workers together may take for prepared scans."""
-    return 0.25 * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-
-
 class Bench:
     """What a worker works with: recordings that it has opened, and scans that it has prepared."""
 
@@ -389,8 +386,15 @@ class Cluster:
         self._futures: dict[str, Any] = {}
         self._done = threading.Event()
         try:
+            with ThreadPoolExecutor(1) as beside:  # a notebook's own thread has a loop that runs
+                kind = beside.submit(lambda: asyncio.run(_what_answers(address))).result()
+            if kind != "Scheduler":
+                raise ClusterError(
+                    f"--cluster {address}: {kind} answers there, and no scheduler; name the "
+                    f"address that `dask scheduler` says (its dashboard has another port)"
+                )
             self._client = distributed.Client(address, timeout=_TIMEOUT, set_as_default=False)
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, TypeError) as error:
             raise ClusterError(
                 f"--cluster {address}: cannot be reached ({error}); start a scheduler there "
                 f"(`dask scheduler`), or leave --cluster out"
@@ -496,6 +500,17 @@ class Cluster:
                     f"--cluster {self._address}: worker {worker} has {what}, and this is "
                     f"{__version__}; install the same version there"
                 )
+
+
+async def _what_answers(address: str) -> str:
+    """What listens at an address, as Scheduler; Dask waits for an introduction without a limit."""
+    from distributed import Security, rpc
+
+    secured = Security().get_connection_args("client")
+    async with rpc(address, timeout=_TIMEOUT, connection_args=secured) as there:
+        with contextlib.suppress(TimeoutError, MemoryError):
+            return str((await asyncio.wait_for(there.identity(), _TIMEOUT + 1.0))["type"])
+    return "something else"
 
 
 def contents(sequences: StudySequences, name: str) -> dict[Path, str]:

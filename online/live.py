@@ -106,6 +106,8 @@ class LiveScans:
         while (found := self._next(last)) is not None:
             (scan, came), dropped = found
             if last is not None and scan.stamp <= last:
+                with self._news:
+                    self._dropped += dropped
                 continue
             before, last = last, scan.stamp
             yield Arrival(self._with_imu(scan, before), came, dropped)
@@ -183,7 +185,7 @@ class LiveScans:
                 lambda: self.stopped or (self._measured and self._measured[-1][0] >= end),
                 IMU_WAIT,
             )
-            # The first scan gets those during it, and the one before.
+            # The first scan gets those during it, or else the one before.
             taken: list[tuple[int, tuple[float, ...]]] = []
             while self._measured and (not taken or taken[-1][0] < end):
                 taken.append(self._measured.popleft())

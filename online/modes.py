@@ -2,6 +2,7 @@
 
 import logging
 import math
+import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
@@ -12,7 +13,7 @@ from typing import Any, NamedTuple, Self
 from adaptune import manifest
 from adaptune.bank.bank import WARM_UP, Bank
 from adaptune.errors import AdaptuneError, Finding, OdometryError
-from adaptune.machine import release_memory, shared_cores
+from adaptune.machine import available, pin, release_memory
 from adaptune.model import ErrorModel
 from adaptune.model.descriptor import DescriptorError
 from adaptune.model.registry import ADAPTIVE, ENTRY_POINTS, RULES, STANDBY
@@ -188,7 +189,7 @@ class ReplaySetup:
         # Where no scan is dropped, no member is left behind either.
         rate = in_time.rate if in_time is not None and in_time.queue else None
         pace = 1.0 if in_time is None else in_time.rate
-        cores = 1 if mode.cost * pace <= ONE_CORE else len(shared_cores())
+        cores = 1 if mode.cost * pace <= ONE_CORE else available()
         return Bank(self.odometry, mode.sets, WARM_UP, self.config.lost_track, cores, rate)
 
     def identity(
@@ -339,35 +340,36 @@ def replay_modes(
     in_vain = cache(lambda: _in_vain(study.odometry, study.sequences.open(sequences[0])))
     model, model_path = fitted or (None, None)
     digest = "" if model is None else model.digest
-    for name in sequences:
-        folder, shared = study.folder / "replays" / name, study.replay_inputs(name)
-        every = [manifest.plain(setup.identity(mode, model, digest) | shared) for mode in modes]
-        due = [inputs for inputs in every if _is_due(study, name, inputs)]
-        live = [i["mode"] for i in due if setup.mode(i["mode"], model).live]
-        if live and (why := in_vain()):
-            _log.warning("%s is not replayed on %s: %s", " and ".join(live), name, why)
-            due = [inputs for inputs in due if inputs["mode"] not in live]
-        if not due and is_reference_of(folder, study.sequences.reference(name)):
-            continue
-        recording = study.sequences.open(name)
-        if due and study.odometry.description.whole:
-            study.sequences.program_input(name)  # may be written, which costs no mode
-        for i, inputs in enumerate(due):
-            mode = setup.mode(inputs["mode"], model)
-            release_memory()
-            try:
-                with closing(setup.instance(mode, name)) as odometry:
-                    what = f"{name}, {mode.name}"
-                    record = _replayed(study, recording, odometry, mode, what, progress)
-            except DescriptorError as error:
-                raise AdaptuneError(f"sequences.{name}: {error}") from error
-            if i == 0:
-                _judge(study, name, recording, record.trajectory)
-            write_replay(folder / mode.name, record, inputs, model_path)
-        if not due:
-            _judge(study, name, recording, StoredReplay.read(folder / modes[0]).trajectory)
-            _log.info("%s: the reference has changed; no replay depends on it", name)
-        made += len(due)
+    with pin(os.getpid(), alone=True):  # the estimates had all cores
+        for name in sequences:
+            folder, shared = study.folder / "replays" / name, study.replay_inputs(name)
+            every = [manifest.plain(setup.identity(mode, model, digest) | shared) for mode in modes]
+            due = [inputs for inputs in every if _is_due(study, name, inputs)]
+            live = [i["mode"] for i in due if setup.mode(i["mode"], model).live]
+            if live and (why := in_vain()):
+                _log.warning("%s is not replayed on %s: %s", " and ".join(live), name, why)
+                due = [inputs for inputs in due if inputs["mode"] not in live]
+            if not due and is_reference_of(folder, study.sequences.reference(name)):
+                continue
+            recording = study.sequences.open(name)
+            if due and study.odometry.description.whole:
+                study.sequences.program_input(name)  # may be written, which costs no mode
+            for i, inputs in enumerate(due):
+                mode = setup.mode(inputs["mode"], model)
+                release_memory()
+                try:
+                    with closing(setup.instance(mode, name)) as odometry:
+                        what = f"{name}, {mode.name}"
+                        record = _replayed(study, recording, odometry, mode, what, progress)
+                except DescriptorError as error:
+                    raise AdaptuneError(f"sequences.{name}: {error}") from error
+                if i == 0:
+                    _judge(study, name, recording, record.trajectory)
+                write_replay(folder / mode.name, record, inputs, model_path)
+            if not due:
+                _judge(study, name, recording, StoredReplay.read(folder / modes[0]).trajectory)
+                _log.info("%s: the reference has changed; no replay depends on it", name)
+            made += len(due)
     return made
 
 

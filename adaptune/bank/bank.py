@@ -167,13 +167,6 @@ class Lateness:
         # The bank's pose at the last scan that each member was given.
         self._T_odom_given = np.tile(np.eye(4), (n, 1, 1))
 
-    def settle(self) -> None:
-        """Wait for all that is owed, as before everybody starts again."""
-        for i in np.flatnonzero(self._owing & ~self.removed).tolist():
-            self._members[i].collect()
-        self._owing[:] = self.away[:] = False
-        self.absent = self.removed | self.resting
-
     def begin(self) -> None:
         """A scan is there: take what came late. Members that still work are absent."""
         self._begun = self._clock.now()
@@ -303,7 +296,7 @@ class Bank(OdometryInstance):
             f"trial {trial}" + (f" ({given[ODOMETRY]})" if ODOMETRY in given else "")
             for trial, given in sets.items()
         ]
-        self._warned_of: set[int] = set()
+        self._warned_of: dict[int, None] = {}  # in the order in which they ended
         self._known_faults = [0] * len(sets)  # of each member, when it last worked
         self.late = Lateness(self._members, self._names, rate, clock)
         self._rate = rate
@@ -321,7 +314,9 @@ class Bank(OdometryInstance):
 
     @property
     def faults(self) -> list[str]:
-        return [fault for member in self._members for fault in member.faults]
+        # Those of members that the bank goes on without explain nothing, unless none is left.
+        left = [i for i in range(len(self._members)) if i not in self._warned_of]
+        return [f for i in left or self._warned_of for f in self._members[i].faults]
 
     @property
     def usage(self) -> Usage:
@@ -365,8 +360,9 @@ class Bank(OdometryInstance):
         self, prepared: PreparedScan, T_odom_sensor: Poses, T_previous_current: Poses | None = None
     ) -> None:
         self.late.resting = self._resting
-        self.late.settle()
         self._returning.clear()
+        self.late.away[:] = False
+        self.late.begin()
         for member in self._present:
             member.start(prepared.by(member), T_odom_sensor, T_previous_current)
         self.late.given(T_odom_sensor)
@@ -375,7 +371,9 @@ class Bank(OdometryInstance):
         self._short.start(prepared.stamp, prepared.scan.points)
         self._past = deque([PastScan(prepared, T_odom_sensor, T_previous_current)])
         self._last_motion.start(T_odom_sensor, T_previous_current)
-        self._asked[:] = self._waking[:] = False
+        self._asked[:] = False
+        # Those that still work on a scan begin when they are done.
+        self._waking = self.late.absent & ~self._resting
         self._tell()
 
     def submit(self, prepared: PreparedScan) -> None:
@@ -472,10 +470,10 @@ class Bank(OdometryInstance):
             # One that has not begun yet, or that waits for its turn, has not failed.
             new = member.faults[self._known_faults[i] :]
             if member.ended and new and i not in self._warned_of:
-                self._warned_of.add(i)
+                self._warned_of[i] = None
                 _log.warning("%s ended: %s; the bank goes on without it", name, new[-1])
             elif not member.ended:
                 self._known_faults[i] = len(member.faults)
                 if i in self._warned_of:
-                    self._warned_of.remove(i)
+                    del self._warned_of[i]
                     _log.warning("%s is back", name)

@@ -2,6 +2,7 @@
 
 import logging
 import math
+import os
 from collections.abc import Mapping
 from contextlib import closing, suppress
 from pathlib import Path
@@ -113,10 +114,9 @@ def online(
     if oracle:
         _oracle(loaded, cluster)
     else:
-        from adaptune.tuning.tuned import alone
         from online.modes import run_replays, run_untrained
 
-        with progress() as show, alone(loaded):
+        with progress() as show:
             path = model or loaded.model_path
             made = run_untrained(loaded, show) if untrained else run_replays(loaded, path, show)
         there = f"{made} replays made" if made else "All replays were there already"
@@ -140,9 +140,9 @@ def _oracle(loaded: "OfflineStudy", cluster: str | None) -> None:
 def _drive(
     loaded: "OfflineStudy", mode: str | None, model: Path | None, *, untrained: bool, ros2: bool
 ) -> None:
+    from adaptune.machine import pin
     from adaptune.ros.relay import local_ros1
     from adaptune.ros.ros2 import local_ros2
-    from adaptune.tuning.tuned import alone
     from online.modes import UNTRAINED, WITHOUT_MODEL
     from online.robot import RobotDrive
 
@@ -150,7 +150,7 @@ def _drive(
     path = None if mode in WITHOUT_MODEL else model or loaded.model_path
     drive = RobotDrive(loaded, mode, path)
     link = local_ros2() if ros2 else local_ros1()
-    with closing(link), alone(loaded), progress() as show:
+    with closing(link), pin(os.getpid(), alone=True), progress() as show:
         log.info("drive, %s: Ctrl-C ends it", drive.mode)
         driven = drive.run(link, lambda of: show("drive", of.done, of.done, now(of)))
     dropped = f", {driven.record.dropped} of them dropped" if driven.record.dropped else ""

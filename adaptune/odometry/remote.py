@@ -4,6 +4,7 @@ A small server imports the odometry once and forks a fresh process for every sta
 milliseconds, and global state of the odometry ends with its process.
 """
 
+import os
 import socket
 from functools import cache
 from pathlib import Path
@@ -15,7 +16,7 @@ from pydantic import AfterValidator, BaseModel, Field, ValidationInfo, model_val
 from adaptune import processes
 from adaptune.errors import OdometryError, UnavailableError
 from adaptune.geometry import Poses
-from adaptune.machine import available, next_core
+from adaptune.machine import next_core
 from adaptune.odometry import wire
 from adaptune.odometry.base import LOST, BaseSettings, Description, Registration, Usage
 from adaptune.odometry.faults import Faulting, pose_fault
@@ -214,7 +215,7 @@ class ProgramTransport(processes.Transport):
         self.bounds = limits.bounds
         self._command, self._address = settings.command, settings.address
         # A program may use several cores, unless this process must not.
-        self._core = next_core() if available() == 1 else None
+        self._core = next_core() if len(os.sched_getaffinity(0)) == 1 else None
         self._program: processes.Program | None = None
 
     def connect(self) -> processes.SocketStream:

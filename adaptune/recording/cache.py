@@ -168,7 +168,7 @@ class _Writer:
         index = np.array(self._index, np.int64).reshape(-1, 1 + 2 * len(_ARRAYS))
         np.save(self._folder / _INDEX, index)
         (self._folder / _ABOUT).write_text(json.dumps(about, indent=1), "utf-8")
-        _make_room(_size(self._folder))
+        make_room(_size(self._folder))
         # Another process may have been first; its arrays are the same.
         if not (folder() / key).exists():
             self._folder.rename(folder() / key)
@@ -213,18 +213,20 @@ def tee(scans: Iterable[Scan], key: str, about: dict[str, Any]) -> Iterator[Scan
             _log.warning(_NOT_KEPT, about.get("name"), error)
 
 
-def _make_room(size: int) -> None:
-    """Remove the entries that were used least recently, so that another one has room."""
+def make_room(size: int = 0) -> None:
+    """Remove entries, and kept references, that were used least recently, so that this has room."""
     entries = []
-    for index in folder().glob(f"[!.]*/{_INDEX}"):
+    for used in (*folder().glob(f"[!.]*/{_ABOUT}"), *folder().glob("*/[!.]*.npz")):
         with suppress(OSError):  # another process may remove it
-            used = (index.parent / _ABOUT).stat().st_mtime
-            entries.append((used, _size(index.parent), index.parent))
+            path = used.parent if used.name == _ABOUT else used
+            entries.append((used.stat().st_mtime, _size(path), path))
     total = sum(n_bytes for _, n_bytes, _ in entries) + size
     for _, n_bytes, path in sorted(entries):
         if total <= cap():
             return
         # Processes that have mapped it keep their arrays.
+        with suppress(OSError):
+            path.unlink()
         shutil.rmtree(path, ignore_errors=True)
         total -= n_bytes
 
@@ -247,7 +249,7 @@ def _unlocked(path: Path) -> bool:
 
 
 def _size(path: Path) -> int:
-    return sum(p.stat().st_size for p in path.iterdir() if p.is_file())
+    return sum(p.stat().st_size for p in (path, *path.glob("*")) if p.is_file())
 
 
 SMALL = 1 << 24  # bytes of files below which their content is read every time

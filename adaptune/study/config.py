@@ -311,10 +311,10 @@ def _read(data: dict[str, Any], entry: Any, origins: dict[str, str]) -> _Named:
     name = next(iter(entry)) if isinstance(entry, dict) else entry
     if name not in known or name in origins:
         whole = [str(other) for other in known if other not in origins]
-        help_, part_of = nearest(str(name), whole), re.fullmatch(r"(.+)_([\d.]+-[\d.]+)", str(name))
-        if part_of and part_of[1] in whole:
-            help_ = f"write the part as {part_of[1]}: {part_of[2]}%"
-        raise ValueError(f"there is no sequence {name!r}: {help_}")
+        part_of = re.fullmatch(r"(.+)_([\d.]+-[\d.]+)", str(name))
+        if isinstance(entry, str) and part_of and part_of[1] in whole:  # as messages call it
+            return _read(data, {part_of[1]: f"{part_of[2]}%"}, origins)
+        raise ValueError(f"there is no sequence {name!r}: {nearest(str(name), whole)}")
     if isinstance(entry, str):
         return _Named(name, name, _WHOLE)
     try:

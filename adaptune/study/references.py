@@ -154,11 +154,14 @@ def _estimated(
     found: EstimatedReference | str | None = kept(path) if cache.cap() else None
     if found is not None:
         _log.info("%s: its reference was estimated before (%s)", name, path)
+        with suppress(OSError):
+            path.touch()  # what was used last is removed last
     else:
         try:
             found = estimate.estimate_reference(scans, advance)
             if cache.cap():
                 keep(path, found)
+                cache.make_room()
         except EstimateError as error:
             found = str(error) if scans.name in str(error) else f"{scans.name}: {error}"
     if config.part is None:

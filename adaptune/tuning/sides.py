@@ -13,7 +13,6 @@ from adaptune.files import plain_name
 from adaptune.progress import Progress
 from adaptune.tuning.asked import Asked, recorded
 from adaptune.tuning.studies import is_image
-from adaptune.tuning.tuned import alone
 from adaptune.yaml12 import Document, YamlError
 
 if TYPE_CHECKING:
@@ -140,5 +139,4 @@ def _drive(studies: "Sequence[OfflineStudy]", show: Progress) -> None:
         for name in sequences_without_model(study.config)
     ]
     for name, study in sorted(due, key=lambda one: one[0]):
-        with alone(study):
-            replay_modes(study, [name], (BASELINE,), show)
+        replay_modes(study, [name], (BASELINE,), show)

@@ -3,7 +3,6 @@
 import base64
 import logging
 import multiprocessing
-import os
 import sys
 from collections.abc import Sequence
 from contextlib import ExitStack, closing
@@ -242,8 +241,7 @@ def tune_asked(
     before = study.fixed
     with closing(study):
         training = train(study, show, cluster, clock)
-        with alone(study):
-            run_replays(study, study.model_path, show)
+        run_replays(study, study.model_path, show)
         return Tuned(study, training, *compared(study), more, before)
 
 
@@ -257,15 +255,6 @@ def _study_name(asked: Asked) -> str:
     names = (name.strip().replace(":", "_") for name in odometry.split(","))
     others = "+".join(dict.fromkeys(names))
     return stem if odometry == "gicp" else f"{stem}_{others}"
-
-
-def alone(study: "OfflineStudy") -> ExitStack:
-    """Bind this process to one core, and leave the others to what it starts."""
-    from adaptune.machine import pin
-
-    # Ask for the number of cores before.
-    _ = study.mechanism
-    return pin(os.getpid(), alone=True)
 
 
 def compared(study: "OfflineStudy") -> "tuple[ComparedReplays, Path]":

@@ -14,6 +14,24 @@ def test_a_process_that_is_killed_is_told():
         pool.submit(os._exit, 1).result()
 
 
+PINNED = """
+import os
+from adaptune.forking import processes
+from adaptune.machine import pin
+
+if __name__ == "__main__":
+    cores = os.sched_getaffinity(0)
+    with pin(0, alone=True), processes(1) as pool:  # this starts the server of all later ones
+        assert pool.submit(os.sched_getaffinity, 0).result() == cores
+        assert len(os.sched_getaffinity(0)) == 1
+"""
+
+
+def test_processes_are_not_pinned_with_the_one_that_they_work_for(tmp_path):
+    (tmp_path / "pinned.py").write_text(PINNED)
+    subprocess.run([sys.executable, "pinned.py"], cwd=tmp_path, check=True)
+
+
 OWNER = """
 import os, sys, time
 from adaptune import forking

@@ -1,3 +1,4 @@
+import os
 import shutil
 
 import drives
@@ -141,8 +142,10 @@ def test_another_study_of_the_same_recording_takes_what_is_kept(
 
     assert estimated() == 1
     # The same content under another path, with what is said of the reference alone.
-    assert estimated(f"sequences.one.bag={copy}", "sequences.one.max_gap=9") == 1
     (kept,) = (cache.folder() / references.KEPT).iterdir()
+    os.utime(kept, (1.0, 1.0))
+    assert estimated(f"sequences.one.bag={copy}", "sequences.one.max_gap=9") == 1
+    assert kept.stat().st_mtime > 1.0
     assert f"one: its reference was estimated before ({kept})" in caplog.messages
     for suffix in (".tum", ".json"):
         one, two = (path.with_suffix(suffix).read_text() for path in paths)
@@ -160,6 +163,10 @@ def test_another_study_of_the_same_recording_takes_what_is_kept(
     monkeypatch.setenv("ADAPTUNE_CACHE_GB", "0")
     asked = len(estimator.asked)
     assert [estimated(), estimated()] == [asked + 1, asked + 2]
+    # They count against what the cache may take.
+    monkeypatch.setenv("ADAPTUNE_CACHE_GB", "1e-6")
+    estimated()
+    assert not list(kept.parent.iterdir())
 
 
 def test_a_recording_with_poses_of_its_own_keeps_them(tmp_path):

@@ -32,6 +32,15 @@ def test_parts_become_sequences_of_their_own(study_file, tmp_path):
     assert recorded_in("one") != recorded_in("two")
 
 
+def test_a_part_may_be_given_by_its_name(study_file, tmp_path):
+    parts = {"training": [{"one": "0-30%"}, {"one": "30-60%"}], "test": [{"one": "60-100%"}]}
+    file = written(study_file, "by_name", **parts)
+    study = load_study(file, ["training=[one_0-30]", "test=[one_30-60, one_60-100]"], tmp_path)
+    assert study.training == ["one_0-30"]
+    assert study.config.test == ("one_30-60", "one_60-100")
+    assert study.config.sequences["one_30-60"].part == (0.3, 0.6)
+
+
 def test_a_name_may_look_like_a_number(study_file):
     text = study_file.read_text().replace("one:", "00:").replace("two:", "1e3:")
     file = study_file.with_name("numbers.yaml")
@@ -55,7 +64,10 @@ def test_parts_of_a_course_share_its_recording(study_file, tmp_path):
         ({"training": [{"one": "60-0%"}]}, "training.0", "60-0% of one is no part"),
         ({"training": [{"one": "0-60%", "two": "0-60%"}]}, "training.0", "an entry of its own"),
         ({"training": [{"one": "0-60%"}] * 2}, "training.1", "named twice"),
-        ({"training": ["one_0-60"]}, "training.0", "'one_0-60': write the part as one: 0-60%"),
+        ({"training": ["one_60-0"]}, "training.0", "60-0% of one is no part"),
+        ({"training": ["one_0-60", {"one": "0-60%"}]}, "training.1", "named twice"),
+        ({"training": [{"one_0-60": "0-50%"}]}, "training.0", "there is no sequence 'one_0-60'"),
+        ({"training": ["on_0-60"]}, "training.0", "there is no sequence 'on_0-60'"),
         (
             {"training": [{"one": "0-60%"}, {"one": "50-100%"}]},
             "training.1",

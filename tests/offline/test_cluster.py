@@ -1,10 +1,13 @@
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from dataclasses import replace
+from threading import Thread
 
 import drives
 import faulty
@@ -106,6 +109,41 @@ def test_a_cluster_without_workers_is_told(study_file, tmp_path, scheduler, monk
         cluster_of(study, "tcp://127.0.0.1:1")
     with pytest.raises(ClusterError, match="cannot be reached"):
         cluster_of(study, "nonsense://x")
+
+
+@pytest.mark.parametrize("greeting", [b"", b"SSH-2.0-OpenSSH_9.2\r\n"])
+def test_what_answers_and_is_no_scheduler_is_told(study_file, tmp_path, monkeypatch, greeting):
+    """As the dashboard, which waits for a question, and other servers."""
+    monkeypatch.setattr(cluster, "_TIMEOUT", 0.5)
+    study = load_study(study_file, [], tmp_path / "study")
+
+    def greet():
+        with suppress(OSError):
+            while True:
+                taken.append(server.accept()[0])
+                taken[-1].sendall(greeting)
+
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        taken = []
+        listening = Thread(target=greet, daemon=True)
+        listening.start()
+        with pytest.raises(
+            ClusterError, match=r"something else answers.*its dashboard has another"
+        ):
+            cluster_of(study, f"tcp://127.0.0.1:{server.getsockname()[1]}")
+        server.shutdown(socket.SHUT_RDWR)
+        listening.join()
+    for connection in taken:
+        connection.close()
+
+
+def test_a_worker_is_no_scheduler(study_file, tmp_path, scheduler, workers):
+    assert len(workers) == 3
+    study = load_study(study_file, [], tmp_path / "study")
+    with distributed.Client(scheduler[0], set_as_default=False) as client:
+        worker = next(iter(client.scheduler_info()["workers"]))
+    with pytest.raises(ClusterError, match="Worker answers there, and no scheduler; name the add"):
+        cluster_of(study, worker)
 
 
 def test_the_cluster_gives_the_local_trials(study_file, tmp_path, scheduler, workers, local):

@@ -1,13 +1,16 @@
 """Replays that an estimated reference judges."""
 
 import json
+import os
 
 import estimates
 import pytest
 
+from adaptune.machine import shared_cores
 from adaptune.paired import Ratio
 from adaptune.reference.estimated import EstimateError
 from offline.config import load_study
+from online import modes
 from online.compare import NONE, compare
 from online.modes import run_untrained
 from online.tables import tables
@@ -45,6 +48,26 @@ def test_it_is_estimated_and_said_to_judge(load, monkeypatch):
     assert rows[1].ratio_interval == (0, 2)
     assert {pair.reference_error for pair in asked} == {rows[1].reference_error}
     assert any(said.endswith("about 0.31 %, is in the intervals.") for said in remarks(rows))
+
+
+def test_it_is_estimated_on_all_cores_and_replayed_on_one(load, monkeypatch):
+    estimator, seen = estimates.install(monkeypatch), []
+
+    def noting(function):
+        def noted(*given, **more):
+            seen.append((os.sched_getaffinity(0), shared_cores()))
+            return function(*given, **more)
+
+        return noted
+
+    monkeypatch.setattr("adaptune.reference.estimate.estimate_reference", noting(estimator))
+    monkeypatch.setattr("online.modes.replay", noting(modes.replay))
+    before = os.sched_getaffinity(0)
+    run_untrained(load())
+    (estimated, *replayed) = seen
+    assert estimated == (before, before)
+    assert [(len(own), shared) for own, shared in replayed] == [(1, before)] * 2
+    assert os.sched_getaffinity(0) == before
 
 
 def test_another_estimate_replays_nothing(load, monkeypatch):

@@ -78,6 +78,15 @@ def test_the_newest_wait(link):
     assert (round((first.scan.stamp - START) / TENTH), first.dropped) == (3, 3)
 
 
+def test_those_dropped_before_a_doubled_one_count_with_the_next(link):
+    scans = topic(link, queue=2)
+    play(link, [0, 1])
+    arrivals = scans.arrivals()
+    assert [next(arrivals).dropped for _ in range(2)] == [0, 0]
+    play(link, [2, 3, 1, 4])
+    assert next(arrivals).dropped == 2
+
+
 @pytest.mark.parametrize("kind", [*CLOUDS])
 @pytest.mark.parametrize("late", [False, True])
 def test_every_type_of_clouds_is_read_also_where_its_driver_starts_late(

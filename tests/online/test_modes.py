@@ -121,7 +121,7 @@ def test_a_program_that_runs_whole_recordings_has_none():
 
 
 def test_a_cheap_bank_runs_on_one_core(monkeypatch):
-    monkeypatch.setattr("online.modes.shared_cores", lambda: {0, 1, 2})
+    monkeypatch.setattr("online.modes.available", lambda: 3)
     made = []
     monkeypatch.setattr("online.modes.Bank", lambda *given: made.append(given[4]))
     model = replace(random_model(), bank_size=2)

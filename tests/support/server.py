@@ -23,8 +23,8 @@ def receive(stream):
     return header, arrays
 
 
-def send(stream, header, pose=None):
-    header["arrays"] = [] if pose is None else [["pose", "<f8", [4, 4]]]
+def send(stream, header, pose=None, columns=4):
+    header["arrays"] = [] if pose is None else [["pose", "<f8", [4, columns]]]
     encoded = json.dumps(header).encode()
     stream.write(struct.pack("<I", len(encoded)) + encoded)
     if pose is not None:
@@ -53,7 +53,10 @@ def main(fault="none"):
             answer = {"type": "pose", "stamp": stamp, "registered": True}
             if n == 3 and fault == "types":
                 answer["stamp"] = "now"
-            send(writer, answer, None if n == 3 and fault == "no pose" else pose)
+            if n == 3 and fault == "fault":
+                answer = {"type": "fault"}
+            columns = 4 * 10**12 if n == 3 and fault == "shape" else 4
+            send(writer, answer, None if n == 3 and fault == "no pose" else pose, columns)
         else:
             if kind == "start":
                 pose, n = list(struct.unpack("<16d", arrays["pose"])), 0

@@ -99,11 +99,11 @@ class PlayedBag(WholeRun):
     def trajectory(self, given: ProgramInput, folder: Path) -> Trajectory:
         self._end = time.monotonic() + self._limits.seconds * len(given.stamps)
         template, text = filled(self.settings, self.parameters)
-        memory = self._limits.memory
+        memory, fault = self._limits.memory, ""
         system = self.settings.system(self.settings, memory, text, folder, given)
-        recorder, fault = PoseRecorder(system.reader()), ""
         with closing(system):
             try:
+                recorder = PoseRecorder(system.reader())
                 points = self._renamed(given).get(given.points, given.points)
                 system.wait(points)
                 system.check(template, self.parameters)

@@ -75,7 +75,7 @@ def look(
             works_on = system._works_on(inside)
     seconds = max(1e-9 * (shown[-1][1] - shown[0][1]), 0.1)
     report["time of a start"] = f"{took:.1f} s"
-    report |= _poses(system.came, shown)
+    report |= about_poses(system.came, shown)
     report["CPU of a second"] = f"{system.usage.cpu / seconds:.2f} s"
     report["memory"] = f"{system.usage.memory or 0.0:.0f} MB"
     for fault in system.faults:
@@ -209,10 +209,12 @@ def _declared(system: Any, template: Template) -> dict[str, str]:
     return {"declared, not in the template": ", ".join(own)} if own else {}
 
 
-def _poses(came: list[tuple[float, int]], shown: list[tuple[float, int]]) -> dict[str, str]:
+def about_poses(came: list[tuple[float, int]], shown: list[tuple[float, int]]) -> dict[str, str]:
     """What is known of poses, which came at a time with a stamp, from scans that were shown."""
+    n, came = len(came), [(t, stamp) for t, stamp in came if t >= shown[0][0]]
+    early = {"poses before the first scan": str(n - len(came))} if len(came) < n else {}
     if not came:
-        return {"poses": "none", "lockstep": "no: see what went wrong"}
+        return early | {"poses": "none", "lockstep": "no: see what went wrong"}
     at, stamps = np.array([t for t, _ in shown]), np.array([stamp for _, stamp in shown])
     times = np.array([t for t, _ in came])
     of_scan = np.searchsorted(at, times, "right") - 1
@@ -225,7 +227,7 @@ def _poses(came: list[tuple[float, int]], shown: list[tuple[float, int]]) -> dic
     if steady and abs(np.median(late)) < OTHER_CLOCK:
         stamped = f"the scans, {1e-6 * np.median(late):.0f} ms after their begin"
     fits = share >= 0.75
-    return {
+    return early | {
         "first pose": f"after {of_scan[0] + 1} scans, {times[0] - at[0]:.1f} s",
         "poses of a scan": f"{len(came) / since:.2f} ({answered} of {since} scans have one)",
         "stamps": f"of {stamped}",

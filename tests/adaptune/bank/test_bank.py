@@ -1,5 +1,6 @@
 import logging
 from pathlib import Path
+from types import SimpleNamespace
 
 import faulty
 import numpy as np
@@ -221,12 +222,24 @@ def test_a_member_that_has_rested_since_the_start_has_not_ended(caplog):
     bank.close()
 
 
+def test_of_members_that_have_all_ended_the_last_fault_is_of_the_last(caplog):
+    bank = Bank(makes()[0], {n: {"speed": 0.1} for n in (7, 3, 5)}, 2.0)
+    bank._members = members = [SimpleNamespace(faults=[], ended=False) for _ in range(3)]
+    for i in (1, 2, 0):
+        members[i].faults, members[i].ended = [f"member {i}"], True
+        bank._tell()
+        left = [] if i else ["member 1", "member 2", "member 0"]
+        assert bank.faults == left
+    assert len(caplog.messages) == 3
+
+
 def test_one_that_cannot_start_is_out_for_good(caplog):
     bank = with_faulty("never begins")
     with caplog.at_level(logging.WARNING, "adaptune.bank.bank"):
         np.testing.assert_allclose(steps_of(bank, 90), 0.1)
     assert [member.ended for member in bank._members].count(True) == 1
-    assert len(bank.faults) == MOST_FAULTS
+    assert sum(len(member.faults) for member in bank._members) == MOST_FAULTS
+    assert not bank.faults  # the others go on
     # Twice for every restart, with a past and without.
     assert bank.restarts < MOST_FAULTS
     told = [r for r in caplog.records if r.name == "adaptune.bank.bank"]

@@ -248,14 +248,24 @@ def test_what_a_server_refuses(first, message):
     assert "https://" not in answer.header["message"]
 
 
-NO_NUMBERS = b'{"arrays": [["pose", ",", [4, 4]]]}'
+def with_length(header):
+    return struct.pack("<I", len(header)) + header
 
 
 @pytest.mark.parametrize(
     "data",
     [
         *(b"Hello, world!", b"\x02\0\0\0{}", b"\x05\0\0\0{}", b"\x01", b"\x03\0\0\0[1]"),
-        struct.pack("<I", len(NO_NUMBERS)) + NO_NUMBERS,
+        with_length(b'"words"'),
+        with_length(b"7"),
+        with_length(b'{"arrays": [["pose", ",", [4, 4]]]}'),
+        with_length(b'{"arrays": [["pose", "<f8", 16]]}'),
+        with_length(b'{"arrays": [["pose", "<f8", ["4", "4"]]]}'),
+        with_length(b'{"arrays": [["pose", "<f8", [-4, 4]]]}') + bytes(128),
+        # Not allocated.
+        with_length(b'{"arrays": [["pose", "<f8", [4, 4000000000000]]]}'),
+        with_length(b'{"arrays": [["pose", "<f8", [4294967296, 4294967296]]]}'),
+        with_length(b'{"arrays": [["pose", "<U1000000000", [4, 4]]]}'),
     ],
 )
 def test_what_is_no_message(data):
@@ -273,10 +283,12 @@ def program(fault="none"):
 TOLD_BY_PROGRAMS = {
     "exit": "its process ended with code 3: about to go wrong",
     "hang": r"a scan took longer than isolation\.seconds = 0\.5: about to go wrong",
-    "words": r"the stream holds no message of adaptune's.*: about to go wrong",
+    "words": r"the stream of \S+python\S* holds no message of adaptune's.*: about to go wrong",
     "backwards": r"a pose of another time, -0\.200 s from the scan's",
     "no pose": "an answer without 'pose'",
     "types": "an answer of other types",
+    "shape": r"stream of \S+ holds no message of adaptune's \(pose: \[4, 4000000000000\]\)",
+    "fault": "it does not say why",
 }
 
 

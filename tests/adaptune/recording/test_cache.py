@@ -103,6 +103,27 @@ def test_the_least_recently_used_goes_first(monkeypatch, cache_folder):
     assert sum(file.stat().st_size for file in cache_folder.rglob("*")) <= cache.cap() + 4 * 4096
 
 
+def test_what_is_kept_besides_counts_and_goes_by_its_last_use(monkeypatch, cache_folder):
+    monkeypatch.setenv("ADAPTUNE_CACHE_GB", "0.0045")
+    now, besides = time.time(), cache_folder / "references"
+    besides.mkdir(parents=True)
+    for i, name in enumerate(["old", "a", "new", "b"]):
+        if i % 2:
+            list(cache.tee(scans_of(1), name, {"name": name}))
+            path = cache_folder / name / "about.json"
+        else:
+            path = besides / f"{name}.npz"
+            path.write_bytes(bytes(10**6))
+        os.utime(path, (now - 100 + i, now - 100 + i))
+    list(cache.tee(scans_of(1), "c", {"name": "c"}))
+    assert entries(cache_folder) == ["a", "b", "c", "references"]
+    assert [path.name for path in besides.iterdir()] == ["new.npz"]
+    monkeypatch.setenv("ADAPTUNE_CACHE_GB", "0.0025")
+    cache.make_room()
+    assert entries(cache_folder) == ["b", "c", "references"]
+    assert not list(besides.iterdir())
+
+
 def test_an_entry_that_is_removed_while_it_is_read_can_be_read_on():
     list(cache.tee(scans_of(1), "a", {"name": "a"}))
     kept = cache.find("a")

@@ -22,7 +22,7 @@ use ros2_client::{
     Context, ContextOptions, DEFAULT_PUBLISHER_QOS, DEFAULT_SUBSCRIPTION_QOS, MessageTypeName,
     Name, Node, NodeName, NodeOptions, ParameterValue, Publisher, QosProfile, Subscription,
     builtin_interfaces::Time,
-    qos::{Durability, History},
+    qos::{Durability, History, WhenFull},
 };
 use serde_yaml::Value;
 
@@ -256,7 +256,10 @@ async fn reached(newest: &AtomicI64, time: i64) {
 
 /// Waits until somebody says where the IMU is on the LiDAR.
 async fn find_imu(node: &mut Node) {
-    let qos = DEFAULT_SUBSCRIPTION_QOS.durability(Durability::TransientLocal);
+    // As tf2's listener: only one that is reliable is sent what was published before it came.
+    let qos = DEFAULT_SUBSCRIPTION_QOS
+        .durability(Durability::TransientLocal)
+        .reliability_reliable(WhenFull::DEFAULT);
     let fixed = subscribe::<Transforms>(node, "/tf_static", ("tf2_msgs", "TFMessage"), qos);
     let mut stream = Box::pin(fixed.async_stream());
     while let Some(Ok((Transforms(all), _))) = stream.next().await {

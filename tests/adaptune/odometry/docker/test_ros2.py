@@ -242,7 +242,7 @@ def test_an_imu_is_heard_until_the_end_of_a_scan(make):
         {"imitate": {"livox": True}},
         {"sim_time": True},
         {
-            "imitate": {"wants_imu_frame": True},
+            "imitate": {"wants_imu_frame": True, "ready_delay": 2.0},
             "transforms": {"imu": ("lidar", (0.1, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0))},
         },
     ],

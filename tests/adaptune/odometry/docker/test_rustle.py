@@ -23,6 +23,7 @@ from adaptune.odometry.factory import OdometryFactory
 from adaptune.odometry.program import ProgramInput
 from adaptune.odometry.remote import Limits
 from adaptune.recording.pose_messages import usable
+from adaptune.ros.link import LinkError
 from adaptune.space import ParameterSpace
 from adaptune.study.config import StudyConfig
 from online.modes import ReplaySetup
@@ -171,6 +172,31 @@ def played(tmp_path):
 
 
 GIVEN = ProgramInput(Path("drive.bag"), "/points", "", SCANS, None)
+
+
+def test_a_system_whose_poses_cannot_be_heard_is_ended(played, tmp_path, monkeypatch):
+    done = []
+
+    class Deaf(RustleSettings.system):
+        def __init__(self, *_):
+            pass
+
+        def reader(self):
+            raise LinkError("the node has ended")
+
+        def words(self):
+            return ""
+
+        def stop(self):
+            done.append("stop")
+
+        def close(self):
+            done.append("close")
+
+    monkeypatch.setattr(RustleSettings, "system", Deaf)
+    with pytest.raises(LinkError, match="the node has ended"):
+        played.trajectory(GIVEN, tmp_path)
+    assert done == ["stop", "close"]
 
 
 def test_a_topic_without_poses_is_told_with_the_others(link, played):
