@@ -83,8 +83,7 @@ def online(
     With `--untrained`, it needs no trials, no model and no ground truth. It replays all sequences
     if the study names no test.
 
-    With `-o online.modes=all`, it replays all modes: the fixed set with a bank that stands by, the
-    bank with even weights, and the untrained bank, too.
+    With `-o online.modes=all`, it replays all modes, those to compare with, too.
 
     With `-o online.real_time.rate=1`, scans come when the sensor gave them. A selection that is
     late is dropped, and so are scans that wait too long.

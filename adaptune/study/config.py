@@ -187,7 +187,9 @@ class OnlineConfig(StrictModel):
         AfterValidator(_once),
     ] = ("adaptive", "paper")
     switching: SwitchingConfig = SwitchingConfig()
-    budget: Annotated[float | str | None, BeforeValidator(read_budget)] = None
+    budget: Annotated[
+        Annotated[float, Field(gt=0, le=1e6)] | str | None, BeforeValidator(read_budget)
+    ] = None
     real_time: RealTimeConfig | None = None
     ros: RosConfig = RosConfig()
 
