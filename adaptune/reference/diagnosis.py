@@ -103,7 +103,10 @@ def _motions_over(stretch: list[Scan]) -> Iterator[tuple[int, int, Hop]]:
 
 
 SUSPICIOUS = 1.5  # percent; poses that differ less from what scans show break no convention
-EXPLAINED = 0.5  # a cause explains the difference if it leaves less than this share of it
+EXPLAINED, SET_RIGHT = 0.5, 0.25
+"""A cause explains the difference if it leaves less than this share of it; one that a setting mends
+must leave less than the second."""
+UNITS = (10.0, 100.0, 1000.0, 1.0 / 0.3048)  # how many of one are a metre
 FEWEST_HOPS = 5  # measured motions that a verdict needs
 TRUSTED = 0.8  # share of the measured motions that are right at least, those that fit best
 CLOCK = 30.0  # seconds by which clocks may differ to be found
@@ -124,6 +127,7 @@ class _Candidate(NamedTuple):
     what: str
     mend: str
     T_world_sensor: Poses  # (n, 4, 4): at the scans
+    most: float = SET_RIGHT  # share of the difference that it may leave
 
 
 def mismatch(T_world_sensor: Poses, hops: Hops) -> NDArray[np.float64]:
