@@ -5,6 +5,7 @@ another order of numbers, another frame, another clock. Each convention predicts
 would be without it; the one that fits the measured motions is the likeliest.
 """
 
+from collections import deque
 from collections.abc import Collection, Iterable, Iterator
 from itertools import accumulate, islice
 from typing import NamedTuple
@@ -28,7 +29,8 @@ from adaptune.live.hops import OFFLINE_CLOUD, OFFLINE_REACHES, Hop, HopCloud, Ho
 from adaptune.recording.compensation import neighbour_motions
 from adaptune.recording.content import Content
 from adaptune.recording.scan import Recording, Scan
-from adaptune.reference.check import CONTRADICTS, NOISY
+from adaptune.reference.carried import Carried, begin_of, without
+from adaptune.reference.check import CONTRADICTS, NOISY, pose_at
 from adaptune.trajectory import Trajectory
 
 _STRETCHES, _SCANS = 4, 40
@@ -126,6 +128,7 @@ def _cause(what: str, mend: str, before: float, after: float = np.nan) -> Findin
     return Finding((), f"{differ}; they look {what}{left}", mend, of="reference")
 
 
+UNEXPLAINED = ", which none of the known causes explains"
 _OWN = "that is the odometry's own error, and no convention: tuning may lessen it"
 
 
@@ -433,36 +436,45 @@ def contradictions(
 ) -> Iterator[Finding]:
     """What scans say where a reference and an odometry differ by `error` percent, if that is large.
 
-    The odometry's poses, of shape (n_scans, 4, 4), owe nothing to the reference, and are those of
-    the scans with the stamps `seen`, or of all. `place` is as in `diagnose_reference`; `given` says
-    whether the reference came with the recording.
+    Stretches on which the scans stand still while the reference moves come first. The odometry's
+    poses, of shape (n_scans, 4, 4), owe nothing to the reference, and are those of the scans with
+    the stamps `seen`, or of all. `place` is as in `diagnose_reference`; `given` says whether the
+    reference came with the recording.
     """
-    if not error > SUSPICIOUS:
-        return
     stamps: list[int] = []
-    content = Content()
+    content, carried = Content(), Carried()
+    reference = scans.reference() if given else None
 
     def read() -> Iterator[Scan]:
         for scan in scans:
             if seen is None or scan.stamp in seen:
                 stamps.append(scan.stamp)
                 content.see(scan)
+                if reference is not None:
+                    carried.see(scan, pose_at(reference, scan.stamp))
                 yield scan
 
-    hops = measured_motions(read(), len(T_odom_sensor))
-    reference = scans.reference() if given else None
+    passing = read()
+    hops = measured_motions(passing, len(T_odom_sensor))
+    deque(passing, 0)
+    at = np.array(stamps, np.int64)
+    found = carried.findings(begin := begin_of(scans, at))
+    yield from found
+    if not error > SUSPICIOUS:
+        return
     if reference is not None:
+        reference = without(reference, found, begin)
         yield from content.of_place(reference, not len(hops.start))
-        at = np.array(stamps, np.int64)
         T_ref_sensor = reference.at(at)
         wrong, others = (mismatch(T, hops) for T in (T_ref_sensor, T_odom_sensor))
         if (cause := diagnose_reference(reference, at, hops, place)) is not None:
             yield cause.below((CONTRADICTS,))
         elif _surely_worse(wrong, others):
+            why = UNEXPLAINED * (_mean(wrong) > SUSPICIOUS)
             what = (
                 f"over some metres they differ by {_mean(wrong):.3g} %, by registrations of scans, "
-                f"and the odometry by {_mean(others):.3g} %; sets that differ by less cannot be "
-                f"told apart"
+                f"and the odometry by {_mean(others):.3g} %{why}; sets that differ by less cannot "
+                f"be told apart"
             )
             mend = (
                 "use `reference: estimated` or a longer sub_trajectory, or check its file or topic "
