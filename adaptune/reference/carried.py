@@ -18,7 +18,6 @@ from adaptune.trajectory import Trajectory
 
 _NEAR, _FAR = 1.0, 2.5  # metres that the reference moves between two scans that are compared
 _STANDS = 0.1  # by which share of them, and radians, scans that stand seem to move at most
-_ALIKE = 0.8  # share of their points that are near each other then
 _FEWEST, _SHORTEST = 2, 2_000_000_000  # comparisons in a row, and nanoseconds, from which it counts
 _PAUSE = 1_000_000_000  # nanoseconds to the next comparison where the scans move
 
@@ -28,6 +27,7 @@ class _Pair(NamedTuple):
     end: int
     metres: float  # that the reference moves
     stands: bool  # whether the scans stand still
+    agrees: bool  # whether they move as the reference does
 
 
 class Carried:
@@ -36,6 +36,7 @@ class Carried:
     def __init__(self) -> None:
         self._pairs: list[_Pair] = []
         self._before: tuple[int, Poses, HopCloud] | None = None
+        self._alone = False  # scans moved while the reference stood, as by another clock
 
     def see(self, scan: Scan, T_ref_sensor: Poses) -> None:
         """See the next scan, and its reference, of shape (4, 4)."""
@@ -47,19 +48,21 @@ class Carried:
             return
         T = invert(before[1]) @ T_ref_sensor
         metres = float(np.linalg.norm(T[:3, 3]))
-        if metres >= _NEAR:
-            stands = metres <= _FAR and _stand(before[2], here[2], T)
-            pairs.append(_Pair(before[0], scan.stamp, metres, stands))
-            self._before = here if stands else None
-        elif metres < _STANDS and scan.stamp > before[0] + _PAUSE:
+        if _NEAR <= metres <= _FAR:
+            pairs.append(_Pair(before[0], scan.stamp, metres, *_compared(before[2], here[2], T)))
+            self._before = here if pairs[-1].stands else None
+        elif metres > _FAR or (metres < _STANDS and scan.stamp > before[0] + _PAUSE):
+            hop = register(before[2], here[2], [T]) if metres < _STANDS else None
+            self._alone |= hop is not None and np.linalg.norm(hop.T_start_end[:3, 3]) > 0.5 * _NEAR
             self._before = here
 
     def findings(self, begin: int) -> list[Finding]:
         """The stretches, whose poses do not count; seconds from `begin`, in nanoseconds, on."""
         pairs, found = self._pairs, []
         stand = np.array([False, *(pair.stands for pair in pairs), False])
-        if np.count_nonzero(~stand) < _FEWEST + 2:
-            return []  # scans that never move are in the frame of a map
+        agree = sum(pair.agrees for pair in pairs)
+        if self._alone or agree < max(_FEWEST, 0.5 * (~stand[1:-1]).sum()):
+            return []  # the reference is wrong elsewhere, too, or the scans are in a map's frame
         for first, stop in np.flatnonzero(np.diff(stand)).reshape(-1, 2).tolist():
             start, end = pairs[first].start, pairs[stop - 1].end
             if stop - first < _FEWEST or end - start < _SHORTEST:
@@ -75,14 +78,15 @@ class Carried:
         return found
 
 
-def _stand(start: HopCloud, end: HopCloud, T_start_end: Poses) -> bool:
-    """Whether scans stand still that are registered from where the reference has moved to."""
-    metres, unlike = float(np.linalg.norm(T_start_end[:3, 3])), 1.0 - _STANDS
-    hop = register(start, end, [T_start_end], _ALIKE, OFFLINE_REACHES)
-    if hop is None or np.linalg.norm(hop.projection @ T_start_end[:3, 3]) < unlike * metres:
-        return False
-    moved = float(np.linalg.norm(hop.T_start_end[:3, 3]))
-    return moved < _STANDS * metres and bool(rotation_angle(hop.T_start_end) < _STANDS)
+def _compared(start: HopCloud, end: HopCloud, T_start_end: Poses) -> tuple[bool, bool]:
+    """Whether scans stand still, or move as their reference, from which they are registered."""
+    way, metres = T_start_end[:3, 3], float(np.linalg.norm(T_start_end[:3, 3]))
+    hop = register(start, end, [T_start_end], reaches=OFFLINE_REACHES)
+    if hop is None or np.linalg.norm(hop.projection @ way) < (1.0 - _STANDS) * metres:
+        return False, hop is not None
+    moved = hop.T_start_end[:3, 3]
+    near = [bool(np.linalg.norm(moved - other) < _STANDS * metres) for other in (0.0 * way, way)]
+    return near[0] and bool(rotation_angle(hop.T_start_end) < _STANDS), near[1]
 
 
 def left_out(
