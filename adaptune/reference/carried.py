@@ -70,8 +70,8 @@ class Carried:
             metres = sum(pair.metres for pair in pairs[first:stop])
             what = f"the scans stand still while the reference moves by {metres:.1f} m and more"
             # It begins, and ends, during the pairs beside.
-            start = max(start - _SHORTEST, *(pair.start for pair in pairs[first - 1 : first]))
-            end = min(end + _SHORTEST, *(pair.end for pair in pairs[stop : stop + 1]))
+            start = max([start - _SHORTEST, *(pair.start for pair in pairs[first - 1 : first])])
+            end = min([end + _SHORTEST, *(pair.end for pair in pairs[stop : stop + 1])])
             seconds = ((start - begin) * 1e-9, (end - begin) * 1e-9)
             mend = "a lift or a ferry may carry the robot: these poses are left out"
             found.append(Finding((), what, mend, seconds, of="reference"))

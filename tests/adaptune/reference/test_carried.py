@@ -46,6 +46,15 @@ def test_a_lift_and_a_ferry_are_told_and_left_out(way):
     np.testing.assert_array_equal(unknown, left_out(reference.stamps, [finding], START))
 
 
+@pytest.mark.parametrize(("before", "after"), [(0.0, 12.0), (12.0, 0.0)])
+def test_a_recording_may_begin_or_end_in_a_lift(before, after):
+    scans, reference = drive(np.array((0, 0, 9.0)), before=before, after=after)
+    (finding,) = found_by(scans, reference)
+    begin, end = finding.seconds
+    assert begin <= max(before, 0.5)
+    assert end >= before + 5.0
+
+
 @pytest.mark.parametrize(
     "change",
     [
