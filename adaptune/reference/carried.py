@@ -53,7 +53,8 @@ class Carried:
             self._before = here if pairs[-1].stands else None
         elif metres > _FAR or (metres < _STANDS and scan.stamp > before[0] + _PAUSE):
             hop = register(before[2], here[2], [T]) if metres < _STANDS else None
-            self._alone |= hop is not None and np.linalg.norm(hop.T_start_end[:3, 3]) > 0.5 * _NEAR
+            if hop is not None and np.linalg.norm(hop.T_start_end[:3, 3]) > 0.5 * _NEAR:
+                self._alone = True
             self._before = here
 
     def findings(self, begin: int) -> list[Finding]:
@@ -70,8 +71,9 @@ class Carried:
             metres = sum(pair.metres for pair in pairs[first:stop])
             what = f"the scans stand still while the reference moves by {metres:.1f} m and more"
             # It begins, and ends, during the pairs beside.
-            start = max([start - _SHORTEST, *(pair.start for pair in pairs[first - 1 : first])])
-            end = min([end + _SHORTEST, *(pair.end for pair in pairs[stop : stop + 1])])
+            beside = pairs[first - 1 : first], pairs[stop : stop + 1]
+            start = max([begin, start - _SHORTEST, *(pair.start for pair in beside[0])])
+            end = min([end + _SHORTEST, *(pair.end for pair in beside[1])])
             seconds = ((start - begin) * 1e-9, (end - begin) * 1e-9)
             mend = "a lift or a ferry may carry the robot: these poses are left out"
             found.append(Finding((), what, mend, seconds, of="reference"))
