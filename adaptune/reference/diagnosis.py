@@ -213,7 +213,8 @@ def diagnose_odometry(T_odom_sensor: Poses, hops: Hops) -> Finding | None:
         *_scales(T_odom_sensor, hops, np.eye(4), _OWN),
         *_places(T_odom_sensor, hops, of_odometry=True),
     ]
-    return _likeliest(candidates, hops, errors)
+    # What is left may be the odometry's own error.
+    return _likeliest([c._replace(most=EXPLAINED) for c in candidates], hops, errors)
 
 
 def _likeliest(

@@ -257,6 +257,12 @@ def test_what_an_odometry_returns_instead_of_poses_is_named(spoil, what):
     assert after < 0.2 * before
 
 
+def test_an_odometry_may_fall_short_and_break_a_convention():
+    found = diagnose_odometry(carried(counted(poses(SCANS), ways=0.93)), hops())
+    assert "lever arm" in found.what
+    assert 3.0 < percents(found)[1] < 8.0
+
+
 def test_an_odometry_that_is_lost_breaks_no_convention():
     still = np.tile(np.eye(4), (len(SCANS), 1, 1))
     assert diagnose_odometry(still, hops()) is None
