@@ -4,11 +4,13 @@ All readers raise a TrajectoryError that names the file, and the line where one 
 """
 
 import logging
+import os
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from functools import cache
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -152,20 +154,39 @@ _NAMES = {
     "q": r"(.*[._ /])?(q|quat|orient|rot)(.*[._ /])?[xyzw]",
     "": r"(t_?|(.*[._ /])?(p|pos|trans|loc)(.*[._ /])?)?[xyz]",
 }
+_OTHERS = re.compile(r"(?<![a-z])(vel|rate|acc|std|sigma|cov|var|err|q?dot)")  # no poses
 
 
-def _named(header: str) -> dict[str, list[int]]:
+def _named(path: Path, header: str) -> dict[str, list[int]]:
     """Where a header has each of `_COLUMNS`, as far as it names them; the likeliest one first."""
     header = re.sub(r"\[.*?\]|\(.*?\)|[#%\"]", "", header).lower().strip()
     names = re.split(r"\s*[,;]\s*" if re.search("[,;]", header) else r"\s+", header)
     found: dict[str, list[int]] = {}
+    stems: dict[str, dict[str, dict[str, list[int]]]] = {"": {}, "q": {}}
     for i, name in enumerate(names):
         kind = next((k for k, known in _NAMES.items() if re.fullmatch(known, name)), None)
-        if kind is not None:
-            found.setdefault(kind if len(kind) > 1 else kind + name[-1], []).append(i)
+        if kind in stems:
+            stems[kind].setdefault(name[:-1], {}).setdefault(kind + name[-1], [i])
+        elif kind is not None:
+            found.setdefault(kind, []).append(i)
+    # Of several, a whole position and a whole turn, of one body.
+    whole = [
+        [stem for stem, axes in of.items() if len(axes) == 3 + len(kind)] or [*of, ""][:1]
+        for kind, of in stems.items()
+    ]
+
+    def unlikely(pair: tuple[str, ...]) -> tuple[bool, int]:
+        common = os.path.commonprefix(pair)  # noqa: RUF071 (names, not paths)
+        return any(map(_OTHERS.search, pair)), len("".join(pair)) - 2 * len(common)
+
+    pairs = sorted(product(*whole), key=unlikely)
+    for of, stem in zip(stems.values(), pairs[0], strict=True):
+        found |= of.get(stem, {})
+    if len(pairs) > 1:
+        _assume(path, f"of its poses, those in {' and '.join(f'{s}x' for s in pairs[0])} are used")
     # A message's own stamp comes before the time at which it was recorded.
     for times in (found.get("timestamp", []), found.get("nanoseconds", [])):
-        times.sort(key=lambda i: ("header" not in names[i], "stamp" not in names[i]))
+        times.sort(key=lambda i: ("header" not in names[i], "stamp" not in names[i], len(names[i])))
     return found
 
 
@@ -177,7 +198,7 @@ def _table(path: Path) -> tuple[dict[str, list[int]], list[Row]]:
         if fields and (rows or any(map(_NUMBER.match, fields))):
             rows.append((number, fields))
         elif not rows:
-            found = _named(line)
+            found = _named(path, line)
             missing = ", ".join(name for name in _COLUMNS if name not in found)
             if fields and missing:
                 what = f"line {number}: names no column {missing}"
@@ -229,6 +250,7 @@ def _is_matrix(fields: Sequence[str]) -> bool:
     return turned and len(T) in (3, 4) and bool((T[3:] == [0, 0, 0, 1]).all())
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def _matrices(path: Path, rows: list[Row]) -> Poses:
     """Poses of lines that end with the 12 or 16 numbers of the rows of a matrix."""
     need = len(rows[0][1])
@@ -238,7 +260,13 @@ def _matrices(path: Path, rows: list[Row]) -> Poses:
             raise TrajectoryError(f"{path}, line {number}: {what}")
     values = _numbers(path, [(number, fields[need % 4 :]) for number, fields in rows])
     T = np.tile(np.eye(4), (len(rows), 1, 1))
-    T[:, :3] = values.reshape(len(rows), -1, 4)[:, :3]
+    T[:, : need // 4] = values.reshape(len(rows), -1, 4)
+    R = T[:, :3, :3]
+    wrong = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2)) > 1e-2
+    wrong |= (T[:, 3] != (0.0, 0.0, 0.0, 1.0)).any(axis=1)
+    if wrong.any():
+        what = "its numbers are no rigid pose; write the rows of its matrix, one after the other"
+        raise TrajectoryError(f"{path}, line {rows[int(np.argmax(wrong))][0]}: {what}")
     return T
 
 

@@ -8,11 +8,14 @@ from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from adaptune.archive import REGISTER_MS, Archive, ArchiveError, Frames, Summary, Trial
 from adaptune.errors import AdaptuneError
+from adaptune.live.hops import Hops
 from adaptune.model.rules import BASELINE
 from adaptune.progress import Progress, about, unseen
+from adaptune.reference.carried import begin_of, left_out
 from adaptune.space import ParameterSet, PooledSpace
 from adaptune.study.references import contradictions_of
 from offline.choice import FINALISTS, OTHERS
@@ -20,7 +23,7 @@ from offline.config import OfflineStudy
 from offline.drive import Drive
 from offline.objective import Verdict, label
 from offline.search import ELAPSED, TIME_IS_UP, Search, Stopwatch
-from offline.stretches import Stretch, stretches_along
+from offline.stretches import Stretch, stretches_along, stretches_of
 from offline.trial import trial_of
 from offline.workers import Pool, Result, Task, TaskProgress, run
 
@@ -109,6 +112,23 @@ class Schedule:
         """Store a trial, and before it what all on the sequence share: which scans are driven."""
         self._save(name)
         self._archive.write(name, number, trial, self._whole, self._bare)
+
+    def frames(self, name: str) -> Frames:
+        """What all trials on a sequence share."""
+        return self._described[name]
+
+    def leave_out(self, name: str, lost: NDArray[np.bool_]) -> None:
+        """Let the reference be unknown at these scans, (n,); it counts for drives from now on."""
+        frames, config = self._described[name], self._config
+        T = np.where(lost[:, None, None], np.nan, frames.T_ref_sensor)
+        some = stretches_of(T, frames.stamps, config.sub_trajectory, config.stretches)
+        # The hops along them are measured again.
+        frames = replace(
+            frames, T_ref_sensor=T, stretches=some, hops=Hops.of([]), evidence_ms=np.nan
+        )
+        self._described[name] = frames
+        self._frames[name] = frames.uncut if self._whole else frames
+        self._unsaved.add(name)
 
     def close(self) -> None:
         """Store the frames that no trial was stored with."""
@@ -416,7 +436,8 @@ def run_baseline(
 
     Of several odometries, the baseline of each. Nothing is stored before all have done well on all
     sequences: there is a BaselineError if one fails. Where the reference contradicts the motion of
-    one, scans say which of them is wrong.
+    one, scans say which of them is wrong. Where it moves while the scans stand still, it is left
+    out, and the baseline drives again.
     """
     space = study.odometry.space
     there = read_whole_drives(archive, study.training, range(len(space.baselines)))
@@ -427,16 +448,39 @@ def run_baseline(
         for number, parameters in enumerate(space.baselines):
             if number not in there[name]:
                 schedule.add(name, number, parameters)
-    done = []
-    for name, number, trial in schedule.run(workers):
-        check_baseline(labels[number], name, trial)
-        done.append((name, number, trial))
-    for name, number, trial in done:
+    done: dict[tuple[str, int], Trial] = {}
+
+    def drive() -> None:
+        for name, number, trial in schedule.run(workers):
+            check_baseline(labels[number], name, trial)
+            done[name, number] = trial
+
+    drive()
+    for (name, number), trial in [*done.items()]:
+        if _contradicted(study, schedule, name, labels[number], trial):
+            for of, other in [key for key in done if key[0] == name]:
+                schedule.add(of, other, done[of, other].parameters)
+    drive()
+    for (name, number), trial in done.items():
         schedule.store(name, number, replace(trial, source="baseline"))
-        poses, error = trial.T_odom_sensor, trial.mean_error
-        for contradiction in contradictions_of(study.sequences, name, poses, error):
-            _log.warning("sequences.%s, %s: %s", name, labels[number], contradiction)
     schedule.close()
+
+
+def _contradicted(
+    study: OfflineStudy, schedule: Schedule, sequence: str, odometry: str, run: Trial
+) -> bool:
+    """Tell what scans say against a reference or a baseline; whether stretches are left out now."""
+    frames, sequences = schedule.frames(sequence), study.sequences
+    given = run.T_odom_sensor, run.mean_error, None, frames.T_ref_sensor
+    for contradiction in (wrong := contradictions_of(sequences, sequence, *given)):
+        _log.warning("sequences.%s, %s: %s", sequence, odometry, contradiction)
+    if not wrong:
+        return False
+    lost = left_out(frames.stamps, wrong, begin_of(sequences.open(sequence), frames.stamps))
+    if np.isnan(frames.T_ref_sensor[lost]).all():
+        return False
+    schedule.leave_out(sequence, lost)
+    return True
 
 
 def check_baseline(odometry: str, sequence: str, run: Trial) -> None:

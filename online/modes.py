@@ -25,6 +25,7 @@ from adaptune.odometry.registry import ROS_SYSTEMS
 from adaptune.progress import Progress, unseen
 from adaptune.recording.config import part_name
 from adaptune.recording.scan import Recording, Scan
+from adaptune.reference.carried import begin_of, without
 from adaptune.reference.check import mean_difference
 from adaptune.selector import AnySelector, Selector, UntrainedSelector, untrained_sets
 from adaptune.space import ParameterSet, ParameterSets, Selection
@@ -393,7 +394,8 @@ def _judge(study: Study, name: str, recording: Recording, replayed: Trajectory) 
         T_ref_sensor, T_odom_sensor = reference.at(replayed.stamps), replayed.T_world_sensor
         error = mean_difference(T_ref_sensor, T_odom_sensor, study.config.sub_trajectory)
         seen = set(replayed.stamps.tolist())
-        wrong = contradictions_of(sequences, name, T_odom_sensor, error, seen)
+        wrong = contradictions_of(sequences, name, T_odom_sensor, error, seen, T_ref_sensor)
+        reference = without(reference, wrong, begin_of(recording, replayed.stamps))
     for what in wrong:
         _log.warning("sequences.%s: %s", name, what)
     folder = study.folder / "replays" / name

@@ -123,7 +123,10 @@ class Reference(NamedTuple):
             # Frames in a gap, and across a jump, have no label in training, and get none here.
             known = study.sequences.open(name).reference()
             gap = trajectory.max_gap if known is None else known.max_gap
-            trajectory = replace(trajectory, max_gap=gap)
+            # Nor have those of a stretch that is left out, which is longer than this.
+            steps = np.diff(trajectory.stamps) * 1e-9
+            rare = 3.0 * float(np.median(steps)) if len(steps) else 0.0
+            trajectory = replace(trajectory, max_gap=min(gap, max(1.9, rare)))
         stored = study.sequences.estimate(name)
         error = math.nan if stored is None else stored.error(length)
         return cls(trajectory, length, stored is not None, None if math.isnan(error) else error)

@@ -48,6 +48,8 @@ def pose_fault(T_odom_sensor: Poses) -> str | None:
         return f"of shape {T_odom_sensor.shape}"
     if not np.isfinite(T_odom_sensor).all():
         return "that is not finite"
+    if np.abs(T_odom_sensor[3] - (0.0, 0.0, 0.0, 1.0)).max() > _TOLERANCE:
+        return "that is not rigid: its last row is not 0 0 0 1; is it transposed?"
     R = T_odom_sensor[:3, :3]
     if np.abs(R @ R.T - np.eye(3)).max() > _TOLERANCE or np.linalg.det(R) < 0:
         return "that is not rigid"

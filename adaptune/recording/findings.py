@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from adaptune.errors import Finding
 from adaptune.recording.content import Content, of_looks
-from adaptune.recording.poses import sound
+from adaptune.recording.poses import in_angles, sound
 from adaptune.recording.scan import Frame, in_order
 from adaptune.recording.timing import SOONEST, doubts
 from adaptune.trajectory import Trajectory
@@ -231,6 +231,9 @@ def of_reference(
         if complete:
             mend = "no motion follows from it; name another topic, or a file of poses"
             yield Finding((), "the reference holds a single pose", mend, of=role, lacks=lacks)
+        return
+    if (angles := in_angles(reference)) is not None:
+        yield angles
         return
     positions = reference.T_world_sensor[:, :3, 3]
     if np.linalg.norm(positions - positions[0], axis=1).max() < _STILL:

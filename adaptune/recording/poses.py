@@ -20,6 +20,8 @@ _HELD, _AS_FAST = 0.02, 0.6
 at which the next pose makes up for it."""
 _PERIOD = 40_000_000  # nanoseconds; of poses that follow each other faster, some are enough
 _AROUND = 5  # steps before, and after, that say how the robot moves
+_ANGLES = ("degrees", 180.0, 1.11e5), ("radians", np.pi, 6.37e6)
+"""Units of longitude and latitude, the largest of them, and metres of one on the ground."""
 _SAID = 3  # stretches that are told one by one
 
 
@@ -53,6 +55,25 @@ def sound(
         lost |= (reference.stamps > start) & (reference.stamps < after)
     found += _in_words(f"jumps by up to {metres:.3g} m (or radians)", reference, lost, begin)
     return _without(reference, lost, gap if lost.any() else None), found
+
+
+def in_angles(reference: Trajectory) -> Finding | None:
+    """What is said of positions that are longitude and latitude; None of those in metres.
+
+    As metres, such a robot would creep by micrometres, far from the origin and without noise.
+    """
+    at = reference.T_world_sensor[:, :2, 3]
+    ways = np.linalg.norm(np.diff(at, axis=0), axis=1)
+    seconds = np.maximum(np.diff(reference.stamps) * 1e-9, 1e-3)
+    far, usual = np.linalg.norm(at - at[0], axis=1).max(), np.median(ways)
+    for unit, most, metres in _ANGLES:
+        angles = np.abs(at).max() <= most and np.linalg.norm(at[0]) > most / 180.0
+        moves = max(5.0 * usual, 5.0 / metres) < far < FASTEST * seconds.sum() / metres
+        if angles and moves and np.quantile(ways / seconds, 0.9) * metres < FASTEST:
+            what = f"the reference's positions are {unit} of longitude and latitude, not metres"
+            mend = "convert them to metres, as of UTM, or use `reference: estimated`"
+            return Finding((), what, mend, of="reference", lacks="a reference in metres")
+    return None
 
 
 def _without(

@@ -19,7 +19,7 @@ from adaptune.geometry import to_pose
 from adaptune.recording import cache, compensation
 from adaptune.recording.config import ESTIMATED, NO_REFERENCE, SequenceConfig, files_of
 from adaptune.recording.content import Content, of_looks
-from adaptune.recording.poses import sound
+from adaptune.recording.poses import in_angles, sound
 from adaptune.recording.scan import BACKWARD, Frame, Imu, Recording, Scan, SequenceError, in_order
 from adaptune.recording.timing import FIRST_SCANS, SOONEST, Timing, doubts
 from adaptune.trajectory import Trajectory, TrajectoryError, is_kitti, read_kitti, read_trajectory
@@ -382,6 +382,8 @@ class RecordedSequence:
 
     def _checked_poses(self, trajectory: Trajectory) -> Trajectory:
         """The poses that a robot can have had; a SequenceError if they are of another time."""
+        if len(trajectory) > 1 and (angles := in_angles(trajectory)) is not None:
+            raise SequenceError(f"{self.name}: {angles}")
         span = self.source.span()
         if span is None:
             return trajectory

@@ -1,6 +1,6 @@
 """How wrong a reference is, by direct registrations of scans, and over which length to judge by."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import islice
@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from adaptune.errors import Finding
 from adaptune.geometry import Poses, invert
 from adaptune.live.evidence import hops_along
 from adaptune.live.hops import LENGTHS as HOPS
@@ -16,6 +17,7 @@ from adaptune.live.hops import Hop, Hops
 from adaptune.live.own_error import MIN_REACH, Link, OwnError, OwnErrors
 from adaptune.metrics import cap, sub_trajectory_rte, travelled
 from adaptune.recording.scan import Recording, Scan
+from adaptune.reference.carried import Carried, begin_of, left_out
 from adaptune.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -34,6 +36,7 @@ class MeasuredReference:
     T_ref_sensor: Poses  # (n, 4, 4): poses of the reference; NaN where there is none
     hops: Hops  # direct registrations of the same scans
     doubt: str = ""  # why registrations of these scans prove nothing, see `hard_to_track`
+    carried: Sequence[Finding] = ()  # stretches that are left out, see `adaptune.reference.carried`
 
     def error(self, length: float) -> OwnError | None:
         """Mean error of the reference, in percent of sub-trajectories of `length` metres.
@@ -101,21 +104,27 @@ def measure_reference(
 ) -> MeasuredReference:
     """Register the scans of a recording to find how wrong a reference of its LiDAR is."""
     stamps, poses = [], []
-    n, doubt = scans.n_messages, hard_to_track(scans)
+    n, doubt, carried = scans.n_messages, hard_to_track(scans), Carried()
 
     def with_poses() -> Iterator[tuple[Scan, Poses]]:
         for scan in scans:
             stamps.append(scan.stamp)
-            poses.append(_pose_at(reference, scan.stamp))
+            poses.append(pose_at(reference, scan.stamp))
+            carried.see(scan, poses[-1])
             yield scan, poses[-1]
 
     hops = hops_along(with_poses(), lambda done: advance(min(done, n), n))
     advance(len(stamps), len(stamps))
-    T_ref_sensor = np.array(poses).reshape(-1, 4, 4)
-    return MeasuredReference(np.array(stamps, np.int64), T_ref_sensor, hops, doubt)
+    at, T_ref_sensor = np.array(stamps, np.int64), np.array(poses).reshape(-1, 4, 4)
+    found = carried.findings(begin_of(scans, at))
+    T_ref_sensor[left_out(at, found, begin_of(scans, at))] = np.nan
+    gaps = np.cumsum(np.isnan(T_ref_sensor[:, 0, 0]))
+    whole = (gaps[hops.start] == gaps[hops.end]) & ~np.isnan(T_ref_sensor[hops.start, 0, 0])
+    hops = Hops._make(array[whole] for array in hops)
+    return MeasuredReference(at, T_ref_sensor, hops, doubt, found)
 
 
-def _pose_at(reference: Trajectory, stamp: int) -> Poses:
+def pose_at(reference: Trajectory, stamp: int) -> Poses:
     """The pose at a stamp, of shape (4, 4), without a look at the whole trajectory."""
     after = int(np.searchsorted(reference.stamps, stamp))
     near = slice(max(after - 1, 0), after + 1)

@@ -5,6 +5,7 @@ another order of numbers, another frame, another clock. Each convention predicts
 would be without it; the one that fits the measured motions is the likeliest.
 """
 
+from collections import deque
 from collections.abc import Collection, Iterable, Iterator
 from itertools import accumulate, islice
 from typing import NamedTuple
@@ -21,13 +22,15 @@ from adaptune.geometry import (
     invert,
     nearest_rotation,
     rotation_angle,
+    steps,
     to_quaternions,
 )
 from adaptune.live.hops import OFFLINE_CLOUD, OFFLINE_REACHES, Hop, HopCloud, Hops, register
 from adaptune.recording.compensation import neighbour_motions
 from adaptune.recording.content import Content
 from adaptune.recording.scan import Recording, Scan
-from adaptune.reference.check import CONTRADICTS, NOISY
+from adaptune.reference.carried import Carried, begin_of, without
+from adaptune.reference.check import CONTRADICTS, NOISY, pose_at
 from adaptune.trajectory import Trajectory
 
 _STRETCHES, _SCANS = 4, 40
@@ -103,7 +106,12 @@ def _motions_over(stretch: list[Scan]) -> Iterator[tuple[int, int, Hop]]:
 
 
 SUSPICIOUS = 1.5  # percent; poses that differ less from what scans show break no convention
-EXPLAINED = 0.5  # a cause explains the difference if it leaves less than this share of it
+EXPLAINED, SET_RIGHT, LEFT = 0.5, 0.2, 10.0
+"""A cause explains the difference if it leaves no more than this share of it, the second if it can
+be set right, and no more percent than the third."""
+UNITS, UNLIKE = (10.0, 100.0, 1000.0, 1.0 / 0.3048), 0.05
+"""How many of a unit are a metre, or how many metres one of it; by which share that may be off."""
+SAME = 0.01  # share of a way or a turn, and radians, that count as none
 FEWEST_HOPS = 5  # measured motions that a verdict needs
 TRUSTED = 0.8  # share of the measured motions that are right at least, those that fit best
 CLOCK = 30.0  # seconds by which clocks may differ to be found
@@ -120,10 +128,15 @@ def _cause(what: str, mend: str, before: float, after: float = np.nan) -> Findin
     return Finding((), f"{differ}; they look {what}{left}", mend, of="reference")
 
 
+UNEXPLAINED = ", which none of the known causes explains"
+_OWN = "that is the odometry's own error, and no convention: tuning may lessen it"
+
+
 class _Candidate(NamedTuple):
     what: str
     mend: str
     T_world_sensor: Poses  # (n, 4, 4): at the scans
+    most: float = SET_RIGHT  # share of the difference that it may leave
 
 
 def mismatch(T_world_sensor: Poses, hops: Hops) -> NDArray[np.float64]:
@@ -170,11 +183,14 @@ def diagnose_reference(
         T = T_world_given @ T_given_sensor
         return Trajectory(reference.stamps, T, reference.max_gap).at(stamps)
 
+    T_world_body = at_scans(given) @ invert(T_given_sensor)
+    calibrate = "no setting mends that: calibrate what made them, or use `reference: estimated`"
     candidates = [
         *(c._replace(T_world_sensor=at_scans(c.T_world_sensor)) for c in _conventions(given)),
         *_far_apart(reference, stamps),
         *_clock(reference, stamps, hops),
-        *_places(at_scans(given) @ invert(T_given_sensor), hops, T_given_sensor),
+        *_scales(T_world_body, hops, T_given_sensor, calibrate),
+        *_places(T_world_body, hops),
     ]
     return _likeliest(candidates, hops, errors)
 
@@ -186,17 +202,19 @@ def diagnose_odometry(T_odom_sensor: Poses, hops: Hops) -> Finding | None:
     if np.isnan(before) or before < SUSPICIOUS:
         return None
     known = np.isfinite(T_odom_sensor).all(axis=(1, 2), keepdims=True)
-    steps = np.where(known, T_odom_sensor, np.eye(4))
+    safe = np.where(known, T_odom_sensor, np.eye(4))
     candidates = [
         _Candidate(
             "like increments from scan to scan",
             "let the odometry return the pose of each scan in the frame of the first one",
-            np.array([*accumulate(steps, np.matmul)]),
+            np.array([*accumulate(safe, np.matmul)]),
         ),
         *_conventions(T_odom_sensor),
-        *_places(T_odom_sensor, hops, np.eye(4), of_odometry=True),
+        *_scales(T_odom_sensor, hops, np.eye(4), _OWN),
+        *_places(T_odom_sensor, hops, of_odometry=True),
     ]
-    return _likeliest(candidates, hops, errors)
+    # What is left may be the odometry's own error.
+    return _likeliest([c._replace(most=EXPLAINED) for c in candidates], hops, errors)
 
 
 def _likeliest(
@@ -211,10 +229,10 @@ def _likeliest(
         return _mean(errors) * before / max(same, 1e-9)
 
     left = [(c, after(mismatch(c.T_world_sensor, hops))) for c in candidates]
-    left = [(c, rest) for c, rest in left if np.isfinite(rest)]
-    least = min((rest for _, rest in left), default=np.inf)
-    if least > EXPLAINED * before:
+    left = [(c, rest) for c, rest in left if rest <= min(c.most * before, LEFT)]
+    if not left:
         return None
+    least = min(rest for _, rest in left)
     # The last one, with the most freedom, fits whatever others fit, and noise, too.
     most = max(1.25 * least, 0.1 * before)
     fit = [(c, rest) for c, rest in left if rest <= most]
@@ -255,7 +273,7 @@ def _far_apart(reference: Trajectory, stamps: NDArray[np.int64]) -> Iterator[_Ca
     T[known, :3, :3] = RotationSpline(seconds, R)(at).as_matrix()
     T[known, :3, 3] = CubicSpline(seconds, reference.T_world_sensor[:, :3, 3])(at)
     what = f"too rare: one every {every:.2g} s, and a straight way for the scans in between"
-    yield _Candidate(what, "give more poses a second, or use `reference: estimated`", T)
+    yield _Candidate(what, "give more poses a second, or use `reference: estimated`", T, EXPLAINED)
 
 
 def _clock(reference: Trajectory, stamps: NDArray[np.int64], hops: Hops) -> Iterator[_Candidate]:
@@ -299,27 +317,76 @@ def _turned_moved(T: Poses) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return rotation_angle(T), np.linalg.norm(T[:, :3, 3], axis=1)
 
 
-def _places(
-    T_world_body: Poses, hops: Hops, T_body_sensor: Poses, of_odometry: bool = False
+def _scales(
+    T_world_body: Poses, hops: Hops, T_body_sensor: Poses, mend: str
 ) -> Iterator[_Candidate]:
-    """The poses of another body of the same platform, or in other units."""
+    """Poses in other units, or whose ways or turns are too long, or with a drift of their turns."""
+    known = np.flatnonzero(np.isfinite(T_world_body[:, 0, 0]))
+    there = np.isfinite(T_world_body[hops.start, 0, 0] + T_world_body[hops.end, 0, 0])
+    if there.sum() < FEWEST_HOPS:
+        return
+    start, end, measured = hops.start[there], hops.end[there], hops.T_start_end[there]
+    right, far = _turned_moved(measured)
+    T = invert(T_world_body[start]) @ T_world_body[end]
+    turned, turning = _turned_moved(T)[0], right > TURNED
+    turn = float(np.median(turned[turning] / right[turning])) if turning.any() else 1.0
+    apart = _rotation_vectors(T) - _rotation_vectors(measured)
+    rate = np.median(apart / (end - start)[:, None], axis=0)  # radians a scan
+
+    def turning_less(share: float, by: NDArray[np.float64]) -> Poses:
+        """The poses if they turned less by a share, and by some radians a scan."""
+        moved = steps(T_world_body[known])
+        less = share * _rotation_vectors(moved) + by * np.diff(known)[:, None]
+        half = np.tile(np.eye(4), (len(less), 1, 1))
+        half[:, :3, :3] = Rotation.from_rotvec(-0.5 * less).as_matrix()
+        found = T_world_body.copy()
+        found[known] = [*accumulate([T_world_body[known[0]], *(half @ moved @ half)], np.matmul)]
+        return found
+
+    causes = [("", T_world_body)]
+    if turn > 0.0 and abs(turn - 1.0) > SAME:
+        what = f"turned {turn:.3g} times as far as the scans"
+        causes.append((what, turning_less(1.0 - 1.0 / turn, np.zeros(3))))
+    if np.linalg.norm(rate) * np.median(end - start) > SAME:
+        what = f"turned by {np.degrees(np.linalg.norm(rate)):.2g} degrees too much with every scan"
+        causes.append((what, turning_less(0.0, rate)))
+    for what, poses in causes:
+        if what:
+            yield _Candidate(what, mend, poses @ T_body_sensor, EXPLAINED)
+        way = _turned_moved(invert(poses[start]) @ poses[end])[1]
+        scale = float(np.median(way / np.maximum(far, 1e-9)))
+        if scale > 0.0 and abs(scale - 1.0) > SAME:
+            scaled = poses.copy()
+            scaled[:, :3, 3] /= scale
+            said = f"{what}{', and ' * bool(what)}{scale:.4g} times as long as the scans' way"
+            found = _Candidate(said, mend, scaled @ T_body_sensor, EXPLAINED)
+            if not what and np.abs(np.abs(np.log(scale)) - np.log(UNITS)).min() < UNLIKE:
+                found = found._replace(mend="write the positions in metres", most=SET_RIGHT)
+            yield found
+
+
+def _rotation_vectors(T: Poses) -> NDArray[np.float64]:
+    return np.asarray(Rotation.from_matrix(T[:, :3, :3]).as_rotvec())
+
+
+def _places(T_world_body: Poses, hops: Hops, of_odometry: bool = False) -> Iterator[_Candidate]:
+    """The poses of another body of the same platform."""
     T = invert(T_world_body[hops.start]) @ T_world_body[hops.end]
     known = np.isfinite(T).all(axis=(1, 2))
     T, measured = T[known], hops.T_start_end[known]
     if len(T) < FEWEST_HOPS:
         return
-    scale = float(np.median(_turned_moved(T)[1] / np.maximum(_turned_moved(measured)[1], 1e-9)))
-    if scale > 0.0:
-        scaled = T_world_body.copy()
-        scaled[:, :3, 3] /= scale
-        what = f"{scale:.4g} times as long as the way of the scans"
-        yield _Candidate(what, "write the positions in metres", scaled @ T_body_sensor)
     turned, lever = _rotation(T, measured), _lever(T, measured, np.eye(3))
-    both = _lever(T, measured, turned)
+    turned_too, both = turned, lever
+    for _ in range(5):  # each tells the other better
+        both = _lever(T, measured, turned_too)
+        beside = T.copy()
+        beside[:, :3, 3] += (T[:, :3, :3] - np.eye(3)) @ both
+        turned_too = _rotation(beside, measured)
     for R, t, what in (
         (np.eye(3), lever, "like those of another body, a lever arm away"),
         (turned, np.zeros(3), "like those of other axes"),
-        (turned, both, "like those of another body, with other axes"),
+        (turned_too, both, "like those of another body, with other axes"),
     ):
         place = np.eye(4)
         place[:3, :3], place[:3, 3] = R, t
@@ -337,11 +404,8 @@ def _places(
 
 def _rotation(T: Poses, measured: Poses) -> NDArray[np.float64]:
     """Rotation of shape (3, 3) from the measured frame to that of the poses, by all motions."""
-    vectors = []
-    for motions in (T, measured):
-        turns = Rotation.from_matrix(motions[:, :3, :3]).as_rotvec()
-        vectors.append(np.concatenate([motions[:, :3, 3], 10.0 * turns]))
-    return nearest_rotation(vectors[1], vectors[0])
+    to, of = (np.concatenate([m[:, :3, 3], 10.0 * _rotation_vectors(m)]) for m in (T, measured))
+    return nearest_rotation(of, to)
 
 
 def _lever(T: Poses, measured: Poses, R_body_sensor: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -373,36 +437,45 @@ def contradictions(
 ) -> Iterator[Finding]:
     """What scans say where a reference and an odometry differ by `error` percent, if that is large.
 
-    The odometry's poses, of shape (n_scans, 4, 4), owe nothing to the reference, and are those of
-    the scans with the stamps `seen`, or of all. `place` is as in `diagnose_reference`; `given` says
-    whether the reference came with the recording.
+    Stretches on which the scans stand still while the reference moves come first. The odometry's
+    poses, of shape (n_scans, 4, 4), owe nothing to the reference, and are those of the scans with
+    the stamps `seen`, or of all. `place` is as in `diagnose_reference`; `given` says whether the
+    reference came with the recording.
     """
-    if not error > SUSPICIOUS:
-        return
     stamps: list[int] = []
-    content = Content()
+    content, carried = Content(), Carried()
+    reference = scans.reference() if given else None
 
     def read() -> Iterator[Scan]:
         for scan in scans:
             if seen is None or scan.stamp in seen:
                 stamps.append(scan.stamp)
                 content.see(scan)
+                if reference is not None:
+                    carried.see(scan, pose_at(reference, scan.stamp))
                 yield scan
 
-    hops = measured_motions(read(), len(T_odom_sensor))
-    reference = scans.reference() if given else None
+    passing = read()
+    hops = measured_motions(passing, len(T_odom_sensor))
+    deque(passing, 0)
+    at = np.array(stamps, np.int64)
+    found = carried.findings(begin := begin_of(scans, at))
+    yield from found
+    if not error > SUSPICIOUS:
+        return
     if reference is not None:
+        reference = without(reference, found, begin)
         yield from content.of_place(reference, not len(hops.start))
-        at = np.array(stamps, np.int64)
         T_ref_sensor = reference.at(at)
         wrong, others = (mismatch(T, hops) for T in (T_ref_sensor, T_odom_sensor))
         if (cause := diagnose_reference(reference, at, hops, place)) is not None:
             yield cause.below((CONTRADICTS,))
         elif _surely_worse(wrong, others):
+            why = UNEXPLAINED * (_mean(wrong) > SUSPICIOUS)
             what = (
                 f"over some metres they differ by {_mean(wrong):.3g} %, by registrations of scans, "
-                f"and the odometry by {_mean(others):.3g} %; sets that differ by less cannot be "
-                f"told apart"
+                f"and the odometry by {_mean(others):.3g} %{why}; sets that differ by less cannot "
+                f"be told apart"
             )
             mend = (
                 "use `reference: estimated` or a longer sub_trajectory, or check its file or topic "

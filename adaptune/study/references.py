@@ -15,6 +15,7 @@ from adaptune.recording import cache
 from adaptune.recording.config import Fractions, SequenceConfig
 from adaptune.recording.recording import RecordedSequence, wants_estimate
 from adaptune.reference import estimate
+from adaptune.reference.carried import may_be_carried
 from adaptune.reference.diagnosis import SUSPICIOUS, contradictions
 from adaptune.reference.estimated import EstimatedReference, EstimateError
 from adaptune.reference.stored import Refusal, StoredEstimate, keep, kept, write_estimate
@@ -234,13 +235,17 @@ def contradictions_of(
     T_odom_sensor: Poses,
     error: float,
     seen: Collection[int] | None = None,
+    T_ref_sensor: Poses | None = None,
 ) -> list[Finding]:
     """What the scans of a sequence say where its reference and an odometry disagree.
 
-    For the parameters see `adaptune.reference.diagnosis.contradictions`.
+    For the parameters see `adaptune.reference.diagnosis.contradictions`; the reference's poses tell
+    where it may move while the scans stand still.
     """
     config = sequences.config(name)
-    if not error > SUSPICIOUS:
+    if not error > SUSPICIOUS and (
+        T_ref_sensor is None or not may_be_carried(T_ref_sensor, T_odom_sensor)
+    ):
         return []
     scans = RecordedSequence(config.model_copy(update=_AS_RECORDED))
     given = sequences.estimate(name) is None

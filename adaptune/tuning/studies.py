@@ -102,7 +102,13 @@ def proposed(found: "Inspection", deep: bool, show: Progress) -> tuple[float | N
         return None, USUAL_LENGTH, ""
     from adaptune.recording.recording import open_sequence
     from adaptune.reference import check
-    from adaptune.reference.diagnosis import diagnose_reference, measured_motions
+    from adaptune.reference.carried import begin_of, without
+    from adaptune.reference.diagnosis import (
+        SUSPICIOUS,
+        UNEXPLAINED,
+        diagnose_reference,
+        measured_motions,
+    )
 
     share = share_of(found.reference)
     usual = check.proposed_sub_trajectory(found.reference, training=share)
@@ -113,13 +119,18 @@ def proposed(found: "Inspection", deep: bool, show: Progress) -> tuple[float | N
         if (reference := scans.reference()) is None:
             return share, usual, ""
         measured = check.measure_reference(scans, reference, partial(show, "registering"))
+        found.findings += measured.carried
+        reference = without(reference, measured.carried, begin_of(scans, measured.stamps))
         motions = measured_motions(scans, len(measured.stamps))
         if (cause := diagnose_reference(reference, measured.stamps, motions)) is not None:
             found.findings.append(cause.below((check.CONTRADICTS,)))
-    except AdaptuneError as error:
-        return share, usual, f"its error cannot be measured: {error}"
+    except AdaptuneError as why:
+        return share, usual, f"its error cannot be measured: {why}"
     length = check.proposed_sub_trajectory(reference, measured, share)
-    words = check.accuracy_words(measured, usual, length), check.advice(measured, reference, share)
+    accuracy, error = check.accuracy_words(measured, usual, length), measured.error(length)
+    if cause is None and not measured.doubt and error is not None and error.low > SUSPICIOUS:
+        accuracy += UNEXPLAINED
+    words = accuracy, check.advice(measured, reference, share)
     return share, length, "; ".join(filter(None, words))
 
 

@@ -66,6 +66,12 @@ BAGPY = "Time,header.seq,header.stamp.secs,header.stamp.nsecs,header.frame_id," 
 JUGGLER = "__time,/o/header/stamp/nanosec,/o/header/stamp/sec," + ",".join(
     f"/o/pose/pose/{of}/{axis}" for of in ("position", "orientation") for axis in "xyzw"
 ).replace("/o/pose/pose/position/w,", "")
+
+
+def axes(stem):
+    return ",".join(stem + axis for axis in "xyz")
+
+
 TURNED = "0,-1,0,1,1,0,0,2,0,0,1,3"
 S, MS, NS = (("1700000000" + zeros, "1700000001" + zeros) for zeros in ("", "000", "0" * 9))
 
@@ -101,6 +107,23 @@ S, MS, NS = (("1700000000" + zeros, "1700000001" + zeros) for zeros in ("", "000
         (f"{JUGGLER}\n", f"1.5,0,{{}},{AT},{TURN}\n", S),
         # Or that one, if the message has none.
         (RECORDED, f"{{}},5,0,lidar,{AT},{TURN},9\n", NS),
+        # Rates and deviations beside, parts of another body, and two bodies.
+        (f"t,{axes('rot_vel.')},{axes('p.')},{axes('q.')},q.w\n", f"{{}},9,9,9,{AT},{TURN}\n", S),
+        (
+            f"t,{axes('pos_std_')},{axes('q_std_')},q_std_w,{axes('pos_')},{axes('q_')},q_w\n",
+            f"{{}},9,9,9,0,0,0,1,{AT},{TURN}\n",
+            S,
+        ),
+        (
+            f"t,{axes('aim.p.')},{axes('o.p.')},{axes('o.q.')},o.q.w\n",
+            f"{{}},9,9,9,{AT},{TURN}\n",
+            S,
+        ),
+        (
+            f"t_used,t,{axes('a.p.')},{axes('a.q.')},a.q.w,{axes('far.p.')},{axes('far.q.')},far.q.w\n",
+            f"9,{{}},{AT},{TURN},9,9,9,0,0,0,1\n",
+            S,
+        ),
         # ROS 2, without and with a second frame.
         ("", f"{{}},0,odom,{AT},{TURN}\n", S),
         ("", f"{{}},0,odom,,{AT},{TURN},0.1,0.1\n", S),
@@ -122,6 +145,13 @@ def test_matrices_without_stamps_are_kittis(tmp_path, row):
         (tmp_path / name).write_text(f"{text}\n" * 2)
         assert is_kitti(tmp_path / name)
         assert read_kitti(tmp_path / name)[1, :3, 3].tolist() == [1, 2, 3]
+
+
+@pytest.mark.parametrize("row", ["0 1 0 -1 0 0 0 0 1 1 2 3", "2 0 0 0 0 2 0 0 0 0 2 0"])
+def test_matrices_that_are_no_poses_are_refused(tmp_path, row):
+    (tmp_path / "a.txt").write_text(f"1 0 0 0 0 1 0 0 0 0 1 0\n{row}\n")
+    with pytest.raises(TrajectoryError, match="line 2: its numbers are no rigid pose"):
+        read_kitti(tmp_path / "a.txt")
 
 
 def test_what_is_assumed_is_said_once(tmp_path, caplog):
@@ -183,6 +213,12 @@ TUM_LINE = "1.5 0 0 0 0 0 0 1\n"
         ("a.csv", "1e19,0,0,0,1,0,0,0\n", "line 1: '1e19' is not a time"),
         ("a.csv", "t,x,y,z,yaw\n1.5,0,0,0,1\n", "line 1: names no column qx, qy, qz, qw; name"),
         ("a.csv", "w,t,x,y,z,qx,qy,qz,qw\n1,2,3,4,5,6,7,8\n", "line 2: a CSV line has 9 numbers"),
+        # Columns of the matrix, one after the other.
+        (
+            "a.csv",
+            "1.5,1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1\n2.5,0,1,0,0,-1,0,0,0,0,0,1,0,1,2,3,1\n",
+            "line 2: its numbers are no rigid pose; write the rows",
+        ),
     ],
 )
 def test_the_line_that_is_wrong_is_named(tmp_path, name, text, message):

@@ -9,9 +9,11 @@ import pytest
 from kills import contents
 
 from adaptune.archive import Archive, Trial
-from adaptune.errors import AdaptuneError
+from adaptune.errors import AdaptuneError, Finding
+from adaptune.metrics import window_ends
 from adaptune.model import ErrorModel
 from adaptune.model.descriptor import averaged
+from offline import campaign
 from offline.campaign import BaselineError, check_baseline
 from offline.config import load_study
 from offline.train import train
@@ -192,8 +194,9 @@ def test_a_single_fault_does_no_harm():
     [
         ({"step": 0.375}, None),
         ({}, "0.79"),
-        ({"axis": 1}, "like those of other axes"),
-        ({"step": -0.3}, "or inverted"),
+        ({"axis": 1, "step": 0.375}, "like those of other axes"),
+        ({"step": -0.375}, "or inverted"),
+        ({"axis": 1}, None),
     ],
 )
 def test_an_odometry_that_contradicts_the_scans_is_told(
@@ -209,3 +212,32 @@ def test_an_odometry_that_contradicts_the_scans_is_told(
     assert len(told) == 2
     assert told[0].startswith("sequences.one, faulty:Stumbling: the odometry's poses contradict")
     assert words in told[0]
+
+
+def test_where_scans_stand_and_the_reference_moves_nothing_counts(
+    study_file, tmp_path, monkeypatch, caplog
+):
+    asked = []
+
+    def carried(_, name, *__):
+        asked.append(name)
+        return [Finding((), f"{name} is carried", seconds=(1.0, 1.5), of="reference")]
+
+    monkeypatch.setattr(campaign, "contradictions_of", carried)
+    study = load_study(study_file, ["offline.trials=2"], tmp_path / "study")
+    with caplog.at_level(logging.WARNING, "offline.campaign"):
+        train(study)
+    assert "Fake: one is carried, from 1.0 to 1.5 s" in caplog.text
+    archive = Archive(study.folder / "trials")
+    for name in study.training:
+        frames = archive.read_frames(name)
+        seconds = (frames.stamps - frames.stamps[0]) * 1e-9
+        lost = (seconds >= 1.0) & (seconds <= 1.5)
+        assert lost.any()
+        np.testing.assert_array_equal(np.isnan(frames.T_ref_sensor[:, 0, 0]), lost)
+        known = window_ends(frames.T_ref_sensor, study.config.sub_trajectory) >= 0
+        for number in (0, 1):
+            errors = archive.read(name, number).errors
+            np.testing.assert_array_equal(np.isfinite(errors), known)
+    train(study)
+    assert asked == study.training  # what was stored is not asked again

@@ -87,12 +87,21 @@ class Faulty(Odometry):
                 time.sleep(60)
             case "memory":
                 np.ones(1 << 30)
-            case "NaN":
-                T[0, 3] = np.nan
-            case "not rigid":
-                T[:3, :3] *= 1.1
-            case "mirrored":
-                T[2, 2] = -1.0
+            case wrong:
+                spoil(T, wrong)
+
+
+def spoil(T, fault):
+    """Make a pose wrong."""
+    match fault:
+        case "NaN":
+            T[0, 3] = np.nan
+        case "not rigid":
+            T[:3, :3] *= 1.1
+        case "transposed":
+            T[:] = T.T.copy()
+        case "mirrored":
+            T[2, 2] = -1.0
 
 
 class Clean(Faulty):

@@ -55,7 +55,8 @@ HERE = {
     "nothing": r"Faulty\.register \(\S+faulty\.py, line \d+\) returned None; let it return Reg",
     "text": r"faulty\.py, line \d+\) returned \('left', 1\); let it return Registration\(pose\)",
     "NaN": "it gave a pose that is not finite",
-    "not rigid": "it gave a pose that is not rigid",
+    "not rigid": "it gave a pose that is not rigid$",
+    "transposed": r"not rigid: its last row is not 0 0 0 1; is it transposed\?",
     "shape": r"it gave a pose of shape \(3, 4\)",
 }
 """Those that clean classes have in this process, too."""

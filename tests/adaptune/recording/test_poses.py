@@ -3,7 +3,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from adaptune.geometry import invert
-from adaptune.recording.poses import sound
+from adaptune.recording.poses import in_angles, sound
 from adaptune.trajectory import Trajectory
 
 RATES = [1, 10, 20, 100, 400]
@@ -122,3 +122,41 @@ def test_a_few_poses_say_nothing(n):
     T = np.tile(np.eye(4), (n, 1, 1))
     T[:, 0, 3] = np.arange(n) ** 3
     assert sound(Trajectory(np.arange(n) * 10**9, T))[1] == []
+
+
+def on_the_globe(stamps, T, at=(114.17, 22.3), noise=0.0):
+    """The poses with longitude and latitude in degrees for x and y."""
+    T = T.copy()
+    T[:, :2, 3] += np.random.default_rng(1).normal(0.0, noise, (len(T), 2))
+    T[:, :2, 3] /= 1.1e5 * np.cos(np.radians(at[1])), 1.1e5
+    T[:, :2, 3] += at
+    return Trajectory(stamps, T)
+
+
+@pytest.mark.parametrize("rate", RATES)
+@pytest.mark.parametrize("drive", [winding, stopping, lambda rate: winding(rate, speed=30.0)])
+def test_longitude_and_latitude_are_no_metres(rate, drive):
+    found = in_angles(on_the_globe(*drive(rate)))
+    assert "are degrees of longitude and latitude, not metres" in found.what
+    assert "`reference: estimated`" in found.mend
+    assert in_angles(Trajectory(*drive(rate))) is None
+
+
+def test_longitude_and_latitude_are_known_in_any_order_and_unit():
+    stamps, T = winding(10)
+    degrees = on_the_globe(stamps, T, at=(-0.1, 51.5), noise=0.1).T_world_sensor
+    swapped, radians = degrees.copy(), degrees.copy()
+    swapped[:, :2, 3] = degrees[:, 1::-1, 3]
+    radians[:, :2, 3] = np.radians(degrees[:, :2, 3])
+    assert "degrees" in in_angles(Trajectory(stamps, swapped)).what
+    assert "radians" in in_angles(Trajectory(stamps, radians)).what
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-6, 1e-5, 1e-4, 1e-3])
+def test_who_stands_far_from_the_origin_may_do_so_in_metres(noise):
+    T = np.tile(np.eye(4), (3000, 1, 1))
+    T[:, :3, 3] = np.random.default_rng(0).normal((30.0, 20.0, 1.0), noise, (3000, 3))
+    stamps = np.arange(3000) * 10**8
+    assert in_angles(Trajectory(stamps, T)) is None
+    T[2900:, 0, 3] += np.linspace(0.0, 3.0, 100)  # and drives in the end
+    assert in_angles(Trajectory(stamps, T)) is None
