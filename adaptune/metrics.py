@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from adaptune.geometry import Poses, invert, nearest_rotation, rotation_angle, steps
 
 RESAMPLES = 2000  # resamples of a bootstrap
-MIN_BLOCKS = 10  # least number of blocks of a recording: with fewer, an interval means nothing
 WORST = 0.1  # share of the stretches that are the worst
 KITTI_LENGTHS = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 JITTER = 0.1
@@ -261,24 +260,6 @@ def lost_in_words(
         f"points' times, motion compensation, the range settings or the reference are wrong "
         f"(`adaptune inspect --deep` checks the recording)."
     ]
-
-
-def bootstrap(
-    errors: NDArray[np.float64], fixed: NDArray[np.float64], block: int
-) -> tuple[tuple[float, float], tuple[float, float]] | None:
-    """95 % intervals of the mean error, and of its ratio to the fixed set's: the ends of both.
-
-    A moving-block bootstrap (Künsch, Annals of Statistics 1989): errors of neighbouring frames
-    share most of their sub-trajectories, and `block` frames are drawn together. The interval holds
-    for this recording, not for other places. With few blocks it is too narrow; there is none with
-    fewer than `MIN_BLOCKS`. Errors of the same frames, of shape (n,), are in percent.
-    """
-    if len(errors) < MIN_BLOCKS * block:
-        return None
-    means = resampled_means(np.stack([errors, fixed]), block, np.random.default_rng(0))
-    ratios = means[0] / np.maximum(means[1], 1e-12)
-    (low, high), (ratio_low, ratio_high) = np.percentile([means[0], ratios], [2.5, 97.5], axis=1).T
-    return (float(low), float(high)), (float(ratio_low), float(ratio_high))
 
 
 def resampled_means(

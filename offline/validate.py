@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 
 from adaptune.archive import Archive
 from adaptune.errors import AdaptuneError
-from adaptune.metrics import bootstrap, cap
+from adaptune.metrics import cap
 from adaptune.model import ErrorModel, ModelError
 from adaptune.model.registry import ADAPTIVE, RULES, rule_class
 from adaptune.model.rules import BASELINE, ERROR_FLOOR
+from adaptune.paired import Pair, ratio
 from adaptune.progress import Progress, unseen
 from adaptune.report import tables
 from adaptune.report.drawing import draw_chart
@@ -350,8 +351,8 @@ def _rows(validation: Validation) -> list[dict[str, Any]]:
         ratios = {mode: float(validation.ratios[mode][i]) for mode in modes}
         errors, fixed = sequence.errors[ADAPTIVE], sequence.errors["fixed"]
         # It is about this sequence, and says nothing about other places.
-        intervals = bootstrap(errors, fixed, sequence.span)
-        rows.append(row(sequence.name, fixed.mean(), ratios, intervals and intervals[1]))
+        interval = ratio([Pair(np.stack([errors, fixed]), sequence.span)]).interval
+        rows.append(row(sequence.name, fixed.mean(), ratios, interval))
     costs = {mode: validation.cost(mode) for mode in ["fixed", *modes]}
     if np.isfinite(list(costs.values())).any():
         rows.append(row("cost [ms]", costs["fixed"], costs))

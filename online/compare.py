@@ -9,26 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptune import manifest
-from adaptune.metrics import (
-    LOST_ABOVE,
-    MIN_BLOCKS,
-    RESAMPLES,
-    lost_in_words,
-    resampled_means,
-    worst_tenth,
-)
+from adaptune.metrics import LOST_ABOVE, lost_in_words, worst_tenth
 from adaptune.model import ErrorModel, rules
 from adaptune.model.registry import ADAPTIVE
+from adaptune.paired import Ratio, ratio
 from adaptune.reference.check import hard_to_track
 from adaptune.report import tables as report
 from adaptune.study.config import ALSO
-from adaptune.study.driven import (
-    BEST_DEFAULT,
-    MIN_RECORDINGS,
-    PER_STRETCH,
-    RIVALS,
-    not_compared,
-)
+from adaptune.study.driven import BEST_DEFAULT, PER_STRETCH, RIVALS, not_compared
 from adaptune.study.oracle import oracle_errors
 from adaptune.study.references import estimates_of
 from adaptune.study.study import Study
@@ -46,13 +34,10 @@ from online.record import ReplaySummary, StoredReplay, StoredReplayError
 from online.reference import Reference, StandardErrors, check_reference, read_contradictions
 from online.statistics import (
     ALL,
-    ERROR_FACTOR,
     NO_DIFFERENCE,
     ORACLE,
     ComparisonRow,
     JudgedModes,
-    Ratio,
-    allowing_for,
     compare_modes,
     mean_of,
     oracle_row,
@@ -116,8 +101,6 @@ def compared_modes(study: Study) -> ComparedModes:
 
 AS_WRONG = 0.5
 """Share of the baseline's error in training from which an estimated reference can rank no sets."""
-SEED = 0
-"""Of the resampling."""
 LEAST_STRETCHES = 10
 """With fewer, there is no worst tenth."""
 
@@ -172,46 +155,8 @@ def _mean_row(mode: str, rows: Sequence[ComparisonRow]) -> ComparisonRow:
 
 
 def ratio_to(judged: Sequence[JudgedModes], mode: str, other: str | None = None) -> Ratio:
-    """Geometric mean of the ratios of two modes' errors, and its interval.
-
-    The 95 % interval comes from a paired block bootstrap. With `MIN_RECORDINGS` recordings or more,
-    recordings are drawn, too, and it speaks of others like these. With fewer it speaks of these,
-    and there is none unless each holds `MIN_BLOCKS` blocks. (The parts of one recording are one.)
-    Means of few recordings vary too little in a bootstrap, hence the factor. What an estimated
-    reference errs is allowed for as on a sequence. `other` is by default the yardstick.
-    """
-    known = [(one.pair(mode, other), one.block, one.rows[0].reference_error) for one in judged]
-    value = float(np.exp(np.mean([_log(errors) for errors, *_ in known])))
-    place = np.unique([one.recording or one.name for one in judged], return_inverse=True)[1]
-    n, rng = int(place.max()) + 1, np.random.default_rng(SEED)
-    if n < MIN_RECORDINGS and any(e.shape[1] < MIN_BLOCKS * block for e, block, _ in known):
-        return Ratio(value)
-    logs = np.array([resampled_logs(errors, block, rng) for errors, block, _ in known])
-    low, high = pooled_logs(logs, place, rng)
-    wider = np.mean([allowed(errors, own) for errors, _, own in known], axis=0)
-    return Ratio(value, (float(np.exp(low + wider[0])), float(np.exp(high + wider[1]))))
-
-
-def pooled_logs(
-    logs: NDArray[np.float64], place: NDArray[np.intp], rng: np.random.Generator
-) -> tuple[float, float]:
-    """Ends of the 95 % interval of a mean logarithm over recordings, see `ratio_to`.
-
-    `logs`, of shape (k, RESAMPLES), are resamples of k sequences; `place`, of shape (k,), has the
-    number of the recording that each is a part of.
-    """
-    n, counts, scale = int(place.max()) + 1, np.bincount(place).astype(float), 1.0
-    sums = np.zeros((n, RESAMPLES))
-    np.add.at(sums, place, logs)
-    if n >= MIN_RECORDINGS:
-        drawn = rng.integers(0, n, (n, RESAMPLES))
-        means = sums[drawn, rng.integers(0, RESAMPLES, (n, RESAMPLES))].sum(axis=0)
-        means /= counts[drawn].sum(axis=0)
-        scale = float(np.sqrt(n / (n - 1)))
-    else:
-        means = sums.sum(axis=0) / counts.sum()
-    low, high = means.mean() + scale * (np.percentile(means, [2.5, 97.5]) - means.mean())
-    return float(low), float(high)
+    """Ratio of two modes' errors over sequences; `other` is by default the yardstick."""
+    return ratio([one.pair(mode, other) for one in judged])
 
 
 def _log(errors: NDArray[np.float64]) -> float:
@@ -219,30 +164,11 @@ def _log(errors: NDArray[np.float64]) -> float:
     return float(np.log(mine / others))
 
 
-def resampled_logs(
-    errors: NDArray[np.float64], block: int, rng: np.random.Generator
-) -> NDArray[np.float64]:
-    """Logarithms of the ratio in resamples of one sequence, of shape (RESAMPLES,)."""
-    means = np.maximum(resampled_means(errors, min(block, errors.shape[1]), rng), 1e-12)
-    return np.asarray(np.log(means[0] / means[1]))
-
-
-def allowed(errors: NDArray[np.float64], reference_error: float | None) -> tuple[float, float]:
-    """By how much the reference's own error may move the logarithm of a ratio, down and up."""
-    if reference_error is None:
-        return 0.0, 0.0
-    mine, other = errors.mean(axis=1).tolist()
-    ratio, error = mine / max(other, 1e-12), ERROR_FACTOR * reference_error
-    _, (low, high) = allowing_for((mine, mine), (ratio, ratio), other, error)
-    with np.errstate(divide="ignore"):
-        return float(np.log(low / ratio)), float(np.log(high / ratio))
-
-
 def _of_stretches(judged: Sequence[JudgedModes], mode: str) -> NDArray[np.float64]:
     """Logarithms of the ratio on each stretch: as many whole ones as a sequence has, or one."""
     found = []
     for one in judged:
-        errors = one.pair(mode)
+        errors = one.pair(mode).errors
         n = max(1, errors.shape[1] // (PER_STRETCH * one.block))
         found += [_log(part) for part in np.array_split(errors, n, axis=1)]
     return np.array(found)

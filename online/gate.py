@@ -1,7 +1,7 @@
 """The gate: whether one side of the same recordings is worse than another."""
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from functools import reduce
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -13,12 +13,11 @@ from numpy.typing import NDArray
 from adaptune import manifest
 from adaptune.errors import AdaptuneError
 from adaptune.files import write_text
-from adaptune.metrics import MIN_BLOCKS, RESAMPLES
 from adaptune.odometry.faults import MAX_SHARE_WITHOUT_POSE
+from adaptune.paired import Pair, Ratio, ratio
 from adaptune.report.tables import Listing, markdown
-from adaptune.study.driven import MIN_RECORDINGS, PER_STRETCH
+from adaptune.study.driven import PER_STRETCH
 from adaptune.study.study import Study, is_written_to
-from online.compare import SEED, allowed, pooled_logs, resampled_logs
 from online.modes import BASELINE, FIXED
 from online.record import StoredReplay
 from online.reference import Reference
@@ -26,8 +25,8 @@ from online.statistics import ALL
 
 Verdict = Literal["better", "worse", "equal", "unclear"]
 """`equal` is surely within the bound, `unclear` too little to tell."""
-ERROR, COST, P99, RESTARTS = "error", "cost", "cost, 99th percentile", "restarts"
-_UNITS = {ERROR: "RTE [%]", COST: "cost [ms]", P99: "cost, 99th percentile [ms]"}
+ERROR, COST, RESTARTS = "error", "cost", "restarts"
+_UNITS = {ERROR: "RTE [%]", COST: "cost [ms]"}
 """Quantities as tables name them."""
 _WARM_UP, _COSTS = 10, 5
 """Scans whose costs do not count, because caches fill, and scans whose costs are drawn together."""
@@ -146,8 +145,7 @@ def compare_sides(new: Side, old: Side, error: float = 0.05, cost: float = 0.1) 
     whole = any(side.study.odometry.description.whole for side in (new, old))
     pairs, left_out = _pairs(new, old, whole)
     rows = _rows(ERROR, pairs, error)
-    for quantity in (COST,) if whole else (COST, P99):
-        rows += _rows(quantity, pairs, cost)
+    rows += _rows(COST, pairs, cost)
     lost = [(pair.name, *pair.lost) for pair in pairs]
     if len(pairs) > 1:
         lost.append((ALL, *np.sum([pair.lost for pair in pairs], axis=0).tolist()))
@@ -249,66 +247,38 @@ def _pair(name: str, replays: Sequence[StoredReplay], reference: Reference, whol
 
 def _rows(quantity: str, pairs: Sequence[_Pair], bound: float) -> list[GateRow]:
     """A row for each recording, and if there are several, one for all."""
-    rng, rows, pooled = np.random.default_rng(SEED), list[GateRow](), list[Any]()
-    share = 100.0 * _SHARE / len(pairs)
+    rows, known, share = list[GateRow](), list[Pair](), _SHARE / len(pairs)
     for pair in pairs:
-        values, block, why = pair.costs, _COSTS, pair.obstacle
+        one = Pair(pair.costs, _COSTS, pair.name)
+        why = pair.obstacle
         if quantity == ERROR:
-            values, block = pair.errors, pair.block
-            why = "" if values.shape[1] else "no reference"
+            one = Pair(pair.errors, pair.block, pair.name, pair.reference_error)
+            why = "" if pair.errors.shape[1] else "no reference"
         if why:
             rows.append(GateRow(pair.name, quantity, why=why))
             continue
-        both = np.percentile(values, 99, axis=1) if quantity == P99 else values.mean(axis=1)
-        new, old = both.tolist()
-        few = "one figure a run" if quantity == COST and values.shape[1] == 1 else "too short"
-        row = GateRow(pair.name, quantity, new, old, ratio=new / max(old, 1e-12), why=few)
-        same = bool((values[0] == values[1]).all())
-        resampled = _resampled_p99 if quantity == P99 else resampled_logs
-        logs = resampled(values, block, rng)
+        new, old = one.errors.mean(axis=1).tolist()
+        few = "one figure a run" if quantity == COST and one.errors.shape[1] == 1 else "too short"
+        row = GateRow(pair.name, quantity, new, old, why=few)
         if quantity == ERROR:
             row = row._replace(stretches=_stretches(pair))
-            if not same:
-                logs += np.where(logs < np.median(logs), *allowed(values, pair.reference_error))
-        enough = same or values.shape[1] >= MIN_BLOCKS * block
-        if enough:
-            ends = np.percentile(logs, [share / 2, 100.0 - share / 2])
-            row = _judged(row._replace(why=""), ends, bound)
-        if enough or len(pairs) >= MIN_RECORDINGS:
-            pooled.append((new, old, row.ratio, logs))
-        rows.append(row)
-    return [*rows, _over_all(quantity, pooled, len(pairs), bound)] if len(pairs) > 1 else rows
+        rows.append(_judged(row, ratio([one], share), bound))
+        known.append(one)
+    if len(pairs) == 1 or 2 * len(known) < len(pairs):
+        return rows
+    why = "" if len(known) == len(pairs) else f"known on {len(known)} of {len(pairs)} recordings"
+    new, old = np.mean([one.errors.mean(axis=1) for one in known], axis=0).tolist()
+    row = GateRow(ALL, quantity, new, old, why="too short")
+    return [*rows, _judged(row, ratio(known), bound)._replace(why=why)]
 
 
-def _over_all(quantity: str, pooled: Sequence[Any], n: int, bound: float) -> GateRow:
-    """The row of all recordings: geometric mean of the ratios, and its interval."""
-    why = "" if len(pooled) == n else f"known on {len(pooled)} of {n} recordings"
-    row = GateRow(ALL, quantity, why=why)
-    if 2 * len(pooled) < n or not pooled:
+def _judged(row: GateRow, found: Ratio, bound: float) -> GateRow:
+    row = row._replace(ratio=found.value)
+    if found.interval is None:
         return row
-    new, old, ratios, logs = map(np.array, zip(*pooled, strict=True))
-    ends = pooled_logs(logs, np.arange(len(logs)), np.random.default_rng(SEED))
-    ratio = float(np.exp(np.log(np.maximum(ratios, 1e-12)).mean()))
-    row = row._replace(new=float(new.mean()), old=float(old.mean()), ratio=ratio)
-    return _judged(row, ends, bound)
-
-
-def _judged(row: GateRow, ends: Iterable[float], bound: float) -> GateRow:
-    low, high = (float(np.exp(end)) for end in ends)
-    return row._replace(low=low, high=high, verdict=judged(row.ratio or 0.0, (low, high), bound))
-
-
-def _resampled_p99(
-    values: NDArray[np.float64], block: int, rng: np.random.Generator
-) -> NDArray[np.float64]:
-    """As `resampled_logs`, but of the ratio of 99th percentiles."""
-    n = values.shape[1]
-    block = min(block, n)
-    starts = rng.integers(0, n - block + 1, (RESAMPLES, -(-n // block), 1))
-    drawn = (starts + np.arange(block)).reshape(RESAMPLES, -1)
-    values = np.maximum(values, 1e-12)
-    new, old = np.array([np.percentile(values[:, frames], 99, axis=1) for frames in drawn]).T
-    return np.asarray(np.log(new / old))
+    low, high = found.interval
+    said = judged(found.value, found.interval, bound)
+    return row._replace(low=low, high=high, verdict=said, why="")
 
 
 def _stretches(pair: _Pair) -> tuple[tuple[float, float], ...]:

@@ -1,6 +1,5 @@
 """Statistics of stored replays: errors, intervals, and ratios to those of another mode."""
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import reduce
@@ -9,7 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptune.metrics import bootstrap, cap
+from adaptune.metrics import cap
+from adaptune.paired import Interval, Pair, Ratio, interval_of_mean, ratio
 from adaptune.study.oracle import OracleErrors
 from adaptune.trajectory import Trajectory
 from online.record import StoredReplay, switched
@@ -21,15 +21,6 @@ NO_DIFFERENCE = 0.01
 """Share of the yardstick's error by which others may differ without it being told."""
 ORACLE = "oracle, sequence"
 """Row of what the best set of each sequence has in its trials."""
-Interval = tuple[float, float] | None
-"""Ends of a 95 % interval, where it is known."""
-
-
-class Ratio(NamedTuple):
-    """The ratio of the errors of two modes, over several sequences their geometric mean."""
-
-    value: float
-    interval: Interval = None
 
 
 @dataclass(frozen=True)
@@ -136,10 +127,6 @@ class ComparisonRow:
         return head | over_all | shown | changed
 
 
-ERROR_FACTOR = 1.5
-"""By how much more than estimated an estimated reference may err."""
-
-
 class JudgedModes(NamedTuple):
     """The modes on a sequence, judged by its reference."""
 
@@ -151,13 +138,11 @@ class JudgedModes(NamedTuple):
     block: int  # frames of a sub-trajectory
     recording: str = ""  # that it is a part of; itself if empty
 
-    def pair(self, mode: str, other: str | None = None) -> NDArray[np.float64]:
-        """Errors of a mode and of another one, by default the yardstick, of shape (2, n).
-
-        They are those of the frames at which both are known.
-        """
+    def pair(self, mode: str, other: str | None = None) -> Pair:
+        """A mode and another one, by default the yardstick, at the frames where both are known."""
         both = np.stack([self.errors[mode], self.errors[other or self.rows[0].yardstick]])
-        return both[:, np.isfinite(both).all(axis=0)]
+        known, own = np.isfinite(both).all(axis=0), self.rows[0].reference_error
+        return Pair(both[:, known], self.block, self.recording or self.name, own)
 
 
 def compare_modes(
@@ -208,20 +193,16 @@ def _measured(row: ComparisonRow, replay: StoredReplay, reference: Reference) ->
 
 
 def _with_errors(row: ComparisonRow, judged: JudgedModes) -> ComparisonRow:
-    mine, others = judged.pair(row.mode)
-    if not len(mine):
+    pair = judged.pair(row.mode)
+    if not pair.errors.size:
         return row
-    intervals = bootstrap(mine, others, judged.block)
-    if intervals is not None and row.reference_error is not None:
-        judge = ERROR_FACTOR * row.reference_error
-        intervals = allowing_for(*intervals, float(others.mean()), judge)
-    rte_interval, ratio_interval = intervals or (None, None)
+    found, mine = ratio([pair]), pair.errors[0]
     return replace(
         row,
         rte=float(mine.mean()),
-        ratio=float(mine.mean()) / max(float(others.mean()), 1e-12),
-        rte_interval=rte_interval,
-        ratio_interval=ratio_interval,
+        ratio=found.value,
+        rte_interval=interval_of_mean(mine, judged.block, row.reference_error),
+        ratio_interval=found.interval,
     )
 
 
@@ -229,35 +210,6 @@ def mean_of(values: Sequence[float | None]) -> float | None:
     """Mean of those that are known."""
     known = [value for value in values if value is not None]
     return float(np.mean(known)) if known else None
-
-
-def allowing_for(
-    rte: tuple[float, float], ratio: tuple[float, float], other: float, error: float
-) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Intervals that hold, too, what would be measured by a reference without error.
-
-    If what the reference errs has nothing to do with a mode, it adds to the mode's error, in
-    quadrature: taken out, errors become smaller, and ratios lie further from 1. If a mode errs as
-    the reference does, as one that averages motions may, that part of its error is not seen.
-
-    `rte` and `ratio` are intervals of a mean error in percent, and of its ratio to that of another
-    mode, `other`. The reference errs by any percentage up to `error`.
-    """
-
-    def true(mean: float) -> float:
-        return math.sqrt(max(mean**2 - error**2, 0.0))
-
-    def further(end: float) -> float:
-        if end == 1.0:
-            return end
-        if true(other) == 0.0:  # nothing of it may be the mode's own
-            return 0.0 if end < 1.0 else math.inf
-        return true(end * other) / true(other)
-
-    (rte_low, rte_high), (low, high) = rte, ratio
-    hidden = math.hypot(high * other, error) / other, low * other / math.hypot(other, error)
-    interval = min(low, further(low), hidden[1]), max(high, further(high), hidden[0])
-    return (true(rte_low), math.hypot(rte_high, error)), interval
 
 
 def _estimated(estimates: NDArray[np.float64]) -> tuple[float | None, Interval]:

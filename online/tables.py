@@ -4,9 +4,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from adaptune.model.registry import rule_class
+from adaptune.paired import ERROR_FACTOR, MIN_RECORDINGS
 from adaptune.report.tables import Listing
-from adaptune.study.driven import MIN_RECORDINGS
-from online.statistics import ALL, ERROR_FACTOR, ORACLE, ComparisonRow
+from online.statistics import ALL, ORACLE, ComparisonRow
 
 YARDSTICKS = {"fixed": "fixed set", "baseline": "baseline"}
 
@@ -72,8 +72,8 @@ def _of_modes(rows: Sequence[ComparisonRow], length: float) -> Listing:
 def _caption(rows: Sequence[ComparisonRow], shown: Mapping[str, Any]) -> str:
     yardstick = rows[0].yardstick
     said = [
-        "Intervals of 95 %: paired block bootstrap, seed 0, where there is enough to draw from; "
-        f"with fewer than {MIN_RECORDINGS} test recordings, they speak of these alone.",
+        "Intervals of 95 %: from blocks of both modes' errors at the same scans, where there are "
+        f"enough; with fewer than {MIN_RECORDINGS} test recordings, they speak of these alone.",
         f"vs {yardstick}: geometric mean of the ratios to the {YARDSTICKS[yardstick]}'s RTE."
         * (rows[-1].sequence == ALL),
         "Worst tenth: that mean over the worst tenth of the stretches." * ("worst tenth" in shown),

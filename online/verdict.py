@@ -3,10 +3,11 @@
 import math
 from collections.abc import Mapping, Sequence
 
+from adaptune.paired import Ratio
 from adaptune.study.config import WORTH
 from adaptune.study.driven import EQUAL_COST, RIVAL_WORDS, RIVALS, is_worth
 from online.modes import EVEN, MODES
-from online.statistics import ALL, ORACLE, ComparisonRow, Ratio
+from online.statistics import ALL, ORACLE, ComparisonRow
 from online.tables import YARDSTICKS, last_rows
 
 ROUNDING = 1e-6

@@ -180,7 +180,7 @@ def validate(
         "Error as a ratio to the fixed set's, each recording or stretch left out in turn",
         rows,
         "The oracle knows the errors: the best set of the sequence. Intervals: "
-        "for a recording, a block bootstrap over time, if it is long enough; for the geometric "
+        "for a recording, from blocks along it, if it is long enough; for the geometric "
         "mean over the stretches, what is expected elsewhere.",
     )
     say(f"Tables and picture: {loaded.folder / 'validation'}.*, {loaded.folder / 'stretches'}.*")

@@ -215,8 +215,8 @@ def compare(
     """Compare the replays: what to drive, what adapting gained, and at what cost.
 
     *RTE* is the mean sub-trajectory error. *vs fixed* is its ratio to the fixed set's error: below
-    1, adapting is better. Intervals come from a paired block bootstrap. With six test sequences or
-    more, they speak of other sequences like these, else of these alone. Where an estimated
+    1, adapting is better. Intervals come from blocks of scans. With six test sequences or more,
+    they speak of other sequences like these, else of these alone. Where an estimated
     reference judged, they include its own error.
 
     The study's folder receives a page (HTML) of all that is known of the study, also of one that

@@ -57,7 +57,7 @@ def _studies(given: Sequence[str]) -> "list[OfflineStudy]":
 def _driven(given: Sequence[str], asked: Asked, show: Progress) -> "list[OfflineStudy]":
     """Both sides as studies of the same recordings."""
     from adaptune.manifest import digest
-    from adaptune.metrics import MIN_BLOCKS
+    from adaptune.paired import MIN_BLOCKS
     from adaptune.reference.check import path_after, proposed_sub_trajectory
     from adaptune.study.references import ensure_references
     from offline.config import load_study
@@ -76,7 +76,7 @@ def _driven(given: Sequence[str], asked: Asked, show: Progress) -> "list[Offline
     known = [first.sequences.open(name).reference() for name in names if name not in refused]
     # As many as intervals need fit into most recordings.
     lengths = [
-        min(proposed_sub_trajectory(one), path_after(one, 0.0)[0] / (MIN_BLOCKS + 2))
+        min(proposed_sub_trajectory(one), path_after(one, 0.0)[0] / (3 * MIN_BLOCKS))
         for one in known
         if one is not None
     ]

@@ -9,7 +9,6 @@ from scipy.spatial.transform import Rotation
 
 from adaptune.metrics import (
     absolute_error,
-    bootstrap,
     kitti_error,
     lost_in_words,
     relative_error,
@@ -150,31 +149,6 @@ def test_an_estimate_that_is_not_finite_is_a_failure(bad):
     errors = sub_trajectory_rte(T_ref, T_est, 1.5)
     assert np.isinf(errors[[2, 4]]).all()
     assert np.isnan(errors).tolist() == [False] * 7 + [True] * 2
-
-
-@pytest.mark.services
-def test_bootstrap_covers_the_mean_of_correlated_errors():
-    rng = np.random.default_rng(0)
-    covered = {1: 0, 40: 0}
-    for _ in range(60):
-        noise = rng.normal(size=640)
-        errors = 1.0 + np.convolve(noise, np.ones(40) / 40, mode="valid")
-        for block in covered:
-            (low, high), _ = bootstrap(errors, errors, block)
-            covered[block] += low <= 1.0 <= high
-    # Neighbouring errors share their windows: drawn one by one they seem far too certain.
-    assert covered[40] >= 48
-    assert covered[1] <= 30
-
-
-def test_bootstrap_of_a_ratio_is_paired():
-    rng = np.random.default_rng(1)
-    fixed = rng.lognormal(size=500)
-    (low, high), ratio = bootstrap(0.5 * fixed, fixed, 20)
-    assert ratio == pytest.approx((0.5, 0.5))
-    assert low < 0.5 * fixed.mean() < high
-    # Nine blocks tell nothing.
-    assert bootstrap(fixed[:199], fixed[:199], 20) is None
 
 
 def test_a_large_error_has_words():

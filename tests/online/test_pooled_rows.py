@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from online.compare import pooled, ratio_to
-from online.statistics import ORACLE, ComparisonRow, JudgedModes, allowing_for
+from online.statistics import ORACLE, ComparisonRow, JudgedModes
 
 BLOCK = 20
 
@@ -44,7 +44,7 @@ def test_the_ratio_is_the_geometric_mean_and_lies_in_its_interval():
 def test_few_sequences_speak_of_themselves():
     few = adaptive(pooled(of_ratios([0.5, 1.1]))).ratio_interval
     assert few[1] - few[0] < 0.1
-    short = of_ratios([0.5, 1.1], n=9 * BLOCK)
+    short = of_ratios([0.5, 1.1], n=3 * BLOCK)
     assert adaptive(pooled(short)).ratio_interval is None
 
 
@@ -53,7 +53,7 @@ def test_the_parts_of_one_recording_are_no_recordings():
     apart = adaptive(pooled(of_ratios(ratios))).ratio_interval
     together = adaptive(pooled(of_ratios(ratios, recording="hall"))).ratio_interval
     assert together[1] - together[0] < 0.5 * (apart[1] - apart[0])  # of this recording alone
-    short = of_ratios(ratios, n=5 * BLOCK, recording="hall")
+    short = of_ratios(ratios, n=3 * BLOCK, recording="hall")
     assert adaptive(pooled(short)).ratio_interval is None
     # Two recordings of four parts each vary as two would.
     rng = np.random.default_rng(0)
@@ -113,13 +113,9 @@ def test_the_oracle_is_the_mean_of_the_best_set_of_each_sequence():
 
 def test_what_an_estimated_reference_errs_is_in_the_interval():
     plain = adaptive(pooled(of_ratios([0.8] * 8))).ratio_interval
-    found = of_ratios([0.8] * 8, reference_error=0.2)
-    low, high = adaptive(pooled(found)).ratio_interval
-    assert low < plain[0]
-    assert high > plain[1]
-    mine, others = found[0].pair("adaptive").mean(axis=1)
-    _, ends = allowing_for((mine, mine), (mine / others,) * 2, others, 0.3)
-    assert low / plain[0] == pytest.approx(ends[0] / (mine / others), rel=0.01)
+    low, high = adaptive(pooled(of_ratios([0.8] * 8, reference_error=0.2))).ratio_interval
+    assert low < 0.97 * plain[0]
+    assert high > 1.03 * plain[1]
 
 
 def test_sequences_without_a_reference_do_not_count():

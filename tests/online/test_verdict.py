@@ -2,7 +2,8 @@ from dataclasses import replace
 
 import pytest
 
-from online.statistics import ALL, ORACLE, ComparisonRow, Ratio
+from adaptune.paired import Ratio
+from online.statistics import ALL, ORACLE, ComparisonRow
 from online.verdict import decided, late, remarks, verdict
 
 

@@ -1,0 +1,143 @@
+"""The statistic of pairs: how the errors of two runs on the same frames compare, and how surely."""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+MIN_BLOCKS = 4
+"""Blocks of a recording: with fewer, an interval means nothing."""
+MIN_RECORDINGS = 6
+"""With as many, what differs between recordings counts, and with fewer what differs along them."""
+ERROR_FACTOR = 1.5
+"""By how much more than estimated an estimated reference may err."""
+_LEAST = 1e-12
+Interval = tuple[float, float] | None
+"""Ends of an interval, where it is known."""
+
+
+class Pair(NamedTuple):
+    """The errors of two runs on the same frames of a recording, or of a part of it."""
+
+    errors: NDArray[np.float64]  # (2, n): percent, of a run and of the one to compare with
+    block: int = 1  # frames of a sub-trajectory: errors of so many neighbours overlap
+    recording: str = ""  # the parts of one recording share its name
+    reference_error: float | None = None  # percent, of an estimated reference
+
+
+class Ratio(NamedTuple):
+    """The ratio of the errors of two runs, over several recordings their geometric mean."""
+
+    value: float
+    interval: Interval = None
+    error: float = math.inf  # standard error of its logarithm, without the reference's
+
+
+def ratio(pairs: Sequence[Pair], share: float = 0.05) -> Ratio:
+    """Ratio of the mean errors, and an interval that misses the truth in a `share` of cases.
+
+    The standard error of its logarithm comes from moving blocks (Künsch, Annals of Statistics
+    1989) of the difference between both runs. Its expectation is set right for errors of
+    sub-trajectories that overlap, and the interval is Student's, so it holds for few blocks, too.
+
+    With `MIN_RECORDINGS` recordings or more, the interval speaks of others like these. With fewer
+    it speaks of these, and there is none unless each pair has `MIN_BLOCKS` blocks. What an
+    estimated reference may err is added to it. Where all errors are equal, the ratio is surely 1.
+    """
+    logs, errors, freedom = np.array([_of_blocks(pair) for pair in pairs]).T
+    found = pooled(logs, errors, freedom, [pair.recording for pair in pairs], share)
+    if found.interval is not None:
+        low, high = np.mean([_of_reference(pair) for pair in pairs], axis=0)
+        ends = found.interval[0] * math.exp(low), found.interval[1] * math.exp(high)
+        found = found._replace(interval=ends)
+    return found
+
+
+def pooled(
+    logs: NDArray[np.float64],
+    errors: NDArray[np.float64],
+    freedom: NDArray[np.float64],
+    recordings: Sequence[str],
+    share: float = 0.05,
+) -> Ratio:
+    """The geometric mean of ratios, given their logarithms, of shape (n,), and how sure these are.
+
+    That is their standard errors, their degrees of freedom (0 where an interval would mean
+    nothing), and the names of their recordings. See `ratio`.
+    """
+    from scipy.special import stdtrit  # slow to import
+
+    mean = float(logs.mean())
+    _, place = np.unique(np.asarray(recordings), return_inverse=True)
+    n = int(place.max()) + 1
+    if n >= MIN_RECORDINGS:
+        sums = np.bincount(place, logs - mean)
+        error, free = math.sqrt(float(sums @ sums) * n / (n - 1)) / len(logs), n - 1.0
+    else:
+        variances = (errors / len(logs)) ** 2
+        error, free = math.sqrt(variances.sum()), 0.0
+        if error == 0.0:
+            free = math.inf
+        elif freedom.all() and math.isfinite(error):  # Welch and Satterthwaite
+            free = float(variances.sum() ** 2 / (variances**2 / freedom).sum())
+    if free == 0.0:
+        return Ratio(math.exp(mean), None, error)
+    margin = 0.0 if error == 0.0 else min(error * float(stdtrit(free, 1.0 - share / 2.0)), 700.0)
+    return Ratio(math.exp(mean), (math.exp(mean - margin), math.exp(mean + margin)), error)
+
+
+def interval_of_mean(errors: NDArray[np.float64], block: int, own: float | None) -> Interval:
+    """95 % interval of a mean error; `own` is that of an estimated reference.
+
+    If what the reference errs has nothing to do with the run, it adds to its error, in quadrature.
+    """
+    found = ratio([Pair(np.stack([errors, np.ones_like(errors)]), block)]).interval
+    if found is None or own is None:
+        return found
+    return _without(found[0], ERROR_FACTOR * own), math.hypot(found[1], ERROR_FACTOR * own)
+
+
+def _of_blocks(pair: Pair) -> tuple[float, float, float]:
+    """The logarithm of a ratio, its standard error, and the degrees of freedom of that."""
+    n, block = pair.errors.shape[1], pair.block
+    means = np.maximum(pair.errors.mean(axis=1, keepdims=True), _LEAST)
+    log = float(np.log(means[0, 0] / means[1, 0]))
+    if (pair.errors[0] == pair.errors[1]).all():
+        return 0.0, 0.0, math.inf
+    if n < 2 * block:
+        return log, math.inf, 0.0
+    first, second = pair.errors / means
+    sums = np.concatenate([[0.0], np.cumsum(first - second)])
+    variance = float(np.mean(((sums[block:] - sums[:-block]) / block) ** 2))
+    # Means of blocks vary less about the mean of all than about the truth; and of errors over
+    # windows, each shares a part with those of the next block.
+    expected = (1.0 - block / n) * (2.0 * block**2 + 1.0) / (3.0 * block**2)
+    free = 1.5 * (n / block - 1.0) if n >= MIN_BLOCKS * block else 0.0
+    return log, math.sqrt(variance * block / n / expected), free
+
+
+def _of_reference(pair: Pair) -> tuple[float, float]:
+    """By how much the reference's own error may move the logarithm of a ratio, down and up.
+
+    Taken out of both errors, ratios lie further from 1. If one run errs as the reference does, as
+    one that averages motions may, that part of its error is not seen.
+    """
+    mine, other = np.maximum(pair.errors.mean(axis=1), _LEAST).tolist()
+    if pair.reference_error is None or (pair.errors[0] == pair.errors[1]).all():
+        return 0.0, 0.0
+    own, seen = ERROR_FACTOR * pair.reference_error, mine / other
+    further = seen
+    if seen != 1.0:
+        mine_true, other_true = _without(mine, own), _without(other, own)
+        # Nothing of the other one's error may be its own.
+        far = 0.0 if seen < 1.0 else math.inf
+        further = mine_true / other_true if other_true else far
+    ends = further / seen, math.hypot(mine, own) / mine, other / math.hypot(other, own)
+    low = min(1.0, *ends)
+    return math.log(low) if low else -math.inf, math.log(max(1.0, *ends))
+
+
+def _without(mean: float, own: float) -> float:
+    return math.sqrt(max(mean**2 - own**2, 0.0))
