@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from adaptune.odometry import Odometry
     from adaptune.recording.fleet import Reading
     from adaptune.space import ParameterSet
+    from adaptune.study.study import Study
     from offline.config import OfflineStudy
     from offline.train import Training
     from online.compare import ComparedReplays
@@ -259,7 +260,7 @@ def _study_name(asked: Asked) -> str:
     return stem if odometry == "gicp" else f"{stem}_{others}"
 
 
-def alone(study: "OfflineStudy") -> ExitStack:
+def alone(study: "Study") -> ExitStack:
     """Bind this process to one core, and leave the others to what it starts."""
     from adaptune.machine import pin
 
