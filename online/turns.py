@@ -30,8 +30,8 @@ Costs = Mapping[str, NDArray[np.float64]]
 """On a recording, by quantity: of shape (2, 2, n), by side, the new one first, turn, and scan."""
 _FIRST = 20
 """Scans that each side takes before: a process is slower at first."""
-_BLOCK = 10
-"""Scans whose costs count as one."""
+_BLOCK, _PARTS = 10, 4
+"""Scans whose costs count as one, and parts of a recording in each of which turns are compared."""
 
 
 class Driven(NamedTuple):
@@ -137,13 +137,15 @@ def cost_ratios(
     recordings, or of one where that is more.
     """
     n, scans = len(every), [along(Pair(costs.mean(axis=1), _BLOCK)) for costs in every]
-    logs = np.log(np.maximum([costs.mean(axis=2) for costs in every], 1e-12))
-    of_turns = np.diff(logs, axis=2)[..., 0]  # by recording and side
-    if every[0].shape[2] == 1:  # one figure a run
-        turns, free = (of_turns**2).sum(axis=1) / 4.0, 2.0
+    parts = min(_PARTS, every[0].shape[2])
+    split = [np.array_split(np.maximum(costs, 1e-12), parts, axis=2) for costs in every]
+    logs = np.log([[part.mean(axis=2) for part in of] for of in split])
+    of_turns = np.diff(logs, axis=3)[..., 0]  # by recording, part and side
+    if parts == 1:  # one figure a run
+        turns, free = (of_turns**2).sum(axis=2)[:, 0] / 4.0, 2.0
         scans = [(log, 0.0, math.inf) for log, *_ in scans]
     else:  # what both have met at the same scan is no difference
-        turns, free = np.diff(of_turns, axis=1)[:, 0] ** 2 / 4.0, 1.0
+        turns, free = (np.diff(of_turns, axis=2) ** 2).mean(axis=(1, 2)) / 4.0, float(parts)
     usual, found = float(turns.mean()), list[Ratio]()
     for (log, error, own), turn in zip(scans, turns.tolist(), strict=True):
         joint = np.array(joined((error, max(usual, turn) ** 0.5), (own, n * free)))
