@@ -4,6 +4,7 @@ import shlex
 import shutil
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -40,11 +41,11 @@ def sides(
     """
     from online.gate import Side
 
-    if asked.recordings:
-        studies = _driven(given, asked, length, show)
-    else:
-        studies = _studies(given, [] if length is None else [f"sub_trajectory={length}"])
+    studies = _driven(given, asked, show) if asked.recordings else _studies(given)
     _drive(studies, show)
+    if length is not None:
+        over = {"sub_trajectory": length}
+        studies = [replace(one, config=one.config.model_copy(update=over)) for one in studies]
     new, old = (Side(name, study) for name, study in zip(given, studies, strict=True))
     return new, old
 
@@ -62,7 +63,7 @@ def costs(shared: "Shared", show: Progress) -> "dict[str, Costs | str]":
     return found
 
 
-def _studies(given: Sequence[str], override: list[str]) -> "list[OfflineStudy]":
+def _studies(given: Sequence[str]) -> "list[OfflineStudy]":
     from offline.config import load_study
 
     for name in given:
@@ -74,12 +75,10 @@ def _studies(given: Sequence[str], override: list[str]) -> "list[OfflineStudy]":
                 raise AdaptuneError(
                     f"{name}: is no study; of a parameter file, name the bags and --odometry, too"
                 )
-    return [load_study(name, override, needed=Path(name).is_file()) for name in given]
+    return [load_study(name, needed=Path(name).is_file()) for name in given]
 
 
-def _driven(
-    given: Sequence[str], asked: Asked, length: float | None, show: Progress
-) -> "list[OfflineStudy]":
+def _driven(given: Sequence[str], asked: Asked, show: Progress) -> "list[OfflineStudy]":
     """Both sides as studies of the same recordings."""
     from adaptune.manifest import digest
     from adaptune.reference.check import greatest_speed
@@ -99,7 +98,7 @@ def _driven(
     refused = ensure_references(first.sequences, names, 5.0, show, required=False)
     known = [first.sequences.open(name).reference() for name in names if name not in refused]
     fastest = max((greatest_speed(one) for one in known if one is not None), default=0.0)
-    shared["sub_trajectory"] = length or (CAR if fastest > FAST else ROBOT)
+    shared["sub_trajectory"] = CAR if fastest > FAST else ROBOT
     if folders[0] != folders[1] and (estimates := folders[0] / "references").exists():
         shutil.copytree(estimates, folders[1] / "references", dirs_exist_ok=True)
     both = zip(entries, folders, strict=True)
