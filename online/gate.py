@@ -246,10 +246,9 @@ def _places(restarted: NDArray[np.bool_], block: int) -> tuple[int, int]:
     A place is one sub-trajectory, or several that follow each other.
     """
     starts = np.arange(0, restarted.shape[1], block)
-    new, old = np.logical_or.reduceat(restarted, starts, axis=1)
-    first, second = (
-        int((only & ~np.append(False, only[:-1])).sum()) for only in (new & ~old, old & ~new)
-    )
+    in_place = np.logical_or.reduceat(restarted, starts, axis=1)
+    only = np.pad(in_place & ~in_place[::-1], ((0, 0), (1, 0)))
+    first, second = (only[:, 1:] & ~only[:, :-1]).sum(axis=1).tolist()
     return first, second
 
 
@@ -269,12 +268,12 @@ def compare_sides(
     # Of both ends of an interval, one finds a side worse.
     each = 2.0 * share / (len(pairs) + (len(pairs) > 1))
     judges = {pair.name: pair.pair for pair in pairs if pair.pair.errors.size}
-    groups = [[one] for one in judges.values()] + [list(judges.values())] * bool(judges)
-    ratios = [ratio(group, each) for group in groups]
+    groups = [*([one] for one in judges.values()), [*judges.values()]]
+    ratios = [ratio(group, each) for group in groups if group]
     means = {name: one.errors.mean(axis=1) for name, one in judges.items()}
-    rows += _rows(ERROR, pairs, means, ratios, error, {})
     stretches = {pair.name: _stretches(pair) for pair in pairs if pair.name in judges}
-    rows = [row._replace(stretches=stretches.get(row.recording, ())) for row in rows]
+    for row in _rows(ERROR, pairs, means, ratios, error, {}):
+        rows.append(row._replace(stretches=stretches.get(row.recording, ())))
     for quantity in quantities:
         of = {pair.name: known[pair.name][quantity] for pair in pairs if pair.name in known}
         means = {name: one.mean(axis=(1, 2)) for name, one in of.items()}
