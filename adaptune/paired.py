@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 MIN_BLOCKS = 4
 """Blocks of a recording: with fewer, an interval means nothing."""
@@ -46,8 +46,7 @@ def ratio(pairs: Sequence[Pair], share: float = 0.05) -> Ratio:
     it speaks of these, and there is none unless each pair has `MIN_BLOCKS` blocks. What an
     estimated reference may err is added to it. Where all errors are equal, the ratio is surely 1.
     """
-    each = [_of_blocks(pair) for pair in pairs]
-    logs, errors, freedom = map(np.array, zip(*each, strict=True))
+    logs, errors, freedom = np.array([along(pair) for pair in pairs]).T
     found = pooled(logs, errors, freedom, [pair.recording for pair in pairs], share)
     if found.interval is not None:
         low, high = np.mean([_of_reference(pair) for pair in pairs], axis=0)
@@ -77,16 +76,22 @@ def pooled(
         sums = np.bincount(place, logs - mean)
         error, free = math.sqrt(float(sums @ sums) * n / (n - 1)) / len(logs), n - 1.0
     else:
-        variances = (errors / len(logs)) ** 2
-        error, free = math.sqrt(variances.sum()), 0.0
-        if error == 0.0:
-            free = math.inf
-        elif freedom.all() and math.isfinite(error):  # Welch and Satterthwaite
-            free = float(variances.sum() ** 2 / (variances**2 / freedom).sum())
+        error, free = joined(errors / len(logs), freedom)
     if free == 0.0:
         return Ratio(math.exp(mean), None, error)
     margin = 0.0 if error == 0.0 else min(error * float(stdtrit(free, 1.0 - share / 2.0)), 700.0)
     return Ratio(math.exp(mean), (math.exp(mean - margin), math.exp(mean + margin)), error)
+
+
+def joined(errors: ArrayLike, freedom: ArrayLike) -> tuple[float, float]:
+    """Standard error of a sum, and its degrees of freedom (Welch and Satterthwaite)."""
+    variances, each = np.square(np.asarray(errors, float)), np.asarray(freedom, float)
+    total = float(variances.sum())
+    if total == 0.0:
+        return 0.0, math.inf
+    if not (each.all() and math.isfinite(total)):
+        return math.sqrt(total), 0.0
+    return math.sqrt(total), float(total**2 / (variances**2 / each).sum())
 
 
 def of_stretches(logs: NDArray[np.float64], recordings: Sequence[str]) -> Ratio:
@@ -118,8 +123,8 @@ def interval_of_mean(errors: NDArray[np.float64], block: int, own: float | None)
     return _without(found[0], ERROR_FACTOR * own), math.hypot(found[1], ERROR_FACTOR * own)
 
 
-def _of_blocks(pair: Pair) -> tuple[float, float, float]:
-    """The logarithm of a ratio, its standard error, and the degrees of freedom of that."""
+def along(pair: Pair) -> tuple[float, float, float]:
+    """The logarithm of a ratio along a recording, its standard error and its degrees of freedom."""
     n, block = pair.errors.shape[1], pair.block
     means = np.maximum(pair.errors.mean(axis=1, keepdims=True), _LEAST)
     log = float(np.log(means[0, 0] / means[1, 0]))

@@ -159,19 +159,15 @@ def ratio_to(judged: Sequence[JudgedModes], mode: str, other: str | None = None)
     return ratio([one.pair(mode, other) for one in judged])
 
 
-def _log(errors: NDArray[np.float64]) -> float:
-    mine, others = np.maximum(errors.mean(axis=1), 1e-12)
-    return float(np.log(mine / others))
-
-
 def _of_stretches(judged: Sequence[JudgedModes], mode: str) -> NDArray[np.float64]:
     """Logarithms of the ratio on each stretch: as many whole ones as a sequence has, or one."""
     found = []
     for one in judged:
-        errors = one.pair(mode).errors
-        n = max(1, errors.shape[1] // (PER_STRETCH * one.block))
-        found += [_log(part) for part in np.array_split(errors, n, axis=1)]
-    return np.array(found)
+        pair = one.pair(mode)
+        n = max(1, pair.errors.shape[1] // (PER_STRETCH * one.block))
+        parts = np.array_split(pair.errors, n, axis=1)
+        found += [ratio([pair._replace(errors=part)]).value for part in parts]
+    return np.log(found)
 
 
 class CurrentReplays(NamedTuple):

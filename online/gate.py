@@ -1,8 +1,7 @@
-"""The gate: whether one side of the same recordings is worse than another."""
+"""The gate: a comparison whose modes are a new and an old side of the same recordings."""
 
 import json
-from collections.abc import Sequence
-from functools import reduce
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 from xml.etree import ElementTree as Xml
@@ -19,19 +18,20 @@ from adaptune.report.tables import Listing, markdown
 from adaptune.study.driven import PER_STRETCH
 from adaptune.study.study import Study, is_written_to
 from online.modes import BASELINE, FIXED
-from online.record import StoredReplay
+from online.record import ReplaySummary, StoredReplay
 from online.reference import Reference
 from online.statistics import ALL
+from online.turns import COST, P99, Costs, Driven, cost_ratios
 
 Verdict = Literal["better", "worse", "equal", "unclear"]
 """`equal` is surely within the bound, `unclear` too little to tell."""
-ERROR, COST, RESTARTS = "error", "cost", "restarts"
-_UNITS = {ERROR: "RTE [%]", COST: "cost [ms]"}
+ERROR, RESTARTS = "error", "restarts"
+_UNITS = {ERROR: "RTE [%]", COST: "cost [ms]", P99: f"{P99} [ms]"}
 """Quantities as tables name them."""
-_WARM_UP, _COSTS = 10, 5
-"""Scans whose costs do not count, because caches fill, and scans whose costs are drawn together."""
 _SHARE = 0.05
-"""Of the intervals of all recordings together, so many may miss the truth."""
+"""Of the comparisons of equal sides, so many may find one worse."""
+_NO_COST = 0.5
+"""Milliseconds a scan by which the same code differs, where other work shares the caches."""
 
 
 class Side(NamedTuple):
@@ -40,26 +40,32 @@ class Side(NamedTuple):
     name: str
     study: Study
 
-    def replays(self) -> dict[str, StoredReplay]:
-        """The replay of each sequence, by its name: of the fixed set, or of the baseline.
+    def replays(self, mode: str) -> dict[str, Driven]:
+        """What was replayed in a mode, by content and part of the recording."""
+        made = sorted((self.study.folder / "replays").glob(f"*/{mode}/replay.json"))
+        # Earlier ones may be of recordings that the study does not name any more.
+        named = {*self.study.config.sequences, *self.study.config.courses}
+        found = [
+            Driven(self.study, path.parents[1].name, ReplaySummary.read(path.parent))
+            for path in made
+            if path.parents[1].name in named
+        ]
+        return {_key(one): one for one in found}
 
-        An AdaptuneError says that there is none, or that they are still being made.
-        """
-        if is_written_to(self.study.folder):
-            raise AdaptuneError(
-                f"{self.study.folder}: another adaptune writes to it; run this again when that is "
-                f"done"
-            )
-        for mode in (FIXED, BASELINE):
-            made = sorted((self.study.folder / "replays").glob(f"*/{mode}/replay.json"))
-            found = {path.parents[1].name: path.parent for path in made}
-            # Earlier ones may be of recordings that the study does not name any more.
-            named = {*self.study.config.sequences, *self.study.config.courses}
-            if there := {n: StoredReplay.read(at) for n, at in found.items() if n in named}:
-                return there
-        raise AdaptuneError(
-            f"{self.study.folder}: holds no replays; run `adaptune online` with this study first"
-        )
+
+class Paired(NamedTuple):
+    """Both sides on a recording, new first."""
+
+    both: tuple[Driven, Driven]
+    pair: Pair  # the errors, at the scans where both are known
+    seconds: NDArray[np.float64]  # (n,): of these, from the first scan
+    restarts: tuple[int, int]
+    lost: tuple[int, int]  # places where only one was restarted
+
+    @property
+    def name(self) -> str:
+        """The new side's."""
+        return self.both[0].name
 
 
 class GateRow(NamedTuple):
@@ -101,19 +107,6 @@ class Gate(NamedTuple):
     words: str  # in one line
 
 
-class _Pair(NamedTuple):
-    """Both sides on a recording, new first, at the same scans."""
-
-    name: str
-    errors: NDArray[np.float64]  # (2, n): percent, where both are known
-    costs: NDArray[np.float64]  # (2, n_costs): milliseconds
-    block: int  # scans whose errors are drawn together
-    seconds: NDArray[np.float64]  # (n,): from the first scan, of the errors
-    lost: tuple[int, int]
-    obstacle: str  # why costs say nothing
-    reference_error: float | None
-
-
 def judged(ratio: float, ends: tuple[float, float], bound: float) -> Verdict:
     """What a ratio of new to old says, with its interval.
 
@@ -128,163 +121,225 @@ def judged(ratio: float, ends: tuple[float, float], bound: float) -> Verdict:
     return "equal" if high <= 1.0 + bound else "unclear"
 
 
-def compare_sides(new: Side, old: Side, error: float = 0.05, cost: float = 0.1) -> Gate:
-    """Pair the replays of two sides by recording, and judge error, cost and restarts.
+class Shared(NamedTuple):
+    """What both sides have replayed."""
 
-    The new side's error and cost may be larger by these shares.
+    new: Side
+    old: Side
+    mode: str
+    pairs: list[Paired]
+    alone: str  # in words, the recordings of one side only
+
+
+def shared_replays(new: Side, old: Side) -> Shared:
+    """Pair the replays of two sides by recording, in the mode that both have: fixed, or baseline.
 
     Raises
     ------
     AdaptuneError
-        If they have no recording in common, or what they share differs.
+        If they have no recording in common, what they share differs, or a side is being driven.
     """
+    for side in (new, old):
+        if is_written_to(side.study.folder):
+            raise AdaptuneError(
+                f"{side.study.folder}: another adaptune writes to it; run this again when that is "
+                f"done"
+            )
     if new.study.config.sub_trajectory != old.study.config.sub_trajectory:
         lengths = [f"{side.study.config.sub_trajectory:g} m ({side.name})" for side in (new, old)]
-        raise AdaptuneError(f"sub_trajectory: errors over {' and '.join(lengths)} do not compare")
-    # A program that runs whole recordings has no cost of each scan.
-    whole = any(side.study.odometry.description.whole for side in (new, old))
-    pairs, left_out = _pairs(new, old, whole)
-    rows = _rows(ERROR, pairs, error)
-    rows += _rows(COST, pairs, cost)
-    lost = [(pair.name, *pair.lost) for pair in pairs]
-    if len(pairs) > 1:
-        lost.append((ALL, *np.sum([pair.lost for pair in pairs], axis=0).tolist()))
-    for name, mine, others in lost:
-        said: Verdict = "equal" if mine == others else "worse" if mine > others else "better"
-        rows.append(GateRow(name, RESTARTS, mine, others, said))
-    verdict = _overall(rows)
-    words = _in_words(new, old, verdict, rows)
-    return Gate(verdict, rows, words + (f" Not compared: {left_out}." if left_out else ""))
-
-
-def _pairs(new: Side, old: Side, whole: bool) -> tuple[list[_Pair], str]:
-    """The recordings of both sides, and in words those of one side only."""
-    sides = new.replays(), old.replays()
-    named = [{_key(n, replay.summary.inputs): n for n, replay in side.items()} for side in sides]
-    common = [key for key in named[0] if key in named[1]]
-    alone = "; ".join(
-        f"{', '.join(names[key] for key in names if key not in common)} (only in {side.name})"
-        for side, names in zip((new, old), named, strict=True)
-        if len(names) > len(common)
-    )
-    if not common:
-        raise AdaptuneError(f"no recording is in both, by content and part: {alone}")
-    pairs = []
-    for name, other in ((named[0][key], named[1][key]) for key in common):
-        replays = sides[0][name], sides[1][other]
-        lacking, n = replays[1].summary.unhealthy.get("no_pose", 0), replays[1].summary.scans
-        if lacking >= MAX_SHARE_WITHOUT_POSE * n:
+        raise AdaptuneError(
+            f"sub_trajectory: errors over {' and '.join(lengths)} do not compare; give both the "
+            f"same with --sub-trajectory"
+        )
+    found = {mode: (new.replays(mode), old.replays(mode)) for mode in (FIXED, BASELINE)}
+    for i, side in enumerate((new, old)):
+        if not any(both[i] for both in found.values()):
             raise AdaptuneError(
-                f"{other}: {old.name} gives no pose for {lacking} of {n} scans, so nothing "
-                f"compares with it; mend it, or leave the recording out"
+                f"{side.study.folder}: holds no replays; run `adaptune online` with this study "
+                f"first"
             )
-        _check_same((name, other), (new, old), [replay.summary.inputs for replay in replays])
-        pairs.append(_pair(name, replays, Reference.read(new.study, name), whole))
-    return pairs, alone
+    if not any(mine and others for mine, others in found.values()):
+        first, second = (next(m for m, both in found.items() if both[i]) for i in (0, 1))
+        raise AdaptuneError(
+            f"{new.name} was replayed as `{first}` only, and {old.name} as `{second}`; run "
+            f"`adaptune online` with both"
+        )
+    common = {m: [key for key in mine if key in others] for m, (mine, others) in found.items()}
+    mode = max(common, key=lambda mode: len(common[mode]))
+    alone = "; ".join(
+        f"{', '.join(one.name for key, one in own.items() if key not in common[mode])} "
+        f"(only in {side.name})"
+        for side, own in zip((new, old), found[mode], strict=True)
+        if len(own) > len(common[mode])
+    )
+    if not common[mode]:
+        raise AdaptuneError(f"no recording is in both, by content and part: {alone}")
+    mine, others = found[mode]
+    pairs = [_paired((new, old), mode, (mine[key], others[key])) for key in common[mode]]
+    return Shared(new, old, mode, pairs, alone)
 
 
-def _settings(name: str, inputs: manifest.Inputs) -> dict[str, Any]:
-    return dict(inputs["sequences" if "sequences" in inputs else "courses"][name])
-
-
-def _key(name: str, inputs: manifest.Inputs) -> str:
+def _key(one: Driven) -> str:
     """A recording by its content, and which part of it was driven."""
-    part = [_settings(name, inputs).get(key) for key in ("part", "start", "stop")]
-    return manifest.digest([inputs["recording"][name], part])
+    inputs = one.summary.inputs
+    part = [_settings(one).get(key) for key in ("part", "start", "stop")]
+    return manifest.digest([inputs["recording"][one.name], part])
 
 
-def _check_same(
-    names: Sequence[str], sides: Sequence[Side], inputs: Sequence[manifest.Inputs]
-) -> None:
-    """Refuse another reading of the same recording, and another reference."""
-    both = f"{names[0]}: {sides[0].name} and {sides[1].name}"
+def _settings(one: Driven) -> dict[str, Any]:
+    inputs = one.summary.inputs
+    return dict(inputs["sequences" if "sequences" in inputs else "courses"][one.name])
+
+
+def _check_same(sides: Sequence[Side], both: Sequence[Driven]) -> None:
+    """Refuse another pace, another reading of the same recording, and another reference."""
+    words = f"{both[0].name}: {sides[0].name} and {sides[1].name}"
+    inputs = [one.summary.inputs for one in both]
+    for key in ("real_time", "period"):
+        if inputs[0][key] != inputs[1][key]:
+            given = " and ".join(json.dumps(of[key]) for of in inputs)
+            raise AdaptuneError(
+                f"{words} were replayed with other values of online.{key}: {given}; replay both "
+                f"alike"
+            )
     new, old = (
-        {"reader": made_from["reader"], "settings": _settings(name, made_from)}
-        for name, made_from in zip(names, inputs, strict=True)
+        {"reader": of["reader"], "settings": _settings(one)}
+        for of, one in zip(inputs, both, strict=True)
     )
     if said := manifest.changes(old, new):
-        raise AdaptuneError(f"{both} read it differently: {'; '.join(said)}; replay both alike")
-    paths = (
-        side.study.folder / "replays" / name / f"reference.{manifest.FILE}"
-        for side, name in zip(sides, names, strict=True)
-    )
+        raise AdaptuneError(f"{words} read it differently: {'; '.join(said)}; replay both alike")
+    paths = (one.folder / f"reference.{manifest.FILE}" for one in both)
     # Without the names of the sequence.
     mine, other = (
         [list(v.values()) for v in (manifest.recorded(path) or {}).values() if isinstance(v, dict)]
         for path in paths
     )
     if mine != other:
-        raise AdaptuneError(f"{both} are judged by different references; name the same in both")
+        raise AdaptuneError(f"{words} are judged by different references; name the same in both")
 
 
-def _pair(name: str, replays: Sequence[StoredReplay], reference: Reference, whole: bool) -> _Pair:
-    common = reduce(np.intersect1d, (replay.trajectory.stamps for replay in replays))
-    errors, costs = [], []
-    for replay in replays:
-        kept = np.isin(replay.trajectory.stamps, common)
-        errors.append(reference.errors(replay.trajectory)[kept])
-        costs.append((replay.frames["prepare_ms"] + replay.frames["register_ms"])[kept])
+def _paired(sides: Sequence[Side], mode: str, both: tuple[Driven, Driven]) -> Paired:
+    _check_same(sides, both)
+    old = both[1].summary
+    if (lacking := old.unhealthy.get("no_pose", 0)) >= MAX_SHARE_WITHOUT_POSE * old.scans:
+        raise AdaptuneError(
+            f"{both[1].name}: {sides[1].name} gives no pose for {lacking} of {old.scans} scans, so "
+            f"nothing compares with it; mend it, or leave the recording out"
+        )
+    new, reference = both[0], Reference.read(sides[0].study, both[0].name)
+    mine, other = (StoredReplay.read(one.folder / mode) for one in both)
+    stamps = np.intersect1d(mine.trajectory.stamps, other.trajectory.stamps)
+    kept = [(replay, np.isin(replay.trajectory.stamps, stamps)) for replay in (mine, other)]
+    errors = np.array([reference.errors(replay.trajectory)[at] for replay, at in kept])
+    restarted = np.array([replay.restarted[at] for replay, at in kept])
     known = np.isfinite(errors).all(axis=0)
-    cost = np.array(costs)[:, _WARM_UP:]
-    if whole:
-        cost = np.array([[replay.summary.cpu_ms or np.nan] for replay in replays])
-    cost = cost[:, np.isfinite(cost).all(axis=0)]
-    machines = {replay.summary.machine for replay in replays}
-    why = "" if cost.shape[1] else "no times"
-    if None in machines or len(machines) > 1:
-        why = "driven on different machines"
-    return _Pair(
-        name,
-        np.array(errors)[:, known],
-        cost,
-        reference.block,
-        (common[known] - common[0]) * 1e-9,
-        (replays[0].summary.restarts, replays[1].summary.restarts),
-        why,
-        reference.error,
-    )
+    recording = manifest.digest(new.summary.inputs["recording"][new.name])
+    pair = Pair(errors[:, known], reference.block, recording, reference.error)
+    restarts = new.summary.restarts, old.restarts
+    seconds = (stamps[known] - stamps[0]) * 1e-9
+    return Paired(both, pair, seconds, restarts, _places(restarted, reference.block))
 
 
-def _rows(quantity: str, pairs: Sequence[_Pair], bound: float) -> list[GateRow]:
-    """A row for each recording, and if there are several, one for all."""
-    rows, known, share = list[GateRow](), list[Pair](), _SHARE / len(pairs)
-    for pair in pairs:
-        one = Pair(pair.costs, _COSTS, pair.name)
-        why = pair.obstacle
-        if quantity == ERROR:
-            one = Pair(pair.errors, pair.block, pair.name, pair.reference_error)
-            why = "" if pair.errors.shape[1] else "no reference"
-        if why:
-            rows.append(GateRow(pair.name, quantity, why=why))
-            continue
-        new, old = one.errors.mean(axis=1).tolist()
-        few = "one figure a run" if quantity == COST and one.errors.shape[1] == 1 else "too short"
-        row = GateRow(pair.name, quantity, new, old, why=few)
-        if quantity == ERROR:
-            row = row._replace(stretches=_stretches(pair))
-        rows.append(_judged(row, ratio([one], share), bound))
-        known.append(one)
-    if len(pairs) == 1 or 2 * len(known) < len(pairs):
-        return rows
-    why = "" if len(known) == len(pairs) else f"known on {len(known)} of {len(pairs)} recordings"
-    new, old = np.mean([one.errors.mean(axis=1) for one in known], axis=0).tolist()
-    row = GateRow(ALL, quantity, new, old, why="too short")
-    return [*rows, _judged(row, ratio(known), bound)._replace(why=why)]
+def _places(restarted: NDArray[np.bool_], block: int) -> tuple[int, int]:
+    """Places where only the new side was restarted, and only the old one.
+
+    A place is one sub-trajectory, or several that follow each other.
+    """
+    starts = np.arange(0, restarted.shape[1], block)
+    in_place = np.logical_or.reduceat(restarted, starts, axis=1)
+    only = np.pad(in_place & ~in_place[::-1], ((0, 0), (1, 0)))
+    first, second = (only[:, 1:] & ~only[:, :-1]).sum(axis=1).tolist()
+    return first, second
 
 
-def _judged(row: GateRow, found: Ratio, bound: float) -> GateRow:
-    row = row._replace(ratio=found.value)
-    if found.interval is None:
-        return row
-    low, high = found.interval
-    said = judged(found.value, found.interval, bound)
-    return row._replace(low=low, high=high, verdict=said, why="")
+def compare_sides(
+    shared: Shared, costs: Mapping[str, Costs | str] | None, error: float, cost: float
+) -> Gate:
+    """Judge error, cost and restarts; the new side's may be larger by the shares `error`, `cost`.
+
+    `costs` are by recording, or why they are not known; None where they are no matter. Of equal
+    sides, one in twenty may be found worse, whatever the number of quantities and recordings.
+    """
+    pairs, given, rows = shared.pairs, costs or {}, list[GateRow]()
+    known = {name: of for name, of in given.items() if not isinstance(of, str)}
+    quantities = list(dict.fromkeys(key for of in known.values() for key in of))
+    quantities = quantities or [COST] * bool(given)
+    share = _SHARE / (2 + len(quantities))
+    # Of both ends of an interval, one finds a side worse.
+    each = 2.0 * share / (len(pairs) + (len(pairs) > 1))
+    judges = {pair.name: pair.pair for pair in pairs if pair.pair.errors.size}
+    groups = [*([one] for one in judges.values()), [*judges.values()]]
+    ratios = [ratio(group, each) for group in groups if group]
+    means = {name: one.errors.mean(axis=1) for name, one in judges.items()}
+    stretches = {pair.name: _stretches(pair) for pair in pairs if pair.name in judges}
+    for row in _rows(ERROR, pairs, means, ratios, error, {}):
+        rows.append(row._replace(stretches=stretches.get(row.recording, ())))
+    for quantity in quantities:
+        of = {pair.name: known[pair.name][quantity] for pair in pairs if pair.name in known}
+        means = {name: one.mean(axis=(1, 2)) for name, one in of.items()}
+        names = [pair.pair.recording for pair in pairs if pair.name in of]
+        ratios = cost_ratios(list(of.values()), names, each) if of else []
+        rows += _rows(quantity, pairs, means, ratios, cost, given, _NO_COST)
+    rows.append(_restarts(pairs, share))
+    verdict = _overall(rows)
+    left_out = f" Not compared: {shared.alone}." if shared.alone else ""
+    return Gate(verdict, rows, _in_words(shared, verdict, rows) + left_out)
 
 
-def _stretches(pair: _Pair) -> tuple[tuple[float, float], ...]:
+def _rows(
+    quantity: str,
+    pairs: Sequence[Paired],
+    means: Mapping[str, NDArray[np.float64]],
+    ratios: Sequence[Ratio],
+    bound: float,
+    why: Mapping[str, Any],
+    least: float = 0.0,
+) -> list[GateRow]:
+    """A row for each recording, and if there are several, one for all.
+
+    `means` are those of both sides by recording, where they are known, `ratios` in the same order,
+    the last one that of all; `why` says why they are not. The `bound` is `least` at least.
+    """
+    of, n, rows = dict(zip(means, ratios, strict=False)), len(pairs), list[GateRow]()
+
+    def judge(row: GateRow, means: NDArray[np.float64], found: Ratio) -> GateRow:
+        new, old = means.tolist()
+        row = row._replace(new=new, old=old, ratio=found.value, why="too short")
+        if found.interval is None:
+            return row
+        low, high = found.interval
+        said = judged(found.value, found.interval, max(bound, least / max(old, 1e-12)))
+        return row._replace(low=low, high=high, verdict=said, why="")
+
+    for name in (pair.name for pair in pairs):
+        row = GateRow(name, quantity, why=why.get(name, "no reference"))
+        rows.append(judge(row, means[name], of[name]) if name in means else row)
+    if n > 1:
+        row = GateRow(ALL, quantity)
+        if 0 < 2 * len(means) >= n:
+            row = judge(row, np.mean(list(means.values()), axis=0), ratios[-1])
+        said = f"known on {len(means)} of {n} recordings" * (len(means) < n)
+        rows.append(row._replace(why=said or row.why))
+    return rows
+
+
+def _restarts(pairs: Sequence[Paired], share: float) -> GateRow:
+    """The row of the restarts over all recordings: where only one side has them, by a sign test."""
+    from scipy.special import bdtr  # slow to import
+
+    new, old = np.sum([pair.restarts for pair in pairs], axis=0).tolist()
+    first, second = np.sum([pair.lost for pair in pairs], axis=0).tolist()
+    worse, better = (float(bdtr(n, first + second, 0.5)) for n in (second, first))
+    said: Verdict = "worse" if worse <= share else "better" if better <= share else "equal"
+    if said == "equal" and worse <= _SHARE:
+        said = "unclear"
+    return GateRow(ALL if len(pairs) > 1 else pairs[0].name, RESTARTS, new, old, said)
+
+
+def _stretches(pair: Paired) -> tuple[tuple[float, float], ...]:
     """By stretch of `PER_STRETCH` sub-trajectories its first second, and the ratio there."""
-    n = max(1, len(pair.seconds) // (PER_STRETCH * pair.block))
-    parts = np.array_split(np.vstack([pair.seconds, pair.errors]), n, axis=1)
+    n = max(1, len(pair.seconds) // (PER_STRETCH * pair.pair.block))
+    parts = np.array_split(np.vstack([pair.seconds, pair.pair.errors]), n, axis=1)
     return tuple(
         (round(float(t[0]), 1), float(new.mean() / max(old.mean(), 1e-12))) for t, new, old in parts
     )
@@ -301,9 +356,8 @@ def _overall(rows: Sequence[GateRow]) -> Verdict:
     return "better" if any(row.verdict == "better" for row in over_all) else "equal"
 
 
-def _in_words(new: Side, old: Side, verdict: Verdict, rows: Sequence[GateRow]) -> str:
+def _in_words(shared: Shared, verdict: Verdict, rows: Sequence[GateRow]) -> str:
     said = {"better": "Better", "worse": "WORSE", "equal": "Not worse"}
-    names = list(dict.fromkeys(row.recording for row in rows if row.recording != ALL))
     over_all = [row for row in rows if row.recording == ALL] or rows
     parts = []
     for row in over_all:
@@ -316,9 +370,12 @@ def _in_words(new: Side, old: Side, verdict: Verdict, rows: Sequence[GateRow]) -
             parts.append(f"{row.quantity} x{row.ratio:.3f} ({ends}), {row.verdict}")
     wrong = [f"{r.recording} ({r.quantity})" for r in rows if r.verdict == "worse"]
     where = f" Worse: {', '.join(wrong)}." if wrong else ""
-    n = f"{len(names)} recording{'s' * (len(names) > 1)}"
+    n = len({pair.pair.recording for pair in shared.pairs})
+    of = f"{n} recording{'s' * (n > 1)}"
+    of += f" in {len(shared.pairs)} parts" * (len(shared.pairs) > n)
     first = said.get(verdict, "TOO LITTLE TO TELL")
-    return f"{first}: {new.name} against {old.name}, {n}: {'; '.join(parts)}.{where}"
+    of += f" (`{shared.mode}`)" * (shared.mode != BASELINE)
+    return f"{first}: {shared.new.name} against {shared.old.name}, {of}: {'; '.join(parts)}.{where}"
 
 
 def write_gate(folder: Path, gate: Gate) -> None:

@@ -187,7 +187,17 @@ Against = Annotated[
 ]
 OfFiles = Annotated[str | None, typer.Option(metavar="NAME", help="Of parameter files.")]
 Worse = Annotated[str, typer.Option(metavar="PERCENT", help="Error that is no matter.")]
-Cost = Annotated[str, typer.Option(metavar="PERCENT", help="Cost that is no matter.")]
+Cost = Annotated[
+    str, typer.Option(metavar="PERCENT", help="Cost that is no matter; `off`: no cost is.")
+]
+Length = Annotated[
+    float | None,
+    typer.Option(
+        metavar="METRES",
+        help="What errors are measured over.",
+        show_default="the studies'; of cars 10 m, else 2 m",
+    ),
+]
 Unclear = Annotated[
     Literal["pass", "fail"], typer.Option(help="What too little to tell counts as.")
 ]
@@ -206,6 +216,7 @@ def compare(
     reading: As = None,
     worse: Worse = "5%",
     cost: Cost = "10%",
+    sub_trajectory: Length = None,
     unclear: Unclear = "pass",
     out: Out = Path("runs/compare"),
     override: Override = [],  # noqa: B006
@@ -224,20 +235,24 @@ def compare(
     tables are there as CSV, JSON and Markdown, too; `--details` prints them.
 
     With `--against`, it says whether STUDY is worse than OLD, recording by recording, in error, in
-    cost and in restarts by the health check. Its exit code is 3 then.
+    CPU time and in restarts by the health check. Its exit code is 3 then. For the CPU time, it
+    drives both twice, by turns.
     """
     of_bags: dict[str, object] = {"BAG": recordings, "--odometry": odometry, "--points": points}
     of_bags |= {"--reference": reference, "--as": reading}
+    of_both = of_bags | {"--sub-trajectory": sub_trajectory}
     if against is not None:
         if override or folder or details:
             raise AdaptuneError("-o, --folder and --details go with one study, not with --against")
         if not recordings and any(of_bags.values()):
             raise AdaptuneError(f"{_given(of_bags)}: goes with the bags to drive; name them, too")
         asked = Asked(recordings or (), odometry or "", points, reference, reading=reading)
-        _gate((study, against), asked, (worse, cost), unclear, out)
+        if sub_trajectory is not None and not 0.0 < sub_trajectory < math.inf:
+            raise AdaptuneError(f"--sub-trajectory {sub_trajectory:g}: give metres, more than 0")
+        _gate((study, against), asked, (worse, cost), sub_trajectory, unclear, out)
         return
-    if any(of_bags.values()):
-        raise AdaptuneError(f"{_given(of_bags)}: goes with --against, which names the other side")
+    if any(of_both.values()):
+        raise AdaptuneError(f"{_given(of_both)}: goes with --against, which names the other side")
     from adaptune.tuning.tuned import compared
 
     loaded = load(Path(study), override, folder)
@@ -279,17 +294,23 @@ def _gate(
     given: tuple[str, str],
     asked: Asked,
     percents: tuple[str, str],
+    length: float | None,
     unclear: str,
     out: Path,
 ) -> None:
     """Say whether the first side is worse than the second one, and exit with a code."""
-    from adaptune.tuning.sides import sides
-    from online.gate import compare_sides, write_gate
+    from adaptune.tuning.sides import costs, sides
+    from online.gate import compare_sides, shared_replays, write_gate
 
-    shares = [_share_of(text, key) for text, key in zip(percents, ("worse", "cost"), strict=True)]
+    error, cost = (
+        math.inf if (key, text) == ("cost", "off") else _share_of(text, key)
+        for key, text in zip(("worse", "cost"), percents, strict=True)
+    )
     with progress() as show:
-        both = sides(given, asked, show)
-    gate = compare_sides(*both, *shares)
+        both = sides(given, asked, length, show)
+        shared = shared_replays(*both)
+        measured = costs(shared, show) if cost < math.inf else None
+    gate = compare_sides(shared, measured, error, cost)
     write_gate(out, gate)
     say(gate.words)
     metres = both[0].study.config.sub_trajectory
@@ -303,7 +324,8 @@ def _share_of(text: str, key: str) -> float:
     with suppress(ValueError):
         if 0.0 <= (share := float(text.removesuffix("%")) / 100.0) < math.inf:
             return share
-    raise AdaptuneError(f"--{key} {text}: give a percentage, as in --{key} 5%")
+    off = ", or `off`" * (key == "cost")
+    raise AdaptuneError(f"--{key} {text}: give a percentage, as in --{key} 5%{off}")
 
 
 def say_compared(

@@ -1,15 +1,17 @@
 """The gate for changes: drive what is not known yet on both sides, and compare."""
 
+import os
 import shlex
 import shutil
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
-from statistics import median
 from typing import TYPE_CHECKING, Any
 
 from adaptune.errors import AdaptuneError
 from adaptune.files import plain_name
+from adaptune.machine import pin
 from adaptune.progress import Progress
 from adaptune.tuning.asked import Asked, recorded
 from adaptune.tuning.studies import is_image
@@ -17,25 +19,51 @@ from adaptune.yaml12 import Document, YamlError
 
 if TYPE_CHECKING:
     from offline.config import OfflineStudy
-    from online.gate import Side
+    from online.gate import Shared, Side
+    from online.turns import Costs
 
 FOLDER = Path("runs/compare")
 """Where what the gate drives is kept."""
 
 
-def sides(given: Sequence[str], asked: Asked, show: Progress) -> "tuple[Side, Side]":
+FAST, CAR, ROBOT = 4.0, 10.0, 2.0
+"""Metres a second that only cars drive, and metres of a sub-trajectory for these and for others.
+Lengths that suit the recordings would change with each that is added, and with them all errors."""
+
+
+def sides(
+    given: Sequence[str], asked: Asked, length: float | None, show: Progress
+) -> "tuple[Side, Side]":
     """The replays of both sides, the new one first; those that are missing are made.
 
     A side is a study or its folder; or where recordings are `asked` for, a parameter file of the
     odometry, or an odometry: a name, a command or an image. They are driven by turns, each alone on
-    a core.
+    a core. `length` is that of sub-trajectories; by default the studies', or `CAR` or `ROBOT`.
     """
     from online.gate import Side
 
     studies = _driven(given, asked, show) if asked.recordings else _studies(given)
     _drive(studies, show)
+    if length is not None:
+        over = {"sub_trajectory": length}
+        studies = [replace(one, config=one.config.model_copy(update=over)) for one in studies]
     new, old = (Side(name, study) for name, study in zip(given, studies, strict=True))
     return new, old
+
+
+def costs(shared: "Shared", show: Progress) -> "dict[str, Costs | str]":
+    """What both sides cost on each recording, driven twice by turns; or why that is not known."""
+    from online.turns import by_turns
+
+    found: dict[str, Costs | str] = {}
+    for pair in shared.pairs:
+        found[pair.name] = next(filter(None, (one.obstacle for one in pair.both)), "")
+        if not found[pair.name]:
+            # How many cores there are is asked before this process keeps to one.
+            _ = [one.study.mechanism for one in pair.both]
+            with pin(os.getpid(), alone=True):
+                found[pair.name] = by_turns(pair.both, FOLDER / "turns", show)
+    return found
 
 
 def _studies(given: Sequence[str]) -> "list[OfflineStudy]":
@@ -56,8 +84,7 @@ def _studies(given: Sequence[str]) -> "list[OfflineStudy]":
 def _driven(given: Sequence[str], asked: Asked, show: Progress) -> "list[OfflineStudy]":
     """Both sides as studies of the same recordings."""
     from adaptune.manifest import digest
-    from adaptune.paired import MIN_BLOCKS
-    from adaptune.reference.check import path_after, proposed_sub_trajectory
+    from adaptune.reference.check import greatest_speed
     from adaptune.study.references import ensure_references
     from offline.config import load_study
 
@@ -73,13 +100,8 @@ def _driven(given: Sequence[str], asked: Asked, show: Progress) -> "list[Offline
     first.open()
     refused = ensure_references(first.sequences, names, 5.0, show, required=False)
     known = [first.sequences.open(name).reference() for name in names if name not in refused]
-    # As many as intervals need fit into most recordings.
-    lengths = [
-        min(proposed_sub_trajectory(one), path_after(one, 0.0)[0] / (3 * MIN_BLOCKS))
-        for one in known
-        if one is not None
-    ]
-    shared["sub_trajectory"] = round(median(lengths), 1) if lengths else 5.0
+    fastest = max((greatest_speed(one) for one in known if one is not None), default=0.0)
+    shared["sub_trajectory"] = CAR if fastest > FAST else ROBOT
     if folders[0] != folders[1] and (estimates := folders[0] / "references").exists():
         shutil.copytree(estimates, folders[1] / "references", dirs_exist_ok=True)
     both = zip(entries, folders, strict=True)

@@ -1,6 +1,7 @@
 """Two sides of the same recordings: is the new one worse?"""
 
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -12,10 +13,11 @@ import drives
 import pytest
 
 from adaptune import manifest
+from adaptune.odometry.tracker import Tracker
 from online.gate import judged
 
 FAKE = ("--odometry", "fake_odometry:Fake")
-COSTS = ("--cost", "1000000")
+COSTS = ("--cost", "off")
 """Nobody knows what else the machine does."""
 
 
@@ -76,6 +78,64 @@ def test_nothing_known_is_driven_again_and_folders_are_sides(bags):
     said = commands.refused("compare", bad, "--against", study)
     study.write_text(text)
     assert "sub_trajectory: errors over" in said
+    assert "give both the same with --sub-trajectory" in said
+
+
+@pytest.mark.services
+def test_errors_are_over_the_same_length_for_one_bag_and_for_several(bags):
+    """Of a robot; a length that is given holds for folders, too."""
+    for recordings in (("drive_a.bag",), ("drive_a.bag", "drive_b.bag", "drive_c.bag")):
+        assert "RTE over 2 m" in gate("bad", "good", recordings=recordings).stdout
+    assert "RTE over 3 m" in gate("bad", "good", "--sub-trajectory", 3).stdout
+    gate("bad", "good")
+    bad, good = (next(Path("runs/compare").glob(f"{name}_*/")) for name in ("bad", "good"))
+    before = (bad / "study.yaml").read_text()
+    done = commands.call("compare", bad, "--against", good, *COSTS, "--sub-trajectory", 4)
+    assert "RTE over 4 m" in done.stdout
+    assert (bad / "study.yaml").read_text() == before
+    drives.write_bag(bags / "car.bag", drives.scans(9, 60, step=0.8))
+    assert "RTE over 10 m" in gate("bad", "good", recordings=("car.bag",)).stdout
+
+
+@pytest.mark.services
+def test_for_the_cost_both_are_driven_twice_by_turns_and_that_is_kept(bags, monkeypatch):
+    driven = []
+    registered = Tracker.register
+
+    def register(tracker, scan):
+        driven.append(tracker)
+        return registered(tracker, scan)
+
+    monkeypatch.setattr("online.turns.Tracker.register", register)
+    gate("same", "good", "--out", "out", "--cost", "1000000", recordings=("drive_a.bag",))
+    data = json.loads((bags / "out/gate.json").read_text())
+    (row,) = [row for row in data["rows"] if row["quantity"] == "cost"]
+    assert row["new"] > 0.0
+    assert row["low"] < row["ratio"] < row["high"]
+    # A few scans to begin with, and twice the drive; the sides meet each scan one after the other.
+    in_turn = driven[-4 * 150 :]
+    assert [one is in_turn[0] for one in in_turn[:8]] == [True, False, False, True] * 2
+    for both in (in_turn[:300], in_turn[300:]):
+        assert sorted(map(id, both)) == sorted([id(both[0])] * 150 + [id(both[1])] * 150)
+    assert in_turn[300] is not in_turn[0]
+    n = len(driven)
+    gate("same", "good", "--cost", "1000000", recordings=("drive_a.bag",))
+    assert len(driven) == n
+
+
+@pytest.mark.services
+@pytest.mark.usefixtures("bags")
+def test_what_has_changed_since_has_no_cost():
+    gate("bad", "good")
+    made = (next(Path("runs/compare").glob(f"{name}_*/")) for name in ("bad", "good"))
+    bad, good = (copied(folder, f"changed_{i}") for i, folder in enumerate(made))
+    study = bad / "study.yaml"
+    study.write_text(re.sub("downsampling: .*", "downsampling: 0.7", study.read_text()))
+    commands.call("compare", bad, "--against", good, "--out", "out")
+    rows = json.loads(Path("out/gate.json").read_text())["rows"]
+    assert {row["verdict"] for row in rows if row["quantity"] == "cost"} == {"unclear"}
+    (why,) = {row["why"] for row in rows if row["quantity"] == "cost" and row["recording"] != "all"}
+    assert "has changed since: odometry.settings.downsampling" in why
 
 
 @pytest.mark.services
@@ -114,6 +174,10 @@ def test_the_interval_decides(ratio, ends, verdict):
         (["bad.yaml", "--against", "good.yaml", "--as", "one"], "--as: goes with the bags"),
         (["bad.yaml", "--against", "good.yaml", "--details"], "--details go with one study"),
         (["bad.yaml", "--against", "good.yaml", "--worse", "much"], "--worse much: give a perce"),
+        (["bad.yaml", "--against", "good.yaml", "--worse", "off"], "as in --worse 5%"),
+        (["bad.yaml", "--against", "good.yaml", "--cost", "none"], "--cost 5%, or `off`"),
+        (["bad.yaml", "--against", "good.yaml", "--sub-trajectory", "-1"], "give metres, more"),
+        (["bad.yaml", "--sub-trajectory", "3"], "--sub-trajectory: goes with --against"),
         (["bad.yaml", "none.bag", "--against", "good.yaml", *FAKE], "none.bag: there is no such"),
         (["no.yaml", "drive_a.bag", "--against", "good.yaml", *FAKE], "no.yaml: there is no such"),
     ],
@@ -148,6 +212,22 @@ def test_what_does_not_compare_is_refused():
     assert "read it differently: reader changed from" in refused(bad, other)
     judged_by = copied(before, "judge", "reference.inputs.json", reference={"drive_a": ["x"]})
     assert "are judged by different references" in refused(bad, judged_by)
+    for key, value in {"real_time": {"rate": 2.0}, "period": 3.0}.items():
+        paced = copied(before, f"paced_{key}", "fixed/inputs.json", **{key: value})
+        assert f"with other values of online.{key}: " in refused(bad, paced)
+    only_baseline = shutil.copytree(before, before.with_name("only_baseline"))
+    said = refused(bad, only_baseline)
+    assert "was replayed as `fixed` only, and" in said
+    # Where one of three was interrupted, the mode that both have counts.
+    for name in ("drive_a", "drive_b", "drive_c"):
+        shutil.copytree(bad / f"replays/{name}/fixed", bad / f"replays/{name}/baseline")
+    done = commands.call("compare", bad, "--against", only_baseline, *COSTS)
+    assert "3 recordings: error" in done.stdout
+    shutil.copytree(before / "replays/drive_a/baseline", only_baseline / "replays/drive_a/fixed")
+    assert (
+        "3 recordings: error"
+        in commands.call("compare", bad, "--against", only_baseline, *COSTS).stdout
+    )
     old = copied(before, "old")
     (old / "replays/drive_a/fixed/inputs.json").unlink()
     assert "an older adaptune did not record what this replay was made from" in refused(bad, old)
