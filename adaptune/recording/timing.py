@@ -22,6 +22,7 @@ LEAVE_OUT = "no `time_unit` mends them: write `time_unit: none` to leave the tim
 _LONGEST = 10.0
 # A header and its points are on the same clock if they are no further apart than this.
 _SAME_CLOCK = 10.0
+_TURN = 2**32 * 1e-9  # seconds after which nanoseconds of 32 bits begin again
 _AGREE = 0.1  # times below a day or so are absolute, too, if they agree with the header to this
 
 
@@ -62,8 +63,10 @@ class Timing:
             start = stamp - round(self.period * 1e9) if self.stamp == "end" else stamp
             none = values is None or self.unit == "none"
             return start, None if none else np.empty(0, np.float32), UNREAD
-        values, extent = _unwrapped(values, extent)
+        spread = extent[1] - extent[0]
+        values, extent = _signed(stamp, values, extent)
         scale, absolute = self._scale(stamp, values.dtype, extent)
+        values, extent = _unwrapped(values, extent, scale)
         self._check(values.dtype, extent, scale, absolute)
         zero, begin = self._start(stamp, extent, scale, absolute)
         if scale == 1.0 and zero == 0 and values.dtype == np.float32:
@@ -75,7 +78,10 @@ class Timing:
             times = ((wide - wide.dtype.type(zero)) * scale).astype(np.float32)
         start, clock = stamp + round(begin * 1e9), _nanoseconds(extent[0], scale)
         first, last = ((end - zero) * scale for end in extent)
-        return start, times, Reading(start, first, last, scale, clock if absolute else None)
+        reading = Reading(start, first, last, scale, clock if absolute else None)
+        if extent[1] - extent[0] < spread:
+            reading = reading._replace(wrapped=spread * scale)
+        return start, times, reading
 
     def _check(
         self, dtype: np.dtype[Any], extent: tuple[float, float], scale: float, absolute: bool
@@ -155,16 +161,36 @@ def _agree(stamp: float, extent: tuple[float, float], scale: float) -> bool:
     return min(abs(low - stamp), abs(high - stamp)) <= _AGREE
 
 
-def _unwrapped(
-    values: NDArray[Any], extent: tuple[float, float]
-) -> tuple[NDArray[Any], tuple[float, float]]:
-    """The times and their extent; those below zero, which unsigned numbers wrap, as such."""
+Times = tuple[NDArray[Any], tuple[float, float]]
+"""Of points, as the driver wrote them, and their extent."""
+
+
+def _signed(stamp: int, values: NDArray[Any], extent: tuple[float, float]) -> Times:
+    """Times below zero, which unsigned numbers wrap, as such."""
     size, spread = values.dtype.itemsize, extent[1] - extent[0]
-    if values.dtype.kind == "u" and size >= 4 and spread > 2 ** (8 * size - 1):
+    half = 2 ** (8 * size - 1)
+    # A simulator's clock may be as small as four bytes.
+    all_below = size == 4 and extent[0] > 1.8 * half and stamp > 10**10
+    if values.dtype.kind == "u" and size >= 4 and (spread > half or all_below):
         signed = values.view(f"i{size}")
         low, high = int(signed.min()), int(signed.max())
-        if high - low < spread // 2:
+        if high - low < half // 2:
             return signed, (low, high)
+    return values, extent
+
+
+def _unwrapped(values: NDArray[Any], extent: tuple[float, float], scale: float) -> Times:
+    """Times of which some wrapped as nanoseconds of 32 bits before they became other numbers."""
+    low, high = extent
+    turn: Any = _TURN / scale
+    if 0.5 * turn < high - low < 1.001 * turn:
+        if values.dtype.kind in "iu":
+            turn, values = round(turn), values.astype(np.int64)
+        late = values > low + turn / 2
+        moved = np.where(late, values - values.dtype.type(turn), values)
+        first, last = moved.min().item(), moved.max().item()
+        if last - first < 0.25 * turn:
+            return moved, (first, last)
     return values, extent
 
 
@@ -180,6 +206,10 @@ def doubts(readings: Sequence[Reading], period: float, timing: Timing = AUTO) ->
         mend = "name their unit if it holds those of the points (`time_unit`), or write `none`"
         yield Finding((), f"the field {unread!r} looks like times and is not read", mend, of="imu")
     timed = [reading for reading in readings if reading.last == reading.last]
+    if wrapped := [reading.wrapped for reading in timed if reading.wrapped]:
+        what = f"in {len(wrapped)} of {len(timed)} scans some points are {max(wrapped):.2f} s later"
+        what += " than the others: times below zero were stored without a sign"
+        yield Finding((), what, "adaptune takes them as below zero", of="points")
     if len(timed) >= 5 and period * 1e9 >= SOONEST:
         first, last = np.array([reading[1:3] for reading in timed]).T
         late, span = float(np.median(first)), float(np.median(last - first))
