@@ -4,12 +4,14 @@ All functions raise a SequenceError that names the file or folder that is missin
 """
 
 import re
+from calendar import timegm
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from decimal import Decimal, InvalidOperation
 from functools import partial
 from itertools import takewhile
 from pathlib import Path
+from time import strptime
 from typing import Any, ClassVar
 
 import numpy as np
@@ -21,7 +23,7 @@ from adaptune.files import DAMAGED_NPZ
 from adaptune.geometry import Poses
 from adaptune.recording.clouds import FARTHEST, PointCloudError, from_fields
 from adaptune.recording.scan import Frame, Imu, Scan, SequenceError
-from adaptune.recording.timing import AUTO, Timing
+from adaptune.recording.timing import AUTO, SOONEST, Timing
 from adaptune.trajectory import Trajectory, read_kitti
 
 SUFFIXES = (".bin", ".npy", ".pcd", ".ply")
@@ -240,7 +242,9 @@ def _natural(path: Path) -> list[tuple[int, str]]:
 
 # Times in the names of files: the number, and what may come after it as a part of a second; the
 # power of ten that makes the number nanoseconds. Short ones count from 1970.
+_DATE = r"(?:19|20)\d\d(?:[-_.]?\d\d){2}[-_.T ]?\d\d(?:[-_.:hm]?\d\d){2}"
 _NAMES = (
+    (rf"(?:^|\D)({_DATE})([._,-]?(?:\d{{3}}){{1,3}}|\.\d+|)\D*$", 9, "dates in UTC"),
     (r"^(\d{1,10})(\.\d+)$", 9, "seconds"),
     (r"(?:^|\D)([1-4]\d{9})([._-]\d{1,9})\D*$", 9, "seconds and their parts"),
     (r"(?:^|\D)(\d{17,19})()\D*$", 0, "nanoseconds"),
@@ -257,14 +261,44 @@ def _named_stamps(files: Sequence[Path]) -> tuple[NDArray[np.int64] | None, str]
         found = [match.groups() for match in map(re.compile(pattern).search, stems) if match]
         if len(found) < len(stems):
             continue
-        # `_5` is five nanoseconds, unless all have the same number of digits: `_000005`.
-        padded = len({len(rest) for _, rest in found}) == 1 or found[0][1].startswith(".")
-        parts = [rest[1:].ljust(9, "0")[:9] if padded else rest[1:] for _, rest in found]
-        times = zip(found, parts, strict=True)
-        return np.array([int(n) * 10**power + int(part) for (n, _), part in times], np.int64), unit
+        dates, parts = unit == "dates in UTC", [re.sub(r"\D", "", rest) for _, rest in found]
+        try:
+            begin = np.array([_since_1970(n) if dates else int(n) for n, _ in found], np.int64)
+        except (ValueError, OverflowError):
+            continue  # no dates, or no times
+        stamps = begin * 10**power
+        stamps += _nanoseconds(stamps, parts, point=found[0][1][:1] == ".")
+        # A number that counts may follow a date.
+        if not dates or len(stamps) < 2 or np.median(_steps(stamps)) >= SOONEST:
+            return stamps, unit
     numbers = [int(re.sub(r"\D", "", stem) or 0) for stem in stems]
     look = len(stems) > 1 and numbers[0] > 1e7 and np.median(np.diff(numbers)) > 1
     return None, files[0].name if look else ""
+
+
+def _since_1970(date: str) -> int:
+    return timegm(strptime(re.sub(r"\D", "", date), "%Y%m%d%H%M%S"))
+
+
+def _steps(stamps: NDArray[np.int64]) -> NDArray[np.int64]:
+    return np.maximum(np.diff(np.sort(stamps)), 1)
+
+
+def _nanoseconds(begin: NDArray[np.int64], parts: list[str], point: bool) -> NDArray[np.int64]:
+    """Nanoseconds of the digits after seconds that `begin`, with a point or another sign between.
+
+    Where their numbers differ, zeros may be lacking behind them, or before: scans come evenly.
+    Unless that tells, `.5` is half a second, and `_5` is five nanoseconds.
+    """
+    most, widths = max(map(len, parts)), [0]
+    if min(map(len, parts)) < most and not any(len(p) > 1 and p[0] == "0" for p in parts):
+        widths = sorted([0, *(w for w in (9, 6, 3) if w >= most)], reverse=not point)
+    digits = ([part.zfill(width).ljust(9, "0")[:9] for part in parts] for width in widths)
+    read = [np.array(ones, np.int64) for ones in digits]
+    steps = [_steps(begin + ones) for ones in read]
+    uneven = [np.abs(np.log(s / np.median(s))).mean() if len(s) else 0.0 for s in steps]
+    best = int(np.argmin(uneven))
+    return read[best if uneven[best] < 0.5 * uneven[0] else 0]
 
 
 def kitti(folder: Path, elevation: float | None = None) -> FileSource:
