@@ -97,7 +97,7 @@ def inspect(
 
 def _show_several(path: Path, reading: "Reading | None") -> bool:
     """Show the recordings of a folder, a line each; False if it holds one, or may."""
-    from adaptune.recording.fleet import both_readings, check_alike, read_folder
+    from adaptune.recording.fleet import both_readings, check_alike, copies, read_folder
     from adaptune.recording.inspect import inspect as inspect_file
 
     folder = read_folder(path) if path.exists() else None
@@ -108,13 +108,15 @@ def _show_several(path: Path, reading: "Reading | None") -> bool:
     with progress() as show:
         found = [inspect_file(one, False, show) for one in folder.recordings]
     rows = []
-    for one in found:
+    for at, one in zip(folder.recordings, found, strict=True):
         topic = one.topics.get(one.used.get("points", ""))
         scans = {"scans": topic and topic.count, "rate [Hz]": topic and topic.rate}
         given = {"reference": one.used.get("reference", "estimated")}
         wrong = {"lacks": ", ".join(one.missing.get("offline", ())) or None}
-        rows.append({"recording": one.path.name, **scans, **given, **wrong})
+        rows.append({"recording": str(at.relative_to(path)), **scans, **given, **wrong})
     show_table(f"{path}: {len(rows)} recordings ({folder.why})", rows)
+    for one, other in copies(found):
+        say(f"! {one.path}: holds the same scans as {other.path}; tuning leaves it out")
     if reading is None and folder.reading is None:
         say("As one:")
         return False

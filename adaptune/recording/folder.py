@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from adaptune import geometry, open3d
 from adaptune.errors import Finding, NotInstalledError
-from adaptune.files import DAMAGED_NPZ
+from adaptune.files import DAMAGED_NPZ, entries
 from adaptune.geometry import Poses
 from adaptune.recording.clouds import FARTHEST, PointCloudError, from_fields
 from adaptune.recording.scan import Frame, Imu, Scan, SequenceError
@@ -205,7 +205,8 @@ def scan_folder(folder: Path, timing: Timing = AUTO) -> FileSource:
     if not folder.is_dir():
         raise SequenceError(f"{folder}: there is no such folder")
     places = [folder / below for below in ("", "data", "velodyne_points/data")]
-    found = ((p, sorted(p.glob(f"*{s}"), key=_natural)) for p in places for s in SUFFIXES)
+    there = [(place, sorted(entries(place), key=_natural)) for place in places if place.is_dir()]
+    found = ((place, [p for p in all_ if p.suffix == s]) for place, all_ in there for s in SUFFIXES)
     place, files = next(((p, files) for p, files in found if files), (folder, []))
     if not files:
         raise SequenceError(f"{folder}: holds no scan ({', '.join(SUFFIXES)}) and no bag")
@@ -309,7 +310,8 @@ def kitti(folder: Path, elevation: float | None = None) -> FileSource:
     """
     if not folder.is_dir():
         raise SequenceError(f"{folder}: there is no such folder")
-    files = sorted((folder / "velodyne").glob("*.bin"))
+    below = folder / "velodyne"
+    files = [p for p in (entries(below) if below.is_dir() else []) if p.suffix == ".bin"]
     if not files:
         raise SequenceError(f"{folder}: not a KITTI sequence; it has no velodyne/*.bin")
     stamps = _seconds(folder / "times.txt")

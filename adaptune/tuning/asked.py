@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from adaptune.errors import AdaptuneError, NotInstalledError
+from adaptune.files import plain_name
 from adaptune.progress import Progress
 
 if TYPE_CHECKING:
@@ -70,7 +71,7 @@ def check_no_study(path: Path) -> None:
 def recorded(asked: Asked, show: Progress) -> "tuple[dict[str, Inspection], list[str]]":
     """The recordings by the names of their sequences, and the names of those for the test."""
     from adaptune.recording.config import NO_REFERENCE
-    from adaptune.recording.fleet import check_alike, recordings_at
+    from adaptune.recording.fleet import check_alike, copies, recordings_at
 
     for path in asked.recordings:
         check_no_study(path)
@@ -94,12 +95,17 @@ def recorded(asked: Asked, show: Progress) -> "tuple[dict[str, Inspection], list
             f"its own; write a study file, see docs/your-bag.md"
         )
     inspections = [usable(path, asked.points, asked.reference, show) for path in paths]
+    for one, other in copies(inspections[: len(paths) - len(tested)]):
+        _log.warning("%s: holds the same scans as %s, and is left out", one.path, other.path)
+        inspections.remove(one)
     check_alike(inspections)
     named: dict[str, Inspection] = {}
     for inspection in inspections:
-        names = chain([inspection.name], (f"{inspection.name}_{i}" for i in count(2)))
+        path = inspection.path
+        longer = plain_name(path.with_name(f"{path.parent.name}_{path.name}"))
+        names = chain([inspection.name, longer], (f"{inspection.name}_{i}" for i in count(2)))
         named[next(name for name in names if name not in named)] = inspection
-    return named, list(named)[len(paths) - len(tested) :]
+    return named, list(named)[len(named) - len(tested) :]
 
 
 def usable(path: Path, points: str | None, reference: str | None, show: Progress) -> "Inspection":

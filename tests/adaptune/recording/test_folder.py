@@ -182,6 +182,13 @@ def test_stamps_of_files(tmp_path, names, times, stamps):
     assert found[: len(stamps)] == stamps
 
 
+def test_hidden_files_are_no_scans(tmp_path):
+    for name in ("1", "2"):
+        np.save(tmp_path / f"{name}.npy", rec.scans(1)[0])
+        (tmp_path / f"._{name}.npy").write_bytes(b"\0\5\x16\7")
+    assert inspect(tmp_path).n_messages == 2
+
+
 def test_names_that_look_like_times_and_are_not_read_are_told(tmp_path):
     for i, number in enumerate(("14_11_2023_221320_1", "14_11_2023_221320_6")):
         np.save(tmp_path / f"{number}.npy", rec.scans(2)[i])
