@@ -238,20 +238,19 @@ def _grown(path: Path, asked: Asked, show: Progress) -> list[str]:
         "training": [name for name, recording in added.items() if recording.path not in tested],
         "test": [name for name, recording in added.items() if recording.path in tested],
     }
-    roles_now = {role: list(data.get(role) or ()) for role in into}
-    n, before = offline.get("stretches", 12), len(roles_now["training"]) or 1
+    new_of = {name: recording.given for name, recording in added.items()}
+    more: dict[YamlPath, Any] = {("sequences",): new_of} | {(r,): n for r, n in into.items() if n}
+    n, before = offline.get("stretches", 12), len(data.get("training") or ()) or 1
     if into["training"] and isinstance(n, int):
         # As many stretches of each as before: the trials that there are stay.
         each, now = max(4, -(-n // before)), before + len(into["training"])
-        data["offline"] = offline | {"stretches": each * now}
-    data["sequences"] |= {name: recording.given for name, recording in added.items()}
-    for role, names in into.items():
-        # 00 is a name there.
-        data[role] = [
-            name if isinstance(name, str | dict) else document.name((role, i))
-            for i, name in enumerate(roles_now[role])
-        ] + names
-    write_text(path, dump(data, document.comments))
+        more[("offline", "stretches")] = each * now
+    for at, value in more.items():
+        document = Document(document.with_added(at, value))
+    if document.data["sequences"] != data["sequences"] | new_of:
+        names = ", ".join(new_of)
+        raise AdaptuneError(f"{path}: {names} cannot be added; add them to it as the others are")
+    write_text(path, document.text)
     return list(added)
 
 

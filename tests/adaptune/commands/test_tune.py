@@ -151,6 +151,25 @@ def test_the_last_of_several_bags_is_the_test(bag, study_file, tmp_path):
 
 
 @pytest.mark.usefixtures("decided")
+def test_a_folder_that_grows_changes_only_the_lists_of_its_study(study_file):
+    Path("drives").mkdir()
+    for name in ("one", "two"):
+        shutil.copy(study_file.parent / f"{name}.bag", f"drives/{name}.bag")
+    failed("drives", "--as", "several")
+    path = Path("runs/drives/drives.yaml")
+    text = path.read_text().replace("training:\n- one\n", "training: [  # mine\n  'one' ]  # why\n")
+    path.write_text(text.replace("  two:\n", "  two: &b  # on a road\n") + "# the end\n")
+    before = path.read_text().splitlines()
+    shutil.copy(study_file.parent / "three.bag", "drives/three.bag")
+    failed("drives", "--as", "several")
+    after = path.read_text().splitlines()
+    assert [line for line in before if line not in after] == ["  'one' ]  # why"]
+    study = study_in(path)
+    assert (study.training, study.config.test) == (["one", "three"], ("two",))
+    assert study.config.offline.stretches == 24
+
+
+@pytest.mark.usefixtures("decided")
 def test_a_copy_in_a_folder_is_left_out_also_when_the_folder_grows(bag, study_file, caplog):
     Path("drives").mkdir()
     for name in ("one", "one.orig"):
