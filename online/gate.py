@@ -27,10 +27,13 @@ from online.statistics import ALL
 Verdict = Literal["better", "worse", "equal", "unclear"]
 """`equal` is surely within the bound, `unclear` too little to tell."""
 ERROR, COST, P99, RESTARTS = "error", "cost", "cost, 99th percentile", "restarts"
+LACKING = "scans without a pose"
 _UNITS = {ERROR: "RTE [%]", COST: "cost [ms]", P99: "cost, 99th percentile [ms]"}
 """Quantities as tables name them."""
 _WARM_UP, _COSTS = 10, 5
 """Scans whose costs do not count, because caches fill, and scans whose costs are drawn together."""
+_CHANCE = 0.01
+"""Of the scans, so many may lack a pose on one side only."""
 _SHARE = 0.05
 """Of the intervals of all recordings together, so many may miss the truth."""
 
@@ -110,7 +113,7 @@ class _Pair(NamedTuple):
     costs: NDArray[np.float64]  # (2, n_costs): milliseconds
     block: int  # scans whose errors are drawn together
     seconds: NDArray[np.float64]  # (n,): from the first scan, of the errors
-    lost: tuple[int, int]
+    counts: dict[str, tuple[int, int, int]]  # of both sides, and how much may be chance
     obstacle: str  # why costs say nothing
     reference_error: float | None
 
@@ -148,12 +151,15 @@ def compare_sides(new: Side, old: Side, error: float = 0.05, cost: float = 0.1) 
     rows = _rows(ERROR, pairs, error)
     for quantity in (COST,) if whole else (COST, P99):
         rows += _rows(quantity, pairs, cost)
-    lost = [(pair.name, *pair.lost) for pair in pairs]
-    if len(pairs) > 1:
-        lost.append((ALL, *np.sum([pair.lost for pair in pairs], axis=0).tolist()))
-    for name, mine, others in lost:
-        said: Verdict = "equal" if mine == others else "worse" if mine > others else "better"
-        rows.append(GateRow(name, RESTARTS, mine, others, said))
+    for quantity in (RESTARTS, LACKING):
+        counts = [(pair.name, *pair.counts[quantity]) for pair in pairs]
+        if len(pairs) > 1:
+            counts.append((ALL, *np.sum([count[1:] for count in counts], axis=0).tolist()))
+        for name, mine, others, chance in counts:
+            said: Verdict = "worse" if mine > others + chance else "equal"
+            said = "better" if mine < others - chance else said
+            if quantity == RESTARTS or any(count[1] or count[2] for count in counts):
+                rows.append(GateRow(name, quantity, mine, others, said))
     verdict = _overall(rows)
     words = _in_words(new, old, verdict, rows)
     return Gate(verdict, rows, words + (f" Not compared: {left_out}." if left_out else ""))
@@ -222,6 +228,7 @@ def _check_same(
 def _pair(name: str, replays: Sequence[StoredReplay], reference: Reference, whole: bool) -> _Pair:
     common = reduce(np.intersect1d, (replay.trajectory.stamps for replay in replays))
     errors, costs = [], []
+    new, old = (replay.summary for replay in replays)
     for replay in replays:
         kept = np.isin(replay.trajectory.stamps, common)
         errors.append(reference.errors(replay.trajectory)[kept])
@@ -241,7 +248,10 @@ def _pair(name: str, replays: Sequence[StoredReplay], reference: Reference, whol
         cost,
         reference.block,
         (common[known] - common[0]) * 1e-9,
-        (replays[0].summary.restarts, replays[1].summary.restarts),
+        {
+            RESTARTS: (new.restarts, old.restarts, 0),
+            LACKING: (new.lacking, old.lacking, round(_CHANCE * new.scans)),
+        },
         why,
         reference.error,
     )
@@ -339,6 +349,8 @@ def _in_words(new: Side, old: Side, verdict: Verdict, rows: Sequence[GateRow]) -
     for row in over_all:
         if row.quantity == RESTARTS:
             parts.append(f"{row.new} restarts by the health check instead of {row.old}")
+        elif row.quantity == LACKING:
+            parts.append(f"no pose for {row.new} scans instead of {row.old}")
         elif row.low is None:
             parts.append(f"{row.quantity} unclear ({row.why})")
         else:

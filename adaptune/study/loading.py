@@ -249,13 +249,19 @@ def _override(data: dict[str, Any], text: str) -> Key:
     dotted, equals, value = text.partition("=")
     if not equals or not dotted:
         raise ConfigurationError(f"-o {text}: give a key and a value, as in -o offline.trials=32")
-    *parents, last = path = tuple(dotted.split("."))
-    for part in parents:
-        if data.get(part) is None:
-            data[part] = {}
-        data = data[part]
+    path, rest = Key(), dotted.split(".")
+    while True:
+        # A name may hold dots itself.
+        names = (".".join(rest[:n]) for n in range(len(rest), 0, -1))
+        last = next((name for name in names if name in data), rest[0])
+        path, rest = (*path, last), rest[last.count(".") + 1 :]
+        if not rest:
+            break
+        if data.get(last) is None:
+            data[last] = {}
+        data = data[last]
         if not isinstance(data, dict):
-            raise ConfigurationError(f"-o {text}: {part} has no keys below it")
+            raise ConfigurationError(f"-o {text}: {last} has no keys below it")
     try:
         data[last] = yaml12.Document(value).data
     except yaml12.YamlError as error:

@@ -1,6 +1,7 @@
 """What a user asks to tune: recordings, or folders of them, and an odometry."""
 
 import logging
+import shlex
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -57,6 +58,16 @@ class Asked(NamedTuple):
         spelt = {"reading": "--as", "about": "the odometry's object", "recordings": "BAG"}
         limits = ("trials", "minutes", "budget")
         return dict(plain({spelt.get(k, f"--{k}"): v for k, v in found.items() if k not in limits}))
+
+
+def words_of(given: str) -> list[str]:
+    """A command as words; a file's name is one."""
+    try:
+        return [given] if Path(given).exists() else shlex.split(given)
+    except ValueError as error:  # of quotes
+        raise AdaptuneError(
+            f"{given}: {error}; put \\ before a quote that is part of it"
+        ) from error
 
 
 def check_no_study(path: Path) -> None:

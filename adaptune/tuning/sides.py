@@ -1,6 +1,5 @@
 """The gate for changes: drive what is not known yet on both sides, and compare."""
 
-import shlex
 import shutil
 from collections.abc import Sequence
 from contextlib import suppress
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from adaptune.errors import AdaptuneError
 from adaptune.files import plain_name
 from adaptune.progress import Progress
-from adaptune.tuning.asked import Asked, recorded
+from adaptune.tuning.asked import Asked, recorded, words_of
 from adaptune.tuning.studies import is_image
 from adaptune.tuning.tuned import alone
 from adaptune.yaml12 import Document, YamlError
@@ -92,7 +91,7 @@ def _entry(given: str, odometry: str) -> dict[str, Any]:
     from adaptune.odometry.registry import is_user_class, odometry_class
 
     file = Path(given)
-    if len(shlex.split(given)) > 1 or file.suffix not in (".yaml", ".yml", ".json"):
+    if len(words_of(given)) > 1 or file.suffix not in (".yaml", ".yml", ".json"):
         return _named(given)
     if not file.is_file():
         raise AdaptuneError(f"{given}: there is no such file")
@@ -116,7 +115,7 @@ def _entry(given: str, odometry: str) -> dict[str, Any]:
 
 
 def _named(given: str) -> dict[str, Any]:
-    words = shlex.split(given)
+    words = words_of(given)
     if len(words) > 1:
         # It runs in a folder of its own.
         words = [str(Path(w).absolute()) if Path(w).is_file() else w for w in words]

@@ -2,7 +2,6 @@
 
 import logging
 import re
-import shlex
 import shutil
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -15,7 +14,7 @@ from adaptune import manifest
 from adaptune.errors import AdaptuneError, NotInstalledError
 from adaptune.files import plain_name, write_text
 from adaptune.progress import Progress, about
-from adaptune.tuning.asked import EACH, TRIALS, Asked, odometries_of, recorded
+from adaptune.tuning.asked import EACH, TRIALS, Asked, odometries_of, recorded, words_of
 from adaptune.yaml12 import Document, YamlError, YamlPath, dump
 
 if TYPE_CHECKING:
@@ -377,7 +376,7 @@ def _estimate(study: "OfflineStudy", names: Sequence[str], show: Progress) -> No
 
 def _system_of(given: str) -> dict[str, Any] | None:
     """The image or the launch command of a ROS system, as settings; None if it is none."""
-    words = shlex.split(given)
+    words = words_of(given)
     if words[:1] == ["ros2"]:
         if not any("{parameters}" in word for word in words):
             words.append(f"{LACKING}:={{parameters}}")
