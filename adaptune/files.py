@@ -53,10 +53,10 @@ def temporary_folder() -> Iterator[Path]:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def entries(folder: Path) -> list[Path]:
+def entries(folder: Path, suffix: str = "") -> list[Path]:
     """What a folder holds, by name, without what a system or a file manager keeps there."""
-    own = (".", "@eaDir", "$RECYCLE.BIN")  # as ._drive.bag, and copies of previews or of all
-    return sorted(path for path in folder.iterdir() if not path.name.startswith(own))
+    own = (".", "@eaDir", "$RECYCLE.BIN")  # as ._drive.bag
+    return sorted(path for path in folder.glob(f"*{suffix}") if not path.name.startswith(own))
 
 
 @contextmanager

@@ -97,7 +97,7 @@ def inspect(
 
 def _show_several(path: Path, reading: "Reading | None") -> bool:
     """Show the recordings of a folder, a line each; False if it holds one, or may."""
-    from adaptune.recording.fleet import both_readings, check_alike, copies, read_folder
+    from adaptune.recording.fleet import both_readings, check_alike, read_folder
     from adaptune.recording.inspect import inspect as inspect_file
 
     folder = read_folder(path) if path.exists() else None
@@ -115,8 +115,6 @@ def _show_several(path: Path, reading: "Reading | None") -> bool:
         wrong = {"lacks": ", ".join(one.missing.get("offline", ())) or None}
         rows.append({"recording": str(at.relative_to(path)), **scans, **given, **wrong})
     show_table(f"{path}: {len(rows)} recordings ({folder.why})", rows)
-    for one, other in copies(found):
-        say(f"! {one.path}: holds the same scans as {other.path}; tuning leaves it out")
     if reading is None and folder.reading is None:
         say("As one:")
         return False
@@ -132,8 +130,11 @@ _LOOK = 20.0
 def _look(path: Path) -> bool:
     """Show what the ROS system of a study does; False if it has none."""
     from adaptune.odometry.registry import ROS_SYSTEMS
+    from adaptune.trajectory import is_kitti
     from adaptune.tuning.studies import LACKING
 
+    if path.is_file():
+        is_kitti(path)  # poses as YAML are refused
     loaded = load(path, [], None)
     factory: Any = loaded.odometry
     if loaded.config.odometries.keys().isdisjoint(ROS_SYSTEMS) or len(loaded.config.odometries) > 1:

@@ -20,7 +20,7 @@ Compensation = Literal["constant_velocity"] | None
 """How motion within a scan is undone; none if it is left as it is."""
 Fractions = tuple[float, float]
 """Where a part of a sequence begins and ends, as fractions of its duration."""
-REFERENCE_FILES = (".tum", ".txt", ".csv")
+REFERENCE_FILES = (".tum", ".txt", ".csv", ".g2o", ".yaml", ".yml", ".json")
 ESTIMATED, NO_REFERENCE = "estimated", "none"
 """In place of a `reference`: it is estimated from the scans, or there is none."""
 SOURCES = ("bag", "kitti", "folder")
@@ -123,7 +123,7 @@ def _in_folder(folder: Path) -> list[Path]:
         return [folder]
     # A recorder that was killed leaves its files without the metadata.
     for suffix in (".mcap", ".db3", ".bag"):
-        if found := [path for path in entries(folder) if path.suffix == suffix]:
+        if found := entries(folder, suffix):
             return found
     raise SequenceError(f"{folder}: neither a ROS 2 bag nor a folder with bags")
 

@@ -2,14 +2,12 @@
 
 import re
 from collections.abc import Sequence
-from contextlib import suppress
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
-from adaptune.errors import AdaptuneError
 from adaptune.files import entries
 from adaptune.recording.bag import UNOPENED, BagSource
 from adaptune.recording.config import BAG_SUFFIXES, bag_paths
@@ -23,7 +21,6 @@ Reading = Literal["one", "several"]
 _OVERLAP, _NEXT, LONGEST_GAP = -0.5, 2.0, 60.0
 """Seconds. Between parts of one recording lies no less and no more than the first two, between
 separate ones less than the first or more than the last."""
-_COPIED = 0.9  # of its duration, which another recording of the same scans has as well
 _RATES = 1.25  # rates that differ by a larger factor are those of different sensors
 
 
@@ -106,31 +103,6 @@ def both_readings(folder: FolderReading) -> str:
         f"holds one recording in {n} parts, or {n} recordings: {folder.why}; choose with "
         f"`--as one` or `--as several`"
     )
-
-
-def copies(recordings: Sequence["Inspection"]) -> "list[tuple[Inspection, Inspection]]":
-    """Recordings that hold nearly only the scans of another one, each with that one."""
-    from adaptune.recording.recording import RecordedSequence
-
-    spans = {}
-    for one in recordings:
-        topic = one.topics.get(one.given.get("points", one.used.get("points", "")))
-        if topic is not None and any(topic.stamps):
-            spans[one] = int(topic.times.min()), int(topic.times.max())
-    kept, found = list["Inspection"](), list[tuple["Inspection", "Inspection"]]()
-    for one in sorted(spans, key=lambda one: spans[one][0] - spans[one][1]):
-        begin, end = spans[one]
-        for other in kept:
-            common = min(end, spans[other][1]) - max(begin, spans[other][0])
-            with suppress(AdaptuneError):  # using it says why
-                if common > _COPIED * (end - begin) and RecordedSequence(one.config()).shares_scans(
-                    RecordedSequence(other.config())
-                ):
-                    found.append((one, other))
-                    break
-        else:
-            kept.append(one)
-    return found
 
 
 def check_alike(recordings: Sequence["Inspection"]) -> None:

@@ -205,8 +205,7 @@ def scan_folder(folder: Path, timing: Timing = AUTO) -> FileSource:
     if not folder.is_dir():
         raise SequenceError(f"{folder}: there is no such folder")
     places = [folder / below for below in ("", "data", "velodyne_points/data")]
-    there = [(place, sorted(entries(place), key=_natural)) for place in places if place.is_dir()]
-    found = ((place, [p for p in all_ if p.suffix == s]) for place, all_ in there for s in SUFFIXES)
+    found = ((p, sorted(entries(p, s), key=_natural)) for p in places for s in SUFFIXES)
     place, files = next(((p, files) for p, files in found if files), (folder, []))
     if not files:
         raise SequenceError(f"{folder}: holds no scan ({', '.join(SUFFIXES)}) and no bag")
@@ -241,11 +240,11 @@ def _natural(path: Path) -> list[tuple[int, str]]:
     return [(int(n or 0), text) for text, n in re.findall(r"(\D*)(\d*)", path.stem)]
 
 
-# Times in the names of files: the number, and what may come after it as a part of a second; the
-# power of ten that makes the number nanoseconds. Short ones count from 1970.
-_DATE = r"(?:19|20)\d\d(?:[-_.]?\d\d){2}[-_.T ]?\d\d(?:[-_.:hm]?\d\d){2}"
+# Times in the names of files: a date or a number, and what may come after it as a part of a second;
+# the power of ten that makes the number nanoseconds. Short ones count from 1970.
+_DATE = r"(?:^|\D)((?:19|20)\d\d(?:[-_.]?\d\d){2}[-_.T ]?\d\d(?:[-_.:hm]?\d\d){2})"
 _NAMES = (
-    (rf"(?:^|\D)({_DATE})([._,-]?(?:\d{{3}}){{1,3}}|\.\d+|)\D*$", 9, "dates in UTC"),
+    (_DATE + r"([._,-]?(?:\d{3}){1,3}|\.\d+|)\D*$", None, "dates in UTC"),
     (r"^(\d{1,10})(\.\d+)$", 9, "seconds"),
     (r"(?:^|\D)([1-4]\d{9})([._-]\d{1,9})\D*$", 9, "seconds and their parts"),
     (r"(?:^|\D)(\d{17,19})()\D*$", 0, "nanoseconds"),
@@ -262,42 +261,43 @@ def _named_stamps(files: Sequence[Path]) -> tuple[NDArray[np.int64] | None, str]
         found = [match.groups() for match in map(re.compile(pattern).search, stems) if match]
         if len(found) < len(stems):
             continue
-        dates, parts = unit == "dates in UTC", [re.sub(r"\D", "", rest) for _, rest in found]
         try:
-            begin = np.array([_since_1970(n) if dates else int(n) for n, _ in found], np.int64)
+            begin = np.array([_nanoseconds(whole, power) for whole, _ in found], np.int64)
         except (ValueError, OverflowError):
             continue  # no dates, or no times
-        stamps = begin * 10**power
-        stamps += _nanoseconds(stamps, parts, point=found[0][1][:1] == ".")
+        stamps = begin + _parts(begin, [rest for _, rest in found])
         # A number that counts may follow a date.
-        if not dates or len(stamps) < 2 or np.median(_steps(stamps)) >= SOONEST:
+        if power is not None or len(files) < 2 or np.median(_steps(stamps)) >= SOONEST:
             return stamps, unit
     numbers = [int(re.sub(r"\D", "", stem) or 0) for stem in stems]
     look = len(stems) > 1 and numbers[0] > 1e7 and np.median(np.diff(numbers)) > 1
     return None, files[0].name if look else ""
 
 
-def _since_1970(date: str) -> int:
-    return timegm(strptime(re.sub(r"\D", "", date), "%Y%m%d%H%M%S"))
+def _nanoseconds(text: str, power: int | None) -> int:
+    if power is None:
+        return timegm(strptime(re.sub(r"\D", "", text), "%Y%m%d%H%M%S")) * 10**9
+    return int(text) * int(10**power)
 
 
 def _steps(stamps: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.maximum(np.diff(np.sort(stamps)), 1)
 
 
-def _nanoseconds(begin: NDArray[np.int64], parts: list[str], point: bool) -> NDArray[np.int64]:
-    """Nanoseconds of the digits after seconds that `begin`, with a point or another sign between.
+def _parts(begin: NDArray[np.int64], rest: list[str]) -> NDArray[np.int64]:
+    """Nanoseconds of the digits that follow the seconds that `begin`.
 
     Where their numbers differ, zeros may be lacking behind them, or before: scans come evenly.
     Unless that tells, `.5` is half a second, and `_5` is five nanoseconds.
     """
-    most, widths = max(map(len, parts)), [0]
-    if min(map(len, parts)) < most and not any(len(p) > 1 and p[0] == "0" for p in parts):
-        widths = sorted([0, *(w for w in (9, 6, 3) if w >= most)], reverse=not point)
+    parts, widths = [re.sub(r"\D", "", text) for text in rest], [0]
+    most = max(map(len, parts))
+    if min(map(len, parts)) < most and not any(re.match(r"0\d", part) for part in parts):
+        widths = sorted([0, *(w for w in (9, 6, 3) if w >= most)], reverse=rest[0][0] != ".")
     digits = ([part.zfill(width).ljust(9, "0")[:9] for part in parts] for width in widths)
     read = [np.array(ones, np.int64) for ones in digits]
     steps = [_steps(begin + ones) for ones in read]
-    uneven = [np.abs(np.log(s / np.median(s))).mean() if len(s) else 0.0 for s in steps]
+    uneven = [np.abs(np.log(s / np.median(s))).sum() if len(s) else 0.0 for s in steps]
     best = int(np.argmin(uneven))
     return read[best if uneven[best] < 0.5 * uneven[0] else 0]
 
@@ -310,8 +310,7 @@ def kitti(folder: Path, elevation: float | None = None) -> FileSource:
     """
     if not folder.is_dir():
         raise SequenceError(f"{folder}: there is no such folder")
-    below = folder / "velodyne"
-    files = [p for p in (entries(below) if below.is_dir() else []) if p.suffix == ".bin"]
+    files = entries(folder / "velodyne", ".bin")
     if not files:
         raise SequenceError(f"{folder}: not a KITTI sequence; it has no velodyne/*.bin")
     stamps = _seconds(folder / "times.txt")

@@ -22,7 +22,6 @@ LEAVE_OUT = "no `time_unit` mends them: write `time_unit: none` to leave the tim
 _LONGEST = 10.0
 # A header and its points are on the same clock if they are no further apart than this.
 _SAME_CLOCK = 10.0
-_TURN = 2**32 * 1e-9  # seconds after which nanoseconds of 32 bits begin again
 _AGREE = 0.1  # times below a day or so are absolute, too, if they agree with the header to this
 
 
@@ -64,9 +63,8 @@ class Timing:
             none = values is None or self.unit == "none"
             return start, None if none else np.empty(0, np.float32), UNREAD
         spread = extent[1] - extent[0]
-        values, extent = _signed(stamp, values, extent)
+        values, extent = _unwrapped(stamp, values, extent)
         scale, absolute = self._scale(stamp, values.dtype, extent)
-        values, extent = _unwrapped(values, extent, scale)
         self._check(values.dtype, extent, scale, absolute)
         zero, begin = self._start(stamp, extent, scale, absolute)
         if scale == 1.0 and zero == 0 and values.dtype == np.float32:
@@ -78,10 +76,9 @@ class Timing:
             times = ((wide - wide.dtype.type(zero)) * scale).astype(np.float32)
         start, clock = stamp + round(begin * 1e9), _nanoseconds(extent[0], scale)
         first, last = ((end - zero) * scale for end in extent)
-        reading = Reading(start, first, last, scale, clock if absolute else None)
-        if extent[1] - extent[0] < spread:
-            reading = reading._replace(wrapped=spread * scale)
-        return start, times, reading
+        wrapped = spread * scale if extent[1] - extent[0] < spread else 0.0
+        clock = clock if absolute else None
+        return start, times, Reading(start, first, last, scale, clock, wrapped=wrapped)
 
     def _check(
         self, dtype: np.dtype[Any], extent: tuple[float, float], scale: float, absolute: bool
@@ -161,33 +158,21 @@ def _agree(stamp: float, extent: tuple[float, float], scale: float) -> bool:
     return min(abs(low - stamp), abs(high - stamp)) <= _AGREE
 
 
-Times = tuple[NDArray[Any], tuple[float, float]]
-"""Of points, as the driver wrote them, and their extent."""
+def _unwrapped(
+    stamp: int, values: NDArray[Any], extent: tuple[float, float]
+) -> tuple[NDArray[Any], tuple[float, float]]:
+    """The times and their extent; those below zero, which unsigned numbers wrap, as such.
 
-
-def _signed(stamp: int, values: NDArray[Any], extent: tuple[float, float]) -> Times:
-    """Times below zero, which unsigned numbers wrap, as such."""
-    size, spread = values.dtype.itemsize, extent[1] - extent[0]
-    half = 2 ** (8 * size - 1)
-    # A simulator's clock may be as small as four bytes.
-    all_below = size == 4 and extent[0] > 1.8 * half and stamp > 10**10
-    if values.dtype.kind == "u" and size >= 4 and (spread > half or all_below):
-        signed = values.view(f"i{size}")
-        low, high = int(signed.min()), int(signed.max())
-        if high - low < half // 2:
-            return signed, (low, high)
-    return values, extent
-
-
-def _unwrapped(values: NDArray[Any], extent: tuple[float, float], scale: float) -> Times:
-    """Times of which some wrapped as nanoseconds of 32 bits before they became other numbers."""
-    low, high = extent
-    turn: Any = _TURN / scale
-    if 0.5 * turn < high - low < 1.001 * turn:
-        if values.dtype.kind in "iu":
-            turn, values = round(turn), values.astype(np.int64)
+    Also those that wrapped as nanoseconds of 32 bits before they became other numbers.
+    """
+    (low, high), size = extent, values.dtype.itemsize
+    unsigned = values.dtype.kind == "u" and size >= 4
+    turns = [2 ** (8 * size)] if unsigned else [2**32 * 1e-9 / s for s in _SECONDS.values()]
+    # All may be below zero; but a simulator's clock may be as small as four bytes.
+    below = unsigned and size == 4 and low > 0.9 * 2**32 and stamp > 10**10
+    for turn in (t for t in turns if below or 0.5 * t < high - low < 1.001 * t):
         late = values > low + turn / 2
-        moved = np.where(late, values - values.dtype.type(turn), values)
+        moved = values.view(f"i{size}") if unsigned else np.where(late, values - turn, values)
         first, last = moved.min().item(), moved.max().item()
         if last - first < 0.25 * turn:
             return moved, (first, last)

@@ -8,7 +8,7 @@ from itertools import combinations, product
 from pathlib import Path
 from typing import Any, TypeVar
 
-from adaptune import yaml12
+from adaptune import errors, yaml12
 from adaptune.errors import AdaptuneError, Finding, Key, NotInstalledError, OdometryError, nearest
 from adaptune.odometry.base import Description
 from adaptune.odometry.registry import (
@@ -179,6 +179,10 @@ def _overlaps(config: StudyConfig, opened: dict[str, RecordedSequence]) -> Itera
             return opened[names[0]].shares_scans(opened[names[1]])
         return False
 
+    for one, other in combinations(dict.fromkeys(config.training), 2):
+        if same(one, other):
+            what = f"training: {one!r} and {other!r} hold the same scans, which count twice"
+            errors.warn_once(f"{what}; leave one of them out")
     for (i, test), training in product(enumerate(config.test), config.training):
         if test != training and same(test, training):
             message = (

@@ -65,9 +65,7 @@ def words_of(given: str) -> list[str]:
     try:
         return [given] if Path(given).exists() else shlex.split(given)
     except ValueError as error:  # of quotes
-        raise AdaptuneError(
-            f"{given}: {error}; put \\ before a quote that is part of it"
-        ) from error
+        raise AdaptuneError(f"{given}: {error}; put \\ before a quote in a name") from error
 
 
 def check_no_study(path: Path) -> None:
@@ -82,7 +80,7 @@ def check_no_study(path: Path) -> None:
 def recorded(asked: Asked, show: Progress) -> "tuple[dict[str, Inspection], list[str]]":
     """The recordings by the names of their sequences, and the names of those for the test."""
     from adaptune.recording.config import NO_REFERENCE
-    from adaptune.recording.fleet import check_alike, copies, recordings_at
+    from adaptune.recording.fleet import check_alike, recordings_at
 
     for path in asked.recordings:
         check_no_study(path)
@@ -106,9 +104,6 @@ def recorded(asked: Asked, show: Progress) -> "tuple[dict[str, Inspection], list
             f"its own; write a study file, see docs/your-bag.md"
         )
     inspections = [usable(path, asked.points, asked.reference, show) for path in paths]
-    for one, other in copies(inspections[: len(paths) - len(tested)]):
-        _log.warning("%s: holds the same scans as %s, and is left out", one.path, other.path)
-        inspections.remove(one)
     check_alike(inspections)
     named: dict[str, Inspection] = {}
     for inspection in inspections:
@@ -116,7 +111,7 @@ def recorded(asked: Asked, show: Progress) -> "tuple[dict[str, Inspection], list
         longer = plain_name(path.with_name(f"{path.parent.name}_{path.name}"))
         names = chain([inspection.name, longer], (f"{inspection.name}_{i}" for i in count(2)))
         named[next(name for name in names if name not in named)] = inspection
-    return named, list(named)[len(named) - len(tested) :]
+    return named, list(named)[len(paths) - len(tested) :]
 
 
 def usable(path: Path, points: str | None, reference: str | None, show: Progress) -> "Inspection":

@@ -227,8 +227,6 @@ def _grown(path: Path, asked: Asked, show: Progress) -> list[str]:
     named, _ = recorded(asked._replace(recordings=there, test=(), reading="one"), show)
     undo_motion([*named.values()], odometries_of(asked.odometry, False))
     added = {name: recording for name, recording in named.items() if recording.path in new}
-    if not added:  # copies
-        return []
     if taken := [name for name in added if name in data["sequences"]]:
         raise AdaptuneError(
             f"{path}: sequences.{taken[0]} is another recording; rename the new one"

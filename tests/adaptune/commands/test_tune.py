@@ -146,8 +146,13 @@ def test_the_last_of_several_bags_is_the_test(bag, study_file, tmp_path):
     assert (study.config.offline.trials, study.config.offline.hours) == (None, 0.1)
     assert "one.bag: is named twice; the test" in failed(bag, bag, "--folder", "twice")
     shutil.copy(bag, tmp_path / "other/copy.bag")
-    said = failed(bag, "--test", "other/copy.bag", "--folder", "twice")
+    said = failed(bag, "other/copy.bag", "--folder", "twice")
     assert said.startswith("error: test.0: 'copy' is the recording of the training sequence 'one'")
+
+
+@pytest.mark.parametrize(("given", "why"), [("o'hare", "No closing"), ("a\\", "No escaped")])
+def test_quotes_that_do_not_close_are_told(bag, given, why):
+    assert f"{given}: {why}" in failed(bag, "--odometry", given)
 
 
 @pytest.mark.usefixtures("decided")
@@ -167,20 +172,6 @@ def test_a_folder_that_grows_changes_only_the_lists_of_its_study(study_file):
     study = study_in(path)
     assert (study.training, study.config.test) == (["one", "three"], ("two",))
     assert study.config.offline.stretches == 24
-
-
-@pytest.mark.usefixtures("decided")
-def test_a_copy_in_a_folder_is_left_out_also_when_the_folder_grows(bag, study_file, caplog):
-    Path("drives").mkdir()
-    for name in ("one", "one.orig"):
-        shutil.copy(bag, f"drives/{name}.bag")
-    shutil.copy(study_file.parent / "two.bag", "drives/two.bag")
-    failed("drives")
-    assert study_in("runs/drives/drives.yaml").training == ["one"]
-    assert "one.orig.bag: holds the same scans as" in caplog.text
-    before = Path("runs/drives/drives.yaml").read_text()
-    failed("drives")
-    assert Path("runs/drives/drives.yaml").read_text() == before
 
 
 def test_of_several_odometries_the_replayed_one_is_named(monkeypatch):

@@ -1,13 +1,11 @@
 """Folders: the parts of one recording, or several recordings."""
 
-import shutil
-
 import commands
 import drives
 import pytest
 
 from adaptune.recording.config import bag_paths
-from adaptune.recording.fleet import check_alike, copies, read_folder, recordings_at
+from adaptune.recording.fleet import check_alike, read_folder, recordings_at
 from adaptune.recording.inspect import inspect
 from adaptune.recording.scan import SequenceError
 
@@ -78,17 +76,6 @@ def test_files_of_an_operating_system_are_no_recordings(tmp_path):
     assert recordings_at([tmp_path]) == [tmp_path / "drive.bag"]
     for given in (tmp_path, tmp_path / "*.bag"):
         assert bag_paths([str(given)]) == [tmp_path / "drive.bag"]
-
-
-def test_copies_and_parts_cut_out_are_told(tmp_path):
-    write(tmp_path, a=0.0, b=500.0)
-    shutil.copy(tmp_path / "a.bag", tmp_path / "a_orig.bag")
-    cut = [(stamp + 500 * 10**9, xyz, T) for stamp, xyz, T in drives.scans(0, 10)][:6]
-    drives.write_bag(tmp_path / "b_cut.bag", cut)
-    found = copies([inspect(tmp_path / f"{name}.bag") for name in ("a", "a_orig", "b_cut", "b")])
-    assert {(one.name, other.name) for one, other in found} == {("a_orig", "a"), ("b_cut", "b")}
-    said = commands.succeeded("inspect", tmp_path).output
-    assert "a_orig.bag: holds the same scans as" in said
 
 
 def test_a_bag_that_is_being_recorded_is_told(tmp_path):
