@@ -192,15 +192,13 @@ class Document:
             return self.with_added(path[:-1], {path[-1]: added})
         node = nodes[-1][1] if nodes else self._node
         begin, end = node.start_mark.index, node.end_mark.index
-        flow = yaml.dump(added, Dumper=_Dumper, default_flow_style=True, width=2**31)
-        flow = flow.split("\n")[0]
+        flow = yaml.dump(added, None, _Dumper, default_flow_style=True, width=2**31).split("\n")[0]
         if isinstance(node, yaml.ScalarNode) or not node.value:
             return f"{text[:begin]}{' ' * (text[begin - 1] == ':')}{flow}{text[end:]}"
         mapping = isinstance(node, yaml.MappingNode)
         first, last = (node.value[i][i] if mapping else node.value[i] for i in (0, -1))
         if node.flow_style:
-            end = last.end_mark.index
-            return f"{text[:end]}, {flow[1:-1]}{text[end:]}"
+            return f"{text[: last.end_mark.index]}, {flow[1:-1]}{text[last.end_mark.index :]}"
         lines = text[:end].split("\n")
         while lines[-1].strip()[:1] in ("", "#"):
             lines.pop()  # what stands above the next key

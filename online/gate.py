@@ -26,14 +26,12 @@ from online.statistics import ALL
 
 Verdict = Literal["better", "worse", "equal", "unclear"]
 """`equal` is surely within the bound, `unclear` too little to tell."""
-ERROR, COST, P99, RESTARTS = "error", "cost", "cost, 99th percentile", "restarts"
-LACKING = "scans without a pose"
+ERROR, COST, P99 = "error", "cost", "cost, 99th percentile"
+RESTARTS, LACKING = "restarts", "scans without a pose"
 _UNITS = {ERROR: "RTE [%]", COST: "cost [ms]", P99: "cost, 99th percentile [ms]"}
 """Quantities as tables name them."""
 _WARM_UP, _COSTS = 10, 5
 """Scans whose costs do not count, because caches fill, and scans whose costs are drawn together."""
-_CHANCE = 0.01
-"""Of the scans, so many may lack a pose on one side only."""
 _SHARE = 0.05
 """Of the intervals of all recordings together, so many may miss the truth."""
 
@@ -156,8 +154,8 @@ def compare_sides(new: Side, old: Side, error: float = 0.05, cost: float = 0.1) 
         if len(pairs) > 1:
             counts.append((ALL, *np.sum([count[1:] for count in counts], axis=0).tolist()))
         for name, mine, others, chance in counts:
-            said: Verdict = "worse" if mine > others + chance else "equal"
-            said = "better" if mine < others - chance else said
+            apart = mine - others if abs(mine - others) > chance else 0
+            said: Verdict = "worse" if apart > 0 else "better" if apart else "equal"
             if quantity == RESTARTS or any(count[1] or count[2] for count in counts):
                 rows.append(GateRow(name, quantity, mine, others, said))
     verdict = _overall(rows)
@@ -229,6 +227,7 @@ def _pair(name: str, replays: Sequence[StoredReplay], reference: Reference, whol
     common = reduce(np.intersect1d, (replay.trajectory.stamps for replay in replays))
     errors, costs = [], []
     new, old = (replay.summary for replay in replays)
+    few = new.scans // 100  # of which one side may lack the poses by chance
     for replay in replays:
         kept = np.isin(replay.trajectory.stamps, common)
         errors.append(reference.errors(replay.trajectory)[kept])
@@ -248,10 +247,7 @@ def _pair(name: str, replays: Sequence[StoredReplay], reference: Reference, whol
         cost,
         reference.block,
         (common[known] - common[0]) * 1e-9,
-        {
-            RESTARTS: (new.restarts, old.restarts, 0),
-            LACKING: (new.lacking, old.lacking, round(_CHANCE * new.scans)),
-        },
+        {RESTARTS: (new.restarts, old.restarts, 0), LACKING: (new.lacking, old.lacking, few)},
         why,
         reference.error,
     )
@@ -347,10 +343,9 @@ def _in_words(new: Side, old: Side, verdict: Verdict, rows: Sequence[GateRow]) -
     over_all = [row for row in rows if row.recording == ALL] or rows
     parts = []
     for row in over_all:
-        if row.quantity == RESTARTS:
-            parts.append(f"{row.new} restarts by the health check instead of {row.old}")
-        elif row.quantity == LACKING:
-            parts.append(f"no pose for {row.new} scans instead of {row.old}")
+        if row.quantity in (RESTARTS, LACKING):
+            by = " by the health check" * (row.quantity == RESTARTS)
+            parts.append(f"{row.new} {row.quantity}{by} instead of {row.old}")
         elif row.low is None:
             parts.append(f"{row.quantity} unclear ({row.why})")
         else:

@@ -245,8 +245,7 @@ def _grown(path: Path, asked: Asked, show: Progress) -> list[str]:
     for at, value in more.items():
         document = Document(document.with_added(at, value))
     if document.data["sequences"] != data["sequences"] | new_of:
-        names = ", ".join(new_of)
-        raise AdaptuneError(f"{path}: {names} cannot be added; add them to it as the others are")
+        raise AdaptuneError(f"{path}: cannot be added to; add {', '.join(new_of)} as the others")
     write_text(path, document.text)
     return list(added)
 

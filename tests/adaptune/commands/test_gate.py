@@ -107,7 +107,7 @@ def test_a_side_that_lacks_poses_is_worse(bags):
     given = ("drive_a.bag", "--reference", "/truth", *COSTS)
     done = commands.call("compare", drives[0], *given, "--against", drives[1])
     assert done.exit_code == 3, done.output
-    assert "no pose for 12 scans instead of 0" in done.stdout
+    assert "12 scans without a pose instead of 0" in done.stdout
     assert "(scans without a pose)" in done.stdout
     assert commands.call("compare", drives[1], *given, "--against", drives[0]).exit_code == 0
 
