@@ -267,7 +267,7 @@ def _named_stamps(files: Sequence[Path]) -> tuple[NDArray[np.int64] | None, str]
             continue  # no dates, or no times
         stamps = begin + _parts(begin, [rest for _, rest in found])
         # A number that counts may follow a date.
-        if power is not None or len(files) < 2 or np.median(_steps(stamps)) >= SOONEST:
+        if power is not None or np.ptp(stamps) >= SOONEST * (len(files) - 1):
             return stamps, unit
     numbers = [int(re.sub(r"\D", "", stem) or 0) for stem in stems]
     look = len(stems) > 1 and numbers[0] > 1e7 and np.median(np.diff(numbers)) > 1
@@ -278,10 +278,6 @@ def _nanoseconds(text: str, power: int | None) -> int:
     if power is None:
         return timegm(strptime(re.sub(r"\D", "", text), "%Y%m%d%H%M%S")) * 10**9
     return int(text) * int(10**power)
-
-
-def _steps(stamps: NDArray[np.int64]) -> NDArray[np.int64]:
-    return np.maximum(np.diff(np.sort(stamps)), 1)
 
 
 def _parts(begin: NDArray[np.int64], rest: list[str]) -> NDArray[np.int64]:
@@ -296,8 +292,8 @@ def _parts(begin: NDArray[np.int64], rest: list[str]) -> NDArray[np.int64]:
         widths = sorted([0, *(w for w in (9, 6, 3) if w >= most)], reverse=rest[0][0] != ".")
     digits = ([part.zfill(width).ljust(9, "0")[:9] for part in parts] for width in widths)
     read = [np.array(ones, np.int64) for ones in digits]
-    steps = [_steps(begin + ones) for ones in read]
-    uneven = [np.abs(np.log(s / np.median(s))).sum() if len(s) else 0.0 for s in steps]
+    steps = [np.log(np.maximum(np.diff(np.sort(begin + ones)), 1)) for ones in read]
+    uneven = [np.abs(s - np.median(s)).sum() if len(s) else 0.0 for s in steps]
     best = int(np.argmin(uneven))
     return read[best if uneven[best] < 0.5 * uneven[0] else 0]
 
