@@ -182,7 +182,7 @@ class Document:
             node = entries[-1][1]
         return found
 
-    def with_added(self, path: Sequence[str], added: Any) -> str:
+    def with_added(self, path: Sequence[str | int], added: Any) -> str:
         """The text with more entries in the mapping or list at a path, or with another value there.
 
         Nothing else in it changes.
@@ -190,7 +190,7 @@ class Document:
         nodes, text = self._along(path), self.text
         if len(nodes) < len(path):
             return self.with_added(path[:-1], {path[-1]: added})
-        node = nodes[-1][1] if nodes else self._node
+        node: Any = nodes[-1][1] if nodes else self._node
         begin, end = node.start_mark.index, node.end_mark.index
         flow = yaml.dump(added, None, _Dumper, default_flow_style=True, width=2**31).split("\n")[0]
         if isinstance(node, yaml.ScalarNode) or not node.value:
@@ -203,7 +203,8 @@ class Document:
         while lines[-1].strip()[:1] in ("", "#"):
             lines.pop()  # what stands above the next key
         before = "\n".join(lines)
-        indent = re.match(" *", text.split("\n")[first.start_mark.line])[0]
+        line = text.split("\n")[first.start_mark.line]
+        indent = line[: len(line) - len(line.lstrip())]
         return f"{before}\n{textwrap.indent(dump(added), indent)}{text[len(before) + 1 :]}"
 
     def where(self, file: Path, path: Sequence[str | int]) -> str:

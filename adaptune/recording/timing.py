@@ -74,10 +74,10 @@ class Timing:
             small = values.dtype.kind in "iu" and values.dtype.itemsize < 8
             wide = values.astype(np.int64) if small else values
             times = ((wide - wide.dtype.type(zero)) * scale).astype(np.float32)
-        start, clock = stamp + round(begin * 1e9), _nanoseconds(extent[0], scale)
+        start = stamp + round(begin * 1e9)
+        clock = _nanoseconds(extent[0], scale) if absolute else None
         first, last = ((end - zero) * scale for end in extent)
         wrapped = spread * scale if extent[1] - extent[0] < spread else 0.0
-        clock = clock if absolute else None
         return start, times, Reading(start, first, last, scale, clock, wrapped=wrapped)
 
     def _check(

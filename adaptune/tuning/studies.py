@@ -244,7 +244,7 @@ def _grown(path: Path, asked: Asked, show: Progress) -> list[str]:
         more[("offline", "stretches")] = each * now
     for at, value in more.items():
         document = Document(document.with_added(at, value))
-    if document.data["sequences"] != data["sequences"] | new_of:
+    if (document.data or {})["sequences"] != data["sequences"] | new_of:
         raise AdaptuneError(f"{path}: cannot be added to; add {', '.join(new_of)} as the others")
     write_text(path, document.text)
     return list(added)
