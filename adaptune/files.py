@@ -53,6 +53,12 @@ def temporary_folder() -> Iterator[Path]:
         shutil.rmtree(folder, ignore_errors=True)
 
 
+def entries(folder: Path, suffix: str = "") -> list[Path]:
+    """What a folder holds, by name, without what a system or a file manager keeps there."""
+    own = (".", "@eaDir", "$RECYCLE.BIN")  # as ._drive.bag
+    return sorted(path for path in folder.glob(f"*{suffix}") if not path.name.startswith(own))
+
+
 @contextmanager
 def needing_room(path: Path) -> Iterator[None]:
     """Raise a FullError that names the file for which there is no room in the block."""

@@ -108,6 +108,15 @@ _NUMBER = re.compile(r"[-+.]*\d")
 _DECIMAL = re.compile(r"[-+]?\d+,\d+(?:[eE][-+]?\d+)?")
 
 
+_TO_TUM = "write a line `timestamp x y z qx qy qz qw` for each pose"
+_ECHO = "`rostopic echo -p TOPIC` or `ros2 topic echo --csv TOPIC`"
+_FOREIGN = {  # what other files begin with, what they are, and what to do
+    r"(VERTEX|EDGE|FIX)\w*[ :]": f"a pose graph (g2o), whose poses have no stamps; {_TO_TUM}",
+    r"(---\s+)?(header|pose|position|transforms):\s": f"messages as YAML; print them by {_ECHO}",
+    r"<|[\[{]\s*[\[{\"]|\$G": f"XML, JSON or NMEA; {_TO_TUM}",
+}
+
+
 def _lines(path: Path) -> Iterator[tuple[int, str, list[str]]]:
     """Number, text and fields of lines that are not empty; a comment has no fields."""
     try:
@@ -116,6 +125,9 @@ def _lines(path: Path) -> Iterator[tuple[int, str, list[str]]]:
         raise TrajectoryError(f"{path}: there is no such file") from error
     except (OSError, UnicodeDecodeError) as error:
         raise TrajectoryError(f"{path}: cannot be read as text in UTF-8 ({error})") from error
+    for begin, what in _FOREIGN.items():
+        if re.match(begin, text.lstrip()):
+            raise TrajectoryError(f"{path}: holds {what}")
     for number, line in enumerate(text.splitlines(), start=1):
         if line := line.strip().rstrip(",; "):
             fields = re.split(r"\s*;\s*" if ";" in line else r"\s+", line)

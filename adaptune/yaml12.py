@@ -1,8 +1,8 @@
 """YAML with the numbers and booleans of YAML 1.2, unique keys, and line numbers."""
 
 import re
+import textwrap
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import takewhile
 from pathlib import Path
 from typing import Any, Self
 
@@ -117,7 +117,7 @@ class Document:
     """
 
     def __init__(self, text: str, foreign: bool = False):
-        self._text = text
+        self.text = text
         try:
             loader = _Foreign(text) if foreign else _Loader(text)
             self._node = loader.get_single_node()
@@ -182,20 +182,30 @@ class Document:
             node = entries[-1][1]
         return found
 
-    @property
-    def comments(self) -> dict[YamlPath, str]:
-        """The comments above keys, and at the end of their lines, by the path of the key."""
-        lines, found = self._text.split("\n"), dict[YamlPath, str]()
-        for path, key, value in _keys(self._node):
-            before = lines[: key.start_mark.line]
-            above = [*takewhile(lambda line: line.strip()[:1] in ("", "#"), reversed(before))]
-            same = value.start_mark.line == key.end_mark.line
-            mark = value.end_mark if same else key.end_mark
-            rest = lines[mark.line][mark.column :].strip(": ")
-            comments = [line.strip() for line in (*reversed(above), rest)]
-            if text := "\n".join(line.lstrip("#").strip() for line in comments if line[:1] == "#"):
-                found.setdefault(path, text)
-        return found
+    def with_added(self, path: Sequence[str | int], added: Any) -> str:
+        """The text with more entries in the mapping or list at a path, or with another value there.
+
+        Nothing else in it changes.
+        """
+        nodes, text = self._along(path), self.text
+        if len(nodes) < len(path):
+            return self.with_added(path[:-1], {path[-1]: added})
+        node: Any = nodes[-1][1] if nodes else self._node
+        begin, end = node.start_mark.index, node.end_mark.index
+        flow = yaml.dump(added, None, _Dumper, default_flow_style=True, width=2**31).split("\n")[0]
+        if isinstance(node, yaml.ScalarNode) or not node.value:
+            return f"{text[:begin]}{' ' * (text[begin - 1] == ':')}{flow}{text[end:]}"
+        mapping = isinstance(node, yaml.MappingNode)
+        first, last = (node.value[i][i] if mapping else node.value[i] for i in (0, -1))
+        if node.flow_style:
+            return f"{text[: last.end_mark.index]}, {flow[1:-1]}{text[last.end_mark.index :]}"
+        lines = text[:end].split("\n")
+        while lines[-1].strip()[:1] in ("", "#"):
+            lines.pop()  # what stands above the next key
+        before = "\n".join(lines)
+        line = text.split("\n")[first.start_mark.line]
+        indent = line[: len(line) - len(line.lstrip())]
+        return f"{before}\n{textwrap.indent(dump(added), indent)}{text[len(before) + 1 :]}"
 
     def where(self, file: Path, path: Sequence[str | int]) -> str:
         """The file of this text, and the line of `path` in it."""

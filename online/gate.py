@@ -25,7 +25,7 @@ from online.turns import COST, P99, Costs, Driven, cost_ratios
 
 Verdict = Literal["better", "worse", "equal", "unclear"]
 """`equal` is surely within the bound, `unclear` too little to tell."""
-ERROR, RESTARTS = "error", "restarts"
+ERROR, RESTARTS, LACKING = "error", "restarts", "scans without a pose"
 _UNITS = {ERROR: "RTE [%]", COST: "cost [ms]", P99: f"{P99} [ms]"}
 """Quantities as tables name them."""
 _SHARE = 0.05
@@ -280,7 +280,7 @@ def compare_sides(
         names = [pair.pair.recording for pair in pairs if pair.name in of]
         ratios = cost_ratios(list(of.values()), names, each) if of else []
         rows += _rows(quantity, pairs, means, ratios, cost, given, _NO_COST)
-    rows.append(_restarts(pairs, share))
+    rows += [_restarts(pairs, share), *_lacking(pairs)]
     verdict = _overall(rows)
     left_out = f" Not compared: {shared.alone}." if shared.alone else ""
     return Gate(verdict, rows, _in_words(shared, verdict, rows) + left_out)
@@ -336,6 +336,16 @@ def _restarts(pairs: Sequence[Paired], share: float) -> GateRow:
     return GateRow(ALL if len(pairs) > 1 else pairs[0].name, RESTARTS, new, old, said)
 
 
+def _lacking(pairs: Sequence[Paired]) -> list[GateRow]:
+    """The row of scans without a pose over all recordings, if there are any."""
+    new, old = (sum(pair.both[i].summary.lacking for pair in pairs) for i in range(2))
+    # One scan in a hundred may lack its pose on one side by chance.
+    apart = abs(new - old) > sum(pair.both[0].summary.scans // 100 for pair in pairs)
+    said: Verdict = "equal" if not apart else "worse" if new > old else "better"
+    name = ALL if len(pairs) > 1 else pairs[0].name
+    return [GateRow(name, LACKING, new, old, said)] if new or old else []
+
+
 def _stretches(pair: Paired) -> tuple[tuple[float, float], ...]:
     """By stretch of `PER_STRETCH` sub-trajectories its first second, and the ratio there."""
     n = max(1, len(pair.seconds) // (PER_STRETCH * pair.pair.block))
@@ -361,8 +371,9 @@ def _in_words(shared: Shared, verdict: Verdict, rows: Sequence[GateRow]) -> str:
     over_all = [row for row in rows if row.recording == ALL] or rows
     parts = []
     for row in over_all:
-        if row.quantity == RESTARTS:
-            parts.append(f"{row.new} restarts by the health check instead of {row.old}")
+        if row.quantity in (RESTARTS, LACKING):
+            by = " by the health check" * (row.quantity == RESTARTS)
+            parts.append(f"{row.new} {row.quantity}{by} instead of {row.old}")
         elif row.low is None:
             parts.append(f"{row.quantity} unclear ({row.why})")
         else:

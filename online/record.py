@@ -47,6 +47,7 @@ class ReplaySummary(BaseModel):
     memory_mb: float | None = None  # most megabytes of all processes
     real_time: dict[str, float] | None = None  # how it kept up, see `kept_up`
     first_pose: float = 0.0  # seconds from the first scan; what was before is left out
+    lacking: int = 0  # scans without a pose
     fault: str = ""  # the last one of the odometry
     machine: str | None = None  # on which it was driven
     model_file: str | None  # of the model that it was made with; None if it needed none
@@ -196,6 +197,7 @@ def write_replay(
         memory_mb=round(replay.memory, 1),
         real_time=kept_up(replay),
         first_pose=round(replay.first_pose, 3),
+        lacking=replay.lacking,
         fault=replay.faults[-1] if replay.faults else "",
         machine=machine(),
         model_file=None if model_file is None else str(model_file.resolve()),

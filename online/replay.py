@@ -161,6 +161,7 @@ class ReplayRecord:
     newest: Choice | None = None  # applied or not
     cpu_ms: float = math.nan  # milliseconds of CPU time a scan, in all processes, without reading
     memory: float = 0.0  # most megabytes of all processes
+    lacking: int = 0  # scans without a pose
     first_pose: float = 0.0  # seconds from the first scan to the odometry's first pose
     faults: tuple[str, ...] = ()  # of the odometry, as it says them
     # In real time:
@@ -235,6 +236,7 @@ class ReplayRecord:
         usage, self.faults = odometry.usage, tuple(odometry.faults)
         self.cpu_ms = 1e3 * (self._cpu + usage.other_cpu + other_cpu) / self._n
         self.memory += usage.memory or 0.0
+        self.lacking = max(usage.lacking, self.unhealthy.get("no_pose", 0))
         return self
 
 

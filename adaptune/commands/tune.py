@@ -108,12 +108,12 @@ def _show_several(path: Path, reading: "Reading | None") -> bool:
     with progress() as show:
         found = [inspect_file(one, False, show) for one in folder.recordings]
     rows = []
-    for one in found:
+    for at, one in zip(folder.recordings, found, strict=True):
         topic = one.topics.get(one.used.get("points", ""))
         scans = {"scans": topic and topic.count, "rate [Hz]": topic and topic.rate}
         given = {"reference": one.used.get("reference", "estimated")}
         wrong = {"lacks": ", ".join(one.missing.get("offline", ())) or None}
-        rows.append({"recording": one.path.name, **scans, **given, **wrong})
+        rows.append({"recording": str(at.relative_to(path)), **scans, **given, **wrong})
     show_table(f"{path}: {len(rows)} recordings ({folder.why})", rows)
     if reading is None and folder.reading is None:
         say("As one:")
@@ -130,8 +130,11 @@ _LOOK = 20.0
 def _look(path: Path) -> bool:
     """Show what the ROS system of a study does; False if it has none."""
     from adaptune.odometry.registry import ROS_SYSTEMS
+    from adaptune.trajectory import is_kitti
     from adaptune.tuning.studies import LACKING
 
+    if path.is_file():
+        is_kitti(path)  # poses as YAML are refused
     loaded = load(path, [], None)
     factory: Any = loaded.odometry
     if loaded.config.odometries.keys().isdisjoint(ROS_SYSTEMS) or len(loaded.config.odometries) > 1:

@@ -83,6 +83,7 @@ class Usage(NamedTuple):
     memory: float | None  # peak megabytes of its own processes; None if it shares this process
     seconds: float | None = None  # a scan, if it runs apart from its calls; None if within them
     other_cpu: float = 0.0  # of `cpu`, seconds in other processes
+    lacking: int = 0  # scans at which a program wrote no pose; those beside them may tell it
 
     @classmethod
     def total(cls, usages: Iterable["Usage"]) -> "Usage":

@@ -165,7 +165,7 @@ class WholeRun(Faulting):
         self._T_own_sensor: dict[int, Poses] | None = None
         self._T_begin = self._T_odom_own = np.eye(4)
         self._begun = False
-        self._usage = Usage(0.0, None)
+        self._usage, self._lacking = Usage(0.0, None), 0
 
     @staticmethod
     def describe(settings: Any) -> Description:  # noqa: ARG004
@@ -184,7 +184,7 @@ class WholeRun(Faulting):
     @property
     def usage(self) -> Usage:
         """What the program has used, with all processes that it has started."""
-        return self._usage
+        return self._usage._replace(lacking=self._lacking)
 
     @property
     def too_long(self) -> OdometryError:
@@ -245,6 +245,10 @@ class WholeRun(Faulting):
                     T = trajectory.T_world_sensor @ to_pose(self.settings.extrinsic)
                     trajectory = Trajectory(trajectory.stamps, T)
                 T_own_sensor = poses_at(trajectory, given.stamps)
+                beside = np.searchsorted(trajectory.stamps, given.stamps) - [[1], [0]]
+                nearest = trajectory.stamps[beside.clip(0, len(trajectory) - 1)] - given.stamps
+                spacing = np.ptp(given.stamps) / len(given.stamps)
+                self._lacking = int((np.abs(nearest).min(axis=0) > 0.6 * spacing).sum())
                 known = np.isfinite(T_own_sensor[:, 0, 0])
                 if known.mean() < _COVERAGE:
                     when = when_known(known, given.stamps)

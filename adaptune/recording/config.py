@@ -11,7 +11,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, mod
 
 from adaptune import geometry
 from adaptune.errors import AdaptuneError
-from adaptune.files import expand_user
+from adaptune.files import entries, expand_user
 from adaptune.recording.scan import USUAL, Imu, ImuNoise, SequenceError
 from adaptune.recording.timing import Mark, Unit
 from adaptune.strict import StrictModel
@@ -20,7 +20,7 @@ Compensation = Literal["constant_velocity"] | None
 """How motion within a scan is undone; none if it is left as it is."""
 Fractions = tuple[float, float]
 """Where a part of a sequence begins and ends, as fractions of its duration."""
-REFERENCE_FILES = (".tum", ".txt", ".csv")
+REFERENCE_FILES = (".tum", ".txt", ".csv", ".g2o", ".yaml", ".yml", ".json")
 ESTIMATED, NO_REFERENCE = "estimated", "none"
 """In place of a `reference`: it is estimated from the scans, or there is none."""
 SOURCES = ("bag", "kitti", "folder")
@@ -103,7 +103,7 @@ def bag_paths(given: Sequence[str]) -> list[Path]:
                 bags = "bags are .bag, .mcap and .db3 files and ROS 2 folders"
                 raise SequenceError(f"{path}: not a bag; {bags}")
             paths.append(path)
-        elif found := sorted(path.parent.glob(path.name)):
+        elif found := [p for p in sorted(path.parent.glob(path.name)) if p.name[0] != "."]:
             paths += bag_paths([str(match) for match in found])
         else:
             raise SequenceError(f"{path}: there is no such bag")
@@ -114,7 +114,7 @@ def bag_paths(given: Sequence[str]) -> list[Path]:
 
 def files_of(paths: Sequence[Path]) -> list[Path]:
     """The files of bags, of which some may be folders."""
-    found = [sorted(path.iterdir()) if path.is_dir() else [path] for path in paths]
+    found = [entries(path) if path.is_dir() else [path] for path in paths]
     return [file for files in found for file in files if file.is_file()]
 
 
@@ -123,7 +123,7 @@ def _in_folder(folder: Path) -> list[Path]:
         return [folder]
     # A recorder that was killed leaves its files without the metadata.
     for suffix in (".mcap", ".db3", ".bag"):
-        if found := sorted(folder.glob(f"*{suffix}")):
+        if found := entries(folder, suffix):
             return found
     raise SequenceError(f"{folder}: neither a ROS 2 bag nor a folder with bags")
 

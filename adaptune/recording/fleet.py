@@ -2,11 +2,13 @@
 
 import re
 from collections.abc import Sequence
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
+from adaptune.files import entries
 from adaptune.recording.bag import UNOPENED, BagSource
 from adaptune.recording.config import BAG_SUFFIXES, bag_paths
 from adaptune.recording.scan import SequenceError
@@ -39,12 +41,14 @@ def read_folder(path: Path) -> FolderReading:
     alone = FolderReading((path,), "one")
     if not path.is_dir() or (path / "metadata.yaml").exists() or (path / "velodyne").is_dir():
         return alone
-    if active := next((p for p in sorted(path.iterdir()) if p.suffix == ".active"), None):
+    there = entries(path)
+    if active := next((p for p in there if p.suffix == ".active"), None):
         raise SequenceError(f"{active}: is still being recorded; run this again when it is closed")
-    bags = [p for p in sorted(path.iterdir()) if p.is_file() and p.suffix in BAG_SUFFIXES]
-    folders = [p for p in sorted(path.iterdir()) if p.is_dir() and _is_recording(p)]
-    if folders:
-        return FolderReading((*folders, *bags), "several", "each folder is a recording")
+    bags = [p for p in there if p.is_file() and p.suffix in BAG_SUFFIXES]
+    if folders := [p for p in there if p.is_dir() and _is_recording(p)]:
+        below = [(p, read_folder(p)) for p in folders]  # as one where that is not clear
+        each = (one.recordings if one.reading == "several" else (p,) for p, one in below)
+        return FolderReading((*chain(*each), *bags), "several", "in folders of their own")
     if len(bags) < 2:  # by its own name: there may be more later
         return FolderReading(tuple(bags), "one") if bags else alone
     spans = sorted((*_span(bag), bag) for bag in bags)
@@ -61,10 +65,14 @@ def read_folder(path: Path) -> FolderReading:
     return FolderReading(tuple(bag for *_, bag in spans), reading, why)
 
 
-def _is_recording(path: Path) -> bool:
+def _is_recording(path: Path, depth: int = 1) -> bool:
+    """Whether a folder is one, or holds some: files, and folders so many levels down."""
     if (path / "metadata.yaml").exists() or (path / "velodyne").is_dir():
         return True
-    return any(p.suffix in BAG_SUFFIXES for p in path.iterdir())
+    return any(
+        depth > 0 and _is_recording(p, depth - 1) if p.is_dir() else p.suffix in BAG_SUFFIXES
+        for p in entries(path)
+    )
 
 
 def _span(bag: Path) -> tuple[int, int]:

@@ -4,12 +4,14 @@ All functions raise a SequenceError that names the file or folder that is missin
 """
 
 import re
+from calendar import timegm
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from decimal import Decimal, InvalidOperation
 from functools import partial
 from itertools import takewhile
 from pathlib import Path
+from time import strptime
 from typing import Any, ClassVar
 
 import numpy as np
@@ -17,11 +19,11 @@ from numpy.typing import NDArray
 
 from adaptune import geometry, open3d
 from adaptune.errors import Finding, NotInstalledError
-from adaptune.files import DAMAGED_NPZ
+from adaptune.files import DAMAGED_NPZ, entries
 from adaptune.geometry import Poses
 from adaptune.recording.clouds import FARTHEST, PointCloudError, from_fields
 from adaptune.recording.scan import Frame, Imu, Scan, SequenceError
-from adaptune.recording.timing import AUTO, Timing
+from adaptune.recording.timing import AUTO, SOONEST, Timing
 from adaptune.trajectory import Trajectory, read_kitti
 
 SUFFIXES = (".bin", ".npy", ".pcd", ".ply")
@@ -203,7 +205,7 @@ def scan_folder(folder: Path, timing: Timing = AUTO) -> FileSource:
     if not folder.is_dir():
         raise SequenceError(f"{folder}: there is no such folder")
     places = [folder / below for below in ("", "data", "velodyne_points/data")]
-    found = ((p, sorted(p.glob(f"*{s}"), key=_natural)) for p in places for s in SUFFIXES)
+    found = ((p, sorted(entries(p, s), key=_natural)) for p in places for s in SUFFIXES)
     place, files = next(((p, files) for p, files in found if files), (folder, []))
     if not files:
         raise SequenceError(f"{folder}: holds no scan ({', '.join(SUFFIXES)}) and no bag")
@@ -238,9 +240,11 @@ def _natural(path: Path) -> list[tuple[int, str]]:
     return [(int(n or 0), text) for text, n in re.findall(r"(\D*)(\d*)", path.stem)]
 
 
-# Times in the names of files: the number, and what may come after it as a part of a second; the
-# power of ten that makes the number nanoseconds. Short ones count from 1970.
+# Times in the names of files: a date or a number, and what may come after it as a part of a second;
+# the power of ten that makes the number nanoseconds. Short ones count from 1970.
+_DATE = r"(?:^|\D)((?:19|20)\d\d(?:[-_.]?\d\d){2}[-_.T ]?\d\d(?:[-_.:hm]?\d\d){2})"
 _NAMES = (
+    (_DATE + r"([._,-]?(?:\d{3}){1,3}|\.\d+|)\D*$", None, "dates in UTC"),
     (r"^(\d{1,10})(\.\d+)$", 9, "seconds"),
     (r"(?:^|\D)([1-4]\d{9})([._-]\d{1,9})\D*$", 9, "seconds and their parts"),
     (r"(?:^|\D)(\d{17,19})()\D*$", 0, "nanoseconds"),
@@ -257,14 +261,41 @@ def _named_stamps(files: Sequence[Path]) -> tuple[NDArray[np.int64] | None, str]
         found = [match.groups() for match in map(re.compile(pattern).search, stems) if match]
         if len(found) < len(stems):
             continue
-        # `_5` is five nanoseconds, unless all have the same number of digits: `_000005`.
-        padded = len({len(rest) for _, rest in found}) == 1 or found[0][1].startswith(".")
-        parts = [rest[1:].ljust(9, "0")[:9] if padded else rest[1:] for _, rest in found]
-        times = zip(found, parts, strict=True)
-        return np.array([int(n) * 10**power + int(part) for (n, _), part in times], np.int64), unit
+        try:
+            begin = np.array([_nanoseconds(whole, power) for whole, _ in found], np.int64)
+        except (ValueError, OverflowError):
+            continue  # no dates, or no times
+        stamps = begin + _parts(begin, [rest for _, rest in found])
+        # A number that counts may follow a date.
+        if power is not None or np.ptp(stamps) >= SOONEST * (len(files) - 1):
+            return stamps, unit
     numbers = [int(re.sub(r"\D", "", stem) or 0) for stem in stems]
     look = len(stems) > 1 and numbers[0] > 1e7 and np.median(np.diff(numbers)) > 1
     return None, files[0].name if look else ""
+
+
+def _nanoseconds(text: str, power: int | None) -> int:
+    if power is None:
+        return timegm(strptime(re.sub(r"\D", "", text), "%Y%m%d%H%M%S")) * 10**9
+    return int(text) * int(10**power)
+
+
+def _parts(begin: NDArray[np.int64], rest: list[str]) -> NDArray[np.int64]:
+    """Nanoseconds of the digits that follow the seconds that `begin`.
+
+    Where their numbers differ, zeros may be lacking behind them, or before: scans come evenly.
+    Unless that tells, `.5` is half a second, and `_5` is five nanoseconds.
+    """
+    parts, widths = [re.sub(r"\D", "", text) for text in rest], [0]
+    most = max(map(len, parts))
+    if min(map(len, parts)) < most and not any(re.match(r"0\d", part) for part in parts):
+        widths = sorted([0, *(w for w in (9, 6, 3) if w >= most)], reverse=rest[0][0] != ".")
+    digits = ([part.zfill(width).ljust(9, "0")[:9] for part in parts] for width in widths)
+    read = [np.array(ones, np.int64) for ones in digits]
+    steps = [np.log(np.maximum(np.diff(np.sort(begin + ones)), 1)) for ones in read]
+    uneven = [np.abs(s - np.median(s)).sum() if len(s) else 0.0 for s in steps]
+    best = int(np.argmin(uneven))
+    return read[best if uneven[best] < 0.5 * uneven[0] else 0]
 
 
 def kitti(folder: Path, elevation: float | None = None) -> FileSource:
@@ -275,7 +306,7 @@ def kitti(folder: Path, elevation: float | None = None) -> FileSource:
     """
     if not folder.is_dir():
         raise SequenceError(f"{folder}: there is no such folder")
-    files = sorted((folder / "velodyne").glob("*.bin"))
+    files = entries(folder / "velodyne", ".bin")
     if not files:
         raise SequenceError(f"{folder}: not a KITTI sequence; it has no velodyne/*.bin")
     stamps = _seconds(folder / "times.txt")

@@ -140,7 +140,8 @@ def inspect(path: Path, deep: bool = False, show: Progress = unseen) -> Inspecti
     if (path / "velodyne").is_dir():
         return _inspect_scans(path, "kitti", deep, show)
     # Files of a ROS 2 folder may be compressed, and then have other suffixes.
-    if {p.suffix for p in path.iterdir()} & {*BAG_SUFFIXES} or (path / "metadata.yaml").exists():
+    there = files.entries(path)
+    if {p.suffix for p in there} & {*BAG_SUFFIXES} or path / "metadata.yaml" in there:
         return _inspect_bags(path, deep, show)
     return _inspect_scans(path, "folder", deep, show)
 

@@ -80,6 +80,7 @@ class Reading(NamedTuple):
     clock: int | None = None  # nanoseconds of the first point, if the sensor gives its own clock
     unread: str = ""  # a field whose name says that it holds times, and whose values do not
     marks: float = 0.0  # share of the points that mark rays that did not come back, far away
+    wrapped: float = 0.0  # seconds that the times span as stored, where some wrapped below zero
 
 
 UNREAD = Reading()

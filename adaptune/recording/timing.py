@@ -62,7 +62,8 @@ class Timing:
             start = stamp - round(self.period * 1e9) if self.stamp == "end" else stamp
             none = values is None or self.unit == "none"
             return start, None if none else np.empty(0, np.float32), UNREAD
-        values, extent = _unwrapped(values, extent)
+        spread = extent[1] - extent[0]
+        values, extent = _unwrapped(stamp, values, extent)
         scale, absolute = self._scale(stamp, values.dtype, extent)
         self._check(values.dtype, extent, scale, absolute)
         zero, begin = self._start(stamp, extent, scale, absolute)
@@ -73,9 +74,11 @@ class Timing:
             small = values.dtype.kind in "iu" and values.dtype.itemsize < 8
             wide = values.astype(np.int64) if small else values
             times = ((wide - wide.dtype.type(zero)) * scale).astype(np.float32)
-        start, clock = stamp + round(begin * 1e9), _nanoseconds(extent[0], scale)
+        start = stamp + round(begin * 1e9)
+        clock = _nanoseconds(extent[0], scale) if absolute else None
         first, last = ((end - zero) * scale for end in extent)
-        return start, times, Reading(start, first, last, scale, clock if absolute else None)
+        wrapped = spread * scale if extent[1] - extent[0] < spread else 0.0
+        return start, times, Reading(start, first, last, scale, clock, wrapped=wrapped)
 
     def _check(
         self, dtype: np.dtype[Any], extent: tuple[float, float], scale: float, absolute: bool
@@ -156,15 +159,23 @@ def _agree(stamp: float, extent: tuple[float, float], scale: float) -> bool:
 
 
 def _unwrapped(
-    values: NDArray[Any], extent: tuple[float, float]
+    stamp: int, values: NDArray[Any], extent: tuple[float, float]
 ) -> tuple[NDArray[Any], tuple[float, float]]:
-    """The times and their extent; those below zero, which unsigned numbers wrap, as such."""
-    size, spread = values.dtype.itemsize, extent[1] - extent[0]
-    if values.dtype.kind == "u" and size >= 4 and spread > 2 ** (8 * size - 1):
-        signed = values.view(f"i{size}")
-        low, high = int(signed.min()), int(signed.max())
-        if high - low < spread // 2:
-            return signed, (low, high)
+    """The times and their extent; those below zero, which unsigned numbers wrap, as such.
+
+    Also those that wrapped as nanoseconds of 32 bits before they became other numbers.
+    """
+    (low, high), size = extent, values.dtype.itemsize
+    unsigned = values.dtype.kind == "u" and size >= 4
+    turns = [2 ** (8 * size)] if unsigned else [2**32 * 1e-9 / s for s in _SECONDS.values()]
+    # All may be below zero; but a simulator's clock may be as small as four bytes.
+    below = unsigned and size == 4 and low > 0.9 * 2**32 and stamp > 10**10
+    for turn in (t for t in turns if below or 0.5 * t < high - low < 1.001 * t):
+        late = values > low + turn / 2
+        moved = values.view(f"i{size}") if unsigned else np.where(late, values - turn, values)
+        first, last = moved.min().item(), moved.max().item()
+        if last - first < 0.25 * turn:
+            return moved, (first, last)
     return values, extent
 
 
@@ -180,6 +191,10 @@ def doubts(readings: Sequence[Reading], period: float, timing: Timing = AUTO) ->
         mend = "name their unit if it holds those of the points (`time_unit`), or write `none`"
         yield Finding((), f"the field {unread!r} looks like times and is not read", mend, of="imu")
     timed = [reading for reading in readings if reading.last == reading.last]
+    if wrapped := [reading.wrapped for reading in timed if reading.wrapped]:
+        what = f"in {len(wrapped)} of {len(timed)} scans some points are {max(wrapped):.2f} s later"
+        what += " than the others: times below zero were stored without a sign"
+        yield Finding((), what, "adaptune takes them as below zero", of="points")
     if len(timed) >= 5 and period * 1e9 >= SOONEST:
         first, last = np.array([reading[1:3] for reading in timed]).T
         late, span = float(np.median(first)), float(np.median(last - first))

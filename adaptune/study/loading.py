@@ -8,7 +8,7 @@ from itertools import combinations, product
 from pathlib import Path
 from typing import Any, TypeVar
 
-from adaptune import yaml12
+from adaptune import errors, yaml12
 from adaptune.errors import AdaptuneError, Finding, Key, NotInstalledError, OdometryError, nearest
 from adaptune.odometry.base import Description
 from adaptune.odometry.registry import (
@@ -179,6 +179,10 @@ def _overlaps(config: StudyConfig, opened: dict[str, RecordedSequence]) -> Itera
             return opened[names[0]].shares_scans(opened[names[1]])
         return False
 
+    for one, other in combinations(dict.fromkeys(config.training), 2):
+        if same(one, other):
+            what = f"training: {one!r} and {other!r} hold the same scans, which count twice"
+            errors.warn_once(f"{what}; leave one of them out")
     for (i, test), training in product(enumerate(config.test), config.training):
         if test != training and same(test, training):
             message = (
@@ -249,13 +253,19 @@ def _override(data: dict[str, Any], text: str) -> Key:
     dotted, equals, value = text.partition("=")
     if not equals or not dotted:
         raise ConfigurationError(f"-o {text}: give a key and a value, as in -o offline.trials=32")
-    *parents, last = path = tuple(dotted.split("."))
-    for part in parents:
-        if data.get(part) is None:
-            data[part] = {}
-        data = data[part]
+    path, rest = Key(), dotted.split(".")
+    while True:
+        # A name may hold dots itself.
+        names = (".".join(rest[:n]) for n in range(len(rest), 0, -1))
+        last = next((name for name in names if name in data), rest[0])
+        path, rest = (*path, last), rest[last.count(".") + 1 :]
+        if not rest:
+            break
+        if data.get(last) is None:
+            data[last] = {}
+        data = data[last]
         if not isinstance(data, dict):
-            raise ConfigurationError(f"-o {text}: {part} has no keys below it")
+            raise ConfigurationError(f"-o {text}: {last} has no keys below it")
     try:
         data[last] = yaml12.Document(value).data
     except yaml12.YamlError as error:

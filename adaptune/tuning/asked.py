@@ -1,6 +1,7 @@
 """What a user asks to tune: recordings, or folders of them, and an odometry."""
 
 import logging
+import shlex
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -9,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from adaptune.errors import AdaptuneError, NotInstalledError
+from adaptune.files import plain_name
 from adaptune.progress import Progress
 
 if TYPE_CHECKING:
@@ -63,6 +65,14 @@ class Asked(NamedTuple):
         return dict(plain({spelt.get(k, f"--{k}"): v for k, v in found.items() if k not in limits}))
 
 
+def words_of(given: str) -> list[str]:
+    """A command as words; a file's name is one."""
+    try:
+        return [given] if Path(given).exists() else shlex.split(given)
+    except ValueError as error:  # of quotes
+        raise AdaptuneError(f"{given}: {error}; put \\ before a quote in a name") from error
+
+
 def check_no_study(path: Path) -> None:
     """Refuse a study where a recording is expected."""
     if path.suffix in (".yaml", ".yml") or (path / "study.yaml").is_file():
@@ -102,7 +112,9 @@ def recorded(asked: Asked, show: Progress) -> "tuple[dict[str, Inspection], list
     check_alike(inspections)
     named: dict[str, Inspection] = {}
     for inspection in inspections:
-        names = chain([inspection.name], (f"{inspection.name}_{i}" for i in count(2)))
+        path = inspection.path
+        longer = plain_name(path.with_name(f"{path.parent.name}_{path.name}"))
+        names = chain([inspection.name, longer], (f"{inspection.name}_{i}" for i in count(2)))
         named[next(name for name in names if name not in named)] = inspection
     return named, list(named)[len(paths) - len(tested) :]
 

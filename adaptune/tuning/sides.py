@@ -1,7 +1,6 @@
 """The gate for changes: drive what is not known yet on both sides, and compare."""
 
 import os
-import shlex
 import shutil
 from collections.abc import Sequence
 from contextlib import suppress
@@ -13,7 +12,7 @@ from adaptune.errors import AdaptuneError
 from adaptune.files import plain_name
 from adaptune.machine import pin
 from adaptune.progress import Progress
-from adaptune.tuning.asked import Asked, recorded
+from adaptune.tuning.asked import Asked, recorded, words_of
 from adaptune.tuning.studies import is_image
 from adaptune.yaml12 import Document, YamlError
 
@@ -113,7 +112,7 @@ def _entry(given: str, odometry: str) -> dict[str, Any]:
     from adaptune.odometry.registry import is_user_class, odometry_class
 
     file = Path(given)
-    if len(shlex.split(given)) > 1 or file.suffix not in (".yaml", ".yml", ".json"):
+    if len(words_of(given)) > 1 or file.suffix not in (".yaml", ".yml", ".json"):
         return _named(given)
     if not file.is_file():
         raise AdaptuneError(f"{given}: there is no such file")
@@ -137,7 +136,7 @@ def _entry(given: str, odometry: str) -> dict[str, Any]:
 
 
 def _named(given: str) -> dict[str, Any]:
-    words = shlex.split(given)
+    words = words_of(given)
     if len(words) > 1:
         # It runs in a folder of its own.
         words = [str(Path(w).absolute()) if Path(w).is_file() else w for w in words]

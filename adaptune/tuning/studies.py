@@ -2,7 +2,6 @@
 
 import logging
 import re
-import shlex
 import shutil
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -15,7 +14,7 @@ from adaptune import manifest
 from adaptune.errors import AdaptuneError, NotInstalledError
 from adaptune.files import plain_name, write_text
 from adaptune.progress import Progress, about
-from adaptune.tuning.asked import EACH, TRIALS, Asked, odometries_of, recorded
+from adaptune.tuning.asked import EACH, TRIALS, Asked, odometries_of, recorded, words_of
 from adaptune.yaml12 import Document, YamlError, YamlPath, dump
 
 if TYPE_CHECKING:
@@ -247,20 +246,18 @@ def _grown(path: Path, asked: Asked, show: Progress) -> list[str]:
         "training": [name for name, recording in added.items() if recording.path not in tested],
         "test": [name for name, recording in added.items() if recording.path in tested],
     }
-    roles_now = {role: list(data.get(role) or ()) for role in into}
-    n, before = offline.get("stretches", 12), len(roles_now["training"]) or 1
+    new_of = {name: recording.given for name, recording in added.items()}
+    more: dict[YamlPath, Any] = {("sequences",): new_of} | {(r,): n for r, n in into.items() if n}
+    n, before = offline.get("stretches", 12), len(data.get("training") or ()) or 1
     if into["training"] and isinstance(n, int):
         # As many stretches of each as before: the trials that there are stay.
         each, now = max(4, -(-n // before)), before + len(into["training"])
-        data["offline"] = offline | {"stretches": each * now}
-    data["sequences"] |= {name: recording.given for name, recording in added.items()}
-    for role, names in into.items():
-        # 00 is a name there.
-        data[role] = [
-            name if isinstance(name, str | dict) else document.name((role, i))
-            for i, name in enumerate(roles_now[role])
-        ] + names
-    write_text(path, dump(data, document.comments))
+        more[("offline", "stretches")] = each * now
+    for at, value in more.items():
+        document = Document(document.with_added(at, value))
+    if (document.data or {})["sequences"] != data["sequences"] | new_of:
+        raise AdaptuneError(f"{path}: cannot be added to; add {', '.join(new_of)} as the others")
+    write_text(path, document.text)
     return list(added)
 
 
@@ -387,7 +384,7 @@ def _estimate(study: "OfflineStudy", names: Sequence[str], show: Progress) -> No
 
 def _system_of(given: str) -> dict[str, Any] | None:
     """The image or the launch command of a ROS system, as settings; None if it is none."""
-    words = shlex.split(given)
+    words = words_of(given)
     if words[:1] == ["ros2"]:
         if not any("{parameters}" in word for word in words):
             words.append(f"{LACKING}:={{parameters}}")

@@ -48,6 +48,11 @@ def test_sections_may_not_overlap(load, one, three, overlapping):
         load(*overrides)
 
 
+def test_a_copy_among_the_training_sequences_is_told(load, caplog):
+    load("training=[one, three]", "test=[]")
+    assert "training: 'one' and 'three' hold the same scans, which count twice" in caplog.text
+
+
 def write_folder(folder, scans):
     folder.mkdir(exist_ok=True)
     for i, points in enumerate(scans):

@@ -133,19 +133,25 @@ def test_what_is_dumped_is_read_back(data):
     assert repr(back) == repr(data)
 
 
-def test_comments_come_back():
-    text = "# mine\na: 1 # at its end\nb:  # of b\n  # inner\n  c: [1]\nd:\n- e: 1 # item\n  f: 2\n"
-    document = Document(text)
-    found = dump(document.data, document.comments)
-    assert found == (
-        "# mine\n# at its end\na: 1\n# of b\nb:\n  # inner\n  c:\n  - 1\n"
-        "d:\n  # item\n- e: 1\n  f: 2\n"
-    )
-    again = Document(found)
-    assert (again.data, dump(again.data, again.comments)) == (document.data, found)
-    assert dump({"x": 1}, document.comments) == "x: 1\n"
-    spaced = Document("# head\n\n\na: 1\n\n\nb: 2\n")
-    assert dump(spaced.data, spaced.comments) == "# head\na: 1\nb: 2\n"
+@pytest.mark.parametrize(
+    ("text", "path", "added", "changed"),
+    [
+        ("a:\n- 00  # x\n# y\n- 1\n\n# of b\nb: 1\n", ["a"], ["c"], ("- 1\n", "- 1\n- c\n")),
+        ("a: &x\n  - b\nc: *x\n# end\n", [], {"d": 1}, ("*x\n", "*x\nd: 1\n")),
+        ("a: &x\n  - b\nc: *x\n", ["a"], ["c"], ("- b\n", "- b\n  - c\n")),
+        ("a: [b, # x\n  'c'  # y\n ]\n", ["a"], ["d"], ("'c'", "'c', d")),
+        ("a: {b: {c: 1e-3}}", ["a"], {"d": {"e": "01"}}, ("}}", "}, d: {e: '01'}}")),
+        ("a: {b: 1, }", ["a"], {"c": 1}, ("1,", "1, c: 1,")),
+        ("a:  # x\nb: 1\n", ["a"], ["c"], ("a:", "a: [c]")),
+        ("a: []\n", ["a"], ["c", {"d": [1]}], ("[]", "[c, {d: [1]}]")),
+        ("a:\n    b:\n      c: 1", ["a"], {"d": {"e": 1}}, ("1", "1\n    d:\n      e: 1\n")),
+        ("a:\n  b: 1\n", ["a", "c"], 48, ("1\n", "1\n  c: 48\n")),
+        ("a: {b: 1} # x\n", ["a", "b"], 48, ("1", "48")),
+        ("a: 1\n", ["c", "d"], 48, ("1\n", "1\nc:\n  d: 48\n")),
+    ],
+)
+def test_nothing_else_changes_where_something_is_added(text, path, added, changed):
+    assert Document(text).with_added(path, added) == text.replace(*changed)
 
 
 @pytest.mark.parametrize("text", ["a\udcff.bag", "a\0", "\ud800"])

@@ -148,6 +148,30 @@ def test_too_little_to_tell_is_a_result_of_its_own(bags):
     assert gate("bad", "good", "--unclear", "fail", **few).exit_code == 3
 
 
+PROGRAM = """import sys
+from pathlib import Path
+from adaptune.recording import SequenceConfig
+from adaptune.recording.recording import open_sequence
+from adaptune.trajectory import Trajectory, write_tum
+source, output, left_out = sys.argv[1:]
+known = open_sequence(SequenceConfig(bag=source, reference="/truth")).reference()
+kept = [i for i in range(len(known)) if (i + 1) % int(left_out)]
+write_tum(Path(output), Trajectory(known.stamps[kept], known.T_world_sensor[kept]))
+"""
+
+
+@pytest.mark.services
+def test_a_side_that_lacks_poses_is_worse(bags):
+    (bags / "program.py").write_text(PROGRAM)
+    drives = [f"{sys.executable} program.py {{input}} {{output}} {n}" for n in (12, 1000)]
+    given = ("drive_a.bag", "--reference", "/truth", *COSTS)
+    done = commands.call("compare", drives[0], *given, "--against", drives[1])
+    assert done.exit_code == 3, done.output
+    assert "12 scans without a pose instead of 0" in done.stdout
+    assert "(scans without a pose)" in done.stdout
+    assert commands.call("compare", drives[1], *given, "--against", drives[0]).exit_code == 0
+
+
 @pytest.mark.parametrize(
     ("ratio", "ends", "verdict"),
     [
@@ -179,6 +203,10 @@ def test_the_interval_decides(ratio, ends, verdict):
         (["bad.yaml", "--against", "good.yaml", "--sub-trajectory", "-1"], "give metres, more"),
         (["bad.yaml", "--sub-trajectory", "3"], "--sub-trajectory: goes with --against"),
         (["bad.yaml", "none.bag", "--against", "good.yaml", *FAKE], "none.bag: there is no such"),
+        (
+            ["o'hare --x", "drive_a.bag", "--against", "gicp"],
+            "o'hare --x: No closing quotation; put",
+        ),
         (["no.yaml", "drive_a.bag", "--against", "good.yaml", *FAKE], "no.yaml: there is no such"),
     ],
 )

@@ -142,12 +142,36 @@ def test_the_last_of_several_bags_is_the_test(bag, study_file, tmp_path):
     failed(bag, study_file.parent / "two.bag", "other/one.bag", "--minutes", 6)
     study = study_in("runs/one_and_more/one_and_more.yaml")
     assert study.training == ["one", "two"]
-    assert study.config.test == ("one_2",)
+    assert study.config.test == ("other_one",)
     assert (study.config.offline.trials, study.config.offline.hours) == (None, 0.1)
     assert "one.bag: is named twice; the test" in failed(bag, bag, "--folder", "twice")
     shutil.copy(bag, tmp_path / "other/copy.bag")
     said = failed(bag, "other/copy.bag", "--folder", "twice")
     assert said.startswith("error: test.0: 'copy' is the recording of the training sequence 'one'")
+
+
+@pytest.mark.parametrize(("given", "why"), [("o'hare", "No closing"), ("a\\", "No escaped")])
+def test_quotes_that_do_not_close_are_told(bag, given, why):
+    assert f"{given}: {why}" in failed(bag, "--odometry", given)
+
+
+@pytest.mark.usefixtures("decided")
+def test_a_folder_that_grows_changes_only_the_lists_of_its_study(study_file):
+    Path("drives").mkdir()
+    for name in ("one", "two"):
+        shutil.copy(study_file.parent / f"{name}.bag", f"drives/{name}.bag")
+    failed("drives", "--as", "several")
+    path = Path("runs/drives/drives.yaml")
+    text = path.read_text().replace("training:\n- one\n", "training: [  # mine\n  'one' ]  # why\n")
+    path.write_text(text.replace("  two:\n", "  two: &b  # on a road\n") + "# the end\n")
+    before = path.read_text().splitlines()
+    shutil.copy(study_file.parent / "three.bag", "drives/three.bag")
+    failed("drives", "--as", "several")
+    after = path.read_text().splitlines()
+    assert [line for line in before if line not in after] == ["  'one' ]  # why"]
+    study = study_in(path)
+    assert (study.training, study.config.test) == (["one", "three"], ("two",))
+    assert study.config.offline.stretches == 24
 
 
 def test_of_several_odometries_the_replayed_one_is_named(monkeypatch):

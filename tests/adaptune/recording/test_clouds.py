@@ -159,6 +159,9 @@ DIALECTS = {
         -100,
     ),
     "wrapped below zero": ("t", "<u4", [2**32 - 1000, 0, 10**8], NS, [0, 1e-6, 0.100001], -0.001),
+    "all wrapped below zero": ("t", "<u4", [2**32 - 10**8, 2**32 - 1], NS, [0, 0.1], -100),
+    "wrapped, and then seconds": ("time", "<f4", [4.294966296, 0, 0.1], NS, [0, 0, 0.1], 0),
+    "wrapped, absolute": ("t", "<f8", [S + 4.294967296, S, S + 0.1], NS, [0, 0, 0.1], 0),
     "microseconds, absolute": ("timestamp", "<f8", [S * 1e6, S * 1e6 + 1e5], NS, [0, 0.1], 0),
 }
 
@@ -175,6 +178,16 @@ def test_times_count_from_the_start_of_the_scan_in_every_dialect(
     assert scan.times is not None
     np.testing.assert_allclose(scan.times, expected, atol=1e-6)
     assert abs(scan.stamp - (stamp + shift * 10**6)) < 1000
+
+
+@pytest.mark.parametrize(
+    ("kind", "late"), [("<u4", 2**32 - 1000), ("<f4", 4.294966), ("<u4", 10**8)]
+)
+def test_times_that_wrap_are_told(kind, late):
+    scans = [decode(rec.cloud(raw_of(2, time=(kind, [0, late])), NS + n * 10**8)) for n in range(9)]
+    told = [str(doubt) for doubt in doubts([scan.reading for scan in scans], 0.1)]
+    said = "in 9 of 9 scans some points are 4.29 s later than the others"
+    assert any(said in text for text in told) == (late != 10**8)
 
 
 @pytest.mark.parametrize(

@@ -1,8 +1,10 @@
 """Folders: the parts of one recording, or several recordings."""
 
+import commands
 import drives
 import pytest
 
+from adaptune.recording.config import bag_paths
 from adaptune.recording.fleet import check_alike, read_folder, recordings_at
 from adaptune.recording.inspect import inspect
 from adaptune.recording.scan import SequenceError
@@ -53,6 +55,27 @@ def test_a_folder_of_folders_holds_several(tmp_path):
     for name in ("monday", "tuesday"):
         write(tmp_path / name, drive_0=0.0, drive_1=1.0)
     assert recordings_at([tmp_path]) == [tmp_path / "monday", tmp_path / "tuesday"]
+
+
+def test_folders_of_days_hold_their_recordings_and_their_parts(tmp_path):
+    write(tmp_path / "2024/monday", run_1=0.0, run_2=500.0)
+    write(tmp_path / "2024/tuesday", run_0=0.0, run_1=1.0)
+    runs = [tmp_path / "2024/monday/run_1.bag", tmp_path / "2024/monday/run_2.bag"]
+    assert recordings_at([tmp_path]) == [*runs, tmp_path / "2024/tuesday"]
+    said = commands.succeeded("inspect", tmp_path).output
+    assert "2024/monday/run_1.bag" in said
+    assert "lacks" not in said.partition("run_1.bag")[2]
+
+
+def test_files_of_an_operating_system_are_no_recordings(tmp_path):
+    write(tmp_path, drive=0.0)
+    for name in ("._drive.bag", ".DS_Store", "Thumbs.db", "__MACOSX/._drive.bag"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(b"\0\5\x16\7")
+    (tmp_path / "@eaDir/drive.bag").mkdir(parents=True)
+    assert recordings_at([tmp_path]) == [tmp_path / "drive.bag"]
+    for given in (tmp_path, tmp_path / "*.bag"):
+        assert bag_paths([str(given)]) == [tmp_path / "drive.bag"]
 
 
 def test_a_bag_that_is_being_recorded_is_told(tmp_path):

@@ -159,6 +159,14 @@ def test_cloudcompares_intensities_are_read(tmp_path):
         (["1700000000_5", "1700000000_250000000"], None, [S + 5, S + 25 * 10**7]),
         (["1700000000.9.pcd", "1700000000.10.pcd"], None, [S + 10**8, S + 9 * 10**8]),
         (["0000000000", "0000000001"], None, [0, 10**8]),
+        # Nanoseconds and microseconds without leading zeros, and halves and quarters.
+        ([f"1700000000.{n}" for n in (5, 200000005, 400000005, 600000005)], None, [S + 5]),
+        ([f"170000000{n}" for n in ("0_5", "0_400005", "0_800005", "1_200005")], None, [S + 5000]),
+        ([f"1700000000.{n}" for n in ("25", "5", "75")], None, [S + 25 * 10**7, S + 5 * 10**8]),
+        ([f"1700000000_{n}" for n in ("05", "1", "15")], None, [S + 5 * 10**7, S + 10**8]),
+        (["a20231114221320000", "a20231114221321250"], None, [S, S + 125 * 10**7]),
+        (["2023-11-14-22-13-20.5", "2023-11-14-22-13-21.25"], None, [S + 5 * 10**8]),
+        (["20231114.221320", "20231114.221323"], None, [S, S + 3 * 10**9]),
         (["1", "2"], "5.000000001\n6\n", [5_000_000_001, 6 * 10**9]),
         (["1", "2"], "1700000000100\n1700000000250\n", [S + 10**8, S + 25 * 10**7]),
         (["1", "2"], "1700000000000000005\n1700000001000000000\n", [S + 5, S + 10**9]),
@@ -166,7 +174,7 @@ def test_cloudcompares_intensities_are_read(tmp_path):
     ],
 )
 def test_stamps_of_files(tmp_path, names, times, stamps):
-    for name, points in zip(names, rec.scans(2), strict=True):
+    for name, points in zip(names, rec.scans(len(names)), strict=True):
         np.save(tmp_path / f"{name}.npy", points)
     if times:
         (tmp_path / "times.txt").write_text(times)
@@ -174,12 +182,19 @@ def test_stamps_of_files(tmp_path, names, times, stamps):
     assert found[: len(stamps)] == stamps
 
 
+def test_hidden_files_are_no_scans(tmp_path):
+    for name in ("1", "2"):
+        np.save(tmp_path / f"{name}.npy", rec.scans(1)[0])
+        (tmp_path / f"._{name}.npy").write_bytes(b"\0\5\x16\7")
+    assert inspect(tmp_path).n_messages == 2
+
+
 def test_names_that_look_like_times_and_are_not_read_are_told(tmp_path):
-    for i, number in enumerate(("20231114_221320_1", "20231114_221320_6")):
+    for i, number in enumerate(("14_11_2023_221320_1", "14_11_2023_221320_6")):
         np.save(tmp_path / f"{number}.npy", rec.scans(2)[i])
     told = inspect(tmp_path)
     assert texts(told) == [
-        "the names of the files look like times and are not read (20231114_221320_1.npy); one "
+        "the names of the files look like times and are not read (14_11_2023_221320_1.npy); one "
         "every 0.1 s, as nothing gives their times; write a times.txt with the seconds of each "
         "scan, or set `period`"
     ]
