@@ -3,6 +3,7 @@
 import inspect
 import json
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -13,8 +14,9 @@ from pydantic import BaseModel, ConfigDict, RootModel
 from adaptune import processes, strict
 from adaptune.errors import Finding, NotInstalledError, OdometryError
 from adaptune.odometry import wire
-from adaptune.odometry.base import Description, Odometry
+from adaptune.odometry.base import Description, Odometry, ToolSettings
 from adaptune.odometry.remote import SERVICE
+from adaptune.odometry.template import Template
 from adaptune.space import ParameterSet, ParameterSpace
 from adaptune.strict import validated
 
@@ -160,8 +162,26 @@ def declare_here(name: str, settings: Any, folder: Path | None = None) -> Declar
     mistakes: list[Finding] = []
     context = None if folder is None else {"folder": folder}
     checked: Any = validated(cls.settings_type, settings, (), mistakes, context)
+    if isinstance(checked, ToolSettings) and (template := checked.template):
+        _check_whose(name, template, cls._under(template))
     describes = checked is not None or issubclass(cls, Odometry)
     return Declaration(checked, mistakes, cls.describe(checked) if describes else None)
+
+
+def _check_whose(name: str, template: Template, under: str) -> None:
+    """Refuse the parameter file of another odometry, which names more than what both have."""
+    held = {path.rpartition(".")[2] for path in template.names if path.startswith(under)}
+    there = dict[str, set[str]]()
+    for other in ODOMETRIES:
+        with suppress(OdometryError):  # one that is not installed
+            there[other] = held.intersection(odometry_class(other).space.names)
+    if others := [other for other, names in there.items() if names > there[name]]:
+        whose = max(others, key=lambda other: len(there[other]))
+        more = ", ".join(sorted(there[whose] - there[name]))
+        raise OdometryError(
+            f"{template.path}: holds {more}, which {name} does not have: it is a file of {whose}; "
+            f"name that (--odometry {whose})"
+        )
 
 
 def forget_user_code() -> None:
