@@ -160,11 +160,14 @@ def read_scenario(path: Path | str) -> Scenario:
     path = Path(path)
     try:
         columns, about = _columns(path), json.loads(_sets_path(path).read_text("utf-8"))
-        features, errors = (
-            np.stack([of for name, of in columns.items() if name.startswith(kind)], axis=1)
-            for kind in ("feature_", "rte_")
+        sets, numbers = about["sets"], range(sum(about["blocks"].values()))
+        trials, costs, parameters = (
+            [one[key] for one in sets] for key in ("trial", "cost", "parameters")
         )
-        trials, costs, parameters = zip(*(one.values() for one in about["sets"]), strict=True)
+        features, errors = (
+            np.stack([columns[f"{kind}_{i}"] for i in which], axis=1)
+            for kind, which in (("feature", numbers), ("rte", trials))
+        )
         frame, end, stretch, fold = (columns[name].astype(np.intp) for name in _OF_FRAMES[1:])
         return Scenario(
             columns["sequence"].astype(str),
@@ -175,7 +178,7 @@ def read_scenario(path: Path | str) -> Scenario:
             features.astype(np.float32),
             errors.astype(np.float32),
             about["blocks"],
-            ParameterSets(load_space(about["space"]), trials, parameters),
+            ParameterSets(load_space(about["space"]), tuple(trials), tuple(parameters)),
             np.array(costs, float),
         )
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:

@@ -1,13 +1,19 @@
 """What an odometry is, by its content: versions, sources, programs."""
 
+import ast
 import os
 import shutil
 import sys
-from importlib import metadata
+from contextlib import suppress
+from importlib import machinery, metadata
+from itertools import accumulate, product
 from pathlib import Path
 from typing import Any
 
 from adaptune.odometry.registry import ENTRY_POINTS, ODOMETRIES, PACKAGES, PROGRAMS
+
+_SUFFIXES = machinery.all_suffixes()
+_LONGEST = 1 << 20  # bytes of source; what is longer is none
 
 Content = dict[str, str]
 """By what it is of, in words, a version or the hash of a file."""
@@ -16,9 +22,9 @@ Content = dict[str, str]
 def odometry_content(name: str, settings: Any, module: str = "") -> Content:
     """What the poses of an odometry depend on besides its name, settings and parameters.
 
-    Nothing of the user's is imported. What a class imports, shared libraries, and a program behind
-    an address are not part of it. The settings name the files of a program. `module` is the one in
-    which a class is written, if another one exports it.
+    Nothing of the user's is imported. Shared libraries, and a program behind an address, are not
+    part of it. The settings name the files of a program. `module` is the one in which a class is
+    written, if another one exports it.
     """
     if name in PROGRAMS:
         return _program(settings)
@@ -33,10 +39,10 @@ def odometry_content(name: str, settings: Any, module: str = "") -> Content:
 
 
 def python_content(name: str, group: str, written_in: str = "") -> Content:
-    """Source of a module, and version of the distribution that it is from.
+    """Source of a module and of those that it imports, and version of the distribution it is from.
 
     `name` is ``module:attribute``, or what a distribution calls it in an entry-point group. The
-    source of `written_in` counts, too.
+    source of `written_in` counts, too. See `_imported`.
     """
     versions: Content = {}
     if ":" not in name:
@@ -53,7 +59,36 @@ def python_content(name: str, group: str, written_in: str = "") -> Content:
         for package in metadata.packages_distributions().get(module.partition(".")[0], ()):
             versions[f"version of {package}"] = package_version(package)
     files = {module: file} | {m: f for m in [written_in] if m and (f := module_file(m))}
+    for name, path in dict(files).items():
+        root = path.parents[name.count(".") + (path.stem == "__init__")]
+        files |= {os.path.relpath(one, root): one for one in _imported(path, root)}
     return versions | {f"module {m}": _fingerprint(f) for m, f in files.items()}
+
+
+def _imported(file: Path, folder: Path) -> set[Path]:
+    """Files of what Python code imports, itself or through others, from a folder or PYTHONPATH.
+
+    Nothing is run. What is installed is not followed, its version tells.
+    """
+    others = filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))
+    found, new, folders = set[Path](), [file], [folder, *map(Path, others)]
+    while new:
+        file, tree = new.pop(), ast.Module([], [])
+        with suppress(OSError, ValueError, SyntaxError, RecursionError):  # no Python, or of another
+            tree = ast.parse(file.read_bytes() if file.stat().st_size < _LONGEST else b"")
+        for node in ast.walk(tree):
+            level, of = getattr(node, "level", 0), getattr(node, "module", None) or ""
+            names = [one.name for one in getattr(node, "names", ()) if isinstance(one, ast.alias)]
+            for root, name in product([file.parents[level - 1]] if level else folders, names):
+                parts = [part for part in f"{of}.{name}".split(".") if part]
+                if "-packages" in str(root) or parts[0] in ("adaptune", "offline", "online"):
+                    continue
+                wheres = accumulate(parts, Path.joinpath, initial=root)
+                files = (Path(f"{w}{end}") for w in wheres for end in ("/__init__.py", *_SUFFIXES))
+                more = {one for one in files if one.is_file()} - found
+                found |= more
+                new += more
+    return found
 
 
 def module_file(name: str) -> Path | None:
@@ -82,7 +117,9 @@ def _program(settings: Any) -> Content:
         # Arguments may be anything, also too long for a path.
         for file in (name or "", *(name or "").split("=", 1)[1:]):
             if os.path.isfile(file):  # noqa: PTH113
-                content[file] = _fingerprint(Path(file))
+                content[file] = _fingerprint(path := Path(file).resolve())
+                imported = _imported(path, path.parent)
+                content |= {str(module): _fingerprint(module) for module in imported}
     return content
 
 

@@ -1,9 +1,12 @@
 """The gate for changes: drive what is not known yet on both sides, and compare."""
 
+import logging
 import shlex
 import shutil
+import time
 from collections.abc import Sequence
 from contextlib import suppress
+from datetime import datetime
 from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any
@@ -20,6 +23,7 @@ if TYPE_CHECKING:
     from offline.config import OfflineStudy
     from online.gate import Side
 
+_log = logging.getLogger(__name__)
 FOLDER = Path("runs/compare")
 """Where what the gate drives is kept."""
 
@@ -33,8 +37,16 @@ def sides(given: Sequence[str], asked: Asked, show: Progress) -> "tuple[Side, Si
     """
     from online.gate import Side
 
-    studies = _driven(given, asked, show) if asked.recordings else _studies(given)
+    studies, now = _driven(given, asked, show) if asked.recordings else _studies(given), time.time()
     _drive(studies, show)
+    for name, study in zip(given, studies, strict=True):
+        made = [path.stat().st_mtime for path in study.folder.glob("replays/*/*/replay.json")]
+        if made and (first := min(made)) < now:
+            _log.info(
+                f"{name}: its replays of {datetime.fromtimestamp(first):%Y-%m-%d %H:%M} are "
+                f"compared. Libraries and other files that it loads may have changed since; to "
+                f"drive it anew, remove {study.folder / 'replays'}"
+            )
     new, old = (Side(name, study) for name, study in zip(given, studies, strict=True))
     return new, old
 
