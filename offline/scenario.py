@@ -16,6 +16,7 @@ from adaptune.errors import AdaptuneError
 from adaptune.files import replacing, write_text
 from adaptune.metrics import cap
 from adaptune.model import Rule, TrainingData
+from adaptune.model.registry import asked, selected
 from adaptune.model.rules import Costs, SetCost
 from adaptune.report.tables import csv_text
 from adaptune.space import ParameterSets, load_space
@@ -82,9 +83,9 @@ class Scenario(NamedTuple):
             features = pca.fit(self.features[rest]).transform(self.features)
             of_rest = features[rest], self.stretch[rest], self.performances[rest]
             fixed, costs = self.fixed(rest), Costs(each, 0.0)
-            rule.fit(TrainingData(*of_rest, self.sets, fixed, costs=costs))
+            asked(rule.fit, TrainingData(*of_rest, self.sets, fixed, costs=costs))
             for i in np.flatnonzero(left_out):
-                selection = rule.select(features[i])
+                selection = selected(rule, self.sets, features[i])
                 if selection.weights is not None:
                     why = "its error is not one of the table's; take `adaptune validate`"
                     raise AdaptuneError(f"{type(rule).__name__}: weighs a bank: {why}")

@@ -52,6 +52,7 @@ from offline.objective import (
     failed_in_words,
     judge,
     label,
+    unread_in_words,
 )
 from offline.search import BUDGETS, ELAPSED, Finished, Stopwatch
 from offline.tuning import NO_BANK, choose, driven_cost, reserve, rivals
@@ -68,7 +69,7 @@ class Training(NamedTuple):
     # For every training sequence what the baseline, the fixed set and its own best set do there.
     rows: list[dict[str, Any]]
     said: Sequence[str] = ()  # further sentences
-    failed: Sequence[str] = ()  # a sentence if some sets failed
+    failed: Sequence[str] = ()  # sentences if some sets failed, or all gave the same poses
     # What error costs, a row for each choice, that which is recommended first.
     front: Sequence[dict[str, Any]] = ()
     elsewhere: str = ""  # what to expect of such a choice elsewhere
@@ -152,7 +153,8 @@ def train(
     said += bare_in_words(archive, whole, fixed, dropped)
     rows_of_front = front_rows(usable, model)
     tables.write_rows(study.folder, "front", rows_of_front)
-    failed, elsewhere = failed_in_words(verdicts), left_out_in_words(usable)
+    failed = [*unread_in_words(finished), *failed_in_words(verdicts)]
+    elsewhere = left_out_in_words(usable)
     return Training(model, trials, rows, said, failed, rows_of_front, elsewhere)
 
 

@@ -16,7 +16,7 @@ from adaptune.archive import Archive
 from adaptune.errors import AdaptuneError
 from adaptune.metrics import bootstrap, cap
 from adaptune.model import ErrorModel, ModelError
-from adaptune.model.registry import ADAPTIVE, RULES, rule_class
+from adaptune.model.registry import ADAPTIVE, RULES, asked, rule_class, selected
 from adaptune.model.rules import BASELINE, ERROR_FLOOR
 from adaptune.progress import Progress, unseen
 from adaptune.report import tables
@@ -233,8 +233,9 @@ def leave_out(
     chosen = choose(others, bank, by_recording, MOST_FOLDS)
     alone, costs = others.costs.alone, dict[str, float]()
     for name in (name for name in rules if name != ADAPTIVE):
-        rule = rule_class(name).of(None).fit(data)
-        trials = [rule.select(features[i]).trial for i in first]
+        rule = asked(rule_class(name).of, None)
+        asked(rule.fit, data)
+        trials = [selected(rule, data.sets, features[i]).trial for i in first]
         errors[name] = capped[frames, data.sets.columns(trials)[period]]
         adapted[name] = float(np.mean([trial != data.fixed for trial in trials]))
         costs[name] = float(np.mean([alone(trial) for trial in trials]))

@@ -13,7 +13,6 @@ from typing import Any
 from adaptune.odometry.registry import ENTRY_POINTS, ODOMETRIES, PACKAGES, PROGRAMS
 
 _SUFFIXES = machinery.all_suffixes()
-_LONGEST = 1 << 20  # bytes of source; what is longer is none
 
 Content = dict[str, str]
 """By what it is of, in words, a version or the hash of a file."""
@@ -65,30 +64,28 @@ def python_content(name: str, group: str, written_in: str = "") -> Content:
     return versions | {f"module {m}": _fingerprint(f) for m, f in files.items()}
 
 
-def _imported(file: Path, folder: Path) -> set[Path]:
+def _imported(file: Path, folder: Path) -> list[Path]:
     """Files of what Python code imports, itself or through others, from a folder or PYTHONPATH.
 
-    Nothing is run. What is installed is not followed, its version tells.
+    Nothing is run. What is installed is not followed: its version tells.
     """
     others = filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))
-    found, new, folders = set[Path](), [file], [folder, *map(Path, others)]
-    while new:
-        file, tree = new.pop(), ast.Module([], [])
-        with suppress(OSError, ValueError, SyntaxError, RecursionError):  # no Python, or of another
-            tree = ast.parse(file.read_bytes() if file.stat().st_size < _LONGEST else b"")
+    found, folders = [file], [folder, *map(Path, others)]
+    for source in found:  # which grows
+        tree = ast.Module([], [])
+        with suppress(ValueError, SyntaxError):  # of another Python
+            tree = ast.parse(source.read_bytes() if source.suffix == ".py" else b"")
         for node in ast.walk(tree):
             level, of = getattr(node, "level", 0), getattr(node, "module", None) or ""
             names = [one.name for one in getattr(node, "names", ()) if isinstance(one, ast.alias)]
-            for root, name in product([file.parents[level - 1]] if level else folders, names):
+            for root, name in product([source.parents[level - 1]] if level else folders, names):
                 parts = [part for part in f"{of}.{name}".split(".") if part]
                 if "-packages" in str(root) or parts[0] in ("adaptune", "offline", "online"):
                     continue
                 wheres = accumulate(parts, Path.joinpath, initial=root)
                 files = (Path(f"{w}{end}") for w in wheres for end in ("/__init__.py", *_SUFFIXES))
-                more = {one for one in files if one.is_file()} - found
-                found |= more
-                new += more
-    return found
+                found += [one for one in files if one.is_file() and one not in found]
+    return found[1:]
 
 
 def module_file(name: str) -> Path | None:
@@ -117,9 +114,9 @@ def _program(settings: Any) -> Content:
         # Arguments may be anything, also too long for a path.
         for file in (name or "", *(name or "").split("=", 1)[1:]):
             if os.path.isfile(file):  # noqa: PTH113
-                content[file] = _fingerprint(path := Path(file).resolve())
-                imported = _imported(path, path.parent)
-                content |= {str(module): _fingerprint(module) for module in imported}
+                path = Path(file).resolve()
+                content[file] = _fingerprint(path)
+                content |= {str(one): _fingerprint(one) for one in _imported(path, path.parent)}
     return content
 
 

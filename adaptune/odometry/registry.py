@@ -12,7 +12,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, RootModel
 
 from adaptune import processes, strict
-from adaptune.errors import Finding, NotInstalledError, OdometryError
+from adaptune.errors import Finding, NotInstalledError, OdometryError, hidden
 from adaptune.odometry import wire
 from adaptune.odometry.base import Description, Odometry, ToolSettings
 from adaptune.odometry.remote import SERVICE
@@ -77,7 +77,7 @@ def odometry_class(name: str) -> type[Any]:
     except strict.PluginError as error:
         if name in ODOMETRIES and isinstance(error.__cause__, ImportError):
             what = f"{name} cannot be imported ({error.__cause__})"
-            help_ = f"run `pip install {PACKAGES.get(name, name)}`"
+            help_ = hidden(error.__cause__) or f"run `pip install {PACKAGES.get(name, name)}`"
             raise NotInstalledError(f"{what}; {help_}") from error
         raise OdometryError(str(error)) from error
     if name in PROGRAMS:
@@ -175,13 +175,11 @@ def _check_whose(name: str, template: Template, under: str) -> None:
     for other in ODOMETRIES:
         with suppress(OdometryError):  # one that is not installed
             there[other] = held.intersection(odometry_class(other).space.names)
-    if others := [other for other, names in there.items() if names > there[name]]:
-        whose = max(others, key=lambda other: len(there[other]))
-        more = ", ".join(sorted(there[whose] - there[name]))
-        raise OdometryError(
-            f"{template.path}: holds {more}, which {name} does not have: it is a file of {whose}; "
-            f"name that (--odometry {whose})"
-        )
+    whose = max(there, key=lambda other: len(there[other]) * (there[other] > there[name]))
+    if there[whose] > there[name]:
+        what = f"{template.path}: holds {', '.join(sorted(there[whose] - there[name]))}"
+        help_ = f"it is a file of {whose}; name that (--odometry {whose})"
+        raise OdometryError(f"{what}, which {name} does not have: {help_}")
 
 
 def forget_user_code() -> None:
