@@ -197,6 +197,9 @@ def tune(
     progress
         Called with how far each task is; by default, bars show it.
     """
+    if reading not in (None, "one", "several"):
+        raise AdaptuneError(f"reading: give 'one' or 'several', not {reading!r}")
+    overrides = [overrides] if isinstance(overrides, str) else overrides
     name, about = named_odometry(odometry or ("gicp" if config is None else "kiss_icp"))
     judged = None if reference is None else str(reference)
     file = None if config is None else Path(config)
