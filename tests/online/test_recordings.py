@@ -15,7 +15,7 @@ from adaptune.odometry.tracker import RegisteredScan
 from adaptune.space import Selection
 from adaptune.trajectory import Trajectory
 from offline.config import load_study
-from online.record import StoredReplayError, write_replay
+from online.record import StoredReplay, StoredReplayError, write_replay
 from online.recordings import record_replays, topic
 from online.reference import write_reference
 from online.replay import Choice, ReplayRecord
