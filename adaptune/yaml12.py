@@ -108,7 +108,8 @@ class _Foreign(yaml.SafeLoader):
 
 
 # Tags of other tools, as !!opencv-matrix, say nothing of what is below them.
-_Foreign.add_constructor(None, lambda loader, node: getattr(loader, f"construct_{node.id}")(node))
+_plain: Any = lambda loader, node: getattr(loader, f"construct_{node.id}")(node)  # noqa: E731
+_Foreign.add_constructor(None, _plain)
 
 
 class Document:

@@ -29,7 +29,7 @@ class NoSelf(Cheapest):
         super().fit(data)
 
 
-class Nothing(Cheapest):
+class Empty(Cheapest):
     def select(self, feature, live=NOTHING):
         pass
 
