@@ -55,7 +55,7 @@ def selected(
     rule: Rule, sets: ParameterSets, feature: Any, live: Live = NOTHING, members: Any = None
 ) -> Selection:
     """What a rule selects; a `RuleError` if that is none of the sets, or weighs other members."""
-    found = asked(rule.select, feature, live)
+    found: Selection = asked(rule.select, feature, live)
     sound = isinstance(found, Selection) and found.trial in sets
     sound = sound and found.parameters == sets[found.trial]
     if not sound or not (None in (found.weights, members) or {*found.weights} == {*members}):

@@ -89,7 +89,7 @@ def test_rules_are_scored_without_an_odometry(study):
     near = found.score(NearestNeighbours(k=3))
     assert near.shape == (42,)
     assert np.isin(near, cap(found.performances)).all()
-    with pytest.raises(AdaptuneError, match="Best.select: ValueError: not enough values"):
+    with pytest.raises(AdaptuneError, match=r"Best\.select: ValueError: not enough values"):
         found.score(Best())
     for folds in (np.zeros(42, np.intp), np.arange(42) % 2):
         with pytest.raises(AdaptuneError, match="nothing is left to learn from"):
