@@ -26,9 +26,17 @@ def main() -> None:
     most = _FILES if hard < 0 else min(hard, _FILES)
     if 0 <= soft < most:
         resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
-    from adaptune.commands import cli
+    try:
+        from adaptune.commands import cli
 
-    cli.main()
+        cli.main()
+    except ImportError as error:
+        from adaptune.errors import hidden
+
+        if not (said := hidden(error)):
+            raise
+        sys.stderr.write(f"error: {error}: {said}\n")
+        sys.exit(2)
 
 
 if __name__ == "__main__":

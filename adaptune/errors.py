@@ -3,10 +3,13 @@
 import difflib
 import errno
 import logging
+import os
+import sys
 import traceback
 from collections.abc import Iterable
 from functools import cache
 from importlib import import_module
+from importlib.machinery import PathFinder
 from typing import Any, NamedTuple
 
 
@@ -113,12 +116,25 @@ def nearest(name: str, names: Iterable[str]) -> str:
     return f"there is {', '.join(map(repr, names))}" if names else "there is none"
 
 
+def hidden(error: BaseException) -> str:
+    """Which package PYTHONPATH hides, where that may have led to an ImportError; else nothing."""
+    theirs = [*filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
+    ours = [folder for folder in sys.path if folder not in theirs]
+    frames = (at.f_globals.get("__name__") for at, _ in traceback.walk_tb(error.__traceback__))
+    for name in (getattr(error, "name", None), *frames):
+        package = str(name).partition(".")[0]
+        specs = [PathFinder.find_spec(package, path) for path in (theirs, ours)]
+        if specs[0] and specs[1]:
+            where = specs[0].origin
+            return f"{package} comes from PYTHONPATH ({where}), before the installed one; unset it"
+    return ""
+
+
 @cache
 def import_extra(extra: str, *modules: str) -> tuple[Any, ...]:
     """Import modules of a package that one of adaptune's extras installs; an error without it."""
     try:
         return tuple(map(import_module, modules))
     except ImportError as error:
-        install = f"pip install 'adaptune[{extra}]'"
-        what = f"{extra} cannot be imported ({error}); run `{install}`"
-        raise NotInstalledError(what) from error
+        help_ = hidden(error) or f"run `pip install 'adaptune[{extra}]'`"
+        raise NotInstalledError(f"{extra} cannot be imported ({error}); {help_}") from error

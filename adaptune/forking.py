@@ -10,7 +10,7 @@ from concurrent.futures import Executor, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from functools import cache
-from multiprocessing import forkserver, get_context, parent_process
+from multiprocessing import current_process, forkserver, get_context, parent_process
 from multiprocessing.context import ForkServerContext
 from multiprocessing.util import get_temp_dir
 
@@ -35,6 +35,9 @@ def end_with_parent() -> None:
 
 def fork_server(*preload: str) -> ForkServerContext:
     """What forks processes that have imported some modules; it is started if there is none."""
+    if current_process().daemon:
+        help_ = "call adaptune in the main process, or in threads"
+        raise AdaptuneError(f"a process of multiprocessing.Pool may start no others: {help_}")
     # A process forked from one with threads may deadlock.
     context = get_context("forkserver")
     context.set_forkserver_preload(list(preload))

@@ -23,7 +23,7 @@ from adaptune.model.descriptor import (
     lowest_elevation,
     speed_and_turn_rate,
 )
-from adaptune.model.registry import ADAPTIVE, STANDBY, rule_class
+from adaptune.model.registry import ADAPTIVE, STANDBY, asked, rule_class, selected
 from adaptune.model.rules import NOVEL_FAMILIARITY, Live
 from adaptune.model.weights import measured_weights, weighted_selection
 from adaptune.odometry.base import Motions
@@ -209,7 +209,8 @@ class Selector(_Measuring):
             spreads = spread_of(np.where(np.isfinite(vectors), vectors, FAILURE))
             self._usual_spread = float(np.quantile(spreads, UNUSUAL))
         data = model.training_data(self._pca, self.members or None)
-        self._rule = cls.of(model.bank_settings if gives_weights else None).fit(data)
+        self._rule = asked(cls.of, model.bank_settings if gives_weights else None)
+        asked(self._rule.fit, data)
         self._describe = Describer(model.blocks)
         if self._describe.blocks != model.blocks:
             raise DescriptorError(
@@ -281,7 +282,8 @@ class Selector(_Measuring):
         self._foreign = self._rule.needs_known_sensor and self._is_foreign(self._scan)
         self._resting = frozenset()
         live = Live(self._worse_than_predicted, self._live.squares, self._at_work)
-        selection = self._rule.select(feature, live)._replace(resting=self._resting)
+        selection = selected(self._rule, self._sets, feature, live, self.members)
+        selection = selection._replace(resting=self._resting)
         self._failed = False
         # Where the fixed set does worse than predicted, training's guess is better than none.
         if self._foreign and self.fixed not in self._worse:

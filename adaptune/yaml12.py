@@ -99,15 +99,17 @@ def _count(node: Any, counted: dict[int, int]) -> int:
 
 
 class _Foreign(yaml.SafeLoader):
-    """What ROS 1 reads: YAML 1.1, where 1e3 is a text; of a key that comes twice, the last counts.
-
-    Keys stay as they are written.
-    """
+    """What ROS 1 reads: YAML 1.1, where 1e3 is a text. Keys stay as they are written."""
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
         """Construct a mapping."""
         self.flatten_mapping(node)
         return {str(key.value): self.construct_object(value, deep) for key, value in node.value}
+
+
+# Tags of other tools, as !!opencv-matrix, say nothing of what is below them.
+_plain: Any = lambda loader, node: getattr(loader, f"construct_{node.id}")(node)  # noqa: E731
+_Foreign.add_constructor(None, _plain)
 
 
 class Document:
@@ -118,11 +120,15 @@ class Document:
 
     def __init__(self, text: str, foreign: bool = False):
         self.text = text
+        if foreign:
+            # OpenCV begins files so, which no YAML does; all places in the text stay.
+            text = re.sub(r"\A(\ufeff?)%YAML:", r"\1#YAML:", text)
         try:
             loader = _Foreign(text) if foreign else _Loader(text)
             self._node = loader.get_single_node()
             if self._node is not None and _count(self._node, {}) > _MOST:
                 raise YamlError(f"holds more than {_MOST:,} values, or an alias of itself")
+            self.again = [*_again(self._node)] if foreign else []  # before keys are merged
             self.data = None if self._node is None else loader.construct_document(self._node)
         except yaml.MarkedYAMLError as error:
             mark = error.problem_mark or error.context_mark
@@ -217,11 +223,21 @@ def _keys(node: Any, path: YamlPath = ()) -> Iterator[tuple[YamlPath, Any, Any]]
     """The keys of all mappings in a node, with their paths and the nodes of both."""
     if isinstance(node, yaml.MappingNode):
         for key, value in node.value:
-            yield (*path, key.value), key, value
-            yield from _keys(value, (*path, key.value))
+            there = (*path, str(key.value))
+            yield there, key, value
+            yield from _keys(value, there)
     elif isinstance(node, yaml.SequenceNode):
         for i, value in enumerate(node.value):
             yield from _keys(value, (*path, i))
+
+
+def _again(root: Any) -> Iterator[tuple[str, int, int]]:
+    """The keys that come again in a mapping, with their lines, and those of the first ones."""
+    first: dict[YamlPath, Any] = {}
+    for path, key, _ in _keys(root):
+        if first.setdefault(path, key) is not key and key.tag != _PREFIX + "merge":
+            lines = (one.start_mark.line + 1 for one in (key, first[path]))
+            yield ".".join(map(str, path)), *lines
 
 
 class _Dumper(yaml.SafeDumper):

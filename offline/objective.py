@@ -8,8 +8,8 @@ import numpy as np
 
 from adaptune.archive import Summary
 from adaptune.geometry import Poses
-from adaptune.metrics import absolute_error, kitti_error, relative_error
-from adaptune.space import ParameterSet
+from adaptune.metrics import FAILURE, absolute_error, kitti_error, relative_error
+from adaptune.space import ODOMETRY, ParameterSet
 from offline.config import TIMED, Metric, OfflineConfig
 
 UNITS: dict[Metric, str] = {
@@ -90,6 +90,22 @@ def failed_in_words(verdicts: Mapping[int, Verdict]) -> list[str]:
     return [
         f"{failures.total()} of {len(verdicts)} parameter sets failed and are never chosen: "
         f"{why}{often}; `trials.csv` has all reasons."
+    ]
+
+
+def unread_in_words(finished: Mapping[str, Mapping[int, Summary]]) -> list[str]:
+    """A sentence for each odometry whose sets all gave the same poses, by sequence and trial."""
+    errors: dict[str, list[tuple[float, ...]]] = {}
+    for number, run in next(iter(finished.values())).items():
+        if not run.failure:
+            each = tuple(of[number].mean_error for of in finished.values())
+            errors.setdefault(str(run.parameters.get(ODOMETRY, "")), []).append(each)
+    return [
+        f"All {len(every)} sets {f'of {label} ' * bool(label)}gave the same poses, to the last "
+        f"digit: no parameter has an effect; look whether they reach the program."
+        for label, every in errors.items()
+        # Where track is always lost, nobody knows.
+        if len(every) > len({*every}) == 1 and min(every[0]) < FAILURE
     ]
 
 

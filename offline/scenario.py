@@ -16,6 +16,7 @@ from adaptune.errors import AdaptuneError
 from adaptune.files import replacing, write_text
 from adaptune.metrics import cap
 from adaptune.model import Rule, TrainingData
+from adaptune.model.registry import asked, selected
 from adaptune.model.rules import Costs, SetCost
 from adaptune.paired import MIN_RECORDINGS
 from adaptune.report.tables import csv_text
@@ -82,9 +83,9 @@ class Scenario(NamedTuple):
             features = pca.fit(self.features[rest]).transform(self.features)
             of_rest = features[rest], self.stretch[rest], self.performances[rest]
             fixed, costs = self.fixed(rest), Costs(each, 0.0)
-            rule.fit(TrainingData(*of_rest, self.sets, fixed, costs=costs))
+            asked(rule.fit, TrainingData(*of_rest, self.sets, fixed, costs=costs))
             for i in np.flatnonzero(left_out):
-                selection = rule.select(features[i])
+                selection = selected(rule, self.sets, features[i])
                 if selection.weights is not None:
                     why = "its error is not one of the table's; take `adaptune validate`"
                     raise AdaptuneError(f"{type(rule).__name__}: weighs a bank: {why}")
@@ -160,11 +161,14 @@ def read_scenario(path: Path | str) -> Scenario:
     path = Path(path)
     try:
         columns, about = _columns(path), json.loads(_sets_path(path).read_text("utf-8"))
-        features, errors = (
-            np.stack([of for name, of in columns.items() if name.startswith(kind)], axis=1)
-            for kind in ("feature_", "rte_")
+        sets, numbers = about["sets"], range(sum(about["blocks"].values()))
+        trials, costs, parameters = (
+            [one[key] for one in sets] for key in ("trial", "cost", "parameters")
         )
-        trials, costs, parameters = zip(*(one.values() for one in about["sets"]), strict=True)
+        features, errors = (
+            np.stack([columns[f"{kind}_{i}"] for i in which], axis=1)
+            for kind, which in (("feature", numbers), ("rte", trials))
+        )
         frame, end, stretch, fold = (columns[name].astype(np.intp) for name in _OF_FRAMES[1:])
         return Scenario(
             columns["sequence"].astype(str),
@@ -175,7 +179,7 @@ def read_scenario(path: Path | str) -> Scenario:
             features.astype(np.float32),
             errors.astype(np.float32),
             about["blocks"],
-            ParameterSets(load_space(about["space"]), trials, parameters),
+            ParameterSets(load_space(about["space"]), tuple(trials), tuple(parameters)),
             np.array(costs, float),
         )
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:

@@ -52,6 +52,7 @@ from offline.objective import (
     failed_in_words,
     judge,
     label,
+    unread_in_words,
 )
 from offline.search import BUDGETS, ELAPSED, Finished, Stopwatch
 from offline.tuning import choose, recommends_bank, reserve
@@ -68,7 +69,7 @@ class Training(NamedTuple):
     # For every training sequence what the baseline, the fixed set and its own best set do there.
     rows: list[dict[str, Any]]
     said: Sequence[str] = ()  # further sentences
-    failed: Sequence[str] = ()  # a sentence if some sets failed
+    failed: Sequence[str] = ()  # sentences if some sets failed, or all gave the same poses
     # What error costs, a row for each choice, that which is recommended first.
     front: Sequence[dict[str, Any]] = ()
 
@@ -151,7 +152,8 @@ def train(
     said += bare_in_words(archive, whole, fixed, dropped)
     rows_of_front = front_rows(usable, model)
     tables.write_rows(study.folder, "front", rows_of_front)
-    return Training(model, trials, rows, said, failed_in_words(verdicts), rows_of_front)
+    failed = [*unread_in_words(finished), *failed_in_words(verdicts)]
+    return Training(model, trials, rows, said, failed, rows_of_front)
 
 
 def _left_out(others: LabelledData, drives: Mapping[int, Summary]) -> float | None:

@@ -16,7 +16,7 @@ from adaptune.archive import Archive
 from adaptune.errors import AdaptuneError
 from adaptune.metrics import cap
 from adaptune.model import ErrorModel, ModelError
-from adaptune.model.registry import ADAPTIVE, RULES, STANDBY, rule_class
+from adaptune.model.registry import ADAPTIVE, RULES, STANDBY, asked, rule_class, selected
 from adaptune.model.rules import BASELINE, ERROR_FLOOR
 from adaptune.paired import MIN_RECORDINGS, Pair, ratio
 from adaptune.progress import Progress, unseen
@@ -211,8 +211,9 @@ def leave_out(
     chosen = choose(others, bank, by_recording, MOST_FOLDS)
     alone, costs = others.costs.alone, dict[str, float]()
     for name in (name for name in rules if name not in (ADAPTIVE, STANDBY)):
-        rule = rule_class(name).of(None).fit(data)
-        trials = [rule.select(features[i]).trial for i in first]
+        rule = asked(rule_class(name).of, None)
+        asked(rule.fit, data)
+        trials = [selected(rule, data.sets, features[i]).trial for i in first]
         errors[name] = capped[frames, data.sets.columns(trials)[period]]
         adapted[name] = float(np.mean([trial != data.fixed for trial in trials]))
         costs[name] = float(np.mean([alone(trial) for trial in trials]))

@@ -23,6 +23,7 @@ from adaptune import manifest
 from adaptune.errors import AdaptuneError
 from adaptune.files import replacing, write_text
 from adaptune.odometry.tracker import RegisteredScan
+from adaptune.space import load_space
 from adaptune.strict import ConfigurationError, in_one_line
 from adaptune.trajectory import Trajectory, TrajectoryError, read_tum, tum_lines, write_tum
 from online.replay import Choice, ReplayRecord
@@ -145,6 +146,8 @@ class StoredReplay:
             stamps = np.array(list(map(int, columns.pop("stamp_ns"))), np.int64)
             weights = _weights(columns.pop("weights"))
             selections = {name: _floats(columns.pop(name)) for name in _NUMBERS}
+            # Another version of adaptune may have written further columns.
+            names = load_space(summary.inputs["odometry"]["parameters"]).names
         except (OSError, KeyError, ValueError) as error:
             raise damaged(path, error) from error
         if {len(frames[name]) for name in FRAME_COLUMNS[1:-1]} != {len(trajectory)}:
@@ -154,7 +157,7 @@ class StoredReplay:
             kept = summary.inputs["parameters"] or {}
             columns = {name: [str(value)] for name, value in kept.items()}
             stamps, selections = trajectory.stamps[:1], dict.fromkeys(_NUMBERS, np.full(1, np.nan))
-        choices = {name: _numbers(values) for name, values in columns.items()}
+        choices = {name: _numbers(columns[name]) for name in names if name in columns}
         return cls(summary, trajectory, frames, stamps, choices, weights, selections)
 
 

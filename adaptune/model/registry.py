@@ -1,10 +1,13 @@
 """The selection rules by name: adaptune's own, and the user's."""
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
+from textwrap import shorten
+from typing import Any
 
 from adaptune import strict
-from adaptune.errors import AdaptuneError
-from adaptune.model.rules import Rule
+from adaptune.errors import AdaptuneError, in_a_line
+from adaptune.model.rules import NOTHING, Live, Rule
+from adaptune.space import ParameterSets, Selection
 
 RULES = {
     "adaptive": "adaptune.model.weights:BankRule",
@@ -36,4 +39,27 @@ def rule_class(name: str, also: Collection[str] = ()) -> type[Rule]:
         raise RuleError(f"{name}: cannot be imported: {strict.in_one_line(error)}") from error
     if not (isinstance(found, type) and issubclass(found, Rule)):
         raise RuleError(f"{name}: is not a class derived from adaptune.model.Rule")
+    return found
+
+
+def asked(method: Callable[..., Any], *given: Any) -> Any:
+    """What a method of a rule returns; a `RuleError` says what goes wrong in it."""
+    try:
+        return method(*given)
+    except AdaptuneError:
+        raise
+    except Exception as error:
+        raise RuleError(f"{method.__qualname__}: {in_a_line(error)}") from error
+
+
+def selected(
+    rule: Rule, sets: ParameterSets, feature: Any, live: Live = NOTHING, members: Any = None
+) -> Selection:
+    """What a rule selects; a `RuleError` if that is none of the sets, or weighs other members."""
+    found: Selection = asked(rule.select, feature, live)
+    sound = isinstance(found, Selection) and found.trial in sets
+    sound = sound and found.parameters == sets[found.trial]
+    if not sound or not (None in (found.weights, members) or {*found.weights} == {*members}):
+        what = f"{rule.select.__qualname__}: returns {shorten(repr(found), 120)}"
+        raise RuleError(f"{what}; return Selection(trial, data.sets[trial])")
     return found

@@ -104,7 +104,9 @@ class Pipeline(OwnFrameOdometry):
         if template is not None:
             # adaptune drives on one thread, whatever the file says.
             names = [name for name in self._defaults if name not in self.untuned]
-            of_user = template.held(names, self._under(template))
+            under = self._under(template)
+            of_user = template.held(names, under)
+            template.check_known(self._defaults, self.pipeline, under)
         kept = {name: self._typed(name, v) for name, v in of_user.items()}
         given = {name: self._typed(name, v) for name, v in (parameters or {}).items()}
         self.parameters |= {name: v for name, v in kept.items() if name in self.space.names} | given

@@ -38,6 +38,7 @@ _SECTION = {
 _KNOWN = {f"{section}.{name}" for name, section in _SECTION.items()} | {
     "out_dir",
     "data.preprocess",  # of older versions
+    *("covariance.position_covariance", "covariance.orientation_covariance"),  # of its node
 }
 
 

@@ -344,7 +344,7 @@ class FileRun(WholeRun):
         if (own := self.own_file(self.parameters, self.settings)) is None:
             return None
         file = folder / Path(self.settings.template).name
-        file.write_text(own.text, encoding="utf-8")
+        file.write_text(own.text, encoding="utf-8", errors="surrogateescape")
         return file
 
     def arguments(self, given: ProgramInput, **paths: str | Path) -> list[str]:

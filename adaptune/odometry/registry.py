@@ -3,6 +3,7 @@
 import inspect
 import json
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -11,10 +12,11 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, RootModel
 
 from adaptune import processes, strict
-from adaptune.errors import Finding, NotInstalledError, OdometryError
+from adaptune.errors import Finding, NotInstalledError, OdometryError, hidden
 from adaptune.odometry import wire
-from adaptune.odometry.base import Description, Odometry
+from adaptune.odometry.base import Description, Odometry, ToolSettings
 from adaptune.odometry.remote import SERVICE
+from adaptune.odometry.template import Template
 from adaptune.space import ParameterSet, ParameterSpace
 from adaptune.strict import validated
 
@@ -75,7 +77,7 @@ def odometry_class(name: str) -> type[Any]:
     except strict.PluginError as error:
         if name in ODOMETRIES and isinstance(error.__cause__, ImportError):
             what = f"{name} cannot be imported ({error.__cause__})"
-            help_ = f"run `pip install {PACKAGES.get(name, name)}`"
+            help_ = hidden(error.__cause__) or f"run `pip install {PACKAGES.get(name, name)}`"
             raise NotInstalledError(f"{what}; {help_}") from error
         raise OdometryError(str(error)) from error
     if name in PROGRAMS:
@@ -160,8 +162,24 @@ def declare_here(name: str, settings: Any, folder: Path | None = None) -> Declar
     mistakes: list[Finding] = []
     context = None if folder is None else {"folder": folder}
     checked: Any = validated(cls.settings_type, settings, (), mistakes, context)
+    if isinstance(checked, ToolSettings) and (template := checked.template):
+        _check_whose(name, template, cls._under(template))
     describes = checked is not None or issubclass(cls, Odometry)
     return Declaration(checked, mistakes, cls.describe(checked) if describes else None)
+
+
+def _check_whose(name: str, template: Template, under: str) -> None:
+    """Refuse the parameter file of another odometry, which names more than what both have."""
+    held = {path.rpartition(".")[2] for path in template.names if path.startswith(under)}
+    there = dict[str, set[str]]()
+    for other in ODOMETRIES:
+        with suppress(OdometryError):  # one that is not installed
+            there[other] = held.intersection(odometry_class(other).space.names)
+    whose = max(there, key=lambda other: len(there[other]) * (there[other] > there[name]))
+    if there[whose] > there[name]:
+        what = f"{template.path}: holds {', '.join(sorted(there[whose] - there[name]))}"
+        help_ = f"it is a file of {whose}; name that (--odometry {whose})"
+        raise OdometryError(f"{what}, which {name} does not have: {help_}")
 
 
 def forget_user_code() -> None:

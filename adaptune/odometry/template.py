@@ -3,9 +3,11 @@
 import copy
 import json
 import re
+import textwrap
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
 from functools import reduce
+from multiprocessing import parent_process
 from operator import getitem
 from pathlib import Path
 from typing import Any
@@ -35,14 +37,17 @@ class Template:
         if path.suffix not in _SUFFIXES:
             raise OdometryError(f"{path}: a template is a file of {', '.join(_SUFFIXES)}")
         try:
-            # Ends of lines stay as they are.
-            self._text = path.read_bytes().decode()
+            # Ends of lines stay as they are, and comments in another encoding.
+            self._text = path.read_bytes().decode(errors="surrogateescape")
             self._document = self._parsed(self._text)
         except FileNotFoundError as error:
             raise OdometryError(f"{path}: there is no such file") from error
         except (OSError, ValueError, yaml12.YamlError) as error:
             raise OdometryError(f"{path}: {error}") from error
         self._data: Any = self._document.data
+        for name, line, first in self._document.again if parent_process() is None else ():
+            what = f"{name} is given twice, first in line {first}; adaptune and ROS 1 take the last"
+            warn_once(f"{path}, line {line}: {what} one, other programs may not; leave one out")
         held = isinstance(self._data, dict | list)
         self._places = list(_places(self._data)) if held else []
 
@@ -51,7 +56,9 @@ class Template:
             json.loads(text)
             # JSON is YAML but for tabs, which it has between values only.
             text = text.replace("\t", " ")
-        return yaml12.Document(text, foreign=True)
+        if "\0" in text:
+            raise ValueError("is not text in UTF-8; save it so")
+        return yaml12.Document(re.sub("[\udc80-\udcff]", "?", text), foreign=True)
 
     def path_of(self, name: str) -> tuple[str, ...]:
         """Keys of a value, from the outermost on; none if there is no such, an error if several."""
@@ -95,23 +102,25 @@ class Template:
             raise OdometryError(f"{self.path.name} has no such value; {known}")
         return place[1][place[2]]
 
-    def check_known(self, known: Collection[str], tool: str) -> None:
-        """Refuse names that are not `known` to a tool, and warn of those outside its sections.
+    def check_known(self, known: Collection[str], tool: str, under: str = "") -> None:
+        """Refuse names that are not `known` to a tool in its sections, and warn of other numbers.
 
-        A file without these sections, or in ROS 2's layout, may hold anything.
+        ROS 2's layout has no sections of a tool. Only names `under` a path count.
         """
-        sections = {name.partition(".")[0] for name in known}
-        inside = [not sections.isdisjoint(path[:1]) for path, *_ in self._places]
-        if self.ros2 or not any(inside):
-            return
-        for name, own, (*_, keys) in zip(self.names, inside, self._places, strict=True):
-            if name in known or name in sections:
+        sections = {name.partition(".")[0] for name in known if "." in name}
+        last, others = {name.rpartition(".")[2] for name in known}, list[str]()
+        for name, (path, held_in, key, keys) in zip(self.names, self._places, strict=True):
+            if name in known or name in sections or not name.startswith(under):
                 continue
-            where = self._document.where(self.path, keys)
-            what = f"{where}: {name}: {tool} has no such value; {nearest(name, known)}"
-            if own:
+            if not self.ros2 and not sections.isdisjoint(path[:1]):
+                where = self._document.where(self.path, keys)
+                what = f"{where}: {name}: {tool} has no such value; {nearest(name, known)}"
                 raise OdometryError(what)
-            warn_once(what)
+            if type(held_in[key]) in (int, float) and last.isdisjoint(path[-1:]):
+                others.append(f"{name} (line {self._document.line(keys)})")
+        if others:
+            said = textwrap.shorten(", ".join(others), 400, placeholder=" ...")
+            warn_once(f"{self.path}: nothing reads {said}: {tool} has no such value")
 
     def held(self, names: Iterable[str], under: str = "") -> dict[str, Any]:
         """The values of those names that the file has and that are not null, `under` a path."""
@@ -178,9 +187,10 @@ class Template:
             spans.append((begin, end, new if begin < end else f" {new}"))
         for begin, end, new in sorted(spans, reverse=True):
             text = text[:begin] + new + text[end:]
+        tagged = any(self._text.startswith("!", begin) for begin, *_ in spans)
         with suppress(yaml12.YamlError):
             # Where nan is nan.
-            if repr(self._parsed(text).data) == repr(data):
+            if not tagged and repr(self._parsed(text).data) == repr(data):
                 return text
         where = ", ".join(str(self._document.line(keys)) for keys in changed)
         raise OdometryError(
@@ -194,7 +204,9 @@ class Template:
         if len(places) > 1:
             places = [place for place in places if place[0] == wanted] or places
         if len(places) > 1:
-            paths = ", ".join(".".join(path) for path, *_ in places)
+            paths = ", ".join(
+                f"{'.'.join(path)} (line {self._document.line(keys)})" for path, *_, keys in places
+            )
             raise OdometryError(f"{self.path}: {name!r} may be any of {paths}; name one of them")
         return places[0] if places else None
 

@@ -1,10 +1,13 @@
 """The gate for changes: drive what is not known yet on both sides, and compare."""
 
+import logging
 import os
 import shutil
+import time
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
+from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +24,7 @@ if TYPE_CHECKING:
     from online.gate import Shared, Side
     from online.turns import Costs
 
+_log = logging.getLogger(__name__)
 FOLDER = Path("runs/compare")
 """Where what the gate drives is kept."""
 
@@ -41,11 +45,19 @@ def sides(
     """
     from online.gate import Side
 
-    studies = _driven(given, asked, show) if asked.recordings else _studies(given)
+    studies, now = _driven(given, asked, show) if asked.recordings else _studies(given), time.time()
     _drive(studies, show)
     if length is not None:
         over = {"sub_trajectory": length}
         studies = [replace(one, config=one.config.model_copy(update=over)) for one in studies]
+    for name, study in zip(given, studies, strict=True):
+        made = [path.stat().st_mtime for path in study.folder.glob("replays/*/*/replay.json")]
+        if made and (first := min(made)) < now:
+            _log.info(
+                f"{name}: its replays of {datetime.fromtimestamp(first):%Y-%m-%d %H:%M} are "
+                f"compared. Libraries and other files that it loads may have changed since; to "
+                f"drive it anew, remove {study.folder / 'replays'}"
+            )
     new, old = (Side(name, study) for name, study in zip(given, studies, strict=True))
     return new, old
 

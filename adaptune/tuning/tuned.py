@@ -196,6 +196,9 @@ def tune(
     progress
         Called with how far each task is; by default, bars show it.
     """
+    if reading not in (None, "one", "several"):
+        raise AdaptuneError(f"reading: give 'one' or 'several', not {reading!r}")
+    overrides = [overrides] if isinstance(overrides, str) else overrides
     name, about = named_odometry(odometry or ("gicp" if config is None else "kiss_icp"))
     judged = None if reference is None else str(reference)
     file = None if config is None else Path(config)
@@ -203,7 +206,8 @@ def tune(
     asked = Asked(_paths(recordings), name, points, judged, file, tested, reading, about, *limits)
     with ExitStack() as stack:
         show = progress or stack.enter_context(bars_and_words())
-        into = Path(folder).absolute() if folder else None
+        # It stays where it is if the working folder changes.
+        into = Path(folder or _folder(asked)).absolute()
         return tune_asked(asked, overrides, into, cluster, show)
 
 
@@ -221,8 +225,6 @@ def tune_asked(
     from offline.train import train
     from online.modes import run_replays
 
-    if not asked.recordings:
-        raise AdaptuneError("name a recording: the list is empty")
     started = getattr(sys.modules["__main__"], "__spec__", None)
     imported = started is not None and started.name == processes.__name__
     if imported or getattr(multiprocessing.current_process(), "_inheriting", False):
@@ -233,7 +235,7 @@ def tune_asked(
     forget_user_code()
     if asked.reference is not None and Path(asked.reference).is_file():
         asked = asked._replace(reference=str(Path(asked.reference).resolve()))
-    folder = folder or Path("runs") / _study_name(asked)
+    folder = folder or _folder(asked)
     clock = Stopwatch(folder / ELAPSED, replays=True)
     path, now, more = written(asked, overrides, folder, show)
     study = load_study(path, [*overrides, *now], folder)
@@ -249,12 +251,14 @@ def _paths(given: Paths) -> list[Path]:
     return [Path(given)] if isinstance(given, str | Path) else [Path(path) for path in given]
 
 
-def _study_name(asked: Asked) -> str:
+def _folder(asked: Asked) -> Path:
     recordings, odometry = asked.recordings, asked.odometry
+    if not recordings:
+        raise AdaptuneError("name a recording: the list is empty")
     stem = plain_name(recordings[0].resolve()) + "_and_more" * (len(recordings) > 1)
     names = (name.strip().replace(":", "_") for name in odometry.split(","))
     others = "+".join(dict.fromkeys(names))
-    return stem if odometry == "gicp" else f"{stem}_{others}"
+    return Path("runs") / (stem if odometry == "gicp" else f"{stem}_{others}")
 
 
 def compared(study: "OfflineStudy") -> "tuple[ComparedReplays, Path]":

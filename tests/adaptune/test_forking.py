@@ -89,3 +89,24 @@ def test_processes_begin_whatever_the_folder_holds_and_however_long_its_name_is(
     )
     assert (done.stdout, done.stderr) == ("well\n", "")
     assert not list(here.glob("pymp-*"))
+
+
+POOL = """
+import multiprocessing as mp
+from adaptune import errors, forking
+def work(_):
+    try:
+        forking.fork_server()
+    except errors.AdaptuneError as error:
+        return str(error)
+if __name__ == "__main__":
+    with mp.Pool(1) as pool:
+        print(*pool.map(work, [0]))
+"""
+
+
+def test_a_worker_of_a_pool_is_told_that_it_may_start_no_processes(tmp_path):
+    (tmp_path / "pooled.py").write_text(POOL)
+    command = [sys.executable, tmp_path / "pooled.py"]
+    said = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    assert "multiprocessing.Pool may start no others: call adaptune in the main process" in said

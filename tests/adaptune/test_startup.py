@@ -7,6 +7,7 @@ import sys
 import pytest
 
 import adaptune.__main__
+from adaptune.errors import hidden
 
 HEAVY = {"scipy", "numba", "open3d", "optuna", "vl_convert", "rosbags", "sklearn", "small_gicp"}
 
@@ -103,3 +104,24 @@ def test_a_checkout_runs_its_own_stages(tmp_path):
     command = [sys.executable, "-m", "adaptune"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
     assert done.stdout == f"{tmp_path / 'offline/__init__.py'}\n"
+
+
+def test_a_package_that_pythonpath_hides_is_named(tmp_path, monkeypatch):
+    (tmp_path / "dist/numpy").mkdir(parents=True)
+    (tmp_path / "dist/numpy/__init__.py").write_text("raise ImportError('for another Python')")
+    (tmp_path / "dist/kiss_icp").mkdir()
+    (tmp_path / "dist/kiss_icp/__init__.py").touch()
+    (tmp_path / "a.bag").touch()
+    command = [sys.executable, "-m", "adaptune", "inspect", tmp_path / "a.bag"]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join((str(tmp_path / "dist"), "/none"))}
+    ended = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+    where = f"numpy comes from PYTHONPATH ({tmp_path}/dist/numpy/__init__.py)"
+    assert ended.returncode == 2
+    assert ended.stderr.startswith(f"error: for another Python: {where}, before the installed one")
+    # An older kiss_icp lacks a module; what is not installed is not hidden.
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path / "dist"))
+    assert "kiss_icp comes from PYTHONPATH" in hidden(ImportError("x", name="kiss_icp.config"))
+    (tmp_path / "dist/theirs.py").touch()
+    assert hidden(ImportError("x", name="theirs")) == ""
+    monkeypatch.delenv("PYTHONPATH")
+    assert hidden(ImportError("x", name="kiss_icp.config")) == ""

@@ -7,6 +7,7 @@ from offline.objective import (
     baseline_words,
     judge,
     trajectory_metrics,
+    unread_in_words,
 )
 
 
@@ -40,3 +41,27 @@ def test_a_metric_that_cannot_be_measured_counts_as_the_largest():
     assert judge(of, runs).value == pytest.approx(0.5 * (3.0 + 2.0 + 1e6))
     poses = np.tile(np.eye(4), (6, 1, 1))
     assert trajectory_metrics(np.full_like(poses, np.nan), poses) == {}
+
+
+@pytest.mark.parametrize(
+    ("errors", "said"),
+    [
+        ([(4.0, 2.0)] * 3, "All 3 sets gave the same poses"),
+        ([(4.0, 30.0)] * 2, "All 2 sets gave the same poses"),
+        ([(4.0, 2.0), (4.0, 2.0), (4.0, 2.0 + 1e-15)], None),
+        ([(30.0, 30.0)] * 3, None),  # lost
+        ([(4.0, 2.0)], None),
+    ],
+)
+def test_sets_that_all_give_the_same_poses_are_told(errors, said):
+    def runs(of, label=None):
+        named = {} if label is None else {"odometry": label}
+        return {n: Summary({**named, "a": n}, e[of], 0, 0, 1.0) for n, e in enumerate(errors)}
+
+    words = unread_in_words({"one": runs(0), "two": runs(1)})
+    assert [line.startswith(str(said)) for line in words] == [True] * (said is not None)
+    # Of several odometries, one; a set that failed gives no poses to compare.
+    other = {9: Summary({"odometry": "icp"}, 1.0, 0, 0, 1.0)}
+    failed = {8: Summary({"odometry": "gicp"}, 5.0, 0, 0, 1.0, failure="it ended")}
+    words = unread_in_words({"one": runs(0, "gicp") | other | failed})
+    assert all("sets of gicp gave the same poses" in line for line in words)

@@ -1,3 +1,4 @@
+import json
 import sys
 
 import numpy as np
@@ -88,7 +89,7 @@ def test_rules_are_scored_without_an_odometry(study):
     near = found.score(NearestNeighbours(k=3))
     assert near.shape == (42,)
     assert np.isin(near, cap(found.performances)).all()
-    with pytest.raises(ValueError, match="not enough values"):
+    with pytest.raises(AdaptuneError, match=r"Best\.select: ValueError: not enough values"):
         found.score(Best())
     for folds in (np.zeros(42, np.intp), np.arange(42) % 2):
         with pytest.raises(AdaptuneError, match="nothing is left to learn from"):
@@ -131,6 +132,18 @@ def test_it_is_read_back(study, tmp_path, name):
     found.performances[0, 0] = np.inf
     write_scenario(tmp_path / name, found)
     same(read_scenario(tmp_path / name), found)
+
+
+def test_columns_are_found_by_their_names(study, tmp_path):
+    write_scenario(tmp_path / "a.csv", found := scenario(study))
+    header, *rows = (line.split(",") for line in (tmp_path / "a.csv").read_text().splitlines())
+    order = sorted(range(len(header)), key=lambda i: header[i], reverse=True)
+    turned = [["feature_x", *(row[i] for i in order)] for row in (header, *rows)]
+    (tmp_path / "a.csv").write_text("".join(",".join(row) + "\n" for row in turned))
+    about = json.loads((tmp_path / "a_sets.json").read_text())
+    about["sets"] = [dict(reversed(one.items())) for one in about["sets"]]
+    (tmp_path / "a_sets.json").write_text(json.dumps(about))
+    same(read_scenario(tmp_path / "a.csv"), found)
 
 
 def test_mistakes_are_told(study, study_file, tmp_path, monkeypatch):

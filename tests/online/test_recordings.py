@@ -15,7 +15,7 @@ from adaptune.odometry.tracker import RegisteredScan
 from adaptune.space import Selection
 from adaptune.trajectory import Trajectory
 from offline.config import load_study
-from online.record import StoredReplayError, write_replay
+from online.record import StoredReplay, StoredReplayError, write_replay
 from online.recordings import record_replays, topic
 from online.reference import write_reference
 from online.replay import Choice, ReplayRecord
@@ -235,6 +235,11 @@ def test_replays_of_something_else_are_refused(study, study_file):
     with pytest.raises(StoredReplayError, match="was judged by another reference; run"):
         record_replays(other, "three")
     path = study.folder / "replays/three/adaptive/selections.csv"
+    # A column of another version is none of the parameters, wherever it stands.
+    before = StoredReplay.read(path.parent).choices
+    header, *rows = path.read_text().splitlines()
+    path.write_text("\n".join([f"scans,{header},more", *(f"7,{row},x" for row in rows)]) + "\n")
+    assert StoredReplay.read(path.parent).choices == before
     path.write_text(path.read_text().replace("0.7000", "many"))
     with pytest.raises(StoredReplayError, match=r"selections\.csv: is damaged"):
         record_replays(study, "three")

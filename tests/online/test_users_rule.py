@@ -14,6 +14,7 @@ from adaptune.selector import Selector
 from adaptune.strict import ConfigurationError
 from adaptune.tuning.tuned import compared
 from offline.config import load_study
+from offline.scenario import scenario
 from offline.validate import validate
 from online.compare import compare
 from online.modes import run_replays
@@ -65,6 +66,34 @@ def test_it_chooses_among_the_members_of_a_bank(study):
     assert Selector(model, "my_rules:Cheapest", members).members == tuple(members)
     with pytest.raises(ModelError, match=r"Outside: selects trial .* choose among data.candidates"):
         Selector(model, "my_rules:Outside", members)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("NoSelf", None),
+        ("Empty", "Empty.select: returns None; return Selection(trial, data.sets[trial])"),
+        ("Number", "Number.select: returns 3; return"),
+        ("Unknown", "Unknown.select: returns Selection(trial=999, "),
+        ("OtherValues", "OtherValues.select: returns Selection(trial="),
+        ("Weights", "Weights.select: returns Selection(trial="),
+        ("OneArgument", "takes 2 positional arguments but 3 were given"),
+        ("Maker", "missing 1 required positional argument: 'k'"),
+        ("Raises", "Raises.fit: AttributeError: 'TrainingData' object has no attribute 'nothing'"),
+    ],
+)
+def test_what_a_rule_does_wrong_is_told_by_its_name(study, name, words):
+    model, mode = ErrorModel.load(study.model_path), f"my_rules:{name}"
+    if words is None:
+        assert Selector(model, mode, ()).select is not None
+        assert scenario(study).score(getattr(users_rule, name)()) is not None
+        return
+    with pytest.raises(RuleError, match=re.escape(words)):
+        Selector(model, mode, ())
+    if name == "Weights":  # it has no bank to weigh there
+        return
+    with pytest.raises(RuleError, match=re.escape(words)):
+        validate(load_study(study.folder / "study.yaml", [f"online.modes=[{mode}]"], study.folder))
 
 
 @pytest.mark.parametrize(

@@ -24,5 +24,53 @@ class Outside(Cheapest):
         return self
 
 
+class NoSelf(Cheapest):
+    def fit(self, data):
+        super().fit(data)
+
+
+class Empty(Cheapest):
+    def select(self, feature, live=NOTHING):
+        pass
+
+
+class Number(Cheapest):
+    def select(self, feature, live=NOTHING):  # noqa: ARG002
+        return 3
+
+
+class Unknown(Cheapest):
+    def select(self, feature, live=NOTHING):
+        return super().select(feature, live)._replace(trial=999)
+
+
+class OtherValues(Cheapest):
+    def select(self, feature, live=NOTHING):
+        return super().select(feature, live)._replace(parameters={"voxel": 1.9})
+
+
+class Weights(Cheapest):
+    gives_weights = True
+
+    def select(self, feature, live=NOTHING):
+        selection = super().select(feature, live)
+        return selection._replace(weights={77: 1.0})
+
+
+class OneArgument(Cheapest):
+    def select(self, feature):
+        return super().select(feature)
+
+
+class Maker(Cheapest):
+    def __init__(self, k):
+        self.k = k
+
+
+class Raises(Cheapest):
+    def fit(self, data):
+        return data.nothing
+
+
 class Other:
     pass

@@ -114,7 +114,7 @@ class RosSystem(ABC):
         self.folder, self._given = engine.make_shared(folder / "shared"), folder / "given"
         self._given.mkdir()
         self._parameters = self._given / "params.yaml"
-        self._parameters.write_text(parameters, encoding="utf-8")
+        self._parameters.write_text(parameters, encoding="utf-8", errors="surrogateescape")
         with contextlib.ExitStack() as undo:
             with socket.socket(socket.AF_UNIX) as server:
                 with processes.socket_name(self.folder / "link") as name:

@@ -64,12 +64,16 @@ def test_a_worse_set_fails_and_the_same_one_does_not(bags):
 
 
 @pytest.mark.services
-def test_nothing_known_is_driven_again_and_folders_are_sides(bags):
+def test_nothing_known_is_driven_again_and_folders_are_sides(bags, caplog):
     gate("bad", "good")
     replays = sorted((bags / "runs/compare").glob("*/replays/*/baseline/replay.json"))
     times = [path.stat().st_mtime_ns for path in replays]
-    gate("bad", "good")
+    caplog.clear()
+    with caplog.at_level("INFO"):
+        gate("bad", "good")
     assert [path.stat().st_mtime_ns for path in replays] == times
+    for name in ("good", "bad"):
+        assert re.search(rf"{name}.yaml: its replays of [\d-]+ [\d:]+ are compared", caplog.text)
     bad, good = (next(Path("runs/compare").glob(f"{name}_*/")) for name in ("bad", "good"))
     assert commands.call("compare", bad, "--against", good, *COSTS).exit_code == 3
     study = good / "study.yaml"

@@ -1,9 +1,12 @@
 """Parameter sets as the odometries' own tools read them."""
 
+import re
+
 import pytest
 import yaml
 
 from adaptune.errors import OdometryError
+from adaptune.files import write_text
 from adaptune.odometry.factory import OdometryFactory
 from adaptune.odometry.kiss_icp import Kiss
 from adaptune.odometry.registry import declare, is_user_class, odometry_class
@@ -201,9 +204,97 @@ def test_kiss_icp_s_file_may_hold_all_that_it_knows_and_unknown_sections_are_tol
     given = {"config": str(path)}
     assert declare("kiss_icp", given).mistakes == []
     assert not caplog.records
-    path.write_text(path.read_text() + "robot:\n  voxelsize: 0.5\n")
+    path.write_text(path.read_text() + "robot:\n  voxelsize: 0.5\n  frame: base\n")
     assert declare("kiss_icp", given).mistakes == []
-    assert "robot.voxelsize: KISS-ICP has no such value; did you mean" in caplog.text
+    (said,) = caplog.messages
+    assert re.search(r"nothing reads robot.voxelsize \(line \d+\): KISS-ICP has no such", said)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "unread"),
+    [
+        ("kiss_icp", "voxel_size: 1.0\nvoxle: 2.0\nframe: base\n", "voxle (line 2)"),
+        ("kiss_icp", ROS2 + "    reach: 3\n    visualize: true\n", "reach (line 5)"),
+        ("genz_icp", ROS2 + "    max_range: 80.0\n", "max_range (line 5)"),
+        ("evalio_kiss_icp", EVALIO.replace("max_num", "num"), "pipelines.0.num_threads (line 2)"),
+        ("kiss_icp", ROS2 + "    covariance: {position_covariance: 0.1}\n", None),
+    ],
+)
+def test_numbers_that_nothing_reads_are_told(tmp_path, caplog, name, text, unread):
+    path = tmp_path / "users.yaml"
+    path.write_text(text)
+    declare(name, {"config": str(path)})
+    said = [message for message in caplog.messages if "nothing reads" in message]
+    assert len(said) == (unread is not None)
+    assert unread is None or f"{path}: nothing reads {unread}: " in said[0].replace(
+        "kiss_icp_node.", ""
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "whose"),
+    [
+        ("kiss_icp", ROS2 + "    planarity_threshold: 0.2\n", ("planarity_threshold", "genz_icp")),
+        ("kiss_icp", "dlio: {vf_res: 0.3}\n", ("vf_res", "dlio")),
+        ("genz_icp", "voxel_size: 1\nnum_iters_icp: 9\n", ("num_iters_icp", "ct_icp")),
+    ],
+)
+def test_another_odometry_s_file_is_refused_with_its_name(tmp_path, name, text, whose):
+    path = tmp_path / "users.yaml"
+    path.write_text(text)
+    with pytest.raises(OdometryError, match=rf"users.yaml: holds {whose[0]}, which {name}") as told:
+        declare(name, {"config": str(path)})
+    assert f"--odometry {whose[1]}" in str(told.value)
+    # What is common to several is nobody's own.
+    path.write_text("voxel_size: 1.0\nmax_num_iterations: 5\n")
+    assert declare("kiss_icp", {"config": str(path)}).mistakes == []
+
+
+def test_a_key_that_comes_twice_is_told_with_both_lines(tmp_path, caplog):
+    path = tmp_path / "twice.yaml"
+    path.write_text("map: &m\n  size: 0.5\nmap:\n  size: 1.5\nb: {<<: *m, size: 2}\n")
+    template = Template(path)
+    assert template.value("map.size") == 1.5
+    places = [("map", 3, 1), ("map.size", 4, 2)]
+    for said, (name, line, first) in zip(caplog.messages, places, strict=True):
+        assert f"{path}, line {line}: {name} is given twice, first in line {first}" in said
+    path.write_text("map.size: 1.0\nmap: {size: 0.5}\n")
+    with pytest.raises(OdometryError, match=r"map.size \(line 1\), map.size \(line 2\)"):
+        Template(path).value("size")
+
+
+OPENCV = b"""%YAML:1.0
+---
+# \xcc\xe5\xcb\xd8 \x85
+T: !!opencv-matrix
+   rows: 1
+   cols: 2
+   dt: d
+   data: [ 1., 0. ]
+Map.size: 0.5 # \xc3\xd7
+yaw: !degrees 90
+"""
+
+
+@pytest.mark.parametrize(
+    "head", [b"%YAML:1.0\n---\n", b"%YAML:1.0\n", b"\xef\xbb\xbf%YAML:1.0\r\n", b""]
+)
+def test_files_of_opencv_and_other_encodings_keep_all_else(tmp_path, head):
+    text = OPENCV.replace(b"%YAML:1.0\n---\n", head)
+    (path := tmp_path / "orb.yaml").write_bytes(text)
+    template = Template(path)
+    assert template.value("T.data.0") == 1.0
+    command = {"command": ["slam", "{parameters}"], "template": str(path)}
+    own = own_file(
+        "command", command, ParameterSpace.load({"Map.size": FLOAT}), **{"Map.size": 0.25}
+    )
+    write_text(path, own.text)
+    assert path.read_bytes() == text.replace(b"0.5 #", b"0.25 #")
+    with pytest.raises(OdometryError, match="without anchors, aliases and tags"):
+        template.fill({"yaw": 80.0})
+    path.write_bytes("size: 1.0".encode("utf-16"))
+    with pytest.raises(OdometryError, match=r"orb.yaml: is not text in UTF-8"):
+        Template(path)
 
 
 def test_what_the_file_gives_is_not_given_twice(tmp_path):

@@ -219,6 +219,34 @@ def test_a_program_is_its_files(tmp_path):
     assert odometry_content("process", away) == {}
 
 
+def test_what_code_imports_is_part_of_it(package, tmp_path, monkeypatch):
+    # Also from folders without __init__.py, within functions, and from PYTHONPATH.
+    other = tmp_path / "other"
+    for file in ("utils/poses.py", "utils/deep.py", "core.py", "theirs/rest.py", "bad.py"):
+        (tmp_path / file).parent.mkdir(exist_ok=True)
+        (tmp_path / file).write_text("x = 1\n")
+    other.mkdir()
+    (other / "kit.py").write_text("from theirs import odometry\n")
+    (tmp_path / "unused.py").write_text("")
+    (tmp_path / "bad.py").write_text("print 'of Python 2'\n")
+    (tmp_path / "utils/poses.py").write_text("from .deep import *\nfrom kit import x\n")
+    (tmp_path / "core.py").write_text("def run():\n    import utils.poses, numpy, bad\n")
+    (package / "odometry.py").write_text("from . import rest\nimport core, adaptune.space\n")
+    (tmp_path / "run.py").write_text("import sys\nfrom core import run\n")
+    monkeypatch.setenv("PYTHONPATH", str(other))
+    settings = CommandSettings(command=(sys.executable, str(tmp_path / "run.py")))
+    files = ("core.py", "bad.py", "utils/poses.py", "utils/deep.py", "other/kit.py")
+    of_both = [*files, "theirs/odometry.py", "theirs/rest.py"]
+    given = ("command", settings), ("theirs.odometry:Mine", None)
+    for file in of_both:
+        before = [odometry_content(*one) for one in given]
+        (tmp_path / file).write_text((tmp_path / file).read_text() + "# changed\n")
+        now = [odometry_content(*one) for one in given]
+        assert all(a != b for a, b in zip(before, now, strict=True)), file
+    assert not any("unused" in key for of in now for key in of)
+    assert not any("numpy" in key or "adaptune/" in key for of in now for key in of)
+
+
 def test_descriptors_of_the_user_are_their_modules(package):
     assert descriptor_content(["ndt", "motion"]) == {}
     before = descriptor_content(["ndt", "theirs.odometry:describe"])

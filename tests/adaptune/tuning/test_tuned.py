@@ -91,9 +91,26 @@ def test_what_is_no_odometry_is_refused(given):
         named_odometry(given)
 
 
+def test_a_misspelt_reading_is_refused(monkeypatch):
+    with pytest.raises(AdaptuneError, match="reading: give 'one' or 'several', not 'severl'"):
+        adaptune.tune("one.bag", reading="severl")
+    given = []
+    monkeypatch.setattr("adaptune.tuning.tuned.tune_asked", lambda *args: given.append(args[1]))
+    adaptune.tune("one.bag", overrides="offline.seed=1")
+    assert given == [["offline.seed=1"]]
+
+
 def test_no_recording_is_refused():
     with pytest.raises(AdaptuneError, match="name a recording"):
         adaptune.tune([])
+
+
+def test_results_stay_where_they_are_if_the_working_folder_changes(monkeypatch, tmp_path):
+    given = []
+    monkeypatch.setattr("adaptune.tuning.tuned.tune_asked", lambda *args: given.append(args[2]))
+    adaptune.tune("some/one.bag", "kiss_icp")
+    adaptune.tune(["one.bag", "two.bag"], folder="mine")
+    assert given == [tmp_path / "runs/one_kiss_icp", tmp_path / "mine"]
 
 
 def test_a_study_of_which_nobody_knows_how_it_was_made_is_kept():
