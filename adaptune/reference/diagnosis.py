@@ -24,6 +24,7 @@ from adaptune.geometry import (
     to_quaternions,
 )
 from adaptune.live.hops import OFFLINE_CLOUD, OFFLINE_REACHES, Hop, HopCloud, Hops, register
+from adaptune.metrics import sub_trajectory_rte
 from adaptune.recording.compensation import neighbour_motions
 from adaptune.recording.content import Content
 from adaptune.recording.scan import Recording, Scan
@@ -110,6 +111,9 @@ CLOCK = 30.0  # seconds by which clocks may differ to be found
 FAR_APART = 0.25  # seconds between poses, from which on the way between them is not straight
 TURNED = 0.1
 """Radians, the root of their mean square, by which motions must turn a lever arm to show it."""
+END_LENGTH, ENDS = 10.0, 0.8
+"""Metres over which poses of scans' ends show, and the share of the error that is left at most
+where they are taken as these."""
 SAME_CLOCK = 0.01  # seconds by which two clocks may differ and count as the same
 
 
@@ -380,12 +384,14 @@ def contradictions(
     if not error > SUSPICIOUS:
         return
     stamps: list[int] = []
+    spans: list[int] = []
     content = Content()
 
     def read() -> Iterator[Scan]:
         for scan in scans:
             if seen is None or scan.stamp in seen:
                 stamps.append(scan.stamp)
+                spans.append(scan.span)
                 content.see(scan)
                 yield scan
 
@@ -410,8 +416,32 @@ def contradictions(
                 "(`clock_offset`)"
             )
             yield Finding((CONTRADICTS,), what, mend, of="reference")
+        elif (cause := _of_ends(reference, at, np.median(spans), T_odom_sensor)) is not None:
+            yield cause
     if (cause := diagnose_odometry(T_odom_sensor, hops)) is not None:
         yield cause.below(("the odometry's poses contradict the scans",))
+
+
+def _of_ends(
+    reference: Trajectory, stamps: NDArray[np.int64], span: float, T_odom_sensor: Poses
+) -> Finding | None:
+    """Whether an odometry's poses fit the reference best about one scan later than their stamps."""
+    errors = {}
+    for share in (-1.0, -0.5, 0.0, 0.5, 1.0, 1.5, 2.0) if span > 0 else ():
+        T_ref_sensor = reference.at(stamps + round(share * span))
+        rte = sub_trajectory_rte(T_ref_sensor, T_odom_sensor, END_LENGTH)
+        errors[share] = _mean(rte)
+    if not errors or min(errors, key=errors.__getitem__) != 1.0 or errors[1.0] > ENDS * errors[0.0]:
+        return None
+    what = (
+        f"they fit the reference best {1e-9 * span:.2g} s, about one scan, after their stamps "
+        f"({errors[1.0]:.3g} % over {END_LENGTH:g} m instead of {errors[0.0]:.3g} %)"
+    )
+    mend = (
+        "a system that gives the pose of a scan's end needs odometry.settings.pose_time: end; if "
+        "it does not, the reference is of another clock (`clock_offset`)"
+    )
+    return Finding(("the odometry's poses",), what, mend, of="reference")
 
 
 def _surely_worse(wrong: NDArray[np.float64], others: NDArray[np.float64]) -> bool:

@@ -21,6 +21,7 @@ from adaptune.odometry.base import LOST, Registration, Usage
 from adaptune.odometry.docker.played_bag import MAX_SCATTER, OWN_CLOCK
 from adaptune.odometry.docker.ros_system import QUIET, RosSystem, filled, matrix
 from adaptune.odometry.faults import Faulting, pose_fault
+from adaptune.odometry.own_frame import END, AtStamp, duration_of
 from adaptune.odometry.remote import Limits
 from adaptune.recording.clouds import LIVOX_TYPES
 from adaptune.recording.export import IMU, POINTS, Messages, measurements, structured
@@ -101,7 +102,9 @@ class Lockstep(Faulting):
         self._T_odom_sensor = np.array(T_odom_sensor)
         self._T_step = np.eye(4) if T_previous_current is None else np.array(T_previous_current)
         self._T_odom_own: Poses | None = None
-        self._silent, self._stamp, self._poses, self._missed = 0, prepared.stamp, [], []
+        self._at_stamp, self._T_known = AtStamp(END), T_previous_current
+        self._silent, self._poses, self._missed = 0, [], []
+        self._take_scan(prepared)
         self._n_too_late = 0
         self._shown = (prepared.stamp, -np.inf)
         self._late: int | None = None
@@ -119,8 +122,13 @@ class Lockstep(Faulting):
                 raise OdometryError(f"{self.name}: {fault}") from error
             self.note_fault(fault)
 
+    def _take_scan(self, scan: Scan) -> None:
+        self._stamp = scan.stamp
+        self._span = duration_of(scan) if self._settings.pose_time == "end" else 0
+
     def submit(self, prepared: Scan) -> None:
-        self._stamp, self._waiting = prepared.stamp, True
+        self._take_scan(prepared)
+        self._waiting = True
         if self._system is not None:
             try:
                 self._show(prepared)
@@ -199,21 +207,26 @@ class Lockstep(Faulting):
 
     def _works_on(self, system: RosSystem) -> bool:
         """Whether it uses CPU time now, after its last pose."""
-        self._look(system)
+        self._look(system, fresh=True)
         before = self._used.cpu
         time.sleep(_BACKGROUND)
-        self._look(system)
+        self._look(system, fresh=True)
         return self._used.cpu - before > _BUSY * _BACKGROUND
 
     def __del__(self) -> None:
         self.close()
 
-    def _look(self, system: RosSystem) -> None:
-        """See what the system has used."""
+    def _look(self, system: RosSystem, fresh: bool = False) -> None:
+        """See what the system has used; log, once, which node died where poses come still."""
         self._looked = time.monotonic()
         with contextlib.suppress(OdometryError, LinkError):
-            system.state()
+            system.state(fresh)
         self._used = system.usage
+        if system.died and self._n_answered and not self._silent:
+            warn_once(
+                f"{self.name}: {system.died}, and poses come still; if it is not needed, let the "
+                f"launch file leave it out, as by visualize:=false"
+            )
 
     def _begin(self, scan: Scan) -> None:
         """Start the system, and wait until it listens."""
@@ -296,9 +309,13 @@ class Lockstep(Faulting):
                     f"odometry.settings.patience and isolation.seconds"
                 )
         T_own = self._at_scan(stamp, T_own @ self._T_base_sensor)
+        # A stamp that is late says itself of when the pose is.
+        taken = self._stamp, self._span if self._late < self._span // 2 else 0
         if self._T_odom_own is None:
-            self._T_odom_own = self._T_odom_sensor @ invert(T_own)
-        self._T_odom_sensor = self._T_odom_own @ T_own
+            T_odom_then = self._at_stamp.begin(*taken, self._T_odom_sensor, self._T_known)
+            self._T_odom_own = T_odom_then @ invert(T_own)
+        else:
+            self._T_odom_sensor = self._at_stamp(*taken, self._T_odom_own @ T_own)
         return True
 
     def _check_silent(self, system: RosSystem) -> None:
@@ -308,10 +325,13 @@ class Lockstep(Faulting):
         try:
             system.state()
         except OdometryError as error:
-            if self._n_answered:
+            what = str(error)
+            if self._n_answered or not ("died" in what or "ended" in what):
                 raise
-            help_ = "if it knows no points but the bag's own, set odometry.settings.play: bag"
-            raise OdometryError(f"{error} before its first pose; {help_}") from error
+            # One that ends with a code has said why.
+            help_ = "; if it knows no points but the bag's own, set odometry.settings.play: bag"
+            help_ *= "with code" not in what
+            raise OdometryError(f"{what} before its first pose{help_}") from error
         if self._silent >= _MOST_SILENT:
             published = system.link.topics().keys() - {*QUIET, *self._topics}
             topic = self._settings.odometry

@@ -53,7 +53,8 @@ def look(
     system.came = []
     report: dict[str, str] = {}
     shown: list[tuple[float, int]] = []
-    path, works_on = [np.eye(4)], False
+    path, works_on, why = [np.eye(4)], False, "see what went wrong"
+    bag = "set odometry.settings.play: bag"
     with closing(system):
         begin, steps = time.monotonic(), iter(scans)
         first = next(steps)
@@ -73,9 +74,11 @@ def look(
                 said = filter(None, (about, other_frame(about, settings)))
                 report["poses are of"] = "; ".join(said)
             works_on = system._works_on(inside)
+            with suppress(LinkError):
+                why = inside.link.why_unheard(system._topics[0]) or bag
     seconds = max(1e-9 * (shown[-1][1] - shown[0][1]), 0.1)
     report["time of a start"] = f"{took:.1f} s"
-    report |= _poses(system.came, shown)
+    report |= _poses(system.came, shown, why)
     report["CPU of a second"] = f"{system.usage.cpu / seconds:.2f} s"
     report["memory"] = f"{system.usage.memory or 0.0:.0f} MB"
     for fault in system.faults:
@@ -209,10 +212,15 @@ def _declared(system: Any, template: Template) -> dict[str, str]:
     return {"declared, not in the template": ", ".join(own)} if own else {}
 
 
-def _poses(came: list[tuple[float, int]], shown: list[tuple[float, int]]) -> dict[str, str]:
-    """What is known of poses, which came at a time with a stamp, from scans that were shown."""
+def _poses(
+    came: list[tuple[float, int]], shown: list[tuple[float, int]], why: str
+) -> dict[str, str]:
+    """What is known of poses, which came at a time with a stamp, from scans that were shown.
+
+    `why` says what to do where there are too few for lockstep.
+    """
     if not came:
-        return {"poses": "none", "lockstep": "no: see what went wrong"}
+        return {"poses": "none", "lockstep": f"no: {why}"}
     at, stamps = np.array([t for t, _ in shown]), np.array([stamp for _, stamp in shown])
     times = np.array([t for t, _ in came])
     of_scan = np.searchsorted(at, times, "right") - 1
@@ -230,5 +238,5 @@ def _poses(came: list[tuple[float, int]], shown: list[tuple[float, int]]) -> dic
         "poses of a scan": f"{len(came) / since:.2f} ({answered} of {since} scans have one)",
         "stamps": f"of {stamped}",
         "lag": f"{1e3 * float(np.median(times - at[of_scan])):.0f} ms",
-        "lockstep": "yes" if fits else "no: set odometry.settings.play: bag",
+        "lockstep": "yes" if fits else f"no: {why}",
     }

@@ -23,6 +23,7 @@ from adaptune import processes
 from adaptune.errors import OdometryError, import_extra, in_a_line, nearest
 from adaptune.geometry import to_pose, to_quaternions
 from adaptune.odometry.base import Usage
+from adaptune.odometry.docker import engine
 from adaptune.odometry.docker.engine import Container, Mount, own_container
 from adaptune.odometry.docker.ros_system import RosSettings, RosSystem, SimClock, image_user
 from adaptune.odometry.docker.rustle import Rustle
@@ -66,6 +67,7 @@ NOISE = re.compile(
     rb"\[INFO\] \[(launch|[\w.-]+)\]: (All log files|Default logging|process started).*"
 )
 _BETWEEN_LOOKS, _BETWEEN_STATES = 0.3, 0.05  # seconds
+_MOST_SEEN = 1 << 20  # bytes of a log that are read at a look
 _UNDECLARED = 3.0  # seconds in which a node that subscribes declares its parameters
 _MATCHED = 3.0  # seconds in which nodes find what is published
 _LEAD = 300_000_000  # nanoseconds between the begin of the clock and of the recording
@@ -88,8 +90,10 @@ class Ros2System(RosSystem):
     _node: Any = None
     _player: "_Player | None" = None
     _looked = -float("inf")
+    _n_seen = 0  # bytes of the log
 
     def _begin(self) -> None:
+        self._dead: dict[bytes, bytes] = {}  # exit codes by nodes
         settings = self._settings
         common = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "PYTHONUNBUFFERED": "1"}
         if settings.image is None:
@@ -155,16 +159,18 @@ class Ros2System(RosSystem):
             return None
         return f"{' '.join(self._settings.command[:4])}: {processes.how_it_ended(code)}"
 
-    def state(self) -> dict[str, Any]:
+    def state(self, fresh: bool = False) -> dict[str, Any]:
         now = time.monotonic()
-        if now - self._looked > _BETWEEN_LOOKS:
+        if fresh or now - self._looked > _BETWEEN_LOOKS:
             self._looked = now
             used = self._container.used()
             cpu, memory = max(used.cpu, self.usage.cpu), max(used.memory, self.usage.memory or 0.0)
             self.usage = Usage(cpu, memory)
-            if died := DIED.search(self._tail(self._log_name)):
-                name, code = died[1].decode(), int(died[2])
-                raise OdometryError(f"node {name} died: {processes.how_it_ended(code)}")
+            self._dead |= dict(DIED.findall(self._unseen()))
+        if self._dead:
+            how = [(name, processes.how_it_ended(int(code))) for name, code in self._dead.items()]
+            self.died = "; ".join(f"node {name.decode()} died: {ended}" for name, ended in how)
+            raise OdometryError(self.died)
         if (ended := self._ended()) is not None:
             raise OdometryError(ended)
         topic = self._settings.odometry
@@ -178,6 +184,16 @@ class Ros2System(RosSystem):
             names = " and ".join(senders)
             raise OdometryError(f"{topic} is published by two ({names}), whose poses would mix")
         return state
+
+    def _unseen(self) -> bytes:
+        """What was written since the last look, and the line in which that ended."""
+        with engine.opened(self.folder / self._log_name, self.folder) as file:
+            if file is None:
+                return b""
+            file.seek(self._n_seen)
+            written = file.read(_MOST_SEEN)
+            self._n_seen += written.rfind(b"\n") + 1 or len(written)
+            return written
 
     def cloud_type(self, topic: str) -> str:
         while time.monotonic() - self._begun < self._settings.ready:

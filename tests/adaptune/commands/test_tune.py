@@ -197,6 +197,11 @@ def test_of_a_launch_command_a_study_is_written_to_fill_in(bag):
     config = load_study(Path("one_ros2.yaml"), [], None, needed=False).config
     assert config.odometries["ros2"].settings["points"] == "/points"
     assert "one_ros2.yaml: exists" in failed(*given[1:], "ros2 launch a b")
+    # It is looked for before anything is started, as by the stages.
+    filled = Path("one_ros2.yaml").read_text().replace("- ros2\n", "- ros3\n")
+    Path("one_ros2.yaml").write_text(filled.replace("FILL_IN", "voxel"))
+    words = "a login shell of this machine finds no 'ros3'; source your ROS 2 in ~/.bash_profile"
+    assert words in commands.refused("inspect", "one_ros2.yaml")
     refused = failed(*given[1:], "my/kiss-icp:jazzy")
     assert "there is no image 'my/kiss-icp:jazzy'" in refused or "no Docker engine" in refused
 
