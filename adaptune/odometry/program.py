@@ -156,6 +156,8 @@ class WholeRun(Faulting):
     """
 
     _words = ""  # the last lines that the program wrote
+    _unanswered: NDArray[np.bool_] | slice = slice(0)  # scans that got no pose of their own
+    _help = ""  # what to do about them
 
     def __init__(
         self,
@@ -254,7 +256,9 @@ class WholeRun(Faulting):
                 T_own_sensor = poses_at(trajectory, given.stamps)
                 known = np.isfinite(T_own_sensor[:, 0, 0])
                 if known.mean() < _COVERAGE:
-                    when = when_known(known, given.stamps)
+                    # All who count the scans without a pose are to count the same.
+                    T_own_sensor[self._unanswered], known[self._unanswered] = np.nan, False
+                    when = when_known(known, given.stamps) + self._help
                     failure = f"it gave poses for {known.sum()} of {len(known)} scans; {when}"
             except UnavailableError:
                 raise

@@ -23,7 +23,6 @@ from adaptune import processes
 from adaptune.errors import OdometryError, import_extra, in_a_line, nearest
 from adaptune.geometry import to_pose, to_quaternions
 from adaptune.odometry.base import Usage
-from adaptune.odometry.docker import engine
 from adaptune.odometry.docker.engine import Container, Mount, own_container
 from adaptune.odometry.docker.ros_system import RosSettings, RosSystem, SimClock, image_user
 from adaptune.odometry.docker.rustle import Rustle
@@ -67,7 +66,6 @@ NOISE = re.compile(
     rb"\[INFO\] \[(launch|[\w.-]+)\]: (All log files|Default logging|process started).*"
 )
 _BETWEEN_LOOKS, _BETWEEN_STATES = 0.3, 0.05  # seconds
-_MOST_SEEN = 1 << 20  # bytes of a log that are read at a look
 _UNDECLARED = 3.0  # seconds in which a node that subscribes declares its parameters
 _MATCHED = 3.0  # seconds in which nodes find what is published
 _LEAD = 300_000_000  # nanoseconds between the begin of the clock and of the recording
@@ -90,7 +88,6 @@ class Ros2System(RosSystem):
     _node: Any = None
     _player: "_Player | None" = None
     _looked = -float("inf")
-    _n_seen = 0  # bytes of the log
 
     def _begin(self) -> None:
         self._dead: dict[bytes, bytes] = {}  # exit codes by nodes
@@ -166,7 +163,7 @@ class Ros2System(RosSystem):
             used = self._container.used()
             cpu, memory = max(used.cpu, self.usage.cpu), max(used.memory, self.usage.memory or 0.0)
             self.usage = Usage(cpu, memory)
-            self._dead |= dict(DIED.findall(self._unseen()))
+            self._dead |= dict(DIED.findall(self._tail(self._log_name)))
         if self._dead:
             how = [(name, processes.how_it_ended(int(code))) for name, code in self._dead.items()]
             self.died = "; ".join(f"node {name.decode()} died: {ended}" for name, ended in how)
@@ -184,16 +181,6 @@ class Ros2System(RosSystem):
             names = " and ".join(senders)
             raise OdometryError(f"{topic} is published by two ({names}), whose poses would mix")
         return state
-
-    def _unseen(self) -> bytes:
-        """What was written since the last look, and the line in which that ended."""
-        with engine.opened(self.folder / self._log_name, self.folder) as file:
-            if file is None:
-                return b""
-            file.seek(self._n_seen)
-            written = file.read(_MOST_SEEN)
-            self._n_seen += written.rfind(b"\n") + 1 or len(written)
-            return written
 
     def cloud_type(self, topic: str) -> str:
         while time.monotonic() - self._begun < self._settings.ready:

@@ -37,7 +37,7 @@ from adaptune.space import ParameterSet
 QUIET = {"/clock", "/rosout", "/rosout_agg", "/parameter_events"}  # topics of every node
 CLOCK = "rosgraph_msgs/msg/Clock"
 _BETWEEN_LOOKS = 0.05
-_TAIL = 1 << 14  # bytes of a log in which its last lines are
+_TAIL = 1 << 16  # bytes of a log in which its last lines are
 _TICK = 0.01  # seconds
 _FLOOD = 2000  # messages of a second that are too many
 _log = logging.getLogger(__name__)
