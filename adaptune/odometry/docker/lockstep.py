@@ -3,19 +3,17 @@
 import contextlib
 import logging
 import shutil
-import tempfile
 import threading
 import time
 import weakref
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from adaptune import processes
 from adaptune.errors import AdaptuneError, OdometryError, UnavailableError, nearest, warn_once
-from adaptune.files import temporary_prefix
+from adaptune.files import make_temporary
 from adaptune.geometry import Poses, invert, rectify, to_pose
 from adaptune.odometry.base import LOST, Registration, Usage
 from adaptune.odometry.docker.played_bag import MAX_SCATTER, OWN_CLOCK
@@ -231,7 +229,7 @@ class Lockstep(Faulting):
     def _begin(self, scan: Scan) -> None:
         """Start the system, and wait until it listens."""
         self._template, text = filled(self._settings, self.parameters)
-        self._folder = Path(tempfile.mkdtemp(prefix=temporary_prefix()))
+        self._folder = make_temporary()
         try:
             system = self._settings.system(self._settings, self._limits.memory, text, self._folder)
         except AdaptuneError:
