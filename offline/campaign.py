@@ -378,15 +378,14 @@ def drive_whole(
     def drive(on: Mapping[str, Collection[int]], what: str, bare: bool = False) -> None:
         schedule = Schedule(study, archive, what, progress, whole=True, bare=bare)
         there = read_whole_drives(archive, names, sets, bare)
-        again = 0 if bare else len(labels)  # trials below this, the baselines, drive along
+        checked = [] if bare else labels
+        again = len(checked)  # trials below this, the baselines, drive along
         for name, numbers in on.items():
             if {*numbers} - {*there[name]}:
                 for n in numbers:
                     if n < again or n not in there[name]:
                         schedule.add(name, n, sets[n])
-        for name, n, trial in schedule.run(workers):
-            if n < again:
-                check_baseline(labels[n], name, trial)
+        for name, n, trial in _checked(schedule, workers, checked):
             schedule.store(name, n, trial)
 
     drive(dict.fromkeys(names, sets), "whole drives")
@@ -427,11 +426,7 @@ def run_baseline(
         for number, parameters in enumerate(space.baselines):
             if number not in there[name]:
                 schedule.add(name, number, parameters)
-    done = []
-    for name, number, trial in schedule.run(workers):
-        check_baseline(labels[number], name, trial)
-        done.append((name, number, trial))
-    for name, number, trial in done:
+    for name, number, trial in [*_checked(schedule, workers, labels)]:
         schedule.store(name, number, replace(trial, source="baseline"))
         poses, error = trial.T_odom_sensor, trial.mean_error
         for contradiction in contradictions_of(study.sequences, name, poses, error):
@@ -439,13 +434,31 @@ def run_baseline(
     schedule.close()
 
 
+def _checked(
+    schedule: Schedule, workers: Pool[Any], labels: Sequence[str]
+) -> Iterator[tuple[str, int, Trial]]:
+    """Run a schedule; a baseline that had a fault, with which all is compared, drives once more."""
+    again = set()
+    for name, number, trial in schedule.run(workers):
+        if number < len(labels):
+            if trial.faults and not trial.failure and (name, number) not in again:
+                again.add((name, number))
+                what = "sequences.%s: %s has a fault with its own parameters, so once more: %s"
+                _log.warning(what, name, labels[number], trial.faults[-1])
+                schedule.add(name, number, trial.parameters)
+                continue
+            check_baseline(labels[number], name, trial)
+        yield name, number, trial
+
+
 def check_baseline(odometry: str, sequence: str, run: Trial) -> None:
-    """Refuse a baseline that failed, by a BaselineError; a fault now and then does no harm."""
-    if not run.failure:
+    """Refuse a baseline that failed, or had a fault, by a BaselineError."""
+    if not (run.failure or run.faults):
         return
-    last = run.faults[-1] if run.faults else "it gave no pose, and no reason"
+    said = run.faults[-1] if run.faults else "it gave no pose, and no reason"
+    said = f"{run.failure}; {said}" if run.failure else said
     raise BaselineError(
         f"sequences.{sequence}: {odometry} fails with its own parameters, the baseline: "
-        f"{run.failure}; {last}; nothing of it is stored: mend the odometry (odometry "
-        f"in the study), or leave the sequence out, and run the same command again"
+        f"{said}; nothing of it is stored: mend the odometry (odometry in the study), or leave the "
+        f"sequence out, and run the same command again"
     )
