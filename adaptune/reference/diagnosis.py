@@ -426,16 +426,14 @@ def _of_ends(
     reference: Trajectory, stamps: NDArray[np.int64], span: float, T_odom_sensor: Poses
 ) -> Finding | None:
     """Whether an odometry's poses fit the reference best about one scan later than their stamps."""
-    errors = {}
-    for share in (-1.0, -0.5, 0.0, 0.5, 1.0, 1.5, 2.0) if span > 0 else ():
-        T_ref_sensor = reference.at(stamps + round(share * span))
-        rte = sub_trajectory_rte(T_ref_sensor, T_odom_sensor, END_LENGTH)
-        errors[share] = _mean(rte)
-    if not errors or min(errors, key=errors.__getitem__) != 1.0 or errors[1.0] > ENDS * errors[0.0]:
+    shares = (0.0, 1.0, -1.0, -0.5, 0.5, 1.5, 2.0)
+    at = [reference.at(stamps + round(share * span)) for share in shares]
+    errors = [_mean(sub_trajectory_rte(T, T_odom_sensor, END_LENGTH)) for T in at]
+    if not span > 0 or errors[1] > min(ENDS * errors[0], *errors[2:]) or np.isnan(errors).any():
         return None
     what = (
         f"they fit the reference best {1e-9 * span:.2g} s, about one scan, after their stamps "
-        f"({errors[1.0]:.3g} % over {END_LENGTH:g} m instead of {errors[0.0]:.3g} %)"
+        f"({errors[1]:.3g} % over {END_LENGTH:g} m instead of {errors[0]:.3g} %)"
     )
     mend = (
         "a system that gives the pose of a scan's end needs odometry.settings.pose_time: end; if "

@@ -26,7 +26,6 @@ from adaptune.recording.export import IMU, POINTS, Messages, measurements, struc
 from adaptune.recording.scan import Scan
 from adaptune.ros.link import LinkError
 from adaptune.space import ParameterSet, Selection
-from adaptune.trajectory import Trajectory
 
 _IMU = "sensor_msgs/msg/Imu"
 
@@ -101,13 +100,10 @@ class Lockstep(Faulting):
         self._T_step = np.eye(4) if T_previous_current is None else np.array(T_previous_current)
         self._T_odom_own: Poses | None = None
         self._at_stamp, self._T_known = AtStamp(END), T_previous_current
-        self._silent, self._poses, self._missed = 0, [], []
-        self._take_scan(prepared)
-        self._n_too_late = 0
+        self._silent, self._poses, self._missed, self._n_too_late = 0, [], [], 0
         self._shown = (prepared.stamp, -np.inf)
         self._late: int | None = None
         self._steady = True  # whether all poses are as late as the first one
-        self._before: tuple[int, Poses] | None = None
         try:
             self._begin(prepared)
             self._show(prepared)
@@ -120,12 +116,7 @@ class Lockstep(Faulting):
                 raise OdometryError(f"{self.name}: {fault}") from error
             self.note_fault(fault)
 
-    def _take_scan(self, scan: Scan) -> None:
-        self._stamp = scan.stamp
-        self._span = duration_of(scan) if self._settings.pose_time == "end" else 0
-
     def submit(self, prepared: Scan) -> None:
-        self._take_scan(prepared)
         self._waiting = True
         if self._system is not None:
             try:
@@ -252,7 +243,10 @@ class Lockstep(Faulting):
 
     def _show(self, scan: Scan) -> None:
         """Publish what the system hears until the end of a scan."""
+        self._stamp = scan.stamp
+        self._span = duration_of(scan) if self._settings.pose_time == "end" else 0
         stamp, at = self._shown
+        self._gap = scan.stamp - stamp
         if rate := self._settings.rate:
             time.sleep(max(0.0, at + 1e-9 * (scan.stamp - stamp) / rate - time.monotonic()))
         self._shown = scan.stamp, time.monotonic()
@@ -306,9 +300,11 @@ class Lockstep(Faulting):
                     f"a late pose cannot be told from the next one; raise "
                     f"odometry.settings.patience and isolation.seconds"
                 )
-        T_own = self._at_scan(stamp, T_own @ self._T_base_sensor)
-        # A stamp that is late says itself of when the pose is.
-        taken = self._stamp, self._span if self._late < self._span // 2 else 0
+        T_own = T_own @ self._T_base_sensor
+        # It is of a later moment if its stamp says so, or the user; stamps of a clock say nothing.
+        late, is_first = stamp - self._stamp, self._T_odom_own is None
+        is_later = self._steady and late > 0 and (is_first or late <= 1.5 * self._gap)
+        taken = self._stamp, late if is_later else self._span
         if self._T_odom_own is None:
             T_odom_then = self._at_stamp.begin(*taken, self._T_odom_sensor, self._T_known)
             self._T_odom_own = T_odom_then @ invert(T_own)
@@ -330,42 +326,29 @@ class Lockstep(Faulting):
             help_ = "; if it knows no points but the bag's own, set odometry.settings.play: bag"
             help_ *= "with code" not in what
             raise OdometryError(f"{what} before its first pose{help_}") from error
-        if self._silent >= _MOST_SILENT:
+        n, answered, is_silent = self._n_shown, self._n_answered, self._silent >= _MOST_SILENT
+        if not is_silent and (n < _MOST_SILENT or answered >= _LEAST_ANSWERED * n):
+            return
+        why = self._of_patience() or system.link.why_unheard(self._topics[0])
+        if is_silent:
             published = system.link.topics().keys() - {*QUIET, *self._topics}
             topic = self._settings.odometry
             near = "" if topic in published else nearest(topic, published)
             needs = "" if self._settings.imu else "an IMU (odometry.settings.imu), or "
             why = (
                 self._reader.lacking
-                or self._of_patience()
-                or system.link.why_unheard(self._topics[0])
+                or why
                 or near * near.startswith("did you mean")
                 or (f"does it need {needs}all that the bag holds (play: bag)?")
             )
             raise OdometryError(
-                f"no pose {'' if self._n_answered else 'yet '}on {self._settings.odometry} for "
-                f"{_MOST_SILENT} scans in a row; topics that are published: "
-                f"{', '.join(sorted(published)) or 'none'}; {why}"
+                f"no pose {'' if answered else 'yet '}on {topic} for {_MOST_SILENT} scans in a "
+                f"row; topics that are published: {', '.join(sorted(published)) or 'none'}; {why}"
             )
-        n, answered = self._n_shown, self._n_answered
-        if n >= _MOST_SILENT and answered < _LEAST_ANSWERED * n:
-            why = (
-                self._of_patience()
-                or system.link.why_unheard(self._topics[0])
-                or "set odometry.settings.play: bag"
-            )
-            raise OdometryError(
-                f"it gave poses for {answered} of {n} scans, and lockstep needs one for each; {why}"
-            )
-
-    def _at_scan(self, stamp: int, T_own_sensor: Poses) -> Poses:
-        """The pose at the scan's stamp, if the system gives that at the scan's end."""
-        before, self._before = self._before, (stamp, T_own_sensor)
-        # Stamps of a clock say nothing.
-        if before is None or not before[0] <= self._stamp < stamp or not self._steady:
-            return T_own_sensor
-        both = Trajectory(np.array([before[0], stamp]), np.stack([before[1], T_own_sensor]))
-        return np.asarray(both.at(np.array([self._stamp], np.int64), 1e9)[0])
+        raise OdometryError(
+            f"it gave poses for {answered} of {n} scans, and lockstep needs one for each; "
+            f"{why or 'set odometry.settings.play: bag'}"
+        )
 
     def _pose(self, seconds: float) -> tuple[int, Poses] | None:
         """The system's pose of the scan that was published last; None if it does not come.

@@ -54,7 +54,6 @@ def look(
     report: dict[str, str] = {}
     shown: list[tuple[float, int]] = []
     path, works_on, why = [np.eye(4)], False, "see what went wrong"
-    bag = "set odometry.settings.play: bag"
     with closing(system):
         begin, steps = time.monotonic(), iter(scans)
         first = next(steps)
@@ -74,8 +73,9 @@ def look(
                 said = filter(None, (about, other_frame(about, settings)))
                 report["poses are of"] = "; ".join(said)
             works_on = system._works_on(inside)
+            why = "set odometry.settings.play: bag"
             with suppress(LinkError):
-                why = inside.link.why_unheard(system._topics[0]) or bag
+                why = inside.link.why_unheard(system._topics[0]) or why
     seconds = max(1e-9 * (shown[-1][1] - shown[0][1]), 0.1)
     report["time of a start"] = f"{took:.1f} s"
     report |= _poses(system.came, shown, why)
