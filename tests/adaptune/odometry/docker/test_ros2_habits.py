@@ -11,7 +11,7 @@ from odometry_node import path
 from ros2_reference import ros2
 
 from adaptune.errors import OdometryError, warn_once
-from adaptune.odometry.docker import lockstep
+from adaptune.odometry.docker import lockstep, ros2_system
 from adaptune.odometry.docker.probe import look
 from adaptune.odometry.docker.ros2_system import Ros2
 from adaptune.recording import Scan
@@ -61,10 +61,10 @@ def settings(tmp_path):
 def drive(settings):
     made = []
 
-    def begin(*given, **more):
+    def begin(*given, n=N, **more):
         odometry = Ros2.instance({}, settings(*given, **more), LIMITS, None)
         made.append(odometry)
-        first, *others = scans()
+        first, *others = scans()[:n]
         odometry.start(first, np.eye(4))
         poses = [np.eye(4), *(odometry.register(scan).T_odom_sensor for scan in others)]
         return odometry, np.array(poses)
@@ -130,7 +130,14 @@ def test_one_that_ends_with_a_code_has_said_why(drive, leaves, words, helped):
     assert ("play: bag" in str(raised.value)) == helped
 
 
-def test_one_that_rests_after_its_last_pose_does_not_work_on(drive, caplog):
-    odometry, _ = drive({"computes": 0.15})
+def test_one_that_rests_after_its_last_pose_does_not_work_on(drive, caplog, monkeypatch):
+    monkeypatch.setattr(lockstep, "_BETWEEN_LOOKS", 0.0)
+    monkeypatch.setattr(ros2_system, "_BETWEEN_LOOKS", 0.49)
+    odometry, _ = drive({"computes": 0.15}, n=4)
+    system = odometry._system
+    system._looked = -np.inf
+    assert odometry.usage.cpu > 0.4
+    # What it computes from here on was before its last pose, too.
+    odometry.register(scans()[4])
     odometry.close()
     assert "works on" not in caplog.text
